@@ -1,0 +1,330 @@
+"""The one tree of settings: frozen dataclasses, read from TOML and ``key=value`` overrides.
+
+Every key carries its unit in its name. An unknown key, a wrong type or a value out of range is a
+`ConfigError` that names the key. There are no per-log settings: the defaults are meant for
+everything of a kind.
+"""
+
+import dataclasses
+import difflib
+import tomllib
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from graphslam.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class LogsConfig:
+    """How logs are read.
+
+    reorder_s: messages may arrive this much out of order, by their stamps, and still be placed.
+    topics: topics to use, name -> robot; empty means every topic whose schema is known, the robot
+        being the topic's namespace.
+    """
+
+    reorder_s: float = 2.0
+    topics: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class RobotConfig:
+    """What the log does not say about a robot; the table [robots.NAME], NAME or `default`.
+
+    laser: [x m, y m, yaw rad] of the laser in the base frame, over what tf_static says.
+    wheel_radius_left_m, wheel_radius_right_m, axle_m: the wheels' geometry for JointState logs.
+    left_joint, right_joint: names in JointState; empty means the names that contain left/right.
+    """
+
+    laser: tuple[float, ...] = ()
+    wheel_radius_left_m: float = 0.1
+    wheel_radius_right_m: float = 0.1
+    axle_m: float = 0.5
+    left_joint: str = ""
+    right_joint: str = ""
+
+
+@dataclass(frozen=True)
+class OdometryConfig:
+    """Noise of the motion between two states (thesis 4.8-4.15, see docs/thesis.md).
+
+    The model error is white, its variance grows with path and turning (4.14): k_x_m and k_y_m in
+    m² per m, k_x_rad and k_y_rad in m² per rad, k_phi_m in rad² per m, k_phi_rad in rad² per rad.
+    The calibration errors are constant within one interval: translation_scale_sigma and
+    rotation_scale_sigma are relative, drift_sigma_rad_per_m is turning per metre driven;
+    for wheel angles wheel_radius_sigma_m and axle_sigma_m, and count_sigma_rad per reading.
+    floor_sigma_m and floor_sigma_rad are added once per interval in which the robot moved.
+    max_gap_s: longest span without odometry that is bridged.
+    """
+
+    k_x_m: float = 1e-4
+    k_x_rad: float = 1e-5
+    k_y_m: float = 1e-4
+    k_y_rad: float = 1e-5
+    k_phi_m: float = 1e-4
+    k_phi_rad: float = 1e-4
+    translation_scale_sigma: float = 0.03
+    rotation_scale_sigma: float = 0.04
+    drift_sigma_rad_per_m: float = 0.03
+    wheel_radius_sigma_m: float = 0.0005
+    axle_sigma_m: float = 0.005
+    count_sigma_rad: float = 0.003
+    floor_sigma_m: float = 0.005
+    floor_sigma_rad: float = 0.005
+    max_gap_s: float = 5.0
+
+
+@dataclass(frozen=True)
+class KeyframeConfig:
+    """When a robot gets a state.
+
+    mode: `motion` = at an observation, once the robot moved distance_m or turned angle_rad since
+    its last state; `all` = at every odometry, scan and sighting stamp.
+    """
+
+    mode: Literal["motion", "all"] = "motion"
+    distance_m: float = 0.25
+    angle_rad: float = 0.15
+
+
+@dataclass(frozen=True)
+class FrontEndConfig:
+    """Line segments from scans (thesis 4.7.5-4.7.8).
+
+    name: which front end. max_range_m: farther returns are not used for lines. gap_m: neighbouring
+    returns farther apart than gap_m + gap_share * range start a new chain. split_m: largest
+    orthogonal deviation inside one segment. min_points, min_length_m: smaller ones are dropped.
+    range_sigma_m: white range noise. floor_normal_m, floor_angle_rad: what a wall's material,
+    flatness and the laser's bias leave however many points there are. end_sigma_m: how sharp a
+    segment's real end is. covariance: `incidence` weights each point by its own normal noise,
+    `thesis` uses eq. 4.32 as printed.
+    """
+
+    name: Literal["segments", "none"] = "segments"
+    max_range_m: float = 30.0
+    gap_m: float = 0.3
+    gap_share: float = 0.05
+    split_m: float = 0.05
+    min_points: int = 6
+    min_length_m: float = 0.4
+    range_sigma_m: float = 0.02
+    floor_normal_m: float = 0.01
+    floor_angle_rad: float = 0.005
+    end_sigma_m: float = 0.05
+    covariance: Literal["incidence", "thesis"] = "incidence"
+
+
+@dataclass(frozen=True)
+class AssociationConfig:
+    """Which observation belongs to which landmark (thesis 3.21-3.25 and 4.22-4.28).
+
+    method: `greedy` is the thesis' variant of the NNSF, `optimal` minimises the sum.
+    identities: `use` those in the log or `ignore` them. max_distance_m: eq. 3.23. directed:
+    a line has two sides; false takes directions modulo pi (3.24). gate_probability: chi-square
+    gate (3.25). new_probability: an observation is a new landmark only if its distance to every
+    landmark exceeds this second, higher quantile. overlap_gap_m: largest gap along the line
+    between an observed part and the known extent. sightings_to_promote: a tentative landmark
+    enters the graph at this many. tentative_s, tentative_m: one not seen again after this time and
+    path is deleted. reacquire_m: a landmark not seen for this much path counts as old; old lines
+    are taken up again only if reacquire_min of them that are not all parallel agree.
+    """
+
+    method: Literal["optimal", "greedy"] = "optimal"
+    identities: Literal["use", "ignore"] = "use"
+    max_distance_m: float = 1.5
+    directed: bool = True
+    gate_probability: float = 0.99
+    new_probability: float = 0.9999
+    overlap_gap_m: float = 0.3
+    sightings_to_promote: int = 3
+    tentative_s: float = 20.0
+    tentative_m: float = 5.0
+    reacquire_m: float = 10.0
+    reacquire_min: int = 3
+
+
+@dataclass(frozen=True)
+class RobustConfig:
+    """Kernel on observation factors; scale in sigmas (Cauchy: k with 95 % efficiency 2.385)."""
+
+    kernel: Literal["none", "huber", "cauchy", "geman-mcclure"] = "cauchy"
+    scale: float = 2.0
+
+
+@dataclass(frozen=True)
+class BackendConfig:
+    """The estimator.
+
+    relinearize_threshold: largest change of a variable (m, rad) before it is linearised anew;
+    polish: optimise to convergence at the end.
+    """
+
+    name: Literal["isam2", "batch", "dead-reckoning"] = "isam2"
+    relinearize_threshold: float = 0.02
+    relinearize_every: int = 10
+    polish: bool = True
+
+
+@dataclass(frozen=True)
+class StartConfig:
+    """Priors of the first poses: sigmas of a start that is given; of the one that is the origin.
+
+    poses: robot -> [x m, y m, phi rad], or robot -> `truth`.
+    """
+
+    origin_sigma_m: float = 1e-3
+    origin_sigma_rad: float = 1e-3
+    given_sigma_m: float = 0.05
+    given_sigma_rad: float = 0.03
+    poses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    from_truth: bool = False
+
+
+@dataclass(frozen=True)
+class Config:
+    """The whole tree; `config.toml` in a result folder is this, written out."""
+
+    logs: LogsConfig = field(default_factory=LogsConfig)
+    robots: Mapping[str, RobotConfig] = field(default_factory=dict)
+    odometry: OdometryConfig = field(default_factory=OdometryConfig)
+    keyframe: KeyframeConfig = field(default_factory=KeyframeConfig)
+    front_end: FrontEndConfig = field(default_factory=FrontEndConfig)
+    association: AssociationConfig = field(default_factory=AssociationConfig)
+    robust: RobustConfig = field(default_factory=RobustConfig)
+    backend: BackendConfig = field(default_factory=BackendConfig)
+    start: StartConfig = field(default_factory=StartConfig)
+
+    def robot(self, name: str) -> RobotConfig:
+        """Settings of robot ``name``: its own table, else [robots.default], else the defaults."""
+        return self.robots.get(name, self.robots.get("default", RobotConfig()))
+
+
+def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Config:
+    """Default settings, then the TOML file, then ``key=value`` overrides (dotted keys).
+
+    Raises:
+        ConfigError: the file cannot be read, a key is unknown, a value has the wrong type.
+    """
+    tree: dict[str, Any] = {}
+    if path is not None:
+        try:
+            tree = tomllib.loads(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise ConfigError(f"{path}: not valid TOML: {error}") from error
+    for text in overrides:
+        key, separator, value = text.partition("=")
+        if not separator or not key.strip():
+            raise ConfigError(f"--set {text}: write it as key=value, for example keyframe.mode=all")
+        _set(tree, key.strip().split("."), _parse_value(value.strip()))
+    config = _build(Config, tree, "")
+    assert isinstance(config, Config)  # narrows the type; _build returns what it is asked for
+    return config
+
+
+def dump_config(config: Config) -> str:
+    """The effective configuration as TOML text that `load_config` reads back to an equal tree."""
+    lines: list[str] = []
+    _dump(config, (), lines)
+    return "\n".join(lines).strip() + "\n"
+
+
+def _set(tree: dict[str, Any], keys: list[str], value: object) -> None:
+    for depth, key in enumerate(keys[:-1]):
+        tree = tree.setdefault(key, {})
+        if not isinstance(tree, dict):
+            raise ConfigError(f"{'.'.join(keys)}: {'.'.join(keys[: depth + 1])} is not a table")
+    tree[keys[-1]] = value
+
+
+def _parse_value(text: str) -> object:
+    """A TOML value; what is not valid TOML is taken as a string, so quotes may be left out."""
+    try:
+        return tomllib.loads(f"v = {text}")["v"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _build(kind: Any, value: Any, key: str) -> Any:
+    """The value of type ``kind`` (dataclass, mapping, tuple, literal or scalar) at ``key``."""
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if dataclasses.is_dataclass(kind):
+        return _build_table(kind, value, key)
+    if origin is Literal:
+        if value not in arguments:
+            raise ConfigError(f"{key}: {value!r} is not one of {', '.join(map(str, arguments))}")
+        return value
+    if origin is Mapping:
+        if not isinstance(value, dict):
+            raise ConfigError(f"{key}: expected a table, got {value!r}")
+        return types.MappingProxyType(
+            {name: _build(arguments[1], item, f"{key}.{name}") for name, item in value.items()}
+        )
+    if origin is tuple:
+        if not isinstance(value, list | tuple):
+            raise ConfigError(f"{key}: expected a list, got {value!r}")
+        return tuple(_build(arguments[0], item, f"{key}[{i}]") for i, item in enumerate(value))
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
+        raise ConfigError(f"{key}: expected {kind.__name__}, got {value!r}")
+    if kind is float and not abs(value) < float("inf"):
+        raise ConfigError(f"{key}: must be finite, got {value!r}")
+    if kind in (int, float) and value < 0 and "[" not in key:
+        raise ConfigError(f"{key}: must not be negative, got {value!r}")
+    return value
+
+
+def _build_table(kind: Any, value: Any, key: str) -> Any:
+    if not isinstance(value, dict):
+        raise ConfigError(f"{key}: is a table of settings, got {value!r}")
+    hints = typing.get_type_hints(kind)
+    for name in value:
+        if name not in hints:
+            close = difflib.get_close_matches(name, hints, n=1)
+            hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(hints)}"
+            raise ConfigError(f"{f'{key}.{name}'.lstrip('.')}: unknown key; {hint}")
+    return kind(
+        **{n: _build(hints[n], item, f"{key}.{n}".lstrip(".")) for n, item in value.items()}
+    )
+
+
+def _dump(node: Any, path: tuple[str, ...], lines: list[str]) -> None:
+    items = (
+        [(f.name, getattr(node, f.name)) for f in dataclasses.fields(node)]
+        if dataclasses.is_dataclass(node)
+        else list(node.items())
+    )
+    plain = [(n, v) for n, v in items if not dataclasses.is_dataclass(v) and not _is_table(v)]
+    if path and (plain or not items):
+        lines += ["", f"[{'.'.join(map(_key, path))}]"]
+    lines += [f"{_key(name)} = {_value(value)}" for name, value in plain]
+    for name, value in items:
+        if dataclasses.is_dataclass(value) or _is_table(value):
+            _dump(value, (*path, name), lines)
+
+
+def _is_table(value: object) -> bool:
+    return isinstance(value, Mapping)
+
+
+def _key(name: str) -> str:
+    bare = name.replace("_", "").replace("-", "")
+    return name if bare.isalnum() and bare.isascii() else _quote(name)
+
+
+def _quote(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_value, value))}]"
+    return _quote(value) if isinstance(value, str) else repr(value)

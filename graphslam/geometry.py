@@ -1,0 +1,121 @@
+"""Planar rigid-body geometry on plain arrays.
+
+A pose is an array ``(..., 3)`` of x in metres, y in metres and heading in radians
+(counter-clockwise, x forward, y to the left). ``compose(a, b)`` is the pose ``b``, given in the
+frame of ``a``, expressed in the frame that ``a`` is given in. Functions broadcast over leading
+axes unless they say otherwise. GTSAM's objects never appear here.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def wrap(angle_rad: ArrayLike) -> Array:
+    """Angle in [-pi, pi): the one place where angles are wrapped."""
+    return np.asarray((np.asarray(angle_rad, dtype=float) + np.pi) % (2 * np.pi) - np.pi)
+
+
+def rotation(angle_rad: float) -> Array:
+    """Rotation matrix ``(2, 2)`` that turns vectors counter-clockwise by ``angle_rad``."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[c, -s], [s, c]])
+
+
+def rotation3(angle_rad: float) -> Array:
+    """``blockdiag(rotation(angle), 1)``, the thesis' M(-angle): local to global for (x, y, phi)."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def compose(a: Array, b: Array) -> Array:
+    """``a`` followed by ``b`` given in the frame of ``a``: poses ``(..., 3)``, thesis eq. 4.4."""
+    a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    return np.stack(
+        [
+            a[..., 0] + c * b[..., 0] - s * b[..., 1],
+            a[..., 1] + s * b[..., 0] + c * b[..., 1],
+            wrap(a[..., 2] + b[..., 2]),
+        ],
+        axis=-1,
+    )
+
+
+def inverse(a: Array) -> Array:
+    """The pose of the reference frame seen from ``a``: ``compose(a, inverse(a)) = 0``."""
+    a = np.asarray(a, dtype=float)
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    return np.stack(
+        [-c * a[..., 0] - s * a[..., 1], s * a[..., 0] - c * a[..., 1], wrap(-a[..., 2])], axis=-1
+    )
+
+
+def between(a: Array, b: Array) -> Array:
+    """``b`` seen from ``a``: ``compose(a, between(a, b)) = b``; thesis eq. 4.18 without noise."""
+    return compose(inverse(a), b)
+
+
+def transform(pose: Array, points: Array) -> Array:
+    """Points ``(n, 2)`` in the frame of ``pose`` (3,), expressed in the pose's reference frame."""
+    return np.asarray(points @ rotation(pose[2]).T + pose[:2])
+
+
+def _sinc_terms(phi: Array) -> tuple[Array, Array]:
+    """``sin(phi)/phi`` and ``(1 - cos phi)/phi`` without cancellation near zero.
+
+    1 - cos phi = 2 sin²(phi/2), so both are exact to rounding: sinc(phi) and phi/2 sinc²(phi/2).
+    """
+    sinc = np.sinc(phi / np.pi)
+    half = np.sinc(phi / (2 * np.pi))
+    return np.asarray(sinc), np.asarray(0.5 * phi * half * half)
+
+
+def exp(twist: Array) -> Array:
+    """Exponential map of SE(2): twist ``(..., 3)`` (v_x, v_y, omega) over unit time to a pose."""
+    twist = np.asarray(twist, dtype=float)
+    a, b = _sinc_terms(twist[..., 2])
+    x, y = twist[..., 0], twist[..., 1]
+    return np.stack([a * x - b * y, b * x + a * y, wrap(twist[..., 2])], axis=-1)
+
+
+def log(pose: Array) -> Array:
+    """Inverse of `exp` for headings in (-pi, pi): pose ``(..., 3)`` to twist."""
+    pose = np.asarray(pose, dtype=float)
+    phi = wrap(pose[..., 2])
+    half = np.asarray(phi) / 2
+    # (phi/2) cot(phi/2): cos(h)/sinc(h) is exact at zero as well
+    c = np.cos(half) / np.sinc(half / np.pi)
+    x, y = pose[..., 0], pose[..., 1]
+    return np.stack([c * x + half * y, -half * x + c * y, phi], axis=-1)
+
+
+def compose_jacobians(a: Array, b: Array) -> tuple[Array, Array]:
+    """Derivatives ``(3, 3)`` of ``compose(a, b)`` with respect to a and b, additive errors.
+
+    Thesis eq. 4.7: F for the first pose; W = rotation3(heading of a) for the second.
+    """
+    c, s = np.cos(a[2]), np.sin(a[2])
+    F = np.array([[1.0, 0.0, -s * b[0] - c * b[1]], [0.0, 1.0, c * b[0] - s * b[1]], [0, 0, 1.0]])
+    return F, rotation3(a[2])
+
+
+def compose_cov(a: Array, cov_a: Array, b: Array, cov_b: Array) -> Array:
+    """Covariance (3, 3) of ``compose(a, b)`` for independent a and b, additive errors (x, y, phi).
+
+    ``cov_a`` is along the axes of a's reference frame, ``cov_b`` along the axes of frame a.
+    """
+    F, W = compose_jacobians(a, b)
+    return np.asarray(F @ cov_a @ F.T + W @ cov_b @ W.T)
+
+
+def rotate_cov(cov: Array, angle_rad: float) -> Array:
+    """Covariance (3, 3) of (x, y, phi) turned by ``angle_rad``: axes of a frame to its parent's."""
+    M = rotation3(angle_rad)
+    return np.asarray(M @ cov @ M.T)
+
+
+def interpolate(a: Array, b: Array, share: ArrayLike) -> Array:
+    """Pose between a and b ``(..., 3)`` at share 0..1 along the constant twist from a to b."""
+    return compose(a, exp(np.asarray(share)[..., None] * log(between(a, b))))
