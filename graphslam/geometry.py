@@ -119,3 +119,50 @@ def rotate_cov(cov: Array, angle_rad: float) -> Array:
 def interpolate(a: Array, b: Array, share: ArrayLike) -> Array:
     """Pose between a and b ``(..., 3)`` at share 0..1 along the constant twist from a to b."""
     return compose(a, exp(np.asarray(share)[..., None] * log(between(a, b))))
+
+
+def exp_jacobian(twist: Array) -> Array:
+    """Derivative ``(..., 3, 3)`` of `exp` (additive errors of the pose) for twists ``(..., 3)``.
+
+    Thesis eq. 4.11-4.13 need its columns for v_x and omega; exact at omega = 0 as well.
+    """
+    twist = np.asarray(twist, dtype=float)
+    w = twist[..., 2]
+    a, b = _sinc_terms(w)
+    small = np.abs(w) < 0.3
+    safe = np.where(small, 1.0, w)
+    # a' = (w cos w - sin w)/w², b' = (w sin w - 1 + cos w)/w²: both cancel near zero, where five
+    # terms of their series leave less than 1e-16 for |w| < 0.3
+    w2 = w * w
+    da_series = -w / 3 * (1 - w2 / 10 * (1 - w2 / 28 * (1 - w2 / 54 * (1 - w2 / 88))))
+    db_series = 0.5 - w2 / 8 * (1 - w2 / 18 * (1 - w2 / 40 * (1 - w2 / 70)))
+    da = np.where(small, da_series, (safe * np.cos(safe) - np.sin(safe)) / safe**2)
+    db = np.where(small, db_series, (safe * np.sin(safe) - 1 + np.cos(safe)) / safe**2)
+    out = np.zeros((*twist.shape, 3))
+    out[..., 0, 0] = out[..., 1, 1] = a
+    out[..., 0, 1], out[..., 1, 0] = -b, b
+    out[..., 0, 2] = da * twist[..., 0] - db * twist[..., 1]
+    out[..., 1, 2] = db * twist[..., 0] + da * twist[..., 1]
+    out[..., 2, 2] = 1.0
+    return out
+
+
+def log_jacobian(pose: Array) -> Array:
+    """Derivative ``(..., 3, 3)`` of `log` with respect to additive errors of the pose."""
+    pose = np.asarray(pose, dtype=float)
+    phi = wrap(pose[..., 2])
+    half = phi / 2
+    c = np.cos(half) / np.sinc(half / np.pi)
+    small = np.abs(phi) < 0.1
+    safe = np.where(small, 1.0, half)
+    # derivative of (phi/2) cot(phi/2); its series near zero, next term 1e-13 at 0.1 rad
+    series = -phi / 6 * (1 + phi**2 / 30 * (1 + phi**2 / 28 * (1 + phi**2 / 30)))
+    dc = np.where(small, series, 0.5 / np.tan(safe) - 0.5 * safe / np.sin(safe) ** 2)
+    x, y = pose[..., 0], pose[..., 1]
+    out = np.zeros((*pose.shape, 3))
+    out[..., 0, 0] = out[..., 1, 1] = c
+    out[..., 0, 1], out[..., 1, 0] = half, -half
+    out[..., 0, 2] = dc * x + y / 2
+    out[..., 1, 2] = -x / 2 + dc * y
+    out[..., 2, 2] = 1.0
+    return out

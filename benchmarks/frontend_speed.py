@@ -1,0 +1,83 @@
+"""Scans per second of the front ends on one core.
+
+Generated scans of a cluttered room (180 beams at 1°, 361 at 0.5°), and the Intel log if the data
+are there (GRAPHSLAM_DATA, else ../shared/data beside the repository). CPU time, best of five.
+
+Run: python benchmarks/frontend_speed.py
+"""
+
+import bz2
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from graphslam.config import FrontEndConfig
+from graphslam.frontend import FRONT_ENDS
+from graphslam.records import Scan
+
+DATA = Path(__file__).resolve().parents[1] / "../shared/data"
+
+
+def generated(beams: int, count: int = 500) -> list[Scan]:
+    """Scans of a room with things in it: 1 cm of noise and 3 % drop-outs."""
+    rng = np.random.default_rng(1)
+    angles = np.linspace(-np.pi / 2, np.pi / 2, beams)
+    scans = []
+    for _ in range(count):
+        distance, normal = rng.uniform(1, 12, 12), rng.uniform(-np.pi, np.pi, 12)
+        with np.errstate(divide="ignore"):
+            to_wall = distance[:, None] / np.cos(angles - normal[:, None])
+        to_wall[to_wall <= 0] = np.inf
+        r = to_wall.min(axis=0)
+        for _ in range(6):  # things that stand in front
+            at, half = rng.uniform(-1.5, 1.5), rng.uniform(0.02, 0.15)
+            r = np.where(np.abs(angles - at) < half, r * rng.uniform(0.4, 0.9), r)
+        r = r + 0.01 * rng.normal(size=beams)
+        r[rng.random(beams) < 0.03] = np.nan
+        scans.append(Scan("r", 0, 0, r, angles[0], angles[1] - angles[0], np.zeros(3)))
+    return scans
+
+
+def intel(every: int = 10) -> list[Scan]:
+    """Each tenth scan of the Intel log; none if it is not there."""
+    path = Path(os.environ.get("GRAPHSLAM_DATA", DATA)) / "freiburg/intel.clf.bz2"
+    if not path.exists():
+        return []
+    scans = []
+    with bz2.open(path, "rt") as lines:
+        for words in (line.split() for line in lines if line.startswith("FLASER")):
+            r = np.array(words[2 : 2 + int(words[1])], dtype=float)
+            r[r >= 81] = np.nan
+            scans.append(Scan("r", 0, 0, r, -np.pi / 2, np.pi / 180, np.zeros(3)))
+    return scans[::every]
+
+
+def report(label: str, scans: Sequence[Scan], config: FrontEndConfig) -> None:
+    for name, front_end in FRONT_ENDS.items():
+        seconds, found = np.inf, 0
+        for _ in range(5):
+            start = time.process_time()
+            found = sum(len(front_end(scan, config)) for scan in scans)
+            seconds = min(seconds, time.process_time() - start)
+        per_scan = seconds / len(scans)
+        print(
+            f"{label:22} {name:10} {1e3 * per_scan:7.3f} ms/scan {1 / per_scan:11.0f} scans/s"
+            f" {found / len(scans):6.1f} lines/scan"
+        )
+
+
+def main() -> None:
+    cv2.setNumThreads(1)
+    config = FrontEndConfig()
+    report("generated, 180 beams", generated(180), config)
+    report("generated, 361 beams", generated(361), config)
+    if scans := intel():
+        report("Intel, 180 beams", scans, config)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,99 @@
+"""The interface of every estimator, and what they share: which state is which."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from graphslam.errors import EstimationError
+from graphslam.geometry import Array
+from graphslam.records import Estimate, Step
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Joint:
+    """Joint marginal of a robot's latest pose and some landmarks, world frame.
+
+    ``pose`` (3,), ``landmarks`` one array (2,) or (3,) each; ``cov`` (D, D) of additive
+    world-axis errors, the pose first, then the landmarks in order; ``slices[i]`` is where
+    landmark i's block lies.
+    """
+
+    pose: Array
+    landmarks: tuple[Array, ...]
+    cov: Array
+    slices: tuple[slice, ...]
+
+
+class Backend(Protocol):
+    """An estimator that takes steps in time order and can be asked at any time."""
+
+    def add(self, step: Step) -> None:
+        """Take in everything of one step.
+
+        Raises:
+            EstimationError: the step makes the estimate indeterminate.
+        """
+        ...
+
+    def joint(self, robot: str, landmarks: Sequence[int]) -> Joint:
+        """Joint marginal of the robot's latest pose and the landmarks, from data so far."""
+        ...
+
+    def landmark_means(self, landmarks: Sequence[int]) -> list[Array]:
+        """Current estimates of the landmarks, without covariance (cheap)."""
+        ...
+
+    def finish(self) -> Estimate:
+        """The final estimate from all steps."""
+        ...
+
+
+class StateTable:
+    """Which states each robot has: their times, in order."""
+
+    def __init__(self) -> None:
+        self.times: dict[str, list[int]] = {}
+        self._number: dict[tuple[str, int], int] = {}
+
+    def append(self, robot: str, time_ns: int) -> int:
+        """Number of a new state."""
+        times = self.times.setdefault(robot, [])
+        self._number[robot, time_ns] = len(times)
+        times.append(time_ns)
+        return len(times) - 1
+
+    def number(self, robot: str, time_ns: int) -> int:
+        """Number of the state of ``robot`` at exactly ``time_ns``.
+
+        Raises:
+            EstimationError: there is none.
+        """
+        try:
+            return self._number[robot, time_ns]
+        except KeyError:
+            raise EstimationError(
+                f"robot {robot} has no state at {time_ns} ns: a step refers to a state that no "
+                "earlier step made"
+            ) from None
+
+    def latest(self, robot: str) -> int:
+        """Number of the robot's latest state.
+
+        Raises:
+            EstimationError: the robot has not started.
+        """
+        if robot not in self.times:
+            raise EstimationError(f"robot {robot} has no start: give one with --start")
+        return len(self.times[robot]) - 1
+
+    def stamps(self, robot: str) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+        """Times (n,) of the robot's states, ns."""
+        return np.array(self.times[robot], dtype=np.int64)
+
+
+def block_slices(dims: Sequence[int]) -> tuple[slice, ...]:
+    """Where blocks of sizes ``dims`` lie behind a pose block of three."""
+    ends = 3 + np.cumsum(dims, dtype=int)
+    return tuple(slice(int(e - d), int(e)) for d, e in zip(dims, ends, strict=True))

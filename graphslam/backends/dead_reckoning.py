@@ -1,0 +1,73 @@
+"""Odometry alone: every landmark stays where it was first seen."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from graphslam.backends.base import Joint, StateTable, block_slices
+from graphslam.config import Config
+from graphslam.geometry import Array, compose, compose_cov
+from graphslam.models import MODELS
+from graphslam.records import Estimate, Step, Trajectory
+
+
+class DeadReckoningBackend:
+    """The baseline that uses no observation for the trajectory."""
+
+    def __init__(self, _config: Config) -> None:
+        self._states = StateTable()
+        self._poses: dict[str, list[Array]] = {}
+        self._covs: dict[str, list[Array]] = {}
+        self._landmarks: dict[int, tuple[Array, Array]] = {}
+
+    def add(self, step: Step) -> None:
+        """See `Backend`."""
+        for robot, start in step.starts.items():
+            self._append(robot, step.time_ns, start.pose, start.cov)
+        for robot, motion in step.motions.items():
+            last = self._states.latest(robot)
+            x, P = self._poses[robot][last], self._covs[robot][last]
+            moved = compose(x, motion.delta)
+            self._append(
+                robot, step.time_ns, moved, compose_cov(x, P, motion.delta, motion.cov)
+            )
+        for seen in step.associations:
+            if isinstance(seen.target, int) and seen.target not in self._landmarks:
+                number = self._states.number(seen.robot, seen.time_ns)
+                x, P = self._poses[seen.robot][number], self._covs[seen.robot][number]
+                model = MODELS[seen.model]
+                G_x, G_z = model.invert_jacobians(seen.z, x)
+                cov = G_x @ P @ G_x.T + G_z @ seen.cov @ G_z.T
+                self._landmarks[seen.target] = (model.invert(seen.z, x), cov)
+
+    def _append(self, robot: str, time_ns: int, pose: Array, cov: Array) -> None:
+        self._states.append(robot, time_ns)
+        self._poses.setdefault(robot, []).append(pose)
+        self._covs.setdefault(robot, []).append(cov)
+
+    def joint(self, robot: str, landmarks: Sequence[int]) -> Joint:
+        """See `Backend`; pose and landmarks are taken as independent."""
+        last = self._states.latest(robot)
+        found = [self._landmarks[i] for i in landmarks]
+        slices = block_slices([len(mean) for mean, _ in found])
+        cov = np.zeros((slices[-1].stop if slices else 3,) * 2)
+        cov[:3, :3] = self._covs[robot][last]
+        for block, (_, landmark_cov) in zip(slices, found, strict=True):
+            cov[block, block] = landmark_cov
+        return Joint(self._poses[robot][last], tuple(mean for mean, _ in found), cov, slices)
+
+    def landmark_means(self, landmarks: Sequence[int]) -> list[Array]:
+        """See `Backend`."""
+        return [self._landmarks[i][0] for i in landmarks]
+
+    def finish(self) -> Estimate:
+        """See `Backend`."""
+        states = {
+            robot: Trajectory(
+                self._states.stamps(robot),
+                np.array(self._poses[robot]),
+                np.array(self._covs[robot]),
+            )
+            for robot in sorted(self._poses)
+        }
+        return Estimate(states, dict(self._landmarks), 0.0, 0)

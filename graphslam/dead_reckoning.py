@@ -1,0 +1,159 @@
+"""One robot's odometry as a continuous track: motions between any two times.
+
+The track keeps one small row per reading, so a motion over any interval, its covariance and its
+derivative by the calibration are computed when asked for and can be computed again with another
+calibration. Between two readings the robot is taken to move on a circle segment.
+"""
+
+import numpy as np
+
+from graphslam.config import OdometryConfig, RobotConfig
+from graphslam.geometry import Array, between, compose, exp, log
+from graphslam.models import MOTION_SOURCES, compound
+from graphslam.models.motion import Increments
+from graphslam.records import Motion, OdometryIncrement, OdometryPose, WheelAngles
+
+Odometry = OdometryPose | OdometryIncrement | WheelAngles
+
+#: m and rad: what a robot that reports no motion may still have moved between two states
+STANDING_SIGMA = 1e-3
+
+#: m per rad: how much path a turn counts for when a correction is spread over an interval
+TURNING_EFFORT_M = 0.3
+
+_ROW_SIZE = {"odometry": 3, "given": 12, "wheels": 2}
+
+
+class Track:
+    """Odometry readings of one robot, in time order, and the motions that they describe."""
+
+    def __init__(self, config: OdometryConfig, robot: RobotConfig) -> None:
+        self.source = ""
+        self._config, self._robot = config, robot
+        self._count = 0
+        self._times = np.empty(1024, dtype=np.int64)  # time of the end of each row's interval
+        self._rows = np.empty((1024, 0))
+        self._poses = np.empty((1024, 3))  # by odometry alone, first reading = origin
+        self._effort = np.empty(1024)  # accumulated, see `effort`
+        self._last: Array | None = None
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def first_ns(self) -> int:
+        """Time of the first reading."""
+        return int(self._times[0])
+
+    @property
+    def last_ns(self) -> int:
+        """Time of the latest reading."""
+        return int(self._times[self._count - 1])
+
+    @property
+    def times(self) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+        """Times (n,) of the readings, ns."""
+        return self._times[: self._count]
+
+    def add(self, message: Odometry) -> None:
+        """Append a reading; readings come in time order."""
+        if isinstance(message, OdometryIncrement):
+            if not self._count:
+                self._append("given", message.start_ns, np.zeros(12))
+            self._append(
+                "given",
+                message.time_ns,
+                np.concatenate([log(message.delta), message.cov.ravel()]),
+            )
+        elif isinstance(message, OdometryPose):
+            row = np.zeros(3) if self._last is None else log(between(self._last, message.pose))
+            self._append("odometry", message.time_ns, row)
+            self._last = message.pose
+        else:
+            angles = np.array([message.left_rad, message.right_rad])
+            row = np.zeros(2) if self._last is None else angles - self._last
+            self._append("wheels", message.time_ns, row)
+            self._last = angles
+
+    def _append(self, source: str, time_ns: int, row: Array) -> None:
+        if not self._count:
+            self.source = source
+            self._rows = np.empty((len(self._times), _ROW_SIZE[source]))
+        if self._count == len(self._times):
+            self._times = np.concatenate([self._times, np.empty_like(self._times)])
+            self._rows = np.concatenate([self._rows, np.empty_like(self._rows)])
+            self._poses = np.concatenate([self._poses, np.empty_like(self._poses)])
+            self._effort = np.concatenate([self._effort, np.empty_like(self._effort)])
+        n = self._count
+        self._times[n], self._rows[n] = time_ns, row
+        step = self._increments(row[None]).delta[0]
+        self._poses[n] = compose(self._poses[n - 1], step) if n else np.zeros(3)
+        moved = np.hypot(step[0], step[1]) + TURNING_EFFORT_M * abs(step[2])
+        self._effort[n] = self._effort[n - 1] + moved if n else 0.0
+        self._count += 1
+
+    def _increments(self, rows: Array) -> Increments:
+        return MOTION_SOURCES[self.source](rows, self._robot, self._config)
+
+    def reaches(self, time_ns: int) -> bool:
+        """Whether the motion up to ``time_ns`` is known without looking beyond a reading."""
+        return self._count > 0 and self.last_ns >= time_ns
+
+    def near(self, time_ns: int, gap_ns: int) -> bool:
+        """Whether there is odometry within ``gap_ns`` of ``time_ns``, or on both sides of it."""
+        if not self._count:
+            return False
+        return self.first_ns - gap_ns <= time_ns <= self.last_ns + gap_ns
+
+    def pose(self, times_ns: Array | int) -> Array:
+        """Poses (..., 3) by odometry alone, in the frame of the first reading.
+
+        Before the first reading and after the last one the robot is taken to stand still.
+        """
+        times = np.asarray(times_ns, dtype=np.int64)
+        i = np.clip(np.searchsorted(self.times, times, side="left"), 1, max(self._count - 1, 1))
+        if self._count < 2:
+            return np.zeros((*times.shape, 3))
+        t0, t1 = self._times[i - 1], self._times[i]
+        share = np.clip((times - t0) / np.maximum(t1 - t0, 1), 0.0, 1.0)
+        twist = log(between(self._poses[i - 1], self._poses[i]))
+        return compose(self._poses[i - 1], exp(share[..., None] * twist))
+
+    def effort(self, times_ns: Array | int) -> Array:
+        """Accumulated motion (...,), m: path plus turning. Odometry errors grow with it."""
+        return np.interp(times_ns, self.times, self._effort[: self._count])
+
+    def motion(self, start_ns: int, end_ns: int) -> Motion:
+        """The motion from ``start_ns`` to ``end_ns`` with its covariance; thesis 4.4-4.15.
+
+        Readings that an interval cuts count with the share of time that lies inside.
+        """
+        times, n = self.times, self._count
+        first = int(np.searchsorted(times, start_ns, side="right"))
+        last = min(int(np.searchsorted(times, end_ns, side="left")), n - 1)
+        first = max(first, 1)
+        if end_ns <= start_ns or last < first:
+            return self._standing(start_ns, end_ns)
+        rows = self._rows[first : last + 1]
+        begin, end = times[first - 1 : last], times[first : last + 1]
+        span = np.maximum(end - begin, 1)
+        share = (np.minimum(end, end_ns) - np.maximum(begin, start_ns)) / span
+        parts = self._increments(rows * np.clip(share, 0.0, 1.0)[:, None])
+        whole = compound(parts)
+        cov = whole.cov + whole.d_cal @ parts.calibration_cov @ whole.d_cal.T
+        length = float(np.hypot(parts.delta[:, 0], parts.delta[:, 1]).sum())
+        if self.source != "given":
+            cov = cov + self._floor(length > 0 or whole.delta[2] != 0)
+        return Motion(start_ns, end_ns, whole.delta, cov, whole.d_cal, length)
+
+    def _standing(self, start_ns: int, end_ns: int) -> Motion:
+        p = self._increments(self._rows[:0]).d_cal.shape[2]
+        return Motion(start_ns, end_ns, np.zeros(3), self._floor(False), np.zeros((3, p)), 0.0)
+
+    def _floor(self, moved: bool) -> Array:
+        """Covariance (3, 3) added once per interval; never zero, or two states would be welded."""
+        if not moved:
+            return np.diag([STANDING_SIGMA**2] * 3)
+        return np.diag(
+            [self._config.floor_sigma_m**2] * 2 + [self._config.floor_sigma_rad**2]
+        )

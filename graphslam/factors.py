@@ -1,0 +1,182 @@
+"""The only place that makes GTSAM factors, keys and noise models.
+
+GTSAM's errors of a `Pose2` live in its body frame (`retract` is the exponential map) and a factor's
+error is *expected minus measured*. Our covariances are of additive errors along the axes of the
+frame a quantity is given in; the conversions are here.
+"""
+
+from collections.abc import Callable
+
+import gtsam
+import numpy as np
+
+from graphslam.config import RobustConfig
+from graphslam.errors import EstimationError
+from graphslam.geometry import Array, rotate_cov, rotation3
+from graphslam.models.observation import LineModel
+from graphslam.records import Association, Closure, Motion, Start
+
+#: m: where on a wall a line landmark's origin sits, relative to the state that first saw it. A
+#: gauge: the only factor with information along the line, so its size changes no other estimate.
+LINE_GAUGE_SIGMA_M = 1.0
+
+
+def state_key(robot_index: int, number: int) -> int:
+    """Key of a robot's state; up to 2^16 robots and 2^40 states each."""
+    return int(gtsam.symbol("x", robot_index << 40 | number))
+
+
+def landmark_key(landmark: int) -> int:
+    """Key of a landmark."""
+    return int(gtsam.symbol("l", landmark))
+
+
+def pose2(pose: Array) -> gtsam.Pose2:
+    """Array (3,) to GTSAM."""
+    return gtsam.Pose2(float(pose[0]), float(pose[1]), float(pose[2]))
+
+
+def array3(pose: gtsam.Pose2) -> Array:
+    """GTSAM pose to array (3,)."""
+    return np.array([pose.x(), pose.y(), pose.theta()])
+
+
+def world_from_body(heading_rad: float) -> Array:
+    """Matrix (3, 3) that turns body-frame errors of a pose into additive world-axis errors."""
+    return rotation3(heading_rad)
+
+
+def gaussian(cov: Array) -> gtsam.noiseModel.Base:
+    """Noise model of a covariance.
+
+    Raises:
+        EstimationError: the covariance is not positive definite.
+    """
+    try:
+        np.linalg.cholesky(cov)
+    except np.linalg.LinAlgError as error:
+        raise EstimationError(f"covariance is not positive definite: {cov.tolist()}") from error
+    return gtsam.noiseModel.Gaussian.Covariance(cov)
+
+
+_KERNELS: dict[str, Callable[[float], gtsam.noiseModel.mEstimator.Base]] = {
+    "huber": gtsam.noiseModel.mEstimator.Huber.Create,
+    "cauchy": gtsam.noiseModel.mEstimator.Cauchy.Create,
+    "geman-mcclure": gtsam.noiseModel.mEstimator.GemanMcClure.Create,
+}
+
+
+def robust(noise: gtsam.noiseModel.Base, config: RobustConfig) -> gtsam.noiseModel.Base:
+    """``noise`` under the configured kernel."""
+    if config.kernel == "none":
+        return noise
+    return gtsam.noiseModel.Robust.Create(_KERNELS[config.kernel](config.scale), noise)
+
+
+def start_factor(key: int, start: Start) -> gtsam.NonlinearFactor:
+    """Prior on a robot's first state."""
+    cov = rotate_cov(start.cov, -float(start.pose[2]))
+    return gtsam.PriorFactorPose2(key, pose2(start.pose), gaussian(cov))
+
+
+def motion_factor(key: int, next_key: int, motion: Motion) -> gtsam.NonlinearFactor:
+    """Odometry between two states of one robot."""
+    return relative_pose_factor(key, next_key, motion.delta, gaussian, motion.cov)
+
+
+def closure_factor(
+    key: int, other_key: int, closure: Closure, kernel: RobustConfig
+) -> gtsam.NonlinearFactor:
+    """A measured relative pose: ``key`` seen from ``other_key``."""
+    return relative_pose_factor(
+        other_key, key, closure.delta, lambda cov: robust(gaussian(cov), kernel), closure.cov
+    )
+
+
+def relative_pose_factor(
+    key: int,
+    next_key: int,
+    delta: Array,
+    noise: Callable[[Array], gtsam.noiseModel.Base],
+    cov: Array,
+) -> gtsam.NonlinearFactor:
+    """Between factor; ``cov`` along the first frame's axes, GTSAM wants the measured frame's."""
+    turned = rotate_cov(cov, -float(delta[2]))
+    return gtsam.BetweenFactorPose2(key, next_key, pose2(delta), noise(turned))
+
+
+def _pose_observation(
+    key: int, target: int, seen: Association, kernel: RobustConfig, _x: Array, _t: Array
+) -> gtsam.NonlinearFactor:
+    noise = robust(gaussian(rotate_cov(seen.cov, -float(seen.z[2]))), kernel)
+    return gtsam.BetweenFactorPose2(key, target, pose2(seen.z), noise)
+
+
+def _line_observation(
+    key: int, target: int, seen: Association, kernel: RobustConfig, x: Array, t: Array
+) -> gtsam.NonlinearFactor:
+    """The measurement, moved along its line to face the landmark's origin at the estimate.
+
+    The square root information has a zero first row: nothing is known along the line.
+    """
+    model = LineModel()
+    V = model.noise(seen.z, seen.cov, x, t)
+    R = np.zeros((3, 3))
+    # upper triangular U with UᵀU = V⁻¹: from the Cholesky factor of the inverse
+    R[1:, 1:] = np.linalg.cholesky(np.linalg.inv(V)).T
+    noise = robust(gtsam.noiseModel.Gaussian.SqrtInformation(R, False), kernel)
+    return gtsam.BetweenFactorPose2(key, target, pose2(model.facing(seen.z, x, t)), noise)
+
+
+def _point_observation(
+    key: int, target: int, seen: Association, kernel: RobustConfig, _x: Array, _t: Array
+) -> gtsam.NonlinearFactor:
+    bearing, range_m = gtsam.Rot2(float(seen.z[0])), float(seen.z[1])
+    return gtsam.BearingRangeFactor2D(
+        key, target, bearing, range_m, robust(gaussian(seen.cov), kernel)
+    )
+
+
+def _robot_point_observation(
+    key: int, target: int, seen: Association, kernel: RobustConfig, _x: Array, _t: Array
+) -> gtsam.NonlinearFactor:
+    bearing, range_m = gtsam.Rot2(float(seen.z[0])), float(seen.z[1])
+    return gtsam.BearingRangeFactorPose2(
+        key, target, bearing, range_m, robust(gaussian(seen.cov), kernel)
+    )
+
+
+_FactorMaker = Callable[[int, int, Association, RobustConfig, Array, Array], gtsam.NonlinearFactor]
+
+#: row of `MODELS` -> its factor
+FACTORS: dict[str, _FactorMaker] = {
+    "point": _point_observation,
+    "line": _line_observation,
+    "segment": _pose_observation,
+    "robot-pose": _pose_observation,
+    "robot-point": _robot_point_observation,
+}
+
+
+def observation_factor(
+    key: int, target: int, seen: Association, kernel: RobustConfig, x: Array, t: Array
+) -> gtsam.NonlinearFactor:
+    """Factor between a state and what was observed from it.
+
+    Args:
+        key: the observing state.
+        target: key of the landmark, or of the observed robot's state.
+        seen: the association.
+        kernel: robust kernel.
+        x: estimate (3,) of the observing state, where the factor is built.
+        t: estimate of the target.
+    """
+    return FACTORS[seen.model](key, target, seen, kernel, x, t)
+
+
+def line_gauge_factor(key: int, target: int, seen: Association) -> gtsam.NonlinearFactor:
+    """Ties a new line landmark's origin along its line; see `LINE_GAUGE_SIGMA_M`."""
+    R = np.zeros((3, 3))
+    R[0, 0] = 1.0 / LINE_GAUGE_SIGMA_M
+    noise = gtsam.noiseModel.Gaussian.SqrtInformation(R, False)
+    return gtsam.BetweenFactorPose2(key, target, pose2(seen.z), noise)

@@ -1,0 +1,123 @@
+"""What the pipeline knows about landmarks beside their estimate: kind, extent, sightings, age.
+
+A landmark is *tentative* until it has been seen often enough; only then does it enter the graph,
+together with its earlier sightings. Estimates are copies, refreshed from the back end when they
+may have changed: reading them is much of an incremental smoother's cost.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from graphslam.association import IntArray
+from graphslam.backends import Backend
+from graphslam.geometry import Array, between, compose
+from graphslam.models import MODELS
+from graphslam.records import Association, Observation
+
+
+@dataclass(slots=True, eq=False)
+class Entry:
+    """One landmark, tentative or in the graph.
+
+    ``mean`` (3,) world frame (heading 0 for points); ``extent`` (2,) along its x axis, m;
+    ``cov`` (3, 3) of a tentative one relative to the robot that saw it; ``path_m[robot]`` is how
+    far the robot had driven when it last saw it; ``evidence`` the associations that wait.
+    """
+
+    id: int
+    kind: str
+    mean: Array
+    cov: Array
+    extent: Array
+    first_ns: int
+    last_ns: int
+    identity: str | None
+    sightings: int = 0
+    in_graph: bool = False
+    path_m: dict[str, float] = field(default_factory=dict)
+    evidence: list[Association] = field(default_factory=list)
+
+
+class LandmarkMap:
+    """All landmarks by number, with arrays over them for the vectorised gates."""
+
+    def __init__(self) -> None:
+        self.entries: dict[int, Entry] = {}
+        self.by_identity: dict[str, int] = {}
+        self.deleted = 0
+        self._next = 0
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    def graph_ids(self) -> list[int]:
+        """Numbers of the landmarks in the graph."""
+        return [i for i, entry in self.entries.items() if entry.in_graph]
+
+    def arrays(self) -> tuple[IntArray, Array, Array, Array, Array]:
+        """Numbers (m,), means (m, 3), extents (m, 2), point flags (m,), whole-segment flags (m,)."""
+        entries = list(self.entries.values())
+        m = len(entries)
+        return (
+            np.array([e.id for e in entries], dtype=np.int64),
+            np.array([e.mean for e in entries]).reshape(m, 3),
+            np.array([e.extent for e in entries]).reshape(m, 2),
+            np.array([e.kind == "point" for e in entries], dtype=bool),
+            np.array([e.kind == "segment" for e in entries], dtype=bool),
+        )
+
+    def add(self, seen: Observation, pose: Array, time_ns: int) -> Entry:
+        """A new tentative landmark from an observation in the base frame of ``pose``."""
+        model = MODELS[seen.kind]
+        mean, extent = np.zeros(3), np.zeros(2)
+        state = model.invert(seen.z, pose)
+        mean[: len(state)] = state
+        cov = np.zeros((3, 3))
+        _, G_z = model.invert_jacobians(seen.z, pose)
+        cov[: len(state), : len(state)] = G_z @ seen.cov @ G_z.T
+        if seen.extent is not None:
+            extent = seen.extent.copy()
+        entry = Entry(
+            self._next, seen.kind, mean, cov, extent, time_ns, time_ns, seen.identity
+        )
+        self.entries[entry.id] = entry
+        if seen.identity is not None:
+            self.by_identity[seen.identity] = entry.id
+        self._next += 1
+        return entry
+
+    def saw(
+        self, entry: Entry, seen: Observation, pose: Array, time_ns: int, robot: str, path_m: float
+    ) -> None:
+        """Book a sighting: count it and let the extent grow to what was seen."""
+        entry.sightings += 1
+        entry.last_ns = max(entry.last_ns, time_ns)
+        entry.path_m[robot] = path_m
+        if seen.extent is not None and entry.kind != "point":
+            relative = between(entry.mean, compose(pose, seen.z))
+            ends = relative[0] + np.cos(relative[2]) * seen.extent
+            # a segment seen whole keeps its own ends; a line grows
+            if entry.kind == "line" or entry.sightings == 1:
+                entry.extent = np.array(
+                    [min(entry.extent[0], ends.min()), max(entry.extent[1], ends.max())]
+                )
+
+    def refresh(self, backend: Backend, ids: list[int]) -> None:
+        """Copy the back end's current estimates of these landmarks."""
+        for i, mean in zip(ids, backend.landmark_means(ids), strict=True):
+            self.entries[i].mean[: len(mean)] = mean
+
+    def expire(self, time_ns: int, robot: str, path_m: float, age_ns: int, age_m: float) -> None:
+        """Delete tentative landmarks that this robot has not seen for long, in time *and* path."""
+        gone = [
+            i
+            for i, e in self.entries.items()
+            if not e.in_graph
+            and robot in e.path_m
+            and time_ns - e.last_ns > age_ns
+            and path_m - e.path_m[robot] > age_m
+        ]
+        for i in gone:
+            del self.entries[i]
+        self.deleted += len(gone)

@@ -1,0 +1,249 @@
+"""From one decoded ROS message to one of our records: a row of `DECODERS` per schema.
+
+A decoder is a pure function of the message and of what is known about its topic. It raises
+`UnusableError` with a reason when the message must be dropped; the caller counts reasons.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from graphslam import records
+from graphslam.geometry import Array
+from graphslam.logs import schemas
+
+ABSURD_M = 1000.0  # no planar laser sees as far; some drivers write 1e6 or 65535 for an error
+
+
+class UnusableError(Exception):
+    """A message that must be dropped; its text is the reason under which it is counted."""
+
+
+@dataclass(frozen=True)
+class TopicContext:
+    """What a decoder knows about a topic beside the message.
+
+    ``mounts`` gives the pose (3,) of a sensor frame in the base frame; ``inverted`` names the
+    frames of sensors that hang upside down. Ranges of ``no_return_m`` and more mean no return.
+    ``beams`` counts single beams that were dropped from scans that stay, by reason.
+    """
+
+    robot: str
+    mounts: Mapping[str, Array] = field(default_factory=dict)
+    inverted: frozenset[str] = frozenset()
+    no_return_m: float = np.inf
+    left_joint: str = ""
+    right_joint: str = ""
+    beams: Counter[str] = field(default_factory=Counter)
+
+
+Decode = Callable[[Any, TopicContext], records.Message]
+
+
+class Decoder(NamedTuple):
+    """A row of `DECODERS`: what comes out, and how."""
+
+    record: type[records.Message]
+    decode: Decode
+
+
+def scan(message: Any, topic: TopicContext) -> records.Scan:
+    """sensor_msgs/LaserScan: ranges (n,) m, NaN where a beam gave nothing; beams counter-clockwise.
+
+    inf and NaN are ROS' way to say no return, and 0 that of many drivers. Negative and absurd
+    ranges are errors of a driver: dropped beam by beam and counted.
+
+    Raises:
+        UnusableError: no beams, or an angle increment that is zero or not finite.
+    """
+    ranges = np.asarray(message.ranges, dtype=float)
+    start, step = float(message.angle_min), float(message.angle_increment)
+    if not len(ranges):
+        raise UnusableError("scan: no beams")
+    if not (np.isfinite(start) and np.isfinite(step) and step):
+        raise UnusableError("scan: angle increment is zero or angles are not finite")
+    finite = np.isfinite(ranges)
+    negative, absurd = finite & (ranges < 0), finite & (ranges > ABSURD_M)
+    if negative.any():
+        topic.beams["range: negative"] += int(negative.sum())
+    if absurd.any():
+        topic.beams["range: absurd"] += int(absurd.sum())
+    low, high = float(message.range_min), float(message.range_max)
+    usable = finite & (ranges > 0) & (ranges <= ABSURD_M) & (ranges < topic.no_return_m)
+    # a driver that leaves the limits at 0, or writes NaN or inf, does not limit anything
+    if low > 0:
+        usable &= ranges >= low
+    if high > 0:
+        usable &= ranges <= high
+    ranges[~usable] = np.nan
+    frame = frame_of(message)
+    if frame in topic.inverted:
+        # seen from above, an upside-down laser turns clockwise
+        start, step = -start, -step
+    if step < 0:
+        start, step = start + step * (len(ranges) - 1), -step
+        ranges = ranges[::-1].copy()
+    stamp = stamp_of(message)
+    mount = topic.mounts.get(frame, _NO_MOUNT)
+    return records.Scan(topic.robot, stamp, stamp, ranges, start, step, mount)
+
+
+def odometry(message: Any, topic: TopicContext) -> records.OdometryPose:
+    """nav_msgs/Odometry: the pose (3,) of the base in the odometry frame.
+
+    Raises:
+        UnusableError: the pose is not finite or its quaternion is no rotation.
+    """
+    position, q = message.pose.pose.position, message.pose.pose.orientation
+    norm = q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w
+    if not 0.5 < norm < 2.0:  # also false for NaN
+        raise UnusableError("odometry: quaternion is not a rotation")
+    yaw = np.arctan2(2 * (q.w * q.z + q.x * q.y), norm - 2 * (q.y * q.y + q.z * q.z))
+    pose = np.array([position.x, position.y, yaw])
+    _check_finite("odometry", pose)
+    stamp = stamp_of(message)
+    return records.OdometryPose(topic.robot, stamp, stamp, pose)
+
+
+def joint_state(message: Any, topic: TopicContext) -> records.WheelAngles:
+    """sensor_msgs/JointState: the angles of the left and the right wheel, rad.
+
+    Raises:
+        UnusableError: a wheel is missing or named twice, or its angle is not finite.
+    """
+    positions = dict(zip(message.name, np.asarray(message.position).tolist(), strict=False))
+    left = _joint(positions, topic.left_joint, "left")
+    right = _joint(positions, topic.right_joint, "right")
+    _check_finite("joints", np.array([left, right]))
+    stamp = stamp_of(message)
+    return records.WheelAngles(topic.robot, stamp, stamp, left, right)
+
+
+def sighting(message: Any, topic: TopicContext) -> records.Sighting:
+    """graphslam_msgs/Sighting.
+
+    Raises:
+        UnusableError: something is not finite, the range is not positive, a variance is not.
+    """
+    size = 2 if np.isnan(message.direction) else 3
+    z = np.array([message.bearing, message.range, message.direction])[:size]
+    cov = _covariance("sighting", message.covariance, size)
+    _check_finite("sighting", z)
+    if z[1] <= 0:
+        raise UnusableError("sighting: range is not positive")
+    stamp = stamp_of(message)
+    mount = topic.mounts.get(frame_of(message), _NO_MOUNT)
+    identity, seen = message.identity or None, message.robot or None
+    return records.Sighting(topic.robot, stamp, stamp, z, cov, identity, seen, mount)
+
+
+def odometry_increment(message: Any, topic: TopicContext) -> records.OdometryIncrement:
+    """graphslam_msgs/OdometryIncrement.
+
+    Raises:
+        UnusableError: something is not finite, a variance is not positive, it ends before it starts.
+    """
+    start, stamp = schemas.stamp_ns(message.start), stamp_of(message)
+    if stamp <= start:
+        raise UnusableError("increment: does not end after its start")
+    delta = _pose("increment", message)
+    cov = _covariance("increment", message.covariance, 3)
+    return records.OdometryIncrement(topic.robot, stamp, stamp, start, delta, cov)
+
+
+def relative_pose(message: Any, topic: TopicContext) -> records.RelativePose:
+    """graphslam_msgs/RelativePose.
+
+    Raises:
+        UnusableError: something is not finite or a variance is not positive.
+    """
+    start, stamp = schemas.stamp_ns(message.start), stamp_of(message)
+    delta = _pose("relative pose", message)
+    cov = _covariance("relative pose", message.covariance, 3)
+    other = message.other or topic.robot
+    return records.RelativePose(topic.robot, stamp, stamp, other, start, delta, cov)
+
+
+def true_pose(message: Any, topic: TopicContext) -> records.Truth:
+    """graphslam_msgs/TruePose.
+
+    Raises:
+        UnusableError: the pose is not finite.
+    """
+    stamp = stamp_of(message)
+    return records.Truth(topic.robot, stamp, stamp, _pose("truth", message))
+
+
+def true_landmark(message: Any, _topic: TopicContext) -> records.TrueLandmark:
+    """graphslam_msgs/TrueLandmark.
+
+    Raises:
+        UnusableError: an unknown kind, a position that is not finite, an extent of a wrong size.
+    """
+    if message.kind not in ("point", "segment", "line"):
+        raise UnusableError("true landmark: kind is not point, segment or line")
+    pose = np.array([message.x, message.y, message.phi])
+    _check_finite("true landmark", pose[:2] if message.kind == "point" else pose)
+    extent = np.asarray(message.extent, dtype=float)
+    if len(extent) not in (0, 4):
+        raise UnusableError("true landmark: extent is not x1 y1 x2 y2")
+    ends = extent.reshape(2, 2) if len(extent) else None
+    stamp = stamp_of(message)
+    return records.TrueLandmark("", stamp, stamp, message.identity, message.kind, pose, ends)
+
+
+DECODERS: dict[str, Decoder] = {
+    schemas.LASER_SCAN: Decoder(records.Scan, scan),
+    schemas.ODOMETRY: Decoder(records.OdometryPose, odometry),
+    schemas.JOINT_STATE: Decoder(records.WheelAngles, joint_state),
+    schemas.SIGHTING: Decoder(records.Sighting, sighting),
+    schemas.ODOMETRY_INCREMENT: Decoder(records.OdometryIncrement, odometry_increment),
+    schemas.RELATIVE_POSE: Decoder(records.RelativePose, relative_pose),
+    schemas.TRUE_POSE: Decoder(records.Truth, true_pose),
+    schemas.TRUE_LANDMARK: Decoder(records.TrueLandmark, true_landmark),
+}
+
+_NO_MOUNT = np.zeros(3)
+
+
+def stamp_of(message: Any) -> int:
+    """Header stamp of a message, integer nanoseconds."""
+    return schemas.stamp_ns(message.header.stamp)
+
+
+def frame_of(message: Any) -> str:
+    """Frame of a message's header; ROS 1 tools write a leading slash that means nothing."""
+    return str(message.header.frame_id).lstrip("/")
+
+
+def _check_finite(what: str, values: Array) -> None:
+    if not np.isfinite(values).all():
+        raise UnusableError(f"{what}: not finite")
+
+
+def _pose(what: str, message: Any) -> Array:
+    pose = np.array([message.x, message.y, message.phi])
+    _check_finite(what, pose)
+    return pose
+
+
+def _covariance(what: str, values: Any, size: int) -> Array:
+    """The upper left (size, size) of nine numbers, symmetric to the last bit."""
+    cov = np.asarray(values, dtype=float).reshape(3, 3)[:size, :size]
+    cov = np.asarray((cov + cov.T) / 2)
+    _check_finite(what, cov)
+    if np.linalg.eigvalsh(cov)[0] <= 0:
+        raise UnusableError(f"{what}: covariance is not positive definite")
+    return cov
+
+
+def _joint(positions: Mapping[str, float], name: str, side: str) -> float:
+    names = [name] if name else [n for n in positions if side in n.lower()]
+    if len(names) != 1 or names[0] not in positions:
+        raise UnusableError(
+            f"joints: {side} wheel missing or ambiguous; set robots.NAME.{side}_joint"
+        )
+    return positions[names[0]]

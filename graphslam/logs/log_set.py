@@ -1,0 +1,180 @@
+"""Logs opened together: what robots they hold, and their messages in the order of time."""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from graphslam import records
+from graphslam.config import Config
+from graphslam.errors import LogError
+from graphslam.logs import order, schemas
+from graphslam.logs.decoders import DECODERS, TopicContext, UnusableError
+from graphslam.logs.mcap_file import McapFile, RawMessage, open_mcap, raw_messages
+from graphslam.logs.survey import survey_topics
+from graphslam.logs.topics import ODOMETRY_KINDS, Topic, choose_topics, find_topics
+from graphslam.records import Message
+
+
+@dataclass(frozen=True, slots=True)
+class LogFile:
+    """One file of a `LogSet`: ``messages`` read of all topics, ``lost`` None when unknown."""
+
+    path: Path
+    sha256: str
+    messages: int
+    lost: int | None
+
+
+@dataclass
+class LogSet:
+    """Logs that belong together.
+
+    Attributes:
+        robots: names of the robots with odometry, sorted.
+        files: what each file held.
+        topics: the topics that are used.
+        notes: the metadata record `graphslam` of the files, for example that stamps are invented.
+        warnings: what had to be assumed or is wrong, one line each; `messages` adds to it when it
+            has come to its end.
+        dropped: number of messages (or single beams, reasons that begin with ``range:``) that
+            were dropped, by reason; filled when `messages` has come to its end.
+        repaired: the same for messages that are used although something was odd.
+    """
+
+    robots: tuple[str, ...]
+    files: tuple[LogFile, ...]
+    topics: tuple[Topic, ...]
+    notes: Mapping[str, str]
+    warnings: list[str]
+    dropped: Counter[str]
+    repaired: Counter[str]
+    _mcap: Sequence[McapFile] = field(repr=False)
+    _contexts: Mapping[str, TopicContext] = field(repr=False)
+    _window_ns: int
+
+    def __post_init__(self) -> None:
+        self._opening_warnings = len(self.warnings)
+
+    def has_scans(self, robot: str) -> bool:
+        """Whether the logs hold laser scans of ``robot``."""
+        return any(t.robot == robot and t.record is records.Scan for t in self.topics)
+
+    def no_return_m(self, topic: str) -> float:
+        """Range from which on a beam of ``topic`` means no return, m; inf when none was found."""
+        return self._contexts[topic].no_return_m
+
+    def messages(self) -> Iterator[Message]:
+        """All messages in the order of ``time_ns``; at equal times odometry comes first.
+
+        Memory holds what falls into ``logs.reorder_s``, not the log. Every call starts anew.
+        """
+        self.dropped.clear()
+        self.repaired.clear()
+        del self.warnings[self._opening_warnings :]
+        topics = {topic.name: topic for topic in self.topics}
+        readers = [
+            _FileReader(file, topics, self._contexts, self._window_ns) for file in self._mcap
+        ]
+        yield from order.merge([reader.messages() for reader in readers])
+        for file, reader in zip(self._mcap, readers, strict=True):
+            self.dropped += reader.dropped
+            for topic, counts in sorted(reader.line.counts.items()):
+                self.warnings += _warn_of_stamps(file, topic, counts)
+                self.dropped[order.TOO_LATE] += counts.pop(order.TOO_LATE, 0)
+                self.repaired += counts
+        self.dropped += Counter()  # without zeros
+
+
+def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
+    """Open ``paths`` (MCAP files) as one log and find out what is in it.
+
+    Raises:
+        LogError: a file is missing, not MCAP or empty; no topic is usable; all usable topics are
+            empty; a robot has scans but no odometry. The message names file and topic.
+    """
+    if not paths:
+        raise LogError("no log given; name at least one .mcap file")
+    files = [open_mcap(Path(path)) for path in paths]
+    topics, warnings = choose_topics(files, find_topics(files, config))
+    contexts, assumed = survey_topics(files, topics, config)
+    notes: dict[str, str] = {}
+    for file in files:
+        notes |= file.notes
+    return LogSet(
+        robots=tuple(sorted({t.robot for t in topics if t.record in ODOMETRY_KINDS})),
+        files=tuple(LogFile(f.path, f.sha256, f.messages, f.lost) for f in files),
+        topics=tuple(topics),
+        notes=notes,
+        warnings=[_damage(file) for file in files if file.damage] + warnings + assumed,
+        dropped=Counter(),
+        repaired=Counter(),
+        _mcap=files,
+        _contexts=contexts,
+        _window_ns=round(config.logs.reorder_s * 1e9),
+    )
+
+
+def decode_message(
+    raw: RawMessage, topic: Topic, context: TopicContext, dropped: Counter[str]
+) -> Message | None:
+    """The record in one raw message; None, and the reason counted, when it must be dropped."""
+    try:
+        return DECODERS[topic.schema].decode(schemas.decode(topic.schema, raw.data), context)
+    except UnusableError as reason:
+        dropped[str(reason)] += 1
+    except schemas.CdrError:
+        dropped[f"{topic.schema}: cannot be decoded"] += 1
+    return None
+
+
+class _FileReader:
+    """One pass over the messages of one file."""
+
+    def __init__(
+        self,
+        file: McapFile,
+        topics: Mapping[str, Topic],
+        contexts: Mapping[str, TopicContext],
+        window_ns: int,
+    ) -> None:
+        self.dropped: Counter[str] = Counter()
+        self.line = order.TimeLine(window_ns)
+        self._file, self._topics = file, topics
+        # beams are counted by the decoders, into this pass' own counter
+        self._contexts = {n: replace(c, beams=self.dropped) for n, c in contexts.items()}
+
+    def messages(self) -> Iterator[Message]:
+        """Sorted messages of this file."""
+        for raw in raw_messages(self._file, self._topics.keys()):
+            topic, context = self._topics[raw.topic], self._contexts[raw.topic]
+            message = decode_message(raw, topic, context, self.dropped)
+            if message is not None:
+                yield from self.line.push(raw.topic, message)
+        yield from self.line.finish()
+
+
+def _warn_of_stamps(file: McapFile, topic: str, counts: Counter[str]) -> list[str]:
+    """One line per kind of oddity among the stamps of a topic."""
+    where = f"{file.path}: {topic}"
+    lines = []
+    if counts[order.GLITCH]:
+        lines.append(
+            f"{where}: {counts[order.GLITCH]} stamps contradict the order of recording; "
+            "placed between their neighbours"
+        )
+    if counts[order.DUPLICATE]:
+        lines.append(f"{where}: {counts[order.DUPLICATE]} messages repeat a stamp; kept")
+    if counts[order.TOO_LATE]:
+        lines.append(
+            f"{where}: {counts[order.TOO_LATE]} messages came too late and were dropped; "
+            "raise logs.reorder_s to keep them"
+        )
+    return lines
+
+
+def _damage(file: McapFile) -> str:
+    lost = "an unknown number of" if file.lost is None else str(file.lost)
+    return (
+        f"{file.path}: damaged, {lost} messages are lost, {file.messages} are read: {file.damage}"
+    )

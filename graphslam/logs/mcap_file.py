@@ -1,0 +1,381 @@
+"""Raw messages of one MCAP file in the order of recording, whatever state the file is in.
+
+The file's own summary is not trusted: one pass over the data section lists the blocks of messages
+that can really be read, with their CRCs checked. A file that was cut off, has flipped bits or
+lacks a summary so gives everything that is left, and what is lost is counted. The only module
+that reads with `mcap`.
+"""
+
+import hashlib
+import heapq
+import struct
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO, NamedTuple, TypeVar
+
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
+from mcap.records import (
+    Channel,
+    Chunk,
+    McapRecord,
+    Message,
+    Metadata,
+    Schema,
+    Statistics,
+)
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.summary import Summary
+
+from graphslam.errors import LogError
+
+_T = TypeVar("_T")
+
+MAGIC = b"\x89MCAP0\r\n"
+NOTES = "graphslam"  # name of the metadata record in which our own logs carry notes
+
+# What mcap, zstandard and lz4 raise on damaged bytes, found by flipping and cutting: their own
+# errors, and whatever the standard library says to a nonsensical length, id or string.
+_DAMAGE = (
+    McapError,
+    zstandard.ZstdError,
+    struct.error,
+    ValueError,
+    KeyError,
+    TypeError,
+    RuntimeError,
+    MemoryError,
+    OverflowError,
+    EOFError,
+)
+# Messages outside chunks are read in runs of this many, so that a block is never large.
+_LOOSE_RUN = 1000
+
+
+class RawMessage(NamedTuple):
+    """One message as recorded: its topic, the recorder's time and the encoded bytes."""
+
+    topic: str
+    log_time_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class RawTopic:
+    """A topic of one file: schema name, message encoding and number of readable messages."""
+
+    name: str
+    schema: str
+    encoding: str
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Block:
+    """A chunk, or a run of messages outside chunks, that was read once without error."""
+
+    offset: int
+    start_ns: int
+    end_ns: int
+    counts: Mapping[int, int]  # channel id -> messages
+
+
+@dataclass(frozen=True, slots=True)
+class McapFile:
+    """What one pass over an MCAP file found; `raw_messages` reads it again.
+
+    ``lost`` is the number of messages that the file once held and that cannot be read, None when
+    it is damaged but does not say how many there were. ``damage`` describes it in one line, empty
+    for a whole file. ``in_order`` tells that log times never decrease in file order.
+    """
+
+    path: Path
+    sha256: str
+    topics: tuple[RawTopic, ...]
+    messages: int
+    lost: int | None
+    damage: str
+    notes: Mapping[str, str]
+    in_order: bool
+    blocks: tuple[_Block, ...] = field(repr=False)
+    channels: Mapping[int, str] = field(repr=False)  # id -> topic
+
+
+def open_mcap(path: Path) -> McapFile:
+    """Read through ``path`` once and list what it holds.
+
+    Raises:
+        LogError: no such file, a directory, unreadable, not MCAP, or without any message.
+    """
+    try:
+        if path.is_dir():
+            raise LogError(f"{path}: is a directory; name the .mcap files in it")
+        with path.open("rb") as stream:
+            if stream.read(len(MAGIC)) != MAGIC:
+                raise LogError(
+                    f"{path}: is not an MCAP file; `graphslam import` turns other formats into MCAP"
+                )
+            file = _Indexer(path, stream).run()
+    except FileNotFoundError as error:
+        raise LogError(f"{path}: no such file; check the path") from error
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror}; check the file") from error
+    if not file.messages:
+        why = f"no message can be read: {file.damage}" if file.damage else "is an empty log"
+        raise LogError(f"{path}: {why}; record it again or name another file")
+    return file
+
+
+def raw_messages(file: McapFile, topics: Collection[str]) -> Iterator[RawMessage]:
+    """Messages of ``topics`` in the order of recording.
+
+    That is the order of the file when its log times never decrease, else that of the log times.
+
+    Memory holds the blocks that overlap in log time, one where the file is in order.
+    """
+    wanted = {number for number, topic in file.channels.items() if topic in topics}
+    blocks = [block for block in file.blocks if not wanted.isdisjoint(block.counts)]
+    with file.path.open("rb") as stream:
+        if file.in_order:
+            for block in blocks:
+                for message in _block_messages(stream, block):
+                    if message.channel_id in wanted:
+                        yield _raw(file, message)
+        else:
+            yield from _by_log_time(file, stream, blocks, wanted)
+
+
+def sample_messages(file: McapFile, topic: str, blocks: int, per_block: int) -> Iterator[bytes]:
+    """Data of about ``blocks * per_block`` messages of ``topic``, spread evenly over the file."""
+    numbers = {number for number, name in file.channels.items() if name == topic}
+    holding = [b for b in file.blocks if not numbers.isdisjoint(b.counts)]
+    with file.path.open("rb") as stream:
+        for block in _spread(holding, blocks):
+            found = [m.data for m in _block_messages(stream, block) if m.channel_id in numbers]
+            yield from _spread(found, per_block)
+
+
+def _spread(items: Sequence[_T], n: int) -> Sequence[_T]:
+    """At most ``n`` of the items, evenly spaced."""
+    return items[:: max(1, -(-len(items) // n))]
+
+
+def _raw(file: McapFile, message: Message) -> RawMessage:
+    return RawMessage(file.channels[message.channel_id], message.log_time, message.data)
+
+
+def _by_log_time(
+    file: McapFile, stream: BinaryIO, blocks: list[_Block], wanted: Collection[int]
+) -> Iterator[RawMessage]:
+    """Merge blocks that overlap in log time; equal times keep the order of the file."""
+    heap: list[tuple[int, int, int, Message]] = []
+    for number, block in enumerate(sorted(blocks, key=lambda b: (b.start_ns, b.offset))):
+        while heap and heap[0][0] < block.start_ns:
+            yield _raw(file, heapq.heappop(heap)[3])
+        for position, message in enumerate(_block_messages(stream, block)):
+            if message.channel_id in wanted:
+                heapq.heappush(heap, (message.log_time, number, position, message))
+    while heap:
+        yield _raw(file, heapq.heappop(heap)[3])
+
+
+# ---------------------------------------------------------------- blocks
+
+
+def _records(stream: BinaryIO, offset: int, limit: int) -> Iterator[tuple[int, McapRecord]]:
+    """Offset and record, chunks unopened, from ``offset`` to the footer or to a damaged place."""
+    stream.seek(offset)
+    reader = StreamReader(stream, skip_magic=True, emit_chunks=True, record_size_limit=limit)
+    for record in reader.records:
+        yield offset, record
+        offset = stream.tell()
+
+
+def _chunk_at(stream: BinaryIO, offset: int) -> list[McapRecord]:
+    """The records in the chunk at ``offset``; of a chunk that the file's end cuts, its beginning.
+
+    Raises:
+        One of `_DAMAGE` when the chunk is damaged in any other way, its CRC included.
+    """
+    stream.seek(offset)
+    head = stream.read(9)
+    if len(head) < 9 or head[0] != Opcode.CHUNK:
+        raise McapError("no chunk where the index has one")
+    body = stream.read(int.from_bytes(head[1:], "little"))
+    chunk = Chunk.read(ReadDataStream(BytesIO(body)))
+    if len(body) == int.from_bytes(head[1:], "little"):
+        return breakup_chunk(chunk, validate_crc=True)
+    return _cut_chunk(chunk)
+
+
+def _cut_chunk(chunk: Chunk) -> list[McapRecord]:
+    """Whole records at the beginning of a chunk whose end is missing."""
+    data = chunk.data
+    if chunk.compression == "zstd":
+        data = zstandard.ZstdDecompressor().decompressobj().decompress(data)
+    elif chunk.compression:
+        raise McapError(f"the beginning of a {chunk.compression} chunk cannot be read")
+    end = 0
+    while end + 9 <= len(data):
+        length = int.from_bytes(data[end + 1 : end + 9], "little")
+        if end + 9 + length > len(data):
+            break
+        end += 9 + length
+    return breakup_chunk(Chunk("", data[:end], 0, 0, 0, end))
+
+
+def _block_messages(stream: BinaryIO, block: _Block) -> Iterator[Message]:
+    stream.seek(block.offset)
+    if stream.read(1)[0] == Opcode.CHUNK:
+        records: Iterable[McapRecord] = _chunk_at(stream, block.offset)
+    else:
+        count = sum(block.counts.values())
+        loose = (r for _, r in _records(stream, block.offset, 1 << 40) if isinstance(r, Message))
+        records = (message for message, _ in zip(loose, range(count), strict=False))
+    return (record for record in records if isinstance(record, Message))
+
+
+class _Indexer:
+    """The one pass over a file; `run` does it, everything else is a step of it."""
+
+    def __init__(self, path: Path, stream: BinaryIO) -> None:
+        self.path, self.stream = path, stream
+        self.size = path.stat().st_size
+        self.position = len(MAGIC)  # where the next record begins
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.blocks: list[_Block] = []
+        self.loose: list[tuple[int, Message]] = []
+        self.damage: list[str] = []
+        self.statistics: Statistics | None = None
+        self.notes: dict[str, str] = {}
+        self.tried: set[int] = set()  # offsets of chunks
+        self.in_order, self.latest_ns = True, -1
+
+    def run(self) -> McapFile:
+        try:
+            for offset, record in _records(self.stream, self.position, self.size):
+                self.take(offset, record)
+                self.position = self.stream.tell()
+        except _DAMAGE as error:
+            self.rescue(error)
+        self.close_run()
+        return self.result()
+
+    def take(self, offset: int, record: McapRecord) -> None:
+        if isinstance(record, Message):
+            self.loose.append((offset, record))
+            if len(self.loose) == _LOOSE_RUN:
+                self.close_run()
+        elif isinstance(record, Chunk):
+            self.close_run()
+            self.tried.add(offset)
+            try:
+                self.take_block(offset, breakup_chunk(record, validate_crc=True))
+            except _DAMAGE as error:
+                self.damage.append(f"the chunk at byte {offset} is damaged ({_say(error)})")
+        elif isinstance(record, Statistics):
+            self.statistics = record
+        elif isinstance(record, Metadata) and record.name == NOTES:
+            self.notes.update(record.metadata)
+        else:
+            self.describe(record)
+
+    def describe(self, record: McapRecord) -> None:
+        if isinstance(record, Schema):
+            self.schemas.setdefault(record.id, record)
+        elif isinstance(record, Channel):
+            self.channels.setdefault(record.id, record)
+
+    def take_block(self, offset: int, records: Iterable[McapRecord]) -> None:
+        counts: Counter[int] = Counter()
+        times: list[int] = []
+        for record in records:
+            if isinstance(record, Message):
+                counts[record.channel_id] += 1
+                times.append(record.log_time)
+                self.in_order &= record.log_time >= self.latest_ns
+                self.latest_ns = max(self.latest_ns, record.log_time)
+            else:
+                self.describe(record)
+        if times:
+            self.blocks.append(_Block(offset, min(times), max(times), dict(counts)))
+
+    def close_run(self) -> None:
+        if self.loose:
+            self.take_block(self.loose[0][0], [message for _, message in self.loose])
+            self.loose = []
+
+    def rescue(self, error: Exception) -> None:
+        """What can be had beyond the place where reading in sequence failed."""
+        self.close_run()
+        self.damage.append(
+            f"it cannot be read on at byte {self.position} of {self.size} ({_say(error)})"
+        )
+        offsets = [self.position]
+        summary = self.summary()
+        if summary is not None:
+            self.statistics = self.statistics or summary.statistics
+            for record in (*summary.schemas.values(), *summary.channels.values()):
+                self.describe(record)
+            offsets += [index.chunk_start_offset for index in summary.chunk_indexes]
+        for offset in sorted(set(offsets) - self.tried):
+            try:
+                self.take_block(offset, _chunk_at(self.stream, offset))
+            except _DAMAGE:
+                continue  # lost; the statistics, where there are any, tell how much
+
+    def summary(self) -> Summary | None:
+        try:
+            self.stream.seek(0)
+            return SeekingReader(self.stream, record_size_limit=self.size).get_summary()
+        except (*_DAMAGE, OSError, StopIteration):  # OSError: a seek to before the beginning
+            return None
+
+    def result(self) -> McapFile:
+        counts: Counter[int] = Counter()
+        for block in self.blocks:
+            counts.update(block.counts)
+        known = {n: c for n, c in self.channels.items() if c.schema_id in self.schemas}
+        topics: dict[str, RawTopic] = {}
+        for number, channel in known.items():
+            before = topics[channel.topic].count if channel.topic in topics else 0
+            schema = self.schemas[channel.schema_id].name
+            topics[channel.topic] = RawTopic(
+                channel.topic, schema, channel.message_encoding, before + counts[number]
+            )
+        messages = sum(counts.values())
+        lost: int | None = None if self.damage else 0
+        if self.statistics is not None:
+            lost = max(0, self.statistics.message_count - messages)
+        return McapFile(
+            path=self.path,
+            sha256=_sha256(self.stream),
+            topics=tuple(sorted(topics.values())),
+            messages=messages,
+            lost=lost,
+            damage="; ".join(self.damage),
+            notes=self.notes,
+            in_order=self.in_order,
+            blocks=tuple(self.blocks),
+            channels={number: channel.topic for number, channel in known.items()},
+        )
+
+
+def _sha256(stream: BinaryIO) -> str:
+    stream.seek(0)
+    digest = hashlib.sha256()
+    while piece := stream.read(1 << 20):
+        digest.update(piece)
+    return digest.hexdigest()
+
+
+def _say(error: Exception) -> str:
+    """One line about an error of `_DAMAGE`; several of them come without words."""
+    return " ".join(str(error).split()) or type(error).__name__

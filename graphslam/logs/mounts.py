@@ -1,0 +1,95 @@
+"""Where the sensors sit: static transforms to planar mounts."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from graphslam.geometry import Array
+
+# Transforms are parent_from_child, keyed by the child: a frame has one parent.
+Tree = Mapping[str, tuple[str, Array]]
+
+# A laser tilted by less than this still sees a planar slice to about one per mille.
+_LEVEL = np.cos(np.deg2rad(3.0))
+
+
+@dataclass(frozen=True, slots=True)
+class Mount:
+    """Pose (3,) of a sensor in the base frame; ``inverted`` when it hangs upside down.
+
+    ``tilt_rad`` is the angle between its axis and the vertical, 0 for either way up.
+    """
+
+    pose: Array
+    inverted: bool
+    tilt_rad: float
+
+
+def transform_tree(messages: Iterable[Any]) -> dict[str, tuple[str, Array]]:
+    """All transforms of TFMessages as matrices (4, 4), parent from child; the last one counts."""
+    tree = {}
+    for message in messages:
+        for stamped in message.transforms:
+            parent, child = stamped.header.frame_id, stamped.child_frame_id
+            matrix = _matrix(stamped.transform)
+            if np.isfinite(matrix).all():
+                tree[child.lstrip("/")] = (parent.lstrip("/"), matrix)
+    return tree
+
+
+def find_mount(tree: Tree, base: str, sensor: str) -> Mount | None:
+    """Mount of frame ``sensor`` on frame ``base``; None when the tree does not connect them.
+
+    Either may be the other's ancestor, or both hang below a common one (base_footprint).
+    """
+    if base == sensor:
+        return Mount(np.zeros(3), False, 0.0)
+    above_base, above_sensor = _ancestors(tree, base), _ancestors(tree, sensor)
+    common = next((frame for frame in above_sensor if frame in above_base), None)
+    if common is None:
+        return None
+    return planar_mount(np.asarray(np.linalg.solve(above_base[common], above_sensor[common])))
+
+
+def planar_mount(base_from_sensor: Array) -> Mount:
+    """The planar part of a transform (4, 4): where the sensor's x axis points, seen from above."""
+    R = base_from_sensor[:3, :3]
+    x, y = base_from_sensor[:2, 3]
+    pose = np.array([x, y, np.arctan2(R[1, 0], R[0, 0])])
+    inverted = bool(R[2, 2] < 0)
+    return Mount(pose, inverted, float(np.arccos(min(1.0, abs(R[2, 2])))))
+
+
+def is_level(mount: Mount) -> bool:
+    """Whether the sensor's plane is the floor's to within what a planar map can ignore."""
+    return bool(np.cos(mount.tilt_rad) >= _LEVEL)
+
+
+def _ancestors(tree: Tree, frame: str) -> dict[str, Array]:
+    """``frame`` and everything above it, with the transform (4, 4) ancestor from ``frame``."""
+    found = {frame: np.eye(4)}
+    while frame in tree:
+        parent, parent_from_frame = tree[frame]
+        if parent in found:  # a loop, which tf forbids
+            break
+        found[parent] = parent_from_frame @ found[frame]
+        frame = parent
+    return found
+
+
+def _matrix(transform: Any) -> Array:
+    t, q = transform.translation, transform.rotation
+    norm = np.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
+    if not norm > 0:
+        return np.full((4, 4), np.nan)
+    x, y, z, w = q.x / norm, q.y / norm, q.z / norm, q.w / norm
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    matrix[:3, 3] = [t.x, t.y, t.z]
+    return matrix

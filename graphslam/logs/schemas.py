@@ -1,0 +1,151 @@
+"""Message types of a log: ROS 2's own and ours, and their CDR encoding.
+
+The only module that knows rosbags. Messages are rosbags' plain dataclasses whose number arrays
+are numpy arrays. Our own types are defined here as ros2msg text, which is also what `LogWriter`
+puts into the file, so that any ROS 2 or MCAP tool can decode them. docs/logs.md explains them.
+"""
+
+from functools import cache
+from typing import Any
+
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from graphslam.errors import LogError
+
+LASER_SCAN = "sensor_msgs/msg/LaserScan"
+ODOMETRY = "nav_msgs/msg/Odometry"
+JOINT_STATE = "sensor_msgs/msg/JointState"
+TF_MESSAGE = "tf2_msgs/msg/TFMessage"
+SIGHTING = "graphslam_msgs/msg/Sighting"
+ODOMETRY_INCREMENT = "graphslam_msgs/msg/OdometryIncrement"
+RELATIVE_POSE = "graphslam_msgs/msg/RelativePose"
+TRUE_POSE = "graphslam_msgs/msg/TruePose"
+TRUE_LANDMARK = "graphslam_msgs/msg/TrueLandmark"
+
+DEFINITIONS: dict[str, str] = {
+    SIGHTING: """\
+# A landmark or another robot, seen from the sensor frame header.frame_id at header.stamp.
+std_msgs/Header header
+# Where it is: angle from the sensor's x axis, counter-clockwise, rad; distance, m.
+float64 bearing
+float64 range
+# Its heading relative to the sensor's, rad; NaN = not measured.
+float64 direction
+# Covariance of (bearing, range, direction), row-major; the last row and column are ignored
+# where direction is NaN.
+float64[9] covariance
+# Which landmark it is; empty = unknown.
+string identity
+# Name of the robot seen; empty = a landmark was seen.
+string robot
+""",
+    ODOMETRY_INCREMENT: """\
+# Pose of the base at header.stamp in the base frame at start: m, m, rad.
+std_msgs/Header header
+builtin_interfaces/Time start
+float64 x
+float64 y
+float64 phi
+# Covariance of additive errors (x, y, phi) along the axes of the base frame at start, row-major.
+float64[9] covariance
+""",
+    RELATIVE_POSE: """\
+# Pose of this robot's base at header.stamp in the base frame at start of the robot other.
+std_msgs/Header header
+builtin_interfaces/Time start
+float64 x
+float64 y
+float64 phi
+# Covariance of additive errors (x, y, phi) along the axes of the frame at start, row-major.
+float64[9] covariance
+# Name of the robot in whose frame the pose is given; empty = this robot itself.
+string other
+""",
+    TRUE_POSE: """\
+# True pose of the base in the world frame: m, m, rad.
+std_msgs/Header header
+float64 x
+float64 y
+float64 phi
+""",
+    TRUE_LANDMARK: """\
+# A landmark as it truly is, in the world frame.
+std_msgs/Header header
+string identity
+# point, segment or line
+string kind
+# m, m, rad; phi is NaN for a point.
+float64 x
+float64 y
+float64 phi
+# Its end points x1 y1 x2 y2, m; empty = none.
+float64[] extent
+""",
+}
+
+
+class CdrError(Exception):
+    """The bytes of one message do not fit its schema."""
+
+
+@cache
+def _typestore() -> Typestore:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for name, text in DEFINITIONS.items():
+        store.register(get_types_from_msg(text, name))
+    return store
+
+
+def decode(schema: str, data: bytes) -> Any:
+    """The message that ``data`` (CDR with its four header bytes) holds; ``schema`` is known.
+
+    Raises:
+        CdrError: the bytes are cut short or are no such message.
+    """
+    try:
+        return _typestore().deserialize_cdr(data, schema)
+    except (SerdeError, IndexError, MemoryError, OverflowError) as error:
+        raise CdrError(str(error)) from error
+
+
+def encode(schema: str, message: Any) -> bytes:
+    """CDR bytes of ``message``, made by `build`; little-endian on every machine."""
+    return bytes(_typestore().serialize_cdr(message, schema, little_endian=True))
+
+
+def build(schema: str, **fields: Any) -> Any:
+    """A message of type ``schema``; every field must be given."""
+    return _typestore().types[schema](**fields)
+
+
+def definition(schema: str) -> bytes:
+    """The ros2msg text of ``schema`` with all types it is made of, as MCAP stores it."""
+    if schema in DEFINITIONS:
+        # our own text keeps its comments; the nested types are appended as rosbags writes them
+        nested = _typestore().generate_msgdef(schema, ros_version=2)[0].partition("=" * 80)
+        return (DEFINITIONS[schema] + nested[1] + nested[2]).encode()
+    return _typestore().generate_msgdef(schema, ros_version=2)[0].encode()
+
+
+def time(stamp_ns: int) -> Any:
+    """builtin_interfaces/Time of integer nanoseconds.
+
+    Raises:
+        LogError: the stamp does not fit the signed 32-bit seconds of ROS 2.
+    """
+    seconds, nanoseconds = divmod(int(stamp_ns), 1_000_000_000)
+    if not -(2**31) <= seconds < 2**31:
+        raise LogError(f"stamp {stamp_ns} ns cannot be written: ROS 2 has 32 bits for seconds")
+    return build("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+
+
+def header(stamp_ns: int, frame: str) -> Any:
+    """std_msgs/Header with the stamp in integer nanoseconds."""
+    return build("std_msgs/msg/Header", stamp=time(stamp_ns), frame_id=frame)
+
+
+def stamp_ns(time_message: Any) -> int:
+    """Integer nanoseconds of a builtin_interfaces/Time, never through a float."""
+    return int(time_message.sec) * 1_000_000_000 + int(time_message.nanosec)

@@ -1,0 +1,119 @@
+"""What must be known before the first message is decoded: mounts and no-return values."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from graphslam import records
+from graphslam.config import Config
+from graphslam.geometry import Array
+from graphslam.logs import schemas
+from graphslam.logs.decoders import TopicContext, frame_of
+from graphslam.logs.mcap_file import McapFile, raw_messages, sample_messages
+from graphslam.logs.mounts import Tree, find_mount, is_level, transform_tree
+from graphslam.logs.no_return import find_no_return
+from graphslam.logs.topics import ODOMETRY_KINDS, Topic, robot_of, static_transform_topics
+from graphslam.logs.writer import DEFAULT_ROBOT
+
+# 16 x 16 scans over the whole log: enough to find a frequent value, little to read
+_SAMPLE_BLOCKS, _SAMPLE_PER_BLOCK = 16, 16
+
+
+def survey_topics(
+    files: Sequence[McapFile], topics: Sequence[Topic], config: Config
+) -> tuple[dict[str, TopicContext], list[str]]:
+    """Context for the decoder of each topic, and warnings about what had to be assumed."""
+    warnings: list[str] = []
+    bases = {t.robot: _base_frame(files, t) for t in topics if t.record in ODOMETRY_KINDS}
+    contexts = {}
+    for topic in topics:
+        settings = config.robot(topic.robot)
+        mounts: dict[str, Array] = {}
+        inverted: set[str] = set()
+        no_return = None
+        if topic.record in (records.Scan, records.Sighting):
+            messages = list(samples(files, topic))
+            frames = sorted({frame_of(message) for message in messages})
+            tree = _transforms(files, topic.robot)
+            for frame in frames:
+                base = bases.get(topic.robot, "base_link")
+                pose, upside_down, notes = _mount(topic, tree, base, frame, settings.laser)
+                mounts[frame] = pose
+                inverted |= {frame} if upside_down else set()
+                warnings += notes
+            if topic.record is records.Scan:
+                no_return = find_no_return(message.ranges for message in messages)
+        contexts[topic.name] = TopicContext(
+            robot=topic.robot,
+            mounts=mounts,
+            inverted=frozenset(inverted),
+            no_return_m=np.inf if no_return is None else no_return,
+            left_joint=settings.left_joint,
+            right_joint=settings.right_joint,
+        )
+    return contexts, warnings
+
+
+def samples(files: Sequence[McapFile], topic: Topic) -> Iterator[Any]:
+    """Some decoded messages of ``topic`` from all over the log; those that decode."""
+    for file in files:
+        for data in sample_messages(file, topic.name, _SAMPLE_BLOCKS, _SAMPLE_PER_BLOCK):
+            try:
+                yield schemas.decode(topic.schema, data)
+            except schemas.CdrError:
+                continue  # counted when the topic is read
+
+
+def _base_frame(files: Sequence[McapFile], topic: Topic) -> str:
+    """Frame that an odometry topic tells the motion of."""
+    if topic.record is records.WheelAngles:
+        return "base_link"  # JointState names no frame that moves; this is ROS' convention
+    for message in samples(files, topic):
+        name = message.child_frame_id if topic.record is records.OdometryPose else frame_of(message)
+        return str(name).lstrip("/") or "base_link"
+    return "base_link"
+
+
+def _transforms(files: Sequence[McapFile], robot: str) -> Tree:
+    """Static transforms for ``robot``: the global ones and those of its own namespace."""
+    tree: dict[str, tuple[str, Array]] = {}
+    for file in files:
+        own = [n for n in static_transform_topics(file) if robot_of(n) in (DEFAULT_ROBOT, robot)]
+        tree |= transform_tree(_decoded(raw.data for raw in raw_messages(file, own)))
+    return tree
+
+
+def _decoded(transforms: Iterable[bytes]) -> Iterator[Any]:
+    for data in transforms:
+        try:
+            yield schemas.decode(schemas.TF_MESSAGE, data)
+        except schemas.CdrError:
+            continue  # a mount that is missing for it is warned about
+
+
+def _mount(
+    topic: Topic, tree: Tree, base: str, frame: str, configured: Sequence[float]
+) -> tuple[Array, bool, list[str]]:
+    """Pose (3,) of ``frame`` on the robot, whether it hangs upside down, and warnings."""
+    where = f"{topic.name}: frame {frame or '(none)'}"
+    found = find_mount(tree, base, frame)
+    inverted = found is not None and found.inverted
+    if len(configured) == 3 and topic.record is records.Scan:
+        return np.array(configured, dtype=float), inverted, []
+    if found is None:
+        if topic.record is records.Sighting and not frame:
+            return np.zeros(3), False, []  # no frame: measured from the base
+        return (
+            np.zeros(3),
+            False,
+            [
+                f"{where}: tf_static does not place it on {base}; taken as the base itself; "
+                f"set robots.{topic.robot}.laser"
+            ],
+        )
+    notes = []
+    if not is_level(found):
+        tilt = np.rad2deg(found.tilt_rad)
+        notes.append(f"{where}: is tilted by {tilt:.0f} deg; read as if it were level")
+    return found.pose, inverted, notes

@@ -1,0 +1,145 @@
+"""Which topics of a log are used, and for which robot."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from graphslam import records
+from graphslam.config import Config
+from graphslam.errors import LogError
+from graphslam.logs.decoders import DECODERS
+from graphslam.logs.mcap_file import McapFile
+from graphslam.logs.schemas import TF_MESSAGE
+from graphslam.logs.writer import DEFAULT_ROBOT
+
+# What a robot's motion is taken from, the best first: an increment carries its covariance, wheel
+# angles need the wheels' geometry from the configuration.
+ODOMETRY_KINDS: tuple[type[records.Message], ...] = (
+    records.OdometryIncrement,
+    records.OdometryPose,
+    records.WheelAngles,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A topic that can be decoded; ``count`` messages over all files, for ``robot``."""
+
+    name: str
+    schema: str
+    robot: str
+    record: type[records.Message]
+    count: int
+
+
+def find_topics(files: Sequence[McapFile], config: Config) -> list[Topic]:
+    """All topics whose schema has a decoder, sorted by name.
+
+    The robot is the first part of the topic's name, ``robot`` where there is only one part.
+    ``config.logs.topics``, where not empty, restricts the topics and names the robots.
+
+    Raises:
+        LogError: no topic is usable, or a configured one is not in the logs.
+    """
+    found: dict[str, Topic] = {}
+    others: set[str] = set()
+    for file in files:
+        for raw in file.topics:
+            if raw.schema not in DECODERS or raw.encoding != "cdr":
+                others.add(f"{raw.name} ({raw.schema}, {raw.encoding})")
+                continue
+            before = found[raw.name].count if raw.name in found else 0
+            robot = config.logs.topics.get(raw.name, robot_of(raw.name))
+            record = DECODERS[raw.schema].record
+            found[raw.name] = Topic(raw.name, raw.schema, robot, record, before + raw.count)
+    names = _names(file.path for file in files)
+    if not found:
+        there = ", ".join(sorted(others)) or "nothing"
+        raise LogError(
+            f"{names}: no usable topic; the log has {there}; "
+            f"usable are {', '.join(DECODERS)}, encoded as cdr"
+        )
+    wanted = config.logs.topics
+    missing = sorted(set(wanted) - set(found))
+    if missing:
+        raise LogError(
+            f"{names}: logs.topics names {missing[0]}, which is not a usable topic of the log; "
+            f"there are {', '.join(sorted(found))}"
+        )
+    return [found[name] for name in sorted(found) if not wanted or name in wanted]
+
+
+def robot_of(topic: str) -> str:
+    """Robot that a topic belongs to by its name: robot1 for ``/robot1/scan``, robot for ``/scan``."""
+    first, separator, _ = topic.strip("/").partition("/")
+    return first if separator else DEFAULT_ROBOT
+
+
+def static_transform_topics(file: McapFile) -> list[str]:
+    """Topics of ``file`` with transforms that never change."""
+    return [
+        topic.name
+        for topic in file.topics
+        if topic.schema == TF_MESSAGE and topic.name.endswith("tf_static")
+    ]
+
+
+def choose_topics(
+    files: Sequence[McapFile], topics: Sequence[Topic]
+) -> tuple[list[Topic], list[str]]:
+    """One source of odometry and one laser per robot, and everything else; with warnings.
+
+    Raises:
+        LogError: all topics are empty, or a robot has scans or sightings but no odometry.
+    """
+    names = _names(file.path for file in files)
+    filled = [topic for topic in topics if topic.count]
+    if not filled:
+        raise LogError(
+            f"{names}: all usable topics are empty: {', '.join(t.name for t in topics)}; "
+            "record it again"
+        )
+    chosen, warnings = [], []
+    for robot in sorted({topic.robot for topic in filled}):
+        own = [topic for topic in filled if topic.robot == robot]
+        odometry = sorted((t for t in own if t.record in ODOMETRY_KINDS), key=_odometry_preference)
+        lasers = sorted(
+            (t for t in own if t.record is records.Scan), key=lambda t: (-t.count, t.name)
+        )
+        _demand_odometry(names, robot, own, odometry)
+        rest = [t for t in own if t.record not in (*ODOMETRY_KINDS, records.Scan)]
+        chosen += odometry[:1] + lasers[:1] + rest
+        warnings += _one_of("odometry", robot, odometry) + _one_of("laser", robot, lasers)
+    if not any(topic.record in ODOMETRY_KINDS for topic in chosen):
+        raise LogError(
+            f"{names}: no odometry; the log has only {', '.join(t.name for t in filled)}; "
+            "smoothing needs nav_msgs/Odometry, JointState or OdometryIncrement"
+        )
+    return chosen, warnings
+
+
+def _odometry_preference(topic: Topic) -> tuple[int, int, str]:
+    return ODOMETRY_KINDS.index(topic.record), -topic.count, topic.name
+
+
+def _demand_odometry(
+    names: str, robot: str, own: Sequence[Topic], odometry: Sequence[Topic]
+) -> None:
+    for topic in own:
+        if topic.record in (records.Scan, records.Sighting) and not odometry:
+            what = "scan" if topic.record is records.Scan else "sighting"
+            raise LogError(
+                f"{names}: a {what} without odometry: robot {robot} has {topic.name} but no "
+                "odometry; record it, or assign topics to robots in logs.topics"
+            )
+
+
+def _one_of(what: str, robot: str, topics: Sequence[Topic]) -> list[str]:
+    if len(topics) < 2:
+        return []
+    others = ", ".join(topic.name for topic in topics[1:])
+    return [f"robot {robot}: {what} is taken from {topics[0].name}; not used: {others}"]
+
+
+def _names(paths: Iterable[Path]) -> str:
+    return ", ".join(map(str, paths))

@@ -1,0 +1,357 @@
+"""Write logs: ROS 2 MCAP files that our reader and every ROS 2 or MCAP tool opens.
+
+The only module that writes with `mcap`.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO, Self
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+from numpy.typing import ArrayLike
+
+from graphslam import __version__
+from graphslam.errors import OutputError
+from graphslam.geometry import Array
+from graphslam.logs import schemas
+from graphslam.logs.mcap_file import NOTES
+
+DEFAULT_ROBOT = "robot"  # its topics have no namespace
+# Small chunks cost a few per cent of compression; a damaged chunk loses less.
+_CHUNK_BYTES = 256 * 1024
+
+
+class LogWriter:
+    """A log being written; a context manager.
+
+    The file appears under its name only when the block ends without an error; until then it is
+    written beside it. Equal calls give equal bytes. Robot ``robot``'s topics are ``/odom``,
+    ``/scan``, ...; those of any other robot ``/NAME/odom``, ... Frames follow the same rule:
+    ``odom``, ``base_link``, ``laser``.
+
+    Every method takes ``stamp_ns``, the header stamp, and ``log_time_ns``, when the message was
+    recorded (default: at its stamp); readers take the order of recording from it.
+    """
+
+    def __init__(self, path: Path, notes: Mapping[str, str] | None = None) -> None:
+        """Prepare to write ``path``; ``notes`` go into the metadata record `graphslam`."""
+        self.path = path
+        self.counts: dict[str, int] = {}
+        self._notes = dict(notes or {})
+        self._partial = path.with_name(f".{path.name}.partial")
+        self._stream: BinaryIO | None = None
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+
+    def __enter__(self) -> Self:
+        """Open the temporary file.
+
+        Raises:
+            OutputError: the folder does not exist or cannot be written to.
+        """
+        try:
+            self._stream = self._partial.open("wb")
+        except OSError as error:
+            raise OutputError(
+                f"{self.path}: cannot be written: {error.strerror}; check the folder"
+            ) from error
+        self._writer = Writer(
+            self._stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD
+        )
+        self._writer.start(profile="ros2", library=f"graphslam {__version__}")
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Finish and rename the file, or remove it when the block raised."""
+        assert self._stream is not None  # __enter__ opened it
+        try:
+            if kind is None:
+                if self._notes:
+                    self._writer.add_metadata(NOTES, self._notes)
+                self._writer.finish()  # type: ignore[no-untyped-call]
+            self._stream.close()
+            if kind is None:
+                self._partial.replace(self.path)
+        except OSError as problem:
+            raise OutputError(f"{self.path}: cannot be written: {problem.strerror}") from problem
+        finally:
+            self._stream.close()
+            self._partial.unlink(missing_ok=True)
+
+    # ------------------------------------------------------------ what a robot measures
+
+    def odometry(
+        self, robot: str, stamp_ns: int, pose: ArrayLike, *, log_time_ns: int | None = None
+    ) -> None:
+        """nav_msgs/Odometry on ``odom``: pose (3,) of the base in the odometry frame."""
+        x, y, phi = np.asarray(pose, dtype=float).tolist()
+        message = schemas.build(
+            schemas.ODOMETRY,
+            header=schemas.header(stamp_ns, frame(robot, "odom")),
+            child_frame_id=frame(robot, "base_link"),
+            pose=_with_covariance("Pose", pose=_pose(x, y, phi)),
+            twist=_with_covariance("Twist", twist=_twist()),
+        )
+        self._add(_topic(robot, "odom"), schemas.ODOMETRY, message, stamp_ns, log_time_ns)
+
+    def wheel_angles(
+        self,
+        robot: str,
+        stamp_ns: int,
+        left_rad: float,
+        right_rad: float,
+        *,
+        log_time_ns: int | None = None,
+    ) -> None:
+        """sensor_msgs/JointState on ``joint_states``: accumulated wheel angles, never wrapped."""
+        message = schemas.build(
+            schemas.JOINT_STATE,
+            header=schemas.header(stamp_ns, ""),
+            name=["left_wheel_joint", "right_wheel_joint"],
+            position=np.array([left_rad, right_rad]),
+            velocity=np.zeros(0),
+            effort=np.zeros(0),
+        )
+        self._add(
+            _topic(robot, "joint_states"), schemas.JOINT_STATE, message, stamp_ns, log_time_ns
+        )
+
+    def increment(
+        self,
+        robot: str,
+        start_ns: int,
+        stamp_ns: int,
+        *,
+        delta: ArrayLike,
+        cov: ArrayLike,
+        log_time_ns: int | None = None,
+    ) -> None:
+        """OdometryIncrement on ``odom_increment``.
+
+        ``delta`` (3,) is the base's pose at ``stamp_ns`` in the base frame at ``start_ns``, ``cov``
+        (3, 3) of additive errors along the axes of the frame at ``start_ns``.
+        """
+        message = schemas.build(
+            schemas.ODOMETRY_INCREMENT,
+            header=schemas.header(stamp_ns, frame(robot, "base_link")),
+            start=schemas.time(start_ns),
+            **_named(delta),
+            covariance=_flat(cov),
+        )
+        schema = schemas.ODOMETRY_INCREMENT
+        self._add(_topic(robot, "odom_increment"), schema, message, stamp_ns, log_time_ns)
+
+    def scan(
+        self,
+        robot: str,
+        stamp_ns: int,
+        ranges: ArrayLike,
+        *,
+        angle_min_rad: float,
+        angle_step_rad: float,
+        range_max_m: float,
+        range_min_m: float = 0.0,
+        log_time_ns: int | None = None,
+    ) -> None:
+        """sensor_msgs/LaserScan on ``scan``: ranges (n,) m in the laser frame, kept as float32.
+
+        A beam without a return is written as inf or as a value above ``range_max_m``.
+        """
+        values = np.asarray(ranges, dtype=np.float32)
+        message = schemas.build(
+            schemas.LASER_SCAN,
+            header=schemas.header(stamp_ns, frame(robot, "laser")),
+            angle_min=angle_min_rad,
+            angle_max=angle_min_rad + angle_step_rad * (len(values) - 1),
+            angle_increment=angle_step_rad,
+            time_increment=0.0,
+            scan_time=0.0,
+            range_min=range_min_m,
+            range_max=range_max_m,
+            ranges=values,
+            intensities=np.zeros(0, dtype=np.float32),
+        )
+        self._add(_topic(robot, "scan"), schemas.LASER_SCAN, message, stamp_ns, log_time_ns)
+
+    def mount(self, robot: str, stamp_ns: int, pose: ArrayLike, sensor: str = "laser") -> None:
+        """tf2_msgs/TFMessage on ``/tf_static``: pose (3,) of the sensor in the base frame."""
+        x, y, phi = np.asarray(pose, dtype=float).tolist()
+        transform = schemas.build(
+            "geometry_msgs/msg/TransformStamped",
+            header=schemas.header(stamp_ns, frame(robot, "base_link")),
+            child_frame_id=frame(robot, sensor),
+            transform=schemas.build(
+                "geometry_msgs/msg/Transform", translation=_vector(x, y), rotation=_quaternion(phi)
+            ),
+        )
+        message = schemas.build(schemas.TF_MESSAGE, transforms=[transform])
+        self._add(_topic(DEFAULT_ROBOT, "tf_static"), schemas.TF_MESSAGE, message, stamp_ns, None)
+
+    def sighting(
+        self,
+        robot: str,
+        stamp_ns: int,
+        z: ArrayLike,
+        cov: ArrayLike,
+        *,
+        identity: str | None = None,
+        seen_robot: str | None = None,
+        sensor: str = "base_link",
+        log_time_ns: int | None = None,
+    ) -> None:
+        """Sighting on ``sightings``: ``z`` (2,) or (3,), ``cov`` (2, 2) or (3, 3).
+
+        ``z`` is (bearing rad, range m[, direction rad]) in the frame of ``sensor``.
+        """
+        bearing, distance, *direction = np.asarray(z, dtype=float).tolist()
+        full = np.zeros((3, 3))
+        size = 2 + len(direction)
+        full[:size, :size] = cov
+        message = schemas.build(
+            schemas.SIGHTING,
+            header=schemas.header(stamp_ns, frame(robot, sensor)),
+            bearing=bearing,
+            range=distance,
+            direction=direction[0] if direction else np.nan,
+            covariance=full.ravel(),
+            identity=identity or "",
+            robot=seen_robot or "",
+        )
+        self._add(_topic(robot, "sightings"), schemas.SIGHTING, message, stamp_ns, log_time_ns)
+
+    def relative_pose(
+        self,
+        robot: str,
+        start_ns: int,
+        stamp_ns: int,
+        *,
+        delta: ArrayLike,
+        cov: ArrayLike,
+        other: str | None = None,
+        log_time_ns: int | None = None,
+    ) -> None:
+        """RelativePose on ``relative_poses``: the robot at ``stamp_ns`` seen from ``start_ns``.
+
+        ``delta`` (3,) is in the base frame at ``start_ns`` of ``other`` (None: the robot itself),
+        ``cov`` (3, 3) of additive errors along that frame's axes.
+        """
+        message = schemas.build(
+            schemas.RELATIVE_POSE,
+            header=schemas.header(stamp_ns, frame(robot, "base_link")),
+            start=schemas.time(start_ns),
+            **_named(delta),
+            covariance=_flat(cov),
+            other=other or "",
+        )
+        schema = schemas.RELATIVE_POSE
+        self._add(_topic(robot, "relative_poses"), schema, message, stamp_ns, log_time_ns)
+
+    # ------------------------------------------------------------ what is true
+
+    def truth(
+        self, robot: str, stamp_ns: int, pose: ArrayLike, *, log_time_ns: int | None = None
+    ) -> None:
+        """TruePose on ``truth``: pose (3,) of the base in the world frame."""
+        message = schemas.build(
+            schemas.TRUE_POSE, header=schemas.header(stamp_ns, "world"), **_named(pose)
+        )
+        self._add(_topic(robot, "truth"), schemas.TRUE_POSE, message, stamp_ns, log_time_ns)
+
+    def true_landmark(
+        self,
+        stamp_ns: int,
+        identity: str,
+        kind: str,
+        pose: ArrayLike,
+        *,
+        extent: ArrayLike | None = None,
+        log_time_ns: int | None = None,
+    ) -> None:
+        """TrueLandmark on ``/true_landmarks``: pose (3,), extent (2, 2) or None, world frame."""
+        message = schemas.build(
+            schemas.TRUE_LANDMARK,
+            header=schemas.header(stamp_ns, "world"),
+            identity=identity,
+            kind=kind,
+            **_named(pose),
+            extent=np.zeros(0) if extent is None else _flat(extent),
+        )
+        schema = schemas.TRUE_LANDMARK
+        self._add(_topic(DEFAULT_ROBOT, "true_landmarks"), schema, message, stamp_ns, log_time_ns)
+
+    # ------------------------------------------------------------ inside
+
+    def _add(
+        self, topic: str, schema: str, message: Any, stamp_ns: int, log_time_ns: int | None
+    ) -> None:
+        channel = self._channel(topic, schema)
+        sequence = self.counts[topic] = self.counts.get(topic, 0) + 1
+        self._writer.add_message(
+            channel_id=channel,
+            log_time=stamp_ns if log_time_ns is None else log_time_ns,
+            publish_time=stamp_ns,
+            data=schemas.encode(schema, message),
+            sequence=sequence,
+        )
+
+    def _channel(self, topic: str, schema: str) -> int:
+        if topic not in self._channels:
+            if schema not in self._schemas:
+                self._schemas[schema] = self._writer.register_schema(
+                    schema, "ros2msg", schemas.definition(schema)
+                )
+            self._channels[topic] = self._writer.register_channel(
+                topic, "cdr", self._schemas[schema], {"offered_qos_profiles": ""}
+            )
+        return self._channels[topic]
+
+
+def _topic(robot: str, name: str) -> str:
+    return f"/{name}" if robot == DEFAULT_ROBOT else f"/{robot}/{name}"
+
+
+def frame(robot: str, name: str) -> str:
+    """Name of a robot's frame as `LogWriter` writes it."""
+    return name if robot == DEFAULT_ROBOT else f"{robot}/{name}"
+
+
+def _named(pose: ArrayLike) -> dict[str, float]:
+    return dict(zip(("x", "y", "phi"), np.asarray(pose, dtype=float).tolist(), strict=True))
+
+
+def _flat(matrix: ArrayLike) -> Array:
+    return np.asarray(matrix, dtype=float).ravel()
+
+
+def _vector(x: float, y: float) -> Any:
+    return schemas.build("geometry_msgs/msg/Vector3", x=x, y=y, z=0.0)
+
+
+def _quaternion(phi: float) -> Any:
+    z, w = np.sin(phi / 2), np.cos(phi / 2)
+    return schemas.build("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=float(z), w=float(w))
+
+
+def _pose(x: float, y: float, phi: float) -> Any:
+    point = schemas.build("geometry_msgs/msg/Point", x=x, y=y, z=0.0)
+    return schemas.build("geometry_msgs/msg/Pose", position=point, orientation=_quaternion(phi))
+
+
+def _twist() -> Any:
+    return schemas.build(
+        "geometry_msgs/msg/Twist", linear=_vector(0.0, 0.0), angular=_vector(0.0, 0.0)
+    )
+
+
+def _with_covariance(kind: str, **fields: Any) -> Any:
+    """PoseWithCovariance or TwistWithCovariance; zeros mean unknown in ROS."""
+    return schemas.build(
+        f"geometry_msgs/msg/{kind}WithCovariance", covariance=np.zeros(36), **fields
+    )

@@ -1,0 +1,164 @@
+"""From what wheels and odometry report to motions with covariance (thesis ch. 2.1 and 4.8-4.15).
+
+Every source of motion is brought to *twists*: motion on a circle segment, ``exp(twist)``. A twist
+has two kinds of error. The white one is fresh in every increment, so its variance adds up. The
+calibration error (a wrong wheel radius, a scale, a drift per metre) is one constant for much
+longer than an interval between two states, so within an interval its *effect* adds up; the thesis
+treats it as white (see docs/thesis.md for why that misstates it).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphslam.config import OdometryConfig, RobotConfig
+from graphslam.geometry import Array, exp, exp_jacobian
+
+
+def wheel_twist(angles_rad: Array, robot: RobotConfig) -> Array:
+    """Twists ``(n, 3)`` (path m, 0, turning rad) of wheel rotations ``(n, 2)`` (left, right) rad.
+
+    Thesis eq. 2.6 and 2.7, counter-clockwise positive: right wheel minus left.
+    """
+    left = robot.wheel_radius_left_m * angles_rad[:, 0]
+    right = robot.wheel_radius_right_m * angles_rad[:, 1]
+    return np.column_stack([(left + right) / 2, np.zeros(len(left)), (right - left) / robot.axle_m])
+
+
+def wheel_jacobian(angles_rad: Array, robot: RobotConfig) -> Array:
+    """Derivative ``(n, 3, 5)`` of the twists by (r_l, r_r, turn_l, turn_r, axle), eq. 4.11-4.13.
+
+    The thesis differentiates the relative pose; that is this times `exp_jacobian` of the twist.
+    """
+    left, right = angles_rad[:, 0], angles_rad[:, 1]
+    r_l, r_r, axle = robot.wheel_radius_left_m, robot.wheel_radius_right_m, robot.axle_m
+    J = np.zeros((len(left), 3, 5))
+    J[:, 0, 0], J[:, 0, 1], J[:, 0, 2], J[:, 0, 3] = left / 2, right / 2, r_l / 2, r_r / 2
+    J[:, 2, 0], J[:, 2, 1] = -left / axle, right / axle
+    J[:, 2, 2], J[:, 2, 3] = -r_l / axle, r_r / axle
+    J[:, 2, 4] = -(r_r * right - r_l * left) / axle**2
+    return J
+
+
+def model_error_cov(twists: Array, config: OdometryConfig) -> Array:
+    """Covariance ``(n, 3, 3)`` of the white model error of motions ``(n, 3)``, eq. 4.14.
+
+    Along the axes of each increment's start frame; linear in path and turning, so it does not
+    depend on how finely the odometry is sampled.
+    """
+    path = np.hypot(twists[:, 0], twists[:, 1])
+    turn = np.abs(twists[:, 2])
+    cov = np.zeros((len(twists), 3, 3))
+    cov[:, 0, 0] = config.k_x_m * path + config.k_x_rad * turn
+    cov[:, 1, 1] = config.k_y_m * path + config.k_y_rad * turn
+    cov[:, 2, 2] = config.k_phi_m * path + config.k_phi_rad * turn
+    return cov
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Increments:
+    """Consecutive motions: ``delta`` (n, 3), white ``cov`` (n, 3, 3), ``d_cal`` (n, 3, p).
+
+    ``cov`` is along the axes of each increment's start frame. ``calibration_cov`` (p, p) is the
+    prior covariance of the source's calibration parameters.
+    """
+
+    delta: Array
+    cov: Array
+    d_cal: Array
+    calibration_cov: Array
+
+
+def odometry_increments(rows: Array, _robot: RobotConfig, config: OdometryConfig) -> Increments:
+    """Increments of an odometry that reports poses: ``rows`` (n, 3) are twists.
+
+    Calibration parameters: relative scale of translation, relative scale of rotation, turning per
+    metre driven (rad/m).
+    """
+    path = np.hypot(rows[:, 0], rows[:, 1])
+    d_twist = np.zeros((len(rows), 3, 3))
+    d_twist[:, :2, 0] = rows[:, :2]
+    d_twist[:, 2, 1] = rows[:, 2]
+    d_twist[:, 2, 2] = path
+    sigmas = [
+        config.translation_scale_sigma,
+        config.rotation_scale_sigma,
+        config.drift_sigma_rad_per_m,
+    ]
+    return Increments(
+        exp(rows),
+        model_error_cov(rows, config),
+        exp_jacobian(rows) @ d_twist,
+        np.diag(np.square(sigmas)),
+    )
+
+
+def given_increments(rows: Array, _robot: RobotConfig, _config: OdometryConfig) -> Increments:
+    """Increments that bring their own covariance: ``rows`` (n, 12) are twist and covariance.
+
+    Nothing to calibrate: p = 0.
+    """
+    n = len(rows)
+    return Increments(
+        exp(rows[:, :3]), rows[:, 3:].reshape(n, 3, 3), np.zeros((n, 3, 0)), np.zeros((0, 0))
+    )
+
+
+def wheel_increments(rows: Array, robot: RobotConfig, config: OdometryConfig) -> Increments:
+    """Increments of wheel rotations: ``rows`` (n, 2) left and right, rad.
+
+    Calibration parameters: left radius, right radius, axle length, m. The counting error of one
+    reading enters two neighbouring increments with opposite signs and nearly cancels; it is
+    treated as white here (cautious), thesis eq. 4.9.
+    """
+    twists = wheel_twist(rows, robot)
+    J = exp_jacobian(twists) @ wheel_jacobian(rows, robot)
+    moved = np.any(rows != 0, axis=1)
+    counting = (config.count_sigma_rad**2 * moved)[:, None, None]
+    cov = model_error_cov(twists, config) + counting * (J[:, :, 2:4] @ J[:, :, 2:4].mT)
+    sigmas = [config.wheel_radius_sigma_m, config.wheel_radius_sigma_m, config.axle_sigma_m]
+    return Increments(exp(twists), cov, J[:, :, [0, 1, 4]], np.diag(np.square(sigmas)))
+
+
+#: motion source -> increments of its rows; rows scale with the share of an interval that is used
+MOTION_SOURCES: dict[str, Callable[[Array, RobotConfig, OdometryConfig], Increments]] = {
+    "given": given_increments,
+    "odometry": odometry_increments,
+    "wheels": wheel_increments,
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Compounded:
+    """A chain of increments as one motion; see `compound`."""
+
+    delta: Array
+    cov: Array
+    d_cal: Array
+
+
+def compound(parts: Increments) -> Compounded:
+    """One motion from consecutive increments, eq. 4.4 and 4.7 applied n times, without a loop.
+
+    With p_k the pose after k increments in the frame of the first, an additive error e of
+    increment k moves the end by ``rotation3(heading of p_(k-1)) e`` and, through its heading part,
+    by that times the vector from p_k to the end, turned a quarter.
+
+    Returns:
+        ``delta`` (3,), white ``cov`` (3, 3) along the start frame's axes, ``d_cal`` (3, p).
+    """
+    n = len(parts.delta)
+    before = np.concatenate([[0.0], np.cumsum(parts.delta[:, 2])])
+    c, s = np.cos(before[:-1]), np.sin(before[:-1])
+    dx, dy = parts.delta[:, 0], parts.delta[:, 1]
+    x = np.cumsum(c * dx - s * dy)
+    y = np.cumsum(s * dx + c * dy)
+    E = np.zeros((n, 3, 3))
+    E[:, 0, 0] = E[:, 1, 1] = c
+    E[:, 0, 1], E[:, 1, 0] = -s, s
+    E[:, 0, 2], E[:, 1, 2] = -(y[-1] - y), x[-1] - x
+    E[:, 2, 2] = 1.0
+    cov = (E @ parts.cov @ E.mT).sum(axis=0)
+    d_cal = (E @ parts.d_cal).sum(axis=0)
+    return Compounded(np.array([x[-1], y[-1], before[-1]]), cov, d_cal)

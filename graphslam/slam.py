@@ -1,0 +1,434 @@
+"""The pipeline: from the messages of a log to a `Result`, readable top to bottom.
+
+One event (a scan, or the sightings of one stamp) goes: motion since the robot's last state ->
+keyframe or not -> observations in the base frame -> association -> `Step` -> back end. It branches
+on no landmark kind, front end or back end; those are rows of tables.
+"""
+
+import itertools
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from graphslam.associator import Associator
+from graphslam.backends import BACKENDS
+from graphslam.config import Config
+from graphslam.dead_reckoning import Track
+from graphslam.errors import EstimationError, LogError
+from graphslam.frontend import FRONT_ENDS, scan_points
+from graphslam.geometry import Array, compose, compose_cov, inverse
+from graphslam.logs import LogSet
+from graphslam.models import transport
+from graphslam.records import (
+    Association,
+    Closure,
+    Landmark,
+    Message,
+    Motion,
+    Observation,
+    Picture,
+    RelativePose,
+    Result,
+    RobotResult,
+    Scan,
+    Sighting,
+    Start,
+    Step,
+    Trajectory,
+    Truth,
+)
+from graphslam.summary import make_landmarks, summarise
+from graphslam.timeline import ODOMETRY, synchronise
+from graphslam.trajectories import between_states, mounted
+
+#: Hz at which the base of a robot without scans is reported
+BASE_RATE_HZ = 10
+#: scans kept for the picture at most, so that memory does not grow with the log
+MAX_PICTURES = 4000
+
+Progress = Callable[[int], None]
+
+
+@dataclass(slots=True, eq=False)
+class RobotRun:
+    """What the pipeline keeps for one robot."""
+
+    track: Track
+    state_ns: int = -1
+    path_m: float = 0.0
+    times: list[int] = field(default_factory=list)
+    causal_poses: list[Array] = field(default_factory=list)
+    causal_covs: list[Array] = field(default_factory=list)
+    scans: list[tuple[int, int]] = field(default_factory=list)
+    mounts: list[Array] = field(default_factory=list)
+
+    @property
+    def started(self) -> bool:
+        """Whether the robot has a state."""
+        return bool(self.times)
+
+
+class Pipeline:
+    """One run over a log."""
+
+    def __init__(self, log: LogSet, config: Config) -> None:
+        self.log, self.config = log, config
+        self.backend = BACKENDS[config.backend.name](config)
+        self.associator = Associator(config.association, self.backend)
+        self.front_end = FRONT_ENDS[config.front_end.name]
+        self.runs = {
+            name: RobotRun(Track(config.odometry, config.robot(name))) for name in log.robots
+        }
+        self.starts = start_poses(log, config)
+        self.steps: list[Step] = []
+        self.pictures: list[Picture] = []
+        self.counts: Counter[str] = Counter()
+        self.dropped: Counter[str] = Counter()
+        self.seconds: Counter[str] = Counter()
+        self.step_ms: list[float] = []
+
+    # ------------------------------------------------------------ the loop
+
+    def run(self, progress: Progress) -> None:
+        """Take in every message of the log."""
+        tracks = {name: run.track for name, run in self.runs.items()}
+        messages = synchronise(
+            _counted(self.log.messages(), self.counts, progress),
+            tracks,
+            self.config.odometry.max_gap_s,
+            self.dropped,
+        )
+        clock = time.perf_counter()
+        for event in events(messages):
+            self.seconds["read"] += time.perf_counter() - clock
+            began = time.perf_counter()
+            steps = len(self.steps)
+            self.take(event)
+            clock = time.perf_counter()
+            if len(self.steps) > steps:
+                self.step_ms.append(1e3 * (clock - began))
+
+    def take(self, event: list[Message]) -> None:
+        """One event: everything one robot perceived at one time."""
+        first = event[0]
+        run, time_ns = self.runs[first.robot], first.time_ns
+        if not run.started:
+            self.start(first.robot, time_ns)
+        motion = self.motion_since_state(first.robot, time_ns)
+        scans = [m for m in event if isinstance(m, Scan)]
+        for scan in scans:
+            run.scans.append((scan.stamp_ns, scan.time_ns))
+            run.mounts.append(scan.mount)
+            self.counts["scans"] += 1
+        keyframe = self.is_keyframe(event, motion, first_scan=bool(scans) and len(run.scans) == 1)
+        if isinstance(first, ODOMETRY) and not keyframe:
+            return
+        if scans and not keyframe:
+            return  # its pose follows from the states around it
+        began = time.perf_counter()
+        seen = self.observations(event, None if keyframe else motion)
+        self.seconds["front end"] += time.perf_counter() - began
+        self.advance(first.robot, time_ns, event, seen, motion if keyframe else None)
+
+    def start(self, robot: str, time_ns: int) -> None:
+        """Give a robot its first state."""
+        if robot not in self.starts:
+            raise EstimationError(
+                f"robot {robot}: its start is unknown; give --start {robot}=x,y,phi (m, rad) or "
+                "--start truth"
+            )
+        start = self.starts[robot]
+        step = Step(time_ns, starts={robot: start})
+        self.backend.add(step)
+        self.steps.append(step)
+        self.note_state(robot, time_ns)
+
+    def motion_since_state(self, robot: str, time_ns: int) -> Motion | None:
+        """Motion since the robot's last state; None when it is at that very time."""
+        run = self.runs[robot]
+        if time_ns <= run.state_ns:
+            return None
+        return run.track.motion(run.state_ns, time_ns)
+
+    def is_keyframe(self, event: list[Message], motion: Motion | None, first_scan: bool) -> bool:
+        """Whether the event gets a state of its own."""
+        keyframe = self.config.keyframe
+        if first_scan or any(isinstance(m, Sighting) and m.seen_robot for m in event):
+            return True
+        if motion is None:
+            return False
+        if keyframe.mode == "all":
+            return True
+        if isinstance(event[0], ODOMETRY):
+            return False
+        turned = abs(float(motion.delta[2]))
+        return motion.length_m >= keyframe.distance_m or turned >= keyframe.angle_rad
+
+    def observations(self, event: list[Message], since: Motion | None) -> list[Observation]:
+        """Landmarks seen, in the base frame of the state (``since`` carries back to it)."""
+        out = []
+        for message in event:
+            if isinstance(message, Scan):
+                found = self.front_end(message, self.config.front_end)
+            elif isinstance(message, Sighting) and message.seen_robot is None:
+                found = (sighting_observation(message),)
+            else:
+                continue
+            for o in found:
+                z, cov = transport(o.z, o.cov, message.mount, np.zeros((3, 3)))
+                if since is not None:
+                    z, cov = transport(z, cov, since.delta, since.cov)
+                out.append(Observation(o.kind, z, cov, o.extent, o.identity))
+        self.counts["observations"] += len(out)
+        return out
+
+    def advance(
+        self,
+        robot: str,
+        time_ns: int,
+        event: list[Message],
+        seen: list[Observation],
+        motion: Motion | None,
+    ) -> None:
+        """Associate, make the step, give it to the back end."""
+        run = self.runs[robot]
+        motions = {robot: motion} if motion is not None else {}
+        state_ns = time_ns if motion is not None else run.state_ns
+        if motion is not None:
+            run.path_m += motion.length_m
+        began = time.perf_counter()
+        associations: tuple[Association, ...] = ()
+        if seen:
+            associations = self.associator.associate(
+                robot, state_ns, seen, motion, run.track, run.path_m
+            )
+        for message in event:
+            if isinstance(message, Sighting) and message.seen_robot is not None:
+                associations += self.robot_sighting(message, state_ns, motions)
+        closures = tuple(
+            self.closure(m, state_ns) for m in event if isinstance(m, RelativePose)
+        )
+        self.seconds["association"] += time.perf_counter() - began
+        if not (motions or associations or closures):
+            return
+        step = Step(time_ns, {}, motions, associations, tuple(c for c in closures if c))
+        began = time.perf_counter()
+        self.backend.add(step)
+        self.seconds["back end"] += time.perf_counter() - began
+        self.steps.append(step)
+        for name in motions:
+            self.note_state(name, time_ns)
+        for message in event:
+            if isinstance(message, Scan):
+                points = scan_points(message, self.config.front_end.max_range_m)
+                self.add_picture(Picture(robot, state_ns, points.astype(np.float32)))
+
+    def robot_sighting(
+        self, message: Sighting, state_ns: int, motions: dict[str, Motion]
+    ) -> tuple[Association, ...]:
+        """A sighting of another robot: brings that robot's motion to the same time."""
+        other = message.seen_robot
+        assert other is not None
+        if other not in self.runs:
+            self.dropped[f"sighting: robot {other} is not in the log"] += 1
+            return ()
+        if not self.runs[other].started:
+            self.start(other, self.runs[other].track.first_ns)
+        moved = self.motion_since_state(other, state_ns)
+        if moved is not None and other not in motions:
+            motions[other] = moved
+            self.runs[other].path_m += moved.length_m
+        z, cov = message.z, message.cov
+        model = "robot-point"
+        if len(z) == 3:
+            o = sighting_observation(message)
+            z, cov, model = o.z, o.cov, "robot-pose"
+        z, cov = transport(z, cov, message.mount, np.zeros((3, 3)))
+        self.counts["observations"] += 1
+        return (Association(message.robot, state_ns, other, model, z, cov),)
+
+    def closure(self, message: RelativePose, state_ns: int) -> Closure | None:
+        """A measured relative pose, carried by odometry to the states nearest before its ends."""
+        other = self.runs.get(message.other)
+        if other is None or not other.started or message.start_ns < other.times[0]:
+            self.dropped["relative pose: its first end has no state"] += 1
+            return None
+        other_ns = other.times[int(np.searchsorted(other.times, message.start_ns, "right")) - 1]
+        delta, cov = message.delta, message.cov
+        if other_ns < message.start_ns:
+            lead = other.track.motion(other_ns, message.start_ns)
+            cov = compose_cov(lead.delta, lead.cov, delta, cov)
+            delta = compose(lead.delta, delta)
+        if state_ns < message.time_ns:
+            tail = self.runs[message.robot].track.motion(state_ns, message.time_ns)
+            back = inverse(tail.delta)
+            back_cov = compose_cov(back, tail.cov, np.zeros(3), np.zeros((3, 3)))
+            cov = compose_cov(delta, cov, back, back_cov)
+            delta = compose(delta, back)
+        self.counts["loop_closures"] += 1
+        return Closure(message.robot, state_ns, message.other, other_ns, delta, cov)
+
+    def note_state(self, robot: str, time_ns: int) -> None:
+        """Book a new state with its causal estimate."""
+        run = self.runs[robot]
+        joint = self.backend.joint(robot, [])
+        run.state_ns = time_ns
+        run.times.append(time_ns)
+        run.causal_poses.append(joint.pose)
+        run.causal_covs.append(joint.cov)
+        self.counts["keyframes"] += 1
+
+    def add_picture(self, picture: Picture) -> None:
+        """Keep a scan for drawing; when there are too many, every second one is let go."""
+        self.pictures.append(picture)
+        if len(self.pictures) > MAX_PICTURES:
+            del self.pictures[::2]
+
+
+def smooth(log: LogSet, config: Config, progress: Progress = lambda _count: None) -> Result:
+    """Estimate everything that a log tells: the main job.
+
+    Args:
+        log: opened logs.
+        config: settings.
+        progress: called with the number of messages read so far.
+
+    Raises:
+        LogError: no message of the log could be used.
+        EstimationError: the estimate is indeterminate, or a robot's start is unknown.
+    """
+    began = time.perf_counter()
+    pipeline = Pipeline(log, config)
+    pipeline.run(progress)
+    if not pipeline.steps:
+        raise LogError(f"{log.files[0].path}: nothing in it could be used; see `graphslam info`")
+    finishing = time.perf_counter()
+    estimate = pipeline.backend.finish()
+    pipeline.seconds["final optimisation"] = time.perf_counter() - finishing
+    robots = {
+        name: robot_result(run, estimate.states[name])
+        for name, run in sorted(pipeline.runs.items())
+        if run.started
+    }
+    landmarks: tuple[Landmark, ...] = make_landmarks(pipeline.associator.map, estimate)
+    t0 = min(trajectory.stamps_ns[0] for trajectory in estimate.states.values())
+    innovations = {
+        model: np.array([((t - t0) * 1e-9, d2) for t, d2 in values]).reshape(-1, 2)
+        for model, values in sorted(pipeline.associator.innovations.items())
+    }
+    pipeline.seconds["all"] = time.perf_counter() - began
+    summary = summarise(
+        log=log,
+        config=config,
+        estimate=estimate,
+        counts=pipeline.counts,
+        rejected=pipeline.associator.rejected,
+        dropped=pipeline.dropped,
+        tentative_deleted=pipeline.associator.map.deleted,
+        line_closures=pipeline.associator.closures,
+        landmarks=len(landmarks),
+        seconds=pipeline.seconds,
+    )
+    return Result(
+        robots,
+        landmarks,
+        estimate,
+        tuple(pipeline.steps),
+        tuple(pipeline.pictures),
+        innovations,
+        np.array(pipeline.step_ms),
+        summary,
+    )
+
+
+def robot_result(run: RobotRun, states: Trajectory) -> RobotResult:
+    """Trajectories of one robot at the stamps it is reported at."""
+    causal_states = Trajectory(
+        states.stamps_ns, np.array(run.causal_poses), np.array(run.causal_covs)
+    )
+    if run.scans:
+        scans = np.array(run.scans, dtype=np.int64)
+        order = np.argsort(scans[:, 0], kind="stable")
+        stamps, times = scans[order, 0], scans[order, 1]
+        mounts = np.array(run.mounts)[order]
+    else:
+        period = round(1e9 / BASE_RATE_HZ)
+        times = stamps = np.arange(run.track.first_ns, run.track.last_ns + 1, period)
+    final = between_states(states, run.track, times, stamps, causal=False)
+    causal = between_states(causal_states, run.track, times, stamps, causal=True)
+    start = compose(states.poses[0], inverse(run.track.pose(int(states.stamps_ns[0]))))
+    poses = compose(start, run.track.pose(times))
+    reckoned = Trajectory(stamps, poses, np.full((len(poses), 3, 3), np.nan))
+    return RobotResult(
+        final,
+        causal,
+        mounted(final, mounts) if run.scans else None,
+        mounted(causal, mounts) if run.scans else None,
+        reckoned,
+    )
+
+
+def events(messages: Iterable[Message]) -> Iterator[list[Message]]:
+    """Messages grouped: the sightings of one robot at one time are one image."""
+
+    def key(message: Message) -> tuple[object, ...]:
+        if isinstance(message, Sighting):
+            return (message.robot, message.time_ns)
+        return (id(message),)
+
+    for _, group in itertools.groupby(messages, key):
+        yield list(group)
+
+
+def sighting_observation(message: Sighting) -> Observation:
+    """A sighting as an observation: a point, or with a direction a pose on the thing seen."""
+    if len(message.z) == 2:
+        return Observation("point", message.z, message.cov, None, message.identity)
+    bearing, range_m, direction = message.z
+    c, s = np.cos(bearing), np.sin(bearing)
+    J = np.array([[-range_m * s, c, 0.0], [range_m * c, s, 0.0], [0.0, 0.0, 1.0]])
+    z = np.array([range_m * c, range_m * s, direction])
+    return Observation("segment", z, J @ message.cov @ J.T, np.zeros(2), message.identity)
+
+
+def start_poses(log: LogSet, config: Config) -> dict[str, Start]:
+    """Where each robot starts: as given, from one truth sample, or the origin for the first.
+
+    Raises:
+        EstimationError: truth was asked for and a robot has none, or a given pose is malformed.
+    """
+    start = config.start
+    given = np.diag([start.given_sigma_m**2] * 2 + [start.given_sigma_rad**2])
+    starts: dict[str, Start] = {}
+    if start.from_truth:
+        for message in log.messages():
+            if isinstance(message, Truth) and message.robot not in starts:
+                starts[message.robot] = Start(message.pose, given)
+            if len(starts) >= len(log.robots):
+                break
+        missing = [robot for robot in log.robots if robot not in starts]
+        if missing:
+            raise EstimationError(f"--start truth: the log has no truth for {', '.join(missing)}")
+    for robot, pose in start.poses.items():
+        if len(pose) != 3 or robot not in log.robots:
+            raise EstimationError(
+                f"--start {robot}: needs x,y,phi of one of the robots {', '.join(log.robots)}"
+            )
+        starts[robot] = Start(np.array(pose), given)
+    if log.robots and log.robots[0] not in starts and not starts:
+        origin = np.diag([start.origin_sigma_m**2] * 2 + [start.origin_sigma_rad**2])
+        starts[log.robots[0]] = Start(np.zeros(3), origin)
+    return starts
+
+
+def _counted(
+    messages: Iterable[Message], counts: Counter[str], progress: Progress
+) -> Iterator[Message]:
+    for message in messages:
+        counts["messages"] += 1
+        if counts["messages"] % 500 == 0:
+            progress(counts["messages"])
+        yield message

@@ -1,0 +1,135 @@
+"""What a run adds up to: the map's landmarks as records, and the keys of summary.json."""
+
+import hashlib
+import platform
+import resource
+import sys
+from collections import Counter
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from graphslam import __version__
+from graphslam.config import Config, dump_config
+from graphslam.geometry import Array, transform
+from graphslam.landmark_map import Entry, LandmarkMap
+from graphslam.logs import LogSet
+from graphslam.records import Estimate, Landmark
+
+FORMAT = "graphslam-result-1"
+
+
+def line_parameters(pose: Array, cov: Array) -> tuple[float, float, Array]:
+    """Normal direction (rad), offset (m) and their covariance (2, 2) of the line through a pose.
+
+    The line's direction is the pose's x axis; its normal points to the left of it. The offset is
+    that of the line from the world's origin along the normal.
+    """
+    normal = float(pose[2] + np.pi / 2)
+    n = np.array([np.cos(normal), np.sin(normal)])
+    along = float(-n[1] * pose[0] + n[0] * pose[1])
+    # offset = n·p: turning the normal by e moves it by (dn/de)·p = along * e
+    J = np.array([[0.0, 0.0, 1.0], [n[0], n[1], along]])
+    return normal, float(n @ pose[:2]), J @ cov @ J.T
+
+
+def make_landmark(entry: Entry, mean: Array, cov: Array) -> Landmark:
+    """Bookkeeping and estimate of one landmark as a record."""
+    if entry.kind == "point":
+        position = np.array([mean[0], mean[1], np.nan])
+        extent = np.array([mean, mean])
+        line = None
+    else:
+        position = mean
+        ends = np.array([[entry.extent[0], 0.0], [entry.extent[1], 0.0]])
+        extent = transform(mean, ends)
+        line = line_parameters(mean, cov)
+    return Landmark(
+        entry.id,
+        entry.kind,
+        position,
+        cov,
+        extent,
+        line,
+        entry.sightings,
+        entry.first_ns,
+        entry.last_ns,
+        entry.identity,
+    )
+
+
+def make_landmarks(landmarks: LandmarkMap, estimate: Estimate) -> tuple[Landmark, ...]:
+    """The final map: every landmark that the back end estimated."""
+    return tuple(
+        make_landmark(landmarks.entries[number], mean, cov)
+        for number, (mean, cov) in sorted(estimate.landmarks.items())
+    )
+
+
+def summarise(
+    *,
+    log: LogSet,
+    config: Config,
+    estimate: Estimate,
+    counts: Counter[str],
+    rejected: Counter[str],
+    dropped: Counter[str],
+    tentative_deleted: int,
+    line_closures: int,
+    landmarks: int,
+    seconds: Counter[str],
+) -> dict[str, Any]:
+    """The keys of summary.json (see docs/formats.md)."""
+    scans, total = counts["scans"], max(seconds["all"], 1e-9)
+    spans = [t.stamps_ns for t in estimate.states.values()]
+    log_s = 1e-9 * (max(int(s[-1]) for s in spans) - min(int(s[0]) for s in spans))
+    all_dropped = Counter(log.dropped) + dropped
+    if tentative_deleted:
+        all_dropped["tentative landmark: not seen often enough"] += tentative_deleted
+    return {
+        "format": FORMAT,
+        "versions": {
+            "graphslam": __version__,
+            "gtsam": version("gtsam"),
+            "numpy": version("numpy"),
+            "opencv": version("opencv-python-headless"),
+            "python": platform.python_version(),
+        },
+        "logs": [
+            {
+                "path": str(file.path),
+                "sha256": file.sha256,
+                "messages": file.messages,
+                "lost": file.lost,
+            }
+            for file in log.files
+        ],
+        "notes": dict(log.notes),
+        "config_sha256": hashlib.sha256(dump_config(config).encode()).hexdigest(),
+        "backend": config.backend.name,
+        "stages": {name: round(value, 4) for name, value in sorted(seconds.items())},
+        "scans_per_s": round(scans / total, 2),
+        "real_time_factor": round(log_s / total, 2),
+        "peak_memory_mb": round(_peak_memory_mb(), 1),
+        "counts": {
+            "messages": counts["messages"],
+            "scans": scans,
+            "keyframes": counts["keyframes"],
+            "observations": counts["observations"],
+            "landmarks": landmarks,
+            "loop_closures": counts["loop_closures"] + line_closures,
+        },
+        "rejected": dict(sorted(rejected.items())),
+        "dropped": dict(sorted(all_dropped.items())),
+        "repaired": dict(sorted(log.repaired.items())),
+        "graph": {"error": estimate.error, "dof": estimate.dof},
+        "calibration": {},
+        "warnings": list(log.warnings),
+    }
+
+
+def _peak_memory_mb() -> float:
+    """Largest resident size of this process; macOS counts bytes, Linux kilobytes."""
+    peak = float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+    return peak / 1e6 if sys.platform == "darwin" else peak / 1e3

@@ -1,0 +1,66 @@
+"""Messages in time order, each released once its robot's odometry reaches it."""
+
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Mapping
+
+from graphslam.dead_reckoning import Track
+from graphslam.records import (
+    Message,
+    OdometryIncrement,
+    OdometryPose,
+    Sighting,
+    TrueLandmark,
+    Truth,
+    WheelAngles,
+)
+
+ODOMETRY = (OdometryPose, OdometryIncrement, WheelAngles)
+
+
+def _robots(message: Message) -> tuple[str, ...]:
+    """Robots that get a state at the message's time."""
+    if isinstance(message, Sighting) and message.seen_robot is not None:
+        return message.robot, message.seen_robot
+    return (message.robot,)
+
+
+def synchronise(
+    messages: Iterable[Message],
+    tracks: Mapping[str, Track],
+    max_gap_s: float,
+    dropped: Counter[str],
+) -> Iterator[Message]:
+    """Feed odometry into the tracks and hold everything else until the track covers its time.
+
+    A scan stamped between two odometry readings needs the later one to be placed. The order of
+    time is kept over all robots, so one robot's silence may delay the others, by ``max_gap_s`` at
+    most: what is farther than that from any odometry of its robot is dropped and counted. At the
+    end of the log the robot is taken to stand still after its last reading.
+    """
+    waiting: deque[Message] = deque()
+    max_gap_ns = round(max_gap_s * 1e9)
+    now_ns = 0
+
+    def release(final: bool) -> Iterator[Message]:
+        while waiting:
+            head = waiting[0]
+            if not isinstance(head, ODOMETRY):
+                needed = [tracks.get(robot) for robot in _robots(head)]
+                covered = all(track and track.reaches(head.time_ns) for track in needed)
+                if not covered and not final and now_ns - head.time_ns <= max_gap_ns:
+                    return
+                if not all(track and track.near(head.time_ns, max_gap_ns) for track in needed):
+                    waiting.popleft()
+                    dropped[f"{type(head).__name__.lower()}: no odometry near it"] += 1
+                    continue
+            yield waiting.popleft()
+
+    for message in messages:
+        if isinstance(message, Truth | TrueLandmark):
+            continue
+        now_ns = max(now_ns, message.time_ns)
+        if isinstance(message, ODOMETRY):
+            tracks[message.robot].add(message)
+        waiting.append(message)
+        yield from release(final=False)
+    yield from release(final=True)
