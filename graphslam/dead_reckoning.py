@@ -13,11 +13,16 @@ from graphslam.models import MOTION_SOURCES, compound
 from graphslam.models.motion import Increments
 from graphslam.records import Motion, OdometryIncrement, OdometryPose, WheelAngles
 
+IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 Odometry = OdometryPose | OdometryIncrement | WheelAngles
 
 #: m and rad: what a robot that reports no motion may still have moved between two states
 STANDING_SIGMA = 1e-3
 
+#: m/s and rad/s: no wheeled robot's odometry says more. An interval that implies it was stamped in a
+#: burst (a logger that fell behind): its stamps do not tell when the motion took place, so a time
+#: inside it belongs to the reading before, as the order of recording has it
+MAX_SPEED_M_S, MAX_TURN_RAD_S = 20.0, 20.0
 #: m per rad: how much path a turn counts for when a correction is spread over an interval
 TURNING_EFFORT_M = 0.3
 
@@ -35,6 +40,7 @@ class Track:
         self._rows = np.empty((1024, 0))
         self._poses = np.empty((1024, 3))  # by odometry alone, first reading = origin
         self._effort = np.empty(1024)  # accumulated, see `effort`
+        self._burst = np.empty(1024, dtype=bool)  # interval too short for its motion
         self._last: Array | None = None
 
     def __len__(self) -> int:
@@ -84,12 +90,15 @@ class Track:
             self._rows = np.concatenate([self._rows, np.empty_like(self._rows)])
             self._poses = np.concatenate([self._poses, np.empty_like(self._poses)])
             self._effort = np.concatenate([self._effort, np.empty_like(self._effort)])
+            self._burst = np.concatenate([self._burst, np.empty_like(self._burst)])
         n = self._count
         self._times[n], self._rows[n] = time_ns, row
         step = self._increments(row[None]).delta[0]
         self._poses[n] = compose(self._poses[n - 1], step) if n else np.zeros(3)
-        moved = np.hypot(step[0], step[1]) + TURNING_EFFORT_M * abs(step[2])
-        self._effort[n] = self._effort[n - 1] + moved if n else 0.0
+        path, turn = np.hypot(step[0], step[1]), abs(step[2])
+        self._effort[n] = self._effort[n - 1] + path + TURNING_EFFORT_M * turn if n else 0.0
+        seconds = 1e-9 * (time_ns - self._times[n - 1]) if n else 0.0
+        self._burst[n] = path > MAX_SPEED_M_S * seconds or turn > MAX_TURN_RAD_S * seconds
         self._count += 1
 
     def _increments(self, rows: Array) -> Increments:
@@ -105,7 +114,7 @@ class Track:
             return False
         return self.first_ns - gap_ns <= time_ns <= self.last_ns + gap_ns
 
-    def pose(self, times_ns: Array | int) -> Array:
+    def pose(self, times_ns: IntArray | int) -> Array:
         """Poses (..., 3) by odometry alone, in the frame of the first reading.
 
         Before the first reading and after the last one the robot is taken to stand still.
@@ -114,12 +123,21 @@ class Track:
         i = np.clip(np.searchsorted(self.times, times, side="left"), 1, max(self._count - 1, 1))
         if self._count < 2:
             return np.zeros((*times.shape, 3))
-        t0, t1 = self._times[i - 1], self._times[i]
-        share = np.clip((times - t0) / np.maximum(t1 - t0, 1), 0.0, 1.0)
+        share = self._share(i, self._times[i - 1], times)
         twist = log(between(self._poses[i - 1], self._poses[i]))
         return compose(self._poses[i - 1], exp(share[..., None] * twist))
 
-    def effort(self, times_ns: Array | int) -> Array:
+    def _share(self, i: IntArray, from_ns: IntArray | int, to_ns: IntArray | int) -> Array:
+        """Share (..., ) of the interval that ends at reading i that lies in from_ns..to_ns."""
+        begin, end = self._times[i - 1], self._times[i]
+
+        def reached(time_ns: IntArray | int) -> Array:
+            share = np.clip((time_ns - begin) / np.maximum(end - begin, 1), 0.0, 1.0)
+            return np.where(self._burst[i], share >= 1.0, share)
+
+        return reached(to_ns) - reached(from_ns)
+
+    def effort(self, times_ns: IntArray | int) -> Array:
         """Accumulated motion (...,), m: path plus turning. Odometry errors grow with it."""
         return np.interp(times_ns, self.times, self._effort[: self._count])
 
@@ -135,10 +153,9 @@ class Track:
         if end_ns <= start_ns or last < first:
             return self._standing(start_ns, end_ns)
         rows = self._rows[first : last + 1]
-        begin, end = times[first - 1 : last], times[first : last + 1]
-        span = np.maximum(end - begin, 1)
-        share = (np.minimum(end, end_ns) - np.maximum(begin, start_ns)) / span
-        parts = self._increments(rows * np.clip(share, 0.0, 1.0)[:, None])
+        inside = np.arange(first, last + 1)
+        share = self._share(inside, start_ns, end_ns)
+        parts = self._increments(rows * share[:, None])
         whole = compound(parts)
         cov = whole.cov + whole.d_cal @ parts.calibration_cov @ whole.d_cal.T
         length = float(np.hypot(parts.delta[:, 0], parts.delta[:, 1]).sum())

@@ -89,7 +89,7 @@ def _fewest_points(config: FrontEndConfig) -> int:
 
 def _allowed_rms(config: FrontEndConfig) -> float:
     """Root mean square deviation from one line, m, that goes with a largest one of split_m."""
-    return config.split_m / 2
+    return max(config.split_m, 1e-4) / 2  # it is divided by, and rounding must pass
 
 
 def _point_moments(points: Array) -> Array:

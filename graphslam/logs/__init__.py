@@ -3,7 +3,21 @@
 `mcap` and `rosbags` are known to this package only. See docs/logs.md.
 """
 
+from graphslam.logs.importers import IMPORTERS, ImportSummary, pose_stamp_ns
+from graphslam.logs.inspect import LogInfo, RobotInfo, TopicInfo, inspect_logs
 from graphslam.logs.log_set import LogFile, LogSet, open_logs
 from graphslam.logs.writer import LogWriter
 
-__all__ = ["LogFile", "LogSet", "LogWriter", "open_logs"]
+__all__ = [
+    "IMPORTERS",
+    "ImportSummary",
+    "LogFile",
+    "LogInfo",
+    "LogSet",
+    "LogWriter",
+    "RobotInfo",
+    "TopicInfo",
+    "inspect_logs",
+    "open_logs",
+    "pose_stamp_ns",
+]

@@ -144,7 +144,7 @@ def odometry_increment(message: Any, topic: TopicContext) -> records.OdometryInc
     """graphslam_msgs/OdometryIncrement.
 
     Raises:
-        UnusableError: something is not finite, a variance is not positive, it ends before it starts.
+        UnusableError: it ends before it starts, is not finite, or its covariance is not positive.
     """
     start, stamp = schemas.stamp_ns(message.start), stamp_of(message)
     if stamp <= start:

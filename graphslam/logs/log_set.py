@@ -106,7 +106,7 @@ def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
         files=tuple(LogFile(f.path, f.sha256, f.messages, f.lost) for f in files),
         topics=tuple(topics),
         notes=notes,
-        warnings=[_damage(file) for file in files if file.damage] + warnings + assumed,
+        warnings=[describe_damage(file) for file in files if file.damage] + warnings + assumed,
         dropped=Counter(),
         repaired=Counter(),
         _mcap=files,
@@ -173,7 +173,8 @@ def _warn_of_stamps(file: McapFile, topic: str, counts: Counter[str]) -> list[st
     return lines
 
 
-def _damage(file: McapFile) -> str:
+def describe_damage(file: McapFile) -> str:
+    """One line that says what of a damaged file is lost."""
     lost = "an unknown number of" if file.lost is None else str(file.lost)
     return (
         f"{file.path}: damaged, {lost} messages are lost, {file.messages} are read: {file.damage}"

@@ -1,6 +1,7 @@
 """What must be known before the first message is decoded: mounts and no-return values."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,12 +21,32 @@ from graphslam.logs.writer import DEFAULT_ROBOT
 _SAMPLE_BLOCKS, _SAMPLE_PER_BLOCK = 16, 16
 
 
+@dataclass(frozen=True, slots=True)
+class ScanShape:
+    """What a laser's messages say about it: beams, field of view, limits of range."""
+
+    beams: int
+    field_of_view_rad: float
+    range_min_m: float
+    range_max_m: float
+
+
+def scan_shape(files: Sequence[McapFile], topic: Topic) -> ScanShape | None:
+    """Shape of the first scan of ``topic`` that decodes; None when none does."""
+    for message in samples(files, topic):
+        beams = len(message.ranges)
+        view = abs(float(message.angle_increment)) * max(beams - 1, 0)
+        return ScanShape(beams, view, float(message.range_min), float(message.range_max))
+    return None
+
+
 def survey_topics(
     files: Sequence[McapFile], topics: Sequence[Topic], config: Config
 ) -> tuple[dict[str, TopicContext], list[str]]:
     """Context for the decoder of each topic, and warnings about what had to be assumed."""
     warnings: list[str] = []
-    bases = {t.robot: _base_frame(files, t) for t in topics if t.record in ODOMETRY_KINDS}
+    odometry = [t for kind in ODOMETRY_KINDS[::-1] for t in topics if t.record is kind]
+    bases = {t.robot: _base_frame(files, t) for t in odometry}  # the preferred kind comes last
     contexts = {}
     for topic in topics:
         settings = config.robot(topic.robot)

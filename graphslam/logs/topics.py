@@ -70,7 +70,7 @@ def find_topics(files: Sequence[McapFile], config: Config) -> list[Topic]:
 
 
 def robot_of(topic: str) -> str:
-    """Robot that a topic belongs to by its name: robot1 for ``/robot1/scan``, robot for ``/scan``."""
+    """Robot that a topic's name tells: robot1 for ``/robot1/scan``, robot for ``/scan``."""
     first, separator, _ = topic.strip("/").partition("/")
     return first if separator else DEFAULT_ROBOT
 

@@ -6,18 +6,21 @@ relations refer to it.
 """
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, DecimalException
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graphslam.errors import LogError
-from graphslam.geometry import Array
 from graphslam.logs.importers.summary import ImportSummary, text_lines
 from graphslam.logs.no_return import find_no_return
 from graphslam.logs.writer import DEFAULT_ROBOT, LogWriter
+
+Ranges = NDArray[np.float32]
 
 _ROBOT = DEFAULT_ROBOT
 _TRAILER = 3  # ipc time, host, logger time
@@ -35,7 +38,7 @@ class _Odometry:
 @dataclass(frozen=True, slots=True)
 class _Scan:
     stamp_ns: int
-    ranges: Array
+    ranges: Ranges
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,31 +57,22 @@ def import_carmen(source: Path, target: Path) -> ImportSummary:
         LogError: ``source`` cannot be read, or holds neither scans nor odometry.
         OutputError: ``target`` cannot be written.
     """
-    stamps, sample, malformed = [], [], Counter[str]()
-    offset_m, scans = 0.0, 0
-    for entry in _entries(source, malformed):
-        if isinstance(entry, _Offset):
-            offset_m = entry.forward_m
-            continue
-        stamps.append(entry.stamp_ns)
-        if isinstance(entry, _Scan):
-            sample += [entry.ranges] if scans % _SAMPLE_EVERY == 0 else []
-            scans += 1
-    if not stamps:
+    malformed: Counter[str] = Counter()
+    # kept whole, about 4 bytes per beam: the log times need what comes last first
+    entries = list(_entries(source, malformed))
+    offsets = [entry.forward_m for entry in entries if isinstance(entry, _Offset)]
+    stamped = [entry for entry in entries if not isinstance(entry, _Offset)]
+    if not stamped:
         raise LogError(f"{source}: has no FLASER or ODOM line that can be read; is it CARMEN?")
-    no_return = find_no_return(sample)
-    range_max = _BEYOND_M if no_return is None else float(np.nextafter(np.float32(no_return), 0))
-    # The recorder's times must not decrease, yet keep the file's order: the earliest stamp of
-    # this line and of all behind it.
-    log_times = np.minimum.accumulate(np.array(stamps, dtype=np.int64)[::-1])[::-1].tolist()
+    log_times = _recording_times([entry.stamp_ns for entry in stamped])
+    range_max = _range_max([entry.ranges for entry in stamped if isinstance(entry, _Scan)])
     notes = {"format": "carmen", "source": source.name, "stamps": "ipc time, exact"}
     with LogWriter(target, notes) as log:
-        log.mount(_ROBOT, log_times[0], (offset_m, 0.0, 0.0))
-        numbers = iter(log_times)
-        for entry in _entries(source, Counter()):
+        log.mount(_ROBOT, log_times[0], (offsets[-1] if offsets else 0.0, 0.0, 0.0))
+        for entry, log_time_ns in zip(stamped, log_times, strict=True):
             if isinstance(entry, _Odometry):
-                log.odometry(_ROBOT, entry.stamp_ns, entry.pose, log_time_ns=next(numbers))
-            elif isinstance(entry, _Scan):
+                log.odometry(_ROBOT, entry.stamp_ns, entry.pose, log_time_ns=log_time_ns)
+            else:
                 start, step = _beam_angles(len(entry.ranges))
                 log.scan(
                     _ROBOT,
@@ -87,10 +81,24 @@ def import_carmen(source: Path, target: Path) -> ImportSummary:
                     angle_min_rad=start,
                     angle_step_rad=step,
                     range_max_m=range_max,
-                    log_time_ns=next(numbers),
+                    log_time_ns=log_time_ns,
                 )
     warnings = [f"{source}: {n} {tag} lines cannot be read" for tag, n in sorted(malformed.items())]
     return ImportSummary(source, target, log.counts, tuple(warnings))
+
+
+def _recording_times(stamps_ns: Sequence[int]) -> list[int]:
+    """Times of recording: they never decrease, so that readers keep the order of the file.
+
+    The line was written before all lines behind it, so not after the earliest of their stamps.
+    """
+    return list(accumulate(reversed(stamps_ns), min))[::-1]
+
+
+def _range_max(scans: Sequence[Ranges]) -> float:
+    """Just below the range that means no return, as float32 like the ranges."""
+    no_return = find_no_return(scans[::_SAMPLE_EVERY])
+    return _BEYOND_M if no_return is None else float(np.nextafter(np.float32(no_return), 0))
 
 
 def parse_stamp_ns(text: str) -> int:
@@ -154,4 +162,8 @@ def _parameter(fields: list[str]) -> _Offset | None:
     return _Offset(float(fields[2])) if fields[1] == "robot_frontlaser_offset" else None
 
 
-_PARSERS = {"ODOM": _odometry, "FLASER": _scan, "PARAM": _parameter}
+_PARSERS: dict[str, Callable[[list[str]], _Odometry | _Scan | _Offset | None]] = {
+    "ODOM": _odometry,
+    "FLASER": _scan,
+    "PARAM": _parameter,
+}

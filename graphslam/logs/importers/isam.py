@@ -235,7 +235,7 @@ def _pose_covariance(v: Array, is_g2o: bool) -> Array:
     """
     upper = np.array([[v[0], v[1], v[2]], [v[1], v[3], v[4]], [v[2], v[4], v[5]]])
     if is_g2o:
-        return _checked(np.linalg.inv(_checked(upper)))
+        return _checked(np.asarray(np.linalg.inv(_checked(upper))))
     zero = tuple(v == 0)
     if zero == (False, True, False, False, True, True):
         return _checked(np.array([[v[0], v[1], v[4]], [v[1], v[2], v[5]], [v[4], v[5], v[3]]]))

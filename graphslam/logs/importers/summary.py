@@ -6,10 +6,11 @@ import lzma
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TextIO
 
 from graphslam.errors import LogError
 
-_OPENERS: dict[str, Callable[..., object]] = {
+_OPENERS: dict[str, Callable[..., TextIO]] = {
     ".bz2": bz2.open,
     ".gz": gzip.open,
     ".xz": lzma.open,
@@ -39,7 +40,7 @@ def text_lines(path: Path) -> Iterator[str]:
     """
     try:
         opener = _OPENERS.get(path.suffix, open)
-        with opener(path, "rt", encoding="utf-8", errors="replace") as lines:  # type: ignore[attr-defined]
+        with opener(path, "rt", encoding="utf-8", errors="replace") as lines:
             yield from lines
     except FileNotFoundError as error:
         raise LogError(f"{path}: no such file; check the path") from error

@@ -1,0 +1,213 @@
+"""The order of the report, its words and its style."""
+
+from collections.abc import Mapping
+from html import escape
+from pathlib import PurePath
+from typing import Any
+
+import numpy as np
+
+from graphslam.config import Config, dump_config
+from graphslam.records import Result
+from graphslam.report import maps, plots, tables
+from graphslam.report.style import CSS
+
+
+def page(result: Result, evaluation: Mapping[str, Any] | None, config: Config | None) -> str:
+    """See `graphslam.report.render`."""
+    summary = result.summary
+    title = " + ".join(PurePath(log["path"]).name for log in summary.get("logs", [])) or "Result"
+    sections = [
+        _header(result, title),
+        _warnings(summary),
+        _map_section(result),
+        _quality_section(evaluation or {}),
+        _uncertainty_section(result),
+        _estimator_section(result),
+        _accounting_section(summary),
+        _landmark_section(result),
+        _reproduce_section(summary, config),
+    ]
+    body = "\n".join(section for section in sections if section)
+    return (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        '<meta name="color-scheme" content="light dark">\n'
+        f"<title>{escape(title)} – graphslam</title>\n<style>{CSS}</style>\n</head>\n"
+        f"<body>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
+    )
+
+
+def _header(result: Result, title: str) -> str:
+    counts = result.summary.get("counts", {})
+    sigma = tables.median_sigma(result)
+    tiles = [
+        ("scans", tables.number(counts.get("scans")) if counts.get("scans") else None),
+        ("keyframes", tables.number(counts.get("keyframes"))),
+        ("landmarks", tables.number(len(result.landmarks))),
+        ("loop closures", tables.number(counts["loop_closures"]) if counts.get("loop_closures") else None),
+        ("median σ", f"{tables.number(100 * sigma, 2)} cm" if sigma is not None else None),
+        ("real time", f"{tables.number(float(result.summary['real_time_factor']), 2)} ×"
+         if result.summary.get("real_time_factor") else None),
+        ("peak memory", f"{tables.number(float(result.summary['peak_memory_mb']))} MB"
+         if result.summary.get("peak_memory_mb") else None),
+    ]  # fmt: skip
+    shown = "".join(
+        f"<div><dt>{name}</dt><dd>{text}</dd></div>" for name, text in tiles if text is not None
+    )
+    return (
+        f"<header><p class=brand>graphslam</p><h1>{escape(title)}</h1>\n"
+        f"<p class=lead>{escape(tables.headline(result))}</p>\n<dl class=tiles>{shown}</dl></header>"
+    )
+
+
+def _warnings(summary: Mapping[str, Any]) -> str:
+    items = "".join(f"<li>{escape(str(text))}</li>" for text in summary.get("warnings", []))
+    return f'<section class="warn"><h2>Warnings</h2><ul>{items}</ul></section>' if items else ""
+
+
+def _figure(drawing: str, title: str, caption: str) -> str:
+    return (
+        f"<figure><figcaption><b>{escape(title)}</b> {escape(caption)}</figcaption>\n"
+        f"{drawing}</figure>"
+    )
+
+
+def _map_section(result: Result) -> str:
+    scans = bool(result.pictures)
+    what = "Superposed scans" if scans else "Paths"
+    landmark_note = "" if scans else " Triangles are landmarks."
+    figures = [
+        _figure(
+            maps.overview(result, dead_reckoning=False),
+            "Final trajectory.",
+            f"{what} on the trajectory from all data.{landmark_note}",
+        ),
+        _figure(
+            maps.overview(result, dead_reckoning=True),
+            "Dead reckoning.",
+            f"The same {'scans' if scans else 'paths'} by odometry alone.",
+        ),
+    ]
+    if result.landmarks:
+        drawing, factor = maps.landmark_map(result)
+        points = any(m.kind == "point" for m in result.landmarks)
+        lines = any(m.line is not None for m in result.landmarks)
+        bounds = " and ".join(["ellipses"] * points + ["bars across the ends"] * lines)
+        named = min(len(result.landmarks), maps.MAX_LABELS)
+        which = "" if named == len(result.landmarks) else " of those seen most often"
+        figures.append(
+            _figure(
+                drawing,
+                "Landmarks.",
+                f"Numbers{which} as in landmarks.json; 95 % {bounds}{_times(factor)}.",
+            )
+        )
+    drawing, factor = maps.trajectory_map(result)
+    figures.append(
+        _figure(
+            drawing,
+            "Uncertainty of the trajectory.",
+            f"95 % ellipses{_times(factor)}; a dot marks the start; "
+            "the faint line is the causal estimate.",
+        )
+    )
+    return _section("Map", figures)
+
+
+def _times(factor: int) -> str:
+    return f" drawn {factor} times as large" if factor > 1 else " to scale"
+
+
+def _quality_section(evaluation: Mapping[str, Any]) -> str:
+    content = tables.quality(evaluation)
+    return f"<section><h2>Against the truth</h2>{content}</section>" if content else ""
+
+
+def _uncertainty_section(result: Result) -> str:
+    return _section(
+        "Over time",
+        [
+            _figure(
+                plots.uncertainty(result),
+                "Standard deviations.",
+                "Final (strong) and causal (pale); position along its worst direction.",
+            ),
+            _figure(
+                plots.revision(result),
+                "Final against causal.",
+                "Distance of the causal estimate (solid) and of odometry alone (dashed) from the "
+                "final trajectory: what later data changed.",
+            ),
+        ],
+    )
+
+
+def _estimator_section(result: Result) -> str:
+    figures = []
+    if any(len(values) for values in result.innovations.values()):
+        figures.append(
+            _figure(
+                plots.innovations(result.innovations),
+                "Innovations.",
+                "Normalised innovation squared per degree of freedom of accepted associations; "
+                "black its running mean, orange its expectation 1 and, dashed, the 95 % quantile. "
+                "A mean below 1 says that the stated noise is cautious; the gate cuts the tail.",
+            )
+        )
+    if len(result.step_ms):
+        p50, p99 = np.quantile(result.step_ms, [0.5, 0.99])
+        figures.append(
+            _figure(
+                plots.timing(result.step_ms),
+                "Wall time per keyframe.",
+                f"Black the running median; p50 {tables.number(float(p50))} ms, "
+                f"p99 {tables.number(float(p99))} ms, max "
+                f"{tables.number(float(result.step_ms.max()))} ms.",
+            )
+        )
+    return _section("Estimator", figures) if figures else ""
+
+
+def _accounting_section(summary: Mapping[str, Any]) -> str:
+    parts = [
+        tables.counts(summary),
+        f"<div>{tables.reasons(summary)}</div>",
+        f"<div>{tables.stages(summary)}</div>",
+        tables.calibration(summary),
+    ]
+    content = "\n".join(part for part in parts if part)
+    return f'<section><h2>Accounts</h2><div class="accounts">{content}</div></section>'
+
+
+def _landmark_section(result: Result) -> str:
+    if not result.landmarks:
+        return ""
+    return (
+        f"<section><details><summary>All {tables.number(len(result.landmarks))} landmarks</summary>"
+        f"{tables.landmarks(result.landmarks)}</details></section>"
+    )
+
+
+def _reproduce_section(summary: Mapping[str, Any], config: Config | None) -> str:
+    logs = [
+        (log["path"], log["messages"], log["lost"], log["sha256"])
+        for log in summary.get("logs", [])
+    ]
+    versions = ", ".join(f"{name} {text}" for name, text in summary.get("versions", {}).items())
+    paths = " ".join(str(log[0]) for log in logs)
+    command = f"graphslam smooth {paths} -o DIR --config config.toml"
+    parts = [
+        "<section><details><summary>How to reproduce this</summary>",
+        f"<p>With the config.toml beside this file: <code>{escape(command)}</code></p>",
+        f"<p class=note>Versions: {escape(versions)}. Configuration sha256 "
+        f"<code>{escape(str(summary.get('config_sha256', '–')))}</code></p>",
+        tables.table(["log", "messages", "lost", "sha256"], logs),
+    ]
+    if config is not None:
+        parts.append(f"<pre>{escape(dump_config(config))}</pre>")
+    return "\n".join([*parts, "</details></section>"])
+
+
+def _section(title: str, figures: list[str]) -> str:
+    return f'<section><h2>{title}</h2><div class="grid">{"".join(figures)}</div></section>'
