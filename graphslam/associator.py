@@ -62,6 +62,7 @@ class Associator:
         robot: str,
         time_ns: int,
         seen: Sequence[Observation],
+        pose: Array,
         motion: Motion | None,
         track: Track,
         path_m: float,
@@ -72,6 +73,7 @@ class Associator:
             robot: who saw it.
             time_ns: time of the robot's state that the observations belong to.
             seen: observations in the robot's base frame at that state.
+            pose: (3,) estimate of the robot's latest state in the back end.
             motion: from the robot's latest state in the back end to this one; None if it is it.
             track: the robot's odometry.
             path_m: how far the robot has driven.
@@ -87,7 +89,8 @@ class Associator:
         self.map.expire(
             time_ns, robot, path_m, round(config.tentative_s * 1e9), config.tentative_m
         )
-        pose = predicted_joint(self._backend.joint(robot, []), motion).pose
+        if motion is not None:
+            pose = compose(pose, motion.delta)
         ids, means, extents, is_point, whole = self.map.arrays()
         pairs = candidate_pairs(seen, pose, means, extents, is_point, whole, config)
         known = self._known(seen)

@@ -8,7 +8,7 @@ calibration. Between two readings the robot is taken to move on a circle segment
 import numpy as np
 
 from graphslam.config import OdometryConfig, RobotConfig
-from graphslam.geometry import Array, between, compose, exp, log
+from graphslam.geometry import Array, between, compose, exp, log, wrap
 from graphslam.models import MOTION_SOURCES, compound
 from graphslam.models.motion import Increments
 from graphslam.records import Motion, OdometryIncrement, OdometryPose, WheelAngles
@@ -40,6 +40,7 @@ class Track:
         self._rows = np.empty((1024, 0))
         self._poses = np.empty((1024, 3))  # by odometry alone, first reading = origin
         self._effort = np.empty(1024)  # accumulated, see `effort`
+        self._path = np.empty(1024)  # accumulated, m
         self._burst = np.empty(1024, dtype=bool)  # interval too short for its motion
         self._last: Array | None = None
 
@@ -90,6 +91,7 @@ class Track:
             self._rows = np.concatenate([self._rows, np.empty_like(self._rows)])
             self._poses = np.concatenate([self._poses, np.empty_like(self._poses)])
             self._effort = np.concatenate([self._effort, np.empty_like(self._effort)])
+            self._path = np.concatenate([self._path, np.empty_like(self._path)])
             self._burst = np.concatenate([self._burst, np.empty_like(self._burst)])
         n = self._count
         self._times[n], self._rows[n] = time_ns, row
@@ -97,6 +99,7 @@ class Track:
         self._poses[n] = compose(self._poses[n - 1], step) if n else np.zeros(3)
         path, turn = np.hypot(step[0], step[1]), abs(step[2])
         self._effort[n] = self._effort[n - 1] + path + TURNING_EFFORT_M * turn if n else 0.0
+        self._path[n] = self._path[n - 1] + path if n else 0.0
         seconds = 1e-9 * (time_ns - self._times[n - 1]) if n else 0.0
         self._burst[n] = path > MAX_SPEED_M_S * seconds or turn > MAX_TURN_RAD_S * seconds
         self._count += 1
@@ -140,6 +143,12 @@ class Track:
     def effort(self, times_ns: IntArray | int) -> Array:
         """Accumulated motion (...,), m: path plus turning. Odometry errors grow with it."""
         return np.interp(times_ns, self.times, self._effort[: self._count])
+
+    def moved(self, start_ns: int, end_ns: int) -> tuple[float, float]:
+        """Path (m) and net turning (rad, absolute) from ``start_ns`` to ``end_ns``; cheap."""
+        poses = self.pose(np.array([start_ns, end_ns]))
+        path = np.interp([start_ns, end_ns], self.times, self._path[: self._count])
+        return float(path[1] - path[0]), abs(float(wrap(poses[1, 2] - poses[0, 2])))
 
     def motion(self, start_ns: int, end_ns: int) -> Motion:
         """The motion from ``start_ns`` to ``end_ns`` with its covariance; thesis 4.4-4.15.

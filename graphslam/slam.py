@@ -117,17 +117,15 @@ class Pipeline:
         run, time_ns = self.runs[first.robot], first.time_ns
         if not run.started:
             self.start(first.robot, time_ns)
-        motion = self.motion_since_state(first.robot, time_ns)
         scans = [m for m in event if isinstance(m, Scan)]
         for scan in scans:
             run.scans.append((scan.stamp_ns, scan.time_ns))
             run.mounts.append(scan.mount)
             self.counts["scans"] += 1
-        keyframe = self.is_keyframe(event, motion, first_scan=bool(scans) and len(run.scans) == 1)
-        if isinstance(first, ODOMETRY) and not keyframe:
-            return
-        if scans and not keyframe:
+        keyframe = self.is_keyframe(event, first_scan=bool(scans) and len(run.scans) == 1)
+        if not keyframe and isinstance(first, (Scan, *ODOMETRY)):
             return  # its pose follows from the states around it
+        motion = self.motion_since_state(first.robot, time_ns)
         began = time.perf_counter()
         seen = self.observations(event, None if keyframe else motion)
         self.seconds["front end"] += time.perf_counter() - began
@@ -153,19 +151,20 @@ class Pipeline:
             return None
         return run.track.motion(run.state_ns, time_ns)
 
-    def is_keyframe(self, event: list[Message], motion: Motion | None, first_scan: bool) -> bool:
+    def is_keyframe(self, event: list[Message], first_scan: bool) -> bool:
         """Whether the event gets a state of its own."""
-        keyframe = self.config.keyframe
+        keyframe, first = self.config.keyframe, event[0]
         if first_scan or any(isinstance(m, Sighting) and m.seen_robot for m in event):
             return True
-        if motion is None:
+        run = self.runs[first.robot]
+        if first.time_ns <= run.state_ns:
             return False
         if keyframe.mode == "all":
             return True
-        if isinstance(event[0], ODOMETRY):
+        if isinstance(first, ODOMETRY):
             return False
-        turned = abs(float(motion.delta[2]))
-        return motion.length_m >= keyframe.distance_m or turned >= keyframe.angle_rad
+        path_m, turned_rad = run.track.moved(run.state_ns, first.time_ns)
+        return path_m >= keyframe.distance_m or turned_rad >= keyframe.angle_rad
 
     def observations(self, event: list[Message], since: Motion | None) -> list[Observation]:
         """Landmarks seen, in the base frame of the state (``since`` carries back to it)."""
@@ -203,7 +202,7 @@ class Pipeline:
         associations: tuple[Association, ...] = ()
         if seen:
             associations = self.associator.associate(
-                robot, state_ns, seen, motion, run.track, run.path_m
+                robot, state_ns, seen, run.causal_poses[-1], motion, run.track, run.path_m
             )
         for message in event:
             if isinstance(message, Sighting) and message.seen_robot is not None:

@@ -135,9 +135,9 @@ def summary(messages, scans, keyframes, observations, landmarks, warnings, **mor
     }
 
 
-def nis(rng, model_dof, n, span_s):
+def nis(rng, model_dof, n, span_s, scale=1.0):
     t = np.sort(rng.uniform(0, span_s, n))
-    return np.column_stack([t, rng.chisquare(model_dof, n) / model_dof])
+    return np.column_stack([t, scale * rng.chisquare(model_dof, n) / model_dof])
 
 
 def wall_landmark(number, wall, rng):
@@ -226,7 +226,7 @@ def room(keyframes=300, beams=181, seed=3):
         estimate=estimate,
         steps=tuple(steps),
         pictures=tuple(pictures),
-        innovations={"line": nis(rng, 2, 2200, span), "segment": 1.4 * nis(rng, 3, 900, span)},
+        innovations={"line": nis(rng, 2, 2200, span), "segment": nis(rng, 3, 900, span, 1.4)},
         step_ms=rng.gamma(3, 1.2, keyframes) + np.linspace(0.5, 5, keyframes),
         summary=summary(
             27341,
@@ -312,7 +312,7 @@ def orchard(keyframes=400, trees=60, seed=5):
         steps=tuple(steps),
         pictures=(),
         innovations={
-            "point": 1.2 * nis(rng, 2, 1500, keyframes),
+            "point": nis(rng, 2, 1500, keyframes, 1.2),
             "robot-point": nis(rng, 2, 300, keyframes),
         },
         step_ms=rng.gamma(2, 1.0, keyframes),

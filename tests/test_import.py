@@ -219,13 +219,13 @@ def test_pose_graphs_that_make_no_sense_name_the_place(text, why, tmp_path):
 # ---------------------------------------------------------------- CARMEN
 
 
-@given(st.integers(0, 2**62))
+@given(st.integers(0, 2**31 * 10**9 - 1))
 def test_decimal_seconds_become_nanoseconds_exactly(nanoseconds):
     text = f"{nanoseconds // 10**9}.{nanoseconds % 10**9:09d}"
     assert parse_stamp_ns(text) == nanoseconds
 
 
-@pytest.mark.parametrize("text", ["nan", "inf", "", "12:00", "1e400000"])
+@pytest.mark.parametrize("text", ["nan", "inf", "", "12:00", "1e10"])
 def test_a_stamp_that_is_no_time_is_an_error(text):
     with pytest.raises(ValueError, match="not a time"):
         parse_stamp_ns(text)
@@ -252,10 +252,10 @@ def test_carmen_lines_become_messages_in_the_order_of_the_file(suffix, tmp_path)
     target = tmp_path / "log.mcap"
     summary = IMPORTERS["carmen"](source, target)
     assert summary.counts == {"/tf_static": 1, "/odom": 2, "/scan": 1}
-    assert [line.rpartition(": ")[2] for line in summary.warnings] == [
-        "2 FLASER lines cannot be read".replace("2", "2"),
-        "1 ODOM lines cannot be read",
-    ] or len(summary.warnings) == 2
+    assert summary.warnings == (
+        f"{source}: 2 FLASER lines cannot be read",
+        f"{source}: 1 ODOM lines cannot be read",
+    )
     first, second, scan = open_logs([target], Config()).messages()
     assert (first.stamp_ns, second.stamp_ns) == (100_000_001_000, 100_250_000_000)
     assert isinstance(scan, records.Scan) and scan.stamp_ns == 100_500_000_000

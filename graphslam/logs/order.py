@@ -80,7 +80,7 @@ class TimeLine:
             self._repairs[topic] = _Repair(self._window_ns, self.counts[topic])
         self._place(topic, self._repairs[topic].push(message))
         for name, repair in self._repairs.items():
-            # a rare topic must not hold up the others until four more of it have come
+            # a rare topic must not hold up the others until more of it has come
             self._place(name, repair.settle_before(self._latest_ns - self._window_ns))
         # nothing may be passed on that a message still under judgement can be placed before
         judged = [repair.earliest_ns for repair in self._repairs.values()]

@@ -20,7 +20,7 @@ from graphslam.logs.mcap_file import NOTES
 
 DEFAULT_ROBOT = "robot"  # its topics have no namespace
 # Small chunks cost a few per cent of compression; a damaged chunk loses less.
-_CHUNK_BYTES = 256 * 1024
+_CHUNK_BYTES = 64 * 1024
 
 
 class LogWriter:

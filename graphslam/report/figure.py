@@ -9,12 +9,14 @@ import io
 import re
 from collections.abc import Callable
 from html import escape
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from graphslam.geometry import Array
 
@@ -28,7 +30,9 @@ WIDTH_IN = 4.9
 _THEMED = {INK: "currentColor", FAINT: "var(--grid)", ACCENT: "var(--accent)"} | {
     color: f"var(--robot{i})" for i, color in enumerate(PALETTE)
 }
-_STYLE = {
+# Any: matplotlib types the keys of rcParams as literals since 3.11 and as str before
+_STYLE: Any = {
+    "axes.facecolor": "none",
     "axes.edgecolor": FAINT,
     "axes.grid": True,
     "axes.labelcolor": INK,
@@ -60,7 +64,9 @@ _STYLE = {
 def svg(label: str, height_in: float, draw: Callable[[Figure], None]) -> str:
     """What ``draw`` draws as an inline SVG element, described by ``label`` for screen readers."""
     # The salt makes identifiers repeatable, and different for figures on one page.
-    with mpl.rc_context({**mpl.rcParamsDefault, **_STYLE, "svg.hashsalt": label}):
+    with mpl.rc_context():
+        mpl.rcdefaults()  # a user's matplotlibrc has no say in the report
+        mpl.rcParams.update({**_STYLE, "svg.hashsalt": label})
         figure = Figure(figsize=(WIDTH_IN, height_in), dpi=200, facecolor="none")
         FigureCanvasSVG(figure)
         draw(figure)
@@ -120,10 +126,16 @@ def density(points: Array, limits: Array, color: str, pixels: int = 900) -> Arra
 
 def map_axes(figure: Figure, limits: Array) -> Axes:
     """Axes in metres with equal scales that hold ``limits`` [[x_min, x_max], [y_min, y_max]]."""
-    axes = figure.add_axes((0.1, 0.1, 0.88, 0.87))
-    axes.set_xlim(*limits[0])
-    axes.set_ylim(*limits[1])
-    axes.set_aspect("equal", adjustable="datalim")
+    width, height = figure.get_size_inches()
+    left, bottom, right, top = 0.5, 0.42, 0.08, 0.24
+    box = np.array([width - left - right, height - bottom - top])
+    # widen the narrower direction, so that a metre is as long both ways
+    scale = ((limits[:, 1] - limits[:, 0]) / box).max()
+    half, middle = box * scale / 2, limits.mean(axis=1)
+    axes = figure.add_axes((left / width, bottom / height, *(box / (width, height))))
+    axes.set_xlim(middle[0] - half[0], middle[0] + half[0])
+    axes.set_ylim(middle[1] - half[1], middle[1] + half[1])
+    axes.set_autoscale_on(False)
     axes.set_xlabel("x, m", labelpad=1)
     axes.set_ylabel("y, m", labelpad=0)
     return axes
@@ -132,11 +144,45 @@ def map_axes(figure: Figure, limits: Array) -> Axes:
 def time_rows(figure: Figure, rows: int, label: str) -> list[Axes]:
     """Axes one above the other with one common x axis."""
     grid = figure.add_gridspec(
-        rows, 1, left=0.12, right=0.98, top=0.93, bottom=0.46 / figure.get_figheight(), hspace=0.35
+        rows,
+        1,
+        left=0.13,
+        right=0.98,
+        top=1 - 0.25 / figure.get_figheight(),
+        bottom=0.46 / figure.get_figheight(),
+        hspace=0.35,
     )
     first = figure.add_subplot(grid[0])
     found = [first, *(figure.add_subplot(grid[i], sharex=first) for i in range(1, rows))]
     for axes in found[:-1]:
         axes.tick_params(labelbottom=False)
+    figure.align_ylabels(found)
     found[-1].set_xlabel(label, labelpad=2)
     return found
+
+
+def legend(axes: Axes) -> None:
+    """One row above the axes, where it hides nothing; each name once."""
+    handles, labels = axes.get_legend_handles_labels()
+    first = dict(reversed(list(zip(labels, handles, strict=True))))
+    names = list(dict.fromkeys(labels))
+    axes.legend(
+        [first[name] for name in names], names, loc="lower right", bbox_to_anchor=(1, 0.98),
+        ncols=min(len(names), 6), handlelength=1.4, columnspacing=1.0, borderaxespad=0,
+    )  # fmt: skip
+
+
+def log_scale(axes: Axes, label: str) -> None:
+    """A logarithmic y axis with plain numbers; 1, 2 and 5 are named where decades are few."""
+    axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    if high < 3 * low:  # hardly any spread: give it room rather than magnify noise
+        middle = float(np.sqrt(low * high))
+        low, high = middle / 2, middle * 2
+        axes.set_ylim(low, high)
+    subs = (1.0,) if high > 300 * low else (1.0, 2.0, 5.0)
+    axes.yaxis.set_major_locator(LogLocator(subs=subs))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.set_ylabel(label)
+    axes.margins(x=0.01)

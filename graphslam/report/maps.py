@@ -10,7 +10,16 @@ from scipy.stats import chi2
 
 from graphslam.geometry import Array, interpolate
 from graphslam.records import Landmark, Result, Trajectory
-from graphslam.report.figure import ACCENT, INK, WIDTH_IN, density, map_axes, robot_color, svg
+from graphslam.report.figure import (
+    ACCENT,
+    INK,
+    WIDTH_IN,
+    density,
+    legend,
+    map_axes,
+    robot_color,
+    svg,
+)
 
 MAX_LABELS = 40
 MAX_ELLIPSES = 400
@@ -41,30 +50,27 @@ def overview(result: Result, *, dead_reckoning: bool) -> str:
         for name, robot in sorted(result.robots.items())
     }
     clouds = {name: _cloud(result, name, path, dead_reckoning) for name, path in paths.items()}
-    limits = _limits([*(p.poses[:, :2] for p in paths.values()), *clouds.values()])
+    marks = () if result.pictures or dead_reckoning else result.landmarks
+    extents = [landmark.extent for landmark in marks]
+    limits = _limits([*(p.poses[:, :2] for p in paths.values()), *clouds.values(), *extents])
 
     def draw(figure: Figure) -> None:
         axes = map_axes(figure, limits)
-        for i, (name, path) in enumerate(paths.items()):
-            if len(clouds[name]):
+        for i, cloud in enumerate(clouds.values()):
+            if len(cloud):
                 axes.imshow(
-                    density(clouds[name], limits, robot_color(i)),
-                    extent=(*limits[0], *limits[1]),
+                    density(cloud, limits, robot_color(i)),
+                    extent=(limits[0, 0], limits[0, 1], limits[1, 0], limits[1, 1]),
                     origin="lower",
                     interpolation="none",
-                    zorder=1,
+                    aspect="auto",  # the axes have equal scales already
                 )
-        # imshow resets the scales
-        axes.set_xlim(*limits[0])
-        axes.set_ylim(*limits[1])
-        axes.set_aspect("equal", adjustable="datalim")
         for i, (name, path) in enumerate(paths.items()):
             color = ACCENT if len(paths) == 1 else robot_color(i)
             axes.plot(*path.poses[:, :2].T, color=color, linewidth=0.9, label=name)
-        if not result.pictures and not dead_reckoning:
-            _draw_landmarks(axes, result.landmarks, 1.0)
+        _draw_landmarks(axes, marks, 1.0)
         if len(paths) > 1:
-            _legend(axes)
+            legend(axes)
 
     what = "odometry alone" if dead_reckoning else "the final trajectory"
     return svg(f"Scans and paths on {what}", map_height(result), draw)
@@ -126,7 +132,7 @@ def trajectory_map(result: Result) -> tuple[str, int]:
             means, covs = samples[name]
             ellipses = [_ellipse(m, c, factor) for m, c in zip(means, covs, strict=True)]
             axes.add_collection(LineCollection(ellipses, colors=ACCENT, linewidths=0.7))
-        _legend(axes)
+        legend(axes)
 
     return svg("Trajectory with 95 % ellipses", map_height(result), draw), factor
 
@@ -174,10 +180,6 @@ def _limits(parts: Iterable[Array]) -> Array:
     return np.column_stack([low - margin, high + margin])
 
 
-def _legend(axes: Axes) -> None:
-    axes.legend(loc="upper right", handlelength=1.2, borderaxespad=0.2)
-
-
 def _draw_landmarks(axes: Axes, landmarks: Sequence[Landmark], width: float) -> None:
     """Points as triangles, lines over the extent seen."""
     points = np.array([m.position[:2] for m in landmarks if m.kind == "point"]).reshape(-1, 2)
@@ -203,7 +205,7 @@ def _enlargement(sizes: Sequence[float], limits: Array) -> int:
     if not sizes:
         return 1
     wanted = 0.008 * float((limits[:, 1] - limits[:, 0]).max()) / float(np.median(sizes))
-    steps = [m * 10**e for e in range(4) for m in (1, 2, 5)]
+    steps: list[int] = [m * int(10**e) for e in range(4) for m in (1, 2, 5)]
     return next((step for step in steps if step >= wanted), steps[-1])
 
 

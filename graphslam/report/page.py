@@ -1,3 +1,4 @@
+# ruff: noqa: RUF001 -- σ, × and – are meant: people read them
 """The order of the report, its words and its style."""
 
 from collections.abc import Mapping
@@ -39,25 +40,27 @@ def page(result: Result, evaluation: Mapping[str, Any] | None, config: Config | 
 
 
 def _header(result: Result, title: str) -> str:
-    counts = result.summary.get("counts", {})
+    counts, summary = result.summary.get("counts", {}), result.summary
     sigma = tables.median_sigma(result)
-    tiles = [
-        ("scans", tables.number(counts.get("scans")) if counts.get("scans") else None),
-        ("keyframes", tables.number(counts.get("keyframes"))),
-        ("landmarks", tables.number(len(result.landmarks))),
-        ("loop closures", tables.number(counts["loop_closures"]) if counts.get("loop_closures") else None),
-        ("median σ", f"{tables.number(100 * sigma, 2)} cm" if sigma is not None else None),
-        ("real time", f"{tables.number(float(result.summary['real_time_factor']), 2)} ×"
-         if result.summary.get("real_time_factor") else None),
-        ("peak memory", f"{tables.number(float(result.summary['peak_memory_mb']))} MB"
-         if result.summary.get("peak_memory_mb") else None),
-    ]  # fmt: skip
+    tiles: list[tuple[str, object, str]] = [
+        ("scans", counts.get("scans"), ""),
+        ("keyframes", counts.get("keyframes"), ""),
+        ("landmarks", len(result.landmarks), ""),
+        ("loop closures", counts.get("loop_closures"), ""),
+        ("median σ", 100 * sigma if sigma is not None else None, " cm"),
+        ("real time", summary.get("real_time_factor"), " ×"),
+        ("peak memory", summary.get("peak_memory_mb"), " MB"),
+    ]
+    # what is zero or unknown (no scans, no closures) has no tile
     shown = "".join(
-        f"<div><dt>{name}</dt><dd>{text}</dd></div>" for name, text in tiles if text is not None
+        f"<div><dt>{name}</dt><dd>{tables.number(value)}{unit}</dd></div>"
+        for name, value, unit in tiles
+        if value
     )
     return (
         f"<header><p class=brand>graphslam</p><h1>{escape(title)}</h1>\n"
-        f"<p class=lead>{escape(tables.headline(result))}</p>\n<dl class=tiles>{shown}</dl></header>"
+        f"<p class=lead>{escape(tables.headline(result))}</p>\n"
+        f"<dl class=tiles>{shown}</dl></header>"
     )
 
 
@@ -151,7 +154,7 @@ def _estimator_section(result: Result) -> str:
                 plots.innovations(result.innovations),
                 "Innovations.",
                 "Normalised innovation squared per degree of freedom of accepted associations; "
-                "black its running mean, orange its expectation 1 and, dashed, the 95 % quantile. "
+                "with its running mean, in orange its expectation 1 and (dashed) 95 % quantile. "
                 "A mean below 1 says that the stated noise is cautious; the gate cuts the tail.",
             )
         )
@@ -161,7 +164,7 @@ def _estimator_section(result: Result) -> str:
             _figure(
                 plots.timing(result.step_ms),
                 "Wall time per keyframe.",
-                f"Black the running median; p50 {tables.number(float(p50))} ms, "
+                f"With its running median; p50 {tables.number(float(p50))} ms, "
                 f"p99 {tables.number(float(p99))} ms, max "
                 f"{tables.number(float(result.step_ms.max()))} ms.",
             )

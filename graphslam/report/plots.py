@@ -1,16 +1,17 @@
+# ruff: noqa: RUF001 -- σ and – are meant: people read them
 """Curves over time: uncertainty, revision of the past, innovations, time per keyframe."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.stats import chi2
 
 from graphslam.geometry import Array, wrap
 from graphslam.models.observation import MODELS
 from graphslam.records import Result, Trajectory
-from graphslam.report.figure import ACCENT, INK, robot_color, svg, time_rows
+from graphslam.report.figure import ACCENT, INK, legend, log_scale, robot_color, svg, time_rows
 
 _SMALLEST = 1e-6  # m or degrees: nothing below it is worth a decade of a logarithmic axis
 _MAX_DOTS = 4000
@@ -23,15 +24,16 @@ def uncertainty(result: Result) -> str:
     def draw(figure: Figure) -> None:
         top, bottom = time_rows(figure, 2, clock.label)
         for i, (name, robot) in enumerate(sorted(result.robots.items())):
-            for path, alpha, kind in ((robot.causal, 0.45, "causal"), (robot.final, 1.0, "final")):
+            both = ((robot.final, 1.0, 3, "final"), (robot.causal, 0.5, 2, "causal"))
+            for path, alpha, layer, kind in both:
                 label = _label(name, kind, len(result.robots))
                 t = clock.time(path)
-                style = {"color": robot_color(i), "alpha": alpha, "linewidth": 1.0}
+                style: dict[str, Any] = {"color": robot_color(i), "alpha": alpha, "zorder": layer}
                 top.plot(t, _worst_sigma(path), label=label, **style)
                 bottom.plot(t, np.degrees(_root(path.covs[:, 2, 2])), **style)
-        _log(top, "position σ, m")
-        _log(bottom, "heading σ, °")
-        _legend(top)
+        log_scale(top, "position σ, m")
+        log_scale(bottom, "heading σ, °")
+        legend(top)
 
     return svg("Uncertainty over time", 3.5, draw)
 
@@ -43,9 +45,9 @@ def revision(result: Result) -> str:
     def draw(figure: Figure) -> None:
         top, bottom = time_rows(figure, 2, clock.label)
         for i, (name, robot) in enumerate(sorted(result.robots.items())):
-            others = (
-                (robot.dead_reckoning, {"linestyle": (0, (2, 1.2)), "alpha": 0.7}, "odometry"),
-                (robot.causal, {"alpha": 1.0}, "causal"),
+            others: tuple[tuple[Trajectory, dict[str, Any], str], ...] = (
+                (robot.causal, {"zorder": 3}, "causal"),
+                (robot.dead_reckoning, {"linestyle": (0, (2, 1.2)), "alpha": 0.8}, "odometry"),
             )
             for path, style, kind in others:
                 if len(path) != len(robot.final):
@@ -57,9 +59,9 @@ def revision(result: Result) -> str:
                 top.plot(t, _positive(distance), color=color, label=label, linewidth=1, **style)
                 turn = np.degrees(np.abs(wrap(off[:, 2])))
                 bottom.plot(t, _positive(turn), color=color, linewidth=1, **style)
-        _log(top, "position, m")
-        _log(bottom, "heading, °")
-        _legend(top)
+        log_scale(top, "position, m")
+        log_scale(bottom, "heading, °")
+        legend(top)
 
     return svg("Distance from the final trajectory over time", 3.5, draw)
 
@@ -76,19 +78,19 @@ def innovations(found: Mapping[str, Array]) -> str:
         for axes, (model, values) in zip(rows, found.items(), strict=True):
             dots = values[:: max(1, len(values) // _MAX_DOTS)]
             axes.plot(
-                dots[:, 0], _positive(dots[:, 1], 1e-3), ".", color=robot_color(0), markersize=2,
-                alpha=0.4, markeredgewidth=0, rasterized=True,
+                dots[:, 0], _positive(dots[:, 1], 1e-3), ".", color=robot_color(0), markersize=2.5,
+                alpha=0.55, markeredgewidth=0, rasterized=True,
             )  # fmt: skip
             axes.plot(*_running(values, np.mean), color=INK, linewidth=1.2)
             axes.axhline(1.0, color=ACCENT, linewidth=1.0)
-            title = f"{model}: {len(values)} accepted, mean {values[:, 1].mean():.2f}"
+            title = f"{model}: n {len(values)}, mean {values[:, 1].mean():.2f}"
             if model in MODELS:
                 limit = float(chi2.ppf(0.95, MODELS[model].rows)) / MODELS[model].rows
                 axes.axhline(limit, color=ACCENT, linewidth=0.8, linestyle="--")
-                title += f", {np.mean(values[:, 1] > limit):.1%} above the 95 % quantile"
+                title += f", {100 * np.mean(values[:, 1] > limit):.1f} % above the dashes"
             axes.set_title(title, loc="left", pad=3)
-            _log(axes, "NIS / dof")
             axes.set_ylim(bottom=max(1e-3, float(np.quantile(values[:, 1], 0.005)) / 2))
+            log_scale(axes, "NIS / dof")
 
     return svg("Innovations per observation model", 0.75 + 1.35 * len(found), draw)
 
@@ -101,13 +103,13 @@ def timing(step_ms: Array) -> str:
     def draw(figure: Figure) -> None:
         (axes,) = time_rows(figure, 1, "keyframe")
         axes.plot(
-            number[dots], _positive(step_ms[dots], 1e-3), ".", color=robot_color(0), markersize=2.5,
-            alpha=0.5, markeredgewidth=0, rasterized=True,
+            number[dots], _positive(step_ms[dots], 1e-3), ".", color=robot_color(0), markersize=3,
+            alpha=0.6, markeredgewidth=0, rasterized=True,
         )  # fmt: skip
         axes.plot(
             *_running(np.column_stack([number, step_ms]), np.median), color=INK, linewidth=1.2
         )
-        _log(axes, "ms")
+        log_scale(axes, "ms")
 
     return svg("Wall time per keyframe", 2.6, draw)
 
@@ -145,33 +147,15 @@ def _positive(values: Array, smallest: float = _SMALLEST) -> Array:
     return np.where(values > smallest, values, np.nan)
 
 
-def _running(values: Array, statistic: object, bins: int = 60) -> tuple[Array, Array]:
+def _running(
+    values: Array, statistic: Callable[[Array], Any], bins: int = 60
+) -> tuple[Array, Array]:
     """Mean abscissa and a statistic of the ordinate in bins of equally many samples."""
     parts = np.array_split(values, min(bins, max(1, len(values) // 5)))
     x = np.array([part[:, 0].mean() for part in parts])
-    return x, np.array([statistic(part[:, 1]) for part in parts])  # type: ignore[operator]
+    return x, np.array([statistic(part[:, 1]) for part in parts])
 
 
-def _label(name: str, kind: str, robots: int) -> str | None:
-    """Legend text; with several robots only one entry each, colours tell them apart."""
-    if robots == 1:
-        return kind
-    return name if kind in ("final", "causal") and kind != "odometry" else None
-
-
-def _log(axes: Axes, label: str) -> None:
-    axes.set_yscale("log")
-    axes.set_ylabel(label)
-    axes.margins(x=0.01)
-
-
-def _legend(axes: Axes) -> None:
-    handles, labels = axes.get_legend_handles_labels()
-    first: dict[str, object] = {}
-    for handle, label in zip(reversed(handles), reversed(labels), strict=True):
-        first.setdefault(label, handle)
-    names: Sequence[str] = list(first)
-    axes.legend(
-        list(first.values()), names, loc="lower right", bbox_to_anchor=(1, 0.98),
-        ncols=min(len(names), 6), handlelength=1.4, columnspacing=1.0, borderaxespad=0,
-    )  # fmt: skip
+def _label(name: str, kind: str, robots: int) -> str:
+    """Legend text: colours tell several robots apart, strokes the kinds of one robot."""
+    return kind if robots == 1 else name

@@ -1,3 +1,4 @@
+# ruff: noqa: RUF001 -- σ and – are meant: people read them
 """Numbers as HTML: the headline, tables of counts and reasons, quality, landmarks."""
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,24 +14,22 @@ _SPACE = "\u202f"  # narrow, no break: 13 631
 
 def number(value: object, digits: int = 3) -> str:
     """A number for reading: integers in groups of three, others to ``digits`` significant ones."""
-    if value is None:
-        return "–"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int | np.integer):
         return f"{int(value):,}".replace(",", _SPACE)
-    if not isinstance(value, float | np.floating):
-        return escape(str(value))
+    if isinstance(value, float | np.floating):
+        return _decimal(float(value), digits)
+    return "–" if value is None else escape(str(value))
+
+
+def _decimal(value: float, digits: int) -> str:
     if not np.isfinite(value):
         return "–"
-    magnitude = abs(float(value))
-    if magnitude >= 10**digits:
-        return f"{value:,.0f}".replace(",", _SPACE)
-    if 0 < magnitude < 1e-4:
+    if 0 < abs(value) < 1e-4:
         return f"{value:.{digits - 1}e}"
-    places = digits - 1 - int(np.floor(np.log10(magnitude))) if magnitude else 0
-    text = f"{value:.{max(places, 0)}f}"
-    return text
+    places = digits - 1 - int(np.floor(np.log10(abs(value)))) if value else 0
+    return f"{value:,.{max(places, 0)}f}".replace(",", _SPACE)
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]], caption: str = "") -> str:
@@ -135,27 +134,37 @@ def calibration(summary: Mapping[str, Any]) -> str:
 
 def landmarks(found: Sequence[Landmark]) -> str:
     """Every landmark with its position and uncertainty."""
-    rows = []
-    for m in found:
-        across = m.line[2] if m.line is not None else None
-        if across is None:
-            sigma = float(np.sqrt(max(np.linalg.eigvalsh(m.cov[:2, :2])[-1], 0.0)))
-        else:
-            # at the middle of the seen part, where offset and direction errors do not add up
-            assert m.line is not None
-            t = float(m.extent.mean(axis=0) @ [-np.sin(m.line[0]), np.cos(m.line[0])])
-            a = np.array([-t, 1.0])
-            sigma = float(np.sqrt(max(float(a @ across @ a), 0.0)))
-        length = float(np.hypot(*(m.extent[1] - m.extent[0])))
-        heading = None if m.kind == "point" else float(np.degrees(m.position[2]))
-        x, y = m.position[:2].tolist()
-        rows.append(
-            (f"{m.id}", m.kind, m.identity or "", f"{x:.3f}", f"{y:.3f}")
-            + ("–" if heading is None else f"{heading:.2f}", "–" if not length else f"{length:.2f}")
-            + (100 * sigma, m.sightings)
-        )
+    rows = [
+        [
+            str(m.id),
+            m.kind,
+            m.identity or "",
+            f"{m.position[0]:.3f}",
+            f"{m.position[1]:.3f}",
+            "–" if m.line is None else f"{np.degrees(m.position[2]):.2f}",
+            "–" if m.line is None else f"{np.hypot(*(m.extent[1] - m.extent[0])):.2f}",
+            100 * landmark_sigma(m),
+            m.sightings,
+        ]
+        for m in found
+    ]
     head = ["no", "kind", "identity", "x, m", "y, m", "heading, °", "length, m", "σ, cm", "seen"]
     return table(head, rows)
+
+
+def landmark_sigma(landmark: Landmark) -> float:
+    """Standard deviation, m: of a point in its worst direction, of a line across its seen middle.
+
+    At ``t`` along the line its normal offset varies as offset error - t * direction error.
+    """
+    if landmark.line is None:
+        variance = float(np.linalg.eigvalsh(landmark.cov[:2, :2])[-1])
+    else:
+        normal, _, cov = landmark.line
+        t = float(landmark.extent.mean(axis=0) @ np.array([-np.sin(normal), np.cos(normal)]))
+        a = np.array([-t, 1.0])
+        variance = float(a @ cov @ a)
+    return float(np.sqrt(max(variance, 0.0)))
 
 
 def quality(evaluation: Mapping[str, Any]) -> str:
@@ -174,8 +183,8 @@ def quality(evaluation: Mapping[str, Any]) -> str:
         parts.append(table(head, rows, "Against true poses"))
     relations = evaluation.get("relations", {})
     if relations:
-        keys = ("n", "unmatched", "trans_mean_m", "trans_std_m", "trans_median_m")
-        keys += ("rot_mean_deg", "rot_std_deg")
+        keys = ["n", "unmatched", "trans_mean_m", "trans_std_m", "trans_median_m"]
+        keys += ["rot_mean_deg", "rot_std_deg"]
         rows = [
             (f"{group}, {kind}", *(found[group][key] for key in keys))
             for kind, found in (("final", relations), ("causal", relations.get("causal", {})))
@@ -186,7 +195,7 @@ def quality(evaluation: Mapping[str, Any]) -> str:
         parts.append(table(head, rows, "Against reference relations"))
     marks = evaluation.get("landmarks", {})
     if marks:
-        keys = ("rmse_m", "nees_per_dof", "matched", "missed", "extra")
+        keys = ["rmse_m", "nees_per_dof", "matched", "missed", "extra"]
         head = ["", "RMSE, m", "NEES/dof", "matched", "missed", "extra"]
         parts.append(
             table(head, [("map", *(marks[key] for key in keys))], "Against true landmarks")

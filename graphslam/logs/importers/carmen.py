@@ -105,11 +105,11 @@ def parse_stamp_ns(text: str) -> int:
     """Nanoseconds of decimal seconds, exact to the ninth digit, never through a float.
 
     Raises:
-        ValueError: it is not a finite decimal number.
+        ValueError: it is not a decimal number, or more than the 32 bits of a ROS stamp hold.
     """
     try:
         seconds = Decimal(text)
-        if not seconds.is_finite():
+        if not abs(seconds) < 2**31:
             raise ValueError(f"{text!r} is not a time")
         return int(seconds.scaleb(9).to_integral_value())
     except DecimalException as error:

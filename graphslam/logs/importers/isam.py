@@ -15,7 +15,7 @@ from typing import TypeVar
 import numpy as np
 
 from graphslam.errors import LogError
-from graphslam.geometry import Array, inverse, rotate_cov, rotation
+from graphslam.geometry import Array, inverse, rotate_cov, rotation, wrap
 from graphslam.logs.importers.summary import ImportSummary, text_lines
 from graphslam.logs.writer import DEFAULT_ROBOT, LogWriter
 
@@ -221,8 +221,8 @@ def _landmark(graph: PoseGraph, fields: Sequence[str], is_g2o: bool) -> None:
 
 def _bearing_range(graph: PoseGraph, fields: Sequence[str], _is_g2o: bool) -> None:
     """BR pose landmark bearing range and their sigmas, rad and m."""
-    z, sigmas = _numbers(fields[2:4], 2), _numbers(fields[4:6], 2)
-    cov = _checked(np.diag(sigmas**2))
+    (bearing, distance), sigmas = _numbers(fields[2:4], 2), _numbers(fields[4:6], 2)
+    z, cov = np.array([wrap(bearing), distance]), _checked(np.diag(sigmas**2))
     graph.sightings.append(LandmarkEdge(int(fields[0]), int(fields[1]), z, cov))
 
 
