@@ -5,6 +5,7 @@ between two thresholds). Pure functions on arrays; what is known about the landm
 `Candidates`, made by `graphslam.landmark_map`.
 """
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -57,12 +58,13 @@ class Compared:
 
 def gate_distance(probability: float, dof: IntArray | int) -> Array:
     """Chi-square quantile: the squared distance that a true pair stays below, eq. 3.25."""
-    return np.asarray(_QUANTILES.setdefault(probability, chi2.ppf(probability, range(1, 10))))[
-        np.asarray(dof) - 1
-    ]
+    return np.asarray(_quantiles(probability)[np.asarray(dof) - 1])
 
 
-_QUANTILES: dict[float, Array] = {}
+@functools.cache
+def _quantiles(probability: float) -> Array:
+    """Chi-square quantiles (9,) of 1 to 9 degrees of freedom."""
+    return np.asarray(chi2.ppf(probability, range(1, 10)))
 
 
 def flip(seen: Observation) -> Observation:

@@ -13,8 +13,13 @@ Array = NDArray[np.float64]
 
 
 def wrap(angle_rad: ArrayLike) -> Array:
-    """Angle in [-pi, pi): the one place where angles are wrapped."""
-    return np.asarray((np.asarray(angle_rad, dtype=float) + np.pi) % (2 * np.pi) - np.pi)
+    """Angles (...,) in [-pi, pi), rad: the one place where angles are wrapped.
+
+    An angle that is inside already comes back to the digit: adding pi and taking it away again
+    would leave nothing of a turn below 4e-16 rad.
+    """
+    angle = np.asarray(angle_rad, dtype=float)
+    return np.asarray(angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi)))
 
 
 def rotation(angle_rad: float) -> Array:
@@ -44,7 +49,7 @@ def compose(a: Array, b: Array) -> Array:
 
 
 def inverse(a: Array) -> Array:
-    """The pose of the reference frame seen from ``a``: ``compose(a, inverse(a)) = 0``."""
+    """Pose of the reference frame seen from ``a`` (..., 3), so that ``compose(a, inverse(a)) = 0``."""
     a = np.asarray(a, dtype=float)
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     return np.stack(
@@ -53,7 +58,10 @@ def inverse(a: Array) -> Array:
 
 
 def between(a: Array, b: Array) -> Array:
-    """``b`` seen from ``a``: ``compose(a, between(a, b)) = b``; thesis eq. 4.18 without noise."""
+    """Pose ``b`` seen from ``a``, both (..., 3): thesis eq. 4.18 without noise.
+
+    ``compose(a, between(a, b))`` is ``b``.
+    """
     return compose(inverse(a), b)
 
 

@@ -73,7 +73,7 @@ class Scan(Message):
     @property
     def angles(self) -> Array:
         """Beam directions (n,), rad, in the laser frame."""
-        return self.angle_min_rad + self.angle_step_rad * np.arange(len(self.ranges))
+        return self.angle_min_rad + self.angle_step_rad * np.arange(len(self.ranges), dtype=float)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

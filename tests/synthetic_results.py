@@ -38,6 +38,8 @@ WALLS = np.concatenate(
     ]
 )
 
+ROOM_PATH = (6.0, 3.0)
+
 
 def cast(pose, angles, walls=WALLS, limit=30.0):
     """Distances to the nearest wall along each beam; NaN where none is within the limit."""
@@ -147,10 +149,10 @@ def wall_landmark(number, wall, rng):
     middle = wall.mean(axis=0)
     normal = phi + np.pi / 2
     n, t = np.array([np.cos(normal), np.sin(normal)]), np.array([np.cos(phi), np.sin(phi)])
-    # (direction, normal offset) errors at the middle, moved to the world origin for the line
+    # offset = n . middle and dn/dnormal = -t: a direction error has the lever arm -t . middle
     C = np.diag([0.004**2, 0.02**2])
     turn, shift = rng.normal(0, [0.004, 0.02])
-    J = np.array([[1.0, 0.0], [float(t @ middle), 1.0]])
+    J = np.array([[1.0, 0.0], [-float(t @ middle), 1.0]])
     line_cov = J @ C @ J.T
     found_middle = middle + shift * n
     normal += turn
@@ -178,12 +180,20 @@ def wall_landmark(number, wall, rng):
     )
 
 
+def room_walls():
+    """The walls (12, 2, 2) in the world frame, whose origin is the first pose."""
+    # every sampling of the path starts at the same place in the same direction
+    first = np.array([ROOM_PATH[0], 0.0, np.pi / 2])
+    ends = np.concatenate([WALLS, np.zeros((*WALLS.shape[:2], 1))], axis=-1)
+    return between(first, ends)[..., :2]
+
+
 def room(keyframes=300, beams=181, seed=3):
     """One robot, laser, 12 line landmarks. Returns the result and the true trajectory."""
     rng = np.random.default_rng(seed)
-    truth = loop_path(keyframes, 2.1, 6.0, 3.0)
-    truth = between(truth[0], truth)
-    origin = loop_path(keyframes, 2.1, 6.0, 3.0)[0]
+    path = loop_path(keyframes, 2.1, *ROOM_PATH)
+    path[0, 2] = np.pi / 2  # the tangent; finite differences give the chord
+    origin, truth = path[0], between(path[0], path)
     stamps = START_NS + (np.arange(keyframes) * 0.4e9).astype(np.int64)
     covs_growth = 1 + 0.8 * np.sin(np.linspace(0, 6 * np.pi, keyframes)) ** 2
     final = estimated(stamps, truth, rng, 0.015 * covs_growth, 0.004 * covs_growth)
@@ -202,8 +212,7 @@ def room(keyframes=300, beams=181, seed=3):
         ok = np.isfinite(ranges)
         points = np.column_stack([ranges * np.cos(angles), ranges * np.sin(angles)])[ok] + mount[:2]
         pictures.append(Picture("robot", stamp, points))
-    to_map = between(origin, np.zeros(3))
-    walls = np.array([[compose(to_map, np.array([*p, 0.0]))[:2] for p in wall] for wall in WALLS])
+    walls = room_walls()
     landmarks = tuple(wall_landmark(i, wall, rng) for i, wall in enumerate(walls))
     start = Start(final.poses[0], np.diag([1e-6, 1e-6, 1e-6]))
     steps = [Step(stamps[0].item(), starts={"robot": start})]

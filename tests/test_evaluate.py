@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from synthetic_results import START_NS, orchard, room
+from synthetic_results import START_NS, orchard, room, room_walls
 
 from graphslam.config import Config
 from graphslam.errors import OutputError
@@ -372,9 +372,20 @@ def test_room_lines_are_consistent_and_relations_are_answered(tmp_path):
     saved = load(tmp_path / "out")
     a, b = result.robots["robot"].scan_final.stamps_ns[[3, 40]]
     relations = Relations(np.array([a]), np.array([b]), np.zeros((1, 3)))
-    found = evaluate(saved, {"robot": truth}, relations=relations)
+    true = [wall_truth(str(i), wall) for i, wall in enumerate(room_walls())]
+    found = evaluate(saved, {"robot": truth}, true, relations)
     assert found["relations"]["all"]["n"] == found["relations"]["causal"]["all"]["n"] == 1
     assert found["robots"]["robot"]["final"]["ate_rmse_m"] < 0.05
+    assert (found["landmarks"]["matched"], found["landmarks"]["extra"]) == (12, 0)
+    # errors are drawn from the stated (normal, offset) covariance: 99.99 % bounds of 24 dof
+    low, high = chi2.ppf([5e-5, 1 - 5e-5], 24) / 24
+    assert low < found["landmarks"]["nees_per_dof"] < high
+
+
+def wall_truth(name, wall):
+    middle, direction = wall.mean(axis=0), wall[1] - wall[0]
+    pose = np.array([*middle, np.arctan2(direction[1], direction[0])])
+    return TrueLandmark("", 0, 0, name, "line", pose, wall)
 
 
 def test_truth_of_another_time_or_robot_is_one_line(tmp_path):

@@ -52,7 +52,8 @@ class TimeLine:
 
     A stamp that a later message of its topic contradicts by being earlier is a *glitch*: stamped
     too late. Its message is placed between its neighbours in the order of recording (``time_ns``),
-    a run of them evenly, and ``stamp_ns`` stays. Two messages that contradict each other and
+    in proportion to what was recorded between them on *all* topics, so that a scan and the odometry
+    recorded around it stay in order when both are late; ``stamp_ns`` stays. Two messages that contradict each other and
     nothing else are a mere swap and go by their stamps. A message may come up to ``window_ns``
     after younger ones and is still placed; one older than what was already passed on is dropped.
 
@@ -71,6 +72,7 @@ class TimeLine:
         self._repairs: dict[str, _Repair] = {}
         self._heap: list[tuple[tuple[int, int], int, Message]] = []
         self._number = 0
+        self._recorded = 0
         self._latest_ns = self._emitted_ns = _LONG_AGO
 
     def push(self, topic: str, message: Message) -> Iterator[Message]:
@@ -78,7 +80,8 @@ class TimeLine:
         if topic not in self._repairs:
             self.counts[topic] = Counter()
             self._repairs[topic] = _Repair(self._window_ns, self.counts[topic])
-        self._place(topic, self._repairs[topic].push(message))
+        self._recorded += 1
+        self._place(topic, self._repairs[topic].push(message, self._recorded))
         for name, repair in self._repairs.items():
             # a rare topic must not hold up the others until more of it has come
             self._place(name, repair.settle_before(self._latest_ns - self._window_ns))
@@ -120,15 +123,17 @@ class _Repair:
         self._window_ns, self._counts = window_ns, counts
         self._pending: deque[list[Message]] = deque()  # groups of equal stamp
         self._stamps: deque[int] = deque()  # of the pending groups
+        self._numbers: deque[int] = deque()  # where in the file the pending groups were recorded
         self._settled: deque[int] = deque(maxlen=_LOOK_AHEAD)  # stamps of the last settled ones
         self._placed_ns = _LONG_AGO  # latest time of a settled message
+        self._placed_number = 0  # where in the file it was recorded
 
     @property
     def earliest_ns(self) -> int:
         """No message that is still pending will be placed before this."""
         return self._placed_ns if self._stamps else _FAR_AHEAD
 
-    def push(self, message: Message) -> list[Message]:
+    def push(self, message: Message, number: int) -> list[Message]:
         if not isinstance(message, _SAMPLED):
             return [message]
         stamp_ns, stamps = message.stamp_ns, self._stamps
@@ -143,6 +148,7 @@ class _Repair:
                 return []
         self._pending.append([message])
         stamps.append(stamp_ns)
+        self._numbers.append(number)
         settled = []
         while stamp_ns - stamps[0] > self._window_ns or len(stamps) > _LOOK_AHEAD:
             settled += self._settle()
@@ -162,15 +168,17 @@ class _Repair:
 
     def _settle(self) -> list[Message]:
         group, stamp_ns = self._pending.popleft(), self._stamps.popleft()
-        time_ns = self._time_of(stamp_ns)
+        number = self._numbers.popleft()
+        time_ns = self._time_of(stamp_ns, number)
         if time_ns != stamp_ns:
             self._counts[GLITCH] += len(group)
             group = [replace(message, time_ns=time_ns) for message in group]
-        self._placed_ns = max(self._placed_ns, time_ns)
+        if time_ns >= self._placed_ns:
+            self._placed_ns, self._placed_number = time_ns, number
         self._settled.append(stamp_ns)
         return group
 
-    def _time_of(self, stamp_ns: int) -> int:
+    def _time_of(self, stamp_ns: int, number: int) -> int:
         """Where a stamp that was just taken from the front of the queue belongs."""
         later = self._stamps
         if not later or min(later) >= stamp_ns:
@@ -183,5 +191,7 @@ class _Repair:
             return stamp_ns  # a swap
         if self._placed_ns == _LONG_AGO:
             return first_ns
-        # what lies between is later than first_ns as well: a run of glitches, spread evenly
-        return self._placed_ns + (first_ns - self._placed_ns) // (first + 2)
+        # what lies between is later than first_ns as well: a run of glitches, all placed in here
+        before = self._placed_number
+        part, whole = number - before, self._numbers[first] - before
+        return self._placed_ns + (first_ns - self._placed_ns) * part // whole

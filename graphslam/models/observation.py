@@ -25,10 +25,17 @@ from graphslam.geometry import (
 
 
 class ObservationModel(Protocol):
-    """A row of `MODELS`. ``rows`` residual rows, ``dim`` size of the target's state."""
+    """A row of `MODELS`."""
 
-    rows: int
-    dim: int
+    @property
+    def rows(self) -> int:
+        """Rows of the residual."""
+        ...
+
+    @property
+    def dim(self) -> int:
+        """Size of the target's state."""
+        ...
 
     def predict(self, x: Array, t: Array) -> Array:
         """Expected measurement of target ``t`` from pose ``x``."""

@@ -79,8 +79,10 @@ def _clean(text: str, label: str) -> str:
     """The <svg> element alone: page colours, page font, no size of its own, no spare names."""
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.DOTALL)
-    text = re.sub(r'(<svg[^>]*?) (?:width|height)="[^"]*"', r"\1", text)
-    text = re.sub(r'(<svg[^>]*?) (?:width|height)="[^"]*"', r"\1", text)
+    # matplotlib's own style sheet would hold for the whole page; ours says the same of drawings
+    text = re.sub(r"<defs>\s*<style.*?</defs>\s*", "", text, flags=re.DOTALL)
+    for size in ("width", "height"):
+        text = re.sub(rf'(<svg[^>]*?) {size}="[^"]*"', r"\1", text, count=1)
     text = re.sub(r"(font: [^;\"']*px) [^;\"]*", r"\1 system-ui, sans-serif", text)
     used = set(re.findall(r'(?:url\(|href=")#([^)"]+)', text))
     text = re.sub(r' id="halo[^"]*"', ' class="halo"', text)
@@ -176,10 +178,11 @@ def log_scale(axes: Axes, label: str) -> None:
     """A logarithmic y axis with plain numbers; 1, 2 and 5 are named where decades are few."""
     axes.set_yscale("log")
     low, high = axes.get_ylim()
+    low = max(low, 1e-4 * high)  # where a difference passes through zero says nothing
     if high < 3 * low:  # hardly any spread: give it room rather than magnify noise
         middle = float(np.sqrt(low * high))
         low, high = middle / 2, middle * 2
-        axes.set_ylim(low, high)
+    axes.set_ylim(low, high)
     subs = (1.0,) if high > 300 * low else (1.0, 2.0, 5.0)
     axes.yaxis.set_major_locator(LogLocator(subs=subs))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

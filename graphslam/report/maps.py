@@ -111,7 +111,8 @@ def landmark_map(result: Result) -> tuple[str, int]:
 def trajectory_map(result: Result) -> tuple[str, int]:
     """Final and causal paths with 95 % ellipses along the final one, and their enlargement."""
     robots = sorted(result.robots.items())
-    limits = _limits([path.poses[:, :2] for _, r in robots for path in (r.final, r.causal)])
+    # the causal path may stray far and is cut off where it does
+    limits = _limits([robot.final.poses[:, :2] for _, robot in robots])
     samples = {name: _every(robot.final, max(40 // len(robots), 12)) for name, robot in robots}
     factor = _enlargement([float(s) for _, c in samples.values() for s in _semi_axes(c)], limits)
 
@@ -123,12 +124,12 @@ def trajectory_map(result: Result) -> tuple[str, int]:
             axes.plot(
                 *robot.causal.poses[:, :2].T,
                 color=INK if len(robots) == 1 else color,
-                linewidth=0.6,
-                alpha=0.5,
+                linewidth=0.5,
+                alpha=0.4,
                 label="causal" if len(robots) == 1 else None,
             )
             axes.plot(*robot.final.poses[:, :2].T, color=color, linewidth=1.1, label=label)
-            axes.plot(*robot.final.poses[0, :2], marker="o", color=color, markersize=4)
+            axes.plot(*robot.final.poses[0, :2], marker="o", color=color, markersize=5.5)
             means, covs = samples[name]
             ellipses = [_ellipse(m, c, factor) for m, c in zip(means, covs, strict=True)]
             axes.add_collection(LineCollection(ellipses, colors=ACCENT, linewidths=0.7))

@@ -38,6 +38,7 @@ figure { margin: 0; background: var(--card); border: 1px solid var(--grid); bord
 figcaption { color: var(--soft); font-size: .85rem; line-height: 1.4; margin-bottom: 6px; }
 figcaption b { color: var(--ink); }
 figure svg { display: block; width: 100%; height: auto; color: var(--ink); }
+figure svg * { stroke-linejoin: round; stroke-linecap: butt; }
 svg text { fill: currentColor; }
 svg .halo text { paint-order: stroke; stroke: var(--card); stroke-width: 2.5px;
   stroke-linejoin: round; font-weight: 600; }

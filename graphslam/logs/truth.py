@@ -1,0 +1,63 @@
+"""What is true according to logs. Only evaluation reads this; it needs no odometry."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from graphslam.config import Config
+from graphslam.logs.decoders import TopicContext
+from graphslam.logs.log_set import decode_message
+from graphslam.logs.mcap_file import open_mcap, raw_messages
+from graphslam.logs.topics import find_topics
+from graphslam.records import Trajectory, TrueLandmark, Truth
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LogTruth:
+    """True trajectories of robots' bases and true landmarks, world frame.
+
+    Covariances are NaN. ``sha256`` are those of the files, in their order.
+    """
+
+    trajectories: Mapping[str, Trajectory]
+    landmarks: tuple[TrueLandmark, ...]
+    sha256: tuple[str, ...]
+
+
+def read_truth(paths: Sequence[Path], config: Config) -> LogTruth:
+    """All TruePose and TrueLandmark messages of ``paths``; both may be empty.
+
+    Poses are sorted by header stamp. A landmark told more than once (one per robot or file) is
+    taken once, by its identity.
+
+    Raises:
+        LogError: a file is missing, not MCAP, empty, or without any topic that can be decoded.
+    """
+    files = [open_mcap(path) for path in paths]
+    topics = {t.name: t for t in find_topics(files, config) if t.record in (Truth, TrueLandmark)}
+    poses: dict[str, list[Truth]] = {}
+    landmarks: dict[str, TrueLandmark] = {}
+    unusable: Counter[str] = Counter()  # `graphslam info` counts and shows these
+    for file in files:
+        for raw in raw_messages(file, topics.keys()):
+            topic = topics[raw.topic]
+            message = decode_message(raw, topic, TopicContext(topic.robot), unusable)
+            if isinstance(message, Truth):
+                poses.setdefault(topic.robot, []).append(message)
+            elif isinstance(message, TrueLandmark):
+                landmarks[message.identity or f"without identity {len(landmarks)}"] = message
+    return LogTruth(
+        {robot: _trajectory(found) for robot, found in sorted(poses.items())},
+        tuple(landmarks.values()),
+        tuple(file.sha256 for file in files),
+    )
+
+
+def _trajectory(found: Sequence[Truth]) -> Trajectory:
+    ordered = sorted(found, key=lambda message: message.stamp_ns)
+    stamps = np.array([message.stamp_ns for message in ordered], dtype=np.int64)
+    poses = np.array([message.pose for message in ordered])
+    return Trajectory(stamps, poses, np.full((len(poses), 3, 3), np.nan))
