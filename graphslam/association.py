@@ -6,7 +6,7 @@ between two thresholds). Pure functions on arrays; what is known about the landm
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,18 +102,20 @@ def candidate_pairs(
     points = np.array([o.kind == "point" for o in seen])
     world = np.zeros((len(seen), 3))
     ends = np.zeros((len(seen), 2))
-    for i, o in enumerate(seen):
-        if points[i]:
-            world[i, :2] = MODELS["point"].invert(o.z, pose)
+    for n, o in enumerate(seen):
+        if points[n]:
+            world[n, :2] = MODELS["point"].invert(o.z, pose)
         else:
-            world[i] = compose(pose, o.z)
-            ends[i] = o.extent if o.extent is not None else 0.0
+            world[n] = compose(pose, o.z)
+            ends[n] = o.extent if o.extent is not None else 0.0
+    both_points = points[:, None] & is_point[None]
+    both_lines = ~points[:, None] & ~is_point[None]
     # the landmark's origin and direction as seen from each observation
     relative = between(world[:, None], means[None])
     turned = wrap(relative[..., 2])
     flipped = np.zeros_like(turned, dtype=bool)
     if not config.directed:
-        flipped = np.abs(turned) > np.pi / 2
+        flipped = both_lines & (np.abs(turned) > np.pi / 2)
         turned = np.where(flipped, wrap(turned + np.pi), turned)
     # the observed middle in the landmark's frame: along the line, and its distance from it
     middle = between(means[None], world[:, None])
@@ -127,8 +129,6 @@ def candidate_pairs(
         & (gap < config.overlap_gap_m)
     )
     near = np.hypot(middle[..., 0], middle[..., 1]) < config.max_distance_m
-    both_points = points[:, None] & is_point[None]
-    both_lines = ~points[:, None] & ~is_point[None]
     i, j = np.nonzero((both_points & near) | (both_lines & line_ok))
     length = ends[:, 1] - ends[:, 0]
     known = extents[:, 1] - extents[:, 0]
@@ -136,11 +136,9 @@ def candidate_pairs(
         "point"
         if points[a]
         else "segment"
-        if seen[a].kind == "segment"
-        and whole[b]
-        and abs(length[a] - known[b]) < LENGTH_TOLERANCE_M
+        if seen[a].kind == "segment" and whole[b] and abs(length[a] - known[b]) < LENGTH_TOLERANCE_M
         else "line"
-        for a, b in zip(i, j, strict=True)
+        for a, b in zip(i.tolist(), j.tolist(), strict=True)
     )
     return Pairs(i.astype(np.int64), j.astype(np.int64), models, flipped[i, j])
 
@@ -153,6 +151,7 @@ def compare(
     P_xx: Array,
     P_xt: Array,
     P_tt: Array,
+    floor: Mapping[str, Array],
 ) -> Compared:
     """Squared Mahalanobis distance of each pair, eq. 3.22, vectorised over pairs of one model.
 
@@ -165,6 +164,9 @@ def compare(
             landmark, P_tt: (k, 3, 3) of the landmark; world axes, points padded with zeros.
         P_xt: see P_xx.
         P_tt: see P_xx.
+        floor: model name -> covariance (rows, rows) added to every innovation: what the models
+            leave out (walls that are not flat, stamps that are not exact). It widens the gates and
+            never enters the estimate.
     """
     k = len(pairs.observation)
     d2, dof = np.full(k, np.inf), np.zeros(k, dtype=np.int64)
@@ -184,7 +186,7 @@ def compare(
         t = states[which][:, : model.dim]
         x = np.broadcast_to(pose, (len(which), 3))
         r = model.residual(z, x, t)
-        R = model.noise(z, cov, x, t)
+        R = model.noise(z, cov, x, t) + floor[name]
         H_x, H_t = model.jacobians(z, x, t)
         tt, xt = P_tt[which][:, : model.dim, : model.dim], P_xt[which][:, :, : model.dim]
         cross = H_x @ xt @ H_t.mT

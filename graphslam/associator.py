@@ -56,6 +56,12 @@ class Associator:
         self.innovations: dict[str, list[tuple[int, float]]] = {}
         self._config, self._backend = config, backend
         self._images = 0
+        m2, rad2 = config.floor_m**2, config.floor_rad**2
+        self._floor = {
+            "line": np.diag([m2, rad2]),
+            "point": np.diag([rad2, m2]),
+            "segment": np.diag([m2, m2, rad2]),
+        }
 
     def associate(
         self,
@@ -152,7 +158,7 @@ class Associator:
                         moved.cov, float(joint.pose[2] - moved.delta[2])
                     )
                 states[n], P_xx[n], P_tt[n] = entry.mean, since[entry.last_ns], entry.cov
-        return compare(seen, pairs, joint.pose, states, P_xx, P_xt, P_tt)
+        return compare(seen, pairs, joint.pose, states, P_xx, P_xt, P_tt, self._floor)
 
     def _choose(
         self,

@@ -58,6 +58,7 @@ class OdometryConfig:
     rotation_scale_sigma are relative, drift_sigma_rad_per_m is turning per metre driven;
     for wheel angles wheel_radius_sigma_m and axle_sigma_m, and count_sigma_rad per reading.
     floor_sigma_m and floor_sigma_rad are added once per interval in which the robot moved.
+    calibrate: learn the calibration errors from the estimate while it grows.
     max_gap_s: longest span without odometry that is bridged.
     """
 
@@ -75,6 +76,7 @@ class OdometryConfig:
     count_sigma_rad: float = 0.003
     floor_sigma_m: float = 0.005
     floor_sigma_rad: float = 0.005
+    calibrate: bool = True
     max_gap_s: float = 5.0
 
 
@@ -125,7 +127,8 @@ class AssociationConfig:
     method: `greedy` is the thesis' variant of the NNSF, `optimal` minimises the sum.
     identities: `use` those in the log or `ignore` them. max_distance_m: eq. 3.23. directed:
     a line has two sides; false takes directions modulo pi (3.24). gate_probability: chi-square
-    gate (3.25). new_probability: an observation is a new landmark only if its distance to every
+    gate (3.25). floor_m, floor_rad: added to the innovations' sigmas before gating, for what the
+    models leave out; never enters the estimate. new_probability: an observation is a new landmark only if its distance to every
     landmark exceeds this second, higher quantile. overlap_gap_m: largest gap along the line
     between an observed part and the known extent. sightings_to_promote: a tentative landmark
     enters the graph at this many. tentative_s, tentative_m: one not seen again after this time and
@@ -138,6 +141,8 @@ class AssociationConfig:
     max_distance_m: float = 1.5
     directed: bool = True
     gate_probability: float = 0.99
+    floor_m: float = 0.05
+    floor_rad: float = 0.03
     new_probability: float = 0.9999
     overlap_gap_m: float = 0.3
     sightings_to_promote: int = 3

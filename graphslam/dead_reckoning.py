@@ -10,7 +10,7 @@ import numpy as np
 from graphslam.config import OdometryConfig, RobotConfig
 from graphslam.geometry import Array, between, compose, exp, log, wrap
 from graphslam.models import MOTION_SOURCES, compound
-from graphslam.models.motion import Increments
+from graphslam.models.motion import Increments, nominal_calibration
 from graphslam.records import Motion, OdometryIncrement, OdometryPose, WheelAngles
 
 IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
@@ -34,6 +34,7 @@ class Track:
 
     def __init__(self, config: OdometryConfig, robot: RobotConfig) -> None:
         self.source = ""
+        self.calibration = nominal_calibration("given", config)
         self._config, self._robot = config, robot
         self._count = 0
         self._times = np.empty(1024, dtype=np.int64)  # time of the end of each row's interval
@@ -85,6 +86,7 @@ class Track:
     def _append(self, source: str, time_ns: int, row: Array) -> None:
         if not self._count:
             self.source = source
+            self.calibration = nominal_calibration(source, self._config)
             self._rows = np.empty((len(self._times), _ROW_SIZE[source]))
         if self._count == len(self._times):
             self._times = np.concatenate([self._times, np.empty_like(self._times)])
@@ -95,7 +97,8 @@ class Track:
             self._burst = np.concatenate([self._burst, np.empty_like(self._burst)])
         n = self._count
         self._times[n], self._rows[n] = time_ns, row
-        step = self._increments(row[None]).delta[0]
+        nominal = np.zeros(len(self.calibration.mean))
+        step = self._increments(row[None], nominal).delta[0]
         self._poses[n] = compose(self._poses[n - 1], step) if n else np.zeros(3)
         path, turn = np.hypot(step[0], step[1]), abs(step[2])
         self._effort[n] = self._effort[n - 1] + path + TURNING_EFFORT_M * turn if n else 0.0
@@ -104,8 +107,8 @@ class Track:
         self._burst[n] = path > MAX_SPEED_M_S * seconds or turn > MAX_TURN_RAD_S * seconds
         self._count += 1
 
-    def _increments(self, rows: Array) -> Increments:
-        return MOTION_SOURCES[self.source](rows, self._robot, self._config)
+    def _increments(self, rows: Array, calibration: Array) -> Increments:
+        return MOTION_SOURCES[self.source](rows, calibration, self._robot, self._config)
 
     def reaches(self, time_ns: int) -> bool:
         """Whether the motion up to ``time_ns`` is known without looking beyond a reading."""
@@ -153,6 +156,7 @@ class Track:
     def motion(self, start_ns: int, end_ns: int) -> Motion:
         """The motion from ``start_ns`` to ``end_ns`` with its covariance; thesis 4.4-4.15.
 
+        Uses the current ``calibration`` (`pose`, `moved` and `effort` are by nominal values).
         Readings that an interval cuts count with the share of time that lies inside.
         """
         times, n = self.times, self._count
@@ -164,16 +168,16 @@ class Track:
         rows = self._rows[first : last + 1]
         inside = np.arange(first, last + 1)
         share = self._share(inside, start_ns, end_ns)
-        parts = self._increments(rows * share[:, None])
+        parts = self._increments(rows * share[:, None], self.calibration.mean)
         whole = compound(parts)
-        cov = whole.cov + whole.d_cal @ parts.calibration_cov @ whole.d_cal.T
+        cov = whole.cov + whole.d_cal @ self.calibration.cov @ whole.d_cal.T
         length = float(np.hypot(parts.delta[:, 0], parts.delta[:, 1]).sum())
         if self.source != "given":
             cov = cov + self._floor(length > 0 or whole.delta[2] != 0)
         return Motion(start_ns, end_ns, whole.delta, cov, whole.d_cal, length)
 
     def _standing(self, start_ns: int, end_ns: int) -> Motion:
-        p = self._increments(self._rows[:0]).d_cal.shape[2]
+        p = len(self.calibration.mean)
         return Motion(start_ns, end_ns, np.zeros(3), self._floor(False), np.zeros((3, p)), 0.0)
 
     def _floor(self, moved: bool) -> Array:

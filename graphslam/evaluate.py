@@ -9,7 +9,7 @@ was given (``smooth --start truth``). Aligned numbers are after the best rigid m
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -18,7 +18,7 @@ from scipy.stats import chi2
 from graphslam.errors import OutputError
 from graphslam.geometry import Array, between, interpolate, transform, wrap
 from graphslam.records import Landmark, Trajectory, TrueLandmark
-from graphslam.results import SavedResult, read_text, stamp_ns
+from graphslam.results import read_text, stamp_ns
 
 Stamps = np.ndarray[Any, np.dtype[np.int64]]
 
@@ -387,8 +387,30 @@ def _find(wanted: Stamps, known: Stamps) -> tuple[Any, Any]:
 # ---------------------------------------------------------------- all of it
 
 
+class RobotPoses(Protocol):
+    """What is compared of one robot; see `graphslam.records.RobotResult`."""
+
+    @property
+    def final(self) -> Trajectory: ...
+    @property
+    def causal(self) -> Trajectory: ...
+    @property
+    def scan_final(self) -> Trajectory | None: ...
+    @property
+    def scan_causal(self) -> Trajectory | None: ...
+
+
+class Estimated(Protocol):
+    """What is compared: a `Result`, or a `SavedResult` read back from its folder."""
+
+    @property
+    def robots(self) -> Mapping[str, RobotPoses]: ...
+    @property
+    def landmarks(self) -> tuple[Landmark, ...]: ...
+
+
 def evaluate(
-    saved: SavedResult,
+    result: Estimated,
     truth: Mapping[str, Trajectory] | None = None,
     true_landmarks: Sequence[TrueLandmark] = (),
     relations: Relations | None = None,
@@ -407,13 +429,13 @@ def evaluate(
     if truth:
         pairs = {
             name: {k: pair(getattr(robot, k), truth[name]) for k in ("final", "causal")}
-            for name, robot in saved.robots.items()
+            for name, robot in result.robots.items()
             if name in truth and len(truth[name])
         }
         pairs = {name: both for name, both in pairs.items() if all(map(len, both.values()))}
         if not pairs:
             raise OutputError(
-                f"no pose of {', '.join(saved.robots)} lies within the span of the truth, "
+                f"no pose of {', '.join(result.robots)} lies within the span of the truth, "
                 f"which is of {', '.join(truth)}"
             )
         found["robots"] = {
@@ -425,16 +447,16 @@ def evaluate(
             for kind in ("final", "causal")
         }
     if true_landmarks:
-        found["landmarks"] = landmark_metrics(saved.landmarks, true_landmarks)
+        found["landmarks"] = landmark_metrics(result.landmarks, true_landmarks)
     if relations is not None:
-        found["relations"] = _relations(saved, relations)
+        found["relations"] = _relations(result, relations)
     return found
 
 
-def _relations(saved: SavedResult, relations: Relations) -> dict[str, Any]:
+def _relations(result: Estimated, relations: Relations) -> dict[str, Any]:
     scans = [
         (robot.scan_final, robot.scan_causal)
-        for robot in saved.robots.values()
+        for robot in result.robots.values()
         if robot.scan_final is not None and robot.scan_causal is not None
     ]
     if not scans:

@@ -49,7 +49,7 @@ def compose(a: Array, b: Array) -> Array:
 
 
 def inverse(a: Array) -> Array:
-    """Pose of the reference frame seen from ``a`` (..., 3), so that ``compose(a, inverse(a)) = 0``."""
+    """Inverse poses ``(..., 3)``: where the reference frame is, seen from ``a``."""
     a = np.asarray(a, dtype=float)
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     return np.stack(
@@ -62,7 +62,11 @@ def between(a: Array, b: Array) -> Array:
 
     ``compose(a, between(a, b))`` is ``b``.
     """
-    return compose(inverse(a), b)
+    # the difference first: two equal poses give exactly zero, wherever they are
+    a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    dx, dy = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
+    return np.stack([c * dx + s * dy, -s * dx + c * dy, wrap(b[..., 2] - a[..., 2])], axis=-1)
 
 
 def transform(pose: Array, points: Array) -> Array:
@@ -139,11 +143,13 @@ def exp_jacobian(twist: Array) -> Array:
     a, b = _sinc_terms(w)
     small = np.abs(w) < 0.3
     safe = np.where(small, 1.0, w)
-    # a' = (w cos w - sin w)/w², b' = (w sin w - 1 + cos w)/w²: both cancel near zero, where five
+    # a' = (w cos w - sin w)/w², b' = (w sin w - 1 + cos w)/w²: both cancel near zero, where six
     # terms of their series leave less than 1e-16 for |w| < 0.3
     w2 = w * w
-    da_series = -w / 3 * (1 - w2 / 10 * (1 - w2 / 28 * (1 - w2 / 54 * (1 - w2 / 88))))
-    db_series = 0.5 - w2 / 8 * (1 - w2 / 18 * (1 - w2 / 40 * (1 - w2 / 70)))
+    da_series = (
+        -w / 3 * (1 - w2 / 10 * (1 - w2 / 28 * (1 - w2 / 54 * (1 - w2 / 88 * (1 - w2 / 130)))))
+    )
+    db_series = 0.5 - w2 / 8 * (1 - w2 / 18 * (1 - w2 / 40 * (1 - w2 / 70 * (1 - w2 / 108))))
     da = np.where(small, da_series, (safe * np.cos(safe) - np.sin(safe)) / safe**2)
     db = np.where(small, db_series, (safe * np.sin(safe) - 1 + np.cos(safe)) / safe**2)
     out = np.zeros((*twist.shape, 3))

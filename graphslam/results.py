@@ -58,8 +58,14 @@ def check_target(directory: Path, *, force: bool) -> None:
     """Say before a long computation whether `save` may write to ``directory``.
 
     Raises:
-        OutputError: it exists and ``force`` is not given, or it exists and is not a result folder.
+        OutputError: it exists and ``force`` is not given, it exists and is not a result folder, or
+            nothing can be written where it is to be.
     """
+    parent = directory.absolute().parent
+    while not parent.exists():
+        parent = parent.parent
+    if not (parent.is_dir() and os.access(parent, os.W_OK | os.X_OK)):
+        raise OutputError(f"{directory}: cannot be made: {parent} is no folder to write to")
     if not os.path.lexists(directory):
         return
     if not force:

@@ -15,11 +15,12 @@ import numpy as np
 
 from graphslam.associator import Associator
 from graphslam.backends import BACKENDS
+from graphslam.calibration import Calibrator
 from graphslam.config import Config
 from graphslam.dead_reckoning import Track
 from graphslam.errors import EstimationError, LogError
 from graphslam.frontend import FRONT_ENDS, scan_points
-from graphslam.geometry import Array, compose, compose_cov, inverse
+from graphslam.geometry import Array, between, compose, compose_cov, inverse
 from graphslam.logs import LogSet
 from graphslam.models import transport
 from graphslam.records import (
@@ -57,6 +58,7 @@ class RobotRun:
     """What the pipeline keeps for one robot."""
 
     track: Track
+    calibrator: Calibrator
     state_ns: int = -1
     path_m: float = 0.0
     times: list[int] = field(default_factory=list)
@@ -80,7 +82,10 @@ class Pipeline:
         self.associator = Associator(config.association, self.backend)
         self.front_end = FRONT_ENDS[config.front_end.name]
         self.runs = {
-            name: RobotRun(Track(config.odometry, config.robot(name))) for name in log.robots
+            name: RobotRun(
+                Track(config.odometry, config.robot(name)), Calibrator()
+            )
+            for name in log.robots
         }
         self.starts = start_poses(log, config)
         self.steps: list[Step] = []
@@ -218,8 +223,8 @@ class Pipeline:
         self.backend.add(step)
         self.seconds["back end"] += time.perf_counter() - began
         self.steps.append(step)
-        for name in motions:
-            self.note_state(name, time_ns)
+        for name, moved in motions.items():
+            self.note_state(name, time_ns, moved)
         for message in event:
             if isinstance(message, Scan):
                 points = scan_points(message, self.config.front_end.max_range_m)
@@ -270,10 +275,13 @@ class Pipeline:
         self.counts["loop_closures"] += 1
         return Closure(message.robot, state_ns, message.other, other_ns, delta, cov)
 
-    def note_state(self, robot: str, time_ns: int) -> None:
-        """Book a new state with its causal estimate."""
+    def note_state(self, robot: str, time_ns: int, motion: Motion | None = None) -> None:
+        """Book a new state with its causal estimate, and learn from how the robot got there."""
         run = self.runs[robot]
         joint = self.backend.joint(robot, [])
+        if motion is not None and self.config.odometry.calibrate:
+            moved = between(run.causal_poses[-1], joint.pose)
+            run.track.calibration = run.calibrator.learn(run.track.calibration, motion, moved)
         run.state_ns = time_ns
         run.times.append(time_ns)
         run.causal_poses.append(joint.pose)
@@ -330,6 +338,7 @@ def smooth(log: LogSet, config: Config, progress: Progress = lambda _count: None
         line_closures=pipeline.associator.closures,
         landmarks=len(landmarks),
         seconds=pipeline.seconds,
+        calibration={name: run.track.calibration for name, run in pipeline.runs.items()},
     )
     return Result(
         robots,

@@ -5,6 +5,7 @@ import platform
 import resource
 import sys
 from collections import Counter
+from collections.abc import Mapping
 from importlib.metadata import version
 from typing import Any
 
@@ -15,6 +16,7 @@ from graphslam.config import Config, dump_config
 from graphslam.geometry import Array, transform
 from graphslam.landmark_map import Entry, LandmarkMap
 from graphslam.logs import LogSet
+from graphslam.models.motion import Calibration
 from graphslam.records import Estimate, Landmark
 
 FORMAT = "graphslam-result-1"
@@ -79,6 +81,7 @@ def summarise(
     line_closures: int,
     landmarks: int,
     seconds: Counter[str],
+    calibration: Mapping[str, Calibration],
 ) -> dict[str, Any]:
     """The keys of summary.json (see docs/formats.md)."""
     scans, total = counts["scans"], max(seconds["all"], 1e-9)
@@ -124,7 +127,13 @@ def summarise(
         "dropped": dict(sorted(all_dropped.items())),
         "repaired": dict(sorted(log.repaired.items())),
         "graph": {"error": estimate.error, "dof": estimate.dof},
-        "calibration": {},
+        "calibration": {
+            f"{robot}.{name}": {"value": float(value), "sigma": float(sigma), "observable": True}
+            for robot, found in sorted(calibration.items())
+            for name, value, sigma in zip(
+                found.names, found.mean, np.sqrt(np.diag(found.cov)), strict=True
+            )
+        },
         "warnings": list(log.warnings),
     }
 

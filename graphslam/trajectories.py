@@ -30,25 +30,26 @@ def between_states(
     odometry_at_state = track.pose(at)
     moved = between(odometry_at_state[i], track.pose(times_ns))
     poses = compose(states.poses[i], moved)
-    share = _shares(track, at, i, times_ns)
-    noise = _interval_noise(track, at, int(times_ns.max()))[i]
     turn = _rotations(states.poses[i, 2])
     if causal:
-        added = share[:, None, None] * noise
+        added = _noise_since(track, at[i], times_ns)
     else:
+        share = _shares(track, at, i, times_ns)
+        noise = _interval_noise(track, at, int(times_ns.max()))[i]
         following = np.minimum(i + 1, len(at) - 1)
-        arrived = compose(states.poses[i], between(odometry_at_state[i], odometry_at_state[following]))
+        arrived = compose(
+            states.poses[i], between(odometry_at_state[i], odometry_at_state[following])
+        )
         miss = log(between(arrived, states.poses[following]))
         poses = compose(poses, exp(share[:, None] * np.where((following > i)[:, None], miss, 0.0)))
         inside = (following > i)[:, None, None]
-        added = np.where(inside, share[:, None, None] * (1 - share[:, None, None]), 1.0) * noise
-        added = np.where(inside, added, share[:, None, None] * noise)
+        s = share[:, None, None]
+        added = s * np.where(inside, 1 - s, 1.0) * noise
     F = np.broadcast_to(np.eye(3), (len(i), 3, 3)).copy()
     F[:, 0, 2] = -(poses[:, 1] - states.poses[i, 1])
     F[:, 1, 2] = poses[:, 0] - states.poses[i, 0]
     carried = F @ states.covs[i] @ F.mT
     if not causal:
-        s = share[:, None, None]
         carried = np.where(inside, (1 - s) * carried + s * states.covs[following], carried)
     return Trajectory(stamps_ns, poses, carried + turn @ added @ turn.mT)
 
@@ -70,6 +71,14 @@ def _shares(track: Track, at: IntArray, i: IntArray, times_ns: IntArray) -> Arra
     whole = effort_end - effort_at
     part = (track.effort(times_ns) - effort_at[i]) / np.where(whole[i] > 0, whole[i], 1.0)
     return np.clip(np.where(whole[i] > 0, part, 0.0), 0.0, 1.0)
+
+
+def _noise_since(track: Track, since_ns: IntArray, times_ns: IntArray) -> Array:
+    """Odometry covariance (n, 3, 3) from a state to a time, along the state's axes; 0 at it."""
+    noise = np.zeros((len(times_ns), 3, 3))
+    for n in np.flatnonzero(times_ns > since_ns):
+        noise[n] = track.motion(int(since_ns[n]), int(times_ns[n])).cov
+    return noise
 
 
 def _interval_noise(track: Track, at: IntArray, last_ns: int) -> Array:

@@ -28,9 +28,7 @@ class DeadReckoningBackend:
             last = self._states.latest(robot)
             x, P = self._poses[robot][last], self._covs[robot][last]
             moved = compose(x, motion.delta)
-            self._append(
-                robot, step.time_ns, moved, compose_cov(x, P, motion.delta, motion.cov)
-            )
+            self._append(robot, step.time_ns, moved, compose_cov(x, P, motion.delta, motion.cov))
         for seen in step.associations:
             if isinstance(seen.target, int) and seen.target not in self._landmarks:
                 number = self._states.number(seen.robot, seen.time_ns)

@@ -23,13 +23,17 @@ CONVERGED = 1e-6
 
 
 class GraphBuilder:
-    """Turns steps into factors and first values; remembers which key is what."""
+    """Turns steps into factors and first values; remembers which key is what.
+
+    ``rows`` counts the residual rows that carry information: GTSAM counts a line's empty row too.
+    """
 
     def __init__(self, config: Config) -> None:
         self._config = config
         self.states = StateTable()
         self.robots: list[str] = []
         self.landmark_dims: dict[int, int] = {}
+        self.rows = 0
         self.graph = gtsam.NonlinearFactorGraph()
 
     def state_key(self, robot: str, number: int) -> int:
@@ -55,11 +59,13 @@ class GraphBuilder:
             key = self.state_key(robot, self.states.append(robot, step.time_ns))
             insert(key, start.pose)
             graph.add(factors.start_factor(key, start))
+            self.rows += 3
         for robot, motion in step.motions.items():
             last = self.state_key(robot, self.states.latest(robot))
             key = self.state_key(robot, self.states.append(robot, step.time_ns))
             insert(key, compose(estimate(last, 3), motion.delta))
             graph.add(factors.motion_factor(last, key, motion))
+            self.rows += 3
         for seen in step.associations:
             key = self.state_key(seen.robot, self.states.number(seen.robot, seen.time_ns))
             x = estimate(key, 3)
@@ -70,16 +76,17 @@ class GraphBuilder:
                 insert(target, MODELS[seen.model].invert(seen.z, x))
                 if seen.model == "line":
                     graph.add(factors.line_gauge_factor(key, target, seen))
+                    self.rows += 1
             t = estimate(target, dim)
             graph.add(factors.observation_factor(key, target, seen, self._config.robust, x, t))
+            self.rows += MODELS[seen.model].rows
         for closure in step.closures:
-            key = self.state_key(
-                closure.robot, self.states.number(closure.robot, closure.time_ns)
-            )
+            key = self.state_key(closure.robot, self.states.number(closure.robot, closure.time_ns))
             other = self.state_key(
                 closure.other, self.states.number(closure.other, closure.other_time_ns)
             )
             graph.add(factors.closure_factor(key, other, closure, self._config.robust))
+            self.rows += 3
         self.graph.push_back(graph)
         return graph, values
 
@@ -87,6 +94,14 @@ class GraphBuilder:
         if isinstance(seen.target, int):
             return factors.landmark_key(seen.target)
         return self.state_key(seen.target, self.states.number(seen.target, time_ns))
+
+    def diagnose(self, values: gtsam.Values) -> EstimationError:
+        """Which variable is indeterminate: QR answers NaN for all of them, Cholesky names one."""
+        try:
+            gtsam.Marginals(self.graph, values)
+        except RuntimeError as error:
+            return self.explain(error)
+        return self.explain(RuntimeError(""))
 
     def explain(self, error: RuntimeError) -> EstimationError:
         """GTSAM's complaint about a variable, said in terms of the log."""
@@ -103,18 +118,23 @@ class GraphBuilder:
         )
 
 
+def qr_parameters(config: Config) -> gtsam.ISAM2Params:
+    """Settings of iSAM2."""
+    parameters = gtsam.ISAM2Params()
+    parameters.setRelinearizeThreshold(config.backend.relinearize_threshold)
+    parameters.relinearizeSkip = config.backend.relinearize_every
+    # Cholesky calls good graphs indeterminate: information spans ten orders of magnitude here
+    parameters.setFactorization("QR")
+    return parameters
+
+
 class Isam2Backend:
     """Incremental smoothing of all states; see the module's docstring."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
         self._builder = GraphBuilder(config)
-        parameters = gtsam.ISAM2Params()
-        parameters.setRelinearizeThreshold(config.backend.relinearize_threshold)
-        parameters.relinearizeSkip = config.backend.relinearize_every
-        # Cholesky calls good graphs indeterminate: information spans ten orders of magnitude here
-        parameters.setFactorization("QR")
-        self._isam = gtsam.ISAM2(parameters)
+        self._isam = gtsam.ISAM2(qr_parameters(config))
 
     def value(self, key: int, dim: int) -> Array:
         """Current estimate of a variable."""
@@ -144,6 +164,8 @@ class Isam2Backend:
                 cov = self._isam.marginalCovariance(key)
         except RuntimeError as error:
             raise self._builder.explain(error) from error
+        if not np.isfinite(cov).all():
+            raise self._builder.diagnose(self._isam.calculateEstimate())
         slices = block_slices(dims)
         turn = np.eye(len(cov))
         for block, mean in zip((slice(0, 3), *slices), (pose, *means), strict=True):
@@ -161,7 +183,7 @@ class Isam2Backend:
         """See `Backend`: iSAM2 until it moves no more, then optimised to convergence."""
         values = self._converged()
         if self._config.backend.polish:
-            values = optimise(self._builder.graph, values)
+            values = self._optimised(values)
         return self._estimate(values)
 
     def _converged(self) -> gtsam.Values:
@@ -175,12 +197,27 @@ class Isam2Backend:
             raise self._builder.explain(error) from error
         return self._isam.calculateBestEstimate()
 
-    def _estimate(self, values: gtsam.Values) -> Estimate:
-        builder = self._builder
+    def _optimised(self, values: gtsam.Values) -> gtsam.Values:
         try:
-            marginals = gtsam.Marginals(builder.graph, values, "QR")
-        except (RuntimeError, TypeError):
-            marginals = gtsam.Marginals(builder.graph, values)
+            return optimise(self._builder.graph, values)
+        except RuntimeError as error:
+            raise self._builder.explain(error) from error
+
+    def _marginals(self, values: gtsam.Values) -> gtsam.Marginals | gtsam.ISAM2:
+        """Marginal covariances at ``values``: by Cholesky, or by QR where that gives up."""
+        try:
+            return gtsam.Marginals(self._builder.graph, values)
+        except RuntimeError as error:
+            isam = gtsam.ISAM2(qr_parameters(self._config))
+            isam.update(self._builder.graph, values)
+            # QR does not complain about an indeterminate graph, it answers NaN
+            keys = values.keys()
+            if not all(np.isfinite(isam.marginalCovariance(key)).all() for key in keys):
+                raise self._builder.explain(error) from error
+            return isam
+
+    def _estimate(self, values: gtsam.Values) -> Estimate:
+        builder, marginals = self._builder, self._marginals(values)
         states = {}
         for robot in sorted(builder.robots):
             keys = [builder.state_key(robot, n) for n in range(len(builder.states.times[robot]))]
@@ -199,11 +236,8 @@ class Isam2Backend:
             else:
                 mean = np.asarray(values.atPoint2(key))
             landmarks[landmark] = (mean, cov)
-        rows = sum(
-            builder.graph.at(i).dim() for i in range(builder.graph.size())
-        )
-        unknowns = values.dim()
-        return Estimate(states, landmarks, float(builder.graph.error(values)), rows - unknowns)
+        error = float(builder.graph.error(values))
+        return Estimate(states, landmarks, error, builder.rows - values.dim())
 
 
 class BatchBackend(Isam2Backend):
@@ -211,8 +245,7 @@ class BatchBackend(Isam2Backend):
 
     def finish(self) -> Estimate:
         """See `Backend`."""
-        values = optimise(self._builder.graph, self._isam.calculateBestEstimate())
-        return self._estimate(values)
+        return self._estimate(self._optimised(self._isam.calculateBestEstimate()))
 
 
 def optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:

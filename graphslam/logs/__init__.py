@@ -6,6 +6,7 @@
 from graphslam.logs.importers import IMPORTERS, ImportSummary, pose_stamp_ns
 from graphslam.logs.inspect import LogInfo, RobotInfo, TopicInfo, inspect_logs
 from graphslam.logs.log_set import LogFile, LogSet, open_logs
+from graphslam.logs.truth import LogTruth, read_truth
 from graphslam.logs.writer import LogWriter
 
 __all__ = [
@@ -14,10 +15,12 @@ __all__ = [
     "LogFile",
     "LogInfo",
     "LogSet",
+    "LogTruth",
     "LogWriter",
     "RobotInfo",
     "TopicInfo",
     "inspect_logs",
     "open_logs",
     "pose_stamp_ns",
+    "read_truth",
 ]

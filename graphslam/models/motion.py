@@ -8,7 +8,7 @@ treats it as white (see docs/thesis.md for why that misstates it).
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -60,17 +60,27 @@ def model_error_cov(twists: Array, config: OdometryConfig) -> Array:
 class Increments:
     """Consecutive motions: ``delta`` (n, 3), white ``cov`` (n, 3, 3), ``d_cal`` (n, 3, p).
 
-    ``cov`` is along the axes of each increment's start frame. ``calibration_cov`` (p, p) is the
-    prior covariance of the source's calibration parameters.
+    ``cov`` is along the axes of each increment's start frame, ``d_cal`` the derivative by the
+    source's p calibration parameters.
     """
 
     delta: Array
     cov: Array
     d_cal: Array
-    calibration_cov: Array
 
 
-def odometry_increments(rows: Array, _robot: RobotConfig, config: OdometryConfig) -> Increments:
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """Calibration errors of a motion source: ``mean`` (p,), ``cov`` (p, p); nominal is zero."""
+
+    names: tuple[str, ...]
+    mean: Array
+    cov: Array
+
+
+def odometry_increments(
+    rows: Array, calibration: Array, _robot: RobotConfig, config: OdometryConfig
+) -> Increments:
     """Increments of an odometry that reports poses: ``rows`` (n, 3) are twists.
 
     Calibration parameters: relative scale of translation, relative scale of rotation, turning per
@@ -81,48 +91,65 @@ def odometry_increments(rows: Array, _robot: RobotConfig, config: OdometryConfig
     d_twist[:, :2, 0] = rows[:, :2]
     d_twist[:, 2, 1] = rows[:, 2]
     d_twist[:, 2, 2] = path
-    sigmas = [
-        config.translation_scale_sigma,
-        config.rotation_scale_sigma,
-        config.drift_sigma_rad_per_m,
-    ]
-    return Increments(
-        exp(rows),
-        model_error_cov(rows, config),
-        exp_jacobian(rows) @ d_twist,
-        np.diag(np.square(sigmas)),
-    )
+    twists = rows + d_twist @ calibration
+    return Increments(exp(twists), model_error_cov(rows, config), exp_jacobian(twists) @ d_twist)
 
 
-def given_increments(rows: Array, _robot: RobotConfig, _config: OdometryConfig) -> Increments:
+def given_increments(
+    rows: Array, _calibration: Array, _robot: RobotConfig, _config: OdometryConfig
+) -> Increments:
     """Increments that bring their own covariance: ``rows`` (n, 12) are twist and covariance.
 
     Nothing to calibrate: p = 0.
     """
     n = len(rows)
-    return Increments(
-        exp(rows[:, :3]), rows[:, 3:].reshape(n, 3, 3), np.zeros((n, 3, 0)), np.zeros((0, 0))
-    )
+    return Increments(exp(rows[:, :3]), rows[:, 3:].reshape(n, 3, 3), np.zeros((n, 3, 0)))
 
 
-def wheel_increments(rows: Array, robot: RobotConfig, config: OdometryConfig) -> Increments:
+def wheel_increments(
+    rows: Array, calibration: Array, robot: RobotConfig, config: OdometryConfig
+) -> Increments:
     """Increments of wheel rotations: ``rows`` (n, 2) left and right, rad.
 
-    Calibration parameters: left radius, right radius, axle length, m. The counting error of one
-    reading enters two neighbouring increments with opposite signs and nearly cancels; it is
-    treated as white here (cautious), thesis eq. 4.9.
+    Calibration parameters: what is to be added to left radius, right radius and axle length, m.
+    The counting error of one reading enters two neighbouring increments with opposite signs and
+    nearly cancels; it is treated as white here (cautious), thesis eq. 4.9.
     """
+    robot = replace(
+        robot,
+        wheel_radius_left_m=robot.wheel_radius_left_m + calibration[0],
+        wheel_radius_right_m=robot.wheel_radius_right_m + calibration[1],
+        axle_m=robot.axle_m + calibration[2],
+    )
     twists = wheel_twist(rows, robot)
     J = exp_jacobian(twists) @ wheel_jacobian(rows, robot)
     moved = np.any(rows != 0, axis=1)
     counting = (config.count_sigma_rad**2 * moved)[:, None, None]
     cov = model_error_cov(twists, config) + counting * (J[:, :, 2:4] @ J[:, :, 2:4].mT)
-    sigmas = [config.wheel_radius_sigma_m, config.wheel_radius_sigma_m, config.axle_sigma_m]
-    return Increments(exp(twists), cov, J[:, :, [0, 1, 4]], np.diag(np.square(sigmas)))
+    return Increments(exp(twists), cov, J[:, :, [0, 1, 4]])
+
+
+def nominal_calibration(source: str, config: OdometryConfig) -> Calibration:
+    """What is known about a source's calibration before any data: zero, with prior sigmas."""
+    sigmas = {
+        "given": {},
+        "odometry": {
+            "translation_scale": config.translation_scale_sigma,
+            "rotation_scale": config.rotation_scale_sigma,
+            "drift_rad_per_m": config.drift_sigma_rad_per_m,
+        },
+        "wheels": {
+            "wheel_radius_left_m": config.wheel_radius_sigma_m,
+            "wheel_radius_right_m": config.wheel_radius_sigma_m,
+            "axle_m": config.axle_sigma_m,
+        },
+    }[source]
+    values = np.array(list(sigmas.values()), dtype=float)
+    return Calibration(tuple(sigmas), np.zeros(len(values)), np.diag(values**2))
 
 
 #: motion source -> increments of its rows; rows scale with the share of an interval that is used
-MOTION_SOURCES: dict[str, Callable[[Array, RobotConfig, OdometryConfig], Increments]] = {
+MOTION_SOURCES: dict[str, Callable[[Array, Array, RobotConfig, OdometryConfig], Increments]] = {
     "given": given_increments,
     "odometry": odometry_increments,
     "wheels": wheel_increments,

@@ -1,0 +1,64 @@
+# Two commands are enough on a fresh machine with Python and make: `make demo`, `make test`.
+# Both make the virtual environment .venv first; after that nothing needs the network.
+# Kept to what GNU make 3.81 (macOS) understands.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+OUT := out
+
+.PHONY: help demo test lint types docs clean
+
+help:
+	@echo 'make demo    smooth a real log (Victoria Park, shipped with gtsam) into $(OUT)/'
+	@echo 'make test    run the tests'
+	@echo 'make lint    check style and formatting'
+	@echo 'make types   check types'
+	@echo 'make docs    write the pages that are made from the code'
+	@echo 'make clean   remove $(VENV), $(OUT) and caches'
+	@echo 'PYTHON=...   the Python (3.11 or newer) to make $(VENV) with'
+
+demo: $(INSTALLED)
+	@mkdir -p $(OUT)
+	$(BIN)/graphslam import isam "$$($(BIN)/python -c \
+	  'import gtsam; print(gtsam.findExampleDataFile("victoria_park.txt"))')" \
+	  -o $(OUT)/victoria_park.mcap --force
+	$(BIN)/graphslam smooth $(OUT)/victoria_park.mcap -o $(OUT)/victoria_park --force
+	$(BIN)/graphslam smooth $(OUT)/victoria_park.mcap -o $(OUT)/victoria_park_all_poses --force \
+	  --set keyframe.mode=all --set robust.kernel=none
+	$(BIN)/python benchmarks/victoria_park.py $(OUT)/victoria_park $(OUT)/victoria_park_all_poses
+	@echo 'Open this in a browser: $(CURDIR)/$(OUT)/victoria_park/report.html'
+
+test: $(INSTALLED)
+	$(BIN)/python -m pytest
+
+lint: $(INSTALLED)
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+
+types: $(INSTALLED)
+	$(BIN)/mypy
+
+docs: $(INSTALLED)
+	$(BIN)/python docs/configuration.py
+
+clean:
+	rm -rf $(VENV) $(OUT) .pytest_cache .mypy_cache .ruff_cache .hypothesis
+
+# Installs anew only when pyproject.toml changed; the package itself is used where it lies.
+# python3 may be an old one (macOS), so newer names are tried after it.
+$(INSTALLED): pyproject.toml
+	@new='import sys; sys.exit(sys.version_info < (3, 11))'; \
+	if ! test -x $(BIN)/python; then \
+	  for python in "$(PYTHON)" python3.14 python3.13 python3.12 python3.11; do \
+	    if "$$python" -c "$$new" 2>/dev/null; then found="$$python"; break; fi; \
+	  done; \
+	  if test -z "$$found"; then \
+	    echo 'graphslam needs Python 3.11 or newer; run make PYTHON=/path/to/python3' >&2; exit 1; \
+	  fi; \
+	  echo "making $(VENV) with $$found"; \
+	  "$$found" -m venv $(VENV) || exit 1; \
+	fi; \
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@touch $@

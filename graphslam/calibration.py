@@ -1,0 +1,68 @@
+"""Learning a motion source's calibration errors while the estimate grows.
+
+A wrong wheel radius is one constant of the whole run. Left unmodelled, part of it leaks into the
+heading whenever landmarks are handed over to new ones, and the map bends. So after every state the
+motion that the estimate found is compared with what odometry said, and a recursive least-squares
+filter keeps the parameters that explain the difference (thesis 4.8-4.13 has the derivatives, but
+treats the errors as white). The estimate is itself pulled towards odometry, by some per cent; as
+the learned values are used for the next motions, that share vanishes geometrically.
+"""
+
+import numpy as np
+
+from graphslam.geometry import Array, wrap
+from graphslam.models.motion import Calibration
+from graphslam.records import Motion
+
+#: m and rad: how well the motion between two neighbouring states is known from landmarks
+RELATIVE_SIGMA = (0.02, 0.02, 0.01)
+#: weight of the past per state: remembers about 1/(1 - FORGET) states, so tyres may warm up
+FORGET = 0.995
+#: share of the prior sigma that always remains in a motion's covariance: no constant is constant
+REMAINING = 0.5
+#: squared Mahalanobis distance, 3 dof, beyond which a difference is no calibration error but a
+#: jump of the estimate (a loop closure) or a slip: 99.9 %
+OUTLIER = 16.3
+
+
+class Calibrator:
+    """Recursive least squares over one robot's motions."""
+
+    def __init__(self) -> None:
+        self._prior: Array | None = None
+        self._info = np.zeros((0, 0))
+        self._vector = np.zeros(0)
+
+    def learn(self, current: Calibration, motion: Motion, moved: Array) -> Calibration:
+        """The calibration after one more motion.
+
+        Args:
+            current: what ``motion`` was computed with.
+            motion: what odometry said.
+            moved: (3,) the same motion according to the estimate, in the frame of its start.
+
+        Returns:
+            Mean, and the covariance to be used for coming motions.
+        """
+        D = motion.d_delta_d_calibration
+        if not D.shape[1] or motion.length_m == 0 and motion.delta[2] == 0:
+            return current
+        if self._prior is None:
+            self._prior = current.cov
+            self._info = np.linalg.inv(self._prior)
+            self._vector = np.zeros(D.shape[1])
+        miss = moved - motion.delta
+        miss[2] = wrap(miss[2])
+        noise = motion.cov - D @ current.cov @ D.T + np.diag(np.square(RELATIVE_SIGMA))
+        total = noise + D @ self._prior @ D.T
+        if miss @ np.linalg.solve(total, miss) > OUTLIER:
+            return current
+        weighted = np.linalg.solve(noise, D).T
+        # relative to nominal values: what is missing now plus what was already corrected
+        self._info = FORGET * self._info + (1 - FORGET) * np.linalg.inv(self._prior)
+        self._info += weighted @ D
+        self._vector = FORGET * self._vector + weighted @ (miss + D @ current.mean)
+        cov = np.linalg.inv(self._info)
+        return Calibration(
+            current.names, cov @ self._vector, cov + REMAINING**2 * self._prior
+        )

@@ -1,0 +1,200 @@
+"""What a command prints for people; with --json none of this is used."""
+
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime
+from math import degrees
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from graphslam.logs import ImportSummary, LogInfo, RobotInfo, TopicInfo
+from graphslam.records import Result
+
+_PIPE_WIDTH = 200  # a pipe has no width; tables take what they need of this
+
+
+def log_info(info: LogInfo) -> None:
+    """Files, topics, robots, then what is odd and whether the log can be smoothed."""
+    console = _console()
+    for file in info.files:
+        lost = "an unknown number" if file.lost is None else _number(file.lost)
+        damage = "" if file.lost == 0 else f", {lost} lost"
+        console.print(f"{file.path}: {_number(file.messages)} messages{damage}")
+    for name, text in info.notes.items():
+        console.print(f"  {name}: {text}")
+    console.print(_span(info.topics))
+    console.print()
+    head = ["topic", "schema", "robot", "used", "messages", "Hz", "gaps", "time jumps back"]
+    console.print(_table(head, map(_topic_row, info.topics), texts=4))
+    for topic in info.topics:
+        if topic.scan is not None:
+            console.print(f"{topic.name}: {_scan(topic)}")
+    head = ["robot", "odometry", "path, m", "turning, deg", "mean m/s", "top m/s", "reverses"]
+    console.print()
+    console.print(_table(head, map(_robot_row, info.robots), texts=2))
+    _reasons(console, "dropped", info.dropped)
+    for warning in info.warnings:
+        console.print(f"warning: {warning}")
+    if info.problem:
+        console.print(f"not usable: {info.problem}")
+    else:
+        names = " ".join(str(file.path) for file in info.files)
+        console.print(f"usable: graphslam smooth {names} -o DIR")
+
+
+def imported(done: ImportSummary) -> None:
+    """Where the log is, how many messages it has per topic, what was odd."""
+    console = _console()
+    console.print(f"{done.target}: {_number(sum(done.counts.values()))} messages")
+    for topic, count in sorted(done.counts.items()):
+        console.print(f"  {topic}: {_number(count)}")
+    for warning in done.warnings:
+        console.print(f"warning: {warning}")
+
+
+def smoothed(result: Result, directory: Path) -> None:
+    """The headline of a run, what was rejected or dropped and why, where the report lies."""
+    console, summary, robots = _console(), result.summary, len(result.robots)
+    counts = summary["counts"]
+    parts = [f"{robots} robot{'s' * (robots > 1)}"]
+    parts += [
+        f"{_number(counts[key])} {key.replace('_', ' ')}"
+        for key in ("scans", "keyframes", "landmarks", "loop_closures")
+        if counts[key]
+    ]
+    seconds, factor = summary["stages"]["all"], summary["real_time_factor"]
+    console.print(f"{', '.join(parts)}; {seconds:.1f} s, {factor:.0f} times real time")
+    _reasons(console, "rejected", summary["rejected"])
+    _reasons(console, "dropped", summary["dropped"])
+    for warning in summary["warnings"]:
+        console.print(f"warning: {warning}")
+    console.print(f"report: {directory / 'report.html'}")
+
+
+def evaluation(found: Mapping[str, Any]) -> None:
+    """Tables of errors: trajectories, landmarks, relations, as far as they were compared."""
+    console = _console()
+    robots = found.get("robots", {})
+    runs = [*robots.items()] + ([("all together", found["joint"])] if len(robots) > 1 else [])
+    rows = [(name, kind, *_trajectory_row(both[kind])) for name, both in runs for kind in both]
+    head = ["robot", "", "ATE, m", "aligned, m", "max, m", "heading, deg"]
+    head += ["RPE 1 s, m", "RPE 10 m, m", "NEES/dof", "coverage"]
+    if rows:
+        console.print(_table(head, rows, texts=2))
+    if marks := found.get("landmarks"):
+        head = ["landmarks", "RMSE, m", "NEES/dof", "matched", "missed", "extra"]
+        keys = ["rmse_m", "nees_per_dof", "matched", "missed", "extra"]
+        console.print(_table(head, [("map", *(marks[key] for key in keys))]))
+    if relations := found.get("relations"):
+        head = ["relations", "", "matched", "unmatched", "mean, m", "std, m", "median, m"]
+        head += ["mean, deg", "std, deg"]
+        keys = ["n", "unmatched", "trans_mean_m", "trans_std_m", "trans_median_m"]
+        keys += ["rot_mean_deg", "rot_std_deg"]
+        kinds = {"final": relations, "causal": relations.get("causal", {})}
+        rows = [
+            (group, kind, *(values[group][key] for key in keys))
+            for kind, values in kinds.items()
+            for group in ("all", "local", "loops")
+            if group in values
+        ]
+        console.print(_table(head, rows, texts=2))
+        if not relations["all"]["n"]:
+            console.print("warning: no scan has the stamps of a relation, to the nanosecond")
+
+
+def _console() -> Console:
+    """Plain text: names of topics may hold what looks like markup."""
+    width = None if sys.stdout.isatty() else _PIPE_WIDTH
+    return Console(width=width, markup=False, highlight=False, emoji=False, soft_wrap=True)
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[object]], texts: int = 1) -> Table:
+    """A table without borders; all but the first ``texts`` columns are right-aligned."""
+    table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
+    for column, name in enumerate(head):
+        table.add_column(name, justify="left" if column < texts else "right", overflow="fold")
+    for row in rows:
+        table.add_row(*map(_number, row))
+    return table
+
+
+def _number(value: object) -> str:
+    """A cell: integers in groups of three, other numbers with three or more digits."""
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return f"{value:,}".replace(",", " ")
+    if isinstance(value, float):
+        return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+    return str(value)
+
+
+def _topic_row(topic: TopicInfo) -> tuple[object, ...]:
+    return (
+        topic.name,
+        topic.schema,
+        topic.robot,
+        topic.used,
+        topic.count,
+        topic.rate_hz,
+        len(topic.gaps),
+        topic.jumps_back,
+    )
+
+
+def _robot_row(robot: RobotInfo) -> tuple[object, ...]:
+    return (
+        robot.name,
+        robot.odometry,
+        robot.path_m,
+        None if robot.turning_rad is None else degrees(robot.turning_rad),
+        robot.speed_m_s,
+        robot.top_speed_m_s,
+        robot.reverses,
+    )
+
+
+def _scan(topic: TopicInfo) -> str:
+    """The laser in one line."""
+    assert topic.scan is not None  # the caller asks only for topics with scans
+    scan = topic.scan
+    parts = [
+        f"{scan.beams} beams over {degrees(scan.field_of_view_rad):.0f} deg",
+        f"range {scan.range_min_m:g} to {scan.range_max_m:g} m",
+    ]
+    if topic.dropouts is not None:
+        parts.append(f"{100 * topic.dropouts:.1f} % of the beams without a range")
+    return ", ".join(parts)
+
+
+def _span(topics: Sequence[TopicInfo]) -> str:
+    """From when to when, over all topics; UTC."""
+    times = [t for topic in topics for t in (topic.first_ns, topic.last_ns) if t is not None]
+    if not times:
+        return "no time"
+    start = datetime.fromtimestamp(min(times) // 10**9, UTC)
+    return f"{(max(times) - min(times)) * 1e-9:.1f} s from {start:%Y-%m-%d %H:%M:%S} UTC"
+
+
+def _reasons(console: Console, what: str, reasons: Mapping[str, int]) -> None:
+    for reason, count in sorted(reasons.items(), key=lambda item: (-item[1], item[0])):
+        console.print(f"{what}: {_number(count)} {reason}")
+
+
+def _trajectory_row(values: Mapping[str, Any]) -> tuple[object, ...]:
+    coverage = values["coverage"]
+    return (
+        values["ate_rmse_m"],
+        values["ate_aligned_rmse_m"],
+        values["max_m"],
+        degrees(values["heading_rmse_rad"]),
+        values["rpe"]["1_s"]["trans_rmse_m"],
+        values["rpe"]["10_m"]["trans_rmse_m"],
+        values["nees_per_dof"],
+        None if coverage is None else f"{100 * coverage:.1f} %",
+    )

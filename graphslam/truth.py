@@ -1,0 +1,87 @@
+"""Where evaluation takes its truth from: the logs of a run, another log, or TUM files."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from graphslam.config import Config
+from graphslam.errors import LogError, OutputError
+from graphslam.logs import LogSet, read_truth
+from graphslam.records import Trajectory, TrueLandmark, Truth
+from graphslam.results import SavedResult, read_trajectory
+
+_NO_TRUTH = "holds no true poses or landmarks; give --truth or --relations"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownTruth:
+    """True trajectories of robots' bases and true landmarks, world frame; either may be empty."""
+
+    trajectories: Mapping[str, Trajectory]
+    landmarks: tuple[TrueLandmark, ...]
+
+    def __bool__(self) -> bool:
+        """Whether there is anything to compare with."""
+        return bool(self.trajectories or self.landmarks)
+
+
+def truth_of_logs(log: LogSet, config: Config) -> KnownTruth:
+    """What open logs say about the truth, perhaps nothing."""
+    if not any(topic.record in (Truth, TrueLandmark) for topic in log.topics):
+        return KnownTruth({}, ())  # spares reading them once more
+    found = read_truth([file.path for file in log.files], config)
+    return KnownTruth(found.trajectories, found.landmarks)
+
+
+def truth_of_run(saved: SavedResult) -> KnownTruth:
+    """What the logs that a result came from say about the truth.
+
+    Raises:
+        LogError: a log is not where it was or is another one now, or none holds any truth.
+    """
+    logs = saved.summary["logs"]
+    found = read_truth([Path(log["path"]) for log in logs], saved.config)
+    for log, sha256 in zip(logs, found.sha256, strict=True):
+        if log["sha256"] != sha256:
+            raise LogError(f"{log['path']}: is not the log that was smoothed; give --truth")
+    truth = KnownTruth(found.trajectories, found.landmarks)
+    if not truth:
+        raise LogError(f"{', '.join(log['path'] for log in logs)}: {_NO_TRUTH}")
+    return truth
+
+
+def truth_of_files(sources: Sequence[str], robots: Sequence[str]) -> KnownTruth:
+    """Truth from logs (``LOG.mcap``) and TUM files (``FILE.tum``, ``ROBOT=FILE.tum``).
+
+    Args:
+        sources: files as given on the command line; several add up.
+        robots: names of the result's robots; a TUM file may go without one if there is only one.
+
+    Raises:
+        LogError: a log cannot be read or holds no truth.
+        OutputError: a TUM file cannot be read, or it is not clear whose it is.
+    """
+    trajectories: dict[str, Trajectory] = {}
+    landmarks: list[TrueLandmark] = []
+    for source in sources:
+        if source.endswith(".mcap"):
+            found = read_truth([Path(source)], Config())
+            if not found.trajectories and not found.landmarks:
+                raise LogError(f"{source}: {_NO_TRUTH}")
+            trajectories |= found.trajectories
+            landmarks += found.landmarks
+            continue
+        robot, path = _robot_and_path(source, robots)
+        trajectories[robot] = read_trajectory(path)
+    return KnownTruth(trajectories, tuple(landmarks))
+
+
+def _robot_and_path(source: str, robots: Sequence[str]) -> tuple[str, Path]:
+    name, separator, path = source.partition("=")
+    if separator and name in robots:
+        return name, Path(path)
+    if len(robots) == 1 and (not separator or Path(source).exists()):
+        return robots[0], Path(source)
+    raise OutputError(
+        f"--truth {source}: whose is it? write ROBOT=FILE.tum with one of {', '.join(robots)}"
+    )

@@ -1,0 +1,388 @@
+"""Motion from wheels and odometry (thesis 2.1-2.12, 4.8-4.15) and the track that it makes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from finite_differences import jacobian
+from hypothesis import given
+from hypothesis import strategies as st
+
+from graphslam.config import OdometryConfig, RobotConfig
+from graphslam.dead_reckoning import STANDING_SIGMA, Track
+from graphslam.geometry import between, compose, compose_cov, exp, wrap
+from graphslam.models import MOTION_SOURCES, compound
+from graphslam.models.motion import (
+    Increments,
+    model_error_cov,
+    nominal_calibration,
+    wheel_jacobian,
+    wheel_twist,
+)
+from graphslam.records import OdometryIncrement, OdometryPose, WheelAngles
+
+ROBOT = RobotConfig(wheel_radius_left_m=0.11, wheel_radius_right_m=0.1, axle_m=0.6)
+EVEN = RobotConfig(wheel_radius_left_m=0.1, wheel_radius_right_m=0.1, axle_m=0.5)
+NOISE = OdometryConfig()
+SECOND = 1_000_000_000
+
+
+def increments(source, rows, robot=ROBOT, config=NOISE):
+    nominal = nominal_calibration(source, config).mean
+    return MOTION_SOURCES[source](np.asarray(rows, float), nominal, robot, config)
+
+
+def drive(left, right, robot=EVEN, n=1):
+    """The motion of n equal wheel increments, rad."""
+    return compound(increments("wheels", [[left, right]] * n, robot)).delta
+
+
+def odometry_track(times_s, poses, config=NOISE):
+    track = Track(config, EVEN)
+    for t, pose in zip(times_s, poses, strict=True):
+        ns = round(t * SECOND)
+        track.add(OdometryPose("r", ns, ns, np.asarray(pose, float)))
+    return track
+
+
+def wheel_track(angles, robot, config=NOISE):
+    """Readings every second; ``angles`` (n, 2) rad."""
+    track = Track(config, robot)
+    for k, (left, right) in enumerate(angles):
+        track.add(WheelAngles("r", k * SECOND, k * SECOND, float(left), float(right)))
+    return track
+
+
+# ------------------------------------------------------------ thesis 2.6-2.12
+
+
+def test_equal_wheels_drive_straight():
+    """2.12: any turning or sidestep here is a sign or a radius mixed up."""
+    np.testing.assert_allclose(drive(3.0, 3.0), [0.3, 0.0, 0.0], atol=1e-16)
+
+
+def test_opposite_wheels_turn_on_the_spot_counter_clockwise():
+    """2.6 with right minus left: 2 r theta / L."""
+    np.testing.assert_allclose(drive(-1.0, 1.0), [0.0, 0.0, 2 * 0.1 / 0.5], atol=1e-16)
+
+
+def test_faster_right_wheel_curves_to_the_left_on_the_thesis_circle():
+    """2.11 as printed, at a turn where it does not cancel."""
+    turn, path = 0.1 * (4 - 1) / 0.5, 0.1 * (4 + 1) / 2
+    expected = [path * np.sin(turn) / turn, path * (1 - np.cos(turn)) / turn, turn]
+    np.testing.assert_allclose(drive(1.0, 4.0), expected, rtol=1e-14)
+    assert drive(1.0, 4.0)[1] > 0
+
+
+def test_a_full_circle_closes():
+    """Breaks if an increment is a chord with the start's heading instead of a circle segment."""
+    n = 100
+    path = 2 * np.pi / n * 2.0  # radius 2 m
+    turn = 2 * np.pi / n
+    left, right = (path - turn * 0.25) / 0.1, (path + turn * 0.25) / 0.1
+    whole = drive(left, right, n=n)
+    np.testing.assert_allclose(whole[:2], 0, atol=1e-13)  # 100 sums of rounding 1e-16 x 4 m
+    np.testing.assert_allclose(wrap(whole[2]), 0, atol=1e-13)
+    np.testing.assert_allclose(drive(left, right, n=n // 2)[:2], [0, 4.0], atol=1e-13)
+
+
+@pytest.mark.parametrize("turn", [1e-15, 1e-12, 1e-9, 1e-6])
+def test_tiny_turns_lose_nothing(turn):
+    """y = path * turn / 2 to a few roundings; (1 - cos)/turn gives 0, and wrapping lost 1e-4 of it."""
+    parts = increments("odometry", [[2.0, 0.0, turn]])
+    np.testing.assert_allclose(parts.delta[0], [2.0, turn, turn], rtol=1e-12)
+    still = increments("odometry", [[2.0, 0.0, 0.0]])
+    # covariance and derivatives are smooth through zero: they differ by the turn times ten at most
+    np.testing.assert_allclose(parts.cov, still.cov, atol=10 * turn)
+    np.testing.assert_allclose(parts.d_cal, still.d_cal, atol=10 * turn)
+
+
+# ------------------------------------------------------------ thesis 4.8-4.15
+
+
+@given(st.floats(-20, 20), st.floats(-20, 20))
+def test_wheel_jacobian_equals_finite_differences(left, right):
+    """All five parameters of 4.11; the axle's sign is the one that is easily lost."""
+
+    def twist(parameters):
+        r_l, r_r, turn_l, turn_r, axle = parameters
+        return wheel_twist(np.array([[turn_l, turn_r]]), RobotConfig((), r_l, r_r, axle))[0]
+
+    at = np.array([0.11, 0.1, left, right, 0.6])
+    # third derivatives by the axle are 6 * 4 rad m / 0.6^4, times h² = 1e-10
+    np.testing.assert_allclose(
+        wheel_jacobian(at[None, 2:4], ROBOT)[0], jacobian(twist, at), atol=5e-8
+    )
+
+
+def test_model_error_grows_with_path_and_turning_as_printed():
+    """4.14, each coefficient by itself, and unsigned when reversing."""
+    config = OdometryConfig(
+        k_x_m=1, k_x_rad=10, k_y_m=2, k_y_rad=20, k_phi_m=3, k_phi_rad=30
+    )
+    expected = np.diag([2.0 + 10 * 0.5, 4.0 + 20 * 0.5, 6.0 + 30 * 0.5])
+    for twist in ([2.0, 0.0, 0.5], [-2.0, 0.0, -0.5]):
+        np.testing.assert_allclose(model_error_cov(np.array([twist]), config)[0], expected)
+
+
+@pytest.mark.parametrize("n", [2, 10, 300])
+def test_model_error_does_not_depend_on_sampling(n):
+    """A straight line in n parts. A variance that grew with the square of an increment would shrink
+    with n. The heading's part moves the end sideways, which one part alone cannot show: k s³
+    (n-1)(2n-1)/6n² by hand."""
+    config, path = OdometryConfig(k_y_m=2e-4, k_phi_m=3e-4), 6.0
+    one = compound(increments("odometry", [[path, 0, 0]], config=config)).cov
+    cov = compound(increments("odometry", [[path / n, 0, 0]] * n, config=config)).cov
+    lever = 3e-4 * path**3 * (n - 1) * (2 * n - 1) / (6 * n**2)
+    expected = one[1, 1] + lever
+    np.testing.assert_allclose(cov[0, 0], one[0, 0], rtol=1e-13)  # n roundings
+    np.testing.assert_allclose(cov[2, 2], one[2, 2], rtol=1e-13)
+    np.testing.assert_allclose(cov[1, 1], expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("source", sorted(MOTION_SOURCES))
+def test_every_source_turns_rows_into_increments(source):
+    """Contract of a row of MOTION_SOURCES: shapes, symmetric positive semidefinite noise, and rows
+    that scale: half of a row is half of the way."""
+    rng = np.random.default_rng(5)
+    size = {"odometry": 3, "given": 12, "wheels": 2}[source]
+    rows = rng.normal(size=(7, size))
+    if source == "given":
+        roots = rng.normal(size=(7, 3, 3))
+        rows[:, 3:] = (roots @ roots.mT).reshape(7, 9)
+    parts = increments(source, rows)
+    p = len(nominal_calibration(source, NOISE).mean)
+    assert (parts.delta.shape, parts.cov.shape, parts.d_cal.shape) == ((7, 3), (7, 3, 3), (7, 3, p))
+    np.testing.assert_allclose(parts.cov, parts.cov.mT, atol=1e-15)
+    assert np.linalg.eigvalsh(parts.cov).min() > -1e-15
+    half = increments(source, rows / 2).delta
+    # up to a turn of pi, where half a twist is half the circle segment
+    slow = np.abs(parts.delta[:, 2]) < 1.5
+    np.testing.assert_allclose(compose(half, half)[slow], parts.delta[slow], atol=1e-12)
+
+
+def random_parts(n=30, p=2, seed=1, size=0.03):
+    rng = np.random.default_rng(seed)
+    roots = size * rng.normal(size=(n, 3, 3))
+    deltas = rng.normal([0.3, 0.0, 0.05], [0.1, 0.02, 0.1], size=(n, 3))
+    return Increments(deltas, roots @ roots.mT, rng.normal(size=(n, 3, p)))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_compound_equals_one_compose_after_the_other(seed):
+    """4.4 and 4.7 n times; a lever arm from the wrong end breaks the covariance only."""
+    parts = random_parts(seed=seed)
+    pose, cov = np.zeros(3), np.zeros((3, 3))
+    for delta, white in zip(parts.delta, parts.cov, strict=True):
+        cov = compose_cov(pose, cov, delta, white)
+        pose = compose(pose, delta)
+    whole = compound(parts)
+    np.testing.assert_allclose(whole.delta, pose, atol=1e-13)  # 30 sums of rounding at 10 m
+    np.testing.assert_allclose(whole.cov, cov, atol=1e-13)
+
+
+def test_compound_cov_equals_monte_carlo():
+    """The linearisation itself: with 1 % noise its second-order error is below the sampling error."""
+    parts = random_parts(size=0.003)
+    rng, n = np.random.default_rng(11), 20_000
+    ends = np.zeros((n, 3))
+    for delta, white in zip(parts.delta, parts.cov, strict=True):
+        ends = compose(ends, rng.multivariate_normal(delta, white, n))
+    cov = compound(parts).cov
+    d = np.diag(cov)
+    sampling = np.sqrt((np.outer(d, d) + cov**2) / n)
+    assert np.all(np.abs(np.cov(ends.T) - cov) < 5 * sampling)
+
+
+def test_compound_derivative_equals_finite_differences():
+    """The same constant enters every increment: effects add up, not their squares."""
+    parts = random_parts()
+
+    def end(parameters):
+        shifted = parts.delta + parts.d_cal @ parameters
+        return compound(replace(parts, delta=shifted)).delta
+
+    np.testing.assert_allclose(
+        compound(parts).d_cal, jacobian(end, np.zeros(2)), atol=1e-6
+    )  # 30 increments of curvature 30 m each, times h² = 1e-10, with room
+
+
+# ------------------------------------------------------------ the track: calibration
+
+
+WHEELS = np.cumsum(np.random.default_rng(2).uniform([1, 1], [3, 4], size=(8, 2)), axis=0)
+
+
+def test_motion_derivative_by_wheel_geometry_equals_other_geometry():
+    """Calibration re-integrates without decoding again: d_delta_d_calibration must be what another
+    wheel radius in the configuration really does."""
+
+    def end(geometry):
+        robot = RobotConfig((), geometry[0], geometry[1], geometry[2])
+        return wheel_track(WHEELS, robot).motion(SECOND // 2, 6 * SECOND + 7).delta
+
+    at = np.array([0.11, 0.1, 0.6])
+    found = wheel_track(WHEELS, ROBOT).motion(SECOND // 2, 6 * SECOND + 7).d_delta_d_calibration
+    # derivatives are up to 60 rad m / 0.6²; third ones, times h² = 1e-10, stay below 1e-6
+    np.testing.assert_allclose(found, jacobian(end, at), atol=2e-6)
+
+
+def test_motion_derivative_by_odometry_scales_equals_scaled_odometry():
+    """Translation scale, rotation scale, turning per metre."""
+    twists = np.random.default_rng(4).normal([0.4, 0.0, 0.1], 0.1, size=(6, 3))
+
+    def end(parameters):
+        scale, turn_scale, drift = parameters
+        scaled = twists * [1 + scale, 1 + scale, 1 + turn_scale]
+        scaled[:, 2] += drift * np.hypot(twists[:, 0], twists[:, 1])
+        poses = [np.zeros(3)]
+        for twist in scaled:
+            poses.append(compose(poses[-1], exp(twist)))
+        return odometry_track(range(7), poses).motion(0, 5 * SECOND + 3).delta
+
+    found = odometry_track([0], [np.zeros(3)])
+    assert found.motion(0, 0).d_delta_d_calibration.shape == (3, 3)
+    poses = [np.zeros(3)]
+    for twist in twists:
+        poses.append(compose(poses[-1], exp(twist)))
+    motion = odometry_track(range(7), poses).motion(0, 5 * SECOND + 3)
+    np.testing.assert_allclose(motion.d_delta_d_calibration, jacobian(end, np.zeros(3)), atol=1e-7)
+
+
+def test_calibration_error_grows_with_path_and_white_error_with_its_root():
+    """The insight that one wrong wheel radius is a constant of the run: four times the path is four
+    times its sigma, and only twice the white one's."""
+    quiet = {f: 0.0 for f in ("k_x_rad", "k_y_rad", "k_phi_m", "k_phi_rad", "floor_sigma_m")}
+    quiet |= {"floor_sigma_rad": 0.0, "drift_sigma_rad_per_m": 0.0}
+    line = [[0.5 * k, 0, 0] for k in range(9)]
+    for config, ratio in (
+        (OdometryConfig(k_x_m=0.0, k_y_m=0.0, translation_scale_sigma=0.03, **quiet), 4.0),
+        (OdometryConfig(k_x_m=1e-4, translation_scale_sigma=0.0, **quiet), 2.0),
+    ):
+        track = odometry_track(range(9), line, config)
+        short, long = (track.motion(0, n * SECOND).cov[0, 0] for n in (2, 8))
+        assert np.sqrt(long / short) == pytest.approx(ratio, rel=1e-12)
+
+
+# ------------------------------------------------------------ the track: any time
+
+
+def circle(t):
+    """Pose at time t s on a circle of radius 3 m at 0.2 rad/s."""
+    return exp(np.array([0.6, 0.0, 0.2]) * t)
+
+
+@given(st.lists(st.floats(0, 9.5), min_size=1, max_size=6))
+def test_pose_at_any_time_lies_on_the_circle_between_readings(times):
+    """Breaks with straight interpolation of positions: 4 cm at this curvature."""
+    readings = [0, 0.7, 2.5, 3.0, 6.0, 9.5]
+    track = odometry_track(readings, [circle(t) for t in readings])
+    at = np.array([round(t * SECOND) for t in times])
+    expected = np.array([circle(ns / SECOND) for ns in at])
+    found = track.pose(at)
+    np.testing.assert_allclose(found[:, :2], expected[:, :2], atol=1e-12)
+    np.testing.assert_allclose(wrap(found[:, 2] - expected[:, 2]), 0, atol=1e-12)
+
+
+@given(st.floats(0, 9.5), st.floats(0, 9.5))
+def test_motion_is_the_pose_difference_for_any_cut(a, b):
+    start, end = sorted((round(a * SECOND), round(b * SECOND)))
+    readings = [0, 0.7, 2.5, 3.0, 6.0, 9.5]
+    track = odometry_track(readings, [circle(t) for t in readings])
+    motion = track.motion(start, end)
+    expected = between(track.pose(start), track.pose(end))
+    np.testing.assert_allclose(motion.delta[:2], expected[:2], atol=1e-12)
+    np.testing.assert_allclose(wrap(motion.delta[2] - expected[2]), 0, atol=1e-12)
+    assert motion.length_m == pytest.approx(0.6 * (end - start) / SECOND, rel=0.1, abs=1e-9)
+    assert np.linalg.eigvalsh(motion.cov).min() > 0
+
+
+def test_two_motions_in_a_row_are_the_whole_one():
+    """White noise split at a time between readings is neither lost nor counted twice."""
+    config = OdometryConfig(
+        translation_scale_sigma=0,
+        rotation_scale_sigma=0,
+        drift_sigma_rad_per_m=0,
+        floor_sigma_m=0,
+        floor_sigma_rad=0,
+        k_phi_m=0,
+        k_phi_rad=0,
+    )
+    track = odometry_track(range(5), [[k, 0, 0] for k in range(5)], config)
+    cut = 2 * SECOND + SECOND // 3
+    first, second, whole = (
+        track.motion(a, b) for a, b in ((0, cut), (cut, 4 * SECOND), (0, 4 * SECOND))
+    )
+    np.testing.assert_allclose(compose(first.delta, second.delta), whole.delta, atol=1e-14)
+    np.testing.assert_allclose(first.cov + second.cov, whole.cov, rtol=1e-9)  # 1/3 s is rounded to ns
+    assert first.length_m + second.length_m == pytest.approx(whole.length_m)
+
+
+def test_before_the_first_and_after_the_last_reading_the_robot_stands():
+    track = odometry_track([10, 11], [[5, 5, 1], [6, 5, 1]])
+    before, after = track.pose(np.array([0, 20 * SECOND]))
+    np.testing.assert_array_equal(before, [0, 0, 0])
+    np.testing.assert_allclose(after, between(np.array([5, 5, 1]), np.array([6, 5, 1])), atol=1e-15)
+    motion = track.motion(11 * SECOND, 20 * SECOND)
+    np.testing.assert_array_equal(motion.delta, 0)
+
+
+@pytest.mark.parametrize("times", [[0], [0, 1, 2]])
+def test_standing_leaves_a_small_covariance_that_is_never_zero(times):
+    """A zero covariance would weld two states together (and no noise model takes it)."""
+    track = odometry_track(times, [[1, 2, 3]] * len(times))
+    motion = track.motion(0, 2 * SECOND)
+    np.testing.assert_array_equal(motion.delta, 0)
+    np.testing.assert_allclose(motion.cov, STANDING_SIGMA**2 * np.eye(3))
+    assert motion.length_m == 0
+    assert motion.d_delta_d_calibration.shape[0] == 3
+
+
+def test_burst_of_stamps_belongs_to_the_reading_before():
+    """0.5 m in a microsecond is no motion but a logger that caught up: a scan stamped inside gets the
+    reading recorded before it, not a share of the jump. At a real speed the share counts."""
+    burst = odometry_track([0, 1, 1.000001, 2], [[0, 0, 0], [1, 0, 0], [1.5, 0, 0], [2, 0, 0]])
+    inside = SECOND + 500
+    assert burst.pose(inside)[0] == pytest.approx(1.0)
+    assert burst.motion(0, inside).delta[0] == pytest.approx(1.0)
+    assert burst.pose(SECOND + 1000)[0] == pytest.approx(1.5)
+    assert burst.motion(inside, 2 * SECOND).delta[0] == pytest.approx(1.0)  # nothing is lost
+    slow = odometry_track([0, 1, 2], [[0, 0, 0], [1, 0, 0], [1.5, 0, 0]])
+    assert slow.pose(SECOND + SECOND // 2)[0] == pytest.approx(1.25)
+
+
+def test_two_readings_of_one_stamp_both_count():
+    """Zero seconds between them must not divide."""
+    track = odometry_track([0, 1, 1, 2], [[0, 0, 0], [1, 0, 0], [1.2, 0, 0], [2, 0, 0]])
+    assert track.motion(0, 2 * SECOND).delta[0] == pytest.approx(2.0)
+    assert np.isfinite(track.pose(np.array([0, SECOND, 2 * SECOND]))).all()
+
+
+def test_given_increments_keep_their_own_covariance():
+    """An odometry source with honest noise gets none of ours on top; a share of an interval has that
+    share of the variance."""
+    track = Track(NOISE, EVEN)
+    cov = np.diag([4e-4, 1e-4, 1e-5])
+    track.add(OdometryIncrement("r", SECOND, SECOND, 0, np.array([1.0, 0.0, 0.0]), cov))
+    motion = track.motion(0, SECOND)
+    np.testing.assert_allclose(motion.delta, [1, 0, 0], atol=1e-15)
+    np.testing.assert_allclose(motion.cov, cov, atol=1e-18)
+    np.testing.assert_allclose(track.motion(0, SECOND // 4).cov, cov / 4, atol=1e-18)
+    assert motion.d_delta_d_calibration.shape == (3, 0)
+
+
+def test_track_grows_beyond_its_first_arrays():
+    """2500 readings; a lost row would shorten the path."""
+    track = odometry_track(0.1 * np.arange(2500), [[0.01 * k, 0, 0] for k in range(2500)])
+    assert len(track) == len(track.times) == 2500
+    assert track.motion(track.first_ns, track.last_ns).delta[0] == pytest.approx(24.99)
+    assert track.moved(track.first_ns, track.last_ns) == pytest.approx((24.99, 0.0))
+
+
+def test_reaches_and_near_tell_what_odometry_covers():
+    track = Track(NOISE, EVEN)
+    assert not track.reaches(0) and not track.near(0, SECOND)
+    track = odometry_track([10, 11], [[0, 0, 0], [1, 0, 0]])
+    assert track.reaches(11 * SECOND) and not track.reaches(11 * SECOND + 1)
+    assert track.near(9 * SECOND, SECOND) and track.near(12 * SECOND, SECOND)
+    assert not track.near(9 * SECOND - 1, SECOND) and not track.near(12 * SECOND + 1, SECOND)
