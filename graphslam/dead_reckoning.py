@@ -8,9 +8,9 @@ calibration. Between two readings the robot is taken to move on a circle segment
 import numpy as np
 
 from graphslam.config import OdometryConfig, RobotConfig
-from graphslam.geometry import Array, between, compose, exp, log, wrap
+from graphslam.geometry import Array, between, compose, exp, log, rotation3, wrap
 from graphslam.models import MOTION_SOURCES, compound
-from graphslam.models.motion import Increments, nominal_calibration
+from graphslam.models.motion import Increments, mounted_motion, nominal_calibration
 from graphslam.records import Motion, OdometryIncrement, OdometryPose, WheelAngles
 
 IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
@@ -32,11 +32,15 @@ _ROW_SIZE = {"odometry": 3, "given": 12, "wheels": 2}
 class Track:
     """Odometry readings of one robot, in time order, and the motions that they describe."""
 
-    def __init__(self, config: OdometryConfig, robot: RobotConfig) -> None:
+    def __init__(
+        self, config: OdometryConfig, robot: RobotConfig, *, mounted: bool = False
+    ) -> None:
+        """An empty track; ``mounted``: its motions are those of a sensor's frame, see `motion`."""
         self.source = ""
-        self.calibration = nominal_calibration("given", config)
+        self.calibration = nominal_calibration("given", config, False)
+        self._mounted = mounted
         self._config, self._robot = config, robot
-        self._count = 0
+        self._count, self._p = 0, 0
         self._times = np.empty(1024, dtype=np.int64)  # time of the end of each row's interval
         self._rows = np.empty((1024, 0))
         self._poses = np.empty((1024, 3))  # by odometry alone, first reading = origin
@@ -44,6 +48,13 @@ class Track:
         self._path = np.empty(1024)  # accumulated, m
         self._burst = np.empty(1024, dtype=bool)  # interval too short for its motion
         self._last: Array | None = None
+
+    @property
+    def mount(self) -> Array:
+        """Pose (3,) in the base frame of the frame whose motions this track describes."""
+        if len(self.calibration.mean) > self._p:
+            return self.calibration.mean[self._p :]
+        return np.zeros(3)
 
     def __len__(self) -> int:
         return self._count
@@ -86,7 +97,9 @@ class Track:
     def _append(self, source: str, time_ns: int, row: Array) -> None:
         if not self._count:
             self.source = source
-            self.calibration = nominal_calibration(source, self._config)
+            mounted = self._mounted and source != "given"
+            self.calibration = nominal_calibration(source, self._config, mounted)
+            self._p = len(self.calibration.mean) - 3 * mounted  # parameters of the increments
             self._rows = np.empty((len(self._times), _ROW_SIZE[source]))
         if self._count == len(self._times):
             self._times = np.concatenate([self._times, np.empty_like(self._times)])
@@ -97,8 +110,7 @@ class Track:
             self._burst = np.concatenate([self._burst, np.empty_like(self._burst)])
         n = self._count
         self._times[n], self._rows[n] = time_ns, row
-        nominal = np.zeros(len(self.calibration.mean))
-        step = self._increments(row[None], nominal).delta[0]
+        step = self._increments(row[None], np.zeros(self._p)).delta[0]
         self._poses[n] = compose(self._poses[n - 1], step) if n else np.zeros(3)
         path, turn = np.hypot(step[0], step[1]), abs(step[2])
         self._effort[n] = self._effort[n - 1] + path + TURNING_EFFORT_M * turn if n else 0.0
@@ -156,7 +168,8 @@ class Track:
     def motion(self, start_ns: int, end_ns: int) -> Motion:
         """The motion from ``start_ns`` to ``end_ns`` with its covariance; thesis 4.4-4.15.
 
-        Uses the current ``calibration`` (`pose`, `moved` and `effort` are by nominal values).
+        Uses the current ``calibration`` (`pose`, `moved` and `effort` are by nominal values). For
+        a mounted track it is the motion of the frame at ``mount`` in the base.
         Readings that an interval cuts count with the share of time that lies inside.
         """
         times, n = self.times, self._count
@@ -168,13 +181,19 @@ class Track:
         rows = self._rows[first : last + 1]
         inside = np.arange(first, last + 1)
         share = self._share(inside, start_ns, end_ns)
-        parts = self._increments(rows * share[:, None], self.calibration.mean)
+        parts = self._increments(rows * share[:, None], self.calibration.mean[: self._p])
         whole = compound(parts)
-        cov = whole.cov + whole.d_cal @ self.calibration.cov @ whole.d_cal.T
+        delta, d_cal, cov = whole.delta, whole.d_cal, whole.cov
+        if len(self.calibration.mean) > self._p:
+            delta, d_mount = mounted_motion(delta, self.mount)
+            turn = rotation3(-self.mount[2])
+            d_cal = np.column_stack([turn @ d_cal, d_mount])
+            cov = turn @ cov @ turn.T
+        cov = cov + d_cal @ self.calibration.cov @ d_cal.T
         length = float(np.hypot(parts.delta[:, 0], parts.delta[:, 1]).sum())
         if self.source != "given":
-            cov = cov + self._floor(length > 0 or whole.delta[2] != 0)
-        return Motion(start_ns, end_ns, whole.delta, cov, whole.d_cal, length)
+            cov = cov + self._floor(length > 0 or delta[2] != 0)
+        return Motion(start_ns, end_ns, delta, cov, d_cal, length)
 
     def _standing(self, start_ns: int, end_ns: int) -> Motion:
         p = len(self.calibration.mean)

@@ -9,7 +9,7 @@ was given (``smooth --start truth``). Aligned numbers are after the best rigid m
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -17,8 +17,8 @@ from scipy.stats import chi2
 
 from graphslam.errors import OutputError
 from graphslam.geometry import Array, between, interpolate, transform, wrap
-from graphslam.records import Landmark, Trajectory, TrueLandmark
-from graphslam.results import read_text, stamp_ns
+from graphslam.records import Landmark, Result, Trajectory, TrueLandmark
+from graphslam.results import SavedResult, read_text, stamp_ns
 
 Stamps = np.ndarray[Any, np.dtype[np.int64]]
 
@@ -387,30 +387,8 @@ def _find(wanted: Stamps, known: Stamps) -> tuple[Any, Any]:
 # ---------------------------------------------------------------- all of it
 
 
-class RobotPoses(Protocol):
-    """What is compared of one robot; see `graphslam.records.RobotResult`."""
-
-    @property
-    def final(self) -> Trajectory: ...
-    @property
-    def causal(self) -> Trajectory: ...
-    @property
-    def scan_final(self) -> Trajectory | None: ...
-    @property
-    def scan_causal(self) -> Trajectory | None: ...
-
-
-class Estimated(Protocol):
-    """What is compared: a `Result`, or a `SavedResult` read back from its folder."""
-
-    @property
-    def robots(self) -> Mapping[str, RobotPoses]: ...
-    @property
-    def landmarks(self) -> tuple[Landmark, ...]: ...
-
-
 def evaluate(
-    result: Estimated,
+    result: Result | SavedResult,
     truth: Mapping[str, Trajectory] | None = None,
     true_landmarks: Sequence[TrueLandmark] = (),
     relations: Relations | None = None,
@@ -453,7 +431,7 @@ def evaluate(
     return found
 
 
-def _relations(result: Estimated, relations: Relations) -> dict[str, Any]:
+def _relations(result: Result | SavedResult, relations: Relations) -> dict[str, Any]:
     scans = [
         (robot.scan_final, robot.scan_causal)
         for robot in result.robots.values()

@@ -65,7 +65,7 @@ def check_target(directory: Path, *, force: bool) -> None:
     while not parent.exists():
         parent = parent.parent
     if not (parent.is_dir() and os.access(parent, os.W_OK | os.X_OK)):
-        raise OutputError(f"{directory}: cannot be made: {parent} is no folder to write to")
+        raise OutputError(f"{directory}: cannot be written: {parent} is no folder to write to")
     if not os.path.lexists(directory):
         return
     if not force:

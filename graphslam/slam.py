@@ -83,7 +83,8 @@ class Pipeline:
         self.front_end = FRONT_ENDS[config.front_end.name]
         self.runs = {
             name: RobotRun(
-                Track(config.odometry, config.robot(name)), Calibrator()
+                Track(config.odometry, config.robot(name), mounted=log.has_scans(name)),
+                Calibrator(),
             )
             for name in log.robots
         }
@@ -367,12 +368,15 @@ def robot_result(run: RobotRun, states: Trajectory) -> RobotResult:
         times = stamps = np.arange(run.track.first_ns, run.track.last_ns + 1, period)
     final = between_states(states, run.track, times, stamps, causal=False)
     causal = between_states(causal_states, run.track, times, stamps, causal=True)
-    start = compose(states.poses[0], inverse(run.track.pose(int(states.stamps_ns[0]))))
-    poses = compose(start, run.track.pose(times))
+    # the states are rigid to the laser: the base is where the calibration puts it
+    back = inverse(run.track.mount)
+    start = compose(states.poses[0], back)
+    started = run.track.pose(int(states.stamps_ns[0]))
+    poses = compose(start, between(started, run.track.pose(times)))
     reckoned = Trajectory(stamps, poses, np.full((len(poses), 3, 3), np.nan))
     return RobotResult(
-        final,
-        causal,
+        mounted(final, back),
+        mounted(causal, back),
         mounted(final, mounts) if run.scans else None,
         mounted(causal, mounts) if run.scans else None,
         reckoned,

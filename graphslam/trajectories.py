@@ -27,8 +27,8 @@ def between_states(
     """
     at = states.stamps_ns
     i = np.clip(np.searchsorted(at, times_ns, side="right") - 1, 0, len(at) - 1)
-    odometry_at_state = track.pose(at)
-    moved = between(odometry_at_state[i], track.pose(times_ns))
+    odometry_at_state = compose(track.pose(at), track.mount)
+    moved = between(odometry_at_state[i], compose(track.pose(times_ns), track.mount))
     poses = compose(states.poses[i], moved)
     turn = _rotations(states.poses[i, 2])
     if causal:
@@ -55,7 +55,7 @@ def between_states(
 
 
 def mounted(base: Trajectory, mounts: Array) -> Trajectory:
-    """Trajectory of sensors that sit at ``mounts`` (n, 3) in the base frame, rigidly."""
+    """Trajectory of frames that sit at ``mounts`` (n, 3) or (3,) in the base frame, rigidly."""
     poses = compose(base.poses, mounts)
     F = np.broadcast_to(np.eye(3), base.covs.shape).copy()
     F[:, 0, 2] = -(poses[:, 1] - base.poses[:, 1])

@@ -178,21 +178,15 @@ def evaluate_command(
     """
     with errors_in_one_line(debug):
         from graphslam.evaluate import evaluate, read_relations
-        from graphslam.truth import truth_of_files, truth_of_run
+        from graphslam.truth import KnownTruth, truth_of_files, truth_of_run
 
         saved = load(directory)
         reference = read_relations(relations) if relations else None
-        known = None
         if truth:
             known = truth_of_files(truth, list(saved.robots))
-        elif not relations:
-            known = truth_of_run(saved)
-        found = evaluate(
-            saved,
-            known.trajectories if known else None,
-            known.landmarks if known else (),
-            reference,
-        )
+        else:
+            known = KnownTruth({}, ()) if reference else truth_of_run(saved)
+        found = evaluate(saved, known.trajectories, known.landmarks, reference)
         if json:
             typer.echo(to_json(found, "evaluation"), nl=False)
         else:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphslam.config import OdometryConfig, RobotConfig
-from graphslam.geometry import Array, exp, exp_jacobian
+from graphslam.geometry import Array, compose, exp, exp_jacobian, inverse, rotation
 
 
 def wheel_twist(angles_rad: Array, robot: RobotConfig) -> Array:
@@ -129,8 +129,27 @@ def wheel_increments(
     return Increments(exp(twists), cov, J[:, :, [0, 1, 4]])
 
 
-def nominal_calibration(source: str, config: OdometryConfig) -> Calibration:
-    """What is known about a source's calibration before any data: zero, with prior sigmas."""
+def mounted_motion(delta: Array, mount: Array) -> tuple[Array, Array]:
+    """The motion of a frame that sits at ``mount`` (3,) in a body that moves by ``delta`` (3,).
+
+    Returns:
+        ``inverse(mount) delta mount`` (3,), and its derivative (3, 3) by the mount. Turning in
+        place shows the mount's position, driving straight its direction.
+    """
+    moved = compose(inverse(mount), compose(delta, mount))
+    back = rotation(-mount[2])
+    D = np.zeros((3, 3))
+    D[:2, :2] = back @ (rotation(delta[2]) - np.eye(2))
+    D[0, 2], D[1, 2] = moved[1], -moved[0]
+    return moved, D
+
+
+def nominal_calibration(source: str, config: OdometryConfig, mounted: bool) -> Calibration:
+    """What is known about a source's calibration before any data: zero, with prior sigmas.
+
+    With ``mounted`` the last three parameters are where the sensor really sits, relative to where
+    the log says (x m, y m, yaw rad, base axes): the estimated states are rigid to the sensor.
+    """
     sigmas = {
         "given": {},
         "odometry": {
@@ -144,6 +163,12 @@ def nominal_calibration(source: str, config: OdometryConfig) -> Calibration:
             "axle_m": config.axle_sigma_m,
         },
     }[source]
+    if mounted:
+        sigmas |= {
+            "laser_x_m": config.laser_sigma_m,
+            "laser_y_m": config.laser_sigma_m,
+            "laser_yaw_rad": config.laser_sigma_rad,
+        }
     values = np.array(list(sigmas.values()), dtype=float)
     return Calibration(tuple(sigmas), np.zeros(len(values)), np.diag(values**2))
 
