@@ -57,7 +57,8 @@ class OdometryConfig:
     The calibration errors are constant within one interval: translation_scale_sigma and
     rotation_scale_sigma are relative, drift_sigma_rad_per_m is turning per metre driven;
     for wheel angles wheel_radius_sigma_m and axle_sigma_m, and count_sigma_rad per reading.
-    laser_sigma_m, laser_sigma_rad: how far the laser may sit from where the log says.
+    laser_sigma_m, laser_sigma_rad: how far the laser may sit from where the log says;
+    laser_latency_sigma_s: how far its clock may be from the odometry's.
     floor_sigma_m and floor_sigma_rad are added once per interval in which the robot moved.
     calibrate: learn the calibration errors from the estimate while it grows.
     max_gap_s: longest span without odometry that is bridged.
@@ -77,6 +78,7 @@ class OdometryConfig:
     count_sigma_rad: float = 0.003
     laser_sigma_m: float = 0.1
     laser_sigma_rad: float = 0.02
+    laser_latency_sigma_s: float = 0.05
     floor_sigma_m: float = 0.005
     floor_sigma_rad: float = 0.005
     calibrate: bool = True

@@ -10,7 +10,12 @@ import numpy as np
 from graphslam.config import OdometryConfig, RobotConfig
 from graphslam.geometry import Array, between, compose, exp, log, rotation3, wrap
 from graphslam.models import MOTION_SOURCES, compound
-from graphslam.models.motion import Increments, mounted_motion, nominal_calibration
+from graphslam.models.motion import (
+    Compounded,
+    Increments,
+    mounted_motion,
+    nominal_calibration,
+)
 from graphslam.records import Motion, OdometryIncrement, OdometryPose, WheelAngles
 
 IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
@@ -23,6 +28,10 @@ STANDING_SIGMA = 1e-3
 #: burst (a logger that fell behind): its stamps do not tell when the motion took place, so a time
 #: inside it belongs to the reading before, as the order of recording has it
 MAX_SPEED_M_S, MAX_TURN_RAD_S = 20.0, 20.0
+#: share of readings in bursts above which the stamps are not good enough to learn a latency
+MAX_BURST_SHARE = 0.01
+#: ns: step of the difference quotient by latency; about one period of common odometry
+LATENCY_STEP_NS = 50_000_000
 #: m per rad: how much path a turn counts for when a correction is spread over an interval
 TURNING_EFFORT_M = 0.3
 
@@ -40,7 +49,7 @@ class Track:
         self.calibration = nominal_calibration("given", config, False)
         self._mounted = mounted
         self._config, self._robot = config, robot
-        self._count, self._p = 0, 0
+        self._count, self._p, self._bursts = 0, 0, 0
         self._times = np.empty(1024, dtype=np.int64)  # time of the end of each row's interval
         self._rows = np.empty((1024, 0))
         self._poses = np.empty((1024, 3))  # by odometry alone, first reading = origin
@@ -53,8 +62,20 @@ class Track:
     def mount(self) -> Array:
         """Pose (3,) in the base frame of the frame whose motions this track describes."""
         if len(self.calibration.mean) > self._p:
-            return self.calibration.mean[self._p :]
+            return self.calibration.mean[self._p : self._p + 3]
         return np.zeros(3)
+
+    @property
+    def bursty(self) -> bool:
+        """Whether many readings were stamped in bursts: then a shift of time means nothing."""
+        return self._bursts > MAX_BURST_SHARE * self._count
+
+    @property
+    def latency_ns(self) -> int:
+        """By how long the times of states are late against the odometry's; 0 if unobservable."""
+        if len(self.calibration.mean) > self._p and not self.bursty:
+            return round(float(self.calibration.mean[-1]) * 1e9)
+        return 0
 
     def __len__(self) -> int:
         return self._count
@@ -99,7 +120,7 @@ class Track:
             self.source = source
             mounted = self._mounted and source != "given"
             self.calibration = nominal_calibration(source, self._config, mounted)
-            self._p = len(self.calibration.mean) - 3 * mounted  # parameters of the increments
+            self._p = len(self.calibration.mean) - 4 * mounted  # parameters of the increments
             self._rows = np.empty((len(self._times), _ROW_SIZE[source]))
         if self._count == len(self._times):
             self._times = np.concatenate([self._times, np.empty_like(self._times)])
@@ -117,6 +138,7 @@ class Track:
         self._path[n] = self._path[n - 1] + path if n else 0.0
         seconds = 1e-9 * (time_ns - self._times[n - 1]) if n else 0.0
         self._burst[n] = path > MAX_SPEED_M_S * seconds or turn > MAX_TURN_RAD_S * seconds
+        self._bursts += int(self._burst[n])
         self._count += 1
 
     def _increments(self, rows: Array, calibration: Array) -> Increments:
@@ -169,31 +191,44 @@ class Track:
         """The motion from ``start_ns`` to ``end_ns`` with its covariance; thesis 4.4-4.15.
 
         Uses the current ``calibration`` (`pose`, `moved` and `effort` are by nominal values). For
-        a mounted track it is the motion of the frame at ``mount`` in the base.
-        Readings that an interval cuts count with the share of time that lies inside.
+        a mounted track it is the motion of the frame at ``mount`` in the base, the times being
+        ``latency_ns`` late.
         """
-        times, n = self.times, self._count
-        first = int(np.searchsorted(times, start_ns, side="right"))
-        last = min(int(np.searchsorted(times, end_ns, side="left")), n - 1)
-        first = max(first, 1)
-        if end_ns <= start_ns or last < first:
+        whole = self._compounded(start_ns - self.latency_ns, end_ns - self.latency_ns)
+        if whole is None:
             return self._standing(start_ns, end_ns)
-        rows = self._rows[first : last + 1]
-        inside = np.arange(first, last + 1)
-        share = self._share(inside, start_ns, end_ns)
-        parts = self._increments(rows * share[:, None], self.calibration.mean[: self._p])
-        whole = compound(parts)
         delta, d_cal, cov = whole.delta, whole.d_cal, whole.cov
         if len(self.calibration.mean) > self._p:
             delta, d_mount = mounted_motion(delta, self.mount)
             turn = rotation3(-self.mount[2])
-            d_cal = np.column_stack([turn @ d_cal, d_mount])
+            late = self._by_latency(start_ns, end_ns, whole.delta)
+            d_cal = np.column_stack([turn @ d_cal, d_mount, turn @ late])
             cov = turn @ cov @ turn.T
         cov = cov + d_cal @ self.calibration.cov @ d_cal.T
-        length = float(np.hypot(parts.delta[:, 0], parts.delta[:, 1]).sum())
         if self.source != "given":
-            cov = cov + self._floor(length > 0 or delta[2] != 0)
-        return Motion(start_ns, end_ns, delta, cov, d_cal, length)
+            cov = cov + self._floor(whole.length_m > 0 or delta[2] != 0)
+        return Motion(start_ns, end_ns, delta, cov, d_cal, whole.length_m)
+
+    def _compounded(self, start_ns: int, end_ns: int) -> Compounded | None:
+        """The base's motion between two times of the odometry's clock; None when it stands."""
+        times, n = self.times, self._count
+        first = max(int(np.searchsorted(times, start_ns, side="right")), 1)
+        last = min(int(np.searchsorted(times, end_ns, side="left")), n - 1)
+        if end_ns <= start_ns or last < first:
+            return None
+        share = self._share(np.arange(first, last + 1), start_ns, end_ns)
+        rows = self._rows[first : last + 1] * share[:, None]
+        return compound(self._increments(rows, self.calibration.mean[: self._p]))
+
+    def _by_latency(self, start_ns: int, end_ns: int, delta: Array) -> Array:
+        """Derivative (3,) of the base's motion by the latency, /s; a one-sided difference."""
+        if self.bursty:
+            return np.zeros(3)
+        late = self.latency_ns + LATENCY_STEP_NS
+        later = self._compounded(start_ns - late, end_ns - late)
+        change = (later.delta if later is not None else np.zeros(3)) - delta
+        change[2] = wrap(change[2])
+        return np.asarray(change * (1e9 / LATENCY_STEP_NS))
 
     def _standing(self, start_ns: int, end_ns: int) -> Motion:
         p = len(self.calibration.mean)

@@ -27,8 +27,9 @@ def between_states(
     """
     at = states.stamps_ns
     i = np.clip(np.searchsorted(at, times_ns, side="right") - 1, 0, len(at) - 1)
-    odometry_at_state = compose(track.pose(at), track.mount)
-    moved = between(odometry_at_state[i], compose(track.pose(times_ns), track.mount))
+    late = track.latency_ns
+    odometry_at_state = compose(track.pose(at - late), track.mount)
+    moved = between(odometry_at_state[i], compose(track.pose(times_ns - late), track.mount))
     poses = compose(states.poses[i], moved)
     turn = _rotations(states.poses[i, 2])
     if causal:
@@ -67,9 +68,10 @@ def _shares(track: Track, at: IntArray, i: IntArray, times_ns: IntArray) -> Arra
     """How much (0..1) of the motion between state i and the next lies before each time."""
     last = max(int(times_ns.max()), int(at[-1]))
     ends = np.append(at[1:], last)
-    effort_at, effort_end = track.effort(at), track.effort(ends)
+    late = track.latency_ns
+    effort_at, effort_end = track.effort(at - late), track.effort(ends - late)
     whole = effort_end - effort_at
-    part = (track.effort(times_ns) - effort_at[i]) / np.where(whole[i] > 0, whole[i], 1.0)
+    part = (track.effort(times_ns - late) - effort_at[i]) / np.where(whole[i] > 0, whole[i], 1.0)
     return np.clip(np.where(whole[i] > 0, part, 0.0), 0.0, 1.0)
 
 

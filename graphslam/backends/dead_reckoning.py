@@ -30,8 +30,8 @@ class DeadReckoningBackend:
             moved = compose(x, motion.delta)
             self._append(robot, step.time_ns, moved, compose_cov(x, P, motion.delta, motion.cov))
         for seen in step.associations:
+            number = self._states.number(seen.robot, seen.time_ns)
             if isinstance(seen.target, int) and seen.target not in self._landmarks:
-                number = self._states.number(seen.robot, seen.time_ns)
                 x, P = self._poses[seen.robot][number], self._covs[seen.robot][number]
                 model = MODELS[seen.model]
                 G_x, G_z = model.invert_jacobians(seen.z, x)

@@ -98,7 +98,9 @@ class GraphBuilder:
     def diagnose(self, values: gtsam.Values) -> EstimationError:
         """Which variable is indeterminate: QR answers NaN for all of them, Cholesky names one."""
         try:
-            gtsam.Marginals(self.graph, values)
+            marginals = gtsam.Marginals(self.graph, values)
+            for key in values.keys():  # noqa: SIM118 (GTSAM's values are no mapping)
+                marginals.marginalCovariance(key)
         except RuntimeError as error:
             return self.explain(error)
         return self.explain(RuntimeError(""))
@@ -203,18 +205,20 @@ class Isam2Backend:
         except RuntimeError as error:
             raise self._builder.explain(error) from error
 
-    def _marginals(self, values: gtsam.Values) -> gtsam.Marginals | gtsam.ISAM2:
-        """Marginal covariances at ``values``: by Cholesky, or by QR where that gives up."""
+    def _marginals(self, values: gtsam.Values) -> dict[int, Array]:
+        """Marginal covariance of every key: by Cholesky, or by QR where that gives up."""
+        keys = values.keys()
         try:
-            return gtsam.Marginals(self._builder.graph, values)
+            marginals = gtsam.Marginals(self._builder.graph, values)
+            return {key: marginals.marginalCovariance(key) for key in keys}
         except RuntimeError as error:
             isam = gtsam.ISAM2(qr_parameters(self._config))
             isam.update(self._builder.graph, values)
+            found = {key: isam.marginalCovariance(key) for key in keys}
             # QR does not complain about an indeterminate graph, it answers NaN
-            keys = values.keys()
-            if not all(np.isfinite(isam.marginalCovariance(key)).all() for key in keys):
+            if not all(np.isfinite(cov).all() for cov in found.values()):
                 raise self._builder.explain(error) from error
-            return isam
+            return found
 
     def _estimate(self, values: gtsam.Values) -> Estimate:
         builder, marginals = self._builder, self._marginals(values)
@@ -222,14 +226,14 @@ class Isam2Backend:
         for robot in sorted(builder.robots):
             keys = [builder.state_key(robot, n) for n in range(len(builder.states.times[robot]))]
             poses = np.array([factors.array3(values.atPose2(k)) for k in keys])
-            covs = np.array([marginals.marginalCovariance(k) for k in keys])
+            covs = np.array([marginals[k] for k in keys])
             states[robot] = Trajectory(
                 builder.states.stamps(robot), poses, _to_world(covs, poses[:, 2])
             )
         landmarks = {}
         for landmark, dim in builder.landmark_dims.items():
             key = factors.landmark_key(landmark)
-            cov = marginals.marginalCovariance(key)
+            cov = marginals[key]
             if dim == 3:
                 mean = factors.array3(values.atPose2(key))
                 cov = _to_world(cov[None], mean[None, 2])[0]

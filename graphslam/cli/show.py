@@ -67,6 +67,8 @@ def smoothed(result: Result, directory: Path) -> None:
     ]
     seconds, factor = summary["stages"]["all"], summary["real_time_factor"]
     console.print(f"{', '.join(parts)}; {seconds:.1f} s, {factor:.0f} times real time")
+    if "stamps" in summary["notes"]:
+        console.print(f"stamps: {summary['notes']['stamps']}")
     _reasons(console, "rejected", summary["rejected"])
     _reasons(console, "dropped", summary["dropped"])
     for warning in summary["warnings"]:
@@ -165,7 +167,7 @@ def _scan(topic: TopicInfo) -> str:
     scan = topic.scan
     parts = [
         f"{scan.beams} beams over {degrees(scan.field_of_view_rad):.0f} deg",
-        f"range {scan.range_min_m:g} to {scan.range_max_m:g} m",
+        f"range {_number(scan.range_min_m)} to {_number(scan.range_max_m)} m",
     ]
     if topic.dropouts is not None:
         parts.append(f"{100 * topic.dropouts:.1f} % of the beams without a range")

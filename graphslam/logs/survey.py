@@ -23,12 +23,12 @@ _SAMPLE_BLOCKS, _SAMPLE_PER_BLOCK = 16, 16
 
 @dataclass(frozen=True, slots=True)
 class ScanShape:
-    """What a laser's messages say about it: beams, field of view, limits of range."""
+    """What a laser's messages say about it; a limit of range is None where it is not finite."""
 
     beams: int
     field_of_view_rad: float
-    range_min_m: float
-    range_max_m: float
+    range_min_m: float | None
+    range_max_m: float | None
 
 
 def scan_shape(files: Sequence[McapFile], topic: Topic) -> ScanShape | None:
@@ -36,7 +36,10 @@ def scan_shape(files: Sequence[McapFile], topic: Topic) -> ScanShape | None:
     for message in samples(files, topic):
         beams = len(message.ranges)
         view = abs(float(message.angle_increment)) * max(beams - 1, 0)
-        return ScanShape(beams, view, float(message.range_min), float(message.range_max))
+        low, high = float(message.range_min), float(message.range_max)
+        return ScanShape(
+            beams, view, low if np.isfinite(low) else None, high if np.isfinite(high) else None
+        )
     return None
 
 

@@ -147,8 +147,9 @@ def mounted_motion(delta: Array, mount: Array) -> tuple[Array, Array]:
 def nominal_calibration(source: str, config: OdometryConfig, mounted: bool) -> Calibration:
     """What is known about a source's calibration before any data: zero, with prior sigmas.
 
-    With ``mounted`` the last three parameters are where the sensor really sits, relative to where
-    the log says (x m, y m, yaw rad, base axes): the estimated states are rigid to the sensor.
+    With ``mounted`` the last four parameters are where the sensor really sits, relative to where
+    the log says (x m, y m, yaw rad, base axes), and by how long its stamps are late against the
+    odometry's (s): the estimated states are rigid to the sensor and its clock.
     """
     sigmas = {
         "given": {},
@@ -168,6 +169,7 @@ def nominal_calibration(source: str, config: OdometryConfig, mounted: bool) -> C
             "laser_x_m": config.laser_sigma_m,
             "laser_y_m": config.laser_sigma_m,
             "laser_yaw_rad": config.laser_sigma_rad,
+            "laser_latency_s": config.laser_latency_sigma_s,
         }
     values = np.array(list(sigmas.values()), dtype=float)
     return Calibration(tuple(sigmas), np.zeros(len(values)), np.diag(values**2))
@@ -183,11 +185,12 @@ MOTION_SOURCES: dict[str, Callable[[Array, Array, RobotConfig, OdometryConfig], 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Compounded:
-    """A chain of increments as one motion; see `compound`."""
+    """A chain of increments as one motion; see `compound`. ``length_m`` is the path."""
 
     delta: Array
     cov: Array
     d_cal: Array
+    length_m: float
 
 
 def compound(parts: Increments) -> Compounded:
@@ -213,4 +216,5 @@ def compound(parts: Increments) -> Compounded:
     E[:, 2, 2] = 1.0
     cov = (E @ parts.cov @ E.mT).sum(axis=0)
     d_cal = (E @ parts.d_cal).sum(axis=0)
-    return Compounded(np.array([x[-1], y[-1], before[-1]]), cov, d_cal)
+    length_m = float(np.hypot(dx, dy).sum())
+    return Compounded(np.array([x[-1], y[-1], before[-1]]), cov, d_cal, length_m)

@@ -1,0 +1,89 @@
+"""Writes docs/configuration.md from the dataclasses in `graphslam.config`.
+
+Run: python docs/configuration.py   (or `make docs`)
+"""
+
+import dataclasses
+import inspect
+import json
+import re
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from graphslam.config import Config
+
+PAGE = Path(__file__).with_suffix(".md")
+
+HEAD = """\
+# Configuration
+
+Made from `graphslam/config.py` by `make docs`; change it there.
+
+One tree of settings. `graphslam smooth` takes the defaults, then `--config FILE.toml`, then its
+own options (`--backend isam2` is `backend.name`, `--front-end` is `front_end.name`, `--start` is
+`start.from_truth` or `start.poses.ROBOT`), then every `--set KEY=VALUE`; what comes later wins.
+Keys carry their unit. An unknown key, a wrong type or a value out of range is an error that names
+the key. `config.toml` in a result folder is the whole tree as used; `--config` takes it back.
+
+```
+graphslam smooth LOG.mcap -o DIR --set keyframe.mode=all --set robust.kernel=none
+```
+"""
+
+
+def page() -> str:
+    """The whole page."""
+    hints = typing.get_type_hints(Config)
+    parts = [HEAD]
+    for field in dataclasses.fields(Config):
+        kind, title = hints[field.name], f"[{field.name}]"
+        if typing.get_origin(kind) is Mapping:  # one table per name
+            kind, title = typing.get_args(kind)[1], f"[{field.name}.NAME]"
+        parts.append(section(title, kind))
+    return "\n".join(parts)
+
+
+def section(title: str, kind: Any) -> str:
+    """One table of settings: its docstring, then keys with values and defaults."""
+    hints, defaults = typing.get_type_hints(kind), kind()
+    rows = [
+        f"| `{field.name}` | {values(hints[field.name])} | `{default(defaults, field.name)}` |"
+        for field in dataclasses.fields(kind)
+    ]
+    text = prose(inspect.cleandoc(kind.__doc__), list(hints))
+    return "\n".join(
+        [f"## `{title}`", "", text, "", "| key | values | default |", "|---|---|---|", *rows, ""]
+    )
+
+
+def prose(text: str, keys: list[str]) -> str:
+    """A docstring as Markdown: names of keys, and tables in brackets, as code."""
+    text = re.sub(r"\n +", "\n", text)
+    for key in keys:  # one without an underscore is also a word, unless a clause begins with it
+        pattern = rf"\b{key}\b" if "_" in key else rf"(?m)(?:^|(?<=[.,;] )){key}(?=:)"
+        text = re.sub(pattern, f"`{key}`", text)
+    return re.sub(r"\[.*?\]", r"`\g<0>`", text)
+
+
+def values(kind: Any) -> str:
+    """What a key takes, in words."""
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is Literal:
+        return ", ".join(f"`{value}`" for value in arguments)
+    if origin is Mapping:
+        return f"table of {values(arguments[1])}"
+    if origin is tuple:
+        return f"list of {values(arguments[0])}s"
+    return {float: "number", int: "whole number", bool: "`true`, `false`", str: "text"}[kind]
+
+
+def default(defaults: Any, name: str) -> str:
+    """A default as TOML; a table is empty."""
+    value = getattr(defaults, name)
+    return "{}" if isinstance(value, Mapping) else json.dumps(value)
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")
