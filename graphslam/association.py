@@ -57,7 +57,10 @@ class Compared:
 
 
 def gate_distance(probability: float, dof: IntArray | int) -> Array:
-    """Chi-square quantile: the squared distance that a true pair stays below, eq. 3.25."""
+    """Chi-square quantiles, shaped like ``dof``: what a true pair's d² (0-d or (k,)) stays below.
+
+    Thesis eq. 3.25; 1 to 9 degrees of freedom.
+    """
     return np.asarray(_quantiles(probability)[np.asarray(dof) - 1])
 
 

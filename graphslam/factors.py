@@ -47,7 +47,7 @@ def world_from_body(heading_rad: float) -> Array:
 
 
 def gaussian(cov: Array) -> gtsam.noiseModel.Base:
-    """Noise model of a covariance.
+    """Noise model of a covariance (k, k).
 
     Raises:
         EstimationError: the covariance is not positive definite.

@@ -37,7 +37,7 @@ def line_parameters(pose: Array, cov: Array) -> tuple[float, float, Array]:
 
 
 def make_landmark(entry: Entry, mean: Array, cov: Array) -> Landmark:
-    """Bookkeeping and estimate of one landmark as a record."""
+    """Bookkeeping and estimate (``mean`` (2,) or (3,), ``cov``; world axes) as one record."""
     if entry.kind == "point":
         position = np.array([mean[0], mean[1], np.nan])
         extent = np.array([mean, mean])

@@ -1,36 +1,22 @@
 """Where evaluation takes its truth from: the logs of a run, another log, or TUM files."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 from graphslam.config import Config
 from graphslam.errors import LogError, OutputError
-from graphslam.logs import LogSet, read_truth
+from graphslam.logs import KnownTruth, LogSet, read_truth
 from graphslam.records import Trajectory, TrueLandmark, Truth
 from graphslam.results import SavedResult, read_trajectory
 
 _NO_TRUTH = "holds no true poses or landmarks; give --truth or --relations"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class KnownTruth:
-    """True trajectories of robots' bases and true landmarks, world frame; either may be empty."""
-
-    trajectories: Mapping[str, Trajectory]
-    landmarks: tuple[TrueLandmark, ...]
-
-    def __bool__(self) -> bool:
-        """Whether there is anything to compare with."""
-        return bool(self.trajectories or self.landmarks)
-
-
 def truth_of_logs(log: LogSet, config: Config) -> KnownTruth:
     """What open logs say about the truth, perhaps nothing."""
     if not any(topic.record in (Truth, TrueLandmark) for topic in log.topics):
         return KnownTruth({}, ())  # spares reading them once more
-    found = read_truth([file.path for file in log.files], config)
-    return KnownTruth(found.trajectories, found.landmarks)
+    return read_truth([file.path for file in log.files], config)
 
 
 def truth_of_run(saved: SavedResult) -> KnownTruth:
@@ -44,10 +30,9 @@ def truth_of_run(saved: SavedResult) -> KnownTruth:
     for log, sha256 in zip(logs, found.sha256, strict=True):
         if log["sha256"] != sha256:
             raise LogError(f"{log['path']}: is not the log that was smoothed; give --truth")
-    truth = KnownTruth(found.trajectories, found.landmarks)
-    if not truth:
+    if not found:
         raise LogError(f"{', '.join(log['path'] for log in logs)}: {_NO_TRUTH}")
-    return truth
+    return found
 
 
 def truth_of_files(sources: Sequence[str], robots: Sequence[str]) -> KnownTruth:
@@ -66,13 +51,13 @@ def truth_of_files(sources: Sequence[str], robots: Sequence[str]) -> KnownTruth:
     for source in sources:
         if source.endswith(".mcap"):
             found = read_truth([Path(source)], Config())
-            if not found.trajectories and not found.landmarks:
+            if not found:
                 raise LogError(f"{source}: {_NO_TRUTH}")
             trajectories |= found.trajectories
             landmarks += found.landmarks
-            continue
-        robot, path = _robot_and_path(source, robots)
-        trajectories[robot] = read_trajectory(path)
+        else:
+            robot, path = _robot_and_path(source, robots)
+            trajectories[robot] = read_trajectory(path)
     return KnownTruth(trajectories, tuple(landmarks))
 
 

@@ -110,8 +110,8 @@ def test_lines_pair_only_where_they_overlap_or_nearly(gap, inside, side, turned)
 
 @given(st.floats(-3.14, 3.14), st.floats(-0.55, 0.55), st.booleans())
 def test_undirected_lines_are_compared_modulo_pi(direction, error, opposite):
-    """3.24: the measured direction is turned by pi when that brings it nearer, and then d² is that of
-    the small difference, not of the big one."""
+    """3.24: the measured direction is turned by pi when that brings it nearer, and then d² is that
+    of the small difference, not of the big one."""
     wall = np.array([6.0, 3.0, direction])
     pose = np.array([6.0, 3.5, 0.0])
     turned = float(wrap(direction + error + (np.pi if opposite else 0.0)))
@@ -171,7 +171,13 @@ def test_ends_count_only_where_both_sides_know_them(kind, whole, length, model):
 def test_nothing_seen_or_nothing_known_gives_no_pairs(n):
     seen = [see_point([5, 4])] * n
     pairs = candidate_pairs(
-        seen, POSE, np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0, bool), np.zeros(0, bool), DIRECTED
+        seen,
+        POSE,
+        np.zeros((0, 3)),
+        np.zeros((0, 2)),
+        np.zeros(0, bool),
+        np.zeros(0, bool),
+        DIRECTED,
     )
     assert len(pairs.observation) == len(pairs.model) == 0
     empty = (np.zeros((0, *s)) for s in [(3,), *[(3, 3)] * 3])
@@ -343,9 +349,7 @@ def test_optimal_assignment_equals_brute_force(table):
 def test_greedy_assignment_takes_the_smallest_left(table):
     """The thesis' words: pick the smallest element, strike its row and column, repeat."""
     cost, gate = table
-    cells = sorted(
-        (cost[i, j], i, j) for i, j in np.ndindex(cost.shape) if cost[i, j] < gate[i, j]
-    )
+    cells = sorted((cost[i, j], i, j) for i, j in np.ndindex(cost.shape) if cost[i, j] < gate[i, j])
     expected, rows, columns = [], set(), set()
     for _, i, j in cells:
         if i not in rows and j not in columns:

@@ -77,7 +77,9 @@ def test_set_below_a_value_says_what_is_no_table(tmp_path):
 
 
 def test_unknown_key_in_a_file_is_named(tmp_path):
-    with pytest.raises(ConfigError, match=r"keyframe\.distnce_m: unknown key; did you mean distance_m"):
+    with pytest.raises(
+        ConfigError, match=r"keyframe\.distnce_m: unknown key; did you mean distance_m"
+    ):
         from_text(tmp_path, "[keyframe]\ndistnce_m = 1.0\n")
 
 
@@ -188,7 +190,8 @@ def tables(kind):
 
 @given(tables(Config))
 def test_dump_then_load_is_the_same_configuration(config):
-    """config.toml in a result folder repeats the run: every type, to the last digit of every float."""
+    """config.toml in a result folder repeats the run: every type, to the last digit of every
+    float."""
     import tomllib
 
     text = dump_config(config)

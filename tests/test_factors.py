@@ -116,7 +116,8 @@ def test_line_factor_has_no_information_along_the_line(seed):
 
 
 def test_line_gauge_ties_only_along_the_line():
-    """One row of information, of a sigma that says so; across the wall and in direction it is free."""
+    """One row of information, of a sigma that says so; across the wall and in direction it is
+    free."""
     x, z = np.array([1.0, 2.0, 0.5]), np.array([3.0, 1.0, 0.2])
     seen = Association("r", 0, 0, "line", z, np.eye(3))
     factor = factors.line_gauge_factor(X, T, seen)
@@ -130,8 +131,8 @@ def test_line_gauge_ties_only_along_the_line():
 
 
 def test_motion_factor_takes_its_covariance_along_the_start_frame():
-    """The robot turned left by 90°: an error of e along the start's x axis must weigh e²/σ_x². GTSAM
-    wants the end's frame; without the conversion the sigmas would be exchanged."""
+    """The robot turned left by 90°: an error of e along the start's x axis must weigh e²/σ_x².
+    GTSAM wants the end's frame; without the conversion the sigmas would be exchanged."""
     sigma = np.array([0.5, 0.1, 0.02])
     start, delta = np.array([4.0, -2.0, 0.8]), np.array([1.0, 1.0, np.pi / 2])
     motion = Motion(0, 1, delta, np.diag(sigma**2), np.zeros((3, 0)), 1.0)
@@ -140,7 +141,9 @@ def test_motion_factor_takes_its_covariance_along_the_start_frame():
         off = delta.copy()
         off[axis] += 0.3
         np.testing.assert_allclose(
-            squared_norm(factor, at(start, compose(start, off))), (0.3 / sigma[axis]) ** 2, rtol=1e-12
+            squared_norm(factor, at(start, compose(start, off))),
+            (0.3 / sigma[axis]) ** 2,
+            rtol=1e-12,
         )
 
 
@@ -151,7 +154,7 @@ def test_closure_factor_is_the_pose_of_the_first_seen_from_the_other():
     factor = factors.closure_factor(X, T, closure, PLAIN)
     exact = at(compose(other, delta), other)
     np.testing.assert_allclose(squared_norm(factor, exact), 0, atol=EXACT)
-    off = at(compose(other, delta + [0.2, 0, 0]), other)
+    off = at(compose(other, delta + np.array([0.2, 0, 0])), other)
     np.testing.assert_allclose(squared_norm(factor, off), 1.0, rtol=1e-12)  # 0.2 m, sigma 0.2 m
 
 
@@ -160,7 +163,7 @@ def test_start_factor_takes_its_covariance_along_world_axes():
     start = Start(np.array([2.0, 3.0, np.pi / 2]), np.diag([1e-4, 1.0, 1e-2]))
     factor = factors.start_factor(X, start)
     values = gtsam.Values()
-    values.insert(X, factors.pose2(start.pose + [0.02, 0.0, 0.0]))
+    values.insert(X, factors.pose2(start.pose + np.array([0.02, 0.0, 0.0])))
     np.testing.assert_allclose(squared_norm(factor, values), 4.0, rtol=1e-12)
 
 
@@ -227,9 +230,7 @@ def corridor_steps(model, along_sigma_m, seed=0):
         for wall, (y, direction) in enumerate([(1.0, np.pi), (-1.0, 0.0)]):
             z = between(true, np.array([(begin + end) / 2, y, direction]))
             z = compose(z, rng.normal(0, [0, 0.01, 0.005]))
-            seen.append(
-                Association("r", k, wall, model, z, rotate_cov(cov, z[2]))
-            )
+            seen.append(Association("r", k, wall, model, z, rotate_cov(cov, z[2])))
         steps.append(Step(k, motions=motions, associations=tuple(seen)))
     return steps
 
@@ -260,8 +261,8 @@ def test_corridor_line_landmarks_keep_what_odometry_says_along_the_walls(backend
 
 
 def test_corridor_naive_middles_are_wrong_and_confident():
-    """The same walls with their seen middle taken as a point with a large sigma along the wall (1.4 m):
-    the end comes out metres short with a sigma of 0.2 m. Shows that the test above can fail."""
+    """The same walls with their seen middle taken as a point with a large sigma along the wall (1.4
+    m): the end comes out metres short with a sigma of 0.2 m. Shows that the test above can fail."""
     distance, sigma = drive_corridor("isam2", "segment", along_sigma_m=1.4)
     assert distance == pytest.approx(19, abs=1.5)
     assert sigma < 0.25
@@ -283,7 +284,7 @@ def test_point_rows_measure_bearing_and_range():
     for name in ("point", "robot-point"):
         assert isinstance(MODELS[name], PointModel)
         seen, x, t = random_case(name, 1, error=0.0)
-        off = seen.z + [0.01, 0.0]
+        off = seen.z + np.array([0.01, 0.0])
         moved = Association("r", 0, 0, name, off, np.diag([1e-4, 1e4]))
         factor = factors.observation_factor(X, T, moved, PLAIN, x, t)
         np.testing.assert_allclose(squared_norm(factor, at(x, t)), 1.0, rtol=1e-9)

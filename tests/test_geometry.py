@@ -26,7 +26,7 @@ from graphslam.geometry import (
     wrap,
 )
 
-#: coordinates reach 1e3 m, where one rounding is 1e-13; a chain of three poses rounds about ten times
+#: coordinates reach 1e3 m, where one rounding is 1e-13; three poses in a chain round ten times
 CHAIN = 1e-11
 #: finite differences of functions of size ten, see `finite_differences.STEP`; a wrong entry is 1e-2
 DIFFERENCES = 1e-8
@@ -63,7 +63,9 @@ def test_wrap_returns_angles_inside_to_the_digit(angle):
 
 @given(st.floats(-1e4, 1e4))
 def test_wrap_lands_in_one_turn_and_changes_by_whole_turns(angle):
-    rounding = 4 * np.spacing(abs(angle) + np.pi)  # the turns taken away round like the angle itself
+    rounding = 4 * np.spacing(
+        abs(angle) + np.pi
+    )  # the turns taken away round like the angle itself
     wrapped = float(wrap(angle))
     assert -np.pi - rounding <= wrapped <= np.pi + rounding
     turns = (angle - wrapped) / (2 * np.pi)
@@ -214,9 +216,7 @@ def test_compose_cov_equals_monte_carlo():
     a, b = np.array([1.0, 2.0, 2.2]), np.array([3.0, -1.0, 0.4])
     cov_a, cov_b = np.diag([4e-4, 1e-4, 1e-5]), np.diag([9e-4, 1e-6, 4e-5])
     n = 40_000
-    ends = compose(
-        rng.multivariate_normal(a, cov_a, n), rng.multivariate_normal(b, cov_b, n)
-    )
+    ends = compose(rng.multivariate_normal(a, cov_a, n), rng.multivariate_normal(b, cov_b, n))
     cov = compose_cov(a, cov_a, b, cov_b)
     d = np.diag(cov)
     sampling = np.sqrt((np.outer(d, d) + cov**2) / n)  # sigma of a sample covariance's entry

@@ -58,7 +58,9 @@ class Run:
 def test_scan_waits_for_the_odometry_reading_after_it():
     """A scan between two readings needs the later one; released at once, it would be placed by a
     robot that stands."""
-    run = Run([odometry("a", 0), scan("a", 0.5), odometry("a", 1), scan("a", 1.5), odometry("a", 2)])
+    run = Run(
+        [odometry("a", 0), scan("a", 0.5), odometry("a", 1), scan("a", 1.5), odometry("a", 2)]
+    )
     assert [type(m).__name__ for m in run.released] == [
         "OdometryPose", "Scan", "OdometryPose", "Scan", "OdometryPose",
     ]  # fmt: skip
@@ -73,7 +75,13 @@ def test_scan_at_the_stamp_of_a_reading_needs_no_later_one():
 
 def test_order_of_time_is_kept_over_robots():
     """Robot b's scan may not overtake robot a's earlier one that still waits."""
-    messages = [odometry("a", 0), odometry("b", 0), scan("a", 0.5), scan("b", 0.6), odometry("b", 1)]
+    messages = [
+        odometry("a", 0),
+        odometry("b", 0),
+        scan("a", 0.5),
+        scan("b", 0.6),
+        odometry("b", 1),
+    ]
     run = Run([*messages, odometry("a", 2), odometry("b", 2)])
     times = [m.time_ns for m in run.released]
     assert times == sorted(times)
@@ -83,8 +91,8 @@ def test_order_of_time_is_kept_over_robots():
 
 
 def test_one_robots_silence_delays_the_others_by_the_gap_at_most():
-    """Robot b's odometry ends at 0 s, its scan of 3 s can never be covered: what robot a does is held
-    until 5 s have passed, not until the end of the log."""
+    """Robot b's odometry ends at 0 s, its scan of 3 s can never be covered: what robot a does is
+    held until 5 s have passed, not until the end of the log."""
     messages = [odometry("b", 0)]
     for k in range(200):
         t = 0.1 * k

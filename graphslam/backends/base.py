@@ -42,7 +42,7 @@ class Backend(Protocol):
         ...
 
     def landmark_means(self, landmarks: Sequence[int]) -> list[Array]:
-        """Current estimates of the landmarks, without covariance (cheap)."""
+        """Current estimates (2,) or (3,) of the landmarks, without covariance (cheap)."""
         ...
 
     def finish(self) -> Estimate:

@@ -27,7 +27,7 @@ from graphslam.cli.arguments import (
 from graphslam.cli.terminal import errors_in_one_line, progress_bar
 from graphslam.config import Config, load_config
 from graphslam.errors import OutputError
-from graphslam.logs import IMPORTERS, LogSet, inspect_logs, open_logs
+from graphslam.logs import IMPORTERS, KnownTruth, LogSet, inspect_logs, open_logs
 from graphslam.records import Result
 from graphslam.results import check_target, load, save, to_json
 
@@ -178,7 +178,7 @@ def evaluate_command(
     """
     with errors_in_one_line(debug):
         from graphslam.evaluate import evaluate, read_relations
-        from graphslam.truth import KnownTruth, truth_of_files, truth_of_run
+        from graphslam.truth import truth_of_files, truth_of_run
 
         saved = load(directory)
         reference = read_relations(relations) if relations else None

@@ -66,7 +66,7 @@ def smoothed(result: Result, directory: Path) -> None:
         if counts[key]
     ]
     seconds, factor = summary["stages"]["all"], summary["real_time_factor"]
-    console.print(f"{', '.join(parts)}; {seconds:.1f} s, {factor:.0f} times real time")
+    console.print(f"{', '.join(parts)}; {seconds:.1f} s, {factor:.3g} x real time")
     if "stamps" in summary["notes"]:
         console.print(f"stamps: {summary['notes']['stamps']}")
     _reasons(console, "rejected", summary["rejected"])

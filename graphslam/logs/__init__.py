@@ -6,16 +6,16 @@
 from graphslam.logs.importers import IMPORTERS, ImportSummary, pose_stamp_ns
 from graphslam.logs.inspect import LogInfo, RobotInfo, TopicInfo, inspect_logs
 from graphslam.logs.log_set import LogFile, LogSet, open_logs
-from graphslam.logs.truth import LogTruth, read_truth
+from graphslam.logs.truth import KnownTruth, read_truth
 from graphslam.logs.writer import LogWriter
 
 __all__ = [
     "IMPORTERS",
     "ImportSummary",
+    "KnownTruth",
     "LogFile",
     "LogInfo",
     "LogSet",
-    "LogTruth",
     "LogWriter",
     "RobotInfo",
     "TopicInfo",

@@ -18,6 +18,7 @@ from graphslam.logs.decoders import TopicContext
 from graphslam.logs.log_set import LogFile, decode_message, describe_damage
 from graphslam.logs.mcap_file import McapFile, open_mcap, raw_messages
 from graphslam.logs.schemas import SIGHTING
+from graphslam.logs.recording import place_late
 from graphslam.logs.survey import ScanShape, scan_shape, survey_topics
 from graphslam.logs.topics import (
     ODOMETRY_KINDS,
@@ -184,10 +185,12 @@ def _read_topic(
     reading = _Reading([], [], [], 0, 0, Counter())
     for file in files:
         line = order.TimeLine(round(config.logs.reorder_s * 1e9))
-        for raw in raw_messages(file, {topic.name}):
-            message = decode_message(raw, topic, context, dropped)
-            if message is None:
-                continue
+        decoded = (
+            (topic.name, message, raw.log_time_ns)
+            for raw in raw_messages(file, {topic.name})
+            if (message := decode_message(raw, topic, context, dropped)) is not None
+        )
+        for _, message, _ in place_late(decoded, order.SAMPLED):
             reading.stamps_ns.append(message.stamp_ns)
             if isinstance(message, records.Scan):
                 reading.beams += len(message.ranges)

@@ -11,6 +11,7 @@ from graphslam.errors import LogError
 from graphslam.logs import order, schemas
 from graphslam.logs.decoders import DECODERS, TopicContext, UnusableError
 from graphslam.logs.mcap_file import McapFile, RawMessage, open_mcap, raw_messages
+from graphslam.logs.recording import Recorded, place_late
 from graphslam.logs.survey import survey_topics
 from graphslam.logs.topics import ODOMETRY_KINDS, Topic, choose_topics, find_topics
 from graphslam.records import Message
@@ -146,12 +147,17 @@ class _FileReader:
 
     def messages(self) -> Iterator[Message]:
         """Sorted messages of this file."""
+        for topic, message, _ in place_late(self._recorded(), order.SAMPLED):
+            yield from self.line.push(topic, message)
+        yield from self.line.finish()
+
+    def _recorded(self) -> Iterator[Recorded]:
+        """Messages in the order of recording, with their topic and log time."""
         for raw in raw_messages(self._file, self._topics.keys()):
             topic, context = self._topics[raw.topic], self._contexts[raw.topic]
             message = decode_message(raw, topic, context, self.dropped)
             if message is not None:
-                yield from self.line.push(raw.topic, message)
-        yield from self.line.finish()
+                yield raw.topic, message, raw.log_time_ns
 
 
 def _warn_of_stamps(file: McapFile, topic: str, counts: Counter[str]) -> list[str]:

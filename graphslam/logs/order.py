@@ -30,7 +30,7 @@ _LONG_AGO, _FAR_AHEAD = -(1 << 63), 1 << 63
 _Odometry = records.OdometryPose | records.WheelAngles | records.OdometryIncrement
 # What samples a continuous process, so that the order of recording is evidence of time.
 # Increments and relative poses name both of their times themselves.
-_SAMPLED = (
+SAMPLED = (
     records.OdometryPose,
     records.WheelAngles,
     records.Scan,
@@ -53,8 +53,8 @@ class TimeLine:
     A stamp that a later message of its topic contradicts by being earlier is a *glitch*: stamped
     too late. Its message is placed between its neighbours in the order of recording (``time_ns``),
     in proportion to what was recorded between them on *all* topics, so that a scan and the odometry
-    recorded around it stay in order when both are late; ``stamp_ns`` stays. Two messages that contradict each other and
-    nothing else are a mere swap and go by their stamps. A message may come up to ``window_ns``
+    recorded around it stay in order when both are late; ``stamp_ns`` stays. Two messages that
+    contradict each other and nothing else are a mere swap and go by their stamps. A message may come up to ``window_ns``
     after younger ones and is still placed; one older than what was already passed on is dropped.
 
     Believing recording over stamps is right because one topic has one publisher and one transport,
@@ -81,6 +81,7 @@ class TimeLine:
             self.counts[topic] = Counter()
             self._repairs[topic] = _Repair(self._window_ns, self.counts[topic])
         self._recorded += 1
+        self.counts[topic][GLITCH] += message.time_ns != message.stamp_ns
         self._place(topic, self._repairs[topic].push(message, self._recorded))
         for name, repair in self._repairs.items():
             # a rare topic must not hold up the others until more of it has come
@@ -134,9 +135,10 @@ class _Repair:
         return self._placed_ns if self._stamps else _FAR_AHEAD
 
     def push(self, message: Message, number: int) -> list[Message]:
-        if not isinstance(message, _SAMPLED):
+        if not isinstance(message, SAMPLED):
             return [message]
-        stamp_ns, stamps = message.stamp_ns, self._stamps
+        # where it is placed so far, see `recording`; usually its stamp
+        stamp_ns, stamps = message.time_ns, self._stamps
         if stamp_ns < self._placed_ns - self._window_ns:
             # refused here already, lest it makes glitches of everything before it
             self._counts[TOO_LATE] += 1

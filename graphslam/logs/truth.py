@@ -16,18 +16,22 @@ from graphslam.records import Trajectory, TrueLandmark, Truth
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LogTruth:
-    """True trajectories of robots' bases and true landmarks, world frame.
+class KnownTruth:
+    """True trajectories of robots' bases and true landmarks, world frame; either may be empty.
 
-    Covariances are NaN. ``sha256`` are those of the files, in their order.
+    Covariances are NaN. ``sha256`` are those of the logs it was read from, in their order.
     """
 
     trajectories: Mapping[str, Trajectory]
     landmarks: tuple[TrueLandmark, ...]
-    sha256: tuple[str, ...]
+    sha256: tuple[str, ...] = ()
+
+    def __bool__(self) -> bool:
+        """Whether there is anything to compare with."""
+        return bool(self.trajectories or self.landmarks)
 
 
-def read_truth(paths: Sequence[Path], config: Config) -> LogTruth:
+def read_truth(paths: Sequence[Path], config: Config) -> KnownTruth:
     """All TruePose and TrueLandmark messages of ``paths``; both may be empty.
 
     Poses are sorted by header stamp. A landmark told more than once (one per robot or file) is
@@ -49,7 +53,7 @@ def read_truth(paths: Sequence[Path], config: Config) -> LogTruth:
                 poses.setdefault(topic.robot, []).append(message)
             elif isinstance(message, TrueLandmark):
                 landmarks[message.identity or f"without identity {len(landmarks)}"] = message
-    return LogTruth(
+    return KnownTruth(
         {robot: _trajectory(found) for robot, found in sorted(poses.items())},
         tuple(landmarks.values()),
         tuple(file.sha256 for file in files),

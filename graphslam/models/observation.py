@@ -38,7 +38,7 @@ class ObservationModel(Protocol):
         ...
 
     def predict(self, x: Array, t: Array) -> Array:
-        """Expected measurement of target ``t`` from pose ``x``."""
+        """Expected measurement (..., k) of target ``t`` from pose ``x``."""
         ...
 
     def residual(self, z: Array, x: Array, t: Array) -> Array:
@@ -54,7 +54,7 @@ class ObservationModel(Protocol):
         ...
 
     def invert(self, z: Array, x: Array) -> Array:
-        """The target that ``z`` from ``x`` describes, thesis eq. 4.24."""
+        """The target (..., dim) that ``z`` from ``x`` describes, thesis eq. 4.24."""
         ...
 
     def invert_jacobians(self, z: Array, x: Array) -> tuple[Array, Array]:
