@@ -33,12 +33,12 @@ READINGS = np.arange(0, 12.01, 0.1)
 STATES_S = [1.0, 3.0, 4.0, 7.0, 11.0]
 
 
-def states(rng=None, size=0.05):
+def states():
     """States that odometry's curve misses by some centimetres, in another world frame."""
-    rng = np.random.default_rng(9) if rng is None else rng
+    rng = np.random.default_rng(9)
     world = np.array([3.0, -2.0, 1.0])
     poses = np.array(
-        [compose(compose(world, curve(t)), size * rng.normal(size=3)) for t in STATES_S]
+        [compose(compose(world, curve(t)), 0.05 * rng.normal(size=3)) for t in STATES_S]
     )
     roots = 0.05 * rng.normal(size=(len(STATES_S), 3, 3))
     covs = roots @ roots.mT + 1e-5 * np.eye(3)

@@ -253,9 +253,9 @@ class BatchBackend(Isam2Backend):
 
 
 def optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
-    """Levenberg-Marquardt from ``values`` until the error changes by less than 1e-9 of itself."""
+    """Levenberg-Marquardt from ``values`` until the error changes by less than 1e-7 of itself."""
     parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setRelativeErrorTol(1e-9)
+    parameters.setRelativeErrorTol(1e-7)
     parameters.setAbsoluteErrorTol(1e-9)
     parameters.setMaxIterations(200)
     return gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
