@@ -23,6 +23,8 @@ BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 
 #: rad: lines that differ more in direction are never compared, however uncertain the heading
 MAX_ANGLE_RAD = 0.6
+#: m, rad: scale of how far a right pair is apart before any covariance is known
+TYPICAL_M, TYPICAL_RAD = 0.1, 0.05
 #: m: lengths of a segment seen whole twice agree within this; else only its line is used
 LENGTH_TOLERANCE_M = 0.15
 
@@ -32,13 +34,22 @@ class Pairs:
     """Candidate pairs (k,) of observation and landmark that passed the cheap gates.
 
     ``model`` names the row of `MODELS` per pair; ``flipped``: the measured direction is to be
-    turned by pi before it is compared (eq. 3.24).
+    turned by pi before it is compared (eq. 3.24). ``miss`` is a crude distance, without covariance:
+    how many times `TYPICAL_M` and `TYPICAL_RAD` the two are apart.
     """
 
     observation: IntArray
     landmark: IntArray
     model: tuple[str, ...]
     flipped: BoolArray
+    miss: Array
+
+    def only(self, keep: BoolArray) -> "Pairs":
+        """The pairs for which ``keep`` (k,) holds."""
+        models = tuple(m for m, k in zip(self.model, keep, strict=True) if k)
+        return Pairs(
+            self.observation[keep], self.landmark[keep], models, self.flipped[keep], self.miss[keep]
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,7 +112,8 @@ def candidate_pairs(
         The candidate pairs, sorted by observation.
     """
     if not len(seen) or not len(means):
-        return Pairs(np.zeros(0, np.int64), np.zeros(0, np.int64), (), np.zeros(0, bool))
+        nothing = np.zeros(0, np.int64)
+        return Pairs(nothing, nothing, (), np.zeros(0, bool), np.zeros(0))
     points = np.array([o.kind == "point" for o in seen])
     world = np.zeros((len(seen), 3))
     ends = np.zeros((len(seen), 2))
@@ -143,7 +155,10 @@ def candidate_pairs(
         else "line"
         for a, b in zip(i.tolist(), j.tolist(), strict=True)
     )
-    return Pairs(i.astype(np.int64), j.astype(np.int64), models, flipped[i, j])
+    across, turn = middle[i, j, 1] / TYPICAL_M, turned[i, j] / TYPICAL_RAD
+    apart = np.hypot(middle[i, j, 0], middle[i, j, 1]) / TYPICAL_M
+    miss = np.where(is_point[j], apart, np.hypot(across, turn))
+    return Pairs(i.astype(np.int64), j.astype(np.int64), models, flipped[i, j], miss)
 
 
 def compare(

@@ -7,13 +7,13 @@ a tentative landmark; a new one; else rejected, with the reason.
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from graphslam.association import (
+    BoolArray,
     Compared,
-    IntArray,
     Pairs,
     assign,
     candidate_pairs,
@@ -30,8 +30,11 @@ from graphslam.geometry import Array, compose, compose_jacobians, rotate_cov
 from graphslam.landmark_map import Entry, LandmarkMap
 from graphslam.records import Association, Motion, Observation
 
-#: images between two refreshes of all landmark estimates; those in view are always fresh
+#: images between two refreshes of all landmark estimates; those compared are always fresh
 REFRESH_EVERY = 50
+#: landmarks per observation whose joint marginal is asked for, the crudely nearest: recently seen
+#: ones, and old ones (whose distance says less, as the pose has drifted)
+NEAREST_RECENT, NEAREST_OLD = 3, 4
 
 
 def predicted_joint(joint: Joint, motion: Motion | None) -> Joint:
@@ -44,6 +47,27 @@ def predicted_joint(joint: Joint, motion: Motion | None) -> Joint:
     P[:, :3] = P[:, :3] @ F.T
     P[:3, :3] += W @ motion.cov @ W.T
     return replace(joint, pose=compose(joint.pose, motion.delta), cov=P)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Image:
+    """One image under association: what was seen, and its candidate pairs with landmarks.
+
+    ``entries`` (k) is the landmark of each pair, ``recent`` (k,) whether this robot saw it lately;
+    ``joint`` is over the predicted pose and the graph's landmarks among them, ``where[id]`` their
+    place in it.
+    """
+
+    robot: str
+    time_ns: int
+    path_m: float
+    seen: Sequence[Observation]
+    pairs: Pairs
+    entries: tuple[Entry, ...]
+    recent: BoolArray
+    joint: Joint
+    where: dict[int, int]
+    compared: Compared
 
 
 class Associator:
@@ -92,43 +116,69 @@ class Associator:
         if self._images % REFRESH_EVERY == 0:
             self.map.refresh(self._backend, self.map.graph_ids())
         self._images += 1
-        self.map.expire(
-            time_ns, robot, path_m, round(config.tentative_s * 1e9), config.tentative_m
-        )
+        self.map.expire(time_ns, robot, path_m, round(config.tentative_s * 1e9), config.tentative_m)
         if motion is not None:
             pose = compose(pose, motion.delta)
+        image = self._image(robot, time_ns, seen, pose, motion, track, path_m)
+        return self._book(image, self._choose(image))
+
+    def _image(
+        self,
+        robot: str,
+        time_ns: int,
+        seen: Sequence[Observation],
+        pose: Array,
+        motion: Motion | None,
+        track: Track,
+        path_m: float,
+    ) -> Image:
+        """Candidate pairs, compared."""
         ids, means, extents, is_point, whole = self.map.arrays()
-        pairs = candidate_pairs(seen, pose, means, extents, is_point, whole, config)
-        known = self._known(seen)
-        graph_ids = sorted(
-            {int(ids[j]) for j in pairs.landmark if self.map.entries[int(ids[j])].in_graph}
-            | {i for i in known.values() if i is not None}
+        free = [n for n, o in enumerate(seen) if not self._has_identity(o)]
+        pairs = candidate_pairs(
+            [seen[n] for n in free], pose, means, extents, is_point, whole, self._config
         )
+        entries = [self.map.entries[int(ids[j])] for j in pairs.landmark]
+        recent = np.array([self._is_recent(e, robot, path_m) for e in entries], dtype=bool)
+        keep = _worth_comparing(pairs, entries, recent, self._config.reacquire_min)
+        pairs, recent = pairs.only(keep), recent[keep]
+        entries = [e for e, k in zip(entries, keep, strict=True) if k]
+        # observations with an identity bring their pair along, ungated
+        known = [
+            (n, self.map.entries[self.map.by_identity[str(o.identity)]])
+            for n, o in enumerate(seen)
+            if self._has_identity(o) and o.identity in self.map.by_identity
+        ]
+        pairs = Pairs(
+            np.array([free[i] for i in pairs.observation] + [n for n, _ in known], dtype=np.int64),
+            np.array([e.id for e in entries] + [e.id for _, e in known], dtype=np.int64),
+            pairs.model + tuple(seen[n].kind for n, _ in known),
+            np.append(pairs.flipped, np.zeros(len(known), dtype=bool)),
+            np.append(pairs.miss, np.zeros(len(known))),
+        )
+        entries += [e for _, e in known]
+        recent = np.append(recent, np.ones(len(known), dtype=bool))
+        graph_ids = sorted({e.id for e in entries if e.in_graph})
+        where = {landmark: n for n, landmark in enumerate(graph_ids)}
         joint = predicted_joint(self._backend.joint(robot, graph_ids), motion)
-        pose = joint.pose
-        compared = self._compare(seen, pairs, ids, joint, graph_ids, track, time_ns)
-        chosen = self._choose(seen, pairs, ids, compared, joint, graph_ids, known, robot, path_m)
-        return self._book(
-            robot, time_ns, seen, pairs, ids, compared, chosen, known, pose, path_m
+        compared = self._compare(seen, pairs, entries, joint, where, track, time_ns)
+        return Image(
+            robot, time_ns, path_m, seen, pairs, tuple(entries), recent, joint, where, compared
         )
 
-    def _known(self, seen: Sequence[Observation]) -> dict[int, int | None]:
-        """Observation -> landmark for observations with an identity; None for a first sighting."""
-        if self._config.identities == "ignore":
-            return {}
-        return {
-            n: self.map.by_identity.get(o.identity)
-            for n, o in enumerate(seen)
-            if o.identity is not None
-        }
+    def _has_identity(self, o: Observation) -> bool:
+        return o.identity is not None and self._config.identities == "use"
+
+    def _is_recent(self, entry: Entry, robot: str, path_m: float) -> bool:
+        return path_m - entry.path_m.get(robot, -np.inf) <= self._config.reacquire_m
 
     def _compare(
         self,
         seen: Sequence[Observation],
         pairs: Pairs,
-        ids: IntArray,
+        entries: Sequence[Entry],
         joint: Joint,
-        graph_ids: Sequence[int],
+        where: dict[int, int],
         track: Track,
         time_ns: int,
     ) -> Compared:
@@ -137,127 +187,82 @@ class Associator:
         A tentative landmark is known relative to the robot that saw it, so what separates it from
         now is its own measurement noise and the motion since, not the robot's place in the world.
         """
-        k = len(pairs.observation)
+        k = len(entries)
         P_xx, P_xt, P_tt = (np.zeros((k, 3, 3)) for _ in range(3))
         states = np.zeros((k, 3))
-        place = {landmark: n for n, landmark in enumerate(graph_ids)}
         since: dict[int, Array] = {}
-        for n, j in enumerate(pairs.landmark):
-            entry = self.map.entries[int(ids[j])]
+        for n, entry in enumerate(entries):
             if entry.in_graph:
-                where = joint.slices[place[entry.id]]
-                size = where.stop - where.start
-                states[n, :size] = joint.landmarks[place[entry.id]]
+                block = joint.slices[where[entry.id]]
+                size = block.stop - block.start
+                states[n, :size] = joint.landmarks[where[entry.id]]
                 P_xx[n] = joint.cov[:3, :3]
-                P_xt[n, :, :size] = joint.cov[:3, where]
-                P_tt[n, :size, :size] = joint.cov[where, where]
+                P_xt[n, :, :size] = joint.cov[:3, block]
+                P_tt[n, :size, :size] = joint.cov[block, block]
             else:
                 if entry.last_ns not in since:
                     moved = track.motion(entry.last_ns, time_ns)
-                    since[entry.last_ns] = rotate_cov(
-                        moved.cov, float(joint.pose[2] - moved.delta[2])
-                    )
+                    start_heading = joint.pose[2] - moved.delta[2]
+                    since[entry.last_ns] = rotate_cov(moved.cov, start_heading)
                 states[n], P_xx[n], P_tt[n] = entry.mean, since[entry.last_ns], entry.cov
         return compare(seen, pairs, joint.pose, states, P_xx, P_xt, P_tt, self._floor)
 
-    def _choose(
-        self,
-        seen: Sequence[Observation],
-        pairs: Pairs,
-        ids: IntArray,
-        compared: Compared,
-        joint: Joint,
-        graph_ids: Sequence[int],
-        known: dict[int, int | None],
-        robot: str,
-        path_m: float,
-    ) -> dict[int, int]:
-        """Observation -> pair, for observations without identity."""
-        config = self._config
-        entries = [self.map.entries[int(ids[j])] for j in pairs.landmark]
-        free = np.array([int(i) not in known for i in pairs.observation], dtype=bool)
-        in_graph = np.array([e.in_graph for e in entries], dtype=bool)
-        recent = np.array(
-            [path_m - e.path_m.get(robot, -np.inf) <= config.reacquire_m for e in entries],
-            dtype=bool,
-        )
+    def _choose(self, image: Image) -> dict[int, int]:
+        """Observation -> pair."""
+        config, pairs, compared = self._config, image.pairs, image.compared
+        known = np.array([self._has_identity(image.seen[i]) for i in pairs.observation], dtype=bool)
+        in_graph = np.array([e.in_graph for e in image.entries], dtype=bool)
         gate = gate_distance(config.gate_probability, np.maximum(compared.dof, 1))
 
-        def best(which: Array) -> dict[int, int]:
-            return _assign_pairs(pairs, compared, gate, which, len(seen), config.method)
+        def best(which: BoolArray) -> dict[int, int]:
+            return _assign_pairs(pairs, compared, gate, which, len(image.seen), config.method)
 
-        chosen = best(free & in_graph & recent)
-        old = best(free & in_graph & ~recent)
-        if len(old) >= config.reacquire_min:
-            picks = list(old.values())
-            place = {landmark: n for n, landmark in enumerate(graph_ids)}
-            slices = [joint.slices[place[int(ids[pairs.landmark[k]])]] for k in picks]
-            if fixes_pose(compared, picks) and jointly_compatible(
-                compared, picks, slices, joint.cov, config.gate_probability
-            ):
-                chosen |= old
-                self.closures += 1
+        chosen = best(~known & in_graph & image.recent)
+        old = best(~known & in_graph & ~image.recent)
+        if self._closes_loop(image, list(old.values())):
+            chosen |= old
+            self.closures += 1
         taken = np.array([int(i) in chosen for i in pairs.observation], dtype=bool)
-        chosen |= best(free & ~in_graph & ~taken)
-        return chosen
+        chosen |= best(~known & ~in_graph & ~taken)
+        return chosen | {int(pairs.observation[k]): int(k) for k in np.flatnonzero(known)}
 
-    def _book(
-        self,
-        robot: str,
-        time_ns: int,
-        seen: Sequence[Observation],
-        pairs: Pairs,
-        ids: IntArray,
-        compared: Compared,
-        chosen: dict[int, int],
-        known: dict[int, int | None],
-        pose: Array,
-        path_m: float,
-    ) -> tuple[Association, ...]:
+    def _closes_loop(self, image: Image, picks: list[int]) -> bool:
+        """Whether pairs with landmarks not seen for long are believed: only many, and together."""
+        if len(picks) < self._config.reacquire_min:
+            return False
+        slices = [image.joint.slices[image.where[image.entries[k].id]] for k in picks]
+        return fixes_pose(image.compared, picks) and jointly_compatible(
+            image.compared, picks, slices, image.joint.cov, self._config.gate_probability
+        )
+
+    def _book(self, image: Image, chosen: dict[int, int]) -> tuple[Association, ...]:
         """Turn the choices into associations; make, promote and reject."""
-        config = self._config
+        pairs, compared, pose = image.pairs, image.compared, image.joint.pose
+        new_gate = gate_distance(self._config.new_probability, np.maximum(compared.dof, 1))
+        close = image.recent & (compared.d2 < new_gate)
         out: list[Association] = []
-        new_gate = gate_distance(config.new_probability, np.maximum(compared.dof, 1))
-        for n, raw in enumerate(seen):
-            o = raw
-            if n in known:
-                known_id = known[n]
-                entry = (
-                    self.map.add(o, pose, time_ns)
-                    if known_id is None
-                    else self.map.entries[known_id]
-                )
-                model = o.kind
-            elif n in chosen:
+        for n, seen in enumerate(image.seen):
+            o = seen
+            if n in chosen:
                 k = chosen[n]
-                entry = self.map.entries[int(ids[pairs.landmark[k]])]
-                model = pairs.model[k]
+                entry, model = image.entries[k], pairs.model[k]
                 o = flip(o) if pairs.flipped[k] else o
                 self.innovations.setdefault(model, []).append(
-                    (time_ns, float(compared.d2[k] / compared.dof[k]))
+                    (image.time_ns, float(compared.d2[k] / compared.dof[k]))
                 )
+            elif not self._has_identity(o) and np.any(close & (pairs.observation == n)):
+                self.rejected["between the thresholds: neither a match nor new"] += 1
+                continue
             else:
-                of_this = pairs.observation == n
-                recent = np.array(
-                    [
-                        path_m - self.map.entries[int(ids[j])].path_m.get(robot, -np.inf)
-                        <= config.reacquire_m
-                        for j in pairs.landmark
-                    ],
-                    dtype=bool,
-                )
-                if np.any(of_this & recent & (compared.d2 < new_gate)):
-                    self.rejected["between the thresholds: neither a match nor new"] += 1
-                    continue
-                entry, model = self.map.add(o, pose, time_ns), o.kind
-            self.map.saw(entry, o, pose, time_ns, robot, path_m)
-            association = Association(robot, time_ns, entry.id, model, o.z, o.cov)
-            out += self._admit(entry, association, o.identity is not None and n in known, pose, o)
+                identity = o.identity if self._has_identity(o) else None
+                o = replace(o, identity=identity)
+                entry, model = self.map.add(o, pose, image.time_ns), o.kind
+            self.map.saw(entry, o, pose, image.time_ns, image.robot, image.path_m)
+            association = Association(image.robot, image.time_ns, entry.id, model, o.z, o.cov)
+            out += self._admit(entry, association, self._has_identity(o))
         return tuple(out)
 
-    def _admit(
-        self, entry: Entry, seen: Association, certain: bool, pose: Array, o: Observation
-    ) -> list[Association]:
+    def _admit(self, entry: Entry, seen: Association, certain: bool) -> list[Association]:
         """What enters the graph with this sighting: nothing, it alone, or all so far."""
         if entry.in_graph:
             return [seen]
@@ -265,16 +270,37 @@ class Associator:
         if not certain and entry.sightings < self._config.sightings_to_promote:
             return []
         entry.in_graph = True
-        whole = all(e.model == "segment" for e in entry.evidence)
-        if entry.kind == "segment" and not whole:
+        if entry.kind == "segment" and any(e.model != "segment" for e in entry.evidence):
             entry.kind = "line"
-        model = entry.kind
         waiting, entry.evidence = entry.evidence, []
-        return [replace(e, model=model, late=e.time_ns != seen.time_ns) for e in waiting]
+        return [replace(e, model=entry.kind, late=e.time_ns != seen.time_ns) for e in waiting]
+
+
+def _worth_comparing(
+    pairs: Pairs, entries: Sequence[Entry], recent: BoolArray, reacquire_min: int
+) -> BoolArray:
+    """Pairs (k,) whose joint marginal is worth its price.
+
+    Tentative landmarks need none. Of the graph's, the crudely nearest few per observation; old ones
+    only where enough observations have some, else no loop could be closed by them.
+    """
+    in_graph = np.array([e.in_graph for e in entries], dtype=bool)
+    keep = ~in_graph
+    old = in_graph & ~recent
+    if len(set(pairs.observation[old].tolist())) < reacquire_min:
+        old = np.zeros_like(old)
+    for group, limit in ((in_graph & recent, NEAREST_RECENT), (old, NEAREST_OLD)):
+        members = np.flatnonzero(group)
+        members = members[np.lexsort((pairs.miss[members], pairs.observation[members]))]
+        rank = np.arange(len(members)) - np.searchsorted(
+            pairs.observation[members], pairs.observation[members]
+        )
+        keep[members[rank < limit]] = True
+    return keep
 
 
 def _assign_pairs(
-    pairs: Pairs, compared: Compared, gate: Array, which: Array, n: int, method: str
+    pairs: Pairs, compared: Compared, gate: Array, which: BoolArray, n: int, method: str
 ) -> dict[int, int]:
     """Observation -> pair among the pairs ``which``.
 

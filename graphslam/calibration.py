@@ -30,8 +30,9 @@ class Calibrator:
 
     def __init__(self) -> None:
         self._prior: Array | None = None
-        self._info = np.zeros((0, 0))
+        self._info: Array = np.zeros((0, 0))
         self._vector = np.zeros(0)
+        self._names: tuple[str, ...] = ()
 
     def learn(self, current: Calibration, motion: Motion, moved: Array) -> Calibration:
         """The calibration after one more motion.
@@ -45,12 +46,13 @@ class Calibrator:
             Mean, and the covariance to be used for coming motions.
         """
         D = motion.d_delta_d_calibration
-        if not D.shape[1] or motion.length_m == 0 and motion.delta[2] == 0:
+        if not D.shape[1] or (motion.length_m == 0 and motion.delta[2] == 0):
             return current
         if self._prior is None:
             self._prior = current.cov
-            self._info = np.linalg.inv(self._prior)
+            self._info = np.asarray(np.linalg.inv(self._prior), dtype=np.float64)
             self._vector = np.zeros(D.shape[1])
+            self._names = current.names
         miss = moved - motion.delta
         miss[2] = wrap(miss[2])
         noise = motion.cov - D @ current.cov @ D.T + np.diag(np.square(RELATIVE_SIGMA))
@@ -63,6 +65,20 @@ class Calibrator:
         self._info += weighted @ D
         self._vector = FORGET * self._vector + weighted @ (miss + D @ current.mean)
         cov = np.linalg.inv(self._info)
-        return Calibration(
-            current.names, cov @ self._vector, cov + REMAINING**2 * self._prior
-        )
+        return Calibration(current.names, cov @ self._vector, cov + REMAINING**2 * self._prior)
+
+    def found(self) -> dict[str, tuple[float, float, bool]]:
+        """Parameter -> (value, sigma, observable): what the data say so far.
+
+        Observable: the data halve the prior's sigma at least. The sigma is that of the remembered
+        stretch, so it does not shrink for ever.
+        """
+        if self._prior is None:
+            return {}
+        cov = np.linalg.inv(self._info)
+        values, sigmas = cov @ self._vector, np.sqrt(np.diag(cov))
+        halved = sigmas < 0.5 * np.sqrt(np.diag(self._prior))
+        return {
+            name: (float(value), float(sigma), bool(known))
+            for name, value, sigma, known in zip(self._names, values, sigmas, halved, strict=True)
+        }

@@ -7,6 +7,7 @@ everything of a kind.
 
 import dataclasses
 import difflib
+import json
 import tomllib
 import types
 import typing
@@ -133,8 +134,8 @@ class AssociationConfig:
     identities: `use` those in the log or `ignore` them. max_distance_m: eq. 3.23. directed:
     a line has two sides; false takes directions modulo pi (3.24). gate_probability: chi-square
     gate (3.25). floor_m, floor_rad: added to the innovations' sigmas before gating, for what the
-    models leave out; never enters the estimate. new_probability: an observation is a new landmark only if its distance to every
-    landmark exceeds this second, higher quantile. overlap_gap_m: largest gap along the line
+    models leave out; never enters the estimate. new_probability: an observation is a new landmark
+    only if its distance to every landmark exceeds this second, higher quantile. overlap_gap_m: largest gap along the line
     between an observed part and the known extent. sightings_to_promote: a tentative landmark
     enters the graph at this many. tentative_s, tentative_m: one not seen again after this time and
     path is deleted. reacquire_m: a landmark not seen for this much path counts as old; old lines
@@ -159,7 +160,10 @@ class AssociationConfig:
 
 @dataclass(frozen=True)
 class RobustConfig:
-    """Kernel on observation factors; scale in sigmas (Cauchy: k with 95 % efficiency 2.385)."""
+    """How observation factors treat outliers.
+
+    kernel: which M-estimator. scale: its parameter, in sigmas (Cauchy: 95 % efficient at 2.385).
+    """
 
     kernel: Literal["none", "huber", "cauchy", "geman-mcclure"] = "cauchy"
     scale: float = 2.0
@@ -169,21 +173,24 @@ class RobustConfig:
 class BackendConfig:
     """The estimator.
 
-    relinearize_threshold: largest change of a variable (m, rad) before it is linearised anew;
-    polish: optimise to convergence at the end.
+    name: which one. relinearize_threshold: largest change of a variable (m, rad) before it is
+    linearised anew; relinearize_every: steps between two looks for such variables. polish:
+    optimise to convergence at the end.
     """
 
     name: Literal["isam2", "batch", "dead-reckoning"] = "isam2"
-    relinearize_threshold: float = 0.02
-    relinearize_every: int = 10
+    relinearize_threshold: float = 0.05
+    relinearize_every: int = 20
     polish: bool = True
 
 
 @dataclass(frozen=True)
 class StartConfig:
-    """Priors of the first poses: sigmas of a start that is given; of the one that is the origin.
+    """Where the robots start.
 
-    poses: robot -> [x m, y m, phi rad], or robot -> `truth`.
+    origin_sigma_m, origin_sigma_rad: prior of the robot whose first pose is the world's origin.
+    given_sigma_m, given_sigma_rad: prior of a start that is given. poses: robot -> [x m, y m,
+    phi rad]. from_truth: read one truth sample of each robot instead.
     """
 
     origin_sigma_m: float = 1e-3
@@ -231,7 +238,7 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Conf
         key, separator, value = text.partition("=")
         if not separator or not key.strip():
             raise ConfigError(f"--set {text}: write it as key=value, for example keyframe.mode=all")
-        _set(tree, key.strip().split("."), _parse_value(value.strip()))
+        _set(tree, _split_key(key.strip()), _parse_value(value.strip()))
     config = _build(Config, tree, "")
     assert isinstance(config, Config)  # narrows the type; _build returns what it is asked for
     return config
@@ -242,6 +249,19 @@ def dump_config(config: Config) -> str:
     lines: list[str] = []
     _dump(config, (), lines)
     return "\n".join(lines).strip() + "\n"
+
+
+def _split_key(text: str) -> list[str]:
+    """The parts of a dotted key; a part with a dot of its own is quoted, as in TOML."""
+    try:
+        node: Any = tomllib.loads(f"{text} = 0")
+    except tomllib.TOMLDecodeError:
+        return text.split(".")
+    keys = []
+    while isinstance(node, dict):
+        ((key, node),) = node.items()
+        keys.append(key)
+    return keys
 
 
 def _set(tree: dict[str, Any], keys: list[str], value: object) -> None:
@@ -280,7 +300,7 @@ def _build(kind: Any, value: Any, key: str) -> Any:
             raise ConfigError(f"{key}: expected a list, got {value!r}")
         return tuple(_build(arguments[0], item, f"{key}[{i}]") for i, item in enumerate(value))
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
+        value = float(value) if abs(value) < 2**1000 else float("inf")
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
         raise ConfigError(f"{key}: expected {kind.__name__}, got {value!r}")
     if kind is float and not abs(value) < float("inf"):
@@ -329,7 +349,8 @@ def _key(name: str) -> str:
 
 
 def _quote(text: str) -> str:
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    # JSON's escapes are TOML's as well, and DEL is the one control character that JSON leaves alone
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _value(value: Any) -> str:

@@ -5,12 +5,15 @@ derivative by the calibration are computed when asked for and can be computed ag
 calibration. Between two readings the robot is taken to move on a circle segment.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from graphslam.config import OdometryConfig, RobotConfig
-from graphslam.geometry import Array, between, compose, exp, log, rotation3, wrap
+from graphslam.geometry import Array, between, compose, compose_jacobians, exp, log, rotation3, wrap
 from graphslam.models import MOTION_SOURCES, compound
 from graphslam.models.motion import (
+    Calibration,
     Compounded,
     Increments,
     mounted_motion,
@@ -24,8 +27,8 @@ Odometry = OdometryPose | OdometryIncrement | WheelAngles
 #: m and rad: what a robot that reports no motion may still have moved between two states
 STANDING_SIGMA = 1e-3
 
-#: m/s and rad/s: no wheeled robot's odometry says more. An interval that implies it was stamped in a
-#: burst (a logger that fell behind): its stamps do not tell when the motion took place, so a time
+#: m/s and rad/s: no wheeled robot's odometry says more. An interval that implies it was stamped
+#: in a burst (a logger that fell behind): its stamps do not tell when the motion took place, so a time
 #: inside it belongs to the reading before, as the order of recording has it
 MAX_SPEED_M_S, MAX_TURN_RAD_S = 20.0, 20.0
 #: share of readings in bursts above which the stamps are not good enough to learn a latency
@@ -52,6 +55,7 @@ class Track:
         self._count, self._p, self._bursts = 0, 0, 0
         self._times = np.empty(1024, dtype=np.int64)  # time of the end of each row's interval
         self._rows = np.empty((1024, 0))
+        self._sums = np.empty((1024, 0))  # of the rows
         self._poses = np.empty((1024, 3))  # by odometry alone, first reading = origin
         self._effort = np.empty(1024)  # accumulated, see `effort`
         self._path = np.empty(1024)  # accumulated, m
@@ -61,8 +65,12 @@ class Track:
     @property
     def mount(self) -> Array:
         """Pose (3,) in the base frame of the frame whose motions this track describes."""
-        if len(self.calibration.mean) > self._p:
-            return self.calibration.mean[self._p : self._p + 3]
+        return self.mount_of(self.calibration)
+
+    def mount_of(self, calibration: Calibration) -> Array:
+        """The mount (3,) according to a calibration of this track."""
+        if len(calibration.mean) > self._p:
+            return calibration.mean[self._p : self._p + 3]
         return np.zeros(3)
 
     @property
@@ -122,15 +130,14 @@ class Track:
             self.calibration = nominal_calibration(source, self._config, mounted)
             self._p = len(self.calibration.mean) - 4 * mounted  # parameters of the increments
             self._rows = np.empty((len(self._times), _ROW_SIZE[source]))
+            self._sums = np.empty_like(self._rows)
         if self._count == len(self._times):
-            self._times = np.concatenate([self._times, np.empty_like(self._times)])
-            self._rows = np.concatenate([self._rows, np.empty_like(self._rows)])
-            self._poses = np.concatenate([self._poses, np.empty_like(self._poses)])
-            self._effort = np.concatenate([self._effort, np.empty_like(self._effort)])
-            self._path = np.concatenate([self._path, np.empty_like(self._path)])
-            self._burst = np.concatenate([self._burst, np.empty_like(self._burst)])
+            for name in ("_times", "_rows", "_sums", "_poses", "_effort", "_path", "_burst"):
+                full = getattr(self, name)
+                setattr(self, name, np.concatenate([full, np.empty_like(full)]))
         n = self._count
         self._times[n], self._rows[n] = time_ns, row
+        self._sums[n] = self._sums[n - 1] + row if n else 0.0
         step = self._increments(row[None], np.zeros(self._p)).delta[0]
         self._poses[n] = compose(self._poses[n - 1], step) if n else np.zeros(3)
         path, turn = np.hypot(step[0], step[1]), abs(step[2])
@@ -149,10 +156,10 @@ class Track:
         return self._count > 0 and self.last_ns >= time_ns
 
     def near(self, time_ns: int, gap_ns: int) -> bool:
-        """Whether there is odometry within ``gap_ns`` of ``time_ns``, or on both sides of it."""
-        if not self._count:
-            return False
-        return self.first_ns - gap_ns <= time_ns <= self.last_ns + gap_ns
+        """Whether a reading lies within ``gap_ns`` of ``time_ns``."""
+        i = int(np.searchsorted(self.times, time_ns))
+        around = self.times[max(i - 1, 0) : i + 1]
+        return bool(np.any(np.abs(around - time_ns) <= gap_ns))
 
     def pose(self, times_ns: IntArray | int) -> Array:
         """Poses (..., 3) by odometry alone, in the frame of the first reading.
@@ -173,18 +180,28 @@ class Track:
 
         def reached(time_ns: IntArray | int) -> Array:
             share = np.clip((time_ns - begin) / np.maximum(end - begin, 1), 0.0, 1.0)
-            return np.where(self._burst[i], share >= 1.0, share)
+            return np.asarray(np.where(self._burst[i], share >= 1.0, share))
 
         return reached(to_ns) - reached(from_ns)
 
     def effort(self, times_ns: IntArray | int) -> Array:
         """Accumulated motion (...,), m: path plus turning. Odometry errors grow with it."""
-        return np.interp(times_ns, self.times, self._effort[: self._count])
+        return self._at(np.asarray(times_ns, dtype=np.int64), self._effort)
+
+    def _at(self, times_ns: IntArray, accumulated: Array) -> Array:
+        """An accumulated quantity at any times, by the same rule as `pose`."""
+        if self._count < 2:
+            return np.zeros((*times_ns.shape, *accumulated.shape[1:]))
+        i = np.clip(np.searchsorted(self.times, times_ns, side="left"), 1, self._count - 1)
+        share = self._share(i, self._times[i - 1], times_ns)
+        if accumulated.ndim > 1:
+            share = share[..., None]
+        return accumulated[i - 1] + share * (accumulated[i] - accumulated[i - 1])
 
     def moved(self, start_ns: int, end_ns: int) -> tuple[float, float]:
         """Path (m) and net turning (rad, absolute) from ``start_ns`` to ``end_ns``; cheap."""
-        poses = self.pose(np.array([start_ns, end_ns]))
-        path = np.interp([start_ns, end_ns], self.times, self._path[: self._count])
+        times = np.array([start_ns, end_ns])
+        poses, path = self.pose(times), self._at(times, self._path)
         return float(path[1] - path[0]), abs(float(wrap(poses[1, 2] - poses[0, 2])))
 
     def motion(self, start_ns: int, end_ns: int) -> Motion:
@@ -200,14 +217,60 @@ class Track:
         delta, d_cal, cov = whole.delta, whole.d_cal, whole.cov
         if len(self.calibration.mean) > self._p:
             delta, d_mount = mounted_motion(delta, self.mount)
-            turn = rotation3(-self.mount[2])
+            # errors of the base's motion, as they move the mounted frame: with its lever arm
+            lever = rotation3(-self.mount[2]) @ compose_jacobians(whole.delta, self.mount)[0]
             late = self._by_latency(start_ns, end_ns, whole.delta)
-            d_cal = np.column_stack([turn @ d_cal, d_mount, turn @ late])
-            cov = turn @ cov @ turn.T
+            d_cal = np.column_stack([lever @ d_cal, d_mount, lever @ late])
+            cov = lever @ cov @ lever.T
         cov = cov + d_cal @ self.calibration.cov @ d_cal.T
         if self.source != "given":
             cov = cov + self._floor(whole.length_m > 0 or delta[2] != 0)
         return Motion(start_ns, end_ns, delta, cov, d_cal, whole.length_m)
+
+    def coarse_motions(
+        self,
+        start_ns: IntArray,
+        end_ns: IntArray,
+        calibrations: Sequence[Calibration],
+        which: IntArray,
+    ) -> tuple[Array, Array]:
+        """Many short motions at once, each taken as *one* increment; see `motion`.
+
+        Good for intervals between neighbouring states, where the path is close to an arc.
+
+        Args:
+            start_ns: (n,) times.
+            end_ns: (n,) times.
+            calibrations: those known at some states.
+            which: (n,) which of them applies.
+
+        Returns:
+            Motions (n, 3) and their covariances (n, 3, 3), along the axes of each start.
+        """
+        mean = np.array([c.mean for c in calibrations])[which]
+        cal_cov = np.array([c.cov for c in calibrations])[which]
+        p, mounted = self._p, mean.shape[1] > self._p
+        late = np.zeros(len(which), dtype=np.int64)
+        if mounted and not self.bursty:
+            late = np.rint(1e9 * mean[:, -1]).astype(np.int64)
+        begin, end = start_ns - late, end_ns - late
+        rows = self._at(end, self._sums) - self._at(begin, self._sums)
+        parts = MOTION_SOURCES[self.source](rows, np.zeros(p), self._robot, self._config)
+        delta, cov = between(self.pose(begin), self.pose(end)), parts.cov
+        delta = delta + np.einsum("nij,nj->ni", parts.d_cal, mean[:, :p])
+        d_cal = parts.d_cal
+        if mounted:
+            F, _ = compose_jacobians(delta, mean[:, p : p + 3])
+            lever = rotation3(-mean[:, p + 2]) @ F
+            delta, d_mount = mounted_motion(delta, mean[:, p : p + 3])
+            d_cal = np.concatenate([lever @ d_cal, d_mount], axis=2)
+            cov = lever @ cov @ lever.mT
+        used = d_cal.shape[2]
+        cov = cov + d_cal @ cal_cov[:, :used, :used] @ d_cal.mT
+        if self.source != "given":
+            moved = np.any(rows != 0, axis=1)[:, None, None]
+            cov = cov + np.where(moved, self._floor(True), self._floor(False))
+        return delta, np.where((end_ns > start_ns)[:, None, None], cov, 0.0)
 
     def _compounded(self, start_ns: int, end_ns: int) -> Compounded | None:
         """The base's motion between two times of the odometry's clock; None when it stands."""
@@ -238,6 +301,4 @@ class Track:
         """Covariance (3, 3) added once per interval; never zero, or two states would be welded."""
         if not moved:
             return np.diag([STANDING_SIGMA**2] * 3)
-        return np.diag(
-            [self._config.floor_sigma_m**2] * 2 + [self._config.floor_sigma_rad**2]
-        )
+        return np.diag([self._config.floor_sigma_m**2] * 2 + [self._config.floor_sigma_rad**2])

@@ -28,10 +28,15 @@ def rotation(angle_rad: float) -> Array:
     return np.array([[c, -s], [s, c]])
 
 
-def rotation3(angle_rad: float) -> Array:
-    """``blockdiag(rotation(angle), 1)``, the thesis' M(-angle): local to global for (x, y, phi)."""
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+def rotation3(angle_rad: ArrayLike) -> Array:
+    """``blockdiag(rotation(angle), 1)`` ``(..., 3, 3)``: the thesis' M(-angle), local to global."""
+    angle = np.asarray(angle_rad, dtype=float)
+    c, s = np.cos(angle), np.sin(angle)
+    M = np.zeros((*angle.shape, 3, 3))
+    M[..., 0, 0] = M[..., 1, 1] = c
+    M[..., 0, 1], M[..., 1, 0] = -s, s
+    M[..., 2, 2] = 1.0
+    return M
 
 
 def compose(a: Array, b: Array) -> Array:
@@ -104,28 +109,41 @@ def log(pose: Array) -> Array:
 
 
 def compose_jacobians(a: Array, b: Array) -> tuple[Array, Array]:
-    """Derivatives ``(3, 3)`` of ``compose(a, b)`` with respect to a and b, additive errors.
+    """Derivatives ``(..., 3, 3)`` of ``compose(a, b)`` by a and b, additive errors.
 
     Thesis eq. 4.7: F for the first pose; W = rotation3(heading of a) for the second.
     """
-    c, s = np.cos(a[2]), np.sin(a[2])
-    F = np.array([[1.0, 0.0, -s * b[0] - c * b[1]], [0.0, 1.0, c * b[0] - s * b[1]], [0, 0, 1.0]])
-    return F, rotation3(a[2])
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    F = np.zeros((*np.broadcast_shapes(a.shape, b.shape), 3))
+    F[..., 0, 0] = F[..., 1, 1] = F[..., 2, 2] = 1.0
+    F[..., 0, 2] = -s * b[..., 0] - c * b[..., 1]
+    F[..., 1, 2] = c * b[..., 0] - s * b[..., 1]
+    return F, rotation3(a[..., 2])
 
 
 def compose_cov(a: Array, cov_a: Array, b: Array, cov_b: Array) -> Array:
-    """Covariance (3, 3) of ``compose(a, b)`` for independent a and b, additive errors (x, y, phi).
+    """Covariance (..., 3, 3) of ``compose(a, b)`` for independent a and b, additive errors.
 
     ``cov_a`` is along the axes of a's reference frame, ``cov_b`` along the axes of frame a.
     """
     F, W = compose_jacobians(a, b)
-    return np.asarray(F @ cov_a @ F.T + W @ cov_b @ W.T)
+    return np.asarray(F @ cov_a @ F.mT + W @ cov_b @ W.mT)
 
 
-def rotate_cov(cov: Array, angle_rad: float) -> Array:
-    """Covariance (3, 3) of (x, y, phi) turned by ``angle_rad``: axes of a frame to its parent's."""
+def inverse_cov(a: Array, cov_a: Array) -> Array:
+    """Covariance (..., 3, 3) of ``inverse(a)``, along the axes of frame a.
+
+    From ``compose(a, inverse(a)) = 0``: F da + W d(inverse) = 0.
+    """
+    F, W = compose_jacobians(a, inverse(a))
+    K = W.mT @ F
+    return np.asarray(K @ cov_a @ K.mT)
+
+
+def rotate_cov(cov: Array, angle_rad: ArrayLike) -> Array:
+    """Covariance (..., 3, 3) of (x, y, phi) turned by ``angle_rad``: to the parent's axes."""
     M = rotation3(angle_rad)
-    return np.asarray(M @ cov @ M.T)
+    return np.asarray(M @ cov @ M.mT)
 
 
 def interpolate(a: Array, b: Array, share: ArrayLike) -> Array:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from graphslam.association import IntArray
+from graphslam.association import BoolArray, IntArray
 from graphslam.backends import Backend
 from graphslam.geometry import Array, between, compose
 from graphslam.models import MODELS
@@ -55,8 +55,8 @@ class LandmarkMap:
         """Numbers of the landmarks in the graph."""
         return [i for i, entry in self.entries.items() if entry.in_graph]
 
-    def arrays(self) -> tuple[IntArray, Array, Array, Array, Array]:
-        """Numbers (m,), means (m, 3), extents (m, 2), point flags (m,), whole-segment flags (m,)."""
+    def arrays(self) -> tuple[IntArray, Array, Array, BoolArray, BoolArray]:
+        """Numbers (m,), means (m, 3), extents (m, 2), flags (m,): points, whole segments."""
         entries = list(self.entries.values())
         m = len(entries)
         return (
@@ -78,9 +78,7 @@ class LandmarkMap:
         cov[: len(state), : len(state)] = G_z @ seen.cov @ G_z.T
         if seen.extent is not None:
             extent = seen.extent.copy()
-        entry = Entry(
-            self._next, seen.kind, mean, cov, extent, time_ns, time_ns, seen.identity
-        )
+        entry = Entry(self._next, seen.kind, mean, cov, extent, time_ns, time_ns, seen.identity)
         self.entries[entry.id] = entry
         if seen.identity is not None:
             self.by_identity[seen.identity] = entry.id

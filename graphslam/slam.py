@@ -7,25 +7,33 @@ on no landmark kind, front end or back end; those are rows of tables.
 
 import itertools
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from graphslam.associator import Associator
 from graphslam.backends import BACKENDS
-from graphslam.calibration import Calibrator
 from graphslam.config import Config
 from graphslam.dead_reckoning import Track
 from graphslam.errors import EstimationError, LogError
 from graphslam.frontend import FRONT_ENDS, scan_points
-from graphslam.geometry import Array, between, compose, compose_cov, inverse
+from graphslam.frontend.sightings import sighting_observation
+from graphslam.geometry import (
+    Array,
+    compose,
+    compose_cov,
+    inverse,
+    inverse_cov,
+    rotation3,
+    transform,
+)
 from graphslam.logs import LogSet
 from graphslam.models import transport
 from graphslam.records import (
     Association,
     Closure,
+    Estimate,
     Landmark,
     Message,
     Motion,
@@ -33,44 +41,20 @@ from graphslam.records import (
     Picture,
     RelativePose,
     Result,
-    RobotResult,
     Scan,
     Sighting,
-    Start,
     Step,
-    Trajectory,
-    Truth,
 )
+from graphslam.robot_run import RobotRun
+from graphslam.starts import start_poses
 from graphslam.summary import make_landmarks, summarise
 from graphslam.timeline import ODOMETRY, synchronise
-from graphslam.trajectories import between_states, mounted
+from graphslam.trajectories import moved_world, origin_shift
 
-#: Hz at which the base of a robot without scans is reported
-BASE_RATE_HZ = 10
 #: scans kept for the picture at most, so that memory does not grow with the log
 MAX_PICTURES = 4000
 
 Progress = Callable[[int], None]
-
-
-@dataclass(slots=True, eq=False)
-class RobotRun:
-    """What the pipeline keeps for one robot."""
-
-    track: Track
-    calibrator: Calibrator
-    state_ns: int = -1
-    path_m: float = 0.0
-    times: list[int] = field(default_factory=list)
-    causal_poses: list[Array] = field(default_factory=list)
-    causal_covs: list[Array] = field(default_factory=list)
-    scans: list[tuple[int, int]] = field(default_factory=list)
-    mounts: list[Array] = field(default_factory=list)
-
-    @property
-    def started(self) -> bool:
-        """Whether the robot has a state."""
-        return bool(self.times)
 
 
 class Pipeline:
@@ -82,10 +66,7 @@ class Pipeline:
         self.associator = Associator(config.association, self.backend)
         self.front_end = FRONT_ENDS[config.front_end.name]
         self.runs = {
-            name: RobotRun(
-                Track(config.odometry, config.robot(name), mounted=log.has_scans(name)),
-                Calibrator(),
-            )
+            name: RobotRun(Track(config.odometry, config.robot(name), mounted=log.has_scans(name)))
             for name in log.robots
         }
         self.starts = start_poses(log, config)
@@ -93,7 +74,7 @@ class Pipeline:
         self.pictures: list[Picture] = []
         self.counts: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
-        self.seconds: Counter[str] = Counter()
+        self.seconds: dict[str, float] = defaultdict(float)
         self.step_ms: list[float] = []
 
     # ------------------------------------------------------------ the loop
@@ -122,13 +103,12 @@ class Pipeline:
         first = event[0]
         run, time_ns = self.runs[first.robot], first.time_ns
         if not run.started:
-            self.start(first.robot, time_ns)
+            self.start(first.robot, min(run.track.first_ns, time_ns))
         scans = [m for m in event if isinstance(m, Scan)]
-        for scan in scans:
-            run.scans.append((scan.stamp_ns, scan.time_ns))
-            run.mounts.append(scan.mount)
-            self.counts["scans"] += 1
-        keyframe = self.is_keyframe(event, first_scan=bool(scans) and len(run.scans) == 1)
+        first_scan = bool(scans) and not run.scans
+        run.scans += [(m.stamp_ns, m.time_ns, m.mount) for m in scans]
+        self.counts["scans"] += len(scans)
+        keyframe = self.is_keyframe(event, first_scan)
         if not keyframe and isinstance(first, (Scan, *ODOMETRY)):
             return  # its pose follows from the states around it
         motion = self.motion_since_state(first.robot, time_ns)
@@ -138,7 +118,11 @@ class Pipeline:
         self.advance(first.robot, time_ns, event, seen, motion if keyframe else None)
 
     def start(self, robot: str, time_ns: int) -> None:
-        """Give a robot its first state."""
+        """Give a robot its first state.
+
+        Raises:
+            EstimationError: it is not known where.
+        """
         if robot not in self.starts:
             raise EstimationError(
                 f"robot {robot}: its start is unknown; give --start {robot}=x,y,phi (m, rad) or "
@@ -146,6 +130,7 @@ class Pipeline:
             )
         start = self.starts[robot]
         step = Step(time_ns, starts={robot: start})
+        self.note_covariances()
         self.backend.add(step)
         self.steps.append(step)
         self.note_state(robot, time_ns)
@@ -160,11 +145,11 @@ class Pipeline:
     def is_keyframe(self, event: list[Message], first_scan: bool) -> bool:
         """Whether the event gets a state of its own."""
         keyframe, first = self.config.keyframe, event[0]
-        if first_scan or any(isinstance(m, Sighting) and m.seen_robot for m in event):
-            return True
         run = self.runs[first.robot]
         if first.time_ns <= run.state_ns:
             return False
+        if first_scan or any(isinstance(m, Sighting) and m.seen_robot for m in event):
+            return True
         if keyframe.mode == "all":
             return True
         if isinstance(first, ODOMETRY):
@@ -200,7 +185,7 @@ class Pipeline:
     ) -> None:
         """Associate, make the step, give it to the back end."""
         run = self.runs[robot]
-        motions = {robot: motion} if motion is not None else {}
+        motions: dict[str, Motion] = {robot: motion} if motion is not None else {}
         state_ns = time_ns if motion is not None else run.state_ns
         if motion is not None:
             run.path_m += motion.length_m
@@ -213,19 +198,18 @@ class Pipeline:
         for message in event:
             if isinstance(message, Sighting) and message.seen_robot is not None:
                 associations += self.robot_sighting(message, state_ns, motions)
-        closures = tuple(
-            self.closure(m, state_ns) for m in event if isinstance(m, RelativePose)
-        )
+        closures = tuple(self.closure(m, state_ns) for m in event if isinstance(m, RelativePose))
+        self.note_covariances()
         self.seconds["association"] += time.perf_counter() - began
         if not (motions or associations or closures):
             return
         step = Step(time_ns, {}, motions, associations, tuple(c for c in closures if c))
         began = time.perf_counter()
         self.backend.add(step)
-        self.seconds["back end"] += time.perf_counter() - began
         self.steps.append(step)
         for name, moved in motions.items():
             self.note_state(name, time_ns, moved)
+        self.seconds["back end"] += time.perf_counter() - began
         for message in event:
             if isinstance(message, Scan):
                 points = scan_points(message, self.config.front_end.max_range_m)
@@ -270,24 +254,29 @@ class Pipeline:
         if state_ns < message.time_ns:
             tail = self.runs[message.robot].track.motion(state_ns, message.time_ns)
             back = inverse(tail.delta)
-            back_cov = compose_cov(back, tail.cov, np.zeros(3), np.zeros((3, 3)))
-            cov = compose_cov(delta, cov, back, back_cov)
+            cov = compose_cov(delta, cov, back, inverse_cov(tail.delta, tail.cov))
             delta = compose(delta, back)
         self.counts["loop_closures"] += 1
         return Closure(message.robot, state_ns, message.other, other_ns, delta, cov)
 
     def note_state(self, robot: str, time_ns: int, motion: Motion | None = None) -> None:
-        """Book a new state with its causal estimate, and learn from how the robot got there."""
+        """Book a new state, and learn from how the robot got there."""
         run = self.runs[robot]
-        joint = self.backend.joint(robot, [])
+        pose = self.backend.state_mean(robot)
         if motion is not None and self.config.odometry.calibrate:
-            moved = between(run.causal_poses[-1], joint.pose)
-            run.track.calibration = run.calibrator.learn(run.track.calibration, motion, moved)
-        run.state_ns = time_ns
-        run.times.append(time_ns)
-        run.causal_poses.append(joint.pose)
-        run.causal_covs.append(joint.cov)
+            run.learn(motion, pose)
+        run.append(time_ns, pose)
         self.counts["keyframes"] += 1
+
+    def note_covariances(self) -> None:
+        """Book the causal covariance of states that have none yet.
+
+        Asked for as late as possible, just before the next step: by then association has needed
+        the same marginal, and reading it from an incremental smoother is dear.
+        """
+        for robot, run in self.runs.items():
+            if len(run.causal_covs) < len(run.times):
+                run.causal_covs.append(self.backend.joint(robot, []).cov)
 
     def add_picture(self, picture: Picture) -> None:
         """Keep a scan for drawing; when there are too many, every second one is let go."""
@@ -313,14 +302,18 @@ def smooth(log: LogSet, config: Config, progress: Progress = lambda _count: None
     pipeline.run(progress)
     if not pipeline.steps:
         raise LogError(f"{log.files[0].path}: nothing in it could be used; see `graphslam info`")
+    pipeline.note_covariances()
     finishing = time.perf_counter()
     estimate = pipeline.backend.finish()
     pipeline.seconds["final optimisation"] = time.perf_counter() - finishing
-    robots = {
-        name: robot_result(run, estimate.states[name])
-        for name, run in sorted(pipeline.runs.items())
-        if run.started
-    }
+    finishing = time.perf_counter()
+    runs = {name: run for name, run in sorted(pipeline.runs.items()) if run.started}
+    first = next(iter(runs))
+    start = pipeline.starts[first].pose
+    world = origin_shift(start, runs[first].track.mount)
+    estimate = in_world(estimate, world)
+    robots = {name: run.result(estimate.states[name], start) for name, run in runs.items()}
+    pipeline.seconds["trajectories"] = time.perf_counter() - finishing
     landmarks: tuple[Landmark, ...] = make_landmarks(pipeline.associator.map, estimate)
     t0 = min(trajectory.stamps_ns[0] for trajectory in estimate.states.values())
     innovations = {
@@ -339,7 +332,7 @@ def smooth(log: LogSet, config: Config, progress: Progress = lambda _count: None
         line_closures=pipeline.associator.closures,
         landmarks=len(landmarks),
         seconds=pipeline.seconds,
-        calibration={name: run.track.calibration for name, run in pipeline.runs.items()},
+        calibration={name: run.calibrator.found() for name, run in runs.items()},
     )
     return Result(
         robots,
@@ -353,34 +346,16 @@ def smooth(log: LogSet, config: Config, progress: Progress = lambda _count: None
     )
 
 
-def robot_result(run: RobotRun, states: Trajectory) -> RobotResult:
-    """Trajectories of one robot at the stamps it is reported at."""
-    causal_states = Trajectory(
-        states.stamps_ns, np.array(run.causal_poses), np.array(run.causal_covs)
-    )
-    if run.scans:
-        scans = np.array(run.scans, dtype=np.int64)
-        order = np.argsort(scans[:, 0], kind="stable")
-        stamps, times = scans[order, 0], scans[order, 1]
-        mounts = np.array(run.mounts)[order]
-    else:
-        period = round(1e9 / BASE_RATE_HZ)
-        times = stamps = np.arange(run.track.first_ns, run.track.last_ns + 1, period)
-    final = between_states(states, run.track, times, stamps, causal=False)
-    causal = between_states(causal_states, run.track, times, stamps, causal=True)
-    # the states are rigid to the laser: the base is where the calibration puts it
-    back = inverse(run.track.mount)
-    start = compose(states.poses[0], back)
-    started = run.track.pose(int(states.stamps_ns[0]))
-    poses = compose(start, between(started, run.track.pose(times)))
-    reckoned = Trajectory(stamps, poses, np.full((len(poses), 3, 3), np.nan))
-    return RobotResult(
-        mounted(final, back),
-        mounted(causal, back),
-        mounted(final, mounts) if run.scans else None,
-        mounted(causal, mounts) if run.scans else None,
-        reckoned,
-    )
+def in_world(estimate: Estimate, world: Array) -> Estimate:
+    """The same estimate after its world frame was put at ``world`` (3,)."""
+    states = {name: moved_world(t, world) for name, t in estimate.states.items()}
+    turn = rotation3(world[2])
+    landmarks = {}
+    for number, (mean, cov) in estimate.landmarks.items():
+        M = turn[: len(mean), : len(mean)]
+        moved = compose(world, mean) if len(mean) == 3 else transform(world, mean)
+        landmarks[number] = (moved, M @ cov @ M.T)
+    return Estimate(states, landmarks, estimate.error, estimate.dof)
 
 
 def events(messages: Iterable[Message]) -> Iterator[list[Message]]:
@@ -393,47 +368,6 @@ def events(messages: Iterable[Message]) -> Iterator[list[Message]]:
 
     for _, group in itertools.groupby(messages, key):
         yield list(group)
-
-
-def sighting_observation(message: Sighting) -> Observation:
-    """A sighting as an observation: a point, or with a direction a pose on the thing seen."""
-    if len(message.z) == 2:
-        return Observation("point", message.z, message.cov, None, message.identity)
-    bearing, range_m, direction = message.z
-    c, s = np.cos(bearing), np.sin(bearing)
-    J = np.array([[-range_m * s, c, 0.0], [range_m * c, s, 0.0], [0.0, 0.0, 1.0]])
-    z = np.array([range_m * c, range_m * s, direction])
-    return Observation("segment", z, J @ message.cov @ J.T, np.zeros(2), message.identity)
-
-
-def start_poses(log: LogSet, config: Config) -> dict[str, Start]:
-    """Where each robot starts: as given, from one truth sample, or the origin for the first.
-
-    Raises:
-        EstimationError: truth was asked for and a robot has none, or a given pose is malformed.
-    """
-    start = config.start
-    given = np.diag([start.given_sigma_m**2] * 2 + [start.given_sigma_rad**2])
-    starts: dict[str, Start] = {}
-    if start.from_truth:
-        for message in log.messages():
-            if isinstance(message, Truth) and message.robot not in starts:
-                starts[message.robot] = Start(message.pose, given)
-            if len(starts) >= len(log.robots):
-                break
-        missing = [robot for robot in log.robots if robot not in starts]
-        if missing:
-            raise EstimationError(f"--start truth: the log has no truth for {', '.join(missing)}")
-    for robot, pose in start.poses.items():
-        if len(pose) != 3 or robot not in log.robots:
-            raise EstimationError(
-                f"--start {robot}: needs x,y,phi of one of the robots {', '.join(log.robots)}"
-            )
-        starts[robot] = Start(np.array(pose), given)
-    if log.robots and log.robots[0] not in starts and not starts:
-        origin = np.diag([start.origin_sigma_m**2] * 2 + [start.origin_sigma_rad**2])
-        starts[log.robots[0]] = Start(np.zeros(3), origin)
-    return starts
 
 
 def _counted(

@@ -16,7 +16,6 @@ from graphslam.config import Config, dump_config
 from graphslam.geometry import Array, transform
 from graphslam.landmark_map import Entry, LandmarkMap
 from graphslam.logs import LogSet
-from graphslam.models.motion import Calibration
 from graphslam.records import Estimate, Landmark
 
 FORMAT = "graphslam-result-1"
@@ -80,8 +79,8 @@ def summarise(
     tentative_deleted: int,
     line_closures: int,
     landmarks: int,
-    seconds: Counter[str],
-    calibration: Mapping[str, Calibration],
+    seconds: Mapping[str, float],
+    calibration: Mapping[str, Mapping[str, tuple[float, float, bool]]],
 ) -> dict[str, Any]:
     """The keys of summary.json (see docs/formats.md)."""
     scans, total = counts["scans"], max(seconds["all"], 1e-9)
@@ -128,11 +127,9 @@ def summarise(
         "repaired": dict(sorted(log.repaired.items())),
         "graph": {"error": estimate.error, "dof": estimate.dof},
         "calibration": {
-            f"{robot}.{name}": {"value": float(value), "sigma": float(sigma), "observable": True}
+            f"{robot}.{name}": {"value": value, "sigma": sigma, "observable": observable}
             for robot, found in sorted(calibration.items())
-            for name, value, sigma in zip(
-                found.names, found.mean, np.sqrt(np.diag(found.cov)), strict=True
-            )
+            for name, (value, sigma, observable) in found.items()
         },
         "warnings": list(log.warnings),
     }

@@ -1,98 +1,115 @@
 """Trajectories at any stamps, from the states that an estimator keeps and the odometry between."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from graphslam.dead_reckoning import Track
-from graphslam.geometry import Array, between, compose, exp, log
+from graphslam.geometry import (
+    Array,
+    between,
+    compose,
+    compose_cov,
+    compose_jacobians,
+    exp,
+    inverse,
+    log,
+    rotation3,
+)
+from graphslam.models.motion import Calibration
 from graphslam.records import Trajectory
 
 IntArray = np.ndarray[tuple[int], np.dtype[np.int64]]
 
 
-def between_states(
-    states: Trajectory, track: Track, times_ns: IntArray, stamps_ns: IntArray, *, causal: bool
+def causal_at(
+    states: Trajectory,
+    calibrations: Sequence[Calibration],
+    track: Track,
+    times_ns: IntArray,
+    stamps_ns: IntArray,
 ) -> Trajectory:
     """Poses at ``times_ns``: the last state before it, carried on by odometry.
 
-    Final (``causal`` false): the disagreement between odometry and the *next* state is spread over
-    the interval in proportion to the motion in it, and the covariance is that of a bridge between
-    both states. Causal: nothing after the time is used, the covariance grows by odometry.
+    Nothing after the time is used if the states are causal: ``calibrations[i]`` is what was known
+    when state i was made. The covariance grows by odometry.
 
     Args:
         states: the states, stamped with their times.
+        calibrations: of the odometry, one per state.
         track: the robot's odometry.
         times_ns: (n,) when.
         stamps_ns: (n,) what the result is stamped with.
-        causal: see above.
     """
-    at = states.stamps_ns
-    i = np.clip(np.searchsorted(at, times_ns, side="right") - 1, 0, len(at) - 1)
-    late = track.latency_ns
-    odometry_at_state = compose(track.pose(at - late), track.mount)
-    moved = between(odometry_at_state[i], compose(track.pose(times_ns - late), track.mount))
-    poses = compose(states.poses[i], moved)
-    turn = _rotations(states.poses[i, 2])
-    if causal:
-        added = _noise_since(track, at[i], times_ns)
-    else:
-        share = _shares(track, at, i, times_ns)
-        noise = _interval_noise(track, at, int(times_ns.max()))[i]
-        following = np.minimum(i + 1, len(at) - 1)
-        arrived = compose(
-            states.poses[i], between(odometry_at_state[i], odometry_at_state[following])
-        )
-        miss = log(between(arrived, states.poses[following]))
-        poses = compose(poses, exp(share[:, None] * np.where((following > i)[:, None], miss, 0.0)))
-        inside = (following > i)[:, None, None]
-        s = share[:, None, None]
-        added = s * np.where(inside, 1 - s, 1.0) * noise
-    F = np.broadcast_to(np.eye(3), (len(i), 3, 3)).copy()
-    F[:, 0, 2] = -(poses[:, 1] - states.poses[i, 1])
-    F[:, 1, 2] = poses[:, 0] - states.poses[i, 0]
+    i = _state_before(states, times_ns)
+    delta, noise = track.coarse_motions(states.stamps_ns[i], times_ns, calibrations, i)
+    covs = compose_cov(states.poses[i], states.covs[i], delta, noise)
+    return Trajectory(stamps_ns, compose(states.poses[i], delta), covs)
+
+
+def final_at(
+    states: Trajectory, track: Track, times_ns: IntArray, stamps_ns: IntArray
+) -> Trajectory:
+    """Poses at ``times_ns`` between final states.
+
+    The disagreement between odometry and the *next* state is spread over the interval in proportion
+    to the motion in it, and the covariance is that of a bridge between both states.
+
+    Args:
+        states: the states, stamped with their times.
+        track: the robot's odometry, its calibration the final one.
+        times_ns: (n,) when.
+        stamps_ns: (n,) what the result is stamped with.
+    """
+    at, known = states.stamps_ns, [track.calibration]
+    i = _state_before(states, times_ns)
+    following = np.minimum(i + 1, len(at) - 1)
+    same = np.zeros(len(i), dtype=np.int64)
+    delta, noise = track.coarse_motions(at[i], times_ns, known, same)
+    whole, whole_noise = track.coarse_motions(at[i], at[following], known, same)
+    inside = following > i
+    effort = track.effort(at)
+    driven = np.where(inside, effort[following] - effort[i], 0.0)
+    share = (track.effort(times_ns) - effort[i]) / np.where(driven > 0, driven, 1.0)
+    share = np.clip(np.where(driven > 0, share, 0.0), 0.0, 1.0)
+    miss = log(between(compose(states.poses[i], whole), states.poses[following]))
+    poses = compose(states.poses[i], delta)
+    poses = compose(poses, exp(share[:, None] * np.where(inside[:, None], miss, 0.0)))
+    F, _ = compose_jacobians(states.poses[i], between(states.poses[i], poses))
+    s, turn = share[:, None, None], rotation3(states.poses[i, 2])
     carried = F @ states.covs[i] @ F.mT
-    if not causal:
-        carried = np.where(inside, (1 - s) * carried + s * states.covs[following], carried)
-    return Trajectory(stamps_ns, poses, carried + turn @ added @ turn.mT)
+    bridge = (
+        (1 - s) * carried
+        + s * states.covs[following]
+        + turn @ (s * (1 - s) * whole_noise) @ turn.mT
+    )
+    beyond = carried + turn @ noise @ turn.mT
+    return Trajectory(stamps_ns, poses, np.where(inside[:, None, None], bridge, beyond))
 
 
 def mounted(base: Trajectory, mounts: Array) -> Trajectory:
     """Trajectory of frames that sit at ``mounts`` (n, 3) or (3,) in the base frame, rigidly."""
-    poses = compose(base.poses, mounts)
-    F = np.broadcast_to(np.eye(3), base.covs.shape).copy()
-    F[:, 0, 2] = -(poses[:, 1] - base.poses[:, 1])
-    F[:, 1, 2] = poses[:, 0] - base.poses[:, 0]
-    return Trajectory(base.stamps_ns, poses, F @ base.covs @ F.mT)
+    F, _ = compose_jacobians(base.poses, mounts)
+    return Trajectory(base.stamps_ns, compose(base.poses, mounts), F @ base.covs @ F.mT)
 
 
-def _shares(track: Track, at: IntArray, i: IntArray, times_ns: IntArray) -> Array:
-    """How much (0..1) of the motion between state i and the next lies before each time."""
-    last = max(int(times_ns.max()), int(at[-1]))
-    ends = np.append(at[1:], last)
-    late = track.latency_ns
-    effort_at, effort_end = track.effort(at - late), track.effort(ends - late)
-    whole = effort_end - effort_at
-    part = (track.effort(times_ns - late) - effort_at[i]) / np.where(whole[i] > 0, whole[i], 1.0)
-    return np.clip(np.where(whole[i] > 0, part, 0.0), 0.0, 1.0)
+def moved_world(trajectory: Trajectory, world: Array) -> Trajectory:
+    """The same trajectory after its world frame was put at ``world`` (3,) or (n, 3)."""
+    turn = rotation3(world[..., 2])
+    poses = compose(np.broadcast_to(world, trajectory.poses.shape), trajectory.poses)
+    return Trajectory(trajectory.stamps_ns, poses, turn @ trajectory.covs @ turn.mT)
 
 
-def _noise_since(track: Track, since_ns: IntArray, times_ns: IntArray) -> Array:
-    """Odometry covariance (n, 3, 3) from a state to a time, along the state's axes; 0 at it."""
-    noise = np.zeros((len(times_ns), 3, 3))
-    for n in np.flatnonzero(times_ns > since_ns):
-        noise[n] = track.motion(int(since_ns[n]), int(times_ns[n])).cov
-    return noise
+def origin_shift(start: Array, mounts: Array) -> Array:
+    """World frames ``(..., 3)`` that bring a robot's *base* to its start pose.
+
+    A prior puts the first state at ``start`` (3,), but states are rigid to the sensor, which sits
+    at ``mounts`` (..., 3) from the base: ``start ∘ mount ∘ start⁻¹`` makes up for it.
+    """
+    return compose(compose(np.broadcast_to(start, mounts.shape), mounts), inverse(start))
 
 
-def _interval_noise(track: Track, at: IntArray, last_ns: int) -> Array:
-    """Odometry covariance (n, 3, 3) of the interval after each state, along the state's axes."""
-    ends = np.append(at[1:], max(last_ns, int(at[-1])))
-    return np.array([track.motion(int(a), int(b)).cov for a, b in zip(at, ends, strict=True)])
-
-
-def _rotations(headings: Array) -> Array:
-    c, s = np.cos(headings), np.sin(headings)
-    turn = np.zeros((len(headings), 3, 3))
-    turn[:, 0, 0] = turn[:, 1, 1] = c
-    turn[:, 0, 1], turn[:, 1, 0] = -s, s
-    turn[:, 2, 2] = 1.0
-    return turn
+def _state_before(states: Trajectory, times_ns: IntArray) -> IntArray:
+    """Index (n,) of the last state at or before each time (the first for earlier times)."""
+    found = np.searchsorted(states.stamps_ns, times_ns, side="right") - 1
+    return np.clip(found, 0, len(states) - 1)

@@ -66,7 +66,7 @@ def compared(seen, models, states, P_xx=None, pose=POSE, flipped=False, floor=NO
     """`compare` of observation k with landmark k, landmarks known exactly."""
     k = len(seen)
     index = np.arange(k)
-    pairs = Pairs(index, index, tuple(models), np.full(k, flipped))
+    pairs = Pairs(index, index, tuple(models), np.full(k, flipped), np.zeros(k))
     padded = np.array([(*s, 0.0)[:3] for s in states])
     P = np.zeros((3, 3)) if P_xx is None else P_xx
     zero = np.zeros((k, 3, 3))
@@ -228,7 +228,7 @@ def test_gate_accepts_its_probability_of_true_pairs(name, probability):
     z = exact + rng.multivariate_normal(np.zeros(width), cov, n)
     seen = [Observation("line", v, cov, np.zeros(2)) for v in z]
     index = np.arange(n)
-    pairs = Pairs(index, index, (name,) * n, np.zeros(n, bool))
+    pairs = Pairs(index, index, (name,) * n, np.zeros(n, bool), np.zeros(n))
     padded = np.broadcast_to((*t, 0.0)[:3], (n, 3))
     full = np.zeros((6, 6))
     full[: 3 + model.dim, : 3 + model.dim] = P

@@ -270,9 +270,10 @@ def test_corridor_naive_middles_are_wrong_and_confident():
 
 
 def test_corridor_line_sigma_is_unmoved_by_what_is_claimed_along_the_wall():
-    """A line's first row of covariance means nothing: 1 cm there or 100 m is the same result."""
+    """A line's first row of covariance means nothing: 1 cm there or 100 m is the same result, to
+    the optimiser's own tolerance (1e-10 of the error is some 1e-7 of the distance)."""
     results = [drive_corridor("batch", "line", along_sigma_m=s) for s in (0.01, 100.0)]
-    np.testing.assert_allclose(results[0], results[1], rtol=1e-9)
+    np.testing.assert_allclose(results[0], results[1], rtol=1e-6)
 
 
 def test_world_from_body_is_the_thesis_rotation():

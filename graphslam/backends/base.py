@@ -41,6 +41,10 @@ class Backend(Protocol):
         """Joint marginal of the robot's latest pose and the landmarks, from data so far."""
         ...
 
+    def state_mean(self, robot: str) -> Array:
+        """Current estimate (3,) of the robot's latest pose, without covariance (cheap)."""
+        ...
+
     def landmark_means(self, landmarks: Sequence[int]) -> list[Array]:
         """Current estimates (2,) or (3,) of the landmarks, without covariance (cheap)."""
         ...

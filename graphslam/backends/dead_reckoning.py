@@ -54,6 +54,10 @@ class DeadReckoningBackend:
             cov[block, block] = landmark_cov
         return Joint(self._poses[robot][last], tuple(mean for mean, _ in found), cov, slices)
 
+    def state_mean(self, robot: str) -> Array:
+        """See `Backend`."""
+        return self._poses[robot][self._states.latest(robot)]
+
     def landmark_means(self, landmarks: Sequence[int]) -> list[Array]:
         """See `Backend`."""
         return [self._landmarks[i][0] for i in landmarks]

@@ -12,20 +12,23 @@ import numpy as np
 
 from graphslam import factors
 from graphslam.backends.base import Joint, StateTable, block_slices
-from graphslam.config import Config
+from graphslam.config import Config, RobustConfig
 from graphslam.errors import EstimationError
-from graphslam.geometry import Array, compose
+from graphslam.geometry import Array, compose, rotate_cov
 from graphslam.models import MODELS
 from graphslam.records import Association, Estimate, Step, Trajectory
 
 #: m or rad: the estimate has converged when all variables together move less than this
 CONVERGED = 1e-6
+#: the same for lines that are faced anew, and how often they are at most: it converges in two
+FACED, MAX_FACINGS = 1e-6, 4
 
 
 class GraphBuilder:
     """Turns steps into factors and first values; remembers which key is what.
 
     ``rows`` counts the residual rows that carry information: GTSAM counts a line's empty row too.
+    ``graph`` holds every factor so far.
     """
 
     def __init__(self, config: Config) -> None:
@@ -34,6 +37,7 @@ class GraphBuilder:
         self.robots: list[str] = []
         self.landmark_dims: dict[int, int] = {}
         self.rows = 0
+        self._lines: list[tuple[int, int, int, Association]] = []  # place in graph, keys, what
         self.graph = gtsam.NonlinearFactorGraph()
 
     def state_key(self, robot: str, number: int) -> int:
@@ -77,6 +81,8 @@ class GraphBuilder:
                 if seen.model == "line":
                     graph.add(factors.line_gauge_factor(key, target, seen))
                     self.rows += 1
+            if seen.model == "line":
+                self._lines.append((self.graph.size() + graph.size(), key, target, seen))
             t = estimate(target, dim)
             graph.add(factors.observation_factor(key, target, seen, self._config.robust, x, t))
             self.rows += MODELS[seen.model].rows
@@ -89,6 +95,19 @@ class GraphBuilder:
             self.rows += 3
         self.graph.push_back(graph)
         return graph, values
+
+    def face_lines(self, values: gtsam.Values) -> None:
+        """Rebuild the factors of lines at ``values``.
+
+        A line's measurement was moved along the line to face the landmark's origin as estimated at
+        its time (see `LineModel`); where the estimate has moved since, so must the measurement, or
+        it claims some knowledge along the line.
+        """
+        for place, key, target, seen in self._lines:
+            x = factors.array3(values.atPose2(key))
+            t = factors.array3(values.atPose2(target))
+            factor = factors.observation_factor(key, target, seen, self._config.robust, x, t)
+            self.graph.replace(place, factor)
 
     def _target_key(self, seen: Association, time_ns: int) -> int:
         if isinstance(seen.target, int):
@@ -120,13 +139,12 @@ class GraphBuilder:
         )
 
 
-def qr_parameters(config: Config) -> gtsam.ISAM2Params:
-    """Settings of iSAM2."""
+def isam2_parameters(config: Config, factorization: str) -> gtsam.ISAM2Params:
+    """Settings of iSAM2; ``factorization`` CHOLESKY or QR."""
     parameters = gtsam.ISAM2Params()
     parameters.setRelinearizeThreshold(config.backend.relinearize_threshold)
     parameters.relinearizeSkip = config.backend.relinearize_every
-    # Cholesky calls good graphs indeterminate: information spans ten orders of magnitude here
-    parameters.setFactorization("QR")
+    parameters.setFactorization(factorization)
     return parameters
 
 
@@ -136,7 +154,9 @@ class Isam2Backend:
     def __init__(self, config: Config) -> None:
         self._config = config
         self._builder = GraphBuilder(config)
-        self._isam = gtsam.ISAM2(qr_parameters(config))
+        self._factorization = "CHOLESKY"
+        self._isam = gtsam.ISAM2(isam2_parameters(config, self._factorization))
+        self._joints: dict[str, Joint] = {}  # since the last step
 
     def value(self, key: int, dim: int) -> Array:
         """Current estimate of a variable."""
@@ -147,13 +167,33 @@ class Isam2Backend:
     def add(self, step: Step) -> None:
         """See `Backend`."""
         graph, values = self._builder.expand(step, self)
+        self._joints.clear()
         try:
             self._isam.update(graph, values)
         except RuntimeError as error:
+            self._use_qr(error)
+
+    def _use_qr(self, error: RuntimeError) -> None:
+        """Start the tree anew with QR, at what the failed one was linearised at.
+
+        Cholesky is twice as fast but calls good graphs indeterminate where information spans many
+        orders of magnitude (MIT at pose 165, M3500 at 695); QR does not.
+        """
+        if self._factorization == "QR":
             raise self._builder.explain(error) from error
+        self._factorization = "QR"
+        values = self._isam.getLinearizationPoint()
+        self._isam = gtsam.ISAM2(isam2_parameters(self._config, "QR"))
+        try:
+            self._isam.update(self._builder.graph, values)
+        except RuntimeError as again:
+            raise self._builder.explain(again) from again
 
     def joint(self, robot: str, landmarks: Sequence[int]) -> Joint:
-        """See `Backend`."""
+        """See `Backend`; asked for the pose alone after more, it answers from what it has."""
+        if not landmarks and robot in self._joints:
+            known = self._joints[robot]
+            return Joint(known.pose, (), known.cov[:3, :3], ())
         key = self._builder.state_key(robot, self._builder.states.latest(robot))
         dims = [self._builder.landmark_dims[i] for i in landmarks]
         keys = [factors.landmark_key(i) for i in landmarks]
@@ -173,7 +213,13 @@ class Isam2Backend:
         for block, mean in zip((slice(0, 3), *slices), (pose, *means), strict=True):
             if len(mean) == 3:
                 turn[block, block] = factors.world_from_body(float(mean[2]))
-        return Joint(pose, means, turn @ cov @ turn.T, slices)
+        self._joints[robot] = Joint(pose, means, turn @ cov @ turn.T, slices)
+        return self._joints[robot]
+
+    def state_mean(self, robot: str) -> Array:
+        """See `Backend`."""
+        number = self._builder.states.latest(robot)
+        return self.value(self._builder.state_key(robot, number), 3)
 
     def landmark_means(self, landmarks: Sequence[int]) -> list[Array]:
         """See `Backend`."""
@@ -185,7 +231,7 @@ class Isam2Backend:
         """See `Backend`: iSAM2 until it moves no more, then optimised to convergence."""
         values = self._converged()
         if self._config.backend.polish:
-            values = self._optimised(values)
+            return self._estimate(self._optimised(values))
         return self._estimate(values)
 
     def _converged(self) -> gtsam.Values:
@@ -196,14 +242,21 @@ class Isam2Backend:
                 if self._isam.getDelta().norm() < CONVERGED:
                     break
         except RuntimeError as error:
-            raise self._builder.explain(error) from error
+            self._use_qr(error)
         return self._isam.calculateBestEstimate()
 
     def _optimised(self, values: gtsam.Values) -> gtsam.Values:
+        """Optimised, the lines faced anew until that moves nothing any more."""
         try:
-            return optimise(self._builder.graph, values)
+            for _ in range(MAX_FACINGS):
+                before = values
+                self._builder.face_lines(values)
+                values = optimise(self._builder.graph, values, self._config.robust)
+                if before.localCoordinates(values).norm() < FACED:
+                    break
         except RuntimeError as error:
             raise self._builder.explain(error) from error
+        return values
 
     def _marginals(self, values: gtsam.Values) -> dict[int, Array]:
         """Marginal covariance of every key: by Cholesky, or by QR where that gives up."""
@@ -212,7 +265,7 @@ class Isam2Backend:
             marginals = gtsam.Marginals(self._builder.graph, values)
             return {key: marginals.marginalCovariance(key) for key in keys}
         except RuntimeError as error:
-            isam = gtsam.ISAM2(qr_parameters(self._config))
+            isam = gtsam.ISAM2(isam2_parameters(self._config, "QR"))
             isam.update(self._builder.graph, values)
             found = {key: isam.marginalCovariance(key) for key in keys}
             # QR does not complain about an indeterminate graph, it answers NaN
@@ -228,7 +281,7 @@ class Isam2Backend:
             poses = np.array([factors.array3(values.atPose2(k)) for k in keys])
             covs = np.array([marginals[k] for k in keys])
             states[robot] = Trajectory(
-                builder.states.stamps(robot), poses, _to_world(covs, poses[:, 2])
+                builder.states.stamps(robot), poses, rotate_cov(covs, poses[:, 2])
             )
         landmarks = {}
         for landmark, dim in builder.landmark_dims.items():
@@ -236,7 +289,7 @@ class Isam2Backend:
             cov = marginals[key]
             if dim == 3:
                 mean = factors.array3(values.atPose2(key))
-                cov = _to_world(cov[None], mean[None, 2])[0]
+                cov = rotate_cov(cov, mean[2])
             else:
                 mean = np.asarray(values.atPoint2(key))
             landmarks[landmark] = (mean, cov)
@@ -252,20 +305,17 @@ class BatchBackend(Isam2Backend):
         return self._estimate(self._optimised(self._isam.calculateBestEstimate()))
 
 
-def optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
-    """Levenberg-Marquardt from ``values`` until the error changes by less than 1e-7 of itself."""
+def optimise(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, kernel: RobustConfig
+) -> gtsam.Values:
+    """Levenberg-Marquardt from ``values`` until the error hardly changes.
+
+    Without a kernel convergence is quadratic and 1e-10 of the error comes for free. Under a kernel
+    GTSAM reweights, which converges linearly: beyond 1e-7 hundreds of iterations move nothing that
+    shows.
+    """
     parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setRelativeErrorTol(1e-7)
+    parameters.setRelativeErrorTol(1e-10 if kernel.kernel == "none" else 1e-7)
     parameters.setAbsoluteErrorTol(1e-9)
     parameters.setMaxIterations(200)
     return gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-
-
-def _to_world(covs: Array, headings: Array) -> Array:
-    """Body-frame covariances (n, 3, 3) to additive world-axis errors."""
-    c, s = np.cos(headings), np.sin(headings)
-    turn = np.zeros((len(headings), 3, 3))
-    turn[:, 0, 0] = turn[:, 1, 1] = c
-    turn[:, 0, 1], turn[:, 1, 0] = -s, s
-    turn[:, 2, 2] = 1.0
-    return np.asarray(turn @ covs @ turn.mT)

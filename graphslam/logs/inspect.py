@@ -17,8 +17,8 @@ from graphslam.logs import order
 from graphslam.logs.decoders import TopicContext
 from graphslam.logs.log_set import LogFile, decode_message, describe_damage
 from graphslam.logs.mcap_file import McapFile, open_mcap, raw_messages
-from graphslam.logs.schemas import SIGHTING
 from graphslam.logs.recording import place_late
+from graphslam.logs.schemas import SIGHTING
 from graphslam.logs.survey import ScanShape, scan_shape, survey_topics
 from graphslam.logs.topics import (
     ODOMETRY_KINDS,

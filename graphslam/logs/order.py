@@ -54,8 +54,9 @@ class TimeLine:
     too late. Its message is placed between its neighbours in the order of recording (``time_ns``),
     in proportion to what was recorded between them on *all* topics, so that a scan and the odometry
     recorded around it stay in order when both are late; ``stamp_ns`` stays. Two messages that
-    contradict each other and nothing else are a mere swap and go by their stamps. A message may come up to ``window_ns``
-    after younger ones and is still placed; one older than what was already passed on is dropped.
+    contradict each other and nothing else are a mere swap and go by their stamps. A message may
+    come up to ``window_ns`` after younger ones and is still placed; one older than what was already
+    passed on is dropped.
 
     Believing recording over stamps is right because one topic has one publisher and one transport,
     which keep its order, and because clocks are read late, not early. It took Intel's dead

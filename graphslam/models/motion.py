@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphslam.config import OdometryConfig, RobotConfig
-from graphslam.geometry import Array, compose, exp, exp_jacobian, inverse, rotation
+from graphslam.geometry import Array, compose, exp, exp_jacobian, inverse, rotation3
 
 
 def wheel_twist(angles_rad: Array, robot: RobotConfig) -> Array:
@@ -130,17 +130,15 @@ def wheel_increments(
 
 
 def mounted_motion(delta: Array, mount: Array) -> tuple[Array, Array]:
-    """The motion of a frame that sits at ``mount`` (3,) in a body that moves by ``delta`` (3,).
+    """The motion of a frame that sits at ``mount`` (..., 3) in a body that moves by ``delta``.
 
     Returns:
-        ``inverse(mount) delta mount`` (3,), and its derivative (3, 3) by the mount. Turning in
-        place shows the mount's position, driving straight its direction.
+        ``inverse(mount) delta mount`` (..., 3), and its derivative (..., 3, 3) by the mount.
+        Turning in place shows the mount's position, driving straight its direction.
     """
     moved = compose(inverse(mount), compose(delta, mount))
-    back = rotation(-mount[2])
-    D = np.zeros((3, 3))
-    D[:2, :2] = back @ (rotation(delta[2]) - np.eye(2))
-    D[0, 2], D[1, 2] = moved[1], -moved[0]
+    D = rotation3(-mount[..., 2]) @ (rotation3(delta[..., 2]) - np.eye(3))
+    D[..., 0, 2], D[..., 1, 2] = moved[..., 1], -moved[..., 0]
     return moved, D
 
 

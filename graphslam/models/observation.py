@@ -77,16 +77,6 @@ def _relative_jacobians(x: Array, t: Array) -> tuple[Array, Array]:
     return H_x, H_t
 
 
-def _turned(cov: Array, angle_rad: Array) -> Array:
-    """`rotate_cov` over leading axes."""
-    M = np.zeros((*np.shape(angle_rad), 3, 3))
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
-    M[..., 0, 0] = M[..., 1, 1] = c
-    M[..., 0, 1], M[..., 1, 0] = -s, s
-    M[..., 2, 2] = 1.0
-    return np.asarray(M @ cov @ M.mT)
-
-
 @dataclass(frozen=True)
 class PoseModel:
     """A target with position and direction, measured as a pose: thesis eq. 4.18.
@@ -108,7 +98,7 @@ class PoseModel:
 
     def noise(self, z: Array, cov: Array, x: Array, t: Array) -> Array:
         """See `ObservationModel`; z's covariance is along the axes of the base frame."""
-        return _turned(cov, -z[..., 2])
+        return rotate_cov(cov, -z[..., 2])
 
     def jacobians(self, z: Array, x: Array, t: Array) -> tuple[Array, Array]:
         """See `ObservationModel`."""
@@ -165,7 +155,7 @@ class LineModel(PoseModel):
 
     def noise(self, z: Array, cov: Array, x: Array, t: Array) -> Array:
         """See `ObservationModel`; the part of ``cov`` along the line is not used."""
-        V = _turned(cov, -z[..., 2])[..., 1:, 1:]
+        V = rotate_cov(cov, -z[..., 2])[..., 1:, 1:]
         T = np.zeros((*V.shape[:-2], 2, 2))
         T[..., 0, 0] = T[..., 1, 1] = 1.0
         T[..., 0, 1] = self.along(z, x, t)

@@ -1,0 +1,94 @@
+"""What a run keeps for one robot while the log goes by, and the trajectories it becomes."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from graphslam.calibration import Calibrator
+from graphslam.dead_reckoning import Track
+from graphslam.geometry import Array, between, compose, inverse
+from graphslam.models.motion import Calibration
+from graphslam.records import Motion, RobotResult, Trajectory
+from graphslam.trajectories import IntArray, causal_at, final_at, mounted, moved_world, origin_shift
+
+#: Hz at which the base of a robot without scans is reported
+BASE_RATE_HZ = 10
+
+
+@dataclass(slots=True, eq=False)
+class RobotRun:
+    """One robot's odometry, its states so far and its scans.
+
+    ``times`` of the states, ns; per state the causal pose, its covariance and the calibration that
+    was known; ``scans`` (stamp, time, mount). The states are rigid to the sensor: the base is where
+    the calibration puts it.
+    """
+
+    track: Track
+    calibrator: Calibrator = field(default_factory=Calibrator)
+    path_m: float = 0.0
+    times: list[int] = field(default_factory=list)
+    causal_poses: list[Array] = field(default_factory=list)
+    causal_covs: list[Array] = field(default_factory=list)
+    calibrations: list[Calibration] = field(default_factory=list)
+    scans: list[tuple[int, int, Array]] = field(default_factory=list)
+
+    @property
+    def started(self) -> bool:
+        """Whether the robot has a state."""
+        return bool(self.times)
+
+    @property
+    def state_ns(self) -> int:
+        """Time of the latest state; -1 before the first."""
+        return self.times[-1] if self.times else -1
+
+    def append(self, time_ns: int, pose: Array) -> None:
+        """Book a new state; its covariance follows."""
+        self.times.append(time_ns)
+        self.causal_poses.append(pose)
+        self.calibrations.append(self.track.calibration)
+
+    def learn(self, motion: Motion, pose: Array) -> None:
+        """Improve the calibration from the motion to a new state, estimated at ``pose`` (3,)."""
+        moved = between(self.causal_poses[-1], pose)
+        self.track.calibration = self.calibrator.learn(self.track.calibration, motion, moved)
+
+    def result(self, states: Trajectory, start: Array) -> RobotResult:
+        """Trajectories of the robot at the stamps that it is reported at.
+
+        Args:
+            states: the final states, world frame.
+            start: (3,) where the prior put the robot that defines the world frame.
+        """
+        stamps, times, laser = self._report_times()
+        final = final_at(states, self.track, times, stamps)
+        base = mounted(final, inverse(self.track.mount))
+        known = Trajectory(
+            states.stamps_ns, np.array(self.causal_poses), np.array(self.causal_covs)
+        )
+        causal = causal_at(known, self.calibrations, self.track, times, stamps)
+        # the mount that was known then, for the base and for the world that hangs on it
+        last = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, None)
+        mount = np.array([self.track.mount_of(c) for c in self.calibrations])[last]
+        causal = moved_world(causal, origin_shift(start, mount))
+        at_start = compose(states.poses[0], inverse(self.track.mount))
+        odometry = between(self.track.pose(self.times[0]), self.track.pose(times))
+        unknown = np.full((len(times), 3, 3), np.nan)
+        return RobotResult(
+            base,
+            mounted(causal, inverse(mount)),
+            mounted(final, laser) if self.scans else None,
+            mounted(causal, laser) if self.scans else None,
+            Trajectory(stamps, compose(at_start, odometry), unknown),
+        )
+
+    def _report_times(self) -> tuple[IntArray, IntArray, Array]:
+        """Stamps (n,), times (n,) and, for scans, laser mounts (n, 3), sorted by stamp."""
+        if self.scans:
+            scans = sorted(self.scans, key=lambda scan: scan[0])
+            stamps, times = (np.array([scan[k] for scan in scans], dtype=np.int64) for k in (0, 1))
+            return stamps, times, np.array([scan[2] for scan in scans])
+        period = round(1e9 / BASE_RATE_HZ)
+        times = np.arange(self.track.first_ns, self.track.last_ns + 1, period)
+        return times, times, np.zeros((0, 3))
