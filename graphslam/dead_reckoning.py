@@ -28,8 +28,8 @@ Odometry = OdometryPose | OdometryIncrement | WheelAngles
 STANDING_SIGMA = 1e-3
 
 #: m/s and rad/s: no wheeled robot's odometry says more. An interval that implies it was stamped
-#: in a burst (a logger that fell behind): its stamps do not tell when the motion took place, so a time
-#: inside it belongs to the reading before, as the order of recording has it
+#: in a burst (a logger that fell behind): its stamps do not tell when the motion took place, so a
+#: time inside it belongs to the reading before, as the order of recording has it
 MAX_SPEED_M_S, MAX_TURN_RAD_S = 20.0, 20.0
 #: share of readings in bursts above which the stamps are not good enough to learn a latency
 MAX_BURST_SHARE = 0.01

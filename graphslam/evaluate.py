@@ -98,6 +98,8 @@ def nees(errors: Array, covs: Array) -> Array:
 def consistency(errors: Array, covs: Array) -> dict[str, Any]:
     """``nees_per_dof``, its two-sided 95 % ``nees_bounds`` and ``coverage`` of the 95 % ellipsoids.
 
+    Of errors (n, d) with covariances (n, d, d) along the same axes.
+
     The bounds are the chi-square quantiles of an average of n *independent* poses. Poses of one
     run are strongly correlated, so one run leaves the bounds far more often than 5 %: they are a
     scale to read the number on; a test of consistency needs many runs. Without a usable

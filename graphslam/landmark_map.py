@@ -68,7 +68,7 @@ class LandmarkMap:
         )
 
     def add(self, seen: Observation, pose: Array, time_ns: int) -> Entry:
-        """A new tentative landmark from an observation in the base frame of ``pose``."""
+        """A new tentative landmark from an observation made at ``pose`` (3,), in its frame."""
         model = MODELS[seen.kind]
         mean, extent = np.zeros(3), np.zeros(2)
         state = model.invert(seen.z, pose)
@@ -88,7 +88,11 @@ class LandmarkMap:
     def saw(
         self, entry: Entry, seen: Observation, pose: Array, time_ns: int, robot: str, path_m: float
     ) -> None:
-        """Book a sighting: count it and let the extent grow to what was seen."""
+        """Book a sighting: count it and let the extent grow to what was seen.
+
+        ``seen`` is in the base frame of the robot's ``pose`` (3,), which is in the world frame;
+        ``path_m`` is how far ``robot`` has driven.
+        """
         entry.sightings += 1
         entry.last_ns = max(entry.last_ns, time_ns)
         entry.path_m[robot] = path_m

@@ -221,9 +221,6 @@ class Pipeline:
         """A sighting of another robot: brings that robot's motion to the same time."""
         other = message.seen_robot
         assert other is not None
-        if other not in self.runs:
-            self.dropped[f"sighting: robot {other} is not in the log"] += 1
-            return ()
         if not self.runs[other].started:
             self.start(other, self.runs[other].track.first_ns)
         moved = self.motion_since_state(other, state_ns)

@@ -34,8 +34,9 @@ def synchronise(
 
     A scan stamped between two odometry readings needs the later one to be placed. The order of
     time is kept over all robots, so one robot's silence may delay the others, by ``max_gap_s`` at
-    most: what is farther than that from any odometry of its robot is dropped and counted. At the
-    end of the log the robot is taken to stand still after its last reading.
+    most: what is farther than that from any odometry of its robot is dropped and counted, and so
+    is, at once, a sighting of a robot that has no track. At the end of the log the robot is taken
+    to stand still after its last reading.
     """
     waiting: deque[Message] = deque()
     max_gap_ns = round(max_gap_s * 1e9)
@@ -57,6 +58,9 @@ def synchronise(
 
     for message in messages:
         if isinstance(message, Truth | TrueLandmark):
+            continue
+        if isinstance(message, Sighting) and message.seen_robot not in (None, *tracks):
+            dropped[f"sighting: robot {message.seen_robot} is not in the log"] += 1
             continue
         now_ns = max(now_ns, message.time_ns)
         if isinstance(message, ODOMETRY):

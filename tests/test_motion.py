@@ -300,10 +300,6 @@ def test_mounted_motion_is_the_base_motion_seen_from_the_mount():
     np.testing.assert_allclose(ahead, [-0.3, 0.3, np.pi / 2], atol=1e-15)
 
 
-@pytest.mark.xfail(
-    reason="Track.motion turns d_cal and cov into the laser's axes without the mount's lever arm",
-    strict=False,
-)
 def test_motion_derivative_of_a_mounted_track_equals_finite_differences():
     """Scales, drift and the laser's pose together, at values that are not nominal: how a turning
     error moves a laser that sits ahead is the entry most easily forgotten."""

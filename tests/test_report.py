@@ -133,7 +133,7 @@ def test_everything_asked_for_is_shown(indoors):
         "between the two thresholds",
         "no odometry around the scan",
         "631 scans are stamped earlier than the one before <scan & odom>",  # escaped, so readable
-        "robot.translation_scale",
+        "robot · translation scale",
         "All 12 landmarks",
         "gtsam 4.3.0",
         "[front_end]",

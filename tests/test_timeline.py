@@ -146,11 +146,21 @@ def test_sighting_of_a_robot_waits_for_both_robots():
     assert run.read_at_release[index] == 1 * SECOND  # of a landmark: a alone
 
 
-def test_sighting_of_a_robot_without_odometry_is_counted():
-    messages = [odometry("a", 0), sighting("a", 0.5, "nobody"), odometry("a", 1)]
+def test_sighting_of_a_robot_without_odometry_near_it_is_counted():
+    messages = [odometry("a", 0), sighting("a", 0.5, "b"), odometry("a", 1)]
     run = Run(messages)
     assert run.times(Sighting) == []
     assert run.dropped == {"sighting: no odometry near it": 1}
+
+
+def test_sighting_of_a_robot_that_is_not_in_the_log_is_counted_and_delays_nothing():
+    """A name misspelt, or a robot whose log was not given: no odometry of it can ever come, so
+    waiting for it would hold up everything else for the whole gap."""
+    messages = [odometry("a", 0), sighting("a", 0.5, "nobody"), scan("a", 0.6), odometry("a", 1)]
+    run = Run([*messages, odometry("a", 2)])
+    assert run.times(Sighting) == [] and run.times(Scan) == [0.6]
+    assert run.dropped == {"sighting: robot nobody is not in the log": 1}
+    assert run.read_at_release[1] == 1 * SECOND
 
 
 def test_truth_never_reaches_the_estimator():

@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import eigh
 
 from graphslam.config import OdometryConfig, RobotConfig
 from graphslam.dead_reckoning import Track
-from graphslam.geometry import between, compose, compose_cov, exp, wrap
+from graphslam.geometry import between, compose, compose_cov, exp, inverse, wrap
 from graphslam.records import OdometryPose, Trajectory
-from graphslam.trajectories import between_states, mounted
+from graphslam.trajectories import causal_at, final_at, mounted, moved_world, origin_shift
 
 SECOND = 1_000_000_000
 TWIST = np.array([0.5, 0.02, 0.15])  # per second
@@ -54,9 +55,14 @@ TRACK = odometry_track(READINGS, [curve(t) for t in READINGS])
 EVERYWHERE = np.sort(np.random.default_rng(3).uniform(0.0, 12.0, 200))
 
 
-def at(times_s, *, causal, given=STATES, track=TRACK):
+def at(times_s, *, causal, given=STATES, track=TRACK, known=None, stamps=None):
+    """Poses at the times; ``known``: the calibration at each state, the track's own if None."""
     times = ns(times_s)
-    return between_states(given, track, times, times, causal=causal)
+    stamps = times if stamps is None else stamps
+    if causal:
+        known = [track.calibration] * len(given) if known is None else known
+        return causal_at(given, known, track, times, stamps)
+    return final_at(given, track, times, stamps)
 
 
 def assert_same_pose(a, b, atol=1e-12):
@@ -75,6 +81,7 @@ def test_trajectory_passes_through_the_states(causal):
 @pytest.mark.parametrize("causal", [True, False])
 def test_covariances_are_symmetric_and_positive_semidefinite_everywhere(causal):
     covs = at(EVERYWHERE, causal=causal).covs
+    covs = np.concatenate([covs, at(STATES_S, causal=causal).covs])
     np.testing.assert_allclose(covs, covs.mT, atol=1e-16)
     assert np.linalg.eigvalsh(covs).min() > 0
 
@@ -82,8 +89,8 @@ def test_covariances_are_symmetric_and_positive_semidefinite_everywhere(causal):
 @pytest.mark.parametrize("causal", [True, False])
 def test_results_bear_the_stamps_given(causal):
     """Time places a message, its stamp names it; they differ where a log's stamps jump."""
-    times, stamps = ns([2.0, 5.0]), np.array([77, 55])
-    found = between_states(STATES, TRACK, times, stamps, causal=causal)
+    stamps = np.array([77, 55])
+    found = at([2.0, 5.0], causal=causal, stamps=stamps)
     np.testing.assert_array_equal(found.stamps_ns, stamps)
     np.testing.assert_array_equal(found.poses, at([2.0, 5.0], causal=causal).poses)
 
@@ -103,6 +110,39 @@ def test_causal_never_uses_later_data(time_s):
     np.testing.assert_array_equal(whole.covs, seen.covs)
 
 
+def test_causal_never_uses_a_calibration_that_was_learned_later():
+    """Neither that of later states nor what the track has in the end: position, heading, latency
+    and the laser's place are all learned on the way."""
+    track = odometry_track(READINGS, [curve(t) for t in READINGS], mounted=True)
+    nominal, rng = track.calibration, np.random.default_rng(4)
+    known = [
+        replace(nominal, mean=0.05 * rng.normal(size=len(nominal.mean)), cov=n * nominal.cov)
+        for n in range(1, 6)
+    ]
+    times = [2.0, 3.5, 6.9]
+    before = at(times, causal=True, track=track, known=known)
+    track.calibration = replace(nominal, mean=np.full(len(nominal.mean), 0.07))
+    other = [*known[:3], *(replace(nominal, mean=nominal.mean + 0.03) for _ in range(2))]
+    after = at(times, causal=True, track=track, known=other)
+    np.testing.assert_array_equal(before.poses, after.poses)
+    np.testing.assert_array_equal(before.covs, after.covs)
+    # and it does use what was known: another calibration of the state before moves the pose
+    other[2] = replace(nominal, mean=nominal.mean + 0.03)
+    moved = at(times, causal=True, track=track, known=other).poses
+    assert np.abs(moved[2] - before.poses[2]).max() > 1e-3
+    np.testing.assert_array_equal(moved[:2], before.poses[:2])
+
+
+def test_final_uses_the_calibration_of_the_track():
+    """A scale of 10 % between two states that are 1.1 m apart where odometry says 1 m: nothing is
+    left to correct, wherever the motion was."""
+    track = odometry_track([0, 1, 2], [[0, 0, 0], [0.7, 0, 0], [1.0, 0, 0]])
+    track.calibration = replace(track.calibration, mean=np.array([0.1, 0.0, 0.0]))
+    ends = Trajectory(ns([0, 2]), np.array([[0, 0, 0], [1.1, 0, 0]]), np.zeros((2, 3, 3)))
+    found = at([0, 0.5, 1, 1.5, 2], causal=False, given=ends, track=track).poses
+    np.testing.assert_allclose(found[:, 0], [0, 0.385, 0.77, 0.935, 1.1], atol=1e-12)
+
+
 def test_causal_is_the_last_state_carried_on_by_odometry():
     """No correction before the state that brings it."""
     for t, last in ((2.9, 0), (3.5, 1), (6.0, 2), (10.9, 3), (11.9, 4)):
@@ -110,13 +150,32 @@ def test_causal_is_the_last_state_carried_on_by_odometry():
         assert_same_pose(at([t], causal=True).poses[0], expected)
 
 
+def coarse(start_s, end_s, track=TRACK):
+    """One interval as `Track.coarse_motions` has it: motion (3,) and covariance (3, 3)."""
+    times = ns([start_s, end_s])
+    delta, cov = track.coarse_motions(times[:1], times[1:], [track.calibration], np.array([0]))
+    return delta[0], cov[0]
+
+
 def test_causal_covariance_is_the_system_update():
     """P = F P Fᵀ + W Q Wᵀ with the odometry's own noise from the last state to the time
     (4.4-4.7)."""
     for t, last in ((2.0, 0), (6.999, 2), (11.9, 4)):
-        motion = TRACK.motion(*ns([STATES_S[last], t]))
-        expected = compose_cov(STATES.poses[last], STATES.covs[last], motion.delta, motion.cov)
+        delta, Q = coarse(STATES_S[last], t)
+        expected = compose_cov(STATES.poses[last], STATES.covs[last], delta, Q)
         np.testing.assert_allclose(at([t], causal=True).covs[0], expected, atol=1e-15)
+
+
+@pytest.mark.parametrize("path_m", [0.25, 0.4])
+def test_an_interval_taken_as_one_increment_is_as_uncertain_as_the_chain(path_m):
+    """Between keyframes (0.25 m) the sigma of no direction is off by more than 4 %: one increment
+    leaves out how an early error of the heading moves the end."""
+    end_s = 2.0 + path_m / TWIST[0]
+    motion = TRACK.motion(*ns([2.0, end_s]))
+    delta, cov = coarse(2.0, end_s)
+    assert_same_pose(delta, motion.delta)
+    ratios = eigh(cov, motion.cov, eigvals_only=True)
+    assert ratios.min() > 0.96**2 and ratios.max() < 1.04**2
 
 
 def test_final_arrives_at_the_next_state():
@@ -160,7 +219,7 @@ def test_final_covariance_is_that_of_a_bridge_by_hand():
     track = odometry_track([0, 1, 2], [[0, 0, 0], [1, 0, 0], [2, 0, 0]])
     covs = np.array([np.diag([4e-4, 4e-4, 0]), np.diag([1e-4, 9e-4, 0])])
     ends = Trajectory(ns([0, 2]), np.array([[0, 0, 0], [2.0, 0, 0]]), covs)
-    Q = track.motion(0, 2 * SECOND).cov
+    _, Q = coarse(0, 2, track)
     final = at([1], causal=False, given=ends, track=track).covs[0]
     np.testing.assert_allclose(final, 0.5 * covs[0] + 0.5 * covs[1] + 0.25 * Q, atol=1e-15)
 
@@ -221,3 +280,33 @@ def test_mounted_is_composition_with_covariance():
         assert_same_pose(found.poses[n], expected)
         np.testing.assert_allclose(found.covs[n], cov, atol=1e-16)
     np.testing.assert_array_equal(found.stamps_ns, STATES.stamps_ns)
+
+
+def test_moved_world_is_composition_from_the_left_with_covariance():
+    """Per pose or for all of them; the covariance turns with the axes and gains nothing."""
+    rng = np.random.default_rng(8)
+    worlds = rng.normal(0, 2.0, size=(len(STATES), 3))
+    found = moved_world(STATES, worlds)
+    for n, world in enumerate(worlds):
+        cov = compose_cov(world, np.zeros((3, 3)), STATES.poses[n], STATES.covs[n])
+        assert_same_pose(found.poses[n], compose(world, STATES.poses[n]))
+        np.testing.assert_allclose(found.covs[n], cov, atol=1e-16)
+    once = moved_world(STATES, worlds[0])
+    assert_same_pose(once.poses[0], found.poses[0], atol=0)
+    assert_same_pose(
+        between(once.poses[0], once.poses[1:]), between(STATES.poses[0], STATES.poses[1:])
+    )
+
+
+def test_origin_shift_brings_the_base_to_the_start():
+    """The prior put the first *laser* state there; nominal mounts shift nothing."""
+    start, mounts = (
+        np.array([2.0, -1.0, 0.7]),
+        np.array([[0.3, -0.1, 0.2], [0, 0, 0], [0.1, 0, 3.0]]),
+    )
+    world = origin_shift(start, mounts)
+    for shift, mount in zip(world, mounts, strict=True):
+        base = compose(compose(shift, start), inverse(mount))
+        assert_same_pose(base, start, atol=1e-14)
+    assert_same_pose(world[1], np.zeros(3), atol=1e-15)
+    assert_same_pose(origin_shift(start, mounts[0]), world[0], atol=0)

@@ -20,8 +20,8 @@ from graphslam.records import Association, Estimate, Step, Trajectory
 
 #: m or rad: the estimate has converged when all variables together move less than this
 CONVERGED = 1e-6
-#: the same for lines that are faced anew, and how often they are at most: it converges in two
-FACED, MAX_FACINGS = 1e-6, 4
+#: the same for lines that are faced anew (it converges in two rounds), without and with a kernel
+FACED, FACED_ROBUST, MAX_FACINGS = 1e-6, 1e-2, 4
 
 
 class GraphBuilder:
@@ -228,11 +228,10 @@ class Isam2Backend:
         ]
 
     def finish(self) -> Estimate:
-        """See `Backend`: iSAM2 until it moves no more, then optimised to convergence."""
-        values = self._converged()
+        """See `Backend`: optimised to convergence, or iSAM2 until it moves no more."""
         if self._config.backend.polish:
-            return self._estimate(self._optimised(values))
-        return self._estimate(values)
+            return self._estimate(self._optimised(self._isam.calculateBestEstimate()))
+        return self._estimate(self._converged())
 
     def _converged(self) -> gtsam.Values:
         nothing, no_values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -247,12 +246,13 @@ class Isam2Backend:
 
     def _optimised(self, values: gtsam.Values) -> gtsam.Values:
         """Optimised, the lines faced anew until that moves nothing any more."""
+        enough = FACED if self._config.robust.kernel == "none" else FACED_ROBUST
         try:
             for _ in range(MAX_FACINGS):
                 before = values
                 self._builder.face_lines(values)
                 values = optimise(self._builder.graph, values, self._config.robust)
-                if before.localCoordinates(values).norm() < FACED:
+                if before.localCoordinates(values).norm() < enough:
                     break
         except RuntimeError as error:
             raise self._builder.explain(error) from error
@@ -298,7 +298,7 @@ class Isam2Backend:
 
 
 class BatchBackend(Isam2Backend):
-    """The converged limit: associations from iSAM2's estimate, the result from one optimisation."""
+    """The converged limit, whatever `backend.polish` says; associations as with iSAM2."""
 
     def finish(self) -> Estimate:
         """See `Backend`."""
@@ -311,11 +311,11 @@ def optimise(
     """Levenberg-Marquardt from ``values`` until the error hardly changes.
 
     Without a kernel convergence is quadratic and 1e-10 of the error comes for free. Under a kernel
-    GTSAM reweights, which converges linearly: beyond 1e-7 hundreds of iterations move nothing that
+    GTSAM reweights, which converges linearly: beyond 1e-6 hundreds of iterations move nothing that
     shows.
     """
     parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setRelativeErrorTol(1e-10 if kernel.kernel == "none" else 1e-7)
+    parameters.setRelativeErrorTol(1e-10 if kernel.kernel == "none" else 1e-6)
     parameters.setAbsoluteErrorTol(1e-9)
     parameters.setMaxIterations(200)
     return gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()

@@ -69,6 +69,7 @@ def revision(result: Result) -> str:
 def innovations(found: Mapping[str, Array]) -> str:
     """Normalised innovation squared per degree of freedom of each model, over time.
 
+    ``found[model]`` (n, 2) has a row per innovation: time s, d² / dof.
     Its expectation is 1; the dashed line is the 95 % quantile of chi-square for one innovation.
     """
     found = {model: values for model, values in sorted(found.items()) if len(values)}
@@ -96,7 +97,7 @@ def innovations(found: Mapping[str, Array]) -> str:
 
 
 def timing(step_ms: Array) -> str:
-    """Wall time of every keyframe with its running median, ms."""
+    """Wall time ``step_ms`` (n,), ms, of every keyframe with its running median."""
     number = np.arange(len(step_ms))
     dots = slice(None, None, max(1, len(step_ms) // _MAX_DOTS))
 

@@ -57,7 +57,9 @@ def headline(result: Result) -> str:
     robots = len(result.robots)
     fleet = "one robot" if robots == 1 else f"{robots} robots"
     paths = [robot.final for robot in result.robots.values()]
-    metres = sum(float(np.hypot(*np.diff(p.poses[:, :2], axis=0).T).sum()) for p in paths)
+    # of the states: they are in the order of time, which late stamps in a trajectory are not
+    driven = result.estimate.states.values()
+    metres = sum(float(np.hypot(*np.diff(p.poses[:, :2], axis=0).T).sum()) for p in driven)
     span = (max(p.stamps_ns[-1] for p in paths) - min(p.stamps_ns[0] for p in paths)) / 1e9
     source = f"{number(counts['scans'])} scans of {fleet}" if counts.get("scans") else fleet
     kinds = {landmark.kind for landmark in result.landmarks}
@@ -127,9 +129,14 @@ def stages(summary: Mapping[str, Any]) -> str:
 def calibration(summary: Mapping[str, Any]) -> str:
     """Calibrated parameters; empty text where there are none."""
     found = summary.get("calibration", {})
-    rows = [(name, p["value"], p["sigma"], p["observable"]) for name, p in found.items()]
-    head = ["parameter", "value", "σ", "observable"]
-    return table(head, rows, "Calibration") if rows else ""
+    rows = [
+        (
+            name.replace(".", " · ").replace("_", " "),
+            f"{p['value']:.3f} ± {p['sigma']:.3f}" if p["observable"] else "not observable",
+        )
+        for name, p in found.items()
+    ]
+    return table(["parameter", "value ± σ"], rows, "Calibration") if rows else ""
 
 
 def landmarks(found: Sequence[Landmark]) -> str:

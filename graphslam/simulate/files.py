@@ -52,9 +52,22 @@ def load_scenario(scenario: str | Path) -> Scenario:
         found: Scenario = build(Scenario, tree)
     except ScenarioError as error:
         raise ScenarioError(f"{path.name}: {error}") from error
+    if found.world_of:
+        found = _with_world_of(found, path)
     for problem in _contradictions(found):
         raise ScenarioError(f"{path.name}: {problem}")
     return replace(found, name=path.name)
+
+
+def _with_world_of(scenario: Scenario, path: Path) -> Scenario:
+    """The scenario in another one's world, whose file may lie beside its own."""
+    if scenario.world != Things():
+        raise ScenarioError(f"{path.name}: give either world or world_of")
+    beside = path.parent / scenario.world_of
+    if beside == path:
+        raise ScenarioError(f"{path.name}: world_of: names the file itself")
+    other = load_scenario(beside if beside.is_file() else scenario.world_of)
+    return replace(scenario, world=other.world)
 
 
 def _contradictions(scenario: Scenario) -> Iterator[str]:

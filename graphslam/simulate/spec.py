@@ -261,11 +261,13 @@ class Later:
 class Scenario:
     """A whole scenario. duration_s: 0 = until the last drive is over.
 
-    name: the file's; it is not a key.
+    world_of: name or file of another scenario whose world this one has. name: the file's; it is
+    not a key.
     """
 
     robots: Mapping[str, Robot]
     world: Things = field(default_factory=Things)
+    world_of: str = ""
     description: str = ""
     duration_s: float = field(default=0.0, metadata=NOT_NEGATIVE)
     truth_period_s: float = field(default=0.1, metadata=POSITIVE)

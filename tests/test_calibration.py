@@ -1,0 +1,266 @@
+"""Calibration learned from the motions that the estimate found: recursive least squares."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from graphslam.calibration import FORGET, OUTLIER, RELATIVE_SIGMA, REMAINING, Calibrator
+from graphslam.config import OdometryConfig, RobotConfig
+from graphslam.dead_reckoning import Track
+from graphslam.geometry import between, compose, exp
+from graphslam.models.motion import wheel_twist
+from graphslam.records import OdometryIncrement, OdometryPose, WheelAngles
+
+SECOND = 1_000_000_000
+PERIOD_NS = 50_000_000  # of odometry
+STATE_NS = 500_000_000
+#: what is wrong with the robot: scales, drift rad/m; where the laser sits, how late it is
+SCALES = {"translation_scale": 0.03, "rotation_scale": -0.04, "drift_rad_per_m": 0.02}
+LASER = {"laser_x_m": 0.08, "laser_y_m": -0.06, "laser_yaw_rad": 0.02, "laser_latency_s": 0.04}
+NOTHING = dict.fromkeys(SCALES, 0.0)
+CENTRED = dict.fromkeys(LASER, 0.0)
+
+
+def weaving(n, rng):
+    """Odometry twists (n, 3) of a robot that speeds up, slows down and turns both ways."""
+    t = np.arange(n) * PERIOD_NS / SECOND
+    speed = 0.5 + 0.3 * np.sin(0.9 * t + rng.uniform(0, 6))
+    turning = 0.5 * np.sin(0.37 * t + rng.uniform(0, 6)) + 0.2 * np.sin(1.7 * t)
+    return np.column_stack([speed, 0 * t, turning]) * PERIOD_NS / SECOND
+
+
+def straight(n):
+    return np.tile([0.5 * PERIOD_NS / SECOND, 0.0, 0.0], (n, 1))
+
+
+def chain(twists):
+    poses = [np.zeros(3)]
+    for twist in twists:
+        poses.append(compose(poses[-1], exp(twist)))
+    return np.array(poses)
+
+
+class Drive:
+    """A robot whose odometry says ``twists``, and the true motions of its laser between states."""
+
+    def __init__(self, twists, scales=SCALES, laser=LASER, *, mounted=True, rng=None):
+        scale, turn_scale, drift = scales.values()
+        true = twists * [1 + scale, 1 + scale, 1 + turn_scale]
+        true[:, 2] += drift * np.hypot(twists[:, 0], twists[:, 1])
+        self.rng = rng
+        self.track = Track(OdometryConfig(), RobotConfig(), mounted=mounted)
+        self._truth = Track(OdometryConfig(), RobotConfig())
+        said, real = chain(twists), chain(true)
+        for k in range(len(said)):
+            ns = k * PERIOD_NS
+            self.track.add(OdometryPose("r", ns, ns, said[k]))
+            self._truth.add(OdometryPose("r", ns, ns, real[k]))
+        *mount, late = laser.values()
+        self._mount, self._late_ns = np.array(mount), round(late * SECOND)
+        self.states = np.arange(SECOND, len(twists) * PERIOD_NS - SECOND, STATE_NS)
+        self.calibrator = Calibrator()
+
+    def moved(self, start_ns, end_ns):
+        """True motion of the laser, as landmarks show it: noise `RELATIVE_SIGMA` if any."""
+        times = np.array([start_ns, end_ns]) - self._late_ns
+        start, end = compose(self._truth.pose(times), self._mount)
+        noise = 0.0 if self.rng is None else self.rng.normal(0, RELATIVE_SIGMA)
+        return between(start, end) + noise
+
+    def learn(self):
+        for start, end in zip(self.states[:-1], self.states[1:], strict=True):
+            motion = self.track.motion(int(start), int(end))
+            moved = self.moved(start, end)
+            self.track.calibration = self.calibrator.learn(self.track.calibration, motion, moved)
+        return self.calibrator.found()
+
+
+def test_known_errors_are_found_from_perfect_motions():
+    """Scale, drift, mount and latency at once, to a twentieth of a prior sigma (the prior pulls;
+    the latency is a one-sided difference over 50 ms)."""
+    drive = Drive(weaving(6000, np.random.default_rng(0)))
+    found = drive.learn()
+    nominal = np.sqrt(np.diag(Track(OdometryConfig(), RobotConfig()).calibration.cov))
+    assert nominal.shape == (0,)  # a track without readings knows no parameters
+    for name, value in (SCALES | LASER).items():
+        prior = PRIOR[name]
+        assert found[name][0] == pytest.approx(value, abs=0.05 * prior), name
+        assert found[name][2], name
+
+
+#: sigmas of the prior, from the settings
+PRIOR = {
+    "translation_scale": OdometryConfig().translation_scale_sigma,
+    "rotation_scale": OdometryConfig().rotation_scale_sigma,
+    "drift_rad_per_m": OdometryConfig().drift_sigma_rad_per_m,
+    "laser_x_m": OdometryConfig().laser_sigma_m,
+    "laser_y_m": OdometryConfig().laser_sigma_m,
+    "laser_yaw_rad": OdometryConfig().laser_sigma_rad,
+    "laser_latency_s": OdometryConfig().laser_latency_sigma_s,
+}
+
+
+def test_what_is_found_lies_within_its_sigmas():
+    """Over 12 runs with noise, truth drawn from the prior: squared errors over variances average to
+    no more than the upper 99.9 % bound of chi-square. (Only the upper one: a filter that forgets
+    claims a little more than the scatter that it has, by up to a half.)"""
+    total, n = np.zeros(len(PRIOR)), 12
+    for seed in range(n):
+        rng = np.random.default_rng(seed)
+        drawn = {name: rng.normal(0, sigma) for name, sigma in PRIOR.items()}
+        scales = {name: drawn[name] for name in SCALES}
+        laser = {name: drawn[name] for name in LASER}
+        found = Drive(weaving(3000, rng), scales, laser, rng=rng).learn()
+        total += [((found[name][0] - drawn[name]) / found[name][1]) ** 2 for name in PRIOR]
+    assert np.all(total / n < chi2.ppf(0.999, n) / n), dict(zip(PRIOR, total / n, strict=True))
+    assert np.all(total / n > 0.1)  # nor are the sigmas so wide that they say nothing
+
+
+def test_wheels_of_unequal_size_are_found():
+    """A left tyre 1 mm and a right one 0.5 mm larger than configured: found to a quarter of the
+    prior's 0.5 mm; the axle's 2 mm on the way."""
+    rng = np.random.default_rng(3)
+    config = OdometryConfig(wheel_radius_sigma_m=1e-3)
+    nominal = RobotConfig()
+    real = replace(nominal, wheel_radius_left_m=0.101, wheel_radius_right_m=0.1005, axle_m=0.502)
+    n = 4000
+    t = np.arange(n) * 0.05
+    steps = np.column_stack([5 + 2 * np.sin(0.6 * t), 5 + 2 * np.cos(0.45 * t)]) * 0.05
+    track = Track(config, nominal)
+    for k, (left, right) in enumerate(np.cumsum(np.vstack([[0, 0], steps]), axis=0)):
+        track.add(WheelAngles("r", k * PERIOD_NS, k * PERIOD_NS, left, right))
+    true = chain(wheel_twist(steps, real))
+    calibrator = Calibrator()
+    for k in range(0, n, 10):
+        motion = track.motion(k * PERIOD_NS, (k + 10) * PERIOD_NS)
+        moved = between(true[k], true[k + 10]) + rng.normal(0, RELATIVE_SIGMA)
+        track.calibration = calibrator.learn(track.calibration, motion, moved)
+    found = calibrator.found()
+    errors = {"wheel_radius_left_m": 1e-3, "wheel_radius_right_m": 5e-4, "axle_m": 2e-3}
+    assert set(found) == set(errors)
+    for name, value in errors.items():
+        assert abs(found[name][0] - value) < 3 * found[name][1], name
+    assert abs(found["wheel_radius_left_m"][0] - 1e-3) < 1.25e-4
+    assert abs(found["wheel_radius_right_m"][0] - 5e-4) < 1.25e-4
+
+
+@pytest.mark.parametrize("jump", [[1.0, 0, 0], [0, -0.5, 0], [0, 0, 0.3], [0, 0, 2 * np.pi - 0.3]])
+def test_a_jump_of_the_estimate_teaches_nothing(jump):
+    """A loop closure moves the new state by a metre: no motion of the robot. The calibration stays
+    the very object that it was, and later learning goes on as if nothing had been."""
+    drive = Drive(weaving(1000, np.random.default_rng(1)))
+    before = drive.learn()
+    motion = drive.track.motion(2 * SECOND, 2 * SECOND + STATE_NS)
+    current = drive.track.calibration
+    moved = drive.moved(2 * SECOND, 2 * SECOND + STATE_NS) + jump
+    assert drive.calibrator.learn(current, motion, moved) is current
+    assert drive.calibrator.found() == before
+
+
+def test_the_gate_of_jumps_is_chi_square():
+    """Three degrees of freedom, 99.9 %."""
+    assert pytest.approx(chi2.ppf(0.999, 3), rel=2e-3) == OUTLIER
+
+
+def test_headings_are_compared_the_short_way_round():
+    """A motion of pi - 0.01 that was estimated as -pi + 0.01 is off by 0.02 and no outlier."""
+    track = Track(OdometryConfig(), RobotConfig())
+    for k, phi in enumerate(np.linspace(0, np.pi - 0.01, 50)):
+        track.add(OdometryPose("r", k * PERIOD_NS, k * PERIOD_NS, np.array([0, 0, phi])))
+    motion = track.motion(0, 49 * PERIOD_NS)
+    calibrator = Calibrator()
+    after = calibrator.learn(track.calibration, motion, np.array([0, 0, -np.pi + 0.01]))
+    assert 0 < after.mean[1] < 0.02 / np.pi
+
+
+# ------------------------------------------------------------ what cannot be seen
+
+
+def test_driving_straight_never_shows_where_the_laser_is():
+    """Nor the scale of rotation, nor the latency at constant speed: they keep the prior, to the
+    digit, and say so. Scale, drift and yaw do show."""
+    drive = Drive(straight(2000), NOTHING, CENTRED)
+    found = drive.learn()
+    for name in ("laser_x_m", "laser_y_m", "rotation_scale", "laser_latency_s"):
+        value, sigma, observable = found[name]
+        assert value == pytest.approx(0.0, abs=1e-9) and not observable, name
+        assert sigma == pytest.approx(PRIOR[name], rel=1e-9), name
+    for name in ("translation_scale", "drift_rad_per_m", "laser_yaw_rad"):
+        assert found[name][2], name
+
+
+def test_turning_in_place_shows_the_lasers_place_and_not_its_yaw():
+    drive = Drive(straight(2000) @ np.array([[0, 0, 1.0], [0] * 3, [0] * 3]), NOTHING, LASER)
+    found = drive.learn()
+    assert found["laser_x_m"][2] and found["laser_y_m"][2] and found["rotation_scale"][2]
+    for name in ("laser_x_m", "laser_y_m"):
+        assert abs(found[name][0] - LASER[name]) < found[name][1]
+    for name in ("translation_scale", "drift_rad_per_m"):
+        value, sigma, observable = found[name]
+        assert value == pytest.approx(0.0, abs=1e-9) and not observable, name
+        assert sigma == pytest.approx(PRIOR[name], rel=1e-9), name
+
+
+def test_what_was_learned_is_not_forgotten_below_the_prior():
+    """After a stretch that shows the laser's place, a long one that does not: the value goes back
+    to the prior with it, the sigma grows to the prior's and never beyond."""
+    drive = Drive(weaving(2000, np.random.default_rng(5)), NOTHING, CENTRED)
+    learned = drive.learn()["laser_x_m"][1]
+    going_on = Drive(straight(20000), NOTHING, CENTRED)
+    going_on.calibrator, going_on.track.calibration = drive.calibrator, drive.track.calibration
+    sigma = going_on.learn()["laser_x_m"][1]
+    assert learned < 0.1 * PRIOR["laser_x_m"] < sigma <= PRIOR["laser_x_m"] * (1 + 1e-9)
+
+
+def test_tyres_may_warm_up():
+    """The scale changes by 2 % half way: after 5 / (1 - FORGET) states less than 1 % of the old
+    one is left."""
+    n = round(5 / (1 - FORGET)) * STATE_NS // PERIOD_NS + 100
+    cold = Drive(weaving(n, np.random.default_rng(6)), NOTHING, CENTRED, mounted=False)
+    cold.learn()
+    warm_scales = NOTHING | {"translation_scale": 0.02}
+    warm = Drive(weaving(n, np.random.default_rng(7)), warm_scales, CENTRED, mounted=False)
+    warm.calibrator, warm.track.calibration = cold.calibrator, cold.track.calibration
+    assert warm.learn()["translation_scale"][0] == pytest.approx(0.02, abs=4e-4)
+
+
+def test_coming_motions_stay_uncertain():
+    """What is used for them is wider than what the data say, by a share of the prior: a constant is
+    none, and the filter takes noise of neighbouring states for independent."""
+    drive = Drive(weaving(3000, np.random.default_rng(2)))
+    found = drive.learn()
+    used = np.sqrt(np.diag(drive.track.calibration.cov))
+    for sigma, (_, known, _), prior in zip(used, found.values(), PRIOR.values(), strict=True):
+        assert sigma == pytest.approx(np.hypot(known, REMAINING * prior), rel=1e-9)
+
+
+# ------------------------------------------------------------ nothing to learn
+
+
+def test_given_increments_are_left_alone():
+    """They bring their own covariance and have no parameters; a mount changes nothing."""
+    track = Track(OdometryConfig(), RobotConfig(), mounted=True)
+    for k in range(20):
+        start, end = k * SECOND, (k + 1) * SECOND
+        step = np.array([0.5, 0, 0.1])
+        track.add(OdometryIncrement("r", end, end, start, step, 1e-4 * np.eye(3)))
+    calibrator, current = Calibrator(), track.calibration
+    for k in range(20):
+        motion = track.motion(k * SECOND, (k + 1) * SECOND)
+        assert calibrator.learn(current, motion, np.array([0.6, 0.05, 0.2])) is current
+    assert calibrator.found() == {}
+    np.testing.assert_array_equal(track.mount, 0)
+
+
+def test_a_robot_that_stands_teaches_nothing():
+    """Whatever the estimate says: no parameter of odometry makes a standing robot move."""
+    track = Track(OdometryConfig(), RobotConfig(), mounted=True)
+    for k in range(100):
+        track.add(OdometryPose("r", k * PERIOD_NS, k * PERIOD_NS, np.ones(3)))
+    calibrator, current = Calibrator(), track.calibration
+    for k in range(4):
+        motion = track.motion(k * SECOND, (k + 1) * SECOND)
+        assert calibrator.learn(current, motion, np.array([0.01, 0.0, 0.005])) is current
+    assert calibrator.found() == {}
