@@ -6,6 +6,7 @@ trajectory at the poses' stamps and its landmarks by their identities; our own f
 Beside it: where Levenberg-Marquardt gets from odometry alone, and the optimum.
 
 Run: python benchmarks/victoria_park.py DIR...   (folders that `graphslam smooth` wrote)
+tests/test_real_logs.py holds the bar with the functions below.
 """
 
 import sys
@@ -14,9 +15,11 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
+from graphslam.config import load_config
 from graphslam.errors import GraphSlamError, OutputError
-from graphslam.logs import pose_stamp_ns
-from graphslam.results import load
+from graphslam.logs import IMPORTERS, open_logs, pose_stamp_ns
+from graphslam.results import load, save
+from graphslam.slam import smooth
 
 SOURCE = gtsam.findExampleDataFile("victoria_park.txt")
 PRIOR_SIGMA = 1e-3
@@ -26,12 +29,25 @@ LANDMARK = ord("l")  # how load2D marks the keys of landmarks; those of poses ar
 BAR = 2341.6
 
 
-def file_graph() -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """The factors of the file with the prior, and the poses of its odometry chained up."""
-    graph, odometry = gtsam.load2D(SOURCE)
+def file_graph(source: str = SOURCE) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """The factors of a file with the prior, and its own poses (odometry chained up)."""
+    if source.endswith(".g2o"):
+        graph, odometry = gtsam.readG2o(source, False)
+    else:
+        graph, odometry = gtsam.load2D(source)
     prior = gtsam.noiseModel.Isotropic.Sigma(3, PRIOR_SIGMA)
     graph.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(), prior))
     return graph, odometry
+
+
+def smooth_all_poses(source: str, directory: Path) -> Path:
+    """Import a file and smooth it, every pose kept and no robust kernel; the result folder."""
+    log = directory / "log.mcap"
+    IMPORTERS["isam"](Path(source), log)
+    config = load_config(overrides=["keyframe.mode=all", "robust.kernel=none"])
+    result = smooth(open_logs([log], config), config)
+    save(result, config, directory / "all_poses", force=False)
+    return directory / "all_poses"
 
 
 def values_of(directory: Path, like: gtsam.Values) -> gtsam.Values:

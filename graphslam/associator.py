@@ -145,9 +145,9 @@ class Associator:
         entries = [e for e, k in zip(entries, keep, strict=True) if k]
         # observations with an identity bring their pair along, ungated
         known = [
-            (n, self.map.entries[self.map.by_identity[str(o.identity)]])
+            (n, entry)
             for n, o in enumerate(seen)
-            if self._has_identity(o) and o.identity in self.map.by_identity
+            if (entry := self._named(o)) and (entry.kind == "point") == (o.kind == "point")
         ]
         pairs = Pairs(
             np.array([free[i] for i in pairs.observation] + [n for n, _ in known], dtype=np.int64),
@@ -168,6 +168,12 @@ class Associator:
 
     def _has_identity(self, o: Observation) -> bool:
         return o.identity is not None and self._config.identities == "use"
+
+    def _named(self, o: Observation) -> Entry | None:
+        """The landmark that bears the observation's identity."""
+        if not self._has_identity(o) or o.identity not in self.map.by_identity:
+            return None
+        return self.map.entries[self.map.by_identity[str(o.identity)]]
 
     def _is_recent(self, entry: Entry, robot: str, path_m: float) -> bool:
         return path_m - entry.path_m.get(robot, -np.inf) <= self._config.reacquire_m
@@ -252,6 +258,9 @@ class Associator:
                 )
             elif not self._has_identity(o) and np.any(close & (pairs.observation == n)):
                 self.rejected["between the thresholds: neither a match nor new"] += 1
+                continue
+            elif self._named(o) is not None:
+                self.rejected["identity: known as a landmark of another kind"] += 1
                 continue
             else:
                 identity = o.identity if self._has_identity(o) else None

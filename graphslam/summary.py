@@ -112,7 +112,8 @@ def summarise(
         "backend": config.backend.name,
         "stages": {name: round(value, 4) for name, value in sorted(seconds.items())},
         "scans_per_s": round(scans / total, 2),
-        "real_time_factor": round(log_s / total, 2),
+        # invented stamps have no real time to compare with
+        "real_time_factor": None if has_invented_stamps(log.notes) else round(log_s / total, 2),
         "peak_memory_mb": round(_peak_memory_mb(), 1),
         "counts": {
             "messages": counts["messages"],
@@ -133,6 +134,11 @@ def summarise(
         },
         "warnings": list(log.warnings),
     }
+
+
+def has_invented_stamps(notes: Mapping[str, str]) -> bool:
+    """Whether an importer had to make up the stamps: the source had none."""
+    return notes.get("stamps", "").startswith("invented")
 
 
 def _peak_memory_mb() -> float:

@@ -21,6 +21,16 @@ SCALES = {"translation_scale": 0.03, "rotation_scale": -0.04, "drift_rad_per_m":
 LASER = {"laser_x_m": 0.08, "laser_y_m": -0.06, "laser_yaw_rad": 0.02, "laser_latency_s": 0.04}
 NOTHING = dict.fromkeys(SCALES, 0.0)
 CENTRED = dict.fromkeys(LASER, 0.0)
+#: sigmas of the prior, from the settings
+PRIOR = {
+    "translation_scale": OdometryConfig().translation_scale_sigma,
+    "rotation_scale": OdometryConfig().rotation_scale_sigma,
+    "drift_rad_per_m": OdometryConfig().drift_sigma_rad_per_m,
+    "laser_x_m": OdometryConfig().laser_sigma_m,
+    "laser_y_m": OdometryConfig().laser_sigma_m,
+    "laser_yaw_rad": OdometryConfig().laser_sigma_rad,
+    "laser_latency_s": OdometryConfig().laser_latency_sigma_s,
+}
 
 
 def weaving(n, rng):
@@ -78,53 +88,39 @@ class Drive:
 
 
 def test_known_errors_are_found_from_perfect_motions():
-    """Scale, drift, mount and latency at once, to a twentieth of a prior sigma (the prior pulls;
-    the latency is a one-sided difference over 50 ms)."""
-    drive = Drive(weaving(6000, np.random.default_rng(0)))
-    found = drive.learn()
-    nominal = np.sqrt(np.diag(Track(OdometryConfig(), RobotConfig()).calibration.cov))
-    assert nominal.shape == (0,)  # a track without readings knows no parameters
+    """Scale, drift, mount and latency at once, to 0.3 of the sigma found: the prior takes its share
+    of the value, (sigma / prior)², and the latency is a one-sided difference over 50 ms."""
+    found = Drive(weaving(6000, np.random.default_rng(0))).learn()
     for name, value in (SCALES | LASER).items():
-        prior = PRIOR[name]
-        assert found[name][0] == pytest.approx(value, abs=0.05 * prior), name
-        assert found[name][2], name
-
-
-#: sigmas of the prior, from the settings
-PRIOR = {
-    "translation_scale": OdometryConfig().translation_scale_sigma,
-    "rotation_scale": OdometryConfig().rotation_scale_sigma,
-    "drift_rad_per_m": OdometryConfig().drift_sigma_rad_per_m,
-    "laser_x_m": OdometryConfig().laser_sigma_m,
-    "laser_y_m": OdometryConfig().laser_sigma_m,
-    "laser_yaw_rad": OdometryConfig().laser_sigma_rad,
-    "laser_latency_s": OdometryConfig().laser_latency_sigma_s,
-}
+        estimate, sigma, observable = found[name]
+        assert estimate == pytest.approx(value, abs=0.3 * sigma), name
+        assert observable and sigma < 0.3 * PRIOR[name], name
 
 
 def test_what_is_found_lies_within_its_sigmas():
-    """Over 12 runs with noise, truth drawn from the prior: squared errors over variances average to
+    """Over 8 runs with noise, truth drawn from the prior: squared errors over variances average to
     no more than the upper 99.9 % bound of chi-square. (Only the upper one: a filter that forgets
     claims a little more than the scatter that it has, by up to a half.)"""
-    total, n = np.zeros(len(PRIOR)), 12
+    total, n = np.zeros(len(PRIOR)), 8
     for seed in range(n):
         rng = np.random.default_rng(seed)
         drawn = {name: rng.normal(0, sigma) for name, sigma in PRIOR.items()}
         scales = {name: drawn[name] for name in SCALES}
         laser = {name: drawn[name] for name in LASER}
-        found = Drive(weaving(3000, rng), scales, laser, rng=rng).learn()
+        found = Drive(weaving(2500, rng), scales, laser, rng=rng).learn()
         total += [((found[name][0] - drawn[name]) / found[name][1]) ** 2 for name in PRIOR]
     assert np.all(total / n < chi2.ppf(0.999, n) / n), dict(zip(PRIOR, total / n, strict=True))
     assert np.all(total / n > 0.1)  # nor are the sigmas so wide that they say nothing
 
 
 def test_wheels_of_unequal_size_are_found():
-    """A left tyre 1 mm and a right one 0.5 mm larger than configured: found to a quarter of the
-    prior's 0.5 mm; the axle's 2 mm on the way."""
+    """Tyres 4 mm and 2 mm larger than configured, the axle 1 cm longer: within three sigmas, and
+    the difference of the radii, which bends the path, to 0.3 mm (0.01 rad over 0.25 m and 200
+    states, times the axle)."""
     rng = np.random.default_rng(3)
-    config = OdometryConfig(wheel_radius_sigma_m=1e-3)
+    config = OdometryConfig(wheel_radius_sigma_m=3e-3, axle_sigma_m=0.02)
     nominal = RobotConfig()
-    real = replace(nominal, wheel_radius_left_m=0.101, wheel_radius_right_m=0.1005, axle_m=0.502)
+    real = replace(nominal, wheel_radius_left_m=0.104, wheel_radius_right_m=0.102, axle_m=0.51)
     n = 4000
     t = np.arange(n) * 0.05
     steps = np.column_stack([5 + 2 * np.sin(0.6 * t), 5 + 2 * np.cos(0.45 * t)]) * 0.05
@@ -138,12 +134,12 @@ def test_wheels_of_unequal_size_are_found():
         moved = between(true[k], true[k + 10]) + rng.normal(0, RELATIVE_SIGMA)
         track.calibration = calibrator.learn(track.calibration, motion, moved)
     found = calibrator.found()
-    errors = {"wheel_radius_left_m": 1e-3, "wheel_radius_right_m": 5e-4, "axle_m": 2e-3}
+    errors = {"wheel_radius_left_m": 4e-3, "wheel_radius_right_m": 2e-3, "axle_m": 0.01}
     assert set(found) == set(errors)
     for name, value in errors.items():
         assert abs(found[name][0] - value) < 3 * found[name][1], name
-    assert abs(found["wheel_radius_left_m"][0] - 1e-3) < 1.25e-4
-    assert abs(found["wheel_radius_right_m"][0] - 5e-4) < 1.25e-4
+    left, right = (found[f"wheel_radius_{side}_m"][0] for side in ("left", "right"))
+    assert left - right == pytest.approx(2e-3, abs=3e-4)
 
 
 @pytest.mark.parametrize("jump", [[1.0, 0, 0], [0, -0.5, 0], [0, 0, 0.3], [0, 0, 2 * np.pi - 0.3]])
@@ -161,7 +157,7 @@ def test_a_jump_of_the_estimate_teaches_nothing(jump):
 
 def test_the_gate_of_jumps_is_chi_square():
     """Three degrees of freedom, 99.9 %."""
-    assert pytest.approx(chi2.ppf(0.999, 3), rel=2e-3) == OUTLIER
+    assert chi2.sf(OUTLIER, 3) == pytest.approx(1e-3, rel=0.02)
 
 
 def test_headings_are_compared_the_short_way_round():
@@ -208,22 +204,23 @@ def test_what_was_learned_is_not_forgotten_below_the_prior():
     to the prior with it, the sigma grows to the prior's and never beyond."""
     drive = Drive(weaving(2000, np.random.default_rng(5)), NOTHING, CENTRED)
     learned = drive.learn()["laser_x_m"][1]
-    going_on = Drive(straight(20000), NOTHING, CENTRED)
+    going_on = Drive(straight(8000), NOTHING, CENTRED)
     going_on.calibrator, going_on.track.calibration = drive.calibrator, drive.track.calibration
     sigma = going_on.learn()["laser_x_m"][1]
-    assert learned < 0.1 * PRIOR["laser_x_m"] < sigma <= PRIOR["laser_x_m"] * (1 + 1e-9)
+    prior = PRIOR["laser_x_m"]
+    assert learned < 0.2 * prior and 0.5 * prior < sigma <= prior * (1 + 1e-9)
 
 
 def test_tyres_may_warm_up():
-    """The scale changes by 2 % half way: after 5 / (1 - FORGET) states less than 1 % of the old
-    one is left."""
-    n = round(5 / (1 - FORGET)) * STATE_NS // PERIOD_NS + 100
+    """The scale changes by 2 % half way: after 3 / (1 - FORGET) states 5 % of the old one is left,
+    and the prior takes 4 %."""
+    n = round(3 / (1 - FORGET)) * STATE_NS // PERIOD_NS + 100
     cold = Drive(weaving(n, np.random.default_rng(6)), NOTHING, CENTRED, mounted=False)
     cold.learn()
     warm_scales = NOTHING | {"translation_scale": 0.02}
     warm = Drive(weaving(n, np.random.default_rng(7)), warm_scales, CENTRED, mounted=False)
     warm.calibrator, warm.track.calibration = cold.calibrator, cold.track.calibration
-    assert warm.learn()["translation_scale"][0] == pytest.approx(0.02, abs=4e-4)
+    assert warm.learn()["translation_scale"][0] == pytest.approx(0.02, rel=0.12)
 
 
 def test_coming_motions_stay_uncertain():

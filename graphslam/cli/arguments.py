@@ -9,6 +9,7 @@ import typer
 
 from graphslam.config import BackendConfig, FrontEndConfig
 from graphslam.logs import IMPORTERS
+from graphslam.simulate import SCENARIOS
 
 
 def _choices(section: Any) -> list[str]:
@@ -89,6 +90,13 @@ Format = Annotated[
         help=f"Format of SOURCE: {', '.join(sorted(IMPORTERS))}.",
     ),
 ]
+Scenario = Annotated[
+    str,
+    typer.Argument(
+        metavar="SCENARIO", help=f"A scenario file (TOML), or one of {', '.join(SCENARIOS)}."
+    ),
+]
+Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Other noise.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace what is there.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]

@@ -21,6 +21,8 @@ from graphslam.cli.arguments import (
     FrontEnd,
     Json,
     Logs,
+    Scenario,
+    Seed,
     Settings,
     Starts,
 )
@@ -95,6 +97,40 @@ def import_command(
             typer.echo(to_json(found, "import"), nl=False)
         else:
             show.imported(done)
+
+
+@app.command("simulate")
+def simulate_command(
+    scenario: Scenario,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="LOG.mcap|DIR",
+            help="The log; of a scenario with two visits, the folder for both.",
+        ),
+    ],
+    seed: Seed = 0,
+    json: Json = False,
+    force: Force = False,
+    debug: Debug = False,
+) -> None:
+    """Simulate a recording, with its truth.
+
+    Equal scenarios and seeds give equal bytes.
+    """
+    with errors_in_one_line(debug):
+        from graphslam.simulate import load_scenario, simulate
+
+        wanted = load_scenario(scenario)
+        if os.path.lexists(output) and not force:
+            raise OutputError(f"{output}: already exists; give --force to replace it")
+        done = simulate(wanted, output, seed)
+        if json:
+            typer.echo(to_json(show.simulation(done), "simulation"), nl=False)
+        else:
+            show.simulated(done)
 
 
 @app.command("smooth")

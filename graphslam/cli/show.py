@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
 from datetime import UTC, datetime
 from math import degrees
 from pathlib import Path
@@ -12,6 +13,7 @@ from rich.table import Table
 
 from graphslam.logs import ImportSummary, LogInfo, RobotInfo, TopicInfo
 from graphslam.records import Result
+from graphslam.simulate import Simulation
 
 _PIPE_WIDTH = 200  # a pipe has no width; tables take what they need of this
 
@@ -55,6 +57,46 @@ def imported(done: ImportSummary) -> None:
         console.print(f"warning: {warning}")
 
 
+def simulation(done: Simulation) -> dict[str, Any]:
+    """What ``simulate --json`` prints."""
+    return {
+        "scenario": done.scenario,
+        "seed": done.seed,
+        "target": str(done.target),
+        "counts": dict(done.counts),
+        "changed_cells": done.changed_cells,
+        "recordings": [
+            {
+                "path": str(recording.path),
+                "robots": {name: asdict(facts) for name, facts in recording.robots.items()},
+            }
+            for recording in done.recordings
+        ],
+    }
+
+
+def simulated(done: Simulation) -> None:
+    """Where the logs are, what each robot did in them, how far off its odometry ends."""
+    console = _console()
+    head = ["log", "robot", "path, m", "s", "scans", "sightings", "dead reckoning ends off, m"]
+    rows = [
+        (
+            str(recording.path),
+            name,
+            facts.path_m,
+            facts.duration_s,
+            facts.scans,
+            facts.sightings,
+            facts.dead_reckoning_end_m,
+        )
+        for recording in done.recordings
+        for name, facts in recording.robots.items()
+    ]
+    console.print(_table(head, rows, texts=2))
+    if done.changed_cells:
+        console.print(f"{done.changed_cells} changed cells in {done.target / 'truth.json'}")
+
+
 def smoothed(result: Result, directory: Path) -> None:
     """The headline of a run, what was rejected or dropped and why, where the report lies."""
     console, summary, robots = _console(), result.summary, len(result.robots)
@@ -65,11 +107,11 @@ def smoothed(result: Result, directory: Path) -> None:
         for key in ("scans", "keyframes", "landmarks", "loop_closures")
         if counts[key]
     ]
-    seconds, factor = summary["stages"]["all"], summary["real_time_factor"]
-    console.print(f"{', '.join(parts)}; {seconds:.1f} s, {factor:.3g} x real time")
-    stamps = summary["notes"].get("stamps", "")
-    if stamps.startswith("invented"):  # the real-time factor then means nothing
-        console.print(f"stamps: {stamps}")
+    factor = summary["real_time_factor"]
+    speed = "" if factor is None else f", {factor:.3g} x real time"
+    console.print(f"{', '.join(parts)}; {summary['stages']['all']:.1f} s{speed}")
+    if factor is None:  # the stamps are invented
+        console.print(f"stamps: {summary['notes']['stamps']}")
     _reasons(console, "rejected", summary["rejected"])
     _reasons(console, "dropped", summary["dropped"])
     for warning in summary["warnings"]:

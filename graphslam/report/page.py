@@ -65,7 +65,10 @@ def _header(result: Result, title: str) -> str:
 
 
 def _warnings(summary: Mapping[str, Any]) -> str:
-    items = "".join(f"<li>{escape(str(text))}</li>" for text in summary.get("warnings", []))
+    stamps = summary.get("notes", {}).get("stamps", "")
+    texts = [f"stamps: {stamps}"] if stamps.startswith("invented") else []
+    texts += [str(text) for text in summary.get("warnings", [])]
+    items = "".join(f"<li>{escape(text)}</li>" for text in texts)
     return f'<section class="warn"><h2>Warnings</h2><ul>{items}</ul></section>' if items else ""
 
 

@@ -122,7 +122,7 @@ def _within(sweep: Sweep) -> np.ndarray[Any, np.dtype[np.bool_]]:
 def _angles(sweep: Sweep) -> Array:
     """Directions (beams,) rad in the laser's frame."""
     beams = sweep.hits.ranges.shape[1]
-    return np.radians(sweep.laser.step_deg) * (np.arange(beams) - (beams - 1) / 2)
+    return np.asarray(np.radians(sweep.laser.step_deg) * (np.arange(beams) - (beams - 1) / 2))
 
 
 def _ends(sweep: Sweep, scan: Any, beam: Any) -> Array:
@@ -155,9 +155,7 @@ def _rows(
             pose = inverse(motion) if back else motion
             moved = float(np.hypot(*(transform(pose, center[None])[0] - center)))
         x, y = center.tolist()
-        rows.append(
-            {"kind": kind, "x": x, "y": y, "name": str(name), "displacement_m": moved}
-        )
+        rows.append({"kind": kind, "x": x, "y": y, "name": str(name), "displacement_m": moved})
     return rows
 
 

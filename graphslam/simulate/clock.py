@@ -17,7 +17,7 @@ START_NS = 1_054_425_600 * 10**9  # 1 June 2003, the year of the thesis
 def sample_times(duration_s: float, period_s: float, phase_s: float = 0.0) -> Array:
     """True times (n,) s of a sensor's samples up to and including the end of the scenario."""
     count = int(np.floor((duration_s - phase_s) / period_s + 1e-9)) + 1
-    return phase_s + period_s * np.arange(max(count, 0))
+    return np.asarray(phase_s + period_s * np.arange(max(count, 0)), dtype=float)
 
 
 def stamps(time_s: Array, clock: Clock, latency_s: float = 0.0) -> Stamps:

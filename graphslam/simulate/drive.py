@@ -5,6 +5,7 @@ Legs begin and end at rest; along a leg the speed is a trapezoid.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import sqrt
 
 import numpy as np
 
@@ -38,7 +39,7 @@ class Trapezoid:
 
     @property
     def _ramp_s(self) -> float:
-        return min(self.speed / self.acceleration, np.sqrt(self.distance / self.acceleration))
+        return min(self.speed / self.acceleration, sqrt(self.distance / self.acceleration))
 
     @property
     def duration_s(self) -> float:
@@ -126,7 +127,8 @@ class Drive:
         """States at times (n,) s; the robot stands before the first motion and after the last."""
         times = np.asarray(time_s, dtype=float)
         which = np.clip(np.searchsorted(self.begins_s, times, side="right") - 1, 0, None)
-        poses, travel, turned = np.zeros((len(times), 3)), np.zeros(len(times)), np.zeros(len(times))
+        poses = np.zeros((len(times), 3))
+        travel, turned = np.zeros(len(times)), np.zeros(len(times))
         for number in np.unique(which):
             rows = which == number
             found = self.motions[number].at(times[rows] - self.begins_s[number])
@@ -175,6 +177,3 @@ def _motions(pose: Array, leg: Leg, robot: Robot) -> list[Follow | Turn]:
     if abs(angle) < _ALIGNED_RAD:
         return [follow]
     return [Turn(pose, angle, Trapezoid(abs(angle), rate, 2 * rate)), follow]
-
-
-__all__ = ["Drive", "States", "Trapezoid", "plan"]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from graphslam.simulate.errors import ScenarioError
 from graphslam.simulate.sightings import LANDMARKS, ROBOTS
-from graphslam.simulate.spec import Laser, Leg, Robot, Scenario, Seer, Things
+from graphslam.simulate.spec import Laser, Later, Leg, Robot, Scenario, Seer, Things
 from graphslam.simulate.tree import build
 
 _FOLDER = Path(__file__).parent / "scenarios"
@@ -82,18 +82,22 @@ def _contradictions(scenario: Scenario) -> Iterator[str]:
         for problem in _robot(name, robot, scenario):
             yield f"robots.{name}{problem}"
     if scenario.later is not None:
-        later = scenario.later
-        for name in (*(move.name for move in later.moved), *later.vanished):
-            if name not in names:
-                yield f"later: nothing is named {name!r}; known: {', '.join(names)}"
-        for name in _names(later.appeared):
-            if name in names:
-                yield f"later.appeared: {name!r} is there already; names must differ"
-        for name, again in later.robots.items():
-            if name not in scenario.robots:
-                yield f"later.robots.{name}: no such robot; known: {', '.join(scenario.robots)}"
-            for problem in _drive(again.drive):
-                yield f"later.robots.{name}{problem}"
+        yield from _later(scenario.later, scenario)
+
+
+def _later(later: Later, scenario: Scenario) -> Iterator[str]:
+    names = list(_names(scenario.world))
+    for name in (*(move.name for move in later.moved), *later.vanished):
+        if name not in names:
+            yield f"later: nothing is named {name!r}; known: {', '.join(names)}"
+    for name in _names(later.appeared):
+        if name in names:
+            yield f"later.appeared: {name!r} is there already; names must differ"
+    for name, again in later.robots.items():
+        if name not in scenario.robots:
+            yield f"later.robots.{name}: no such robot; known: {', '.join(scenario.robots)}"
+        for problem in _drive(again.drive):
+            yield f"later.robots.{name}{problem}"
 
 
 def _robot(name: str, robot: Robot, scenario: Scenario) -> Iterator[str]:

@@ -48,7 +48,7 @@ def noisy_ranges(hits: Hits, biases: Array, laser: Laser, rng: np.random.Generat
     """Ranges (n, beams) m as the laser reports them; inf where it reports nothing.
 
     ``biases`` (surfaces,) m are added to what is measured on a surface. All random numbers are
-    drawn in one order whatever the shares are, so that one kind of error does not change the others.
+    drawn in one order whatever the shares are: one kind of error does not change the others.
     """
     clean, shape = hits.ranges, hits.ranges.shape
     bias = np.where(hits.surfaces == NOTHING, 0.0, np.append(biases, 0.0)[hits.surfaces])

@@ -6,6 +6,7 @@ the curve without a jump in its turn rate, and its heading is known in closed fo
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -47,7 +48,7 @@ class Curve:
         return self.position[i] + self.steps(i, ds), self._heading(i, ds)
 
     def steps(self, i: Ints, ds: Array) -> Array:
-        """Displacements (n, 2) m over ``ds`` (n,) m from the tabulated arc lengths number i (n,)."""
+        """Displacements (n, 2) m over ``ds`` (n,) m from tabulated arc lengths number i (n,)."""
         inner = self._heading(i[:, None], ds[:, None] * _NODES)
         return ds[:, None] * np.stack([np.cos(inner) @ _WEIGHTS, np.sin(inner) @ _WEIGHTS], -1)
 
@@ -62,7 +63,7 @@ def curve_from_curvature(
     """The curve from ``start`` (2,) whose ``curvature`` (k,) rad/m is linear between knots (k,)."""
     inside = [
         np.linspace(a, b, max(2, int(np.ceil((b - a) / _STEP_M)) + 1))[:-1]
-        for a, b in zip(knots_m[:-1], knots_m[1:], strict=True)
+        for a, b in pairwise(knots_m)
     ]
     s = np.append(np.concatenate(inside), knots_m[-1])
     kappa = np.interp(s, knots_m, curvature)

@@ -33,7 +33,7 @@ class Fan:
     @property
     def angles(self) -> Array:
         """Directions (count,), rad."""
-        return self.start_rad + self.step_rad * np.arange(self.count)
+        return np.asarray(self.start_rad + self.step_rad * np.arange(self.count), dtype=float)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

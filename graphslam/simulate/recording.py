@@ -201,9 +201,7 @@ def _biases(visit: Visit, name: str, laser: Laser, seed: int) -> Array:
     return laser.bias_sigma_m * np.array(draws, dtype=float)
 
 
-def _sightings(
-    name: str, actor: Actor, visit: Visit, seed: int
-) -> Iterator[tuple[Event, str]]:
+def _sightings(name: str, actor: Actor, visit: Visit, seed: int) -> Iterator[tuple[Event, str]]:
     """The sightings' messages, each with the name of what was seen."""
     for number, seer in enumerate(actor.robot.sightings):
         times = sample_times(visit.duration_s, seer.period_s, seer.phase_s)
@@ -263,6 +261,3 @@ def _middle(ends: Array) -> Array:
 def _center(visit: Visit, number: int) -> Array:
     x, y, _ = visit.world.shapes.circles[number - len(visit.world.shapes.segments)]
     return np.array([x, y, np.nan])
-
-
-__all__ = ["Recording", "RobotFacts", "Sweep", "generator", "record"]

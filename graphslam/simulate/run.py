@@ -3,7 +3,7 @@
 import json
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from graphslam.errors import OutputError
@@ -75,4 +75,5 @@ def _two_visits(
         raise OutputError(f"{target}: cannot be written: {error.strerror}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    return Simulation(scenario.name, seed, target, (first, second), len(truth["cells"]))
+    written = tuple(replace(r, path=target / r.path.name) for r in (first, second))
+    return Simulation(scenario.name, seed, target, written, len(truth["cells"]))

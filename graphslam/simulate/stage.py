@@ -58,9 +58,7 @@ def visits(scenario: Scenario) -> tuple[Visit, ...]:
         return (first,)
     later = scenario.later
     robots = {
-        name: replace(
-            robot, start_m=again.start_m, start_deg=again.start_deg, drive=again.drive
-        )
+        name: replace(robot, start_m=again.start_m, start_deg=again.start_deg, drive=again.drive)
         if (again := later.robots.get(name))
         else robot
         for name, robot in scenario.robots.items()

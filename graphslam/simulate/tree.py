@@ -67,9 +67,8 @@ def _table(value: Any, key: str) -> dict[str, Any]:
 def _tuple(arguments: tuple[Any, ...], value: Any, key: str, bounds: Mapping[str, Any]) -> Any:
     if not isinstance(value, list):
         raise ScenarioError(f"{key}: expected a list, got {value!r}")
-    if arguments[-1] is not ...:
-        if len(value) != len(arguments):
-            raise ScenarioError(f"{key}: expected {len(arguments)} values, got {value!r}")
+    if arguments[-1] is not ... and len(value) != len(arguments):
+        raise ScenarioError(f"{key}: expected {len(arguments)} values, got {value!r}")
     return tuple(build(arguments[0], v, f"{key}[{i}]", bounds) for i, v in enumerate(value))
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphslam.geometry import Array, compose, rotation, transform
-from graphslam.simulate.spec import Board, Box, Door, Move, Things, Wall
+from graphslam.simulate.spec import Box, Move, Things
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +50,7 @@ class Shapes:
     @property
     def count(self) -> int:
         """Number of surfaces."""
-        return self.segments.shape[-3] + self.circles.shape[-2]
+        return int(self.segments.shape[-3] + self.circles.shape[-2])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,8 +77,14 @@ def outlines_of(things: Things) -> Iterator[Outline]:
         yield Outline(wall.name, np.array(wall.points_m), 0.0, wall.closed, False, wall.may_cross)
     for box in things.boxes:
         yield _box(box)
-    for leaf in (*things.boards, *things.doors):
-        yield Outline(leaf.name, _ends(leaf), may_cross=leaf.may_cross)
+    for board in things.boards:
+        along = board.length_m / 2 * _direction(board.angle_deg)
+        ends = np.array([board.center_m - along, board.center_m + along])
+        yield Outline(board.name, ends, may_cross=board.may_cross)
+    for door in things.doors:
+        leaf = door.width_m * _direction(door.closed_deg + door.opening_deg)
+        ends = np.array([door.hinge_m, door.hinge_m + leaf])
+        yield Outline(door.name, ends, may_cross=door.may_cross)
     for cylinder in things.cylinders:
         center = np.array([cylinder.center_m])
         yield Outline(cylinder.name, center, cylinder.radius_m, solid=True)
@@ -91,17 +97,8 @@ def _box(box: Box) -> Outline:
     return Outline(box.name, transform(pose, corners), 0.0, True, True, box.may_cross)
 
 
-def _ends(leaf: Board | Door) -> Array:
-    """The two ends (2, 2) of a board or of a door's leaf."""
-    if isinstance(leaf, Board):
-        along = leaf.length_m / 2 * _direction(leaf.angle_deg)
-        return np.array([leaf.center_m - along, leaf.center_m + along])
-    along = leaf.width_m * _direction(leaf.closed_deg + leaf.opening_deg)
-    return np.array([leaf.hinge_m, leaf.hinge_m + along])
-
-
 def _direction(angle_deg: float) -> Array:
-    return rotation(np.radians(angle_deg))[:, 0]
+    return np.asarray(rotation(float(np.radians(angle_deg)))[:, 0])
 
 
 def make_world(outlines: Iterable[Outline]) -> World:
@@ -170,16 +167,3 @@ def too_short(outlines: Sequence[Outline]) -> str | None:
         if not outline.radius_m and not (len(along) and np.hypot(*along.T).min() > 1e-6):
             return outline.name
     return None
-
-
-__all__ = [
-    "Outline",
-    "Shapes",
-    "Wall",
-    "World",
-    "crossing",
-    "displacement",
-    "make_world",
-    "outlines_of",
-    "too_short",
-]

@@ -1,0 +1,161 @@
+"""Intel and ACES whole, with default settings: how good, how fast, how large.
+
+Each log is imported, smoothed and evaluated by the commands that a user types, each in a process
+of its own. The errors are those of Kümmerle et al. 2009 over hand-made relations between scans:
+over all, over pairs at most 60 s apart (local), and farther apart (loops). Speed is the length of
+the log over the wall time of the whole `smooth` command, report and all; memory its peak.
+
+Run: python benchmarks/real_logs.py [intel] [aces]     exit code 1 if a bar is not held
+The data are taken from GRAPHSLAM_DATA (default: ../shared/data beside the repository).
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+DATA = Path(os.environ.get("GRAPHSLAM_DATA", ROOT / "../shared/data")) / "freiburg"
+LOGS = ("intel", "aces")
+GRAPHSLAM = [sys.executable, "-m", "graphslam"]
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A value of Intel must be at most ``limit``, or at least it."""
+
+    name: str
+    limit: float
+    at_least: bool = False
+
+    def held(self, value: float) -> bool:
+        """Whether ``value`` is on the right side of the limit."""
+        return value >= self.limit if self.at_least else value <= self.limit
+
+
+BARS = (
+    Bar("all, mean m", 1.2),
+    Bar("loops, median m", 0.3),
+    Bar("local, mean m", 0.0185),
+    Bar("x real time", 20.0, at_least=True),
+    Bar("peak memory MB", 1000.0),
+    Bar("unmatched", 0),
+)
+
+
+@dataclass(frozen=True)
+class Run:
+    """What one log gave."""
+
+    relations: dict[str, Any]
+    summary: dict[str, Any]
+    wall_s: float
+    peak_mb: float
+
+    @property
+    def times_real_time(self) -> float:
+        """Length of the log over the wall time of the command."""
+        stages = self.summary["stages"]
+        return float(self.summary["real_time_factor"] * stages["all"] / self.wall_s)
+
+    def values(self) -> dict[str, float]:
+        """What the bars are about, by their names."""
+        groups = self.relations
+        return {
+            "all, mean m": groups["all"]["trans_mean_m"],
+            "loops, median m": groups["loops"]["trans_median_m"],
+            "local, mean m": groups["local"]["trans_mean_m"],
+            "x real time": self.times_real_time,
+            "peak memory MB": self.peak_mb,
+            "unmatched": groups["all"]["unmatched"],
+        }
+
+
+def command(*arguments: str) -> dict[str, Any]:
+    """What a command prints with --json."""
+    done = subprocess.run([*GRAPHSLAM, *arguments, "--json"], stdout=subprocess.PIPE, check=True)
+    return json.loads(done.stdout)
+
+
+def smooth(log: Path, target: Path) -> tuple[float, float]:
+    """Wall time (s) and peak memory (MB) of `graphslam smooth`."""
+    began = time.perf_counter()
+    process = subprocess.Popen(
+        [*GRAPHSLAM, "smooth", str(log), "-o", str(target), "--json"], stdout=subprocess.DEVNULL
+    )
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise subprocess.CalledProcessError(process.returncode, process.args)
+    unit = 1e6 if sys.platform == "darwin" else 1e3
+    return time.perf_counter() - began, usage.ru_maxrss / unit
+
+
+def run(name: str, folder: Path) -> Run:
+    log, target = folder / f"{name}.mcap", folder / name
+    command("import", "carmen", str(DATA / f"{name}.clf.bz2"), "-o", str(log))
+    wall_s, peak_mb = smooth(log, target)
+    found = command("evaluate", str(target), "--relations", str(DATA / f"{name}.relations"))
+    summary = json.loads((target / "summary.json").read_text(encoding="utf-8"))
+    return Run(found["relations"], summary, wall_s, peak_mb)
+
+
+def print_errors(name: str, done: Run) -> None:
+    counts = done.summary["counts"]
+    print(
+        f"\n{name}: {counts['scans']} scans, {counts['keyframes']} keyframes,"
+        f" {counts['landmarks']} landmarks, {counts['loop_closures']} loop closures"
+    )
+    print(f"{'':18}{'n':>6}{'mean m':>10}{'median m':>10}{'std m':>10}{'mean °':>10}{'std °':>10}")
+    causal = done.relations["causal"]
+    for label, groups in (("final", done.relations), ("causal", causal)):
+        for group in ("all", "local", "loops"):
+            g = groups[group]
+            numbers = [
+                g[k] for k in ("trans_mean_m", "trans_median_m", "trans_std_m", "rot_mean_deg",
+                               "rot_std_deg")
+            ]  # fmt: skip
+            row = "".join(f"{value:10.4f}" for value in numbers)
+            print(f"{label:10}{group:8}{g['n']:6}{row}")
+    print(
+        f"{done.times_real_time:.1f} x real time ({done.wall_s:.1f} s wall),"
+        f" peak {done.peak_mb:.0f} MB"
+    )
+
+
+def print_bars(name: str, done: Run) -> bool:
+    """Whether all hold."""
+    values = done.values()
+    print(f"\n{name + ': bar':30}{'limit':>10}{'found':>10}")
+    for bar in BARS:
+        value = values[bar.name]
+        sign = ">=" if bar.at_least else "<="
+        print(
+            f"  {bar.name:26}{sign} {bar.limit:<9g}{value:10.4g}"
+            f"  {'held' if bar.held(value) else 'NOT HELD'}"
+        )
+    return all(bar.held(values[bar.name]) for bar in BARS)
+
+
+def main(names: list[str]) -> int:
+    for name in names:
+        if name not in LOGS or not (DATA / f"{name}.clf.bz2").exists():
+            print(f"real_logs: error: {DATA}/{name}.clf.bz2: no such log; set GRAPHSLAM_DATA")
+            return 2
+    good = True
+    with tempfile.TemporaryDirectory() as folder:
+        for name in names:
+            done = run(name, Path(folder))
+            print_errors(name, done)
+            if name == "intel":
+                good = print_bars(name, done)
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:] or list(LOGS)))
