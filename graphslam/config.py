@@ -130,16 +130,16 @@ class FrontEndConfig:
 class AssociationConfig:
     """Which observation belongs to which landmark (thesis 3.21-3.25 and 4.22-4.28).
 
-    method: `greedy` is the thesis' variant of the NNSF, `optimal` minimises the sum.
-    identities: `use` those in the log or `ignore` them. max_distance_m: eq. 3.23. directed:
-    a line has two sides; false takes directions modulo pi (3.24). gate_probability: chi-square
-    gate (3.25). floor_m, floor_rad: added to the innovations' sigmas before gating, for what the
-    models leave out; never enters the estimate. new_probability: an observation is a new landmark
-    only if its distance to every landmark exceeds this second, higher quantile. overlap_gap_m:
-    largest gap along the line between an observed part and the known extent.
-    sightings_to_promote: a tentative landmark enters the graph at this many. tentative_s, tentative_m: one not seen again after this time and
-    path is deleted. reacquire_m: a landmark not seen for this much path counts as old; old lines
-    are taken up again only if reacquire_min of them that are not all parallel agree.
+    method: `greedy` is the thesis' variant of the NNSF, `optimal` minimises the sum. identities:
+    `use` those in the log or `ignore` them. max_distance_m: eq. 3.23. directed: a line has two
+    sides; false takes directions modulo pi (3.24). gate_probability: chi-square gate (3.25).
+    floor_m, floor_rad: added to the innovations' sigmas before gating, for what the models leave
+    out; never enters the estimate. new_probability: an observation is a new landmark only if its
+    distance to every landmark exceeds this second, higher quantile. overlap_gap_m: largest gap
+    along the line between an observed part and the known extent. sightings_to_promote: a tentative
+    landmark enters the graph at this many. tentative_s, tentative_m: one not seen again after this
+    time and path is deleted. reacquire_m: a landmark not seen for this much path counts as old;
+    old lines are taken up again only if reacquire_min of them that are not all parallel agree.
     """
 
     method: Literal["optimal", "greedy"] = "optimal"

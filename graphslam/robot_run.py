@@ -20,13 +20,14 @@ class RobotRun:
     """One robot's odometry, its states so far and its scans.
 
     ``times`` of the states, ns; per state the causal pose, its covariance and the calibration that
-    was known; ``scans`` (stamp, time, mount). The states are rigid to the sensor: the base is where
-    the calibration puts it.
+    was known; ``scans`` (stamp, time, mount), ``scanned_ns`` the last one that was used. The
+    states are rigid to the sensor: the base is where the calibration puts it.
     """
 
     track: Track
     calibrator: Calibrator = field(default_factory=Calibrator)
     path_m: float = 0.0
+    scanned_ns: int | None = None
     times: list[int] = field(default_factory=list)
     causal_poses: list[Array] = field(default_factory=list)
     causal_covs: list[Array] = field(default_factory=list)

@@ -104,18 +104,16 @@ class Pipeline:
         run, time_ns = self.runs[first.robot], first.time_ns
         if not run.started:
             self.start(first.robot, min(run.track.first_ns, time_ns))
-        scans = [m for m in event if isinstance(m, Scan)]
-        first_scan = bool(scans) and not run.scans
-        run.scans += [(m.stamp_ns, m.time_ns, m.mount) for m in scans]
-        self.counts["scans"] += len(scans)
-        keyframe = self.is_keyframe(event, first_scan)
-        if not keyframe and isinstance(first, (Scan, *ODOMETRY)):
+        run.scans += [(m.stamp_ns, m.time_ns, m.mount) for m in event if isinstance(m, Scan)]
+        self.counts["scans"] += isinstance(first, Scan)
+        if not self.is_used(event):
             return  # its pose follows from the states around it
         motion = self.motion_since_state(first.robot, time_ns)
+        own_state = self.gets_state(event)
         began = time.perf_counter()
-        seen = self.observations(event, None if keyframe else motion)
+        seen = self.observations(event, None if own_state else motion)
         self.seconds["front end"] += time.perf_counter() - began
-        self.advance(first.robot, time_ns, event, seen, motion if keyframe else None)
+        self.advance(first.robot, time_ns, event, seen, motion if own_state else None)
 
     def start(self, robot: str, time_ns: int) -> None:
         """Give a robot its first state.
@@ -142,19 +140,37 @@ class Pipeline:
             return None
         return run.track.motion(run.state_ns, time_ns)
 
-    def is_keyframe(self, event: list[Message], first_scan: bool) -> bool:
-        """Whether the event gets a state of its own."""
-        keyframe, first = self.config.keyframe, event[0]
+    def is_used(self, event: list[Message]) -> bool:
+        """Whether the event is more than a place on the trajectory.
+
+        Scans overlap, so one is enough per stretch of motion since the last one used, whatever
+        states other observations have made in between; sightings are all used.
+        """
+        first = event[0]
+        if self.config.keyframe.mode == "all" or not isinstance(first, (Scan, *ODOMETRY)):
+            return True
         run = self.runs[first.robot]
-        if first.time_ns <= run.state_ns:
+        if isinstance(first, ODOMETRY) or not self.has_moved(run, run.scanned_ns, first.time_ns):
             return False
-        if first_scan or any(isinstance(m, Sighting) and m.seen_robot for m in event):
+        run.scanned_ns = first.time_ns
+        return True
+
+    def gets_state(self, event: list[Message]) -> bool:
+        """Whether a used event has a state at its own time, or is carried back to the last one."""
+        first, run = event[0], self.runs[event[0].robot]
+        return (
+            self.config.keyframe.mode == "all"
+            or isinstance(first, Scan)
+            or any(isinstance(m, Sighting) and m.seen_robot for m in event)
+            or self.has_moved(run, run.state_ns, first.time_ns)
+        )
+
+    def has_moved(self, run: RobotRun, since_ns: int | None, time_ns: int) -> bool:
+        """Whether the robot moved by a keyframe's distance or angle; True since None."""
+        if since_ns is None:
             return True
-        if keyframe.mode == "all":
-            return True
-        if isinstance(first, ODOMETRY):
-            return False
-        path_m, turned_rad = run.track.moved(run.state_ns, first.time_ns)
+        path_m, turned_rad = run.track.moved(since_ns, time_ns)
+        keyframe = self.config.keyframe
         return path_m >= keyframe.distance_m or turned_rad >= keyframe.angle_rad
 
     def observations(self, event: list[Message], since: Motion | None) -> list[Observation]:
@@ -222,7 +238,7 @@ class Pipeline:
         other = message.seen_robot
         assert other is not None
         if not self.runs[other].started:
-            self.start(other, self.runs[other].track.first_ns)
+            self.start(other, min(self.runs[other].track.first_ns, state_ns))
         moved = self.motion_since_state(other, state_ns)
         if moved is not None and other not in motions:
             motions[other] = moved

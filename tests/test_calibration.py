@@ -113,6 +113,22 @@ def test_what_is_found_lies_within_its_sigmas():
     assert np.all(total / n > 0.1)  # nor are the sigmas so wide that they say nothing
 
 
+def test_one_step_is_the_information_filter_by_hand():
+    """Prior and motion, each by its own covariance: the motion's without its calibration part,
+    which is what is being learned, plus what the estimate of a motion is off by."""
+    drive = Drive(weaving(100, np.random.default_rng(1)), mounted=False)
+    prior, motion = drive.track.calibration, drive.track.motion(SECOND, 3 * SECOND)
+    moved = motion.delta + [0.02, 0.01, -0.01]
+    after = drive.calibrator.learn(prior, motion, moved)
+    D = motion.d_delta_d_calibration
+    noise = motion.cov - D @ prior.cov @ D.T + np.diag(np.square(RELATIVE_SIGMA))
+    info = np.linalg.inv(prior.cov) + D.T @ np.linalg.solve(noise, D)
+    expected = np.linalg.solve(info, D.T @ np.linalg.solve(noise, moved - motion.delta))
+    np.testing.assert_allclose(after.mean, expected, rtol=1e-9)
+    found = [sigma for _, sigma, _ in drive.calibrator.found().values()]
+    np.testing.assert_allclose(found, np.sqrt(np.diag(np.linalg.inv(info))), rtol=1e-9)
+
+
 def test_wheels_of_unequal_size_are_found():
     """Tyres 4 mm and 2 mm larger than configured, the axle 1 cm longer: within three sigmas, and
     the difference of the radii, which bends the path, to 0.3 mm (0.01 rad over 0.25 m and 200
