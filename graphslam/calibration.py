@@ -8,13 +8,16 @@ treats the errors as white). The estimate is itself pulled towards odometry, by 
 the learned values are used for the next motions, that share vanishes geometrically.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from graphslam.geometry import Array, wrap
+from graphslam.geometry import Array, rotation3, wrap
+from graphslam.models import MODELS
 from graphslam.models.motion import Calibration
-from graphslam.records import Motion
+from graphslam.records import Association, Motion
 
-#: m and rad: how well the motion between two neighbouring states is known from landmarks
+#: m and rad: what landmarks cannot know better about one motion (stamps, walls that are not flat)
 RELATIVE_SIGMA = (0.02, 0.02, 0.01)
 #: weight of the past per state: remembers about 1/(1 - FORGET) states, so tyres may warm up
 FORGET = 0.995
@@ -34,13 +37,17 @@ class Calibrator:
         self._vector = np.zeros(0)
         self._names: tuple[str, ...] = ()
 
-    def learn(self, current: Calibration, motion: Motion, moved: Array) -> Calibration:
+    def learn(
+        self, current: Calibration, motion: Motion, moved: Array, observed: Array
+    ) -> Calibration:
         """The calibration after one more motion.
 
         Args:
             current: what ``motion`` was computed with.
             motion: what odometry said.
             moved: (3,) the same motion according to the estimate, in the frame of its start.
+            observed: (3, 3) information about the motion's end that came from landmarks, along the
+                axes of its start. Without any the estimate *is* odometry and teaches nothing.
 
         Returns:
             Mean, and the covariance to be used for coming motions.
@@ -56,10 +63,12 @@ class Calibrator:
         miss = moved - motion.delta
         miss[2] = wrap(miss[2])
         noise = motion.cov - D @ current.cov @ D.T + np.diag(np.square(RELATIVE_SIGMA))
+        # (noise + observed⁻¹)⁻¹, for an information matrix that may be singular
+        W = np.linalg.solve(np.eye(3) + observed @ noise, observed)
         total = noise + D @ self._prior @ D.T
-        if miss @ np.linalg.solve(total, miss) > OUTLIER:
+        if miss @ np.linalg.solve(total, miss) > OUTLIER or not W.any():
             return current
-        weighted = np.linalg.solve(noise, D).T
+        weighted = D.T @ W
         # relative to nominal values: what is missing now plus what was already corrected
         self._info = FORGET * self._info + (1 - FORGET) * np.linalg.inv(self._prior)
         self._info += weighted @ D
@@ -82,3 +91,24 @@ class Calibrator:
             name: (float(value), float(sigma), bool(known))
             for name, value, sigma, known in zip(self._names, values, sigmas, halved, strict=True)
         }
+
+
+def observed_information(
+    seen: Sequence[Association], pose: Array, landmarks: Sequence[Array], heading_rad: float
+) -> Array:
+    """Information (3, 3) about a robot's pose in observations of landmarks that are known.
+
+    Args:
+        seen: observations from this pose.
+        pose: (3,) world frame.
+        landmarks: their targets, world frame.
+        heading_rad: direction of the x axis that the result is wanted along.
+    """
+    info = np.zeros((3, 3))
+    for association, landmark in zip(seen, landmarks, strict=True):
+        model = MODELS[association.model]
+        H, _ = model.jacobians(association.z, pose, landmark)
+        R = model.noise(association.z, association.cov, pose, landmark)
+        info += H.T @ np.linalg.solve(R, H)
+    turn = rotation3(heading_rad)
+    return np.asarray(turn.T @ info @ turn)

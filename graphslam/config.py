@@ -48,6 +48,11 @@ class RobotConfig:
     left_joint: str = ""
     right_joint: str = ""
 
+    def __post_init__(self) -> None:
+        """Raise ConfigError where `laser` is no pose."""
+        if len(self.laser) not in (0, 3):
+            raise ConfigError(f"robots.*.laser: needs [x, y, yaw], got {list(self.laser)}")
+
 
 @dataclass(frozen=True)
 class OdometryConfig:
@@ -305,9 +310,49 @@ def _build(kind: Any, value: Any, key: str) -> Any:
         raise ConfigError(f"{key}: expected {kind.__name__}, got {value!r}")
     if kind is float and not abs(value) < float("inf"):
         raise ConfigError(f"{key}: must be finite, got {value!r}")
-    if kind in (int, float) and value < 0 and "[" not in key:
-        raise ConfigError(f"{key}: must not be negative, got {value!r}")
+    if kind in (int, float) and "[" not in key:
+        _check_range(key, value)
     return value
+
+
+def _check_range(key: str, value: float) -> None:
+    """Numbers are between 0 and a million, zero excluded for some, probabilities between 0 and 1.
+
+    Raises:
+        ConfigError: the value is outside.
+    """
+    name = key.rpartition(".")[2]
+    if name.endswith("_probability"):
+        if not 0 < value < 1:
+            raise ConfigError(f"{key}: must be between 0 and 1, got {value!r}")
+    elif value < 0:
+        raise ConfigError(f"{key}: must not be negative, got {value!r}")
+    elif value == 0 and name in _NOT_ZERO:
+        raise ConfigError(f"{key}: must be greater than 0")
+    elif value > 1e6:
+        raise ConfigError(f"{key}: must not exceed a million, got {value!r}")
+
+
+#: settings that divide, or weld states together, at 0
+_NOT_ZERO = {
+    "scale",
+    "split_m",
+    "range_sigma_m",
+    "max_range_m",
+    "max_distance_m",
+    "relinearize_every",
+    "relinearize_threshold",
+    "origin_sigma_m",
+    "origin_sigma_rad",
+    "given_sigma_m",
+    "given_sigma_rad",
+    "wheel_radius_left_m",
+    "wheel_radius_right_m",
+    "axle_m",
+    "floor_sigma_m",
+    "floor_sigma_rad",
+    "sightings_to_promote",
+}
 
 
 def _build_table(kind: Any, value: Any, key: str) -> Any:

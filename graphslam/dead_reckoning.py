@@ -31,8 +31,12 @@ STANDING_SIGMA = 1e-3
 #: in a burst (a logger that fell behind): its stamps do not tell when the motion took place, so a
 #: time inside it belongs to the reading before, as the order of recording has it
 MAX_SPEED_M_S, MAX_TURN_RAD_S = 20.0, 20.0
+#: m/s over at least this many ns (and half a metre): the odometry jumped, see `Track.resets`
+RESET_SPEED_M_S, SHORTEST_RESET_NS = 10.0, 10_000_000
 #: share of readings in bursts above which the stamps are not good enough to learn a latency
 MAX_BURST_SHARE = 0.01
+#: ns: how long before the first reading or after the last a robot is taken to stand
+EDGE_NS = 500_000_000
 #: ns: step of the difference quotient by latency; about one period of common odometry
 LATENCY_STEP_NS = 50_000_000
 #: m per rad: how much path a turn counts for when a correction is spread over an interval
@@ -49,6 +53,7 @@ class Track:
     ) -> None:
         """An empty track; ``mounted``: its motions are those of a sensor's frame, see `motion`."""
         self.source = ""
+        self.resets = 0  # times that the odometry jumped
         self.calibration = nominal_calibration("given", config, False)
         self._mounted = mounted
         self._config, self._robot = config, robot
@@ -72,6 +77,14 @@ class Track:
         if len(calibration.mean) > self._p:
             return calibration.mean[self._p : self._p + 3]
         return np.zeros(3)
+
+    @property
+    def mount_cov(self) -> Array:
+        """Covariance (3, 3) of `mount`; zeros for a track that is not mounted."""
+        where = slice(self._p, self._p + 3)
+        if len(self.calibration.mean) > self._p:
+            return self.calibration.cov[where, where]
+        return np.zeros((3, 3))
 
     @property
     def bursty(self) -> bool:
@@ -115,6 +128,9 @@ class Track:
             )
         elif isinstance(message, OdometryPose):
             row = np.zeros(3) if self._last is None else log(between(self._last, message.pose))
+            if self._jumps(row, message.time_ns):
+                self.resets += 1
+                row = self._rows[self._count - 1] if self._count > 1 else np.zeros(3)
             self._append("odometry", message.time_ns, row)
             self._last = message.pose
         else:
@@ -122,6 +138,17 @@ class Track:
             row = np.zeros(2) if self._last is None else angles - self._last
             self._append("wheels", message.time_ns, row)
             self._last = angles
+
+    def _jumps(self, row: Array, time_ns: int) -> bool:
+        """Whether a pose is no continuation of the last: the odometry was set anew.
+
+        Faster than any robot over an interval that is no burst. The motion in it is unknown; the
+        robot is taken to have gone on as before.
+        """
+        if not self._count or time_ns - self.last_ns < SHORTEST_RESET_NS:
+            return False
+        seconds = 1e-9 * (time_ns - self.last_ns)
+        return bool(np.hypot(row[0], row[1]) > RESET_SPEED_M_S * seconds + 0.5)
 
     def _append(self, source: str, time_ns: int, row: Array) -> None:
         if not self._count:
@@ -135,6 +162,12 @@ class Track:
             for name in ("_times", "_rows", "_sums", "_poses", "_effort", "_path", "_burst"):
                 full = getattr(self, name)
                 setattr(self, name, np.concatenate([full, np.empty_like(full)]))
+        if self._count and time_ns <= self.last_ns:
+            # a second reading of one time: its motion belongs to the interval that ends here
+            self._count -= 1
+            row = row + self._rows[self._count]
+            time_ns = int(self._times[self._count])
+            self._bursts -= int(self._burst[self._count])
         n = self._count
         self._times[n], self._rows[n] = time_ns, row
         self._sums[n] = self._sums[n - 1] + row if n else 0.0
@@ -156,10 +189,14 @@ class Track:
         return self._count > 0 and self.last_ns >= time_ns
 
     def near(self, time_ns: int, gap_ns: int) -> bool:
-        """Whether a reading lies within ``gap_ns`` of ``time_ns``."""
+        """Whether ``time_ns`` lies between readings at most ``gap_ns`` apart, or just outside."""
+        if not self._count:
+            return False
         i = int(np.searchsorted(self.times, time_ns))
-        around = self.times[max(i - 1, 0) : i + 1]
-        return bool(np.any(np.abs(around - time_ns) <= gap_ns))
+        if 0 < i < self._count:
+            return bool(self._times[i] - self._times[i - 1] <= gap_ns)
+        end_ns = self.first_ns if i == 0 else self.last_ns
+        return abs(time_ns - end_ns) <= EDGE_NS
 
     def pose(self, times_ns: IntArray | int) -> Array:
         """Poses (..., 3) by odometry alone, in the frame of the first reading.

@@ -50,10 +50,18 @@ class RobotRun:
         self.causal_poses.append(pose)
         self.calibrations.append(self.track.calibration)
 
-    def learn(self, motion: Motion, pose: Array) -> None:
-        """Improve the calibration from the motion to a new state, estimated at ``pose`` (3,)."""
+    def learn(self, motion: Motion, pose: Array, observed: Array) -> None:
+        """Improve the calibration from the motion to a new state.
+
+        Args:
+            motion: according to odometry.
+            pose: (3,) estimate of the new state.
+            observed: (3, 3) see `Calibrator.learn`.
+        """
         moved = between(self.causal_poses[-1], pose)
-        self.track.calibration = self.calibrator.learn(self.track.calibration, motion, moved)
+        self.track.calibration = self.calibrator.learn(
+            self.track.calibration, motion, moved, observed
+        )
 
     def result(self, states: Trajectory, start: Array) -> RobotResult:
         """Trajectories of the robot at the stamps that it is reported at.

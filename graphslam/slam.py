@@ -9,14 +9,16 @@ import itertools
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from graphslam.associator import Associator
 from graphslam.backends import BACKENDS
+from graphslam.calibration import observed_information
 from graphslam.config import Config
 from graphslam.dead_reckoning import Track
-from graphslam.errors import EstimationError, LogError
+from graphslam.errors import ConfigError, EstimationError, LogError
 from graphslam.frontend import FRONT_ENDS, scan_points
 from graphslam.frontend.sightings import sighting_observation
 from graphslam.geometry import (
@@ -25,6 +27,7 @@ from graphslam.geometry import (
     compose_cov,
     inverse,
     inverse_cov,
+    rotate_cov,
     rotation3,
     transform,
 )
@@ -43,6 +46,7 @@ from graphslam.records import (
     Result,
     Scan,
     Sighting,
+    Start,
     Step,
 )
 from graphslam.robot_run import RobotRun
@@ -76,6 +80,7 @@ class Pipeline:
         self.dropped: Counter[str] = Counter()
         self.seconds: dict[str, float] = defaultdict(float)
         self.step_ms: list[float] = []
+        self.first_ns, self.last_ns = 1 << 63, 0
 
     # ------------------------------------------------------------ the loop
 
@@ -102,6 +107,7 @@ class Pipeline:
         """One event: everything one robot perceived at one time."""
         first = event[0]
         run, time_ns = self.runs[first.robot], first.time_ns
+        self.first_ns, self.last_ns = min(self.first_ns, time_ns), max(self.last_ns, time_ns)
         if not run.started:
             self.start(first.robot, min(run.track.first_ns, time_ns))
         run.scans += [(m.stamp_ns, m.time_ns, m.mount) for m in event if isinstance(m, Scan)]
@@ -127,6 +133,11 @@ class Pipeline:
                 "--start truth"
             )
         start = self.starts[robot]
+        if robot != min(self.starts):
+            # priors are on the base, states on the sensor: where it sits is not known yet, nor is
+            # where that of the first robot sits, to which the world is fixed
+            cov = start.cov + rotate_cov(2 * self.runs[robot].track.mount_cov, start.pose[2])
+            start = replace(start, cov=cov)
         step = Step(time_ns, starts={robot: start})
         self.note_covariances()
         self.backend.add(step)
@@ -206,6 +217,7 @@ class Pipeline:
         if motion is not None:
             run.path_m += motion.length_m
         began = time.perf_counter()
+        known = {i for i, entry in self.associator.map.entries.items() if entry.in_graph}
         associations: tuple[Association, ...] = ()
         if seen:
             associations = self.associator.associate(
@@ -223,8 +235,10 @@ class Pipeline:
         began = time.perf_counter()
         self.backend.add(step)
         self.steps.append(step)
-        for name, moved in motions.items():
-            self.note_state(name, time_ns, moved)
+        for name in motions:
+            if self.config.odometry.calibrate:
+                self.learn(name, step, known)
+            self.note_state(name, time_ns)
         self.seconds["back end"] += time.perf_counter() - began
         for message in event:
             if isinstance(message, Scan):
@@ -272,14 +286,24 @@ class Pipeline:
         self.counts["loop_closures"] += 1
         return Closure(message.robot, state_ns, message.other, other_ns, delta, cov)
 
-    def note_state(self, robot: str, time_ns: int, motion: Motion | None = None) -> None:
-        """Book a new state, and learn from how the robot got there."""
+    def note_state(self, robot: str, time_ns: int) -> None:
+        """Book a new state."""
         run = self.runs[robot]
-        pose = self.backend.state_mean(robot)
-        if motion is not None and self.config.odometry.calibrate:
-            run.learn(motion, pose)
-        run.append(time_ns, pose)
+        run.append(time_ns, self.backend.state_mean(robot))
         self.counts["keyframes"] += 1
+
+    def learn(self, robot: str, step: Step, known: set[int]) -> None:
+        """Improve the robot's calibration from a step; ``known`` landmarks were there before it."""
+        run, pose = self.runs[robot], self.backend.state_mean(robot)
+        seen = [
+            a
+            for a in step.associations
+            if a.robot == robot and a.target in known and a.time_ns == step.time_ns
+        ]
+        landmarks = self.backend.landmark_means([a.target for a in seen if a.target in known])
+        heading = float(run.causal_poses[-1][2])
+        observed = observed_information(seen, pose, landmarks, heading)
+        run.learn(step.motions[robot], pose, observed)
 
     def note_covariances(self) -> None:
         """Book the causal covariance of states that have none yet.
@@ -308,9 +332,11 @@ def smooth(log: LogSet, config: Config, progress: Progress = lambda _count: None
 
     Raises:
         LogError: no message of the log could be used.
+        ConfigError: a setting is about a robot that is not in the log.
         EstimationError: the estimate is indeterminate, or a robot's start is unknown.
     """
     began = time.perf_counter()
+    check_robots(log, config)
     pipeline = Pipeline(log, config)
     pipeline.run(progress)
     if not pipeline.steps:
@@ -325,6 +351,7 @@ def smooth(log: LogSet, config: Config, progress: Progress = lambda _count: None
     start = pipeline.starts[first].pose
     world = origin_shift(start, runs[first].track.mount)
     estimate = in_world(estimate, world)
+    steps = tuple(step_in_world(step, world) for step in pipeline.steps)
     robots = {name: run.result(estimate.states[name], start) for name, run in runs.items()}
     pipeline.seconds["trajectories"] = time.perf_counter() - finishing
     landmarks: tuple[Landmark, ...] = make_landmarks(pipeline.associator.map, estimate)
@@ -346,17 +373,45 @@ def smooth(log: LogSet, config: Config, progress: Progress = lambda _count: None
         landmarks=len(landmarks),
         seconds=pipeline.seconds,
         calibration={name: run.calibrator.found() for name, run in runs.items()},
+        warnings=run_warnings(pipeline),
+        log_s=1e-9 * (pipeline.last_ns - pipeline.first_ns),
     )
     return Result(
         robots,
         landmarks,
         estimate,
-        tuple(pipeline.steps),
+        steps,
         tuple(pipeline.pictures),
         innovations,
         np.array(pipeline.step_ms),
         summary,
     )
+
+
+def check_robots(log: LogSet, config: Config) -> None:
+    """Refuse settings about robots that are not there.
+
+    Raises:
+        ConfigError: naming the key.
+    """
+    for table, names in (("robots", config.robots), ("start.poses", config.start.poses)):
+        for name in names:
+            if name not in (*log.robots, "default"):
+                raise ConfigError(
+                    f"{table}.{name}: the log has no robot {name}, but {', '.join(log.robots)}"
+                )
+
+
+def run_warnings(pipeline: Pipeline) -> list[str]:
+    """What a user should know about a run although it went through."""
+    warnings = [
+        f"{name}: its odometry jumped {run.track.resets} times; taken to have gone on as before"
+        for name, run in pipeline.runs.items()
+        if run.track.resets
+    ]
+    if not any(step.associations or step.closures for step in pipeline.steps):
+        warnings.append("no observation entered the estimate: this is dead reckoning")
+    return warnings
 
 
 def in_world(estimate: Estimate, world: Array) -> Estimate:
@@ -369,6 +424,15 @@ def in_world(estimate: Estimate, world: Array) -> Estimate:
         moved = compose(world, mean) if len(mean) == 3 else transform(world, mean)
         landmarks[number] = (moved, M @ cov @ M.T)
     return Estimate(states, landmarks, estimate.error, estimate.dof)
+
+
+def step_in_world(step: Step, world: Array) -> Step:
+    """The same step after the world frame was put at ``world`` (3,): its starts move along."""
+    starts = {
+        robot: Start(compose(world, start.pose), rotate_cov(start.cov, world[2]))
+        for robot, start in step.starts.items()
+    }
+    return replace(step, starts=starts)
 
 
 def events(messages: Iterable[Message]) -> Iterator[list[Message]]:

@@ -4,8 +4,13 @@ import numpy as np
 
 from graphslam.config import Config
 from graphslam.errors import EstimationError
+from graphslam.geometry import Array
 from graphslam.logs import LogSet
 from graphslam.records import Start, Truth
+from graphslam.timeline import ODOMETRY
+
+#: ns: a truth sample this near to a robot's first odometry is taken as the truth of its start
+MAX_TRUTH_LAG_NS = 500_000_000
 
 
 def start_poses(log: LogSet, config: Config) -> dict[str, Start]:
@@ -18,21 +23,48 @@ def start_poses(log: LogSet, config: Config) -> dict[str, Start]:
     given = np.diag([start.given_sigma_m**2] * 2 + [start.given_sigma_rad**2])
     starts: dict[str, Start] = {}
     if start.from_truth:
-        for message in log.messages():
-            if isinstance(message, Truth) and message.robot not in starts:
-                starts[message.robot] = Start(message.pose, given)
-            if len(starts) >= len(log.robots):
-                break
-        missing = [robot for robot in log.robots if robot not in starts]
-        if missing:
-            raise EstimationError(f"--start truth: the log has no truth for {', '.join(missing)}")
+        starts = {robot: Start(pose, given) for robot, pose in first_truth(log).items()}
     for robot, pose in start.poses.items():
         if len(pose) != 3 or robot not in log.robots:
             raise EstimationError(
                 f"--start {robot}: needs x,y,phi of one of the robots {', '.join(log.robots)}"
             )
         starts[robot] = Start(np.array(pose), given)
-    if log.robots and log.robots[0] not in starts and not starts:
+    if log.robots and log.robots[0] not in starts:
         origin = np.diag([start.origin_sigma_m**2] * 2 + [start.origin_sigma_rad**2])
         starts[log.robots[0]] = Start(np.zeros(3), origin)
     return starts
+
+
+def first_truth(log: LogSet) -> dict[str, Array]:
+    """The true pose (3,) of each robot when its odometry begins: one sample each.
+
+    Raises:
+        EstimationError: a robot has no truth within `MAX_TRUTH_LAG_NS` of its first odometry.
+    """
+    begins: dict[str, int] = {}
+    nearest: dict[str, Truth] = {}
+    for message in log.messages():
+        if isinstance(message, ODOMETRY):
+            begins.setdefault(message.robot, message.time_ns)
+        elif isinstance(message, Truth):
+            known = nearest.get(message.robot)
+            begin = begins.get(message.robot, message.time_ns)
+            if known is None or abs(message.time_ns - begin) < abs(known.time_ns - begin):
+                nearest[message.robot] = message
+        if all(
+            robot in begins and message.time_ns > begins[robot] + MAX_TRUTH_LAG_NS
+            for robot in log.robots
+        ):
+            break
+    for robot in log.robots:
+        truth = nearest.get(robot)
+        if truth is None:
+            raise EstimationError(f"--start truth: the log has no truth for {robot} at its start")
+        begin = begins.get(robot, truth.time_ns)
+        if abs(truth.time_ns - begin) > MAX_TRUTH_LAG_NS:
+            raise EstimationError(
+                f"--start truth: {robot} starts at {begin} ns and its truth nearest to that is of "
+                f"{truth.time_ns} ns; give --start {robot}=x,y,phi"
+            )
+    return {robot: nearest[robot].pose for robot in log.robots}

@@ -5,7 +5,7 @@ import platform
 import resource
 import sys
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from typing import Any
 
@@ -81,11 +81,11 @@ def summarise(
     landmarks: int,
     seconds: Mapping[str, float],
     calibration: Mapping[str, Mapping[str, tuple[float, float, bool]]],
+    warnings: Sequence[str],
+    log_s: float,
 ) -> dict[str, Any]:
     """The keys of summary.json (see docs/formats.md)."""
     scans, total = counts["scans"], max(seconds["all"], 1e-9)
-    spans = [t.stamps_ns for t in estimate.states.values()]
-    log_s = 1e-9 * (max(int(s[-1]) for s in spans) - min(int(s[0]) for s in spans))
     all_dropped = Counter(log.dropped) + dropped
     if tentative_deleted:
         all_dropped["tentative landmark: not seen often enough"] += tentative_deleted
@@ -132,7 +132,7 @@ def summarise(
             for robot, found in sorted(calibration.items())
             for name, (value, sigma, observable) in found.items()
         },
-        "warnings": list(log.warnings),
+        "warnings": [*log.warnings, *warnings],
     }
 
 

@@ -6,12 +6,20 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from graphslam.calibration import FORGET, OUTLIER, RELATIVE_SIGMA, REMAINING, Calibrator
+from graphslam.calibration import (
+    FORGET,
+    OUTLIER,
+    RELATIVE_SIGMA,
+    REMAINING,
+    Calibrator,
+    observed_information,
+)
 from graphslam.config import OdometryConfig, RobotConfig
 from graphslam.dead_reckoning import Track
-from graphslam.geometry import between, compose, exp
+from graphslam.geometry import between, compose, exp, rotation3
+from graphslam.models import MODELS
 from graphslam.models.motion import wheel_twist
-from graphslam.records import OdometryIncrement, OdometryPose, WheelAngles
+from graphslam.records import Association, OdometryIncrement, OdometryPose, WheelAngles
 
 SECOND = 1_000_000_000
 PERIOD_NS = 50_000_000  # of odometry
@@ -21,6 +29,8 @@ SCALES = {"translation_scale": 0.03, "rotation_scale": -0.04, "drift_rad_per_m":
 LASER = {"laser_x_m": 0.08, "laser_y_m": -0.06, "laser_yaw_rad": 0.02, "laser_latency_s": 0.04}
 NOTHING = dict.fromkeys(SCALES, 0.0)
 CENTRED = dict.fromkeys(LASER, 0.0)
+#: information from landmarks that show a motion as well as `RELATIVE_SIGMA` lets them
+PLENTY = 1e12 * np.eye(3)
 #: sigmas of the prior, from the settings
 PRIOR = {
     "translation_scale": OdometryConfig().translation_scale_sigma,
@@ -83,7 +93,9 @@ class Drive:
         for start, end in zip(self.states[:-1], self.states[1:], strict=True):
             motion = self.track.motion(int(start), int(end))
             moved = self.moved(start, end)
-            self.track.calibration = self.calibrator.learn(self.track.calibration, motion, moved)
+            self.track.calibration = self.calibrator.learn(
+                self.track.calibration, motion, moved, PLENTY
+            )
         return self.calibrator.found()
 
 
@@ -118,15 +130,15 @@ def test_one_step_is_the_information_filter_by_hand():
     which is what is being learned, plus what the estimate of a motion is off by."""
     drive = Drive(weaving(100, np.random.default_rng(1)), mounted=False)
     prior, motion = drive.track.calibration, drive.track.motion(SECOND, 3 * SECOND)
-    moved = motion.delta + [0.02, 0.01, -0.01]
-    after = drive.calibrator.learn(prior, motion, moved)
+    moved = motion.delta + np.array([0.02, 0.01, -0.01])
+    after = drive.calibrator.learn(prior, motion, moved, PLENTY)
     D = motion.d_delta_d_calibration
     noise = motion.cov - D @ prior.cov @ D.T + np.diag(np.square(RELATIVE_SIGMA))
     info = np.linalg.inv(prior.cov) + D.T @ np.linalg.solve(noise, D)
     expected = np.linalg.solve(info, D.T @ np.linalg.solve(noise, moved - motion.delta))
-    np.testing.assert_allclose(after.mean, expected, rtol=1e-9)
+    np.testing.assert_allclose(after.mean, expected, rtol=1e-7)
     found = [sigma for _, sigma, _ in drive.calibrator.found().values()]
-    np.testing.assert_allclose(found, np.sqrt(np.diag(np.linalg.inv(info))), rtol=1e-9)
+    np.testing.assert_allclose(found, np.sqrt(np.diag(np.linalg.inv(info))), rtol=1e-7)
 
 
 def test_wheels_of_unequal_size_are_found():
@@ -148,7 +160,7 @@ def test_wheels_of_unequal_size_are_found():
     for k in range(0, n, 10):
         motion = track.motion(k * PERIOD_NS, (k + 10) * PERIOD_NS)
         moved = between(true[k], true[k + 10]) + rng.normal(0, RELATIVE_SIGMA)
-        track.calibration = calibrator.learn(track.calibration, motion, moved)
+        track.calibration = calibrator.learn(track.calibration, motion, moved, PLENTY)
     found = calibrator.found()
     errors = {"wheel_radius_left_m": 4e-3, "wheel_radius_right_m": 2e-3, "axle_m": 0.01}
     assert set(found) == set(errors)
@@ -167,7 +179,7 @@ def test_a_jump_of_the_estimate_teaches_nothing(jump):
     motion = drive.track.motion(2 * SECOND, 2 * SECOND + STATE_NS)
     current = drive.track.calibration
     moved = drive.moved(2 * SECOND, 2 * SECOND + STATE_NS) + jump
-    assert drive.calibrator.learn(current, motion, moved) is current
+    assert drive.calibrator.learn(current, motion, moved, PLENTY) is current
     assert drive.calibrator.found() == before
 
 
@@ -183,7 +195,7 @@ def test_headings_are_compared_the_short_way_round():
         track.add(OdometryPose("r", k * PERIOD_NS, k * PERIOD_NS, np.array([0, 0, phi])))
     motion = track.motion(0, 49 * PERIOD_NS)
     calibrator = Calibrator()
-    after = calibrator.learn(track.calibration, motion, np.array([0, 0, -np.pi + 0.01]))
+    after = calibrator.learn(track.calibration, motion, np.array([0, 0, -np.pi + 0.01]), PLENTY)
     assert 0 < after.mean[1] < 0.02 / np.pi
 
 
@@ -249,6 +261,54 @@ def test_coming_motions_stay_uncertain():
         assert sigma == pytest.approx(np.hypot(known, REMAINING * prior), rel=1e-9)
 
 
+# ------------------------------------------------------------ what landmarks show of a motion
+
+
+def test_without_landmarks_nothing_is_learned():
+    """The estimate is odometry then: agreement with itself is no evidence."""
+    drive = Drive(weaving(100, np.random.default_rng(1)))
+    current, motion = drive.track.calibration, drive.track.motion(SECOND, 3 * SECOND)
+    after = drive.calibrator.learn(current, motion, motion.delta, np.zeros((3, 3)))
+    np.testing.assert_array_equal(after.mean, current.mean)
+    np.testing.assert_array_equal(after.cov, current.cov)
+
+
+def test_a_corridor_does_not_show_the_scale_of_the_path():
+    """Its walls give the offset across and the heading: along them the estimate is odometry."""
+    drive = Drive(straight(200), mounted=False)
+    walls = np.diag([0.0, 1e8, 1e8])
+    for start, end in zip(drive.states[:-1], drive.states[1:], strict=True):
+        motion = drive.track.motion(int(start), int(end))
+        moved = drive.moved(start, end)
+        moved[0] = motion.delta[0]
+        drive.track.calibration = drive.calibrator.learn(
+            drive.track.calibration, motion, moved, walls
+        )
+    found = drive.calibrator.found()
+    assert found["translation_scale"][1] == pytest.approx(PRIOR["translation_scale"], rel=1e-4)
+    assert found["drift_rad_per_m"][2] and not found["translation_scale"][2]
+
+
+@pytest.mark.parametrize("heading_rad", [0.0, 0.7, -2.5])
+def test_information_of_observations_lies_along_the_axes_asked_for(heading_rad):
+    """A post 4 m ahead in the world's x direction: range gives 1/sigma² along x, bearing that of
+    4 m times its sigma across, whichever way the robot faces."""
+    pose = np.array([1.0, 2.0, 0.3])
+    post = np.array([5.0, 2.0])
+    model = MODELS["point"]
+    cov = np.diag([1e-4, 4e-4])
+    seen = Association("r", 0, 0, "point", model.predict(pose, post), cov)
+    info = observed_information([seen], pose, [post], heading_rad)
+    turn = rotation3(heading_rad)
+    along_world = turn @ info @ turn.T
+    np.testing.assert_allclose(along_world[0, 0], 1 / 4e-4, rtol=1e-9)
+    np.testing.assert_allclose(along_world[1, 1], 1 / (16 * 1e-4), rtol=1e-9)
+    np.testing.assert_allclose(along_world[2, 2], 1 / 1e-4, rtol=1e-9)
+    two = observed_information([seen, seen], pose, [post, post], heading_rad)
+    np.testing.assert_allclose(two, 2 * info, rtol=1e-12)
+    np.testing.assert_array_equal(observed_information([], pose, [], heading_rad), np.zeros((3, 3)))
+
+
 # ------------------------------------------------------------ nothing to learn
 
 
@@ -262,7 +322,7 @@ def test_given_increments_are_left_alone():
     calibrator, current = Calibrator(), track.calibration
     for k in range(20):
         motion = track.motion(k * SECOND, (k + 1) * SECOND)
-        assert calibrator.learn(current, motion, np.array([0.6, 0.05, 0.2])) is current
+        assert calibrator.learn(current, motion, np.array([0.6, 0.05, 0.2]), PLENTY) is current
     assert calibrator.found() == {}
     np.testing.assert_array_equal(track.mount, 0)
 
@@ -275,5 +335,5 @@ def test_a_robot_that_stands_teaches_nothing():
     calibrator, current = Calibrator(), track.calibration
     for k in range(4):
         motion = track.motion(k * SECOND, (k + 1) * SECOND)
-        assert calibrator.learn(current, motion, np.array([0.01, 0.0, 0.005])) is current
+        assert calibrator.learn(current, motion, np.array([0.01, 0.0, 0.005]), PLENTY) is current
     assert calibrator.found() == {}

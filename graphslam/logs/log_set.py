@@ -97,6 +97,9 @@ def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
     if not paths:
         raise LogError("no log given; name at least one .mcap file")
     files = [open_mcap(Path(path)) for path in paths]
+    for n, file in enumerate(files):
+        if file.sha256 in {other.sha256 for other in files[:n]}:
+            raise LogError(f"{file.path}: is given twice; each log counts once")
     topics, warnings = choose_topics(files, find_topics(files, config))
     contexts, assumed = survey_topics(files, topics, config)
     notes: dict[str, str] = {}

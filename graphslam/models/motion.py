@@ -169,7 +169,8 @@ def nominal_calibration(source: str, config: OdometryConfig, mounted: bool) -> C
             "laser_yaw_rad": config.laser_sigma_rad,
             "laser_latency_s": config.laser_latency_sigma_s,
         }
-    values = np.array(list(sigmas.values()), dtype=float)
+    # a parameter whose sigma is set to 0 is held, without making the covariance singular
+    values = np.maximum(np.array(list(sigmas.values()), dtype=float), 1e-9)
     return Calibration(tuple(sigmas), np.zeros(len(values)), np.diag(values**2))
 
 

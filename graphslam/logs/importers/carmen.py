@@ -109,7 +109,7 @@ def parse_stamp_ns(text: str) -> int:
     """
     try:
         seconds = Decimal(text)
-        if not abs(seconds) < 2**31:
+        if not 0 <= seconds < 2**31:
             raise ValueError(f"{text!r} is not a time")
         return int(seconds.scaleb(9).to_integral_value())
     except DecimalException as error:
