@@ -394,12 +394,10 @@ def check_robots(log: LogSet, config: Config) -> None:
     Raises:
         ConfigError: naming the key.
     """
-    for table, names in (("robots", config.robots), ("start.poses", config.start.poses)):
-        for name in names:
-            if name not in (*log.robots, "default"):
-                raise ConfigError(
-                    f"{table}.{name}: the log has no robot {name}, but {', '.join(log.robots)}"
-                )
+    for name in config.robots:
+        if name not in (*log.robots, "default"):
+            known = ", ".join(log.robots)
+            raise ConfigError(f"robots.{name}: the log has no robot {name}, but {known}")
 
 
 def run_warnings(pipeline: Pipeline) -> list[str]:

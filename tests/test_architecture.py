@@ -23,10 +23,10 @@ ROWS = (
     ("models",),  # motion, and one observation model per kind of target
     # one job each, on records and arrays
     ("association", "calibration", "dead_reckoning", "export", "factors", "frontend", "logs"),
-    # estimators; order in time; poses at any time; where robots start; worlds and their logs
-    ("backends", "simulate", "starts", "timeline", "trajectories"),
-    # what is known about landmarks beside their estimate; what a run keeps for one robot
-    ("landmark_map", "robot_run"),
+    # estimators; order in time; poses at any time; worlds and their logs
+    ("backends", "simulate", "timeline", "trajectories"),
+    # what is known about landmarks beside their estimate; of a robot; where robots start
+    ("landmark_map", "robot_run", "starts"),
     ("associator", "summary"),  # decisions of one image; what a run adds up to
     ("slam",),  # the pipeline
     ("results",),  # a result as a folder, and back

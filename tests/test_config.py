@@ -45,6 +45,11 @@ def one_line(error):
         ("front_end.min_points=true", "front_end.min_points: expected int, got True"),
         ("robust.scale=-1", "robust.scale: must not be negative, got -1.0"),
         ("front_end.min_points=-1", "front_end.min_points: must not be negative, got -1"),
+        ("robust.scale=0", "robust.scale: must be greater than 0"),
+        ("backend.relinearize_every=0", "backend.relinearize_every: must be greater than 0"),
+        ("odometry.max_gap_s=1e300", "odometry.max_gap_s: must not exceed a million, got 1e+300"),
+        ("association.gate_probability=2", "association.gate_probability: must be between 0 and"),
+        ("robots.r.laser=[0.1,0]", "robots.*.laser: needs [x, y, yaw], got [0.1, 0.0]"),
         ("robust.scale=nan", "robust.scale: must be finite, got nan"),
         ("robust.scale=inf", "robust.scale: must be finite, got inf"),
         ("robust.kernel=hubr", "robust.kernel: 'hubr' is not one of none, huber,"),
@@ -170,14 +175,16 @@ def values(kind):
     if origin is typing.Literal:
         return st.sampled_from(arguments)
     if origin is tuple:
-        return st.lists(st.floats(-1e9, 1e9), max_size=3).map(tuple)
+        return st.sampled_from([0, 3]).flatmap(
+            lambda n: st.lists(st.floats(-1e9, 1e9), min_size=n, max_size=n).map(tuple)
+        )
     if origin is not None:  # a mapping
         return st.dictionaries(NAMES, values(arguments[1]), max_size=3)
     if dataclasses.is_dataclass(kind):
         return tables(kind)
     return {
-        float: st.floats(0, 1e300, allow_subnormal=False),
-        int: st.integers(0, 2**62),
+        float: st.floats(1e-300, 1e6, allow_subnormal=False),
+        int: st.integers(1, 10**6),
         bool: st.booleans(),
         str: NAMES,
     }[kind]
@@ -185,7 +192,10 @@ def values(kind):
 
 def tables(kind):
     hints = typing.get_type_hints(kind)
-    return st.builds(kind, **{name: values(hint) for name, hint in hints.items()})
+    odds = {name for name in hints if name.endswith("_probability")}
+    strategies = {name: values(hint) for name, hint in hints.items() if name not in odds}
+    strategies |= {name: st.floats(1e-9, 1 - 1e-9) for name in odds}
+    return st.builds(kind, **strategies)
 
 
 @given(tables(Config))

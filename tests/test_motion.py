@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graphslam.config import OdometryConfig, RobotConfig
-from graphslam.dead_reckoning import STANDING_SIGMA, Track
+from graphslam.dead_reckoning import EDGE_NS, STANDING_SIGMA, Track
 from graphslam.geometry import between, compose, compose_cov, exp, wrap
 from graphslam.models import MOTION_SOURCES, compound
 from graphslam.models.motion import (
@@ -376,9 +376,8 @@ def test_two_motions_in_a_row_are_the_whole_one():
         track.motion(a, b) for a, b in ((0, cut), (cut, 4 * SECOND), (0, 4 * SECOND))
     )
     np.testing.assert_allclose(compose(first.delta, second.delta), whole.delta, atol=1e-14)
-    np.testing.assert_allclose(
-        first.cov + second.cov, whole.cov, rtol=1e-9
-    )  # 1/3 s is rounded to ns
+    # 1/3 s is rounded to ns; a sigma of zero is held at 1e-9
+    np.testing.assert_allclose(first.cov + second.cov, whole.cov, rtol=1e-9, atol=1e-15)
     assert first.length_m + second.length_m == pytest.approx(whole.length_m)
 
 
@@ -446,7 +445,31 @@ def test_track_grows_beyond_its_first_arrays():
 def test_reaches_and_near_tell_what_odometry_covers():
     track = Track(NOISE, EVEN)
     assert not track.reaches(0) and not track.near(0, SECOND)
-    track = odometry_track([10, 11], [[0, 0, 0], [1, 0, 0]])
-    assert track.reaches(11 * SECOND) and not track.reaches(11 * SECOND + 1)
-    assert track.near(9 * SECOND, SECOND) and track.near(12 * SECOND, SECOND)
-    assert not track.near(9 * SECOND - 1, SECOND) and not track.near(12 * SECOND + 1, SECOND)
+    track = odometry_track([10, 11, 14], [[0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    assert track.reaches(14 * SECOND) and not track.reaches(14 * SECOND + 1)
+    # between readings: they are no farther apart than the gap
+    assert track.near(10 * SECOND + 1, SECOND) and not track.near(12 * SECOND, SECOND)
+    assert track.near(12 * SECOND, 3 * SECOND)
+    # outside: the robot is taken to stand for half a second, whatever the gap
+    first, last = 10 * SECOND - EDGE_NS, 14 * SECOND + EDGE_NS
+    assert track.near(first, 9 * SECOND) and track.near(last, 9 * SECOND)
+    assert not track.near(first - 1, 9 * SECOND) and not track.near(last + 1, 9 * SECOND)
+
+
+def test_a_second_reading_of_one_time_belongs_to_the_interval_that_ends_there():
+    """Nothing of the way is lost, and no interval is empty."""
+    track = odometry_track([0, 1, 1, 2], [[0, 0, 0], [1, 0, 0], [1.5, 0, 0], [2, 0, 0]])
+    assert len(track) == 3 and not track.bursty
+    np.testing.assert_allclose(track.motion(0, SECOND).delta, [1.5, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(track.motion(SECOND, 2 * SECOND).delta, [0.5, 0, 0], atol=1e-12)
+    assert track.motion(0, 2 * SECOND).length_m == pytest.approx(2.0)
+
+
+def test_odometry_that_is_set_anew_is_no_motion():
+    """It jumps by 50 m within a second; the robot is taken to have gone on as before."""
+    places = [0.0, 0.5, 1.0, 51.0, 51.5]
+    track = odometry_track(range(5), [[x, 0, 0] for x in places])
+    assert track.resets == 1
+    np.testing.assert_allclose(track.motion(0, 4 * SECOND).delta, [2.0, 0, 0], atol=1e-12)
+    usual = odometry_track(range(5), [[0.5 * k, 0, 0] for k in range(5)])
+    assert usual.resets == 0

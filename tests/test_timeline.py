@@ -110,17 +110,31 @@ def test_one_robots_silence_delays_the_others_by_the_gap_at_most():
 
 
 def test_what_is_near_odometry_at_the_end_of_the_log_is_released_and_the_rest_counted():
-    """After its last reading a robot is taken to stand, for the gap and no longer."""
-    messages = [odometry("a", 0), odometry("a", 1), scan("a", 2), scan("a", 5.9), scan("a", 6.1)]
+    """After its last reading a robot is taken to stand, for half a second and no longer."""
+    messages = [odometry("a", 0), odometry("a", 1), scan("a", 1.2), scan("a", 1.5), scan("a", 1.6)]
     run = Run(messages)
-    assert run.times(Scan) == [2.0, 5.9]
+    assert run.times(Scan) == [1.2, 1.5]
     assert run.dropped == {"scan: no odometry near it": 1}
 
 
 def test_scans_long_before_the_first_odometry_are_counted_and_near_ones_kept():
-    messages = [scan("a", 0), scan("a", 3), scan("a", 6), odometry("a", 7), odometry("a", 8)]
+    messages = [scan("a", 0), scan("a", 6.4), scan("a", 6.6), odometry("a", 7), odometry("a", 8)]
     run = Run(messages)
-    assert run.times(Scan) == [3.0, 6.0]
+    assert run.times(Scan) == [6.6]
+    assert run.dropped == {"scan: no odometry near it": 2}
+
+
+def test_scans_in_a_hole_of_the_odometry_are_counted():
+    """Longer than the gap, nobody knows where the robot was in it."""
+    messages = [
+        odometry("a", 0),
+        scan("a", 1),
+        odometry("a", 4.9),
+        scan("a", 7),
+        odometry("a", 10.0),
+    ]
+    run = Run(messages)
+    assert run.times(Scan) == [1.0]
     assert run.dropped == {"scan: no odometry near it": 1}
 
 

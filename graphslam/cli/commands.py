@@ -187,8 +187,10 @@ def _quality(result: Result, log: LogSet, tree: Config) -> dict[str, Any] | None
 
     try:
         return evaluate(result, known.trajectories, known.landmarks)
-    except OutputError:
-        return None  # the truth is of another time: no reason to lose the run
+    except OutputError as error:
+        # the truth is of another time: no reason to lose the run, but one to say so
+        result.summary["warnings"].append(f"not evaluated: {error}")
+        return None
 
 
 @app.command("evaluate")
