@@ -332,7 +332,10 @@ BAD_OPTIONS = {
     "no value": (("--set", "keyframe"), "write it as key=value"),
     "wrong type": (("--set", "backend.polish=3"), "backend.polish: expected bool"),
     "no config file": (("--config", "missing.toml"), "missing.toml: cannot be read"),
-    "start of a stranger": (("--start", "nobody=1,2,3"), "start.poses.nobody: the log has no robot nobody, but robot"),
+    "start of a stranger": (
+        ("--start", "nobody=1,2,3"),
+        "--start nobody: .*robots robot",
+    ),
     "start from no truth": (("--start", "truth"), "has no truth for robot"),
 }
 
