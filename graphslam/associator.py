@@ -223,13 +223,15 @@ class Associator:
         def best(which: BoolArray) -> dict[int, int]:
             return _assign_pairs(pairs, compared, gate, which, len(image.seen), config.method)
 
-        chosen = best(~known & in_graph & image.recent)
-        old = best(~known & in_graph & ~image.recent)
+        # sightings of one image exclude each other: what a named one sees is taken
+        free = ~known & ~np.isin(pairs.landmark, pairs.landmark[known])
+        chosen = best(free & in_graph & image.recent)
+        old = best(free & in_graph & ~image.recent)
         if self._closes_loop(image, list(old.values())):
             chosen |= old
             self.closures += 1
         taken = np.array([int(i) in chosen for i in pairs.observation], dtype=bool)
-        chosen |= best(~known & ~in_graph & ~taken)
+        chosen |= best(free & ~in_graph & ~taken)
         return chosen | {int(pairs.observation[k]): int(k) for k in np.flatnonzero(known)}
 
     def _closes_loop(self, image: Image, picks: list[int]) -> bool:

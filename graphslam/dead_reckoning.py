@@ -35,6 +35,8 @@ MAX_SPEED_M_S, MAX_TURN_RAD_S = 20.0, 20.0
 RESET_SPEED_M_S, SHORTEST_RESET_NS = 10.0, 10_000_000
 #: share of readings in bursts above which the stamps are not good enough to learn a latency
 MAX_BURST_SHARE = 0.01
+#: m of effort (see `Track.effort`): so short a motion is close enough to an arc to be one increment
+COARSE_M = 0.3
 #: ns: how long before the first reading or after the last a robot is taken to stand
 EDGE_NS = 500_000_000
 #: ns: step of the difference quotient by latency; about one period of common odometry
@@ -90,6 +92,14 @@ class Track:
     def bursty(self) -> bool:
         """Whether many readings were stamped in bursts: then a shift of time means nothing."""
         return self._bursts > MAX_BURST_SHARE * self._count
+
+    @property
+    def used_calibration(self) -> Calibration:
+        """The calibration as it is applied: without latency where the stamps do not allow one."""
+        known = self.calibration
+        if len(known.mean) > self._p and self.bursty:
+            return Calibration(known.names, np.append(known.mean[:-1], 0.0), known.cov)
+        return known
 
     @property
     def latency_ns(self) -> int:
@@ -271,9 +281,10 @@ class Track:
         calibrations: Sequence[Calibration],
         which: IntArray,
     ) -> tuple[Array, Array]:
-        """Many short motions at once, each taken as *one* increment; see `motion`.
+        """Many motions at once, in pieces of `COARSE_M` that each count as one increment.
 
-        Good for intervals between neighbouring states, where the path is close to an arc.
+        What `motion` gives, but vectorised and with a calibration per motion; it leaves out the
+        uncertainty of the latency.
 
         Args:
             start_ns: (n,) times.
@@ -288,14 +299,15 @@ class Track:
         cal_cov = np.array([c.cov for c in calibrations])[which]
         p, mounted = self._p, mean.shape[1] > self._p
         late = np.zeros(len(which), dtype=np.int64)
-        if mounted and not self.bursty:
+        if mounted:
             late = np.rint(1e9 * mean[:, -1]).astype(np.int64)
         begin, end = start_ns - late, end_ns - late
-        rows = self._at(end, self._sums) - self._at(begin, self._sums)
-        parts = MOTION_SOURCES[self.source](rows, np.zeros(p), self._robot, self._config)
-        delta, cov = between(self.pose(begin), self.pose(end)), parts.cov
-        delta = delta + np.einsum("nij,nj->ni", parts.d_cal, mean[:, :p])
-        d_cal = parts.d_cal
+        head, knot = self._walked(begin, end, mean[:, :p])
+        tail = self._piece(knot, end, mean[:, :p])
+        F, W = compose_jacobians(head.delta, tail.delta)
+        delta = compose(head.delta, tail.delta)
+        cov = F @ head.cov @ F.mT + W @ tail.cov @ W.mT
+        d_cal = F @ head.d_cal + W @ tail.d_cal
         if mounted:
             F, _ = compose_jacobians(delta, mean[:, p : p + 3])
             lever = rotation3(-mean[:, p + 2]) @ F
@@ -305,9 +317,53 @@ class Track:
         used = d_cal.shape[2]
         cov = cov + d_cal @ cal_cov[:, :used, :used] @ d_cal.mT
         if self.source != "given":
-            moved = np.any(rows != 0, axis=1)[:, None, None]
+            moved = (self.effort(end) > self.effort(begin))[:, None, None]
             cov = cov + np.where(moved, self._floor(True), self._floor(False))
         return delta, np.where((end_ns > start_ns)[:, None, None], cov, 0.0)
+
+    def _piece(self, begin: IntArray, end: IntArray, calibration: Array) -> Increments:
+        """Base motions between times (n,) of the odometry's clock, each as one increment."""
+        rows = self._at(end, self._sums) - self._at(begin, self._sums)
+        part = MOTION_SOURCES[self.source](rows, np.zeros(self._p), self._robot, self._config)
+        delta = between(self.pose(begin), self.pose(end))
+        delta = delta + np.einsum("nij,nj->ni", part.d_cal, calibration)
+        return Increments(delta, part.cov, part.d_cal)
+
+    def _walked(
+        self, begin: IntArray, end: IntArray, calibration: Array
+    ) -> tuple[Increments, IntArray]:
+        """Motions (n) from ``begin`` to the last knot before ``end``, and the knots' times (n,).
+
+        Knots lie `COARSE_M` of effort apart, counted from each start.
+        """
+        n, p = len(begin), self._p
+        head = Increments(np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, 3, p)))
+        knot = begin.copy()
+        if self._count < 2:
+            return head, knot
+        effort_begin, effort_end = self.effort(begin), self.effort(end)
+        order = np.argsort(begin, kind="stable")
+        groups = np.split(order, np.flatnonzero(np.diff(begin[order])) + 1)
+        effort, times = self._effort[: self._count], self.times
+        for group in groups:
+            first, far = group[0], float(effort_end[group].max())
+            levels = np.arange(effort_begin[first] + COARSE_M, far, COARSE_M)
+            if not len(levels):
+                continue
+            ends = np.interp(levels, effort, times).astype(np.int64)
+            begins = np.append(begin[first], ends[:-1])
+            pieces = self._piece(begins, ends, np.tile(calibration[first], (len(ends), 1)))
+            passed = np.searchsorted(ends, end[group], side="right")
+            delta, cov, d_cal = np.zeros(3), np.zeros((3, 3)), np.zeros((3, p))
+            for k in range(len(ends)):
+                F, W = compose_jacobians(delta, pieces.delta[k])
+                delta = compose(delta, pieces.delta[k])
+                cov = F @ cov @ F.T + W @ pieces.cov[k] @ W.T
+                d_cal = F @ d_cal + W @ pieces.d_cal[k]
+                here = group[passed == k + 1]
+                head.delta[here], head.cov[here], head.d_cal[here] = delta, cov, d_cal
+                knot[here] = ends[k]
+        return head, knot
 
     def _compounded(self, start_ns: int, end_ns: int) -> Compounded | None:
         """The base's motion between two times of the odometry's clock; None when it stands."""

@@ -48,7 +48,7 @@ class RobotRun:
         """Book a new state; its covariance follows."""
         self.times.append(time_ns)
         self.causal_poses.append(pose)
-        self.calibrations.append(self.track.calibration)
+        self.calibrations.append(self.track.used_calibration)
 
     def learn(self, motion: Motion, pose: Array, observed: Array) -> None:
         """Improve the calibration from the motion to a new state.

@@ -61,7 +61,7 @@ def final_at(
         times_ns: (n,) when.
         stamps_ns: (n,) what the result is stamped with.
     """
-    at, known = states.stamps_ns, [track.calibration]
+    at, known = states.stamps_ns, [track.used_calibration]
     i = _state_before(states, times_ns)
     following = np.minimum(i + 1, len(at) - 1)
     same = np.zeros(len(i), dtype=np.int64)
