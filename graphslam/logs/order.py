@@ -60,7 +60,7 @@ class TimeLine:
 
     Believing recording over stamps is right because one topic has one publisher and one transport,
     which keep its order, and because clocks are read late, not early. It took Intel's dead
-    reckoning from 675 m to 511 m; in the order of recording it has 509 m.
+    reckoning from 675 m to 511 m (with `recording` to 510 m); as recorded it has 509 m.
 
     Attributes:
         counts: per topic, how many were `GLITCH`, `DUPLICATE` (kept) and `TOO_LATE` (dropped).
