@@ -269,6 +269,9 @@ class Pipeline:
     def closure(self, message: RelativePose, state_ns: int) -> Closure | None:
         """A measured relative pose, carried by odometry to the states nearest before its ends."""
         other = self.runs.get(message.other)
+        if message.other == message.robot and message.start_ns >= message.time_ns:
+            self.dropped["relative pose: it does not begin before it ends"] += 1
+            return None
         if other is None or not other.started or message.start_ns < other.times[0]:
             self.dropped["relative pose: its first end has no state"] += 1
             return None
@@ -406,6 +409,11 @@ def run_warnings(pipeline: Pipeline) -> list[str]:
         f"{name}: its odometry jumped {run.track.resets} times; taken to have gone on as before"
         for name, run in pipeline.runs.items()
         if run.track.resets
+    ]
+    warnings += [
+        f"{name}: its wheel radii and axle are not set; the defaults of robots.{name}.* were used"
+        for name, run in pipeline.runs.items()
+        if run.track.source == "wheels" and not {name, "default"} & set(pipeline.config.robots)
     ]
     if not any(step.associations or step.closures for step in pipeline.steps):
         warnings.append("no observation entered the estimate: this is dead reckoning")

@@ -100,7 +100,7 @@ def summarise(
         },
         "logs": [
             {
-                "path": str(file.path),
+                "path": str(file.path.resolve()),
                 "sha256": file.sha256,
                 "messages": file.messages,
                 "lost": file.lost,
