@@ -22,21 +22,17 @@ from graphslam.errors import ConfigError, EstimationError, LogError
 from graphslam.frontend import FRONT_ENDS, scan_points
 from graphslam.frontend.sightings import sighting_observation
 from graphslam.geometry import (
-    Array,
     compose,
     compose_cov,
     inverse,
     inverse_cov,
     rotate_cov,
-    rotation3,
-    transform,
 )
 from graphslam.logs import LogSet
 from graphslam.models import transport
 from graphslam.records import (
     Association,
     Closure,
-    Estimate,
     Landmark,
     Message,
     Motion,
@@ -46,14 +42,13 @@ from graphslam.records import (
     Result,
     Scan,
     Sighting,
-    Start,
     Step,
 )
 from graphslam.robot_run import RobotRun
 from graphslam.starts import start_poses
 from graphslam.summary import make_landmarks, summarise
 from graphslam.timeline import ODOMETRY, synchronise
-from graphslam.trajectories import moved_world, origin_shift
+from graphslam.trajectories import in_world, origin_shift, step_in_world
 
 #: scans kept for the picture at most, so that memory does not grow with the log
 MAX_PICTURES = 4000
@@ -418,27 +413,6 @@ def run_warnings(pipeline: Pipeline) -> list[str]:
     if not any(step.associations or step.closures for step in pipeline.steps):
         warnings.append("no observation entered the estimate: this is dead reckoning")
     return warnings
-
-
-def in_world(estimate: Estimate, world: Array) -> Estimate:
-    """The same estimate after its world frame was put at ``world`` (3,)."""
-    states = {name: moved_world(t, world) for name, t in estimate.states.items()}
-    turn = rotation3(world[2])
-    landmarks = {}
-    for number, (mean, cov) in estimate.landmarks.items():
-        M = turn[: len(mean), : len(mean)]
-        moved = compose(world, mean) if len(mean) == 3 else transform(world, mean)
-        landmarks[number] = (moved, M @ cov @ M.T)
-    return Estimate(states, landmarks, estimate.error, estimate.dof)
-
-
-def step_in_world(step: Step, world: Array) -> Step:
-    """The same step after the world frame was put at ``world`` (3,): its starts move along."""
-    starts = {
-        robot: Start(compose(world, start.pose), rotate_cov(start.cov, world[2]))
-        for robot, start in step.starts.items()
-    }
-    return replace(step, starts=starts)
 
 
 def events(messages: Iterable[Message]) -> Iterator[list[Message]]:

@@ -1,6 +1,10 @@
-"""Trajectories at any stamps, from the states that an estimator keeps and the odometry between."""
+"""Trajectories at any stamps, from the states that an estimator keeps and the odometry between.
+
+And what it takes to move a whole result into another world frame.
+"""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,10 +18,12 @@ from graphslam.geometry import (
     exp,
     inverse,
     log,
+    rotate_cov,
     rotation3,
+    transform,
 )
 from graphslam.models.motion import Calibration
-from graphslam.records import Trajectory
+from graphslam.records import Estimate, Start, Step, Trajectory
 
 IntArray = np.ndarray[tuple[int], np.dtype[np.int64]]
 
@@ -98,6 +104,27 @@ def moved_world(trajectory: Trajectory, world: Array) -> Trajectory:
     turn = rotation3(world[..., 2])
     poses = compose(np.broadcast_to(world, trajectory.poses.shape), trajectory.poses)
     return Trajectory(trajectory.stamps_ns, poses, turn @ trajectory.covs @ turn.mT)
+
+
+def in_world(estimate: Estimate, world: Array) -> Estimate:
+    """The same estimate after its world frame was put at ``world`` (3,)."""
+    states = {name: moved_world(t, world) for name, t in estimate.states.items()}
+    turn = rotation3(world[2])
+    landmarks = {}
+    for number, (mean, cov) in estimate.landmarks.items():
+        M = turn[: len(mean), : len(mean)]
+        moved = compose(world, mean) if len(mean) == 3 else transform(world, mean)
+        landmarks[number] = (moved, M @ cov @ M.T)
+    return Estimate(states, landmarks, estimate.error, estimate.dof)
+
+
+def step_in_world(step: Step, world: Array) -> Step:
+    """The same step after the world frame was put at ``world`` (3,): its starts move along."""
+    starts = {
+        robot: Start(compose(world, start.pose), rotate_cov(start.cov, world[2]))
+        for robot, start in step.starts.items()
+    }
+    return replace(step, starts=starts)
 
 
 def origin_shift(start: Array, mounts: Array) -> Array:
