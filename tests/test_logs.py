@@ -299,7 +299,8 @@ def test_ranges_that_are_no_returns_become_nan_and_errors_are_counted(tmp_path):
     logs, (scan,) = scans_of(tmp_path / "log.mcap", [row], range_min_m=0.1)
     expected = [1, *[np.nan] * 8, 20]
     np.testing.assert_array_equal(scan.ranges, expected)
-    assert logs.dropped == {"range: negative": 1, "range: absurd": 1}
+    bad = {key: n for key, n in logs.dropped.items() if n}
+    assert bad == {"range: NaN": 1, "range: infinite": 2, "range: negative": 1, "range: absurd": 1}
 
 
 def test_scans_without_beams_or_angles_are_dropped_and_counted(tmp_path):

@@ -67,6 +67,10 @@ def scan(message: Any, topic: TopicContext) -> records.Scan:
         raise UnusableError("scan: angle increment is zero or angles are not finite")
     finite = np.isfinite(ranges)
     negative, absurd = finite & (ranges < 0), finite & (ranges > ABSURD_M)
+    if not finite.all():
+        nan = int(np.isnan(ranges).sum())
+        topic.beams["range: NaN"] += nan
+        topic.beams["range: infinite"] += len(ranges) - int(finite.sum()) - nan
     if negative.any():
         topic.beams["range: negative"] += int(negative.sum())
     if absurd.any():
