@@ -69,7 +69,8 @@ def test_every_kind_of_record_comes_back_as_it_was_written(tmp_path):
     logs, messages = read(path)
     assert logs.robots == ("robot1", "robot2", "robot3")
     assert logs.notes == {"stamps": "invented"}
-    assert not logs.warnings and not logs.dropped and not logs.repaired
+    assert not logs.warnings and not logs.repaired
+    assert logs.dropped == {"range: infinite": 1}
     assert logs.has_scans("robot1") and not logs.has_scans("robot2")
     odometry, scan, first, second, relative, truth, landmark, increment, wheels = messages
     assert isinstance(odometry, records.OdometryPose) and odometry.stamp_ns == 2 * S + 1

@@ -69,8 +69,9 @@ def scan(message: Any, topic: TopicContext) -> records.Scan:
     negative, absurd = finite & (ranges < 0), finite & (ranges > ABSURD_M)
     if not finite.all():
         nan = int(np.isnan(ranges).sum())
-        topic.beams["range: NaN"] += nan
-        topic.beams["range: infinite"] += len(ranges) - int(finite.sum()) - nan
+        infinite = len(ranges) - int(finite.sum()) - nan
+        topic.beams.update({"range: NaN": nan} if nan else {})
+        topic.beams.update({"range: infinite": infinite} if infinite else {})
     if negative.any():
         topic.beams["range: negative"] += int(negative.sum())
     if absurd.any():
