@@ -8,6 +8,7 @@ everything of a kind.
 import dataclasses
 import difflib
 import json
+import math
 import tomllib
 import types
 import typing
@@ -180,13 +181,29 @@ class BackendConfig:
 
     name: which one. relinearize_threshold: largest change of a variable (m, rad) before it is
     linearised anew; relinearize_every: steps between two looks for such variables. polish:
-    optimise to convergence at the end.
+    optimise to convergence at the end. horizon_s: how long a past pose stays in isam2's graph
+    before it is marginalised out: inf = full smoothing, 0 = the extended Kalman filter.
     """
 
     name: Literal["isam2", "batch", "dead-reckoning"] = "isam2"
+    horizon_s: float = math.inf
     relinearize_threshold: float = 0.05
     relinearize_every: int = 20
     polish: bool = True
+
+
+@dataclass(frozen=True)
+class EkfConfig:
+    """The extended Kalman filter of the thesis.
+
+    error: which errors are Gaussian: `world` = additive along world axes (thesis 4.20), `body` =
+    of the exponential map at each pose, as in GTSAM. lines: `model` = no row along a line, as the
+    smoother has it; `thesis` = eq. 4.33-4.34, a large variance along it (along_sigma_m).
+    """
+
+    error: Literal["world", "body"] = "world"
+    lines: Literal["model", "thesis"] = "model"
+    along_sigma_m: float = 10.0
 
 
 @dataclass(frozen=True)
@@ -218,6 +235,7 @@ class Config:
     association: AssociationConfig = field(default_factory=AssociationConfig)
     robust: RobustConfig = field(default_factory=RobustConfig)
     backend: BackendConfig = field(default_factory=BackendConfig)
+    ekf: EkfConfig = field(default_factory=EkfConfig)
     start: StartConfig = field(default_factory=StartConfig)
 
     def robot(self, name: str) -> RobotConfig:
@@ -308,7 +326,7 @@ def _build(kind: Any, value: Any, key: str) -> Any:
         value = float(value) if abs(value) < 2**1000 else float("inf")
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
         raise ConfigError(f"{key}: expected {kind.__name__}, got {value!r}")
-    if kind is float and not abs(value) < float("inf"):
+    if kind is float and not abs(value) < math.inf and not (value == math.inf and key in _INFINITE):
         raise ConfigError(f"{key}: must be finite, got {value!r}")
     if kind in (int, float) and "[" not in key:
         _check_range(key, value)
@@ -329,9 +347,12 @@ def _check_range(key: str, value: float) -> None:
         raise ConfigError(f"{key}: must not be negative, got {value!r}")
     elif value == 0 and name in _NOT_ZERO:
         raise ConfigError(f"{key}: must be greater than 0")
-    elif value > 1e6:
+    elif value > 1e6 and key not in _INFINITE:
         raise ConfigError(f"{key}: must not exceed a million, got {value!r}")
 
+
+#: settings that may be infinite
+_INFINITE = {"backend.horizon_s"}
 
 #: settings that divide, or weld states together, at 0
 _NOT_ZERO = {

@@ -25,8 +25,9 @@ ROWS = (
     ("association", "calibration", "dead_reckoning", "export", "factors", "frontend", "logs"),
     # estimators; order in time; poses at any time; worlds and their logs
     ("backends", "simulate", "timeline", "trajectories"),
-    # what is known about landmarks beside their estimate; of a robot; where robots start
-    ("landmark_map", "robot_run", "starts"),
+    # what is known about landmarks beside their estimate; of a robot; where robots start; recorded
+    # steps through an estimator
+    ("landmark_map", "replay", "robot_run", "starts"),
     ("associator", "summary"),  # decisions of one image; what a run adds up to
     ("slam",),  # the pipeline
     ("results",),  # a result as a folder, and back

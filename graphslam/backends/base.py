@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -13,21 +13,32 @@ from graphslam.records import Estimate, Step
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Joint:
-    """Joint marginal of a robot's latest pose and some landmarks, world frame.
+    """Joint marginal of a robot's latest pose, some landmarks and other robots, world frame.
 
-    ``pose`` (3,), ``landmarks`` one array (2,) or (3,) each; ``cov`` (D, D) of additive
-    world-axis errors, the pose first, then the landmarks in order; ``slices[i]`` is where
-    landmark i's block lies.
+    ``pose`` (3,), ``landmarks`` one array (2,) or (3,) each, ``others`` latest poses (3,) of other
+    robots; ``cov`` (D, D) of additive world-axis errors, the pose first, then the landmarks in
+    order, then the others; ``slices`` is where the block of each landmark, then of each other lies.
     """
 
     pose: Array
     landmarks: tuple[Array, ...]
     cov: Array
     slices: tuple[slice, ...]
+    others: tuple[Array, ...] = ()
 
 
 class Backend(Protocol):
-    """An estimator that takes steps in time order and can be asked at any time."""
+    """An estimator that takes steps in time order and can be asked at any time.
+
+    ``error_frame`` says in which errors its covariances are Gaussian, which matters beyond first
+    order: ``world`` = additive along world axes (thesis), ``body`` = of the exponential map at each
+    pose (GTSAM). Whatever it says, covariances are handed out along world axes.
+    """
+
+    @property
+    def error_frame(self) -> Literal["body", "world"]:
+        """See the class."""
+        ...
 
     def add(self, step: Step) -> None:
         """Take in everything of one step.
@@ -37,8 +48,8 @@ class Backend(Protocol):
         """
         ...
 
-    def joint(self, robot: str, landmarks: Sequence[int]) -> Joint:
-        """Joint marginal of the robot's latest pose and the landmarks, from data so far."""
+    def joint(self, robot: str, landmarks: Sequence[int], others: Sequence[str] = ()) -> Joint:
+        """Joint marginal of the robot's latest pose, landmarks and others, from data so far."""
         ...
 
     def state_mean(self, robot: str) -> Array:

@@ -1,6 +1,7 @@
 """Odometry alone: every landmark stays where it was first seen."""
 
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 
@@ -13,6 +14,8 @@ from graphslam.records import Estimate, Step, Trajectory
 
 class DeadReckoningBackend:
     """The baseline that uses no observation for the trajectory."""
+
+    error_frame: Literal["body", "world"] = "world"
 
     def __init__(self, _config: Config) -> None:
         self._states = StateTable()
@@ -43,16 +46,18 @@ class DeadReckoningBackend:
         self._poses.setdefault(robot, []).append(pose)
         self._covs.setdefault(robot, []).append(cov)
 
-    def joint(self, robot: str, landmarks: Sequence[int]) -> Joint:
-        """See `Backend`; pose and landmarks are taken as independent."""
+    def joint(self, robot: str, landmarks: Sequence[int], others: Sequence[str] = ()) -> Joint:
+        """See `Backend`; poses and landmarks are taken as independent."""
         last = self._states.latest(robot)
         found = [self._landmarks[i] for i in landmarks]
+        found += [(self._poses[name][-1], self._covs[name][-1]) for name in others]
         slices = block_slices([len(mean) for mean, _ in found])
         cov = np.zeros((slices[-1].stop if slices else 3,) * 2)
         cov[:3, :3] = self._covs[robot][last]
         for block, (_, landmark_cov) in zip(slices, found, strict=True):
             cov[block, block] = landmark_cov
-        return Joint(self._poses[robot][last], tuple(mean for mean, _ in found), cov, slices)
+        means, n = tuple(mean for mean, _ in found), len(landmarks)
+        return Joint(self._poses[robot][last], means[:n], cov, slices, means[n:])
 
     def state_mean(self, robot: str) -> Array:
         """See `Backend`."""

@@ -6,6 +6,7 @@ is its converged limit: the same graph, optimised by Levenberg-Marquardt from iS
 
 import re
 from collections.abc import Sequence
+from typing import Literal
 
 import gtsam
 import numpy as np
@@ -151,6 +152,8 @@ def isam2_parameters(config: Config, factorization: str) -> gtsam.ISAM2Params:
 class Isam2Backend:
     """Incremental smoothing of all states; see the module's docstring."""
 
+    error_frame: Literal["body", "world"] = "body"
+
     def __init__(self, config: Config) -> None:
         self._config = config
         self._builder = GraphBuilder(config)
@@ -189,14 +192,14 @@ class Isam2Backend:
         except RuntimeError as again:
             raise self._builder.explain(again) from again
 
-    def joint(self, robot: str, landmarks: Sequence[int]) -> Joint:
+    def joint(self, robot: str, landmarks: Sequence[int], others: Sequence[str] = ()) -> Joint:
         """See `Backend`; asked for the pose alone after more, it answers from what it has."""
-        if not landmarks and robot in self._joints:
+        if not landmarks and not others and robot in self._joints:
             known = self._joints[robot]
             return Joint(known.pose, (), known.cov[:3, :3], ())
-        key = self._builder.state_key(robot, self._builder.states.latest(robot))
-        dims = [self._builder.landmark_dims[i] for i in landmarks]
-        keys = [factors.landmark_key(i) for i in landmarks]
+        key = self._latest_key(robot)
+        dims = [self._builder.landmark_dims[i] for i in landmarks] + [3] * len(others)
+        keys = [factors.landmark_key(i) for i in landmarks] + [self._latest_key(r) for r in others]
         pose = self.value(key, 3)
         means = tuple(self.value(k, d) for k, d in zip(keys, dims, strict=True))
         try:
@@ -213,13 +216,16 @@ class Isam2Backend:
         for block, mean in zip((slice(0, 3), *slices), (pose, *means), strict=True):
             if len(mean) == 3:
                 turn[block, block] = factors.world_from_body(float(mean[2]))
-        self._joints[robot] = Joint(pose, means, turn @ cov @ turn.T, slices)
+        n = len(landmarks)
+        self._joints[robot] = Joint(pose, means[:n], turn @ cov @ turn.T, slices, means[n:])
         return self._joints[robot]
+
+    def _latest_key(self, robot: str) -> int:
+        return self._builder.state_key(robot, self._builder.states.latest(robot))
 
     def state_mean(self, robot: str) -> Array:
         """See `Backend`."""
-        number = self._builder.states.latest(robot)
-        return self.value(self._builder.state_key(robot, number), 3)
+        return self.value(self._latest_key(robot), 3)
 
     def landmark_means(self, landmarks: Sequence[int]) -> list[Array]:
         """See `Backend`."""
