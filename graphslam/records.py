@@ -128,6 +128,17 @@ class TrueLandmark(Message):
     extent: Array | None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class TrueAssociations(Message):
+    """What the beams of a scan, or the sightings of one stamp, truly met.
+
+    ``targets`` (n,) are places in ``names`` (landmarks' identities, robots' names), -1 for nothing.
+    """
+
+    names: tuple[str, ...]
+    targets: np.ndarray[tuple[int], np.dtype[np.int64]]
+
+
 # ---------------------------------------------------------------- what the pipeline passes on
 
 

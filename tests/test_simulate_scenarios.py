@@ -10,7 +10,7 @@ import pytest
 from test_cli import call
 
 from graphslam.config import load_config
-from graphslam.logs import open_logs, read_truth
+from graphslam.logs import LogWriter, open_logs, read_true_associations, read_truth
 from graphslam.records import OdometryPose, Scan, Sighting
 from graphslam.simulate import SCENARIOS, ScenarioError, load_scenario, simulate
 from graphslam.simulate.stage import visits
@@ -315,3 +315,51 @@ def test_the_example_of_the_documentation_runs(tmp_path):
     done = call("simulate", path, "-o", tmp_path / "out")
     assert done.code == 0, done.err
     assert all(f"| `{name}` |" in page for name in SCENARIOS)
+
+
+# ------------------------------------------------------------ true associations
+
+
+def test_true_associations_name_what_beams_and_sightings_met(tmp_path):
+    """Every beam's target is the surface that the noise-free beam met, robots among them, and lies
+    where the range says; every sighting's is the robot that it says, or a landmark."""
+    scenario = short("fleet")
+    done = simulate(scenario, tmp_path / "fleet.mcap").recordings[0]
+    topics = read_true_associations([done.path], CONFIG)
+    truth = read_truth([done.path], CONFIG)
+    known = {landmark.identity for landmark in truth.landmarks}
+    met_robots = 0
+    for name in scenario.robots:
+        scans = topics[f"/{name}/true_associations/scan"]
+        surfaces = done.sweeps[name].hits.surfaces
+        assert len(scans) == len(surfaces)
+        for scan, numbers in zip(scans, surfaces, strict=True):
+            np.testing.assert_array_equal(scan.targets >= 0, numbers >= 0)
+            # equal numbers, equal names, and the other way round
+            pairs = {(int(n), int(t)) for n, t in zip(numbers, scan.targets, strict=True)}
+            assert len(pairs) == len({n for n, _ in pairs}) == len({t for _, t in pairs})
+            assert set(scan.names) <= known | set(scenario.robots) - {name}
+            met_robots += bool(set(scan.names) & set(scenario.robots))
+    assert met_robots
+    log = open_logs([done.path], CONFIG)
+    sightings = [m for m in log.messages() if isinstance(m, Sighting)]
+    for name in scenario.robots:
+        own = [m for m in sightings if m.robot == name]
+        named = [
+            (image.stamp_ns, image.names[target])
+            for image in topics[f"/{name}/true_associations/sightings"]
+            for target in image.targets
+        ]
+        assert [m.stamp_ns for m in own] == [stamp_ns for stamp_ns, _ in named]
+        for message, (_, target) in zip(own, named, strict=True):
+            assert message.seen_robot == target or (message.seen_robot is None and target in known)
+
+
+def test_true_associations_need_targets_among_their_names(tmp_path):
+    with LogWriter(tmp_path / "bad.mcap", {}) as log:
+        log.odometry("robot", 1, (0, 0, 0))
+        log.true_associations("robot", 1, "scan", ["wall"], [0, 1])
+        log.true_associations("robot", 2, "scan", ["wall"], [0, -1])
+    found = read_true_associations([tmp_path / "bad.mcap"], CONFIG)
+    (message,) = found["/true_associations/scan"]
+    assert message.names == ("wall",) and message.targets.tolist() == [0, -1]

@@ -200,6 +200,19 @@ def true_landmark(message: Any, _topic: TopicContext) -> records.TrueLandmark:
     return records.TrueLandmark("", stamp, stamp, message.identity, message.kind, pose, ends)
 
 
+def true_associations(message: Any, topic: TopicContext) -> records.TrueAssociations:
+    """graphslam_msgs/TrueAssociations.
+
+    Raises:
+        UnusableError: a target is not among the names.
+    """
+    names, targets = tuple(message.names), np.asarray(message.targets, dtype=np.int64)
+    if len(targets) and not -1 <= targets.min() <= targets.max() < len(names):
+        raise UnusableError("true associations: a target is not among the names")
+    stamp = stamp_of(message)
+    return records.TrueAssociations(topic.robot, stamp, stamp, names, targets)
+
+
 DECODERS: dict[str, Decoder] = {
     schemas.LASER_SCAN: Decoder(records.Scan, scan),
     schemas.ODOMETRY: Decoder(records.OdometryPose, odometry),
@@ -209,6 +222,7 @@ DECODERS: dict[str, Decoder] = {
     schemas.RELATIVE_POSE: Decoder(records.RelativePose, relative_pose),
     schemas.TRUE_POSE: Decoder(records.Truth, true_pose),
     schemas.TRUE_LANDMARK: Decoder(records.TrueLandmark, true_landmark),
+    schemas.TRUE_ASSOCIATIONS: Decoder(records.TrueAssociations, true_associations),
 }
 
 _NO_MOUNT = np.zeros(3)

@@ -23,6 +23,7 @@ ODOMETRY_INCREMENT = "graphslam_msgs/msg/OdometryIncrement"
 RELATIVE_POSE = "graphslam_msgs/msg/RelativePose"
 TRUE_POSE = "graphslam_msgs/msg/TruePose"
 TRUE_LANDMARK = "graphslam_msgs/msg/TrueLandmark"
+TRUE_ASSOCIATIONS = "graphslam_msgs/msg/TrueAssociations"
 
 DEFINITIONS: dict[str, str] = {
     SIGHTING: """\
@@ -82,6 +83,14 @@ float64 y
 float64 phi
 # Its end points x1 y1 x2 y2, m; empty = none.
 float64[] extent
+""",
+    TRUE_ASSOCIATIONS: """\
+# What the beams of the scan, or the sightings of the image, of header.stamp truly met.
+std_msgs/Header header
+# Identities of true landmarks, and names of robots.
+string[] names
+# For every beam, or every sighting in the order of the log, its place in names; -1 = nothing.
+int16[] targets
 """,
 }
 

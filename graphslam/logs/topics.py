@@ -107,7 +107,9 @@ def choose_topics(
             (t for t in own if t.record is records.Scan), key=lambda t: (-t.count, t.name)
         )
         _demand_odometry(names, robot, own, odometry)
-        rest = [t for t in own if t.record not in (*ODOMETRY_KINDS, records.Scan)]
+        # true associations are read by whom they concern only: `logs.truth`
+        others = (*ODOMETRY_KINDS, records.Scan, records.TrueAssociations)
+        rest = [t for t in own if t.record not in others]
         chosen += odometry[:1] + lasers[:1] + rest
         warnings += _one_of("odometry", robot, odometry) + _one_of("laser", robot, lasers)
     if not any(topic.record in ODOMETRY_KINDS for topic in chosen):

@@ -12,7 +12,7 @@ from graphslam.logs.decoders import TopicContext
 from graphslam.logs.log_set import decode_message
 from graphslam.logs.mcap_file import open_mcap, raw_messages
 from graphslam.logs.topics import find_topics
-from graphslam.records import Trajectory, TrueLandmark, Truth
+from graphslam.records import Trajectory, TrueAssociations, TrueLandmark, Truth
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,6 +58,27 @@ def read_truth(paths: Sequence[Path], config: Config) -> KnownTruth:
         tuple(landmarks.values()),
         tuple(file.sha256 for file in files),
     )
+
+
+def read_true_associations(
+    paths: Sequence[Path], config: Config
+) -> Mapping[str, tuple[TrueAssociations, ...]]:
+    """What scans and sightings truly met: topic -> messages in the order of recording.
+
+    Raises:
+        LogError: a file is missing, not MCAP, empty, or without any topic that can be decoded.
+    """
+    files = [open_mcap(path) for path in paths]
+    topics = {t.name: t for t in find_topics(files, config) if t.record is TrueAssociations}
+    found: dict[str, list[TrueAssociations]] = {name: [] for name in topics}
+    unusable: Counter[str] = Counter()
+    for file in files:
+        for raw in raw_messages(file, topics.keys()):
+            topic = topics[raw.topic]
+            message = decode_message(raw, topic, TopicContext(topic.robot), unusable)
+            if isinstance(message, TrueAssociations):
+                found[raw.topic].append(message)
+    return {name: tuple(messages) for name, messages in found.items()}
 
 
 def _trajectory(found: Sequence[Truth]) -> Trajectory:

@@ -3,7 +3,7 @@
 The only module that writes with `mcap`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Self
@@ -285,6 +285,30 @@ class LogWriter:
         )
         schema = schemas.TRUE_LANDMARK
         self._add(_topic(DEFAULT_ROBOT, "true_landmarks"), schema, message, stamp_ns, log_time_ns)
+
+    def true_associations(
+        self,
+        robot: str,
+        stamp_ns: int,
+        of: str,
+        names: Sequence[str],
+        targets: ArrayLike,
+        *,
+        log_time_ns: int | None = None,
+    ) -> None:
+        """TrueAssociations on ``true_associations/OF``: what a scan or an image truly met.
+
+        ``of`` names the topic that they belong to (scan, sightings); ``targets`` (n,) places in
+        ``names``, -1 for nothing.
+        """
+        message = schemas.build(
+            schemas.TRUE_ASSOCIATIONS,
+            header=schemas.header(stamp_ns, "world"),
+            names=list(names),
+            targets=np.asarray(targets, dtype=np.int16),
+        )
+        schema, name = schemas.TRUE_ASSOCIATIONS, f"true_associations/{of}"
+        self._add(_topic(robot, name), schema, message, stamp_ns, log_time_ns)
 
     # ------------------------------------------------------------ inside
 

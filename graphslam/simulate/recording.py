@@ -84,6 +84,9 @@ def record(scenario: Scenario, visit: Visit, path: Path, seed: int) -> Recording
             )
         ]
         events += [*wheels, *truth, *scans, *(event for event, _ in seen)]
+        if sweep is not None:
+            events += _met(name, visit, sweep, scans)
+        events += _identities(name, seen)
         sighted |= {landmark for _, landmark in seen}
         if sweep is not None:
             sweeps[name] = sweep
@@ -224,6 +227,40 @@ def _sightings(name: str, actor: Actor, visit: Visit, seed: int) -> Iterator[tup
 
 
 # ---------------------------------------------------------------- truth
+
+
+def _met(name: str, visit: Visit, sweep: Sweep, scans: list[Event]) -> Iterator[Event]:
+    """What each beam met; a spurious return still belongs to what it should have met."""
+    everything = np.array([*visit.world.names, *(other for other in visit.actors if other != name)])
+    for scan, surfaces in zip(scans, sweep.hits.surfaces, strict=True):
+        met, places = np.unique(surfaces, return_inverse=True)
+        nothing = int(NOTHING in met)  # sorted first, as it is negative
+        write = partial(
+            LogWriter.true_associations,
+            robot=name,
+            stamp_ns=scan.stamp_ns,
+            of="scan",
+            names=everything[met[nothing:]].tolist(),
+            targets=places - nothing,
+        )
+        yield Event(scan.stamp_ns, write)
+
+
+def _identities(name: str, seen: list[tuple[Event, str]]) -> Iterator[Event]:
+    """Who was sighted: one message per image, in the order in which the sightings are written."""
+    images: dict[int, list[str]] = {}
+    for event, target in seen:
+        images.setdefault(event.stamp_ns, []).append(target)
+    for stamp_ns, names in images.items():
+        write = partial(
+            LogWriter.true_associations,
+            robot=name,
+            stamp_ns=stamp_ns,
+            of="sightings",
+            names=names,
+            targets=np.arange(len(names)),
+        )
+        yield Event(stamp_ns, write)
 
 
 def _landmarks(
