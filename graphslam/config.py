@@ -219,6 +219,8 @@ class StartConfig:
     origin_sigma_rad: float = 1e-3
     given_sigma_m: float = 0.05
     given_sigma_rad: float = 0.03
+    truth_sigma_m: float = 0.01
+    truth_sigma_rad: float = 0.01
     poses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     from_truth: bool = False
 

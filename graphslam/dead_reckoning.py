@@ -25,7 +25,7 @@ IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 Odometry = OdometryPose | OdometryIncrement | WheelAngles
 
 #: m and rad: what a robot that reports no motion may still have moved between two states
-STANDING_SIGMA = 1e-3
+STANDING_SIGMA = 1e-4
 
 #: m/s and rad/s: no wheeled robot's odometry says more. An interval that implies it was stamped
 #: in a burst (a logger that fell behind): its stamps do not tell when the motion took place, so a

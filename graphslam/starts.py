@@ -20,10 +20,11 @@ def start_poses(log: LogSet, config: Config) -> dict[str, Start]:
         EstimationError: truth was asked for and a robot has none, or a given pose is malformed.
     """
     start = config.start
-    given = np.diag([start.given_sigma_m**2] * 2 + [start.given_sigma_rad**2])
+    given = _cov(start.given_sigma_m, start.given_sigma_rad)
     starts: dict[str, Start] = {}
     if start.from_truth:
-        starts = {robot: Start(pose, given) for robot, pose in first_truth(log).items()}
+        truth = _cov(start.truth_sigma_m, start.truth_sigma_rad)
+        starts = {robot: Start(pose, truth) for robot, pose in first_truth(log).items()}
     for robot, pose in start.poses.items():
         if len(pose) != 3 or robot not in log.robots:
             raise EstimationError(
@@ -31,9 +32,13 @@ def start_poses(log: LogSet, config: Config) -> dict[str, Start]:
             )
         starts[robot] = Start(np.array(pose), given)
     if log.robots and log.robots[0] not in starts:
-        origin = np.diag([start.origin_sigma_m**2] * 2 + [start.origin_sigma_rad**2])
+        origin = _cov(start.origin_sigma_m, start.origin_sigma_rad)
         starts[log.robots[0]] = Start(np.zeros(3), origin)
     return starts
+
+
+def _cov(sigma_m: float, sigma_rad: float) -> Array:
+    return np.diag([sigma_m**2, sigma_m**2, sigma_rad**2])
 
 
 def first_truth(log: LogSet) -> dict[str, Array]:

@@ -403,10 +403,10 @@ def test_a_start_from_truth_is_one_sample_with_the_stated_sigma(tmp_path):
         increments(log, 20)
         log.truth("robot", T0, [5.0, 6.0, 0.7])
         log.truth("robot", T0 + S, [50.0, 60.0, 0.7])
-    result = run(path, "start.from_truth=true", "start.given_sigma_m=0.2")
+    result = run(path, "start.from_truth=true", "start.truth_sigma_m=0.2")
     start = result.steps[0].starts["robot"]
     np.testing.assert_allclose(start.pose, [5.0, 6.0, 0.7], atol=1e-12)
-    np.testing.assert_allclose(np.diag(start.cov), [0.04, 0.04, 0.03**2])
+    np.testing.assert_allclose(np.diag(start.cov), [0.04, 0.04, 0.01**2])
     assert_same_pose(result.robots["robot"].final.poses[0], np.array([5, 6, 0.7]), atol=1e-6)
     np.testing.assert_allclose(result.robots["robot"].final.covs[0, 0, 0], 0.04, rtol=1e-6)
 
