@@ -65,7 +65,9 @@ class OdometryConfig:
     rotation_scale_sigma are relative, drift_sigma_rad_per_m is turning per metre driven;
     for wheel angles wheel_radius_sigma_m and axle_sigma_m, and count_sigma_rad per reading.
     laser_sigma_m, laser_sigma_rad: how far the laser may sit from where the log says;
-    laser_latency_sigma_s: how far its clock may be from the odometry's.
+    laser_latency_sigma_s: how far its clock may be from the odometry's;
+    sighting_latency_sigma_s: the same for a robot without a laser, whose odometry may be commands
+    that the motion follows later.
     floor_sigma_m and floor_sigma_rad are added once per interval in which the robot moved.
     calibrate: learn the calibration errors from the estimate while it grows.
     max_gap_s: longest span without odometry that is bridged.
@@ -86,6 +88,7 @@ class OdometryConfig:
     laser_sigma_m: float = 0.1
     laser_sigma_rad: float = 0.02
     laser_latency_sigma_s: float = 0.05
+    sighting_latency_sigma_s: float = 0.2
     floor_sigma_m: float = 0.005
     floor_sigma_rad: float = 0.005
     calibrate: bool = True
@@ -97,28 +100,36 @@ class KeyframeConfig:
     """When a robot gets a state.
 
     mode: `motion` = at an observation, once the robot moved distance_m or turned angle_rad since
-    its last state; `all` = at every odometry, scan and sighting stamp.
+    its last state; `all` = at every odometry, scan and sighting stamp. gather_s: in logs of
+    several robots without scans, sightings within this span enter together, carried to its end by
+    odometry.
     """
 
     mode: Literal["motion", "all"] = "motion"
     distance_m: float = 0.25
     angle_rad: float = 0.15
+    gather_s: float = 0.8
 
 
 @dataclass(frozen=True)
 class FrontEndConfig:
-    """Line segments from scans (thesis 4.7.5-4.7.8).
+    """Lines and cylinders from scans (thesis 4.7, docs/front-ends.md).
 
-    name: which front end. max_range_m: farther returns are not used for lines. gap_m: neighbouring
-    returns farther apart than gap_m + gap_share * range start a new chain. split_m: largest
-    orthogonal deviation inside one segment. min_points, min_length_m: smaller ones are dropped.
-    range_sigma_m: white range noise. floor_normal_m, floor_angle_rad: what a wall's material,
-    flatness and the laser's bias leave however many points there are. end_sigma_m: how sharp a
-    segment's real end is. covariance: `incidence` weights each point by its own normal noise,
-    `thesis` uses eq. 4.32 as printed.
+    name: which front end; `both` takes whole segments first, then Hough lines. max_range_m: farther
+    returns are not used for lines. gap_m: neighbouring returns farther apart than gap_m + gap_share
+    * range start a new chain. split_m: largest orthogonal deviation inside one segment. min_points,
+    min_length_m: smaller ones are dropped. range_sigma_m: white range noise. floor_normal_m,
+    floor_angle_rad: what a wall's material, flatness and the laser's bias leave however many points
+    there are. end_sigma_m: how sharp a segment's real end is. covariance: `incidence` weights each
+    point by its own normal noise, `thesis` uses eq. 4.32 as printed. Hough lines (4.7.1-4.7.3):
+    hough_delta_d_m is the distance step Δd, equal to the stripe width 2a; hough_gamma_steps the
+    number of angles γ in a full turn; hough_d_max_m the largest distance d of a line.
+    hough_threshold_m is the threshold of C with g = r times the angle between beams: metres of
+    wall, as long as it were seen face on. cylinders: whether to look for them too;
+    cylinder_min_radius_m, cylinder_max_radius_m: which radii; cylinder_points: fewest returns.
     """
 
-    name: Literal["segments", "none"] = "segments"
+    name: Literal["segments", "hough", "both", "none"] = "segments"
     max_range_m: float = 30.0
     gap_m: float = 0.3
     gap_share: float = 0.05
@@ -130,6 +141,14 @@ class FrontEndConfig:
     floor_angle_rad: float = 0.005
     end_sigma_m: float = 0.05
     covariance: Literal["incidence", "thesis"] = "incidence"
+    hough_delta_d_m: float = 0.025
+    hough_gamma_steps: int = 120
+    hough_d_max_m: float = 20.0
+    hough_threshold_m: float = 0.4
+    cylinders: bool = False
+    cylinder_min_radius_m: float = 0.03
+    cylinder_max_radius_m: float = 0.5
+    cylinder_points: int = 4
 
 
 @dataclass(frozen=True)
@@ -137,7 +156,8 @@ class AssociationConfig:
     """Which observation belongs to which landmark (thesis 3.21-3.25 and 4.22-4.28).
 
     method: `greedy` is the thesis' variant of the NNSF, `optimal` minimises the sum. identities:
-    `use` those in the log or `ignore` them. max_distance_m: eq. 3.23. directed: a line has two
+    `use` those in the log or `ignore` them. robots: `use` sightings of other robots or `ignore`
+    them. max_distance_m: eq. 3.23. directed: a line has two
     sides; false takes directions modulo pi (3.24). gate_probability: chi-square gate (3.25).
     floor_m, floor_rad: added to the innovations' sigmas before gating, for what the models leave
     out; never enters the estimate. new_probability: an observation is a new landmark only if its
@@ -150,6 +170,7 @@ class AssociationConfig:
 
     method: Literal["optimal", "greedy"] = "optimal"
     identities: Literal["use", "ignore"] = "use"
+    robots: Literal["use", "ignore"] = "use"
     max_distance_m: float = 1.5
     directed: bool = True
     gate_probability: float = 0.99
@@ -181,15 +202,18 @@ class BackendConfig:
 
     name: which one. relinearize_threshold: largest change of a variable (m, rad) before it is
     linearised anew; relinearize_every: steps between two looks for such variables. polish:
-    optimise to convergence at the end. horizon_s: how long a past pose stays in isam2's graph
-    before it is marginalised out: inf = full smoothing, 0 = the extended Kalman filter.
+    optimise to convergence at the end; reconsider: then apply the final calibration to all of the
+    log, merge landmarks that are one, and optimise again (smoothers only). horizon_s: how long a
+    past pose stays in isam2's graph before it is marginalised out: inf = full smoothing, 0 = the
+    extended Kalman filter.
     """
 
-    name: Literal["isam2", "batch", "dead-reckoning"] = "isam2"
+    name: Literal["isam2", "batch", "ekf", "dead-reckoning"] = "isam2"
     horizon_s: float = math.inf
     relinearize_threshold: float = 0.05
     relinearize_every: int = 20
     polish: bool = True
+    reconsider: bool = True
 
 
 @dataclass(frozen=True)
@@ -199,11 +223,13 @@ class EkfConfig:
     error: which errors are Gaussian: `world` = additive along world axes (thesis 4.20), `body` =
     of the exponential map at each pose, as in GTSAM. lines: `model` = no row along a line, as the
     smoother has it; `thesis` = eq. 4.33-4.34, a large variance along it (along_sigma_m).
+    iterations: how often each observation is linearised; more than 1 = the iterated filter.
     """
 
     error: Literal["world", "body"] = "world"
     lines: Literal["model", "thesis"] = "model"
     along_sigma_m: float = 10.0
+    iterations: int = 1
 
 
 @dataclass(frozen=True)
@@ -211,7 +237,8 @@ class StartConfig:
     """Where the robots start.
 
     origin_sigma_m, origin_sigma_rad: prior of the robot whose first pose is the world's origin.
-    given_sigma_m, given_sigma_rad: prior of a start that is given. poses: robot -> [x m, y m,
+    given_sigma_m, given_sigma_rad: prior of a start that is given. truth_sigma_m,
+    truth_sigma_rad: of one read from truth (a motion capture sample). poses: robot -> [x m, y m,
     phi rad]. from_truth: read one truth sample of each robot instead.
     """
 
@@ -223,6 +250,35 @@ class StartConfig:
     truth_sigma_rad: float = 0.01
     poses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     from_truth: bool = False
+
+
+@dataclass(frozen=True)
+class ChangesConfig:
+    """Change detection (thesis chapter 5).
+
+    false_alarm_rate: share of the later beams that may be flagged where nothing changed.
+    run_false_alarm_rate: probability that a run without any change reports one. resolution_m: of
+    the map; it gets coarser where it would have more than max_side_cells squared. max_range_m:
+    farther returns are not compared. min_returns, min_scans: a surface is compared if so many
+    returns of so many scans lie on it. flatness_m: how far a straight surface strays from a line.
+    bias_sigma_m: how much too far a material may be measured. gate_m: returns within this distance
+    are compared with a surface by how far they lie off it; beams that end farther behind it passed
+    through. min_length_m: smallest change that is reported. min_beams: fewest beams that must tell
+    of it.
+    """
+
+    false_alarm_rate: float = 0.01
+    run_false_alarm_rate: float = 0.01
+    resolution_m: float = 0.025
+    max_side_cells: int = 2000
+    max_range_m: float = 30.0
+    min_returns: int = 6
+    min_scans: int = 3
+    flatness_m: float = 0.004
+    bias_sigma_m: float = 0.01
+    gate_m: float = 0.15
+    min_length_m: float = 0.1
+    min_beams: int = 5
 
 
 @dataclass(frozen=True)
@@ -239,10 +295,15 @@ class Config:
     backend: BackendConfig = field(default_factory=BackendConfig)
     ekf: EkfConfig = field(default_factory=EkfConfig)
     start: StartConfig = field(default_factory=StartConfig)
+    changes: ChangesConfig = field(default_factory=ChangesConfig)
 
     def robot(self, name: str) -> RobotConfig:
         """Settings of robot ``name``: its own table, else [robots.default], else the defaults."""
         return self.robots.get(name, self.robots.get("default", RobotConfig()))
+
+    def __reduce__(self) -> tuple[Any, tuple[str]]:
+        """Pickled as its TOML text: read-only mappings have no pickle of their own."""
+        return parse_config, (dump_config(self),)
 
 
 def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Config:
@@ -265,6 +326,17 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Conf
             raise ConfigError(f"--set {text}: write it as key=value, for example keyframe.mode=all")
         _set(tree, _split_key(key.strip()), _parse_value(value.strip()))
     config = _build(Config, tree, "")
+    assert isinstance(config, Config)  # narrows the type; _build returns what it is asked for
+    return config
+
+
+def parse_config(text: str) -> Config:
+    """Settings from the TOML text that `dump_config` writes.
+
+    Raises:
+        ConfigError: a key is unknown, a value has the wrong type.
+    """
+    config = _build(Config, tomllib.loads(text), "")
     assert isinstance(config, Config)  # narrows the type; _build returns what it is asked for
     return config
 
@@ -342,7 +414,7 @@ def _check_range(key: str, value: float) -> None:
         ConfigError: the value is outside.
     """
     name = key.rpartition(".")[2]
-    if name.endswith("_probability"):
+    if name.endswith(("_probability", "_rate")):
         if not 0 < value < 1:
             raise ConfigError(f"{key}: must be between 0 and 1, got {value!r}")
     elif value < 0:
@@ -360,6 +432,8 @@ _INFINITE = {"backend.horizon_s"}
 _NOT_ZERO = {
     "scale",
     "split_m",
+    "hough_delta_d_m",
+    "hough_gamma_steps",
     "range_sigma_m",
     "max_range_m",
     "max_distance_m",
@@ -369,12 +443,19 @@ _NOT_ZERO = {
     "origin_sigma_rad",
     "given_sigma_m",
     "given_sigma_rad",
+    "truth_sigma_m",
+    "truth_sigma_rad",
     "wheel_radius_left_m",
     "wheel_radius_right_m",
     "axle_m",
     "floor_sigma_m",
     "floor_sigma_rad",
     "sightings_to_promote",
+    "resolution_m",
+    "max_side_cells",
+    "gate_m",
+    "along_sigma_m",
+    "iterations",
 }
 
 

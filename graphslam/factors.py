@@ -17,8 +17,12 @@ from graphslam.models.observation import LineModel
 from graphslam.records import Association, Closure, Motion, Start
 
 #: m: where on a wall a line landmark's origin sits, relative to the state that first saw it. A
-#: gauge: the only factor with information along the line, so its size changes no other estimate.
+#: gauge: the only factor with information along the line. To first order its size changes no other
+#: estimate. To second order the direction's error couples what lies along the line with the normal:
+#: a smoother leaves that to the gauge, so it is wide; a filter never linearises anew, and a wide
+#: one makes it overconfident at any noise (docs/ekf-versus-smoothing.md).
 LINE_GAUGE_SIGMA_M = 1.0
+FILTER_GAUGE_SIGMA_M = 1e-3
 
 
 def state_key(robot_index: int, number: int) -> int:
@@ -174,9 +178,14 @@ def observation_factor(
     return FACTORS[seen.model](key, target, seen, kernel, x, t)
 
 
-def line_gauge_factor(key: int, target: int, seen: Association) -> gtsam.NonlinearFactor:
-    """Ties a new line landmark's origin along its line; see `LINE_GAUGE_SIGMA_M`."""
+def line_gauge_factor(
+    key: int, target: int, seen: Association, *, wide: bool = True
+) -> gtsam.NonlinearFactor:
+    """Ties a new line landmark's origin along its line; see `LINE_GAUGE_SIGMA_M`.
+
+    ``wide`` for smoothers, not for filters.
+    """
     R = np.zeros((3, 3))
-    R[0, 0] = 1.0 / LINE_GAUGE_SIGMA_M
+    R[0, 0] = 1.0 / (LINE_GAUGE_SIGMA_M if wide else FILTER_GAUGE_SIGMA_M)
     noise = gtsam.noiseModel.Gaussian.SqrtInformation(R, False)
     return gtsam.BetweenFactorPose2(key, target, pose2(seen.z), noise)

@@ -23,6 +23,9 @@ from graphslam.records import Association, Closure, Motion, Start, Step
 
 PLAIN = Config(robust=RobustConfig(kernel="none"))
 SMOOTHERS = ["batch", "isam2"]
+#: isam2 with a horizon in seconds: the filter, a window of two states (they are ns apart), all
+HORIZONS = ["isam2:0", "isam2:2e-9", "isam2:1"]
+EVERY = [*sorted(BACKENDS), *HORIZONS]
 MODEL_OF = {0: "point", 1: "line", 2: "segment"}
 WORLD = {
     0: np.array([4.0, 2.0]),
@@ -98,8 +101,16 @@ def scenario():
     return two_robots(np.random.default_rng(21))
 
 
+def make(name, config=PLAIN):
+    """The estimator NAME or NAME:HORIZON."""
+    name, _, horizon = name.partition(":")
+    if horizon:
+        config = replace(config, backend=replace(config.backend, horizon_s=float(horizon)))
+    return BACKENDS[name](config)
+
+
 def run(name, steps, config=PLAIN):
-    backend = BACKENDS[name](config)
+    backend = make(name, config)
     for step in steps:
         backend.add(step)
     return backend
@@ -115,7 +126,7 @@ def assert_covariance(cov):
 # ------------------------------------------------------------ the contract
 
 
-@pytest.mark.parametrize("name", sorted(BACKENDS))
+@pytest.mark.parametrize("name", EVERY)
 class TestContract:
     """What the pipeline may expect of every row of `BACKENDS`."""
 
@@ -146,7 +157,7 @@ class TestContract:
 
     def test_joint_may_be_asked_after_every_step(self, name, scenario):
         """And speaks of the latest state of the robot it is asked for."""
-        backend, last = BACKENDS[name](PLAIN), None
+        backend, last = make(name), None
         for step in scenario[0]:
             backend.add(step)
             joint = backend.joint("a", [])
@@ -198,7 +209,7 @@ class TestContract:
 
     def test_asking_for_an_unknown_robot_is_an_error_that_names_it(self, name):
         with pytest.raises(EstimationError, match="robot ghost"):
-            BACKENDS[name](PLAIN).joint("ghost", [])
+            make(name).joint("ghost", [])
 
     def test_reference_to_a_state_that_was_never_made_names_robot_and_time(self, name, scenario):
         backend = run(name, scenario[0])
@@ -339,7 +350,7 @@ def test_twice_the_error_follows_chi_square():
     assert abs(np.mean(values) - dof) < 4 * np.sqrt(2 * dof / 30)
 
 
-@pytest.mark.parametrize("name", sorted(BACKENDS))
+@pytest.mark.parametrize("name", EVERY)
 def test_covariance_of_odometry_alone_by_hand(name):
     """Facing north, 1 m forward with 0.2 m along and 0.1 m across: across is world x. And 0.1 rad
     of heading at the start is 0.1 m across at the end."""
@@ -351,7 +362,7 @@ def test_covariance_of_odometry_alone_by_hand(name):
         np.testing.assert_allclose(cov, expected, atol=1e-7)  # the 1e-8 left in
 
 
-@pytest.mark.parametrize("name", SMOOTHERS)
+@pytest.mark.parametrize("name", [*SMOOTHERS, *HORIZONS, "ekf"])
 def test_covariance_of_one_update_by_hand(name):
     """A Kalman update on paper: heading known, so position only. The robot faces north, prior 3 m²
     in world x and 1 m² in y; a landmark known to 1e-4 m (seen at the start, when the pose was) is
@@ -565,27 +576,42 @@ def test_the_gauge_matters_little_with_noise(monkeypatch, scenario):
 # ------------------------------------------------------------ when it goes wrong
 
 
-@pytest.mark.parametrize("name", SMOOTHERS)
+@pytest.mark.parametrize("name", [*SMOOTHERS, *HORIZONS, "ekf"])
 @pytest.mark.parametrize("when", ["joint", "finish"])
 def test_indeterminate_landmark_is_named(name, when):
     """A point at range zero has no bearing: QR answers NaN without a word. One line in terms of the
     log, never GTSAM's."""
     backend = run(name, [Step(0, {"r": Start(np.zeros(3), 1e-4 * np.eye(3))})])
     point = Association("r", 0, 7, "point", np.zeros(2), 1e-4 * np.eye(2))
-    with pytest.raises(EstimationError, match="indeterminate at landmark 7:") as error:
+    with pytest.raises(EstimationError, match="at landmark 7, seen from robot r") as error:
         backend.add(Step(0, associations=(point,)))
         backend.joint("r", [7]) if when == "joint" else backend.finish()
     assert "Symbol" not in str(error.value)
 
 
-@pytest.mark.parametrize("name", SMOOTHERS)
+@pytest.mark.parametrize("name", [*SMOOTHERS, *HORIZONS])
 def test_motion_without_a_valid_covariance_is_refused(name):
     backend = run(name, [Step(0, {"r": Start(np.zeros(3), np.eye(3))})])
     with pytest.raises(EstimationError, match="positive definite"):
         backend.add(Step(1, motions={"r": motion(0, 1, [1, 0, 0], np.zeros((3, 3)))}))
 
 
-@pytest.mark.parametrize("name", SMOOTHERS)
+@pytest.mark.parametrize("name", [*SMOOTHERS, *HORIZONS, "ekf"])
+@pytest.mark.parametrize("what", ["start", "motion", "sighting"])
+def test_infinite_variance_is_named_by_robot_landmark_and_time(name, what):
+    """Infinity in a covariance is no weak knowledge but a mistake; one line, before it spreads."""
+    endless = np.diag([1e-4, np.inf, 1e-4])
+    start = Start(np.zeros(3), endless if what == "start" else 1e-4 * np.eye(3))
+    moved = motion(0, 8, [1, 0, 0], endless if what == "motion" else MOTION_COV)
+    seen = Association("r", 8, 7, "point", np.array([0.1, 3.0]), endless[:2, :2])
+    named = {"start": "robot r at 0 ns", "motion": "robot r to 8 ns"}
+    pattern = named.get(what, "landmark 7.* robot r at 8 ns")
+    with pytest.raises(EstimationError, match=pattern) as error:
+        run(name, [Step(0, {"r": start}), Step(8, {}, {"r": moved}, (seen,))])
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", [*SMOOTHERS, *HORIZONS, "ekf"])
 def test_a_good_graph_with_a_wide_spread_of_information_is_solved(name):
     """Sigmas from 1e-6 to 1e4: Cholesky calls it indeterminate, QR does not. The landmark's
     covariance is that of the motion, carried along."""

@@ -192,7 +192,7 @@ def values(kind):
 
 def tables(kind):
     hints = typing.get_type_hints(kind)
-    odds = {name for name in hints if name.endswith("_probability")}
+    odds = {name for name in hints if name.endswith(("_probability", "_rate"))}
     strategies = {name: values(hint) for name, hint in hints.items() if name not in odds}
     strategies |= {name: st.floats(1e-9, 1 - 1e-9) for name in odds}
     return st.builds(kind, **strategies)
@@ -227,7 +227,7 @@ def test_the_dump_names_every_setting():
 @pytest.mark.parametrize("table", sorted(TABLES))
 def test_every_float_bears_its_unit(table):
     """Metres, radians or seconds at the end of the name; or a share, a scale or a probability."""
-    plain = ("share", "scale", "probability", "threshold", "sigma")
+    plain = ("share", "scale", "probability", "rate", "threshold", "sigma")
     for field in dataclasses.fields(TABLES[table]):
         if isinstance(field.default, float):
             unit = field.name.rsplit("_", 1)[-1]

@@ -1,6 +1,6 @@
 """The interface of every estimator, and what they share: which state is which."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -36,8 +36,18 @@ class Backend(Protocol):
     """
 
     @property
+    def smooths(self) -> bool:
+        """Whether all data have a say in all of its final estimate."""
+        ...
+
+    @property
     def error_frame(self) -> Literal["body", "world"]:
         """See the class."""
+        ...
+
+    @property
+    def skipped(self) -> Mapping[str, int]:
+        """What of the steps could not be used, counted by reason: a filter has no past."""
         ...
 
     def add(self, step: Step) -> None:

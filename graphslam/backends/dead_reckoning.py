@@ -1,6 +1,7 @@
 """Odometry alone: every landmark stays where it was first seen."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -15,7 +16,9 @@ from graphslam.records import Estimate, Step, Trajectory
 class DeadReckoningBackend:
     """The baseline that uses no observation for the trajectory."""
 
+    smooths = False
     error_frame: Literal["body", "world"] = "world"
+    skipped: Mapping[str, int] = MappingProxyType({})  # leaving out is what it is for
 
     def __init__(self, _config: Config) -> None:
         self._states = StateTable()

@@ -4,20 +4,17 @@
 is its converged limit: the same graph, optimised by Levenberg-Marquardt from iSAM2's estimate.
 """
 
-import re
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Iterable
 
 import gtsam
 import numpy as np
 
 from graphslam import factors
-from graphslam.backends.base import Joint, StateTable, block_slices
+from graphslam.backends.graph import Estimates, GraphBackend, GraphBuilder, read, write
 from graphslam.config import Config, RobustConfig
 from graphslam.errors import EstimationError
-from graphslam.geometry import Array, compose, rotate_cov
-from graphslam.models import MODELS
-from graphslam.records import Association, Estimate, Step, Trajectory
+from graphslam.geometry import Array
+from graphslam.records import Association, Estimate, Step
 
 #: m or rad: the estimate has converged when all variables together move less than this
 CONVERGED = 1e-6
@@ -25,95 +22,40 @@ CONVERGED = 1e-6
 FACED, FACED_ROBUST, MAX_FACINGS = 1e-6, 1e-2, 4
 
 
-class GraphBuilder:
-    """Turns steps into factors and first values; remembers which key is what.
+class WholeGraph(GraphBuilder):
+    """Keeps every factor there ever was, in ``graph``."""
 
-    ``rows`` counts the residual rows that carry information: GTSAM counts a line's empty row too.
-    ``graph`` holds every factor so far.
-    """
-
-    def __init__(self, config: Config) -> None:
-        self._config = config
-        self.states = StateTable()
-        self.robots: list[str] = []
-        self.landmark_dims: dict[int, int] = {}
-        self.rows = 0
-        self._lines: list[tuple[int, int, int, Association]] = []  # place in graph, keys, what
+    def __init__(self, kernel: RobustConfig) -> None:
+        super().__init__(kernel)
         self.graph = gtsam.NonlinearFactorGraph()
-
-    def state_key(self, robot: str, number: int) -> int:
-        """Key of a robot's state."""
-        return factors.state_key(self.robots.index(robot), number)
+        self._lines: list[tuple[int, tuple[int, int, Association]]] = []  # place in graph, what
 
     def expand(
-        self, step: Step, current: "Isam2Backend"
+        self, step: Step, current: Estimates
     ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         """Factors and new variables of a step; ``current`` is asked for existing estimates."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         fresh: dict[int, Array] = {}
 
-        def insert(key: int, value: Array) -> None:
-            fresh[key] = value
-            values.insert(key, factors.pose2(value) if len(value) == 3 else value)
-
         def estimate(key: int, dim: int) -> Array:
-            return fresh[key] if key in fresh else current.value(key, dim)
+            return fresh[key] if key in fresh else current(key, dim)
 
-        for robot, start in step.starts.items():
-            self.robots.append(robot)
-            key = self.state_key(robot, self.states.append(robot, step.time_ns))
-            insert(key, start.pose)
-            graph.add(factors.start_factor(key, start))
-            self.rows += 3
-        for robot, motion in step.motions.items():
-            last = self.state_key(robot, self.states.latest(robot))
-            key = self.state_key(robot, self.states.append(robot, step.time_ns))
-            insert(key, compose(estimate(last, 3), motion.delta))
-            graph.add(factors.motion_factor(last, key, motion))
-            self.rows += 3
-        for seen in step.associations:
-            key = self.state_key(seen.robot, self.states.number(seen.robot, seen.time_ns))
-            x = estimate(key, 3)
-            target = self._target_key(seen, step.time_ns)
-            dim = MODELS[seen.model].dim
-            if isinstance(seen.target, int) and seen.target not in self.landmark_dims:
-                self.landmark_dims[seen.target] = dim
-                insert(target, MODELS[seen.model].invert(seen.z, x))
-                if seen.model == "line":
-                    graph.add(factors.line_gauge_factor(key, target, seen))
-                    self.rows += 1
-            if seen.model == "line":
-                self._lines.append((self.graph.size() + graph.size(), key, target, seen))
-            t = estimate(target, dim)
-            graph.add(factors.observation_factor(key, target, seen, self._config.robust, x, t))
-            self.rows += MODELS[seen.model].rows
-        for closure in step.closures:
-            key = self.state_key(closure.robot, self.states.number(closure.robot, closure.time_ns))
-            other = self.state_key(
-                closure.other, self.states.number(closure.other, closure.other_time_ns)
-            )
-            graph.add(factors.closure_factor(key, other, closure, self._config.robust))
-            self.rows += 3
+        for part in self.parts(step, estimate):
+            if part.new is not None:
+                write(values, *part.new)
+                fresh.update([part.new])
+            for factor in part.factors:
+                graph.add(factor)
+            if part.observed is not None and part.observed[2].model == "line":
+                self._lines.append((self.graph.size() + graph.size() - 1, part.observed))
         self.graph.push_back(graph)
         return graph, values
 
     def face_lines(self, values: gtsam.Values) -> None:
-        """Rebuild the factors of lines at ``values``.
-
-        A line's measurement was moved along the line to face the landmark's origin as estimated at
-        its time (see `LineModel`); where the estimate has moved since, so must the measurement, or
-        it claims some knowledge along the line.
-        """
-        for place, key, target, seen in self._lines:
-            x = factors.array3(values.atPose2(key))
-            t = factors.array3(values.atPose2(target))
-            factor = factors.observation_factor(key, target, seen, self._config.robust, x, t)
+        """Rebuild the factors of lines at ``values``; see `GraphBuilder.faced`."""
+        for place, observed in self._lines:
+            factor = self.faced(observed, lambda key, dim: read(values, key, dim))
             self.graph.replace(place, factor)
-
-    def _target_key(self, seen: Association, time_ns: int) -> int:
-        if isinstance(seen.target, int):
-            return factors.landmark_key(seen.target)
-        return self.state_key(seen.target, self.states.number(seen.target, time_ns))
 
     def diagnose(self, values: gtsam.Values) -> EstimationError:
         """Which variable is indeterminate: QR answers NaN for all of them, Cholesky names one."""
@@ -125,20 +67,6 @@ class GraphBuilder:
             return self.explain(error)
         return self.explain(RuntimeError(""))
 
-    def explain(self, error: RuntimeError) -> EstimationError:
-        """GTSAM's complaint about a variable, said in terms of the log."""
-        found = re.search(r"Symbol: ([xl])(\d+)", str(error))
-        where = "some variable"
-        if found and found[1] == "l":
-            where = f"landmark {found[2]}"
-        elif found:
-            robot, number = divmod(int(found[2]), 1 << 40)
-            name = self.robots[robot]
-            where = f"robot {name} at {self.states.times[name][number]} ns"
-        return EstimationError(
-            f"the estimate is indeterminate at {where}: it has too few or too weak observations"
-        )
-
 
 def isam2_parameters(config: Config, factorization: str) -> gtsam.ISAM2Params:
     """Settings of iSAM2; ``factorization`` CHOLESKY or QR."""
@@ -149,27 +77,30 @@ def isam2_parameters(config: Config, factorization: str) -> gtsam.ISAM2Params:
     return parameters
 
 
-class Isam2Backend:
+class Isam2Backend(GraphBackend):
     """Incremental smoothing of all states; see the module's docstring."""
 
-    error_frame: Literal["body", "world"] = "body"
+    smooths = True
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        self._builder = GraphBuilder(config)
+        self._builder = WholeGraph(config.robust)
+        super().__init__(self._builder)
         self._factorization = "CHOLESKY"
         self._isam = gtsam.ISAM2(isam2_parameters(config, self._factorization))
-        self._joints: dict[str, Joint] = {}  # since the last step
+        self._finished: gtsam.Values | None = None  # `finish` ended here; not asked since
 
     def value(self, key: int, dim: int) -> Array:
-        """Current estimate of a variable."""
+        """Current estimate (dim,) of a variable."""
+        self._settle()
         if dim == 3:
             return factors.array3(self._isam.calculateEstimatePose2(key))
         return np.asarray(self._isam.calculateEstimatePoint2(key))
 
     def add(self, step: Step) -> None:
         """See `Backend`."""
-        graph, values = self._builder.expand(step, self)
+        self._settle()
+        graph, values = self._builder.expand(step, self.value)
         self._joints.clear()
         try:
             self._isam.update(graph, values)
@@ -192,52 +123,42 @@ class Isam2Backend:
         except RuntimeError as again:
             raise self._builder.explain(again) from again
 
-    def joint(self, robot: str, landmarks: Sequence[int], others: Sequence[str] = ()) -> Joint:
-        """See `Backend`; asked for the pose alone after more, it answers from what it has."""
-        if not landmarks and not others and robot in self._joints:
-            known = self._joints[robot]
-            return Joint(known.pose, (), known.cov[:3, :3], ())
-        key = self._latest_key(robot)
-        dims = [self._builder.landmark_dims[i] for i in landmarks] + [3] * len(others)
-        keys = [factors.landmark_key(i) for i in landmarks] + [self._latest_key(r) for r in others]
-        pose = self.value(key, 3)
-        means = tuple(self.value(k, d) for k, d in zip(keys, dims, strict=True))
+    def _settle(self) -> None:
+        """After `finish`: a tree built anew at the converged estimate, which answers from now on.
+
+        Only made when something is asked, since most are done after `finish`.
+        """
+        if self._finished is None:
+            return
+        values, self._finished = self._finished, None
+        self._isam = gtsam.ISAM2(isam2_parameters(self._config, self._factorization))
         try:
-            if keys:
-                cov = self._isam.jointMarginalCovariance([key, *keys]).fullMatrix()
+            self._isam.update(self._builder.graph, values)
+        except RuntimeError as error:
+            self._use_qr(error)
+
+    def covariance(self, keys: list[int]) -> Array:
+        """See `GraphBackend`."""
+        self._settle()
+        try:
+            if len(keys) == 1:
+                cov = np.asarray(self._isam.marginalCovariance(keys[0]))
             else:
-                cov = self._isam.marginalCovariance(key)
+                cov = np.asarray(self._isam.jointMarginalCovariance(keys).fullMatrix())
         except RuntimeError as error:
             raise self._builder.explain(error) from error
         if not np.isfinite(cov).all():
             raise self._builder.diagnose(self._isam.calculateEstimate())
-        slices = block_slices(dims)
-        turn = np.eye(len(cov))
-        for block, mean in zip((slice(0, 3), *slices), (pose, *means), strict=True):
-            if len(mean) == 3:
-                turn[block, block] = factors.world_from_body(float(mean[2]))
-        n = len(landmarks)
-        self._joints[robot] = Joint(pose, means[:n], turn @ cov @ turn.T, slices, means[n:])
-        return self._joints[robot]
-
-    def _latest_key(self, robot: str) -> int:
-        return self._builder.state_key(robot, self._builder.states.latest(robot))
-
-    def state_mean(self, robot: str) -> Array:
-        """See `Backend`."""
-        return self.value(self._latest_key(robot), 3)
-
-    def landmark_means(self, landmarks: Sequence[int]) -> list[Array]:
-        """See `Backend`."""
-        return [
-            self.value(factors.landmark_key(i), self._builder.landmark_dims[i]) for i in landmarks
-        ]
+        return cov
 
     def finish(self) -> Estimate:
-        """See `Backend`: optimised to convergence, or iSAM2 until it moves no more."""
+        """See `Backend`: optimised to convergence, or iSAM2 until it moves no more.
+
+        What is asked afterwards, a joint marginal for example, is answered at that estimate.
+        """
         if self._config.backend.polish:
-            return self._estimate(self._optimised(self._isam.calculateBestEstimate()))
-        return self._estimate(self._converged())
+            return self._result(self._optimised(self._isam.calculateBestEstimate()))
+        return self._result(self._converged())
 
     def _converged(self) -> gtsam.Values:
         nothing, no_values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -279,36 +200,33 @@ class Isam2Backend:
                 raise self._builder.explain(error) from error
             return found
 
-    def _estimate(self, values: gtsam.Values) -> Estimate:
-        builder, marginals = self._builder, self._marginals(values)
-        states = {}
-        for robot in sorted(builder.robots):
-            keys = [builder.state_key(robot, n) for n in range(len(builder.states.times[robot]))]
-            poses = np.array([factors.array3(values.atPose2(k)) for k in keys])
-            covs = np.array([marginals[k] for k in keys])
-            states[robot] = Trajectory(
-                builder.states.stamps(robot), poses, rotate_cov(covs, poses[:, 2])
-            )
-        landmarks = {}
-        for landmark, dim in builder.landmark_dims.items():
-            key = factors.landmark_key(landmark)
-            cov = marginals[key]
-            if dim == 3:
-                mean = factors.array3(values.atPose2(key))
-                cov = rotate_cov(cov, mean[2])
-            else:
-                mean = np.asarray(values.atPoint2(key))
-            landmarks[landmark] = (mean, cov)
-        error = float(builder.graph.error(values))
-        return Estimate(states, landmarks, error, builder.rows - values.dim())
+    def _result(self, values: gtsam.Values) -> Estimate:
+        self._finished = values
+        self._joints.clear()
+        covs = self._marginals(values)
+        means = {key: read(values, key, len(cov)) for key, cov in covs.items()}
+        return self._estimate(means, covs, float(self._builder.graph.error(values)))
 
 
 class BatchBackend(Isam2Backend):
     """The converged limit, whatever `backend.polish` says; associations as with iSAM2."""
 
+    def solve(self, steps: Iterable[Step], start: Estimate) -> Estimate:
+        """All steps at once, from an estimate of every variable in them; `add` nothing before.
+
+        Raises:
+            EstimationError: the steps make the estimate indeterminate.
+        """
+        values = gtsam.Values()
+        for step in steps:
+            _, new = self._builder.expand(step, lambda key, dim: read(values, key, dim))
+            for key in new.keys():  # noqa: SIM118 (GTSAM's values are no mapping)
+                write(values, key, self._builder.value_in(start, key))
+        return self._result(self._optimised(values))
+
     def finish(self) -> Estimate:
         """See `Backend`."""
-        return self._estimate(self._optimised(self._isam.calculateBestEstimate()))
+        return self._result(self._optimised(self._isam.calculateBestEstimate()))
 
 
 def optimise(

@@ -45,8 +45,43 @@ def check_start(values: list[str] | None) -> list[str]:
     return settings
 
 
+def span_of(value: str | None) -> tuple[float, float] | None:
+    """``A:B`` as seconds; None as it is.
+
+    Raises:
+        typer.BadParameter: it is not two numbers in order.
+    """
+    if value is None:
+        return None
+    begin, _, end = value.partition(":")
+    try:
+        span = float(begin), float(end)
+    except ValueError:
+        span = (0.0, -1.0)
+    if not 0 <= span[0] < span[1]:
+        raise typer.BadParameter(f"{value!r} is not A:B, seconds since the first scan")
+    return span
+
+
+def _check_span(value: str | None) -> str | None:
+    span_of(value)
+    return value
+
+
+def check_horizon(value: float | None) -> float | None:
+    """A horizon in seconds, or infinity.
+
+    Raises:
+        typer.BadParameter: it is negative or no number.
+    """
+    if value is not None and not value >= 0:
+        raise typer.BadParameter(f"{value} is not a time in seconds from 0 to inf")
+    return value
+
+
 BACKENDS = _choices(BackendConfig)
 FRONT_ENDS = _choices(FrontEndConfig)
+MODES = ["replay", "associate"]
 
 Logs = Annotated[
     list[Path], typer.Argument(metavar="LOG", help="MCAP files; several are one recording.")
@@ -57,6 +92,16 @@ Backend = Annotated[
         metavar="|".join(BACKENDS),
         callback=lambda value: _one_of(value, BACKENDS),
         help="The estimator; backend.name in the configuration.",
+    ),
+]
+Horizon = Annotated[
+    float | None,
+    typer.Option(
+        "--horizon",
+        metavar="S",
+        callback=check_horizon,
+        help="How long isam2 revises a past pose: seconds, 0 = a filter, inf = for ever (the "
+        "default); backend.horizon_s in the configuration.",
     ),
 ]
 FrontEnd = Annotated[
@@ -96,7 +141,33 @@ Scenario = Annotated[
         metavar="SCENARIO", help=f"A scenario file (TOML), or one of {', '.join(SCENARIOS)}."
     ),
 ]
+Backends = Annotated[
+    str,
+    typer.Option(
+        "--backends",
+        metavar="SPEC,...",
+        help="NAME[:HORIZON][+key=value...], NAME one of "
+        f"{', '.join(BACKENDS)}: ekf, isam2:20, ekf+ekf.error=body.",
+    ),
+]
+ComparisonMode = Annotated[
+    str,
+    typer.Option(
+        "--mode",
+        metavar="|".join(MODES),
+        callback=lambda value: _one_of(value, MODES),
+        help="The same recorded steps for all, or each associates for itself.",
+    ),
+]
 Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Other noise.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace what is there.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
+ReferenceSpan = Annotated[
+    str | None,
+    typer.Option(metavar="A:B", callback=_check_span, help="Only scans of these seconds of it."),
+]
+LaterSpan = Annotated[
+    str | None,
+    typer.Option(metavar="A:B", callback=_check_span, help="Only scans of these seconds of it."),
+]

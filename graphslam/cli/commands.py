@@ -5,6 +5,7 @@ about arguments come at once.
 """
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,21 +15,27 @@ from graphslam import __version__
 from graphslam.cli import show
 from graphslam.cli.arguments import (
     Backend,
+    Backends,
+    ComparisonMode,
     ConfigFile,
     Debug,
     Force,
     Format,
     FrontEnd,
+    Horizon,
     Json,
+    LaterSpan,
     Logs,
+    ReferenceSpan,
     Scenario,
     Seed,
     Settings,
     Starts,
+    span_of,
 )
 from graphslam.cli.terminal import errors_in_one_line, progress_bar
 from graphslam.config import Config, load_config
-from graphslam.errors import OutputError
+from graphslam.errors import EstimationError, OutputError
 from graphslam.logs import IMPORTERS, KnownTruth, LogSet, inspect_logs, open_logs
 from graphslam.records import Result
 from graphslam.results import check_target, load, save, to_json
@@ -140,6 +147,7 @@ def smooth_command(
         Path, typer.Option("-o", "--output", metavar="DIR", help="The result folder to make.")
     ],
     backend: Backend = None,
+    horizon: Horizon = None,
     front_end: FrontEnd = None,
     start: Starts = None,
     config: ConfigFile = None,
@@ -154,6 +162,7 @@ def smooth_command(
     """
     with errors_in_one_line(debug):
         options = [f"backend.name={backend}"] if backend else []
+        options += [] if horizon is None else [f"backend.horizon_s={horizon}"]
         options += [f"front_end.name={front_end}"] if front_end else []
         tree = load_config(config, [*options, *(start or ()), *(settings or ())])
         check_target(output, force=force)
@@ -229,3 +238,156 @@ def evaluate_command(
             typer.echo(to_json(found, "evaluation"), nl=False)
         else:
             show.evaluation(found)
+
+
+@app.command("compare")
+def compare_command(
+    logs: Logs,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="The folder to make.")
+    ],
+    backends: Backends = "ekf,isam2:0,isam2,batch",
+    mode: ComparisonMode = "replay",
+    truth: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="LOG.mcap|[ROBOT=]FILE.tum",
+            help="True poses of the base; repeatable. Default: those in the logs.",
+        ),
+    ] = None,
+    relations: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Reference relations between scans: t1 t2 x y z r p y."),
+    ] = None,
+    front_end: FrontEnd = None,
+    start: Starts = None,
+    config: ConfigFile = None,
+    settings: Settings = None,
+    json: Json = False,
+    force: Force = False,
+    debug: Debug = False,
+) -> None:
+    """Compare back ends on one log: errors, consistency, time, memory.
+
+    Writes a folder with compare.json and report.html.
+    """
+    with errors_in_one_line(debug):
+        from graphslam.compare import compare, is_comparison, save_comparison, variants
+        from graphslam.evaluate import read_relations
+        from graphslam.truth import truth_of_files, truth_of_logs
+
+        options = [f"front_end.name={front_end}"] if front_end else []
+        options += [*(start or ()), *(settings or ())]
+        tree = load_config(config, options)
+        rows = variants([spec for spec in backends.split(",") if spec], config, options)
+        check_target(output, force=force, replaceable=is_comparison)
+        log = open_logs(logs, tree)
+        known = truth_of_files(truth, log.robots) if truth else truth_of_logs(log, tree)
+        reference = read_relations(relations) if relations else None
+        with progress_bar(sum(topic.count for topic in log.topics), "associating") as progress:
+            found = compare(
+                log, tree, rows, mode, truth=known, relations=reference, progress=progress,
+                say=show.stage,
+            )  # fmt: skip
+        save_comparison(found, tree, output, force=force)
+        if json:
+            typer.echo(to_json(found.found, "comparison"), nl=False)
+        else:
+            show.comparison(found.found, output)
+        failed = [f"{row['spec']}: {row['error']}" for row in found.found["rows"] if row["error"]]
+        if failed:
+            raise EstimationError(f"{len(failed)} of {len(rows)} back ends failed; {failed[0]}")
+
+
+@app.command("changes")
+def changes_command(
+    reference: Annotated[
+        Path, typer.Argument(metavar="REFERENCE", help="Result folder of the earlier visit.")
+    ],
+    later: Annotated[
+        Path, typer.Argument(metavar="LATER", help="Result folder of the later visit.")
+    ],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="The folder to make.")
+    ],
+    reference_span: ReferenceSpan = None,
+    later_span: LaterSpan = None,
+    config: ConfigFile = None,
+    settings: Settings = None,
+    json: Json = False,
+    force: Force = False,
+    debug: Debug = False,
+) -> None:
+    """Find what is different since the last visit, and how sure.
+
+    Writes changes.json and report.html. REFERENCE and LATER may be one folder with two spans.
+    """
+    with errors_in_one_line(debug):
+        from graphslam.changes import changes_between, render_changes, save_changes
+        from graphslam.changes.files import check_changes_target
+
+        tree = load_config(config, settings or ()).changes
+        check_changes_target(output, force=force)
+        spans = (span_of(reference_span), span_of(later_span))
+        found = changes_between(reference, later, tree, *spans)
+        names = (reference.name, later.name)
+        save_changes(
+            found, output, force=force, report=lambda done: render_changes(done, tree, names)
+        )
+        if json:
+            typer.echo(to_json(found.to_dict(), "changes"), nl=False)
+        else:
+            show.changes(found.to_dict(), output)
+
+
+@app.command("experiment")
+def experiment_command(
+    experiment: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME|FILE.toml",
+            help="An experiment file, or ekf-versus-smoothing or thesis.",
+        ),
+    ],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="The experiment's folder.")
+    ],
+    runs: Annotated[
+        int | None, typer.Option(metavar="N", min=1, help="Seeds, instead of the file's.")
+    ] = None,
+    jobs: Annotated[
+        int | None, typer.Option(metavar="N", min=1, help="Processes; one per core.")
+    ] = None,
+    json: Json = False,
+    force: Annotated[
+        bool,
+        typer.Option(
+            "--force/--resume", help="Throw away what is in DIR, or run only what is missing."
+        ),
+    ] = False,
+    debug: Debug = False,
+) -> None:
+    """Run a Monte Carlo experiment: many seeds, estimators and noise scales.
+
+    Writes results.jsonl, a row per run as it ends, then summary.json, report.html and figures.
+    Stopped, it goes on where it was when it is called again.
+    """
+    with errors_in_one_line(debug):
+        from graphslam.experiments import (
+            jobs_of,
+            load_definition,
+            run_campaign,
+            save_summary,
+            summarise,
+        )
+
+        wanted = load_definition(experiment)
+        wanted = replace(wanted, runs=runs or wanted.runs)
+        with progress_bar(len(jobs_of(wanted)), "running") as progress:
+            rows = run_campaign(wanted, output, jobs=jobs, force=force, progress=progress)
+        found = summarise(wanted, rows)
+        save_summary(found, output)
+        if json:
+            typer.echo(to_json(found, "experiment"), nl=False)
+        else:
+            show.experiment(found, output)

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from graphslam.logs import ImportSummary, LogInfo, RobotInfo, TopicInfo
 from graphslam.records import Result
+from graphslam.report.comparison import filled, notes, sentence
 from graphslam.simulate import Simulation
 
 _PIPE_WIDTH = 200  # a pipe has no width; tables take what they need of this
@@ -148,6 +149,97 @@ def evaluation(found: Mapping[str, Any]) -> None:
         console.print(_table(head, rows, texts=2))
         if not relations["all"]["n"]:
             console.print("warning: no scan has the stamps of a relation, to the nanosecond")
+
+
+def stage(text: str) -> None:
+    """What is done now, on stderr, where someone is watching."""
+    if sys.stderr.isatty():
+        Console(stderr=True, markup=False, highlight=False).print(f"{text} ...")
+
+
+def comparison(found: Mapping[str, Any], directory: Path) -> None:
+    """A table per kind of number, the best of a column with a star; then what failed."""
+    console = _console()
+    console.print(sentence(found))
+    for title, (heads, rows) in filled(found).items():
+        lines = [
+            (row["label"], *(f"{_number(value)}{' *'[best]}" for value, best in cells))
+            for row, cells in zip(found["rows"], rows, strict=True)
+            if cells
+        ]
+        console.print()
+        console.print(title)
+        console.print(_table(["", *heads], lines))
+    console.print()
+    for text in ("* best of its column.", *notes(found)):
+        console.print(text)
+    for warning in found["warnings"]:
+        console.print(f"warning: {warning}")
+    for row in found["rows"]:
+        if row["error"]:
+            console.print(f"failed: {row['label']}: {row['error']}")
+    console.print(f"report: {directory / 'report.html'}")
+
+
+def changes(found: Mapping[str, Any], directory: Path) -> None:
+    """What changed, how many beams say so, where the report lies."""
+    console = _console()
+    compared, flagged = found["beams_compared"], found["beams_flagged"]
+    console.print(
+        f"{_number(compared)} beams compared, {100 * flagged / max(compared, 1):.2f} % flagged; "
+        f"{100 * found['false_alarm_rate_requested']:g} % would be where nothing changed"
+    )
+    rows = []
+    for change in found["changes"]:
+        x, y = zip(*change["polygon"], strict=True)
+        moved = change["displacement"]
+        rows.append(
+            (
+                change["kind"],
+                (min(x) + max(x)) / 2,
+                (min(y) + max(y)) / 2,
+                max(x) - min(x),
+                max(y) - min(y),
+                change["probability"],
+                None if moved is None else degrees(moved["phi"]),
+                change["beams"],
+            )
+        )
+    head = ["change", "x, m", "y, m", "size x, m", "size y, m", "probability", "turned, deg"]
+    if rows:
+        console.print(_table([*head, "beams"], rows))
+    else:
+        console.print("nothing changed, as far as both visits could see")
+    console.print(f"report: {directory / 'report.html'}")
+
+
+def experiment(found: Mapping[str, Any], directory: Path) -> None:
+    """A line per variant and noise scale; what failed; where the report lies."""
+    console = _console()
+    rows = []
+    for row in found["table"]:
+        name = " ".join(str(row[key]) for key in ("scenario", "front_end", "variant") if key in row)
+        cells = [name, row["scale"], row["runs"], row["failed"], row.get("diverged")]
+        if "nees_per_dof" in row:
+            low, high = row["nees_bounds"]
+            cells += [row["nees_per_dof"], f"{low:.3f}..{high:.3f}", row["nees_verdict"]]
+            cells += [row[kind]["position_m2"]["over_bound"] for kind in ("final", "causal")]
+        elif "final" in row:
+            cells += [row[k]["ate_rmse_m"]["mean"] for k in ("final", "causal")]
+            cells += [row[k]["nees_per_dof"]["mean"] for k in ("final", "causal")]
+        rows.append(cells)
+    head = ["", "noise", "runs", "failed", "diverged"]
+    if found["kind"] == "bench":
+        head += ["NEES/dof", "bounds", "", "RMSE/bound", "causal RMSE/bound"]
+    else:
+        head += ["ATE, m", "causal ATE, m", "NEES/dof", "causal NEES/dof"]
+    console.print(_table(head, [(*row, *[None] * (len(head) - len(row))) for row in rows]))
+    console.print(f"diverged: {found['diverged_if']}")
+    for text, count in found["errors"].items():
+        console.print(f"failed {count} times: {text}")
+    for warning in found["warnings"]:
+        console.print(f"warning: {warning}")
+    console.print(f"report: {directory / 'report.html'}")
 
 
 def _console() -> Console:

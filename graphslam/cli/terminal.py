@@ -49,12 +49,12 @@ def _describe(error: Exception) -> str:
 
 
 @contextmanager
-def progress_bar(total: int) -> Iterator[Callable[[int], None]]:
+def progress_bar(total: int, doing: str = "smoothing") -> Iterator[Callable[[int], None]]:
     """A function that takes the number of messages done; it draws only on a terminal."""
     if not sys.stderr.isatty():
         yield lambda _done: None
         return
-    columns = TextColumn("smoothing"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    columns = TextColumn(doing), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("", total=total)
         yield lambda done: progress.update(task, completed=done)

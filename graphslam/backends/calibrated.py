@@ -1,0 +1,189 @@
+"""Batch smoothing with the robots' calibration errors as unknowns of the same graph.
+
+A scale or a latency of odometry is one constant of the whole run. Learned beside the estimate it is
+pulled towards what the estimate already believes; as a variable it is found together with the
+trajectory, and its uncertainty is in every covariance.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from graphslam import factors
+from graphslam.backends.graph import GraphBuilder, Part, read, write
+from graphslam.config import RobustConfig
+from graphslam.geometry import Array, between, log, rotate_cov, rotation3
+from graphslam.models.motion import Calibration
+from graphslam.records import Estimate, Motion, Step, Trajectory
+
+IntArray = np.ndarray[Any, np.dtype[np.int64]]
+
+#: a parameter whose prior sigma is smaller is held
+HELD_SIGMA = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibratedEstimate:
+    """The estimate, and per robot the calibration found with it."""
+
+    estimate: Estimate
+    calibrations: Mapping[str, Calibration]
+
+
+def solve_calibrated(
+    steps: Sequence[Step],
+    start: Estimate,
+    priors: Mapping[str, Calibration],
+    now: Mapping[str, Calibration],
+    kernel: RobustConfig,
+) -> CalibratedEstimate:
+    """Optimise all states, landmarks and calibrations together.
+
+    Motions are linear in the calibration, around the one that they were made with, and linearised
+    in their states at ``start``: solve again from the result, with motions made anew.
+
+    Args:
+        steps: all steps; the covariances of their motions must leave out the calibration.
+        start: an estimate of every variable.
+        priors: per robot what is known of its calibration before any data.
+        now: per robot the calibration that the motions were made with.
+        kernel: for observations.
+
+    Raises:
+        EstimationError: a covariance is not positive definite, or a state is unknown.
+    """
+    builder = GraphBuilder(kernel)
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    numbers = {robot: k for k, robot in enumerate(sorted(priors))}
+    free = {r: np.flatnonzero(np.diag(c.cov) > HELD_SIGMA**2) for r, c in priors.items()}
+    for robot, prior in priors.items():
+        if len(free[robot]):
+            key, use = _key(numbers[robot]), free[robot]
+            values.insert(key, now[robot].mean[use])
+            noise = factors.gaussian(prior.cov[np.ix_(use, use)])
+            graph.add(gtsam.PriorFactorVector(key, prior.mean[use], noise))
+
+    def estimate(key: int, dim: int) -> Array:
+        return read(values, key, dim)
+
+    places: dict[str, int] = dict.fromkeys(priors, 0)
+    for step in steps:
+        bare = Step(step.time_ns, step.starts, {}, (), ())
+        for part in builder.parts(bare, estimate):
+            _insert(graph, values, part, start, builder)
+        for robot, motion in step.motions.items():
+            last = builder.latest_key(robot)
+            key = builder.state_key(robot, builder.states.append(robot, step.time_ns))
+            places[robot] += 1
+            n = places[robot]
+            poses = start.states[robot].poses
+            values.insert(key, factors.pose2(poses[n]))
+            builder.rows += 3
+            use = free[robot]
+            if len(use):
+                D = motion.d_delta_d_calibration[:, use]
+                mean = now[robot].mean[use]
+                c = _key(numbers[robot])
+                graph.add(_motion(last, key, c, motion, D, poses[n - 1], poses[n], mean))
+            else:
+                graph.add(factors.motion_factor(last, key, motion))
+        rest = Step(step.time_ns, {}, {}, step.associations, step.closures)
+        for part in builder.parts(rest, estimate):
+            _insert(graph, values, part, start, builder)
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setRelativeErrorTol(1e-5)
+    parameters.setMaxIterations(50)
+    try:
+        values = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
+        return _result(builder, graph, values, priors, free, numbers)
+    except RuntimeError as error:
+        raise builder.explain(error) from error
+
+
+def _key(number: int) -> int:
+    return int(gtsam.symbol("c", number))
+
+
+def _insert(
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    part: Part,
+    start: Estimate,
+    builder: GraphBuilder,
+) -> None:
+    """Add a part's factors, and its new variable at its value in ``start``."""
+    if part.new is not None:
+        key, first = part.new
+        symbol = gtsam.Symbol(key)
+        if chr(symbol.chr()) == "l":
+            first = start.landmarks[symbol.index()][0]
+        else:
+            robot, number = divmod(symbol.index(), 1 << 40)
+            first = start.states[builder.robots[robot]].poses[number]
+        write(values, key, first)
+    for factor in part.factors:
+        graph.add(factor)
+
+
+def _motion(
+    last: int, key: int, c: int, motion: Motion, D: Array, x: Array, y: Array, mean: Array
+) -> gtsam.NonlinearFactor:
+    """Linear factor of a motion over both states and the calibration, at their estimates.
+
+    Error log(delta(c)⁻¹ x⁻¹ y) along the axes of the measured end; D (3, p) is by c.
+    """
+    R = np.linalg.cholesky(np.linalg.inv(rotate_cov(motion.cov, -motion.delta[2]))).T
+    h = between(x, y)
+    error = log(between(motion.delta, h))
+    A_x = -factors.pose2(h).inverse().AdjointMap()
+    A_c = -rotation3(-motion.delta[2]) @ D
+    unit = gtsam.noiseModel.Unit.Create(3)
+    linear = gtsam.JacobianFactor(last, R @ A_x, key, R, c, R @ A_c, -R @ error, unit)
+    point = gtsam.Values()
+    point.insert(last, factors.pose2(x))
+    point.insert(key, factors.pose2(y))
+    point.insert(c, mean)
+    return gtsam.LinearContainerFactor(linear, point)
+
+
+def _result(
+    builder: GraphBuilder,
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    priors: Mapping[str, Calibration],
+    free: Mapping[str, IntArray],
+    numbers: Mapping[str, int],
+) -> CalibratedEstimate:
+    """Means and marginal covariances of everything, as records."""
+    marginals = gtsam.Marginals(graph, values)
+    states = {}
+    for robot in sorted(builder.robots):
+        keys = [builder.state_key(robot, n) for n in range(len(builder.states.times[robot]))]
+        poses = np.array([read(values, k, 3) for k in keys])
+        covs = np.array([marginals.marginalCovariance(k) for k in keys])
+        states[robot] = Trajectory(
+            builder.states.stamps(robot), poses, rotate_cov(covs, poses[:, 2])
+        )
+    landmarks = {}
+    for landmark, dim in builder.landmark_dims.items():
+        key = factors.landmark_key(landmark)
+        mean, cov = read(values, key, dim), marginals.marginalCovariance(key)
+        landmarks[landmark] = (mean, rotate_cov(cov, mean[2]) if dim == 3 else cov)
+    calibrations = {}
+    for robot, prior in priors.items():
+        mean, cov, use = prior.mean.copy(), prior.cov.copy(), free[robot]
+        if len(use):
+            key = _key(numbers[robot])
+            mean[use] = values.atVector(key)
+            cov[np.ix_(use, use)] = marginals.marginalCovariance(key)
+        calibrations[robot] = Calibration(prior.names, mean, cov)
+    dof = (
+        builder.rows
+        - sum(3 * len(t) for t in states.values())
+        - sum(len(mean) for mean, _ in landmarks.values())
+    )
+    estimate = Estimate(states, landmarks, float(graph.error(values)), dof)
+    return CalibratedEstimate(estimate, calibrations)

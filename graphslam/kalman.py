@@ -1,0 +1,197 @@
+"""Kalman filtering on arrays: the linear filter, and a joint Gaussian whose members come and go.
+
+`predict` and `update` are the linear filter (thesis 3.1-3.8), pure functions on plain arrays. An
+extended filter (`graphslam.backends.ekf`) keeps a `JointGaussian`: the same algebra where a
+measurement touches two members of hundreds, so nothing is multiplied that is known to be zero.
+What an error is, and how a
+mean is corrected by one, is the caller's: poses and points are all the same here.
+"""
+
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from graphslam.geometry import Array
+
+Name = TypeVar("Name", bound=Hashable)
+
+
+def predict(x: Array, P: Array, F: Array, Q: Array, Gu: Array | float = 0.0) -> tuple[Array, Array]:
+    """Time update of the linear filter, thesis 3.3-3.4: F x + G u and F P Fᵀ + Q.
+
+    Args:
+        x: mean (n,).
+        P: covariance (n, n).
+        F: system matrix (n, n).
+        Q: covariance (n, n) of the system noise.
+        Gu: what the known input adds, (n,).
+    """
+    return np.asarray(F @ x + Gu), np.asarray(F @ P @ F.T + Q)
+
+
+def update(x: Array, P: Array, z: Array, H: Array, R: Array) -> tuple[Array, Array]:
+    """Measurement update of the linear filter, thesis 3.5-3.8, for z = H x + noise.
+
+    Args:
+        x: mean (n,).
+        P: covariance (n, n).
+        z: measurement (k,).
+        H: measurement matrix (k, n).
+        R: covariance (k, k) of z.
+
+    Raises:
+        numpy.linalg.LinAlgError: the innovation's covariance is not positive definite.
+    """
+    B, whitened, _ = whiten(P @ H.T, H @ P @ H.T + R, z - H @ x)
+    return x + B.T @ whitened, P - B.T @ B
+
+
+def whiten(PHt: Array, S: Array, innovation: Array) -> tuple[Array, Array, float]:
+    """What a measurement update is made of, without inverting S: with S = L Lᵀ and K = P Hᵀ S⁻¹,
+    the mean moves by K ν = Bᵀ w and the covariance loses K S Kᵀ = Bᵀ B.
+
+    Args:
+        PHt: covariance (n, k) between the state and the expected measurement.
+        S: covariance (k, k) of the innovation, thesis 3.7.
+        innovation: measured minus expected, (k,).
+
+    Returns:
+        B = L⁻¹ H P (k, n), w = L⁻¹ ν (k,), and the squared normalised innovation νᵀ S⁻¹ ν.
+
+    Raises:
+        numpy.linalg.LinAlgError: S is not positive definite.
+    """  # noqa: D205
+    L = np.linalg.cholesky(S)
+    solved = np.linalg.solve(L, np.column_stack([PHt.T, innovation]))
+    B, w = solved[:, :-1], solved[:, -1]
+    return B, w, float(w @ w)
+
+
+class JointGaussian(Generic[Name]):
+    """Named members with one mean and one covariance, both growing.
+
+    Room is made by doubling, so a member costs O(n) to add on average. Blocks are packed: what is
+    removed leaves no hole. The covariance is symmetric to the digit, always.
+    """
+
+    def __init__(self, room: int = 64) -> None:
+        self._x = np.zeros(room)
+        self._P = np.zeros((room, room))
+        self._slots: dict[Name, slice] = {}
+        self._blocks: dict[int, np.ndarray[tuple[int, int], np.dtype[np.int64]]] = {}
+        self._size = 0
+
+    def __len__(self) -> int:
+        """Size n of the state."""
+        return self._size
+
+    def __contains__(self, name: object) -> bool:
+        """Whether there is a member of that name."""
+        return name in self._slots
+
+    def __iter__(self) -> Iterator[Name]:
+        """Names, in the order of their blocks."""
+        return iter(self._slots)
+
+    @property
+    def x(self) -> Array:
+        """The mean (n,), a view of it."""
+        return self._x[: self._size]
+
+    @property
+    def P(self) -> Array:  # noqa: N802
+        """The covariance (n, n), a view of it."""
+        return self._P[: self._size, : self._size]
+
+    def slot(self, name: Name) -> slice:
+        """Where a member's block lies."""
+        return self._slots[name]
+
+    def blocks(self, dim: int) -> np.ndarray[tuple[int, int], np.dtype[np.int64]]:
+        """Where all members of size ``dim`` lie: indices (m, dim)."""
+        if dim not in self._blocks:
+            slots = self._slots.values()
+            starts = [slot.start for slot in slots if slot.stop - slot.start == dim]
+            self._blocks[dim] = np.array(starts, dtype=np.int64)[:, None] + np.arange(dim)
+        return self._blocks[dim]
+
+    def marginal(self, names: Sequence[Name]) -> Array:
+        """Joint covariance (d, d) of some members, in the order asked for."""
+        index = np.concatenate([np.r_[self._slots[name]] for name in names])
+        return np.asarray(self._P[np.ix_(index, index)])
+
+    def add(
+        self, name: Name, mean: Array, cov: Array, given: Mapping[Name, Array] | None = None
+    ) -> None:
+        """A new member, thesis 4.24-4.28: its error is Σ G_i e_i + fresh noise.
+
+        Args:
+            name: of the new member.
+            mean: (d,).
+            cov: covariance (d, d) of its fresh noise.
+            given: member i -> G_i (d, d_i); nothing: it is independent of all others.
+        """
+        n, d = self._size, len(cov)
+        if n + d > len(self._P):
+            grown = np.zeros((2 * (n + d),) * 2)
+            grown[:n, :n] = self.P
+            self._x, self._P = np.append(self.x, np.zeros(n + 2 * d)), grown
+        given = {} if given is None else given
+        PGt, GPGt = self.project(given, d)
+        block = slice(n, n + d)
+        self._P[:n, block], self._P[block, :n] = PGt, PGt.T
+        self._P[block, block] = symmetric(GPGt + cov)
+        self._x[block] = mean
+        self._slots[name] = block
+        self._size += d
+        self._blocks.clear()
+
+    def remove(self, name: Name) -> None:
+        """Forget a member: the others keep their joint marginal."""
+        gone = self._slots.pop(name)
+        n, d = self._size, gone.stop - gone.start
+        keep = np.r_[0 : gone.start, gone.stop : n]
+        self._x[: n - d] = self._x[keep]
+        self._P[: n - d, : n - d] = self._P[np.ix_(keep, keep)]
+        self._size = n - d
+        self._blocks.clear()
+        for other, slot in self._slots.items():
+            if slot.start > gone.start:
+                self._slots[other] = slice(slot.start - d, slot.stop - d)
+
+    def move(self, name: Name, F: Array, Q: Array) -> None:
+        """System update of one member, thesis 3.12: e becomes F e + noise of covariance Q (d, d).
+
+        Only its own rows and columns change.
+        """
+        block, P = self._slots[name], self.P
+        own = symmetric(F @ P[block, block] @ F.T + Q)
+        P[block] = F @ P[block]
+        P[:, block] = P[block].T
+        P[block, block] = own
+
+    def project(self, H: Mapping[Name, Array], rows: int) -> tuple[Array, Array]:
+        """``P Hᵀ`` (n, rows) and ``H P Hᵀ`` (rows, rows) for H given by its blocks."""
+        P = self.P
+        PHt, HPHt = np.zeros((self._size, rows)), np.zeros((rows, rows))
+        for name, block in H.items():
+            PHt += P[:, self._slots[name]] @ block.T
+        for name, block in H.items():
+            HPHt += block @ PHt[self._slots[name]]
+        return PHt, HPHt
+
+    def condition(self, B: Array) -> None:
+        """Measurement update of the covariance: P - Bᵀ B, see `whiten`, with B (k, n).
+
+        NumPy computes Bᵀ B as a symmetric product and mirrors it, so P stays symmetric to the
+        digit. The Joseph form costs a hundred times as much at 900 states; what it protects against
+        (a gain that is not optimal) cannot happen here.
+        """
+        P = self.P
+        P -= B.T @ B
+
+
+def symmetric(P: Array) -> Array:
+    """The symmetric part (n, n) of a matrix that is symmetric but for rounding."""
+    return np.asarray(0.5 * (P + P.T))
