@@ -7,7 +7,7 @@ graph.g2o (with graph_ids.csv naming its vertices) and report.html.
 import json
 import os
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -54,11 +54,18 @@ class SavedResult:
 # ---------------------------------------------------------------- writing
 
 
-def check_target(directory: Path, *, force: bool) -> None:
-    """Say before a long computation whether `save` may write to ``directory``.
+def check_target(
+    directory: Path, *, force: bool, replaceable: Callable[[Path], bool] | None = None
+) -> None:
+    """Say before a long computation whether a folder may be written at ``directory``.
+
+    Args:
+        directory: the folder to be.
+        force: replace what is there.
+        replaceable: what ``force`` may replace beside an empty folder; default: result folders.
 
     Raises:
-        OutputError: it exists and ``force`` is not given, it exists and is not a result folder, or
+        OutputError: it exists and ``force`` is not given, it exists and is no such folder, or
             nothing can be written where it is to be.
     """
     parent = directory.absolute().parent
@@ -71,7 +78,7 @@ def check_target(directory: Path, *, force: bool) -> None:
     if not force:
         raise OutputError(f"{directory}: already exists; give --force to replace it")
     empty = directory.is_dir() and not any(directory.iterdir())
-    if directory.is_symlink() or not (empty or _is_result(directory)):
+    if directory.is_symlink() or not (empty or (replaceable or _is_result)(directory)):
         raise OutputError(
             f"{directory}: is not a result folder of graphslam, so it is not replaced; "
             "choose another name"
@@ -86,22 +93,33 @@ def save(
     force: bool,
     report: Callable[[Result], str] | None = None,
 ) -> None:
-    """Write the result folder: beside its final name first, renamed when whole.
+    """Write the result folder, see `write_folder`.
 
-    An existing result folder is moved away, replaced and only then deleted, so that one of the
-    two is there at any time. ``report`` renders report.html (without it there is none).
+    ``report`` renders report.html (without it there is none).
 
     Raises:
         OutputError: the target exists and may not be replaced, a number is not finite, or the
             disk refuses; nothing is left behind.
     """
     check_target(directory, force=force)
+    write_folder(directory, _files(result, config, report))
+
+
+def write_folder(directory: Path, files: Sequence[tuple[str, str]]) -> None:
+    """Write files (name, text) as a folder: beside its final name first, renamed when whole.
+
+    What is there (see `check_target`) is moved away, replaced and only then deleted, so that one
+    of the two is there at any time.
+
+    Raises:
+        OutputError: the disk refuses; nothing is left behind.
+    """
     final = directory.absolute()
     part = final.with_name(f".{final.name}.{os.getpid()}.part")
     old = final.with_name(f".{final.name}.{os.getpid()}.old")
     try:
         part.mkdir(parents=True)
-        for name, text in _files(result, config, report):
+        for name, text in files:
             path = part / name
             path.parent.mkdir(exist_ok=True)
             path.write_text(text, encoding="utf-8")

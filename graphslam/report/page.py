@@ -1,7 +1,7 @@
 # ruff: noqa: RUF001 -- σ, × and – are meant: people read them
 """The order of the report, its words and its style."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import PurePath
 from typing import Any
@@ -29,7 +29,12 @@ def page(result: Result, evaluation: Mapping[str, Any] | None, config: Config | 
         _landmark_section(result),
         _reproduce_section(summary, config),
     ]
-    body = "\n".join(section for section in sections if section)
+    return document(title, sections)
+
+
+def document(title: str, sections: Sequence[str]) -> str:
+    """A whole HTML document of the sections that are not empty."""
+    body = "\n".join(part for part in sections if part)
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
@@ -72,7 +77,8 @@ def _warnings(summary: Mapping[str, Any]) -> str:
     return f'<section class="warn"><h2>Warnings</h2><ul>{items}</ul></section>' if items else ""
 
 
-def _figure(drawing: str, title: str, caption: str) -> str:
+def figure(drawing: str, title: str, caption: str) -> str:
+    """A drawing (SVG) with a caption that begins with its title."""
     return (
         f"<figure><figcaption><b>{escape(title)}</b> {escape(caption)}</figcaption>\n"
         f"{drawing}</figure>"
@@ -84,12 +90,12 @@ def _map_section(result: Result) -> str:
     what = "Superposed scans" if scans else "Paths"
     landmark_note = "" if scans else " Triangles are landmarks."
     figures = [
-        _figure(
+        figure(
             maps.overview(result, dead_reckoning=False),
             "Final trajectory.",
             f"{what} on the trajectory from all data.{landmark_note}",
         ),
-        _figure(
+        figure(
             maps.overview(result, dead_reckoning=True),
             "Dead reckoning.",
             f"The same {'scans' if scans else 'paths'} by odometry alone.",
@@ -103,7 +109,7 @@ def _map_section(result: Result) -> str:
         named = min(len(result.landmarks), maps.MAX_LABELS)
         which = "" if named == len(result.landmarks) else " of those seen most often"
         figures.append(
-            _figure(
+            figure(
                 drawing,
                 "Landmarks.",
                 f"Numbers{which} as in landmarks.json; 95 % {bounds}{_times(factor)}.",
@@ -111,14 +117,14 @@ def _map_section(result: Result) -> str:
         )
     drawing, factor = maps.trajectory_map(result)
     figures.append(
-        _figure(
+        figure(
             drawing,
             "Uncertainty of the trajectory.",
             f"95 % ellipses{_times(factor)}; a dot marks the start; "
             "the faint line is the causal estimate.",
         )
     )
-    return _section("Map", figures)
+    return section("Map", figures)
 
 
 def _times(factor: int) -> str:
@@ -131,15 +137,15 @@ def _quality_section(evaluation: Mapping[str, Any]) -> str:
 
 
 def _uncertainty_section(result: Result) -> str:
-    return _section(
+    return section(
         "Over time",
         [
-            _figure(
+            figure(
                 plots.uncertainty(result),
                 "Standard deviations.",
                 "Final (strong) and causal (pale); position along its worst direction.",
             ),
-            _figure(
+            figure(
                 plots.revision(result),
                 "Final against causal.",
                 "Distance of the causal estimate (solid) and of odometry alone (dashed) from the "
@@ -153,7 +159,7 @@ def _estimator_section(result: Result) -> str:
     figures = []
     if any(len(values) for values in result.innovations.values()):
         figures.append(
-            _figure(
+            figure(
                 plots.innovations(result.innovations),
                 "Innovations.",
                 "Normalised innovation squared per degree of freedom of accepted associations; "
@@ -164,7 +170,7 @@ def _estimator_section(result: Result) -> str:
     if len(result.step_ms):
         p50, p99 = np.quantile(result.step_ms, [0.5, 0.99])
         figures.append(
-            _figure(
+            figure(
                 plots.timing(result.step_ms),
                 "Wall time per keyframe.",
                 f"With its running median; p50 {tables.number(float(p50))} ms, "
@@ -172,7 +178,7 @@ def _estimator_section(result: Result) -> str:
                 f"{tables.number(float(result.step_ms.max()))} ms.",
             )
         )
-    return _section("Estimator", figures) if figures else ""
+    return section("Estimator", figures) if figures else ""
 
 
 def _accounting_section(summary: Mapping[str, Any]) -> str:
@@ -215,5 +221,6 @@ def _reproduce_section(summary: Mapping[str, Any], config: Config | None) -> str
     return "\n".join([*parts, "</details></section>"])
 
 
-def _section(title: str, figures: list[str]) -> str:
+def section(title: str, figures: Sequence[str]) -> str:
+    """Figures side by side where there is room, under a heading."""
     return f'<section><h2>{title}</h2><div class="grid">{"".join(figures)}</div></section>'

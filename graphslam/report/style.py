@@ -56,6 +56,12 @@ th, td { padding: 4px 10px 4px 0; border-bottom: 1px solid var(--grid); text-ali
   white-space: nowrap; }
 thead th { color: var(--soft); font-weight: 500; font-size: .8rem; }
 th[scope=row], thead th:first-child { text-align: left; font-weight: 400; white-space: normal; }
+td.best { font-weight: 700; }
+.compared th:first-child { position: sticky; left: 0; background: var(--bg); min-width: 8.5em; }
+td.none { text-align: left; color: var(--soft); white-space: normal; }
+i.lane { display: inline-block; width: 18px; height: 4px; border-radius: 2px; margin-right: 7px;
+  vertical-align: middle; }
+.lanes { display: flex; flex-wrap: wrap; gap: 4px 18px; margin: 0 0 .8rem; font-size: .88rem; }
 td.bar { width: 40%; padding-right: 0; }
 td.bar i { display: block; height: 8px; border-radius: 4px; background: var(--robot0); }
 details { background: var(--card); border: 1px solid var(--grid); border-radius: 8px;

@@ -1,0 +1,91 @@
+"""One run over a log, kept as steps, and the way from states to trajectories and a map."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphslam.config import Config
+from graphslam.errors import LogError
+from graphslam.geometry import Array
+from graphslam.landmark_map import LandmarkMap
+from graphslam.logs import LogSet
+from graphslam.records import Step
+from graphslam.replay import Replay
+from graphslam.results import SavedResult, SavedRobot
+from graphslam.robot_run import RobotRun
+from graphslam.slam import Pipeline, Progress, check_robots
+from graphslam.summary import make_landmarks
+from graphslam.trajectories import in_world, origin_shift
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording:
+    """The steps of one run over a log, and what turns states into trajectories and a map.
+
+    ``start`` (3,) is where the prior put the first robot; ``seconds`` the wall time of the run.
+    """
+
+    steps: tuple[Step, ...]
+    runs: Mapping[str, RobotRun]
+    start: Array
+    landmarks: LandmarkMap
+    seconds: float
+
+    @property
+    def associations(self) -> int:
+        """Number of associations in all steps, late ones included."""
+        return sum(len(step.associations) for step in self.steps)
+
+    def growth(self) -> tuple[Array, Array]:
+        """Landmarks in the map and path driven by all robots, m, (n,) after each step."""
+        known: set[int | str] = set()
+        counts, driven = [], []
+        for step in self.steps:
+            known |= {seen.target for seen in step.associations if isinstance(seen.target, int)}
+            counts.append(float(len(known)))
+            driven.append(sum(motion.length_m for motion in step.motions.values()))
+        return np.array(counts), np.cumsum(driven)
+
+    def result(self, done: Replay, config: Config) -> SavedResult:
+        """Trajectories and map from what a back end made of the steps, as `smooth` has them.
+
+        The odometry between the states, the calibration and the mounts are those of the recording.
+        """
+        world = origin_shift(self.start, next(iter(self.runs.values())).track.mount)
+        estimate = in_world(done.estimate, world)
+        robots = {}
+        for name, run in self.runs.items():
+            causal = done.causal[name]
+            own = replace(run, causal_poses=list(causal.poses), causal_covs=list(causal.covs))
+            found = own.result(estimate.states[name], self.start)
+            robots[name] = SavedRobot(
+                found.final, found.causal, found.scan_final, found.scan_causal
+            )
+        landmarks = make_landmarks(self.landmarks.in_world(world), estimate)
+        return SavedResult(robots, landmarks, {}, config)
+
+
+def record(log: LogSet, config: Config, progress: Progress = lambda _count: None) -> Recording:
+    """Run over the log with the back end of ``config`` and keep the steps; optimise nothing.
+
+    Raises:
+        LogError: no message of the log could be used.
+        ConfigError: a setting is about a robot that is not in the log.
+        EstimationError: the estimate is indeterminate, or a robot's start is unknown.
+    """
+    check_robots(log, config)
+    began = time.perf_counter()
+    pipeline = Pipeline(log, config)
+    pipeline.run(progress)
+    if not pipeline.steps:
+        raise LogError(f"{log.files[0].path}: nothing in it could be used; see `graphslam info`")
+    runs = {name: run for name, run in sorted(pipeline.runs.items()) if run.started}
+    return Recording(
+        tuple(pipeline.steps),
+        runs,
+        pipeline.starts[next(iter(runs))].pose,
+        pipeline.associator.map,
+        time.perf_counter() - began,
+    )
