@@ -10,10 +10,10 @@ from graphslam.config import FrontEndConfig
 from graphslam.errors import EstimationError
 from graphslam.frontend import FRONT_ENDS, scan_points
 from graphslam.frontend.line_fit import fit_line, fit_lines
-from graphslam.frontend.split_merge import segments
 from graphslam.geometry import compose, rotate_cov, rotation, transform, wrap
 from graphslam.records import Scan
 
+segments = FRONT_ENDS["segments"]
 CONFIG = FrontEndConfig()
 HONEST = FrontEndConfig(floor_normal_m=0.0, floor_angle_rad=0.0)
 FRONT_WALL = [[3.0, -1.0], [3.0, 1.0]]

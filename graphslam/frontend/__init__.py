@@ -7,8 +7,11 @@ frame of the LASER; moving them to the base frame through ``scan.mount`` is the 
 from collections.abc import Callable
 
 from graphslam.config import FrontEndConfig
+from graphslam.frontend.both import both
+from graphslam.frontend.cylinders import cylinders
+from graphslam.frontend.hough import hough_lines
 from graphslam.frontend.split_merge import segments
-from graphslam.frontend.sweep import scan_points
+from graphslam.frontend.sweep import Sweep, make_sweep, scan_points
 from graphslam.records import Observation, Scan
 
 __all__ = ["FRONT_ENDS", "scan_points"]
@@ -16,9 +19,32 @@ __all__ = ["FRONT_ENDS", "scan_points"]
 FrontEnd = Callable[[Scan, FrontEndConfig], tuple[Observation, ...]]
 
 
+def _front_end(
+    lines: Callable[[Sweep, FrontEndConfig], tuple[Observation, ...]],
+) -> FrontEnd:
+    """A front end from a way to find lines: cylinders come first, and their returns make no line.
+
+    Otherwise a thick tree would be a point and a short segment at once.
+    """
+
+    def front_end(scan: Scan, config: FrontEndConfig) -> tuple[Observation, ...]:
+        sweep = make_sweep(scan, config.max_range_m)
+        points: tuple[Observation, ...] = ()
+        if config.cylinders:
+            points, sweep = cylinders(sweep, config)
+        return (*lines(sweep, config), *points)
+
+    return front_end
+
+
 def _none(scan: Scan, config: FrontEndConfig) -> tuple[Observation, ...]:
     """No observations: for logs whose landmarks come as sightings."""
     return ()
 
 
-FRONT_ENDS: dict[str, FrontEnd] = {"segments": segments, "none": _none}
+FRONT_ENDS: dict[str, FrontEnd] = {
+    "segments": _front_end(segments),
+    "hough": _front_end(hough_lines),
+    "both": _front_end(both),
+    "none": _none,
+}

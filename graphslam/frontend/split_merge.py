@@ -4,10 +4,6 @@ A scan is cut into chains where the range jumps, chains into pieces where they b
 pieces are joined again where one line explains both (merge): the split cuts noisy walls too
 often, and drop-outs or a pole in front of a wall interrupt the chain. What is left is fitted by
 least squares and checked for validity.
-
-A line is a vector q (6, p) such that q·M / M[0] is the mean square deviation from it of the returns
-whose moments are M (6, p). So one product tests any set of returns against any line, and the
-moments of a union are a sum.
 """
 
 import math
@@ -18,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphslam.config import FrontEndConfig
-from graphslam.frontend.line_fit import fit_lines, observations
-from graphslam.frontend.sweep import Sweep, make_sweep
+from graphslam.frontend.line_fit import LineFits, fit_lines, observations
+from graphslam.frontend.moments import fitted_lines, mean_square, point_moments
+from graphslam.frontend.sweep import Sweep
 from graphslam.frontend.visibility import fully_visible
 from graphslam.geometry import Array
-from graphslam.records import Observation, Scan
+from graphslam.records import Observation
 
 MISSING_BEAMS = 3
 """A chain bridges so many missing returns; how far apart the returns are is another test."""
@@ -51,65 +48,71 @@ class Pieces:
         return Pieces(self.first[rows], self.last[rows], self.moments[:, rows])
 
 
-def segments(scan: Scan, config: FrontEndConfig) -> tuple[Observation, ...]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Segments:
+    """Segments (m) of one scan in the order of the beams, counter-clockwise.
+
+    ``rows``: the rows of `Sweep.points` of all of them, one after the other; ``starts`` (m,) where
+    each begins in it. ``whole`` (m,): both ends are real. ``valid`` (m,): long and straight enough.
+    """
+
+    rows: Indices
+    starts: Indices
+    fits: LineFits
+    whole: NDArray[np.bool_]
+    valid: NDArray[np.bool_]
+
+
+def segments(sweep: Sweep, config: FrontEndConfig) -> tuple[Observation, ...]:
     """Line segments of one scan, thesis 4.7.5-4.7.8.
 
     Args:
-        scan: one sweep; missing returns NaN.
+        sweep: one scan, in order.
         config: thresholds and noise.
 
     Returns:
         Observations in the order of the beams, counter-clockwise, laser frame: ``segment`` where
         both ends of the wall were seen, else ``line``.
     """
-    sweep = make_sweep(scan, config.max_range_m)
-    moments = _point_moments(sweep.points)
+    found = find_segments(sweep, config)
+    if found is None:
+        return ()
+    return observations(found.fits[found.valid], found.whole[found.valid], config)
+
+
+def find_segments(sweep: Sweep, config: FrontEndConfig) -> Segments | None:
+    """What `segments` observes, with the returns it is made of; None where there is nothing."""
+    moments = point_moments(sweep.points)
     pieces = _split(sweep, moments, config)
     # Twice: what does not belong to a wall but stands before it keeps the wall's parts from being
     # neighbours, and can be told from small pieces of a wall only when those have been joined.
     pieces = _merge(pieces, sweep, moments, config)
-    pieces = pieces[pieces.moments[0] >= _fewest_points(config)]
+    pieces = pieces[pieces.moments[0] >= fewest_points(config)]
     pieces = _merge(pieces, sweep, moments, config)
     if not len(pieces.first):
-        return ()
+        return None
     rows, starts = _members(pieces, sweep, moments, config)
     if not len(starts):
-        return ()
+        return None
     fits = fit_lines(sweep.points[rows], starts, config)
     stops = np.append(starts[1:], len(rows)) - 1
-    seen = fully_visible(sweep, sweep.beam[rows[starts]], sweep.beam[rows[stops]], fits, config)
-    valid = (fits.length >= config.min_length_m) & (fits.rms <= _allowed_rms(config))
-    return observations(fits[valid], seen[valid], config)
+    whole = fully_visible(sweep, sweep.beam[rows[starts]], sweep.beam[rows[stops]], fits, config)
+    return Segments(rows, starts, fits, whole, valid_lines(fits, config))
 
 
-def _fewest_points(config: FrontEndConfig) -> int:
+def valid_lines(fits: LineFits, config: FrontEndConfig) -> NDArray[np.bool_]:
+    """(m,) True where a line is long enough and its points scatter no more than allowed."""
+    return (fits.length >= config.min_length_m) & (fits.rms <= allowed_rms(config))
+
+
+def fewest_points(config: FrontEndConfig) -> int:
     """At least two, for a direction, beside the two end points that `_members` doubts."""
     return max(config.min_points, 4)
 
 
-def _allowed_rms(config: FrontEndConfig) -> float:
+def allowed_rms(config: FrontEndConfig) -> float:
     """Root mean square deviation from one line, m, that goes with a largest one of split_m."""
     return max(config.split_m, 1e-4) / 2  # it is divided by, and rounding must pass
-
-
-def _point_moments(points: Array) -> Array:
-    """1, x, y, x², xy, y² of each point: (6, k)."""
-    x, y = points.T
-    return np.array((np.ones(len(x)), x, y, x * x, x * y, y * y))
-
-
-def _line(moments: Array) -> Array:
-    """The least-squares lines q (6, p) of returns with ``moments`` (6, p): see the module."""
-    x, y, xx, xy, yy = moments[1:] / moments[0]
-    direction = 0.5 * np.arctan2(2 * (xy - x * y), xx - x * x - yy + y * y)
-    a, b = -np.sin(direction), np.cos(direction)
-    d = a * x + b * y
-    return np.array((d * d, -2 * d * a, -2 * d * b, a * a, 2 * a * b, b * b))
-
-
-def _mean_square(line: Array, moments: Array) -> Array:
-    """Mean square deviation (p,), m², of returns with ``moments`` (6, p) from ``line`` (6, p)."""
-    return np.asarray((line * moments).sum(axis=0) / moments[0])
 
 
 def _misfit(pieces: Array, unions: Array, config: FrontEndConfig) -> Array:
@@ -127,14 +130,14 @@ def _misfit(pieces: Array, unions: Array, config: FrontEndConfig) -> Array:
     """
     p = pieces.shape[1]
     everything = np.concatenate((pieces, unions), axis=1)
-    lines = _line(everything)
-    own = _mean_square(lines, everything)
+    lines = fitted_lines(everything)
+    own = mean_square(lines, everything)
     line = lines[:, p:]
-    rms_sq = _allowed_rms(config) ** 2
+    rms_sq = allowed_rms(config) ** 2
     misfit = own[p:] / (rms_sq * (1 + 2 * np.sqrt(2 / unions[0])))
     allowed = rms_sq / 4 + MERGE_GATE * config.range_sigma_m**2 / pieces[0]
     for side in (slice(None, -1), slice(1, None)):
-        excess = _mean_square(line, pieces[:, side]) - own[:p][side]
+        excess = mean_square(line, pieces[:, side]) - own[:p][side]
         misfit = np.maximum(misfit, excess / allowed[side])
     return np.asarray(misfit)
 
@@ -242,7 +245,7 @@ def _members(
     two pieces share goes to the line that it is closer to. Segments with too few are dropped.
     """
     inner = pieces.moments - moments[:, pieces.first] - moments[:, pieces.last]
-    line = _line(inner)
+    line = fitted_lines(inner)
     counts = pieces.last - pieces.first + 1
     owner = np.repeat(np.arange(len(counts)), counts)
     rows = np.arange(len(owner)) + (pieces.first + counts - np.cumsum(counts))[owner]
@@ -251,7 +254,7 @@ def _members(
     shared = np.flatnonzero(rows[1:] == rows[:-1])
     near[np.where(square[shared] <= square[shared + 1], shared + 1, shared)] = False
     size = np.bincount(owner[near], minlength=len(counts))
-    near &= (size >= _fewest_points(config))[owner]
+    near &= (size >= fewest_points(config))[owner]
     rows, owner = rows[near], owner[near]
     starts = np.flatnonzero(owner[1:] != owner[:-1]) + 1
     return rows, np.concatenate(([0], starts)) if len(rows) else starts
