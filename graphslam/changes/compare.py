@@ -1,0 +1,303 @@
+"""Change detection, top to bottom: one frame, surfaces, evidence, changes.
+
+1. the later run's frame lies in the reference's by landmarks of both (`registration`);
+2. every scan is brought onto the surfaces of the reference, within its covariance (`alignment`);
+3. the beams of each visit are held against the surfaces of the other (`evidence`);
+4. flagged pieces of surface that hang together are changes (`regions`), of which some are one
+   thing that moved (`moves`).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from graphslam.changes.alignment import align
+from graphslam.changes.evidence import Evidence, past, range_noise, spread
+from graphslam.changes.grid import grid_over
+from graphslam.changes.moves import Displacement, close_to, paired, segment_moves
+from graphslam.changes.regions import Region, flagged, regions
+from graphslam.changes.registration import Registration, register
+from graphslam.changes.surface import Surface, surface_of
+from graphslam.changes.visit import Bools, Ints, Visit, dictionary
+from graphslam.config import ChangesConfig
+from graphslam.errors import OutputError
+from graphslam.geometry import Array
+
+Kind = Literal["appeared", "vanished", "moved"]
+
+#: farthest returns that pull a scan, m, round by round: wide first
+_REFERENCE_GATES = (0.15, 0.1, 0.1)
+_LATER_GATES = (0.5, 0.5, 0.4, 0.3, 0.2, 0.15, 0.1, 0.07, 0.06)
+#: from this share of suspected beams on, scans are placed again without them; scores, in sigmas,
+#: that make a beam suspect
+_MANY_SUSPECTS, _SUSPECT = 0.03, 3.0
+_REFERENCE_ROUNDS = 2
+_OVERLAP = 0.05  # share of the later returns that must lie where the reference looked
+_FIRST_SIGMA_M = 0.02  # of ranges, until they tell themselves
+#: a stretch of a segment's new place counts as seen by a region this near to it, m
+_AT_SEGMENT_M = 0.08
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Change:
+    """One change, in the reference's world frame.
+
+    ``polygon`` (c, 2) m counter-clockwise: of the new place, of the old one if it vanished;
+    ``before`` the old place of what moved, where it was seen. ``displacement`` is the rigid motion
+    of the world that takes it from the old to the new place.
+    """
+
+    kind: Kind
+    polygon: Array
+    probability: float
+    displacement: Displacement | None
+    beams: int
+    first_seen_ns: int
+    before: Array | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The entry in changes.json."""
+        moved = self.displacement
+        return {
+            "kind": self.kind,
+            "polygon": self.polygon.tolist(),
+            "before": None if self.before is None else self.before.tolist(),
+            "probability": self.probability,
+            "displacement": None if moved is None else dictionary(moved.motion, moved.cov),
+            "beams": self.beams,
+            "first_seen_ns": self.first_seen_ns,
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison:
+    """All that a comparison found.
+
+    Attributes:
+        changes: largest first.
+        registration: of the later world frame in the reference's.
+        reference, later: the visits, aligned, in the reference's frame.
+        surfaces: of the reference and of the later visit.
+        evidence: later beams past reference surfaces; reference beams past later surfaces.
+        compared, flagged: (n,) which later beams were compared, and flagged.
+        spread: factor on the stated sigmas with which the bulk of the scores is normal.
+        range_sigma_m: range noise of both visits as found.
+        rate: the false-alarm rate that was asked for.
+    """
+
+    changes: tuple[Change, ...]
+    registration: Registration
+    reference: Visit
+    later: Visit
+    surfaces: tuple[Surface, Surface]
+    evidence: tuple[Evidence, Evidence]
+    compared: Bools
+    flagged: Bools
+    spread: float
+    range_sigma_m: tuple[float, float]
+    rate: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """The contents of changes.json."""
+        return {
+            "changes": [change.to_dict() for change in self.changes],
+            "beams_compared": int(self.compared.sum()),
+            "beams_flagged": int(self.flagged.sum()),
+            "false_alarm_rate_requested": self.rate,
+            "registration": dictionary(self.registration.pose, self.registration.cov)
+            | {"landmarks": len(self.registration.matched)},
+            "spread": self.spread,
+            "range_sigma_m": list(self.range_sigma_m),
+        }
+
+
+def same_frame(visit: Visit) -> Registration:
+    """The registration of two spans of one run: they share its world frame."""
+    every = np.arange(len(visit.landmarks))
+    return Registration(
+        np.zeros(3), np.zeros((3, 3)), np.column_stack([every, every]), np.zeros(0, dtype=np.int64)
+    )
+
+
+def compare(
+    reference: Visit,
+    later: Visit,
+    config: ChangesConfig,
+    registration: Registration | None = None,
+) -> Comparison:
+    """Find what is different in the later visit.
+
+    Args:
+        reference: in its world frame.
+        later: in its own.
+        config: settings.
+        registration: where the later frame lies; found by landmarks if not given.
+
+    Raises:
+        OutputError: the two cannot be registered, or saw nothing in common.
+    """
+    if registration is None:
+        registration = register(reference.landmarks, later.landmarks)
+    placed = later.placed(registration.pose, registration.cov)
+    reference, later, surfaces, sigmas = aligned(reference, placed, config)
+    a = surfaces[0]
+    evidence = _evidence(reference, later, surfaces, sigmas, config)
+    suspects = _suspects(later, surfaces, evidence)
+    if suspects.mean() > _MANY_SUSPECTS:
+        # what changed pulled at the scans that saw it: place them again without it
+        later = align(placed, a, _LATER_GATES, suspects)
+        surfaces = (a, surface_of(later, a.nearest.grid, sigmas[1], config))
+        evidence = _evidence(reference, later, surfaces, sigmas, config)
+    a, b = surfaces
+    factor = spread(evidence)
+    flags = tuple(flagged(e, factor, config.false_alarm_rate / 2) for e in evidence)
+    compared, marked = _beams(later, surfaces, evidence, (flags[0], flags[1]))
+    seen = np.nonzero(b.beams >= 0)[0]
+    vanished = regions(
+        a, evidence[0], evidence[0].beams, evidence[0].rows, evidence[0].first_ns, factor, config
+    )
+    appeared = regions(b, evidence[1], seen, b.beams[seen], b.first_ns, factor, config)
+    changes = _changes(vanished, appeared, reference, later, registration)
+    return Comparison(
+        changes, registration, reference, later, surfaces, evidence, compared, marked,
+        factor, sigmas, config.false_alarm_rate,
+    )  # fmt: skip
+
+
+def aligned(
+    reference: Visit, later: Visit, config: ChangesConfig
+) -> tuple[Visit, Visit, tuple[Surface, Surface], tuple[float, float]]:
+    """Two visits in one frame, each on the reference's surfaces; surfaces; range sigmas, m.
+
+    Raises:
+        OutputError: the later visit saw hardly anything of what the reference saw.
+    """
+    ends = np.concatenate([v.ends[v.surface] for v in (reference, later)])
+    grid = grid_over(ends, config.resolution_m, config.max_side_cells**2)
+    sigma = _FIRST_SIGMA_M
+    first = reference
+    a = surface_of(reference, grid, sigma, config)
+    for _ in range(_REFERENCE_ROUNDS):
+        reference = align(first, a, _REFERENCE_GATES)
+        a = surface_of(reference, grid, sigma, config)
+        sigma = range_noise(a, reference, config.gate_m)
+    at = grid.cells(later.ends[later.surface])
+    near = (at >= 0) & (a.nearest.distance_m[at] < _LATER_GATES[0])
+    if not a.good.any() or near.mean() < _OVERLAP:
+        raise OutputError(
+            f"nothing to compare: {100 * near.mean():.0f} % of the later returns lie on surfaces "
+            "of the reference; did both runs see the same place?"
+        )
+    later = align(later, a, _LATER_GATES)
+    sigmas = (sigma, range_noise(a, later, config.gate_m))
+    return reference, later, (a, surface_of(later, grid, sigmas[1], config)), sigmas
+
+
+def _evidence(
+    reference: Visit,
+    later: Visit,
+    surfaces: tuple[Surface, Surface],
+    sigmas: tuple[float, float],
+    config: ChangesConfig,
+) -> tuple[Evidence, Evidence]:
+    """Later beams past reference surfaces, reference beams past later surfaces."""
+    a, b = surfaces
+    return (
+        past(a, later, a.incidence, sigmas[1], config),
+        past(b, reference, b.incidence, sigmas[0], config),
+    )
+
+
+def _suspects(
+    later: Visit, surfaces: tuple[Surface, Surface], evidence: tuple[Evidence, Evidence]
+) -> Bools:
+    """Later beams (n,) on anything that seems to lie elsewhere than before, to either side."""
+    suspect = np.zeros(len(later.range_m), dtype=bool)
+    odd = [np.abs(e.scores(1.0)) > _SUSPECT for e in evidence]
+    suspect[evidence[0].beams[odd[0][evidence[0].rows]]] = True
+    beams, rows = _on_pieces(surfaces[1], later)
+    suspect[beams[odd[1][rows]]] = True
+    return suspect
+
+
+def _beams(
+    later: Visit,
+    surfaces: tuple[Surface, Surface],
+    evidence: tuple[Evidence, Evidence],
+    flags: tuple[Bools, Bools],
+) -> tuple[Bools, Bools]:
+    """Which later beams (n,) met something that could be tested, and which are flagged."""
+    compared = np.zeros(len(later.range_m), dtype=bool)
+    marked = compared.copy()
+    for beams, rows, e, flag in (
+        (evidence[0].beams, evidence[0].rows, evidence[0], flags[0]),
+        (*_on_pieces(surfaces[1], later), evidence[1], flags[1]),
+    ):
+        compared[beams[e.tested[rows]]] = True
+        marked[beams[flag[rows]]] = True
+    return compared, marked
+
+
+def _on_pieces(surface: Surface, visit: Visit) -> tuple[Ints, Ints]:
+    """Beams (k,) of a visit and the good piece (k,) of its own surfaces next to their ends."""
+    beams = np.nonzero(surface.beams >= 0)[0]
+    cell = surface.cells[surface.beams[beams]]
+    near = surface.nearest.distance_m[cell] < 2.5 * surface.nearest.grid.cell_m
+    return beams[near], surface.nearest.member[cell[near]].astype(np.int64)
+
+
+def _changes(
+    vanished: list[Region],
+    appeared: list[Region],
+    reference: Visit,
+    later: Visit,
+    registration: Registration,
+) -> tuple[Change, ...]:
+    """Regions as changes; what moved once instead of twice."""
+    found: list[Change] = []
+    used_v: set[int] = set()
+    used_a: set[int] = set()
+    for landmark, ends, motion in segment_moves(reference.landmarks, later.landmarks, registration):
+        new = [j for j, r in enumerate(appeared) if _mostly_at(r, ends)]
+        old = [i for i, r in enumerate(vanished) if _mostly_at(r, landmark.extent)]
+        new, old = [j for j in new if j not in used_a], [i for i in old if i not in used_v]
+        if new or old:
+            parts = [appeared[j] for j in new] or [vanished[i] for i in old]
+            before = [vanished[i] for i in old] if new else []
+            found.append(_moved(parts, before, motion))
+            used_a.update(new)
+            used_v.update(old)
+    left_v = [i for i in range(len(vanished)) if i not in used_v]
+    left_a = [j for j in range(len(appeared)) if j not in used_a]
+    for i, j, motion in paired([vanished[i] for i in left_v], [appeared[j] for j in left_a]):
+        found.append(_moved([appeared[left_a[j]]], [vanished[left_v[i]]], motion))
+        used_v.add(left_v[i])
+        used_a.add(left_a[j])
+    kinds: Mapping[Kind, list[Region]] = {
+        "vanished": [r for i, r in enumerate(vanished) if i not in used_v],
+        "appeared": [r for j, r in enumerate(appeared) if j not in used_a],
+    }
+    for kind, rest in kinds.items():
+        found += [Change(kind, r.outline, r.probability, None, r.beams, r.first_ns) for r in rest]
+    return tuple(sorted(found, key=lambda c: (-c.beams, c.kind, c.first_seen_ns)))
+
+
+def _mostly_at(region: Region, ends: Array) -> bool:
+    return len(close_to(region.points, ends, _AT_SEGMENT_M)) > 0.5 * len(region.points)
+
+
+def _moved(new: list[Region], old: list[Region], motion: Displacement) -> Change:
+    largest = max(new, key=lambda r: len(r.rows))
+    before = max(old, key=lambda r: len(r.rows)).outline if old else None
+    every = [*new, *old]
+    return Change(
+        "moved",
+        largest.outline,
+        max(r.probability for r in every),
+        motion,
+        sum(r.beams for r in every),
+        min(r.first_ns for r in every),
+        before,
+    )

@@ -1,0 +1,351 @@
+"""Change detection: one frame first, what changed is found, what did not is not."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from typer.testing import CliRunner
+
+from graphslam.changes import compare, visit_of
+from graphslam.changes.alignment import align
+from graphslam.changes.evidence import past
+from graphslam.changes.grid import Grid, distinct, grid_over, nearest_of
+from graphslam.changes.picture import render_changes
+from graphslam.changes.regions import counter_clockwise, outline
+from graphslam.changes.registration import register
+from graphslam.changes.surface import surface_of
+from graphslam.changes.visit import on_surface
+from graphslam.cli.commands import app
+from graphslam.config import ChangesConfig
+from graphslam.errors import OutputError
+from graphslam.geometry import between, compose, inverse, transform, wrap
+from graphslam.records import Landmark
+from graphslam.simulate.raycast import Fan, cast
+from graphslam.simulate.world import Outline, make_world
+
+FAN = Fan(-np.pi / 2, np.pi / 360, 361)
+ROOM = Outline("room", np.array([[0, 0], [8, 0], [8, 6], [0, 6]], float), closed=True)
+SIGMA = 0.015
+CONFIG = ChangesConfig()
+
+
+def box(x, y, w=0.6, h=0.5, name="box"):
+    corners = np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h]], float)
+    return Outline(name, corners, closed=True, solid=True)
+
+
+def drive(n, turn=0.0):
+    """Poses on a small circle in the room's middle, looking around."""
+    t = np.linspace(0, 2 * np.pi, n, endpoint=False) + turn
+    return np.column_stack([3.5 + 0.8 * np.cos(t), 3 + 0.8 * np.sin(t), wrap(2 * t)])
+
+
+def visit(things, poses, rng, pose_sigmas=(0.005, 0.005, 0.002), landmarks=()):
+    """Scans of a world from poses that are known up to their covariance, as it says."""
+    clean = cast(poses, FAN, make_world([ROOM, *things]).shapes, 30.0).ranges
+    ranges = clean + SIGMA * rng.normal(size=clean.shape)
+    sigmas = np.array(pose_sigmas)
+    stated = poses + sigmas * rng.normal(size=poses.shape)
+    covs = np.tile(np.diag(sigmas**2), (len(poses), 1, 1))
+    stamps = np.arange(len(poses), dtype=np.int64) * 100_000_000
+    return visit_of(stamps, stated, covs, [(FAN.angles, r) for r in ranges], tuple(landmarks))
+
+
+def walls(pose=(0, 0, 0), moved=None, rng=None):
+    """Line landmarks in a frame at ``pose``; ``moved``: index, shift.
+
+    The room's four walls, and two more: a rectangle looks the same turned by half a turn, and of
+    two parallel walls either may have moved.
+    """
+    corners = ROOM.points
+    stretches = [np.stack([corners[i], corners[(i + 1) % 4]]) for i in range(4)]
+    stretches += [np.array([[2.0, 1.0], [3.5, 2.0]]), np.array([[6.0, 4.0], [6.0, 5.5]])]
+    out = []
+    for i, place in enumerate(stretches):
+        shift = moved[1] if moved is not None and moved[0] == i else np.zeros(2)
+        ends = transform(inverse(np.array(pose, float)), place + shift)
+        along = ends[1] - ends[0]
+        phi = np.arctan2(along[1], along[0])
+        normal = wrap(phi + np.pi / 2)
+        n = np.array([np.cos(normal), np.sin(normal)])
+        cov = np.diag([0.003, 0.005]) ** 2
+        noise = np.zeros(2) if rng is None else rng.normal(size=2) * [0.003, 0.005]
+        line = (float(normal + noise[0]), float(n @ ends[0] + noise[1]), cov)
+        position = np.array([*ends.mean(axis=0), phi])
+        out.append(
+            Landmark(i + 1, "line", position, np.diag([1, 1, 1e-4]), ends, line, 9, 0, 1, None)
+        )
+    return out
+
+
+def same(a, b, **changes):
+    """Compare two visits that share a frame: registered by the room's walls, known well."""
+    marks = tuple(walls())
+    return compare(
+        replace(a, landmarks=marks), replace(b, landmarks=marks), replace(CONFIG, **changes)
+    )
+
+
+# ------------------------------------------------------------ one frame
+
+
+@pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0), (3.0, -2.0, 2.5), (-7.0, 4.0, -1.2)])
+def test_registration_finds_any_pose_of_the_later_frame(pose):
+    """Not only one near the identity."""
+    found = register(walls(), walls(pose))
+    # noise-free lines: what is left is the convergence of the iteration
+    np.testing.assert_allclose(between(np.array(pose), found.pose), 0, atol=1e-6)
+    assert len(found.matched) == 6
+
+
+def test_a_wall_that_moved_is_left_out_and_does_not_drag():
+    found = register(walls(), walls(moved=(1, np.array([0.4, 0.0]))))
+    np.testing.assert_allclose(found.pose, 0, atol=1e-4)
+    assert list(found.moved) == [1]
+    assert sorted(found.matched[:, 1]) == [0, 2, 3, 4, 5]
+
+
+def test_the_registration_is_as_uncertain_as_it_says():
+    """NEES over seeds against both bounds; the floor for what maps leave out makes it cautious,
+    so the lower bound is that of twice the stated variance of the lines."""
+    runs, total = 60, 0.0
+    for seed in range(runs):
+        rng = np.random.default_rng(seed)
+        found = register(walls(rng=rng), walls(rng=rng))
+        total += float(found.pose @ np.linalg.solve(found.cov, found.pose))
+    assert total < chi2.ppf(0.995, 3 * runs)
+    # floors of 0.005 rad and 0.01 m on sigmas of 0.003 and 0.005, twice: at least a quarter
+    assert total > 0.25 * chi2.ppf(0.005, 3 * runs)
+
+
+@pytest.mark.parametrize("later", [[], walls()[:1], [walls()[0], walls()[2]]])
+def test_no_common_landmarks_is_one_clear_line(later):
+    """None, one wall, two parallel walls: no pose follows from them."""
+    with pytest.raises(OutputError, match="cannot be registered"):
+        register(walls(), later)
+
+
+def test_alignment_takes_out_the_error_that_a_scan_shares():
+    """5 cm and 1 degree of localisation error, with an honest covariance."""
+    rng = np.random.default_rng(1)
+    a = visit([box(5, 4)], drive(60), rng)
+    poses = drive(40, 0.1)
+    b = visit([box(5, 4)], poses, rng, (0.05, 0.05, np.radians(1)))
+    grid = grid_over(a.ends, 0.025, 10**6)
+    done = align(b, surface_of(a, grid, 0.02, CONFIG), (0.5, 0.3, 0.2, 0.1, 0.1))
+    error = done.poses - poses
+    error[:, 2] = wrap(error[:, 2])
+    # the reference's own poses are good to 5 mm / sqrt(60); a scan's 361 beams to a millimetre
+    assert np.abs(error[:, :2]).max() < 0.015
+    assert np.abs(error[:, 2]).max() < 0.006
+    assert (np.diagonal(done.shared, axis1=1, axis2=2) < 0.1 * np.diagonal(
+        b.covs, axis1=1, axis2=2)).all()  # fmt: skip
+
+
+# ------------------------------------------------------------ nothing changed
+
+
+@pytest.mark.parametrize("pose_sigmas", [(0.005, 0.005, 0.002), (0.05, 0.05, np.radians(1))])
+def test_nothing_changed_alarms_at_the_rate_that_was_asked_for(pose_sigmas):
+    """1 % of the later beams, pooled over seeds; no change is reported. The laser has no bias and
+    walls are flat, and the settings say so: then all that is stated is what there is."""
+    flagged = compared = 0
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        things = [box(5, 4), box(1, 1, 0.8, 0.4)]
+        a = visit(things, drive(50), rng)
+        b = visit(things, drive(50, 0.13), rng, pose_sigmas)
+        found = same(a, b, bias_sigma_m=0.0, flatness_m=0.001)
+        assert not found.changes
+        flagged, compared = flagged + found.flagged.sum(), compared + found.compared.sum()
+    assert compared > 0.5 * 6 * 50 * 361  # most beams are compared, or the rate means little
+    # below: sigmas are believed to be overstated by no more than a tenth, which is cautious here
+    assert 0.002 < flagged / compared < 0.02
+
+
+def test_unseen_is_never_vanished():
+    """A new cupboard hides an old box: the box may still be there."""
+    rng = np.random.default_rng(3)
+    hidden = box(7.2, 2.8, 0.4, 0.4, "hidden")
+    a = visit([hidden], drive(50), rng)
+    b = visit([hidden, box(5.6, 1.8, 0.3, 2.4, "cupboard")], drive(50, 0.1), rng)
+    found = same(a, b)
+    assert {change.kind for change in found.changes} == {"appeared"}
+
+
+# ------------------------------------------------------------ something changed
+
+
+def test_what_appeared_is_found_and_outlined():
+    rng = np.random.default_rng(4)
+    found = same(visit([], drive(50), rng), visit([box(5, 4)], drive(50, 0.1), rng))
+    (change,) = found.changes
+    assert change.kind == "appeared"
+    assert change.probability > 0.99
+    # the sides that face the room: within a cell or two of the box
+    assert (change.polygon > [5 - 0.08, 4 - 0.08]).all()
+    assert (change.polygon < [5.6 + 0.08, 4.5 + 0.08]).all()
+    assert np.ptp(change.polygon, axis=0).min() > 0.35
+    x, y = change.polygon.T
+    assert x @ np.roll(y, -1) - y @ np.roll(x, -1) > 0  # counter-clockwise
+
+
+def test_what_vanished_is_found():
+    rng = np.random.default_rng(5)
+    found = same(visit([box(5, 4)], drive(50), rng), visit([], drive(50, 0.1), rng))
+    assert {change.kind for change in found.changes} == {"vanished"}
+    for change in found.changes:
+        assert (change.polygon > [4.9, 3.9]).all()
+        assert (change.polygon < [5.7, 4.6]).all()
+
+
+def test_what_moved_is_one_change_with_its_displacement():
+    rng = np.random.default_rng(6)
+    true = np.array([-3.6, -1.4, 0.0])
+    a = visit([box(5, 4)], drive(50), rng)
+    b = visit([box(1.4, 2.6)], drive(50, 0.1), rng)
+    moved = [change for change in same(a, b).changes if change.kind == "moved"]
+    # seen from other sides after the move, so shapes may differ and the pair not be made; then
+    # it must be two changes and not one with a wrong displacement
+    for change in moved:
+        error = change.displacement.motion - true
+        error[2] = wrap(error[2])
+        nees = error @ np.linalg.solve(change.displacement.cov, error)
+        assert nees < chi2.ppf(0.999, 3)
+
+
+def test_a_slide_of_a_few_centimetres_is_found_by_many_scans():
+    """3 cm: two sigmas of a single beam, and most of the beams on the box are flagged."""
+    rng = np.random.default_rng(7)
+    a = visit([box(5, 2, 0.6, 1)], drive(60), rng)
+    b = visit([box(4.97, 2, 0.6, 1)], drive(60, 0.1), rng)
+    found = same(a, b)
+    ends = found.later.ends
+    on_front = (np.abs(ends[:, 0] - 4.97) < 0.05) & (np.abs(ends[:, 1] - 2.5) < 0.4)
+    chosen = on_front & found.compared
+    assert chosen.sum() > 200
+    assert found.flagged[chosen].mean() > 0.9
+    assert found.changes
+
+
+def test_evidence_is_one_sided():
+    """A surface that came nearer hides the old one: later beams do not go past it."""
+    rng = np.random.default_rng(8)
+    poses = drive(40)
+    a, b = visit([], poses, rng), visit([box(5, 4)], poses, rng)
+    grid = grid_over(a.ends, 0.025, 10**6)
+    old, new = (surface_of(v, grid, SIGMA, CONFIG) for v in (a, b))
+    assert past(old, b, old.incidence, SIGMA, CONFIG).passed.sum() == 0
+    assert past(new, a, new.incidence, SIGMA, CONFIG).passed.sum() > 100
+
+
+def test_no_overlap_is_one_clear_line():
+    rng = np.random.default_rng(9)
+    a = visit([], drive(20), rng)
+    b = visit([], drive(20), rng)
+    away = b.placed(np.array([100.0, 0, 0]), np.zeros((3, 3)))
+    with pytest.raises(OutputError, match="nothing to compare"):
+        same(a, away)
+
+
+# ------------------------------------------------------------ parts
+
+
+def test_returns_at_edges_are_on_no_surface():
+    ranges = np.full(20, 4.0)
+    ranges[8:12] = 2.0  # a thing in front
+    ranges[15] = 1.0  # a spurious return
+    ranges[3] = np.nan
+    found = on_surface(0.01 * np.arange(20), ranges)
+    assert list(np.nonzero(found)[0]) == [1, 5, 6, 9, 10, 13, 17, 18]
+
+
+def test_the_nearest_member_is_the_nearest():
+    grid = Grid((0.0, 0.0), 0.1, (40, 30))
+    rng = np.random.default_rng(0)
+    cells = distinct(rng.integers(0, 1200, 25))
+    chosen = rng.random(len(cells)) < 0.6
+    near = nearest_of(grid, cells, chosen)
+    points, every = grid.centers(cells[chosen]), grid.centers(np.arange(1200))
+    true = np.hypot(*(every[:, None] - points[None]).transpose(2, 0, 1)).min(axis=1)
+    # the 5 x 5 distance mask is good to 2 % and a cell
+    assert np.abs(near.distance_m - true).max() < 0.02 * true.max() + 0.05
+    assert chosen[near.member].all()
+
+
+def test_an_outline_goes_around_its_cells_counter_clockwise():
+    grid = Grid((0.0, 0.0), 0.1, (60, 60))
+    cells = np.array([30 * 60 + j for j in range(20, 32)])
+    polygon = outline(grid, cells)
+    centers = grid.centers(cells)
+    assert (polygon.min(axis=0) < centers.min(axis=0)).all()
+    assert (polygon.max(axis=0) > centers.max(axis=0)).all()
+    # no wider than a cell on each side
+    assert np.ptp(polygon, axis=0).max() < 1.1 + 0.3
+    np.testing.assert_array_equal(polygon, counter_clockwise(polygon[::-1]))
+
+
+def test_moving_a_visit_moves_its_ends():
+    rng = np.random.default_rng(2)
+    a = visit([], drive(5), rng)
+    pose = np.array([1.0, -2.0, 0.7])
+    moved = a.placed(pose, np.zeros((3, 3)))
+    np.testing.assert_allclose(moved.ends, transform(pose, a.ends), atol=1e-9)
+    np.testing.assert_allclose(moved.poses[0], compose(pose, a.poses[0]))
+
+
+# ------------------------------------------------------------ files and the command
+
+
+def test_the_page_is_whole_and_repeatable():
+    rng = np.random.default_rng(4)
+    found = same(visit([], drive(30), rng), visit([box(5, 4)], drive(30, 0.1), rng))
+    page = render_changes(found, CONFIG, ("before & after", "later"))
+    assert page == render_changes(found, CONFIG, ("before & after", "later"))
+    assert "before &amp; after" in page
+    assert "1 change: 1 appeared." in page
+    assert "http" not in page.replace("http://www.w3.org", "")  # opens offline
+
+
+def test_the_command_from_logs_to_json(tmp_path):
+    """simulate, smooth twice, changes: the contract's keys, and the table that was turned."""
+    run = CliRunner()
+
+    def done(*arguments):
+        result = run.invoke(app, [str(a) for a in arguments])
+        assert result.exit_code == 0, result.output
+        return result.stdout
+
+    done("simulate", "change", "-o", tmp_path / "sim")
+    for name in ("reference", "later"):
+        done("smooth", tmp_path / f"sim/{name}.mcap", "-o", tmp_path / name)
+    arguments = ("changes", tmp_path / "reference", tmp_path / "later", "-o", tmp_path / "out")
+    found = json.loads(done(*arguments, "--json"))
+    assert found == json.loads((tmp_path / "out/changes.json").read_text())
+    assert (tmp_path / "out/report.html").exists()
+    assert found["false_alarm_rate_requested"] == 0.01
+    assert 0 < found["beams_flagged"] < 0.15 * found["beams_compared"]
+    (change,) = found["changes"]
+    assert set(change) >= {"kind", "polygon", "probability", "displacement", "beams"}
+    assert change["kind"] == "moved"
+    # turned by 21.61 degrees; 1 degree is four of its sigmas
+    assert np.degrees(change["displacement"]["phi"]) == pytest.approx(21.61, abs=1.0)
+    truth = json.loads((tmp_path / "sim/truth.json").read_text())["starts"]
+    true = between(*(np.array(truth[k]["vehicle"]) for k in ("reference", "later")))
+    pose = np.array([found["registration"][k] for k in ("x", "y", "phi")])
+    np.testing.assert_allclose(pose, true, atol=0.04)  # starts are known to 1 mm, maps to 1 cm
+
+    again = run.invoke(app, [str(a) for a in arguments])
+    assert again.exit_code == 1
+    assert "--force" in again.output
+    same_folder = [*map(str, arguments[:2]), str(arguments[1]), *map(str, arguments[3:]), "--force"]
+    refused = run.invoke(app, same_folder)
+    assert refused.exit_code == 1
+    assert "--reference-span" in refused.output
+    (tmp_path / "sim/later.mcap").write_bytes((tmp_path / "sim/reference.mcap").read_bytes())
+    other = run.invoke(app, [*map(str, arguments), "--force"])
+    assert other.exit_code == 1
+    assert "is not the log" in other.output
+    assert run.invoke(app, [*map(str, arguments), "--later-span", "9:3"]).exit_code == 2
