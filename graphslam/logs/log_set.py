@@ -65,15 +65,16 @@ class LogSet:
         """Range from which on a beam of ``topic`` means no return, m; inf when none was found."""
         return self._contexts[topic].no_return_m
 
-    def messages(self) -> Iterator[Message]:
+    def messages(self, without: tuple[type[Message], ...] = ()) -> Iterator[Message]:
         """All messages in the order of ``time_ns``; at equal times odometry comes first.
 
-        Memory holds what falls into ``logs.reorder_s``, not the log. Every call starts anew.
+        Topics of the records ``without`` are passed over, which saves decoding them. Memory holds
+        what falls into ``logs.reorder_s``, not the log. Every call starts anew.
         """
         self.dropped.clear()
         self.repaired.clear()
         del self.warnings[self._opening_warnings :]
-        topics = {topic.name: topic for topic in self.topics}
+        topics = {topic.name: topic for topic in self.topics if topic.record not in without}
         readers = [
             _FileReader(file, topics, self._contexts, self._window_ns) for file in self._mcap
         ]

@@ -1,0 +1,137 @@
+"""Sightings gathered over a short span, so that many images share one step of the estimator.
+
+A camera with four images per second of five robots would make twenty states per second, most of
+them a few millimetres apart. Instead all that the robots of a log see within a span becomes one
+step: one state per robot at its end, and every sighting carried there by odometry.
+"""
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from graphslam.dead_reckoning import Track
+from graphslam.frontend.sightings import sighting_observation
+from graphslam.geometry import compose, compose_cov, inverse, inverse_cov, rotation
+from graphslam.models import MODELS, transport
+from graphslam.records import Association, Message, Observation, Sighting
+from graphslam.timeline import ODOMETRY
+
+#: rad: how well the relative heading of two robots is known that turns a short motion
+HEADING_SIGMA_RAD = 0.1
+
+#: robot, time of its state and measurement there (as bytes) -> the sighting behind it
+Sources = dict[tuple[str, int, bytes], Sighting]
+
+
+@dataclass(slots=True, eq=False)
+class Gathered:
+    """Images (sightings of one robot at one time) of one span, in the order of time."""
+
+    images: list[Sequence[Sighting]] = field(default_factory=list)
+
+    @property
+    def first_ns(self) -> int:
+        """Time of the earliest image."""
+        return self.images[0][0].time_ns
+
+    @property
+    def time_ns(self) -> int:
+        """Time of the latest image: that of the step."""
+        return self.images[-1][0].time_ns
+
+    @property
+    def robots(self) -> list[str]:
+        """Robots that saw something or were seen, sorted."""
+        seen = {s.seen_robot for image in self.images for s in image if s.seen_robot}
+        return sorted(seen | {image[0].robot for image in self.images})
+
+
+def gather(
+    events: Iterable[Sequence[Message]], tracks: Mapping[str, Track], span_ns: int, max_gap_ns: int
+) -> Iterator[Sequence[Message] | Gathered]:
+    """Events in the order of time, images of one span as one `Gathered`.
+
+    It is handed out once the odometry of all its robots has reached its end (waiting for no longer
+    than ``max_gap_ns``), or before a scan or a relative pose, which make steps of their own.
+
+    Args:
+        events: what one robot perceived at one time, each released by its own robots' odometry.
+        tracks: odometry of every robot; it grows while events are taken.
+        span_ns: from a gathering's first image to its last; 0 gathers nothing.
+        max_gap_ns: longest wait for a robot's odometry.
+    """
+    complete: deque[Gathered] = deque()
+    filling = Gathered()
+
+    def covered(one: Gathered, now_ns: int) -> bool:
+        late = now_ns - one.time_ns > max_gap_ns
+        return late or all(tracks[robot].reaches(one.time_ns) for robot in one.robots)
+
+    for event in events:
+        first = event[0]
+        if filling.images and first.time_ns - filling.first_ns > span_ns:
+            complete.append(filling)
+            filling = Gathered()
+        steps_alone = not isinstance(first, (Sighting, *ODOMETRY))
+        if steps_alone and filling.images:
+            complete.append(filling)
+            filling = Gathered()
+        while complete and (steps_alone or covered(complete[0], first.time_ns)):
+            yield complete.popleft()
+        if span_ns and isinstance(first, Sighting):
+            filling.images.append([s for s in event if isinstance(s, Sighting)])
+        else:
+            yield event
+    yield from complete
+    if filling.images:
+        yield filling
+
+
+def carried(sighting: Sighting, state_ns: int, track: Track) -> Observation:
+    """A sighting in the base frame that its robot had at ``state_ns``, earlier or later."""
+    o = sighting_observation(sighting)
+    z, cov = transport(o.z, o.cov, sighting.mount, np.zeros((3, 3)))
+    moved = track.between(state_ns, sighting.time_ns)
+    if sighting.time_ns != state_ns:
+        z, cov = transport(z, cov, moved.delta, moved.cov)
+    return Observation(o.kind, z, cov, o.extent, o.identity)
+
+
+def met(
+    o: Observation, sighting: Sighting, state_ns: int, other_ns: int, turn_rad: float, track: Track
+) -> Association:
+    """A sighting of a robot, moved from where that robot was to where it is at its state.
+
+    What it drove in between is known along its own axes. The relative heading that turns it into
+    the observer's comes from the estimate and needs not be known well: the way is short.
+
+    Args:
+        o: the sighting in the observer's base frame at its state.
+        sighting: as recorded.
+        state_ns: time of the observer's state.
+        other_ns: time of the seen robot's state.
+        turn_rad: heading of the seen robot relative to the observer's.
+        track: odometry of the robot that was seen.
+    """
+    other = sighting.seen_robot
+    assert other is not None  # callers ask for robots only
+    moved = track.between(other_ns, sighting.time_ns)
+    if o.kind != "point":
+        back = inverse(moved.delta)
+        cov = compose_cov(o.z, o.cov, back, inverse_cov(moved.delta, moved.cov))
+        z = compose(o.z, back)
+        return Association(sighting.robot, state_ns, other, "robot-pose", z, cov)
+    model, origin = MODELS["point"], np.zeros(3)
+    R = rotation(turn_rad)
+    shift = R @ moved.delta[:2]
+    side = np.array([-shift[1], shift[0]])
+    extra = HEADING_SIGMA_RAD**2 * np.outer(side, side)
+    if sighting.time_ns != other_ns:
+        extra += R @ moved.cov[:2, :2] @ R.T
+    point = model.invert(o.z, origin) - shift
+    z = model.predict(origin, point)
+    _, H = model.jacobians(z, origin, point)
+    cov = o.cov + H @ extra @ H.T
+    return Association(sighting.robot, state_ns, other, "robot-point", z, cov)
