@@ -11,7 +11,7 @@ OUT := out
 .PHONY: help demo test lint types docs clean
 
 help:
-	@echo 'make demo    smooth a real log (Victoria Park, shipped with gtsam) into $(OUT)/'
+	@echo 'make demo    smooth a real log (Victoria Park, shipped with gtsam) and a simulated lab into $(OUT)/'
 	@echo 'make test    run the tests'
 	@echo 'make lint    check style and formatting'
 	@echo 'make types   check types'
@@ -28,7 +28,11 @@ demo: $(INSTALLED)
 	$(BIN)/graphslam smooth $(OUT)/victoria_park.mcap -o $(OUT)/victoria_park_all_poses --force \
 	  --set keyframe.mode=all --set robust.kernel=none
 	$(BIN)/python benchmarks/victoria_park.py $(OUT)/victoria_park $(OUT)/victoria_park_all_poses
-	@echo 'Open this in a browser: $(CURDIR)/$(OUT)/victoria_park/report.html'
+	$(BIN)/graphslam smooth logs/lab.mcap -o $(OUT)/lab --force --start truth
+	$(BIN)/graphslam evaluate $(OUT)/lab
+	@echo 'Open these in a browser:'
+	@echo '$(CURDIR)/$(OUT)/victoria_park/report.html   a truck among trees, a real log'
+	@echo '$(CURDIR)/$(OUT)/lab/report.html   a laser in a cluttered room, simulated, with truth'
 
 test: $(INSTALLED)
 	$(BIN)/python -m pytest

@@ -80,6 +80,7 @@ class Associator:
         self.innovations: dict[str, list[tuple[int, float]]] = {}
         self._config, self._backend = config, backend
         self._images = 0
+        self._unsettled: set[int] = set()  # admitted, but not yet in the back end
         m2, rad2 = config.floor_m**2, config.floor_rad**2
         self._floor = {
             "line": np.diag([m2, rad2]),
@@ -96,6 +97,7 @@ class Associator:
         motion: Motion | None,
         track: Track,
         path_m: float,
+        gathering: bool = False,
     ) -> tuple[Association, ...]:
         """Associations of one image.
 
@@ -107,6 +109,9 @@ class Associator:
             motion: from the robot's latest state in the back end to this one; None if it is it.
             track: the robot's odometry.
             path_m: how far the robot has driven.
+            gathering: more images follow before the back end takes the step (`settle` then).
+                Innovations of sightings with an identity, which need the dear joint marginal, are
+                not booked.
 
         Returns:
             What is to enter the graph, including earlier sightings of landmarks that this image
@@ -114,13 +119,21 @@ class Associator:
         """
         config = self._config
         if self._images % REFRESH_EVERY == 0:
-            self.map.refresh(self._backend, self.map.graph_ids())
+            ids = [i for i in self.map.graph_ids() if i not in self._unsettled]
+            self.map.refresh(self._backend, ids)
         self._images += 1
         self.map.expire(time_ns, robot, path_m, round(config.tentative_s * 1e9), config.tentative_m)
         if motion is not None:
             pose = compose(pose, motion.delta)
-        image = self._image(robot, time_ns, seen, pose, motion, track, path_m)
-        return self._book(image, self._choose(image))
+        image = self._image(robot, time_ns, seen, pose, motion, track, path_m, gathering)
+        associations = self._book(image, self._choose(image))
+        if not gathering:
+            self.settle()
+        return associations
+
+    def settle(self) -> None:
+        """Note that the back end has taken the step of all associations so far."""
+        self._unsettled.clear()
 
     def _image(
         self,
@@ -131,6 +144,7 @@ class Associator:
         motion: Motion | None,
         track: Track,
         path_m: float,
+        gathering: bool,
     ) -> Image:
         """Candidate pairs, compared."""
         ids, means, extents, is_point, whole = self.map.arrays()
@@ -158,7 +172,8 @@ class Associator:
         )
         entries += [e for _, e in known]
         recent = np.append(recent, np.ones(len(known), dtype=bool))
-        graph_ids = sorted({e.id for e in entries if e.in_graph})
+        wanted = entries[: len(entries) - len(known)] if gathering else entries
+        graph_ids = sorted({e.id for e in wanted if e.in_graph and e.id not in self._unsettled})
         where = {landmark: n for n, landmark in enumerate(graph_ids)}
         joint = predicted_joint(self._backend.joint(robot, graph_ids), motion)
         compared = self._compare(seen, pairs, entries, joint, where, track, time_ns)
@@ -198,7 +213,7 @@ class Associator:
         states = np.zeros((k, 3))
         since: dict[int, Array] = {}
         for n, entry in enumerate(entries):
-            if entry.in_graph:
+            if entry.id in where:
                 block = joint.slices[where[entry.id]]
                 size = block.stop - block.start
                 states[n, :size] = joint.landmarks[where[entry.id]]
@@ -226,7 +241,9 @@ class Associator:
         # sightings of one image exclude each other: what a named one sees is taken
         free = ~known & ~np.isin(pairs.landmark, pairs.landmark[known])
         chosen = best(free & in_graph & image.recent)
-        old = best(free & in_graph & ~image.recent)
+        # one that the back end does not have yet closes no loop
+        settled = np.array([e.id in image.where for e in image.entries], dtype=bool)
+        old = best(free & in_graph & ~image.recent & settled)
         if self._closes_loop(image, list(old.values())):
             chosen |= old
             self.closures += 1
@@ -255,9 +272,10 @@ class Associator:
                 k = chosen[n]
                 entry, model = image.entries[k], pairs.model[k]
                 o = flip(o) if pairs.flipped[k] else o
-                self.innovations.setdefault(model, []).append(
-                    (image.time_ns, float(compared.d2[k] / compared.dof[k]))
-                )
+                if entry.id in image.where or not entry.in_graph:
+                    self.innovations.setdefault(model, []).append(
+                        (image.time_ns, float(compared.d2[k] / compared.dof[k]))
+                    )
             elif not self._has_identity(o) and np.any(close & (pairs.observation == n)):
                 self.rejected["between the thresholds: neither a match nor new"] += 1
                 continue
@@ -281,6 +299,7 @@ class Associator:
         if not certain and entry.sightings < self._config.sightings_to_promote:
             return []
         entry.in_graph = True
+        self._unsettled.add(entry.id)
         if entry.kind == "segment" and any(e.model != "segment" for e in entry.evidence):
             entry.kind = "line"
         waiting, entry.evidence = entry.evidence, []

@@ -6,11 +6,23 @@ calibration. Between two readings the robot is taken to move on a circle segment
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from graphslam.config import OdometryConfig, RobotConfig
-from graphslam.geometry import Array, between, compose, compose_jacobians, exp, log, rotation3, wrap
+from graphslam.geometry import (
+    Array,
+    between,
+    compose,
+    compose_jacobians,
+    exp,
+    inverse,
+    inverse_cov,
+    log,
+    rotation3,
+    wrap,
+)
 from graphslam.models import MOTION_SOURCES, compound
 from graphslam.models.motion import (
     Calibration,
@@ -18,6 +30,7 @@ from graphslam.models.motion import (
     Increments,
     mounted_motion,
     nominal_calibration,
+    wheel_twist,
 )
 from graphslam.records import Motion, OdometryIncrement, OdometryPose, WheelAngles
 
@@ -57,6 +70,7 @@ class Track:
         self.source = ""
         self.resets = 0  # times that the odometry jumped
         self.calibration = nominal_calibration("given", config, False)
+        self.nominal = self.calibration  # before any data
         self._mounted = mounted
         self._config, self._robot = config, robot
         self._count, self._p, self._bursts = 0, 0, 0
@@ -164,7 +178,7 @@ class Track:
         if not self._count:
             self.source = source
             mounted = self._mounted and source != "given"
-            self.calibration = nominal_calibration(source, self._config, mounted)
+            self.calibration = self.nominal = nominal_calibration(source, self._config, mounted)
             self._p = len(self.calibration.mean) - 4 * mounted  # parameters of the increments
             self._rows = np.empty((len(self._times), _ROW_SIZE[source]))
             self._sums = np.empty_like(self._rows)
@@ -181,7 +195,7 @@ class Track:
         n = self._count
         self._times[n], self._rows[n] = time_ns, row
         self._sums[n] = self._sums[n - 1] + row if n else 0.0
-        step = self._increments(row[None], np.zeros(self._p)).delta[0]
+        step = exp(wheel_twist(row[None], self._robot)[0] if source == "wheels" else row[:3])
         self._poses[n] = compose(self._poses[n - 1], step) if n else np.zeros(3)
         path, turn = np.hypot(step[0], step[1]), abs(step[2])
         self._effort[n] = self._effort[n - 1] + path + TURNING_EFFORT_M * turn if n else 0.0
@@ -273,6 +287,14 @@ class Track:
         if self.source != "given":
             cov = cov + self._floor(whole.length_m > 0 or delta[2] != 0)
         return Motion(start_ns, end_ns, delta, cov, d_cal, whole.length_m)
+
+    def between(self, start_ns: int, end_ns: int) -> Motion:
+        """As `motion`, but ``end_ns`` may be the earlier one: then the way back."""
+        if end_ns >= start_ns:
+            return self.motion(start_ns, end_ns)
+        forth = self.motion(end_ns, start_ns)
+        cov = inverse_cov(forth.delta, forth.cov)
+        return replace(forth, start_ns=start_ns, end_ns=end_ns, delta=inverse(forth.delta), cov=cov)
 
     def coarse_motions(
         self,

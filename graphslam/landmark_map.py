@@ -5,7 +5,7 @@ together with its earlier sightings. Estimates are copies, refreshed from the ba
 may have changed: reading them is much of an incremental smoother's cost.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -37,6 +37,15 @@ class Entry:
     in_graph: bool = False
     path_m: dict[str, float] = field(default_factory=dict)
     evidence: list[Association] = field(default_factory=list)
+
+    def move(self, mean: Array) -> None:
+        """A new estimate (2,) or (3,), in which the extent stays where it was.
+
+        Where on its wall a line's origin sits means nothing, and it may slide by metres.
+        """
+        if self.kind != "point":
+            self.extent = self.extent - between(self.mean, mean)[0]
+        self.mean[: len(mean)] = mean
 
 
 class LandmarkMap:
@@ -108,7 +117,14 @@ class LandmarkMap:
     def refresh(self, backend: Backend, ids: list[int]) -> None:
         """Copy the back end's current estimates of these landmarks."""
         for i, mean in zip(ids, backend.landmark_means(ids), strict=True):
-            self.entries[i].mean[: len(mean)] = mean
+            self.entries[i].move(mean)
+
+    def in_world(self, world: Array) -> "LandmarkMap":
+        """The same map in a world frame that sees this one at ``world`` (3,)."""
+        moved = LandmarkMap()
+        for i, entry in self.entries.items():
+            moved.entries[i] = replace(entry, mean=compose(world, entry.mean))
+        return moved
 
     def expire(self, time_ns: int, robot: str, path_m: float, age_ns: int, age_m: float) -> None:
         """Delete tentative landmarks that this robot has not seen for long, in time *and* path."""

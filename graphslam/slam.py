@@ -8,7 +8,7 @@ on no landmark kind, front end or back end; those are rows of tables.
 import itertools
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,11 +16,13 @@ import numpy as np
 from graphslam.associator import Associator
 from graphslam.backends import BACKENDS
 from graphslam.calibration import observed_information
-from graphslam.config import Config
+from graphslam.config import Config, OdometryConfig, RobotConfig, load_config
+from graphslam.consolidating import consolidate
 from graphslam.dead_reckoning import Track
 from graphslam.errors import ConfigError, EstimationError, LogError
 from graphslam.frontend import FRONT_ENDS, scan_points
 from graphslam.frontend.sightings import sighting_observation
+from graphslam.gathering import Gathered, Sources, carried, gather, met
 from graphslam.geometry import (
     compose,
     compose_cov,
@@ -33,6 +35,7 @@ from graphslam.models import transport
 from graphslam.records import (
     Association,
     Closure,
+    Estimate,
     Landmark,
     Message,
     Motion,
@@ -43,7 +46,10 @@ from graphslam.records import (
     Scan,
     Sighting,
     Step,
+    TrueLandmark,
+    Truth,
 )
+from graphslam.refining import refine
 from graphslam.robot_run import RobotRun
 from graphslam.starts import start_poses
 from graphslam.summary import make_landmarks, summarise
@@ -65,11 +71,18 @@ class Pipeline:
         self.associator = Associator(config.association, self.backend)
         self.front_end = FRONT_ENDS[config.front_end.name]
         self.runs = {
-            name: RobotRun(Track(config.odometry, config.robot(name), mounted=log.has_scans(name)))
+            name: RobotRun(
+                Track(
+                    sensing(config.odometry, log.has_scans(name)),
+                    robot_settings(name, config, log.notes),
+                    mounted=True,
+                )
+            )
             for name in log.robots
         }
         self.starts = start_poses(log, config)
         self.steps: list[Step] = []
+        self.sources: Sources = {}
         self.pictures: list[Picture] = []
         self.counts: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
@@ -83,22 +96,102 @@ class Pipeline:
         """Take in every message of the log."""
         tracks = {name: run.track for name, run in self.runs.items()}
         messages = synchronise(
-            _counted(self.log.messages(), self.counts, progress),
+            self.wanted(_counted(self.log.messages((Truth, TrueLandmark)), self.counts, progress)),
             tracks,
             self.config.odometry.max_gap_s,
             self.dropped,
         )
+        # one robot has nobody to share a step with, and a scan makes its own
+        alone = len(tracks) < 2 or any(map(self.log.has_scans, tracks))
+        alone |= self.config.keyframe.mode == "all"
+        span_ns = 0 if alone else round(1e9 * self.config.keyframe.gather_s)
+        max_gap_ns = round(1e9 * self.config.odometry.max_gap_s)
         clock = time.perf_counter()
-        for event in events(messages):
+        for event in gather(events(messages), tracks, span_ns, max_gap_ns):
             self.seconds["read"] += time.perf_counter() - clock
             began = time.perf_counter()
             steps = len(self.steps)
-            self.take(event)
+            if isinstance(event, Gathered):
+                self.take_gathered(event)
+            else:
+                self.take(event)
             clock = time.perf_counter()
             if len(self.steps) > steps:
                 self.step_ms.append(1e3 * (clock - began))
 
-    def take(self, event: list[Message]) -> None:
+    def wanted(self, messages: Iterable[Message]) -> Iterator[Message]:
+        """Messages without sightings of robots, where these are to be ignored."""
+        ignore = self.config.association.robots == "ignore"
+        for message in messages:
+            if ignore and isinstance(message, Sighting) and message.seen_robot is not None:
+                self.dropped["sighting: of a robot, ignored by association.robots"] += 1
+            else:
+                yield message
+
+    def take_gathered(self, gathered: Gathered) -> None:
+        """All images of a span, in one step at its end.
+
+        Robots that moved, saw a robot or were seen get a state there. Their sightings are carried
+        to it, those of others to their last state.
+        """
+        step_ns = gathered.time_ns
+        self.first_ns = min(self.first_ns, gathered.first_ns)
+        self.last_ns = max(self.last_ns, step_ns)
+        meeting: set[str] = set()
+        for image in gathered.images:
+            run = self.runs[image[0].robot]
+            if not run.started:
+                self.start(image[0].robot, min(run.track.first_ns, image[0].time_ns))
+            meeting |= {robot for s in image if s.seen_robot for robot in (s.robot, s.seen_robot)}
+        for robot in meeting:
+            if not self.runs[robot].started:
+                self.start(robot, min(self.runs[robot].track.first_ns, step_ns))
+        motions: dict[str, Motion] = {}
+        for robot in gathered.robots:
+            run = self.runs[robot]
+            if robot in meeting or self.has_moved(run, run.state_ns, step_ns):
+                motion = self.motion_since_state(robot, step_ns)
+                if motion is not None:
+                    motions[robot] = motion
+                    run.path_m += motion.length_m
+        began = time.perf_counter()
+        known = {i for i, entry in self.associator.map.entries.items() if entry.in_graph}
+        associations: tuple[Association, ...] = ()
+        for image in gathered.images:
+            run, robot = self.runs[image[0].robot], image[0].robot
+            state_ns = step_ns if robot in motions else run.state_ns
+            seen = [carried(sighting, state_ns, run.track) for sighting in image]
+            for o, sighting in zip(seen, image, strict=True):
+                self.sources[robot, state_ns, o.z.tobytes()] = sighting
+            landmarks = [o for o, s in zip(seen, image, strict=True) if s.seen_robot is None]
+            self.counts["observations"] += len(seen)
+            if landmarks:
+                associations += self.associator.associate(
+                    robot,
+                    state_ns,
+                    landmarks,
+                    run.causal_poses[-1],
+                    motions.get(robot),
+                    run.track,
+                    run.path_m,
+                    gathering=True,
+                )
+            for o, s in zip(seen, image, strict=True):
+                if s.seen_robot is not None:
+                    other = self.runs[s.seen_robot]
+                    headings = [
+                        r.causal_poses[-1][2] + (motions[name].delta[2] if name in motions else 0.0)
+                        for name, r in ((s.seen_robot, other), (robot, run))
+                    ]
+                    turn = float(headings[0] - headings[1])
+                    association = met(o, s, state_ns, step_ns, turn, other.track)
+                    self.sources[robot, state_ns, association.z.tobytes()] = s
+                    associations += (association,)
+        self.note_covariances()
+        self.seconds["association"] += time.perf_counter() - began
+        self.enter(Step(step_ns, {}, motions, shared(associations)), known)
+
+    def take(self, event: Sequence[Message]) -> None:
         """One event: everything one robot perceived at one time."""
         first = event[0]
         run, time_ns = self.runs[first.robot], first.time_ns
@@ -146,7 +239,7 @@ class Pipeline:
             return None
         return run.track.motion(run.state_ns, time_ns)
 
-    def is_used(self, event: list[Message]) -> bool:
+    def is_used(self, event: Sequence[Message]) -> bool:
         """Whether the event is more than a place on the trajectory.
 
         Scans overlap, so one is enough per stretch of motion since the last one used, whatever
@@ -161,7 +254,7 @@ class Pipeline:
         run.scanned_ns = first.time_ns
         return True
 
-    def gets_state(self, event: list[Message]) -> bool:
+    def gets_state(self, event: Sequence[Message]) -> bool:
         """Whether a used event has a state at its own time, or is carried back to the last one."""
         first, run = event[0], self.runs[event[0].robot]
         return (
@@ -179,7 +272,7 @@ class Pipeline:
         keyframe = self.config.keyframe
         return path_m >= keyframe.distance_m or turned_rad >= keyframe.angle_rad
 
-    def observations(self, event: list[Message], since: Motion | None) -> list[Observation]:
+    def observations(self, event: Sequence[Message], since: Motion | None) -> list[Observation]:
         """Landmarks seen, in the base frame of the state (``since`` carries back to it)."""
         out = []
         for message in event:
@@ -201,7 +294,7 @@ class Pipeline:
         self,
         robot: str,
         time_ns: int,
-        event: list[Message],
+        event: Sequence[Message],
         seen: list[Observation],
         motion: Motion | None,
     ) -> None:
@@ -226,19 +319,25 @@ class Pipeline:
         self.seconds["association"] += time.perf_counter() - began
         if not (motions or associations or closures):
             return
-        step = Step(time_ns, {}, motions, associations, tuple(c for c in closures if c))
-        began = time.perf_counter()
-        self.backend.add(step)
-        self.steps.append(step)
-        for name in motions:
-            if self.config.odometry.calibrate:
-                self.learn(name, step, known)
-            self.note_state(name, time_ns)
-        self.seconds["back end"] += time.perf_counter() - began
+        self.enter(Step(time_ns, {}, motions, associations, tuple(c for c in closures if c)), known)
         for message in event:
             if isinstance(message, Scan):
                 points = scan_points(message, self.config.front_end.max_range_m)
                 self.add_picture(Picture(robot, state_ns, points.astype(np.float32)))
+
+    def enter(self, step: Step, known: set[int]) -> None:
+        """Give a step to the back end, and learn from it; ``known`` landmarks were there before."""
+        if not (step.motions or step.associations or step.closures):
+            return
+        began = time.perf_counter()
+        self.backend.add(step)
+        self.associator.settle()
+        self.steps.append(step)
+        for name in step.motions:
+            if self.config.odometry.calibrate:
+                self.learn(name, step, known)
+            self.note_state(name, step.time_ns)
+        self.seconds["back end"] += time.perf_counter() - began
 
     def robot_sighting(
         self, message: Sighting, state_ns: int, motions: dict[str, Motion]
@@ -313,6 +412,18 @@ class Pipeline:
             if len(run.causal_covs) < len(run.times):
                 run.causal_covs.append(self.backend.joint(robot, []).cov)
 
+    def reconsider(self, estimate: Estimate) -> Estimate:
+        """The final estimate, from what is only known at the end; the steps follow it."""
+        tracks = {name: run.track for name, run in self.runs.items() if run.started}
+        if self.sources:
+            refined = refine(self.steps, estimate, tracks, self.sources, self.config)
+            self.steps = list(refined.steps)
+            return refined.estimate
+        done = consolidate(self.steps, estimate, tracks, self.associator.map, self.config)
+        self.steps = list(done.steps)
+        self.counts["landmarks_merged"] += done.merged
+        return done.estimate
+
     def add_picture(self, picture: Picture) -> None:
         """Keep a scan for drawing; when there are too many, every second one is let go."""
         self.pictures.append(picture)
@@ -342,6 +453,8 @@ def smooth(log: LogSet, config: Config, progress: Progress = lambda _count: None
     pipeline.note_covariances()
     finishing = time.perf_counter()
     estimate = pipeline.backend.finish()
+    if pipeline.backend.smooths and config.backend.polish and config.backend.reconsider:
+        estimate = pipeline.reconsider(estimate)
     pipeline.seconds["final optimisation"] = time.perf_counter() - finishing
     finishing = time.perf_counter()
     runs = {name: run for name, run in sorted(pipeline.runs.items()) if run.started}
@@ -352,7 +465,9 @@ def smooth(log: LogSet, config: Config, progress: Progress = lambda _count: None
     steps = tuple(step_in_world(step, world) for step in pipeline.steps)
     robots = {name: run.result(estimate.states[name], start) for name, run in runs.items()}
     pipeline.seconds["trajectories"] = time.perf_counter() - finishing
-    landmarks: tuple[Landmark, ...] = make_landmarks(pipeline.associator.map, estimate)
+    landmarks: tuple[Landmark, ...] = make_landmarks(
+        pipeline.associator.map.in_world(world), estimate
+    )
     t0 = min(trajectory.stamps_ns[0] for trajectory in estimate.states.values())
     innovations = {
         model: np.array([((t - t0) * 1e-9, d2) for t, d2 in values]).reshape(-1, 2)
@@ -386,6 +501,36 @@ def smooth(log: LogSet, config: Config, progress: Progress = lambda _count: None
     )
 
 
+def robot_settings(name: str, config: Config, notes: Mapping[str, str]) -> RobotConfig:
+    """Settings of a robot: the configuration's, else what the log's notes say of its geometry."""
+    if {name, "default"} & set(config.robots):
+        return config.robot(name)
+    noted = [f"{key}={value}" for key, value in notes.items() if key.startswith(f"robots.{name}.")]
+    return load_config(overrides=noted).robot(name)
+
+
+def sensing(config: OdometryConfig, scans: bool) -> OdometryConfig:
+    """Settings of a robot's calibration: without a laser only the latency of its sightings."""
+    if scans:
+        return config
+    return replace(
+        config,
+        laser_sigma_m=0.0,
+        laser_sigma_rad=0.0,
+        laser_latency_sigma_s=config.sighting_latency_sigma_s,
+    )
+
+
+def shared(associations: Sequence[Association]) -> tuple[Association, ...]:
+    """Associations of one step: n of one target by one robot count as one.
+
+    Errors of a target's sightings within a short span are nearly the same (MRCLAM: the ranges of
+    consecutive images correlate by 0.8), so they get n times the covariance.
+    """
+    count = Counter((a.robot, a.target) for a in associations)
+    return tuple(replace(a, cov=a.cov * count[a.robot, a.target]) for a in associations)
+
+
 def check_robots(log: LogSet, config: Config) -> None:
     """Refuse settings about robots that are not there.
 
@@ -408,7 +553,12 @@ def run_warnings(pipeline: Pipeline) -> list[str]:
     warnings += [
         f"{name}: its wheel radii and axle are not set; the defaults of robots.{name}.* were used"
         for name, run in pipeline.runs.items()
-        if run.track.source == "wheels" and not {name, "default"} & set(pipeline.config.robots)
+        if run.track.source == "wheels"
+        and robot_settings(name, pipeline.config, pipeline.log.notes) == RobotConfig()
+    ]
+    warnings += [
+        f"the back end could not use {count} x {reason}"
+        for reason, count in sorted(pipeline.backend.skipped.items())
     ]
     if not any(step.associations or step.closures for step in pipeline.steps):
         warnings.append("no observation entered the estimate: this is dead reckoning")

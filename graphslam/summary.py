@@ -13,7 +13,7 @@ import numpy as np
 
 from graphslam import __version__
 from graphslam.config import Config, dump_config
-from graphslam.geometry import Array, transform
+from graphslam.geometry import Array, between, transform
 from graphslam.landmark_map import Entry, LandmarkMap
 from graphslam.logs import LogSet
 from graphslam.records import Estimate, Landmark
@@ -43,7 +43,8 @@ def make_landmark(entry: Entry, mean: Array, cov: Array) -> Landmark:
         line = None
     else:
         position = mean
-        ends = np.array([[entry.extent[0], 0.0], [entry.extent[1], 0.0]])
+        low, high = entry.extent - between(entry.mean, mean)[0]  # see `Entry.move`
+        ends = np.array([[low, 0.0], [high, 0.0]])
         extent = transform(mean, ends)
         line = line_parameters(mean, cov)
     return Landmark(
@@ -61,7 +62,7 @@ def make_landmark(entry: Entry, mean: Array, cov: Array) -> Landmark:
 
 
 def make_landmarks(landmarks: LandmarkMap, estimate: Estimate) -> tuple[Landmark, ...]:
-    """The final map: every landmark that the back end estimated."""
+    """The final map: every landmark that the back end estimated; both in the same world frame."""
     return tuple(
         make_landmark(landmarks.entries[number], mean, cov)
         for number, (mean, cov) in sorted(estimate.landmarks.items())

@@ -19,20 +19,25 @@ ROOT = Path(graphslam.__file__).parent
 #: The rooms of the house, lowest row first. An import goes to a lower row, or stays in its room.
 ROWS = (
     ("errors", "geometry"),  # how it fails; what a pose is
-    ("config", "records"),  # settings; what travels between the modules
+    # settings; what travels between the modules; Kalman filtering on arrays
+    ("config", "kalman", "records"),
     ("models",),  # motion, and one observation model per kind of target
     # one job each, on records and arrays
     ("association", "calibration", "dead_reckoning", "export", "factors", "frontend", "logs"),
     # estimators; order in time; poses at any time; worlds and their logs
     ("backends", "simulate", "timeline", "trajectories"),
     # what is known about landmarks beside their estimate; of a robot; where robots start; recorded
-    # steps through an estimator
-    ("landmark_map", "replay", "robot_run", "starts"),
-    ("associator", "summary"),  # decisions of one image; what a run adds up to
+    # steps through an estimator; sightings that share a step
+    ("gathering", "landmark_map", "replay", "robot_run", "starts"),
+    # decisions of one image; duplicates in a map; a log of sightings solved again; what a run adds
+    # up to
+    ("associator", "merging", "refining", "summary"),
+    ("consolidating",),  # a log of scans solved again
     ("slam",),  # the pipeline
     ("results",),  # a result as a folder, and back
     ("report", "truth"),  # pictures and tables of a result; where truth comes from
-    ("evaluate",),  # a result against the truth
+    ("changes", "evaluate"),  # a result against another one; against the truth
+    ("compare", "experiments"),  # several back ends on one log; many seeded runs of several
     ("cli",),  # arguments, progress, exit codes; no computation
     ("__main__",),
 )
@@ -301,7 +306,8 @@ def test_random_numbers_come_from_a_generator_that_is_passed_in():
         for node in ast.walk(tree_of(path)):
             if isinstance(node, ast.Call):
                 name = ast.unparse(node.func)
-                seeded = name.endswith("default_rng") and (node.args or node.keywords)
+                seeds = name.endswith(("default_rng", "SeedSequence"))
+                seeded = seeds and (node.args or node.keywords)
                 if re.match(r"(np|numpy)\.random\.|random\.", name) and not seeded:
                     wrong.append(f"{place(path, node.lineno)} {name}()")
     assert not wrong, "\n".join(wrong)

@@ -142,10 +142,14 @@ def test_every_scan_has_a_pose_of_base_and_laser_at_its_own_stamp(room):
 
 
 def test_the_room_is_mapped_to_centimetres_where_odometry_is_off_by_decimetres(room):
-    """Odometry alone ends 0.6 m off; walls within 10 m at 1 cm of noise allow a few centimetres."""
+    """Odometry alone ends 0.6 m off; walls within 10 m at 1 cm of noise allow a few centimetres.
+
+    Unaligned there is also where the laser sits on the base, which this drive hardly tells.
+    """
     done = call("evaluate", room.out, "--json")
     found = json.loads(done.out)["robots"]["robot"]
-    assert found["final"]["ate_rmse_m"] < 0.05
+    assert found["final"]["ate_aligned_rmse_m"] < 0.05
+    assert found["final"]["ate_rmse_m"] < 0.08
     assert found["causal"]["ate_rmse_m"] < 0.10
     assert found["final"]["heading_rmse_rad"] < 0.01
     reckoned = call("smooth", room.log, "-o", room.folder / "dr", "--backend", "dead-reckoning",
@@ -249,6 +253,18 @@ def test_evaluate_against_relations_and_tum(room, tmp_path):
 
 
 # ---------------------------------------------------------------- settings
+
+
+@pytest.mark.parametrize(("given", "seconds"), [("0", 0.0), ("2.5", 2.5), ("inf", float("inf"))])
+def test_the_horizon_is_a_setting_and_goes_through_the_whole_pipeline(
+    room, tmp_path, given, seconds
+):
+    """From no past to all of it: every one maps the room, where odometry is off by decimetres."""
+    done = call("smooth", room.log, "-o", tmp_path / "out", "--start", "truth", "--horizon", given)
+    assert done.code == 0, done.err
+    assert load_config(tmp_path / "out" / "config.toml").backend.horizon_s == seconds
+    found = json.loads(call("evaluate", tmp_path / "out", "--json").out)["robots"]["robot"]
+    assert found["final"]["ate_rmse_m"] < 0.10
 
 
 def test_options_become_settings_over_the_file_and_set_has_the_last_word(room, tmp_path):
@@ -360,7 +376,9 @@ USAGE = {
     "not finite": (("smooth", "l", "-o", "o", "--start", "a=1,2,nan"), "ROBOT=x,y,phi"),
     "no robot": (("smooth", "l", "-o", "o", "--start", "=1,2,3"), "ROBOT=x,y,phi"),
     "back end": (("smooth", "l", "-o", "o", "--backend", "ceres"), "isam2, batch"),
-    "front end": (("smooth", "l", "-o", "o", "--front-end", "x"), "segments, none"),
+    "front end": (("smooth", "l", "-o", "o", "--front-end", "x"), "segments, hough, both, none"),
+    "horizon": (("smooth", "l", "-o", "o", "--horizon", "-1"), "seconds from 0 to inf"),
+    "no horizon": (("smooth", "l", "-o", "o", "--horizon", "nan"), "seconds from 0 to inf"),
     "format": (("import", "csv", "a", "-o", "b"), ", ".join(sorted(IMPORTERS))),
 }
 

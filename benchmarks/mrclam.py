@@ -1,0 +1,71 @@
+"""MRCLAM set 6 with default settings: five robots that see landmarks and each other.
+
+Imported, smoothed from the true start poses and evaluated by the commands that a user types; then
+without sightings of robots, and without identities. Errors are root mean squares over all robots at
+10 Hz over the whole span, blind stretches included.
+
+Run: python benchmarks/mrclam.py [robots|alone|unnamed ...]
+The data are taken from GRAPHSLAM_DATA (default: ../shared/data beside the repository).
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+DATA = Path(os.environ.get("GRAPHSLAM_DATA", ROOT / "../shared/data"))
+SOURCE = DATA / "mrclam/MRCLAM_Dataset6.tar.xz"
+GRAPHSLAM = [sys.executable, "-m", "graphslam"]
+RUNS = {
+    "robots": [],
+    "alone": ["--set", "association.robots=ignore"],
+    "unnamed": ["--set", "association.identities=ignore"],
+}
+BARS = (
+    "bars of robots: final 0.105, aligned 0.065, worst 0.13, NEES 2.0, landmarks 0.09, "
+    "causal 0.125, 12 s; of unnamed: final 0.20, extra 0"
+)
+
+
+def command(*arguments: str) -> str:
+    """Standard output of a graphslam command."""
+    return subprocess.run(
+        [*GRAPHSLAM, *arguments], check=True, capture_output=True, text=True
+    ).stdout
+
+
+def row(name: str, log: Path, folder: Path) -> str:
+    """One line of the table."""
+    began = time.perf_counter()
+    command("smooth", str(log), "--start", "truth", "-o", str(folder / name), *RUNS[name])
+    seconds = time.perf_counter() - began
+    found = json.loads(command("evaluate", str(folder / name), "--truth", str(log), "--json"))
+    final, causal = found["joint"]["final"], found["joint"]["causal"]
+    worst = max(robot["final"]["ate_rmse_m"] for robot in found["robots"].values())
+    landmarks = found["landmarks"]
+    return (
+        f"{name:8} {final['ate_rmse_m']:7.3f} {final['ate_aligned_rmse_m']:8.3f} {worst:6.3f} "
+        f"{final['max_m']:5.2f} {final['nees_per_dof']:6.2f} {causal['ate_rmse_m']:7.3f} "
+        f"{landmarks['rmse_m']:10.3f} {landmarks['missed']:7} {landmarks['extra']:6} {seconds:6.1f}"
+    )
+
+
+def main(names: list[str]) -> None:
+    """Print the table."""
+    with tempfile.TemporaryDirectory() as scratch:
+        log = Path(scratch) / "mrclam6.mcap"
+        command("import", "mrclam", str(SOURCE), "-o", str(log))
+        print(
+            "run        final  aligned  worst   max   NEES  causal  landmarks  missed  extra      s"
+        )
+        for name in names:
+            print(row(name, log, Path(scratch)), flush=True)
+    print(BARS)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:] or list(RUNS))

@@ -1,0 +1,245 @@
+"""Duplicates in a map: which landmarks are one and the same, and what that makes of the steps.
+
+A wall that was not recognised when it was seen again is in the map twice. After all data are in,
+the joint covariance of the whole map says how far two landmarks may lie apart if they are one.
+Pairs are tied one after another, the most certain first, and every tie conditions the joint: what
+agrees with one tie must agree with the next. What one image showed side by side is never tied.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from graphslam.backends import Joint
+from graphslam.geometry import Array, between, wrap
+from graphslam.landmark_map import Entry, LandmarkMap
+from graphslam.records import Association, Step
+
+IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
+
+#: m, rad: by how much two images of one wall may differ beyond what the covariance says: across it,
+#: in direction, and in where its ends are
+FLOOR_M, FLOOR_RAD, FLOOR_END_M = 0.02, 0.015, 0.08
+#: share of the shorter wall that must lie beside the longer one
+OVERLAP_SHARE = 0.5
+#: walls farther apart (m across, rad) are not looked at
+REACH_M, REACH_RAD = 1.5, 0.3
+GATE_PROBABILITY = 0.95
+#: a tie waits while another that contradicts it is not worse by more than this (squared distance)
+RIVAL = 9.0
+
+
+@dataclass(slots=True, eq=False)
+class _Map:
+    """All walls: means (n, 3), joint covariance (3n, 3n), extents (n, 2), which are whole (n,).
+
+    ``group`` (n,) numbers what is tied already; ``apart`` (n, n) is true for different things.
+    """
+
+    x: Array
+    P: Array
+    extents: Array
+    whole: BoolArray
+    group: IntArray
+    apart: BoolArray
+
+    def contradict(self, a: int, b: int) -> bool:
+        """Whether the groups of two walls hold things that are known to differ."""
+        return bool(
+            self.apart[np.ix_(self.group == self.group[a], self.group == self.group[b])].any()
+        )
+
+
+def duplicates(
+    entries: Sequence[Entry], joint: Joint, together: Iterable[frozenset[int]]
+) -> list[tuple[int, int]]:
+    """Pairs of landmarks that are one and the same, the older first, the most certain first.
+
+    Args:
+        entries: lines and segments, in the order of ``joint``.
+        joint: their means and joint covariance, world axes (the pose in front is not used).
+        together: pairs that one image showed side by side.
+    """
+    n = len(entries)
+    if n < 2:
+        return []
+    place = {entry.id: k for k, entry in enumerate(entries)}
+    apart = np.zeros((n, n), dtype=bool)
+    for pair in together:
+        if pair <= place.keys():
+            a, b = (place[number] for number in pair)
+            apart[a, b] = apart[b, a] = True
+    walls = _Map(
+        np.array(joint.landmarks),
+        joint.cov[3:, 3:].copy(),
+        np.array([entry.extent for entry in entries]),
+        np.array([entry.kind == "segment" for entry in entries]),
+        np.arange(n),
+        apart,
+    )
+    i, j = np.triu_indices(n, 1)
+    near = _beside(walls, i, j) & ~apart[i, j]
+    i, j = i[near], j[near]
+    found: list[tuple[int, int]] = []
+    while len(i):
+        r, H_i, H_j, rows = _compare(walls, i, j)
+        d2 = _distances(walls.P, i, j, r, H_i, H_j)
+        # what is out of its gate may come back in when a tie has moved the map
+        fits = d2 <= chi2.ppf(GATE_PROBABILITY, rows)
+        k = _next_tie(walls, i, j, d2, fits)
+        if k is None:
+            break
+        a, b = int(i[k]), int(j[k])
+        found.append((entries[a].id, entries[b].id))
+        _tie(walls, a, b, r[k, : rows[k]], H_i[k, : rows[k]], H_j[k, : rows[k]])
+        walls.group[walls.group == walls.group[b]] = walls.group[a]
+        open_still = walls.group[i] != walls.group[j]
+        i, j = i[open_still], j[open_still]
+    return [(min(pair), max(pair)) for pair in found]
+
+
+def _next_tie(walls: _Map, i: IntArray, j: IntArray, d2: Array, fits: BoolArray) -> int | None:
+    """The most certain pair that nothing contradicts, None when there is none."""
+    order = np.flatnonzero(fits)
+    for k in order[np.argsort(d2[order])]:
+        a, b = int(i[k]), int(j[k])
+        if walls.contradict(a, b):
+            continue
+        tied = (walls.group == walls.group[a]) | (walls.group == walls.group[b])
+        rival = fits & (tied[i] != tied[j]) & (d2 <= d2[k] + RIVAL)
+        outside = np.where(tied[i[rival]], j[rival], i[rival])
+        if not any(walls.apart[walls.group == walls.group[o]][:, tied].any() for o in outside):
+            return int(k)
+    return None
+
+
+def _relative(walls: _Map, i: IntArray, j: IntArray) -> tuple[Array, Array, Array, Array]:
+    """Wall j in the frame of wall i, (m,) each: along, across, turn; middle of the overlap."""
+    x, y = walls.x[i], walls.x[j]
+    c, s, d = np.cos(x[:, 2]), np.sin(x[:, 2]), y[:, :2] - x[:, :2]
+    along, across = c * d[:, 0] + s * d[:, 1], -s * d[:, 0] + c * d[:, 1]
+    low = np.maximum(walls.extents[i, 0], along + walls.extents[j, 0])
+    high = np.minimum(walls.extents[i, 1], along + walls.extents[j, 1])
+    return along, across, wrap(y[:, 2] - x[:, 2]), 0.5 * (low + high)
+
+
+def _beside(walls: _Map, i: IntArray, j: IntArray) -> BoolArray:
+    """Which pairs (m,) are near, about parallel, and share much of their length."""
+    along, across, turn, middle = _relative(walls, i, j)
+    a, b = walls.extents[i], walls.extents[j] + along[:, None]
+    shared = np.minimum(a[:, 1], b[:, 1]) - np.maximum(a[:, 0], b[:, 0])
+    shorter = np.minimum(a[:, 1] - a[:, 0], b[:, 1] - b[:, 0])
+    off = across + (middle - along) * turn
+    near = (np.abs(turn) < REACH_RAD) & (np.abs(off) < REACH_M)
+    return np.asarray(near & (shared >= OVERLAP_SHARE * shorter))
+
+
+def _compare(walls: _Map, i: IntArray, j: IntArray) -> tuple[Array, Array, Array, IntArray]:
+    """How pairs (m,) differ, with Jacobians (m, 3, 3) by either wall, and how many rows count.
+
+    Rows: distance across where both are, direction, and for whole walls where their middles are.
+    """
+    along, across, turn, middle = _relative(walls, i, j)
+    c, s = np.cos(walls.x[i, 2]), np.sin(walls.x[i, 2])
+    zero, one, arm = np.zeros(len(i)), np.ones(len(i)), middle - along
+    ends = along + walls.extents[j].mean(axis=1) - walls.extents[i].mean(axis=1)
+    r = np.stack([across + arm * turn, turn, ends], axis=1)
+
+    def rows_of(*rows: Sequence[Array]) -> Array:
+        return np.stack([np.stack(row, axis=1) for row in rows], axis=1)
+
+    H_i = rows_of(
+        [s + turn * c, -c + turn * s, -along - arm - turn * across],
+        [zero, zero, -one],
+        [-c, -s, across],
+    )
+    H_j = rows_of([-s - turn * c, c - turn * s, arm], [zero, zero, one], [c, s, zero])
+    unknown = ~(walls.whole[i] & walls.whole[j])
+    r[unknown, 2] = 0.0  # a row of zeros says nothing
+    H_i[unknown, 2] = H_j[unknown, 2] = 0.0
+    return r, H_i, H_j, np.where(unknown, 2, 3)
+
+
+_FLOOR = np.diag([FLOOR_M**2, FLOOR_RAD**2, FLOOR_END_M**2])
+
+
+def _distances(P: Array, i: IntArray, j: IntArray, r: Array, H_i: Array, H_j: Array) -> Array:
+    """Squared Mahalanobis distances (m,), over the rows that count."""
+    blocks = P.reshape(len(P) // 3, 3, -1, 3).transpose(0, 2, 1, 3)
+    cross = H_i @ blocks[i, j] @ H_j.mT
+    S = H_i @ blocks[i, i] @ H_i.mT + H_j @ blocks[j, j] @ H_j.mT + cross + cross.mT + _FLOOR
+    return np.asarray(np.sum(r * np.linalg.solve(S, r[..., None])[..., 0], axis=1))
+
+
+def _tie(walls: _Map, a: int, b: int, r: Array, H_a: Array, H_b: Array) -> None:
+    """Condition the joint on two walls being one: a Kalman update with ``r`` (k,) measured 0."""
+    P = walls.P
+    PHt = P[:, 3 * a : 3 * a + 3] @ H_a.T + P[:, 3 * b : 3 * b + 3] @ H_b.T
+    S = H_a @ PHt[3 * a : 3 * a + 3] + H_b @ PHt[3 * b : 3 * b + 3] + _FLOOR[: len(r), : len(r)]
+    L = np.linalg.cholesky(S)
+    B = np.linalg.solve(L, PHt.T)
+    walls.x -= (B.T @ np.linalg.solve(L, r)).reshape(-1, 3)
+    P -= B.T @ B
+
+
+# ---------------------------------------------------------------- what it makes of steps and map
+
+
+def seen_together(steps: Iterable[Step]) -> set[frozenset[int]]:
+    """Pairs of landmarks that one robot saw from one state."""
+    pairs: set[frozenset[int]] = set()
+    for step in steps:
+        images: dict[tuple[str, int], set[int]] = {}
+        for a in step.associations:
+            if isinstance(a.target, int):
+                images.setdefault((a.robot, a.time_ns), set()).add(a.target)
+        for seen in images.values():
+            pairs |= {frozenset((p, q)) for p in seen for q in seen if p < q}
+    return pairs
+
+
+def survivors(pairs: Iterable[tuple[int, int]]) -> dict[int, int]:
+    """Landmark that goes -> landmark that it becomes: the oldest of all that are one."""
+    into: dict[int, int] = {}
+
+    def last(i: int) -> int:
+        return last(into[i]) if i in into else i
+
+    for pair in pairs:
+        a, b = sorted(map(last, pair))
+        if a != b:
+            into[b] = a
+    return {gone: last(gone) for gone in into}
+
+
+def merged_steps(
+    steps: Iterable[Step], into: Mapping[int, int], kinds: Mapping[int, str]
+) -> tuple[Step, ...]:
+    """Steps with landmarks renamed; what was seen of a segment that becomes a line is a line's."""
+
+    def renamed(a: Association) -> Association:
+        target = into.get(a.target) if isinstance(a.target, int) else None
+        if target is None:
+            return a
+        line = a.model == "segment" and kinds[target] == "line"
+        return replace(a, target=target, model="line" if line else a.model)
+
+    return tuple(
+        replace(step, associations=tuple(renamed(a) for a in step.associations)) for step in steps
+    )
+
+
+def merge_entries(landmarks: LandmarkMap, into: Mapping[int, int]) -> None:
+    """Book in the map what merging makes of extents, counts and times."""
+    for gone, kept in into.items():
+        old, new = landmarks.entries.pop(gone), landmarks.entries[kept]
+        relative = between(new.mean, old.mean)
+        ends = relative[0] + np.cos(relative[2]) * old.extent
+        if new.kind == "line":
+            new.extent = np.array([min(new.extent[0], ends.min()), max(new.extent[1], ends.max())])
+        new.sightings += old.sightings
+        new.first_ns = min(new.first_ns, old.first_ns)
+        new.last_ns = max(new.last_ns, old.last_ns)

@@ -1,0 +1,228 @@
+"""Duplicates: what is one is tied, what differs is not, and the steps say the same afterwards."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from finite_differences import jacobian
+from test_backends import PLAIN, two_robots
+
+from graphslam.backends import BACKENDS, Joint
+from graphslam.backends.base import block_slices
+from graphslam.backends.isam2 import BatchBackend
+from graphslam.geometry import between, compose
+from graphslam.landmark_map import Entry, LandmarkMap
+from graphslam.merging import (
+    _compare,
+    _Map,
+    _relative,
+    duplicates,
+    merge_entries,
+    merged_steps,
+    seen_together,
+    survivors,
+)
+
+WALLS = np.array([[0.0, 0.0, 0.0], [4.0, 2.0, 1.6], [0.0, 5.0, 3.1], [9.0, 1.0, -1.5]])
+EXTENT = np.array([-1.5, 1.5])
+
+
+def entry(number, kind="line", extent=EXTENT):
+    return Entry(number, kind, np.zeros(3), np.zeros((3, 3)), extent.copy(), number, number, None)
+
+
+def joint_of(means, cov):
+    dims = [3] * len(means)
+    whole = np.zeros((3 + 3 * len(means),) * 2)
+    whole[:3, :3] = 1e-6 * np.eye(3)
+    whole[3:, 3:] = cov
+    return Joint(np.zeros(3), tuple(means), whole, block_slices(dims))
+
+
+def two_visits(shift, sigma, own=0.005):
+    """Walls 0-3, and the same walls seen again as 4-7 from a place that is off by ``shift`` (3,).
+
+    The covariance knows that all of the second visit may be off together by ``sigma`` (3,).
+    """
+    again = compose(np.asarray(shift, float), WALLS)
+    G = np.zeros((12, 3))
+    for k, wall in enumerate(again):
+        G[3 * k : 3 * k + 3] = [[1, 0, -wall[1]], [0, 1, wall[0]], [0, 0, 1]]
+    cov = own**2 * np.eye(24)
+    cov[12:, 12:] += G @ np.diag(np.square(sigma)) @ G.T
+    return [*WALLS, *again], cov
+
+
+def ties(means, cov, kinds=None, extents=None, together=()):
+    n = len(means)
+    kinds, extents = kinds or ["line"] * n, extents or [EXTENT] * n
+    entries = [entry(k, kinds[k], extents[k]) for k in range(n)]
+    return duplicates(entries, joint_of(means, cov), [frozenset(pair) for pair in together])
+
+
+def test_walls_seen_twice_are_tied_all_of_them():
+    """Off by half a metre together, known to be uncertain by that much."""
+    assert sorted(ties(*two_visits([0.4, -0.3, 0.03], [0.4, 0.4, 0.03]))) == [
+        (k, k + 4) for k in range(4)
+    ]
+
+
+def test_nothing_is_tied_beyond_what_the_covariance_allows():
+    assert ties(*two_visits([0.4, -0.3, 0.03], [0.02, 0.02, 0.002])) == []
+
+
+def test_one_that_moved_differently_is_left_alone():
+    """Each alone is within its covariance; after the first ties the joint knows better."""
+    means, cov = two_visits([0.3, -0.2, 0.0], [0.4, 0.4, 0.03])
+    means[7] = means[7] + [0.6, 0.0, 0.0]  # a door that was opened
+    found = ties(means, cov)
+    assert (3, 7) not in found and sorted(found) == [(0, 4), (1, 5), (2, 6)]
+
+
+def test_what_one_image_shows_side_by_side_is_never_tied():
+    means, cov = two_visits([0.0, 0.0, 0.0], [0.1, 0.1, 0.01])
+    assert (1, 5) in ties(means, cov)
+    assert (1, 5) not in ties(means, cov, together=[(1, 5)])
+    # nor through a third: 5 is 1's neighbour, and 8 is the same as either
+    means.append(means[1])
+    wider = np.zeros((27, 27))
+    wider[:24, :24], wider[24:, 24:] = cov, 0.01 * np.eye(3)
+    found = ties(means, wider, together=[(1, 5)])
+    assert not ({(1, 8), (5, 8)} <= set(found))
+
+
+def test_walls_of_one_line_that_do_not_lie_beside_each_other_stay_two():
+    """The two sides of a doorway."""
+    means = [np.array([0.0, 0, 0]), np.array([4.0, 0, 0])]
+    assert ties(means, 1e-4 * np.eye(6)) == []
+    assert ties([means[0], np.array([1.0, 0, 0])], 1e-4 * np.eye(6)) == [(0, 1)]
+
+
+def test_the_two_sides_of_a_thin_wall_stay_two():
+    """Seen from opposite sides their directions are opposite."""
+    means = [np.array([0.0, 0, 0]), np.array([0.0, 0.02, np.pi])]
+    assert ties(means, 1e-4 * np.eye(6)) == []
+
+
+def test_whole_segments_must_agree_along_the_wall_too():
+    """Two equal doors side by side; as lines of unknown ends nothing tells them apart."""
+    means, cov = [np.zeros(3), np.array([0.7, 0.0, 0.0])], 1e-4 * np.eye(6)
+    assert ties(means, cov) == [(0, 1)]
+    assert ties(means, cov, kinds=["segment", "segment"]) == []
+    assert ties(means, cov, kinds=["line", "segment"]) == [(0, 1)]
+
+
+def test_a_doubtful_tie_waits():
+    """A wall between two parallel ones that are known to differ, as near to either: not decided."""
+    means = [np.zeros(3), np.array([0.0, 0.3, 0.0]), np.array([0.0, 0.15, 0.0])]
+    cov = np.diag([1e-4] * 6 + [0.04, 0.04, 1e-4])
+    assert ties(means, cov, together=[(0, 1)]) == []
+    means[2] = np.array([0.0, 0.01, 0.0])
+    cov[6:8, 6:8] = 1e-3 * np.eye(2)  # 9 sigma from the other one
+    assert ties(means, cov, together=[(0, 1)]) == [(0, 2)]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_jacobians_of_the_comparison(seed):
+    """Against central differences, good to 1e-10 here."""
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(2, 3)) * [3, 3, 1]
+    x[1, 2] = x[0, 2] + 0.2 * rng.normal()
+    i, j = np.array([0]), np.array([1])
+    # extents so wide that the overlap is all of the second one: where it lies moves with it
+    extents = np.array([[-50.0, 50.0], [-50.0, 50.0]])
+
+    def walls(pair):
+        flags = np.zeros((2, 2), bool)
+        return _Map(pair, np.eye(6), extents, np.ones(2, bool), np.arange(2), flags)
+
+    _, H_i, H_j, _ = _compare(walls(x), i, j)
+    # where the comparison is made is held: it is no part of the residual's dependence
+    middle = _relative(walls(x), i, j)[3][0]
+
+    def residual(flat):
+        relative = between(flat[:3], flat[3:])
+        return np.array(
+            [relative[1] + (middle - relative[0]) * relative[2], relative[2], relative[0]]
+        )
+
+    H = jacobian(residual, x.ravel())
+    np.testing.assert_allclose(np.hstack([H_i[0], H_j[0]]), H, atol=1e-8)
+
+
+def test_survivors_are_the_oldest_of_all_that_are_one():
+    assert survivors([(2, 5), (5, 7), (1, 2), (3, 4)]) == {5: 1, 7: 1, 2: 1, 4: 3}
+
+
+def split(steps, landmark, since_ns, renamed):
+    """The same steps with a landmark that has another number from some time on."""
+    return [
+        replace(
+            step,
+            associations=tuple(
+                replace(a, target=renamed)
+                if a.target == landmark and step.time_ns >= since_ns
+                else a
+                for a in step.associations
+            ),
+        )
+        for step in steps
+    ]
+
+
+@pytest.mark.parametrize("landmark", [1, 2])
+def test_merged_steps_give_the_estimate_that_never_knew_of_two(landmark):
+    steps, _ = two_robots(np.random.default_rng(4))
+    whole = BACKENDS["batch"](PLAIN)
+    twice = BACKENDS["batch"](PLAIN)
+    for step in steps:
+        whole.add(step)
+    for step in split(steps, landmark, 4, 7):
+        twice.add(step)
+    expected, before = whole.finish(), twice.finish()
+    kinds = {1: "line", 2: "segment", 7: "line" if landmark == 1 else "segment"}
+    after = BatchBackend(PLAIN).solve(
+        merged_steps(split(steps, landmark, 4, 7), {7: landmark}, kinds), before
+    )
+    assert sorted(after.landmarks) == [0, 1, 2]
+    for robot, states in expected.states.items():
+        # both stop when a step of Levenberg-Marquardt moves nothing any more
+        np.testing.assert_allclose(after.states[robot].poses, states.poses, atol=1e-5)
+    assert after.error == pytest.approx(expected.error, rel=1e-6)
+
+
+def test_a_segment_that_becomes_part_of_a_line_is_seen_as_one():
+    steps, _ = two_robots()
+    renamed = merged_steps(steps, {2: 1}, {1: "line", 2: "segment"})
+    assert {a.model for step in renamed for a in step.associations if a.target == 1} == {"line"}
+
+
+def test_seen_together_is_about_one_robot_at_one_state():
+    steps, _ = two_robots()
+    assert seen_together(steps) == {frozenset(pair) for pair in ((0, 1), (0, 2), (1, 2))}
+    only = [replace(step, associations=step.associations[:1]) for step in steps]
+    assert seen_together(only) == set()
+
+
+def test_the_map_keeps_the_extent_of_both():
+    landmarks = LandmarkMap()
+    for number in (1, 2):
+        landmarks.entries[number] = entry(number)
+        landmarks.entries[number].sightings = number
+    landmarks.entries[1].move(np.array([3.0, 2.0, 0.7]))
+    landmarks.entries[1].extent = EXTENT
+    landmarks.entries[2].move(compose(np.array([3.0, 2.0, 0.7]), np.array([1.0, 0.0, np.pi])))
+    landmarks.entries[2].extent = np.array([-3.0, 0.0])  # it points the other way
+    merge_entries(landmarks, {2: 1})
+    (kept,) = landmarks.entries.values()
+    np.testing.assert_allclose(kept.extent, [-1.5, 4.0])
+    assert kept.sightings == 3
+
+
+def test_an_extent_stays_where_it_is_when_the_origin_slides():
+    wall = entry(1)
+    wall.mean[:] = [1.0, 2.0, 0.5]
+    before = compose(wall.mean, np.array([wall.extent[0], 0.0, 0.0]))
+    wall.move(compose(wall.mean, np.array([3.0, 0.01, 0.0])))
+    after = compose(wall.mean, np.array([wall.extent[0], 0.0, 0.0]))
+    np.testing.assert_allclose(between(before, after), [0.0, 0.01, 0.0], atol=1e-12)
