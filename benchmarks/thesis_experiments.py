@@ -54,8 +54,8 @@ class Row:
         shown = [self.scale * float(f(self.values)) for f in (np.median, np.min, np.max)]
         median, low, high = (f"{value:.3g}" for value in shown)
         worst = low if self.least is not None else high
-        bar = "" if self.bar is None else f"≤ {self.scale * self.bar:g} {self.unit}"
-        bar = bar if self.least is None else f"≥ {self.scale * self.least:g} {self.unit}"
+        bar = "" if self.bar is None else f"≤ {self.scale * self.bar:.3g} {self.unit}"
+        bar = bar if self.least is None else f"≥ {self.scale * self.least:.3g} {self.unit}"
         return (
             f"| {self.what} | {self.thesis} | {bar} | {median} {self.unit} | {worst} {self.unit} |"
         )

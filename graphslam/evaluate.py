@@ -204,8 +204,10 @@ def _rms(values: Array) -> float | None:
 def landmark_metrics(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]) -> dict[str, Any]:
     """``rmse_m``, ``nees_per_dof``, ``matched``, ``missed``, ``extra`` of a map.
 
-    Landmarks match by identity where both have one; the rest by the assignment with the smallest
-    sum of distances among pairs within 1 m (and, for lines, 0.35 rad modulo pi). Errors are the
+    Landmarks match by identity where both have one. Other points match by the assignment with the
+    smallest sum of distances among pairs within 1 m; other lines and segments each with the nearest
+    true one within 1 m and 0.35 rad modulo pi, for a wall may be seen in several pieces. ``missed``
+    are true ones that nothing matches, ``extra`` landmarks without a true one. Errors are the
     distance for points; for lines and segments the distance of the seen part's middle from the
     true line, and their NEES has two degrees of freedom (direction and offset of the normal),
     since a position along a wall is a gauge.
@@ -224,7 +226,7 @@ def landmark_metrics(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]
         if usable.any()
         else None,
         "matched": len(pairs),
-        "missed": len(true) - len(pairs),
+        "missed": len(true) - len({j for _, j in pairs}),
         "extra": len(estimated) - len(pairs),
     }
 
@@ -242,6 +244,14 @@ def _match(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]) -> list[
     if not rows or not columns:
         return pairs
     cost = np.array([[_distance(estimated[i], true[j]) for j in columns] for i in rows])
+    wall = np.array([estimated[i].kind != "point" for i in rows])
+    nearest = cost.argmin(axis=1)
+    pairs += [
+        (rows[r], columns[nearest[r]]) for r in np.flatnonzero(wall & np.isfinite(cost.min(axis=1)))
+    ]
+    rows, cost = [i for i, is_wall in zip(rows, wall, strict=True) if not is_wall], cost[~wall]
+    if not rows:
+        return pairs
     # A forbidden pair costs more than all allowed ones together, so as many as possible match.
     forbidden = MATCH_DISTANCE_M * (1 + min(cost.shape))
     chosen = linear_sum_assignment(np.where(np.isfinite(cost), cost, forbidden))

@@ -241,6 +241,34 @@ def test_other_walls_are_not_matched(pose, extent):
     assert metrics["nees_per_dof"] is None
 
 
+def test_pieces_of_a_wall_all_match_it():
+    """Furniture cuts a wall into pieces. One to one, all but one would be judged by other walls."""
+    walls = [
+        TrueLandmark("", 0, 0, "long", "segment", np.zeros(3), np.array([[-5.0, 0], [5, 0]])),
+        TrueLandmark(
+            "", 0, 0, "other", "segment", np.array([3, 0.8, 0.1]), np.array([[2.0, 0.7], [4, 0.9]])
+        ),
+        TrueLandmark(
+            "", 0, 0, "far", "segment", np.array([0, 9.0, 0]), np.array([[-1.0, 9], [1, 9]])
+        ),
+    ]
+    cov = 1e-4 * np.eye(3)
+    pieces = [
+        landmark(
+            k,
+            "line",
+            (x, 0.01, 0.0),
+            cov,
+            [[x - 1, 0.01], [x + 1, 0.01]],
+            (np.pi / 2, 0.01, cov[:2, :2]),
+        )
+        for k, x in enumerate((-4.0, 0.0, 3.0))
+    ]
+    metrics = landmark_metrics(pieces, walls)
+    assert (metrics["matched"], metrics["missed"], metrics["extra"]) == (3, 2, 0)
+    assert metrics["rmse_m"] == pytest.approx(0.01)
+
+
 def test_an_empty_map_is_all_missed():
     true = [TrueLandmark("", 0, 0, "a", "point", np.zeros(3), None)]
     assert landmark_metrics([], true)["missed"] == 1
