@@ -79,7 +79,8 @@ class Run:
 def command(*arguments: str) -> dict[str, Any]:
     """What a command prints with --json."""
     done = subprocess.run([*GRAPHSLAM, *arguments, "--json"], stdout=subprocess.PIPE, check=True)
-    return json.loads(done.stdout)
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
 
 
 def smooth(log: Path, target: Path) -> tuple[float, float]:

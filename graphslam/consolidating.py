@@ -59,7 +59,7 @@ def consolidate(
     merged = 0
     for _ in range(MAX_ROUNDS):
         backend = BatchBackend(config)
-        estimate = backend.solve(steps, estimate)
+        estimate = backend.solve(steps, estimate, rough=True)
         for number, (mean, _) in estimate.landmarks.items():
             landmarks.entries[number].move(mean)
         walls = [
@@ -74,4 +74,7 @@ def consolidate(
         steps = merged_steps(steps, into, {entry.id: entry.kind for entry in walls})
         merge_entries(landmarks, into)
         merged += len(into)
+    estimate = BatchBackend(config).solve(steps, estimate)
+    for number, (mean, _) in estimate.landmarks.items():
+        landmarks.entries[number].move(mean)
     return Consolidated(estimate, steps, merged)

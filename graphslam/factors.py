@@ -5,7 +5,7 @@ error is *expected minus measured*. Our covariances are of additive errors along
 frame a quantity is given in; the conversions are here.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import gtsam
 import numpy as np
@@ -123,13 +123,50 @@ def _line_observation(
 
     The square root information has a zero first row: nothing is known along the line.
     """
+    faced, R = _facing(seen.z, seen.cov, x, t)
+    return _line_factor(key, target, faced, R, kernel)
+
+
+def line_factors(
+    keys: Sequence[int],
+    targets: Sequence[int],
+    z: Array,
+    cov: Array,
+    x: Array,
+    t: Array,
+    kernel: RobustConfig,
+) -> list[gtsam.NonlinearFactor]:
+    """What `observation_factor` makes of n lines, at once.
+
+    Args:
+        keys: the observing states.
+        targets: the lines' keys.
+        z: (n, 3) measurements.
+        cov: (n, 3, 3) their covariances.
+        x: (n, 3) estimates of the states.
+        t: (n, 3) estimates of the lines.
+        kernel: robust kernel.
+    """
+    return [
+        _line_factor(*made, kernel)
+        for made in zip(keys, targets, *_facing(z, cov, x, t), strict=True)
+    ]
+
+
+def _facing(z: Array, cov: Array, x: Array, t: Array) -> tuple[Array, Array]:
+    """Lines (..., 3) that face their landmarks, square root information (..., 3, 3)."""
     model = LineModel()
-    V = model.noise(seen.z, seen.cov, x, t)
-    R = np.zeros((3, 3))
+    R = np.zeros(cov.shape)
     # upper triangular U with UᵀU = V⁻¹: from the Cholesky factor of the inverse
-    R[1:, 1:] = np.linalg.cholesky(np.linalg.inv(V)).T
+    R[..., 1:, 1:] = np.linalg.cholesky(np.linalg.inv(model.noise(z, cov, x, t))).mT
+    return model.facing(z, x, t), R
+
+
+def _line_factor(
+    key: int, target: int, faced: Array, R: Array, kernel: RobustConfig
+) -> gtsam.NonlinearFactor:
     noise = robust(gtsam.noiseModel.Gaussian.SqrtInformation(R, False), kernel)
-    return gtsam.BetweenFactorPose2(key, target, pose2(model.facing(seen.z, x, t)), noise)
+    return gtsam.BetweenFactorPose2(key, target, pose2(faced), noise)
 
 
 def _point_observation(

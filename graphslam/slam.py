@@ -15,6 +15,7 @@ import numpy as np
 
 from graphslam.associator import Associator
 from graphslam.backends import BACKENDS
+from graphslam.backends.isam2 import Isam2Backend
 from graphslam.calibration import observed_information
 from graphslam.config import Config, OdometryConfig, RobotConfig, load_config
 from graphslam.consolidating import consolidate
@@ -412,8 +413,15 @@ class Pipeline:
             if len(run.causal_covs) < len(run.times):
                 run.causal_covs.append(self.backend.joint(robot, []).cov)
 
+    def finish(self) -> Estimate:
+        """The final estimate: of smoothers from what is only known at the end."""
+        settings = self.config.backend
+        if isinstance(self.backend, Isam2Backend) and settings.polish and settings.reconsider:
+            return self.reconsider(self.backend.rough())
+        return self.backend.finish()
+
     def reconsider(self, estimate: Estimate) -> Estimate:
-        """The final estimate, from what is only known at the end; the steps follow it."""
+        """The log solved again from a rough estimate; the steps follow the result."""
         tracks = {name: run.track for name, run in self.runs.items() if run.started}
         if self.sources:
             refined = refine(self.steps, estimate, tracks, self.sources, self.config)
@@ -452,9 +460,7 @@ def smooth(log: LogSet, config: Config, progress: Progress = lambda _count: None
         raise LogError(f"{log.files[0].path}: nothing in it could be used; see `graphslam info`")
     pipeline.note_covariances()
     finishing = time.perf_counter()
-    estimate = pipeline.backend.finish()
-    if pipeline.backend.smooths and config.backend.polish and config.backend.reconsider:
-        estimate = pipeline.reconsider(estimate)
+    estimate = pipeline.finish()
     pipeline.seconds["final optimisation"] = time.perf_counter() - finishing
     finishing = time.perf_counter()
     runs = {name: run for name, run in sorted(pipeline.runs.items()) if run.started}

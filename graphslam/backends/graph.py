@@ -77,6 +77,16 @@ class GraphBuilder:
         """Key of a robot's latest state."""
         return self.state_key(robot, self.states.latest(robot))
 
+    def dims(self) -> dict[int, int]:
+        """Every variable there is, with its size."""
+        found = {
+            self.state_key(robot, n): 3
+            for robot in self.robots
+            for n in range(len(self.states.times[robot]))
+        }
+        found.update((factors.landmark_key(i), d) for i, d in self.landmark_dims.items())
+        return found
+
     def parts(self, step: Step, estimate: Estimates) -> Iterator[Part]:
         """The parts of a step, in recorded order.
 

@@ -20,6 +20,10 @@ from graphslam.records import Association, Estimate, Step
 CONVERGED = 1e-6
 #: the same for lines that are faced anew (it converges in two rounds), without and with a kernel
 FACED, FACED_ROBUST, MAX_FACINGS = 1e-6, 1e-2, 4
+#: relative decrease of the error at which optimising ends: without a kernel; with one (reweighting
+#: converges linearly: beyond 1e-6 hundreds of iterations move nothing that shows); and where
+#: another round follows anyway
+CONVERGED_ERROR, CONVERGED_ERROR_ROBUST, CONVERGED_ERROR_ROUGH = 1e-10, 1e-6, 1e-4
 
 
 class WholeGraph(GraphBuilder):
@@ -52,9 +56,23 @@ class WholeGraph(GraphBuilder):
         return graph, values
 
     def face_lines(self, values: gtsam.Values) -> None:
-        """Rebuild the factors of lines at ``values``; see `GraphBuilder.faced`."""
-        for place, observed in self._lines:
-            factor = self.faced(observed, lambda key, dim: read(values, key, dim))
+        """Rebuild the factors of all lines at ``values``, at once; see `GraphBuilder.faced`."""
+        if not self._lines:
+            return
+        places, observed = zip(*self._lines, strict=True)
+        keys, targets, seen = zip(*observed, strict=True)
+        known = np.unique([keys, targets])
+        poses = np.array([read(values, int(key), 3) for key in known])
+        made = factors.line_factors(
+            keys,
+            targets,
+            np.array([a.z for a in seen]),
+            np.array([a.cov for a in seen]),
+            poses[np.searchsorted(known, keys)],
+            poses[np.searchsorted(known, targets)],
+            self.kernel,
+        )
+        for place, factor in zip(places, made, strict=True):
             self.graph.replace(place, factor)
 
     def diagnose(self, values: gtsam.Values) -> EstimationError:
@@ -160,6 +178,15 @@ class Isam2Backend(GraphBackend):
             return self._result(self._optimised(self._isam.calculateBestEstimate()))
         return self._result(self._converged())
 
+    def rough(self) -> Estimate:
+        """What the tree has now, where solving again begins: covariances are NaN."""
+        return self._rough(self._isam.calculateBestEstimate())
+
+    def _rough(self, values: gtsam.Values) -> Estimate:
+        means = {key: read(values, key, dim) for key, dim in self._builder.dims().items()}
+        covs = {key: np.full((len(mean), len(mean)), np.nan) for key, mean in means.items()}
+        return self._estimate(means, covs, float(self._builder.graph.error(values)))
+
     def _converged(self) -> gtsam.Values:
         nothing, no_values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         try:
@@ -211,8 +238,14 @@ class Isam2Backend(GraphBackend):
 class BatchBackend(Isam2Backend):
     """The converged limit, whatever `backend.polish` says; associations as with iSAM2."""
 
-    def solve(self, steps: Iterable[Step], start: Estimate) -> Estimate:
+    def solve(self, steps: Iterable[Step], start: Estimate, *, rough: bool = False) -> Estimate:
         """All steps at once, from an estimate of every variable in them; `add` nothing before.
+
+        Args:
+            steps: as recorded.
+            start: where to begin.
+            rough: to what a next round can go on from, in a fraction of the time: covariances are
+                NaN (`joint` has them).
 
         Raises:
             EstimationError: the steps make the estimate indeterminate.
@@ -222,7 +255,15 @@ class BatchBackend(Isam2Backend):
             _, new = self._builder.expand(step, lambda key, dim: read(values, key, dim))
             for key in new.keys():  # noqa: SIM118 (GTSAM's values are no mapping)
                 write(values, key, self._builder.value_in(start, key))
-        return self._result(self._optimised(values))
+        if not rough:
+            return self._result(self._optimised(values))
+        try:
+            self._builder.face_lines(values)
+            graph, kernel = self._builder.graph, self._config.robust
+            self._finished = optimise(graph, values, kernel, CONVERGED_ERROR_ROUGH)
+        except RuntimeError as error:
+            raise self._builder.explain(error) from error
+        return self._rough(self._finished)
 
     def finish(self) -> Estimate:
         """See `Backend`."""
@@ -230,16 +271,20 @@ class BatchBackend(Isam2Backend):
 
 
 def optimise(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, kernel: RobustConfig
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    kernel: RobustConfig,
+    converged: float | None = None,
 ) -> gtsam.Values:
-    """Levenberg-Marquardt from ``values`` until the error hardly changes.
+    """Levenberg-Marquardt from ``values`` until the error decreases by less than ``converged``.
 
-    Without a kernel convergence is quadratic and 1e-10 of the error comes for free. Under a kernel
-    GTSAM reweights, which converges linearly: beyond 1e-6 hundreds of iterations move nothing that
-    shows.
+    Relative to the error; by default, without a kernel, to 1e-10, which comes for free where
+    convergence is quadratic.
     """
+    if converged is None:
+        converged = CONVERGED_ERROR if kernel.kernel == "none" else CONVERGED_ERROR_ROBUST
     parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setRelativeErrorTol(1e-10 if kernel.kernel == "none" else 1e-6)
+    parameters.setRelativeErrorTol(converged)
     parameters.setAbsoluteErrorTol(1e-9)
     parameters.setMaxIterations(200)
     return gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()

@@ -1,0 +1,177 @@
+"""Intel and ACES made worse in four ways, with default settings: does any run fail grossly?
+
+late      the first 20 s are missing
+half      every second scan is missing
+noisy     noise on every odometry increment, until odometry's own error, the mean over all
+          relations, is 1.5-fold (two seeds)
+mirrored  left is right
+
+The first is run once as recorded too. Errors are those of `graphslam evaluate --relations`, over
+the relations whose scans are left; a run fails grossly if the mean over all of them exceeds 0.15 m.
+
+Run: python benchmarks/perturbed_logs.py [intel|aces[:as-recorded|late|half|noisy|mirrored]] ...
+exit code 1 if a run fails grossly. GRAPHSLAM_DATA as in real_logs.py.
+"""
+
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from real_logs import DATA, LOGS, command, smooth
+
+from graphslam.config import Config
+from graphslam.evaluate import Relations, read_relations, relation_errors
+from graphslam.geometry import Array, between, compose
+from graphslam.logs import LogWriter, open_logs
+from graphslam.records import Message, OdometryPose, Scan, Trajectory
+
+GROSS_M, LATE_S, WORSE = 0.15, 20.0, 1.5
+SEEDS = (1, 2)
+MIRROR = np.array([1.0, -1.0, -1.0])
+Messages = list[Message]
+
+
+def late(messages: Messages, _relations: Relations, _seed: int) -> Messages:
+    first = min(m.time_ns for m in messages)
+    return [m for m in messages if m.time_ns >= first + LATE_S * 1e9]
+
+
+def half(messages: Messages, _relations: Relations, seed: int) -> Messages:
+    scans = [m for m in messages if isinstance(m, Scan)]
+    gone = set(map(id, scans[seed % 2 :: 2]))
+    return [m for m in messages if id(m) not in gone]
+
+
+def mirrored(messages: Messages, _relations: Relations, _seed: int) -> Messages:
+    return list(map(mirror, messages))
+
+
+def mirror(message: Message) -> Message:
+    if isinstance(message, Scan):
+        return replace(
+            message, ranges=message.ranges[::-1], angle_min_rad=-float(message.angles[-1])
+        )
+    assert isinstance(message, OdometryPose)
+    return replace(message, pose=MIRROR * message.pose)
+
+
+def mirrored_relations(path: Path) -> str:
+    """Lines ``t1 t2 x y z roll pitch yaw`` with y and yaw of the other sign."""
+    lines = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        t1, t2, x, y, z, roll, pitch, yaw = line.split()
+        lines.append(f"{t1} {t2} {x} {-float(y)} {z} {roll} {pitch} {-float(yaw)}\n")
+    return "".join(lines)
+
+
+def noisy(messages: Messages, relations: Relations, seed: int) -> Messages:
+    """The same draws, scaled until the error is what it should be."""
+    odometry = [m for m in messages if isinstance(m, OdometryPose)]
+    poses = np.array([m.pose for m in odometry])
+    times = np.array([m.time_ns for m in odometry])
+    draws = np.random.default_rng(seed).standard_normal((len(poses) - 1, 3))
+    scans = [m for m in messages if isinstance(m, Scan)]
+
+    def error(poses: Array) -> float:
+        at = np.clip(np.searchsorted(times, [m.time_ns for m in scans], "right") - 1, 0, None)
+        order = np.argsort([m.stamp_ns for m in scans])
+        stamps = np.array([m.stamp_ns for m in scans])[order]
+        known = Trajectory(stamps, poses[at][order], np.zeros((len(scans), 3, 3)))
+        return float(np.nanmean(relation_errors(relations, known)[:, 0]))
+
+    increments = between(poses[:-1], poses[1:])
+    length = np.hypot(increments[:, 0], increments[:, 1])
+    turned = np.abs(increments[:, 2])
+    sigma = np.column_stack([np.sqrt(length), np.sqrt(length), np.sqrt(length + turned)])
+
+    def worse(scale: float) -> Array:
+        out = poses.copy()
+        for k, step in enumerate(increments + scale * sigma * draws):
+            out[k + 1] = compose(out[k], step)
+        return out
+
+    goal, low, high = WORSE * error(poses), 0.0, 0.5
+    for _ in range(14):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if error(worse(middle)) < goal else (low, middle)
+    print(f"  noise {low:.3f} m (rad) per root of a metre", flush=True)
+    made = {id(m): replace(m, pose=p) for m, p in zip(odometry, worse(low), strict=True)}
+    return [made.get(id(m), m) for m in messages]
+
+
+def as_recorded(messages: Messages, _relations: Relations, _seed: int) -> Messages:
+    return messages
+
+
+PERTURBATIONS: dict[str, tuple[Callable[[Messages, Relations, int], Messages], tuple[int, ...]]] = {
+    "as-recorded": (as_recorded, (0,)),
+    "late": (late, (0,)),
+    "half": (half, SEEDS),
+    "noisy": (noisy, SEEDS),
+    "mirrored": (mirrored, (0,)),
+}
+
+
+def write(messages: Messages, path: Path) -> None:
+    with LogWriter(path) as log:
+        for m in messages:
+            if isinstance(m, OdometryPose):
+                log.odometry(m.robot, m.stamp_ns, m.pose, log_time_ns=m.time_ns)
+            elif isinstance(m, Scan):
+                log.scan(
+                    m.robot,
+                    m.stamp_ns,
+                    np.where(np.isfinite(m.ranges), m.ranges, np.inf),
+                    angle_min_rad=m.angle_min_rad,
+                    angle_step_rad=m.angle_step_rad,
+                    range_max_m=80.0,
+                    log_time_ns=m.time_ns,
+                )
+
+
+def runs(names: list[str]) -> Iterator[tuple[str, str, int]]:
+    for name in names:
+        log, _, wanted = name.partition(":")
+        for perturbation, (_, seeds) in PERTURBATIONS.items():
+            if wanted in ("", perturbation):
+                yield from ((log, perturbation, seed) for seed in seeds)
+
+
+def main(names: list[str]) -> int:
+    good = True
+    print(f"{'':26}{'n':>6}{'all m':>9}{'local':>9}{'loops':>9}{'rot °':>8}{'causal':>9}{'s':>7}")
+    with tempfile.TemporaryDirectory() as folder:
+        for log, perturbation, seed in runs(names):
+            whole = Path(folder, f"{log}.mcap")
+            if not whole.exists():
+                command("import", "carmen", str(DATA / f"{log}.clf.bz2"), "-o", str(whole))
+            messages = list(open_logs([whole], Config()).messages())
+            relations = read_relations(DATA / f"{log}.relations")
+            name = f"{log}-{perturbation}-{seed}"
+            path, target = Path(folder, f"{name}.mcap"), Path(folder, name)
+            write(PERTURBATIONS[perturbation][0](messages, relations, seed), path)
+            reference = DATA / f"{log}.relations"
+            if perturbation == "mirrored":
+                reference = Path(folder, "mirrored.relations")
+                reference.write_text(mirrored_relations(DATA / f"{log}.relations"))
+            wall_s, _ = smooth(path, target)
+            path.unlink()
+            found = command("evaluate", str(target), "--relations", str(reference))["relations"]
+            causal = found["causal"]["all"]["trans_mean_m"]
+            mean = [found[group]["trans_mean_m"] for group in ("all", "local", "loops")]
+            good &= mean[0] <= GROSS_M
+            print(
+                f"{log + ' ' + perturbation + ' ' + str(seed):26}{found['all']['n']:6}"
+                + "".join(f"{value:9.4f}" for value in mean)
+                + f"{found['all']['rot_mean_deg']:8.3f}{causal:9.3f}{wall_s:7.1f}"
+                + ("" if mean[0] <= GROSS_M else "  GROSS FAILURE"),
+                flush=True,
+            )
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:] or list(LOGS)))
