@@ -203,7 +203,8 @@ class BackendConfig:
     name: which one. relinearize_threshold: largest change of a variable (m, rad) before it is
     linearised anew; relinearize_every: steps between two looks for such variables. polish:
     optimise to convergence at the end; reconsider: then apply the final calibration to all of the
-    log, merge landmarks that are one, and optimise again (smoothers only). horizon_s: how long a
+    log, merge landmarks that are one, and optimise again (smoothers only); close_loops: in between,
+    close loops that scans confirm. horizon_s: how long a
     past pose stays in isam2's graph before it is marginalised out: inf = full smoothing, 0 = the
     extended Kalman filter.
     """
@@ -214,6 +215,7 @@ class BackendConfig:
     relinearize_every: int = 20
     polish: bool = True
     reconsider: bool = True
+    close_loops: bool = True
 
 
 @dataclass(frozen=True)

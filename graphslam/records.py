@@ -301,11 +301,12 @@ class RobotResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """Points of the keyframes' scans for drawing: (n, 2) in the base frame, with their state."""
+    """Points of a keyframe's scan: (n, 2) in the frame of its state, seen from ``sensor`` (3,)."""
 
     robot: str
     time_ns: int
     points: Array
+    sensor: Array = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

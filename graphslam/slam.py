@@ -18,7 +18,7 @@ from graphslam.backends import BACKENDS
 from graphslam.backends.isam2 import Isam2Backend
 from graphslam.calibration import observed_information
 from graphslam.config import Config, OdometryConfig, RobotConfig, load_config
-from graphslam.consolidating import consolidate
+from graphslam.consolidating import Tamper, consolidate
 from graphslam.dead_reckoning import Track
 from graphslam.errors import ConfigError, EstimationError, LogError
 from graphslam.frontend import FRONT_ENDS, scan_points
@@ -57,7 +57,7 @@ from graphslam.summary import make_landmarks, summarise
 from graphslam.timeline import ODOMETRY, synchronise
 from graphslam.trajectories import in_world, origin_shift, step_in_world
 
-#: scans kept for the picture at most, so that memory does not grow with the log
+#: scans in the picture at most
 MAX_PICTURES = 4000
 
 Progress = Callable[[int], None]
@@ -66,8 +66,8 @@ Progress = Callable[[int], None]
 class Pipeline:
     """One run over a log."""
 
-    def __init__(self, log: LogSet, config: Config) -> None:
-        self.log, self.config = log, config
+    def __init__(self, log: LogSet, config: Config, tamper: Tamper | None = None) -> None:
+        self.log, self.config, self.tamper = log, config, tamper
         self.backend = BACKENDS[config.backend.name](config)
         self.associator = Associator(config.association, self.backend)
         self.front_end = FRONT_ENDS[config.front_end.name]
@@ -324,7 +324,9 @@ class Pipeline:
         for message in event:
             if isinstance(message, Scan):
                 points = scan_points(message, self.config.front_end.max_range_m)
-                self.add_picture(Picture(robot, state_ns, points.astype(np.float32)))
+                self.pictures.append(
+                    Picture(robot, state_ns, points.astype(np.float32), message.mount)
+                )
 
     def enter(self, step: Step, known: set[int]) -> None:
         """Give a step to the back end, and learn from it; ``known`` landmarks were there before."""
@@ -427,25 +429,36 @@ class Pipeline:
             refined = refine(self.steps, estimate, tracks, self.sources, self.config)
             self.steps = list(refined.steps)
             return refined.estimate
-        done = consolidate(self.steps, estimate, tracks, self.associator.map, self.config)
+        done = consolidate(
+            self.steps,
+            estimate,
+            tracks,
+            self.associator.map,
+            self.pictures,
+            self.config,
+            self.tamper,
+        )
         self.steps = list(done.steps)
         self.counts["landmarks_merged"] += done.merged
+        self.counts["closures_verified"] += done.closed
+        self.counts["closures_kept"] += done.kept
+        self.counts["closures_refused"] += done.refused
         return done.estimate
 
-    def add_picture(self, picture: Picture) -> None:
-        """Keep a scan for drawing; when there are too many, every second one is let go."""
-        self.pictures.append(picture)
-        if len(self.pictures) > MAX_PICTURES:
-            del self.pictures[::2]
 
-
-def smooth(log: LogSet, config: Config, progress: Progress = lambda _count: None) -> Result:
+def smooth(
+    log: LogSet,
+    config: Config,
+    progress: Progress = lambda _count: None,
+    tamper: Tamper | None = None,
+) -> Result:
     """Estimate everything that a log tells: the main job.
 
     Args:
         log: opened logs.
         config: settings.
         progress: called with the number of messages read so far.
+        tamper: for tests, see `graphslam.consolidating.Tamper`.
 
     Raises:
         LogError: no message of the log could be used.
@@ -454,7 +467,7 @@ def smooth(log: LogSet, config: Config, progress: Progress = lambda _count: None
     """
     began = time.perf_counter()
     check_robots(log, config)
-    pipeline = Pipeline(log, config)
+    pipeline = Pipeline(log, config, tamper)
     pipeline.run(progress)
     if not pipeline.steps:
         raise LogError(f"{log.files[0].path}: nothing in it could be used; see `graphslam info`")
@@ -500,7 +513,7 @@ def smooth(log: LogSet, config: Config, progress: Progress = lambda _count: None
         landmarks,
         estimate,
         steps,
-        tuple(pipeline.pictures),
+        tuple(pipeline.pictures[:: 1 + len(pipeline.pictures) // MAX_PICTURES]),
         innovations,
         np.array(pipeline.step_ms),
         summary,

@@ -24,14 +24,15 @@ ROWS = (
     ("models",),  # motion, and one observation model per kind of target
     # one job each, on records and arrays
     ("association", "calibration", "dead_reckoning", "export", "factors", "frontend", "logs"),
+    ("matching",),  # where a place was seen from
     # estimators; order in time; poses at any time; worlds and their logs
     ("backends", "simulate", "timeline", "trajectories"),
     # what is known about landmarks beside their estimate; of a robot; where robots start; recorded
     # steps through an estimator; sightings that share a step
     ("gathering", "landmark_map", "replay", "robot_run", "starts"),
-    # decisions of one image; duplicates in a map; a log of sightings solved again; what a run adds
-    # up to
-    ("associator", "merging", "refining", "summary"),
+    # decisions of one image; places seen twice; duplicates in a map; a log of sightings solved
+    # again; what a run adds up to
+    ("associator", "closing", "merging", "refining", "summary"),
     ("consolidating",),  # a log of scans solved again
     ("slam",),  # the pipeline
     ("results",),  # a result as a folder, and back

@@ -4,7 +4,7 @@
 is its converged limit: the same graph, optimised by Levenberg-Marquardt from iSAM2's estimate.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import gtsam
 import numpy as np
@@ -177,6 +177,12 @@ class Isam2Backend(GraphBackend):
         if self._config.backend.polish:
             return self._result(self._optimised(self._isam.calculateBestEstimate()))
         return self._result(self._converged())
+
+    def state_covariance(self, states: Sequence[tuple[str, int]]) -> Array:
+        """Joint covariance (3n, 3n) of states, by robot and time, errors along each one's axes."""
+        builder = self._builder
+        numbers = [(robot, builder.states.number(robot, t)) for robot, t in states]
+        return self.covariance([builder.state_key(*state) for state in numbers])
 
     def rough(self) -> Estimate:
         """What the tree has now, where solving again begins: covariances are NaN."""

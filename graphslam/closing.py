@@ -1,0 +1,302 @@
+"""Loop closing that is verified: places seen twice, found by matching what was seen there.
+
+The run is cut into submaps. Where two of them may be of one place, as far as the estimate can tell,
+the later one is searched for in the earlier (`matching`). A closure is believed if most of what
+either saw is confirmed by the other, little of it is looked through, no direction is left open, no
+second place in the window fits nearly as well, and if it agrees with the other closures under the
+joint covariance of the run: J. Mangelson et al., ICRA 2018, DOI 10.1109/ICRA.2018.8460217, for
+pairwise consistency, there of odometry, here of everything that is known so far.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from graphslam.geometry import (
+    Array,
+    between,
+    compose,
+    inverse,
+    log,
+    rotate_cov,
+    rotation,
+    transform,
+)
+from graphslam.matching import Match, Submap, agreement, align, make_submap, match
+from graphslam.records import Closure, Picture, Trajectory
+
+#: m of path: between submaps, what each takes in before and after its middle, between its scans
+SPACING_M, REACH_M, SCAN_M = 3.0, 3.0, 0.5
+#: rad turned between scans of a submap
+SCAN_RAD = 0.4
+#: points of a scan at least
+FEWEST = 20
+#: submaps of a run at most; a longer one has them farther apart
+MAX_SUBMAPS = 400
+#: m of path between two visits, and m between the middles of submaps that may show one place
+APART_M, NEAR_M = 15.0, 3.0
+#: the window searched: so many sigmas and this much more, at most so far (m, m, rad)
+SIGMAS = 3.0
+MARGIN, FARTHEST = np.array([0.6, 0.6, 0.08]), np.array([5.0, 5.0, 0.5])
+#: verified: shares of points confirmed at least, looked through at most (of both)
+SAME, ABSENT = 0.4, 0.15
+#: how sure the position must be in every direction, m
+SURE_M = 0.08
+#: the second best must be worse than this part of the best
+RIVAL = 0.8
+#: closures agree with each other up to this probability, by covariances that may be too small by
+#: this factor (the estimate does not know of what it missed)
+AGREE, TRUST = 0.99, 16.0
+#: m, rad: pairs that lie this well need no closure; closures that come out worse are taken back
+CLOSED, BORNE_OUT = (0.06, 0.01), (0.2, 0.03)
+#: states of one robot at one time
+State = tuple[str, int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Place:
+    """A submap with the state that it is relative to, and how far its robot had driven."""
+
+    state: State
+    pose: Array
+    path_m: float
+    submap: Submap
+
+
+def places(states: Mapping[str, Trajectory], pictures: Iterable[Picture]) -> list[Place]:
+    """Submaps along every robot's path.
+
+    Args:
+        states: estimates of all states.
+        pictures: what was seen from them.
+    """
+    clouds = {(p.robot, p.time_ns): p for p in pictures if len(p.points) >= FEWEST}
+    found = []
+    for robot, states_of in states.items():
+        seen = np.array([(robot, int(t)) in clouds for t in states_of.stamps_ns], dtype=bool)
+        poses, stamps = states_of.poses[seen], states_of.stamps_ns[seen]
+        if len(poses) < 2:
+            continue
+        moves = between(poses[:-1], poses[1:])
+        path = np.concatenate([[0.0], np.cumsum(np.hypot(moves[:, 0], moves[:, 1]))])
+        turned = np.concatenate([[0.0], np.cumsum(np.abs(moves[:, 2]))])
+        spacing = max(SPACING_M, path[-1] / MAX_SUBMAPS)
+        for middle in np.unique(np.searchsorted(path, np.arange(0.0, path[-1], spacing))):
+            used: list[int] = []
+            for k in np.flatnonzero(np.abs(path - path[middle]) <= REACH_M):
+                if (
+                    not used
+                    or path[k] - path[used[-1]] >= SCAN_M
+                    or turned[k] - turned[used[-1]] >= SCAN_RAD
+                ):
+                    used.append(int(k))
+            seen_there = [clouds[robot, int(stamps[k])] for k in used]
+            sensors = np.array([p.sensor for p in seen_there])
+            submap = make_submap(
+                compose(between(poses[middle], poses[used]), sensors),
+                [transform(inverse(p.sensor), p.points.astype(float)) for p in seen_there],
+            )
+            state = robot, int(stamps[middle])
+            found.append(Place(state, poses[middle], float(path[middle]), submap))
+    return found
+
+
+def moved(found: Sequence[Place], states: Mapping[str, Trajectory]) -> list[Place]:
+    """The same places where another estimate has them; what they show stays as it was."""
+    return [
+        replace(p, pose=states[robot].poses[np.searchsorted(states[robot].stamps_ns, time_ns)])
+        for p in found
+        for robot, time_ns in [p.state]
+    ]
+
+
+def candidates(found: Sequence[Place], P: Array) -> list[tuple[int, int, Array]]:
+    """Pairs of places that may be one: later, earlier, and half the window (3,) to search.
+
+    Of a stretch of earlier places only the nearest is named.
+
+    Args:
+        found: the places.
+        P: (3n, 3n) joint covariance of their poses, errors along each pose's own axes.
+    """
+    pairs = []
+    for i, later in enumerate(found):
+        best: dict[tuple[str, int], tuple[float, int, Array]] = {}
+        stretch, last_j = 0, -1
+        for j, earlier in enumerate(found[:i]):
+            same_robot = later.state[0] == earlier.state[0]
+            if same_robot and later.path_m - earlier.path_m < APART_M:
+                continue
+            away = between(earlier.pose, later.pose)
+            distance = float(np.hypot(away[0], away[1]))
+            if distance > NEAR_M + FARTHEST[0]:
+                continue
+            sigma = np.sqrt(np.diag(_relative(P, found, i, j)[1]))
+            window = np.minimum(SIGMAS * sigma + MARGIN, FARTHEST)
+            if distance > NEAR_M + window[:2].max():
+                continue
+            if j != last_j + 1:
+                stretch += 1
+            last_j = j
+            key = earlier.state[0], stretch
+            if key not in best or distance < best[key][0]:
+                best[key] = distance, j, window
+        pairs += [(i, j, window) for _, j, window in best.values()]
+    return pairs
+
+
+def _relative(P: Array, found: Sequence[Place], i: int, j: int) -> tuple[Array, Array]:
+    """Place i seen from place j: Jacobian (3, 6) by errors of j and i, and covariance (3, 3)."""
+    H = _jacobian(between(found[j].pose, found[i].pose))
+    at = np.r_[3 * j : 3 * j + 3, 3 * i : 3 * i + 3]
+    return H, np.asarray(H @ P[np.ix_(at, at)] @ H.T)
+
+
+def _jacobian(h: Array) -> Array:
+    """Of a relative pose h (3,), by errors (6,) of both poses along their own axes."""
+    c, s = np.cos(h[2]), np.sin(h[2])
+    return np.array(
+        [
+            [-1.0, 0.0, h[1], c, -s, 0.0],
+            [0.0, -1.0, -h[0], s, c, 0.0],
+            [0.0, 0.0, -1.0, 0.0, 0.0, 1.0],
+        ]
+    )
+
+
+def verified(matches: Sequence[Match]) -> Match | None:
+    """The first of the matches if it can be believed."""
+    if not matches:
+        return None
+    best = matches[0]
+    score = best.same - best.absent
+    sigma = np.sqrt(np.linalg.eigvalsh(best.cov[:2, :2])[-1])
+    good = (
+        best.same >= SAME
+        and best.absent <= ABSENT * (best.same + best.absent)
+        and sigma <= SURE_M
+        and all(m.same - m.absent <= RIVAL * score for m in matches[1:])
+    )
+    return best if good else None
+
+
+def loop_closures(found: Sequence[Place], P: Array) -> list[Closure]:
+    """Closures between places, each verified by itself.
+
+    Pairs that lie where they should are passed over: there is nothing to close.
+
+    Args:
+        found: the places.
+        P: (3n, 3n) joint covariance of their poses, errors along each pose's own axes.
+    """
+    made = []
+    for i, j, window in candidates(found, TRUST * P):
+        later, earlier = found[i], found[j]
+        guess = between(earlier.pose, later.pose)
+        if closed(later.submap, earlier.submap, guess):
+            continue
+        best = verified(match(later.submap, earlier.submap, guess, window))
+        if best is not None:
+            made.append(Closure(*later.state, *earlier.state, best.pose, best.cov))
+    return made
+
+
+def closed(source: Submap, target: Submap, guess: Array) -> bool:
+    """Whether two places lie where they should, as far as what was seen there can tell."""
+    pose, _ = align(source, target, guess)
+    off = between(guess, pose)
+    if np.hypot(off[0], off[1]) > CLOSED[0] or abs(off[2]) > CLOSED[1]:
+        return False
+    same, absent = agreement(source, target, pose)
+    return same >= SAME and absent <= ABSENT * (same + absent)
+
+
+def agreeing(closures: Sequence[Closure], found: Sequence[Place], P: Array) -> list[Closure]:
+    """The largest set found of closures that agree with the estimate and, in pairs, among them.
+
+    Two agree if, once either is believed, the other is what is to be expected.
+
+    Args:
+        closures: between places.
+        found: the places.
+        P: (3n, 3n) joint covariance of their poses, errors along each pose's own axes.
+    """
+    if not closures:
+        return []
+    r, S = _innovations(closures, found, TRUST * P)
+    n, gate = len(r), chi2.ppf(AGREE, 3)
+    blocks = S.reshape(n, 3, n, 3).transpose(0, 2, 1, 3)
+    own = blocks[np.arange(n), np.arange(n)]
+    gain = blocks @ np.linalg.inv(own)[None]  # [a, b]: what b says of a
+    rest = r[:, None] - (gain @ r[None, :, :, None])[..., 0]
+    left = own[:, None] - gain @ blocks.transpose(1, 0, 2, 3)
+    given = np.einsum("abi,abij,abj->ab", rest, np.linalg.pinv(left, hermitian=True), rest)
+    alone = np.einsum("ai,aij,aj->a", r, np.linalg.inv(own), r) <= gate
+    fits = given <= gate
+    agree = fits & fits.T & alone[:, None] & alone
+    np.fill_diagonal(agree, False)
+    best: list[int] = []
+    for first in np.flatnonzero(alone):
+        chosen, free = [int(first)], agree[first].copy()
+        while free.any():
+            support = np.where(free, (agree & free).sum(axis=1), -1)
+            k = int(support.argmax())
+            chosen.append(k)
+            free &= agree[k]
+        if len(chosen) > len(best):
+            best = chosen
+    return [closures[k] for k in sorted(best)]
+
+
+def _innovations(
+    closures: Sequence[Closure], found: Sequence[Place], P: Array
+) -> tuple[Array, Array]:
+    """How closures differ from the estimate (n, 3), in their own frames; covariance (3n, 3n)."""
+    at = {place.state: k for k, place in enumerate(found)}
+    n = len(closures)
+    r, J, R = np.zeros((n, 3)), np.zeros((3 * n, len(P))), np.zeros((3 * n, 3 * n))
+    for k, closure in enumerate(closures):
+        i = at[closure.robot, closure.time_ns]
+        j = at[closure.other, closure.other_time_ns]
+        h = between(found[j].pose, found[i].pose)
+        r[k] = log(between(closure.delta, h))
+        turn = np.eye(3)
+        turn[:2, :2] = rotation(-float(closure.delta[2]))
+        H, rows = turn @ _jacobian(h), slice(3 * k, 3 * k + 3)
+        J[rows, 3 * j : 3 * j + 3], J[rows, 3 * i : 3 * i + 3] = H[:, :3], H[:, 3:]
+        R[rows, rows] = turn @ closure.cov @ turn.T
+    return r, J @ P @ J.T + R
+
+
+def residuals(closures: Sequence[Closure], states: Mapping[str, Trajectory]) -> Array:
+    """How an estimate differs from closures: (n, 3), in their own frames."""
+    found = np.zeros((len(closures), 3))
+    for k, c in enumerate(closures):
+        ends = (c.other, c.other_time_ns), (c.robot, c.time_ns)
+        poses = [states[r].poses[np.searchsorted(states[r].stamps_ns, t)] for r, t in ends]
+        found[k] = log(between(c.delta, between(*poses)))
+    return found
+
+
+def slack(closures: Sequence[Closure], states: Mapping[str, Trajectory]) -> list[Closure]:
+    """Closures with covariances so large that an estimate lies within three sigmas of each.
+
+    A robust kernel takes what is many sigmas off for wrong; verified closures are to be drawn tight
+    step by step.
+    """
+    found = []
+    for closure, r in zip(closures, residuals(closures, states), strict=True):
+        turned = rotate_cov(closure.cov, -float(closure.delta[2]))
+        scale = max(1.0, float(r @ np.linalg.solve(turned, r)) / 9.0)
+        found.append(replace(closure, cov=scale * closure.cov))
+    return found
+
+
+def far_off(
+    closures: Sequence[Closure], states: Mapping[str, Trajectory], limits: tuple[float, float]
+) -> list[bool]:
+    """Which closures an estimate misses by more than ``limits`` (m, rad)."""
+    off = residuals(closures, states)
+    return list((np.hypot(off[:, 0], off[:, 1]) > limits[0]) | (np.abs(off[:, 2]) > limits[1]))

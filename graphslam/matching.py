@@ -1,0 +1,267 @@
+"""Scan matching: where a place was seen from, among points that were seen before.
+
+A `Submap` holds what some neighbouring scans saw: points, the direction of the surface at each of
+them, and every scan as a range image, which also knows what is *not* there. Two submaps are matched
+in three steps: `search` tries a whole window of poses against a coarse field, `align` refines one
+by point-to-line steps, and `agreement` counts which points of one the scans of the other confirm
+and which they look through.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from graphslam.geometry import Array, between, transform, wrap
+
+BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
+IntArray = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+
+#: m: points of a submap are thinned to one per cell of this size
+CELL_M = 0.05
+#: neighbours that tell the direction of a surface, and how far away they may be, m
+NEIGHBOURS, NEIGHBOURHOOD_M = 8, 0.3
+#: beams of a range image over the full circle
+BEAMS = 360
+#: m: how far a point may lie from what a beam met to be the same, and before it to be absent
+SAME_M, ABSENT_M = 0.15, 0.4
+#: m: noise of one point across its surface, and of a point that lies on no surface
+SURFACE_SIGMA_M, CLUTTER_SIGMA_M = 0.03, 0.06
+#: points whose errors count as one: materials, curvature and the submap's own shape are shared
+SHARED_POINTS = 10
+#: m, rad: errors of the matching as a whole that no number of points averages out
+FLOOR_M, FLOOR_RAD = 0.02, 0.004
+#: m: a point and its nearest neighbour farther apart than this do not belong together: first, last
+REACH_FIRST_M, REACH_LAST_M = 0.6, 0.15
+ITERATIONS = 20
+#: m, rad: steps of the search
+STEP_M, STEP_RAD = 0.15, np.radians(1.5)
+#: points of a submap that the search looks at, and that the alignment uses
+SEARCHED, ALIGNED = 250, 500
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Submap:
+    """What neighbouring scans saw, in one frame.
+
+    ``points`` (n, 2) m, ``normals`` (n, 2) unit, ``flat`` (n,) which of them lie on a surface;
+    ``poses`` (k, 3) of the sensor and ``images`` (k, `BEAMS`, 2), m, the nearest and the farthest
+    return of each degree round it, NaN without one.
+    """
+
+    points: Array
+    normals: Array
+    flat: BoolArray
+    poses: Array
+    images: Array
+    tree: cKDTree
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Match:
+    """Pose (3,) of one submap in the frame of another, cov (3, 3) along that frame's axes.
+
+    ``same`` and ``absent`` are shares of all points of both: confirmed by the other's scans, and
+    looked through by them; the rest was out of sight.
+    """
+
+    pose: Array
+    cov: Array
+    same: float
+    absent: float
+
+
+def make_submap(poses: Array, clouds: Sequence[Array]) -> Submap:
+    """A submap of some scans.
+
+    Args:
+        poses: (k, 3) of the sensor in the submap's frame.
+        clouds: k arrays (n, 2) of points in the sensor's frame, m.
+    """
+    images = np.array([_range_image(cloud) for cloud in clouds])
+    points = np.concatenate([transform(p, c) for p, c in zip(poses, clouds, strict=True)])
+    _, kept = np.unique(np.round(points / CELL_M).astype(np.int64), axis=0, return_index=True)
+    points = points[np.sort(kept)]
+    tree = cKDTree(points)
+    normals, flat = _normals(points, tree)
+    return Submap(points, normals, flat, np.asarray(poses), images, tree)
+
+
+def _range_image(cloud: Array) -> Array:
+    """Nearest and farthest return (`BEAMS`, 2) per degree, NaN without one."""
+    r, beam = np.hypot(cloud[:, 0], cloud[:, 1]), _beam(cloud)
+    near, far = np.full(BEAMS, np.inf), np.full(BEAMS, -np.inf)
+    np.minimum.at(near, beam, r)
+    np.maximum.at(far, beam, r)
+    image = np.stack([near, far], axis=1)
+    return np.where(np.isfinite(image), image, np.nan)
+
+
+def _beam(points: Array) -> IntArray:
+    degrees = np.arctan2(points[..., 1], points[..., 0]) * (BEAMS / (2 * np.pi))
+    return np.asarray(np.round(degrees).astype(np.intp) % BEAMS)
+
+
+def _normals(points: Array, tree: cKDTree) -> tuple[Array, BoolArray]:
+    """Unit normals (n, 2) from the neighbours' scatter, and where they mean something (n,)."""
+    k = min(NEIGHBOURS, len(points))
+    distance, near = tree.query(points, k=k)
+    known = distance.reshape(len(points), k) <= NEIGHBOURHOOD_M
+    around = points[near.reshape(len(points), k)]
+    count = known.sum(axis=1)
+    mean = (around * known[..., None]).sum(axis=1) / count[:, None]
+    d = (around - mean[:, None]) * known[..., None]
+    xx, yy = (d[..., 0] ** 2).sum(axis=1), (d[..., 1] ** 2).sum(axis=1)
+    xy = (d[..., 0] * d[..., 1]).sum(axis=1)
+    along = 0.5 * np.arctan2(2 * xy, xx - yy)
+    spread = np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
+    small, large = 0.5 * (xx + yy) - spread, 0.5 * (xx + yy) + spread
+    flat = (count >= 4) & (small < 0.1 * large)
+    return np.column_stack([-np.sin(along), np.cos(along)]), flat
+
+
+def search(source: Submap, target: Submap, guess: Array, window: Array) -> list[Array]:
+    """Poses (3,) of ``source`` in ``target`` at which many of its points lie on the other's.
+
+    Args:
+        source: what to place.
+        target: where.
+        guess: (3,) middle of the window.
+        window: (3,) m, m, rad: half its size.
+
+    Returns:
+        The best ones, best first, no two of them close together.
+    """
+    points = _some(source.points, SEARCHED)
+    field, low = _field(target.points)
+    sizes = STEP_M, STEP_M, STEP_RAD
+    steps = [_steps(half, size) for half, size in zip(window, sizes, strict=True)]
+    dx, dy = (s.ravel() for s in np.meshgrid(steps[0], steps[1], indexing="ij"))
+    scores = np.empty((len(steps[2]), len(dx)))
+    for row, turn in enumerate(steps[2]):
+        placed = transform(np.array([guess[0], guess[1], guess[2] + turn]), points) - low
+        at_x = np.clip(np.round((placed[:, 0] + dx[:, None]) / STEP_M), 0, len(field) - 1)
+        at_y = np.clip(np.round((placed[:, 1] + dy[:, None]) / STEP_M), 0, field.shape[1] - 1)
+        scores[row] = field[at_x.astype(np.intp), at_y.astype(np.intp)].mean(axis=1)
+    found: list[Array] = []
+    best = float(scores.max())
+    turn_of = steps[2][:, None]
+    while len(found) < 4 and scores.max() > 0.6 * best > 0:
+        k, m = map(int, np.unravel_index(int(scores.argmax()), scores.shape))
+        found.append(guess + np.array([dx[m], dy[m], steps[2][k]]))
+        near = (np.hypot(dx - dx[m], dy - dy[m]) < 0.6)[None] & (
+            np.abs(turn_of - steps[2][k]) < np.radians(8.0)
+        )
+        scores[near] = 0.0
+    return found
+
+
+def _some(points: Array, count: int) -> Array:
+    return points[:: max(1, len(points) // count)]
+
+
+def _steps(half: float, step: float) -> Array:
+    n = int(np.ceil(half / step))
+    return np.asarray(np.arange(-n, n + 1) * step, dtype=float)
+
+
+def _field(points: Array) -> tuple[Array, Array]:
+    """How near a point is to the points (n, 2), on a grid of `STEP_M`: 1 there, 0 far away."""
+    low = points.min(axis=0) - 3 * STEP_M
+    cells = np.round((points - low) / STEP_M).astype(np.intp)
+    grid = np.zeros(cells.max(axis=0) + 4)
+    for weight, reach in ((0.5, 1), (1.0, 0)):
+        for i in range(-reach, reach + 1):
+            for j in range(-reach, reach + 1):
+                grid[cells[:, 0] + i, cells[:, 1] + j] = weight
+    return grid, low
+
+
+def align(source: Submap, target: Submap, guess: Array) -> tuple[Array, Array]:
+    """The pose (3,) of ``source`` in ``target`` near ``guess`` (3,), and its covariance (3, 3).
+
+    Each point is drawn to its nearest neighbour: across a surface, or both ways where there is
+    none; what lies too far away has no say, and what that means shrinks on the way. Along what the
+    points do not tell (a corridor) the covariance is large. Source: A. Censi, ICRA 2008, DOI
+    10.1109/ROBOT.2008.4543181, for the metric.
+    """
+    x = np.array(guess, dtype=float)
+    points = _some(source.points, ALIGNED)
+    A = np.eye(3)
+    for k in range(ITERATIONS):
+        reach = REACH_FIRST_M * (REACH_LAST_M / REACH_FIRST_M) ** min(1.0, 2 * k / ITERATIONS)
+        placed = transform(x, points)
+        distance, near = target.tree.query(placed, distance_upper_bound=reach)
+        ok = np.isfinite(distance)
+        if ok.sum() < 10:
+            return x, np.diag([1e4, 1e4, 1e4])
+        near = near[ok]
+        p, r = placed[ok], placed[ok] - target.points[near]
+        J = np.zeros((len(p), 2, 3))
+        J[:, 0, 0] = J[:, 1, 1] = 1.0
+        J[:, 0, 2], J[:, 1, 2] = -(p[:, 1] - x[1]), p[:, 0] - x[0]
+        n, flat = target.normals[near], target.flat[near]
+        M = n[:, :, None] * n[:, None, :] / SURFACE_SIGMA_M**2
+        M[~flat] = np.eye(2) / CLUTTER_SIGMA_M**2
+        w = 1.0 / (1.0 + np.einsum("ni,nij,nj->n", r, M, r) / 4.0)
+        JtM = np.einsum("nij,nik->njk", J, M) * w[:, None, None]
+        A = np.einsum("nji,nik->jk", JtM, J) + np.diag([1e-4, 1e-4, 1e-4])
+        step = np.linalg.solve(A, np.einsum("nji,ni->j", JtM, r))
+        x -= step
+        x[2] = wrap(x[2])
+        if k > ITERATIONS // 2 and np.abs(step).max() < 1e-5:
+            break
+    cov = SHARED_POINTS * np.linalg.inv(A) + np.diag([FLOOR_M**2, FLOOR_M**2, FLOOR_RAD**2])
+    return x, np.asarray(cov)
+
+
+def agreement(source: Submap, target: Submap, pose: Array) -> tuple[float, float]:
+    """Shares of all points of both submaps that the other's scans confirm, and look through.
+
+    ``pose`` (3,) is that of ``source`` in ``target``. A confirmed point counts as such whatever
+    other scans saw: a door that was open once is no contradiction.
+    """
+    same = absent = 0
+    for a, b, x in (
+        (source, target, pose),
+        (target, source, between(pose, np.zeros(3))),
+    ):
+        confirmed, missed = _seen_from(transform(x, a.points), b)
+        same += int(confirmed.sum())
+        absent += int((missed & ~confirmed).sum())
+    total = len(source.points) + len(target.points)
+    return same / total, absent / total
+
+
+def _seen_from(points: Array, submap: Submap) -> tuple[BoolArray, BoolArray]:
+    """Which points (n, 2) any scan of the submap confirms, and which any looks through."""
+    confirmed, missed = np.zeros(len(points), dtype=bool), np.zeros(len(points), dtype=bool)
+    for pose, image in zip(submap.poses, submap.images, strict=True):
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        d = points - pose[:2]
+        local = np.column_stack([c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0]])
+        r = np.hypot(local[:, 0], local[:, 1])
+        beams = (_beam(local)[:, None] + np.array([-1, 0, 1])) % BEAMS
+        returns = image[beams].reshape(len(points), -1)
+        known = np.isfinite(returns).all(axis=1)
+        with np.errstate(invalid="ignore"):
+            confirmed |= (np.abs(returns - r[:, None]) < SAME_M).any(axis=1)
+            missed |= known & (r < returns.min(axis=1) - ABSENT_M)
+    return confirmed, missed
+
+
+def match(source: Submap, target: Submap, guess: Array, window: Array) -> list[Match]:
+    """All places of ``source`` in ``target`` within a window, the most agreeing first."""
+    found: list[Match] = []
+    for start in search(source, target, guess, window):
+        pose, cov = align(source, target, start)
+        if any(_close(pose, m.pose) for m in found):
+            continue
+        found.append(Match(pose, cov, *agreement(source, target, pose)))
+    return sorted(found, key=lambda m: m.absent - m.same)
+
+
+def _close(a: Array, b: Array) -> bool:
+    d = between(a, b)
+    return bool(np.hypot(d[0], d[1]) < 0.4 and abs(d[2]) < np.radians(6.0))
