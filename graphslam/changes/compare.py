@@ -16,7 +16,14 @@ import numpy as np
 from graphslam.changes.alignment import align
 from graphslam.changes.evidence import Evidence, past, range_noise, spread
 from graphslam.changes.grid import grid_over
-from graphslam.changes.moves import Displacement, close_to, paired, segment_moves
+from graphslam.changes.moves import (
+    Displacement,
+    Shape,
+    close_to,
+    motion_between,
+    segment_moves,
+    shape_of,
+)
 from graphslam.changes.regions import Region, flagged, regions
 from graphslam.changes.registration import Registration, register
 from graphslam.changes.surface import Surface, surface_of
@@ -159,7 +166,12 @@ def compare(
         a, evidence[0], evidence[0].beams, evidence[0].rows, evidence[0].first_ns, factor, config
     )
     appeared = regions(b, evidence[1], seen, b.beams[seen], b.first_ns, factor, config)
-    changes = _changes(vanished, appeared, reference, later, registration)
+    shapes = (
+        [shape_of(a, reference, evidence[0], factor, r.points) for r in vanished],
+        [shape_of(b, later, evidence[1], factor, r.points) for r in appeared],
+    )
+    fits = _fits(*shapes, config.bias_sigma_m)
+    changes = _changes(vanished, appeared, fits, reference, later, registration)
     return Comparison(
         changes, registration, reference, later, surfaces, evidence, compared, marked,
         factor, sigmas, config.false_alarm_rate,
@@ -248,9 +260,24 @@ def _on_pieces(surface: Surface, visit: Visit) -> tuple[Ints, Ints]:
     return beams[near], surface.nearest.member[cell[near]].astype(np.int64)
 
 
+def _fits(
+    before: list[Shape | None], after: list[Shape | None], bias_m: float
+) -> list[tuple[int, int, Displacement]]:
+    """Pairs (vanished, appeared) of like shape and how it moved, the most alike first."""
+    found = []
+    for i, a in enumerate(before):
+        for j, b in enumerate(after):
+            fit = None if a is None or b is None else motion_between(a, b, bias_m)
+            if fit is not None:
+                found.append((fit[0], i, j, fit[1]))
+    found.sort(key=lambda fit: (-fit[0], fit[1], fit[2]))
+    return [(i, j, motion) for _, i, j, motion in found]
+
+
 def _changes(
     vanished: list[Region],
     appeared: list[Region],
+    fits: list[tuple[int, int, Displacement]],
     reference: Visit,
     later: Visit,
     registration: Registration,
@@ -269,12 +296,11 @@ def _changes(
             found.append(_moved(parts, before, motion))
             used_a.update(new)
             used_v.update(old)
-    left_v = [i for i in range(len(vanished)) if i not in used_v]
-    left_a = [j for j in range(len(appeared)) if j not in used_a]
-    for i, j, motion in paired([vanished[i] for i in left_v], [appeared[j] for j in left_a]):
-        found.append(_moved([appeared[left_a[j]]], [vanished[left_v[i]]], motion))
-        used_v.add(left_v[i])
-        used_a.add(left_a[j])
+    for i, j, motion in fits:
+        if i not in used_v and j not in used_a:
+            found.append(_moved([appeared[j]], [vanished[i]], motion))
+            used_v.add(i)
+            used_a.add(j)
     kinds: Mapping[Kind, list[Region]] = {
         "vanished": [r for i, r in enumerate(vanished) if i not in used_v],
         "appeared": [r for j, r in enumerate(appeared) if j not in used_a],
