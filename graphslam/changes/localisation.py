@@ -58,9 +58,9 @@ def localise(surface: Surface, reference: Visit, later: Visit) -> tuple[Visit, R
     placed_share, tracked, share = best
     if placed_share < _RUN_SHARE:
         raise OutputError(
-            "the two runs cannot be registered: no motion brings their landmarks together, and only "
-            f"{100 * placed_share:.0f} % of the later scans fit the reference's surfaces one by "
-            "one; did both drive through the same place?"
+            "the two runs cannot be registered: no motion brings their landmarks together, and "
+            f"only {100 * placed_share:.0f} % of the later scans fit the reference's surfaces "
+            "one by one; did both drive through the same place?"
         )
     kept: Bools = share > _SCAN_SHARE
     motions = compose(tracked.poses[kept], inverse(later.poses[kept]))
