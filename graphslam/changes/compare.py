@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from graphslam.changes.alignment import align
 from graphslam.changes.evidence import Evidence, past, range_noise, spread
@@ -20,7 +21,9 @@ from graphslam.changes.moves import (
     Displacement,
     Shape,
     close_to,
+    is_straight,
     motion_between,
+    moved_points,
     segment_moves,
     shape_of,
 )
@@ -30,7 +33,7 @@ from graphslam.changes.surface import Surface, surface_of
 from graphslam.changes.visit import Bools, Ints, Visit, dictionary
 from graphslam.config import ChangesConfig
 from graphslam.errors import OutputError
-from graphslam.geometry import Array
+from graphslam.geometry import Array, inverse
 
 Kind = Literal["appeared", "vanished", "moved"]
 
@@ -43,7 +46,7 @@ _MANY_SUSPECTS, _SUSPECT = 0.03, 3.0
 _REFERENCE_ROUNDS = 2
 _OVERLAP = 0.05  # share of the later returns that must lie where the reference looked
 _FIRST_SIGMA_M = 0.02  # of ranges, until they tell themselves
-#: a stretch of a segment's new place counts as seen by a region this near to it, m
+#: a region is a part of what is this near to most of it, m
 _AT_SEGMENT_M = 0.08
 
 
@@ -171,7 +174,8 @@ def compare(
         [shape_of(b, later, evidence[1], factor, r.points) for r in appeared],
     )
     fits = _fits(*shapes, config.bias_sigma_m)
-    changes = _changes(vanished, appeared, fits, reference, later, registration)
+    segments = _segments(vanished, appeared, reference, later, registration)
+    changes = _changes(vanished, appeared, fits, segments)
     return Comparison(
         changes, registration, reference, later, surfaces, evidence, compared, marked,
         factor, sigmas, config.false_alarm_rate,
@@ -260,54 +264,102 @@ def _on_pieces(surface: Surface, visit: Visit) -> tuple[Ints, Ints]:
     return beams[near], surface.nearest.member[cell[near]].astype(np.int64)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pair:
+    """Vanished ``old`` and appeared ``new``, numbers of regions, that are one thing; its way."""
+
+    old: list[int]
+    new: list[int]
+    motion: Displacement
+
+
 def _fits(
     before: list[Shape | None], after: list[Shape | None], bias_m: float
-) -> list[tuple[int, int, Displacement]]:
-    """Pairs (vanished, appeared) of like shape and how it moved, the most alike first."""
+) -> tuple[list[_Pair], list[_Pair]]:
+    """Pairs of like shape, the most alike first; those with corners, and straight ones."""
     found = []
     for i, a in enumerate(before):
         for j, b in enumerate(after):
             fit = None if a is None or b is None else motion_between(a, b, bias_m)
-            if fit is not None:
-                found.append((fit[0], i, j, fit[1]))
-    found.sort(key=lambda fit: (-fit[0], fit[1], fit[2]))
-    return [(i, j, motion) for _, i, j, motion in found]
+            if fit is not None and a is not None:
+                found.append((-fit[0], i, j, is_straight(a), fit[1]))
+    found.sort(key=lambda fit: fit[:3])
+    cornered, straight = (
+        [_Pair([i], [j], motion) for _, i, j, flat, motion in found if flat == kind]
+        for kind in (False, True)
+    )
+    return cornered, straight
+
+
+def _segments(
+    vanished: list[Region],
+    appeared: list[Region],
+    reference: Visit,
+    later: Visit,
+    registration: Registration,
+) -> list[_Pair]:
+    """Regions along segments of the maps that moved."""
+    return [
+        _Pair(
+            [i for i, r in enumerate(vanished) if _mostly_at(r, landmark.extent)],
+            [j for j, r in enumerate(appeared) if _mostly_at(r, ends)],
+            motion,
+        )
+        for landmark, ends, motion in segment_moves(
+            reference.landmarks, later.landmarks, registration
+        )
+    ]
 
 
 def _changes(
     vanished: list[Region],
     appeared: list[Region],
-    fits: list[tuple[int, int, Displacement]],
-    reference: Visit,
-    later: Visit,
-    registration: Registration,
+    fits: tuple[list[_Pair], list[_Pair]],
+    segments: list[_Pair],
 ) -> tuple[Change, ...]:
-    """Regions as changes; what moved once instead of twice."""
+    """Regions as changes; what moved once instead of twice.
+
+    Shapes with corners say most about what is which, then segments of both maps (of a box they
+    may be opposite sides), then straight stretches.
+    """
     found: list[Change] = []
-    used_v: set[int] = set()
-    used_a: set[int] = set()
-    for landmark, ends, motion in segment_moves(reference.landmarks, later.landmarks, registration):
-        new = [j for j, r in enumerate(appeared) if _mostly_at(r, ends)]
-        old = [i for i, r in enumerate(vanished) if _mostly_at(r, landmark.extent)]
-        new, old = [j for j in new if j not in used_a], [i for i in old if i not in used_v]
-        if new or old:
+    old_left, new_left = set(range(len(vanished))), set(range(len(appeared)))
+    for pairs, needs_both in ((fits[0], True), (segments, False), (fits[1], True)):
+        for pair in pairs:
+            old = [i for i in pair.old if i in old_left]
+            new = [j for j in pair.new if j in new_left]
+            if not (old and new if needs_both else old or new):
+                continue
+            # other parts of the same thing: the motion brings them onto it
+            there = [vanished[i].points for i in old]
+            here = [appeared[j].points for j in new]
+            back = Displacement(inverse(pair.motion.motion), pair.motion.cov)
+            if old and new:
+                old += [
+                    i for i in sorted(old_left - set(old))
+                    if _lands(moved_points(vanished[i].points, pair.motion), here)
+                ]  # fmt: skip
+                new += [
+                    j for j in sorted(new_left - set(new))
+                    if _lands(moved_points(appeared[j].points, back), there)
+                ]  # fmt: skip
             parts = [appeared[j] for j in new] or [vanished[i] for i in old]
-            before = [vanished[i] for i in old] if new else []
-            found.append(_moved(parts, before, motion))
-            used_a.update(new)
-            used_v.update(old)
-    for i, j, motion in fits:
-        if i not in used_v and j not in used_a:
-            found.append(_moved([appeared[j]], [vanished[i]], motion))
-            used_v.add(i)
-            used_a.add(j)
+            found.append(_moved(parts, [vanished[i] for i in old] if new else [], pair.motion))
+            old_left -= set(old)
+            new_left -= set(new)
     kinds: Mapping[Kind, list[Region]] = {
-        "vanished": [r for i, r in enumerate(vanished) if i not in used_v],
-        "appeared": [r for j, r in enumerate(appeared) if j not in used_a],
+        "vanished": [vanished[i] for i in sorted(old_left)],
+        "appeared": [appeared[j] for j in sorted(new_left)],
     }
     for kind, rest in kinds.items():
         found += [Change(kind, r.outline, r.probability, None, r.beams, r.first_ns) for r in rest]
     return tuple(sorted(found, key=lambda c: (-c.beams, c.kind, c.first_seen_ns)))
+
+
+def _lands(points: Array, parts: list[Array]) -> bool:
+    """Whether most points (k, 2) m lie at some of the parts (n, 2) m."""
+    away = cKDTree(np.concatenate(parts)).query(points)[0]
+    return bool((away < _AT_SEGMENT_M).mean() > 0.5)
 
 
 def _mostly_at(region: Region, ends: Array) -> bool:

@@ -46,9 +46,11 @@ _STRAIGHT = 0.05
 _END_SIGMA_M = 0.04
 #: what a straight stretch is known to across, m; a piece, apart from its noise; how many pieces
 #: share one window
-_ACROSS_SIGMA_M, _PIECE_SIGMA_M, _SHARED = 0.01, 0.004, 5.0
+_ACROSS_SIGMA_M, _PIECE_SIGMA_M, _SHARED = 0.01, 0.003, 5.0
 _LENGTH_M = 0.12
 _FARTHEST_M = 5.0
+#: a box that was seen from another side looks like one that was turned by more than this
+_LARGEST_TURN_RAD = np.radians(60.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,7 +166,8 @@ def motion_between(a: Shape, b: Shape, bias_m: float) -> tuple[float, Displaceme
     """The motion that brings shape a onto shape b; None if they are not alike.
 
     Of motions that fit about as well the one that turns least is taken: a square box looks the
-    same from all sides.
+    same from all sides. For that reason no motion is stated that turns a thing far: most likely it
+    was not turned, and what was seen is another side of it.
 
     Args:
         a: before.
@@ -177,13 +180,13 @@ def motion_between(a: Shape, b: Shape, bias_m: float) -> tuple[float, Displaceme
     away = b.points.mean(axis=0) - a.points.mean(axis=0)
     if min(len(a.points), len(b.points)) < _FEWEST or np.hypot(*away) > _FARTHEST_M:
         return None
-    straight = [_thickness(s) < _STRAIGHT for s in (a, b)]
+    straight = [is_straight(s) for s in (a, b)]
     if all(straight):
         return _straight_motion(a, b)
     if any(straight):
         return None
     fits = [_icp(a, b, float(turn), bias_m) for turn in np.arange(_TURNS) * 2 * np.pi / _TURNS]
-    found = [fit for fit in fits if fit is not None]
+    found = [fit for fit in fits if fit is not None and abs(fit[1].motion[2]) < _LARGEST_TURN_RAD]
     if not found:
         return None
     best = max(fit[0] for fit in found)
@@ -191,10 +194,10 @@ def motion_between(a: Shape, b: Shape, bias_m: float) -> tuple[float, Displaceme
     return min(good, key=lambda fit: abs(float(wrap(fit[1].motion[2]))))
 
 
-def _thickness(shape: Shape) -> float:
-    """How much its normals differ, 0 (a straight wall) to 0.5 (all ways)."""
+def is_straight(shape: Shape) -> bool:
+    """Whether its normals all point the same way, as those of a wall do."""
     n = shape.normals
-    return float(np.linalg.eigvalsh(n.T @ n / len(n))[0])
+    return float(np.linalg.eigvalsh(n.T @ n / len(n))[0]) < _STRAIGHT
 
 
 def _straight_motion(a: Shape, b: Shape) -> tuple[float, Displacement] | None:
@@ -256,15 +259,15 @@ def _icp(a: Shape, b: Shape, turn: float, bias_m: float) -> tuple[float, Displac
     if shares[0] < _ALIKE_SHARES[0] or shares[1] < _ALIKE_SHARES[1]:
         return None
     P = np.linalg.inv(information)
-    # what a side shares is not averaged over its pieces: poses, and the material's bias as far as
-    # the two visits saw it at other angles
+    # What a side shares is not averaged over its pieces: the poses. The material's bias is one for
+    # the thing, and counts as far as the two visits saw it at other angles.
     white = a.white[used] + b.white[near[used]] + _PIECE_SIGMA_M**2
     pull = J[used] / (_SHARED * white)[:, None]
-    common = np.sqrt(a.common[used] + b.common[near[used]]
-                     + (bias_m * (a.incidence[used] - b.incidence[near[used]])) ** 2)  # fmt: skip
+    common = np.sqrt(a.common[used] + b.common[near[used]])
     n = b.normals[near[used]]
     side = np.floor((np.arctan2(n[:, 1], n[:, 0]) + np.pi) / (np.pi / 4)).astype(np.int64)
-    middle = np.zeros((3, 3))
+    too_far = pull.T @ (bias_m * (a.incidence[used] - b.incidence[near[used]]))
+    middle = np.outer(too_far, too_far)
     for number in np.unique(side):
         g = (pull[side == number] * common[side == number, None]).sum(axis=0)
         middle += np.outer(g, g)
