@@ -10,11 +10,14 @@ from typer.testing import CliRunner
 
 from graphslam.changes import compare, visit_of
 from graphslam.changes.alignment import align
+from graphslam.changes.compare import lasers_differ
 from graphslam.changes.evidence import past
 from graphslam.changes.grid import Grid, distinct, grid_over, nearest_of
+from graphslam.changes.localisation import overlays
 from graphslam.changes.picture import render_changes
 from graphslam.changes.regions import counter_clockwise, outline
 from graphslam.changes.registration import register
+from graphslam.changes.straighten import straightened
 from graphslam.changes.surface import surface_of
 from graphslam.changes.visit import on_surface
 from graphslam.cli.commands import app
@@ -349,3 +352,77 @@ def test_the_command_from_logs_to_json(tmp_path):
     assert other.exit_code == 1
     assert "is not the log" in other.output
     assert run.invoke(app, [*map(str, arguments), "--later-span", "9:3"]).exit_code == 2
+
+
+# ------------------------------------------------------------ where maps bend
+
+
+def bent(original, rate_rad_m):
+    """The same scans on a path whose heading drifts by ``rate_rad_m`` per metre."""
+    poses = original.poses.copy()
+    for i in range(1, len(poses)):
+        step = between(original.poses[i - 1], original.poses[i])
+        step[2] += rate_rad_m * np.hypot(*step[:2])
+        poses[i] = compose(poses[i - 1], step)
+    return replace(original, poses=poses)
+
+
+def test_a_bent_path_is_made_straight_by_its_scans():
+    """Breaks if scans are matched to themselves, to nothing, or with the wrong sign."""
+    rng = np.random.default_rng(11)
+    poses = drive(200)
+    a = visit([box(5, 4), box(1, 1, 0.8, 0.4)], poses, rng, (1e-4, 1e-4, 1e-5))
+    crooked = bent(a, 0.05)
+    away = np.abs(wrap(crooked.poses[:, 2] - poses[:, 2])).max()
+    left = np.abs(wrap(straightened(crooked).poses[:, 2] - poses[:, 2])).max()
+    assert away > 0.2
+    assert left < 0.2 * away
+
+
+def test_maps_are_laid_over_each_other_from_any_pose():
+    rng = np.random.default_rng(12)
+    ends = visit([box(5, 4), box(1, 1, 0.8, 0.4)], drive(40), rng).ends
+    pose = np.array([4.0, -3.0, 2.2])
+    found = overlays(transform(pose, ends), ends)
+    error = np.array([between(pose, one) for one in found])
+    # turns are tried every 2 degrees, shifts every 10 cm
+    assert (np.hypot(*error[:, :2].T)[np.abs(wrap(error[:, 2])) < np.radians(2)] < 0.2).any()
+
+
+def test_bent_maps_are_registered_scan_by_scan_and_say_so():
+    """No landmarks at all: only the scans can tell. What appeared is found nevertheless."""
+    rng = np.random.default_rng(13)
+    things = [box(1, 1, 0.8, 0.4), box(6.6, 0.3, 1.1, 0.3)]
+    a = bent(visit(things, drive(120), rng, (1e-4, 1e-4, 1e-5)), 0.02)
+    b = bent(visit([*things, box(5, 4)], drive(120, 0.1), rng, (1e-4, 1e-4, 1e-5)), -0.02)
+    found = compare(a, b.placed(np.array([2.0, 1.0, 0.8]), np.zeros((3, 3))), CONFIG)
+    assert "straightened" in found.warnings[0]
+    largest = found.changes[0]
+    assert largest.kind == "appeared"
+    np.testing.assert_allclose(largest.polygon.mean(axis=0), [5.2, 4.2], atol=0.4)
+
+
+def test_other_rooms_are_not_registered():
+    """Scans of another place fit nowhere: an error, not a map of changes."""
+    rng = np.random.default_rng(14)
+    a = visit([box(5, 4)], drive(60), rng)
+    hall = Outline("hall", np.array([[0, 0], [25, 0], [19, 17], [3, 21]], float), closed=True)
+    poses = drive(60) + np.array([8.0, 5.0, 0.0])
+    clean = cast(poses, FAN, make_world([hall]).shapes, 30.0).ranges
+    b = replace(a, range_m=clean.ravel(), poses=poses)
+    with pytest.raises(OutputError, match="cannot be registered"):
+        compare(a, b, CONFIG)
+
+
+def test_other_lasers_are_warned_of():
+    rng = np.random.default_rng(15)
+    a, b = visit([], drive(30), rng), visit([], drive(30, 0.1), rng)
+    assert lasers_differ(a, b) == ()
+    every_second = np.arange(len(b.range_m)) % 361 % 2 == 0
+    coarse = replace(
+        b, scan=b.scan[every_second], angle=b.angle[every_second],
+        range_m=b.range_m[every_second], surface=b.surface[every_second],
+    )  # fmt: skip
+    (warning,) = lasers_differ(a, coarse)
+    assert "361 beams" in warning
+    assert "181" in warning

@@ -1,6 +1,7 @@
 """Change detection, top to bottom: one frame, surfaces, evidence, changes.
 
-1. the later run's frame lies in the reference's by landmarks of both (`registration`);
+1. the later run's frame lies in the reference's by landmarks of both (`registration`), or, where
+   the maps bend, each of its scans by the surfaces it sees (`localisation`);
 2. every scan is brought onto the surfaces of the reference, within its covariance (`alignment`);
 3. the beams of each visit are held against the surfaces of the other (`evidence`);
 4. flagged pieces of surface that hang together are changes (`regions`), of which some are one
@@ -8,15 +9,16 @@
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from graphslam.changes.alignment import align
-from graphslam.changes.evidence import Evidence, past, range_noise, spread
+from graphslam.changes.evidence import Evidence, past, range_noise, spread, visit_step
 from graphslam.changes.grid import grid_over
+from graphslam.changes.localisation import localise
 from graphslam.changes.moves import (
     Displacement,
     Shape,
@@ -48,6 +50,15 @@ _OVERLAP = 0.05  # share of the later returns that must lie where the reference 
 _FIRST_SIGMA_M = 0.02  # of ranges, until they tell themselves
 #: a region is a part of what is this near to most of it, m
 _AT_SEGMENT_M = 0.08
+
+
+#: where maps bend: how far off a return is still compared, m, and what to say
+_BENT_GATE_M = 0.3
+_BENT = (
+    "the maps bend differently, so no one motion brings their landmarks together: both paths were "
+    "straightened by their scans and the later scans placed one after the other; only large "
+    "changes are found, and where they are is known to decimetres"
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,6 +106,7 @@ class Comparison:
         spread: factor on the stated sigmas with which the bulk of the scores is normal.
         range_sigma_m: range noise of both visits as found.
         rate: the false-alarm rate that was asked for.
+        warnings: what makes the result weaker than its numbers say, one line each.
     """
 
     changes: tuple[Change, ...]
@@ -108,6 +120,7 @@ class Comparison:
     spread: float
     range_sigma_m: tuple[float, float]
     rate: float
+    warnings: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """The contents of changes.json."""
@@ -120,6 +133,7 @@ class Comparison:
             | {"landmarks": len(self.registration.matched)},
             "spread": self.spread,
             "range_sigma_m": list(self.range_sigma_m),
+            "warnings": list(self.warnings),
         }
 
 
@@ -148,14 +162,16 @@ def compare(
     Raises:
         OutputError: the two cannot be registered, or saw nothing in common.
     """
-    if registration is None:
-        registration = register(reference.landmarks, later.landmarks)
-    placed = later.placed(registration.pose, registration.cov)
-    reference, later, surfaces, sigmas = aligned(reference, placed, config)
+    warnings = lasers_differ(reference, later)
+    reference, placed, registration, bent = in_one_frame(reference, later, registration, config)
+    if bent:
+        warnings += (_BENT,)
+        config = replace(config, gate_m=max(config.gate_m, _BENT_GATE_M))
+    reference, later, surfaces, sigmas = aligned(reference, placed, config, bent)
     a = surfaces[0]
     evidence = _evidence(reference, later, surfaces, sigmas, config)
     suspects = _suspects(later, surfaces, evidence)
-    if suspects.mean() > _MANY_SUSPECTS:
+    if suspects.mean() > _MANY_SUSPECTS and not bent:
         # what changed pulled at the scans that saw it: place them again without it
         later = align(placed, a, _LATER_GATES, suspects)
         surfaces = (a, surface_of(later, a.nearest.grid, sigmas[1], config))
@@ -178,14 +194,45 @@ def compare(
     changes = _changes(vanished, appeared, fits, segments)
     return Comparison(
         changes, registration, reference, later, surfaces, evidence, compared, marked,
-        factor, sigmas, config.false_alarm_rate,
+        factor, sigmas, config.false_alarm_rate, warnings,
     )  # fmt: skip
 
 
+def in_one_frame(
+    reference: Visit, later: Visit, registration: Registration | None, config: ChangesConfig
+) -> tuple[Visit, Visit, Registration, bool]:
+    """Both visits in the reference's frame, by landmarks, or else scan by scan as the maps bend.
+
+    Raises:
+        OutputError: neither way works.
+    """
+    if registration is None:
+        try:
+            registration = register(reference.landmarks, later.landmarks)
+        except OutputError:
+            reference, placed, registration = localise(reference, later, config)
+            return reference, placed, registration, True
+    return reference, later.placed(registration.pose, registration.cov), registration, False
+
+
+def lasers_differ(reference: Visit, later: Visit) -> tuple[str, ...]:
+    """A warning if the two visits were made with different lasers."""
+    steps = [2 * np.degrees(visit_step(v)) for v in (reference, later)]
+    beams = [int(np.median(np.bincount(v.scan))) for v in (reference, later)]
+    if abs(steps[0] - steps[1]) < 0.02 * steps[0] and abs(beams[0] - beams[1]) < 0.02 * beams[0]:
+        return ()
+    return (
+        f"the lasers differ ({beams[0]} beams of {steps[0]:.2f} deg, {beams[1]} of "
+        f"{steps[1]:.2f} deg): where they look at different heights, things seem to have changed",
+    )
+
+
 def aligned(
-    reference: Visit, later: Visit, config: ChangesConfig
+    reference: Visit, later: Visit, config: ChangesConfig, bent: bool = False
 ) -> tuple[Visit, Visit, tuple[Surface, Surface], tuple[float, float]]:
     """Two visits in one frame, each on the reference's surfaces; surfaces; range sigmas, m.
+
+    Where the maps are ``bent``, scans are where their neighbours are: one alone sees too little.
 
     Raises:
         OutputError: the later visit saw hardly anything of what the reference saw.
@@ -196,7 +243,7 @@ def aligned(
     first = reference
     a = surface_of(reference, grid, sigma, config)
     for _ in range(_REFERENCE_ROUNDS):
-        reference = align(first, a, _REFERENCE_GATES)
+        reference = first if bent else align(first, a, _REFERENCE_GATES)
         a = surface_of(reference, grid, sigma, config)
         sigma = range_noise(a, reference, config.gate_m)
     at = grid.cells(later.ends[later.surface])
@@ -206,7 +253,7 @@ def aligned(
             f"nothing to compare: {100 * near.mean():.0f} % of the later returns lie on surfaces "
             "of the reference; did both runs see the same place?"
         )
-    later = align(later, a, _LATER_GATES)
+    later = later if bent else align(later, a, _LATER_GATES)
     sigmas = (sigma, range_noise(a, later, config.gate_m))
     return reference, later, (a, surface_of(later, grid, sigmas[1], config)), sigmas
 

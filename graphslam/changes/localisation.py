@@ -1,55 +1,71 @@
 """Each later scan in the map of the reference, where no rigid motion brings the maps together.
 
 Two runs through the same place bend their maps differently where little holds them: odometry over
-a corridor, few loops. Each scan still fits the reference's surfaces somewhere. Crossing landmarks
-vote where, as in `registration`; from the scan that fits best the others follow one after another,
-forwards and backwards, each predicted by the run's own motion and corrected by its beams.
+a corridor, few loops. Each scan still fits the reference's surfaces somewhere. Where is found by
+laying one map over the other in all ways. From the scan that fits best the others follow one after
+another, forwards and backwards, predicted by the run's own motion and corrected by their beams.
 """
 
 from collections.abc import Iterator
 from dataclasses import replace
 
+import cv2
 import numpy as np
 
 from graphslam.changes.alignment import align
-from graphslam.changes.registration import Registration, guesses
-from graphslam.changes.surface import Surface
+from graphslam.changes.grid import grid_over
+from graphslam.changes.registration import Registration
+from graphslam.changes.straighten import straightened
+from graphslam.changes.surface import Surface, surface_of
 from graphslam.changes.visit import Bools, Ints, Visit
+from graphslam.config import ChangesConfig
 from graphslam.errors import OutputError
-from graphslam.geometry import Array, compose, inverse, wrap
+from graphslam.geometry import Array, compose, inverse, rotation, wrap
 
 #: sigmas of a scan's place before its beams are held against the map: of a vote, of a prediction
 _VOTE_SIGMAS = np.array([0.5, 0.5, 0.1])
 _STEP_SIGMAS = np.array([0.08, 0.08, np.radians(2.0)])
 #: sigmas that are stated of a placed scan: of a map that bends they are no more than a bound
-_PLACED_SIGMAS = np.array([0.05, 0.05, np.radians(1.0)])
+_PLACED_SIGMAS = np.array([0.02, 0.02, np.radians(0.5)])
 _GATES = (0.5, 0.4, 0.3, 0.2, 0.15, 0.1)
 #: scans that are placed together, as the motion between them is known well enough, and with how
 #: many before them
 _TOGETHER, _WINDOW = 5, 30
+_RANGE_SIGMA_M = 0.02
 #: a return this near to a surface of the reference, m, agrees with it
 _AGREES_M = 0.1
-#: shares of a scan's returns that must agree; of scans that must be placed
-_SCAN_SHARE, _RUN_SHARE = 0.5, 0.5
+#: shares of a scan's returns that must agree (legs and clutter are no surfaces); of scans that must
+_SCAN_SHARE, _RUN_SHARE = 0.3, 0.5
 #: every so many scans vote; so many of the best votes are followed
 _EVERY, _FOLLOWED = 10, 2
+#: pictures of the maps: cells, m, and how many a side; turns that are tried, rad; best of them kept
+_CELL_M, _MOST_CELLS, _TURN_RAD, _OVERLAYS = 0.1, 600, np.radians(2.0), 6
 
 
-def localise(surface: Surface, reference: Visit, later: Visit) -> tuple[Visit, Registration]:
-    """The later visit in the reference's frame, scan by scan; scans that fit nowhere are left out.
+def localise(
+    reference: Visit, later: Visit, config: ChangesConfig
+) -> tuple[Visit, Visit, Registration]:
+    """Both visits, straightened, in one frame: that in which the reference's first scan stays.
+
+    Scans that fit nowhere are left out.
 
     Args:
-        surface: of the reference.
         reference: in its world frame.
         later: in its own.
+        config: settings.
 
     Returns:
-        The placed visit, and the mean of its scans' motions with their scatter as covariance.
+        The reference, the later visit, and the mean of its scans' motions with their scatter.
 
     Raises:
-        OutputError: fewer than half of the scans fit.
+        OutputError: too few of the scans fit.
     """
-    best = (0.0, later, np.zeros(0))
+    started = later.poses
+    reference, later = straightened(reference), straightened(later)
+    ends = reference.ends[reference.surface]
+    grid = grid_over(ends, config.resolution_m, config.max_side_cells**2)
+    surface = surface_of(reference, grid, _RANGE_SIGMA_M, config)
+    best = (0.0, later, np.zeros(len(later.poses)))
     for pose, start in _starts(surface, reference, later):
         tracked = _tracked(surface, later, pose, start)
         share = agreement(surface, tracked)
@@ -63,16 +79,23 @@ def localise(surface: Surface, reference: Visit, later: Visit) -> tuple[Visit, R
             "one by one; did both drive through the same place?"
         )
     kept: Bools = share > _SCAN_SHARE
-    motions = compose(tracked.poses[kept], inverse(later.poses[kept]))
+    motions = compose(tracked.poses[kept], inverse(started[kept]))
     mean = motions.mean(axis=0)
     mean[2] = np.arctan2(np.sin(motions[:, 2]).mean(), np.cos(motions[:, 2]).mean())
     away = motions - mean
     away[:, 2] = wrap(away[:, 2])
     cov = away.T @ away / len(away) + np.diag(_PLACED_SIGMAS**2)
-    covs = np.tile(np.diag(_PLACED_SIGMAS**2), (int(kept.sum()), 1, 1))
-    found = replace(tracked.chosen(kept), covs=covs, shared=covs)
     none = np.zeros((0, 2), dtype=np.int64)
-    return found, Registration(mean, cov, none, np.zeros(0, dtype=np.int64))
+    return (
+        _as_placed(reference),
+        _as_placed(tracked.chosen(kept)),
+        Registration(mean, cov, none, np.zeros(0, dtype=np.int64)),
+    )
+
+
+def _as_placed(visit: Visit) -> Visit:
+    covs = np.tile(np.diag(_PLACED_SIGMAS**2), (len(visit.poses), 1, 1))
+    return replace(visit, covs=covs, shared=covs)
 
 
 def agreement(surface: Surface, visit: Visit) -> Array:
@@ -90,7 +113,7 @@ def _starts(surface: Surface, reference: Visit, later: Visit) -> Iterator[tuple[
     some[::_EVERY] = True
     few, number = later.chosen(some), np.nonzero(some)[0]
     found = []
-    for guess in guesses(reference.landmarks, later.landmarks):
+    for guess in overlays(reference.ends[reference.surface], later.ends[later.surface]):
         placed = align(few.placed(guess, np.diag(_VOTE_SIGMAS**2)), surface, _GATES)
         share = agreement(surface, placed)
         at = int(share.argmax())
@@ -99,6 +122,40 @@ def _starts(surface: Surface, reference: Visit, later: Visit) -> Iterator[tuple[
         found.append((float(np.sort(share)[-5:].mean()), motion, int(number[at])))
     found.sort(key=lambda start: -start[0])
     yield from ((motion, scan) for _, motion, scan in found[:_FOLLOWED])
+
+
+def overlays(reference: Array, later: Array) -> list[Array]:
+    """Motions (3,) with which the two maps' points (n, 2), (m, 2) m overlap most.
+
+    All turns and shifts are tried: the correlation of two pictures is a product of their spectra.
+    """
+    low, high = np.quantile(reference, [0.005, 0.995], axis=0)
+    middle = np.median(later, axis=0)
+    later = later - middle
+    radius = float(np.quantile(np.hypot(*later.T), 0.995))
+    side = float((high - low).max()) + 2 * radius
+    cell = max(_CELL_M, side / _MOST_CELLS)
+    size = int(np.ceil(side / cell)) + 2
+    spectrum = np.fft.rfft2(_picture(reference - (low + high) / 2, cell, size))
+    found = []
+    for turn in np.arange(0, 2 * np.pi, _TURN_RAD):
+        other = np.fft.rfft2(_picture(later @ rotation(turn).T, cell, size))
+        match = np.fft.irfft2(spectrum * np.conj(other), (size, size))
+        steps = np.array(np.unravel_index(int(match.argmax()), match.shape))
+        steps = np.where(steps > size // 2, steps - size, steps)
+        to = (low + high) / 2 + steps * cell
+        found.append((float(match.max()), np.array([*(to - rotation(turn) @ middle), wrap(turn)])))
+    found.sort(key=lambda one: -one[0])
+    return [motion for _, motion in found[:_OVERLAYS]]
+
+
+def _picture(points: Array, cell_m: float, size: int) -> Array:
+    """Where points (n, 2) m about the origin lie, (size, size), 0 to 1, a little blurred."""
+    ij = np.floor(points / cell_m).astype(np.int64) + size // 2
+    ij = ij[((ij >= 0) & (ij < size)).all(axis=1)]
+    image = np.zeros((size, size), dtype=np.float32)
+    image[ij[:, 0], ij[:, 1]] = 1.0
+    return np.asarray(cv2.GaussianBlur(image, (3, 3), 0), dtype=float)
 
 
 def _tracked(surface: Surface, later: Visit, motion: Array, start: int) -> Visit:

@@ -22,6 +22,8 @@ Bools = NDArray[np.bool_]
 #: an edge: where a beam meets two surfaces its range is that of neither. What recedes faster than
 #: this is seen at a grazing angle and tells little.
 EDGE_SHARE, EDGE_M = 0.025, 0.06
+#: nearer than this, m, a laser sees its own vehicle, dust, or means an error code
+LEAST_M = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,6 +127,7 @@ def on_surface(angles: Array, ranges: Array) -> Bools:
     points = ranges[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
     gap = np.hypot(*np.diff(points, axis=0).T)
     nearer = np.fmin(ranges[1:], ranges[:-1])
+    gap[nearer < LEAST_M] = np.inf
     joined = gap < EDGE_M + EDGE_SHARE * nearer  # false with NaN
     joined = np.concatenate([[False], joined, [False]])
     return np.asarray(joined[1:] & joined[:-1])
