@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from scipy.stats import chi2
 from typer.testing import CliRunner
 
@@ -14,6 +15,7 @@ from graphslam.changes.compare import lasers_differ
 from graphslam.changes.evidence import past
 from graphslam.changes.grid import Grid, distinct, grid_over, nearest_of
 from graphslam.changes.localisation import overlays
+from graphslam.changes.overlay import overlay_map
 from graphslam.changes.picture import render_changes
 from graphslam.changes.regions import counter_clockwise, outline
 from graphslam.changes.registration import register
@@ -302,6 +304,26 @@ def test_moving_a_visit_moves_its_ends():
 # ------------------------------------------------------------ files and the command
 
 
+def test_the_overlay_is_occupied_where_something_is_now_and_free_where_it_was():
+    rng = np.random.default_rng(16)
+    a, b = visit([box(5, 4)], drive(50), rng), visit([box(4, 4.6)], drive(50, 0.1), rng)
+    found = same(a, b)
+    image, text = overlay_map(found)
+    lines = dict(line.split(": ", 1) for line in text.splitlines() if ": " in line[:30])
+    x, y, _ = json.loads(lines["origin"])
+    cell = float(lines["resolution"])
+
+    def values(point):
+        """In a square of 10 cm, as map_server reads it: the first row is the northernmost."""
+        column, row = int((point[0] - x) / cell), image.shape[0] - 1 - int((point[1] - y) / cell)
+        return set(image[row - 2 : row + 3, column - 2 : column + 3].ravel().tolist())
+
+    # the sides that face the room's middle
+    assert 0 in values((4.3, 4.6))
+    assert 254 in values((5.0, 4.2))
+    assert values((1.0, 3.0)) == {205}
+
+
 def test_the_page_is_whole_and_repeatable():
     rng = np.random.default_rng(4)
     found = same(visit([], drive(30), rng), visit([box(5, 4)], drive(30, 0.1), rng))
@@ -328,6 +350,12 @@ def test_the_command_from_logs_to_json(tmp_path):
     found = json.loads(done(*arguments, "--json"))
     assert found == json.loads((tmp_path / "out/changes.json").read_text())
     assert (tmp_path / "out/report.html").exists()
+    header, size, depth, pixels = (tmp_path / "out/changes.pgm").read_bytes().split(b"\n", 3)
+    assert (header, depth) == (b"P5", b"255")
+    assert len(pixels) == np.prod([int(n) for n in size.split()])
+    with (tmp_path / "out/changes.mcap").open("rb") as stream:
+        topics = {c.topic for _, c, _ in make_reader(stream, validate_crcs=True).iter_messages()}
+    assert topics == {"/changes", "/reference", "/later"}
     assert found["false_alarm_rate_requested"] == 0.01
     assert 0 < found["beams_flagged"] < 0.15 * found["beams_compared"]
     (change,) = found["changes"]
