@@ -235,6 +235,30 @@ def test_a_slide_of_a_few_centimetres_is_found_by_many_scans():
     assert found.changes
 
 
+def test_walls_that_were_removed_and_added_are_named():
+    """A partition of the reference is gone, another one is new; the room's walls stay."""
+    rng = np.random.default_rng(17)
+    old, new = box(5.5, 1, 0.04, 1.6), box(5, 4.4, 1.6, 0.04)
+    a, b = visit([old], drive(50), rng), visit([new], drive(50, 0.1), rng)
+
+    def wall(number, start, end):
+        middle = np.array([*np.add(start, end) / 2, np.arctan2(end[1] - start[1], 0)])
+        normal = (1.0, 0.0) if start[0] == end[0] else (0.0, 1.0)
+        line = (np.arctan2(normal[1], normal[0]), np.dot(normal, start), 1e-5 * np.eye(2))
+        ends = np.array([start, end], float)
+        return Landmark(number, "segment", middle, 1e-4 * np.eye(3), ends, line, 9, 0, 1, None)
+
+    found = compare(
+        replace(a, landmarks=(*walls(), wall(70, (5.5, 1.0), (5.5, 2.6)))),
+        replace(b, landmarks=(*walls(), wall(80, (5.0, 4.4), (6.6, 4.4)))),
+        CONFIG,
+    )
+    named = {(c.kind, c.lines_before, c.lines_now) for c in found.changes}
+    assert ("vanished", (70,), ()) in named or ("moved", (70,), (80,)) in named
+    every = [n for c in found.changes for n in (*c.lines_before, *c.lines_now)]
+    assert sorted(every) == [70, 80]
+
+
 def test_evidence_is_one_sided():
     """A surface that came nearer hides the old one: later beams do not go past it."""
     rng = np.random.default_rng(8)

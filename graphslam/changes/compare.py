@@ -35,9 +35,10 @@ from graphslam.changes.surface import Surface, surface_of
 from graphslam.changes.visit import Bools, Ints, Visit, dictionary
 from graphslam.config import ChangesConfig
 from graphslam.errors import OutputError
-from graphslam.geometry import Array, inverse
+from graphslam.geometry import Array, inverse, transform
 
 Kind = Literal["appeared", "vanished", "moved"]
+_Lines = list[tuple[int, Array]]
 
 #: farthest returns that pull a scan, m, round by round: wide first
 _REFERENCE_GATES = (0.15, 0.1, 0.1)
@@ -50,6 +51,7 @@ _OVERLAP = 0.05  # share of the later returns that must lie where the reference 
 _FIRST_SIGMA_M = 0.02  # of ranges, until they tell themselves
 #: a region is a part of what is this near to most of it, m
 _AT_SEGMENT_M = 0.08
+_LINE_SAMPLES = 40  # points of a line that are asked for whether they lie on what changed
 
 
 #: where maps bend: how far off a return is still compared, m, and what to say
@@ -67,7 +69,9 @@ class Change:
 
     ``polygon`` (c, 2) m counter-clockwise: of the new place, of the old one if it vanished;
     ``before`` the old place of what moved, where it was seen. ``displacement`` is the rigid motion
-    of the world that takes it from the old to the new place.
+    of the world that takes it from the old to the new place. ``lines_before`` and ``lines_now`` are
+    ids of line landmarks of either map most of which is what changed: walls that were removed,
+    added or moved.
     """
 
     kind: Kind
@@ -77,6 +81,8 @@ class Change:
     beams: int
     first_seen_ns: int
     before: Array | None = None
+    lines_before: tuple[int, ...] = ()
+    lines_now: tuple[int, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """The entry in changes.json."""
@@ -89,6 +95,8 @@ class Change:
             "displacement": None if moved is None else dictionary(moved.motion, moved.cov),
             "beams": self.beams,
             "first_seen_ns": self.first_seen_ns,
+            "lines_before": list(self.lines_before),
+            "lines_now": list(self.lines_now),
         }
 
 
@@ -191,7 +199,8 @@ def compare(
     )
     fits = _fits(*shapes, config.bias_sigma_m)
     segments = _segments(vanished, appeared, reference, later, registration)
-    changes = _changes(vanished, appeared, fits, segments)
+    lines = (_placed_lines(reference, same_frame(reference)), _placed_lines(later, registration))
+    changes = _changes(vanished, appeared, fits, segments, lines)
     return Comparison(
         changes, registration, reference, later, surfaces, evidence, compared, marked,
         factor, sigmas, config.false_alarm_rate, warnings,
@@ -363,6 +372,7 @@ def _changes(
     appeared: list[Region],
     fits: tuple[list[_Pair], list[_Pair]],
     segments: list[_Pair],
+    lines: tuple[_Lines, _Lines],
 ) -> tuple[Change, ...]:
     """Regions as changes; what moved once instead of twice.
 
@@ -391,7 +401,10 @@ def _changes(
                     if _lands(moved_points(appeared[j].points, back), there)
                 ]  # fmt: skip
             parts = [appeared[j] for j in new] or [vanished[i] for i in old]
-            found.append(_moved(parts, [vanished[i] for i in old] if new else [], pair.motion))
+            change = _moved(parts, [vanished[i] for i in old] if new else [], pair.motion)
+            on = _lines_on(lines[0], [vanished[i] for i in old])
+            now = _lines_on(lines[1], [appeared[j] for j in new])
+            found.append(replace(change, lines_before=on, lines_now=now))
             old_left -= set(old)
             new_left -= set(new)
     kinds: Mapping[Kind, list[Region]] = {
@@ -399,8 +412,34 @@ def _changes(
         "appeared": [appeared[j] for j in sorted(new_left)],
     }
     for kind, rest in kinds.items():
-        found += [Change(kind, r.outline, r.probability, None, r.beams, r.first_ns) for r in rest]
+        for r in rest:
+            change = Change(kind, r.outline, r.probability, None, r.beams, r.first_ns)
+            if kind == "vanished":
+                change = replace(change, lines_before=_lines_on(lines[0], [r]))
+            else:
+                change = replace(change, lines_now=_lines_on(lines[1], [r]))
+            found.append(change)
     return tuple(sorted(found, key=lambda c: (-c.beams, c.kind, c.first_seen_ns)))
+
+
+def _placed_lines(visit: Visit, registration: Registration) -> _Lines:
+    """Ids and ends (2, 2) m of a visit's line landmarks in the reference's frame."""
+    return [
+        (mark.id, transform(registration.pose, mark.extent))
+        for mark in visit.landmarks
+        if mark.line is not None
+    ]
+
+
+def _lines_on(lines: _Lines, regions: list[Region]) -> tuple[int, ...]:
+    """Ids of lines most of whose length lies on regions."""
+    if not regions:
+        return ()
+    points = [region.points for region in regions]
+    steps = np.linspace(0, 1, _LINE_SAMPLES)[:, None]
+    return tuple(
+        number for number, ends in lines if _lands(ends[0] + steps * (ends[1] - ends[0]), points)
+    )
 
 
 def _lands(points: Array, parts: list[Array]) -> bool:
