@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 from scipy.stats import chi2
 from typer.testing import CliRunner
 
-from graphslam.changes import compare, visit_of
+from graphslam.changes import compare, load_visit, visit_of
 from graphslam.changes.alignment import align
 from graphslam.changes.compare import lasers_differ
 from graphslam.changes.evidence import past
@@ -27,6 +27,7 @@ from graphslam.config import ChangesConfig
 from graphslam.errors import OutputError
 from graphslam.geometry import between, compose, inverse, transform, wrap
 from graphslam.records import Landmark
+from graphslam.results import load
 from graphslam.simulate.raycast import Fan, cast
 from graphslam.simulate.world import Outline, make_world
 
@@ -464,6 +465,39 @@ def test_other_rooms_are_not_registered():
     b = replace(a, range_m=clean.ravel(), poses=poses)
     with pytest.raises(OutputError, match="cannot be registered"):
         compare(a, b, CONFIG)
+
+
+def test_maps_that_disagree_all_over_are_refused():
+    """Registered by chance: every wall is a decimetre off. Not a list of changes."""
+    rng = np.random.default_rng(18)
+    a = visit([], drive(40), rng)
+    poses = drive(40, 0.1)
+    middle = ROOM.points.mean(axis=0)
+    smaller = Outline("room", middle + 0.97 * (ROOM.points - middle), closed=True)
+    clean = cast(poses, FAN, make_world([smaller]).shapes, 30.0).ranges
+    sharp = np.tile(np.diag([1e-4, 1e-4, 1e-4]) ** 2, (40, 1, 1))
+    b = replace(a, poses=poses, range_m=clean.ravel(), covs=sharp, shared=sharp)
+    with pytest.raises(OutputError, match="disagree by"):
+        same(a, b)
+
+
+def test_a_result_without_covariances_is_one_clear_line(tmp_path):
+    run = CliRunner()
+    run.invoke(app, ["simulate", "lab", "-o", str(tmp_path / "log.mcap")])
+    run.invoke(app, ["smooth", str(tmp_path / "log.mcap"), "-o", str(tmp_path / "result")])
+    path = tmp_path / "result/trajectories/vehicle.cov.csv"
+    head, *rows = path.read_text().splitlines()
+    empty = [row.split(",")[0] + 6 * ",nan" for row in rows]
+    path.write_text("\n".join([head, *empty, ""]))
+    with pytest.raises(OutputError, match="vehicle has no covariances"):
+        load_visit(load(tmp_path / "result"), tmp_path / "result")
+
+
+def test_several_robots_are_not_followed_from_scan_to_scan():
+    rng = np.random.default_rng(19)
+    a = replace(visit([], drive(20), rng), robots=2)
+    with pytest.raises(OutputError, match="no landmarks in common"):
+        compare(a, a, CONFIG)
 
 
 def test_other_lasers_are_warned_of():

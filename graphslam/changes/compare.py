@@ -56,6 +56,9 @@ _LINE_SAMPLES = 40  # points of a line that are asked for whether they lie on wh
 
 #: where maps bend: how far off a return is still compared, m, and what to say
 _BENT_GATE_M = 0.3
+#: factor on the stated sigmas from which on two maps are not of one place: where scans were placed
+#: one by one, anything that is left was free to fit; and from which on it is warned of
+_MOST_SPREAD, _WIDE_SPREAD = {False: 5.0, True: 1.8}, 1.5
 _BENT = (
     "the maps bend differently, so no one motion brings their landmarks together: both paths were "
     "straightened by their scans and the later scans placed one after the other; only large "
@@ -186,6 +189,7 @@ def compare(
         evidence = _evidence(reference, later, surfaces, sigmas, config)
     a, b = surfaces
     factor = spread(evidence)
+    warnings += _plausible(factor, bent)
     flags = tuple(flagged(e, factor, config.false_alarm_rate / 2) for e in evidence)
     compared, marked = _beams(later, surfaces, evidence, (flags[0], flags[1]))
     seen = np.nonzero(b.beams >= 0)[0]
@@ -219,6 +223,8 @@ def in_one_frame(
         try:
             registration = register(reference.landmarks, later.landmarks)
         except OutputError:
+            if max(reference.robots, later.robots) > 1:  # no path to follow from scan to scan
+                raise
             reference, placed, registration = localise(reference, later, config)
             return reference, placed, registration, True
     return reference, later.placed(registration.pose, registration.cov), registration, False
@@ -265,6 +271,26 @@ def aligned(
     later = later if bent else align(later, a, _LATER_GATES)
     sigmas = (sigma, range_noise(a, later, config.gate_m))
     return reference, later, (a, surface_of(later, grid, sigmas[1], config)), sigmas
+
+
+def _plausible(factor: float, bent: bool) -> tuple[str, ...]:
+    """A warning if the visits disagree all over by more than is stated.
+
+    Raises:
+        OutputError: by so much more that they are hardly of one place.
+    """
+    allowed = _MOST_SPREAD[bent]
+    if factor > allowed:
+        raise OutputError(
+            f"nothing to compare: the surfaces of the two runs disagree by {factor:.1f} times what "
+            "their covariances allow; they are of different places, or one of the maps is broken"
+        )
+    if factor < _WIDE_SPREAD:
+        return ()
+    return (
+        f"the surfaces of the two runs disagree by {factor:.1f} times what their covariances "
+        "allow, all over: a path is worse than it says, and changes may be false",
+    )
 
 
 def _evidence(

@@ -36,6 +36,7 @@ _RANGE_SIGMA_M = 0.02
 _AGREES_M = 0.1
 #: shares of a scan's returns that must agree (legs and clutter are no surfaces); of scans that must
 _SCAN_SHARE, _RUN_SHARE = 0.3, 0.5
+_FEWEST = 20  # returns of a scan that may agree by chance
 #: every so many scans vote; so many of the best votes are followed
 _EVERY, _FOLLOWED = 10, 2
 #: pictures of the maps: cells, m, and how many a side; turns that are tried, rad; best of them kept
@@ -99,12 +100,14 @@ def _as_placed(visit: Visit) -> Visit:
 
 
 def agreement(surface: Surface, visit: Visit) -> Array:
-    """Share (s,) of each scan's returns that lie on a surface."""
+    """Share (s,) of each scan's returns that lie on a surface; 0 for scans with hardly any."""
     beams = np.nonzero(visit.surface)[0]
     cell = surface.nearest.grid.cells(visit.ends[beams])
     near = (cell >= 0) & (surface.nearest.distance_m[cell] < _AGREES_M)
     scan, size = visit.scan[beams], len(visit.poses)
-    return np.asarray(np.bincount(scan, near, size) / np.maximum(np.bincount(scan, None, size), 1))
+    returns = np.bincount(scan, minlength=size)
+    share = np.bincount(scan, near, size) / np.maximum(returns, 1)
+    return np.asarray(np.where(returns >= _FEWEST, share, 0.0))
 
 
 def _starts(surface: Surface, reference: Visit, later: Visit) -> Iterator[tuple[Array, int]]:

@@ -41,6 +41,7 @@ class Visit:
         range_m: (n,) NaN where nothing usable came back.
         surface: (n,) whether the return is on a surface: not an edge, not alone.
         landmarks: the map of the run.
+        robots: how many robots' scans these are; neighbours in time are of one robot only if 1.
     """
 
     stamps_ns: Ints
@@ -52,6 +53,7 @@ class Visit:
     range_m: Array
     surface: Bools
     landmarks: tuple[Landmark, ...]
+    robots: int = 1
 
     @property
     def directions(self) -> Array:
@@ -84,6 +86,7 @@ class Visit:
             self.range_m[beams],
             self.surface[beams],
             self.landmarks,
+            self.robots,
         )
 
 
@@ -169,13 +172,10 @@ def load_visit(saved: SavedResult, directory: Path) -> Visit:
             sweeps.append((message.angles[order], message.ranges[order]))
     if not stamps:
         raise OutputError(f"{directory}: has no laser scans to compare")
-    return visit_of(
-        np.array(stamps, dtype=np.int64),
-        np.array(poses),
-        np.array(covs),
-        sweeps,
-        saved.landmarks,
+    visit = visit_of(
+        np.array(stamps, dtype=np.int64), np.array(poses), np.array(covs), sweeps, saved.landmarks
     )
+    return replace(visit, robots=len({name for name, _ in known}))
 
 
 def within(visit: Visit, span_s: tuple[float, float], what: str) -> Visit:

@@ -28,6 +28,7 @@ _CSS = "".join(
     f"margin-right: .45em; border-radius: 2px; background: var(--robot{PALETTE.index(color)}); }}\n"
     for kind, color in COLORS.items()
 )
+_CSS += "tbody th { white-space: nowrap; }\n"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
