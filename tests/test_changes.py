@@ -5,16 +5,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from scipy.stats import chi2
 from typer.testing import CliRunner
 
-from graphslam.changes import compare, visit_of
+from graphslam.changes import compare, load_visit, visit_of
 from graphslam.changes.alignment import align
+from graphslam.changes.compare import lasers_differ
 from graphslam.changes.evidence import past
 from graphslam.changes.grid import Grid, distinct, grid_over, nearest_of
+from graphslam.changes.localisation import overlays
+from graphslam.changes.overlay import overlay_map
 from graphslam.changes.picture import render_changes
 from graphslam.changes.regions import counter_clockwise, outline
 from graphslam.changes.registration import register
+from graphslam.changes.straighten import straightened
 from graphslam.changes.surface import surface_of
 from graphslam.changes.visit import on_surface
 from graphslam.cli.commands import app
@@ -22,6 +27,7 @@ from graphslam.config import ChangesConfig
 from graphslam.errors import OutputError
 from graphslam.geometry import between, compose, inverse, transform, wrap
 from graphslam.records import Landmark
+from graphslam.results import load
 from graphslam.simulate.raycast import Fan, cast
 from graphslam.simulate.world import Outline, make_world
 
@@ -230,6 +236,30 @@ def test_a_slide_of_a_few_centimetres_is_found_by_many_scans():
     assert found.changes
 
 
+def test_walls_that_were_removed_and_added_are_named():
+    """A partition of the reference is gone, another one is new; the room's walls stay."""
+    rng = np.random.default_rng(17)
+    old, new = box(5.5, 1, 0.04, 1.6), box(5, 4.4, 1.6, 0.04)
+    a, b = visit([old], drive(50), rng), visit([new], drive(50, 0.1), rng)
+
+    def wall(number, start, end):
+        middle = np.array([*np.add(start, end) / 2, np.arctan2(end[1] - start[1], 0)])
+        normal = (1.0, 0.0) if start[0] == end[0] else (0.0, 1.0)
+        line = (np.arctan2(normal[1], normal[0]), np.dot(normal, start), 1e-5 * np.eye(2))
+        ends = np.array([start, end], float)
+        return Landmark(number, "segment", middle, 1e-4 * np.eye(3), ends, line, 9, 0, 1, None)
+
+    found = compare(
+        replace(a, landmarks=(*walls(), wall(70, (5.5, 1.0), (5.5, 2.6)))),
+        replace(b, landmarks=(*walls(), wall(80, (5.0, 4.4), (6.6, 4.4)))),
+        CONFIG,
+    )
+    named = {(c.kind, c.lines_before, c.lines_now) for c in found.changes}
+    assert ("vanished", (70,), ()) in named or ("moved", (70,), (80,)) in named
+    every = [n for c in found.changes for n in (*c.lines_before, *c.lines_now)]
+    assert sorted(every) == [70, 80]
+
+
 def test_evidence_is_one_sided():
     """A surface that came nearer hides the old one: later beams do not go past it."""
     rng = np.random.default_rng(8)
@@ -299,6 +329,26 @@ def test_moving_a_visit_moves_its_ends():
 # ------------------------------------------------------------ files and the command
 
 
+def test_the_overlay_is_occupied_where_something_is_now_and_free_where_it_was():
+    rng = np.random.default_rng(16)
+    a, b = visit([box(5, 4)], drive(50), rng), visit([box(4, 4.6)], drive(50, 0.1), rng)
+    found = same(a, b)
+    image, text = overlay_map(found)
+    lines = dict(line.split(": ", 1) for line in text.splitlines() if ": " in line[:30])
+    x, y, _ = json.loads(lines["origin"])
+    cell = float(lines["resolution"])
+
+    def values(point):
+        """In a square of 10 cm, as map_server reads it: the first row is the northernmost."""
+        column, row = int((point[0] - x) / cell), image.shape[0] - 1 - int((point[1] - y) / cell)
+        return set(image[row - 2 : row + 3, column - 2 : column + 3].ravel().tolist())
+
+    # the sides that face the room's middle
+    assert 0 in values((4.3, 4.6))
+    assert 254 in values((5.0, 4.2))
+    assert values((1.0, 3.0)) == {205}
+
+
 def test_the_page_is_whole_and_repeatable():
     rng = np.random.default_rng(4)
     found = same(visit([], drive(30), rng), visit([box(5, 4)], drive(30, 0.1), rng))
@@ -325,6 +375,12 @@ def test_the_command_from_logs_to_json(tmp_path):
     found = json.loads(done(*arguments, "--json"))
     assert found == json.loads((tmp_path / "out/changes.json").read_text())
     assert (tmp_path / "out/report.html").exists()
+    header, size, depth, pixels = (tmp_path / "out/changes.pgm").read_bytes().split(b"\n", 3)
+    assert (header, depth) == (b"P5", b"255")
+    assert len(pixels) == np.prod([int(n) for n in size.split()])
+    with (tmp_path / "out/changes.mcap").open("rb") as stream:
+        topics = {c.topic for _, c, _ in make_reader(stream, validate_crcs=True).iter_messages()}
+    assert topics == {"/changes", "/reference", "/later"}
     assert found["false_alarm_rate_requested"] == 0.01
     assert 0 < found["beams_flagged"] < 0.15 * found["beams_compared"]
     (change,) = found["changes"]
@@ -349,3 +405,110 @@ def test_the_command_from_logs_to_json(tmp_path):
     assert other.exit_code == 1
     assert "is not the log" in other.output
     assert run.invoke(app, [*map(str, arguments), "--later-span", "9:3"]).exit_code == 2
+
+
+# ------------------------------------------------------------ where maps bend
+
+
+def bent(original, rate_rad_m):
+    """The same scans on a path whose heading drifts by ``rate_rad_m`` per metre."""
+    poses = original.poses.copy()
+    for i in range(1, len(poses)):
+        step = between(original.poses[i - 1], original.poses[i])
+        step[2] += rate_rad_m * np.hypot(*step[:2])
+        poses[i] = compose(poses[i - 1], step)
+    return replace(original, poses=poses)
+
+
+def test_a_bent_path_is_made_straight_by_its_scans():
+    """Breaks if scans are matched to themselves, to nothing, or with the wrong sign."""
+    rng = np.random.default_rng(11)
+    poses = drive(200)
+    a = visit([box(5, 4), box(1, 1, 0.8, 0.4)], poses, rng, (1e-4, 1e-4, 1e-5))
+    crooked = bent(a, 0.05)
+    away = np.abs(wrap(crooked.poses[:, 2] - poses[:, 2])).max()
+    left = np.abs(wrap(straightened(crooked).poses[:, 2] - poses[:, 2])).max()
+    assert away > 0.2
+    assert left < 0.2 * away
+
+
+def test_maps_are_laid_over_each_other_from_any_pose():
+    rng = np.random.default_rng(12)
+    ends = visit([box(5, 4), box(1, 1, 0.8, 0.4)], drive(40), rng).ends
+    pose = np.array([4.0, -3.0, 2.2])
+    found = overlays(transform(pose, ends), ends)
+    error = np.array([between(pose, one) for one in found])
+    # turns are tried every 2 degrees, shifts every 10 cm
+    assert (np.hypot(*error[:, :2].T)[np.abs(wrap(error[:, 2])) < np.radians(2)] < 0.2).any()
+
+
+def test_bent_maps_are_registered_scan_by_scan_and_say_so():
+    """No landmarks at all: only the scans can tell. What appeared is found nevertheless."""
+    rng = np.random.default_rng(13)
+    things = [box(1, 1, 0.8, 0.4), box(6.6, 0.3, 1.1, 0.3)]
+    a = bent(visit(things, drive(120), rng, (1e-4, 1e-4, 1e-5)), 0.02)
+    b = bent(visit([*things, box(5, 4)], drive(120, 0.1), rng, (1e-4, 1e-4, 1e-5)), -0.02)
+    found = compare(a, b.placed(np.array([2.0, 1.0, 0.8]), np.zeros((3, 3))), CONFIG)
+    assert "straightened" in found.warnings[0]
+    largest = found.changes[0]
+    assert largest.kind == "appeared"
+    np.testing.assert_allclose(largest.polygon.mean(axis=0), [5.2, 4.2], atol=0.4)
+
+
+def test_other_rooms_are_not_registered():
+    """Scans of another place fit nowhere: an error, not a map of changes."""
+    rng = np.random.default_rng(14)
+    a = visit([box(5, 4)], drive(60), rng)
+    hall = Outline("hall", np.array([[0, 0], [25, 0], [19, 17], [3, 21]], float), closed=True)
+    poses = drive(60) + np.array([8.0, 5.0, 0.0])
+    clean = cast(poses, FAN, make_world([hall]).shapes, 30.0).ranges
+    b = replace(a, range_m=clean.ravel(), poses=poses)
+    with pytest.raises(OutputError, match="cannot be registered"):
+        compare(a, b, CONFIG)
+
+
+def test_maps_that_disagree_all_over_are_refused():
+    """Registered by chance: every wall is a decimetre off. Not a list of changes."""
+    rng = np.random.default_rng(18)
+    a = visit([], drive(40), rng)
+    poses = drive(40, 0.1)
+    middle = ROOM.points.mean(axis=0)
+    smaller = Outline("room", middle + 0.97 * (ROOM.points - middle), closed=True)
+    clean = cast(poses, FAN, make_world([smaller]).shapes, 30.0).ranges
+    sharp = np.tile(np.diag([1e-4, 1e-4, 1e-4]) ** 2, (40, 1, 1))
+    b = replace(a, poses=poses, range_m=clean.ravel(), covs=sharp, shared=sharp)
+    with pytest.raises(OutputError, match="disagree by"):
+        same(a, b)
+
+
+def test_a_result_without_covariances_is_one_clear_line(tmp_path):
+    run = CliRunner()
+    run.invoke(app, ["simulate", "lab", "-o", str(tmp_path / "log.mcap")])
+    run.invoke(app, ["smooth", str(tmp_path / "log.mcap"), "-o", str(tmp_path / "result")])
+    path = tmp_path / "result/trajectories/vehicle.cov.csv"
+    head, *rows = path.read_text().splitlines()
+    empty = [row.split(",")[0] + 6 * ",nan" for row in rows]
+    path.write_text("\n".join([head, *empty, ""]))
+    with pytest.raises(OutputError, match="vehicle has no covariances"):
+        load_visit(load(tmp_path / "result"), tmp_path / "result")
+
+
+def test_several_robots_are_not_followed_from_scan_to_scan():
+    rng = np.random.default_rng(19)
+    a = replace(visit([], drive(20), rng), robots=2)
+    with pytest.raises(OutputError, match="no landmarks in common"):
+        compare(a, a, CONFIG)
+
+
+def test_other_lasers_are_warned_of():
+    rng = np.random.default_rng(15)
+    a, b = visit([], drive(30), rng), visit([], drive(30, 0.1), rng)
+    assert lasers_differ(a, b) == ()
+    every_second = np.arange(len(b.range_m)) % 361 % 2 == 0
+    coarse = replace(
+        b, scan=b.scan[every_second], angle=b.angle[every_second],
+        range_m=b.range_m[every_second], surface=b.surface[every_second],
+    )  # fmt: skip
+    (warning,) = lasers_differ(a, coarse)
+    assert "361 beams" in warning
+    assert "181" in warning

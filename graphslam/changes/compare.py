@@ -1,6 +1,7 @@
 """Change detection, top to bottom: one frame, surfaces, evidence, changes.
 
-1. the later run's frame lies in the reference's by landmarks of both (`registration`);
+1. the later run's frame lies in the reference's by landmarks of both (`registration`), or, where
+   the maps bend, each of its scans by the surfaces it sees (`localisation`);
 2. every scan is brought onto the surfaces of the reference, within its covariance (`alignment`);
 3. the beams of each visit are held against the surfaces of the other (`evidence`);
 4. flagged pieces of surface that hang together are changes (`regions`), of which some are one
@@ -8,24 +9,36 @@
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from graphslam.changes.alignment import align
-from graphslam.changes.evidence import Evidence, past, range_noise, spread
+from graphslam.changes.evidence import Evidence, past, range_noise, spread, visit_step
 from graphslam.changes.grid import grid_over
-from graphslam.changes.moves import Displacement, close_to, paired, segment_moves
+from graphslam.changes.localisation import localise
+from graphslam.changes.moves import (
+    Displacement,
+    Shape,
+    close_to,
+    is_straight,
+    motion_between,
+    moved_points,
+    segment_moves,
+    shape_of,
+)
 from graphslam.changes.regions import Region, flagged, regions
 from graphslam.changes.registration import Registration, register
 from graphslam.changes.surface import Surface, surface_of
 from graphslam.changes.visit import Bools, Ints, Visit, dictionary
 from graphslam.config import ChangesConfig
 from graphslam.errors import OutputError
-from graphslam.geometry import Array
+from graphslam.geometry import Array, inverse, transform
 
 Kind = Literal["appeared", "vanished", "moved"]
+_Lines = list[tuple[int, Array]]
 
 #: farthest returns that pull a scan, m, round by round: wide first
 _REFERENCE_GATES = (0.15, 0.1, 0.1)
@@ -36,8 +49,21 @@ _MANY_SUSPECTS, _SUSPECT = 0.03, 3.0
 _REFERENCE_ROUNDS = 2
 _OVERLAP = 0.05  # share of the later returns that must lie where the reference looked
 _FIRST_SIGMA_M = 0.02  # of ranges, until they tell themselves
-#: a stretch of a segment's new place counts as seen by a region this near to it, m
+#: a region is a part of what is this near to most of it, m
 _AT_SEGMENT_M = 0.08
+_LINE_SAMPLES = 40  # points of a line that are asked for whether they lie on what changed
+
+
+#: where maps bend: how far off a return is still compared, m, and what to say
+_BENT_GATE_M = 0.3
+#: factor on the stated sigmas from which on two maps are not of one place: where scans were placed
+#: one by one, anything that is left was free to fit; and from which on it is warned of
+_MOST_SPREAD, _WIDE_SPREAD = {False: 5.0, True: 1.8}, 1.5
+_BENT = (
+    "the maps bend differently, so no one motion brings their landmarks together: both paths were "
+    "straightened by their scans and the later scans placed one after the other; only large "
+    "changes are found, and where they are is known to decimetres"
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +72,9 @@ class Change:
 
     ``polygon`` (c, 2) m counter-clockwise: of the new place, of the old one if it vanished;
     ``before`` the old place of what moved, where it was seen. ``displacement`` is the rigid motion
-    of the world that takes it from the old to the new place.
+    of the world that takes it from the old to the new place. ``lines_before`` and ``lines_now`` are
+    ids of line landmarks of either map most of which is what changed: walls that were removed,
+    added or moved.
     """
 
     kind: Kind
@@ -56,6 +84,8 @@ class Change:
     beams: int
     first_seen_ns: int
     before: Array | None = None
+    lines_before: tuple[int, ...] = ()
+    lines_now: tuple[int, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """The entry in changes.json."""
@@ -68,6 +98,8 @@ class Change:
             "displacement": None if moved is None else dictionary(moved.motion, moved.cov),
             "beams": self.beams,
             "first_seen_ns": self.first_seen_ns,
+            "lines_before": list(self.lines_before),
+            "lines_now": list(self.lines_now),
         }
 
 
@@ -85,6 +117,7 @@ class Comparison:
         spread: factor on the stated sigmas with which the bulk of the scores is normal.
         range_sigma_m: range noise of both visits as found.
         rate: the false-alarm rate that was asked for.
+        warnings: what makes the result weaker than its numbers say, one line each.
     """
 
     changes: tuple[Change, ...]
@@ -98,6 +131,7 @@ class Comparison:
     spread: float
     range_sigma_m: tuple[float, float]
     rate: float
+    warnings: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """The contents of changes.json."""
@@ -110,6 +144,7 @@ class Comparison:
             | {"landmarks": len(self.registration.matched)},
             "spread": self.spread,
             "range_sigma_m": list(self.range_sigma_m),
+            "warnings": list(self.warnings),
         }
 
 
@@ -138,20 +173,23 @@ def compare(
     Raises:
         OutputError: the two cannot be registered, or saw nothing in common.
     """
-    if registration is None:
-        registration = register(reference.landmarks, later.landmarks)
-    placed = later.placed(registration.pose, registration.cov)
-    reference, later, surfaces, sigmas = aligned(reference, placed, config)
+    warnings = lasers_differ(reference, later)
+    reference, placed, registration, bent = in_one_frame(reference, later, registration, config)
+    if bent:
+        warnings += (_BENT,)
+        config = replace(config, gate_m=max(config.gate_m, _BENT_GATE_M))
+    reference, later, surfaces, sigmas = aligned(reference, placed, config, bent)
     a = surfaces[0]
     evidence = _evidence(reference, later, surfaces, sigmas, config)
     suspects = _suspects(later, surfaces, evidence)
-    if suspects.mean() > _MANY_SUSPECTS:
+    if suspects.mean() > _MANY_SUSPECTS and not bent:
         # what changed pulled at the scans that saw it: place them again without it
         later = align(placed, a, _LATER_GATES, suspects)
         surfaces = (a, surface_of(later, a.nearest.grid, sigmas[1], config))
         evidence = _evidence(reference, later, surfaces, sigmas, config)
     a, b = surfaces
     factor = spread(evidence)
+    warnings += _plausible(factor, bent)
     flags = tuple(flagged(e, factor, config.false_alarm_rate / 2) for e in evidence)
     compared, marked = _beams(later, surfaces, evidence, (flags[0], flags[1]))
     seen = np.nonzero(b.beams >= 0)[0]
@@ -159,17 +197,57 @@ def compare(
         a, evidence[0], evidence[0].beams, evidence[0].rows, evidence[0].first_ns, factor, config
     )
     appeared = regions(b, evidence[1], seen, b.beams[seen], b.first_ns, factor, config)
-    changes = _changes(vanished, appeared, reference, later, registration)
+    shapes = (
+        [shape_of(a, reference, evidence[0], factor, r.points) for r in vanished],
+        [shape_of(b, later, evidence[1], factor, r.points) for r in appeared],
+    )
+    fits = _fits(*shapes, config.bias_sigma_m)
+    segments = _segments(vanished, appeared, reference, later, registration)
+    lines = (_placed_lines(reference, same_frame(reference)), _placed_lines(later, registration))
+    changes = _changes(vanished, appeared, fits, segments, lines)
     return Comparison(
         changes, registration, reference, later, surfaces, evidence, compared, marked,
-        factor, sigmas, config.false_alarm_rate,
+        factor, sigmas, config.false_alarm_rate, warnings,
     )  # fmt: skip
 
 
+def in_one_frame(
+    reference: Visit, later: Visit, registration: Registration | None, config: ChangesConfig
+) -> tuple[Visit, Visit, Registration, bool]:
+    """Both visits in the reference's frame, by landmarks, or else scan by scan as the maps bend.
+
+    Raises:
+        OutputError: neither way works.
+    """
+    if registration is None:
+        try:
+            registration = register(reference.landmarks, later.landmarks)
+        except OutputError:
+            if max(reference.robots, later.robots) > 1:  # no path to follow from scan to scan
+                raise
+            reference, placed, registration = localise(reference, later, config)
+            return reference, placed, registration, True
+    return reference, later.placed(registration.pose, registration.cov), registration, False
+
+
+def lasers_differ(reference: Visit, later: Visit) -> tuple[str, ...]:
+    """A warning if the two visits were made with different lasers."""
+    steps = [2 * np.degrees(visit_step(v)) for v in (reference, later)]
+    beams = [int(np.median(np.bincount(v.scan))) for v in (reference, later)]
+    if abs(steps[0] - steps[1]) < 0.02 * steps[0] and abs(beams[0] - beams[1]) < 0.02 * beams[0]:
+        return ()
+    return (
+        f"the lasers differ ({beams[0]} beams of {steps[0]:.2f} deg, {beams[1]} of "
+        f"{steps[1]:.2f} deg): where they look at different heights, things seem to have changed",
+    )
+
+
 def aligned(
-    reference: Visit, later: Visit, config: ChangesConfig
+    reference: Visit, later: Visit, config: ChangesConfig, bent: bool = False
 ) -> tuple[Visit, Visit, tuple[Surface, Surface], tuple[float, float]]:
     """Two visits in one frame, each on the reference's surfaces; surfaces; range sigmas, m.
+
+    Where the maps are ``bent``, scans are where their neighbours are: one alone sees too little.
 
     Raises:
         OutputError: the later visit saw hardly anything of what the reference saw.
@@ -180,7 +258,7 @@ def aligned(
     first = reference
     a = surface_of(reference, grid, sigma, config)
     for _ in range(_REFERENCE_ROUNDS):
-        reference = align(first, a, _REFERENCE_GATES)
+        reference = first if bent else align(first, a, _REFERENCE_GATES)
         a = surface_of(reference, grid, sigma, config)
         sigma = range_noise(a, reference, config.gate_m)
     at = grid.cells(later.ends[later.surface])
@@ -190,9 +268,29 @@ def aligned(
             f"nothing to compare: {100 * near.mean():.0f} % of the later returns lie on surfaces "
             "of the reference; did both runs see the same place?"
         )
-    later = align(later, a, _LATER_GATES)
+    later = later if bent else align(later, a, _LATER_GATES)
     sigmas = (sigma, range_noise(a, later, config.gate_m))
     return reference, later, (a, surface_of(later, grid, sigmas[1], config)), sigmas
+
+
+def _plausible(factor: float, bent: bool) -> tuple[str, ...]:
+    """A warning if the visits disagree all over by more than is stated.
+
+    Raises:
+        OutputError: by so much more that they are hardly of one place.
+    """
+    allowed = _MOST_SPREAD[bent]
+    if factor > allowed:
+        raise OutputError(
+            f"nothing to compare: the surfaces of the two runs disagree by {factor:.1f} times what "
+            "their covariances allow; they are of different places, or one of the maps is broken"
+        )
+    if factor < _WIDE_SPREAD:
+        return ()
+    return (
+        f"the surfaces of the two runs disagree by {factor:.1f} times what their covariances "
+        "allow, all over: a path is worse than it says, and changes may be false",
+    )
 
 
 def _evidence(
@@ -248,40 +346,132 @@ def _on_pieces(surface: Surface, visit: Visit) -> tuple[Ints, Ints]:
     return beams[near], surface.nearest.member[cell[near]].astype(np.int64)
 
 
-def _changes(
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pair:
+    """Vanished ``old`` and appeared ``new``, numbers of regions, that are one thing; its way."""
+
+    old: list[int]
+    new: list[int]
+    motion: Displacement
+
+
+def _fits(
+    before: list[Shape | None], after: list[Shape | None], bias_m: float
+) -> tuple[list[_Pair], list[_Pair]]:
+    """Pairs of like shape, the most alike first; those with corners, and straight ones."""
+    found = []
+    for i, a in enumerate(before):
+        for j, b in enumerate(after):
+            fit = None if a is None or b is None else motion_between(a, b, bias_m)
+            if fit is not None and a is not None:
+                found.append((-fit[0], i, j, is_straight(a), fit[1]))
+    found.sort(key=lambda fit: fit[:3])
+    cornered, straight = (
+        [_Pair([i], [j], motion) for _, i, j, flat, motion in found if flat == kind]
+        for kind in (False, True)
+    )
+    return cornered, straight
+
+
+def _segments(
     vanished: list[Region],
     appeared: list[Region],
     reference: Visit,
     later: Visit,
     registration: Registration,
+) -> list[_Pair]:
+    """Regions along segments of the maps that moved."""
+    return [
+        _Pair(
+            [i for i, r in enumerate(vanished) if _mostly_at(r, landmark.extent)],
+            [j for j, r in enumerate(appeared) if _mostly_at(r, ends)],
+            motion,
+        )
+        for landmark, ends, motion in segment_moves(
+            reference.landmarks, later.landmarks, registration
+        )
+    ]
+
+
+def _changes(
+    vanished: list[Region],
+    appeared: list[Region],
+    fits: tuple[list[_Pair], list[_Pair]],
+    segments: list[_Pair],
+    lines: tuple[_Lines, _Lines],
 ) -> tuple[Change, ...]:
-    """Regions as changes; what moved once instead of twice."""
+    """Regions as changes; what moved once instead of twice.
+
+    Shapes with corners say most about what is which, then segments of both maps (of a box they
+    may be opposite sides), then straight stretches.
+    """
     found: list[Change] = []
-    used_v: set[int] = set()
-    used_a: set[int] = set()
-    for landmark, ends, motion in segment_moves(reference.landmarks, later.landmarks, registration):
-        new = [j for j, r in enumerate(appeared) if _mostly_at(r, ends)]
-        old = [i for i, r in enumerate(vanished) if _mostly_at(r, landmark.extent)]
-        new, old = [j for j in new if j not in used_a], [i for i in old if i not in used_v]
-        if new or old:
+    old_left, new_left = set(range(len(vanished))), set(range(len(appeared)))
+    for pairs, needs_both in ((fits[0], True), (segments, False), (fits[1], True)):
+        for pair in pairs:
+            old = [i for i in pair.old if i in old_left]
+            new = [j for j in pair.new if j in new_left]
+            if not (old and new if needs_both else old or new):
+                continue
+            # other parts of the same thing: the motion brings them onto it
+            there = [vanished[i].points for i in old]
+            here = [appeared[j].points for j in new]
+            back = Displacement(inverse(pair.motion.motion), pair.motion.cov)
+            if old and new:
+                old += [
+                    i for i in sorted(old_left - set(old))
+                    if _lands(moved_points(vanished[i].points, pair.motion), here)
+                ]  # fmt: skip
+                new += [
+                    j for j in sorted(new_left - set(new))
+                    if _lands(moved_points(appeared[j].points, back), there)
+                ]  # fmt: skip
             parts = [appeared[j] for j in new] or [vanished[i] for i in old]
-            before = [vanished[i] for i in old] if new else []
-            found.append(_moved(parts, before, motion))
-            used_a.update(new)
-            used_v.update(old)
-    left_v = [i for i in range(len(vanished)) if i not in used_v]
-    left_a = [j for j in range(len(appeared)) if j not in used_a]
-    for i, j, motion in paired([vanished[i] for i in left_v], [appeared[j] for j in left_a]):
-        found.append(_moved([appeared[left_a[j]]], [vanished[left_v[i]]], motion))
-        used_v.add(left_v[i])
-        used_a.add(left_a[j])
+            change = _moved(parts, [vanished[i] for i in old] if new else [], pair.motion)
+            on = _lines_on(lines[0], [vanished[i] for i in old])
+            now = _lines_on(lines[1], [appeared[j] for j in new])
+            found.append(replace(change, lines_before=on, lines_now=now))
+            old_left -= set(old)
+            new_left -= set(new)
     kinds: Mapping[Kind, list[Region]] = {
-        "vanished": [r for i, r in enumerate(vanished) if i not in used_v],
-        "appeared": [r for j, r in enumerate(appeared) if j not in used_a],
+        "vanished": [vanished[i] for i in sorted(old_left)],
+        "appeared": [appeared[j] for j in sorted(new_left)],
     }
     for kind, rest in kinds.items():
-        found += [Change(kind, r.outline, r.probability, None, r.beams, r.first_ns) for r in rest]
+        for r in rest:
+            change = Change(kind, r.outline, r.probability, None, r.beams, r.first_ns)
+            if kind == "vanished":
+                change = replace(change, lines_before=_lines_on(lines[0], [r]))
+            else:
+                change = replace(change, lines_now=_lines_on(lines[1], [r]))
+            found.append(change)
     return tuple(sorted(found, key=lambda c: (-c.beams, c.kind, c.first_seen_ns)))
+
+
+def _placed_lines(visit: Visit, registration: Registration) -> _Lines:
+    """Ids and ends (2, 2) m of a visit's line landmarks in the reference's frame."""
+    return [
+        (mark.id, transform(registration.pose, mark.extent))
+        for mark in visit.landmarks
+        if mark.line is not None
+    ]
+
+
+def _lines_on(lines: _Lines, regions: list[Region]) -> tuple[int, ...]:
+    """Ids of lines most of whose length lies on regions."""
+    if not regions:
+        return ()
+    points = [region.points for region in regions]
+    steps = np.linspace(0, 1, _LINE_SAMPLES)[:, None]
+    return tuple(
+        number for number, ends in lines if _lands(ends[0] + steps * (ends[1] - ends[0]), points)
+    )
+
+
+def _lands(points: Array, parts: list[Array]) -> bool:
+    """Whether most points (k, 2) m lie at some of the parts (n, 2) m."""
+    away = cKDTree(np.concatenate(parts)).query(points)[0]
+    return bool((away < _AT_SEGMENT_M).mean() > 0.5)
 
 
 def _mostly_at(region: Region, ends: Array) -> bool:

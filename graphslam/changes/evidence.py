@@ -98,20 +98,28 @@ def past(
         weight * cosine,
         np.ones(len(row)),
         passed,
+        weight**2,
+        weight**2 * e,
+        weight**2 * e**2,
     )
     sums = np.column_stack([summed(row, t, n) for t in terms])
     inner = _inner(surface)
-    total, sum_e, sum_own, sum_common, sum_cos, count, through = pooled(sums, inner).T
+    total, sum_e, sum_own, sum_common, sum_cos, count, through, *squares = pooled(sums, inner).T
     safe = np.where(total > 0, total, 1.0)
+    mean = sum_e / safe
+    # Beams that contradict each other (most stop at a surface, a few graze past its edge) tell
+    # less than as many that agree: the variance is no smaller than their scatter makes it.
+    scatter = (squares[2] - 2 * mean * squares[1] + mean**2 * squares[0]) / safe**2
+    white = np.maximum(1 / safe, scatter)
     scans = different_scans(row, visit.scan[beam], len(visit.poses), n)
     pose = (sum_common + sum_own / np.maximum(most(scans, inner), 1)) / safe
     bias = config.bias_sigma_m * (sum_cos / safe - incidence_of)
-    variance = 1 / safe + surface.offset_cov + pose + surface.pose_var + bias**2
+    variance = white + surface.offset_cov + pose + surface.pose_var + bias**2
     tested = surface.good & (count >= config.min_beams)
     first = np.full(n, np.iinfo(np.int64).max)
     beyond = e > 0.5 * config.gate_m
     np.minimum.at(first, row[beyond], visit.stamps_ns[visit.scan[beam[beyond]]])
-    return Evidence(beam, row, sum_e / safe, variance, count, through, tested, first)
+    return Evidence(beam, row, mean, variance, count, through, tested, first)
 
 
 def _inner(surface: Surface) -> list[Ints]:

@@ -1,4 +1,4 @@
-"""Result folders in; changes.json and a report out."""
+"""Result folders in; changes.json, a map, messages and a report out."""
 
 import os
 import shutil
@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from graphslam.changes.compare import Comparison, compare, same_frame
+from graphslam.changes.overlay import overlay_map, pgm, write_messages
 from graphslam.changes.visit import load_visit, within
 from graphslam.config import ChangesConfig
 from graphslam.errors import OutputError
@@ -74,7 +75,9 @@ def save_changes(
     force: bool,
     report: Callable[[Comparison], str] | None = None,
 ) -> None:
-    """Write changes.json, and report.html if ``report`` renders one; whole or not at all.
+    """Write the folder of docs/formats.md, with report.html if ``report`` renders one.
+
+    It appears whole or not at all.
 
     Raises:
         OutputError: the target exists and may not be replaced, or the disk refuses.
@@ -85,8 +88,11 @@ def save_changes(
     texts = {"changes.json": to_json(found.to_dict(), "changes.json")}
     if report is not None:
         texts["report.html"] = report(found)
+    image, texts["changes.yaml"] = overlay_map(found)
     try:
         part.mkdir(parents=True)
+        (part / "changes.pgm").write_bytes(pgm(image))
+        write_messages(found, part / "changes.mcap")
         for name, text in texts.items():
             (part / name).write_text(text, encoding="utf-8")
         if final.exists():

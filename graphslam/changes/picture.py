@@ -58,7 +58,7 @@ def render_changes(
     return changes_page(
         ChangesPicture(
             names, reference, later, unseen, limits, tuple(marks), np.concatenate(scores),
-            found.spread, facts, settings,
+            found.spread, facts, settings, found.warnings,
         )
     )  # fmt: skip
 

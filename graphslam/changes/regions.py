@@ -71,7 +71,7 @@ def regions(
     sure = norm.isf(0.5 * config.run_false_alarm_rate / places)
     enough = max(int(np.ceil(config.min_length_m / grid.cell_m)), 1)
     rows = np.nonzero(flagged(evidence, spread, config.false_alarm_rate / 2))[0]
-    label = _connected(grid, surface.cells[rows])
+    label = connected(grid, surface.cells[rows])
     found = []
     for number in range(1, int(label.max(initial=0)) + 1):
         members = rows[label == number]
@@ -97,13 +97,13 @@ def regions(
     return found
 
 
-def _connected(grid: Grid, cells: Ints) -> Ints:
-    """Label (k,) from 1 of the cluster of each cell (k,)."""
+def connected(grid: Grid, cells: Ints, join_cells: int = _JOIN_CELLS) -> Ints:
+    """Label (k,) from 1 of the cluster of each cell (k,); gaps up to ``join_cells`` are closed."""
     if not len(cells):
         return np.zeros(0, dtype=np.int64)
     mask = np.zeros(grid.shape, dtype=np.uint8)
     mask.reshape(-1)[cells] = 1
-    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_JOIN_CELLS, _JOIN_CELLS))
+    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (join_cells, join_cells))
     _, label = cv2.connectedComponents(cv2.dilate(mask, disk), connectivity=8)
     return np.asarray(label.reshape(-1)[cells], dtype=np.int64)
 

@@ -74,9 +74,8 @@ def register(reference: Sequence[Landmark], later: Sequence[Landmark]) -> Regist
         OutputError: there are not enough landmarks in common to fix a pose.
     """
     a, b = (_lines(reference), _points(reference)), (_lines(later), _points(later))
-    votes = np.concatenate([_from_lines(a[0], b[0]), _from_points(a[1], b[1])])
     best: tuple[float, Registration] | None = None
-    for guess in _peaks(votes):
+    for guess in guesses(reference, later):
         refined = _refine(guess, a, b)
         if refined is not None and (best is None or refined[0] > best[0]):
             best = refined
@@ -86,6 +85,12 @@ def register(reference: Sequence[Landmark], later: Sequence[Landmark]) -> Regist
             "pose (two crossing lines or two points); did both drive through the same place?"
         )
     return best[1]
+
+
+def guesses(reference: Sequence[Landmark], later: Sequence[Landmark]) -> list[Array]:
+    """Poses (3,) of the later frame that most pairs of landmarks vote for."""
+    a, b = (_lines(reference), _points(reference)), (_lines(later), _points(later))
+    return _peaks(np.concatenate([_from_lines(a[0], b[0]), _from_points(a[1], b[1])]))
 
 
 def _lines(landmarks: Sequence[Landmark]) -> _Lines:

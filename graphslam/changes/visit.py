@@ -22,6 +22,8 @@ Bools = NDArray[np.bool_]
 #: an edge: where a beam meets two surfaces its range is that of neither. What recedes faster than
 #: this is seen at a grazing angle and tells little.
 EDGE_SHARE, EDGE_M = 0.025, 0.06
+#: nearer than this, m, a laser sees its own vehicle, dust, or means an error code
+LEAST_M = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,6 +41,7 @@ class Visit:
         range_m: (n,) NaN where nothing usable came back.
         surface: (n,) whether the return is on a surface: not an edge, not alone.
         landmarks: the map of the run.
+        robots: how many robots' scans these are; neighbours in time are of one robot only if 1.
     """
 
     stamps_ns: Ints
@@ -50,6 +53,7 @@ class Visit:
     range_m: Array
     surface: Bools
     landmarks: tuple[Landmark, ...]
+    robots: int = 1
 
     @property
     def directions(self) -> Array:
@@ -82,6 +86,7 @@ class Visit:
             self.range_m[beams],
             self.surface[beams],
             self.landmarks,
+            self.robots,
         )
 
 
@@ -125,6 +130,7 @@ def on_surface(angles: Array, ranges: Array) -> Bools:
     points = ranges[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
     gap = np.hypot(*np.diff(points, axis=0).T)
     nearer = np.fmin(ranges[1:], ranges[:-1])
+    gap[nearer < LEAST_M] = np.inf
     joined = gap < EDGE_M + EDGE_SHARE * nearer  # false with NaN
     joined = np.concatenate([[False], joined, [False]])
     return np.asarray(joined[1:] & joined[:-1])
@@ -166,13 +172,10 @@ def load_visit(saved: SavedResult, directory: Path) -> Visit:
             sweeps.append((message.angles[order], message.ranges[order]))
     if not stamps:
         raise OutputError(f"{directory}: has no laser scans to compare")
-    return visit_of(
-        np.array(stamps, dtype=np.int64),
-        np.array(poses),
-        np.array(covs),
-        sweeps,
-        saved.landmarks,
+    visit = visit_of(
+        np.array(stamps, dtype=np.int64), np.array(poses), np.array(covs), sweeps, saved.landmarks
     )
+    return replace(visit, robots=len({name for name, _ in known}))
 
 
 def within(visit: Visit, span_s: tuple[float, float], what: str) -> Visit:

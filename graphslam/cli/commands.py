@@ -320,7 +320,8 @@ def changes_command(
 ) -> None:
     """Find what is different since the last visit, and how sure.
 
-    Writes changes.json and report.html. REFERENCE and LATER may be one folder with two spans.
+    Writes changes.json, report.html, a map and an MCAP file of them. REFERENCE and LATER may be
+    one folder with two spans.
     """
     with errors_in_one_line(debug):
         from graphslam.changes import changes_between, render_changes, save_changes

@@ -210,6 +210,8 @@ def changes(found: Mapping[str, Any], directory: Path) -> None:
         console.print(_table([*head, "beams"], rows))
     else:
         console.print("nothing changed, as far as both visits could see")
+    for warning in found["warnings"]:
+        console.print(f"warning: {warning}")
     console.print(f"report: {directory / 'report.html'}")
 
 

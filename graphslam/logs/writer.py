@@ -310,6 +310,12 @@ class LogWriter:
         schema, name = schemas.TRUE_ASSOCIATIONS, f"true_associations/{of}"
         self._add(_topic(robot, name), schema, message, stamp_ns, log_time_ns)
 
+    # ------------------------------------------------------------ anything else
+
+    def message(self, topic: str, schema: str, message: Any, stamp_ns: int) -> None:
+        """Any ROS 2 message, made by `schemas.build`, on ``topic`` with its leading slash."""
+        self._add(topic, schema, message, stamp_ns, None)
+
     # ------------------------------------------------------------ inside
 
     def _add(

@@ -28,6 +28,7 @@ _CSS = "".join(
     f"margin-right: .45em; border-radius: 2px; background: var(--robot{PALETTE.index(color)}); }}\n"
     for kind, color in COLORS.items()
 )
+_CSS += "tbody th { white-space: nowrap; }\n"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,6 +67,7 @@ class ChangesPicture:
     spread: float
     facts: Mapping[str, str]
     settings: str
+    warnings: tuple[str, ...] = ()
 
 
 def changes_page(picture: ChangesPicture) -> str:
@@ -75,6 +77,7 @@ def changes_page(picture: ChangesPicture) -> str:
         f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>"
         for name, value in picture.facts.items()
     )
+    notes = "".join(f"<p class=note>Note: {escape(line)}.</p>\n" for line in picture.warnings)
     legend = (
         "Grey: surfaces of the reference. Blue: later returns. Hatched: not seen by both, so "
         "nothing is said about it."
@@ -99,7 +102,8 @@ def changes_page(picture: ChangesPicture) -> str:
         '<meta name="color-scheme" content="light dark">\n'
         f"<title>{escape(title)} – graphslam changes</title>\n<style>{CSS}{_CSS}</style>\n</head>\n"
         f"<body>\n<main>\n<header><p class=brand>graphslam changes</p><h1>{escape(title)}</h1>\n"
-        f"<p class=lead>{escape(_headline(picture))}</p>\n<dl class=tiles>{tiles}</dl></header>\n"
+        f"<p class=lead>{escape(_headline(picture))}</p>\n{notes}"
+        f"<dl class=tiles>{tiles}</dl></header>\n"
         f"{_table(picture)}\n"
         f'<section><h2>Map</h2><div class="grid">{"".join(figures)}</div></section>\n'
         f"<section><details><summary>Settings</summary><pre>{escape(picture.settings)}</pre>"
