@@ -4,8 +4,8 @@ The state is each robot's latest pose and every landmark, and its density a squa
 matrix, kept as the Bayes net that eliminating the variables leaves. Each factor is linearised once,
 at the estimate of its moment, eliminated with what is known so far, and the estimate moved; a
 robot's last pose is eliminated as its next one enters, or, as in `ekf`, a few states later
-(`EkfConfig.past_states`). One factor at a time in recorded order:
-taking those of a step together would be another filter.
+(`EkfConfig.past_states`). One factor at a time in recorded order: taking those of a step together
+would be another filter.
 
 With z the sum of all corrections so far, in the tangent space at each variable, the information
 about z is left as it is while the estimate moves: no covariance reset, as in a filter with
@@ -39,7 +39,7 @@ SETTLED, MAX_ROUNDS = 1e-4, 100
 class FactorEkfBackend(GraphBackend):
     """The filter; see the module's docstring. Its final estimate is its causal one.
 
-    What refers to a state that is no more is skipped and counted.
+    What refers to a state that has left is skipped and counted.
     """
 
     def __init__(self, config: Config) -> None:
@@ -54,7 +54,7 @@ class FactorEkfBackend(GraphBackend):
         self._net = gtsam.GaussianBayesNet()  # square root information of z, in that order
         self._z = gtsam.VectorValues()
         self._root: tuple[Array, dict[int, slice]] | None = None  # the net as a matrix
-        self._past: dict[int, tuple[Array, Array]] = {}  # states as they were when the next came
+        self._causal: dict[int, tuple[Array, Array]] = {}  # states as their own step left them
         self._error = 0.0
 
     def value(self, key: int, dim: int) -> Array:
@@ -82,6 +82,9 @@ class FactorEkfBackend(GraphBackend):
             self._update(part, gone)
             if gone is not None:
                 self._forget(gone)
+        for robot in {**step.starts, **step.motions}:
+            key = self.builder.latest_key(robot)
+            self._causal[key] = self.value(key, 3), self.covariance([key])
 
     def _gone(self, part: Part) -> int | None:
         """The state that leaves with this part: its robot has a next one and enough others."""
@@ -97,7 +100,6 @@ class FactorEkfBackend(GraphBackend):
         write(self._values, key, value)
         poses = sum(gtsam.Symbol(k).chr() == ord("x") for k in self._order)
         if replaces is not None:
-            self._past[replaces] = self.value(replaces, 3), self.covariance([replaces])
             self._order.insert(self._order.index(replaces) + 1, key)
         elif gtsam.Symbol(key).chr() == ord("x"):
             self._order.insert(poses, key)
@@ -119,9 +121,8 @@ class FactorEkfBackend(GraphBackend):
         try:
             rest = graph
             if gone is not None:
-                rest = graph.eliminatePartialSequential(
-                    gtsam.Ordering([gone]), gtsam.EliminateQR
-                )[1]
+                first = gtsam.Ordering([gone])
+                _, rest = graph.eliminatePartialSequential(first, gtsam.EliminateQR)
             self._net = rest.eliminateSequential(gtsam.Ordering(self._order), gtsam.EliminateQR)
         except RuntimeError as error:
             raise indeterminate(part.what) from error
@@ -177,9 +178,9 @@ class FactorEkfBackend(GraphBackend):
         return jacobian_factor(root * A, root * b, {key: self._z.at(key).size for key in keys})
 
     def finish(self) -> Estimate:
-        """See `Backend`: every state as it was when the next one came."""
-        means = {key: mean for key, (mean, _) in self._past.items()}
-        covs = {key: cov for key, (_, cov) in self._past.items()}
+        """See `Backend`: every state as its own step left it."""
+        means = {key: mean for key, (mean, _) in self._causal.items()}
+        covs = {key: cov for key, (_, cov) in self._causal.items()}
         for key in self._order:
             if key not in means:
                 means[key] = self.value(key, self._z.at(key).size)
