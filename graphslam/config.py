@@ -223,7 +223,8 @@ class EkfConfig:
     error: which errors are Gaussian: `world` = additive along world axes (thesis 4.20), `body` =
     of the exponential map at each pose, as in GTSAM. lines: `model` = no row along a line, as the
     smoother has it; `thesis` = eq. 4.33-4.34, a large variance along it (along_sigma_m).
-    iterations: how often each observation is linearised; more than 1 = the iterated filter.
+    iterations: how often each observation is linearised; more than 1 = the iterated filter (1 in
+    the invariant one).
     past_states: how many of each robot's last poses stay in the state, also of isam2 with horizon
     0. Sightings from before a landmark's promotion belong to them; 0 = the state of the thesis.
     """
@@ -241,7 +242,7 @@ class RbpfConfig:
 
     particles: how many paths it samples. seed: of its random numbers; the same seed gives the same
     estimate. proposal: what a pose is drawn from: `observation` = motion and sightings of the step
-    (FastSLAM 2.0), `motion` = motion alone (FastSLAM 1.0).
+    (FastSLAM 2.0), `motion` = motion alone (FastSLAM 1.0). It has no robust kernel.
     """
 
     particles: int = 500

@@ -13,7 +13,8 @@ robust kernel.
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal
 
@@ -43,7 +44,8 @@ def low_variance(weights: Array, share: float) -> np.ndarray[tuple[int], np.dtyp
     """
     n = len(weights)
     edges = np.cumsum(weights)
-    return np.searchsorted(edges / edges[-1], (np.arange(n) + share) / n, side="right")
+    inner = edges[:-1] / edges[-1]  # the last edge is 1, also where the last place rounds to 1
+    return np.searchsorted(inner, (np.arange(n) + share) / n, side="right")
 
 
 @dataclass(slots=True)
@@ -80,8 +82,7 @@ class RbpfBackend:
         """See `Backend`.
 
         Raises:
-            EstimationError: a state that was never made, noise that is none, or sightings that no
-                particle explains.
+            EstimationError: a state that was never made, or noise without a valid covariance.
         """
         for robot, start in step.starts.items():
             self._start(robot, step.time_ns, start)
@@ -90,13 +91,7 @@ class RbpfBackend:
         seen = [s for s in step.associations if self._usable(s, step.time_ns)]
         closures = [c for c in step.closures if self._is_now(c)]
         if seen or closures:
-            try:
-                self._take(seen, closures)
-            except np.linalg.LinAlgError:
-                what = ", ".join(f"{s.target} from robot {s.robot}" for s in seen)
-                raise EstimationError(
-                    f"the estimate is indeterminate at {step.time_ns} ns, sightings of {what}"
-                ) from None
+            self._take(seen, closures)
         for robot in {**step.starts, **step.motions}:
             joint = self.joint(robot, ())
             self._track.setdefault(robot, []).append((joint.pose, joint.cov))
@@ -126,9 +121,11 @@ class RbpfBackend:
         """Everything that was seen in a step: meetings, then one robot after the other."""
         for s in seen:
             if isinstance(s.target, str):
-                self._correct(s.robot, s.target, s.model, s.z, s.cov)
+                with _named(_what(s)):
+                    self._correct(s.robot, s.target, s.model, s.z, s.cov)
         for c in closures:
-            self._correct(c.other, c.robot, "robot-pose", c.delta, c.cov)
+            with _named(f"closure of robot {c.robot} at {c.time_ns} ns"):
+                self._correct(c.other, c.robot, "robot-pose", c.delta, c.cov)
         for robot in sorted({s.robot for s in seen}):
             mine = [(s, s.target) for s in seen if s.robot == robot and isinstance(s.target, int)]
             if mine:
@@ -142,14 +139,16 @@ class RbpfBackend:
         # a second sighting of the same landmark is not independent until the first corrected it
         first = {target: s for s, target in reversed(mine) if target in self._landmarks}
         for target, s in first.items():
-            self._correct(robot, target, s.model, s.z, s.cov)
+            with _named(_what(s)):
+                self._correct(robot, target, s.model, s.z, s.cov)
         if self._proposal == "observation":
             self._draw(robot)
         for s, target in mine:
-            if target in self._landmarks:
-                self._map(s, target, weigh=s is not first.get(target))
-            else:
-                self._augment(s, target)
+            with _named(_what(s)):
+                if target in self._landmarks:
+                    self._map(s, target, weigh=s is not first.get(target))
+                else:
+                    self._augment(s, target)
 
     def _correct(self, source: str, target: int | str, model: str, z: Array, cov: Array) -> None:
         """Kalman update of the poses by a sighting, whose landmark is uncertain, too; weigh."""
@@ -164,6 +163,7 @@ class RbpfBackend:
         H = np.zeros((self._count, row.rows, self._x.shape[1]))
         H[:, :, block] = H_x
         R = row.noise(z, R, x, t)
+        np.linalg.cholesky(R[0])  # raises if it is no covariance, which is so in all or in none
         if isinstance(target, str):
             H[:, :, self._blocks[target]] = H_t
         else:
@@ -197,7 +197,9 @@ class RbpfBackend:
             cov = rotate_cov(cov, seen.z[2])
         x, z = self._x[:, self._blocks[seen.robot]], self._each(seen.z)
         _, G = row.invert_jacobians(z, x)
-        self._landmarks[target] = _Landmark(row.invert(z, x), G @ cov @ G.mT)
+        fresh = G @ cov @ G.mT
+        np.linalg.cholesky(fresh)  # raises where the sighting does not say where it is
+        self._landmarks[target] = _Landmark(row.invert(z, x), fresh)
 
     def _map(self, seen: Association, target: int, weigh: bool) -> None:
         """Kalman update of a landmark in each particle, with the pose known."""
@@ -205,6 +207,7 @@ class RbpfBackend:
         x, z = self._x[:, self._blocks[seen.robot]], self._each(seen.z)
         _, H = row.jacobians(z, x, landmark.mean)
         R = row.noise(z, self._each(seen.cov), x, landmark.mean)
+        np.linalg.cholesky(R[0])  # as in `_correct`
         innovation = -row.residual(z, x, landmark.mean)
         scores = _update(landmark.mean, landmark.cov, H, R, innovation)
         if weigh:
@@ -221,8 +224,6 @@ class RbpfBackend:
         self._log_weights -= self._log_weights.max()
         weights = np.exp(self._log_weights)
         self._weights = weights / weights.sum()
-        if not np.isfinite(self._weights).all():
-            raise np.linalg.LinAlgError
         if 1 / np.sum(np.square(self._weights)) < LEAST_EFFECTIVE * self._count:
             kept = low_variance(self._weights, self._rng.random())
             self._x, self._P = self._x[kept], self._P[kept]
@@ -241,9 +242,7 @@ class RbpfBackend:
         elif not current:
             self.skipped["observation from a past state"] += 1
         else:
-            kind = "robot" if isinstance(seen.target, str) else "landmark"
-            what = f"{kind} {seen.target}, seen from robot {seen.robot} at {seen.time_ns} ns"
-            _check_finite(what, seen.z, seen.cov)
+            _check_finite(_what(seen), seen.z, seen.cov)
             return True
         return False
 
@@ -268,12 +267,13 @@ class RbpfBackend:
     # ------------------------------------------------------------ knowledge out
 
     def joint(self, robot: str, landmarks: Sequence[int], others: Sequence[str] = ()) -> Joint:
-        """See `Backend`: mean and covariance of the mixture, in which pose and landmarks of one
-        particle are independent.
+        """See `Backend`; mean and covariance of the mixture.
+
+        Within one particle, landmarks are independent of each other and of all latest poses.
 
         Raises:
             EstimationError: it is not known.
-        """  # noqa: D205
+        """
         robots = [robot, *others]
         parts = [self._poses(robot), *(self._known(i).mean for i in landmarks)]
         parts += [self._poses(other) for other in others]
@@ -372,6 +372,24 @@ def _update(x: Array, P: Array, H: Array, R: Array, innovation: Array) -> tuple[
     P -= B.mT @ B
     log_det = 2 * np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1)
     return np.square(w[..., 0]).sum(axis=1), log_det
+
+
+def _what(seen: Association) -> str:
+    """An observation in words."""
+    kind = "robot" if isinstance(seen.target, str) else "landmark"
+    return f"{kind} {seen.target}, seen from robot {seen.robot} at {seen.time_ns} ns"
+
+
+@contextmanager
+def _named(what: str) -> Iterator[None]:
+    """A covariance that is none becomes an error that says where."""
+    try:
+        yield
+    except np.linalg.LinAlgError:
+        raise EstimationError(
+            f"the estimate is indeterminate at {what}: it says nothing, or its noise is no "
+            "covariance"
+        ) from None
 
 
 def _check_finite(what: str, *values: Array) -> None:

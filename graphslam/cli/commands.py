@@ -346,7 +346,7 @@ def experiment_command(
         str,
         typer.Argument(
             metavar="NAME|FILE.toml",
-            help="An experiment file, or ekf-versus-smoothing or thesis.",
+            help="An experiment file, or ekf-versus-smoothing, filters or thesis.",
         ),
     ],
     output: Annotated[
