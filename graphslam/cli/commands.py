@@ -35,7 +35,7 @@ from graphslam.cli.arguments import (
 )
 from graphslam.cli.terminal import errors_in_one_line, progress_bar
 from graphslam.config import Config, load_config
-from graphslam.errors import ConfigError, OutputError
+from graphslam.errors import ConfigError, EstimationError, OutputError
 from graphslam.logs import IMPORTERS, KnownTruth, LogSet, inspect_logs, open_logs
 from graphslam.records import Result
 from graphslam.results import check_target, load, save, to_json
