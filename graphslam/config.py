@@ -226,14 +226,15 @@ class EkfConfig:
     iterations: how often each observation is linearised; more than 1 = the iterated filter (1 in
     the invariant one).
     past_states: how many of each robot's last poses stay in the state, also of isam2 with horizon
-    0. Sightings from before a landmark's promotion belong to them; 0 = the state of the thesis.
+    0. Sightings from before a landmark's promotion belong to them; it may wait for
+    association.tentative_m, which is 20 keyframes. 0 = the state of the thesis.
     """
 
     error: Literal["world", "body"] = "world"
     lines: Literal["model", "thesis"] = "model"
     along_sigma_m: float = 10.0
     iterations: int = 1
-    past_states: int = 8
+    past_states: int = 20
 
 
 @dataclass(frozen=True)
