@@ -22,7 +22,6 @@ from graphslam.backends.ekf import EkfBackend, Member
 from graphslam.config import Config
 from graphslam.errors import ConfigError
 from graphslam.geometry import Array, compose, exp, wrap
-from graphslam.kalman import symmetric
 from graphslam.models import MODELS
 from graphslam.records import Association
 
@@ -63,10 +62,11 @@ class InvariantEkfBackend(EkfBackend):
         u = d[places] - omega * _quarter_turn(p)
         x[places] = compose(exp(np.hstack([u, omega])), np.pad(p, ((0, 0), (0, 1))))[:, :2]
         x[poses[:, 2]] = wrap(x[poses[:, 2]] + d[poses[:, 2]])
-        carried = _quarter_turn(x[places] - p)
-        P[places] += carried[:, :, None] * P[turns][:, None, :]
-        P[:, places] += P[:, turns][:, :, None] * carried
-        P[:] = symmetric(P)
+        # each error gains ``lever`` times the error ``turn``: P becomes (I + L) P (I + L)ᵀ
+        lever, turn = np.zeros(len(x)), np.arange(len(x))
+        lever[places], turn[places] = _quarter_turn(x[places] - p), turns[:, None]
+        PL = lever * P[turn].T
+        P += PL + PL.T + np.outer(lever, lever) * P[np.ix_(turn, turn)]
 
 
 def _quarter_turn(p: Array) -> Array:
