@@ -165,6 +165,7 @@ class _Run:
             "map_landmarks": len(result.landmarks),
             "associations": recording.associations,
             "late": done.late,
+            "skipped": dict(played.skipped),
             "recording_s": recording.seconds,
             "ms_per_step": {"p50": p50, "p99": p99, "max": most},
             "finish_ms": done.finish_ms,
