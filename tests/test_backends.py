@@ -26,7 +26,6 @@ SMOOTHERS = ["batch", "isam2"]
 #: isam2 with a horizon in seconds: the filter, a window of two states (they are ns apart), all
 HORIZONS = ["isam2:0", "isam2:2e-9", "isam2:1"]
 EVERY = [*sorted(BACKENDS), *HORIZONS]
-FILTERS = ["ekf", "invariant-ekf", "rbpf"]
 MODEL_OF = {0: "point", 1: "line", 2: "segment"}
 WORLD = {
     0: np.array([4.0, 2.0]),
@@ -577,7 +576,7 @@ def test_the_gauge_matters_little_with_noise(monkeypatch, scenario):
 # ------------------------------------------------------------ when it goes wrong
 
 
-@pytest.mark.parametrize("name", [*SMOOTHERS, *HORIZONS, *FILTERS])
+@pytest.mark.parametrize("name", EVERY)
 @pytest.mark.parametrize("when", ["joint", "finish"])
 def test_indeterminate_landmark_is_named(name, when):
     """A point at range zero has no bearing: QR answers NaN without a word. One line in terms of the
@@ -597,7 +596,7 @@ def test_motion_without_a_valid_covariance_is_refused(name):
         backend.add(Step(1, motions={"r": motion(0, 1, [1, 0, 0], np.zeros((3, 3)))}))
 
 
-@pytest.mark.parametrize("name", [*SMOOTHERS, *HORIZONS, *FILTERS])
+@pytest.mark.parametrize("name", EVERY)
 @pytest.mark.parametrize("what", ["start", "motion", "sighting"])
 def test_infinite_variance_is_named_by_robot_landmark_and_time(name, what):
     """Infinity in a covariance is no weak knowledge but a mistake; one line, before it spreads."""

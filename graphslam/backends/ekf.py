@@ -21,6 +21,7 @@ import numpy as np
 
 from graphslam import factors
 from graphslam.backends.base import Joint, StateTable, block_slices
+from graphslam.backends.checks import check_finite, check_positive, indeterminate, sighting
 from graphslam.config import Config, RobustConfig
 from graphslam.errors import EstimationError
 from graphslam.geometry import (
@@ -159,7 +160,7 @@ class EkfBackend:
 
     def _start(self, robot: str, time_ns: int, start: Start) -> None:
         self._states.append(robot, time_ns)
-        _check_finite(f"start of robot {robot} at {time_ns} ns", start.pose, start.cov)
+        check_finite(f"start of robot {robot} at {time_ns} ns", start.pose, start.cov)
         T = self._to_error(start.pose)
         self._gaussian.add(robot, start.pose, T @ start.cov @ T.T)
 
@@ -167,7 +168,7 @@ class EkfBackend:
         """System update 4.4-4.15: only the robot's own rows and columns."""
         last = self._states.latest(robot)
         self._states.append(robot, time_ns)
-        _check_finite(f"motion of robot {robot} to {time_ns} ns", motion.delta, motion.cov)
+        check_finite(f"motion of robot {robot} to {time_ns} ns", motion.delta, motion.cov)
         self._keep(robot, last)
         x = self._mean(robot)
         moved = compose(x, motion.delta)
@@ -201,10 +202,10 @@ class EkfBackend:
         elif source is None or target is None:
             self.skipped["observation from a past state"] += 1
         else:
-            _check_finite(_what(seen), seen.z, seen.cov)
+            check_finite(sighting(seen), seen.z, seen.cov)
             if target in self._gaussian:
                 model, cov = self._measured(seen)
-                self._update(source, target, model, seen.z, cov, _what(seen))
+                self._update(source, target, model, seen.z, cov, sighting(seen))
             else:
                 self._augment(seen, source)
 
@@ -232,7 +233,7 @@ class EkfBackend:
         T = self._to_error(mean)
         G_x, G_z = T @ G_x @ self._to_world(x), T @ G_z
         fresh = G_z @ cov @ G_z.T
-        _check_positive(fresh, _what(seen))
+        check_positive(fresh, sighting(seen))
         self._gaussian.add(seen.target, mean, fresh, {source: G_x})
 
     def _close(self, closure: Closure) -> None:
@@ -243,7 +244,7 @@ class EkfBackend:
             self.skipped["closure to a past state"] += 1
             return
         what = f"closure of robot {closure.robot} at {closure.time_ns} ns"
-        _check_finite(what, closure.delta, closure.cov)
+        check_finite(what, closure.delta, closure.cov)
         model = MODELS["robot-pose"]
         self._update(other, robot, model, closure.delta, closure.cov, what)
 
@@ -269,7 +270,7 @@ class EkfBackend:
             for _ in range(self._settings.iterations):
                 x, t = (self._corrected(name, d[block]) for name, block in blocks.items())
                 R = model.noise(z, cov, x, t)
-                _check_positive(R, what)
+                check_positive(R, what)
                 H = {}
                 for name, J in zip(blocks, model.jacobians(z, x, t), strict=True):
                     mean, e = self._mean(name), d[blocks[name]]
@@ -281,9 +282,9 @@ class EkfBackend:
                 B, w, d2 = whiten(PHt, HPHt + R, innovation)
                 d = w @ B
         except np.linalg.LinAlgError:
-            raise _indeterminate(what) from None
+            raise indeterminate(what) from None
         if not np.isfinite(d2):
-            raise _indeterminate(what)
+            raise indeterminate(what)
         gaussian.condition(B)
         self._correct(d)
         self._twice_error += d2
@@ -378,27 +379,3 @@ def _along(seen: Association, sigma_m: float) -> Array:
     own[0, :] = own[:, 0] = 0.0
     own[0, 0] = sigma_m**2
     return rotate_cov(own, seen.z[2])
-
-
-def _what(seen: Association) -> str:
-    """An observation in words."""
-    kind = "robot" if isinstance(seen.target, str) else "landmark"
-    return f"{kind} {seen.target}, seen from robot {seen.robot} at {seen.time_ns} ns"
-
-
-def _indeterminate(what: str) -> EstimationError:
-    return EstimationError(
-        f"the estimate is indeterminate at {what}: it says nothing, or its noise is no covariance"
-    )
-
-
-def _check_finite(what: str, *values: Array) -> None:
-    if not all(np.isfinite(value).all() for value in values):
-        raise _indeterminate(what)
-
-
-def _check_positive(cov: Array, what: str) -> None:
-    try:
-        np.linalg.cholesky(cov)
-    except np.linalg.LinAlgError:
-        raise _indeterminate(what) from None
