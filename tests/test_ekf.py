@@ -721,6 +721,22 @@ def test_what_belongs_to_a_forgotten_past_is_skipped_and_counted(past_states, sk
     assert filtered(steps, settings(past_states=past_states)).skipped == Counter(skipped)
 
 
+@pytest.mark.parametrize("past_states", [0, 3])
+def test_the_state_stays_bounded(past_states):
+    """Twelve states of a robot: the latest, as many copies as were asked for, one landmark, and no
+    more, in either filter; else every step would cost more than the one before."""
+    config = settings("body", past_states=past_states)
+    for backend in (EkfBackend(config), FactorEkfBackend(config)):
+        backend.add(Step(0, {"r": Start(np.zeros(3), MOTION_COV)}))
+        seen = see("r", 0, 0, "point", np.zeros(3), WORLD[0])
+        backend.add(Step(0, associations=(seen,)))
+        for k in range(1, 12):
+            backend.add(Step(k, motions={"r": motion(k - 1, k, [0.1, 0, 0], MOTION_COV)}))
+        ekf = isinstance(backend, EkfBackend)
+        size = len(backend._gaussian) if ekf else len(backend._matrix()[0])
+        assert size == 3 * (1 + past_states) + 2
+
+
 def test_what_is_skipped_changes_nothing():
     steps, where = two_robots(np.random.default_rng(21))
     backend = filtered(steps, settings(past_states=1))
