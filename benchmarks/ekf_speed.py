@@ -1,8 +1,8 @@
 """Milliseconds per observation of the filter, on one core, by the size of its map.
 
-A robot among point landmarks, all in the filter and correlated; one observation of a known landmark
-is one step. CPU time, median and 99th percentile of 300. Beside it the textbook's update with dense
-matrices and the Joseph form, on the same state.
+A robot among landmarks, all in the filter and correlated, as are its past states; one observation
+of a known landmark is one step. CPU time, median and 99th percentile of 300. Beside it the
+textbook's update with dense matrices and the Joseph form, on the same state.
 
 Run: python benchmarks/ekf_speed.py
 """
@@ -12,13 +12,14 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # one core; read when NumPy is imported
 
 import time
+from dataclasses import replace
 
 import numpy as np
 
 from graphslam.backends.ekf import EkfBackend
 from graphslam.config import Config, EkfConfig
 from graphslam.models import MODELS
-from graphslam.records import Association, Start, Step
+from graphslam.records import Association, Motion, Start, Step
 
 ROOM_M = 30.0
 COVS = {"point": np.diag([1e-4, 1e-3]), "segment": np.diag([1e-3, 1e-3, 1e-4])}
@@ -39,7 +40,12 @@ def mapped(kind: str, count: int, error: str) -> tuple[EkfBackend, list[Associat
 
     backend.add(Step(0, {"r": Start(pose, 1e-2 * np.eye(3))}))
     backend.add(Step(0, associations=tuple(seen(i) for i in range(count))))
-    return backend, [seen(i) for i in rng.integers(0, count, 300)]
+    # as many past states as the filter keeps: the robot trembles
+    for k in range(1, EkfConfig().past_states + 1):
+        still = Motion(k - 1, k, np.zeros(3), 1e-6 * np.eye(3), np.zeros((3, 0)), 0.0)
+        backend.add(Step(k, motions={"r": still}))
+    later = [seen(int(i)) for i in rng.integers(0, count, 300)]
+    return backend, [replace(one, time_ns=EkfConfig().past_states) for one in later]
 
 
 def joseph_ms(n: int, rows: int) -> float:
@@ -61,7 +67,7 @@ def main() -> None:
     for count, kind in ((20, "segment"), (100, "point"), (100, "segment"), (300, "segment")):
         for error in ("world", "body"):
             backend, to_come = mapped(kind, count, error)
-            n = 3 + MODELS[kind].dim * count
+            n = len(backend.joint("r", range(count)).cov) + 3 * EkfConfig().past_states
             took = []
             for association in to_come:
                 step = Step(0, associations=(association,))

@@ -209,7 +209,7 @@ class BackendConfig:
     extended Kalman filter.
     """
 
-    name: Literal["isam2", "batch", "ekf", "dead-reckoning"] = "isam2"
+    name: Literal["isam2", "batch", "ekf", "invariant-ekf", "rbpf", "dead-reckoning"] = "isam2"
     horizon_s: float = math.inf
     relinearize_threshold: float = 0.05
     relinearize_every: int = 20
@@ -220,18 +220,37 @@ class BackendConfig:
 
 @dataclass(frozen=True)
 class EkfConfig:
-    """The extended Kalman filter of the thesis.
+    """The extended Kalman filter of the thesis, and the invariant one (which has its own error).
 
     error: which errors are Gaussian: `world` = additive along world axes (thesis 4.20), `body` =
     of the exponential map at each pose, as in GTSAM. lines: `model` = no row along a line, as the
     smoother has it; `thesis` = eq. 4.33-4.34, a large variance along it (along_sigma_m).
-    iterations: how often each observation is linearised; more than 1 = the iterated filter.
+    iterations: how often each observation is linearised; more than 1 = the iterated filter (1 in
+    the invariant one).
+    past_states: how many of each robot's last poses stay in the state, also of isam2 with horizon
+    0. Sightings from before a landmark's promotion belong to them; it may wait for
+    association.tentative_m, which is 20 keyframes. 0 = the state of the thesis.
     """
 
     error: Literal["world", "body"] = "world"
     lines: Literal["model", "thesis"] = "model"
     along_sigma_m: float = 10.0
     iterations: int = 1
+    past_states: int = 20
+
+
+@dataclass(frozen=True)
+class RbpfConfig:
+    """The Rao-Blackwellised particle filter.
+
+    particles: how many paths it samples. seed: of its random numbers; the same seed gives the same
+    estimate. proposal: what a pose is drawn from: `observation` = motion and sightings of the step
+    (FastSLAM 2.0), `motion` = motion alone (FastSLAM 1.0). It has no robust kernel.
+    """
+
+    particles: int = 500
+    seed: int = 0
+    proposal: Literal["observation", "motion"] = "observation"
 
 
 @dataclass(frozen=True)
@@ -296,6 +315,7 @@ class Config:
     robust: RobustConfig = field(default_factory=RobustConfig)
     backend: BackendConfig = field(default_factory=BackendConfig)
     ekf: EkfConfig = field(default_factory=EkfConfig)
+    rbpf: RbpfConfig = field(default_factory=RbpfConfig)
     start: StartConfig = field(default_factory=StartConfig)
     changes: ChangesConfig = field(default_factory=ChangesConfig)
 
@@ -458,6 +478,7 @@ _NOT_ZERO = {
     "gate_m",
     "along_sigma_m",
     "iterations",
+    "particles",
 }
 
 

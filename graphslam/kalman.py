@@ -147,6 +147,17 @@ class JointGaussian(Generic[Name]):
         self._size += d
         self._blocks.clear()
 
+    def copy(self, name: Name, source: Name) -> None:
+        """A member becomes ``source`` as it is now, of the same size: the same mean, no own noise.
+
+        A copy that stays behind when its source moves on is a past state (S. Roumeliotis,
+        J. Burdick, ICRA 2002, https://doi.org/10.1109/ROBOT.2002.1014801).
+        """
+        to, of, x, P = self._slots[name], self._slots[source], self.x, self.P
+        x[to] = x[of]
+        P[to] = P[of]
+        P[:, to] = P[:, of]
+
     def remove(self, name: Name) -> None:
         """Forget a member: the others keep their joint marginal."""
         gone = self._slots.pop(name)

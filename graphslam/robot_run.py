@@ -63,12 +63,18 @@ class RobotRun:
             self.track.calibration, motion, moved, observed
         )
 
-    def result(self, states: Trajectory, start: Array) -> RobotResult:
+    def is_causal(self, states: Trajectory) -> bool:
+        """Whether final ``states`` are what each was at its own time: a filter's."""
+        return np.array_equal(states.poses, self.causal_poses)
+
+    def result(self, states: Trajectory, start: Array, *, causal_only: bool = False) -> RobotResult:
         """Trajectories of the robot at the stamps that it is reported at.
 
         Args:
             states: the final states, world frame.
             start: (3,) where the prior put the robot that defines the world frame.
+            causal_only: final poses are the causal ones, also between the states: what revises no
+                state knows nothing better about the way there either.
         """
         stamps, times, laser = self._report_times()
         final = final_at(states, self.track, times, stamps)
@@ -84,11 +90,13 @@ class RobotRun:
         at_start = compose(states.poses[0], inverse(self.track.mount))
         odometry = between(self.track.pose(self.times[0]), self.track.pose(times))
         unknown = np.full((len(times), 3, 3), np.nan)
+        base_causal = mounted(causal, inverse(mount))
+        scan_causal = mounted(causal, laser) if self.scans else None
         return RobotResult(
-            base,
-            mounted(causal, inverse(mount)),
-            mounted(final, laser) if self.scans else None,
-            mounted(causal, laser) if self.scans else None,
+            base_causal if causal_only else base,
+            base_causal,
+            scan_causal if causal_only or not self.scans else mounted(final, laser),
+            scan_causal,
             Trajectory(stamps, compose(at_start, odometry), unknown),
         )
 

@@ -480,9 +480,13 @@ def smooth(
     first = next(iter(runs))
     start = pipeline.starts[first].pose
     world = origin_shift(start, runs[first].track.mount)
+    causal_only = all(run.is_causal(estimate.states[name]) for name, run in runs.items())
     estimate = in_world(estimate, world)
     steps = tuple(step_in_world(step, world) for step in pipeline.steps)
-    robots = {name: run.result(estimate.states[name], start) for name, run in runs.items()}
+    robots = {
+        name: run.result(estimate.states[name], start, causal_only=causal_only)
+        for name, run in runs.items()
+    }
     pipeline.seconds["trajectories"] = time.perf_counter() - finishing
     landmarks: tuple[Landmark, ...] = make_landmarks(
         pipeline.associator.map.in_world(world), estimate

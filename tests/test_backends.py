@@ -576,7 +576,7 @@ def test_the_gauge_matters_little_with_noise(monkeypatch, scenario):
 # ------------------------------------------------------------ when it goes wrong
 
 
-@pytest.mark.parametrize("name", [*SMOOTHERS, *HORIZONS, "ekf"])
+@pytest.mark.parametrize("name", EVERY)
 @pytest.mark.parametrize("when", ["joint", "finish"])
 def test_indeterminate_landmark_is_named(name, when):
     """A point at range zero has no bearing: QR answers NaN without a word. One line in terms of the
@@ -596,7 +596,7 @@ def test_motion_without_a_valid_covariance_is_refused(name):
         backend.add(Step(1, motions={"r": motion(0, 1, [1, 0, 0], np.zeros((3, 3)))}))
 
 
-@pytest.mark.parametrize("name", [*SMOOTHERS, *HORIZONS, "ekf"])
+@pytest.mark.parametrize("name", EVERY)
 @pytest.mark.parametrize("what", ["start", "motion", "sighting"])
 def test_infinite_variance_is_named_by_robot_landmark_and_time(name, what):
     """Infinity in a covariance is no weak knowledge but a mistake; one line, before it spreads."""
@@ -611,7 +611,7 @@ def test_infinite_variance_is_named_by_robot_landmark_and_time(name, what):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("name", [*SMOOTHERS, *HORIZONS, "ekf"])
+@pytest.mark.parametrize("name", [*SMOOTHERS, *HORIZONS, "ekf", "invariant-ekf"])
 def test_a_good_graph_with_a_wide_spread_of_information_is_solved(name):
     """Sigmas from 1e-6 to 1e4: Cholesky calls it indeterminate, QR does not. The landmark's
     covariance is that of the motion, carried along."""

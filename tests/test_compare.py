@@ -28,7 +28,7 @@ from graphslam.config import Config, load_config
 from graphslam.errors import ConfigError, EstimationError, LogError, OutputError
 from graphslam.evaluate import evaluate
 from graphslam.logs import KnownTruth, LogWriter, open_logs
-from graphslam.report.comparison import filled, notes, render_comparison
+from graphslam.report.comparison import ahead, filled, notes, render_comparison
 from graphslam.simulate import load_scenario, simulate
 from graphslam.slam import smooth
 from graphslam.truth import truth_of_logs
@@ -153,6 +153,20 @@ def test_late_evidence_is_counted(two):
     assert late > 0
     for row in two.done.found["rows"]:
         assert (row["late"], row["associations"]) == (late, recording.associations)
+        assert row["skipped"] == {}
+
+
+def test_what_a_filter_could_not_use_is_said(two):
+    specs = ["ekf", "ekf+ekf.past_states=0", "isam2"]
+    done = compare(two.log, two.config, variants(specs, None, START), truth=two.truth, run=play)
+    found = rows_of(done)
+    assert found["ekf"]["skipped"] == found["isam2"]["skipped"] == {}
+    assert found[specs[1]]["skipped"] == {"late evidence": found["ekf"]["late"]}
+    assert any(f"{specs[1]} could not use" in text for text in notes(done.found))
+    page = render_comparison(done)
+    # one of both is there: what a filter is better in, or that it is not
+    assert ("Where a filter is ahead" in page) is bool(ahead(done.found))
+    assert ("No filter is ahead" in page) is not bool(ahead(done.found))
 
 
 # ---------------------------------------------------------------- a process of its own
@@ -371,6 +385,34 @@ def test_the_best_is_marked_whoever_it_is():
     assert found["coverage, %"] == [False, True, False]
 
 
+def judged(spec, nees, rmse_m, p50, causal, error=None):
+    """A row of compare.json with three numbers."""
+    return {
+        "spec": spec, "label": spec.upper(), "error": error, "final_is_causal": causal,
+        "joint": {"final": {"ate_rmse_m": 0.0}, "causal": {"nees_per_dof": nees}},
+        "landmarks": {"rmse_m": rmse_m}, "ms_per_step": {"p50": p50},
+    }  # fmt: skip
+
+
+def test_where_a_filter_is_ahead_is_said_and_where_it_is_not():
+    """Of every smoother, by the column's own measure, to the digits shown; dead reckoning is no
+    filter, what failed is nobody, and a filter's final trajectory, which is its causal one, does
+    not win over another's final one."""
+    rows = [
+        judged("isam2", nees=0.5, rmse_m=0.01, p50=5.0, causal=False),
+        judged("batch", nees=0.4, rmse_m=0.02, p50=3.0, causal=False),
+        judged("ekf", nees=1.5, rmse_m=0.0099999, p50=3.5, causal=True),
+        judged("isam2:0", nees=1.7, rmse_m=0.03, p50=2.0, causal=True),
+        judged("dead-reckoning", nees=1.0, rmse_m=0.001, p50=0.1, causal=True),
+        {"spec": "ekf+x=1", "label": "EKF, x=1", "error": "indeterminate"},
+    ]
+    assert ahead({"rows": rows}) == [
+        ("causal: NEES/dof", "EKF", 1.5, "ISAM2", 0.5),
+        ("cost: ms/step p50", "ISAM2:0", 2.0, "BATCH", 3.0),
+    ]
+    assert ahead({"rows": rows[:2]}) == ahead({"rows": rows[2:]}) == []
+
+
 # ---------------------------------------------------------------- the page and the folder
 
 
@@ -382,6 +424,7 @@ def test_the_page_is_one_file_with_every_table_and_figure(two):
         assert row["label"] in page
     for title in filled(two.done.found):
         assert title in page
+    assert "ahead of every smoother" not in page  # odometry is no filter
     assert "estimation and nothing else" in page
     labels = re.findall(r'aria-label="([^"]+)"', page)
     assert len(labels) == len(set(labels)) == 9  # paths, errors, NEES twice each; three of cost

@@ -330,10 +330,14 @@ def test_new_landmark_by_differences(error, name):
 
 
 class Twin:
-    """The textbook filter with dense matrices over the whole state and Joseph's form."""
+    """The textbook filter with dense matrices over the whole state and Joseph's form.
 
-    def __init__(self, error):
+    It forgets no past state, ``(robot, time)`` beside ``robot``, but looks at those only that were
+    among the last ``past_states``."""
+
+    def __init__(self, error, past_states):
         self.error, self.mean, self.P = error, {}, np.zeros((0, 0))
+        self.past_states, self.times = past_states, {}
 
     def turn(self, mean):
         return rotation3(mean[2]) if len(mean) == 3 and self.error == "body" else np.eye(len(mean))
@@ -354,7 +358,14 @@ class Twin:
     def step(self, step):
         for robot, start in step.starts.items():
             self.enter(robot, start.pose, np.zeros((3, len(self.P))), start.cov)
+            self.times[robot] = [step.time_ns]
         for robot, moved in step.motions.items():
+            same = np.eye(len(self.P))[self.place(robot)]
+            last = (robot, self.times[robot][-1])
+            # the turns of both ends are equal, and `enter` wants world axes
+            turn = self.turn(self.mean[robot])
+            self.enter(last, self.mean[robot].copy(), turn @ same, np.zeros((3, 3)))
+            self.times[robot].append(step.time_ns)
             x, block, A = self.mean[robot], self.place(robot), np.eye(len(self.P))
             F, W = compose_jacobians(x, moved.delta)
             self.mean[robot] = compose(x, moved.delta)
@@ -363,12 +374,26 @@ class Twin:
             self.P = A @ self.P @ A.T
             self.P[block, block] += turn @ W @ moved.cov @ W.T @ turn.T
         for seen in step.associations:
-            if not seen.late:
-                self.observe(seen)
+            if not seen.late or self.past_states:
+                target = seen.target
+                if isinstance(target, str):
+                    target = self.state(target, step.time_ns)
+                self.observe(seen, self.state(seen.robot, seen.time_ns), target)
+        for c in step.closures:
+            ends = self.state(c.other, c.other_time_ns), self.state(c.robot, c.time_ns)
+            if None not in ends:
+                seen = Association(c.other, 0, c.robot, "robot-pose", c.delta, c.cov)
+                self.observe(seen, *ends)
 
-    def observe(self, seen):
-        model, x = MODELS[seen.model], self.mean[seen.robot]
-        if seen.target not in self.mean:
+    def state(self, robot, time_ns):
+        age = self.times[robot][::-1].index(time_ns)
+        if age > self.past_states:
+            return None
+        return (robot, time_ns) if age else robot
+
+    def observe(self, seen, source, target):
+        model, x = MODELS[seen.model], self.mean[source]
+        if target not in self.mean:
             R = seen.cov
             if seen.model == "line":
                 V = rotate_cov(R, -seen.z[2])[1:, 1:]
@@ -377,14 +402,14 @@ class Twin:
                 R = rotate_cov(R, seen.z[2])
             G_x, G_z = model.invert_jacobians(seen.z, x)
             T = np.zeros((model.dim, len(self.P)))
-            T[:, self.place(seen.robot)] = G_x @ self.turn(x)
-            self.enter(seen.target, model.invert(seen.z, x), T, G_z @ R @ G_z.T)
+            T[:, self.place(source)] = G_x @ self.turn(x)
+            self.enter(target, model.invert(seen.z, x), T, G_z @ R @ G_z.T)
             return
-        t, H = self.mean[seen.target], np.zeros((model.rows, len(self.P)))
+        t, H = self.mean[target], np.zeros((model.rows, len(self.P)))
         R = model.noise(seen.z, seen.cov, x, t)
         H_x, H_t = model.jacobians(seen.z, x, t)
-        H[:, self.place(seen.robot)] = H_x @ self.turn(x)
-        H[:, self.place(seen.target)] = H_t @ self.turn(t)
+        H[:, self.place(source)] = H_x @ self.turn(x)
+        H[:, self.place(target)] = H_t @ self.turn(t)
         d, self.P, _ = joseph(H[0], self.P, -model.residual(seen.z, x, t), H, R)
         for name, mean in self.mean.items():
             e = d[self.place(name)]
@@ -393,10 +418,14 @@ class Twin:
 
 
 @pytest.mark.parametrize("error", FRAMES)
-def test_the_filter_is_the_textbooks(error):
-    """Everything at once, all kinds of landmarks and both kinds of meetings: 1e-9 of each sigma."""
+@pytest.mark.parametrize("past_states", [0, 2, 8])
+def test_the_filter_is_the_textbooks(error, past_states):
+    """Everything at once, all kinds of landmarks and both kinds of meetings: 1e-9 of each sigma.
+    With two past states, late evidence counts; with eight, the closure to the first state as well.
+    Copies whose place is used again are what a filter that forgets nothing has."""
     steps, _ = two_robots(np.random.default_rng(21))
-    backend, twin = EkfBackend(settings(error)), Twin(error)
+    backend = EkfBackend(settings(error, past_states=past_states))
+    twin = Twin(error, past_states)
     for step in steps:
         backend.add(step)
         twin.step(step)
@@ -676,14 +705,46 @@ def test_the_iterated_filter_is_the_most_probable_state(error):
 # ------------------------------------------------------------ what it cannot use, bad input
 
 
-def test_what_belongs_to_the_past_is_skipped_and_counted():
+@pytest.mark.parametrize(
+    ("past_states", "skipped"),
+    [
+        (0, {"late evidence": 3, "closure to a past state": 1}),
+        (1, {"observation from a past state": 3, "closure to a past state": 1}),
+        (2, {"closure to a past state": 1}),
+        (5, {"closure to a past state": 1}),
+        (6, {}),
+    ],
+)
+def test_what_belongs_to_a_forgotten_past_is_skipped_and_counted(past_states, skipped):
+    """Late evidence is two states old, the closure's other end six."""
+    steps, _ = two_robots(np.random.default_rng(21))
+    assert filtered(steps, settings(past_states=past_states)).skipped == Counter(skipped)
+
+
+@pytest.mark.parametrize("past_states", [0, 3])
+def test_the_state_stays_bounded(past_states):
+    """Twelve states of a robot: the latest, as many copies as were asked for, one landmark, and no
+    more, in either filter; else every step would cost more than the one before."""
+    config = settings("body", past_states=past_states)
+    for backend in (EkfBackend(config), FactorEkfBackend(config)):
+        backend.add(Step(0, {"r": Start(np.zeros(3), MOTION_COV)}))
+        seen = see("r", 0, 0, "point", np.zeros(3), WORLD[0])
+        backend.add(Step(0, associations=(seen,)))
+        for k in range(1, 12):
+            backend.add(Step(k, motions={"r": motion(k - 1, k, [0.1, 0, 0], MOTION_COV)}))
+        ekf = isinstance(backend, EkfBackend)
+        size = len(backend._gaussian) if ekf else len(backend._matrix()[0])
+        assert size == 3 * (1 + past_states) + 2
+
+
+def test_what_is_skipped_changes_nothing():
     steps, where = two_robots(np.random.default_rng(21))
-    backend = filtered(steps, PLAIN)
-    assert backend.skipped == Counter({"late evidence": 3, "closure to a past state": 1})
+    backend = filtered(steps, settings(past_states=1))
+    skipped = backend.skipped["observation from a past state"]
     before = backend.joint("a", [0, 1, 2], ["b"])
     past = see("a", 4, 0, "point", where["a"], WORLD[0])
     backend.add(Step(6, associations=(past,)))
-    assert backend.skipped["observation from a past state"] == 1
+    assert backend.skipped["observation from a past state"] == skipped + 1
     after = backend.joint("a", [0, 1, 2], ["b"])
     np.testing.assert_array_equal(after.pose, before.pose)
     np.testing.assert_array_equal(after.cov, before.cov)

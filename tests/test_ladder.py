@@ -89,9 +89,35 @@ def drive(seed, scale=1.0, steps=30, horizon_of_sight_m=9.0):
     return made
 
 
+def promoted(steps, sightings=3):
+    """The same evidence as a pipeline has it: landmarks enter with their third sighting, and the
+    ones before it, then, as late evidence."""
+    waiting, made = {}, []
+    for step in steps:
+        seen = []
+        for one in step.associations:
+            if not isinstance(one.target, int):
+                seen.append(one)
+                continue
+            held = waiting.setdefault(one.target, [])
+            if len(held) < sightings:
+                held.append(one)
+                if len(held) == sightings:
+                    seen += [replace(h, late=h.time_ns != one.time_ns) for h in held]
+            else:
+                seen.append(one)
+        made.append(replace(step, associations=tuple(seen)))
+    return made
+
+
+def remembering(past_states):
+    """Settings of filters that keep so many past states of each robot."""
+    return replace(PLAIN, ekf=EkfConfig(past_states=past_states))
+
+
 def configured(name, horizon_s=math.inf, error="body", base=PLAIN, **backend):
     settings = replace(base.backend, horizon_s=horizon_s, **backend)
-    return BACKENDS[name](replace(base, backend=settings, ekf=EkfConfig(error=error)))
+    return BACKENDS[name](replace(base, backend=settings, ekf=replace(base.ekf, error=error)))
 
 
 def run(steps, name, horizon_s=math.inf, error="body", base=PLAIN, watch=lambda _s, _b: None):
@@ -160,6 +186,25 @@ def test_horizon_zero_is_the_filter_under_a_kernel_too(kernel):
     assert_twins(drive(3), base=base)
 
 
+@pytest.mark.parametrize("past_states", [0, 1, 3, 40])
+def test_horizon_zero_is_the_filter_with_past_states_too(past_states):
+    """Late evidence is used as far back as states are kept, by a copy in one and by elimination
+    that waits in the other: none, some, more than the oldest evidence needs, all of the run."""
+    base = remembering(past_states)
+    steps = promoted(drive(1))
+    skipped = []
+    for name in ("ekf", "isam2"):
+        backend = configured(name, 0.0, base=base)
+        for step in steps:
+            backend.add(step)
+        skipped.append(sum(backend.skipped.values()))
+    late = sum(a.late for step in steps for a in step.associations)
+    assert late > 4
+    assert skipped == [{0: late, 1: skipped[0]}.get(past_states, 0)] * 2
+    assert past_states != 1 or 0 < skipped[0] < late
+    assert_twins(steps, base=base)
+
+
 def test_final_estimate_of_horizon_zero_is_its_causal_one_and_the_twins():
     found, twin = (run(drive(1), name, 0.0) for name in ("isam2", "ekf"))
     for robot in "ab":
@@ -197,7 +242,9 @@ def test_what_a_filter_has_no_use_for_is_skipped_and_counted_alike():
             ),
         )
     )
-    backends = [configured("ekf"), configured("isam2", 0.0), configured("isam2", 2.0)]
+    base = remembering(0)
+    backends = [configured("ekf", base=base), configured("isam2", 0.0, base=base)]
+    backends.append(configured("isam2", 2.0))
     for backend in backends:
         for step in steps:
             backend.add(step)
@@ -211,7 +258,8 @@ def test_what_a_filter_has_no_use_for_is_skipped_and_counted_alike():
     del expected["late evidence"]
     assert dict(backends[2].skipped) == expected
     assert dict(configured("isam2").skipped) == {}
-    assert_twins(steps)
+    assert_twins(steps, base=base)
+    assert_twins(steps)  # and with past states, which know what to do with all of it
 
 
 # ------------------------------------------------------------ a linear problem
@@ -336,6 +384,40 @@ def test_linear_problem_has_the_closed_form_on_every_rung(name, horizon_s, error
             )
     for landmark, (mean, cov) in found.estimate.landmarks.items():
         assert_closed_form(mean, cov, means[landmark], covs[landmark])
+
+
+@pytest.mark.parametrize(("name", "horizon_s", "error"), RUNGS)
+def test_late_evidence_of_a_linear_problem_counts_as_if_it_were_not_late(name, horizon_s, error):
+    """On every rung, filters included, the estimate has all that was seen so far, whenever it was
+    handed in: the closed form takes no notice of when."""
+    steps = promoted(straight(5))
+    assert sum(a.late for step in steps for a in step.associations) >= 4
+    found = run(steps, name, horizon_s, error)
+    for k in range(len(steps)):
+        means, covs = closed_form(steps[: k + 1], gauge_of(name, horizon_s))
+        for robot in "ab":
+            causal = found.causal[robot]
+            assert_closed_form(
+                causal.poses[k], causal.covs[k], means[robot, k * S], covs[robot, k * S]
+            )
+    for landmark, (mean, cov) in found.estimate.landmarks.items():
+        assert_closed_form(mean, cov, means[landmark], covs[landmark])
+
+
+@pytest.mark.parametrize(("name", "error"), [("ekf", "world"), ("ekf", "body"), ("isam2", "body")])
+def test_a_filter_without_past_states_lacks_late_evidence(name, error):
+    """So that the closed form above is one that a filter can miss: without past states it has what
+    least squares over the evidence in time has, which is less."""
+    steps = promoted(straight(5))
+    in_time = [
+        replace(s, associations=tuple(a for a in s.associations if not a.late)) for s in steps
+    ]
+    found = run(steps, name, 0.0, error, base=remembering(0)).causal["a"]
+    means, covs = closed_form(in_time, gauge_of(name, 0.0))
+    last = "a", (len(steps) - 1) * S
+    assert_closed_form(found.poses[-1], found.covs[-1], means[last], covs[last])
+    whole = closed_form(steps, gauge_of(name, 0.0))[1][last]
+    assert np.trace(whole) < 0.9 * np.trace(found.covs[-1][:2, :2])
 
 
 @pytest.mark.parametrize(("name", "horizon_s"), [("isam2", 2.0), ("isam2", math.inf), ("batch", 0)])

@@ -91,6 +91,24 @@ def test_every_scan_is_in_the_trajectory_under_its_exact_stamp(laser):
     assert laser.result.summary["counts"]["keyframes"] < len(laser.stamps)
 
 
+@pytest.mark.parametrize(
+    ("settings", "revises"),
+    [
+        (("backend.name=ekf",), False),
+        (("backend.name=isam2", "backend.horizon_s=0"), False),
+        (("backend.name=dead-reckoning",), False),
+        (("backend.name=isam2", "backend.horizon_s=2"), True),
+    ],
+)
+def test_final_is_causal_for_what_revises_nothing(laser, settings, revises):
+    """A filter's way between two states is not bent to the second one, nor seen from a mount that
+    was found later: the trajectories are equal to the digit, or both are not."""
+    found = run(laser.path, *settings).robots["robot"]
+    for final, causal in ((found.final, found.causal), (found.scan_final, found.scan_causal)):
+        assert np.array_equal(final.poses, causal.poses) is not revises
+        assert np.array_equal(final.covs, causal.covs) is not revises
+
+
 def test_the_mount_and_the_latency_are_found(laser):
     """Within three of the sigmas given; one minute shows the latency well, the rest just so."""
     found = laser.result.summary["calibration"]

@@ -8,7 +8,9 @@ from graphslam.backends.dead_reckoning import DeadReckoningBackend
 from graphslam.backends.ekf import EkfBackend
 from graphslam.backends.factor_ekf import FactorEkfBackend
 from graphslam.backends.fixed_lag import FixedLagBackend
+from graphslam.backends.invariant_ekf import InvariantEkfBackend
 from graphslam.backends.isam2 import BatchBackend, Isam2Backend
+from graphslam.backends.rbpf import RbpfBackend
 from graphslam.config import Config
 
 
@@ -30,7 +32,9 @@ BACKENDS: dict[str, Callable[[Config], Backend]] = {
     "batch": BatchBackend,
     "dead-reckoning": DeadReckoningBackend,
     "ekf": EkfBackend,
+    "invariant-ekf": InvariantEkfBackend,
     "isam2": with_horizon,
+    "rbpf": RbpfBackend,
 }
 
 __all__ = ["BACKENDS", "Backend", "Joint"]

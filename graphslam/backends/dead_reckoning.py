@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from graphslam.backends.base import Joint, StateTable, block_slices
+from graphslam.backends.checks import check_finite, check_positive, sighting
 from graphslam.config import Config
 from graphslam.geometry import Array, compose, compose_cov
 from graphslam.models import MODELS
@@ -29,19 +30,26 @@ class DeadReckoningBackend:
     def add(self, step: Step) -> None:
         """See `Backend`."""
         for robot, start in step.starts.items():
+            what = f"start of robot {robot} at {step.time_ns} ns"
+            check_finite(what, start.pose, start.cov)
             self._append(robot, step.time_ns, start.pose, start.cov)
         for robot, motion in step.motions.items():
             last = self._states.latest(robot)
+            what = f"motion of robot {robot} to {step.time_ns} ns"
+            check_finite(what, motion.delta, motion.cov)
             x, P = self._poses[robot][last], self._covs[robot][last]
             moved = compose(x, motion.delta)
             self._append(robot, step.time_ns, moved, compose_cov(x, P, motion.delta, motion.cov))
         for seen in step.associations:
             number = self._states.number(seen.robot, seen.time_ns)
             if isinstance(seen.target, int) and seen.target not in self._landmarks:
+                check_finite(sighting(seen), seen.z, seen.cov)
                 x, P = self._poses[seen.robot][number], self._covs[seen.robot][number]
                 model = MODELS[seen.model]
                 G_x, G_z = model.invert_jacobians(seen.z, x)
-                cov = G_x @ P @ G_x.T + G_z @ seen.cov @ G_z.T
+                fresh = G_z @ seen.cov @ G_z.T
+                check_positive(fresh, sighting(seen))
+                cov = G_x @ P @ G_x.T + fresh
                 self._landmarks[seen.target] = (model.invert(seen.z, x), cov)
 
     def _append(self, robot: str, time_ns: int, pose: Array, cov: Array) -> None:

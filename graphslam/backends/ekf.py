@@ -1,7 +1,12 @@
 """The thesis' centralised extended Kalman filter: robots and landmarks in one Gaussian.
 
 The same rows of `MODELS` and the same noise as the smoother, so a comparison is one of estimators.
-What a filter cannot do it leaves out and counts (`EkfBackend.skipped`): it has no past.
+What a filter cannot do it leaves out and counts (`EkfBackend.skipped`): it has no past, but for the
+last few poses that stay in its state as copies (`EkfConfig.past_states`). Those are for sightings
+from before a landmark's promotion. The thesis adds a landmark where it is first seen; here it waits
+until it is known to be one, and a filter that had to forget the sightings it waited for would lose
+what ties the first landmarks to the start, and with it nine tenths of its accuracy
+(docs/ekf-versus-smoothing.md).
 
 Two definitions of the error of a pose, rows of `ERRORS`. A textbook Jacobian is by additive errors
 along world axes; by the chain rule it becomes one by either error.
@@ -16,6 +21,7 @@ import numpy as np
 
 from graphslam import factors
 from graphslam.backends.base import Joint, StateTable, block_slices
+from graphslam.backends.checks import check_finite, check_positive, indeterminate, sighting
 from graphslam.config import Config, RobustConfig
 from graphslam.errors import EstimationError
 from graphslam.geometry import (
@@ -32,6 +38,9 @@ from graphslam.kalman import JointGaussian, whiten
 from graphslam.models import MODELS
 from graphslam.models.observation import ObservationModel
 from graphslam.records import Association, Closure, Estimate, Motion, Start, Step, Trajectory
+
+#: a robot's latest pose by its name, one of its past ones, or a landmark
+Member = str | tuple[str, int] | int
 
 
 @dataclass(frozen=True)
@@ -103,16 +112,17 @@ def robust_weight(innovation: Array, HPHt: Array, R: Array, robust: RobustConfig
 class EkfBackend:
     """The filter; state and equations as in thesis chapters 3.2 and 4.
 
-    Each robot's latest pose and each landmark is a member of one Gaussian. Observations enter one
-    at a time, each linearised at what the ones before left (4.16-4.17). ``skipped`` counts what a
-    filter cannot use, by reason.
+    Each robot's latest pose, copies of its poses just before, as ``(robot, number modulo their
+    count)``, and each landmark are members of one Gaussian. Observations enter one at a time, each
+    linearised at what the ones before left (4.16-4.17). ``skipped`` counts what a filter cannot
+    use, by reason.
     """
 
     def __init__(self, config: Config) -> None:
         self._settings, self._robust = config.ekf, config.robust
         self._error = ERRORS[config.ekf.error]
         self._states = StateTable()
-        self._gaussian: JointGaussian[str | int] = JointGaussian()
+        self._gaussian: JointGaussian[Member] = JointGaussian()
         self._track: dict[str, list[tuple[Array, Array]]] = {}  # causal pose and cov, world axes
         self._twice_error, self._dof = 0.0, 0
         self.skipped: Counter[str] = Counter()
@@ -150,15 +160,16 @@ class EkfBackend:
 
     def _start(self, robot: str, time_ns: int, start: Start) -> None:
         self._states.append(robot, time_ns)
-        _check_finite(f"start of robot {robot} at {time_ns} ns", start.pose, start.cov)
+        check_finite(f"start of robot {robot} at {time_ns} ns", start.pose, start.cov)
         T = self._to_error(start.pose)
         self._gaussian.add(robot, start.pose, T @ start.cov @ T.T)
 
     def _move(self, robot: str, time_ns: int, motion: Motion) -> None:
         """System update 4.4-4.15: only the robot's own rows and columns."""
-        self._states.latest(robot)  # has it started?
+        last = self._states.latest(robot)
         self._states.append(robot, time_ns)
-        _check_finite(f"motion of robot {robot} to {time_ns} ns", motion.delta, motion.cov)
+        check_finite(f"motion of robot {robot} to {time_ns} ns", motion.delta, motion.cov)
+        self._keep(robot, last)
         x = self._mean(robot)
         moved = compose(x, motion.delta)
         F, W = compose_jacobians(x, motion.delta)
@@ -167,22 +178,42 @@ class EkfBackend:
         self._gaussian.move(robot, F, W @ motion.cov @ W.T)
         self._mean(robot)[:] = moved
 
+    def _keep(self, robot: str, number: int) -> None:
+        """A copy of the robot's latest pose, state ``number``, in the place of the oldest copy."""
+        if self._settings.past_states:
+            name = robot, number % self._settings.past_states
+            if name not in self._gaussian:
+                self._gaussian.add(name, self._mean(robot), np.zeros((3, 3)), {robot: np.eye(3)})
+            self._gaussian.copy(name, robot)
+
+    def _state(self, robot: str, time_ns: int) -> Member | None:
+        """The member that is the robot's state at ``time_ns``; None if it is forgotten."""
+        number, latest = self._states.number(robot, time_ns), self._states.latest(robot)
+        if number == latest:
+            return robot
+        kept = self._settings.past_states
+        return (robot, number % kept) if number >= latest - kept else None
+
     def _observe(self, seen: Association, time_ns: int) -> None:
         """One observation: update, or a new landmark."""
-        current = self._is_latest(seen.robot, seen.time_ns)
-        if isinstance(seen.target, str):
-            current &= self._is_latest(seen.target, time_ns)
-        if seen.late:
+        source, target = self._state(seen.robot, seen.time_ns), self._target(seen, time_ns)
+        if seen.late and not self._settings.past_states:
             self.skipped["late evidence"] += 1
-        elif not current:
+        elif source is None or target is None:
             self.skipped["observation from a past state"] += 1
         else:
-            _check_finite(_what(seen), seen.z, seen.cov)
-            if seen.target in self._gaussian:
+            check_finite(sighting(seen), seen.z, seen.cov)
+            if target in self._gaussian:
                 model, cov = self._measured(seen)
-                self._update(seen.robot, seen.target, model, seen.z, cov, _what(seen))
+                self._update(source, target, model, seen.z, cov, sighting(seen))
             else:
-                self._augment(seen)
+                self._augment(seen, source)
+
+    def _target(self, seen: Association, time_ns: int) -> Member | None:
+        """What was observed: a landmark, or a robot's state."""
+        if isinstance(seen.target, str):
+            return self._state(seen.target, time_ns)
+        return seen.target
 
     def _measured(self, seen: Association) -> tuple[ObservationModel, Array]:
         """Model and covariance of an observation: of a line perhaps as the thesis has it."""
@@ -191,39 +222,36 @@ class EkfBackend:
             return MODELS["segment"], _along(seen, self._settings.along_sigma_m)
         return MODELS[seen.model], seen.cov
 
-    def _augment(self, seen: Association) -> None:
-        """A new landmark where the observation puts it, 4.24-4.28."""
+    def _augment(self, seen: Association, source: Member) -> None:
+        """A new landmark where the observation from ``source`` puts it, 4.24-4.28."""
         model, cov = self._measured(seen)
         if model is MODELS["line"]:  # where on the line is a gauge
             cov = _along(seen, factors.FILTER_GAUGE_SIGMA_M)
-        x = self._mean(seen.robot)
+        x = self._mean(source)
         mean = model.invert(seen.z, x)
         G_x, G_z = model.invert_jacobians(seen.z, x)
         T = self._to_error(mean)
         G_x, G_z = T @ G_x @ self._to_world(x), T @ G_z
         fresh = G_z @ cov @ G_z.T
-        _check_positive(fresh, _what(seen))
-        self._gaussian.add(seen.target, mean, fresh, {seen.robot: G_x})
+        check_positive(fresh, sighting(seen))
+        self._gaussian.add(seen.target, mean, fresh, {source: G_x})
 
     def _close(self, closure: Closure) -> None:
-        """A measured relative pose, if both its ends are now: as a robot seen from the other."""
-        latest = self._is_latest(closure.robot, closure.time_ns)
-        if not self._is_latest(closure.other, closure.other_time_ns) or not latest:
+        """A measured relative pose, if both its ends are known: as a robot seen from the other."""
+        robot = self._state(closure.robot, closure.time_ns)
+        other = self._state(closure.other, closure.other_time_ns)
+        if robot is None or other is None:
             self.skipped["closure to a past state"] += 1
             return
         what = f"closure of robot {closure.robot} at {closure.time_ns} ns"
-        _check_finite(what, closure.delta, closure.cov)
+        check_finite(what, closure.delta, closure.cov)
         model = MODELS["robot-pose"]
-        self._update(closure.other, closure.robot, model, closure.delta, closure.cov, what)
-
-    def _is_latest(self, robot: str, time_ns: int) -> bool:
-        self._states.latest(robot)  # has it started?
-        return self._states.number(robot, time_ns) == self._states.latest(robot)
+        self._update(other, robot, model, closure.delta, closure.cov, what)
 
     def _update(
         self,
-        source: str,
-        target: str | int,
+        source: Member,
+        target: Member,
         model: ObservationModel,
         z: Array,
         cov: Array,
@@ -242,7 +270,7 @@ class EkfBackend:
             for _ in range(self._settings.iterations):
                 x, t = (self._corrected(name, d[block]) for name, block in blocks.items())
                 R = model.noise(z, cov, x, t)
-                _check_positive(R, what)
+                check_positive(R, what)
                 H = {}
                 for name, J in zip(blocks, model.jacobians(z, x, t), strict=True):
                     mean, e = self._mean(name), d[blocks[name]]
@@ -254,19 +282,19 @@ class EkfBackend:
                 B, w, d2 = whiten(PHt, HPHt + R, innovation)
                 d = w @ B
         except np.linalg.LinAlgError:
-            raise _indeterminate(what) from None
+            raise indeterminate(what) from None
         if not np.isfinite(d2):
-            raise _indeterminate(what)
+            raise indeterminate(what)
         gaussian.condition(B)
         self._correct(d)
         self._twice_error += d2
         self._dof += model.rows
 
-    def _mean(self, name: str | int) -> Array:
+    def _mean(self, name: Member) -> Array:
         """Mean of one member, a view of it."""
         return self._gaussian.x[self._gaussian.slot(name)]
 
-    def _corrected(self, name: str | int, error: Array) -> Array:
+    def _corrected(self, name: Member, error: Array) -> Array:
         """The mean of one member with an error applied."""
         mean = self._mean(name)
         return self._error.retract(mean, error) if len(mean) == 3 else mean + error
@@ -351,27 +379,3 @@ def _along(seen: Association, sigma_m: float) -> Array:
     own[0, :] = own[:, 0] = 0.0
     own[0, 0] = sigma_m**2
     return rotate_cov(own, seen.z[2])
-
-
-def _what(seen: Association) -> str:
-    """An observation in words."""
-    kind = "robot" if isinstance(seen.target, str) else "landmark"
-    return f"{kind} {seen.target}, seen from robot {seen.robot} at {seen.time_ns} ns"
-
-
-def _indeterminate(what: str) -> EstimationError:
-    return EstimationError(
-        f"the estimate is indeterminate at {what}: it says nothing, or its noise is no covariance"
-    )
-
-
-def _check_finite(what: str, *values: Array) -> None:
-    if not all(np.isfinite(value).all() for value in values):
-        raise _indeterminate(what)
-
-
-def _check_positive(cov: Array, what: str) -> None:
-    try:
-        np.linalg.cholesky(cov)
-    except np.linalg.LinAlgError:
-        raise _indeterminate(what) from None

@@ -3,8 +3,9 @@
 The state is each robot's latest pose and every landmark, and its density a square root information
 matrix, kept as the Bayes net that eliminating the variables leaves. Each factor is linearised once,
 at the estimate of its moment, eliminated with what is known so far, and the estimate moved; a
-robot's last pose is eliminated as its next one enters. One factor at a time in recorded order:
-taking those of a step together would be another filter.
+robot's last pose is eliminated as its next one enters, or, as in `ekf`, a few states later
+(`EkfConfig.past_states`). One factor at a time in recorded order: taking those of a step together
+would be another filter.
 
 With z the sum of all corrections so far, in the tangent space at each variable, the information
 about z is left as it is while the estimate moves: no covariance reset, as in a filter with
@@ -38,21 +39,22 @@ SETTLED, MAX_ROUNDS = 1e-4, 100
 class FactorEkfBackend(GraphBackend):
     """The filter; see the module's docstring. Its final estimate is its causal one.
 
-    Observations of past states, closures to them and late evidence have nothing left to refer to:
-    they are skipped and counted.
+    What refers to a state that has left is skipped and counted.
     """
 
     def __init__(self, config: Config) -> None:
         # kernels are dealt with here: GTSAM would weigh a factor by its innovation alone, however
         # uncertain the prediction is
-        super().__init__(GraphBuilder(RobustConfig(kernel="none"), late=False, wide=False))
+        self._kept = config.ekf.past_states
+        builder = GraphBuilder(RobustConfig(kernel="none"), late=self._kept > 0, wide=False)
+        super().__init__(builder)
         self._kernel = config.robust
         self._values = gtsam.Values()
         self._order: list[int] = []  # robots, then landmarks: a motion touches the first rows only
         self._net = gtsam.GaussianBayesNet()  # square root information of z, in that order
         self._z = gtsam.VectorValues()
         self._root: tuple[Array, dict[int, slice]] | None = None  # the net as a matrix
-        self._past: dict[int, tuple[Array, Array]] = {}  # states that are no more
+        self._causal: dict[int, tuple[Array, Array]] = {}  # states as their own step left them
         self._error = 0.0
 
     def value(self, key: int, dim: int) -> Array:
@@ -76,24 +78,39 @@ class FactorEkfBackend(GraphBackend):
             self._joints.clear()
             if part.new is not None:
                 self._enter(*part.new, part.replaces)
-            self._update(part)
-        for robot in self.builder.robots:
-            self.builder.oldest[robot] = self.builder.states.latest(robot)
+            gone = self._gone(part)
+            self._update(part, gone)
+            if gone is not None:
+                self._forget(gone)
+        for robot in {**step.starts, **step.motions}:
+            key = self.builder.latest_key(robot)
+            self._causal[key] = self.value(key, 3), self.covariance([key])
+
+    def _gone(self, part: Part) -> int | None:
+        """The state that leaves with this part: its robot has a next one and enough others."""
+        if part.replaces is None:
+            return None
+        index, number = divmod(gtsam.Symbol(part.replaces).index(), 1 << 40)
+        robot, oldest = self.builder.robots[index], number - self._kept
+        self.builder.oldest[robot] = max(oldest + 1, 0)
+        return self.builder.state_key(robot, oldest) if oldest >= 0 else None
 
     def _enter(self, key: int, value: Array, replaces: int | None) -> None:
-        """Make room for a variable: a robot's next state in the place of the one before."""
+        """Make room for a variable: a robot's next state behind the one before."""
         write(self._values, key, value)
         poses = sum(gtsam.Symbol(k).chr() == ord("x") for k in self._order)
         if replaces is not None:
-            self._past[replaces] = self.value(replaces, 3), self.covariance([replaces])
-            self._order[self._order.index(replaces)] = key
+            self._order.insert(self._order.index(replaces) + 1, key)
         elif gtsam.Symbol(key).chr() == ord("x"):
             self._order.insert(poses, key)
         else:
             self._order.append(key)
         self._z.insert(key, np.zeros(len(value)))
 
-    def _update(self, part: Part) -> None:
+    def _update(self, part: Part, gone: int | None) -> None:
+        """Take in a part, and marginalise the state ``gone`` out."""
+        if gone is not None:
+            self._order.remove(gone)
         linear = [self._linear(factor) for factor in part.factors]
         if part.robust and part.new is None and self._kernel.kernel != "none":
             linear = [self._weighed(linear[0])]
@@ -103,10 +120,9 @@ class FactorEkfBackend(GraphBackend):
             graph.push_back(found)
         try:
             rest = graph
-            if part.replaces is not None:
-                rest = graph.eliminatePartialSequential(
-                    gtsam.Ordering([part.replaces]), gtsam.EliminateQR
-                )[1]
+            if gone is not None:
+                first = gtsam.Ordering([gone])
+                _, rest = graph.eliminatePartialSequential(first, gtsam.EliminateQR)
             self._net = rest.eliminateSequential(gtsam.Ordering(self._order), gtsam.EliminateQR)
         except RuntimeError as error:
             raise indeterminate(part.what) from error
@@ -116,8 +132,6 @@ class FactorEkfBackend(GraphBackend):
             diagonal = np.abs(np.diag(self._matrix()[0]))
             if not (np.isfinite(diagonal).all() and diagonal.min() > 0):
                 raise indeterminate(part.what)
-            if part.replaces is not None:
-                self._forget(part.replaces)
             return
         z = self._net.optimize()
         moved = z.subtract(self._z)
@@ -164,10 +178,11 @@ class FactorEkfBackend(GraphBackend):
         return jacobian_factor(root * A, root * b, {key: self._z.at(key).size for key in keys})
 
     def finish(self) -> Estimate:
-        """See `Backend`: every state as it was when the next one came."""
-        means = {key: mean for key, (mean, _) in self._past.items()}
-        covs = {key: cov for key, (_, cov) in self._past.items()}
+        """See `Backend`: every state as its own step left it."""
+        means = {key: mean for key, (mean, _) in self._causal.items()}
+        covs = {key: cov for key, (_, cov) in self._causal.items()}
         for key in self._order:
-            means[key] = self.value(key, self._z.at(key).size)
-            covs[key] = self.covariance([key])
+            if key not in means:
+                means[key] = self.value(key, self._z.at(key).size)
+                covs[key] = self.covariance([key])
         return self._estimate(means, covs, self._error)

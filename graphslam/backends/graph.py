@@ -147,7 +147,6 @@ class GraphBuilder:
         t = estimate(target, model.dim) if new is None else new[1]
         with _named(what, seen.cov):
             if new is not None and seen.model == "line":
-                # what takes no late evidence is a filter
                 made.append(factors.line_gauge_factor(key, target, seen, wide=self._wide))
             made.append(factors.observation_factor(key, target, seen, self.kernel, x, t))
         if new is not None and isinstance(seen.target, int):

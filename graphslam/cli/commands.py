@@ -35,7 +35,7 @@ from graphslam.cli.arguments import (
 )
 from graphslam.cli.terminal import errors_in_one_line, progress_bar
 from graphslam.config import Config, load_config
-from graphslam.errors import EstimationError, OutputError
+from graphslam.errors import ConfigError, EstimationError, OutputError
 from graphslam.logs import IMPORTERS, KnownTruth, LogSet, inspect_logs, open_logs
 from graphslam.records import Result
 from graphslam.results import check_target, load, save, to_json
@@ -165,6 +165,8 @@ def smooth_command(
         options += [] if horizon is None else [f"backend.horizon_s={horizon}"]
         options += [f"front_end.name={front_end}"] if front_end else []
         tree = load_config(config, [*options, *(start or ()), *(settings or ())])
+        if horizon is not None and tree.backend.name != "isam2":
+            raise ConfigError(f"--horizon: only isam2 has one, not {tree.backend.name}; leave it")
         check_target(output, force=force)
         result = _smooth(open_logs(logs, tree), tree, output, force)
         if json:
@@ -347,7 +349,7 @@ def experiment_command(
         str,
         typer.Argument(
             metavar="NAME|FILE.toml",
-            help="An experiment file, or ekf-versus-smoothing or thesis.",
+            help="An experiment file, or ekf-versus-smoothing, filters or thesis.",
         ),
     ],
     output: Annotated[

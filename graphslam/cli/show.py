@@ -13,7 +13,7 @@ from rich.table import Table
 
 from graphslam.logs import ImportSummary, LogInfo, RobotInfo, TopicInfo
 from graphslam.records import Result
-from graphslam.report.comparison import filled, notes, sentence
+from graphslam.report.comparison import AHEAD, ahead, filled, notes, sentence
 from graphslam.simulate import Simulation
 
 _PIPE_WIDTH = 200  # a pipe has no width; tables take what they need of this
@@ -170,6 +170,9 @@ def comparison(found: Mapping[str, Any], directory: Path) -> None:
         console.print()
         console.print(title)
         console.print(_table(["", *heads], lines))
+    if won := ahead(found):
+        console.print("\nWhere a filter is ahead of every smoother")
+        console.print(_table(["", *AHEAD[1:]], [tuple(map(_number, row)) for row in won]))
     console.print()
     for text in ("* best of its column.", *notes(found)):
         console.print(text)

@@ -3,7 +3,7 @@
 import resource
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -25,10 +25,14 @@ WARM_UP = 20
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Played:
-    """A replay, and the largest size of the process, MB, before and after it."""
+    """A replay, and the largest size of the process, MB, before and after it.
+
+    ``skipped``: what of the steps the back end could not use, counted by reason.
+    """
 
     replay: Replay
     error_frame: str
+    skipped: Mapping[str, int]
     before_mb: float
     peak_mb: float
 
@@ -45,7 +49,7 @@ def play(steps: Sequence[Step], config: Config) -> Played:
     before = _peak_mb()
     backend = BACKENDS[config.backend.name](config)
     done = replay(steps, backend)
-    return Played(done, backend.error_frame, before, _peak_mb())
+    return Played(done, backend.error_frame, dict(backend.skipped), before, _peak_mb())
 
 
 def play_apart(steps: Sequence[Step], config: Config) -> Played:

@@ -55,11 +55,18 @@ class Recording:
         """
         world = origin_shift(self.start, next(iter(self.runs.values())).track.mount)
         estimate = in_world(done.estimate, world)
+        runs = {
+            name: replace(
+                run,
+                causal_poses=list(done.causal[name].poses),
+                causal_covs=list(done.causal[name].covs),
+            )
+            for name, run in self.runs.items()
+        }
+        causal_only = all(run.is_causal(done.estimate.states[name]) for name, run in runs.items())
         robots = {}
-        for name, run in self.runs.items():
-            causal = done.causal[name]
-            own = replace(run, causal_poses=list(causal.poses), causal_covs=list(causal.covs))
-            found = own.result(estimate.states[name], self.start)
+        for name, run in runs.items():
+            found = run.result(estimate.states[name], self.start, causal_only=causal_only)
             robots[name] = SavedRobot(
                 found.final, found.causal, found.scan_final, found.scan_causal
             )

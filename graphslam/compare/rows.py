@@ -1,7 +1,6 @@
 """Every back end judged: its row of numbers, and what the report draws of it."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,8 +23,6 @@ FORMAT = "graphslam-comparison-1"
 MODES = ("replay", "associate")
 #: the settings that recorded steps follow from: in mode `replay` they are the same for all
 PERCEPTION = ("logs", "robots", "odometry", "keyframe", "front_end", "association", "start")
-#: two states closer than this (m, rad) are the same: far below what any file keeps
-SAME = 1e-9
 
 
 def compare(
@@ -152,18 +149,7 @@ class _Run:
         """A run that came to an end."""
         self, done = cls(variant), played.replay
         result = recording.result(done, variant.config)
-        # with horizon 0 a state still moves until the next one comes (by less than it is known);
-        # what a filter says about a time is what it said then
-        is_filter = variant.horizon_s == 0 or all(
-            _same(done.causal[name], states) for name, states in done.estimate.states.items()
-        )
-        if is_filter:
-            # it knows no better later: what lies between its states is not revised either
-            robots = {
-                name: replace(robot, final=robot.causal, scan_final=robot.scan_causal)
-                for name, robot in result.robots.items()
-            }
-            result = replace(result, robots=robots)
+        is_filter = all(robot.final is robot.causal for robot in result.robots.values())
         self.result, self.step_ms = result, done.step_ms
         self.landmarks, self.path_m = recording.growth()
         p50, p99, most = np.quantile(done.step_ms, [0.5, 0.99, 1.0]).tolist()
@@ -179,6 +165,7 @@ class _Run:
             "map_landmarks": len(result.landmarks),
             "associations": recording.associations,
             "late": done.late,
+            "skipped": dict(played.skipped),
             "recording_s": recording.seconds,
             "ms_per_step": {"p50": p50, "p99": p99, "max": most},
             "finish_ms": done.finish_ms,
@@ -246,14 +233,6 @@ class _Run:
             self.row["spec"], self.row["label"], self.row["final_is_causal"], paths, curves,
             self.step_ms, self.landmarks, self.path_m,
         )  # fmt: skip
-
-
-def _same(one: Trajectory, other: Trajectory) -> bool:
-    if not np.array_equal(one.stamps_ns, other.stamps_ns):
-        return False
-    off = one.poses - other.poses
-    off[:, 2] = wrap(off[:, 2])
-    return bool(np.abs(off).max(initial=0.0) < SAME)
 
 
 def _difference(pairs: Sequence[Pairs]) -> dict[str, float] | None:

@@ -60,5 +60,7 @@ def _variant(spec: str, path: Path | None, overrides: Sequence[str]) -> Variant:
     label = NAMES.get(name, name)
     if name == "isam2" and math.isfinite(config.backend.horizon_s):
         label += f", horizon {config.backend.horizon_s:g} s"
-    extra = [text for text in settings if not text.startswith("backend.horizon_s=")]
+    # the horizon is said, the error frame is added to what a filter is called
+    said = ("backend.horizon_s=", "ekf.error=") if name == "ekf" else ("backend.horizon_s=",)
+    extra = [text for text in settings if not text.startswith(said)]
     return Variant(spec, ", ".join([label, *extra]), config)

@@ -21,7 +21,7 @@ _FOLDER = Path(__file__).parent / "definitions"
 
 #: name -> file of an experiment that comes with the package
 EXPERIMENTS: dict[str, Path] = {
-    name: _FOLDER / f"{name}.toml" for name in ("ekf-versus-smoothing", "thesis")
+    name: _FOLDER / f"{name}.toml" for name in ("ekf-versus-smoothing", "filters", "thesis")
 }
 
 

@@ -3,6 +3,7 @@
 `COLUMNS` says which numbers are shown and which of them is best; the terminal shows the same.
 """
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from graphslam.geometry import Array
-from graphslam.report.tables import number
+from graphslam.report.tables import number, table
 
 Stamps = np.ndarray[tuple[int], np.dtype[np.int64]]
 
@@ -203,17 +204,50 @@ def _best(values: Sequence[Any], aim: float | None) -> list[bool]:
     nothing = [False] * len(values)
     if aim is None:
         return nothing
-
-    def badness(value: float) -> float:
-        if aim == 0.0:
-            return float(f"{abs(value):.3g}")
-        return float(f"{abs(log(max(value, 1e-300) / aim)):.3g}")
-
-    grades = {badness(value) for value in numbers}
+    grades = {_badness(value, aim) for value in numbers}
     if len(grades) < 2:
         return nothing
     least = min(grades)
-    return [isinstance(value, int | float) and badness(value) == least for value in values]
+    return [isinstance(value, int | float) and _badness(value, aim) == least for value in values]
+
+
+def _badness(value: float, aim: float) -> float:
+    """How far a value is from what it should be, to the three digits that are shown."""
+    if aim == 0.0:
+        return float(f"{abs(value):.3g}")
+    return float(f"{abs(log(max(value, 1e-300) / aim)):.3g}")
+
+
+#: heads of `ahead`'s table
+AHEAD = ("number", "best filter", "its value", "best smoother", "its value")
+
+
+def ahead(found: Mapping[str, Any]) -> list[tuple[str, str, Any, str, Any]]:
+    """The numbers in which a filter is better than every smoother: rows of a table, see `AHEAD`.
+
+    What revises no state is a filter; dead reckoning, which is none, is left out.
+    """
+    done = [row for row in found["rows"] if row["error"] is None]
+    done = [row for row in done if not row["spec"].startswith("dead-reckoning")]
+    out = []
+    for title, columns in COLUMNS.items():
+        if title.startswith(("Final", "Associations")):
+            continue  # a filter's final numbers are its causal ones
+        for column in columns:
+            if column.aim is None:
+                continue
+            graded = [
+                (_badness(value, column.aim), i, value)
+                for i, row in enumerate(done)
+                if isinstance(value := column.value(row), int | float)
+            ]
+            filters = [one for one in graded if done[one[1]]["final_is_causal"]]
+            smoothers = [one for one in graded if not done[one[1]]["final_is_causal"]]
+            if filters and smoothers and min(filters)[0] < min(smoothers)[0]:
+                (_, i, mine), (_, k, theirs) = min(filters), min(smoothers)
+                name = f"{re.split('[ ,:]', title)[0].lower()}: {column.head}"
+                out.append((name, done[i]["label"], mine, done[k]["label"], theirs))
+    return out
 
 
 # ---------------------------------------------------------------- words
@@ -239,12 +273,17 @@ def notes(found: Mapping[str, Any]) -> list[str]:
     filters = [row["spec"] for row in done if row["final_is_causal"]]
     if filters:
         texts.append(f"Final equals causal for {', '.join(filters)}: nothing revises the past.")
+    rivals = any(spec != "dead-reckoning" for spec in filters) and len(filters) < len(done)
+    if rivals and not ahead(found):
+        texts.append("No filter is ahead of every smoother in any number.")
     late = max(row["late"] for row in done)
     if late:
         texts.append(
-            f"{number(late)} associations are late (from before their landmark was confirmed): "
-            "filters skip them, smoothers use them."
+            f"{number(late)} associations are late: from before their landmark was confirmed."
         )
+    for row in done:
+        for reason, count in sorted(row["skipped"].items()):
+            texts.append(f"{row['spec']} could not use {number(count)} x {reason}.")
     if any("joint" in row for row in done):
         texts.append(
             "NEES bounds are for independent poses; those of one run are correlated, so a single "
@@ -272,6 +311,7 @@ def render_comparison(comparison: Comparison, settings: str = "") -> str:
     from graphslam.report.page import document, section  # noqa: PLC0415
 
     found, lanes = comparison.found, comparison.lanes
+    won = ahead(found)
     # as the figures draw them: six colours, then the same dashed
     colors = {
         lane.spec: f"repeating-linear-gradient(90deg, {color} 0 5px, transparent 5px 7px)"
@@ -292,6 +332,7 @@ def render_comparison(comparison: Comparison, settings: str = "") -> str:
         f'<section class="warn"><h2>Warnings</h2><ul>{warnings}</ul></section>' if warnings else "",
         "<section><h2>Numbers</h2>"
         + "".join(_table(found, colors, name, *rest) for name, rest in filled(found).items())
+        + (table(AHEAD, won, "Where a filter is ahead of every smoother") if won else "")
         + "".join(f"<p class=note>{escape(text)}</p>" for text in ("Best in bold.", *notes(found)))
         + "</section>",
     ]

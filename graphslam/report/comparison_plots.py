@@ -24,7 +24,7 @@ from graphslam.report.figure import (
 from graphslam.report.page import figure
 
 _SMALLEST = 1e-6  # m or degrees: nothing below it is worth a decade of a logarithmic axis
-_MAX_POINTS = 1500  # of one curve: more are not seen
+_MAX_POINTS = 120  # of one curve: more hide each other where errors change from pose to pose
 
 
 def figures(comparison: Comparison) -> dict[str, list[str]]:
@@ -39,12 +39,18 @@ def figures(comparison: Comparison) -> dict[str, list[str]]:
             figure(_paths(comparison, kind), f"{kind.title()}.", f"In the plane.{dashed}{aligned}")
         )
         if any(lane.curves[kind] for lane in comparison.lanes):
-            caption = f"Distance to {against} and difference of heading.{aligned}"
+            caption = (
+                f"Distance to {against} and difference of heading, RMS of neighbouring poses."
+                f"{aligned}"
+            )
             title = f"Error, {kind}."
             found["Errors over time"].append(figure(_errors(comparison, kind), title, caption))
     for kind in ("final", "causal"):
         if any(np.isfinite(c.nees).any() for _, _, c in _curves(comparison, kind)):
-            caption = "NEES per degree of freedom; solid 1, dashed the 95 % bounds of one pose."
+            caption = (
+                "NEES per degree of freedom, mean of neighbouring poses; solid 1, dashed the 95 % "
+                "bounds of one pose."
+            )
             title = f"Consistency, {kind}."
             found["Errors over time"].append(figure(_nees(comparison, kind), title, caption))
     for label, axis, caption in (
@@ -85,8 +91,9 @@ def _errors(comparison: Comparison, kind: str) -> str:
         top, bottom = time_rows(drawing, 2, label)
         for _, style, curve in _curves(comparison, kind):
             t = (curve.stamps_ns - start) / unit
-            top.plot(*_thinned(t, _positive(curve.position_m)), **style)
-            bottom.plot(*_thinned(t, _positive(np.degrees(curve.heading_rad))), **style)
+            for axes, values in ((top, curve.position_m), (bottom, np.degrees(curve.heading_rad))):
+                middle, squares = _gathered(t, values**2)
+                axes.plot(middle, _positive(np.sqrt(squares)), **style)
         _log(top, "position, m")
         _log(bottom, "heading, °")
 
@@ -100,7 +107,7 @@ def _nees(comparison: Comparison, kind: str) -> str:
         (axes,) = time_rows(drawing, 1, label)
         for _, style, curve in _curves(comparison, kind):
             t = (curve.stamps_ns - start) / unit
-            axes.plot(*_thinned(t, np.where(curve.nees > 1e-4, curve.nees, np.nan)), **style)
+            axes.plot(*_gathered(t, curve.nees), **style)
         for bound in chi2.ppf([0.025, 0.975], 3) / 3:
             axes.axhline(bound, color=ACCENT, linewidth=1, linestyle=(0, (4, 2.5)), zorder=9)
         axes.axhline(1.0, color=ACCENT, linewidth=0.9, zorder=9)
@@ -159,10 +166,11 @@ def _clock(comparison: Comparison) -> tuple[int, float, str]:
     return (first, 60e9, "time, min") if last - first > 900e9 else (first, 1e9, "time, s")
 
 
-def _thinned(t: Array, values: Array) -> tuple[Array, Array]:
-    """Every k-th point of a long curve."""
-    every = slice(None, None, max(1, len(t) // _MAX_POINTS))
-    return t[every], values[every]
+def _gathered(t: Array, values: Array) -> tuple[Array, Array]:
+    """Means of neighbouring values, `_MAX_POINTS` of them at most: every pose is in one."""
+    parts = max(1, min(len(t), _MAX_POINTS))
+    means = [[part.mean() for part in np.array_split(x, parts)] for x in (t, values)]
+    return np.array(means[0]), np.array(means[1])
 
 
 def _positive(values: Array) -> Array:

@@ -1,0 +1,96 @@
+"""What separates a filter from the smoother on a simulated log, by switching it off bit by bit.
+
+Each seed's log is associated once, by the default smoother; its steps go into every row: the same
+evidence, or the same without what is late (from before a landmark's promotion). Base poses over all
+robots, position; mean and standard deviation over seeds.
+
+Run: python benchmarks/filter_gap.py [SCENARIO [SEEDS [key=value ...]]]
+"""
+
+import sys
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from unittest.mock import patch
+
+import numpy as np
+
+from graphslam.backends import BACKENDS
+from graphslam.compare import Recording, record, variants
+from graphslam.config import load_config
+from graphslam.evaluate import evaluate
+from graphslam.logs import KnownTruth, open_logs
+from graphslam.records import Step
+from graphslam.replay import replay
+from graphslam.simulate import load_scenario, simulate
+from graphslam.truth import truth_of_logs
+
+START = ["start.from_truth=true"]
+#: label -> spec, whether late evidence is left out, and the gauge of filters' lines, m
+ROWS: dict[str, tuple[str, bool, float | None]] = {
+    "EKF": ("ekf", False, None),
+    "EKF, two past states": ("ekf+ekf.past_states=2", False, None),
+    "EKF, no past states": ("ekf+ekf.past_states=0", False, None),
+    "isam2": ("isam2", False, None),
+    "isam2, nothing late": ("isam2", True, None),
+    "isam2, horizon 20 s": ("isam2:20", False, None),
+    "isam2, horizon 20 s, nothing late": ("isam2:20", True, None),
+    "EKF, body errors": ("ekf+ekf.error=body", False, None),
+    "isam2, horizon 0": ("isam2:0", False, None),
+    "invariant EKF": ("invariant-ekf", False, None),
+    "EKF, iterated 5 times": ("ekf+ekf.iterations=5", False, None),
+    "EKF, lines' gauge 1 m": ("ekf", False, 1.0),
+    "EKF, no kernel": ("ekf+robust.kernel=none", False, None),
+    "isam2, no kernel": ("isam2+robust.kernel=none", False, None),
+    "dead reckoning": ("dead-reckoning", False, None),
+}
+
+
+def in_time(steps: tuple[Step, ...]) -> tuple[Step, ...]:
+    """The steps without late evidence."""
+    return tuple(
+        replace(s, associations=tuple(a for a in s.associations if not a.late)) for s in steps
+    )
+
+
+def judge(recording: Recording, truth: KnownTruth, label: str, settings: list[str]) -> list[float]:
+    """Causal and final position error, m; causal NEES per degree of freedom; landmarks, m."""
+    spec, strip, gauge_m = ROWS[label]
+    (variant,) = variants([spec], None, settings)
+    gauge: AbstractContextManager[object] = nullcontext()
+    if gauge_m is not None:
+        gauge = patch("graphslam.factors.FILTER_GAUGE_SIGMA_M", gauge_m)
+    with gauge:
+        backend = BACKENDS[variant.config.backend.name](variant.config)
+        done = replay(in_time(recording.steps) if strip else recording.steps, backend)
+    result = recording.result(done, variant.config)
+    found = evaluate(result, truth.trajectories, truth.landmarks)
+    causal, final = found["joint"]["causal"], found["joint"]["final"]
+    errors = causal["ate_rmse_m"], final["ate_rmse_m"], causal["nees_per_dof"]
+    return [*errors, found["landmarks"]["rmse_m"]]
+
+
+def main(scenario: str = "lab", seeds: str = "10", *overrides: str) -> None:
+    settings = [*START, *overrides]
+    config = load_config(None, settings)
+    numbers: dict[str, list[list[float]]] = {label: [] for label in ROWS}
+    with TemporaryDirectory() as folder:
+        for seed in range(int(seeds)):
+            path = Path(folder) / f"{seed}.mcap"
+            simulate(load_scenario(scenario), path, seed)
+            log = open_logs([path], config)
+            truth, recording = truth_of_logs(log, config), record(log, config)
+            for label, rows in numbers.items():
+                rows.append(judge(recording, truth, label, settings))
+    print("                                     causal, mm     final, mm   NEES/dof  landmarks, mm")
+    for label, rows in numbers.items():
+        (c, f, nees, m), (c_, f_, _, m_) = np.mean(rows, axis=0), np.std(rows, axis=0)
+        print(
+            f"{label:34s} {1e3 * c:5.1f} ± {1e3 * c_:4.1f}  {1e3 * f:5.1f} ± {1e3 * f_:4.1f}"
+            f"  {nees:9.2f}  {1e3 * m:5.1f} ± {1e3 * m_:4.1f}"
+        )
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
