@@ -204,7 +204,10 @@ def loop_closures(found: Sequence[Place], P: Array) -> list[Closure]:
 
 
 def closed(source: Submap, target: Submap, guess: Array) -> bool:
-    """Whether two places lie where they should, as far as what was seen there can tell."""
+    """Whether two places lie where they should, as far as what was seen there can tell.
+
+    ``guess`` (3,) is where ``source`` is believed to be in ``target``.
+    """
     pose, _ = align(source, target, guess)
     off = between(guess, pose)
     if np.hypot(off[0], off[1]) > CLOSED[0] or abs(off[2]) > CLOSED[1]:

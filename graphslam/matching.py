@@ -252,7 +252,10 @@ def _seen_from(points: Array, submap: Submap) -> tuple[BoolArray, BoolArray]:
 
 
 def match(source: Submap, target: Submap, guess: Array, window: Array) -> list[Match]:
-    """All places of ``source`` in ``target`` within a window, the most agreeing first."""
+    """All places of ``source`` in ``target`` within a window, the most agreeing first.
+
+    ``guess`` (3,) is the middle of the window, ``window`` (3,) half its size, m, m, rad.
+    """
     found: list[Match] = []
     for start in search(source, target, guess, window):
         pose, cov = align(source, target, start)
