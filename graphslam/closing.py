@@ -57,11 +57,15 @@ State = tuple[str, int]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Place:
-    """A submap with the state that it is relative to, and how far its robot had driven."""
+    """A submap, the state that it is relative to, how far its robot had driven, when it was there.
+
+    ``span_ns`` is the time of the first and of the last scan.
+    """
 
     state: State
     pose: Array
     path_m: float
+    span_ns: tuple[int, int]
     submap: Submap
 
 
@@ -99,7 +103,8 @@ def places(states: Mapping[str, Trajectory], pictures: Iterable[Picture]) -> lis
                 [transform(inverse(p.sensor), p.points.astype(float)) for p in seen_there],
             )
             state = robot, int(stamps[middle])
-            found.append(Place(state, poses[middle], float(path[middle]), submap))
+            span = int(stamps[used[0]]), int(stamps[used[-1]])
+            found.append(Place(state, poses[middle], float(path[middle]), span, submap))
     return found
 
 
@@ -182,7 +187,9 @@ def verified(matches: Sequence[Match]) -> Match | None:
     return best if good else None
 
 
-def loop_closures(found: Sequence[Place], P: Array) -> list[Closure]:
+def loop_closures(
+    found: Sequence[Place], P: Array, looked: dict[tuple[State, State], Array]
+) -> list[Closure]:
     """Closures between places, each verified by itself.
 
     Pairs that lie where they should are passed over: there is nothing to close.
@@ -190,11 +197,17 @@ def loop_closures(found: Sequence[Place], P: Array) -> list[Closure]:
     Args:
         found: the places.
         P: (3n, 3n) joint covariance of their poses, errors along each pose's own axes.
+        looked: relative poses (3,) at which pairs were looked at before, which need no second look;
+            this adds to it.
     """
     made = []
     for i, j, window in candidates(found, TRUST * P):
         later, earlier = found[i], found[j]
         guess = between(earlier.pose, later.pose)
+        pair = later.state, earlier.state
+        if pair in looked and _near(looked[pair], guess, CLOSED):
+            continue
+        looked[pair] = guess
         if closed(later.submap, earlier.submap, guess):
             continue
         best = verified(match(later.submap, earlier.submap, guess, window))
@@ -209,17 +222,22 @@ def closed(source: Submap, target: Submap, guess: Array) -> bool:
     ``guess`` (3,) is where ``source`` is believed to be in ``target``.
     """
     pose, _ = align(source, target, guess)
-    off = between(guess, pose)
-    if np.hypot(off[0], off[1]) > CLOSED[0] or abs(off[2]) > CLOSED[1]:
+    if not _near(guess, pose, CLOSED):
         return False
     same, absent = agreement(source, target, pose)
     return same >= SAME and absent <= ABSENT * (same + absent)
 
 
+def _near(a: Array, b: Array, limits: tuple[float, float]) -> bool:
+    off = between(a, b)
+    return bool(np.hypot(off[0], off[1]) <= limits[0] and abs(off[2]) <= limits[1])
+
+
 def agreeing(closures: Sequence[Closure], found: Sequence[Place], P: Array) -> list[Closure]:
     """The largest set found of closures that agree with the estimate and, in pairs, among them.
 
-    Two agree if, once either is believed, the other is what is to be expected.
+    Two agree if, once either is believed, the other is what is to be expected. Of those that agree
+    in pairs the worst leaves until each is what is to be expected from all the others.
 
     Args:
         closures: between places.
@@ -250,7 +268,25 @@ def agreeing(closures: Sequence[Closure], found: Sequence[Place], P: Array) -> l
             free &= agree[k]
         if len(chosen) > len(best):
             best = chosen
-    return [closures[k] for k in sorted(best)]
+    return [closures[k] for k in _standing(sorted(best), r, S)]
+
+
+def _standing(chosen: list[int], r: Array, S: Array) -> list[int]:
+    """Those of the chosen that all the others bear out, by innovations r (n, 3) and S (3n, 3n)."""
+    gate = chi2.ppf(AGREE, 3)
+    while len(chosen) > 1:
+        rows = np.concatenate([np.arange(3 * k, 3 * k + 3) for k in chosen])
+        information = np.linalg.inv(S[np.ix_(rows, rows)])
+        pull = (information @ r[chosen].ravel()).reshape(-1, 3, 1)
+        own = information.reshape(len(chosen), 3, -1, 3)[
+            np.arange(len(chosen)), :, np.arange(len(chosen))
+        ]
+        # what the others leave of each: residual own⁻¹ pull, covariance own⁻¹
+        d2 = (pull.mT @ np.linalg.solve(own, pull)).ravel()
+        if d2.max() <= gate:
+            break
+        chosen = [k for k, bad in zip(chosen, d2 == d2.max(), strict=True) if not bad]
+    return chosen
 
 
 def _innovations(
@@ -292,8 +328,8 @@ def slack(closures: Sequence[Closure], states: Mapping[str, Trajectory]) -> list
     found = []
     for closure, r in zip(closures, residuals(closures, states), strict=True):
         turned = rotate_cov(closure.cov, -float(closure.delta[2]))
-        scale = max(1.0, float(r @ np.linalg.solve(turned, r)) / 9.0)
-        found.append(replace(closure, cov=scale * closure.cov))
+        scale = float(r @ np.linalg.solve(turned, r)) / 9.0
+        found.append(replace(closure, cov=scale * closure.cov) if scale > 1.0 else closure)
     return found
 
 

@@ -6,14 +6,18 @@ become one, round after round until nothing changes. Where merged landmarks say 
 says, the closure has done its work and goes: both are of the same scans.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+
+import numpy as np
 
 from graphslam.backends.isam2 import BatchBackend
 from graphslam.closing import (
     BORNE_OUT,
     CLOSED,
     Place,
+    State,
     agreeing,
     far_off,
     loop_closures,
@@ -23,16 +27,22 @@ from graphslam.closing import (
 )
 from graphslam.config import Config
 from graphslam.dead_reckoning import Track
+from graphslam.geometry import Array, between, wrap
 from graphslam.landmark_map import LandmarkMap
 from graphslam.merging import duplicates, merge_entries, merged_steps, seen_together, survivors
+from graphslam.reassociating import reassociate
 from graphslam.records import Closure, Estimate, Picture, Step
 
 #: Intel and ACES need three; more only if merging goes on for ever
 MAX_ROUNDS = 6
 
 
+#: m across, rad: how far an observation may lie from a wall, from round to round
+GATES = ((0.3, 0.15), (0.15, 0.1))
+#: motions from which their noise is told at least; median of the absolute value of a unit normal
+FEWEST_MOTIONS, MEDIAN_OF_NORMAL = 50, 0.6745
 #: rounds of closing loops
-MAX_CLOSINGS = 3
+MAX_CLOSINGS = 8
 #: solutions from slack to tight closures
 TIGHTENINGS = 4
 
@@ -42,18 +52,11 @@ Tamper = Callable[[list[Closure], Sequence[Place]], list[Closure]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Consolidated:
-    """The estimate and the steps behind it, with counts.
-
-    ``merged`` landmarks into others, ``closed`` loops by matching, of which ``kept`` are in the
-    steps since no landmark says the same, and ``refused`` closures that do not agree with the rest.
-    """
+    """The estimate and the steps behind it; ``counts`` of what was changed, by name."""
 
     estimate: Estimate
     steps: tuple[Step, ...]
-    merged: int
-    closed: int
-    kept: int
-    refused: int
+    counts: Counter[str]
 
 
 def consolidate(
@@ -79,54 +82,97 @@ def consolidate(
     Raises:
         EstimationError: the estimate is indeterminate.
     """
+    solve = _Solver(config)
     steps = tuple(_recalibrated(step, tracks) for step in steps)
-    backend = BatchBackend(config)
-    estimate = backend.solve(steps, estimate, rough=True)
+    estimate = solve(steps, estimate)
+    steps = _loosened(steps, estimate)
+    estimate = solve(steps, estimate)
+    counts: Counter[str] = Counter()
     closures: list[Closure] = []
-    refused = 0
     if config.backend.close_loops:
-        found = places(estimate.states, pictures)
-        for _ in range(MAX_CLOSINGS):
-            P = backend.state_covariance([place.state for place in found])
-            new = loop_closures(found, P)
-            if tamper is not None:
-                new = tamper(new, found)
-            agreed = agreeing(new, found, P)
-            refused = len(new) - len(agreed)
-            if not agreed:
+        closures, estimate = _closed(steps, estimate, pictures, solve, tamper, counts)
+    # merged first: what went to either of two walls that are one would move to and fro
+    for gates in GATES:
+        estimate = solve(with_closures(steps, closures), estimate)
+        for _ in range(MAX_ROUNDS):
+            into = _duplicates(estimate, solve.backend, landmarks, steps)
+            if not into:
                 break
-            closures += agreed
-            for _ in range(TIGHTENINGS):
-                drawn = slack(closures, estimate.states)
-                backend = BatchBackend(config)
-                estimate = backend.solve(with_closures(steps, drawn), estimate, rough=True)
-            found = moved(found, estimate.states)
-            gone = far_off(closures, estimate.states, BORNE_OUT)
-            refused += sum(gone)
-            closures = [c for c, off in zip(closures, gone, strict=True) if not off]
-    merged = 0
-    tied = with_closures(steps, closures)
-    for _ in range(MAX_ROUNDS):
-        into = _duplicates(estimate, backend, landmarks, tied)
-        if not into:
-            break
-        kinds = {number: landmarks.entries[number].kind for number in into.values()}
-        steps, tied = merged_steps(steps, into, kinds), merged_steps(tied, into, kinds)
-        merge_entries(landmarks, into)
-        merged += len(into)
-        backend = BatchBackend(config)
-        estimate = backend.solve(tied, estimate, rough=True)
-    kept: list[Closure] = []
+            kinds = {number: landmarks.entries[number].kind for number in into.values()}
+            steps = merged_steps(steps, into, kinds)
+            merge_entries(landmarks, into)
+            counts["landmarks_merged"] += len(into)
+            estimate = solve(with_closures(steps, closures), estimate)
+        done = reassociate(steps, estimate, landmarks.entries, *gates)
+        steps = done.steps
+        counts["observations_reassociated"] += done.moved
+        counts["observations_dropped"] += done.dropped
     if closures:
         # what the landmarks do not hold together without them
-        free = BatchBackend(config).solve(steps, estimate, rough=True)
-        missed = far_off(closures, free.states, CLOSED)
+        missed = far_off(closures, solve(steps, estimate).states, CLOSED)
         kept = [c for c, off in zip(closures, missed, strict=True) if off]
+        counts["closures_kept"] = len(kept)
         steps = with_closures(steps, kept)
     estimate = BatchBackend(config).solve(steps, estimate)
-    for number, (mean, _) in estimate.landmarks.items():
-        landmarks.entries[number].move(mean)
-    return Consolidated(estimate, steps, merged, len(closures), len(kept), refused)
+    _move(landmarks, estimate)
+    return Consolidated(estimate, steps, counts)
+
+
+class _Solver:
+    """Solves steps roughly; ``backend`` is the latest one, for its covariances."""
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self.backend = BatchBackend(config)
+
+    def __call__(self, steps: Sequence[Step], start: Estimate) -> Estimate:
+        self.backend = BatchBackend(self._config)
+        return self.backend.solve(steps, start, rough=True)
+
+
+def _closed(
+    steps: Sequence[Step],
+    estimate: Estimate,
+    pictures: Iterable[Picture],
+    solve: _Solver,
+    tamper: Tamper | None,
+    counts: Counter[str],
+) -> tuple[list[Closure], Estimate]:
+    """Loops closed by matching: the closures that are believed, and the estimate with them."""
+    closures: list[Closure] = []
+    refused: list[Closure] = []
+    found = places(estimate.states, pictures)
+    looked: dict[tuple[State, State], Array] = {}
+    for _ in range(MAX_CLOSINGS if found else 0):
+        P = solve.backend.state_covariance([place.state for place in found])
+        # what did not agree before may do so now
+        new = refused + loop_closures(found, P, looked)
+        if tamper is not None:
+            new = tamper(new, found)
+        agreed = agreeing(new, found, P)
+        refused = [closure for closure in new if closure not in agreed]
+        if not agreed:
+            break
+        closures += agreed
+        estimate = _tightened(steps, closures, estimate, solve)
+        gone = far_off(closures, estimate.states, BORNE_OUT)
+        refused += [c for c, off in zip(closures, gone, strict=True) if off]
+        closures = [c for c, off in zip(closures, gone, strict=True) if not off]
+        found = moved(found, estimate.states)
+    counts["closures_verified"], counts["closures_refused"] = len(closures), len(refused)
+    return closures, estimate
+
+
+def _tightened(
+    steps: Sequence[Step], closures: Sequence[Closure], estimate: Estimate, solve: _Solver
+) -> Estimate:
+    """Solved with closures that are slack first, and the tighter the nearer the estimate comes."""
+    for _ in range(TIGHTENINGS):
+        drawn = slack(closures, estimate.states)
+        estimate = solve(with_closures(steps, drawn), estimate)
+        if all(a is b for a, b in zip(drawn, closures, strict=True)):
+            break
+    return estimate
 
 
 def _recalibrated(step: Step, tracks: Mapping[str, Track]) -> Step:
@@ -138,12 +184,44 @@ def _recalibrated(step: Step, tracks: Mapping[str, Track]) -> Step:
     return replace(step, motions=motions)
 
 
+def _loosened(steps: Sequence[Step], estimate: Estimate) -> tuple[Step, ...]:
+    """Steps with motions as noisy as the log shows them, if that is noisier than believed.
+
+    By the median of what the estimate makes of them, over all motions of a robot and axis by axis:
+    what few motions got wrong is left to them.
+    """
+    scales = {}
+    for robot, states in estimate.states.items():
+        motions = [step.motions[robot] for step in steps if robot in step.motions]
+        if len(motions) < FEWEST_MOTIONS:
+            continue
+        first, last = (
+            states.poses[np.searchsorted(states.stamps_ns, [getattr(m, name) for m in motions])]
+            for name in ("start_ns", "end_ns")
+        )
+        off = between(first, last) - np.array([m.delta for m in motions])
+        off[:, 2] = wrap(off[:, 2])
+        sigmas = np.sqrt([np.diag(m.cov) for m in motions])
+        scales[robot] = np.maximum(1.0, np.median(np.abs(off) / sigmas, axis=0) / MEDIAN_OF_NORMAL)
+    return tuple(
+        replace(
+            step,
+            motions={
+                robot: replace(m, cov=scales[robot][:, None] * m.cov * scales[robot])
+                if robot in scales
+                else m
+                for robot, m in step.motions.items()
+            },
+        )
+        for step in steps
+    )
+
+
 def _duplicates(
     estimate: Estimate, backend: BatchBackend, landmarks: LandmarkMap, steps: Sequence[Step]
 ) -> dict[int, int]:
     """Landmark that goes -> landmark that it becomes; the map moves to the estimate."""
-    for number, (mean, _) in estimate.landmarks.items():
-        landmarks.entries[number].move(mean)
+    _move(landmarks, estimate)
     walls = [
         entry
         for entry in landmarks.entries.values()
@@ -151,6 +229,15 @@ def _duplicates(
     ]
     joint = backend.joint(min(estimate.states), [entry.id for entry in walls])
     return survivors(duplicates(walls, joint, seen_together(steps)))
+
+
+def _move(landmarks: LandmarkMap, estimate: Estimate) -> None:
+    """The map moves to the estimate; what nothing was seen of any more leaves it."""
+    for number, entry in list(landmarks.entries.items()):
+        if number in estimate.landmarks:
+            entry.move(estimate.landmarks[number][0])
+        elif entry.in_graph:
+            del landmarks.entries[number]
 
 
 def with_closures(steps: Iterable[Step], closures: Iterable[Closure]) -> tuple[Step, ...]:

@@ -21,7 +21,7 @@ IntArray = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 #: m: points of a submap are thinned to one per cell of this size
 CELL_M = 0.05
 #: neighbours that tell the direction of a surface, and how far away they may be, m
-NEIGHBOURS, NEIGHBOURHOOD_M = 8, 0.3
+NEIGHBOURS, FEWEST_NEIGHBOURS, NEIGHBOURHOOD_M = 8, 4, 0.3
 #: beams of a range image over the full circle
 BEAMS = 360
 #: m: how far a point may lie from what a beam met to be the same, and before it to be absent
@@ -45,7 +45,8 @@ SEARCHED, ALIGNED = 250, 500
 class Submap:
     """What neighbouring scans saw, in one frame.
 
-    ``points`` (n, 2) m, ``normals`` (n, 2) unit, ``flat`` (n,) which of them lie on a surface;
+    ``points`` (n, 2) m, ``normals`` (n, 2) unit, ``flat`` (n,) which of them lie on a surface,
+    ``alone`` (n,) which have too few neighbours to tell (where a wall leaves the laser's reach);
     ``poses`` (k, 3) of the sensor and ``images`` (k, `BEAMS`, 2), m, the nearest and the farthest
     return of each degree round it, NaN without one.
     """
@@ -53,6 +54,7 @@ class Submap:
     points: Array
     normals: Array
     flat: BoolArray
+    alone: BoolArray
     poses: Array
     images: Array
     tree: cKDTree
@@ -84,8 +86,8 @@ def make_submap(poses: Array, clouds: Sequence[Array]) -> Submap:
     _, kept = np.unique(np.round(points / CELL_M).astype(np.int64), axis=0, return_index=True)
     points = points[np.sort(kept)]
     tree = cKDTree(points)
-    normals, flat = _normals(points, tree)
-    return Submap(points, normals, flat, np.asarray(poses), images, tree)
+    normals, flat, alone = _normals(points, tree)
+    return Submap(points, normals, flat, alone, np.asarray(poses), images, tree)
 
 
 def _range_image(cloud: Array) -> Array:
@@ -103,8 +105,8 @@ def _beam(points: Array) -> IntArray:
     return np.asarray(np.round(degrees).astype(np.intp) % BEAMS)
 
 
-def _normals(points: Array, tree: cKDTree) -> tuple[Array, BoolArray]:
-    """Unit normals (n, 2) from the neighbours' scatter, and where they mean something (n,)."""
+def _normals(points: Array, tree: cKDTree) -> tuple[Array, BoolArray, BoolArray]:
+    """Unit normals (n, 2) from the neighbours' scatter; where they mean something, where alone."""
     k = min(NEIGHBOURS, len(points))
     distance, near = tree.query(points, k=k)
     known = distance.reshape(len(points), k) <= NEIGHBOURHOOD_M
@@ -117,8 +119,9 @@ def _normals(points: Array, tree: cKDTree) -> tuple[Array, BoolArray]:
     along = 0.5 * np.arctan2(2 * xy, xx - yy)
     spread = np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
     small, large = 0.5 * (xx + yy) - spread, 0.5 * (xx + yy) + spread
-    flat = (count >= 4) & (small < 0.1 * large)
-    return np.column_stack([-np.sin(along), np.cos(along)]), flat
+    alone = count < FEWEST_NEIGHBOURS
+    flat = ~alone & (small < 0.1 * large)
+    return np.column_stack([-np.sin(along), np.cos(along)]), flat, alone
 
 
 def search(source: Submap, target: Submap, guess: Array, window: Array) -> list[Array]:
@@ -204,6 +207,7 @@ def align(source: Submap, target: Submap, guess: Array) -> tuple[Array, Array]:
         n, flat = target.normals[near], target.flat[near]
         M = n[:, :, None] * n[:, None, :] / SURFACE_SIGMA_M**2
         M[~flat] = np.eye(2) / CLUTTER_SIGMA_M**2
+        M[target.alone[near]] = 0.0
         w = 1.0 / (1.0 + np.einsum("ni,nij,nj->n", r, M, r) / 4.0)
         JtM = np.einsum("nij,nik->njk", J, M) * w[:, None, None]
         A = np.einsum("nji,nik->jk", JtM, J) + np.diag([1e-4, 1e-4, 1e-4])

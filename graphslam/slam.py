@@ -439,10 +439,7 @@ class Pipeline:
             self.tamper,
         )
         self.steps = list(done.steps)
-        self.counts["landmarks_merged"] += done.merged
-        self.counts["closures_verified"] += done.closed
-        self.counts["closures_kept"] += done.kept
-        self.counts["closures_refused"] += done.refused
+        self.counts.update(done.counts)
         return done.estimate
 
 

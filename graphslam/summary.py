@@ -20,6 +20,16 @@ from graphslam.records import Estimate, Landmark
 
 FORMAT = "graphslam-result-1"
 
+#: what solving the whole log again may change, see `graphslam.consolidating`
+CONSOLIDATED = (
+    "closures_verified",
+    "closures_refused",
+    "closures_kept",
+    "landmarks_merged",
+    "observations_reassociated",
+    "observations_dropped",
+)
+
 
 def line_parameters(pose: Array, cov: Array) -> tuple[float, float, Array]:
     """Normal direction (rad), offset (m) and their covariance (2, 2) of the line through a pose.
@@ -122,8 +132,9 @@ def summarise(
             "keyframes": counts["keyframes"],
             "observations": counts["observations"],
             "landmarks": landmarks,
-            "loop_closures": counts["loop_closures"] + line_closures,
+            "loop_closures": counts["loop_closures"] + line_closures + counts["closures_verified"],
         },
+        "consolidated": {name: counts[name] for name in CONSOLIDATED if name in counts},
         "rejected": dict(sorted(rejected.items())),
         "dropped": dict(sorted(all_dropped.items())),
         "repaired": dict(sorted(log.repaired.items())),

@@ -18,8 +18,9 @@ from graphslam.records import Association, Estimate, Step
 
 #: m or rad: the estimate has converged when all variables together move less than this
 CONVERGED = 1e-6
-#: the same for lines that are faced anew (it converges in two rounds), without and with a kernel
-FACED, FACED_ROBUST, MAX_FACINGS = 1e-6, 1e-2, 4
+#: the same for lines that are faced anew, and rounds of it: it converges in two without a kernel;
+#: with one it need not, as weights change too, and more rounds change nothing that shows
+FACED, MAX_FACINGS, MAX_FACINGS_ROBUST = 1e-6, 4, 2
 #: relative decrease of the error at which optimising ends: without a kernel; with one (reweighting
 #: converges linearly: beyond 1e-6 hundreds of iterations move nothing that shows); and where
 #: another round follows anyway
@@ -206,13 +207,13 @@ class Isam2Backend(GraphBackend):
 
     def _optimised(self, values: gtsam.Values) -> gtsam.Values:
         """Optimised, the lines faced anew until that moves nothing any more."""
-        enough = FACED if self._config.robust.kernel == "none" else FACED_ROBUST
+        plain = self._config.robust.kernel == "none"
         try:
-            for _ in range(MAX_FACINGS):
+            for _ in range(MAX_FACINGS if plain else MAX_FACINGS_ROBUST):
                 before = values
                 self._builder.face_lines(values)
                 values = optimise(self._builder.graph, values, self._config.robust)
-                if before.localCoordinates(values).norm() < enough:
+                if before.localCoordinates(values).norm() < FACED:
                     break
         except RuntimeError as error:
             raise self._builder.explain(error) from error
