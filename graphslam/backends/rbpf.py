@@ -107,7 +107,7 @@ class RbpfBackend:
         self._x[:, block], self._P[:, block, block] = start.pose, start.cov
 
     def _move(self, robot: str, time_ns: int, motion: Motion) -> None:
-        """Thesis 4.4-4.15 in each particle; the covariance is zero where the pose was drawn."""
+        """Thesis 4.4-4.17 in each particle; the covariance is zero where the pose was drawn."""
         self._states.latest(robot)  # has it started?
         check_finite(f"motion of robot {robot} to {time_ns} ns", motion.delta, motion.cov)
         self._states.append(robot, time_ns)
