@@ -166,7 +166,7 @@ class EkfBackend:
 
     def _move(self, robot: str, time_ns: int, motion: Motion) -> None:
         """System update 3.11-3.14, 4.4-4.17: only the robot's own rows and columns."""
-        last = self._states.latest(robot)
+        last = self._states.latest(robot, time_ns)
         self._states.append(robot, time_ns)
         check_finite(f"motion of robot {robot} to {time_ns} ns", motion.delta, motion.cov)
         self._keep(robot, last)

@@ -108,7 +108,7 @@ class RbpfBackend:
 
     def _move(self, robot: str, time_ns: int, motion: Motion) -> None:
         """Thesis 4.4-4.17 in each particle; the covariance is zero where the pose was drawn."""
-        self._states.latest(robot)  # has it started?
+        self._states.latest(robot, time_ns)  # has it started?
         check_finite(f"motion of robot {robot} to {time_ns} ns", motion.delta, motion.cov)
         self._states.append(robot, time_ns)
         block, P = self._blocks[robot], self._P
@@ -258,7 +258,6 @@ class RbpfBackend:
         return True
 
     def _is_latest(self, robot: str, time_ns: int) -> bool:
-        self._states.latest(robot)  # has it started?
         return self._states.number(robot, time_ns) == self._states.latest(robot)
 
     def _each(self, value: Array) -> Array:
