@@ -41,6 +41,7 @@ ROWS: dict[str, tuple[str, bool, float | None]] = {
     "invariant EKF": ("invariant-ekf", False, None),
     "EKF, iterated 5 times": ("ekf+ekf.iterations=5", False, None),
     "EKF, lines' gauge 1 m": ("ekf", False, 1.0),
+    "EKF, lines of the thesis": ("ekf+ekf.lines=thesis", False, None),
     "EKF, no kernel": ("ekf+robust.kernel=none", False, None),
     "isam2, no kernel": ("isam2+robust.kernel=none", False, None),
     "dead reckoning": ("dead-reckoning", False, None),

@@ -1,6 +1,6 @@
 """Which observation belongs to which landmark: gate, assign, reject with a reason.
 
-Thesis 3.21-3.25 (a variant of the nearest neighbour standard filter) and 4.22-4.28 (new objects
+Thesis 3.21-3.25 (a variant of the nearest neighbour standard filter) and section 4.6 (new objects
 between two thresholds). Pure functions on arrays; what is known about the landmarks comes in as
 `Candidates`, made by `graphslam.landmark_map`.
 """

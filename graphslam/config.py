@@ -153,7 +153,7 @@ class FrontEndConfig:
 
 @dataclass(frozen=True)
 class AssociationConfig:
-    """Which observation belongs to which landmark (thesis 3.21-3.25 and 4.22-4.28).
+    """Which observation belongs to which landmark (thesis 3.21-3.25 and section 4.6).
 
     method: `greedy` is the thesis' variant of the NNSF, `optimal` minimises the sum. identities:
     `use` those in the log or `ignore` them. robots: `use` sightings of other robots or `ignore`
@@ -222,8 +222,8 @@ class BackendConfig:
 class EkfConfig:
     """The extended Kalman filter of the thesis, and the invariant one (which has its own error).
 
-    error: which errors are Gaussian: `world` = additive along world axes (thesis 4.20), `body` =
-    of the exponential map at each pose, as in GTSAM. lines: `model` = no row along a line, as the
+    error: which errors are Gaussian: `world` = additive along world axes, as in the thesis; `body`
+    = of the exponential map at each pose, as in GTSAM. lines: `model` = no row along a line, as the
     smoother has it; `thesis` = eq. 4.33-4.34, a large variance along it (along_sigma_m).
     iterations: how often each observation is linearised; more than 1 = the iterated filter (1 in
     the invariant one).

@@ -202,7 +202,7 @@ def _rms(values: Array) -> float | None:
 
 
 def landmark_metrics(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]) -> dict[str, Any]:
-    """``rmse_m``, ``nees_per_dof``, ``matched``, ``missed``, ``extra`` of a map.
+    """``rmse_m``, ``nees_per_dof``, ``worst``, ``matched``, ``missed``, ``extra`` of a map.
 
     Landmarks match by identity where both have one. Other points match by the assignment with the
     smallest sum of distances among pairs within 1 m; other lines and segments each with the nearest
@@ -210,7 +210,9 @@ def landmark_metrics(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]
     are true ones that nothing matches, ``extra`` landmarks without a true one. Errors are the
     distance for points; for lines and segments the distance of the seen part's middle from the
     true line, and their NEES has two degrees of freedom (direction and offset of the normal),
-    since a position along a wall is a gauge.
+    since a position along a wall is a gauge. ``worst`` is the landmark of the largest NEES per
+    degree of freedom, ``id``, ``nees_per_dof`` and ``error_m``: one that is not what it is taken
+    for can make the mean.
     """
     pairs = _match(estimated, true)
     errors, values, dofs = [], [], []
@@ -219,12 +221,21 @@ def landmark_metrics(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]
         errors.append(error)
         values.append(float(nees(difference[None], cov[None])[0]))
         dofs.append(len(difference))
-    usable = np.isfinite(values)
+    squares, dof = np.array(values), np.array(dofs)
+    usable = np.flatnonzero(np.isfinite(squares))
+    mean = worst = None
+    if len(usable):
+        mean = float(squares[usable].sum() / dof[usable].sum())
+        k = usable[(squares[usable] / dof[usable]).argmax()]
+        worst = {
+            "id": estimated[pairs[k][0]].id,
+            "nees_per_dof": float(squares[k] / dof[k]),
+            "error_m": errors[k],
+        }
     return {
         "rmse_m": _rms(np.array(errors)),
-        "nees_per_dof": float(np.array(values)[usable].sum() / np.array(dofs)[usable].sum())
-        if usable.any()
-        else None,
+        "nees_per_dof": mean,
+        "worst": worst,
         "matched": len(pairs),
         "missed": len(true) - len({j for _, j in pairs}),
         "extra": len(estimated) - len(pairs),

@@ -1,4 +1,4 @@
-"""Gates, distances, assignment, joint compatibility: thesis 3.21-3.25 and 4.22-4.28."""
+"""Gates, distances, assignment, joint compatibility: thesis 3.21-3.25 and section 4.6."""
 
 import itertools
 

@@ -202,9 +202,10 @@ class TestContract:
             Step(0, associations=(Association("ghost", 0, 0, "point", np.ones(2), np.eye(2)),)),
         ],
     )
-    def test_unknown_robot_is_an_error_that_names_it(self, name, step, scenario):
+    def test_a_robot_without_a_start_is_named_with_the_time(self, name, step, scenario):
         backend = run(name, scenario[0])
-        with pytest.raises(EstimationError, match="robot ghost"):
+        needed = f"robot ghost has no start, needed at {step.time_ns} ns"
+        with pytest.raises(EstimationError, match=needed):
             backend.add(step)
 
     def test_asking_for_an_unknown_robot_is_an_error_that_names_it(self, name):

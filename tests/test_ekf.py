@@ -92,7 +92,7 @@ def test_linear_filter_is_least_squares(rng):
 
 
 def test_one_measurement_at_a_time_is_all_at_once(rng):
-    """What 4.16-4.17 rely on: exact for independent noise in a linear problem."""
+    """What section 4.1 relies on: exact for independent noise in a linear problem."""
     x, P, H = rng.normal(size=6), random_cov(rng, 6), rng.normal(size=(4, 6))
     R1, R2, z = random_cov(rng, 2), random_cov(rng, 2), rng.normal(size=4)
     R = np.block([[R1, np.zeros((2, 2))], [np.zeros((2, 2)), R2]])
@@ -248,7 +248,7 @@ def spied(monkeypatch, method):
 )
 @pytest.mark.parametrize("point_of", [False, True])
 def test_measurement_jacobian_in_the_whole_state(error, robot, target, point_of, monkeypatch):
-    """3.18, 4.19-4.21: by central differences over every error of every member, zeros included.
+    """3.19, 4.19-4.21: by central differences over every error of every member, zeros included.
     Rounding of the differences: 1e-9. A line is seen without noise, since how its facing point
     depends on the state is left out where there is a residual (second order)."""
     backend = in_the_middle(error)
@@ -281,8 +281,8 @@ def test_measurement_jacobian_in_the_whole_state(error, robot, target, point_of,
 
 @pytest.mark.parametrize("error", FRAMES)
 def test_motion_jacobians(error, monkeypatch):
-    """3.13-3.14, 4.7: F by central differences of the error after the motion by that before it; Q
-    by those of the measured motion. Rounding: 1e-9."""
+    """3.13-3.14, 4.7, 4.17: F by central differences of the error after the motion by that before
+    it; Q by those of the measured motion. Rounding: 1e-9."""
     backend = in_the_middle(error)
     x, delta = backend.state_mean("b"), np.array([0.7, 0.2, 0.5])
     moved, Q = compose(x, delta), np.array([[3e-2, 1e-3, 0], [1e-3, 1e-2, 2e-3], [0, 2e-3, 4e-3]])
@@ -569,7 +569,7 @@ def drive(rng, scale):
 def test_final_joint_state_is_as_uncertain_as_it_says(error):
     """NEES of both robots, the point, the segment and the line (without its gauge), 13 degrees of
     freedom, over 60 seeds at small noise (1-4 mm, 2 mrad) within both chi-square bounds at 99.9 %:
-    0.83 and 1.18 per degree. Too small means noise counted twice, too large information."""
+    0.84 and 1.18 per degree. Too small means noise counted twice, too large information."""
     values = []
     for seed in range(60):
         steps, true = drive(np.random.default_rng(seed), 2e-2)

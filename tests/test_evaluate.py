@@ -241,6 +241,28 @@ def test_other_walls_are_not_matched(pose, extent):
     assert metrics["nees_per_dof"] is None
 
 
+def test_the_landmark_that_makes_the_mean_is_named():
+    """By its NEES, not by its error: the farther one knows that it is far. One without a valid
+    covariance is no one's worst."""
+    covs = {3: 1e-4 * np.eye(2), 5: np.eye(2), 8: np.full((2, 2), np.nan)}
+    true = [
+        TrueLandmark("", 0, 0, str(i), "point", np.array([10.0 * i, 0.0, np.nan]), None)
+        for i in covs
+    ]
+    found = [
+        landmark(i, "point", [10.0 * i + off, 0, np.nan], covs[i], identity=str(i))
+        for i, off in zip(covs, (0.1, 0.3, 0.2), strict=True)
+    ]
+    metrics = landmark_metrics(found, true)
+    assert metrics["worst"] == {
+        "id": 3,
+        "nees_per_dof": pytest.approx(50.0),
+        "error_m": pytest.approx(0.1),
+    }
+    assert metrics["nees_per_dof"] == pytest.approx((100 + 0.09) / 4)
+    assert landmark_metrics([], true)["worst"] is None
+
+
 def test_pieces_of_a_wall_all_match_it():
     """Furniture cuts a wall into pieces. One to one, all but one would be judged by other walls."""
     walls = [

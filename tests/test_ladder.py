@@ -561,6 +561,36 @@ def test_a_horizon_longer_than_the_run_is_batch():
     assert found.dof == batch.dof
 
 
+def window_sizes(horizon_s, steps):
+    """What each step solves: variables, factors and rows of residuals, (steps, 3). Counted, not
+    timed: a step's cost is that of linearising and eliminating these, in six rounds at most."""
+    backend, sizes = configured("isam2", horizon_s), []
+    for step in steps:
+        backend.add(step)
+        linear = [placed.factor.linearize(backend._values) for placed in backend._window]
+        rows = [len(factor.jacobian()[1]) for factor in linear]
+        sizes.append((backend._values.size(), len(rows), sum(rows)))
+    return np.array(sizes)
+
+
+@pytest.mark.parametrize("horizon_s", [2.0, 5.0])
+def test_a_finite_horizon_bounds_the_cost_of_a_step(horizon_s):
+    """Three rounds on the circles, all landmarks seen in the first: no later step solves more than
+    the largest one of the first round, but for the few sightings that robots out of step have more
+    or less. Keeping all, or a prior per state that left, the third round would have three times as
+    much."""
+    sizes = window_sizes(horizon_s, drive(1, steps=126))  # robot `b` takes 42 steps a round
+    assert np.all(sizes[42:].max(axis=0) <= 1.1 * sizes[:42].max(axis=0))
+    # states a second of two robots, the latest included, those at the window's edge, and the map
+    assert sizes[-1, 0] == 2 * (horizon_s + 1) + len(LANDMARKS)
+
+
+def test_all_of_the_past_costs_more_and_more():
+    """So that the bound above is one that can be missed."""
+    sizes = window_sizes(1e6, drive(1, steps=40))
+    assert np.all(sizes[-1] > 1.7 * sizes[20])
+
+
 @pytest.mark.parametrize("horizon_s", HORIZONS_S)
 def test_no_landmark_ever_leaves(horizon_s):
     """Every landmark seen so far has a mean and a joint with the robot after every step, however

@@ -93,8 +93,9 @@ class StateTable:
         """Number of the state of ``robot`` at exactly ``time_ns``.
 
         Raises:
-            EstimationError: there is none.
+            EstimationError: there is none, or the robot has not started.
         """
+        self.latest(robot, time_ns)
         try:
             return self._number[robot, time_ns]
         except KeyError:
@@ -103,14 +104,15 @@ class StateTable:
                 "earlier step made"
             ) from None
 
-    def latest(self, robot: str) -> int:
-        """Number of the robot's latest state.
+    def latest(self, robot: str, at_ns: int | None = None) -> int:
+        """Number of the robot's latest state; ``at_ns`` is when it is needed, for the message.
 
         Raises:
             EstimationError: the robot has not started.
         """
         if robot not in self.times:
-            raise EstimationError(f"robot {robot} has no start: give one with --start")
+            needed = "" if at_ns is None else f", needed at {at_ns} ns"
+            raise EstimationError(f"robot {robot} has no start{needed}: give one with --start")
         return len(self.times[robot]) - 1
 
     def stamps(self, robot: str) -> np.ndarray[tuple[int], np.dtype[np.int64]]:

@@ -75,7 +75,7 @@ def solve_calibrated(
         for part in builder.parts(bare, estimate):
             _insert(graph, values, part, start, builder)
         for robot, motion in step.motions.items():
-            last = builder.latest_key(robot)
+            last = builder.latest_key(robot, step.time_ns)
             key = builder.state_key(robot, builder.states.append(robot, step.time_ns))
             places[robot] += 1
             n = places[robot]

@@ -34,7 +34,7 @@ class DeadReckoningBackend:
             check_finite(what, start.pose, start.cov)
             self._append(robot, step.time_ns, start.pose, start.cov)
         for robot, motion in step.motions.items():
-            last = self._states.latest(robot)
+            last = self._states.latest(robot, step.time_ns)
             what = f"motion of robot {robot} to {step.time_ns} ns"
             check_finite(what, motion.delta, motion.cov)
             x, P = self._poses[robot][last], self._covs[robot][last]

@@ -61,7 +61,7 @@ def _add(pose: Array, error: Array) -> Array:
     return moved
 
 
-#: error -> how it works: `world` thesis 4.20, `body` as GTSAM's Pose2
+#: error -> how it works: `world` as the thesis adds them, `body` as GTSAM's Pose2
 ERRORS: dict[str, PoseError] = {
     "world": PoseError(_add, lambda _pose, _error: np.eye(3)),
     "body": PoseError(
@@ -114,7 +114,7 @@ class EkfBackend:
 
     Each robot's latest pose, copies of its poses just before, as ``(robot, number modulo their
     count)``, and each landmark are members of one Gaussian. Observations enter one at a time, each
-    linearised at what the ones before left (4.16-4.17). ``skipped`` counts what a filter cannot
+    linearised at what the ones before left (section 4.1). ``skipped`` counts what a filter cannot
     use, by reason.
     """
 
@@ -150,7 +150,7 @@ class EkfBackend:
             self._track.setdefault(robot, []).append((joint.pose, joint.cov))
 
     def remove(self, landmark: int) -> None:
-        """Delete a landmark (thesis 4.6); the joint marginal of the rest stays as it is.
+        """Delete a landmark (thesis section 4.6); the joint marginal of the rest stays as it is.
 
         Raises:
             EstimationError: there is no such landmark.
@@ -165,8 +165,8 @@ class EkfBackend:
         self._gaussian.add(robot, start.pose, T @ start.cov @ T.T)
 
     def _move(self, robot: str, time_ns: int, motion: Motion) -> None:
-        """System update 4.4-4.15: only the robot's own rows and columns."""
-        last = self._states.latest(robot)
+        """System update 3.11-3.14, 4.4-4.17: only the robot's own rows and columns."""
+        last = self._states.latest(robot, time_ns)
         self._states.append(robot, time_ns)
         check_finite(f"motion of robot {robot} to {time_ns} ns", motion.delta, motion.cov)
         self._keep(robot, last)

@@ -73,9 +73,9 @@ class GraphBuilder:
         """Key of a robot's state."""
         return factors.state_key(self.robots.index(robot), number)
 
-    def latest_key(self, robot: str) -> int:
-        """Key of a robot's latest state."""
-        return self.state_key(robot, self.states.latest(robot))
+    def latest_key(self, robot: str, at_ns: int | None = None) -> int:
+        """Key of a robot's latest state, see `StateTable.latest`."""
+        return self.state_key(robot, self.states.latest(robot, at_ns))
 
     def dims(self) -> dict[int, int]:
         """Every variable there is, with its size."""
@@ -108,7 +108,7 @@ class GraphBuilder:
             self.rows += 3
             yield Part((factor,), what, (key, start.pose))
         for robot, motion in step.motions.items():
-            last = self.latest_key(robot)
+            last = self.latest_key(robot, step.time_ns)
             key = self.state_key(robot, self.states.append(robot, step.time_ns))
             what = f"motion of robot {robot} to {step.time_ns} ns"
             with _named(what, motion.cov):

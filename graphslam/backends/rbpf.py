@@ -21,6 +21,7 @@ from typing import Literal
 import numpy as np
 
 from graphslam.backends.base import Joint, StateTable, block_slices
+from graphslam.backends.checks import check_finite, indeterminate, sighting
 from graphslam.config import Config
 from graphslam.errors import EstimationError
 from graphslam.factors import FILTER_GAUGE_SIGMA_M
@@ -97,7 +98,7 @@ class RbpfBackend:
             self._track.setdefault(robot, []).append((joint.pose, joint.cov))
 
     def _start(self, robot: str, time_ns: int, start: Start) -> None:
-        _check_finite(f"start of robot {robot} at {time_ns} ns", start.pose, start.cov)
+        check_finite(f"start of robot {robot} at {time_ns} ns", start.pose, start.cov)
         self._states.append(robot, time_ns)
         n = self._x.shape[1]
         block = self._blocks[robot] = slice(n, n + 3)
@@ -106,9 +107,9 @@ class RbpfBackend:
         self._x[:, block], self._P[:, block, block] = start.pose, start.cov
 
     def _move(self, robot: str, time_ns: int, motion: Motion) -> None:
-        """Thesis 4.4-4.15 in each particle; the covariance is zero where the pose was drawn."""
-        self._states.latest(robot)  # has it started?
-        _check_finite(f"motion of robot {robot} to {time_ns} ns", motion.delta, motion.cov)
+        """Thesis 4.4-4.17 in each particle; the covariance is zero where the pose was drawn."""
+        self._states.latest(robot, time_ns)  # has it started?
+        check_finite(f"motion of robot {robot} to {time_ns} ns", motion.delta, motion.cov)
         self._states.append(robot, time_ns)
         block, P = self._blocks[robot], self._P
         F, W = compose_jacobians(self._x[:, block], motion.delta)
@@ -121,7 +122,7 @@ class RbpfBackend:
         """Everything that was seen in a step: meetings, then one robot after the other."""
         for s in seen:
             if isinstance(s.target, str):
-                with _named(_what(s)):
+                with _named(sighting(s)):
                     self._correct(s.robot, s.target, s.model, s.z, s.cov)
         for c in closures:
             with _named(f"closure of robot {c.robot} at {c.time_ns} ns"):
@@ -139,12 +140,12 @@ class RbpfBackend:
         # a second sighting of the same landmark is not independent until the first corrected it
         first = {target: s for s, target in reversed(mine) if target in self._landmarks}
         for target, s in first.items():
-            with _named(_what(s)):
+            with _named(sighting(s)):
                 self._correct(robot, target, s.model, s.z, s.cov)
         if self._proposal == "observation":
             self._draw(robot)
         for s, target in mine:
-            with _named(_what(s)):
+            with _named(sighting(s)):
                 if target in self._landmarks:
                     self._map(s, target, weigh=s is not first.get(target))
                 else:
@@ -242,7 +243,7 @@ class RbpfBackend:
         elif not current:
             self.skipped["observation from a past state"] += 1
         else:
-            _check_finite(_what(seen), seen.z, seen.cov)
+            check_finite(sighting(seen), seen.z, seen.cov)
             return True
         return False
 
@@ -253,11 +254,10 @@ class RbpfBackend:
             self.skipped["closure to a past state"] += 1
             return False
         what = f"closure of robot {closure.robot} at {closure.time_ns} ns"
-        _check_finite(what, closure.delta, closure.cov)
+        check_finite(what, closure.delta, closure.cov)
         return True
 
     def _is_latest(self, robot: str, time_ns: int) -> bool:
-        self._states.latest(robot)  # has it started?
         return self._states.number(robot, time_ns) == self._states.latest(robot)
 
     def _each(self, value: Array) -> Array:
@@ -374,24 +374,10 @@ def _update(x: Array, P: Array, H: Array, R: Array, innovation: Array) -> tuple[
     return np.square(w[..., 0]).sum(axis=1), log_det
 
 
-def _what(seen: Association) -> str:
-    """An observation in words."""
-    kind = "robot" if isinstance(seen.target, str) else "landmark"
-    return f"{kind} {seen.target}, seen from robot {seen.robot} at {seen.time_ns} ns"
-
-
 @contextmanager
 def _named(what: str) -> Iterator[None]:
     """A covariance that is none becomes an error that says where."""
     try:
         yield
     except np.linalg.LinAlgError:
-        raise EstimationError(
-            f"the estimate is indeterminate at {what}: it says nothing, or its noise is no "
-            "covariance"
-        ) from None
-
-
-def _check_finite(what: str, *values: Array) -> None:
-    if not all(np.isfinite(value).all() for value in values):
-        raise EstimationError(f"the estimate is indeterminate at {what}: a number is not finite")
+        raise indeterminate(what) from None

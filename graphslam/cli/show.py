@@ -134,6 +134,11 @@ def evaluation(found: Mapping[str, Any]) -> None:
         head = ["landmarks", "RMSE, m", "NEES/dof", "matched", "missed", "extra"]
         keys = ["rmse_m", "nees_per_dof", "matched", "missed", "extra"]
         console.print(_table(head, [("map", *(marks[key] for key in keys))]))
+        if worst := marks["worst"]:
+            console.print(
+                f"largest NEES/dof: {worst['nees_per_dof']:.3g}, landmark {worst['id']}, "
+                f"{worst['error_m']:.3g} m off"
+            )
     if relations := found.get("relations"):
         head = ["relations", "", "matched", "unmatched", "mean, m", "std, m", "median, m"]
         head += ["mean, deg", "std, deg"]
