@@ -6,7 +6,7 @@ calibration. Between two readings the robot is taken to move on a circle segment
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -58,6 +58,16 @@ LATENCY_STEP_NS = 50_000_000
 TURNING_EFFORT_M = 0.3
 
 _ROW_SIZE = {"odometry": 3, "given": 12, "wheels": 2}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motions:
+    """Many motions: ``delta`` (n, 3), ``cov`` (n, 3, 3), ``d_cal`` (n, 3, p), ``length_m`` (n,)."""
+
+    delta: Array
+    cov: Array
+    d_cal: Array
+    length_m: Array
 
 
 class Track:
@@ -296,6 +306,80 @@ class Track:
         cov = inverse_cov(forth.delta, forth.cov)
         return replace(forth, start_ns=start_ns, end_ns=end_ns, delta=inverse(forth.delta), cov=cov)
 
+    def motions(self, start_ns: IntArray, end_ns: IntArray) -> Motions:
+        """What `between` gives, for times (n,) and (n,), at once.
+
+        Differences of sums over the whole track: with P_k the pose after increment k, its error e
+        moves the pose P at the end of an interval by T(P) F_k e, F_k (3, 3) as if the end were the
+        origin and T(P) its lever arm. So the sums of F_k C_k F_kᵀ and F_k D_k up to both ends
+        are all that an interval needs.
+        """
+        begin, end = np.minimum(start_ns, end_ns), np.maximum(start_ns, end_ns)
+        late = self.latency_ns
+        times, where = np.unique(np.concatenate([begin, end]) - late, return_inverse=True)
+        a, b = where[: len(begin)], where[len(begin) :]
+        both = np.concatenate([times, times - LATENCY_STEP_NS])
+        walk = self._walk(both)
+        delta = between(walk.delta[a], walk.delta[b])
+        # from the odometry's frame and origin to the axes of the start, lever arm at the end
+        T = rotation3(-walk.delta[a, 2]) @ _lever(walk.delta[b])
+        cov = T @ (walk.cov[b] - walk.cov[a]) @ T.mT
+        d_cal = T @ (walk.d_cal[b] - walk.d_cal[a])
+        length = walk.length_m[b] - walk.length_m[a]
+        if len(self.calibration.mean) > self._p:
+            lever = rotation3(-self.mount[2]) @ compose_jacobians(delta, self.mount)[0]
+            earlier = walk.delta[len(times) :]
+            change = between(earlier[a], earlier[b]) - delta
+            change[:, 2] = wrap(change[:, 2])
+            change *= 0.0 if self.bursty else 1e9 / LATENCY_STEP_NS
+            delta, d_mount = mounted_motion(delta, self.mount)
+            d_cal = np.concatenate([lever @ d_cal, d_mount, lever @ change[:, :, None]], axis=2)
+            cov = lever @ cov @ lever.mT
+        cov = (cov + cov.mT) / 2 + d_cal @ self.calibration.cov @ d_cal.mT
+        moved = (length > 0) | (delta[:, 2] != 0)
+        if self.source != "given":
+            cov = cov + np.where(moved[:, None, None], self._floor(True), self._floor(False))
+        else:
+            cov = cov + np.where(moved[:, None, None], 0.0, self._floor(False))
+        back = end_ns < start_ns
+        cov[back] = inverse_cov(delta[back], cov[back])
+        delta[back] = inverse(delta[back])
+        return Motions(delta, cov, d_cal, length)
+
+    def _walk(self, times: IntArray) -> Motions:
+        """Sums (n) up to times of the odometry's clock, in the frame of the first reading.
+
+        ``cov`` and ``d_cal`` are the sums that `motions` speaks of: of the pose at the origin.
+        """
+        n = self._count
+        if n < 2:
+            zeros = np.zeros((len(times), 3))
+            wide = np.zeros((len(times), 3, self._p))
+            return Motions(zeros, np.zeros((len(times), 3, 3)), wide, zeros[:, 0])
+        mean = self.calibration.mean[: self._p]
+        parts = self._increments(self._rows[1:n], mean)
+        heading = np.concatenate([[0.0], np.cumsum(parts.delta[:, 2])])
+        step = rotation3(heading[:-1]) @ parts.delta[:, :, None]
+        place = np.vstack([np.zeros(2), np.cumsum(step[:, :2, 0], axis=0)])
+        poses = np.column_stack([place, heading])
+
+        def carried(k: IntArray, part: Increments) -> tuple[Array, Array, Array]:
+            """Ends of increments from poses k, and what their errors do to the origin."""
+            ends = poses[k] + (rotation3(poses[k, 2]) @ part.delta[:, :, None])[:, :, 0]
+            F = _lever(-ends) @ rotation3(poses[k, 2])
+            return ends, F @ part.cov @ F.mT, F @ part.d_cal
+
+        _, covs, d_cals = carried(np.arange(n - 1), parts)
+        covs = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(covs, axis=0)])
+        d_cals = np.concatenate([np.zeros((1, 3, self._p)), np.cumsum(d_cals, axis=0)])
+        lengths = np.append(0.0, np.cumsum(np.hypot(parts.delta[:, 0], parts.delta[:, 1])))
+        i = np.clip(np.searchsorted(self.times, times, side="left"), 1, n - 1)
+        share = self._share(i, self._times[i - 1], times)
+        part = self._increments(self._rows[i] * share[:, None], mean)
+        ends, cov, d_cal = carried(i - 1, part)
+        length = np.hypot(part.delta[:, 0], part.delta[:, 1])
+        return Motions(ends, covs[i - 1] + cov, d_cals[i - 1] + d_cal, lengths[i - 1] + length)
+
     def coarse_motions(
         self,
         start_ns: IntArray,
@@ -417,3 +501,10 @@ class Track:
         if not moved:
             return np.diag([STANDING_SIGMA**2] * 3)
         return np.diag([self._config.floor_sigma_m**2] * 2 + [self._config.floor_sigma_rad**2])
+
+
+def _lever(poses: Array) -> Array:
+    """(n, 3, 3): what an error of a pose at the origin does at rigidly connected poses (n, 3)."""
+    T = np.tile(np.eye(3), (len(poses), 1, 1))
+    T[:, 0, 2], T[:, 1, 2] = -poses[:, 1], poses[:, 0]
+    return T

@@ -13,9 +13,9 @@ import numpy as np
 
 from graphslam.dead_reckoning import Track
 from graphslam.frontend.sightings import sighting_observation
-from graphslam.geometry import compose, compose_cov, inverse, inverse_cov, rotation
+from graphslam.geometry import Array, compose, compose_cov, inverse, inverse_cov, rotation3
 from graphslam.models import MODELS, transport
-from graphslam.records import Association, Message, Observation, Sighting
+from graphslam.records import Association, Message, Motion, Observation, Sighting
 from graphslam.timeline import ODOMETRY
 
 #: rad: how well the relative heading of two robots is known that turns a short motion
@@ -91,21 +91,42 @@ def gather(
 
 def carried(sighting: Sighting, state_ns: int, track: Track) -> Observation:
     """A sighting in the base frame that its robot had at ``state_ns``, earlier or later."""
+    return carried_by(sighting, track.between(state_ns, sighting.time_ns))
+
+
+def carried_by(sighting: Sighting, moved: Motion) -> Observation:
+    """A sighting in the base frame at the start of ``moved``, which ends when it was made."""
     o = sighting_observation(sighting)
     z, cov = transport(o.z, o.cov, sighting.mount, np.zeros((3, 3)))
-    moved = track.between(state_ns, sighting.time_ns)
-    if sighting.time_ns != state_ns:
-        z, cov = transport(z, cov, moved.delta, moved.cov)
+    if moved.start_ns != moved.end_ns:
+        z, cov = transported(z, cov, moved.delta, moved.cov)
     return Observation(o.kind, z, cov, o.extent, o.identity)
+
+
+def transported(z: Array, cov: Array, delta: Array, delta_cov: Array) -> tuple[Array, Array]:
+    """`transport` of many measurements at once, each by its own motion.
+
+    Args:
+        z: (..., 2) bearings and ranges, or (..., 3) poses, at the end of the motion.
+        cov: of ``z``.
+        delta: (..., 3) motions.
+        delta_cov: (..., 3, 3) along the axes of their starts.
+
+    Returns:
+        The measurements as from the start of the motion, and their covariances.
+    """
+    if z.shape[-1] == 3:
+        return compose(delta, z), compose_cov(delta, delta_cov, z, cov)
+    model = MODELS["point"]
+    point = model.invert(z, delta)
+    G_x, G_z = model.invert_jacobians(z, delta)
+    return _seen_at(point, G_x @ delta_cov @ G_x.mT + G_z @ cov @ G_z.mT)
 
 
 def met(
     o: Observation, sighting: Sighting, state_ns: int, other_ns: int, turn_rad: float, track: Track
 ) -> Association:
     """A sighting of a robot, moved from where that robot was to where it is at its state.
-
-    What it drove in between is known along its own axes. The relative heading that turns it into
-    the observer's comes from the estimate and needs not be known well: the way is short.
 
     Args:
         o: the sighting in the observer's base frame at its state.
@@ -118,20 +139,43 @@ def met(
     other = sighting.seen_robot
     assert other is not None  # callers ask for robots only
     moved = track.between(other_ns, sighting.time_ns)
-    if o.kind != "point":
-        back = inverse(moved.delta)
-        cov = compose_cov(o.z, o.cov, back, inverse_cov(moved.delta, moved.cov))
-        z = compose(o.z, back)
-        return Association(sighting.robot, state_ns, other, "robot-pose", z, cov)
+    cov = moved.cov if sighting.time_ns != other_ns else np.zeros((3, 3))
+    z, cov = met_by(o.z, o.cov, moved.delta, cov, np.asarray(turn_rad))
+    model = "robot-point" if len(z) == 2 else "robot-pose"
+    return Association(sighting.robot, state_ns, other, model, z, cov)
+
+
+def met_by(
+    z: Array, cov: Array, delta: Array, delta_cov: Array, turn_rad: Array
+) -> tuple[Array, Array]:
+    """Measurements of robots, moved from where these were seen to where their states are.
+
+    What a robot drove in between is known along its own axes. The relative heading that turns it
+    into the observer's comes from the estimate and needs not be known well: the way is short.
+
+    Args:
+        z: (..., 2) bearings and ranges, or (..., 3) poses, in the observer's base frame.
+        cov: of ``z``.
+        delta: (..., 3) motions of the seen robots from their states to when they were seen.
+        delta_cov: (..., 3, 3) along the axes of their starts.
+        turn_rad: (...,) headings of the seen robots' states relative to the observers'.
+    """
+    if z.shape[-1] == 3:
+        back = inverse(delta)
+        return compose(z, back), compose_cov(z, cov, back, inverse_cov(delta, delta_cov))
     model, origin = MODELS["point"], np.zeros(3)
-    R = rotation(turn_rad)
-    shift = R @ moved.delta[:2]
-    side = np.array([-shift[1], shift[0]])
-    extra = HEADING_SIGMA_RAD**2 * np.outer(side, side)
-    if sighting.time_ns != other_ns:
-        extra += R @ moved.cov[:2, :2] @ R.T
-    point = model.invert(o.z, origin) - shift
+    R = rotation3(turn_rad)[..., :2, :2]
+    shift = (R @ delta[..., :2, None])[..., 0]
+    side = np.stack([-shift[..., 1], shift[..., 0]], axis=-1)
+    _, G = model.invert_jacobians(z, np.broadcast_to(origin, (*z.shape[:-1], 3)))
+    point_cov = G @ cov @ G.mT + R @ delta_cov[..., :2, :2] @ R.mT
+    point_cov += HEADING_SIGMA_RAD**2 * side[..., :, None] * side[..., None, :]
+    return _seen_at(model.invert(z, origin) - shift, point_cov)
+
+
+def _seen_at(point: Array, cov: Array) -> tuple[Array, Array]:
+    """Bearings and ranges (..., 2) of points (..., 2) from the origin, with covariances."""
+    model, origin = MODELS["point"], np.zeros(3)
     z = model.predict(origin, point)
     _, H = model.jacobians(z, origin, point)
-    cov = o.cov + H @ extra @ H.T
-    return Association(sighting.robot, state_ns, other, "robot-point", z, cov)
+    return z, H @ cov @ H.mT

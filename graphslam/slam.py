@@ -22,7 +22,7 @@ from graphslam.dead_reckoning import Track
 from graphslam.errors import ConfigError, EstimationError, LogError
 from graphslam.frontend import FRONT_ENDS, scan_points
 from graphslam.frontend.sightings import sighting_observation
-from graphslam.gathering import Gathered, Sources, carried, gather, met
+from graphslam.gathering import Gathered, Sources, carried_by, gather, met
 from graphslam.geometry import (
     compose,
     compose_cov,
@@ -160,7 +160,8 @@ class Pipeline:
         for image in gathered.images:
             run, robot = self.runs[image[0].robot], image[0].robot
             state_ns = step_ns if robot in motions else run.state_ns
-            seen = [carried(sighting, state_ns, run.track) for sighting in image]
+            moved = run.track.between(state_ns, image[0].time_ns)
+            seen = [carried_by(sighting, moved) for sighting in image]
             for o, sighting in zip(seen, image, strict=True):
                 self.sources[robot, state_ns, o.z.tobytes()] = sighting
             landmarks = [o for o, s in zip(seen, image, strict=True) if s.seen_robot is None]
