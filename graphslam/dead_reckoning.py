@@ -57,7 +57,7 @@ LATENCY_STEP_NS = 50_000_000
 #: m per rad: how much path a turn counts for when a correction is spread over an interval
 TURNING_EFFORT_M = 0.3
 
-_ROW_SIZE = {"odometry": 3, "given": 12, "wheels": 2}
+_ROW_SIZE = {"odometry": 3, "commands": 3, "given": 12, "wheels": 2}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,7 +165,7 @@ class Track:
             if self._jumps(row, message.time_ns):
                 self.resets += 1
                 row = self._rows[self._count - 1] if self._count > 1 else np.zeros(3)
-            self._append("odometry", message.time_ns, row)
+            self._append("commands" if self._config.commanded else "odometry", message.time_ns, row)
             self._last = message.pose
         else:
             angles = np.array([message.left_rad, message.right_rad])

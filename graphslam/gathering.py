@@ -5,9 +5,9 @@ them a few millimetres apart. Instead all that the robots of a log see within a 
 step: one state per robot at its end, and every sighting carried there by odometry.
 """
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -179,3 +179,13 @@ def _seen_at(point: Array, cov: Array) -> tuple[Array, Array]:
     z = model.predict(origin, point)
     _, H = model.jacobians(z, origin, point)
     return z, H @ cov @ H.mT
+
+
+def shared(associations: Sequence[Association]) -> tuple[Association, ...]:
+    """Associations of one step: n of one target by one robot count as one.
+
+    Errors of a target's sightings within a short span are nearly the same (MRCLAM: the ranges of
+    consecutive images correlate by 0.8), so they get n times the covariance.
+    """
+    count = Counter((a.robot, a.target) for a in associations)
+    return tuple(replace(a, cov=a.cov * count[a.robot, a.target]) for a in associations)

@@ -86,7 +86,8 @@ class Seen:
 
     ``where`` (n, 2): number of the step and of the association in it; times (n,) ns of the
     observer's state, of the sighting, and of the step; ``z`` (n, k) and ``cov`` (n, k, k) as
-    measured, in the base frame.
+    measured, in the base frame; ``share`` (n,) how many of the step are of the same target, see
+    `gathering.shared`.
     """
 
     robot: str
@@ -97,12 +98,14 @@ class Seen:
     step_ns: IntArray
     z: Array
     cov: Array
+    share: Array
 
 
 def sightings_of(steps: Sequence[Step], sources: Sources) -> list[Seen]:
     """All sightings behind the associations of steps, in groups to be carried at once."""
     groups: dict[tuple[str, str | None, int], list[tuple[Any, ...]]] = defaultdict(list)
     for n, step in enumerate(steps):
+        count = Counter((a.robot, a.target) for a in step.associations)
         for k, a in enumerate(step.associations):
             sighting = sources.get((a.robot, a.time_ns, a.z.tobytes()))
             if sighting is None:
@@ -110,7 +113,8 @@ def sightings_of(steps: Sequence[Step], sources: Sources) -> list[Seen]:
             o = sighting_observation(sighting)
             z, cov = transport(o.z, o.cov, sighting.mount, np.zeros((3, 3)))
             other = a.target if isinstance(a.target, str) else None
-            row = ((n, k), a.time_ns, sighting.time_ns, step.time_ns, z, cov)
+            times = (a.time_ns, sighting.time_ns, step.time_ns)
+            row = ((n, k), *times, z, cov, count[a.robot, a.target])
             groups[a.robot, other, len(z)].append(row)
     return [
         Seen(robot, other, *map(np.array, zip(*rows, strict=True)))
@@ -125,6 +129,7 @@ def _remade(
     associations = [list(step.associations) for step in steps]
     for group in seen:
         z, cov = _carried(group, estimate, tracks)
+        cov = cov * group.share[:, None, None]
         for (n, k), z_k, cov_k in zip(group.where, z, cov, strict=True):
             associations[n][k] = replace(associations[n][k], z=z_k, cov=cov_k)
     motions: list[dict[str, Motion]] = [{} for _ in steps]

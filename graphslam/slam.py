@@ -5,6 +5,7 @@ keyframe or not -> observations in the base frame -> association -> `Step` -> ba
 on no landmark kind, front end or back end; those are rows of tables.
 """
 
+import dataclasses
 import itertools
 import time
 from collections import Counter, defaultdict
@@ -22,7 +23,7 @@ from graphslam.dead_reckoning import Track
 from graphslam.errors import ConfigError, EstimationError, LogError
 from graphslam.frontend import FRONT_ENDS, scan_points
 from graphslam.frontend.sightings import sighting_observation
-from graphslam.gathering import Gathered, Sources, carried_by, gather, met
+from graphslam.gathering import Gathered, Sources, carried_by, gather, met, shared
 from graphslam.geometry import (
     compose,
     compose_cov,
@@ -73,7 +74,7 @@ class Pipeline:
         self.runs = {
             name: RobotRun(
                 Track(
-                    sensing(config.odometry, log.has_scans(name)),
+                    sensing(odometry_settings(config.odometry, log.notes), log.has_scans(name)),
                     robot_settings(name, config, log.notes),
                     mounted=True,
                 )
@@ -510,6 +511,22 @@ def robot_settings(name: str, config: Config, notes: Mapping[str, str]) -> Robot
     return load_config(overrides=noted).robot(name)
 
 
+def odometry_settings(config: OdometryConfig, notes: Mapping[str, str]) -> OdometryConfig:
+    """Settings of odometry: the configuration's where set, else what the log's notes say of it.
+
+    How well velocities are driven that were only commanded is a property of the log's robots, which
+    whoever wrote the log knows, as with the noise of sightings.
+    """
+    noted = [f"{key}={value}" for key, value in notes.items() if key.startswith("odometry.")]
+    known, default = load_config(overrides=noted).odometry, OdometryConfig()
+    changes = {
+        field.name: getattr(known, field.name)
+        for field in dataclasses.fields(config)
+        if getattr(config, field.name) == getattr(default, field.name)
+    }
+    return replace(config, **changes)
+
+
 def sensing(config: OdometryConfig, scans: bool) -> OdometryConfig:
     """Settings of a robot's calibration: without a laser only the latency of its sightings."""
     if scans:
@@ -520,16 +537,6 @@ def sensing(config: OdometryConfig, scans: bool) -> OdometryConfig:
         laser_sigma_rad=0.0,
         laser_latency_sigma_s=config.sighting_latency_sigma_s,
     )
-
-
-def shared(associations: Sequence[Association]) -> tuple[Association, ...]:
-    """Associations of one step: n of one target by one robot count as one.
-
-    Errors of a target's sightings within a short span are nearly the same (MRCLAM: the ranges of
-    consecutive images correlate by 0.8), so they get n times the covariance.
-    """
-    count = Counter((a.robot, a.target) for a in associations)
-    return tuple(replace(a, cov=a.cov * count[a.robot, a.target]) for a in associations)
 
 
 def check_robots(log: LogSet, config: Config) -> None:
