@@ -69,6 +69,11 @@ class Motions:
     d_cal: Array
     length_m: Array
 
+    def one(self, k: int, start_ns: int, end_ns: int) -> Motion:
+        """The k-th of them, which is between these times."""
+        length_m = float(self.length_m[k])
+        return Motion(start_ns, end_ns, self.delta[k], self.cov[k], self.d_cal[k], length_m)
+
 
 class Track:
     """Odometry readings of one robot, in time order, and the motions that they describe."""
@@ -347,7 +352,7 @@ class Track:
         return Motions(delta, cov, d_cal, length)
 
     def _walk(self, times: IntArray) -> Motions:
-        """Sums (n) up to times of the odometry's clock, in the frame of the first reading.
+        """Sums (n) up to times of the odometry's clock, from a reading before all of them.
 
         ``cov`` and ``d_cal`` are the sums that `motions` speaks of: of the pose at the origin.
         """
@@ -357,28 +362,29 @@ class Track:
             wide = np.zeros((len(times), 3, self._p))
             return Motions(zeros, np.zeros((len(times), 3, 3)), wide, zeros[:, 0])
         mean = self.calibration.mean[: self._p]
-        parts = self._increments(self._rows[1:n], mean)
-        heading = np.concatenate([[0.0], np.cumsum(parts.delta[:, 2])])
-        step = rotation3(heading[:-1]) @ parts.delta[:, :, None]
+        i = np.clip(np.searchsorted(self.times, times, side="left"), 1, n - 1)
+        first, last = int(i.min()), int(i.max())
+        share = self._share(i, self._times[i - 1], times)
+        # the whole rows first..last-1, then the part of its row that each time has reached
+        rows = np.concatenate([self._rows[first:last], self._rows[i] * share[:, None]])
+        parts = self._increments(rows, mean)
+        whole = last - first
+        heading = np.concatenate([[0.0], np.cumsum(parts.delta[:whole, 2])])
+        step = rotation3(heading[:-1]) @ parts.delta[:whole, :, None]
         place = np.vstack([np.zeros(2), np.cumsum(step[:, :2, 0], axis=0)])
         poses = np.column_stack([place, heading])
+        k = np.concatenate([np.arange(whole), i - first])  # where each increment begins
+        turn = rotation3(poses[k, 2])
+        ends = poses[k] + (turn @ parts.delta[:, :, None])[:, :, 0]
+        F = _lever(-ends) @ turn  # what an increment's error does to the origin
+        covs, d_cals = F @ parts.cov @ F.mT, F @ parts.d_cal
+        lengths = np.hypot(parts.delta[:, 0], parts.delta[:, 1])
 
-        def carried(k: IntArray, part: Increments) -> tuple[Array, Array, Array]:
-            """Ends of increments from poses k, and what their errors do to the origin."""
-            ends = poses[k] + (rotation3(poses[k, 2]) @ part.delta[:, :, None])[:, :, 0]
-            F = _lever(-ends) @ rotation3(poses[k, 2])
-            return ends, F @ part.cov @ F.mT, F @ part.d_cal
+        def upto(each: Array) -> Array:
+            sums = np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each[:whole], axis=0)])
+            return np.asarray(sums[i - first] + each[whole:])
 
-        _, covs, d_cals = carried(np.arange(n - 1), parts)
-        covs = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(covs, axis=0)])
-        d_cals = np.concatenate([np.zeros((1, 3, self._p)), np.cumsum(d_cals, axis=0)])
-        lengths = np.append(0.0, np.cumsum(np.hypot(parts.delta[:, 0], parts.delta[:, 1])))
-        i = np.clip(np.searchsorted(self.times, times, side="left"), 1, n - 1)
-        share = self._share(i, self._times[i - 1], times)
-        part = self._increments(self._rows[i] * share[:, None], mean)
-        ends, cov, d_cal = carried(i - 1, part)
-        length = np.hypot(part.delta[:, 0], part.delta[:, 1])
-        return Motions(ends, covs[i - 1] + cov, d_cals[i - 1] + d_cal, lengths[i - 1] + length)
+        return Motions(ends[whole:], upto(covs), upto(d_cals), upto(lengths))
 
     def coarse_motions(
         self,

@@ -5,7 +5,7 @@ them a few millimetres apart. Instead all that the robots of a log see within a 
 step: one state per robot at its end, and every sighting carried there by odometry.
 """
 
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -89,18 +89,53 @@ def gather(
         yield filling
 
 
-def carried(sighting: Sighting, state_ns: int, track: Track) -> Observation:
-    """A sighting in the base frame that its robot had at ``state_ns``, earlier or later."""
-    return carried_by(sighting, track.between(state_ns, sighting.time_ns))
+def ways(
+    gathered: Gathered, state_ns: Mapping[str, int], tracks: Mapping[str, Track]
+) -> dict[tuple[str, int], Motion]:
+    """(robot, time) of every image that it made or was seen in -> its motion there from its state.
+
+    Args:
+        gathered: the images.
+        state_ns: time of each robot's state, before or after.
+        tracks: odometry of every robot.
+    """
+    times: dict[str, set[int]] = defaultdict(set)
+    for image in gathered.images:
+        for robot in {image[0].robot, *(s.seen_robot for s in image if s.seen_robot)}:
+            times[robot].add(image[0].time_ns)
+    out = {}
+    for robot, needed in times.items():
+        ends = sorted(needed)
+        start = np.full(len(ends), state_ns[robot], dtype=np.int64)
+        moved = tracks[robot].motions(start, np.array(ends, dtype=np.int64))
+        for k, time_ns in enumerate(ends):
+            out[robot, time_ns] = moved.one(k, state_ns[robot], time_ns)
+    return out
 
 
-def carried_by(sighting: Sighting, moved: Motion) -> Observation:
-    """A sighting in the base frame at the start of ``moved``, which ends when it was made."""
-    o = sighting_observation(sighting)
-    z, cov = transport(o.z, o.cov, sighting.mount, np.zeros((3, 3)))
-    if moved.start_ns != moved.end_ns:
-        z, cov = transported(z, cov, moved.delta, moved.cov)
-    return Observation(o.kind, z, cov, o.extent, o.identity)
+def carried(sightings: Sequence[Sighting], moved: Sequence[Motion]) -> list[Observation]:
+    """Sightings in the base frames at the starts of ``moved``, each of which ends when it was made.
+
+    What is seen from the state itself keeps its own covariance.
+    """
+    base = []
+    for sighting in sightings:
+        o = sighting_observation(sighting)
+        z, cov = transport(o.z, o.cov, sighting.mount, np.zeros((3, 3)))
+        base.append(replace(o, z=z, cov=cov))
+    away = [k for k, motion in enumerate(moved) if motion.start_ns != motion.end_ns]
+    for size in (2, 3):
+        which = [k for k in away if len(base[k].z) == size]
+        if which:
+            z, cov = transported(
+                np.array([base[k].z for k in which]),
+                np.array([base[k].cov for k in which]),
+                np.array([moved[k].delta for k in which]),
+                np.array([moved[k].cov for k in which]),
+            )
+            for n, k in enumerate(which):
+                base[k] = replace(base[k], z=z[n], cov=cov[n])
+    return base
 
 
 def transported(z: Array, cov: Array, delta: Array, delta_cov: Array) -> tuple[Array, Array]:
@@ -124,7 +159,7 @@ def transported(z: Array, cov: Array, delta: Array, delta_cov: Array) -> tuple[A
 
 
 def met(
-    o: Observation, sighting: Sighting, state_ns: int, other_ns: int, turn_rad: float, track: Track
+    o: Observation, sighting: Sighting, state_ns: int, moved: Motion, turn_rad: float
 ) -> Association:
     """A sighting of a robot, moved from where that robot was to where it is at its state.
 
@@ -132,14 +167,12 @@ def met(
         o: the sighting in the observer's base frame at its state.
         sighting: as recorded.
         state_ns: time of the observer's state.
-        other_ns: time of the seen robot's state.
+        moved: motion of the robot that was seen, from its state to when it was seen.
         turn_rad: heading of the seen robot relative to the observer's.
-        track: odometry of the robot that was seen.
     """
     other = sighting.seen_robot
     assert other is not None  # callers ask for robots only
-    moved = track.between(other_ns, sighting.time_ns)
-    cov = moved.cov if sighting.time_ns != other_ns else np.zeros((3, 3))
+    cov = moved.cov if moved.start_ns != moved.end_ns else np.zeros((3, 3))
     z, cov = met_by(o.z, o.cov, moved.delta, cov, np.asarray(turn_rad))
     model = "robot-point" if len(z) == 2 else "robot-pose"
     return Association(sighting.robot, state_ns, other, model, z, cov)

@@ -141,10 +141,7 @@ def _remade(
         )
         new = track.motions(start_ns, end_ns)
         for i, (n, m) in enumerate(made):
-            length_m = float(new.length_m[i])
-            motions[n][robot] = Motion(
-                m.start_ns, m.end_ns, new.delta[i], new.cov[i], new.d_cal[i], length_m
-            )
+            motions[n][robot] = new.one(i, m.start_ns, m.end_ns)
     return tuple(
         # in the order of the step: it is the order of the states
         replace(step, motions={r: new[r] for r in step.motions}, associations=tuple(found))

@@ -23,7 +23,7 @@ from graphslam.dead_reckoning import Track
 from graphslam.errors import ConfigError, EstimationError, LogError
 from graphslam.frontend import FRONT_ENDS, scan_points
 from graphslam.frontend.sightings import sighting_observation
-from graphslam.gathering import Gathered, Sources, carried_by, gather, met, shared
+from graphslam.gathering import Gathered, Sources, carried, gather, met, shared, ways
 from graphslam.geometry import (
     compose,
     compose_cov,
@@ -158,11 +158,14 @@ class Pipeline:
         began = time.perf_counter()
         known = {i for i, entry in self.associator.map.entries.items() if entry.in_graph}
         associations: tuple[Association, ...] = ()
+        at = {r: step_ns if r in motions else self.runs[r].state_ns for r in gathered.robots}
+        moved = ways(gathered, at, {robot: self.runs[robot].track for robot in at})
+        every = [sighting for image in gathered.images for sighting in image]
+        observed = iter(carried(every, [moved[s.robot, s.time_ns] for s in every]))
         for image in gathered.images:
             run, robot = self.runs[image[0].robot], image[0].robot
-            state_ns = step_ns if robot in motions else run.state_ns
-            moved = run.track.between(state_ns, image[0].time_ns)
-            seen = [carried_by(sighting, moved) for sighting in image]
+            state_ns = at[robot]
+            seen = list(itertools.islice(observed, len(image)))
             for o, sighting in zip(seen, image, strict=True):
                 self.sources[robot, state_ns, o.z.tobytes()] = sighting
             landmarks = [o for o, s in zip(seen, image, strict=True) if s.seen_robot is None]
@@ -186,7 +189,8 @@ class Pipeline:
                         for name, r in ((s.seen_robot, other), (robot, run))
                     ]
                     turn = float(headings[0] - headings[1])
-                    association = met(o, s, state_ns, step_ns, turn, other.track)
+                    way = moved[s.seen_robot, s.time_ns]
+                    association = met(o, s, state_ns, way, turn)
                     self.sources[robot, state_ns, association.z.tobytes()] = s
                     associations += (association,)
         self.note_covariances()
