@@ -21,6 +21,7 @@ from graphslam.config import Config, OdometryConfig, RobotConfig, load_config
 from graphslam.consolidating import consolidate
 from graphslam.dead_reckoning import Track
 from graphslam.errors import ConfigError, EstimationError, LogError
+from graphslam.exchanged import exchanged_names, renamed
 from graphslam.frontend import FRONT_ENDS, scan_points
 from graphslam.frontend.sightings import sighting_observation
 from graphslam.gathering import Gathered, Sources, carried, gather, met, shared, ways
@@ -66,8 +67,9 @@ Progress = Callable[[int], None]
 class Pipeline:
     """One run over a log."""
 
-    def __init__(self, log: LogSet, config: Config) -> None:
-        self.log, self.config = log, config
+    def __init__(self, log: LogSet, config: Config, names: Mapping[str, str] | None = None) -> None:
+        """Nothing read yet; ``names``: false name -> right name of what is sighted."""
+        self.log, self.config, self.names = log, config, names or {}
         self.backend = BACKENDS[config.backend.name](config)
         self.associator = Associator(config.association, self.backend)
         self.front_end = FRONT_ENDS[config.front_end.name]
@@ -121,10 +123,15 @@ class Pipeline:
                 self.step_ms.append(1e3 * (clock - began))
 
     def wanted(self, messages: Iterable[Message]) -> Iterator[Message]:
-        """Messages without sightings of robots, where these are to be ignored."""
+        """Messages under right names, without sightings of robots where these are to be ignored."""
         ignore = self.config.association.robots == "ignore"
-        for message in messages:
-            if ignore and isinstance(message, Sighting) and message.seen_robot is not None:
+        for recorded in messages:
+            message = recorded
+            if self.names and isinstance(message, Sighting):
+                message = renamed(message, self.names, self.log.robots)
+            if isinstance(message, Sighting) and message.seen_robot == message.robot:
+                self.dropped["sighting: a robot does not see itself"] += 1
+            elif ignore and isinstance(message, Sighting) and message.seen_robot is not None:
                 self.dropped["sighting: of a robot, ignored by association.robots"] += 1
             else:
                 yield message
@@ -430,6 +437,15 @@ class Pipeline:
         self.counts["landmarks_merged"] += done.merged
         return done.estimate
 
+    def exchanged(self, estimate: Estimate) -> dict[str, str]:
+        """Names of what was sighted that turn out to be each other's: false -> right name."""
+        if not self.sources or self.config.association.identities == "ignore":
+            return {}
+        tracks = {name: run.track for name, run in self.runs.items() if run.started}
+        sightings = {id(sighting): sighting for sighting in self.sources.values()}
+        pairs = exchanged_names(sightings.values(), estimate, tracks)
+        return {a: b for pair in pairs for a, b in (pair, pair[::-1])}
+
     def add_picture(self, picture: Picture) -> None:
         """Keep a scan for drawing; when there are too many, every second one is let go."""
         self.pictures.append(picture)
@@ -452,13 +468,10 @@ def smooth(log: LogSet, config: Config, progress: Progress = lambda _count: None
     """
     began = time.perf_counter()
     check_robots(log, config)
-    pipeline = Pipeline(log, config)
-    pipeline.run(progress)
-    if not pipeline.steps:
-        raise LogError(f"{log.files[0].path}: nothing in it could be used; see `graphslam info`")
-    pipeline.note_covariances()
-    finishing = time.perf_counter()
-    estimate = pipeline.backend.finish()
+    pipeline, estimate, finishing = _passed(Pipeline(log, config), progress)
+    names = pipeline.exchanged(estimate)
+    if names:
+        pipeline, estimate, finishing = _passed(Pipeline(log, config, names), progress)
     if pipeline.backend.smooths and config.backend.polish and config.backend.reconsider:
         estimate = pipeline.reconsider(estimate)
     pipeline.seconds["final optimisation"] = time.perf_counter() - finishing
@@ -505,6 +518,17 @@ def smooth(log: LogSet, config: Config, progress: Progress = lambda _count: None
         np.array(pipeline.step_ms),
         summary,
     )
+
+
+def _passed(pipeline: Pipeline, progress: Progress) -> tuple[Pipeline, Estimate, float]:
+    """A pipeline after its log went by, what it estimates, and when it began to finish that."""
+    pipeline.run(progress)
+    if not pipeline.steps:
+        path = pipeline.log.files[0].path
+        raise LogError(f"{path}: nothing in it could be used; see `graphslam info`")
+    pipeline.note_covariances()
+    finishing = time.perf_counter()
+    return pipeline, pipeline.backend.finish(), finishing
 
 
 def robot_settings(name: str, config: Config, notes: Mapping[str, str]) -> RobotConfig:
@@ -567,6 +591,11 @@ def run_warnings(pipeline: Pipeline) -> list[str]:
         for name, run in pipeline.runs.items()
         if run.track.source == "wheels"
         and robot_settings(name, pipeline.config, pipeline.log.notes) == RobotConfig()
+    ]
+    warnings += [
+        f"{a} and {b}: bore each other's code in all sightings; their names were exchanged back"
+        for a, b in pipeline.names.items()
+        if a < b
     ]
     warnings += [
         f"the back end could not use {count} x {reason}"

@@ -134,6 +134,8 @@ def evaluation(found: Mapping[str, Any]) -> None:
         head = ["landmarks", "RMSE, m", "NEES/dof", "matched", "missed", "extra"]
         keys = ["rmse_m", "nees_per_dof", "matched", "missed", "extra"]
         console.print(_table(head, [("map", *(marks[key] for key in keys))]))
+        for a, b in marks.get("exchanged", ()):
+            console.print(f"landmarks {a} and {b} bear each other's names; compared by place")
     if relations := found.get("relations"):
         head = ["relations", "", "matched", "unmatched", "mean, m", "std, m", "median, m"]
         head += ["mean, deg", "std, deg"]
