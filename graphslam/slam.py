@@ -431,6 +431,8 @@ class Pipeline:
         if self.sources:
             refined = refine(self.steps, estimate, tracks, self.sources, self.config)
             self.steps = list(refined.steps)
+            for name in tracks:
+                self.runs[name].refined = self.config.odometry.calibrate
             return refined.estimate
         done = consolidate(self.steps, estimate, tracks, self.associator.map, self.config)
         self.steps = list(done.steps)
@@ -504,7 +506,7 @@ def smooth(log: LogSet, config: Config, progress: Progress = lambda _count: None
         line_closures=pipeline.associator.closures,
         landmarks=len(landmarks),
         seconds=pipeline.seconds,
-        calibration={name: run.calibrator.found() for name, run in runs.items()},
+        calibration={name: run.calibration_found() for name, run in runs.items()},
         warnings=run_warnings(pipeline),
         log_s=1e-9 * (pipeline.last_ns - pipeline.first_ns),
     )
