@@ -87,7 +87,8 @@ def main(names: list[str]) -> None:
         command("import", "mrclam", str(SOURCE), "-o", str(log))
         print(f"imported in {cpu_seconds():.1f} s")
         print(
-            "run         final  aligned  worst   max   NEES  causal  landmarks  missed  extra      s"
+            "run         final  aligned  worst   max   NEES  causal  landmarks  missed  extra"
+            "      s"
         )
         for name in names:
             source = log
