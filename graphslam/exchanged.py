@@ -45,16 +45,7 @@ def exchanged_names(
         estimate: of all states.
         tracks: odometry of every robot.
     """
-    called: dict[str, list[Sighting]] = defaultdict(list)
-    for sighting in sightings:
-        name = sighting.seen_robot or sighting.identity
-        if name is not None:
-            called[name].append(sighting)
-    places = {
-        name: _places(found, estimate, tracks)
-        for name, found in called.items()
-        if len(found) >= FEWEST
-    }
+    places = _places(sightings, estimate, tracks)
     robots = [name for name in sorted(places) if name in tracks]
     pairs = list(combinations(robots, 2))
     pairs += [(robot, name) for robot in robots for name in sorted(places) if name not in tracks]
@@ -65,7 +56,10 @@ def exchanged_names(
         if bearer not in tracks:  # a landmark is at one place
             at = np.median(found.points, axis=0)
         else:
-            at = _poses(bearer, found.times_ns, estimate, tracks)[:, :2]
+            states = estimate.states[bearer]
+            at = np.column_stack(
+                [np.interp(found.times_ns, states.stamps_ns, states.poses[:, k]) for k in (0, 1)]
+            )
         return float(np.median(np.hypot(*(found.points - at).T)))
 
     taken: set[str] = set()
@@ -91,29 +85,31 @@ def renamed(sighting: Sighting, names: Mapping[str, str], robots: Sequence[str])
 
 
 def _places(
-    sightings: Sequence[Sighting], estimate: Estimate, tracks: Mapping[str, Track]
-) -> _Places:
-    points, times = [], []
+    sightings: Iterable[Sighting], estimate: Estimate, tracks: Mapping[str, Track]
+) -> dict[str, _Places]:
+    """Name -> where its sightings lie, of names with enough of them."""
     by_robot: dict[str, list[Sighting]] = defaultdict(list)
     for sighting in sightings:
-        by_robot[sighting.robot].append(sighting)
+        if sighting.seen_robot or sighting.identity:
+            by_robot[sighting.robot].append(sighting)
+    points: dict[str, list[Array]] = defaultdict(list)
+    times: dict[str, list[int]] = defaultdict(list)
     for robot, found in by_robot.items():
         when = np.array([s.time_ns for s in found], dtype=np.int64)
-        sensor = compose(_poses(robot, when, estimate, tracks), np.array([s.mount for s in found]))
+        states = estimate.states[robot]
+        # the last state before, carried on by odometry
+        i = np.clip(np.searchsorted(states.stamps_ns, when, side="right") - 1, 0, None)
+        moved = tracks[robot].motions(states.stamps_ns[i], when)
+        sensor = compose(compose(states.poses[i], moved.delta), np.array([s.mount for s in found]))
         z = np.array([s.z[:2] for s in found])
         direction = sensor[:, 2] + z[:, 0]
-        ray = np.column_stack([np.cos(direction), np.sin(direction)])
-        points.append(sensor[:, :2] + z[:, 1:] * ray)
-        times.append(when)
-    return _Places(np.concatenate(points), np.concatenate(times))
-
-
-def _poses(
-    robot: str, times_ns: IntArray, estimate: Estimate, tracks: Mapping[str, Track]
-) -> Array:
-    """Poses (n, 3) of a robot: its last state, carried on by odometry."""
-    states = estimate.states[robot]
-    i = np.searchsorted(states.stamps_ns, times_ns, side="right") - 1
-    i = np.clip(i, 0, None)
-    moved = tracks[robot].motions(states.stamps_ns[i], times_ns)
-    return compose(states.poses[i], moved.delta)
+        seen = sensor[:, :2] + z[:, 1:] * np.column_stack([np.cos(direction), np.sin(direction)])
+        for sighting, point in zip(found, seen, strict=True):
+            name = sighting.seen_robot or str(sighting.identity)
+            points[name].append(point)
+            times[name].append(sighting.time_ns)
+    return {
+        name: _Places(np.array(points[name]), np.array(times[name], dtype=np.int64))
+        for name in points
+        if len(points[name]) >= FEWEST
+    }
