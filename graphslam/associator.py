@@ -125,11 +125,30 @@ class Associator:
         self.map.expire(time_ns, robot, path_m, round(config.tentative_s * 1e9), config.tentative_m)
         if motion is not None:
             pose = compose(pose, motion.delta)
+        if gathering and all(map(self._has_identity, seen)):
+            return self._named_only(robot, time_ns, seen, pose, path_m)
         image = self._image(robot, time_ns, seen, pose, motion, track, path_m, gathering)
         associations = self._book(image, self._choose(image))
         if not gathering:
             self.settle()
         return associations
+
+    def _named_only(
+        self, robot: str, time_ns: int, seen: Sequence[Observation], pose: Array, path_m: float
+    ) -> tuple[Association, ...]:
+        """An image in which everything says what it is: nothing to compare."""
+        out: list[Association] = []
+        for o in seen:
+            entry = self._named(o)
+            if entry is None:
+                entry = self.map.add(o, pose, time_ns)
+            elif (entry.kind == "point") != (o.kind == "point"):
+                self.rejected["identity: known as a landmark of another kind"] += 1
+                continue
+            self.map.saw(entry, o, pose, time_ns, robot, path_m)
+            association = Association(robot, time_ns, entry.id, o.kind, o.z, o.cov)
+            out += self._admit(entry, association, True)
+        return tuple(out)
 
     def settle(self) -> None:
         """Note that the back end has taken the step of all associations so far."""

@@ -77,20 +77,28 @@ class Calibrator:
         return Calibration(current.names, cov @ self._vector, cov + REMAINING**2 * self._prior)
 
     def found(self) -> dict[str, tuple[float, float, bool]]:
-        """Parameter -> (value, sigma, observable): what the data say so far.
+        """What the data say so far, see `told`.
 
-        Observable: the data halve the prior's sigma at least. The sigma is that of the remembered
-        stretch, so it does not shrink for ever.
+        The sigma is that of the remembered stretch, so it does not shrink for ever.
         """
         if self._prior is None:
             return {}
-        cov = np.linalg.inv(self._info)
-        values, sigmas = cov @ self._vector, np.sqrt(np.diag(cov))
-        halved = sigmas < 0.5 * np.sqrt(np.diag(self._prior))
-        return {
-            name: (float(value), float(sigma), bool(known))
-            for name, value, sigma, known in zip(self._names, values, sigmas, halved, strict=True)
-        }
+        cov: Array = np.asarray(np.linalg.inv(self._info), dtype=np.float64)
+        known = Calibration(self._names, cov @ self._vector, cov)
+        return told(known, self._prior)
+
+
+def told(known: Calibration, prior: Array) -> dict[str, tuple[float, float, bool]]:
+    """Parameter -> (value, sigma, observable); ``prior`` (p, p) is the covariance before data.
+
+    Observable: the data halve the prior's sigma at least.
+    """
+    sigmas = np.sqrt(np.diag(known.cov))
+    halved = sigmas < 0.5 * np.sqrt(np.diag(prior))
+    return {
+        name: (float(value), float(sigma), bool(seen))
+        for name, value, sigma, seen in zip(known.names, known.mean, sigmas, halved, strict=True)
+    }
 
 
 def observed_information(

@@ -68,6 +68,8 @@ class OdometryConfig:
     laser_latency_sigma_s: how far its clock may be from the odometry's;
     sighting_latency_sigma_s: the same for a robot without a laser, whose odometry may be commands
     that the motion follows later.
+    commanded: poses of odometry are what commanded velocities compound to; turning_lever_sigma_m:
+    how far from the middle of the axle the point may be whose speed was commanded.
     floor_sigma_m and floor_sigma_rad are added once per interval in which the robot moved.
     calibrate: learn the calibration errors from the estimate while it grows.
     max_gap_s: longest span without odometry that is bridged.
@@ -89,6 +91,8 @@ class OdometryConfig:
     laser_sigma_rad: float = 0.02
     laser_latency_sigma_s: float = 0.05
     sighting_latency_sigma_s: float = 0.2
+    commanded: bool = False
+    turning_lever_sigma_m: float = 0.2
     floor_sigma_m: float = 0.005
     floor_sigma_rad: float = 0.005
     calibrate: bool = True

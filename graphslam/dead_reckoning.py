@@ -6,7 +6,7 @@ calibration. Between two readings the robot is taken to move on a circle segment
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -57,7 +57,22 @@ LATENCY_STEP_NS = 50_000_000
 #: m per rad: how much path a turn counts for when a correction is spread over an interval
 TURNING_EFFORT_M = 0.3
 
-_ROW_SIZE = {"odometry": 3, "given": 12, "wheels": 2}
+_ROW_SIZE = {"odometry": 3, "commands": 3, "given": 12, "wheels": 2}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motions:
+    """Many motions: ``delta`` (n, 3), ``cov`` (n, 3, 3), ``d_cal`` (n, 3, p), ``length_m`` (n,)."""
+
+    delta: Array
+    cov: Array
+    d_cal: Array
+    length_m: Array
+
+    def one(self, k: int, start_ns: int, end_ns: int) -> Motion:
+        """The k-th of them, which is between these times."""
+        length_m = float(self.length_m[k])
+        return Motion(start_ns, end_ns, self.delta[k], self.cov[k], self.d_cal[k], length_m)
 
 
 class Track:
@@ -155,7 +170,7 @@ class Track:
             if self._jumps(row, message.time_ns):
                 self.resets += 1
                 row = self._rows[self._count - 1] if self._count > 1 else np.zeros(3)
-            self._append("odometry", message.time_ns, row)
+            self._append("commands" if self._config.commanded else "odometry", message.time_ns, row)
             self._last = message.pose
         else:
             angles = np.array([message.left_rad, message.right_rad])
@@ -296,6 +311,81 @@ class Track:
         cov = inverse_cov(forth.delta, forth.cov)
         return replace(forth, start_ns=start_ns, end_ns=end_ns, delta=inverse(forth.delta), cov=cov)
 
+    def motions(self, start_ns: IntArray, end_ns: IntArray) -> Motions:
+        """What `between` gives, for times (n,) and (n,), at once.
+
+        Differences of sums over the whole track: with P_k the pose after increment k, its error e
+        moves the pose P at the end of an interval by T(P) F_k e, F_k (3, 3) as if the end were the
+        origin and T(P) its lever arm. So the sums of F_k C_k F_kᵀ and F_k D_k up to both ends
+        are all that an interval needs.
+        """
+        begin, end = np.minimum(start_ns, end_ns), np.maximum(start_ns, end_ns)
+        late = self.latency_ns
+        times, where = np.unique(np.concatenate([begin, end]) - late, return_inverse=True)
+        a, b = where[: len(begin)], where[len(begin) :]
+        both = np.concatenate([times, times - LATENCY_STEP_NS])
+        walk = self._walk(both)
+        delta = between(walk.delta[a], walk.delta[b])
+        # from the odometry's frame and origin to the axes of the start, lever arm at the end
+        T = rotation3(-walk.delta[a, 2]) @ _lever(walk.delta[b])
+        cov = T @ (walk.cov[b] - walk.cov[a]) @ T.mT
+        d_cal = T @ (walk.d_cal[b] - walk.d_cal[a])
+        length = walk.length_m[b] - walk.length_m[a]
+        if len(self.calibration.mean) > self._p:
+            lever = rotation3(-self.mount[2]) @ compose_jacobians(delta, self.mount)[0]
+            earlier = walk.delta[len(times) :]
+            change = between(earlier[a], earlier[b]) - delta
+            change[:, 2] = wrap(change[:, 2])
+            change *= 0.0 if self.bursty else 1e9 / LATENCY_STEP_NS
+            delta, d_mount = mounted_motion(delta, self.mount)
+            d_cal = np.concatenate([lever @ d_cal, d_mount, lever @ change[:, :, None]], axis=2)
+            cov = lever @ cov @ lever.mT
+        cov = (cov + cov.mT) / 2 + d_cal @ self.calibration.cov @ d_cal.mT
+        moved = (length > 0) | (delta[:, 2] != 0)
+        if self.source != "given":
+            cov = cov + np.where(moved[:, None, None], self._floor(True), self._floor(False))
+        else:
+            cov = cov + np.where(moved[:, None, None], 0.0, self._floor(False))
+        back = end_ns < start_ns
+        cov[back] = inverse_cov(delta[back], cov[back])
+        delta[back] = inverse(delta[back])
+        return Motions(delta, cov, d_cal, length)
+
+    def _walk(self, times: IntArray) -> Motions:
+        """Sums (n) up to times of the odometry's clock, from a reading before all of them.
+
+        ``cov`` and ``d_cal`` are the sums that `motions` speaks of: of the pose at the origin.
+        """
+        n = self._count
+        if n < 2:
+            zeros = np.zeros((len(times), 3))
+            wide = np.zeros((len(times), 3, self._p))
+            return Motions(zeros, np.zeros((len(times), 3, 3)), wide, zeros[:, 0])
+        mean = self.calibration.mean[: self._p]
+        i = np.clip(np.searchsorted(self.times, times, side="left"), 1, n - 1)
+        first, last = int(i.min()), int(i.max())
+        share = self._share(i, self._times[i - 1], times)
+        # the whole rows first..last-1, then the part of its row that each time has reached
+        rows = np.concatenate([self._rows[first:last], self._rows[i] * share[:, None]])
+        parts = self._increments(rows, mean)
+        whole = last - first
+        heading = np.concatenate([[0.0], np.cumsum(parts.delta[:whole, 2])])
+        step = rotation3(heading[:-1]) @ parts.delta[:whole, :, None]
+        place = np.vstack([np.zeros(2), np.cumsum(step[:, :2, 0], axis=0)])
+        poses = np.column_stack([place, heading])
+        k = np.concatenate([np.arange(whole), i - first])  # where each increment begins
+        turn = rotation3(poses[k, 2])
+        ends = poses[k] + (turn @ parts.delta[:, :, None])[:, :, 0]
+        F = _lever(-ends) @ turn  # what an increment's error does to the origin
+        covs, d_cals = F @ parts.cov @ F.mT, F @ parts.d_cal
+        lengths = np.hypot(parts.delta[:, 0], parts.delta[:, 1])
+
+        def upto(each: Array) -> Array:
+            sums = np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each[:whole], axis=0)])
+            return np.asarray(sums[i - first] + each[whole:])
+
+        return Motions(ends[whole:], upto(covs), upto(d_cals), upto(lengths))
+
     def coarse_motions(
         self,
         start_ns: IntArray,
@@ -417,3 +507,10 @@ class Track:
         if not moved:
             return np.diag([STANDING_SIGMA**2] * 3)
         return np.diag([self._config.floor_sigma_m**2] * 2 + [self._config.floor_sigma_rad**2])
+
+
+def _lever(poses: Array) -> Array:
+    """(n, 3, 3): what an error of a pose at the origin does at rigidly connected poses (n, 3)."""
+    T = np.tile(np.eye(3), (len(poses), 1, 1))
+    T[:, 0, 2], T[:, 1, 2] = -poses[:, 1], poses[:, 0]
+    return T

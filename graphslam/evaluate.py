@@ -6,6 +6,7 @@ what is not called *aligned* (errors, consistency, landmarks) means something on
 was given (``smooth --start truth``). Aligned numbers are after the best rigid motion.
 """
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,8 @@ from graphslam.results import SavedResult, read_text, stamp_ns
 Stamps = np.ndarray[Any, np.dtype[np.int64]]
 
 MAX_TRUTH_GAP_S = 1.0
+#: names of two landmarks are exchanged if each lies this many times nearer to the other's place
+TIMES_NEARER = 3.0
 MATCH_DISTANCE_M = 1.0
 MATCH_ANGLE_RAD = 0.35
 LOCAL_S = 60.0
@@ -213,8 +216,11 @@ def landmark_metrics(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]
     since a position along a wall is a gauge. ``worst`` is the landmark of the largest NEES per
     degree of freedom, ``id``, ``nees_per_dof`` and ``error_m``: one that is not what it is taken
     for can make the mean.
+    ``exchanged``: pairs of identities of points that lie
+    where the other one truly is, so that their names are wrong and not their places; they match
+    the places.
     """
-    pairs = _match(estimated, true)
+    pairs, exchanged = _unchanged(_match(estimated, true), estimated, true)
     errors, values, dofs = [], [], []
     for i, j in pairs:
         error, difference, cov = _landmark_error(estimated[i], true[j])
@@ -239,7 +245,31 @@ def landmark_metrics(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]
         "matched": len(pairs),
         "missed": len(true) - len({j for _, j in pairs}),
         "extra": len(estimated) - len(pairs),
+        "exchanged": exchanged,
     }
+
+
+def _unchanged(
+    pairs: Sequence[tuple[int, int]], estimated: Sequence[Landmark], true: Sequence[TrueLandmark]
+) -> tuple[list[tuple[int, int]], list[tuple[str, str]]]:
+    """Matches with exchanged names undone, and those names."""
+    place = dict(pairs)
+    named = [i for i, j in pairs if estimated[i].identity and estimated[i].kind == "point"]
+    found = []
+    for a, b in itertools.combinations(named, 2):
+        ways = ((a, b), (b, a))
+        if all(
+            _apart(estimated[i], true[place[i]])
+            > TIMES_NEARER * _apart(estimated[i], true[place[k]])
+            for i, k in ways
+        ):
+            place[a], place[b] = place[b], place[a]
+            found.append((str(estimated[a].identity), str(estimated[b].identity)))
+    return [(i, place[i]) for i, _ in pairs], found
+
+
+def _apart(estimated: Landmark, true: TrueLandmark) -> float:
+    return float(np.hypot(*(estimated.position[:2] - true.pose[:2])))
 
 
 def _match(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]) -> list[tuple[int, int]]:

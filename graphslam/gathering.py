@@ -5,17 +5,17 @@ them a few millimetres apart. Instead all that the robots of a log see within a 
 step: one state per robot at its end, and every sighting carried there by odometry.
 """
 
-from collections import deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from graphslam.dead_reckoning import Track
 from graphslam.frontend.sightings import sighting_observation
-from graphslam.geometry import compose, compose_cov, inverse, inverse_cov, rotation
+from graphslam.geometry import Array, compose, compose_cov, inverse, inverse_cov, rotation3
 from graphslam.models import MODELS, transport
-from graphslam.records import Association, Message, Observation, Sighting
+from graphslam.records import Association, Message, Motion, Observation, Sighting
 from graphslam.timeline import ODOMETRY
 
 #: rad: how well the relative heading of two robots is known that turns a short motion
@@ -89,49 +89,136 @@ def gather(
         yield filling
 
 
-def carried(sighting: Sighting, state_ns: int, track: Track) -> Observation:
-    """A sighting in the base frame that its robot had at ``state_ns``, earlier or later."""
-    o = sighting_observation(sighting)
-    z, cov = transport(o.z, o.cov, sighting.mount, np.zeros((3, 3)))
-    moved = track.between(state_ns, sighting.time_ns)
-    if sighting.time_ns != state_ns:
-        z, cov = transport(z, cov, moved.delta, moved.cov)
-    return Observation(o.kind, z, cov, o.extent, o.identity)
+def ways(
+    gathered: Gathered, state_ns: Mapping[str, int], tracks: Mapping[str, Track]
+) -> dict[tuple[str, int], Motion]:
+    """(robot, time) of every image that it made or was seen in -> its motion there from its state.
+
+    Args:
+        gathered: the images.
+        state_ns: time of each robot's state, before or after.
+        tracks: odometry of every robot.
+    """
+    times: dict[str, set[int]] = defaultdict(set)
+    for image in gathered.images:
+        for robot in {image[0].robot, *(s.seen_robot for s in image if s.seen_robot)}:
+            times[robot].add(image[0].time_ns)
+    out = {}
+    for robot, needed in times.items():
+        ends = sorted(needed)
+        start = np.full(len(ends), state_ns[robot], dtype=np.int64)
+        moved = tracks[robot].motions(start, np.array(ends, dtype=np.int64))
+        for k, time_ns in enumerate(ends):
+            out[robot, time_ns] = moved.one(k, state_ns[robot], time_ns)
+    return out
+
+
+def carried(sightings: Sequence[Sighting], moved: Sequence[Motion]) -> list[Observation]:
+    """Sightings in the base frames at the starts of ``moved``, each of which ends when it was made.
+
+    What is seen from the state itself keeps its own covariance.
+    """
+    base = []
+    for sighting in sightings:
+        o = sighting_observation(sighting)
+        z, cov = transport(o.z, o.cov, sighting.mount, np.zeros((3, 3)))
+        base.append(replace(o, z=z, cov=cov))
+    away = [k for k, motion in enumerate(moved) if motion.start_ns != motion.end_ns]
+    for size in (2, 3):
+        which = [k for k in away if len(base[k].z) == size]
+        if which:
+            z, cov = transported(
+                np.array([base[k].z for k in which]),
+                np.array([base[k].cov for k in which]),
+                np.array([moved[k].delta for k in which]),
+                np.array([moved[k].cov for k in which]),
+            )
+            for n, k in enumerate(which):
+                base[k] = replace(base[k], z=z[n], cov=cov[n])
+    return base
+
+
+def transported(z: Array, cov: Array, delta: Array, delta_cov: Array) -> tuple[Array, Array]:
+    """`transport` of many measurements at once, each by its own motion.
+
+    Args:
+        z: (..., 2) bearings and ranges, or (..., 3) poses, at the end of the motion.
+        cov: of ``z``.
+        delta: (..., 3) motions.
+        delta_cov: (..., 3, 3) along the axes of their starts.
+
+    Returns:
+        The measurements as from the start of the motion, and their covariances.
+    """
+    if z.shape[-1] == 3:
+        return compose(delta, z), compose_cov(delta, delta_cov, z, cov)
+    model = MODELS["point"]
+    point = model.invert(z, delta)
+    G_x, G_z = model.invert_jacobians(z, delta)
+    return _seen_at(point, G_x @ delta_cov @ G_x.mT + G_z @ cov @ G_z.mT)
 
 
 def met(
-    o: Observation, sighting: Sighting, state_ns: int, other_ns: int, turn_rad: float, track: Track
+    o: Observation, sighting: Sighting, state_ns: int, moved: Motion, turn_rad: float
 ) -> Association:
     """A sighting of a robot, moved from where that robot was to where it is at its state.
-
-    What it drove in between is known along its own axes. The relative heading that turns it into
-    the observer's comes from the estimate and needs not be known well: the way is short.
 
     Args:
         o: the sighting in the observer's base frame at its state.
         sighting: as recorded.
         state_ns: time of the observer's state.
-        other_ns: time of the seen robot's state.
+        moved: motion of the robot that was seen, from its state to when it was seen.
         turn_rad: heading of the seen robot relative to the observer's.
-        track: odometry of the robot that was seen.
     """
     other = sighting.seen_robot
     assert other is not None  # callers ask for robots only
-    moved = track.between(other_ns, sighting.time_ns)
-    if o.kind != "point":
-        back = inverse(moved.delta)
-        cov = compose_cov(o.z, o.cov, back, inverse_cov(moved.delta, moved.cov))
-        z = compose(o.z, back)
-        return Association(sighting.robot, state_ns, other, "robot-pose", z, cov)
+    cov = moved.cov if moved.start_ns != moved.end_ns else np.zeros((3, 3))
+    z, cov = met_by(o.z, o.cov, moved.delta, cov, np.asarray(turn_rad))
+    model = "robot-point" if len(z) == 2 else "robot-pose"
+    return Association(sighting.robot, state_ns, other, model, z, cov)
+
+
+def met_by(
+    z: Array, cov: Array, delta: Array, delta_cov: Array, turn_rad: Array
+) -> tuple[Array, Array]:
+    """Measurements of robots, moved from where these were seen to where their states are.
+
+    What a robot drove in between is known along its own axes. The relative heading that turns it
+    into the observer's comes from the estimate and needs not be known well: the way is short.
+
+    Args:
+        z: (..., 2) bearings and ranges, or (..., 3) poses, in the observer's base frame.
+        cov: of ``z``.
+        delta: (..., 3) motions of the seen robots from their states to when they were seen.
+        delta_cov: (..., 3, 3) along the axes of their starts.
+        turn_rad: (...,) headings of the seen robots' states relative to the observers'.
+    """
+    if z.shape[-1] == 3:
+        back = inverse(delta)
+        return compose(z, back), compose_cov(z, cov, back, inverse_cov(delta, delta_cov))
     model, origin = MODELS["point"], np.zeros(3)
-    R = rotation(turn_rad)
-    shift = R @ moved.delta[:2]
-    side = np.array([-shift[1], shift[0]])
-    extra = HEADING_SIGMA_RAD**2 * np.outer(side, side)
-    if sighting.time_ns != other_ns:
-        extra += R @ moved.cov[:2, :2] @ R.T
-    point = model.invert(o.z, origin) - shift
+    R = rotation3(turn_rad)[..., :2, :2]
+    shift = (R @ delta[..., :2, None])[..., 0]
+    side = np.stack([-shift[..., 1], shift[..., 0]], axis=-1)
+    _, G = model.invert_jacobians(z, np.broadcast_to(origin, (*z.shape[:-1], 3)))
+    point_cov = G @ cov @ G.mT + R @ delta_cov[..., :2, :2] @ R.mT
+    point_cov += HEADING_SIGMA_RAD**2 * side[..., :, None] * side[..., None, :]
+    return _seen_at(model.invert(z, origin) - shift, point_cov)
+
+
+def _seen_at(point: Array, cov: Array) -> tuple[Array, Array]:
+    """Bearings and ranges (..., 2) of points (..., 2) from the origin, with covariances."""
+    model, origin = MODELS["point"], np.zeros(3)
     z = model.predict(origin, point)
     _, H = model.jacobians(z, origin, point)
-    cov = o.cov + H @ extra @ H.T
-    return Association(sighting.robot, state_ns, other, "robot-point", z, cov)
+    return z, H @ cov @ H.mT
+
+
+def shared(associations: Sequence[Association]) -> tuple[Association, ...]:
+    """Associations of one step: n of one target by one robot count as one.
+
+    Errors of a target's sightings within a short span are nearly the same (MRCLAM: the ranges of
+    consecutive images correlate by 0.8), so they get n times the covariance.
+    """
+    count = Counter((a.robot, a.target) for a in associations)
+    return tuple(replace(a, cov=a.cov * count[a.robot, a.target]) for a in associations)

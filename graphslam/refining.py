@@ -8,17 +8,19 @@ taken in once (again and again it would collapse).
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from graphslam.backends.calibrated import solve_calibrated
 from graphslam.config import Config
-from graphslam.dead_reckoning import Track
-from graphslam.gathering import Sources, carried, met
+from graphslam.dead_reckoning import IntArray, Track
+from graphslam.frontend.sightings import sighting_observation
+from graphslam.gathering import Sources, met_by, transported
 from graphslam.geometry import Array, between, wrap
-from graphslam.models import MODELS
+from graphslam.models import MODELS, transport
 from graphslam.models.motion import Calibration
-from graphslam.records import Association, Estimate, Step
+from graphslam.records import Estimate, Motion, Step
 
 #: times that motions and sightings are made anew
 ROUNDS = 3
@@ -60,82 +62,140 @@ def refine(
     priors = {name: track.nominal for name, track in tracks.items()}
     inflation: dict[str, Array] = {}
     slack: dict[str, Array] = {}
-    made = tuple(steps)
+    made, seen = tuple(steps), sightings_of(steps, sources)
     for k in range(ROUNDS):
         now = {name: track.calibration for name, track in tracks.items()}
         for name, track in tracks.items():
             still = np.diag(np.full(len(now[name].mean), 1e-18))
             track.calibration = Calibration(now[name].names, now[name].mean, still)
-        made, found = _remade(steps, estimate, tracks, sources)
+        made = _remade(steps, estimate, tracks, seen)
         if k:
-            inflation = variances(found, estimate)
+            inflation = variances(made, seen, estimate)
             slack = motion_variances(made, estimate)
         made = tuple(_inflated(step, inflation, slack) for step in made)
-        solved = solve_calibrated(made, estimate, priors, now, config.robust)
+        solved = solve_calibrated(
+            made, estimate, priors, now, config.robust, covariances=k == ROUNDS - 1
+        )
         estimate = solved.estimate
         for name, track in tracks.items():
             track.calibration = solved.calibrations[name]
     return Refined(estimate, made)
 
 
-def _remade(
-    steps: Sequence[Step], estimate: Estimate, tracks: Mapping[str, Track], sources: Sources
-) -> tuple[tuple[Step, ...], list[tuple[Association, int]]]:
-    """Steps with the tracks' calibration of now; their associations with times of sighting."""
-    made, found = [], []
-    for step in steps:
-        motions = {
-            name: tracks[name].motion(motion.start_ns, motion.end_ns)
-            for name, motion in step.motions.items()
-        }
-        associations = []
-        for a in step.associations:
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """Sightings of one kind by one robot of one other robot, or of landmarks (``other`` None).
+
+    ``where`` (n, 2): number of the step and of the association in it; times (n,) ns of the
+    observer's state, of the sighting, and of the step; ``z`` (n, k) and ``cov`` (n, k, k) as
+    measured, in the base frame; ``share`` (n,) how many of the step are of the same target, see
+    `gathering.shared`.
+    """
+
+    robot: str
+    other: str | None
+    where: IntArray
+    state_ns: IntArray
+    seen_ns: IntArray
+    step_ns: IntArray
+    z: Array
+    cov: Array
+    share: Array
+
+
+def sightings_of(steps: Sequence[Step], sources: Sources) -> list[Seen]:
+    """All sightings behind the associations of steps, in groups to be carried at once."""
+    groups: dict[tuple[str, str | None, int], list[tuple[Any, ...]]] = defaultdict(list)
+    for n, step in enumerate(steps):
+        count = Counter((a.robot, a.target) for a in step.associations)
+        for k, a in enumerate(step.associations):
             sighting = sources.get((a.robot, a.time_ns, a.z.tobytes()))
             if sighting is None:
-                associations.append(a)
                 continue
-            o = carried(sighting, a.time_ns, tracks[a.robot])
-            if isinstance(a.target, str):
-                other = tracks[a.target]
-                turn = _heading(estimate, a.target, step.time_ns) - _heading(
-                    estimate, a.robot, a.time_ns
-                )
-                new = met(o, sighting, a.time_ns, step.time_ns, turn, other)
-            else:
-                new = replace(a, z=o.z, cov=o.cov)
-            associations.append(new)
-            found.append((new, sighting.time_ns))
-        made.append(replace(step, motions=motions, associations=tuple(associations)))
-    return tuple(made), found
+            o = sighting_observation(sighting)
+            z, cov = transport(o.z, o.cov, sighting.mount, np.zeros((3, 3)))
+            other = a.target if isinstance(a.target, str) else None
+            times = (a.time_ns, sighting.time_ns, step.time_ns)
+            row = ((n, k), *times, z, cov, count[a.robot, a.target])
+            groups[a.robot, other, len(z)].append(row)
+    return [
+        Seen(robot, other, *map(np.array, zip(*rows, strict=True)))
+        for (robot, other, _), rows in groups.items()
+    ]
 
 
-def _heading(estimate: Estimate, robot: str, time_ns: int) -> float:
+def _remade(
+    steps: Sequence[Step], estimate: Estimate, tracks: Mapping[str, Track], seen: Sequence[Seen]
+) -> tuple[Step, ...]:
+    """Steps with the tracks' calibration of now."""
+    associations = [list(step.associations) for step in steps]
+    for group in seen:
+        z, cov = _carried(group, estimate, tracks)
+        cov = cov * group.share[:, None, None]
+        for (n, k), z_k, cov_k in zip(group.where, z, cov, strict=True):
+            associations[n][k] = replace(associations[n][k], z=z_k, cov=cov_k)
+    motions: list[dict[str, Motion]] = [{} for _ in steps]
+    for robot, track in tracks.items():
+        made = [(n, step.motions[robot]) for n, step in enumerate(steps) if robot in step.motions]
+        start_ns, end_ns = (
+            np.array([getattr(m, name) for _, m in made], dtype=np.int64)
+            for name in ("start_ns", "end_ns")
+        )
+        new = track.motions(start_ns, end_ns)
+        for i, (n, m) in enumerate(made):
+            motions[n][robot] = new.one(i, m.start_ns, m.end_ns)
+    return tuple(
+        # in the order of the step: it is the order of the states
+        replace(step, motions={r: new[r] for r in step.motions}, associations=tuple(found))
+        for step, new, found in zip(steps, motions, associations, strict=True)
+    )
+
+
+def _carried(group: Seen, estimate: Estimate, tracks: Mapping[str, Track]) -> tuple[Array, Array]:
+    """Measurements (n, k) of a group between the states, and their covariances."""
+    moved = tracks[group.robot].motions(group.state_ns, group.seen_ns)
+    apart = (group.state_ns != group.seen_ns)[:, None, None]
+    z, cov = transported(group.z, group.cov, moved.delta, moved.cov * apart)
+    if group.other is None:
+        return z, cov
+    moved = tracks[group.other].motions(group.step_ns, group.seen_ns)
+    apart = (group.step_ns != group.seen_ns)[:, None, None]
+    turn = (
+        _poses(estimate, group.other, group.step_ns)[:, 2]
+        - _poses(estimate, group.robot, group.state_ns)[:, 2]
+    )
+    return met_by(z, cov, moved.delta, moved.cov * apart, turn)
+
+
+def _poses(estimate: Estimate, robot: str, times_ns: IntArray) -> Array:
+    """States (n, 3) of a robot at their times (n,)."""
     states = estimate.states[robot]
-    return float(states.poses[np.searchsorted(states.stamps_ns, time_ns), 2])
+    return states.poses[np.searchsorted(states.stamps_ns, times_ns)]
 
 
-def variances(found: Sequence[tuple[Association, int]], estimate: Estimate) -> dict[str, Array]:
+def variances(steps: Sequence[Step], seen: Sequence[Seen], estimate: Estimate) -> dict[str, Array]:
     """Robot -> factor (2,) on the variances of its bearings and ranges of points.
 
     The variance of sums of normalised residuals over windows, per residual: 1 for white noise of
     the stated size, larger where errors are larger or correlated, as several sightings then tell no
     more than one. (Batch means, e.g. G. S. Fishman, Discrete-Event Simulation, 2001, section 6.)
     """
-    residuals: dict[str, dict[tuple[int | str, int], list[Array]]] = defaultdict(dict)
-    for a, time_ns in found:
-        if a.model != "point" or not isinstance(a.target, int):
-            continue
-        states = estimate.states[a.robot]
-        x = states.poses[np.searchsorted(states.stamps_ns, a.time_ns)]
-        r = MODELS["point"].residual(a.z, x, estimate.landmarks[a.target][0])
-        window = (a.target, time_ns // WINDOW_NS)
-        residuals[a.robot].setdefault(window, []).append(r / np.sqrt(np.diag(a.cov)))
     factors = {}
-    for robot, windows in residuals.items():
-        every = np.concatenate([np.array(w) for w in windows.values()])
-        cut = CUT * 1.4826 * np.median(np.abs(every), axis=0)
-        sums = np.array([np.clip(w, -cut, cut).sum(axis=0) for w in windows.values()])
-        factors[robot] = np.maximum(np.square(sums).sum(axis=0) / len(every), SMALLEST)
+    for group in seen:
+        if group.other is not None or group.z.shape[1] != 2:
+            continue
+        made = [steps[n].associations[k] for n, k in group.where]
+        targets = np.array([a.target for a in made])
+        x = _poses(estimate, group.robot, group.state_ns)
+        t = np.array([estimate.landmarks[int(i)][0] for i in targets])
+        r = MODELS["point"].residual(np.array([a.z for a in made]), x, t)
+        r /= np.sqrt(np.array([np.diag(a.cov) for a in made]))
+        cut = CUT * 1.4826 * np.median(np.abs(r), axis=0)
+        windows = np.column_stack([targets, group.seen_ns // WINDOW_NS])
+        _, window = np.unique(windows, axis=0, return_inverse=True)
+        sums = np.zeros((window.max() + 1, 2))
+        np.add.at(sums, window.ravel(), np.clip(r, -cut, cut))
+        factors[group.robot] = np.maximum(np.square(sums).sum(axis=0) / len(r), SMALLEST)
     return factors
 
 

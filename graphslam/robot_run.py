@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from graphslam.calibration import Calibrator
+from graphslam.calibration import Calibrator, told
 from graphslam.dead_reckoning import Track
 from graphslam.geometry import Array, between, compose, inverse
 from graphslam.models.motion import Calibration
@@ -21,7 +21,8 @@ class RobotRun:
 
     ``times`` of the states, ns; per state the causal pose, its covariance and the calibration that
     was known; ``scans`` (stamp, time, mount), ``scanned_ns`` the last one that was used. The
-    states are rigid to the sensor: the base is where the calibration puts it.
+    states are rigid to the sensor: the base is where the calibration puts it. ``refined``: the
+    track's calibration is one that was estimated together with all states.
     """
 
     track: Track
@@ -33,6 +34,7 @@ class RobotRun:
     causal_covs: list[Array] = field(default_factory=list)
     calibrations: list[Calibration] = field(default_factory=list)
     scans: list[tuple[int, int, Array]] = field(default_factory=list)
+    refined: bool = False
 
     @property
     def started(self) -> bool:
@@ -66,6 +68,12 @@ class RobotRun:
     def is_causal(self, states: Trajectory) -> bool:
         """Whether final ``states`` are what each was at its own time: a filter's."""
         return np.array_equal(states.poses, self.causal_poses)
+
+    def calibration_found(self) -> dict[str, tuple[float, float, bool]]:
+        """Parameter -> (value, sigma, observable): what the log says of the odometry."""
+        if self.refined:
+            return told(self.track.calibration, self.track.nominal.cov)
+        return self.calibrator.found()
 
     def result(self, states: Trajectory, start: Array, *, causal_only: bool = False) -> RobotResult:
         """Trajectories of the robot at the stamps that it is reported at.

@@ -5,6 +5,7 @@ keyframe or not -> observations in the base frame -> association -> `Step` -> ba
 on no landmark kind, front end or back end; those are rows of tables.
 """
 
+import dataclasses
 import itertools
 import time
 from collections import Counter, defaultdict
@@ -21,9 +22,10 @@ from graphslam.config import Config, OdometryConfig, RobotConfig, load_config
 from graphslam.consolidating import Tamper, consolidate
 from graphslam.dead_reckoning import Track
 from graphslam.errors import ConfigError, EstimationError, LogError
+from graphslam.exchanged import exchanged_names, renamed
 from graphslam.frontend import FRONT_ENDS, scan_points
 from graphslam.frontend.sightings import sighting_observation
-from graphslam.gathering import Gathered, Sources, carried, gather, met
+from graphslam.gathering import Gathered, Sources, carried, gather, met, shared, ways
 from graphslam.geometry import (
     compose,
     compose_cov,
@@ -66,15 +68,23 @@ Progress = Callable[[int], None]
 class Pipeline:
     """One run over a log."""
 
-    def __init__(self, log: LogSet, config: Config, tamper: Tamper | None = None) -> None:
-        self.log, self.config, self.tamper = log, config, tamper
+    def __init__(
+        self,
+        log: LogSet,
+        config: Config,
+        names: Mapping[str, str] | None = None,
+        tamper: Tamper | None = None,
+    ) -> None:
+        """Nothing read yet; ``names``: false name -> right name of what is sighted."""
+        self.log, self.config, self.names = log, config, names or {}
+        self.tamper = tamper
         self.backend = BACKENDS[config.backend.name](config)
         self.associator = Associator(config.association, self.backend)
         self.front_end = FRONT_ENDS[config.front_end.name]
         self.runs = {
             name: RobotRun(
                 Track(
-                    sensing(config.odometry, log.has_scans(name)),
+                    sensing(odometry_settings(config.odometry, log.notes), log.has_scans(name)),
                     robot_settings(name, config, log.notes),
                     mounted=True,
                 )
@@ -121,10 +131,15 @@ class Pipeline:
                 self.step_ms.append(1e3 * (clock - began))
 
     def wanted(self, messages: Iterable[Message]) -> Iterator[Message]:
-        """Messages without sightings of robots, where these are to be ignored."""
+        """Messages under right names, without sightings of robots where these are to be ignored."""
         ignore = self.config.association.robots == "ignore"
-        for message in messages:
-            if ignore and isinstance(message, Sighting) and message.seen_robot is not None:
+        for recorded in messages:
+            message = recorded
+            if self.names and isinstance(message, Sighting):
+                message = renamed(message, self.names, self.log.robots)
+            if isinstance(message, Sighting) and message.seen_robot == message.robot:
+                self.dropped["sighting: a robot does not see itself"] += 1
+            elif ignore and isinstance(message, Sighting) and message.seen_robot is not None:
                 self.dropped["sighting: of a robot, ignored by association.robots"] += 1
             else:
                 yield message
@@ -158,10 +173,14 @@ class Pipeline:
         began = time.perf_counter()
         known = {i for i, entry in self.associator.map.entries.items() if entry.in_graph}
         associations: tuple[Association, ...] = ()
+        at = {r: step_ns if r in motions else self.runs[r].state_ns for r in gathered.robots}
+        moved = ways(gathered, at, {robot: self.runs[robot].track for robot in at})
+        every = [sighting for image in gathered.images for sighting in image]
+        observed = iter(carried(every, [moved[s.robot, s.time_ns] for s in every]))
         for image in gathered.images:
             run, robot = self.runs[image[0].robot], image[0].robot
-            state_ns = step_ns if robot in motions else run.state_ns
-            seen = [carried(sighting, state_ns, run.track) for sighting in image]
+            state_ns = at[robot]
+            seen = list(itertools.islice(observed, len(image)))
             for o, sighting in zip(seen, image, strict=True):
                 self.sources[robot, state_ns, o.z.tobytes()] = sighting
             landmarks = [o for o, s in zip(seen, image, strict=True) if s.seen_robot is None]
@@ -185,7 +204,8 @@ class Pipeline:
                         for name, r in ((s.seen_robot, other), (robot, run))
                     ]
                     turn = float(headings[0] - headings[1])
-                    association = met(o, s, state_ns, step_ns, turn, other.track)
+                    way = moved[s.seen_robot, s.time_ns]
+                    association = met(o, s, state_ns, way, turn)
                     self.sources[robot, state_ns, association.z.tobytes()] = s
                     associations += (association,)
         self.note_covariances()
@@ -415,12 +435,12 @@ class Pipeline:
             if len(run.causal_covs) < len(run.times):
                 run.causal_covs.append(self.backend.joint(robot, []).cov)
 
-    def finish(self) -> Estimate:
-        """The final estimate: of smoothers from what is only known at the end."""
+    def estimate(self) -> tuple[Estimate, bool]:
+        """What the back end has at the end, and whether that is only where `reconsider` begins."""
         settings = self.config.backend
         if isinstance(self.backend, Isam2Backend) and settings.polish and settings.reconsider:
-            return self.reconsider(self.backend.rough())
-        return self.backend.finish()
+            return self.backend.rough(), True
+        return self.backend.finish(), False
 
     def reconsider(self, estimate: Estimate) -> Estimate:
         """The log solved again from a rough estimate; the steps follow the result."""
@@ -428,6 +448,8 @@ class Pipeline:
         if self.sources:
             refined = refine(self.steps, estimate, tracks, self.sources, self.config)
             self.steps = list(refined.steps)
+            for name in tracks:
+                self.runs[name].refined = self.config.odometry.calibrate
             return refined.estimate
         done = consolidate(
             self.steps,
@@ -441,6 +463,15 @@ class Pipeline:
         self.steps = list(done.steps)
         self.counts.update(done.counts)
         return done.estimate
+
+    def exchanged(self, estimate: Estimate) -> dict[str, str]:
+        """Names of what was sighted that turn out to be each other's: false -> right name."""
+        if not self.sources or self.config.association.identities == "ignore":
+            return {}
+        tracks = {name: run.track for name, run in self.runs.items() if run.started}
+        sightings = {id(sighting): sighting for sighting in self.sources.values()}
+        pairs = exchanged_names(sightings.values(), estimate, tracks)
+        return {a: b for pair in pairs for a, b in (pair, pair[::-1])}
 
 
 def smooth(
@@ -464,13 +495,16 @@ def smooth(
     """
     began = time.perf_counter()
     check_robots(log, config)
-    pipeline = Pipeline(log, config, tamper)
-    pipeline.run(progress)
-    if not pipeline.steps:
-        raise LogError(f"{log.files[0].path}: nothing in it could be used; see `graphslam info`")
-    pipeline.note_covariances()
+    pipeline = _passed(Pipeline(log, config, None, tamper), progress)
     finishing = time.perf_counter()
-    estimate = pipeline.finish()
+    estimate, rough = pipeline.estimate()
+    names = pipeline.exchanged(estimate)
+    if names:
+        pipeline = _passed(Pipeline(log, config, names, tamper), progress)
+        finishing = time.perf_counter()
+        estimate, rough = pipeline.estimate()
+    if rough:
+        estimate = pipeline.reconsider(estimate)
     pipeline.seconds["final optimisation"] = time.perf_counter() - finishing
     finishing = time.perf_counter()
     runs = {name: run for name, run in sorted(pipeline.runs.items()) if run.started}
@@ -505,7 +539,7 @@ def smooth(
         line_closures=pipeline.associator.closures,
         landmarks=len(landmarks),
         seconds=pipeline.seconds,
-        calibration={name: run.calibrator.found() for name, run in runs.items()},
+        calibration={name: run.calibration_found() for name, run in runs.items()},
         warnings=run_warnings(pipeline),
         log_s=1e-9 * (pipeline.last_ns - pipeline.first_ns),
     )
@@ -521,12 +555,38 @@ def smooth(
     )
 
 
+def _passed(pipeline: Pipeline, progress: Progress) -> Pipeline:
+    """A pipeline after its log went by."""
+    pipeline.run(progress)
+    if not pipeline.steps:
+        path = pipeline.log.files[0].path
+        raise LogError(f"{path}: nothing in it could be used; see `graphslam info`")
+    pipeline.note_covariances()
+    return pipeline
+
+
 def robot_settings(name: str, config: Config, notes: Mapping[str, str]) -> RobotConfig:
     """Settings of a robot: the configuration's, else what the log's notes say of its geometry."""
     if {name, "default"} & set(config.robots):
         return config.robot(name)
     noted = [f"{key}={value}" for key, value in notes.items() if key.startswith(f"robots.{name}.")]
     return load_config(overrides=noted).robot(name)
+
+
+def odometry_settings(config: OdometryConfig, notes: Mapping[str, str]) -> OdometryConfig:
+    """Settings of odometry: the configuration's where set, else what the log's notes say of it.
+
+    How well velocities are driven that were only commanded is a property of the log's robots, which
+    whoever wrote the log knows, as with the noise of sightings.
+    """
+    noted = [f"{key}={value}" for key, value in notes.items() if key.startswith("odometry.")]
+    known, default = load_config(overrides=noted).odometry, OdometryConfig()
+    changes = {
+        field.name: getattr(known, field.name)
+        for field in dataclasses.fields(config)
+        if getattr(config, field.name) == getattr(default, field.name)
+    }
+    return replace(config, **changes)
 
 
 def sensing(config: OdometryConfig, scans: bool) -> OdometryConfig:
@@ -539,16 +599,6 @@ def sensing(config: OdometryConfig, scans: bool) -> OdometryConfig:
         laser_sigma_rad=0.0,
         laser_latency_sigma_s=config.sighting_latency_sigma_s,
     )
-
-
-def shared(associations: Sequence[Association]) -> tuple[Association, ...]:
-    """Associations of one step: n of one target by one robot count as one.
-
-    Errors of a target's sightings within a short span are nearly the same (MRCLAM: the ranges of
-    consecutive images correlate by 0.8), so they get n times the covariance.
-    """
-    count = Counter((a.robot, a.target) for a in associations)
-    return tuple(replace(a, cov=a.cov * count[a.robot, a.target]) for a in associations)
 
 
 def check_robots(log: LogSet, config: Config) -> None:
@@ -575,6 +625,11 @@ def run_warnings(pipeline: Pipeline) -> list[str]:
         for name, run in pipeline.runs.items()
         if run.track.source == "wheels"
         and robot_settings(name, pipeline.config, pipeline.log.notes) == RobotConfig()
+    ]
+    warnings += [
+        f"{a} and {b}: bore each other's code in all sightings; their names were exchanged back"
+        for a, b in pipeline.names.items()
+        if a < b
     ]
     warnings += [
         f"the back end could not use {count} x {reason}"

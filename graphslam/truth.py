@@ -5,7 +5,7 @@ from pathlib import Path
 
 from graphslam.config import Config
 from graphslam.errors import LogError, OutputError
-from graphslam.logs import KnownTruth, LogSet, read_truth
+from graphslam.logs import KnownTruth, LogSet, read_truth, truth_in
 from graphslam.records import Trajectory, TrueLandmark, Truth
 from graphslam.results import SavedResult, read_trajectory
 
@@ -16,7 +16,7 @@ def truth_of_logs(log: LogSet, config: Config) -> KnownTruth:
     """What open logs say about the truth, perhaps nothing."""
     if not any(topic.record in (Truth, TrueLandmark) for topic in log.topics):
         return KnownTruth({}, ())  # spares reading them once more
-    return read_truth([file.path for file in log.files], config)
+    return truth_in(log.opened, config)
 
 
 def truth_of_run(saved: SavedResult) -> KnownTruth:

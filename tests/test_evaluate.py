@@ -194,6 +194,30 @@ def test_points_match_by_identity_even_when_another_is_nearer():
     assert (metrics["matched"], metrics["missed"], metrics["extra"]) == (1, 1, 0)
 
 
+def test_landmarks_that_bear_each_others_names_are_told_and_compared_by_place():
+    """A table of names may be wrong; the map is not. One that is merely wrong is not excused."""
+    true = [
+        TrueLandmark("", 0, 0, name, "point", np.array([x, 0.0, np.nan]), None)
+        for name, x in (("a", 0.0), ("b", 4.0), ("c", 8.0))
+    ]
+
+    def metrics(**places):
+        return landmark_metrics(
+            [
+                landmark(k, "point", [x, 0, np.nan], 0.01 * np.eye(2), identity=name)
+                for k, (name, x) in enumerate(places.items())
+            ],
+            true,
+        )
+
+    found = metrics(a=4.1, b=0.1, c=8.1)
+    assert found["exchanged"] == [("a", "b")]
+    assert found["rmse_m"] == pytest.approx(0.1)
+    found = metrics(a=4.1, b=4.1, c=8.1)
+    assert found["exchanged"] == []
+    assert found["rmse_m"] > 1
+
+
 def test_points_without_identity_match_optimally_within_one_metre():
     # Greedy would pair the estimate at 0.6 with the truth at 0.8 and leave the other two apart.
     true = [

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from graphslam import records
-from graphslam.config import Config
+from graphslam.config import Config, OdometryConfig
 from graphslam.errors import LogError
 from graphslam.geometry import compose, exp
 from graphslam.logs import IMPORTERS, open_logs, read_truth
-from graphslam.logs.importers.mrclam import LONGEST_ARC_NS
+from graphslam.logs.importers.mrclam import COMMANDED, LONGEST_ARC_NS
+from graphslam.slam import odometry_settings
 
 DATA = Path(os.environ.get("GRAPHSLAM_DATA", Path(__file__).parents[1] / "../shared/data"))
 START = 1248444187
@@ -69,6 +70,17 @@ def test_a_velocity_holds_until_the_next_row(folder, tmp_path):
     np.testing.assert_allclose(odometry[1].pose, [0.05, 0, 0], atol=1e-12)
 
 
+def test_the_log_says_that_its_odometry_is_commanded(folder, tmp_path):
+    """What the log notes applies where the configuration leaves the default."""
+    imported(folder, tmp_path / "log.mcap")
+    notes = open_logs([tmp_path / "log.mcap"], Config()).notes
+    found = odometry_settings(OdometryConfig(k_x_m=0.5), notes)
+    assert found.commanded
+    assert found.k_x_m == 0.5
+    assert found.k_phi_rad == float(COMMANDED["odometry.k_phi_rad"]) != OdometryConfig().k_phi_rad
+    assert odometry_settings(OdometryConfig(), {"format": "carmen"}) == OdometryConfig()
+
+
 def test_stamps_are_exact_and_each_robot_starts_at_its_own_time(folder, tmp_path):
     """A stamp that went through a float is off by up to 120 ns."""
     _, messages = imported(folder, tmp_path / "log.mcap")
@@ -80,9 +92,9 @@ def test_stamps_are_exact_and_each_robot_starts_at_its_own_time(folder, tmp_path
     assert of(messages, records.Truth, "robot1")[0].stamp_ns == START * 1_000_000_000 + 103_000_000
 
 
-def test_rows_that_repeat_a_velocity_are_thinned_without_changing_the_motion(tmp_path):
-    """At 50 Hz only every fifth row of one arc is needed; the path is the same at all of them."""
-    rows = [(START * 1000 + 20 * k, 0.1, 0.3 if k < 60 else -0.2) for k in range(121)]
+def test_rows_are_thinned_without_changing_the_motion(tmp_path):
+    """At 50 Hz only every fifth row is needed; the path is the same at all of them."""
+    rows = [(START * 1000 + 20 * k, 0.1, 0.3 if k < 62 else -0.2) for k in range(125)]
     text = "".join(f"{ms // 1000}.{ms % 1000:03d} {v} {w}\n" for ms, v, w in rows)
     files = {"Barcodes.dat": FILES["Barcodes.dat"], "Robot1_Odometry.dat": text}
     _, messages = imported(write_folder(tmp_path / "set", files), tmp_path / "log.mcap")
@@ -90,7 +102,7 @@ def test_rows_that_repeat_a_velocity_are_thinned_without_changing_the_motion(tmp
     assert len(odometry) < len(rows) / 4
     assert odometry[-1].stamp_ns == rows[-1][0] * 1_000_000
     assert max(np.diff([m.stamp_ns for m in odometry])) <= LONGEST_ARC_NS
-    turned = compose(exp(np.array([0.12, 0, 0.36])), exp(np.array([0.12, 0, -0.24])))
+    turned = compose(exp(np.array([0.124, 0, 0.372])), exp(np.array([0.124, 0, -0.248])))
     np.testing.assert_allclose(odometry[-1].pose, turned, atol=1e-12)
 
 

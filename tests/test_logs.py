@@ -615,3 +615,24 @@ def test_info_on_a_real_log():
     scan = next(topic for topic in info.topics if topic.name == "/scan")
     assert scan.count == 3035 and scan.no_return_m == pytest.approx(81.83)
     assert info.robots[0].reverses and not info.problem
+
+
+@pytest.mark.parametrize("frames", [["world"] * 3, ["map", "world", "map"], ["", "", ""]])
+def test_many_true_poses_at_once_are_the_single_ones(frames):
+    """Numbers are aligned to 8 bytes after a frame's name of any length; stamps to the digit."""
+    poses = [(1.5, -2.0, 3.0), (np.nan, 0.0, 0.0), (1e-9, 7.0, -3.1)]
+    stamps = [1_248_444_187_156_000_001 + k for k in range(3)]
+    data = [
+        schemas.encode(
+            schemas.TRUE_POSE,
+            schemas.build(
+                schemas.TRUE_POSE, header=schemas.header(stamp, frame), x=x, y=y, phi=phi
+            ),
+        )
+        for stamp, frame, (x, y, phi) in zip(stamps, frames, poses, strict=True)
+    ]
+    found_ns, found = schemas.decode_true_poses(data)
+    assert found_ns.tolist() == stamps
+    np.testing.assert_array_equal(found, poses)
+    with pytest.raises(schemas.CdrError):
+        schemas.decode_true_poses([data[0], data[1][:20]])

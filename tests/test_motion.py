@@ -13,6 +13,7 @@ from graphslam.dead_reckoning import EDGE_NS, STANDING_SIGMA, Track
 from graphslam.geometry import between, compose, compose_cov, exp, wrap
 from graphslam.models import MOTION_SOURCES, compound
 from graphslam.models.motion import (
+    Calibration,
     Increments,
     model_error_cov,
     mounted_motion,
@@ -145,7 +146,7 @@ def test_every_source_turns_rows_into_increments(source):
     """Contract of a row of MOTION_SOURCES: shapes, symmetric positive semidefinite noise, and rows
     that scale: half of a row is half of the way."""
     rng = np.random.default_rng(5)
-    size = {"odometry": 3, "given": 12, "wheels": 2}[source]
+    size = {"odometry": 3, "commands": 3, "given": 12, "wheels": 2}[source]
     rows = rng.normal(size=(7, size))
     if source == "given":
         roots = rng.normal(size=(7, 3, 3))
@@ -473,3 +474,58 @@ def test_odometry_that_is_set_anew_is_no_motion():
     np.testing.assert_allclose(track.motion(0, 4 * SECOND).delta, [2.0, 0, 0], atol=1e-12)
     usual = odometry_track(range(5), [[0.5 * k, 0, 0] for k in range(5)])
     assert usual.resets == 0
+
+
+@pytest.mark.parametrize("mounted", [False, True])
+@pytest.mark.parametrize("kind", ["odometry", "commands", "wheels"])
+def test_many_motions_at_once_are_the_single_ones(kind, mounted):
+    """Forth and back, inside readings and beyond both ends; a lever arm from the wrong end, or the
+    time of another clock, breaks it."""
+    rng = np.random.default_rng(8)
+    config = OdometryConfig(commanded=kind == "commands")
+    track = Track(config, ROBOT, mounted=mounted)
+    steps = rng.uniform(-0.02, 0.1, size=(200, 2))
+    steps[60:90] = 0.0  # it stands for a while
+    pose, angles = np.zeros(3), np.zeros(2)
+    for k, step in enumerate(steps):
+        ns = k * SECOND // 10
+        pose = compose(pose, exp(np.array([step[0], 0.0, step[1]])))
+        angles = angles + step
+        if kind == "wheels":
+            track.add(WheelAngles("r", ns, ns, *angles.tolist()))
+        else:
+            track.add(OdometryPose("r", ns, ns, pose))
+    known = track.calibration
+    mean = 0.3 * np.sqrt(np.diag(known.cov)) * rng.normal(size=len(known.mean))
+    track.calibration = Calibration(known.names, mean, known.cov)
+    start, end = rng.integers(-SECOND, 21 * SECOND, size=(2, 60))
+    start[0] = end[0]
+    at_readings = np.arange(60) % 2 == 0
+    start[at_readings], end[at_readings] = (
+        t[at_readings] // (SECOND // 10) * (SECOND // 10) + track.latency_ns for t in (start, end)
+    )
+    many = track.motions(start, end)
+    for k in range(len(start)):
+        one = track.between(int(start[k]), int(end[k]))
+        miss = many.delta[k] - one.delta
+        np.testing.assert_allclose([*miss[:2], wrap(miss[2])], 0.0, atol=1e-10)
+        # within a reading the white noise of the part before is taken out along the axes of its
+        # start, not along those of the part that is left: up to 0.1 rad apart here
+        scale = np.sqrt(np.outer(np.diag(one.cov), np.diag(one.cov)))
+        near = 1e-6 if at_readings[k] else 0.03
+        np.testing.assert_allclose(many.cov[k] / scale, one.cov / scale, atol=near)
+        if end[k] >= start[k]:
+            # chords of parts of a circle segment: shorter by the square of its turn
+            np.testing.assert_allclose(many.length_m[k], one.length_m, atol=1e-4)
+            np.testing.assert_allclose(many.d_cal[k], one.d_delta_d_calibration, atol=1e-6)
+
+
+def test_a_robot_that_turns_drives_less_of_what_was_commanded():
+    """By d²/2 per squared curvature, where the speed meant is that of a point at distance d: to
+    the fourth order in d times the curvature."""
+    v, turn, d = 0.1, 0.08, 0.15
+    twist = [np.hypot(v, d * turn), 0.0, turn]
+    calibration = np.array([0.0, 0.0, 0.0, d**2 / 2])
+    found = MOTION_SOURCES["commands"](np.array([twist]), calibration, ROBOT, NOISE).delta[0]
+    np.testing.assert_allclose(found, exp(np.array([v, 0.0, turn])), atol=v * (d * turn / v) ** 4)
+    assert found[0] < exp(np.array(twist))[0]

@@ -39,6 +39,8 @@ def solve_calibrated(
     priors: Mapping[str, Calibration],
     now: Mapping[str, Calibration],
     kernel: RobustConfig,
+    *,
+    covariances: bool = True,
 ) -> CalibratedEstimate:
     """Optimise all states, landmarks and calibrations together.
 
@@ -51,6 +53,7 @@ def solve_calibrated(
         priors: per robot what is known of its calibration before any data.
         now: per robot the calibration that the motions were made with.
         kernel: for observations.
+        covariances: whether they are wanted, which takes its time; else they are NaN.
 
     Raises:
         EstimationError: a covariance is not positive definite, or a state is unknown.
@@ -98,7 +101,8 @@ def solve_calibrated(
     parameters.setMaxIterations(50)
     try:
         values = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-        return _result(builder, graph, values, priors, free, numbers)
+        marginals = gtsam.Marginals(graph, values) if covariances else None
+        return _result(builder, graph, values, marginals, priors, free, numbers)
     except RuntimeError as error:
         raise builder.explain(error) from error
 
@@ -153,24 +157,30 @@ def _result(
     builder: GraphBuilder,
     graph: gtsam.NonlinearFactorGraph,
     values: gtsam.Values,
+    marginals: gtsam.Marginals | None,
     priors: Mapping[str, Calibration],
     free: Mapping[str, IntArray],
     numbers: Mapping[str, int],
 ) -> CalibratedEstimate:
     """Means and marginal covariances of everything, as records."""
-    marginals = gtsam.Marginals(graph, values)
+
+    def marginal(key: int, dim: int) -> Array:
+        if marginals is None:
+            return np.full((dim, dim), np.nan)
+        return np.asarray(marginals.marginalCovariance(key))
+
     states = {}
     for robot in sorted(builder.robots):
         keys = [builder.state_key(robot, n) for n in range(len(builder.states.times[robot]))]
         poses = np.array([read(values, k, 3) for k in keys])
-        covs = np.array([marginals.marginalCovariance(k) for k in keys])
+        covs = np.array([marginal(k, 3) for k in keys])
         states[robot] = Trajectory(
             builder.states.stamps(robot), poses, rotate_cov(covs, poses[:, 2])
         )
     landmarks = {}
     for landmark, dim in builder.landmark_dims.items():
         key = factors.landmark_key(landmark)
-        mean, cov = read(values, key, dim), marginals.marginalCovariance(key)
+        mean, cov = read(values, key, dim), marginal(key, dim)
         landmarks[landmark] = (mean, rotate_cov(cov, mean[2]) if dim == 3 else cov)
     calibrations = {}
     for robot, prior in priors.items():
@@ -178,7 +188,7 @@ def _result(
         if len(use):
             key = _key(numbers[robot])
             mean[use] = values.atVector(key)
-            cov[np.ix_(use, use)] = marginals.marginalCovariance(key)
+            cov[np.ix_(use, use)] = marginal(key, len(use))
         calibrations[robot] = Calibration(prior.names, mean, cov)
     dof = (
         builder.rows

@@ -133,18 +133,23 @@ class GraphBuilder:
             self.skipped["observation from a past state"] += 1
             return None
         key, model = self.state_key(seen.robot, number), MODELS[seen.model]
-        x = estimate(key, 3)
+        # only new ones, and lines, are built at an estimate, which is dear to ask for
+        x = t = np.zeros(3)
         what = f"seen from robot {seen.robot} at {seen.time_ns} ns"
         made: list[gtsam.NonlinearFactor] = []
         new = None
         if isinstance(seen.target, int):
             target, what = factors.landmark_key(seen.target), f"landmark {seen.target}, {what}"
             if seen.target not in self.landmark_dims:
+                x = estimate(key, 3)
                 new = (target, model.invert(seen.z, x))
         else:
             number = self.states.number(seen.target, time_ns)
             target, what = self.state_key(seen.target, number), f"robot {seen.target}, {what}"
-        t = estimate(target, model.dim) if new is None else new[1]
+        if new is not None:
+            t = new[1]
+        elif seen.model == "line":
+            x, t = estimate(key, 3), estimate(target, model.dim)
         with _named(what, seen.cov):
             if new is not None and seen.model == "line":
                 made.append(factors.line_gauge_factor(key, target, seen, wide=self._wide))

@@ -139,6 +139,8 @@ def evaluation(found: Mapping[str, Any]) -> None:
                 f"largest NEES/dof: {worst['nees_per_dof']:.3g}, landmark {worst['id']}, "
                 f"{worst['error_m']:.3g} m off"
             )
+        for a, b in marks.get("exchanged", ()):
+            console.print(f"landmarks {a} and {b} bear each other's names; compared by place")
     if relations := found.get("relations"):
         head = ["relations", "", "matched", "unmatched", "mean, m", "std, m", "median, m"]
         head += ["mean, deg", "std, deg"]

@@ -6,7 +6,7 @@
 from graphslam.logs.importers import IMPORTERS, ImportSummary, pose_stamp_ns
 from graphslam.logs.inspect import LogInfo, RobotInfo, TopicInfo, inspect_logs
 from graphslam.logs.log_set import LogFile, LogSet, open_logs
-from graphslam.logs.truth import KnownTruth, read_true_associations, read_truth
+from graphslam.logs.truth import KnownTruth, read_true_associations, read_truth, truth_in
 from graphslam.logs.writer import LogWriter
 
 __all__ = [
@@ -24,4 +24,5 @@ __all__ = [
     "pose_stamp_ns",
     "read_true_associations",
     "read_truth",
+    "truth_in",
 ]

@@ -57,6 +57,11 @@ class LogSet:
     def __post_init__(self) -> None:
         self._opening_warnings = len(self.warnings)
 
+    @property
+    def opened(self) -> Sequence[McapFile]:
+        """The files as they were opened, in the order of ``files``."""
+        return self._mcap
+
     def has_scans(self, robot: str) -> bool:
         """Whether the logs hold laser scans of ``robot``."""
         return any(t.robot == robot and t.record is records.Scan for t in self.topics)

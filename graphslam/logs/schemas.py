@@ -5,14 +5,20 @@ are numpy arrays. Our own types are defined here as ros2msg text, which is also 
 puts into the file, so that any ROS 2 or MCAP tool can decode them. docs/logs.md explains them.
 """
 
+import struct
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
+import numpy as np
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from graphslam.errors import LogError
+from graphslam.geometry import Array
+
+IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
 LASER_SCAN = "sensor_msgs/msg/LaserScan"
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -117,6 +123,45 @@ def decode(schema: str, data: bytes) -> Any:
         return _typestore().deserialize_cdr(data, schema)
     except (SerdeError, IndexError, MemoryError, OverflowError) as error:
         raise CdrError(str(error)) from error
+
+
+def decode_true_poses(data: Sequence[bytes]) -> tuple[IntArray, Array]:
+    """Stamps (n,) ns and poses (n, 3) of many `TRUE_POSE` messages at once.
+
+    Truth from motion capture is most of a log. Messages that differ in frame or byte order are
+    decoded one by one.
+
+    Raises:
+        CdrError: the bytes of a message are cut short or are no such message.
+    """
+    first = data[0] if data else b""
+    # CDR: four bytes of header, the second of which tells the byte order; 8-byte numbers are
+    # aligned relative to what follows
+    named = struct.unpack_from("<I", first, 12)[0] if len(first) >= 16 else 0
+    gap = -(12 + named) % 8
+    if len(first) != 4 + 12 + named + gap + 24 or first[1] != 1:
+        return _true_poses_singly(data)
+    layout = np.dtype(
+        [
+            ("order", "V4"),
+            ("sec", "<i4"),
+            ("nanosec", "<u4"),
+            ("named", "<u4"),
+            ("frame", f"V{named + gap}"),
+            ("pose", "<f8", 3),
+        ]
+    )
+    alike = [len(d) == len(first) and d[:4] == first[:4] and d[12:16] == first[12:16] for d in data]
+    if not all(alike):
+        return _true_poses_singly(data)
+    rows = np.frombuffer(b"".join(data), dtype=layout)
+    return rows["sec"].astype(np.int64) * 1_000_000_000 + rows["nanosec"], rows["pose"].copy()
+
+
+def _true_poses_singly(data: Sequence[bytes]) -> tuple[IntArray, Array]:
+    found = [decode(TRUE_POSE, d) for d in data]
+    stamps = np.array([stamp_ns(m.header.stamp) for m in found], dtype=np.int64)
+    return stamps, np.array([(m.x, m.y, m.phi) for m in found], dtype=float).reshape(-1, 3)
 
 
 def encode(schema: str, message: Any) -> bytes:

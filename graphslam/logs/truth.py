@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from graphslam.config import Config
+from graphslam.geometry import Array
+from graphslam.logs import schemas
 from graphslam.logs.decoders import TopicContext
 from graphslam.logs.log_set import decode_message
-from graphslam.logs.mcap_file import open_mcap, raw_messages
+from graphslam.logs.mcap_file import McapFile, open_mcap, raw_messages
 from graphslam.logs.topics import find_topics
 from graphslam.records import Trajectory, TrueAssociations, TrueLandmark, Truth
 
@@ -40,21 +42,27 @@ def read_truth(paths: Sequence[Path], config: Config) -> KnownTruth:
     Raises:
         LogError: a file is missing, not MCAP, empty, or without any topic that can be decoded.
     """
-    files = [open_mcap(path) for path in paths]
+    return truth_in([open_mcap(path) for path in paths], config)
+
+
+def truth_in(files: Sequence[McapFile], config: Config) -> KnownTruth:
+    """`read_truth` of files that are open already."""
     topics = {t.name: t for t in find_topics(files, config) if t.record in (Truth, TrueLandmark)}
-    poses: dict[str, list[Truth]] = {}
+    poses: dict[str, list[bytes]] = {}
     landmarks: dict[str, TrueLandmark] = {}
     unusable: Counter[str] = Counter()  # `graphslam info` counts and shows these
     for file in files:
         for raw in raw_messages(file, topics.keys()):
             topic = topics[raw.topic]
+            if topic.record is Truth:
+                poses.setdefault(topic.robot, []).append(raw.data)
+                continue
             message = decode_message(raw, topic, TopicContext(topic.robot), unusable)
-            if isinstance(message, Truth):
-                poses.setdefault(topic.robot, []).append(message)
-            elif isinstance(message, TrueLandmark):
+            if isinstance(message, TrueLandmark):
                 landmarks[message.identity or f"without identity {len(landmarks)}"] = message
+    trajectories = {robot: _trajectory(found) for robot, found in sorted(poses.items())}
     return KnownTruth(
-        {robot: _trajectory(found) for robot, found in sorted(poses.items())},
+        {robot: found for robot, found in trajectories.items() if len(found)},
         tuple(landmarks.values()),
         tuple(file.sha256 for file in files),
     )
@@ -81,8 +89,27 @@ def read_true_associations(
     return {name: tuple(messages) for name, messages in found.items()}
 
 
-def _trajectory(found: Sequence[Truth]) -> Trajectory:
-    ordered = sorted(found, key=lambda message: message.stamp_ns)
-    stamps = np.array([message.stamp_ns for message in ordered], dtype=np.int64)
-    poses = np.array([message.pose for message in ordered])
-    return Trajectory(stamps, poses, np.full((len(poses), 3, 3), np.nan))
+def _trajectory(found: Sequence[bytes]) -> Trajectory:
+    """Sorted by header stamp; what cannot be used is left out."""
+    try:
+        stamps, poses = schemas.decode_true_poses(found)
+    except schemas.CdrError:
+        stamps, poses = _usable(found)
+    finite = np.isfinite(poses).all(axis=1)
+    stamps, poses = stamps[finite], poses[finite]
+    order = np.argsort(stamps, kind="stable")
+    return Trajectory(stamps[order], poses[order], np.full((len(order), 3, 3), np.nan))
+
+
+def _usable(found: Sequence[bytes]) -> tuple[schemas.IntArray, Array]:
+    """Stamps and poses of the messages that can be decoded."""
+    stamps: list[schemas.IntArray] = [np.zeros(0, dtype=np.int64)]
+    poses = [np.zeros((0, 3))]
+    for data in found:
+        try:
+            stamp, pose = schemas.decode_true_poses([data])
+        except schemas.CdrError:
+            continue
+        stamps.append(stamp)
+        poses.append(pose)
+    return np.concatenate(stamps), np.concatenate(poses)

@@ -15,6 +15,9 @@ import numpy as np
 from graphslam.config import OdometryConfig, RobotConfig
 from graphslam.geometry import Array, compose, exp, exp_jacobian, inverse, rotation3
 
+#: 1/m: robots that turn more tightly lose no more of their path; they hardly drive at all
+TIGHTEST_PER_M = 6.0
+
 
 def wheel_twist(angles_rad: Array, robot: RobotConfig) -> Array:
     """Twists ``(n, 3)`` (path m, 0, turning rad) of wheel rotations ``(n, 2)`` (left, right) rad.
@@ -95,6 +98,27 @@ def odometry_increments(
     return Increments(exp(twists), model_error_cov(rows, config), exp_jacobian(twists) @ d_twist)
 
 
+def command_increments(
+    rows: Array, calibration: Array, _robot: RobotConfig, config: OdometryConfig
+) -> Increments:
+    """Increments of commanded velocities, compounded to poses: ``rows`` (n, 3) are twists.
+
+    Calibration parameters: those of `odometry_increments`, and by how much less a robot drives
+    while it turns, in m²: the path is shorter by this times the squared curvature. So it is where
+    the speed meant is that of a point at distance d from the middle of the axle, hypot(v, d ω):
+    to second order too large by d²/2 times the squared curvature.
+    """
+    path = np.maximum(np.hypot(rows[:, 0], rows[:, 1]), 1e-12)
+    curvature = np.minimum(np.abs(rows[:, 2]) / path, TIGHTEST_PER_M)
+    d_twist = np.zeros((len(rows), 3, 4))
+    d_twist[:, :2, 0] = rows[:, :2]
+    d_twist[:, 2, 1] = rows[:, 2]
+    d_twist[:, 2, 2] = path
+    d_twist[:, :2, 3] = -rows[:, :2] * (curvature**2)[:, None]
+    twists = rows + d_twist @ calibration
+    return Increments(exp(twists), model_error_cov(rows, config), exp_jacobian(twists) @ d_twist)
+
+
 def given_increments(
     rows: Array, _calibration: Array, _robot: RobotConfig, _config: OdometryConfig
 ) -> Increments:
@@ -156,6 +180,12 @@ def nominal_calibration(source: str, config: OdometryConfig, mounted: bool) -> C
             "rotation_scale": config.rotation_scale_sigma,
             "drift_rad_per_m": config.drift_sigma_rad_per_m,
         },
+        "commands": {
+            "translation_scale": config.translation_scale_sigma,
+            "rotation_scale": config.rotation_scale_sigma,
+            "drift_rad_per_m": config.drift_sigma_rad_per_m,
+            "turning_loss_m2": config.turning_lever_sigma_m**2 / 2,
+        },
         "wheels": {
             "wheel_radius_left_m": config.wheel_radius_sigma_m,
             "wheel_radius_right_m": config.wheel_radius_sigma_m,
@@ -178,6 +208,7 @@ def nominal_calibration(source: str, config: OdometryConfig, mounted: bool) -> C
 MOTION_SOURCES: dict[str, Callable[[Array, Array, RobotConfig, OdometryConfig], Increments]] = {
     "given": given_increments,
     "odometry": odometry_increments,
+    "commands": command_increments,
     "wheels": wheel_increments,
 }
 

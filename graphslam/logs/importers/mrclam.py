@@ -30,8 +30,18 @@ ROBOTS = 5
 #: pixels and takes the range from its apparent height, so errors of range grow with it.
 BEARING_SIGMA_RAD = 0.015
 RANGE_SIGMA_M, RANGE_SIGMA_SHARE = 0.05, 0.03
-#: ns: a row that repeats the velocity before it only continues an arc; one is kept per this time,
-#: so that the arc can be followed while it is driven
+#: noise of driving what was commanded, variances per m or rad (see OdometryConfig). Motors follow
+#: after 0.1 to 0.3 s, not always the same, so a turn of some tenths of a rad misses by some
+#: hundredths; speeds are met to a few per cent.
+COMMANDED = {
+    "odometry.commanded": "true",
+    "odometry.k_x_m": "2e-3",
+    "odometry.k_y_m": "5e-4",
+    "odometry.k_phi_m": "2e-3",
+    "odometry.k_phi_rad": "5e-3",
+}
+#: ns: poses are written this far apart at most, and not nearer than needed for that. Within so
+#: short a time it hardly matters when exactly the velocity changed
 LONGEST_ARC_NS = 100_000_000
 
 _FILES = re.compile(
@@ -48,9 +58,9 @@ def import_mrclam(source: Path, target: Path) -> ImportSummary:
 
     Robots are ``robot1``, ``robot2``, ...; landmarks have their subject's number as identity. A
     velocity holds until the robot's next row, so each row but the last is an arc; Odometry is the
-    poses that these arcs compound to, from the origin, where the velocity changes and every 0.1 s.
-    True poses and landmarks go in where
-    present. What cannot be used is counted by reason in the summary's warnings.
+    poses that these arcs compound to, from the origin, every 0.1 s. How well commands are driven
+    goes into the log's notes as ``odometry.*``, where reading finds it. True poses and landmarks go
+    in where present. What cannot be used is counted by reason in the summary's warnings.
 
     Raises:
         LogError: ``source`` cannot be read, or has no odometry or no table of barcodes.
@@ -85,6 +95,7 @@ def import_mrclam(source: Path, target: Path) -> ImportSummary:
         "stamps": "those of the files, exact",
         "sighting noise": f"assumed, bearing {BEARING_SIGMA_RAD} rad, range {RANGE_SIGMA_M} m + "
         f"{RANGE_SIGMA_SHARE:.0%}",
+        **COMMANDED,
     }
     with LogWriter(target, notes) as log:
         for subject, x, y in _landmarks(texts.get("Landmark_Groundtruth.dat", ""), odd):
@@ -100,31 +111,28 @@ def import_mrclam(source: Path, target: Path) -> ImportSummary:
 
 def _odometry(number: int, rows: Rows) -> Iterator[Entry]:
     """Poses that the velocities compound to: each holds until the next row."""
-    rows = list(_arcs(rows))
     times = np.array([stamp for stamp, _ in rows], dtype=np.int64)
     seconds = np.diff(times) * 1e-9
     speeds = np.array([row for _, row in rows]).reshape(-1, 2)[:-1]
     twists = np.column_stack([speeds[:, 0], np.zeros(len(speeds)), speeds[:, 1]])
-    for stamp_ns, pose in zip(times.tolist(), _compounded(twists * seconds[:, None]), strict=True):
+    poses = _compounded(twists * seconds[:, None])
+    for k in _kept(times.tolist()):
+        stamp_ns, pose = int(times[k]), poses[k]
         yield (
             stamp_ns,
             partial(LogWriter.odometry, robot=_name(number), stamp_ns=stamp_ns, pose=pose),
         )
 
 
-def _arcs(rows: Rows) -> Iterator[tuple[int, list[float]]]:
-    """Rows without those that only continue an arc: the motion is the same, to the last digit."""
-    kept: tuple[int, list[float]] | None = None
-    for row, after in zip(rows, [*rows[1:], None], strict=True):
+def _kept(times: list[int]) -> Iterator[int]:
+    """Places of the rows that are written: the ends, and what is needed between."""
+    kept: int | None = None
+    for k, time_ns in enumerate(times):
         # dropped only if the arc would not become longer than allowed without it
-        if (
-            kept is None
-            or row[1] != kept[1]
-            or after is None
-            or after[0] - kept[0] > LONGEST_ARC_NS
-        ):
-            kept = row
-            yield row
+        last = k == len(times) - 1
+        if kept is None or last or times[k + 1] - kept > LONGEST_ARC_NS:
+            kept = time_ns
+            yield k
 
 
 def _compounded(twists: Array) -> Array:
