@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 
 from graphslam.changes.alignment import align
 from graphslam.changes.evidence import Evidence, past, range_noise, spread, visit_step
+from graphslam.changes.glass import solid
 from graphslam.changes.grid import grid_over
 from graphslam.changes.localisation import localise
 from graphslam.changes.moves import (
@@ -187,9 +188,11 @@ def compare(
         later = align(placed, a, _LATER_GATES, suspects)
         surfaces = (a, surface_of(later, a.nearest.grid, sigmas[1], config))
         evidence = _evidence(reference, later, surfaces, sigmas, config)
+    # judged with all there is: of paths that are broken little seems solid
+    warnings += _plausible(spread(evidence), bent)
+    surfaces, evidence = _of_solid(surfaces, evidence, (reference, later), config)
     a, b = surfaces
     factor = spread(evidence)
-    warnings += _plausible(factor, bent)
     flags = tuple(flagged(e, factor, config.false_alarm_rate / 2) for e in evidence)
     compared, marked = _beams(later, surfaces, evidence, (flags[0], flags[1]))
     seen = np.nonzero(b.beams >= 0)[0]
@@ -306,6 +309,18 @@ def _evidence(
         past(a, later, a.incidence, sigmas[1], config),
         past(b, reference, b.incidence, sigmas[0], config),
     )
+
+
+def _of_solid(
+    surfaces: tuple[Surface, Surface],
+    evidence: tuple[Evidence, Evidence],
+    visits: tuple[Visit, Visit],
+    config: ChangesConfig,
+) -> tuple[tuple[Surface, Surface], tuple[Evidence, Evidence]]:
+    """Surfaces and evidence without what a visit itself looked through."""
+    a, b = solid(surfaces, visits, config)
+    left = [replace(e, tested=e.tested & s.good) for e, s in zip(evidence, (a, b), strict=True)]
+    return (a, b), (left[0], left[1])
 
 
 def _suspects(

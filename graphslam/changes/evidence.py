@@ -103,7 +103,7 @@ def past(
         weight**2 * e**2,
     )
     sums = np.column_stack([summed(row, t, n) for t in terms])
-    inner = _inner(surface)
+    inner = inner_windows(surface)
     total, sum_e, sum_own, sum_common, sum_cos, count, through, *squares = pooled(sums, inner).T
     safe = np.where(total > 0, total, 1.0)
     mean = sum_e / safe
@@ -122,7 +122,7 @@ def past(
     return Evidence(beam, row, mean, variance, count, through, tested, first)
 
 
-def _inner(surface: Surface) -> list[Ints]:
+def inner_windows(surface: Surface) -> list[Ints]:
     """The 3 x 3 neighbourhood out of a surface's windows."""
     side = 2 * WINDOW + 1
     return [
