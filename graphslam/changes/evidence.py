@@ -251,3 +251,18 @@ def spread(evidence: tuple[Evidence, ...]) -> float:
     share = np.cumsum(weight[order]) / weight.sum()
     found = float(scores[order][np.searchsorted(share, _BULK)] / norm.ppf((1 + _BULK) / 2))
     return max(found, _LEAST_SPREAD)
+
+
+def repeatability(evidence: tuple[Evidence, ...]) -> float:
+    """Sigma, m, with which two visits place what did not change; robust.
+
+    Whatever the covariances leave out is in it: other things' bias that pulled at the scans, and
+    walls that are not flat.
+    """
+    offsets = np.abs(np.concatenate([e.offset[e.tested] for e in evidence]))
+    weight = np.concatenate([e.count[e.tested] for e in evidence])
+    if not len(offsets):
+        return 0.0
+    order = np.argsort(offsets)
+    half = int(np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum()))
+    return float(offsets[order][half] / norm.ppf(0.75))
