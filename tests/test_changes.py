@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,9 +10,9 @@ from mcap.reader import make_reader
 from scipy.stats import chi2
 from typer.testing import CliRunner
 
-from graphslam.changes import compare, load_visit, visit_of
+from graphslam.changes import changes_between, compare, load_visit, visit_of
 from graphslam.changes.alignment import align
-from graphslam.changes.compare import lasers_differ
+from graphslam.changes.compare import lasers_differ, same_frame
 from graphslam.changes.evidence import past
 from graphslam.changes.grid import Grid, distinct, grid_over, nearest_of
 from graphslam.changes.localisation import overlays
@@ -21,15 +22,18 @@ from graphslam.changes.regions import counter_clockwise, outline
 from graphslam.changes.registration import register
 from graphslam.changes.straighten import straightened
 from graphslam.changes.surface import surface_of
-from graphslam.changes.visit import on_surface
+from graphslam.changes.visit import on_surface, within
 from graphslam.cli.commands import app
-from graphslam.config import ChangesConfig
+from graphslam.config import ChangesConfig, Config
 from graphslam.errors import OutputError
 from graphslam.geometry import between, compose, inverse, rotation, transform, wrap
+from graphslam.logs import open_logs
 from graphslam.records import Landmark
-from graphslam.results import load
+from graphslam.results import load, save
+from graphslam.simulate import load_scenario, simulate
 from graphslam.simulate.raycast import Fan, cast
 from graphslam.simulate.world import Outline, make_world
+from graphslam.slam import smooth
 
 FAN = Fan(-np.pi / 2, np.pi / 360, 361)
 ROOM = Outline("room", np.array([[0, 0], [8, 0], [8, 6], [0, 6]], float), closed=True)
@@ -357,6 +361,61 @@ def test_the_page_is_whole_and_repeatable():
     assert "before &amp; after" in page
     assert "1 change: 1 appeared." in page
     assert "http" not in page.replace("http://www.w3.org", "")  # opens offline
+
+
+def test_the_example_of_the_docs_does_what_the_command_does(tmp_path, monkeypatch):
+    """It runs as printed, and writes the folder that the command writes."""
+    simulate(load_scenario("change"), tmp_path / "sim", 1)
+    for log, name in (("reference", "before"), ("later", "after")):
+        result = smooth(open_logs([tmp_path / f"sim/{log}.mcap"], Config()), Config())
+        save(result, Config(), tmp_path / name, force=False)
+    text = (Path(__file__).parents[1] / "docs/change-detection.md").read_text(encoding="utf-8")
+    (code,) = [part.split("```")[0] for part in text.split("```python\n")[1:]]
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    exec(compile(code, "docs/change-detection.md", "exec"), names)
+    assert [change.kind for change in names["found"].changes] == ["moved"]
+    rate = ("--set", "changes.false_alarm_rate=0.001")
+    done = CliRunner().invoke(app, ["changes", "before", "after", "-o", "command", *rate])
+    assert done.exit_code == 0, done.output
+    for name in ("changes.json", "changes.pgm", "changes.yaml"):
+        assert Path("command", name).read_bytes() == Path("changes", name).read_bytes()
+    assert {p.name for p in Path("command").iterdir()} == {
+        p.name for p in Path("changes").iterdir()
+    }
+
+
+def test_two_spans_of_a_run_in_which_nothing_changes(tmp_path):
+    """Forth and back through the same room: the second half against the first."""
+    simulate(load_scenario("lab"), tmp_path / "lab.mcap", 0)
+    log = open_logs([tmp_path / "lab.mcap"], Config())
+    save(smooth(log, Config()), Config(), tmp_path / "run", force=False)
+    run = tmp_path / "run"
+    found = changes_between(run, run, CONFIG, (0, 52), (52, 105))
+    assert not found.changes
+    assert found.compared.sum() > 20_000  # of 63 000 beams in the second half
+    assert found.flagged.sum() < 0.02 * found.compared.sum()  # 1 % asked for
+    with pytest.raises(OutputError, match="no scan in it"):
+        changes_between(run, run, CONFIG, (0, 52), (200, 300))
+
+
+def test_two_spans_of_a_run_in_which_something_appears():
+    """A box is put down half-way: one run, one frame, no registration."""
+    rng = np.random.default_rng(20)
+    parts = [visit(things, drive(50, 0.1 * i), rng) for i, things in enumerate(([], [box(5, 4)]))]
+    run = visit_of(
+        np.arange(100) * 100_000_000,
+        *(np.concatenate([getattr(p, k) for p in parts]) for k in ("poses", "covs")),
+        [(FAN.angles, r) for p in parts for r in p.range_m.reshape(50, -1)],
+    )
+    first, second = within(run, (0, 4.95), "first"), within(run, (5, 10), "second")
+    assert len(first.poses) == len(second.poses) == 50
+    (change,) = compare(first, second, CONFIG, same_frame(run)).changes
+    assert change.kind == "appeared"
+    np.testing.assert_allclose(change.polygon.mean(axis=0), [5.2, 4.2], atol=0.2)
+    # half-way through the second span the box has long been there: nothing is new
+    halves = within(run, (5, 7.45), "a"), within(run, (7.5, 10), "b")
+    assert not compare(*halves, CONFIG, same_frame(run)).changes
 
 
 def test_the_command_from_logs_to_json(tmp_path):
