@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graphslam.backends.isam2 import BatchBackend
+from graphslam.backends.isam2 import Resolver
 from graphslam.closing import (
     BORNE_OUT,
     CLOSED,
@@ -23,6 +23,7 @@ from graphslam.closing import (
     loop_closures,
     moved,
     places,
+    residuals,
     slack,
 )
 from graphslam.config import Config
@@ -43,8 +44,8 @@ GATES = ((0.3, 0.15), (0.15, 0.1))
 FEWEST_MOTIONS, MEDIAN_OF_NORMAL = 50, 0.6745
 #: rounds of closing loops
 MAX_CLOSINGS = 8
-#: solutions from slack to tight closures
-TIGHTENINGS = 4
+#: solutions from slack to tight closures; less progress than to this part is none
+TIGHTENINGS, STUCK = 4, 0.9
 
 #: stands between verifying closures and believing them: for tests, which add false ones
 Tamper = Callable[[list[Closure], Sequence[Place]], list[Closure]]
@@ -93,7 +94,7 @@ def consolidate(
         closures, estimate = _closed(steps, estimate, pictures, solve, tamper, counts)
     # merged first: what went to either of two walls that are one would move to and fro
     for gates in GATES:
-        estimate = solve(with_closures(steps, closures), estimate)
+        estimate = solve(steps, estimate, closures)
         for _ in range(MAX_ROUNDS):
             into = _duplicates(estimate, solve.backend, landmarks, steps)
             if not into:
@@ -102,32 +103,43 @@ def consolidate(
             steps = merged_steps(steps, into, kinds)
             merge_entries(landmarks, into)
             counts["landmarks_merged"] += len(into)
-            estimate = solve(with_closures(steps, closures), estimate)
+            estimate = solve(steps, estimate, closures)
         done = reassociate(steps, estimate, landmarks.entries, *gates)
         steps = done.steps
         counts["observations_reassociated"] += done.moved
         counts["observations_dropped"] += done.dropped
     if closures:
         # what the landmarks do not hold together without them
-        missed = far_off(closures, solve(steps, estimate).states, CLOSED)
-        kept = [c for c, off in zip(closures, missed, strict=True) if off]
-        counts["closures_kept"] = len(kept)
-        steps = with_closures(steps, kept)
-    estimate = BatchBackend(config).solve(steps, estimate)
+        estimate = solve(steps, estimate)
+        missed = far_off(closures, estimate.states, CLOSED)
+        closures = [c for c, off in zip(closures, missed, strict=True) if off]
+        counts["closures_kept"] = len(closures)
+    estimate = solve(steps, estimate, closures, rough=False)
     _move(landmarks, estimate)
-    return Consolidated(estimate, steps, counts)
+    return Consolidated(estimate, with_closures(steps, closures), counts)
 
 
 class _Solver:
-    """Solves steps roughly; ``backend`` is the latest one, for its covariances."""
+    """Solves steps with closures; ``backend`` is the latest one, for its covariances."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        self.backend = BatchBackend(config)
+        self._solved: tuple[Sequence[Step], Estimate] | None = None
 
-    def __call__(self, steps: Sequence[Step], start: Estimate) -> Estimate:
-        self.backend = BatchBackend(self._config)
-        return self.backend.solve(steps, start, rough=True)
+    def __call__(
+        self,
+        steps: Sequence[Step],
+        start: Estimate,
+        closures: Sequence[Closure] = (),
+        *,
+        rough: bool = True,
+    ) -> Estimate:
+        """The estimate; the graph stays as long as steps are the same and go on from the last."""
+        if self._solved is None or self._solved[0] is not steps or self._solved[1] is not start:
+            self.backend = Resolver(self._config, steps, start)
+        estimate = self.backend.solve(closures, rough=rough)
+        self._solved = steps, estimate
+        return estimate
 
 
 def _closed(
@@ -141,6 +153,7 @@ def _closed(
     """Loops closed by matching: the closures that are believed, and the estimate with them."""
     closures: list[Closure] = []
     refused: list[Closure] = []
+    taken_back = 0
     found = places(estimate.states, pictures)
     looked: dict[tuple[State, State], Array] = {}
     for _ in range(MAX_CLOSINGS if found else 0):
@@ -156,10 +169,11 @@ def _closed(
         closures += agreed
         estimate = _tightened(steps, closures, estimate, solve)
         gone = far_off(closures, estimate.states, BORNE_OUT)
-        refused += [c for c, off in zip(closures, gone, strict=True) if off]
+        taken_back += sum(map(int, gone))
         closures = [c for c, off in zip(closures, gone, strict=True) if not off]
         found = moved(found, estimate.states)
-    counts["closures_verified"], counts["closures_refused"] = len(closures), len(refused)
+    counts["closures_verified"] = len(closures)
+    counts["closures_refused"] = len(refused) + taken_back
     return closures, estimate
 
 
@@ -167,11 +181,14 @@ def _tightened(
     steps: Sequence[Step], closures: Sequence[Closure], estimate: Estimate, solve: _Solver
 ) -> Estimate:
     """Solved with closures that are slack first, and the tighter the nearer the estimate comes."""
+    before = np.inf
     for _ in range(TIGHTENINGS):
         drawn = slack(closures, estimate.states)
-        estimate = solve(with_closures(steps, drawn), estimate)
-        if all(a is b for a, b in zip(drawn, closures, strict=True)):
+        estimate = solve(steps, estimate, drawn)
+        left = float(np.abs(residuals(closures, estimate.states)).sum())
+        if all(a is b for a, b in zip(drawn, closures, strict=True)) or left > STUCK * before:
             break
+        before = left
     return estimate
 
 
@@ -218,7 +235,7 @@ def _loosened(steps: Sequence[Step], estimate: Estimate) -> tuple[Step, ...]:
 
 
 def _duplicates(
-    estimate: Estimate, backend: BatchBackend, landmarks: LandmarkMap, steps: Sequence[Step]
+    estimate: Estimate, backend: Resolver, landmarks: LandmarkMap, steps: Sequence[Step]
 ) -> dict[int, int]:
     """Landmark that goes -> landmark that it becomes; the map moves to the estimate."""
     _move(landmarks, estimate)

@@ -58,7 +58,9 @@ class GraphBuilder:
     wide where everything is linearised anew.
     """
 
-    def __init__(self, kernel: RobustConfig, *, late: bool = True, wide: bool = True) -> None:
+    def __init__(
+        self, kernel: RobustConfig, *, late: bool = True, wide: bool = True, lines: bool = True
+    ) -> None:
         self.kernel = kernel
         self.states = StateTable()
         self.robots: list[str] = []
@@ -66,7 +68,7 @@ class GraphBuilder:
         self.rows = 0
         self.oldest: dict[str, int] = defaultdict(int)
         self.skipped: Counter[str] = Counter()
-        self._late, self._wide = late, wide
+        self._late, self._wide, self._lines = late, wide, lines
         self._first_seen: dict[int, tuple[str, int]] = {}
 
     def state_key(self, robot: str, number: int) -> int:
@@ -148,16 +150,17 @@ class GraphBuilder:
             target, what = self.state_key(seen.target, number), f"robot {seen.target}, {what}"
         if new is not None:
             t = new[1]
-        elif seen.model == "line":
+        elif self._lines and seen.model == "line":
             x, t = estimate(key, 3), estimate(target, model.dim)
         with _named(what, seen.cov):
             if new is not None and seen.model == "line":
                 made.append(factors.line_gauge_factor(key, target, seen, wide=self._wide))
-            made.append(factors.observation_factor(key, target, seen, self.kernel, x, t))
+            if self._lines or seen.model != "line":
+                made.append(factors.observation_factor(key, target, seen, self.kernel, x, t))
         if new is not None and isinstance(seen.target, int):
             self.landmark_dims[seen.target] = model.dim
             self._first_seen[seen.target] = (seen.robot, seen.time_ns)
-        self.rows += model.rows + len(made) - 1
+        self.rows += model.rows + (new is not None and seen.model == "line")
         return Part(tuple(made), what, new, observed=(key, target, seen), robust=True)
 
     def _closure(self, closure: Closure) -> Part | None:

@@ -2,6 +2,7 @@
 
 `Isam2Backend` is incremental smoothing over the whole past (horizon = infinity); `BatchBackend`
 is its converged limit: the same graph, optimised by Levenberg-Marquardt from iSAM2's estimate.
+`Resolver` solves what was recorded once more.
 """
 
 from collections.abc import Iterable, Sequence
@@ -14,7 +15,7 @@ from graphslam.backends.graph import Estimates, GraphBackend, GraphBuilder, read
 from graphslam.config import Config, RobustConfig
 from graphslam.errors import EstimationError
 from graphslam.geometry import Array
-from graphslam.records import Association, Estimate, Step
+from graphslam.records import Association, Closure, Estimate, Step
 
 #: m or rad: the estimate has converged when all variables together move less than this
 CONVERGED = 1e-6
@@ -28,12 +29,17 @@ CONVERGED_ERROR, CONVERGED_ERROR_ROBUST, CONVERGED_ERROR_ROUGH = 1e-10, 1e-6, 1e
 
 
 class WholeGraph(GraphBuilder):
-    """Keeps every factor there ever was, in ``graph``."""
+    """Keeps every factor there ever was, in ``graph``.
 
-    def __init__(self, kernel: RobustConfig) -> None:
-        super().__init__(kernel)
+    With ``faced_later`` those of lines are only there once `face_lines` made them, all at once.
+    """
+
+    def __init__(self, kernel: RobustConfig, *, faced_later: bool = False) -> None:
+        super().__init__(kernel, lines=not faced_later)
         self.graph = gtsam.NonlinearFactorGraph()
-        self._lines: list[tuple[int, tuple[int, int, Association]]] = []  # place in graph, what
+        self._faced_later = faced_later
+        self._observed: list[tuple[int, int, Association]] = []  # lines, and their places in graph
+        self._places: list[int] = []
 
     def expand(
         self, step: Step, current: Estimates
@@ -52,16 +58,22 @@ class WholeGraph(GraphBuilder):
             for factor in part.factors:
                 graph.add(factor)
             if part.observed is not None and part.observed[2].model == "line":
-                self._lines.append((self.graph.size() + graph.size() - 1, part.observed))
+                self._observed.append(part.observed)
+                if not self._faced_later:
+                    self._places.append(self.graph.size() + graph.size() - 1)
         self.graph.push_back(graph)
         return graph, values
 
     def face_lines(self, values: gtsam.Values) -> None:
-        """Rebuild the factors of all lines at ``values``, at once; see `GraphBuilder.faced`."""
-        if not self._lines:
+        """Make the factors of all lines anew at ``values``; see `GraphBuilder.faced`."""
+        if not self._observed:
             return
-        places, observed = zip(*self._lines, strict=True)
-        keys, targets, seen = zip(*observed, strict=True)
+        missing = len(self._observed) - len(self._places)
+        if missing:
+            size = self.graph.size()
+            self.graph.resize(size + missing)
+            self._places += range(size, size + missing)
+        keys, targets, seen = zip(*self._observed, strict=True)
         known = np.unique([keys, targets])
         poses = np.array([read(values, int(key), 3) for key in known])
         made = factors.line_factors(
@@ -73,8 +85,16 @@ class WholeGraph(GraphBuilder):
             poses[np.searchsorted(known, targets)],
             self.kernel,
         )
-        for place, factor in zip(places, made, strict=True):
+        for place, factor in zip(self._places, made, strict=True):
             self.graph.replace(place, factor)
+
+    def close(self, closures: Iterable[Closure]) -> None:
+        """Add closures between states that are there."""
+        for closure in closures:
+            part = self._closure(closure)
+            if part is not None:
+                for factor in part.factors:
+                    self.graph.add(factor)
 
     def diagnose(self, values: gtsam.Values) -> EstimationError:
         """Which variable is indeterminate: QR answers NaN for all of them, Cholesky names one."""
@@ -101,9 +121,9 @@ class Isam2Backend(GraphBackend):
 
     smooths = True
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, builder: WholeGraph | None = None) -> None:
         self._config = config
-        self._builder = WholeGraph(config.robust)
+        self._builder = builder or WholeGraph(config.robust)
         super().__init__(self._builder)
         self._factorization = "CHOLESKY"
         self._isam = gtsam.ISAM2(isam2_parameters(config, self._factorization))
@@ -245,36 +265,63 @@ class Isam2Backend(GraphBackend):
 class BatchBackend(Isam2Backend):
     """The converged limit, whatever `backend.polish` says; associations as with iSAM2."""
 
-    def solve(self, steps: Iterable[Step], start: Estimate, *, rough: bool = False) -> Estimate:
-        """All steps at once, from an estimate of every variable in them; `add` nothing before.
+    def finish(self) -> Estimate:
+        """See `Backend`."""
+        return self._result(self._optimised(self._isam.calculateBestEstimate()))
+
+
+class Resolver(Isam2Backend):
+    """Solves recorded steps again and again, with more closures or fewer."""
+
+    def __init__(self, config: Config, steps: Iterable[Step], start: Estimate) -> None:
+        """Take steps in.
 
         Args:
-            steps: as recorded.
-            start: where to begin.
-            rough: to what a next round can go on from, in a fraction of the time: covariances are
-                NaN (`joint` has them).
+            config: settings.
+            steps: all there are, as recorded.
+            start: an estimate of every variable in them, where solving begins.
 
         Raises:
-            EstimationError: the steps make the estimate indeterminate.
+            EstimationError: a covariance is not positive definite and finite.
         """
+        super().__init__(config, WholeGraph(config.robust, faced_later=True))
         values = gtsam.Values()
         for step in steps:
             _, new = self._builder.expand(step, lambda key, dim: read(values, key, dim))
             for key in new.keys():  # noqa: SIM118 (GTSAM's values are no mapping)
                 write(values, key, self._builder.value_in(start, key))
+        self._builder.face_lines(values)
+        self._finished = values
+        self._size, self._rows = self._builder.graph.size(), self._builder.rows
+
+    def solve(self, closures: Iterable[Closure] = (), *, rough: bool = False) -> Estimate:
+        """Solved from where the last solution ended.
+
+        Args:
+            closures: beside those in the steps; those of the last solution are gone.
+            rough: to what a next round can go on from, in a fraction of the time: covariances are
+                NaN (`joint` and `state_covariance` have them).
+
+        Raises:
+            EstimationError: the steps make the estimate indeterminate.
+        """
+        builder, values = self._builder, self._values()
+        builder.graph.resize(self._size)
+        builder.rows = self._rows
+        builder.close(closures)
         if not rough:
             return self._result(self._optimised(values))
         try:
-            self._builder.face_lines(values)
-            graph, kernel = self._builder.graph, self._config.robust
-            self._finished = optimise(graph, values, kernel, CONVERGED_ERROR_ROUGH)
+            builder.face_lines(values)
+            values = optimise(builder.graph, values, self._config.robust, CONVERGED_ERROR_ROUGH)
         except RuntimeError as error:
-            raise self._builder.explain(error) from error
-        return self._rough(self._finished)
+            raise builder.explain(error) from error
+        self._finished = values
+        self._joints.clear()
+        return self._rough(values)
 
-    def finish(self) -> Estimate:
-        """See `Backend`."""
-        return self._result(self._optimised(self._isam.calculateBestEstimate()))
+    def _values(self) -> gtsam.Values:
+        return self._isam.calculateBestEstimate() if self._finished is None else self._finished
 
 
 def optimise(
