@@ -22,9 +22,10 @@ from graphslam.geometry import (
     log,
     rotate_cov,
     rotation,
+    rotation3,
     transform,
 )
-from graphslam.matching import Match, Submap, agreement, align, make_submap, match
+from graphslam.matching import IntArray, Match, Submap, agreement, align, make_submap, match
 from graphslam.records import Closure, Picture, Trajectory
 
 #: m of path: between submaps, what each takes in before and after its middle, between its scans
@@ -126,49 +127,46 @@ def candidates(found: Sequence[Place], P: Array) -> list[tuple[int, int, Array]]
         found: the places.
         P: (3n, 3n) joint covariance of their poses, errors along each pose's own axes.
     """
+    n = len(found)
+    poses, path = np.array([p.pose for p in found]), np.array([p.path_m for p in found])
+    robots = np.unique([p.state[0] for p in found], return_inverse=True)[1]
+    blocks = P.reshape(n, 3, n, 3).transpose(0, 2, 1, 3)
     pairs = []
-    for i, later in enumerate(found):
-        best: dict[tuple[str, int], tuple[float, int, Array]] = {}
-        stretch, last_j = 0, -1
-        for j, earlier in enumerate(found[:i]):
-            same_robot = later.state[0] == earlier.state[0]
-            if same_robot and later.path_m - earlier.path_m < APART_M:
-                continue
-            away = between(earlier.pose, later.pose)
-            distance = float(np.hypot(away[0], away[1]))
-            if distance > NEAR_M + FARTHEST[0]:
-                continue
-            sigma = np.sqrt(np.diag(_relative(P, found, i, j)[1]))
-            window = np.minimum(SIGMAS * sigma + MARGIN, FARTHEST)
-            if distance > NEAR_M + window[:2].max():
-                continue
-            if j != last_j + 1:
-                stretch += 1
-            last_j = j
-            key = earlier.state[0], stretch
-            if key not in best or distance < best[key][0]:
-                best[key] = distance, j, window
-        pairs += [(i, j, window) for _, j, window in best.values()]
+    for i in range(1, n):
+        away = between(poses[:i], poses[i])
+        distance = np.hypot(away[:, 0], away[:, 1])
+        apart = (robots[:i] != robots[i]) | (path[i] - path[:i] >= APART_M)
+        j = np.flatnonzero(apart & (distance <= NEAR_M + FARTHEST[0]))
+        sigma = np.sqrt(np.diagonal(_relative(blocks, away[j], i, j), axis1=1, axis2=2))
+        window = np.minimum(SIGMAS * sigma + MARGIN, FARTHEST)
+        may = distance[j] <= NEAR_M + window[:, :2].max(axis=1)
+        j, window = j[may], window[may]
+        ends = np.flatnonzero((np.diff(j) > 1) | (np.diff(robots[j]) != 0)) + 1
+        for stretch in np.split(np.arange(len(j)), ends):
+            if len(stretch):
+                k = stretch[distance[j[stretch]].argmin()]
+                pairs.append((i, int(j[k]), window[k]))
     return pairs
 
 
-def _relative(P: Array, found: Sequence[Place], i: int, j: int) -> tuple[Array, Array]:
-    """Place i seen from place j: Jacobian (3, 6) by errors of j and i, and covariance (3, 3)."""
-    H = _jacobian(between(found[j].pose, found[i].pose))
-    at = np.r_[3 * j : 3 * j + 3, 3 * i : 3 * i + 3]
-    return H, np.asarray(H @ P[np.ix_(at, at)] @ H.T)
+def _relative(blocks: Array, h: Array, i: int, j: IntArray) -> Array:
+    """Covariances (m, 3, 3) of place i as seen from places j (m,), where it is at h (m, 3).
+
+    ``blocks`` (n, n, 3, 3) are of the joint covariance of all places.
+    """
+    own = np.broadcast_to(blocks[i, i], (len(j), 3, 3))
+    both = np.block([[blocks[j, j], blocks[j, i]], [blocks[i, j], own]])
+    H = _jacobian(h)
+    return np.asarray(H @ both @ H.mT)
 
 
 def _jacobian(h: Array) -> Array:
-    """Of a relative pose h (3,), by errors (6,) of both poses along their own axes."""
-    c, s = np.cos(h[2]), np.sin(h[2])
-    return np.array(
-        [
-            [-1.0, 0.0, h[1], c, -s, 0.0],
-            [0.0, -1.0, -h[0], s, c, 0.0],
-            [0.0, 0.0, -1.0, 0.0, 0.0, 1.0],
-        ]
-    )
+    """Of relative poses h (..., 3), (..., 3, 6) by errors of both poses along their own axes."""
+    H = np.zeros((*h.shape[:-1], 3, 6))
+    H[..., 0, 0] = H[..., 1, 1] = H[..., 2, 2] = -1.0
+    H[..., 0, 2], H[..., 1, 2] = h[..., 1], -h[..., 0]
+    H[..., 3:] = rotation3(h[..., 2])
+    return H
 
 
 def verified(matches: Sequence[Match]) -> Match | None:

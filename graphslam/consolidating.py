@@ -34,12 +34,8 @@ from graphslam.merging import duplicates, merge_entries, merged_steps, seen_toge
 from graphslam.reassociating import reassociate
 from graphslam.records import Closure, Estimate, Picture, Step
 
-#: Intel and ACES need three; more only if merging goes on for ever
-MAX_ROUNDS = 6
-
-
 #: m across, rad: how far an observation may lie from a wall, from round to round
-GATES = ((0.3, 0.15), (0.15, 0.1))
+GATES = ((0.3, 0.15), (0.15, 0.1), (0.15, 0.1))
 #: motions from which their noise is told at least; median of the absolute value of a unit normal
 FEWEST_MOTIONS, MEDIAN_OF_NORMAL = 50, 0.6745
 #: rounds of closing loops
@@ -92,20 +88,18 @@ def consolidate(
     closures: list[Closure] = []
     if config.backend.close_loops:
         closures, estimate = _closed(steps, estimate, pictures, solve, tamper, counts)
-    # merged first: what went to either of two walls that are one would move to and fro
     for gates in GATES:
         estimate = solve(steps, estimate, closures)
-        for _ in range(MAX_ROUNDS):
-            into = _duplicates(estimate, solve.backend, landmarks, steps)
-            if not into:
-                break
+        into = _duplicates(estimate, solve.backend, landmarks, steps)
+        if into:
             kinds = {number: landmarks.entries[number].kind for number in into.values()}
             steps = merged_steps(steps, into, kinds)
             merge_entries(landmarks, into)
             counts["landmarks_merged"] += len(into)
-            estimate = solve(steps, estimate, closures)
+        # merged first: what went to either of two walls that are one would move to and fro
         done = reassociate(steps, estimate, landmarks.entries, *gates)
-        steps = done.steps
+        if into or done.moved or done.dropped:
+            steps = done.steps
         counts["observations_reassociated"] += done.moved
         counts["observations_dropped"] += done.dropped
     if closures:

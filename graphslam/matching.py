@@ -45,16 +45,15 @@ SEARCHED, ALIGNED = 250, 500
 class Submap:
     """What neighbouring scans saw, in one frame.
 
-    ``points`` (n, 2) m, ``normals`` (n, 2) unit, ``flat`` (n,) which of them lie on a surface,
-    ``alone`` (n,) which have too few neighbours to tell (where a wall leaves the laser's reach);
-    ``poses`` (k, 3) of the sensor and ``images`` (k, `BEAMS`, 2), m, the nearest and the farthest
-    return of each degree round it, NaN without one.
+    ``points`` (n, 2) m; ``information`` (n, 2, 2), 1/m^2, of what each tells about where another
+    one near it lies: across a surface, both ways where there is none, and nothing where there are
+    too few neighbours to tell (where a wall leaves the laser's reach); ``poses`` (k, 3) of the
+    sensor and ``images`` (k, `BEAMS`, 2), m, the nearest and the farthest return of each degree
+    round it, NaN without one.
     """
 
     points: Array
-    normals: Array
-    flat: BoolArray
-    alone: BoolArray
+    information: Array
     poses: Array
     images: Array
     tree: cKDTree
@@ -86,8 +85,7 @@ def make_submap(poses: Array, clouds: Sequence[Array]) -> Submap:
     _, kept = np.unique(np.round(points / CELL_M).astype(np.int64), axis=0, return_index=True)
     points = points[np.sort(kept)]
     tree = cKDTree(points)
-    normals, flat, alone = _normals(points, tree)
-    return Submap(points, normals, flat, alone, np.asarray(poses), images, tree)
+    return Submap(points, _information(points, tree), np.asarray(poses), images, tree)
 
 
 def _range_image(cloud: Array) -> Array:
@@ -105,8 +103,8 @@ def _beam(points: Array) -> IntArray:
     return np.asarray(np.round(degrees).astype(np.intp) % BEAMS)
 
 
-def _normals(points: Array, tree: cKDTree) -> tuple[Array, BoolArray, BoolArray]:
-    """Unit normals (n, 2) from the neighbours' scatter; where they mean something, where alone."""
+def _information(points: Array, tree: cKDTree) -> Array:
+    """What points (n, 2) tell, (n, 2, 2), see `Submap`: by the scatter of their neighbours."""
     k = min(NEIGHBOURS, len(points))
     distance, near = tree.query(points, k=k)
     known = distance.reshape(len(points), k) <= NEIGHBOURHOOD_M
@@ -120,8 +118,11 @@ def _normals(points: Array, tree: cKDTree) -> tuple[Array, BoolArray, BoolArray]
     spread = np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
     small, large = 0.5 * (xx + yy) - spread, 0.5 * (xx + yy) + spread
     alone = count < FEWEST_NEIGHBOURS
-    flat = ~alone & (small < 0.1 * large)
-    return np.column_stack([-np.sin(along), np.cos(along)]), flat, alone
+    normals = np.column_stack([-np.sin(along), np.cos(along)])
+    found = normals[:, :, None] * normals[:, None, :] / SURFACE_SIGMA_M**2
+    found[small >= 0.1 * large] = np.eye(2) / CLUTTER_SIGMA_M**2
+    found[alone] = 0.0
+    return np.asarray(found)
 
 
 def search(source: Submap, target: Submap, guess: Array, window: Array) -> list[Array]:
@@ -204,14 +205,12 @@ def align(source: Submap, target: Submap, guess: Array) -> tuple[Array, Array]:
         J = np.zeros((len(p), 2, 3))
         J[:, 0, 0] = J[:, 1, 1] = 1.0
         J[:, 0, 2], J[:, 1, 2] = -(p[:, 1] - x[1]), p[:, 0] - x[0]
-        n, flat = target.normals[near], target.flat[near]
-        M = n[:, :, None] * n[:, None, :] / SURFACE_SIGMA_M**2
-        M[~flat] = np.eye(2) / CLUTTER_SIGMA_M**2
-        M[target.alone[near]] = 0.0
-        w = 1.0 / (1.0 + np.einsum("ni,nij,nj->n", r, M, r) / 4.0)
-        JtM = np.einsum("nij,nik->njk", J, M) * w[:, None, None]
-        A = np.einsum("nji,nik->jk", JtM, J) + np.diag([1e-4, 1e-4, 1e-4])
-        step = np.linalg.solve(A, np.einsum("nji,ni->j", JtM, r))
+        M = target.information[near]
+        Mr = (M @ r[:, :, None])[..., 0]
+        w = 1.0 / (1.0 + (r * Mr).sum(axis=1) / 4.0)
+        JtM = (w[:, None, None] * (M @ J)).reshape(-1, 3).T
+        A = JtM @ J.reshape(-1, 3) + np.diag([1e-4, 1e-4, 1e-4])
+        step = np.linalg.solve(A, JtM @ r.ravel())
         x -= step
         x[2] = wrap(x[2])
         if k > ITERATIONS // 2 and np.abs(step).max() < 1e-5:
