@@ -50,10 +50,14 @@ RIVAL = 0.8
 #: closures agree with each other up to this probability, by covariances that may be too small by
 #: this factor (the estimate does not know of what it missed)
 AGREE, TRUST = 0.99, 16.0
+#: closures with which the search for those that agree begins: the ones that most agree with
+STARTS = 20
 #: m, rad: pairs that lie this well need no closure; closures that come out worse are taken back
 CLOSED, BORNE_OUT = (0.06, 0.01), (0.2, 0.03)
 #: states of one robot at one time
 State = tuple[str, int]
+#: the later and the earlier state of a closure
+Pair = tuple[State, State]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -186,11 +190,11 @@ def verified(matches: Sequence[Match]) -> Match | None:
 
 
 def loop_closures(
-    found: Sequence[Place], P: Array, looked: dict[tuple[State, State], Array]
-) -> list[Closure]:
-    """Closures between places, each verified by itself.
+    found: Sequence[Place], P: Array, looked: dict[Pair, Array]
+) -> tuple[list[Closure], list[Closure]]:
+    """Closures between places, each verified by itself: those that were lost, and the others.
 
-    Pairs that lie where they should are passed over: there is nothing to close.
+    A pair that lies where it should confirms the estimate; a pair that does not is searched for.
 
     Args:
         found: the places.
@@ -198,7 +202,7 @@ def loop_closures(
         looked: relative poses (3,) at which pairs were looked at before, which need no second look;
             this adds to it.
     """
-    made = []
+    lost, confirmed = [], []
     for i, j, window in candidates(found, TRUST * P):
         later, earlier = found[i], found[j]
         guess = between(earlier.pose, later.pose)
@@ -206,24 +210,27 @@ def loop_closures(
         if pair in looked and _near(looked[pair], guess, CLOSED):
             continue
         looked[pair] = guess
-        if closed(later.submap, earlier.submap, guess):
+        there = closed(later.submap, earlier.submap, guess)
+        if there is not None:
+            confirmed.append(Closure(*later.state, *earlier.state, *there))
             continue
         best = verified(match(later.submap, earlier.submap, guess, window))
         if best is not None:
-            made.append(Closure(*later.state, *earlier.state, best.pose, best.cov))
-    return made
+            lost.append(Closure(*later.state, *earlier.state, best.pose, best.cov))
+    return lost, confirmed
 
 
-def closed(source: Submap, target: Submap, guess: Array) -> bool:
-    """Whether two places lie where they should, as far as what was seen there can tell.
+def closed(source: Submap, target: Submap, guess: Array) -> tuple[Array, Array] | None:
+    """Pose (3,) and covariance (3, 3) of a place that lies where it should, else None.
 
+    As far as what was seen there can tell: along what it does not, the covariance is large.
     ``guess`` (3,) is where ``source`` is believed to be in ``target``.
     """
-    pose, _ = align(source, target, guess)
+    pose, cov = align(source, target, guess)
     if not _near(guess, pose, CLOSED):
-        return False
+        return None
     same, absent = agreement(source, target, pose)
-    return same >= SAME and absent <= ABSENT * (same + absent)
+    return (pose, cov) if same >= SAME and absent <= ABSENT * (same + absent) else None
 
 
 def _near(a: Array, b: Array, limits: tuple[float, float]) -> bool:
@@ -251,13 +258,15 @@ def agreeing(closures: Sequence[Closure], found: Sequence[Place], P: Array) -> l
     gain = blocks @ np.linalg.inv(own)[None]  # [a, b]: what b says of a
     rest = r[:, None] - (gain @ r[None, :, :, None])[..., 0]
     left = own[:, None] - gain @ blocks.transpose(1, 0, 2, 3)
-    given = np.einsum("abi,abij,abj->ab", rest, np.linalg.pinv(left, hermitian=True), rest)
+    left[np.arange(n), np.arange(n)] = np.eye(3)  # of itself nothing is left
+    given = (rest * np.linalg.solve(left, rest[..., None])[..., 0]).sum(axis=-1)
     alone = np.einsum("ai,aij,aj->a", r, np.linalg.inv(own), r) <= gate
     fits = given <= gate
     agree = fits & fits.T & alone[:, None] & alone
     np.fill_diagonal(agree, False)
     best: list[int] = []
-    for first in np.flatnonzero(alone):
+    likely = np.argsort(-agree.sum(axis=1), kind="stable")
+    for first in likely[alone[likely]][:STARTS]:
         chosen, free = [int(first)], agree[first].copy()
         while free.any():
             support = np.where(free, (agree & free).sum(axis=1), -1)

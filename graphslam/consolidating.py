@@ -16,8 +16,8 @@ from graphslam.backends.isam2 import Resolver
 from graphslam.closing import (
     BORNE_OUT,
     CLOSED,
+    Pair,
     Place,
-    State,
     agreeing,
     far_off,
     loop_closures,
@@ -33,6 +33,7 @@ from graphslam.landmark_map import LandmarkMap
 from graphslam.merging import duplicates, merge_entries, merged_steps, seen_together, survivors
 from graphslam.reassociating import reassociate
 from graphslam.records import Closure, Estimate, Picture, Step
+from graphslam.revisits import opened, tied
 
 #: m across, rad: how far an observation may lie from a wall, from round to round
 GATES = ((0.3, 0.15), (0.15, 0.1), (0.15, 0.1))
@@ -87,7 +88,9 @@ def consolidate(
     counts: Counter[str] = Counter()
     closures: list[Closure] = []
     if config.backend.close_loops:
-        closures, estimate = _closed(steps, estimate, pictures, solve, tamper, counts)
+        steps, closures, estimate = _closed(
+            steps, estimate, pictures, landmarks, solve, tamper, counts
+        )
     for gates in GATES:
         estimate = solve(steps, estimate, closures)
         into = _duplicates(estimate, solve.backend, landmarks, steps)
@@ -137,38 +140,52 @@ class _Solver:
 
 
 def _closed(
-    steps: Sequence[Step],
+    steps: tuple[Step, ...],
     estimate: Estimate,
     pictures: Iterable[Picture],
+    landmarks: LandmarkMap,
     solve: _Solver,
     tamper: Tamper | None,
     counts: Counter[str],
-) -> tuple[list[Closure], Estimate]:
-    """Loops closed by matching: the closures that are believed, and the estimate with them."""
-    closures: list[Closure] = []
-    refused: list[Closure] = []
-    taken_back = 0
-    found = places(estimate.states, pictures)
-    looked: dict[tuple[State, State], Array] = {}
-    for _ in range(MAX_CLOSINGS if found else 0):
-        P = solve.backend.state_covariance([place.state for place in found])
-        # what did not agree before may do so now
-        new = refused + loop_closures(found, P, looked)
+) -> tuple[tuple[Step, ...], list[Closure], Estimate]:
+    """Loops closed by matching: steps, the closures that are believed, and the estimate with them.
+
+    Where visits' landmarks are tied wrongly the estimate is wrong and sure of itself. So closures
+    are judged by what is known without those ties, and landmarks are tied again afterwards.
+    """
+    taken_apart = opened(steps, estimate.states, landmarks)
+    now = taken_apart.start(estimate)
+    loose = solve(taken_apart.steps, now)
+    seen = places(loose.states, pictures)  # bent by no tie
+    believed: dict[Pair, Closure] = {}
+    lost: set[Pair] = set()  # those of them that said something new
+    refused: dict[Pair, Closure] = {}
+    looked: dict[Pair, Array] = {}
+    for _ in range(MAX_CLOSINGS if seen else 0):
+        P = solve.backend.state_covariance([place.state for place in seen])
+        new, same = loop_closures(moved(seen, now.states), P, looked)
         if tamper is not None:
-            new = tamper(new, found)
-        agreed = agreeing(new, found, P)
-        refused = [closure for closure in new if closure not in agreed]
-        if not agreed:
+            new = tamper(new, seen)
+        # what did not agree before may do so now
+        open_ones = [*refused.values(), *new]
+        agreed = agreeing([*open_ones, *same], moved(seen, loose.states), P)
+        refused = {c.pair: c for c in open_ones if c not in agreed}
+        told = {c.pair for c in agreed if c not in same}
+        if not told:
             break
-        closures += agreed
-        estimate = _tightened(steps, closures, estimate, solve)
-        gone = far_off(closures, estimate.states, BORNE_OUT)
-        taken_back += sum(map(int, gone))
-        closures = [c for c, off in zip(closures, gone, strict=True) if not off]
-        found = moved(found, estimate.states)
-    counts["closures_verified"] = len(closures)
-    counts["closures_refused"] = len(refused) + taken_back
-    return closures, estimate
+        lost |= told
+        believed |= {c.pair: c for c in agreed}
+        now = loose = _tightened(taken_apart.steps, [*believed.values()], now, solve)
+        gone = far_off([*believed.values()], now.states, BORNE_OUT)
+        taken_back = {pair for pair, off in zip(believed, gone, strict=True) if off}
+        counts["closures_refused"] += len(taken_back & lost)
+        believed = {pair: c for pair, c in believed.items() if pair not in taken_back}
+        lost -= taken_back
+    counts["closures_verified"] = len(lost)
+    counts["closures_refused"] += len(refused)
+    if not lost:
+        return steps, [], estimate
+    return tied(taken_apart, now, landmarks), [believed[pair] for pair in lost], now
 
 
 def _tightened(

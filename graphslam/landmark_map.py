@@ -119,6 +119,14 @@ class LandmarkMap:
         for i, mean in zip(ids, backend.landmark_means(ids), strict=True):
             self.entries[i].move(mean)
 
+    def split(self, number: int, new: int) -> None:
+        """What was taken for one landmark is two: ``new`` looks like ``number`` for now."""
+        old = self.entries[number]
+        self.entries[new] = replace(
+            old, id=new, mean=old.mean.copy(), extent=old.extent.copy(), identity=None
+        )
+        self._next = max(self._next, new + 1)
+
     def in_world(self, world: Array) -> "LandmarkMap":
         """The same map in a world frame that sees this one at ``world`` (3,)."""
         moved = LandmarkMap()

@@ -216,6 +216,11 @@ class Closure:
     delta: Array
     cov: Array
 
+    @property
+    def pair(self) -> tuple[tuple[str, int], tuple[str, int]]:
+        """The two states."""
+        return (self.robot, self.time_ns), (self.other, self.other_time_ns)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:

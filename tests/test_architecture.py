@@ -33,6 +33,7 @@ ROWS = (
     # decisions of one image; places seen twice; duplicates in a map; observations of walls anew; a
     # log of sightings solved again; what a run adds up to
     ("associator", "closing", "merging", "reassociating", "refining", "summary"),
+    ("revisits",),  # landmarks by visit, and one again
     ("consolidating",),  # a log of scans solved again
     ("slam",),  # the pipeline
     ("results",),  # a result as a folder, and back
