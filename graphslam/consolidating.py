@@ -167,9 +167,9 @@ def _closed(
         if tamper is not None:
             new = tamper(new, seen)
         # what did not agree before may do so now
-        open_ones = [*refused.values(), *new]
-        agreed = agreeing([*open_ones, *same], moved(seen, loose.states), P)
-        refused = {c.pair: c for c in open_ones if c not in agreed}
+        open_ones = refused | {c.pair: c for c in new}
+        agreed = agreeing([*open_ones.values(), *same], moved(seen, loose.states), P)
+        refused = {pair: c for pair, c in open_ones.items() if c not in agreed}
         told = {c.pair for c in agreed if c not in same}
         if not told:
             break

@@ -34,11 +34,11 @@ SHARED_POINTS = 10
 FLOOR_M, FLOOR_RAD = 0.02, 0.004
 #: m: a point and its nearest neighbour farther apart than this do not belong together: first, last
 REACH_FIRST_M, REACH_LAST_M = 0.6, 0.15
-ITERATIONS = 20
+ITERATIONS = 12
 #: m, rad: steps of the search
 STEP_M, STEP_RAD = 0.15, np.radians(1.5)
 #: points of a submap that the search looks at, and that the alignment uses
-SEARCHED, ALIGNED = 250, 500
+SEARCHED, ALIGNED = 250, 300
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,14 +48,16 @@ class Submap:
     ``points`` (n, 2) m; ``information`` (n, 2, 2), 1/m^2, of what each tells about where another
     one near it lies: across a surface, both ways where there is none, and nothing where there are
     too few neighbours to tell (where a wall leaves the laser's reach); ``poses`` (k, 3) of the
-    sensor and ``images`` (k, `BEAMS`, 2), m, the nearest and the farthest return of each degree
-    round it, NaN without one.
+    sensor; ``images`` (6, k, `BEAMS`), m, the nearest and the farthest return of each degree round
+    it and of both its neighbours, NaN without one; ``free`` (k, `BEAMS`) the nearest of these six,
+    0 where one is not known.
     """
 
     points: Array
     information: Array
     poses: Array
     images: Array
+    free: Array
     tree: cKDTree
 
 
@@ -80,12 +82,14 @@ def make_submap(poses: Array, clouds: Sequence[Array]) -> Submap:
         poses: (k, 3) of the sensor in the submap's frame.
         clouds: k arrays (n, 2) of points in the sensor's frame, m.
     """
-    images = np.array([_range_image(cloud) for cloud in clouds])
+    returns = np.array([_range_image(cloud) for cloud in clouds]).transpose(2, 0, 1)
+    images = np.concatenate([np.roll(returns, turn, axis=2) for turn in (-1, 0, 1)])
+    free = np.nan_to_num(images.min(axis=0))  # NaN if any of them is
     points = np.concatenate([transform(p, c) for p, c in zip(poses, clouds, strict=True)])
     _, kept = np.unique(np.round(points / CELL_M).astype(np.int64), axis=0, return_index=True)
     points = points[np.sort(kept)]
     tree = cKDTree(points)
-    return Submap(points, _information(points, tree), np.asarray(poses), images, tree)
+    return Submap(points, _information(points, tree), np.asarray(poses), images, free, tree)
 
 
 def _range_image(cloud: Array) -> Array:
@@ -138,26 +142,23 @@ def search(source: Submap, target: Submap, guess: Array, window: Array) -> list[
         The best ones, best first, no two of them close together.
     """
     points = _some(source.points, SEARCHED)
-    field, low = _field(target.points)
     sizes = STEP_M, STEP_M, STEP_RAD
-    steps = [_steps(half, size) for half, size in zip(window, sizes, strict=True)]
-    dx, dy = (s.ravel() for s in np.meshgrid(steps[0], steps[1], indexing="ij"))
-    scores = np.empty((len(steps[2]), len(dx)))
-    for row, turn in enumerate(steps[2]):
-        placed = transform(np.array([guess[0], guess[1], guess[2] + turn]), points) - low
-        at_x = np.clip(np.round((placed[:, 0] + dx[:, None]) / STEP_M), 0, len(field) - 1)
-        at_y = np.clip(np.round((placed[:, 1] + dy[:, None]) / STEP_M), 0, field.shape[1] - 1)
-        scores[row] = field[at_x.astype(np.intp), at_y.astype(np.intp)].mean(axis=1)
+    x, y, turns = (_steps(half, size) for half, size in zip(window, sizes, strict=True))
+    field, low = _field(target.points, (len(x), len(y)))
+    shifted = np.lib.stride_tricks.sliding_window_view(field, (len(x), len(y)))
+    last = np.array(shifted.shape[:2]) - 1
+    scores = np.empty((len(turns), len(x), len(y)))
+    for row, turn in enumerate(turns):
+        placed = transform(np.array([guess[0] + x[0], guess[1] + y[0], guess[2] + turn]), points)
+        at = np.clip(np.round((placed - low) / STEP_M).astype(np.intp), 0, last)
+        scores[row] = shifted[at[:, 0], at[:, 1]].mean(axis=0)
     found: list[Array] = []
     best = float(scores.max())
-    turn_of = steps[2][:, None]
     while len(found) < 4 and scores.max() > 0.6 * best > 0:
-        k, m = map(int, np.unravel_index(int(scores.argmax()), scores.shape))
-        found.append(guess + np.array([dx[m], dy[m], steps[2][k]]))
-        near = (np.hypot(dx - dx[m], dy - dy[m]) < 0.6)[None] & (
-            np.abs(turn_of - steps[2][k]) < np.radians(8.0)
-        )
-        scores[near] = 0.0
+        k, i, j = map(int, np.unravel_index(int(scores.argmax()), scores.shape))
+        found.append(guess + np.array([x[i], y[j], turns[k]]))
+        near = np.hypot(x - x[i], (y - y[j])[:, None]).T < 0.6
+        scores[(np.abs(turns - turns[k]) < np.radians(8.0))[:, None, None] & near] = 0.0
     return found
 
 
@@ -170,11 +171,16 @@ def _steps(half: float, step: float) -> Array:
     return np.asarray(np.arange(-n, n + 1) * step, dtype=float)
 
 
-def _field(points: Array) -> tuple[Array, Array]:
-    """How near a point is to the points (n, 2), on a grid of `STEP_M`: 1 there, 0 far away."""
-    low = points.min(axis=0) - 3 * STEP_M
+def _field(points: Array, room: tuple[int, int]) -> tuple[Array, Array]:
+    """How near a point is to the points (n, 2), on a grid of `STEP_M`: 1 there, 0 far away.
+
+    With so much empty ``room`` round it, in cells, that windows of this size fit there; and the
+    position (2,) of the first cell.
+    """
+    margin = np.array(room) + 2
+    low = points.min(axis=0) - margin * STEP_M
     cells = np.round((points - low) / STEP_M).astype(np.intp)
-    grid = np.zeros(cells.max(axis=0) + 4)
+    grid = np.zeros(cells.max(axis=0) + margin + 1, dtype=np.float32)
     for weight, reach in ((0.5, 1), (1.0, 0)):
         for i in range(-reach, reach + 1):
             for j in range(-reach, reach + 1):
@@ -213,7 +219,7 @@ def align(source: Submap, target: Submap, guess: Array) -> tuple[Array, Array]:
         step = np.linalg.solve(A, JtM @ r.ravel())
         x -= step
         x[2] = wrap(x[2])
-        if k > ITERATIONS // 2 and np.abs(step).max() < 1e-5:
+        if k > ITERATIONS // 2 and np.abs(step).max() < 1e-4:
             break
     cov = SHARED_POINTS * np.linalg.inv(A) + np.diag([FLOOR_M**2, FLOOR_M**2, FLOOR_RAD**2])
     return x, np.asarray(cov)
@@ -239,19 +245,15 @@ def agreement(source: Submap, target: Submap, pose: Array) -> tuple[float, float
 
 def _seen_from(points: Array, submap: Submap) -> tuple[BoolArray, BoolArray]:
     """Which points (n, 2) any scan of the submap confirms, and which any looks through."""
-    confirmed, missed = np.zeros(len(points), dtype=bool), np.zeros(len(points), dtype=bool)
-    for pose, image in zip(submap.poses, submap.images, strict=True):
-        c, s = np.cos(pose[2]), np.sin(pose[2])
-        d = points - pose[:2]
-        local = np.column_stack([c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0]])
-        r = np.hypot(local[:, 0], local[:, 1])
-        beams = (_beam(local)[:, None] + np.array([-1, 0, 1])) % BEAMS
-        returns = image[beams].reshape(len(points), -1)
-        known = np.isfinite(returns).all(axis=1)
-        with np.errstate(invalid="ignore"):
-            confirmed |= (np.abs(returns - r[:, None]) < SAME_M).any(axis=1)
-            missed |= known & (r < returns.min(axis=1) - ABSENT_M)
-    return confirmed, missed
+    poses = submap.poses
+    c, s = np.cos(poses[:, 2])[:, None], np.sin(poses[:, 2])[:, None]
+    dx, dy = points[:, 0] - poses[:, :1], points[:, 1] - poses[:, 1:2]
+    local = np.stack([c * dx + s * dy, c * dy - s * dx], axis=-1)
+    r, scan, beam = np.hypot(dx, dy), np.arange(len(poses))[:, None], _beam(local)
+    with np.errstate(invalid="ignore"):
+        near = (np.abs(submap.images[:, scan, beam] - r) < SAME_M).any(axis=0)
+        through = r < submap.free[scan, beam] - ABSENT_M
+    return np.asarray(near.any(axis=0)), np.asarray(through.any(axis=0))
 
 
 def match(source: Submap, target: Submap, guess: Array, window: Array) -> list[Match]:
