@@ -9,7 +9,7 @@ from test_backends import PLAIN, two_robots
 
 from graphslam.backends import BACKENDS, Joint
 from graphslam.backends.base import block_slices
-from graphslam.backends.isam2 import BatchBackend
+from graphslam.backends.isam2 import Resolver
 from graphslam.geometry import between, compose
 from graphslam.landmark_map import Entry, LandmarkMap
 from graphslam.merging import (
@@ -181,9 +181,9 @@ def test_merged_steps_give_the_estimate_that_never_knew_of_two(landmark):
         twice.add(step)
     expected, before = whole.finish(), twice.finish()
     kinds = {1: "line", 2: "segment", 7: "line" if landmark == 1 else "segment"}
-    after = BatchBackend(PLAIN).solve(
-        merged_steps(split(steps, landmark, 4, 7), {7: landmark}, kinds), before
-    )
+    after = Resolver(
+        PLAIN, merged_steps(split(steps, landmark, 4, 7), {7: landmark}, kinds), before
+    ).solve()
     assert sorted(after.landmarks) == [0, 1, 2]
     for robot, states in expected.states.items():
         # both stop when a step of Levenberg-Marquardt moves nothing any more
