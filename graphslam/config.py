@@ -19,6 +19,21 @@ from typing import Any, Literal
 
 from graphslam.errors import ConfigError
 
+#: what calibration estimates of a robot, see `graphslam.models.motion.nominal_calibration`
+CalibrationParameter = Literal[
+    "translation_scale",
+    "rotation_scale",
+    "drift_rad_per_m",
+    "turning_loss_m2",
+    "wheel_radius_left_m",
+    "wheel_radius_right_m",
+    "axle_m",
+    "laser_x_m",
+    "laser_y_m",
+    "laser_yaw_rad",
+    "laser_latency_s",
+]
+
 
 @dataclass(frozen=True)
 class LogsConfig:
@@ -71,7 +86,8 @@ class OdometryConfig:
     commanded: poses of odometry are what commanded velocities compound to; turning_lever_sigma_m:
     how far from the middle of the axle the point may be whose speed was commanded.
     floor_sigma_m and floor_sigma_rad are added once per interval in which the robot moved.
-    calibrate: learn the calibration errors from the estimate while it grows.
+    calibrate: learn the calibration errors from the estimate while it grows, at the end together
+    with it. fixed: those of them that are held at what the log and [robots.*] say.
     max_gap_s: longest span without odometry that is bridged.
     """
 
@@ -96,6 +112,7 @@ class OdometryConfig:
     floor_sigma_m: float = 0.005
     floor_sigma_rad: float = 0.005
     calibrate: bool = True
+    fixed: tuple[CalibrationParameter, ...] = ()
     max_gap_s: float = 5.0
 
 

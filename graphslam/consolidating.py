@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphslam.backends.isam2 import BatchBackend
+from graphslam.calibrating import calibrate
 from graphslam.closing import (
     BORNE_OUT,
     CLOSED,
@@ -103,17 +104,21 @@ def consolidate(
             merge_entries(landmarks, into)
             counts["landmarks_merged"] += len(into)
             estimate = solve(with_closures(steps, closures), estimate)
-        done = reassociate(steps, estimate, landmarks.entries, *gates)
-        steps = done.steps
-        counts["observations_reassociated"] += done.moved
-        counts["observations_dropped"] += done.dropped
+        again = reassociate(steps, estimate, landmarks.entries, *gates)
+        steps = again.steps
+        counts["observations_reassociated"] += again.moved
+        counts["observations_dropped"] += again.dropped
     if closures:
         # what the landmarks do not hold together without them
         missed = far_off(closures, solve(steps, estimate).states, CLOSED)
         kept = [c for c, off in zip(closures, missed, strict=True) if off]
         counts["closures_kept"] = len(kept)
         steps = with_closures(steps, kept)
-    estimate = BatchBackend(config).solve(steps, estimate)
+    if config.odometry.calibrate:
+        done = calibrate(steps, solve(steps, estimate), tracks, _loosened, config)
+        estimate, steps = done.estimate, done.steps
+    else:
+        estimate = BatchBackend(config).solve(steps, estimate)
     _move(landmarks, estimate)
     return Consolidated(estimate, steps, counts)
 

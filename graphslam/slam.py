@@ -462,6 +462,8 @@ class Pipeline:
         )
         self.steps = list(done.steps)
         self.counts.update(done.counts)
+        for name in tracks:
+            self.runs[name].refined = self.config.odometry.calibrate
         return done.estimate
 
     def exchanged(self, estimate: Estimate) -> dict[str, str]:

@@ -15,6 +15,8 @@ import numpy as np
 from graphslam.config import OdometryConfig, RobotConfig
 from graphslam.geometry import Array, compose, exp, exp_jacobian, inverse, rotation3
 
+#: a calibration parameter whose prior sigma is smaller, in any unit, is held
+HELD_SIGMA = 1e-6
 #: 1/m: robots that turn more tightly lose no more of their path; they hardly drive at all
 TIGHTEST_PER_M = 6.0
 
@@ -199,8 +201,9 @@ def nominal_calibration(source: str, config: OdometryConfig, mounted: bool) -> C
             "laser_yaw_rad": config.laser_sigma_rad,
             "laser_latency_s": config.laser_latency_sigma_s,
         }
-    # a parameter whose sigma is set to 0 is held, without making the covariance singular
-    values = np.maximum(np.array(list(sigmas.values()), dtype=float), 1e-9)
+    known = [0.0 if name in config.fixed else sigma for name, sigma in sigmas.items()]
+    # a parameter whose sigma is 0 is held, without making the covariance singular
+    values = np.maximum(np.array(known, dtype=float), 1e-9)
     return Calibration(tuple(sigmas), np.zeros(len(values)), np.diag(values**2))
 
 
