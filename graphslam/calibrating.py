@@ -83,6 +83,8 @@ def remade(steps: Sequence[Step], tracks: Mapping[str, Track]) -> tuple[Step, ..
 
 
 def _remade(motion: Motion, track: Track) -> Motion:
+    if motion.matched:
+        return motion
     again = track.motion(motion.start_ns, motion.end_ns)
     unseen = track.unseen(motion.start_ns, motion.end_ns)
     return replace(again, cov=again.cov + np.diag(unseen**2)) if unseen.any() else again

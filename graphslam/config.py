@@ -89,6 +89,8 @@ class OdometryConfig:
     calibrate: learn the calibration errors from the estimate while it grows, at the end together
     with it. fixed: those of them that are held at what the log and [robots.*] say.
     max_gap_s: longest span without odometry that is bridged.
+    scan_matching: whether consecutive scans are matched: `auto` = motions that they contradict are
+    taken from them; `on` = besides, what lies on no line is a second source of every motion; `off`.
     """
 
     k_x_m: float = 1e-4
@@ -114,6 +116,7 @@ class OdometryConfig:
     calibrate: bool = True
     fixed: tuple[CalibrationParameter, ...] = ()
     max_gap_s: float = 5.0
+    scan_matching: Literal["auto", "on", "off"] = "auto"
 
 
 @dataclass(frozen=True)

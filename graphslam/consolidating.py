@@ -181,9 +181,9 @@ def _tightened(
 
 
 def _recalibrated(step: Step, tracks: Mapping[str, Track]) -> Step:
-    """The step with motions by the tracks' calibration."""
+    """The step with motions by the tracks' calibration, but for those that scans contradicted."""
     motions = {
-        robot: tracks[robot].motion(motion.start_ns, motion.end_ns)
+        robot: motion if motion.matched else tracks[robot].motion(motion.start_ns, motion.end_ns)
         for robot, motion in step.motions.items()
     }
     return replace(step, motions=motions)
