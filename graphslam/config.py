@@ -77,7 +77,7 @@ class OdometryConfig:
     The model error is white, its variance grows with path and turning (4.14): k_x_m and k_y_m in
     m² per m, k_x_rad and k_y_rad in m² per rad, k_phi_m in rad² per m, k_phi_rad in rad² per rad.
     The calibration errors are constant within one interval: translation_scale_sigma and
-    rotation_scale_sigma are relative, drift_sigma_rad_per_m is turning per metre driven;
+    rotation_scale_sigma are relative, drift_sigma_rad_per_m is turning per metre driven forwards;
     for wheel angles wheel_radius_sigma_m and axle_sigma_m, and count_sigma_rad per reading.
     laser_sigma_m, laser_sigma_rad: how far the laser may sit from where the log says;
     laser_latency_sigma_s: how far its clock may be from the odometry's;

@@ -89,13 +89,12 @@ def odometry_increments(
     """Increments of an odometry that reports poses: ``rows`` (n, 3) are twists.
 
     Calibration parameters: relative scale of translation, relative scale of rotation, turning per
-    metre driven (rad/m).
+    metre driven forwards (rad/m): wheels of unequal size turn the robot the other way in reverse.
     """
-    path = np.hypot(rows[:, 0], rows[:, 1])
     d_twist = np.zeros((len(rows), 3, 3))
     d_twist[:, :2, 0] = rows[:, :2]
     d_twist[:, 2, 1] = rows[:, 2]
-    d_twist[:, 2, 2] = path
+    d_twist[:, 2, 2] = rows[:, 0]
     twists = rows + d_twist @ calibration
     return Increments(exp(twists), model_error_cov(rows, config), exp_jacobian(twists) @ d_twist)
 
@@ -115,7 +114,7 @@ def command_increments(
     d_twist = np.zeros((len(rows), 3, 4))
     d_twist[:, :2, 0] = rows[:, :2]
     d_twist[:, 2, 1] = rows[:, 2]
-    d_twist[:, 2, 2] = path
+    d_twist[:, 2, 2] = rows[:, 0]
     d_twist[:, :2, 3] = -rows[:, :2] * (curvature**2)[:, None]
     twists = rows + d_twist @ calibration
     return Increments(exp(twists), model_error_cov(rows, config), exp_jacobian(twists) @ d_twist)
