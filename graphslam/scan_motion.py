@@ -21,9 +21,11 @@ from graphslam.records import Closure, Motion, Observation
 #: points of a scan at least, to say anything
 FEWEST = 30
 #: squared Mahalanobis distance, 3 dof: worth a closer look; a contradiction
-LOOK, CONTRADICTED = chi2.ppf(0.9, 3), chi2.ppf(0.99999, 3)
+LOOK, CONTRADICTED = chi2.ppf(0.9, 3), chi2.ppf(0.999, 3)
 #: m, rad: smaller disagreements are left to the landmarks
 SMALLEST_M, SMALLEST_RAD = 0.05, 0.03
+#: m, rad: directions in which scans are less sure are left to odometry
+SURE = 0.08
 #: share of points that lie on the scan before: fewer are worth a closer look; at least at another
 #: motion, and so many more than at odometry's
 USUAL, FITS, BETTER = 0.6, 0.5, 0.05
@@ -59,30 +61,45 @@ def checked(motion: Motion, before: Submap, now: Submap) -> Motion:
     there, (pose, cov) = max(
         ((fit(now, before, pose)[0], (pose, cov)) for pose, cov in guesses), key=lambda g: g[0]
     )
-    off = pose - motion.delta
-    off[2] = wrap(off[2])
+    off, information = _sure(_difference(pose, motion.delta), cov)
     if (
         there < max(FITS, here + BETTER)
         or (np.hypot(off[0], off[1]) < SMALLEST_M and abs(off[2]) < SMALLEST_RAD)
         or _distance(off, motion.cov + cov) < CONTRADICTED
     ):
         return motion
-    return fused(replace(motion, cov=motion.cov + np.outer(off, off)), pose, cov)
+    return fused(replace(motion, cov=motion.cov + np.outer(off, off)), off, information)
 
 
-def fused(motion: Motion, pose: Array, cov: Array) -> Motion:
-    """A motion and an independent measurement of it, pose (3,) and cov (3, 3), as one.
+def fused(motion: Motion, off: Array, information: Array) -> Motion:
+    """A motion and a measurement of it as one.
 
-    Calibration errors no longer tell what it is off by.
+    Args:
+        motion: the motion. Calibration errors no longer tell what the result is off by.
+        off: (3,) how the measurement differs from it.
+        information: (3, 3) of the measurement, along the same axes; may be singular.
     """
-    K = np.linalg.solve(motion.cov + cov, motion.cov).T
-    off = pose - motion.delta
-    off[2] = wrap(off[2])
-    delta = motion.delta + K @ off
+    P = np.linalg.inv(np.linalg.inv(motion.cov) + information)
+    delta = motion.delta + P @ information @ off
     delta[2] = wrap(delta[2])
-    P = motion.cov - K @ motion.cov
     D = np.zeros_like(motion.d_delta_d_calibration)
     return replace(motion, delta=delta, cov=(P + P.T) / 2, d_delta_d_calibration=D, matched=True)
+
+
+def _difference(a: Array, b: Array) -> Array:
+    off = a - b
+    off[2] = wrap(off[2])
+    return np.asarray(off)
+
+
+def _sure(off: Array, cov: Array) -> tuple[Array, Array]:
+    """A difference and its information in the directions whose sigma is below `SURE`.
+
+    The noise of points looks like a little structure, also along a corridor.
+    """
+    values, axes = np.linalg.eigh(cov)
+    axes, values = axes[:, values < SURE**2], values[values < SURE**2]
+    return axes @ (axes.T @ off), (axes / values) @ axes.T
 
 
 def measured(motion: Motion, before: Submap, robot: str, points: Array) -> Closure | None:
@@ -98,9 +115,7 @@ def measured(motion: Motion, before: Submap, robot: str, points: Array) -> Closu
     if source is None:
         return None
     pose, cov = align(source, before, motion.delta)
-    off = pose - motion.delta
-    off[2] = wrap(off[2])
-    if _distance(off, motion.cov + cov) > CONTRADICTED:
+    if _distance(_difference(pose, motion.delta), motion.cov + cov) > CONTRADICTED:
         return None
     return Closure(robot, motion.end_ns, robot, motion.start_ns, pose, cov)
 
