@@ -4,14 +4,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 from test_matching import CORRIDOR, ROOM, cloud
+from wrong_odometry import CHANGES, recorded, run
 
-from graphslam.config import load_config
-from graphslam.geometry import between, compose, exp, log, wrap
-from graphslam.logs import LogWriter, open_logs
-from graphslam.records import Motion, Observation, OdometryPose, Scan, Truth
+from graphslam.geometry import compose, wrap
+from graphslam.records import Motion, Observation
 from graphslam.scan_motion import beside_lines, checked, fused, measured, scan_submap
-from graphslam.simulate import load_scenario, simulate
-from graphslam.slam import smooth
 
 S = 1_000_000_000
 AT = np.array([-2.0, 1.0, 0.3])
@@ -141,98 +138,40 @@ def test_clutter_measures_the_motion_that_walls_do_not():
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory):
+def lab(tmp_path_factory):
     """The lab, driven forwards and backwards, with good odometry."""
-    path = tmp_path_factory.mktemp("lab") / "lab.mcap"
-    simulate(load_scenario("lab"), path, 0)
-    config = load_config()
-    kept = OdometryPose, Scan, Truth
-    return [m for m in open_logs([path], config).messages() if isinstance(m, kept)]
+    return recorded(0, tmp_path_factory.mktemp("lab"))
 
 
-def unsigned(_seconds, _span_s, twist):
-    """Counters that do not tell forwards from backwards."""
-    return np.array([abs(twist[0]), twist[1], twist[2]]), True
-
-
-def slipping(seconds, span_s, twist):
-    """0.3 m in one second, every ten seconds."""
-    return twist + np.array([0.3 * span_s * (seconds % 10 < 1), 0, 0]), True
-
-
-def silent(seconds, _span_s, twist):
-    """No reading for 5 s, which bridges what was driven then."""
-    return twist, not 30 <= seconds < 35
-
-
-def counting_stopped(seconds, _span_s, twist):
-    """No reading for 5 s, and no count of what was driven then."""
-    lost = 30 <= seconds < 35
-    return np.zeros(3) if lost else twist, not lost
-
-
-def untouched(_seconds, _span_s, twist):
-    return twist, True
-
-
-def run(recorded, how, path, *settings):
-    """Final poses (n, 3), true ones, and the summary of a log whose odometry is changed."""
-    t0 = min(m.time_ns for m in recorded)
-    last, pose, mounted, truth = None, np.zeros(3), False, []
-    with LogWriter(path) as out:
-        for m in recorded:
-            if isinstance(m, Truth):
-                truth.append((m.time_ns, *m.pose))
-            elif isinstance(m, Scan):
-                if not mounted:
-                    out.mount(m.robot, t0, m.mount)
-                mounted = True
-                beams = {"angle_min_rad": m.angle_min_rad, "angle_step_rad": m.angle_step_rad}
-                out.scan(m.robot, m.stamp_ns, m.ranges, **beams, range_max_m=32.0)
-            else:
-                before = m if last is None else last
-                span_s = (m.time_ns - before.time_ns) / S
-                twist = log(between(before.pose, m.pose))
-                twist, reported = how((m.time_ns - t0) / S, span_s, twist)
-                pose, last = compose(pose, exp(twist)), m
-                if reported:
-                    out.odometry(m.robot, m.stamp_ns, pose)
-    config = load_config(overrides=settings)
-    result = smooth(open_logs([path], config), config)
-    (robot,) = result.robots.values()
-    t, *true = np.array(truth).T
-    x, y, phi = (np.interp(robot.final.stamps_ns, t, c) for c in (*true[:2], np.unwrap(true[2])))
-    true = np.column_stack([x, y, phi])
-    off = robot.final.poses - between(true[0], true)
-    return np.hypot(off[:, 0], off[:, 1]), result.summary
-
-
-@pytest.mark.parametrize(
-    ("how", "contradicted"),
-    [(untouched, False), (silent, False), (unsigned, True), (slipping, True),
-     (counting_stopped, True)],
-)  # fmt: skip
-def test_wrong_odometry_is_noticed_and_survived(recorded, how, contradicted, tmp_path):
+@pytest.mark.parametrize("name", CHANGES)
+def test_wrong_odometry_is_noticed_and_survived(lab, name, tmp_path):
     """Mean error 5 cm at most (with good odometry it is under 1 cm; scans between two states lie on
     odometry's path between them, so single ones are worse), and it is told how often it happened.
-    Without scans to check it, unsigned odometry ends metres away."""
-    error, summary = run(recorded, how, tmp_path / "log.mcap")
-    assert error.mean() < (0.05 if contradicted else 0.01)
+    Gaps that odometry bridges and late stamps contradict nothing."""
+    errors, summary = run(lab, name, tmp_path / "log.mcap")
+    wrong = name in ("slip", "unsigned", "stopped")
+    assert errors["final"].mean() < (0.05 if wrong else 0.01)
     (told,) = summary["odometry"].values()
     assert told["motions"] > 50
-    assert (told["contradicted"] > 0) is contradicted
-    assert any("contradict" in text for text in summary["warnings"]) is contradicted
+    assert (told["contradicted"] > 0) is wrong
+    assert any("contradict" in text for text in summary["warnings"]) is wrong
+    if name == "late":
+        latency = summary["calibration"]["vehicle.laser_latency_s"]
+        assert abs(latency["value"] + 0.15) < 4 * latency["sigma"]
 
 
-def test_without_scan_matching_unsigned_odometry_is_lost(recorded, tmp_path):
+def test_without_scan_matching_unsigned_odometry_is_lost(lab, tmp_path):
     """The other side of the test above: the log is hard enough to need it."""
-    error, summary = run(recorded, unsigned, tmp_path / "log.mcap", "odometry.scan_matching=off")
-    assert error.mean() > 1.0
+    errors, summary = run(lab, "unsigned", tmp_path / "log.mcap", "odometry.scan_matching=off")
+    assert errors["final"].mean() > 1.0
     (told,) = summary["odometry"].values()
     assert told["motions"] == told["contradicted"] == 0
 
 
-def test_the_second_source_enters_as_factors_between_states(recorded, tmp_path):
-    """With `on`; it is of what lies on no line, and makes a good run no worse than 1 cm."""
-    error, _ = run(recorded, untouched, tmp_path / "log.mcap", "odometry.scan_matching=on")
-    assert error.mean() < 0.01
+def test_the_second_source_does_no_harm(lab, tmp_path):
+    """With `on`, of what lies on no line: a good run stays good to 1 cm, and has more factors."""
+    path = tmp_path / "log.mcap"
+    errors, summary = run(lab, "untouched", path, "odometry.scan_matching=on")
+    _, without = run(lab, "untouched", path)
+    assert errors["final"].mean() < 0.01
+    assert summary["graph"]["dof"] > without["graph"]["dof"]
