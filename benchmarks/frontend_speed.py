@@ -2,6 +2,8 @@
 
 Generated scans of a cluttered room (180 beams at 1°, 361 at 0.5°), and the Intel log if the data
 are there (GRAPHSLAM_DATA, else ../shared/data beside the repository). CPU time, best of five.
+Then what one Hough table costs, and the next line after it, with the accumulator that is used and
+with OpenCV's, which count anew for each line.
 
 Run: python benchmarks/frontend_speed.py
 """
@@ -9,7 +11,7 @@ Run: python benchmarks/frontend_speed.py
 import bz2
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
@@ -17,6 +19,8 @@ import numpy as np
 
 from graphslam.config import FrontEndConfig
 from graphslam.frontend import FRONT_ENDS
+from graphslam.frontend.hough import Votes
+from graphslam.frontend.sweep import Sweep, make_sweep
 from graphslam.records import Scan
 
 DATA = Path(__file__).resolve().parents[1] / "../shared/data"
@@ -70,11 +74,60 @@ def report(label: str, scans: Sequence[Scan], config: FrontEndConfig) -> None:
         )
 
 
+def best_ms(what: Callable[[Sweep], object], sweeps: Sequence[Sweep]) -> float:
+    """CPU time per sweep, ms, best of five."""
+    seconds = np.inf
+    for _ in range(5):
+        start = time.process_time()
+        for sweep in sweeps:
+            what(sweep)
+        seconds = min(seconds, time.process_time() - start)
+    return 1e3 * float(seconds) / len(sweeps)
+
+
+def accumulators(scans: Sequence[Scan], config: FrontEndConfig) -> None:
+    """One table of votes for d and γ of the settings, three ways."""
+    sweeps = [make_sweep(scan, config.hough_d_max_m) for scan in scans]
+    half_turn = config.hough_gamma_steps // 2
+    d_max, cell = config.hough_d_max_m, config.hough_delta_d_m
+    side = round(2 * d_max / cell)
+
+    def table(sweep: Sweep) -> Votes:
+        weights = sweep.ranges[sweep.beam] * sweep.step_rad
+        return Votes(sweep.points, weights, np.ones(len(sweep.beam), dtype=np.bool_), config)
+
+    def first(sweep: Sweep) -> object:
+        return table(sweep).peak()
+
+    def two(sweep: Sweep) -> object:
+        votes = table(sweep)
+        votes.remove(votes.peak())
+        return votes.peak()
+
+    def point_set(sweep: Sweep) -> object:
+        points = sweep.points.astype(np.float32)[:, None]
+        step = np.pi / half_turn
+        return cv2.HoughLinesPointSet(points, 1, 3, -d_max, d_max, cell, 0, np.pi - step, step)
+
+    def raster(sweep: Sweep) -> object:
+        image = np.zeros((side, side), dtype=np.uint8)
+        at = ((sweep.points + d_max) / cell).astype(np.intp).clip(0, side - 1)
+        image[at[:, 1], at[:, 0]] = 255
+        return cv2.HoughLines(image, 1, np.pi / half_turn, 3, use_edgeval=True)
+
+    once = best_ms(first, sweeps)
+    again = best_ms(two, sweeps) - once
+    print(f"accumulator: first line {once:.3f} ms, the next {again:.3f} ms")
+    for name, way in (("HoughLinesPointSet", point_set), ("HoughLines on a raster", raster)):
+        print(f"cv2.{name}: each line {best_ms(way, sweeps):.3f} ms")
+
+
 def main() -> None:
     cv2.setNumThreads(1)
     config = FrontEndConfig()
     report("generated, 180 beams", generated(180), config)
     report("generated, 361 beams", generated(361), config)
+    accumulators(generated(180, 100), config)
     if scans := intel():
         report("Intel, 180 beams", scans, config)
 

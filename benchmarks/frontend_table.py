@@ -8,27 +8,34 @@ range); 1 is honest, less is cautious. Mean and spread over seeds.
 
 The time is CPU time per scan on one core; on a real log too, if there is one.
 
-Run: python benchmarks/frontend_table.py [LOG.mcap]
+A second table is of whole runs: mean error of the final positions and of the causal ones over
+seeds, on a real log the mean over its reference relations (all, and loops) of the final ones, the
+landmarks in the map, and CPU time of the front end per scan.
+
+Run: python benchmarks/frontend_table.py [--no-scans] [--no-runs] [LOG.mcap=RELATIONS ...]
 """
 
-import sys
+import argparse
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from graphslam.config import Config, FrontEndConfig
+from graphslam.config import Config, FrontEndConfig, StartConfig
+from graphslam.evaluate import evaluate, read_relations
 from graphslam.frontend import FRONT_ENDS
 from graphslam.geometry import Array, between, rotate_cov, transform, wrap
 from graphslam.logs import open_logs
-from graphslam.records import Observation, Scan
+from graphslam.records import Observation, Result, Scan
 from graphslam.simulate import load_scenario, simulate
 from graphslam.simulate.stage import visits
+from graphslam.slam import smooth
+from graphslam.truth import truth_of_logs
 
 SEEDS = (0, 1, 2, 3)
 SCANS = 120
@@ -37,6 +44,9 @@ SCANS = 120
 NEAR_M, NEAR_RAD = 0.1, 0.1
 """Farther from every face an observation is false. Many sigmas: it must not trim the NIS."""
 
+RUNS = ("lab", "office-loop", "corridor")
+RUN_SEEDS = (0, 1)
+
 SCENARIOS = ("lab", "office-loop", "corridor", "forest", "fleet")
 FRONT = {
     "segments": FrontEndConfig(cylinders=False),
@@ -44,6 +54,8 @@ FRONT = {
     "both": FrontEndConfig(name="both", cylinders=False),
     "both + cylinders": FrontEndConfig(name="both", cylinders=True),
 }
+
+WHOLE = {label: front for label, front in FRONT.items() if not front.cylinders}
 
 
 @dataclass(frozen=True)
@@ -214,32 +226,82 @@ def row(label: str, kind: str, scores: Sequence[Score], scans: int, ms: float | 
     )
 
 
-def main(logs: list[str]) -> None:
-    cv2.setNumThreads(1)
+def run_row(label: str, errors: str, result: Result, ms: float) -> None:
+    landmarks = result.summary["counts"]["landmarks"]
+    print(f"{label:34} {errors} {landmarks:10d} {ms:9.3f}", flush=True)
+
+
+def simulated_runs(folder: Path) -> None:
+    """Position errors (RMSE) in simulation over seeds; the landmarks are those of the last."""
+    for name in RUNS:
+        for label, front in WHOLE.items():
+            config = replace(Config(), front_end=front, start=StartConfig(from_truth=True))
+            final, causal = [], []
+            for seed in RUN_SEEDS:
+                path = folder / f"{name}{seed}.mcap"
+                if not path.exists():
+                    simulate(load_scenario(name), path, seed)
+                log = open_logs([path], config)
+                result = smooth(log, config)
+                found = evaluate(result, truth_of_logs(log, config).trajectories)["joint"]
+                final.append(found["final"]["ate_rmse_m"])
+                causal.append(found["causal"]["ate_rmse_m"])
+            scans = [m for m in log.messages() if isinstance(m, Scan)][::10]
+            errors = f"{spread(final)} {spread(causal)}"
+            run_row(f"{name}: {label}", errors, result, ms_per_scan(front, scans))
+
+
+def real_runs(path: Path, relations: Path) -> None:
+    """Errors over relations of one real log."""
+    for label, front in WHOLE.items():
+        config = replace(Config(), front_end=front)
+        log = open_logs([path], config)
+        result = smooth(log, config)
+        found = evaluate(result, relations=read_relations(relations))["relations"]
+        scans = [m for m in log.messages() if isinstance(m, Scan)][::20]
+        both = (found[group]["trans_mean_m"] for group in ("all", "loops"))
+        errors = " ".join(f"{value:13.4f}" for value in both)
+        run_row(f"{path.stem}: {label}", errors, result, ms_per_scan(front, scans))
+
+
+def scan_table(folder: Path) -> None:
+    """Precision, recall, NIS and time of every front end on every scenario."""
     print(
         f"{'':30} {'':6} {'precision':>14} {'recall':>14} {'NIS / dof':>14} {'again':>7}"
         f" {'per scan':>9} {'ms/scan':>8}"
     )
-    with tempfile.TemporaryDirectory() as folder:
-        for name in SCENARIOS:
-            truths = [list(seen(name, seed, Path(folder))) for seed in SEEDS]
-            scans = [t.scan for t in truths[0]]
-            count = sum(map(len, truths))
-            for label, config in FRONT.items():
-                pairs = [score(name, config, t) for t in truths]
-                ms = ms_per_scan(config, scans)
-                row(f"{name}: {label}", "lines", [a for a, _ in pairs], count, ms)
-                if config.cylinders:
-                    row(f"{name}: {label}", "points", [b for _, b in pairs], count, None)
-    for log in logs:
-        real = [m for m in open_logs([Path(log)], Config()).messages() if isinstance(m, Scan)][::20]
+    for name in SCENARIOS:
+        truths = [list(seen(name, seed, folder)) for seed in SEEDS]
+        scans = [t.scan for t in truths[0]]
+        count = sum(map(len, truths))
         for label, config in FRONT.items():
-            n = sum(len(FRONT_ENDS[config.name](scan, config)) for scan in real) / len(real)
-            print(
-                f"{Path(log).stem + ': ' + label:30} {'all':6} {'':14} {'':14} {'':14} {'':7}"
-                f" {n:9.2f} {ms_per_scan(config, real):8.3f}"
-            )
+            pairs = [score(name, config, t) for t in truths]
+            ms = ms_per_scan(config, scans)
+            row(f"{name}: {label}", "lines", [a for a, _ in pairs], count, ms)
+            if config.cylinders:
+                row(f"{name}: {label}", "points", [b for _, b in pairs], count, None)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("logs", nargs="*", metavar="LOG.mcap=RELATIONS")
+    parser.add_argument("--no-scans", action="store_true", help="leave out the first table")
+    parser.add_argument("--no-runs", action="store_true", help="leave out simulated runs")
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    with tempfile.TemporaryDirectory() as folder:
+        if not arguments.no_scans:
+            scan_table(Path(folder))
+        print(
+            f"{'':34} {'final, all':>13} {'causal, loops':>13} {'landmarks':>10} {'ms/scan':>9}",
+            flush=True,
+        )
+        if not arguments.no_runs:
+            simulated_runs(Path(folder))
+        for pair in arguments.logs:
+            log, _, relations = pair.partition("=")
+            real_runs(Path(log), Path(relations))
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

@@ -75,6 +75,7 @@ def rows(name: str, runs: list[dict[str, float]]) -> list[Row]:
         return [
             Row("end pose, with landmarks", "", v[f"end {WITH}"], bar=0.25, **metre),
             Row("end pose, dead reckoning", "> 90 m", v[f"end {WITHOUT}"], least=80.0, **metre),
+            Row("the wheel's 2 %, found", "", v["wheel"], unit="%", bar=0.002),
             Row("walls at the start, last visit from first", "", v[f"overlay {WITH}"], bar=0.05),
             Row("the same, true poses (the floor)", "", v[f"overlay {TRUE}"]),
         ]

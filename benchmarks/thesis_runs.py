@@ -190,8 +190,12 @@ def end_error(corridor: Run, source: str) -> float:
 
 def corridor(seed: int, folder: Path) -> dict[str, float]:
     """Experiment 2, thesis 6.1.2."""
-    done = simulated(load_scenario("corridor"), seed, folder)
+    scenario = load_scenario("corridor")
+    done = simulated(scenario, seed, folder)
+    encoders = scenario.robots["vehicle"].encoders
+    drift = done.result.summary["calibration"]["vehicle.drift_rad_per_m"]["value"]
     return {
+        "wheel": abs(drift * encoders.axle_m - encoders.radius_error_right),
         f"end {WITH}": end_error(done, WITH),
         f"end {WITHOUT}": end_error(done, WITHOUT),
         f"overlay {WITH}": wall_overlay(done, WITH),

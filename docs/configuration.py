@@ -74,6 +74,8 @@ def values(kind: Any) -> str:
         return ", ".join(f"`{value}`" for value in arguments)
     if origin is Mapping:
         return f"table of {values(arguments[1])}"
+    if origin is tuple and typing.get_origin(arguments[0]) is Literal:
+        return f"list, any of {values(arguments[0])}"
     if origin is tuple:
         return f"list of {values(arguments[0])}s"
     return {float: "number", int: "whole number", bool: "`true`, `false`", str: "text"}[kind]

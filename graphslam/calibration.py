@@ -14,7 +14,7 @@ import numpy as np
 
 from graphslam.geometry import Array, rotation3, wrap
 from graphslam.models import MODELS
-from graphslam.models.motion import Calibration
+from graphslam.models.motion import HELD_SIGMA, Calibration
 from graphslam.records import Association, Motion
 
 #: m and rad: what landmarks cannot know better about one motion (stamps, walls that are not flat)
@@ -53,7 +53,7 @@ class Calibrator:
             Mean, and the covariance to be used for coming motions.
         """
         D = motion.d_delta_d_calibration
-        if not D.shape[1] or (motion.length_m == 0 and motion.delta[2] == 0):
+        if motion.matched or not D.shape[1] or (motion.length_m == 0 and motion.delta[2] == 0):
             return current
         if self._prior is None:
             self._prior = current.cov
@@ -91,13 +91,17 @@ class Calibrator:
 def told(known: Calibration, prior: Array) -> dict[str, tuple[float, float, bool]]:
     """Parameter -> (value, sigma, observable); ``prior`` (p, p) is the covariance before data.
 
-    Observable: the data halve the prior's sigma at least.
+    Observable: the data halve the prior's sigma at least. One that is held has the sigma 0.
     """
-    sigmas = np.sqrt(np.diag(known.cov))
-    halved = sigmas < 0.5 * np.sqrt(np.diag(prior))
+    sigmas, before = np.sqrt(np.diag(known.cov)), np.sqrt(np.diag(prior))
+    held = before < HELD_SIGMA
+    sigmas[held] = 0.0
+    seen = ~held & (sigmas < 0.5 * before)
     return {
-        name: (float(value), float(sigma), bool(seen))
-        for name, value, sigma, seen in zip(known.names, known.mean, sigmas, halved, strict=True)
+        name: (float(value), float(sigma), bool(observable))
+        for name, value, sigma, observable in zip(
+            known.names, np.where(held, 0.0, known.mean), sigmas, seen, strict=True
+        )
     }
 
 

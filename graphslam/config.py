@@ -19,6 +19,21 @@ from typing import Any, Literal
 
 from graphslam.errors import ConfigError
 
+#: what calibration estimates of a robot, see `graphslam.models.motion.nominal_calibration`
+CalibrationParameter = Literal[
+    "translation_scale",
+    "rotation_scale",
+    "drift_rad_per_m",
+    "turning_loss_m2",
+    "wheel_radius_left_m",
+    "wheel_radius_right_m",
+    "axle_m",
+    "laser_x_m",
+    "laser_y_m",
+    "laser_yaw_rad",
+    "laser_latency_s",
+]
+
 
 @dataclass(frozen=True)
 class LogsConfig:
@@ -62,7 +77,7 @@ class OdometryConfig:
     The model error is white, its variance grows with path and turning (4.14): k_x_m and k_y_m in
     m² per m, k_x_rad and k_y_rad in m² per rad, k_phi_m in rad² per m, k_phi_rad in rad² per rad.
     The calibration errors are constant within one interval: translation_scale_sigma and
-    rotation_scale_sigma are relative, drift_sigma_rad_per_m is turning per metre driven;
+    rotation_scale_sigma are relative, drift_sigma_rad_per_m is turning per metre driven forwards;
     for wheel angles wheel_radius_sigma_m and axle_sigma_m, and count_sigma_rad per reading.
     laser_sigma_m, laser_sigma_rad: how far the laser may sit from where the log says;
     laser_latency_sigma_s: how far its clock may be from the odometry's;
@@ -71,8 +86,11 @@ class OdometryConfig:
     commanded: poses of odometry are what commanded velocities compound to; turning_lever_sigma_m:
     how far from the middle of the axle the point may be whose speed was commanded.
     floor_sigma_m and floor_sigma_rad are added once per interval in which the robot moved.
-    calibrate: learn the calibration errors from the estimate while it grows.
+    calibrate: learn the calibration errors from the estimate while it grows, at the end together
+    with it. fixed: those of them that are held at what the log and [robots.*] say.
     max_gap_s: longest span without odometry that is bridged.
+    scan_matching: whether consecutive scans are matched: `auto` = motions that they contradict are
+    taken from them; `on` = besides, what lies on no line is a second source of every motion; `off`.
     """
 
     k_x_m: float = 1e-4
@@ -96,7 +114,9 @@ class OdometryConfig:
     floor_sigma_m: float = 0.005
     floor_sigma_rad: float = 0.005
     calibrate: bool = True
+    fixed: tuple[CalibrationParameter, ...] = ()
     max_gap_s: float = 5.0
+    scan_matching: Literal["auto", "on", "off"] = "auto"
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphslam.backends.isam2 import Resolver
+from graphslam.calibrating import calibrate
 from graphslam.closing import (
     BORNE_OUT,
     CLOSED,
@@ -100,20 +101,26 @@ def consolidate(
             merge_entries(landmarks, into)
             counts["landmarks_merged"] += len(into)
         # merged first: what went to either of two walls that are one would move to and fro
-        done = reassociate(steps, estimate, landmarks.entries, *gates)
-        if into or done.moved or done.dropped:
-            steps = done.steps
-        counts["observations_reassociated"] += done.moved
-        counts["observations_dropped"] += done.dropped
+        again = reassociate(steps, estimate, landmarks.entries, *gates)
+        if into or again.moved or again.dropped:
+            steps = again.steps
+        counts["observations_reassociated"] += again.moved
+        counts["observations_dropped"] += again.dropped
     if closures:
         # what the landmarks do not hold together without them
         estimate = solve(steps, estimate)
         missed = far_off(closures, estimate.states, CLOSED)
         closures = [c for c, off in zip(closures, missed, strict=True) if off]
         counts["closures_kept"] = len(closures)
-    estimate = solve(steps, estimate, closures, rough=False)
+    if config.odometry.calibrate:
+        estimate = solve(steps, estimate, closures)
+        done = calibrate(with_closures(steps, closures), estimate, tracks, _loosened, config)
+        estimate, steps = done.estimate, done.steps
+    else:
+        estimate = solve(steps, estimate, closures, rough=False)
+        steps = with_closures(steps, closures)
     _move(landmarks, estimate)
-    return Consolidated(estimate, with_closures(steps, closures), counts)
+    return Consolidated(estimate, steps, counts)
 
 
 class _Solver:
@@ -204,9 +211,9 @@ def _tightened(
 
 
 def _recalibrated(step: Step, tracks: Mapping[str, Track]) -> Step:
-    """The step with motions by the tracks' calibration."""
+    """The step with motions by the tracks' calibration, but for those that scans contradicted."""
     motions = {
-        robot: tracks[robot].motion(motion.start_ns, motion.end_ns)
+        robot: motion if motion.matched else tracks[robot].motion(motion.start_ns, motion.end_ns)
         for robot, motion in step.motions.items()
     }
     return replace(step, motions=motions)

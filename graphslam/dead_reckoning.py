@@ -303,6 +303,20 @@ class Track:
             cov = cov + self._floor(whole.length_m > 0 or delta[2] != 0)
         return Motion(start_ns, end_ns, delta, cov, d_cal, whole.length_m)
 
+    def unseen(self, start_ns: int, end_ns: int) -> Array:
+        """What of a motion the readings do not cover, (3,), at the speed next to what is missing.
+
+        `motion` takes the robot to stand then; by so much it may be wrong.
+        """
+        begin, end = start_ns - self.latency_ns, end_ns - self.latency_ns
+        most = min(end - begin, self.last_ns - self.first_ns)
+        before, after = (
+            min(max(ns, 0), most) for ns in (self.first_ns - begin, end - self.last_ns)
+        )
+        ahead = between(self.pose(self.first_ns), self.pose(self.first_ns + before))
+        behind = between(self.pose(self.last_ns - after), self.pose(self.last_ns))
+        return np.abs(ahead) + np.abs(behind)
+
     def between(self, start_ns: int, end_ns: int) -> Motion:
         """As `motion`, but ``end_ns`` may be the earlier one: then the way back."""
         if end_ns >= start_ns:

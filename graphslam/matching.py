@@ -201,28 +201,64 @@ def align(source: Submap, target: Submap, guess: Array) -> tuple[Array, Array]:
     A = np.eye(3)
     for k in range(ITERATIONS):
         reach = REACH_FIRST_M * (REACH_LAST_M / REACH_FIRST_M) ** min(1.0, 2 * k / ITERATIONS)
-        placed = transform(x, points)
-        distance, near = target.tree.query(placed, distance_upper_bound=reach)
-        ok = np.isfinite(distance)
-        if ok.sum() < 10:
+        drawn = _drawn(points, target, x, reach)
+        if drawn is None:
             return x, np.diag([1e4, 1e4, 1e4])
-        near = near[ok]
-        p, r = placed[ok], placed[ok] - target.points[near]
-        J = np.zeros((len(p), 2, 3))
-        J[:, 0, 0] = J[:, 1, 1] = 1.0
-        J[:, 0, 2], J[:, 1, 2] = -(p[:, 1] - x[1]), p[:, 0] - x[0]
-        M = target.information[near]
-        Mr = (M @ r[:, :, None])[..., 0]
-        w = 1.0 / (1.0 + (r * Mr).sum(axis=1) / 4.0)
-        JtM = (w[:, None, None] * (M @ J)).reshape(-1, 3).T
-        A = JtM @ J.reshape(-1, 3) + np.diag([1e-4, 1e-4, 1e-4])
-        step = np.linalg.solve(A, JtM @ r.ravel())
-        x -= step
+        A = drawn.information
+        x -= drawn.step
         x[2] = wrap(x[2])
-        if k > ITERATIONS // 2 and np.abs(step).max() < 1e-4:
+        if k > ITERATIONS // 2 and np.abs(drawn.step).max() < 1e-4:
             break
-    cov = SHARED_POINTS * np.linalg.inv(A) + np.diag([FLOOR_M**2, FLOOR_M**2, FLOOR_RAD**2])
-    return x, np.asarray(cov)
+    return x, _covariance(A)
+
+
+def fit(source: Submap, target: Submap, pose: Array) -> tuple[float, Array, Array]:
+    """How well ``source`` lies on ``target`` at ``pose`` (3,), without moving it.
+
+    Returns:
+        Share of its points that lie on something (a point that is 2 sigmas off counts half); by how
+        much the pose would move (3,) to first order; and the covariance (3, 3) of that, see
+        `align`.
+    """
+    points = _some(source.points, ALIGNED)
+    drawn = _drawn(points, target, pose, REACH_LAST_M)
+    if drawn is None:
+        return 0.0, np.zeros(3), np.diag([1e4, 1e4, 1e4])
+    return drawn.weight / len(points), -drawn.step, _covariance(drawn.information)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Drawn:
+    """One step of Gauss and Newton; ``weight`` is the sum over points of their robust weights."""
+
+    step: Array
+    information: Array
+    weight: float
+
+
+def _drawn(points: Array, target: Submap, x: Array, reach: float) -> _Drawn | None:
+    """Points (n, 2), seen from x (3,), drawn to what is within ``reach``; None where hardly any."""
+    placed = transform(x, points)
+    distance, near = target.tree.query(placed, distance_upper_bound=reach)
+    ok = np.isfinite(distance)
+    if ok.sum() < 10:
+        return None
+    near = near[ok]
+    p, r = placed[ok], placed[ok] - target.points[near]
+    J = np.zeros((len(p), 2, 3))
+    J[:, 0, 0] = J[:, 1, 1] = 1.0
+    J[:, 0, 2], J[:, 1, 2] = -(p[:, 1] - x[1]), p[:, 0] - x[0]
+    M = target.information[near]
+    Mr = (M @ r[:, :, None])[..., 0]
+    w = 1.0 / (1.0 + (r * Mr).sum(axis=1) / 4.0)
+    JtM = (w[:, None, None] * (M @ J)).reshape(-1, 3).T
+    A = JtM @ J.reshape(-1, 3) + np.diag([1e-4, 1e-4, 1e-4])
+    return _Drawn(np.linalg.solve(A, JtM @ r.ravel()), A, float(w.sum()))
+
+
+def _covariance(information: Array) -> Array:
+    shared = SHARED_POINTS * np.linalg.inv(information)
+    return np.asarray(shared + np.diag([FLOOR_M**2, FLOOR_M**2, FLOOR_RAD**2]))
 
 
 def agreement(source: Submap, target: Submap, pose: Array) -> tuple[float, float]:

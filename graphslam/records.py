@@ -149,7 +149,8 @@ class Motion:
     ``delta`` (3,) is the end pose in the frame of the start pose, ``cov`` (3, 3) along the start
     frame's axes. ``d_delta_d_calibration`` (3, p) is its derivative with respect to the motion
     source's p calibration parameters (see `graphslam.models.motion`); its part of ``cov`` is
-    already included. ``length_m`` is the path driven.
+    already included. ``length_m`` is the path driven. ``matched``: the sensors were contradicted by
+    scans, and this is what the scans make of it (`graphslam.scan_motion`).
     """
 
     start_ns: int
@@ -158,6 +159,7 @@ class Motion:
     cov: Array
     d_delta_d_calibration: Array
     length_m: float
+    matched: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,6 +7,7 @@ import numpy as np
 from graphslam.calibration import Calibrator, told
 from graphslam.dead_reckoning import Track
 from graphslam.geometry import Array, between, compose, inverse
+from graphslam.matching import Submap
 from graphslam.models.motion import Calibration
 from graphslam.records import Motion, RobotResult, Trajectory
 from graphslam.trajectories import IntArray, causal_at, final_at, mounted, moved_world, origin_shift
@@ -22,7 +23,8 @@ class RobotRun:
     ``times`` of the states, ns; per state the causal pose, its covariance and the calibration that
     was known; ``scans`` (stamp, time, mount), ``scanned_ns`` the last one that was used. The
     states are rigid to the sensor: the base is where the calibration puts it. ``refined``: the
-    track's calibration is one that was estimated together with all states.
+    track's calibration is one that was estimated together with all states. ``scan``: the time of
+    the latest state that has a scan, and what that shows; ``contradicted`` motions of ``motions``.
     """
 
     track: Track
@@ -35,6 +37,9 @@ class RobotRun:
     calibrations: list[Calibration] = field(default_factory=list)
     scans: list[tuple[int, int, Array]] = field(default_factory=list)
     refined: bool = False
+    scan: tuple[int, Submap] | None = None
+    motions: int = 0
+    contradicted: int = 0
 
     @property
     def started(self) -> bool:

@@ -54,6 +54,7 @@ from graphslam.records import (
 )
 from graphslam.refining import refine
 from graphslam.robot_run import RobotRun
+from graphslam.scan_motion import beside_lines, checked, measured, scan_submap
 from graphslam.starts import start_poses
 from graphslam.summary import make_landmarks, summarise
 from graphslam.timeline import ODOMETRY, synchronise
@@ -81,6 +82,10 @@ class Pipeline:
         self.backend = BACKENDS[config.backend.name](config)
         self.associator = Associator(config.association, self.backend)
         self.front_end = FRONT_ENDS[config.front_end.name]
+        # dead reckoning is of odometry alone
+        self.matches_scans = config.odometry.scan_matching != "off" and (
+            config.backend.name != "dead-reckoning" and config.front_end.name != "none"
+        )
         self.runs = {
             name: RobotRun(
                 Track(
@@ -228,7 +233,29 @@ class Pipeline:
         began = time.perf_counter()
         seen = self.observations(event, None if own_state else motion)
         self.seconds["front end"] += time.perf_counter() - began
-        self.advance(first.robot, time_ns, event, seen, motion if own_state else None)
+        second = None
+        if own_state and isinstance(first, Scan) and self.matches_scans:
+            began = time.perf_counter()
+            motion, second = self.matched(first, motion, seen)
+            self.seconds["scan matching"] += time.perf_counter() - began
+        self.advance(first.robot, time_ns, event, seen, motion if own_state else None, second)
+
+    def matched(
+        self, scan: Scan, motion: Motion | None, seen: list[Observation]
+    ) -> tuple[Motion | None, Closure | None]:
+        """The motion to a scan as that of the state before allows it, and a second source of it."""
+        run = self.runs[scan.robot]
+        points = scan_points(scan, self.config.front_end.max_range_m)
+        now, last = scan_submap(points), run.scan
+        run.scan = None if now is None else (scan.time_ns, now)
+        if motion is None or now is None or last is None or last[0] != motion.start_ns:
+            return motion, None
+        run.motions += 1
+        motion = checked(motion, last[1], now)
+        run.contradicted += motion.matched
+        if self.config.odometry.scan_matching == "auto" or motion.matched:
+            return motion, None
+        return motion, measured(motion, last[1], scan.robot, beside_lines(points, seen))
 
     def start(self, robot: str, time_ns: int) -> None:
         """Give a robot its first state.
@@ -318,8 +345,9 @@ class Pipeline:
         event: Sequence[Message],
         seen: list[Observation],
         motion: Motion | None,
+        second: Closure | None,
     ) -> None:
-        """Associate, make the step, give it to the back end."""
+        """Associate, make the step, give it to the back end; ``second`` source of the motion."""
         run = self.runs[robot]
         motions: dict[str, Motion] = {robot: motion} if motion is not None else {}
         state_ns = time_ns if motion is not None else run.state_ns
@@ -335,12 +363,13 @@ class Pipeline:
         for message in event:
             if isinstance(message, Sighting) and message.seen_robot is not None:
                 associations += self.robot_sighting(message, state_ns, motions)
-        closures = tuple(self.closure(m, state_ns) for m in event if isinstance(m, RelativePose))
+        given = (self.closure(m, state_ns) for m in event if isinstance(m, RelativePose))
+        closures = tuple(c for c in (second, *given) if c)
         self.note_covariances()
         self.seconds["association"] += time.perf_counter() - began
         if not (motions or associations or closures):
             return
-        self.enter(Step(time_ns, {}, motions, associations, tuple(c for c in closures if c)), known)
+        self.enter(Step(time_ns, {}, motions, associations, closures), known)
         for message in event:
             if isinstance(message, Scan):
                 points = scan_points(message, self.config.front_end.max_range_m)
@@ -462,6 +491,8 @@ class Pipeline:
         )
         self.steps = list(done.steps)
         self.counts.update(done.counts)
+        for name in tracks:
+            self.runs[name].refined = self.config.odometry.calibrate
         return done.estimate
 
     def exchanged(self, estimate: Estimate) -> dict[str, str]:
@@ -540,6 +571,14 @@ def smooth(
         landmarks=len(landmarks),
         seconds=pipeline.seconds,
         calibration={name: run.calibration_found() for name, run in runs.items()},
+        odometry={
+            name: {
+                "motions": run.motions,
+                "contradicted": run.contradicted,
+                "resets": run.track.resets,
+            }
+            for name, run in runs.items()
+        },
         warnings=run_warnings(pipeline),
         log_s=1e-9 * (pipeline.last_ns - pipeline.first_ns),
     )
@@ -619,6 +658,12 @@ def run_warnings(pipeline: Pipeline) -> list[str]:
         f"{name}: its odometry jumped {run.track.resets} times; taken to have gone on as before"
         for name, run in pipeline.runs.items()
         if run.track.resets
+    ]
+    warnings += [
+        f"{name}: scans contradict its odometry in {run.contradicted} of {run.motions} motions; "
+        "these were taken from the scans"
+        for name, run in pipeline.runs.items()
+        if run.contradicted
     ]
     warnings += [
         f"{name}: its wheel radii and axle are not set; the defaults of robots.{name}.* were used"

@@ -92,6 +92,7 @@ def summarise(
     landmarks: int,
     seconds: Mapping[str, float],
     calibration: Mapping[str, Mapping[str, tuple[float, float, bool]]],
+    odometry: Mapping[str, Mapping[str, int]],
     warnings: Sequence[str],
     log_s: float,
 ) -> dict[str, Any]:
@@ -144,6 +145,7 @@ def summarise(
             for robot, found in sorted(calibration.items())
             for name, (value, sigma, observable) in found.items()
         },
+        "odometry": {robot: dict(counts) for robot, counts in sorted(odometry.items())},
         "warnings": [*log.warnings, *warnings],
     }
 

@@ -25,14 +25,15 @@ ROWS = (
     # one job each, on records and arrays
     ("association", "calibration", "dead_reckoning", "export", "factors", "frontend", "logs"),
     ("matching",),  # where a place was seen from
+    ("scan_motion",),  # what scans say of a motion
     # estimators; order in time; poses at any time; worlds and their logs
     ("backends", "simulate", "timeline", "trajectories"),
     # what is known about landmarks beside their estimate; of a robot; where robots start; recorded
     # steps through an estimator; sightings that share a step; names given to each other's bearers
     ("exchanged", "gathering", "landmark_map", "replay", "robot_run", "starts"),
     # decisions of one image; places seen twice; duplicates in a map; observations of walls anew; a
-    # log of sightings solved again; what a run adds up to
-    ("associator", "closing", "merging", "reassociating", "refining", "summary"),
+    # log of sightings solved again; states and calibration together; what a run adds up to
+    ("associator", "calibrating", "closing", "merging", "reassociating", "refining", "summary"),
     ("revisits",),  # landmarks by visit, and one again
     ("consolidating",),  # a log of scans solved again
     ("slam",),  # the pipeline

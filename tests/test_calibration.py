@@ -68,7 +68,7 @@ class Drive:
     def __init__(self, twists, scales=SCALES, laser=LASER, *, mounted=True, rng=None):
         scale, turn_scale, drift = scales.values()
         true = twists * [1 + scale, 1 + scale, 1 + turn_scale]
-        true[:, 2] += drift * np.hypot(twists[:, 0], twists[:, 1])
+        true[:, 2] += drift * twists[:, 0]
         self.rng = rng
         self.track = Track(OdometryConfig(), RobotConfig(), mounted=mounted)
         self._truth = Track(OdometryConfig(), RobotConfig())

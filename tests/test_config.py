@@ -174,6 +174,8 @@ def values(kind):
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is typing.Literal:
         return st.sampled_from(arguments)
+    if origin is tuple and typing.get_origin(arguments[0]) is typing.Literal:
+        return st.lists(values(arguments[0]), max_size=3).map(tuple)
     if origin is tuple:
         return st.sampled_from([0, 3]).flatmap(
             lambda n: st.lists(st.floats(-1e9, 1e9), min_size=n, max_size=n).map(tuple)

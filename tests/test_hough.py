@@ -1,15 +1,21 @@
 """Hough lines: the transform, the length that it must find, and which returns become one line."""
 
+import itertools
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_frontend import cast, ends, make_scan, near, normal_cov, normal_error, see
 
-from graphslam.config import FrontEndConfig
+from graphslam.config import FrontEndConfig, load_config
 from graphslam.frontend import FRONT_ENDS
 from graphslam.frontend.hough import Votes, find_lines
 from graphslam.frontend.split_merge import find_segments
 from graphslam.frontend.sweep import make_sweep
 from graphslam.geometry import rotation, wrap
+from graphslam.logs import open_logs
+from graphslam.simulate import load_scenario, simulate
+from graphslam.slam import smooth
 
 CONFIG = FrontEndConfig(name="hough")
 hough, both, segments = (FRONT_ENDS[name] for name in ("hough", "both", "segments"))
@@ -237,3 +243,60 @@ def test_cut_segments_without_a_hough_line_stay():
     sweep = everything(scan)
     found = find_segments(sweep, config)
     assert len(both(scan, config)) == np.count_nonzero(found.valid)
+
+
+# ---------------------------------------------------------------- covariance as printed, whole runs
+
+
+def test_the_thesis_covariance_is_an_option_for_hough_lines():
+    """`front_end.covariance = "thesis"`: eq. 4.32 as printed, every return with sigma_r; on a wall
+    seen at 45° on average that is more than the incidence angle leaves."""
+    scan = see([WALL], sigma=0.0)
+    plain = replace(CONFIG, floor_normal_m=0.0, floor_angle_rad=0.0)
+    (found,) = hough(scan, replace(plain, covariance="thesis"))
+    points = everything(scan).points
+    eta = (points - found.z[:2]) @ [np.cos(found.z[2]), np.sin(found.z[2])]
+    A = np.column_stack((np.ones(len(eta)), eta))
+    expected = CONFIG.range_sigma_m**2 * np.linalg.inv(A.T @ A)
+    np.testing.assert_allclose(normal_cov(found), expected, rtol=1e-6, atol=1e-15)
+    (other,) = hough(scan, plain)
+    assert normal_cov(other)[1, 1] < 0.8 * expected[1, 1]
+
+
+ROOM = """
+[world]
+walls = [{ name = "room", points_m = [[0, 0], [10, 0], [10, 7], [0, 7]], closed = true }]
+boxes = [
+  { name = "cupboard", center_m = [3, 6.2], size_m = [1.0, 0.5] },
+  { name = "desk", center_m = [6.5, 5.9], size_m = [1.4, 0.7] },
+  { name = "shelf", center_m = [9.2, 2.5], size_m = [0.5, 1.2] },
+]
+[robots.vehicle]
+start_m = [1.5, 1.5]
+body = { radius_m = 0.3 }
+drive = [{ through_m = [[8, 1.5], [8, 4.5], [2, 4.5], [2, 1.5], [6, 1.5]] }]
+encoders = { slip_m = 0.002 }
+laser = { mount_m = [0.1, 0], range_max_m = 30 }
+"""
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_in_both_a_wall_becomes_one_landmark(tmp_path, seed):
+    """The room's four walls, two of them behind furniture that hides now this part and now that:
+    one landmark each at the end of a whole run, though now a segment and now a Hough line saw
+    them. With two, what is seen of one wall would be split between them."""
+    (tmp_path / "room.toml").write_text(ROOM, encoding="utf-8")
+    simulate(load_scenario(str(tmp_path / "room.toml")), tmp_path / "room.mcap", seed)
+    config = load_config(overrides=["front_end.name=both", "start.from_truth=true"])
+    result = smooth(open_logs([tmp_path / "room.mcap"], config), config)
+    corners = np.array([[0, 0], [10, 0], [10, 7], [0, 7], [0, 0]], dtype=float)
+    for a, b in itertools.pairwise(corners):
+        along = (b - a) / np.hypot(*(b - a))
+        normal = np.array([-along[1], along[0]])
+        on = [
+            landmark
+            for landmark in result.landmarks
+            if landmark.kind != "point" and np.abs((landmark.extent - a) @ normal).max() < 0.1
+        ]
+        assert len(on) == 1
+        assert np.ptp(on[0].extent @ along) > 0.8 * np.hypot(*(b - a))

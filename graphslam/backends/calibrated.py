@@ -16,13 +16,10 @@ from graphslam import factors
 from graphslam.backends.graph import GraphBuilder, Part, read, write
 from graphslam.config import RobustConfig
 from graphslam.geometry import Array, between, log, rotate_cov, rotation3
-from graphslam.models.motion import Calibration
+from graphslam.models.motion import HELD_SIGMA, Calibration
 from graphslam.records import Estimate, Motion, Step, Trajectory
 
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
-
-#: a parameter whose prior sigma is smaller is held
-HELD_SIGMA = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 
 from graphslam import factors
-from graphslam.backends.graph import Estimates, GraphBackend, GraphBuilder, read, write
+from graphslam.backends.graph import Estimates, GraphBackend, GraphBuilder, Part, read, write
 from graphslam.config import Config, RobustConfig
 from graphslam.errors import EstimationError
 from graphslam.geometry import Array
@@ -57,12 +57,17 @@ class WholeGraph(GraphBuilder):
                 fresh.update([part.new])
             for factor in part.factors:
                 graph.add(factor)
-            if part.observed is not None and part.observed[2].model == "line":
-                self._observed.append(part.observed)
-                if not self._faced_later:
-                    self._places.append(self.graph.size() + graph.size() - 1)
+            if self.note_line(part) and not self._faced_later:
+                self._places.append(self.graph.size() + graph.size() - 1)
         self.graph.push_back(graph)
         return graph, values
+
+    def note_line(self, part: Part) -> bool:
+        """Whether a part observes a line: noted for `face_lines`."""
+        if part.observed is None or part.observed[2].model != "line":
+            return False
+        self._observed.append(part.observed)
+        return True
 
     def face_lines(self, values: gtsam.Values) -> None:
         """Make the factors of all lines anew at ``values``; see `GraphBuilder.faced`."""

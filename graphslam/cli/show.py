@@ -115,9 +115,17 @@ def smoothed(result: Result, directory: Path) -> None:
         console.print(f"stamps: {summary['notes']['stamps']}")
     _reasons(console, "rejected", summary["rejected"])
     _reasons(console, "dropped", summary["dropped"])
+    _unobservable(console, summary["calibration"])
     for warning in summary["warnings"]:
         console.print(f"warning: {warning}")
     console.print(f"report: {directory / 'report.html'}")
+
+
+def _unobservable(console: Console, calibration: Mapping[str, Any]) -> None:
+    """Which calibration parameters this drive does not tell."""
+    names = [name for name, p in calibration.items() if not p["observable"] and p["sigma"] > 0]
+    if names:
+        console.print(f"calibration: not observable in this log: {', '.join(names)}")
 
 
 def evaluation(found: Mapping[str, Any]) -> None:

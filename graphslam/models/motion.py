@@ -15,6 +15,8 @@ import numpy as np
 from graphslam.config import OdometryConfig, RobotConfig
 from graphslam.geometry import Array, compose, exp, exp_jacobian, inverse, rotation3
 
+#: a calibration parameter whose prior sigma is smaller, in any unit, is held
+HELD_SIGMA = 1e-6
 #: 1/m: robots that turn more tightly lose no more of their path; they hardly drive at all
 TIGHTEST_PER_M = 6.0
 
@@ -87,13 +89,12 @@ def odometry_increments(
     """Increments of an odometry that reports poses: ``rows`` (n, 3) are twists.
 
     Calibration parameters: relative scale of translation, relative scale of rotation, turning per
-    metre driven (rad/m).
+    metre driven forwards (rad/m): wheels of unequal size turn the robot the other way in reverse.
     """
-    path = np.hypot(rows[:, 0], rows[:, 1])
     d_twist = np.zeros((len(rows), 3, 3))
     d_twist[:, :2, 0] = rows[:, :2]
     d_twist[:, 2, 1] = rows[:, 2]
-    d_twist[:, 2, 2] = path
+    d_twist[:, 2, 2] = rows[:, 0]
     twists = rows + d_twist @ calibration
     return Increments(exp(twists), model_error_cov(rows, config), exp_jacobian(twists) @ d_twist)
 
@@ -113,7 +114,7 @@ def command_increments(
     d_twist = np.zeros((len(rows), 3, 4))
     d_twist[:, :2, 0] = rows[:, :2]
     d_twist[:, 2, 1] = rows[:, 2]
-    d_twist[:, 2, 2] = path
+    d_twist[:, 2, 2] = rows[:, 0]
     d_twist[:, :2, 3] = -rows[:, :2] * (curvature**2)[:, None]
     twists = rows + d_twist @ calibration
     return Increments(exp(twists), model_error_cov(rows, config), exp_jacobian(twists) @ d_twist)
@@ -199,8 +200,9 @@ def nominal_calibration(source: str, config: OdometryConfig, mounted: bool) -> C
             "laser_yaw_rad": config.laser_sigma_rad,
             "laser_latency_s": config.laser_latency_sigma_s,
         }
-    # a parameter whose sigma is set to 0 is held, without making the covariance singular
-    values = np.maximum(np.array(list(sigmas.values()), dtype=float), 1e-9)
+    known = [0.0 if name in config.fixed else sigma for name, sigma in sigmas.items()]
+    # a parameter whose sigma is 0 is held, without making the covariance singular
+    values = np.maximum(np.array(known, dtype=float), 1e-9)
     return Calibration(tuple(sigmas), np.zeros(len(values)), np.diag(values**2))
 
 

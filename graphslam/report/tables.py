@@ -132,11 +132,17 @@ def calibration(summary: Mapping[str, Any]) -> str:
     rows = [
         (
             name.replace(".", " · ").replace("_", " "),
-            f"{p['value']:.3f} ± {p['sigma']:.3f}" if p["observable"] else "not observable",
+            _calibrated(p),
         )
         for name, p in found.items()
     ]
     return table(["parameter", "value ± σ"], rows, "Calibration") if rows else ""
+
+
+def _calibrated(found: Mapping[str, Any]) -> str:
+    if found["observable"]:
+        return f"{found['value']:.4f} ± {found['sigma']:.4f}"
+    return "not observable" if found["sigma"] else "fixed"
 
 
 def landmarks(found: Sequence[Landmark]) -> str:

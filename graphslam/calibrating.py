@@ -1,0 +1,90 @@
+"""The last solution of logs of scans, with the calibration of odometry and mount as unknowns.
+
+A wrong wheel radius is one constant of the whole run, so along a corridor that shows nothing but
+its walls the uncertainty grows with the path, not with its root. What `calibration` learns on the
+way is where this begins; here it becomes a variable of the graph, and its uncertainty a part of
+every covariance.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphslam.backends.calibrated import solve_calibrated
+from graphslam.config import Config
+from graphslam.dead_reckoning import Track
+from graphslam.models.motion import Calibration
+from graphslam.records import Estimate, Motion, Step
+
+#: times that motions are made anew; after the first the calibration moves by a tenth of its sigma
+ROUNDS = 2
+
+#: steps with motions as noisy as an estimate shows them
+Loosen = Callable[[Sequence[Step], Estimate], tuple[Step, ...]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibrated:
+    """The estimate and the steps behind it; the tracks have the calibration found with it."""
+
+    estimate: Estimate
+    steps: tuple[Step, ...]
+
+
+def calibrate(
+    steps: Sequence[Step],
+    estimate: Estimate,
+    tracks: Mapping[str, Track],
+    loosen: Loosen,
+    config: Config,
+) -> Calibrated:
+    """Solve for states, landmarks and calibrations together.
+
+    Args:
+        steps: all steps.
+        estimate: of all their states and landmarks.
+        tracks: odometry of every robot; their calibration is set to what is found.
+        loosen: for motions whose covariance leaves out the calibration.
+        config: settings.
+
+    Raises:
+        EstimationError: the estimate is indeterminate.
+    """
+    priors = {name: track.nominal for name, track in tracks.items()}
+    made = tuple(steps)
+    for k in range(ROUNDS):
+        now = {name: track.calibration for name, track in tracks.items()}
+        for name, track in tracks.items():
+            still = np.diag(np.full(len(now[name].mean), 1e-18))
+            track.calibration = Calibration(now[name].names, now[name].mean, still)
+        made = loosen(remade(steps, tracks), estimate)
+        solved = solve_calibrated(
+            made, estimate, priors, now, config.robust, covariances=k == ROUNDS - 1
+        )
+        estimate = solved.estimate
+        for name, track in tracks.items():
+            track.calibration = solved.calibrations[name]
+    return Calibrated(estimate, made)
+
+
+def remade(steps: Sequence[Step], tracks: Mapping[str, Track]) -> tuple[Step, ...]:
+    """Steps with motions by the calibration that the tracks have.
+
+    With the latency held a motion at the edge of the odometry would be sure of what it does not
+    cover.
+    """
+    return tuple(
+        replace(
+            step, motions={robot: _remade(m, tracks[robot]) for robot, m in step.motions.items()}
+        )
+        for step in steps
+    )
+
+
+def _remade(motion: Motion, track: Track) -> Motion:
+    if motion.matched:
+        return motion
+    again = track.motion(motion.start_ns, motion.end_ns)
+    unseen = track.unseen(motion.start_ns, motion.end_ns)
+    return replace(again, cov=again.cov + np.diag(unseen**2)) if unseen.any() else again
