@@ -92,6 +92,8 @@ def summarise(
     landmarks: int,
     seconds: Mapping[str, float],
     calibration: Mapping[str, Mapping[str, tuple[float, float, bool]]],
+    closures: Mapping[str, Any],
+    frames: Mapping[str, str],
     warnings: Sequence[str],
     log_s: float,
 ) -> dict[str, Any]:
@@ -135,6 +137,8 @@ def summarise(
             "loop_closures": counts["loop_closures"] + line_closures + counts["closures_verified"],
         },
         "consolidated": {name: counts[name] for name in CONSOLIDATED if name in counts},
+        "closures": dict(closures),
+        "frames": dict(frames),
         "rejected": dict(sorted(rejected.items())),
         "dropped": dict(sorted(all_dropped.items())),
         "repaired": dict(sorted(log.repaired.items())),

@@ -30,9 +30,17 @@ ROWS = (
     # what is known about landmarks beside their estimate; of a robot; where robots start; recorded
     # steps through an estimator; sightings that share a step; names given to each other's bearers
     ("exchanged", "gathering", "landmark_map", "replay", "robot_run", "starts"),
-    # decisions of one image; places seen twice; duplicates in a map; observations of walls anew; a
-    # log of sightings solved again; what a run adds up to
-    ("associator", "closing", "merging", "reassociating", "refining", "summary"),
+    # decisions of one image; places seen twice; duplicates in a map; observations of walls anew;
+    # closures that a log brings along; a log of sightings solved again; what a run adds up to
+    (
+        "associator",
+        "closing",
+        "merging",
+        "reassociating",
+        "recorded_closures",
+        "refining",
+        "summary",
+    ),
     ("consolidating",),  # a log of scans solved again
     ("slam",),  # the pipeline
     ("results",),  # a result as a folder, and back
