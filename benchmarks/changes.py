@@ -1,6 +1,6 @@
 """Change detection over seeds of the `change` scenario and its variants, and its speed.
 
-    python benchmarks/changes.py [--seeds N] [--visits FOLDER] [WHAT ...]
+    python benchmarks/changes.py [--seeds N] [--first N] [--visits FOLDER] [WHAT ...]
 
 WHAT: false-alarms, detection, table, thesis, speed, figures; all if none is named. Smoothing the
 visits takes most of the time; they are kept in FOLDER (default: a temporary one). `figures` draws
@@ -413,13 +413,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("what", nargs="*", metavar="WHAT")
     parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--visits", type=Path)
     chosen = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         folder = chosen.visits or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
         for name in chosen.what or WHAT:
-            WHAT[name](range(chosen.seeds), folder)
+            WHAT[name](range(chosen.first, chosen.first + chosen.seeds), folder)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,9 +10,9 @@ from mcap.reader import make_reader
 from scipy.stats import chi2
 from typer.testing import CliRunner
 
-from graphslam.changes import compare, load_visit, visit_of
+from graphslam.changes import changes_between, compare, load_visit, visit_of
 from graphslam.changes.alignment import align
-from graphslam.changes.compare import lasers_differ
+from graphslam.changes.compare import lasers_differ, same_frame
 from graphslam.changes.evidence import past
 from graphslam.changes.grid import Grid, distinct, grid_over, nearest_of
 from graphslam.changes.localisation import overlays
@@ -21,15 +22,18 @@ from graphslam.changes.regions import counter_clockwise, outline
 from graphslam.changes.registration import register
 from graphslam.changes.straighten import straightened
 from graphslam.changes.surface import surface_of
-from graphslam.changes.visit import on_surface
+from graphslam.changes.visit import on_surface, within
 from graphslam.cli.commands import app
-from graphslam.config import ChangesConfig
+from graphslam.config import ChangesConfig, Config
 from graphslam.errors import OutputError
-from graphslam.geometry import between, compose, inverse, transform, wrap
+from graphslam.geometry import between, compose, inverse, rotation, transform, wrap
+from graphslam.logs import open_logs
 from graphslam.records import Landmark
-from graphslam.results import load
+from graphslam.results import load, save
+from graphslam.simulate import load_scenario, simulate
 from graphslam.simulate.raycast import Fan, cast
 from graphslam.simulate.world import Outline, make_world
+from graphslam.slam import smooth
 
 FAN = Fan(-np.pi / 2, np.pi / 360, 361)
 ROOM = Outline("room", np.array([[0, 0], [8, 0], [8, 6], [0, 6]], float), closed=True)
@@ -359,6 +363,61 @@ def test_the_page_is_whole_and_repeatable():
     assert "http" not in page.replace("http://www.w3.org", "")  # opens offline
 
 
+def test_the_example_of_the_docs_does_what_the_command_does(tmp_path, monkeypatch):
+    """It runs as printed, and writes the folder that the command writes."""
+    simulate(load_scenario("change"), tmp_path / "sim", 1)
+    for log, name in (("reference", "before"), ("later", "after")):
+        result = smooth(open_logs([tmp_path / f"sim/{log}.mcap"], Config()), Config())
+        save(result, Config(), tmp_path / name, force=False)
+    text = (Path(__file__).parents[1] / "docs/change-detection.md").read_text(encoding="utf-8")
+    (code,) = [part.split("```")[0] for part in text.split("```python\n")[1:]]
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    exec(compile(code, "docs/change-detection.md", "exec"), names)
+    assert [change.kind for change in names["found"].changes] == ["moved"]
+    rate = ("--set", "changes.false_alarm_rate=0.001")
+    done = CliRunner().invoke(app, ["changes", "before", "after", "-o", "command", *rate])
+    assert done.exit_code == 0, done.output
+    for name in ("changes.json", "changes.pgm", "changes.yaml"):
+        assert Path("command", name).read_bytes() == Path("changes", name).read_bytes()
+    assert {p.name for p in Path("command").iterdir()} == {
+        p.name for p in Path("changes").iterdir()
+    }
+
+
+def test_two_spans_of_a_run_in_which_nothing_changes(tmp_path):
+    """Forth and back through the same room: the second half against the first."""
+    simulate(load_scenario("lab"), tmp_path / "lab.mcap", 0)
+    log = open_logs([tmp_path / "lab.mcap"], Config())
+    save(smooth(log, Config()), Config(), tmp_path / "run", force=False)
+    run = tmp_path / "run"
+    found = changes_between(run, run, CONFIG, (0, 52), (52, 105))
+    assert not found.changes
+    assert found.compared.sum() > 20_000  # of 63 000 beams in the second half
+    assert found.flagged.sum() < 0.02 * found.compared.sum()  # 1 % asked for
+    with pytest.raises(OutputError, match="no scan in it"):
+        changes_between(run, run, CONFIG, (0, 52), (200, 300))
+
+
+def test_two_spans_of_a_run_in_which_something_appears():
+    """A box is put down half-way: one run, one frame, no registration."""
+    rng = np.random.default_rng(20)
+    parts = [visit(things, drive(50, 0.1 * i), rng) for i, things in enumerate(([], [box(5, 4)]))]
+    run = visit_of(
+        np.arange(100) * 100_000_000,
+        *(np.concatenate([getattr(p, k) for p in parts]) for k in ("poses", "covs")),
+        [(FAN.angles, r) for p in parts for r in p.range_m.reshape(50, -1)],
+    )
+    first, second = within(run, (0, 4.95), "first"), within(run, (5, 10), "second")
+    assert len(first.poses) == len(second.poses) == 50
+    (change,) = compare(first, second, CONFIG, same_frame(run)).changes
+    assert change.kind == "appeared"
+    np.testing.assert_allclose(change.polygon.mean(axis=0), [5.2, 4.2], atol=0.2)
+    # half-way through the second span the box has long been there: nothing is new
+    halves = within(run, (5, 7.45), "a"), within(run, (7.5, 10), "b")
+    assert not compare(*halves, CONFIG, same_frame(run)).changes
+
+
 def test_the_command_from_logs_to_json(tmp_path):
     """simulate, smooth twice, changes: the contract's keys, and the table that was turned."""
     run = CliRunner()
@@ -512,3 +571,61 @@ def test_other_lasers_are_warned_of():
     (warning,) = lasers_differ(a, coarse)
     assert "361 beams" in warning
     assert "181" in warning
+
+
+# ------------------------------------------------------------ straight things that moved
+
+
+def board(angle_deg, length=1.6):
+    """A board on its side that turns about its southern end, in the room's east."""
+    a = np.radians(angle_deg)
+    end = np.array([6.2, 2.0]) + length * np.array([np.cos(a), np.sin(a)])
+    return Outline("board", np.array([[6.2, 2.0], end]))
+
+
+def board_line(number, points):
+    along = points[1] - points[0]
+    normal = float(np.arctan2(along[1], along[0]) + np.pi / 2)
+    offset = float(points[0] @ [np.cos(normal), np.sin(normal)])
+    position = np.array([*points.mean(axis=0), np.arctan2(along[1], along[0])])
+    line = (float(wrap(normal)), offset, 1e-5 * np.eye(2))
+    return Landmark(number, "line", position, 1e-4 * np.eye(3), points, line, 9, 0, 1, None)
+
+
+def turned_board(seed, before=90.0, now=112.0, more=()):
+    """Two visits of the room; the board was turned, and hides where it had been."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for angle, turn in ((before, 0.0), (now, 0.1)):
+        thing = board(angle)
+        seen = visit([thing, *more], drive(50, turn), rng)
+        found.append(replace(seen, landmarks=(*walls(), board_line(50, thing.points))))
+    return compare(*found, CONFIG)
+
+
+def test_a_board_that_hides_its_old_place_has_moved_by_as_much_as_is_said():
+    """Displacement in every run, NEES at the board's middle within both 99.8 % bounds."""
+    runs, total = 12, 0.0
+    turn = np.radians(22.0)
+    pivot = np.array([6.2, 2.0])
+    true = np.array([*(pivot - rotation(turn) @ pivot), turn])
+    middle = board(112.0).points.mean(axis=0)
+    for seed in range(runs):
+        (change,) = turned_board(seed).changes
+        assert change.kind == "moved"
+        moved = change.displacement
+        was = transform(inverse(moved.motion), middle[None])
+        error = np.array([*(middle - transform(true, was)[0]), wrap(moved.motion[2] - turn)])
+        arm = middle - moved.motion[:2]
+        J = np.array([[1, 0, -arm[1]], [0, 1, arm[0]], [0, 0, 1]])
+        total += float(error @ np.linalg.solve(J @ moved.cov @ J.T, error))
+    assert total < chi2.ppf(0.999, 3 * runs)
+    # the laser of this test has no bias, of which 1 cm is allowed for: sigmas may be twice too wide
+    assert total > 0.25 * chi2.ppf(0.001, 3 * runs)
+
+
+def test_a_board_whose_end_is_hidden_is_not_said_to_have_moved():
+    """A screen hides its northern end: how far it went along itself nobody saw."""
+    screen = Outline("screen", np.array([[4.9, 2.9], [5.1, 4.6]]))
+    for change in turned_board(0, more=[screen]).changes:
+        assert change.displacement is None

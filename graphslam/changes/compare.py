@@ -16,21 +16,30 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from graphslam.changes.alignment import align
-from graphslam.changes.evidence import Evidence, past, range_noise, spread, visit_step
+from graphslam.changes.evidence import (
+    Evidence,
+    past,
+    range_noise,
+    repeatability,
+    spread,
+    visit_step,
+)
+from graphslam.changes.glass import solid
 from graphslam.changes.grid import grid_over
 from graphslam.changes.localisation import localise
-from graphslam.changes.moves import (
+from graphslam.changes.moves import motion_between
+from graphslam.changes.regions import Region, flagged, regions
+from graphslam.changes.registration import Registration, register
+from graphslam.changes.shapes import (
     Displacement,
+    Known,
     Shape,
     close_to,
     is_straight,
-    motion_between,
     moved_points,
-    segment_moves,
     shape_of,
 )
-from graphslam.changes.regions import Region, flagged, regions
-from graphslam.changes.registration import Registration, register
+from graphslam.changes.stretches import stretch_moves
 from graphslam.changes.surface import Surface, surface_of
 from graphslam.changes.visit import Bools, Ints, Visit, dictionary
 from graphslam.config import ChangesConfig
@@ -187,9 +196,11 @@ def compare(
         later = align(placed, a, _LATER_GATES, suspects)
         surfaces = (a, surface_of(later, a.nearest.grid, sigmas[1], config))
         evidence = _evidence(reference, later, surfaces, sigmas, config)
+    # judged with all there is: of paths that are broken little seems solid
+    warnings += _plausible(spread(evidence), bent)
+    surfaces, evidence = _of_solid(surfaces, evidence, (reference, later), config)
     a, b = surfaces
     factor = spread(evidence)
-    warnings += _plausible(factor, bent)
     flags = tuple(flagged(e, factor, config.false_alarm_rate / 2) for e in evidence)
     compared, marked = _beams(later, surfaces, evidence, (flags[0], flags[1]))
     seen = np.nonzero(b.beams >= 0)[0]
@@ -201,10 +212,15 @@ def compare(
         [shape_of(a, reference, evidence[0], factor, r.points) for r in vanished],
         [shape_of(b, later, evidence[1], factor, r.points) for r in appeared],
     )
-    fits = _fits(*shapes, config.bias_sigma_m)
-    segments = _segments(vanished, appeared, reference, later, registration)
+    known = Known(config.bias_sigma_m, repeatability(evidence), a.nearest.grid.cell_m)
+    fits = _fits(*shapes, known)
+    marks = (reference.landmarks, later.landmarks)
+    moves = stretch_moves(
+        marks, registration, surfaces, (reference, later), evidence, known, factor
+    )
+    stretches = _stretches(vanished, appeared, moves)
     lines = (_placed_lines(reference, same_frame(reference)), _placed_lines(later, registration))
-    changes = _changes(vanished, appeared, fits, segments, lines)
+    changes = _changes(vanished, appeared, fits, stretches, lines)
     return Comparison(
         changes, registration, reference, later, surfaces, evidence, compared, marked,
         factor, sigmas, config.false_alarm_rate, warnings,
@@ -308,6 +324,18 @@ def _evidence(
     )
 
 
+def _of_solid(
+    surfaces: tuple[Surface, Surface],
+    evidence: tuple[Evidence, Evidence],
+    visits: tuple[Visit, Visit],
+    config: ChangesConfig,
+) -> tuple[tuple[Surface, Surface], tuple[Evidence, Evidence]]:
+    """Surfaces and evidence without what a visit itself looked through."""
+    a, b = solid(surfaces, visits, config)
+    left = [replace(e, tested=e.tested & s.good) for e, s in zip(evidence, (a, b), strict=True)]
+    return (a, b), (left[0], left[1])
+
+
 def _suspects(
     later: Visit, surfaces: tuple[Surface, Surface], evidence: tuple[Evidence, Evidence]
 ) -> Bools:
@@ -356,13 +384,13 @@ class _Pair:
 
 
 def _fits(
-    before: list[Shape | None], after: list[Shape | None], bias_m: float
+    before: list[Shape | None], after: list[Shape | None], known: Known
 ) -> tuple[list[_Pair], list[_Pair]]:
     """Pairs of like shape, the most alike first; those with corners, and straight ones."""
     found = []
     for i, a in enumerate(before):
         for j, b in enumerate(after):
-            fit = None if a is None or b is None else motion_between(a, b, bias_m)
+            fit = None if a is None or b is None else motion_between(a, b, known)
             if fit is not None and a is not None:
                 found.append((-fit[0], i, j, is_straight(a), fit[1]))
     found.sort(key=lambda fit: fit[:3])
@@ -373,23 +401,17 @@ def _fits(
     return cornered, straight
 
 
-def _segments(
-    vanished: list[Region],
-    appeared: list[Region],
-    reference: Visit,
-    later: Visit,
-    registration: Registration,
+def _stretches(
+    vanished: list[Region], appeared: list[Region], moves: list[tuple[Array, Array, Displacement]]
 ) -> list[_Pair]:
-    """Regions along segments of the maps that moved."""
+    """Regions along lines of the maps that moved."""
     return [
         _Pair(
-            [i for i, r in enumerate(vanished) if _mostly_at(r, landmark.extent)],
-            [j for j, r in enumerate(appeared) if _mostly_at(r, ends)],
+            [i for i, r in enumerate(vanished) if _mostly_at(r, before)],
+            [j for j, r in enumerate(appeared) if _mostly_at(r, now)],
             motion,
         )
-        for landmark, ends, motion in segment_moves(
-            reference.landmarks, later.landmarks, registration
-        )
+        for before, now, motion in moves
     ]
 
 
@@ -397,17 +419,17 @@ def _changes(
     vanished: list[Region],
     appeared: list[Region],
     fits: tuple[list[_Pair], list[_Pair]],
-    segments: list[_Pair],
+    stretches: list[_Pair],
     lines: tuple[_Lines, _Lines],
 ) -> tuple[Change, ...]:
     """Regions as changes; what moved once instead of twice.
 
-    Shapes with corners say most about what is which, then segments of both maps (of a box they
-    may be opposite sides), then straight stretches.
+    Shapes with corners say most about what is which, then lines of both maps (of a box they
+    may be opposite sides), then other straight shapes.
     """
     found: list[Change] = []
     old_left, new_left = set(range(len(vanished))), set(range(len(appeared)))
-    for pairs, needs_both in ((fits[0], True), (segments, False), (fits[1], True)):
+    for pairs, needs_both in ((fits[0], True), (stretches, False), (fits[1], True)):
         for pair in pairs:
             old = [i for i in pair.old if i in old_left]
             new = [j for j in pair.new if j in new_left]

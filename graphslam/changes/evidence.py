@@ -103,7 +103,7 @@ def past(
         weight**2 * e**2,
     )
     sums = np.column_stack([summed(row, t, n) for t in terms])
-    inner = _inner(surface)
+    inner = inner_windows(surface)
     total, sum_e, sum_own, sum_common, sum_cos, count, through, *squares = pooled(sums, inner).T
     safe = np.where(total > 0, total, 1.0)
     mean = sum_e / safe
@@ -122,7 +122,7 @@ def past(
     return Evidence(beam, row, mean, variance, count, through, tested, first)
 
 
-def _inner(surface: Surface) -> list[Ints]:
+def inner_windows(surface: Surface) -> list[Ints]:
     """The 3 x 3 neighbourhood out of a surface's windows."""
     side = 2 * WINDOW + 1
     return [
@@ -251,3 +251,18 @@ def spread(evidence: tuple[Evidence, ...]) -> float:
     share = np.cumsum(weight[order]) / weight.sum()
     found = float(scores[order][np.searchsorted(share, _BULK)] / norm.ppf((1 + _BULK) / 2))
     return max(found, _LEAST_SPREAD)
+
+
+def repeatability(evidence: tuple[Evidence, ...]) -> float:
+    """Sigma, m, with which two visits place what did not change; robust.
+
+    Whatever the covariances leave out is in it: other things' bias that pulled at the scans, and
+    walls that are not flat.
+    """
+    offsets = np.abs(np.concatenate([e.offset[e.tested] for e in evidence]))
+    weight = np.concatenate([e.count[e.tested] for e in evidence])
+    if not len(offsets):
+        return 0.0
+    order = np.argsort(offsets)
+    half = int(np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum()))
+    return float(offsets[order][half] / norm.ppf(0.75))

@@ -6,7 +6,7 @@ from dataclasses import asdict
 import numpy as np
 
 from graphslam.changes.compare import Comparison
-from graphslam.changes.moves import Displacement, moved_points
+from graphslam.changes.shapes import Displacement, moved_points
 from graphslam.changes.visit import Bools, Visit
 from graphslam.config import ChangesConfig
 from graphslam.geometry import Array, rotation
