@@ -91,10 +91,12 @@ def motion_factor(key: int, next_key: int, motion: Motion) -> gtsam.NonlinearFac
 def closure_factor(
     key: int, other_key: int, closure: Closure, kernel: RobustConfig
 ) -> gtsam.NonlinearFactor:
-    """A measured relative pose: ``key`` seen from ``other_key``."""
-    return relative_pose_factor(
-        other_key, key, closure.delta, lambda cov: robust(gaussian(cov), kernel), closure.cov
-    )
+    """A measured relative pose: ``key`` seen from ``other_key``; under ``kernel`` if unverified."""
+
+    def noise(cov: Array) -> gtsam.noiseModel.Base:
+        return gaussian(cov) if closure.verified else robust(gaussian(cov), kernel)
+
+    return relative_pose_factor(other_key, key, closure.delta, noise, closure.cov)
 
 
 def relative_pose_factor(

@@ -42,6 +42,8 @@ WIDER = 10.0
 CHUNK = 1000
 #: sigmas at which the kernel of the joint solution turns
 KERNEL_SIGMAS = 3.0
+#: part of what is known in a direction that the others must say for a closure to be held against it
+LEAST_TOLD = 1e-3
 #: rounds of taking back and letting in
 MAX_ROUNDS = 30
 #: m, rad: where a frame of its own begins
@@ -53,19 +55,19 @@ ALONE = "nothing bears it out"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Verified:
-    """What was decided: ``refused`` (place in the sequence given -> why), the number ``kept``.
+    """What was decided: ``refused`` (place in the sequence given -> why), the places ``kept``.
 
     ``starts`` are those of the robots that had none; ``frames`` says in whose frame each robot is,
     the one whose start it hangs on; both only of robots that have a relative pose.
     """
 
     refused: Mapping[int, str]
-    kept: int
+    kept: frozenset[int]
     starts: Mapping[str, Start]
     frames: Mapping[str, str]
 
 
-NOTHING_RECORDED = Verified({}, 0, {}, {})
+NOTHING_RECORDED = Verified({}, frozenset(), {}, {})
 
 
 def own_frame() -> Start:
@@ -122,7 +124,7 @@ def verify(
     }
     unknown = [robot for robot in odometry if robot not in starts]
     if len(believed) == len(judged) and not unknown:
-        return Verified({}, len(judged), {}, frames)
+        return Verified({}, frozenset(judged), {}, frames)
     solver = _Joint(messages, odometry, {**placed, **starts}, config)
     candidates = [k for k in judged if frames[messages[k].robot] == frames[messages[k].other]]
     believed, estimate = solver.settle(believed, candidates)
@@ -132,7 +134,7 @@ def verify(
         first = estimate.states[robot]
         wide = ORIGIN if frames[robot] == robot else WIDER**2 * first.covs[0]
         found[robot] = Start(first.poses[0], wide)
-    return Verified(refused, len(believed), found, frames)
+    return Verified(refused, frozenset(believed), found, frames)
 
 
 def _has_ends(m: RelativePose, tracks: Mapping[str, Track]) -> bool:
@@ -355,28 +357,26 @@ class _Joint:
     def _misfit(self, k: int, used: bool, backend: BatchBackend, estimate: Estimate) -> float:
         """Squared Mahalanobis distance of a closure from what all others say.
 
-        With M the covariance of the relative pose by the estimate, r the residual and R/w the
-        closure's weighted covariance: without it, M becomes (M⁻¹ - w R⁻¹)⁻¹ and r becomes
-        (1 + M w R⁻¹) r.
+        In units of the closure's own sigmas, along directions in which the estimate is independent:
+        with m the variance of the relative pose by the estimate, r the residual and w the weight
+        that the closure has in it (0 unless used), all others together say r / (1 - w m) with
+        variance m / (1 - w m). Directions of which they know next to nothing are left out.
         """
         c = self._closures[k]
         ends = (c.other, c.other_time_ns), (c.robot, c.time_ns)
         x, y = (_pose(estimate.states[robot], t) for robot, t in ends)
         h = between(x, y)
-        r, R = log(between(c.delta, h)), rotate_cov(c.cov, -float(c.delta[2]))
+        L = np.linalg.cholesky(rotate_cov(c.cov, -float(c.delta[2])))
+        r = np.linalg.solve(L, log(between(c.delta, h)))
         if ends[0] == ends[1]:
-            return float(r @ np.linalg.solve(R, r))
-        J = np.hstack([-adjoint(inverse(h)), np.eye(3)])
-        M = J @ backend.state_covariance(ends) @ J.T
-        if used:
-            d2 = float(r @ np.linalg.solve(R, r))
-            w = (KERNEL_SIGMAS**2 / (KERNEL_SIGMAS**2 + d2)) ** 2
-            left, Q = np.linalg.eigh(np.linalg.inv(M) - w * np.linalg.inv(R))
-            # where nothing else says anything, the rest is rounding: it may be anything
-            least = 1e-9 * np.trace(np.linalg.inv(R))
-            M = Q @ np.diag(1.0 / np.maximum(left, least)) @ Q.T
-            r = r + M @ (w * np.linalg.solve(R, r))
-        return float(r @ np.linalg.solve(M + R, r))
+            return float(r @ r)
+        J = np.linalg.solve(L, np.hstack([-adjoint(inverse(h)), np.eye(3)]))
+        m, Q = np.linalg.eigh(J @ backend.state_covariance(ends) @ J.T)
+        w = (KERNEL_SIGMAS**2 / (KERNEL_SIGMAS**2 + r @ r)) ** 2 if used else 0.0
+        rest = 1.0 - w * m
+        told = rest > LEAST_TOLD
+        r, m, rest = (Q.T @ r)[told], m[told], rest[told]
+        return float(np.sum(r**2 / (rest * (rest + m))))
 
 
 def _pose(states: Trajectory, time_ns: int) -> Array:

@@ -207,7 +207,10 @@ class Start:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Closure:
-    """Pose (3,) of state (robot, time) in the frame of state (other, other_time), with cov."""
+    """Pose (3,) of state (robot, time) in the frame of state (other, other_time), with cov.
+
+    ``verified``: it was held against all that is known, so no robust kernel belongs on it.
+    """
 
     robot: str
     time_ns: int
@@ -215,6 +218,7 @@ class Closure:
     other_time_ns: int
     delta: Array
     cov: Array
+    verified: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -75,12 +75,12 @@ ClosureId = tuple[str, int, str, int, bytes]
 class Recorded:
     """What became of a log's relative poses, see `graphslam.recorded_closures.Verified`.
 
-    ``refused`` by `closure_id`; ``frames`` of all robots that have a start.
+    ``refused`` and ``kept`` by `closure_id`; ``frames`` of all robots that have a start.
     """
 
     starts: Mapping[str, Start]
     frames: Mapping[str, str]
-    kept: int
+    kept: frozenset[ClosureId]
     refused: Mapping[ClosureId, str]
 
     def own_frames(self) -> dict[str, str]:
@@ -94,7 +94,7 @@ class Recorded:
             {"robot": r, "time_ns": t, "other": o, "other_time_ns": s, "reason": why}
             for (r, t, o, s, _), why in self.refused.items()
         ]
-        return {"kept": self.kept, "refused": refused}
+        return {"kept": len(self.kept), "refused": refused}
 
 
 class Pipeline:
@@ -433,7 +433,8 @@ class Pipeline:
             cov = compose_cov(delta, cov, back, inverse_cov(tail.delta, tail.cov))
             delta = compose(delta, back)
         self.counts["loop_closures"] += 1
-        return Closure(message.robot, state_ns, message.other, other_ns, delta, cov)
+        verified = closure_id(message) in self.recorded.kept
+        return Closure(message.robot, state_ns, message.other, other_ns, delta, cov, verified)
 
     def note_state(self, robot: str, time_ns: int) -> None:
         """Book a new state."""
@@ -662,9 +663,10 @@ def verify_recorded(log: LogSet, config: Config, starts: Mapping[str, Start]) ->
         for robot in set(log.robots) - {*starts, *found}:
             found[robot], frames[robot] = own_frame(), robot
     world = min(starts, default="")
+    kept = frozenset(closure_id(messages[k]) for k in verified.kept)
     refused = {closure_id(messages[k]): why for k, why in verified.refused.items()}
     frames = {robot: frames.get(robot, world) for robot in log.robots if robot in {*starts, *found}}
-    return Recorded(found, frames, verified.kept, refused)
+    return Recorded(found, frames, kept, refused)
 
 
 def sensing(config: OdometryConfig, scans: bool) -> OdometryConfig:

@@ -171,7 +171,7 @@ class GraphBuilder:
         with _named(what, closure.cov):
             factor = factors.closure_factor(key, other, closure, self.kernel)
         self.rows += 3
-        return Part((factor,), what, robust=True)
+        return Part((factor,), what, robust=not closure.verified)
 
     def faced(
         self, observed: tuple[int, int, Association], estimate: Estimates
