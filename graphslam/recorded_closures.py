@@ -12,8 +12,6 @@ Whoever recorded them may have been mistaken, so nothing is believed for what it
 3. Everything is solved together under a kernel that redescends, and each closure is held against
    what all the others leave of it: those that contradict are taken back, the worst first; those
    left out that fit come in; until nothing changes.
-
-Where all agree in pairs and all starts are known, nothing is left to be decided.
 """
 
 from collections import defaultdict
@@ -123,8 +121,6 @@ def verify(
         if frames[a] == frames[b] and (a == b or (a, b) in clear or {a, b} <= set(starts))
     }
     unknown = [robot for robot in odometry if robot not in starts]
-    if len(believed) == len(judged) and not unknown:
-        return Verified({}, frozenset(judged), {}, frames)
     solver = _Joint(messages, odometry, {**placed, **starts}, config)
     candidates = [k for k in judged if frames[messages[k].robot] == frames[messages[k].other]]
     believed, estimate = solver.settle(believed, candidates)

@@ -5,6 +5,7 @@ them, so that our results can be judged by the file's own factors. Such files ha
 stamps are invented, one second apart, and the log says so.
 """
 
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -193,7 +194,8 @@ def read_pose_graph(source: Path) -> PoseGraph:
     """
     graph = PoseGraph()
     is_g2o = ".g2o" in source.suffixes
-    for count, line in enumerate(text_lines(source), start=1):
+    lines = enumerate(text_lines(source), start=1)
+    for count, line in ((n, part) for n, whole in lines for part in _JOINED.split(whole)):
         fields = line.split()
         if not fields or fields[0].startswith("#"):
             continue
@@ -281,6 +283,8 @@ def _numbers(fields: Sequence[str], count: int) -> Array:
     return values
 
 
+#: files put together, of which one did not end its last line: a tag follows a number at once
+_JOINED = re.compile(r"(?<=[0-9])(?=[A-Z]{2})")
 # the tags that load2D reads, and the names that g2o and its relatives give to the same
 _LINES: dict[str, Callable[[PoseGraph, Sequence[str], bool], None]] = {
     "ODOMETRY": _edge,
