@@ -169,6 +169,24 @@ def encode(schema: str, message: Any) -> bytes:
     return bytes(_typestore().serialize_cdr(message, schema, little_endian=True))
 
 
+class Template:
+    """An encoded message of which only the header's stamp and some numbers change."""
+
+    def __init__(self, schema: str, message: Any, marks: Sequence[float]) -> None:
+        """Made from one ``message`` whose numbers that will change are ``marks``, each unique."""
+        self._data = encode(schema, message)
+        self._places = [self._data.index(struct.pack("<d", mark)) for mark in marks]
+
+    def filled(self, stamp_ns: int, *numbers: float) -> bytes:
+        """The bytes with a stamp and numbers, in the order of the marks."""
+        data = bytearray(self._data)
+        # after CDR's own header of four bytes the message begins with its std_msgs/Header
+        struct.pack_into("<iI", data, 4, *_seconds(stamp_ns))
+        for place, number in zip(self._places, numbers, strict=True):
+            struct.pack_into("<d", data, place, number)
+        return bytes(data)
+
+
 def build(schema: str, **fields: Any) -> Any:
     """A message of type ``schema``; every field must be given."""
     return _typestore().types[schema](**fields)
@@ -189,10 +207,15 @@ def time(stamp_ns: int) -> Any:
     Raises:
         LogError: the stamp does not fit the signed 32-bit seconds of ROS 2.
     """
+    seconds, nanoseconds = _seconds(stamp_ns)
+    return build("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+
+
+def _seconds(stamp_ns: int) -> tuple[int, int]:
     seconds, nanoseconds = divmod(int(stamp_ns), 1_000_000_000)
     if not -(2**31) <= seconds < 2**31:
         raise LogError(f"stamp {stamp_ns} ns cannot be written: ROS 2 has 32 bits for seconds")
-    return build("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+    return seconds, nanoseconds
 
 
 def header(stamp_ns: int, frame: str) -> Any:
