@@ -8,7 +8,7 @@ puts into the file, so that any ROS 2 or MCAP tool can decode them. docs/logs.md
 import struct
 from collections.abc import Sequence
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags.serde import SerdeError
@@ -17,6 +17,9 @@ from rosbags.typesys.store import Typestore
 
 from graphslam.errors import LogError
 from graphslam.geometry import Array
+
+#: pose, twist and their covariances
+_ODOMETRY_NUMBERS = 7 + 36 + 6 + 36
 
 IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
@@ -123,6 +126,37 @@ def decode(schema: str, data: bytes) -> Any:
         return _typestore().deserialize_cdr(data, schema)
     except (SerdeError, IndexError, MemoryError, OverflowError) as error:
         raise CdrError(str(error)) from error
+
+
+class PlanarOdometry(NamedTuple):
+    """What is used of a nav_msgs/Odometry: stamp, position in the plane, rotation as quaternion."""
+
+    stamp_ns: int
+    x: float
+    y: float
+    rotation: tuple[float, float, float, float]
+
+
+def decode_odometry(data: bytes) -> PlanarOdometry:
+    """The beginning of a nav_msgs/Odometry; `decode` makes ten objects of each of very many.
+
+    Raises:
+        CdrError: the bytes are cut short.
+    """
+    order = "<" if data[1:2] == b"\x01" else ">"
+    try:
+        seconds, nanoseconds, named = struct.unpack_from(f"{order}iII", data, 4)
+        # numbers are aligned to their size, relative to what follows CDR's four bytes
+        at = 16 + named + -named % 4
+        (named,) = struct.unpack_from(f"{order}I", data, at)
+        at += 4 + named
+        at += -(at - 4) % 8
+        x, y, _, *rotation = struct.unpack_from(f"{order}7d", data, at)
+    except struct.error as error:
+        raise CdrError(str(error)) from error
+    if len(data) < at + _ODOMETRY_NUMBERS * 8:
+        raise CdrError("cut short")
+    return PlanarOdometry(seconds * 1_000_000_000 + nanoseconds, x, y, tuple(rotation))
 
 
 def decode_true_poses(data: Sequence[bytes]) -> tuple[IntArray, Array]:
