@@ -20,11 +20,11 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.stats import chi2
 
 from graphslam.backends.isam2 import BatchBackend, Isam2Backend
 from graphslam.config import BackendConfig, Config, RobustConfig
 from graphslam.dead_reckoning import Track
+from graphslam.gaussian import chi2_quantile
 from graphslam.geometry import Array, between, compose, inverse, log, rotate_cov, rotation3
 from graphslam.records import Closure, Estimate, Motion, RelativePose, Start, Step, Trajectory
 
@@ -212,7 +212,7 @@ def _loops(messages: Sequence[RelativePose], odometry: Mapping[str, _Chain]) -> 
     E = compose(seen, inverse(own.poses[j]))
     A = adjoint(seen)
     R = A @ rotate_cov(np.array([m.cov for m in messages]), -z[:, 2]) @ A.mT
-    gate = chi2.ppf(AGREE, 3)
+    gate = chi2_quantile(AGREE, 3)
     agree = np.zeros((len(z), len(z)), dtype=bool)
     A = adjoint(E)
     for a in range(len(z)):  # row by row: a matrix of 3 x 3 blocks would not fit
@@ -319,7 +319,7 @@ class _Joint:
 
     def settle(self, believed: set[int], candidates: Sequence[int]) -> tuple[set[int], Estimate]:
         """Those of the candidates that bear each other out, beginning with some; the estimate."""
-        gate = chi2.ppf(FIT, 3)
+        gate = chi2_quantile(FIT, 3)
         backend: Isam2Backend = Isam2Backend(self._plain)
         for step in self._steps(believed):
             backend.add(step)

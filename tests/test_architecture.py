@@ -19,6 +19,7 @@ ROOT = Path(graphslam.__file__).parent
 #: The rooms of the house, lowest row first. An import goes to a lower row, or stays in its room.
 ROWS = (
     ("errors", "geometry"),  # how it fails; what a pose is
+    ("gaussian",),  # what squared distances of normal errors may be
     # settings; what travels between the modules; Kalman filtering on arrays
     ("config", "kalman", "records"),
     ("models",),  # motion, and one observation model per kind of target
