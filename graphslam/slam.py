@@ -188,19 +188,20 @@ class Pipeline:
         for robot in meeting:
             if not self.runs[robot].started:
                 self.start(robot, min(self.runs[robot].track.first_ns, step_ns))
-        motions: dict[str, Motion] = {}
-        for robot in gathered.robots:
-            run = self.runs[robot]
-            if robot in meeting or self.has_moved(run, run.state_ns, step_ns):
-                motion = self.motion_since_state(robot, step_ns)
-                if motion is not None:
-                    motions[robot] = motion
-                    run.path_m += motion.length_m
+        last_ns = {
+            robot: run.state_ns
+            for robot, run in ((robot, self.runs[robot]) for robot in gathered.robots)
+            if step_ns > run.state_ns
+            and (robot in meeting or self.has_moved(run, run.state_ns, step_ns))
+        }
+        at = {r: step_ns if r in last_ns else self.runs[r].state_ns for r in gathered.robots}
+        moved, new = ways(gathered, at, last_ns, {robot: self.runs[robot].track for robot in at})
+        motions = {robot: new[robot] for robot in last_ns}
+        for robot, motion in motions.items():
+            self.runs[robot].path_m += motion.length_m
         began = time.perf_counter()
         known = {i for i, entry in self.associator.map.entries.items() if entry.in_graph}
         associations: tuple[Association, ...] = ()
-        at = {r: step_ns if r in motions else self.runs[r].state_ns for r in gathered.robots}
-        moved = ways(gathered, at, {robot: self.runs[robot].track for robot in at})
         every = [sighting for image in gathered.images for sighting in image]
         observed = iter(carried(every, [moved[s.robot, s.time_ns] for s in every]))
         for image in gathered.images:
