@@ -25,7 +25,7 @@ from graphslam.backends.isam2 import BatchBackend, Isam2Backend
 from graphslam.config import BackendConfig, Config, RobustConfig
 from graphslam.dead_reckoning import Track
 from graphslam.gaussian import chi2_quantile
-from graphslam.geometry import Array, between, compose, inverse, log, rotate_cov, rotation3
+from graphslam.geometry import Array, adjoint, between, compose, inverse, log, rotate_cov
 from graphslam.records import Closure, Estimate, Motion, RelativePose, Start, Step, Trajectory
 
 #: probability up to which two closures agree, and up to which one fits what all the others say:
@@ -162,13 +162,6 @@ class _Chain:
     def at(self, times_ns: Iterable[int]) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
         """Places (k,) of times in the chain."""
         return np.searchsorted(self.times_ns, np.array(list(times_ns), dtype=np.int64))
-
-
-def adjoint(pose: Array) -> Array:
-    """Matrix (..., 3, 3) that takes errors (v, omega) at a pose (..., 3) to its parent's origin."""
-    out = rotation3(pose[..., 2])
-    out[..., 0, 2], out[..., 1, 2] = pose[..., 1], -pose[..., 0]
-    return out
 
 
 def _odometry(messages: Iterable[RelativePose], tracks: Mapping[str, Track]) -> dict[str, _Chain]:
