@@ -12,7 +12,7 @@ import struct
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from io import BytesIO
+from io import SEEK_CUR, BytesIO
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, TypeVar
@@ -200,7 +200,17 @@ def _records(stream: BinaryIO, offset: int, limit: int) -> Iterator[tuple[int, M
     reader = StreamReader(stream, skip_magic=True, emit_chunks=True, record_size_limit=limit)
     for record in reader.records:
         yield offset, record
+        offset = _after_indexes(stream)
+
+
+def _after_indexes(stream: BinaryIO) -> int:
+    """Passes over message indexes, which nobody asks for and which take longest to read."""
+    while True:
         offset = stream.tell()
+        head = stream.read(_RECORD.size)
+        if len(head) < _RECORD.size or head[0] != Opcode.MESSAGE_INDEX:
+            return stream.seek(offset)
+        stream.seek(_RECORD.unpack(head)[1], SEEK_CUR)
 
 
 class _Contents(NamedTuple):
