@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.stats import chi2
 
 from graphslam.config import AssociationConfig
+from graphslam.gaussian import chi2_quantile
 from graphslam.geometry import Array, between, compose, wrap
 from graphslam.models import MODELS
 from graphslam.records import Observation
@@ -78,7 +78,7 @@ def gate_distance(probability: float, dof: IntArray | int) -> Array:
 @functools.cache
 def _quantiles(probability: float) -> Array:
     """Chi-square quantiles (9,) of 1 to 9 degrees of freedom."""
-    return np.asarray(chi2.ppf(probability, range(1, 10)))
+    return np.asarray(chi2_quantile(probability, range(1, 10)))
 
 
 def flip(seen: Observation) -> Observation:
@@ -285,7 +285,7 @@ def jointly_compatible(
         R[rows, rows] = compared.noise[k]
         row = rows.stop
     d2 = float(r @ np.linalg.solve(H @ P @ H.T + R, r))
-    return d2 < float(chi2.ppf(probability, len(r)))
+    return d2 < float(chi2_quantile(probability, len(r)))
 
 
 def fixes_pose(compared: Compared, chosen: Sequence[int]) -> bool:

@@ -12,8 +12,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
 
+from graphslam.gaussian import chi2_quantile
 from graphslam.geometry import (
     Array,
     between,
@@ -252,7 +252,7 @@ def agreeing(closures: Sequence[Closure], found: Sequence[Place], P: Array) -> l
     if not closures:
         return []
     r, S = _innovations(closures, found, TRUST * P)
-    n, gate = len(r), chi2.ppf(AGREE, 3)
+    n, gate = len(r), chi2_quantile(AGREE, 3)
     blocks = S.reshape(n, 3, n, 3).transpose(0, 2, 1, 3)
     own = blocks[np.arange(n), np.arange(n)]
     gain = blocks @ np.linalg.inv(own)[None]  # [a, b]: what b says of a
@@ -280,7 +280,7 @@ def agreeing(closures: Sequence[Closure], found: Sequence[Place], P: Array) -> l
 
 def _standing(chosen: list[int], r: Array, S: Array) -> list[int]:
     """Those of the chosen that all the others bear out, by innovations r (n, 3) and S (3n, 3n)."""
-    gate = chi2.ppf(AGREE, 3)
+    gate = chi2_quantile(AGREE, 3)
     while len(chosen) > 1:
         rows = np.concatenate([np.arange(3 * k, 3 * k + 3) for k in chosen])
         information = np.linalg.inv(S[np.ix_(rows, rows)])

@@ -228,9 +228,9 @@ class BackendConfig:
     linearised anew; relinearize_every: steps between two looks for such variables. polish:
     optimise to convergence at the end; reconsider: then apply the final calibration to all of the
     log, merge landmarks that are one, and optimise again (smoothers only); close_loops: in between,
-    close loops that scans confirm. horizon_s: how long a
-    past pose stays in isam2's graph before it is marginalised out: inf = full smoothing, 0 = the
-    extended Kalman filter.
+    close loops that scans confirm. verify_closures: believe relative poses that a log brings along
+    only if they agree with each other. horizon_s: how long a past pose stays in isam2's graph
+    before it is marginalised out: inf = full smoothing, 0 = the extended Kalman filter.
     """
 
     name: Literal["isam2", "batch", "ekf", "invariant-ekf", "rbpf", "dead-reckoning"] = "isam2"
@@ -240,6 +240,7 @@ class BackendConfig:
     polish: bool = True
     reconsider: bool = True
     close_loops: bool = True
+    verify_closures: bool = True
 
 
 @dataclass(frozen=True)

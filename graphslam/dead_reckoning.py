@@ -83,12 +83,13 @@ class Track:
     ) -> None:
         """An empty track; ``mounted``: its motions are those of a sensor's frame, see `motion`."""
         self.source = ""
-        self.resets = 0  # times that the odometry jumped
         self.calibration = nominal_calibration("given", config, False)
         self.nominal = self.calibration  # before any data
         self._mounted = mounted
         self._config, self._robot = config, robot
-        self._count, self._p, self._bursts = 0, 0, 0
+        self._count, self._p, self._bursts, self._resets = 0, 0, 0, 0
+        self._settled = 0  # readings that are worked out; the others' values wait in `_fresh`
+        self._fresh: list[Array] = []
         self._times = np.empty(1024, dtype=np.int64)  # time of the end of each row's interval
         self._rows = np.empty((1024, 0))
         self._sums = np.empty((1024, 0))  # of the rows
@@ -96,7 +97,7 @@ class Track:
         self._effort = np.empty(1024)  # accumulated, see `effort`
         self._path = np.empty(1024)  # accumulated, m
         self._burst = np.empty(1024, dtype=bool)  # interval too short for its motion
-        self._last: Array | None = None
+        self._last = np.zeros(0)  # the last reading that is worked out
 
     @property
     def mount(self) -> Array:
@@ -120,7 +121,14 @@ class Track:
     @property
     def bursty(self) -> bool:
         """Whether many readings were stamped in bursts: then a shift of time means nothing."""
+        self._settle()
         return self._bursts > MAX_BURST_SHARE * self._count
+
+    @property
+    def resets(self) -> int:
+        """Times that the odometry jumped."""
+        self._settle()
+        return self._resets
 
     @property
     def used_calibration(self) -> Calibration:
@@ -159,66 +167,96 @@ class Track:
         """Append a reading; readings come in time order."""
         if isinstance(message, OdometryIncrement):
             if not self._count:
-                self._append("given", message.start_ns, np.zeros(12))
-            self._append(
-                "given",
-                message.time_ns,
-                np.concatenate([log(message.delta), message.cov.ravel()]),
-            )
+                self._begin("given", message.start_ns)
+            value = np.concatenate([log(message.delta), message.cov.ravel()])
         elif isinstance(message, OdometryPose):
-            row = np.zeros(3) if self._last is None else log(between(self._last, message.pose))
-            if self._jumps(row, message.time_ns):
-                self.resets += 1
-                row = self._rows[self._count - 1] if self._count > 1 else np.zeros(3)
-            self._append("commands" if self._config.commanded else "odometry", message.time_ns, row)
-            self._last = message.pose
+            value = message.pose
         else:
-            angles = np.array([message.left_rad, message.right_rad])
-            row = np.zeros(2) if self._last is None else angles - self._last
-            self._append("wheels", message.time_ns, row)
-            self._last = angles
+            value = np.array([message.left_rad, message.right_rad])
+        if not self._count:
+            poses = "commands" if self._config.commanded else "odometry"
+            self._begin("wheels" if isinstance(message, WheelAngles) else poses, message.time_ns)
+            self._last = value
+        elif message.time_ns > self.last_ns:
+            if self._count == len(self._times):
+                self._grow()
+            self._times[self._count] = message.time_ns
+            self._count += 1
+            self._fresh.append(value)
+        else:
+            # a second reading of one time: its motion belongs to the interval that ends here
+            self._settle()
+            n = self._count - 1
+            (row,) = self._rows_between(value[None], self._times[[n, n]])
+            if n:
+                self._bursts -= int(self._burst[n])
+                self._enter(n, (self._rows[n] + row)[None])
 
-    def _jumps(self, row: Array, time_ns: int) -> bool:
-        """Whether a pose is no continuation of the last: the odometry was set anew.
+    def _begin(self, source: str, time_ns: int) -> None:
+        """The first reading, from which all motion counts."""
+        self.source, self._count, self._settled = source, 1, 1
+        mounted = self._mounted and source != "given"
+        self.calibration = self.nominal = nominal_calibration(source, self._config, mounted)
+        self._p = len(self.calibration.mean) - 4 * mounted  # parameters of the increments
+        self._rows = np.zeros((len(self._times), _ROW_SIZE[source]))
+        self._sums = np.zeros_like(self._rows)
+        self._times[0] = time_ns
+        self._poses[0], self._effort[0], self._path[0], self._burst[0] = 0.0, 0.0, 0.0, False
 
-        Faster than any robot over an interval that is no burst. The motion in it is unknown; the
+    def _grow(self) -> None:
+        for name in ("_times", "_rows", "_sums", "_poses", "_effort", "_path", "_burst"):
+            full = getattr(self, name)
+            setattr(self, name, np.concatenate([full, np.empty_like(full)]))
+
+    def _settle(self) -> None:
+        """Work out the readings that came since it was last asked for any motion, all at once."""
+        n = self._settled
+        if n < self._count:
+            values = np.array(self._fresh)
+            self._fresh.clear()
+            self._settled = self._count
+            self._enter(n, self._rows_between(values, self._times[n - 1 : self._count]))
+
+    def _rows_between(self, values: Array, times_ns: IntArray) -> Array:
+        """Rows (n, k) of readings (n, k) that follow the last one, at times (n + 1) with its own.
+
+        A pose that is no continuation of the one before tells that the odometry was set anew: it is
+        faster than any robot over an interval that is no burst. The motion in it is unknown; the
         robot is taken to have gone on as before.
         """
-        if not self._count or time_ns - self.last_ns < SHORTEST_RESET_NS:
-            return False
-        seconds = 1e-9 * (time_ns - self.last_ns)
-        return bool(np.hypot(row[0], row[1]) > RESET_SPEED_M_S * seconds + 0.5)
+        if self.source == "given":
+            return values
+        before = np.vstack([self._last, values[:-1]])
+        self._last = values[-1]
+        if self.source == "wheels":
+            return values - before
+        rows = log(between(before, values))
+        apart_ns = np.diff(times_ns)
+        limit_m = RESET_SPEED_M_S * 1e-9 * apart_ns + 0.5
+        jumped = (apart_ns >= SHORTEST_RESET_NS) & (np.hypot(rows[:, 0], rows[:, 1]) > limit_m)
+        for k in np.flatnonzero(jumped):
+            self._resets += 1
+            rows[k] = rows[k - 1] if k else self._rows[self._settled - len(values) - 1]
+        return rows
 
-    def _append(self, source: str, time_ns: int, row: Array) -> None:
-        if not self._count:
-            self.source = source
-            mounted = self._mounted and source != "given"
-            self.calibration = self.nominal = nominal_calibration(source, self._config, mounted)
-            self._p = len(self.calibration.mean) - 4 * mounted  # parameters of the increments
-            self._rows = np.empty((len(self._times), _ROW_SIZE[source]))
-            self._sums = np.empty_like(self._rows)
-        if self._count == len(self._times):
-            for name in ("_times", "_rows", "_sums", "_poses", "_effort", "_path", "_burst"):
-                full = getattr(self, name)
-                setattr(self, name, np.concatenate([full, np.empty_like(full)]))
-        if self._count and time_ns <= self.last_ns:
-            # a second reading of one time: its motion belongs to the interval that ends here
-            self._count -= 1
-            row = row + self._rows[self._count]
-            time_ns = int(self._times[self._count])
-            self._bursts -= int(self._burst[self._count])
-        n = self._count
-        self._times[n], self._rows[n] = time_ns, row
-        self._sums[n] = self._sums[n - 1] + row if n else 0.0
-        step = exp(wheel_twist(row[None], self._robot)[0] if source == "wheels" else row[:3])
-        self._poses[n] = compose(self._poses[n - 1], step) if n else np.zeros(3)
-        path, turn = np.hypot(step[0], step[1]), abs(step[2])
-        self._effort[n] = self._effort[n - 1] + path + TURNING_EFFORT_M * turn if n else 0.0
-        self._path[n] = self._path[n - 1] + path if n else 0.0
-        seconds = 1e-9 * (time_ns - self._times[n - 1]) if n else 0.0
-        self._burst[n] = path > MAX_SPEED_M_S * seconds or turn > MAX_TURN_RAD_S * seconds
-        self._bursts += int(self._burst[n])
-        self._count += 1
+    def _enter(self, n: int, rows: Array) -> None:
+        """Rows of the readings from the n-th on, n > 0, and what accumulates from them."""
+        new = slice(n, n + len(rows))
+        step = exp(wheel_twist(rows, self._robot) if self.source == "wheels" else rows[:, :3])
+        path, turn = np.hypot(step[:, 0], step[:, 1]), np.abs(step[:, 2])
+        heading = self._poses[n - 1, 2] + np.concatenate([[0.0], np.cumsum(step[:, 2])])
+        c, s = np.cos(heading[:-1]), np.sin(heading[:-1])
+        x, y = c * step[:, 0] - s * step[:, 1], s * step[:, 0] + c * step[:, 1]
+        place = self._poses[n - 1, :2] + np.cumsum(np.column_stack([x, y]), axis=0)
+        self._rows[new] = rows
+        self._sums[new] = self._sums[n - 1] + np.cumsum(rows, axis=0)
+        self._poses[new] = np.column_stack([place, wrap(heading[1:])])
+        self._effort[new] = self._effort[n - 1] + np.cumsum(path + TURNING_EFFORT_M * turn)
+        self._path[new] = self._path[n - 1] + np.cumsum(path)
+        seconds = 1e-9 * np.diff(self._times[n - 1 : n + len(rows)])
+        burst = (path > MAX_SPEED_M_S * seconds) | (turn > MAX_TURN_RAD_S * seconds)
+        self._burst[new] = burst
+        self._bursts += int(burst.sum())
 
     def _increments(self, rows: Array, calibration: Array) -> Increments:
         return MOTION_SOURCES[self.source](rows, calibration, self._robot, self._config)
@@ -242,6 +280,7 @@ class Track:
 
         Before the first reading and after the last one the robot is taken to stand still.
         """
+        self._settle()
         times = np.asarray(times_ns, dtype=np.int64)
         i = np.clip(np.searchsorted(self.times, times, side="left"), 1, max(self._count - 1, 1))
         if self._count < 2:
@@ -262,10 +301,11 @@ class Track:
 
     def effort(self, times_ns: IntArray | int) -> Array:
         """Accumulated motion (...,), m: path plus turning. Odometry errors grow with it."""
+        self._settle()
         return self._at(np.asarray(times_ns, dtype=np.int64), self._effort)
 
     def _at(self, times_ns: IntArray, accumulated: Array) -> Array:
-        """An accumulated quantity at any times, by the same rule as `pose`."""
+        """An accumulated quantity at any times, by the same rule as `pose`; settle first."""
         if self._count < 2:
             return np.zeros((*times_ns.shape, *accumulated.shape[1:]))
         i = np.clip(np.searchsorted(self.times, times_ns, side="left"), 1, self._count - 1)
@@ -370,6 +410,7 @@ class Track:
 
         ``cov`` and ``d_cal`` are the sums that `motions` speaks of: of the pose at the origin.
         """
+        self._settle()
         n = self._count
         if n < 2:
             zeros = np.zeros((len(times), 3))
@@ -421,6 +462,7 @@ class Track:
         Returns:
             Motions (n, 3) and their covariances (n, 3, 3), along the axes of each start.
         """
+        self._settle()
         mean = np.array([c.mean for c in calibrations])[which]
         cal_cov = np.array([c.cov for c in calibrations])[which]
         p, mounted = self._p, mean.shape[1] > self._p
@@ -493,6 +535,7 @@ class Track:
 
     def _compounded(self, start_ns: int, end_ns: int) -> Compounded | None:
         """The base's motion between two times of the odometry's clock; None when it stands."""
+        self._settle()
         times, n = self.times, self._count
         first = max(int(np.searchsorted(times, start_ns, side="right")), 1)
         last = min(int(np.searchsorted(times, end_ns, side="left")), n - 1)

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.stats import chi2
 
 from graphslam.errors import OutputError
+from graphslam.gaussian import chi2_quantile
 from graphslam.geometry import Array, between, interpolate, transform, wrap
 from graphslam.records import Landmark, Result, Trajectory, TrueLandmark
 from graphslam.results import SavedResult, read_text, stamp_ns
@@ -116,8 +116,8 @@ def consistency(errors: Array, covs: Array) -> dict[str, Any]:
     n = dof * len(values)
     return {
         "nees_per_dof": float(values.mean() / dof),
-        "nees_bounds": [float(q) for q in chi2.ppf([0.025, 0.975], n) / n],
-        "coverage": float(np.mean(values <= chi2.ppf(0.95, dof))),
+        "nees_bounds": [float(q) for q in chi2_quantile([0.025, 0.975], n) / n],
+        "coverage": float(np.mean(values <= chi2_quantile(0.95, dof))),
     }
 
 

@@ -193,10 +193,9 @@ EDGES: Mapping[str, Callable[[Association, Array, Array, str], _EdgeParts]] = {
 def _information(cov: Array, what: str) -> Array:
     """Inverse of a covariance, exactly symmetric."""
     try:
-        factor = np.linalg.cholesky(cov)
+        half = np.linalg.inv(np.linalg.cholesky(cov))
     except np.linalg.LinAlgError as error:
         raise OutputError(f"graph.g2o: the covariance of {what} is not positive") from error
-    half = np.linalg.solve(factor, np.eye(len(cov)))
     return np.asarray(half.T @ half)
 
 
@@ -206,5 +205,5 @@ def _record(tag: str, ids: Sequence[int], values: Array, info: Array | None = No
     if len(numbers) == 3:
         numbers[2] = float(wrap(numbers[2]))
     if info is not None:
-        numbers += info[np.triu_indices(len(info))].tolist()
+        numbers += [x for k, row in enumerate(info.tolist()) for x in row[k:]]
     return " ".join([tag, *map(str, ids), *map(repr, numbers)])

@@ -90,27 +90,41 @@ def gather(
 
 
 def ways(
-    gathered: Gathered, state_ns: Mapping[str, int], tracks: Mapping[str, Track]
-) -> dict[tuple[str, int], Motion]:
-    """(robot, time) of every image that it made or was seen in -> its motion there from its state.
+    gathered: Gathered,
+    state_ns: Mapping[str, int],
+    last_ns: Mapping[str, int],
+    tracks: Mapping[str, Track],
+) -> tuple[dict[tuple[str, int], Motion], dict[str, Motion]]:
+    """The motions of a step, those of one robot worked out together.
 
     Args:
         gathered: the images.
-        state_ns: time of each robot's state, before or after.
+        state_ns: time of each robot's state, before or after an image.
+        last_ns: time of its state before that, of robots that get a new one.
         tracks: odometry of every robot.
+
+    Returns:
+        (robot, time) of every image that it made or was seen in -> its motion there from its state;
+        robot -> its motion to its new state.
     """
     times: dict[str, set[int]] = defaultdict(set)
     for image in gathered.images:
         for robot in {image[0].robot, *(s.seen_robot for s in image if s.seen_robot)}:
             times[robot].add(image[0].time_ns)
-    out = {}
+    there, new = {}, {}
     for robot, needed in times.items():
-        ends = sorted(needed)
-        start = np.full(len(ends), state_ns[robot], dtype=np.int64)
-        moved = tracks[robot].motions(start, np.array(ends, dtype=np.int64))
-        for k, time_ns in enumerate(ends):
-            out[robot, time_ns] = moved.one(k, state_ns[robot], time_ns)
-    return out
+        images = sorted(needed)
+        starts, ends = [state_ns[robot]] * len(images), images
+        if robot in last_ns:
+            starts, ends = [*starts, last_ns[robot]], [*ends, state_ns[robot]]
+        moved = tracks[robot].motions(
+            np.array(starts, dtype=np.int64), np.array(ends, dtype=np.int64)
+        )
+        for k, time_ns in enumerate(images):
+            there[robot, time_ns] = moved.one(k, state_ns[robot], time_ns)
+        if robot in last_ns:
+            new[robot] = moved.one(-1, last_ns[robot], state_ns[robot])
+    return there, new
 
 
 def carried(sightings: Sequence[Sighting], moved: Sequence[Motion]) -> list[Observation]:

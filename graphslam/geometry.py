@@ -108,6 +108,13 @@ def log(pose: Array) -> Array:
     return np.stack([c * x + half * y, -half * x + c * y, phi], axis=-1)
 
 
+def adjoint(pose: Array) -> Array:
+    """Matrix (..., 3, 3) that takes errors (v, omega) at a pose (..., 3) to its parent's origin."""
+    out = rotation3(pose[..., 2])
+    out[..., 0, 2], out[..., 1, 2] = pose[..., 1], -pose[..., 0]
+    return out
+
+
 def compose_jacobians(a: Array, b: Array) -> tuple[Array, Array]:
     """Derivatives ``(..., 3, 3)`` of ``compose(a, b)`` by a and b, additive errors.
 

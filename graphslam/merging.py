@@ -10,9 +10,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
 
 from graphslam.backends import Joint
+from graphslam.gaussian import chi2_quantile
 from graphslam.geometry import Array, between, wrap
 from graphslam.landmark_map import Entry, LandmarkMap
 from graphslam.records import Association, Step
@@ -88,7 +88,7 @@ def duplicates(
         r, H_i, H_j, rows = _compare(walls, i, j)
         d2 = _distances(walls.P, i, j, r, H_i, H_j)
         # what is out of its gate may come back in when a tie has moved the map
-        fits = d2 <= chi2.ppf(GATE_PROBABILITY, rows)
+        fits = d2 <= chi2_quantile(GATE_PROBABILITY, rows)
         k = _next_tie(walls, i, j, d2, fits)
         if k is None:
             break

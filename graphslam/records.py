@@ -209,7 +209,10 @@ class Start:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Closure:
-    """Pose (3,) of state (robot, time) in the frame of state (other, other_time), with cov."""
+    """Pose (3,) of state (robot, time) in the frame of state (other, other_time), with cov.
+
+    ``verified``: it was held against all that is known, so no robust kernel belongs on it.
+    """
 
     robot: str
     time_ns: int
@@ -217,6 +220,7 @@ class Closure:
     other_time_ns: int
     delta: Array
     cov: Array
+    verified: bool = False
 
     @property
     def pair(self) -> tuple[tuple[str, int], tuple[str, int]]:

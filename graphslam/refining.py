@@ -23,7 +23,7 @@ from graphslam.models.motion import Calibration
 from graphslam.records import Estimate, Motion, Step
 
 #: times that motions and sightings are made anew
-ROUNDS = 3
+ROUNDS = 2
 #: ns: residuals of one target's sightings farther apart are taken as independent
 WINDOW_NS = 10_000_000_000
 #: residuals are cut at this many of their own sigmas when their noise is measured

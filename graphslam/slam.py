@@ -11,6 +11,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from graphslam.associator import Associator
 from graphslam.backends import BACKENDS
 from graphslam.backends.isam2 import Isam2Backend
 from graphslam.calibration import observed_information
-from graphslam.config import Config, OdometryConfig, RobotConfig, load_config
+from graphslam.config import Config, KeyframeConfig, OdometryConfig, RobotConfig, load_config
 from graphslam.consolidating import Tamper, consolidate
 from graphslam.dead_reckoning import Track
 from graphslam.errors import ConfigError, EstimationError, LogError
@@ -35,6 +36,7 @@ from graphslam.geometry import (
 )
 from graphslam.logs import LogSet
 from graphslam.models import transport
+from graphslam.recorded_closures import NOTHING_RECORDED, own_frame, verify
 from graphslam.records import (
     Association,
     Closure,
@@ -48,6 +50,7 @@ from graphslam.records import (
     Result,
     Scan,
     Sighting,
+    Start,
     Step,
     TrueLandmark,
     Truth,
@@ -64,6 +67,35 @@ from graphslam.trajectories import in_world, origin_shift, step_in_world
 MAX_PICTURES = 4000
 
 Progress = Callable[[int], None]
+Settings = TypeVar("Settings", KeyframeConfig, OdometryConfig)
+#: robot, time, other robot, its time, relative pose (as bytes): what a recorded closure is known by
+ClosureId = tuple[str, int, str, int, bytes]
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Recorded:
+    """What became of a log's relative poses, see `graphslam.recorded_closures.Verified`.
+
+    ``refused`` and ``kept`` by `closure_id`; ``frames`` of all robots that have a start.
+    """
+
+    starts: Mapping[str, Start]
+    frames: Mapping[str, str]
+    kept: frozenset[ClosureId]
+    refused: Mapping[ClosureId, str]
+
+    def own_frames(self) -> dict[str, str]:
+        """Robots that stay in a frame of their own -> the robot in whose frame the world is."""
+        world = next(iter(self.frames.values()), "")
+        return {r: world for r, frame in self.frames.items() if frame == r != world}
+
+    def told(self) -> dict[str, Any]:
+        """For summary.json: number ``kept``, list of those ``refused``, and why."""
+        refused = [
+            {"robot": r, "time_ns": t, "other": o, "other_time_ns": s, "reason": why}
+            for (r, t, o, s, _), why in self.refused.items()
+        ]
+        return {"kept": len(self.kept), "refused": refused}
 
 
 class Pipeline:
@@ -77,6 +109,7 @@ class Pipeline:
         tamper: Tamper | None = None,
     ) -> None:
         """Nothing read yet; ``names``: false name -> right name of what is sighted."""
+        config = replace(config, keyframe=noted(config.keyframe, "keyframe", log.notes))
         self.log, self.config, self.names = log, config, names or {}
         self.tamper = tamper
         self.backend = BACKENDS[config.backend.name](config)
@@ -86,17 +119,10 @@ class Pipeline:
         self.matches_scans = config.odometry.scan_matching != "off" and (
             config.backend.name != "dead-reckoning" and config.front_end.name != "none"
         )
-        self.runs = {
-            name: RobotRun(
-                Track(
-                    sensing(odometry_settings(config.odometry, log.notes), log.has_scans(name)),
-                    robot_settings(name, config, log.notes),
-                    mounted=True,
-                )
-            )
-            for name in log.robots
-        }
+        self.runs = {name: RobotRun(track) for name, track in make_tracks(log, config).items()}
         self.starts = start_poses(log, config)
+        self.recorded = verify_recorded(log, config, self.starts)
+        self.starts |= self.recorded.starts
         self.steps: list[Step] = []
         self.sources: Sources = {}
         self.pictures: list[Picture] = []
@@ -167,19 +193,20 @@ class Pipeline:
         for robot in meeting:
             if not self.runs[robot].started:
                 self.start(robot, min(self.runs[robot].track.first_ns, step_ns))
-        motions: dict[str, Motion] = {}
-        for robot in gathered.robots:
-            run = self.runs[robot]
-            if robot in meeting or self.has_moved(run, run.state_ns, step_ns):
-                motion = self.motion_since_state(robot, step_ns)
-                if motion is not None:
-                    motions[robot] = motion
-                    run.path_m += motion.length_m
+        last_ns = {
+            robot: run.state_ns
+            for robot, run in ((robot, self.runs[robot]) for robot in gathered.robots)
+            if step_ns > run.state_ns
+            and (robot in meeting or self.has_moved(run, run.state_ns, step_ns))
+        }
+        at = {r: step_ns if r in last_ns else self.runs[r].state_ns for r in gathered.robots}
+        moved, new = ways(gathered, at, last_ns, {robot: self.runs[robot].track for robot in at})
+        motions = {robot: new[robot] for robot in last_ns}
+        for robot, motion in motions.items():
+            self.runs[robot].path_m += motion.length_m
         began = time.perf_counter()
         known = {i for i, entry in self.associator.map.entries.items() if entry.in_graph}
         associations: tuple[Association, ...] = ()
-        at = {r: step_ns if r in motions else self.runs[r].state_ns for r in gathered.robots}
-        moved = ways(gathered, at, {robot: self.runs[robot].track for robot in at})
         every = [sighting for image in gathered.images for sighting in image]
         observed = iter(carried(every, [moved[s.robot, s.time_ns] for s in every]))
         for image in gathered.images:
@@ -415,6 +442,9 @@ class Pipeline:
     def closure(self, message: RelativePose, state_ns: int) -> Closure | None:
         """A measured relative pose, carried by odometry to the states nearest before its ends."""
         other = self.runs.get(message.other)
+        if closure_id(message) in self.recorded.refused:
+            self.dropped["relative pose: not believed, see closures"] += 1
+            return None
         if message.other == message.robot and message.start_ns >= message.time_ns:
             self.dropped["relative pose: it does not begin before it ends"] += 1
             return None
@@ -433,7 +463,8 @@ class Pipeline:
             cov = compose_cov(delta, cov, back, inverse_cov(tail.delta, tail.cov))
             delta = compose(delta, back)
         self.counts["loop_closures"] += 1
-        return Closure(message.robot, state_ns, message.other, other_ns, delta, cov)
+        verified = closure_id(message) in self.recorded.kept
+        return Closure(message.robot, state_ns, message.other, other_ns, delta, cov, verified)
 
     def note_state(self, robot: str, time_ns: int) -> None:
         """Book a new state."""
@@ -579,6 +610,8 @@ def smooth(
             }
             for name, run in runs.items()
         },
+        closures=pipeline.recorded.told(),
+        frames=pipeline.recorded.frames,
         warnings=run_warnings(pipeline),
         log_s=1e-9 * (pipeline.last_ns - pipeline.first_ns),
     )
@@ -618,14 +651,62 @@ def odometry_settings(config: OdometryConfig, notes: Mapping[str, str]) -> Odome
     How well velocities are driven that were only commanded is a property of the log's robots, which
     whoever wrote the log knows, as with the noise of sightings.
     """
-    noted = [f"{key}={value}" for key, value in notes.items() if key.startswith("odometry.")]
-    known, default = load_config(overrides=noted).odometry, OdometryConfig()
+    return noted(config, "odometry", notes)
+
+
+def noted(config: Settings, table: str, notes: Mapping[str, str]) -> Settings:
+    """A table of settings: those that are not the defaults, the others as a log's notes say."""
+    lines = [f"{key}={value}" for key, value in notes.items() if key.startswith(f"{table}.")]
+    known, default = getattr(load_config(overrides=lines), table), getattr(Config(), table)
     changes = {
         field.name: getattr(known, field.name)
         for field in dataclasses.fields(config)
         if getattr(config, field.name) == getattr(default, field.name)
     }
     return replace(config, **changes)
+
+
+def make_tracks(log: LogSet, config: Config) -> dict[str, Track]:
+    """An empty track for every robot of a log."""
+    return {
+        name: Track(
+            sensing(odometry_settings(config.odometry, log.notes), log.has_scans(name)),
+            robot_settings(name, config, log.notes),
+            mounted=True,
+        )
+        for name in log.robots
+    }
+
+
+def verify_recorded(log: LogSet, config: Config, starts: Mapping[str, Start]) -> Recorded:
+    """Which relative poses of a log to believe, by all of it; starts that follow from them.
+
+    Robots that nothing else could place keep a frame of their own. That takes a pass over the
+    odometry, which is made only where there are relative poses.
+    """
+    kinds = {topic.record for topic in log.topics}
+    messages: list[RelativePose] = []
+    verified = NOTHING_RECORDED
+    if RelativePose in kinds and config.backend.verify_closures:
+        tracks = make_tracks(log, config)
+        for message in log.messages((Truth, TrueLandmark, Scan, Sighting)):
+            if isinstance(message, ODOMETRY):
+                tracks[message.robot].add(message)
+            elif isinstance(message, RelativePose):
+                messages.append(message)
+        verified = verify(messages, tracks, starts, config)
+    found, frames = dict(verified.starts), dict(verified.frames)
+    if kinds & {Scan, Sighting}:
+        # these may place a robot too: its start is asked for where it is needed
+        found = {robot: start for robot, start in found.items() if frames[robot] != robot}
+    else:
+        for robot in set(log.robots) - {*starts, *found}:
+            found[robot], frames[robot] = own_frame(), robot
+    world = min(starts, default="")
+    kept = frozenset(closure_id(messages[k]) for k in verified.kept)
+    refused = {closure_id(messages[k]): why for k, why in verified.refused.items()}
+    frames = {robot: frames.get(robot, world) for robot in log.robots if robot in {*starts, *found}}
+    return Recorded(found, frames, kept, refused)
 
 
 def sensing(config: OdometryConfig, scans: bool) -> OdometryConfig:
@@ -680,9 +761,25 @@ def run_warnings(pipeline: Pipeline) -> list[str]:
         f"the back end could not use {count} x {reason}"
         for reason, count in sorted(pipeline.backend.skipped.items())
     ]
+    warnings += [
+        f"{name}: nothing says where it was in the frame of {world}; its poses are in a frame of "
+        "its own, which begins where it began"
+        for name, world in pipeline.recorded.own_frames().items()
+    ]
+    if pipeline.recorded.refused:
+        warnings.append(
+            f"{len(pipeline.recorded.refused)} recorded closures are not believed; closures.refused"
+            " in summary.json lists them"
+        )
     if not any(step.associations or step.closures for step in pipeline.steps):
         warnings.append("no observation entered the estimate: this is dead reckoning")
     return warnings
+
+
+def closure_id(message: RelativePose) -> ClosureId:
+    """What a recorded closure is known by in every pass over the log."""
+    ends = message.robot, message.time_ns, message.other, message.start_ns
+    return (*ends, message.delta.tobytes())
 
 
 def events(messages: Iterable[Message]) -> Iterator[list[Message]]:

@@ -93,6 +93,8 @@ def summarise(
     seconds: Mapping[str, float],
     calibration: Mapping[str, Mapping[str, tuple[float, float, bool]]],
     odometry: Mapping[str, Mapping[str, int]],
+    closures: Mapping[str, Any],
+    frames: Mapping[str, str],
     warnings: Sequence[str],
     log_s: float,
 ) -> dict[str, Any]:
@@ -136,6 +138,8 @@ def summarise(
             "loop_closures": counts["loop_closures"] + line_closures + counts["closures_verified"],
         },
         "consolidated": {name: counts[name] for name in CONSOLIDATED if name in counts},
+        "closures": dict(closures),
+        "frames": dict(frames),
         "rejected": dict(sorted(rejected.items())),
         "dropped": dict(sorted(all_dropped.items())),
         "repaired": dict(sorted(log.repaired.items())),

@@ -19,6 +19,7 @@ ROOT = Path(graphslam.__file__).parent
 #: The rooms of the house, lowest row first. An import goes to a lower row, or stays in its room.
 ROWS = (
     ("errors", "geometry"),  # how it fails; what a pose is
+    ("gaussian",),  # what squared distances of normal errors may be
     # settings; what travels between the modules; Kalman filtering on arrays
     ("config", "kalman", "records"),
     ("models",),  # motion, and one observation model per kind of target
@@ -31,9 +32,19 @@ ROWS = (
     # what is known about landmarks beside their estimate; of a robot; where robots start; recorded
     # steps through an estimator; sightings that share a step; names given to each other's bearers
     ("exchanged", "gathering", "landmark_map", "replay", "robot_run", "starts"),
-    # decisions of one image; places seen twice; duplicates in a map; observations of walls anew; a
-    # log of sightings solved again; states and calibration together; what a run adds up to
-    ("associator", "calibrating", "closing", "merging", "reassociating", "refining", "summary"),
+    # decisions of one image; states and calibration together; places seen twice; duplicates in a
+    # map; observations of walls anew; closures that a log brings along; a log of sightings solved
+    # again; what a run adds up to
+    (
+        "associator",
+        "calibrating",
+        "closing",
+        "merging",
+        "reassociating",
+        "recorded_closures",
+        "refining",
+        "summary",
+    ),
     ("revisits",),  # landmarks by visit, and one again
     ("consolidating",),  # a log of scans solved again
     ("slam",),  # the pipeline

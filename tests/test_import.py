@@ -198,10 +198,31 @@ def test_landmarks_of_g2o_files_are_not_lost(tmp_path):
     np.testing.assert_allclose(sightings[1].cov, np.diag([(0.2 / 5) ** 2, 0.2**2]), atol=1e-15)
 
 
+def test_where_odometry_breaks_another_robot_begins(tmp_path):
+    """A closure leads from a pose of one to one of the other, the earlier first; files that were
+    put together without a newline between them are still so many lines."""
+    edge = "EDGE_SE2 {} {} 1 2 0.5 100 0 0 100 0 400"
+    pairs = ((0, 1), (1, 2), (5, 6), (6, 7), (7, 1))
+    source = tmp_path / "graph.g2o"
+    source.write_text("".join(edge.format(*pair) for pair in pairs))
+    summary = IMPORTERS["g2o"](source, tmp_path / "log.mcap")
+    messages = list(open_logs([tmp_path / "log.mcap"], Config()).messages())
+    second = 1_000_000_000
+    assert [(m.robot, m.start_ns // second, m.time_ns // second) for m in messages] == [
+        ("robot1", 1, 2),
+        ("robot1", 2, 3),
+        ("robot2", 4, 5),
+        ("robot2", 5, 6),
+        ("robot2", 2, 6),
+    ]
+    assert messages[-1].other == "robot1"
+    assert any("start of robot2" in line for line in summary.warnings)
+
+
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("ODOMETRY 0 1 1 0 0 1 0 0 1 0 1\nODOMETRY 2 3 1 0 0 1 0 0 1 0 1\n", "break"),
+        ("ODOMETRY 0 1 1 0 0 1 0 0 1 0 1\nEDGE2 0 3 1 0 0 1 0 0 1 0 1\n", "break .* pose 3"),
         ("ODOMETRY 0 1 1 0 zero 1 0 0 1 0 1\n", "line 1 .ODOMETRY."),
         ("ODOMETRY 0 1 1 0 0 1 0 0\n", "line 1 .ODOMETRY.: needs 6 finite numbers"),
         ("ODOMETRY 0 1 1 0 nan 1 0 0 1 0 1\n", "finite"),

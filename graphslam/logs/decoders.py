@@ -4,6 +4,7 @@ A decoder is a pure function of the message and of what is known about its topic
 `UnusableError` with a reason when the message must be dropped; the caller counts reasons.
 """
 
+import math
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -44,10 +45,11 @@ Decode = Callable[[Any, TopicContext], records.Message]
 
 
 class Decoder(NamedTuple):
-    """A row of `DECODERS`: what comes out, and how."""
+    """A row of `DECODERS`: what comes out, and how; ``read`` where bytes are not for `decode`."""
 
     record: type[records.Message]
     decode: Decode
+    read: Callable[[bytes], Any] | None = None
 
 
 def scan(message: Any, topic: TopicContext) -> records.Scan:
@@ -96,21 +98,20 @@ def scan(message: Any, topic: TopicContext) -> records.Scan:
     return records.Scan(topic.robot, stamp, stamp, ranges, start, step, mount)
 
 
-def odometry(message: Any, topic: TopicContext) -> records.OdometryPose:
+def odometry(message: schemas.PlanarOdometry, topic: TopicContext) -> records.OdometryPose:
     """nav_msgs/Odometry: the pose (3,) of the base in the odometry frame.
 
     Raises:
         UnusableError: the pose is not finite or its quaternion is no rotation.
     """
-    position, q = message.pose.pose.position, message.pose.pose.orientation
-    norm = q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w
+    stamp, x, y, (q_x, q_y, q_z, q_w) = message
+    norm = q_x * q_x + q_y * q_y + q_z * q_z + q_w * q_w
     if not 0.5 < norm < 2.0:  # also false for NaN
         raise UnusableError("odometry: quaternion is not a rotation")
-    yaw = np.arctan2(2 * (q.w * q.z + q.x * q.y), norm - 2 * (q.y * q.y + q.z * q.z))
-    pose = np.array([position.x, position.y, yaw])
-    _check_finite("odometry", pose)
-    stamp = stamp_of(message)
-    return records.OdometryPose(topic.robot, stamp, stamp, pose)
+    if not math.isfinite(x + y):
+        raise UnusableError("odometry: not finite")
+    yaw = math.atan2(2 * (q_w * q_z + q_x * q_y), norm - 2 * (q_y * q_y + q_z * q_z))
+    return records.OdometryPose(topic.robot, stamp, stamp, np.array([x, y, yaw]))
 
 
 def joint_state(message: Any, topic: TopicContext) -> records.WheelAngles:
@@ -215,7 +216,7 @@ def true_associations(message: Any, topic: TopicContext) -> records.TrueAssociat
 
 DECODERS: dict[str, Decoder] = {
     schemas.LASER_SCAN: Decoder(records.Scan, scan),
-    schemas.ODOMETRY: Decoder(records.OdometryPose, odometry),
+    schemas.ODOMETRY: Decoder(records.OdometryPose, odometry, schemas.decode_odometry),
     schemas.JOINT_STATE: Decoder(records.WheelAngles, joint_state),
     schemas.SIGHTING: Decoder(records.Sighting, sighting),
     schemas.ODOMETRY_INCREMENT: Decoder(records.OdometryIncrement, odometry_increment),

@@ -130,7 +130,8 @@ def decode_message(
 ) -> Message | None:
     """The record in one raw message; None, and the reason counted, when it must be dropped."""
     try:
-        return DECODERS[topic.schema].decode(schemas.decode(topic.schema, raw.data), context)
+        _, decode, read = DECODERS[topic.schema]
+        return decode(read(raw.data) if read else schemas.decode(topic.schema, raw.data), context)
     except UnusableError as reason:
         dropped[str(reason)] += 1
     except schemas.CdrError:

@@ -10,9 +10,10 @@ import hashlib
 import heapq
 import struct
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from io import BytesIO
+from io import SEEK_CUR, BytesIO
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, TypeVar
 
@@ -54,9 +55,11 @@ _DAMAGE = (
     OverflowError,
     EOFError,
 )
-# What every record begins with (opcode, length), and what a message does (channel, sequence number,
-# log time, publish time); its data follow.
-_RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<HIQQ")
+# What every record begins with (opcode, length), and what a message begins with: that, channel,
+# sequence number, log time, publish time; its data follow.
+_RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<BQHIQQ")
+# an enum compares slowly
+_IS_MESSAGE = int(Opcode.MESSAGE)
 # Messages outside chunks are read in runs of this many, so that a block is never large.
 _LOOSE_RUN = 1000
 
@@ -147,9 +150,8 @@ def raw_messages(file: McapFile, topics: Collection[str]) -> Iterator[RawMessage
     with file.path.open("rb") as stream:
         if file.in_order:
             for block in blocks:
-                for message in _block_messages(stream, block):
-                    if message.channel_id in wanted:
-                        yield _raw(file, message)
+                for channel, log_time_ns, data in _block_messages(stream, block, wanted):
+                    yield RawMessage(file.channels[channel], log_time_ns, data)
         else:
             yield from _by_log_time(file, stream, blocks, wanted)
 
@@ -160,7 +162,7 @@ def sample_messages(file: McapFile, topic: str, blocks: int, per_block: int) -> 
     holding = [b for b in file.blocks if not numbers.isdisjoint(b.counts)]
     with file.path.open("rb") as stream:
         for block in _spread(holding, blocks):
-            found = [m.data for m in _block_messages(stream, block) if m.channel_id in numbers]
+            found = [data for _, _, data in _block_messages(stream, block, numbers)]
             yield from _spread(found, per_block)
 
 
@@ -169,23 +171,24 @@ def _spread(items: Sequence[_T], n: int) -> Sequence[_T]:
     return items[:: max(1, -(-len(items) // n))]
 
 
-def _raw(file: McapFile, message: Message) -> RawMessage:
-    return RawMessage(file.channels[message.channel_id], message.log_time, message.data)
-
-
 def _by_log_time(
     file: McapFile, stream: BinaryIO, blocks: list[_Block], wanted: Collection[int]
 ) -> Iterator[RawMessage]:
     """Merge blocks that overlap in log time; equal times keep the order of the file."""
-    heap: list[tuple[int, int, int, Message]] = []
+    heap: list[tuple[int, int, int, int, bytes]] = []
+
+    def earliest() -> RawMessage:
+        log_time_ns, _, _, channel, data = heapq.heappop(heap)
+        return RawMessage(file.channels[channel], log_time_ns, data)
+
     for number, block in enumerate(sorted(blocks, key=lambda b: (b.start_ns, b.offset))):
         while heap and heap[0][0] < block.start_ns:
-            yield _raw(file, heapq.heappop(heap)[3])
-        for position, message in enumerate(_block_messages(stream, block)):
-            if message.channel_id in wanted:
-                heapq.heappush(heap, (message.log_time, number, position, message))
+            yield earliest()
+        for position, message in enumerate(_block_messages(stream, block, wanted)):
+            channel, log_time_ns, data = message
+            heapq.heappush(heap, (log_time_ns, number, position, channel, data))
     while heap:
-        yield _raw(file, heapq.heappop(heap)[3])
+        yield earliest()
 
 
 # ---------------------------------------------------------------- blocks
@@ -197,10 +200,31 @@ def _records(stream: BinaryIO, offset: int, limit: int) -> Iterator[tuple[int, M
     reader = StreamReader(stream, skip_magic=True, emit_chunks=True, record_size_limit=limit)
     for record in reader.records:
         yield offset, record
+        offset = _after_indexes(stream)
+
+
+def _after_indexes(stream: BinaryIO) -> int:
+    """Passes over message indexes, which nobody asks for and which take longest to read."""
+    while True:
         offset = stream.tell()
+        head = stream.read(_RECORD.size)
+        if len(head) < _RECORD.size or head[0] != Opcode.MESSAGE_INDEX:
+            return stream.seek(offset)
+        stream.seek(_RECORD.unpack(head)[1], SEEK_CUR)
 
 
-def _chunk_at(stream: BinaryIO, offset: int) -> list[McapRecord]:
+class _Contents(NamedTuple):
+    """What is in a chunk: its bytes, messages, and the schemas and channels.
+
+    A message is (channel, log time ns, where its data begin and end in the bytes).
+    """
+
+    data: bytes
+    messages: list[tuple[int, int, int, int]]
+    others: list[McapRecord]
+
+
+def _chunk_at(stream: BinaryIO, offset: int) -> _Contents:
     """The records in the chunk at ``offset``; of a chunk that the file's end cuts, its beginning.
 
     Raises:
@@ -217,36 +241,36 @@ def _chunk_at(stream: BinaryIO, offset: int) -> list[McapRecord]:
     return _cut_chunk(chunk)
 
 
-def _records_in(chunk: Chunk) -> list[McapRecord]:
+def _records_in(chunk: Chunk) -> _Contents:
     """The schemas, channels and messages in a chunk.
 
-    As mcap's own ``breakup_chunk``, but messages, of which there are many, are taken from the bytes
-    at once instead of field by field.
+    As mcap's own ``breakup_chunk``, but messages, of which there are many, are not made objects.
 
     Raises:
         One of `_DAMAGE` when the chunk is damaged, its CRC included.
     """
     stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-    data = stream.read(size)
-    records: list[McapRecord] = []
+    # the head of a message is looked for in any record, the last of which may be shorter
+    data = stream.read(size) + bytes(_MESSAGE.size)
+    found = _Contents(data, [], [])
     begin = 0
     while begin < size:
-        opcode, length = _RECORD.unpack_from(data, begin)
-        begin += _RECORD.size
-        if begin + length > size:
+        opcode, length, channel, _, log_time_ns, _ = _MESSAGE.unpack_from(data, begin)
+        inside, end = begin + _RECORD.size, begin + _RECORD.size + length
+        if end > size:
             raise McapError("a record reaches beyond its chunk")
-        if opcode == Opcode.MESSAGE:
-            channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, begin)
-            content = data[begin + _MESSAGE.size : begin + length]
-            records.append(Message(channel, log_time, content, publish_time, sequence))
+        if opcode == _IS_MESSAGE:
+            if end < begin + _MESSAGE.size:
+                raise McapError("a message is shorter than its head")
+            found.messages.append((channel, log_time_ns, begin + _MESSAGE.size, end))
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             kind = Schema if opcode == Opcode.SCHEMA else Channel
-            records.append(kind.read(ReadDataStream(BytesIO(data[begin : begin + length]))))
-        begin += length
-    return records
+            found.others.append(kind.read(ReadDataStream(BytesIO(data[inside:end]))))
+        begin = end
+    return found
 
 
-def _cut_chunk(chunk: Chunk) -> list[McapRecord]:
+def _cut_chunk(chunk: Chunk) -> _Contents:
     """Whole records at the beginning of a chunk whose end is missing."""
     data = chunk.data
     if chunk.compression == "zstd":
@@ -262,15 +286,22 @@ def _cut_chunk(chunk: Chunk) -> list[McapRecord]:
     return _records_in(Chunk("", data[:end], 0, 0, 0, end))
 
 
-def _block_messages(stream: BinaryIO, block: _Block) -> Iterator[Message]:
+def _block_messages(
+    stream: BinaryIO, block: _Block, wanted: Collection[int]
+) -> Iterator[tuple[int, int, bytes]]:
+    """Channel, log time ns and data of the messages of wanted channels in a block."""
     stream.seek(block.offset)
     if stream.read(1)[0] == Opcode.CHUNK:
-        records: Iterable[McapRecord] = _chunk_at(stream, block.offset)
-    else:
-        count = sum(block.counts.values())
-        loose = (r for _, r in _records(stream, block.offset, 1 << 40) if isinstance(r, Message))
-        records = (message for message, _ in zip(loose, range(count), strict=False))
-    return (record for record in records if isinstance(record, Message))
+        data, messages, _ = _chunk_at(stream, block.offset)
+        for channel, log_time_ns, begin, end in messages:
+            if channel in wanted:
+                yield channel, log_time_ns, data[begin:end]
+        return
+    count = sum(block.counts.values())
+    loose = (r for _, r in _records(stream, block.offset, 1 << 40) if isinstance(r, Message))
+    for message in islice(loose, count):
+        if message.channel_id in wanted:
+            yield message.channel_id, message.log_time, message.data
 
 
 class _Indexer:
@@ -309,7 +340,7 @@ class _Indexer:
             self.close_run()
             self.tried.add(offset)
             try:
-                self.take_block(offset, _records_in(record))
+                self.take_chunk(offset, _records_in(record))
             except _DAMAGE as error:
                 self.damage.append(f"the chunk at byte {offset} is damaged ({_say(error)})")
         elif isinstance(record, Statistics):
@@ -325,23 +356,27 @@ class _Indexer:
         elif isinstance(record, Channel):
             self.channels.setdefault(record.id, record)
 
-    def take_block(self, offset: int, records: Iterable[McapRecord]) -> None:
-        counts: Counter[int] = Counter()
-        times: list[int] = []
-        for record in records:
-            if isinstance(record, Message):
-                counts[record.channel_id] += 1
-                times.append(record.log_time)
-                self.in_order &= record.log_time >= self.latest_ns
-                self.latest_ns = max(self.latest_ns, record.log_time)
-            else:
-                self.describe(record)
-        if times:
-            self.blocks.append(_Block(offset, min(times), max(times), dict(counts)))
+    def take_chunk(self, offset: int, found: _Contents) -> None:
+        for record in found.others:
+            self.describe(record)
+        self.take_block(offset, [m[0] for m in found.messages], [m[1] for m in found.messages])
+
+    def take_block(self, offset: int, channels: Sequence[int], times: Sequence[int]) -> None:
+        """A block of messages with these channels and log times."""
+        if not times:
+            return
+        self.in_order &= all(a <= b for a, b in pairwise((self.latest_ns, *times)))
+        self.latest_ns = max(self.latest_ns, *times)
+        self.blocks.append(_Block(offset, min(times), max(times), dict(Counter(channels))))
 
     def close_run(self) -> None:
         if self.loose:
-            self.take_block(self.loose[0][0], [message for _, message in self.loose])
+            messages = [message for _, message in self.loose]
+            self.take_block(
+                self.loose[0][0],
+                [message.channel_id for message in messages],
+                [message.log_time for message in messages],
+            )
             self.loose = []
 
     def rescue(self, error: Exception) -> None:
@@ -359,7 +394,7 @@ class _Indexer:
             offsets += [index.chunk_start_offset for index in summary.chunk_indexes]
         for offset in sorted(set(offsets) - self.tried):
             try:
-                self.take_block(offset, _chunk_at(self.stream, offset))
+                self.take_chunk(offset, _chunk_at(self.stream, offset))
             except _DAMAGE:
                 continue  # lost; the statistics, where there are any, tell how much
 

@@ -25,6 +25,8 @@ _LOOK_AHEAD = 128
 # Equal stamps are judged together (one image of sightings); a topic without stamps has them all
 # equal, so a group is bounded.
 _LARGEST_GROUP = 1000
+# What can be passed on is looked for so many times per window, not after every message.
+_LOOKS = 64
 _LONG_AGO, _FAR_AHEAD = -(1 << 63), 1 << 63
 
 _Odometry = records.OdometryPose | records.WheelAngles | records.OdometryIncrement
@@ -74,7 +76,7 @@ class TimeLine:
         self._heap: list[tuple[tuple[int, int], int, Message]] = []
         self._number = 0
         self._recorded = 0
-        self._latest_ns = self._emitted_ns = _LONG_AGO
+        self._latest_ns = self._emitted_ns = self._looked_ns = _LONG_AGO
 
     def push(self, topic: str, message: Message) -> Iterator[Message]:
         """Take the next message recorded; yield those whose place is now certain, sorted."""
@@ -84,6 +86,9 @@ class TimeLine:
         self._recorded += 1
         self.counts[topic][GLITCH] += message.time_ns != message.stamp_ns
         self._place(topic, self._repairs[topic].push(message, self._recorded))
+        if self._latest_ns < self._looked_ns + self._window_ns // _LOOKS:
+            return
+        self._looked_ns = self._latest_ns
         for name, repair in self._repairs.items():
             # a rare topic must not hold up the others until more of it has come
             self._place(name, repair.settle_before(self._latest_ns - self._window_ns))

@@ -8,7 +8,7 @@ puts into the file, so that any ROS 2 or MCAP tool can decode them. docs/logs.md
 import struct
 from collections.abc import Sequence
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags.serde import SerdeError
@@ -17,6 +17,9 @@ from rosbags.typesys.store import Typestore
 
 from graphslam.errors import LogError
 from graphslam.geometry import Array
+
+#: pose, twist and their covariances
+_ODOMETRY_NUMBERS = 7 + 36 + 6 + 36
 
 IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
@@ -125,6 +128,37 @@ def decode(schema: str, data: bytes) -> Any:
         raise CdrError(str(error)) from error
 
 
+class PlanarOdometry(NamedTuple):
+    """What is used of a nav_msgs/Odometry: stamp, position in the plane, rotation as quaternion."""
+
+    stamp_ns: int
+    x: float
+    y: float
+    rotation: tuple[float, float, float, float]
+
+
+def decode_odometry(data: bytes) -> PlanarOdometry:
+    """The beginning of a nav_msgs/Odometry; `decode` makes ten objects of each of very many.
+
+    Raises:
+        CdrError: the bytes are cut short.
+    """
+    order = "<" if data[1:2] == b"\x01" else ">"
+    try:
+        seconds, nanoseconds, named = struct.unpack_from(f"{order}iII", data, 4)
+        # numbers are aligned to their size, relative to what follows CDR's four bytes
+        at = 16 + named + -named % 4
+        (named,) = struct.unpack_from(f"{order}I", data, at)
+        at += 4 + named
+        at += -(at - 4) % 8
+        x, y, _, *rotation = struct.unpack_from(f"{order}7d", data, at)
+    except struct.error as error:
+        raise CdrError(str(error)) from error
+    if len(data) < at + _ODOMETRY_NUMBERS * 8:
+        raise CdrError("cut short")
+    return PlanarOdometry(seconds * 1_000_000_000 + nanoseconds, x, y, tuple(rotation))
+
+
 def decode_true_poses(data: Sequence[bytes]) -> tuple[IntArray, Array]:
     """Stamps (n,) ns and poses (n, 3) of many `TRUE_POSE` messages at once.
 
@@ -169,6 +203,24 @@ def encode(schema: str, message: Any) -> bytes:
     return bytes(_typestore().serialize_cdr(message, schema, little_endian=True))
 
 
+class Template:
+    """An encoded message of which only the header's stamp and some numbers change."""
+
+    def __init__(self, schema: str, message: Any, marks: Sequence[float]) -> None:
+        """Made from one ``message`` whose numbers that will change are ``marks``, each unique."""
+        self._data = encode(schema, message)
+        self._places = [self._data.index(struct.pack("<d", mark)) for mark in marks]
+
+    def filled(self, stamp_ns: int, *numbers: float) -> bytes:
+        """The bytes with a stamp and numbers, in the order of the marks."""
+        data = bytearray(self._data)
+        # after CDR's own header of four bytes the message begins with its std_msgs/Header
+        struct.pack_into("<iI", data, 4, *_seconds(stamp_ns))
+        for place, number in zip(self._places, numbers, strict=True):
+            struct.pack_into("<d", data, place, number)
+        return bytes(data)
+
+
 def build(schema: str, **fields: Any) -> Any:
     """A message of type ``schema``; every field must be given."""
     return _typestore().types[schema](**fields)
@@ -189,10 +241,15 @@ def time(stamp_ns: int) -> Any:
     Raises:
         LogError: the stamp does not fit the signed 32-bit seconds of ROS 2.
     """
+    seconds, nanoseconds = _seconds(stamp_ns)
+    return build("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+
+
+def _seconds(stamp_ns: int) -> tuple[int, int]:
     seconds, nanoseconds = divmod(int(stamp_ns), 1_000_000_000)
     if not -(2**31) <= seconds < 2**31:
         raise LogError(f"stamp {stamp_ns} ns cannot be written: ROS 2 has 32 bits for seconds")
-    return build("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+    return seconds, nanoseconds
 
 
 def header(stamp_ns: int, frame: str) -> Any:

@@ -3,7 +3,9 @@
 The only module that writes with `mcap`.
 """
 
+import math
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Self
@@ -92,14 +94,9 @@ class LogWriter:
     ) -> None:
         """nav_msgs/Odometry on ``odom``: pose (3,) of the base in the odometry frame."""
         x, y, phi = np.asarray(pose, dtype=float).tolist()
-        message = schemas.build(
-            schemas.ODOMETRY,
-            header=schemas.header(stamp_ns, frame(robot, "odom")),
-            child_frame_id=frame(robot, "base_link"),
-            pose=_with_covariance("Pose", pose=_pose(x, y, phi)),
-            twist=_with_covariance("Twist", twist=_twist()),
-        )
-        self._add(_topic(robot, "odom"), schemas.ODOMETRY, message, stamp_ns, log_time_ns)
+        z, w = math.sin(phi / 2), math.cos(phi / 2)
+        data = _odometry_template(robot).filled(stamp_ns, x, y, z, w)
+        self._add(_topic(robot, "odom"), schemas.ODOMETRY, data, stamp_ns, log_time_ns)
 
     def wheel_angles(
         self,
@@ -259,10 +256,9 @@ class LogWriter:
         self, robot: str, stamp_ns: int, pose: ArrayLike, *, log_time_ns: int | None = None
     ) -> None:
         """TruePose on ``truth``: pose (3,) of the base in the world frame."""
-        message = schemas.build(
-            schemas.TRUE_POSE, header=schemas.header(stamp_ns, "world"), **_named(pose)
-        )
-        self._add(_topic(robot, "truth"), schemas.TRUE_POSE, message, stamp_ns, log_time_ns)
+        x, y, phi = np.asarray(pose, dtype=float).tolist()
+        data = _truth_template().filled(stamp_ns, x, y, phi)
+        self._add(_topic(robot, "truth"), schemas.TRUE_POSE, data, stamp_ns, log_time_ns)
 
     def true_landmark(
         self,
@@ -321,13 +317,14 @@ class LogWriter:
     def _add(
         self, topic: str, schema: str, message: Any, stamp_ns: int, log_time_ns: int | None
     ) -> None:
+        """A message made by `schemas.build`, or its bytes."""
         channel = self._channel(topic, schema)
         sequence = self.counts[topic] = self.counts.get(topic, 0) + 1
         self._writer.add_message(
             channel_id=channel,
             log_time=stamp_ns if log_time_ns is None else log_time_ns,
             publish_time=stamp_ns,
-            data=schemas.encode(schema, message),
+            data=message if isinstance(message, bytes) else schemas.encode(schema, message),
             sequence=sequence,
         )
 
@@ -341,6 +338,31 @@ class LogWriter:
                 topic, "cdr", self._schemas[schema], {"offered_qos_profiles": ""}
             )
         return self._channels[topic]
+
+
+@cache
+def _odometry_template(robot: str) -> schemas.Template:
+    """nav_msgs/Odometry; its numbers are x, y and the quaternion's z, w."""
+    x, y, z, w = marks = (1.25, 2.25, 3.25, 4.25)
+    rotation = schemas.build("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=z, w=w)
+    point = schemas.build("geometry_msgs/msg/Point", x=x, y=y, z=0.0)
+    pose = schemas.build("geometry_msgs/msg/Pose", position=point, orientation=rotation)
+    message = schemas.build(
+        schemas.ODOMETRY,
+        header=schemas.header(0, frame(robot, "odom")),
+        child_frame_id=frame(robot, "base_link"),
+        pose=_with_covariance("Pose", pose=pose),
+        twist=_with_covariance("Twist", twist=_twist()),
+    )
+    return schemas.Template(schemas.ODOMETRY, message, marks)
+
+
+@cache
+def _truth_template() -> schemas.Template:
+    """TruePose; its numbers are x, y, phi."""
+    marks = (1.25, 2.25, 3.25)
+    message = schemas.build(schemas.TRUE_POSE, header=schemas.header(0, "world"), **_named(marks))
+    return schemas.Template(schemas.TRUE_POSE, message, marks)
 
 
 def _topic(robot: str, name: str) -> str:
@@ -367,11 +389,6 @@ def _vector(x: float, y: float) -> Any:
 def _quaternion(phi: float) -> Any:
     z, w = np.sin(phi / 2), np.cos(phi / 2)
     return schemas.build("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=float(z), w=float(w))
-
-
-def _pose(x: float, y: float, phi: float) -> Any:
-    point = schemas.build("geometry_msgs/msg/Point", x=x, y=y, z=0.0)
-    return schemas.build("geometry_msgs/msg/Pose", position=point, orientation=_quaternion(phi))
 
 
 def _twist() -> Any:

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.stats import chi2
 
+from graphslam.gaussian import chi2_quantile
 from graphslam.geometry import Array
 from graphslam.report.comparison import Comparison, Curve, Lane
 from graphslam.report.figure import (
@@ -108,7 +108,7 @@ def _nees(comparison: Comparison, kind: str) -> str:
         for _, style, curve in _curves(comparison, kind):
             t = (curve.stamps_ns - start) / unit
             axes.plot(*_gathered(t, curve.nees), **style)
-        for bound in chi2.ppf([0.025, 0.975], 3) / 3:
+        for bound in chi2_quantile([0.025, 0.975], 3) / 3:
             axes.axhline(bound, color=ACCENT, linewidth=1, linestyle=(0, (4, 2.5)), zorder=9)
         axes.axhline(1.0, color=ACCENT, linewidth=0.9, zorder=9)
         _log(axes, "NEES / dof")

@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from scipy.stats import chi2
 
+from graphslam.gaussian import chi2_quantile
 from graphslam.geometry import Array, interpolate
 from graphslam.records import Landmark, Result, Trajectory
 from graphslam.report.figure import (
@@ -23,8 +23,8 @@ from graphslam.report.figure import (
 
 MAX_LABELS = 40
 MAX_ELLIPSES = 400
-_SIGMAS_95_2D = float(np.sqrt(chi2.ppf(0.95, 2)))
-_SIGMAS_95_1D = float(np.sqrt(chi2.ppf(0.95, 1)))
+_SIGMAS_95_2D = float(np.sqrt(chi2_quantile(0.95, 2)))
+_SIGMAS_95_1D = float(np.sqrt(chi2_quantile(0.95, 1)))
 
 
 def poses_at(trajectory: Trajectory, stamps_ns: Sequence[int]) -> Array:

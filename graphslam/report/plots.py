@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from scipy.stats import chi2
 
+from graphslam.gaussian import chi2_quantile
 from graphslam.geometry import Array, wrap
 from graphslam.models.observation import MODELS
 from graphslam.records import Result, Trajectory
@@ -86,7 +86,7 @@ def innovations(found: Mapping[str, Array]) -> str:
             axes.axhline(1.0, color=ACCENT, linewidth=1.0)
             title = f"{model}: n {len(values)}, mean {values[:, 1].mean():.2f}"
             if model in MODELS:
-                limit = float(chi2.ppf(0.95, MODELS[model].rows)) / MODELS[model].rows
+                limit = float(chi2_quantile(0.95, MODELS[model].rows)) / MODELS[model].rows
                 axes.axhline(limit, color=ACCENT, linewidth=0.8, linestyle="--")
                 title += f", {100 * np.mean(values[:, 1] > limit):.1f} % above the dashes"
             axes.set_title(title, loc="left", pad=3)

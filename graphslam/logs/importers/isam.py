@@ -5,9 +5,11 @@ them, so that our results can be judged by the file's own factors. Such files ha
 stamps are invented, one second apart, and the log says so.
 """
 
+import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TypeVar
@@ -21,7 +23,6 @@ from graphslam.logs.writer import DEFAULT_ROBOT, LogWriter
 
 _T = TypeVar("_T")
 
-_ROBOT = DEFAULT_ROBOT
 _SECOND_NS = 1_000_000_000
 _STAMPS = "invented: the source has none; pose number k (from 0) is stamped k+1 seconds"
 
@@ -65,14 +66,16 @@ def pose_stamp_ns(number: int) -> int:
 
 
 def import_isam(source: Path, target: Path) -> ImportSummary:
-    """Convert a pose graph of one robot to the MCAP file ``target``.
+    """Convert a pose graph to the MCAP file ``target``.
 
     Edges between consecutive poses become OdometryIncrement, others RelativePose, landmarks
     Sighting with the landmark's number as its identity. Initial values (VERTEX) are ignored.
+    Where two consecutive poses have no edge the odometry of a robot ends, and that of the next
+    begins: robots are told apart by nothing else, and are called ``robot1``, ``robot2``...
 
     Raises:
         LogError: ``source`` cannot be read, its noise or a line makes no sense, it has no edges,
-            or the chain of consecutive poses has a break.
+            or a pose has no odometry.
         OutputError: ``target`` cannot be written.
     """
     graph = read_pose_graph(source)
@@ -80,21 +83,32 @@ def import_isam(source: Path, target: Path) -> ImportSummary:
     if not poses:
         raise LogError(f"{source}: has no edge between two poses; is it a pose graph in 2-D?")
     number = {pose: k for k, pose in enumerate(poses)}
-    chain, others = split_chain(source, graph.edges, poses)
+    odometry, others = split_chain(graph.edges, poses)
+    robots = name_robots(source, odometry, poses)
     closures = _by_pose(others, lambda edge: edge.end)
     sightings = _by_pose(graph.sightings, lambda seen: seen.pose)
     notes = {"format": "pose graph", "source": source.name, "stamps": _STAMPS}
+    if others:
+        # what closures refer to was chosen by whoever made the graph
+        notes["keyframe.mode"] = "all"
     with LogWriter(target, notes) as log:
         for pose in poses:
-            if number[pose]:
-                _write(log.increment, number, chain[number[pose] - 1])
+            robot = robots[pose]
+            if pose in odometry:
+                _write(partial(log.increment, robot), number, odometry[pose])
             for edge in closures.get(pose, ()):
-                _write(log.relative_pose, number, edge)
+                other = robots[edge.start] if robots[edge.start] != robot else None
+                _write(partial(log.relative_pose, robot, other=other), number, edge)
             for seen in sightings.get(pose, ()):
                 stamp_ns = pose_stamp_ns(number[pose])
-                log.sighting(_ROBOT, stamp_ns, seen.z, seen.cov, identity=str(seen.landmark))
+                log.sighting(robot, stamp_ns, seen.z, seen.cov, identity=str(seen.landmark))
     warnings = [f"{source}: {n} {tag} lines are not used" for tag, n in graph.ignored.items()]
     warnings += [f"{source}: {n} {reason}" for reason, n in graph.odd.items()]
+    warnings += [
+        f"{source}: no edge from pose {a} to pose {b}: taken for the start of {robots[b]}"
+        for a, b in pairwise(poses)
+        if robots[a] != robots[b]
+    ]
     strangers = sum(len(seen) for pose, seen in sightings.items() if pose not in number)
     if strangers:
         warnings.append(f"{source}: {strangers} sightings from poses without an edge are not used")
@@ -112,39 +126,48 @@ def _write(write: Callable[..., None], number: dict[int, int], edge: Edge) -> No
     """Write an edge; our covariance is along the axes of its start, gtsam's of its end."""
     start_ns, end_ns = pose_stamp_ns(number[edge.start]), pose_stamp_ns(number[edge.end])
     cov = rotate_cov(edge.cov, float(edge.delta[2]))
-    write(_ROBOT, start_ns, end_ns, delta=edge.delta, cov=cov)
+    write(start_ns, end_ns, delta=edge.delta, cov=cov)
 
 
 # ---------------------------------------------------------------- the graph
 
 
-def split_chain(
-    source: Path, edges: Iterable[Edge], poses: Sequence[int]
-) -> tuple[list[Edge], list[Edge]]:
-    """The odometry, one edge from each of ``poses`` to the next, and all other edges.
+def split_chain(edges: Iterable[Edge], poses: Sequence[int]) -> tuple[dict[int, Edge], list[Edge]]:
+    """The odometry, by the pose that each of its edges leads to, and all other edges.
 
-    The first edge between two neighbours is the odometry. All edges are turned to lead from the
-    earlier pose to the later one, see `turned`.
-
-    Raises:
-        LogError: two consecutive poses have no edge; named with their numbers.
+    The first edge between two neighbours of ``poses`` is the odometry. All edges are turned to lead
+    from the earlier pose to the later one, see `turned`.
     """
     following = dict(pairwise(poses))
     odometry: dict[int, Edge] = {}
     others = []
     for edge in edges:
         forward = edge if edge.start < edge.end else turned(edge)
-        if following.get(forward.start) == forward.end and forward.start not in odometry:
-            odometry[forward.start] = forward
+        if following.get(forward.start) == forward.end and forward.end not in odometry:
+            odometry[forward.end] = forward
         else:
             others.append(forward)
-    for start, end in pairwise(poses):
-        if start not in odometry:
+    return odometry, others
+
+
+def name_robots(source: Path, odometry: Mapping[int, Edge], poses: Sequence[int]) -> dict[int, str]:
+    """Pose -> its robot: a new one begins where no odometry leads to a pose.
+
+    Raises:
+        LogError: a pose has neither odometry before it nor after it; named with its number.
+    """
+    begins = [pose for pose in poses if pose not in odometry]
+    for pose, following in pairwise([*poses, -1]):
+        if pose not in odometry and following not in odometry:
             raise LogError(
-                f"{source}: no edge from pose {start} to pose {end}: the odometry has a break; "
-                "cut the file into one per robot"
+                f"{source}: the odometry has a break on either side of pose {pose}: no edge leads "
+                "to or from its neighbours; leave it out or give it one"
             )
-    return [odometry[pose] for pose in poses[:-1]], others
+    if len(begins) == 1:
+        return dict.fromkeys(poses, DEFAULT_ROBOT)
+    number = np.searchsorted(begins, poses, side="right")
+    digits = len(str(len(begins)))
+    return {p: f"robot{n:0{digits}}" for p, n in zip(poses, number, strict=True)}
 
 
 def turned(edge: Edge) -> Edge:
@@ -171,7 +194,8 @@ def read_pose_graph(source: Path) -> PoseGraph:
     """
     graph = PoseGraph()
     is_g2o = ".g2o" in source.suffixes
-    for count, line in enumerate(text_lines(source), start=1):
+    lines = enumerate(text_lines(source), start=1)
+    for count, line in ((n, part) for n, whole in lines for part in _JOINED.split(whole)):
         fields = line.split()
         if not fields or fields[0].startswith("#"):
             continue
@@ -259,6 +283,8 @@ def _numbers(fields: Sequence[str], count: int) -> Array:
     return values
 
 
+#: files put together, of which one did not end its last line: a tag follows a number at once
+_JOINED = re.compile(r"(?<=[0-9])(?=[A-Z]{2})")
 # the tags that load2D reads, and the names that g2o and its relatives give to the same
 _LINES: dict[str, Callable[[PoseGraph, Sequence[str], bool], None]] = {
     "ODOMETRY": _edge,

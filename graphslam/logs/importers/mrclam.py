@@ -8,6 +8,7 @@ localization and mapping dataset, IJRR 30(8), 2011, DOI 10.1177/0278364911398404
 """
 
 import heapq
+import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -202,7 +203,7 @@ def _rows(name: str, texts: Mapping[str, str], columns: int, odd: Counter[str]) 
     for fields in _lines(texts.get(name, "")):
         try:
             values = [float(field) for field in fields[1:]]
-            if len(values) != columns or not np.isfinite(values).all():
+            if len(values) != columns or not all(map(math.isfinite, values)):
                 raise ValueError
             rows.append((parse_stamp_ns(fields[0]), values))
         except ValueError:
