@@ -14,6 +14,7 @@ import numpy as np
 from graphslam import __version__
 from graphslam.config import Config, dump_config
 from graphslam.geometry import Array, between, transform
+from graphslam.joining import Joined
 from graphslam.landmark_map import Entry, LandmarkMap
 from graphslam.logs import LogSet
 from graphslam.records import Estimate, Landmark
@@ -92,6 +93,7 @@ def summarise(
     landmarks: int,
     seconds: Mapping[str, float],
     calibration: Mapping[str, Mapping[str, tuple[float, float, bool]]],
+    joined: Joined,
     warnings: Sequence[str],
     log_s: float,
 ) -> dict[str, Any]:
@@ -135,6 +137,8 @@ def summarise(
             "loop_closures": counts["loop_closures"] + line_closures + counts["closures_verified"],
         },
         "consolidated": {name: counts[name] for name in CONSOLIDATED if name in counts},
+        "frames": dict(sorted(joined.frames.items())),
+        "starts_found": joined.told(),
         "rejected": dict(sorted(rejected.items())),
         "dropped": dict(sorted(all_dropped.items())),
         "repaired": dict(sorted(log.repaired.items())),
