@@ -49,7 +49,7 @@ MAX_TURN_SIGMA_RAD = 0.2
 APART_M, MOST = 0.1, 100
 #: sigmas of a start that was found are so many times as wide as the relation has them: what it
 #: was found from enters the estimate again
-WIDER = 5.0
+WIDER = 10.0
 UNTIMED = -1
 
 
@@ -206,12 +206,19 @@ def relate(
     if cov[2, 2] > MAX_TURN_SIGMA_RAD**2:
         return f"what {a} and {b} saw in common does not tell how they were turned"
     rest = np.setdiff1d(np.arange(len(worth)), best)
-    rival = rest[_fitted(largest(agree[np.ix_(rest, rest)], worth[rest]),
-                         p.points[rest], q.points[rest], variance[rest])]  # fmt: skip
-    if worth[rival].sum() > RIVAL * worth[best].sum():
+    members = largest(agree[np.ix_(rest, rest)], worth[rest])
+    rival = _fitted(rest[members], p.points, q.points, variance)
+    if len(rival) > 1:
         other, other_cov = registered(p.points[rival], q.points[rival], variance[rival])
-        if other_cov[2, 2] < MAX_TURN_SIGMA_RAD**2 and _differ(pose, cov, other, other_cov):
-            return f"what {a} and {b} saw in common has two meanings"
+        turned = other_cov[2, 2] < MAX_TURN_SIGMA_RAD**2
+        if turned and _differ(pose, cov, other, other_cov):
+            # some pairs may fit both
+            behind = [
+                worth[_misses(move, p.points, q.points, variance) <= chi2.ppf(FIT, 2)].sum()
+                for move in (pose, other)
+            ]
+            if behind[1] > RIVAL * behind[0]:
+                return f"what {a} and {b} saw in common has two meanings"
     floor = np.diag([config.floor_m**2, config.floor_m**2, config.floor_rad**2])
     cov = cov + floor + _drift(pose, views[a], views[b], p, q, best)
     return Relation(b, a, pose, cov, float(worth[best].sum()))
@@ -340,11 +347,16 @@ def _fitted(members: IntArray, p: Array, q: Array, variance: Array) -> IntArray:
     """Those of a set that also lie where a rigid move takes them; a mirror image does not."""
     while len(members) > 1:
         pose, _ = registered(p[members], q[members], variance[members])
-        miss = ((p[members] - transform(pose, q[members])) ** 2).sum(axis=1) / variance[members]
+        miss = _misses(pose, p[members], q[members], variance[members])
         if miss.max() <= chi2.ppf(FIT, 2):
             break
         members = np.delete(members, miss.argmax())
     return members
+
+
+def _misses(pose: Array, p: Array, q: Array, variance: Array) -> Array:
+    """Squared distances (n,) of points from where a move takes them, normalised."""
+    return np.asarray(((p - transform(pose, q)) ** 2).sum(axis=1) / variance)
 
 
 def _drift(pose: Array, a: View, b: View, p: Ends, q: Ends, members: IntArray) -> Array:

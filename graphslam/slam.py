@@ -763,7 +763,7 @@ def run_warnings(pipeline: Pipeline) -> list[str]:
     ]
     warnings += [
         f"{robot}: {pipeline.joined.undecided.get(robot, 'nothing says where it was')}; its poses "
-        "are in a frame of its own, which begins where it began"
+        f"are in a frame of its own, which begins where it began; --start {robot}=x,y,phi places it"
         for robot, run in pipeline.runs.items()
         if run.started and robot == pipeline.frames[robot] != pipeline.joined.world
     ]

@@ -137,6 +137,7 @@ def summarise(
             "loop_closures": counts["loop_closures"] + line_closures + counts["closures_verified"],
         },
         "consolidated": {name: counts[name] for name in CONSOLIDATED if name in counts},
+        "world": joined.world,
         "frames": dict(sorted(joined.frames.items())),
         "starts_found": joined.told(),
         "rejected": dict(sorted(rejected.items())),
