@@ -1,22 +1,23 @@
 """Decentralised smoothing, simulated: a graph per robot, and condensed messages between them.
 
-Every robot smooths its own measurements. From time to time it eliminates, from what it measured
-since the last time, all states that nobody else refers to; what is left is a Gaussian over
-landmarks, its first and last state of the span, and its states at meetings. That, with the place it
-was linearised at, is its message (DDF-SAM: A. Cunningham, M. Paluri, F. Dellaert, IROS 2010, DOI
+Every robot smooths its own measurements. From time to time it tells the others what it measured
+since the last time. States that nobody else refers to are eliminated: what is left of a stretch of
+them is a Gaussian over its ends and the landmarks seen on it, sent as information with the place it
+was linearised at (DDF-SAM: A. Cunningham, M. Paluri, F. Dellaert, IROS 2010, DOI
 10.1109/IROS.2010.5652875, who send the whole condensed map anew each time; here each message is of
-its own span). Sightings of robots are sent as measured: they are as small as anything that could be
-made of them, and whoever made one cannot linearise it, not knowing the other's heading.
+its own span). Shared are landmarks, states at meetings, and the first and last state of the span.
+What nothing is eliminated from is sent as measured, and so is a stretch that is smaller that way.
 
 No information counts twice: a message is made of the sender's own measurements of one span, never
 of messages, so all messages and the receiver's own measurements are different factors of one graph,
-and their sum is the centralised one, but for two losses: what a message was linearised at and
-weighted with stays, and until the next message nothing is known of the others.
+and their sum is the centralised one, but for two losses: what was condensed keeps the place it was
+linearised at and its robust weights, and until the next message nothing is known of the others.
 
 There is no network in it: every message reaches everybody, and identities of landmarks are agreed.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import gtsam
@@ -37,20 +38,24 @@ KEPT = "evidence about a state before the last message: its robot keeps it"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Message:
-    """What a robot tells the others: linear factors, and where they are linearised."""
+class Measured:
+    """Factors of one measurement, and its bytes as it is."""
 
     factors: tuple[gtsam.NonlinearFactor, ...]
-    point: Mapping[int, Array]
+    size: int
 
-    @property
-    def size(self) -> int:
-        """Bytes: per factor its names, information (upper triangle) and vector; and the point."""
-        total = sum(NAME + NUMBER * len(value) for value in self.point.values())
-        for factor in self.factors:
-            dim = sum(len(self.point[key]) for key in factor.keys())  # noqa: SIM118
-            total += NAME * len(factor.keys()) + NUMBER * (dim * (dim + 1) // 2 + dim)
-        return total
+    def keys(self) -> set[int]:
+        """Its variables."""
+        return {key for factor in self.factors for key in factor.keys()}  # noqa: SIM118
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Message:
+    """What a robot tells the others: factors, a value of every variable in them, and its bytes."""
+
+    factors: tuple[gtsam.NonlinearFactor, ...]
+    values: Mapping[int, Array]
+    size: int
 
 
 @dataclass(slots=True, eq=False)
@@ -68,7 +73,7 @@ class Member:
     dims: dict[int, int] = field(default_factory=dict)
     fresh: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     values: dict[int, Array] = field(default_factory=dict)
-    unsent: list[gtsam.NonlinearFactor] = field(default_factory=list)
+    unsent: list[Measured] = field(default_factory=list)
     frontier: int = 0
     sent: int = 0
     measured: int = 0
@@ -101,28 +106,86 @@ class Member:
             return factors.array3(self.isam.calculateEstimatePose2(key))
         return np.asarray(self.isam.calculateEstimatePoint2(key))
 
-    def condensed(self, shared: set[int]) -> Message:
+    def message(self, shared: set[int]) -> Message:
         """Its own measurements since the last message, states that are not ``shared`` eliminated.
 
         A prior on what is eliminated is not needed: it hangs on the chain of states.
         """
-        graph = gtsam.NonlinearFactorGraph()
-        for factor in self.unsent:
+        unsent, self.unsent = self.unsent, []
+        estimate = self.isam.calculateBestEstimate()
+        told: list[gtsam.NonlinearFactor] = []
+        size = 0
+        for stretch, inner in _stretches(unsent, shared):
+            as_measured = sum(measured.size for measured in stretch)
+            if inner:
+                made, smaller = _condensed(stretch, inner, estimate, self.dims)
+                if smaller < as_measured:
+                    told += made
+                    size += smaller
+                    continue
+            told += [factor for measured in stretch for factor in measured.factors]
+            size += as_measured
+        keys = {key for factor in told for key in factor.keys()}  # noqa: SIM118
+        self.sent += size
+        return Message(
+            tuple(told), {key: read(estimate, key, self.dims[key]) for key in keys}, size
+        )
+
+
+def _stretches(
+    unsent: Sequence[Measured], shared: set[int]
+) -> Iterator[tuple[list[Measured], list[int]]]:
+    """Measurements that hang together by states nobody else needs, and those states.
+
+    Those without any such state come together.
+    """
+    root: dict[int, int] = {}
+
+    def find(key: int) -> int:
+        while root[key] != key:
+            key = root[key]
+        return key
+
+    inner = [[k for k in m.keys() if _is_state(k) and k not in shared] for m in unsent]  # noqa: SIM118
+    for keys in inner:
+        for key in keys:
+            root.setdefault(key, key)
+            root[find(key)] = find(keys[0])
+    groups: dict[int | None, list[Measured]] = defaultdict(list)
+    states: dict[int | None, set[int]] = defaultdict(set)
+    for measured, keys in zip(unsent, inner, strict=True):
+        group = find(keys[0]) if keys else None
+        groups[group].append(measured)
+        states[group] |= set(keys)
+    for group, found in groups.items():
+        yield found, sorted(states[group])
+
+
+def _condensed(
+    stretch: Sequence[Measured],
+    inner: Sequence[int],
+    estimate: gtsam.Values,
+    dims: Mapping[int, int],
+) -> tuple[list[gtsam.NonlinearFactor], int]:
+    """What is left of measurements when states are eliminated, and its bytes.
+
+    Per factor the names of its variables, information (upper triangle) and vector; once per
+    variable the place that it was linearised at.
+    """
+    graph = gtsam.NonlinearFactorGraph()
+    for measured in stretch:
+        for factor in measured.factors:
             graph.add(factor)
-        self.unsent = []
-        if not graph.size():
-            return Message((), {})
-        values = self.isam.calculateBestEstimate()
-        linear, keys = graph.linearize(values), graph.keyVector()
-        inner = [key for key in keys if key not in shared and _is_state(key)]
-        if inner:
-            order = gtsam.Ordering(inner)
-            linear = linear.eliminatePartialSequential(order, gtsam.EliminateQR)[1]
-        left = gtsam.LinearContainerFactor.ConvertLinearGraph(linear, values)
-        point = {key: read(values, key, self.dims[key]) for key in keys if key not in inner}
-        message = Message(tuple(left.at(n) for n in range(left.size())), point)
-        self.sent += message.size
-        return message
+    order = gtsam.Ordering(list(inner))
+    left = graph.linearize(estimate).eliminatePartialSequential(order, gtsam.EliminateQR)[1]
+    made = gtsam.LinearContainerFactor.ConvertLinearGraph(left, estimate)
+    every = [made.at(n) for n in range(made.size())]
+    size = sum(NUMBER * dims[key] for key in {key for f in every for key in f.keys()})  # noqa: SIM118
+    for factor in every:
+        keys = factor.keys()
+        dim = sum(dims[key] for key in keys)
+        size += NAME * len(keys) + NUMBER * (dim * (dim + 1) // 2 + dim)
+    return every, size
 
 
 def _is_state(key: int) -> bool:
@@ -176,7 +239,8 @@ class DecentralisedBackend(GraphBackend):
         states = [key for key in keys if _is_state(key)]
         key = part.observed[0] if part.observed else states[-1]
         member = self._member(key)
-        member.measured += _measured_bytes(part)
+        size = _measured_bytes(part)
+        member.measured += size
         late = [k for k in states if _number(k) < self._member(k).frontier]
         if len({_robot(k) for k in states}) > 1:
             if late:
@@ -196,7 +260,7 @@ class DecentralisedBackend(GraphBackend):
         if late:
             self.builder.skipped[KEPT] += 1
         else:
-            member.unsent += made
+            member.unsent.append(Measured(part.factors, size))
 
     def exchange(self) -> None:
         """Everybody tells everybody what was measured since the last time."""
@@ -206,13 +270,13 @@ class DecentralisedBackend(GraphBackend):
         for n, member in enumerate(self._members):
             last = len(self.builder.states.times[member.name]) - 1
             ends = {factors.state_key(n, number) for number in (member.frontier, last)}
-            messages.append(member.condensed(met | ends))
+            messages.append(member.message(met | ends))
             member.frontier = last
             self.messages += 1
         for member in self._members:
             for message, sender in zip(messages, self._members, strict=True):
                 if sender is not member:
-                    member.take(message.factors, message.point)
+                    member.take(message.factors, message.values)
             for part in self._meetings:
                 member.take(part.factors, {})
         for part in self._meetings:
@@ -232,8 +296,8 @@ class DecentralisedBackend(GraphBackend):
         index = _robot(key)
         while len(self._members) <= index:
             name = self.builder.robots[len(self._members)]
-            isam = gtsam.ISAM2(isam2_parameters(self._config, "QR"))
-            self._members.append(Member(name, isam))
+            tree = gtsam.ISAM2(isam2_parameters(self._config, "QR"))
+            self._members.append(Member(name, tree))
         return self._members[index]
 
     # ------------------------------------------------------------ answers
