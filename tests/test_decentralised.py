@@ -110,7 +110,7 @@ def test_nobody_claims_to_know_more_than_all_of_them_together(seed):
             sigma = np.sqrt(np.diag(all_))
             more = np.linalg.eigvalsh((mine - all_) / np.outer(sigma, sigma))
             # 2 %: at a fifth of the noise places of linearisation differ that little; what comes
-            # twice shows with 10 % and more
+            # twice shows with a third and more
             assert more.min() > -0.02
 
 
