@@ -231,10 +231,14 @@ class BackendConfig:
     close loops that scans confirm. verify_closures: believe relative poses that a log brings along
     only if they agree with each other. horizon_s: how long a past pose stays in isam2's graph
     before it is marginalised out: inf = full smoothing, 0 = the extended Kalman filter.
+    exchange_s: time between two messages of a robot in `decentralised`.
     """
 
-    name: Literal["isam2", "batch", "ekf", "invariant-ekf", "rbpf", "dead-reckoning"] = "isam2"
+    name: Literal[
+        "isam2", "batch", "ekf", "invariant-ekf", "rbpf", "dead-reckoning", "decentralised"
+    ] = "isam2"
     horizon_s: float = math.inf
+    exchange_s: float = 30.0
     relinearize_threshold: float = 0.05
     relinearize_every: int = 20
     polish: bool = True

@@ -29,6 +29,10 @@ TIMES_NEARER = 3.0
 MATCH_DISTANCE_M = 1.0
 MATCH_ANGLE_RAD = 0.35
 LOCAL_S = 60.0
+#: what nothing can be said about where a robot's place in the world is not known
+NO_PLACE = dict.fromkeys(
+    ("ate_rmse_m", "max_m", "heading_rmse_rad", "nees_per_dof", "nees_bounds", "coverage")
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -440,6 +444,12 @@ def _find(wanted: Stamps, known: Stamps) -> tuple[Any, Any]:
 # ---------------------------------------------------------------- all of it
 
 
+def robots_apart(summary: Mapping[str, Any]) -> set[str]:
+    """Robots of a result that have a frame of their own: where it lies in the world is unknown."""
+    world = summary.get("world")
+    return {robot for robot, frame in summary.get("frames", {}).items() if frame != world}
+
+
 def evaluate(
     result: Result | SavedResult,
     truth: Mapping[str, Trajectory] | None = None,
@@ -448,7 +458,8 @@ def evaluate(
 ) -> dict[str, Any]:
     """Everything that `evaluate --json` prints (see the contract), from what there is.
 
-    ``robots`` and ``joint`` are there with ``truth`` (robots without truth are left out),
+    ``robots`` and ``joint`` are there with ``truth`` (robots without truth are left out; of robots
+    in a frame of their own there are only aligned and relative errors, and no joint ones),
     ``landmarks`` with ``true_landmarks``, ``relations`` with ``relations``; those are of the final
     poses, and their key ``causal`` holds the same of the causal ones. Relations name no robot:
     they are compared with the one whose scans match most.
@@ -469,16 +480,23 @@ def evaluate(
                 f"no pose of {', '.join(result.robots)} lies within the span of the truth, "
                 f"which is of {', '.join(truth)}"
             )
+        apart = robots_apart(result.summary)
         found["robots"] = {
-            name: {kind: trajectory_metrics([p]) for kind, p in both.items()}
+            name: {
+                kind: trajectory_metrics([p]) | (NO_PLACE if name in apart else {})
+                for kind, p in both.items()
+            }
             for name, both in pairs.items()
         }
-        found["joint"] = {
-            kind: trajectory_metrics([both[kind] for both in pairs.values()])
-            for kind in ("final", "causal")
-        }
+        together = [both for name, both in pairs.items() if name not in apart]
+        if together:
+            found["joint"] = {
+                kind: trajectory_metrics([both[kind] for both in together])
+                for kind in ("final", "causal")
+            }
     if true_landmarks:
-        found["landmarks"] = landmark_metrics(result.landmarks, true_landmarks)
+        marks = [mark for mark in result.landmarks if mark.frame is None]
+        found["landmarks"] = landmark_metrics(marks, true_landmarks)
     if relations is not None:
         found["relations"] = _relations(result, relations)
     return found

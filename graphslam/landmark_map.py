@@ -5,6 +5,7 @@ together with its earlier sightings. Estimates are copies, refreshed from the ba
 may have changed: reading them is much of an incremental smoother's cost.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -127,11 +128,11 @@ class LandmarkMap:
         )
         self._next = max(self._next, new + 1)
 
-    def in_world(self, world: Array) -> "LandmarkMap":
-        """The same map in a world frame that sees this one at ``world`` (3,)."""
+    def in_worlds(self, worlds: Mapping[int, Array]) -> "LandmarkMap":
+        """The same map after the frame of each landmark was put at ``worlds[id]`` (3,)."""
         moved = LandmarkMap()
         for i, entry in self.entries.items():
-            moved.entries[i] = replace(entry, mean=compose(world, entry.mean))
+            moved.entries[i] = replace(entry, mean=compose(worlds[i], entry.mean))
         return moved
 
     def expire(self, time_ns: int, robot: str, path_m: float, age_ns: int, age_m: float) -> None:

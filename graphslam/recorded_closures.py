@@ -21,7 +21,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from graphslam.backends.isam2 import BatchBackend, Isam2Backend
+from graphslam.backends.isam2 import Isam2Backend, Resolver
 from graphslam.config import BackendConfig, Config, RobustConfig
 from graphslam.dead_reckoning import Track
 from graphslam.gaussian import chi2_quantile
@@ -319,8 +319,8 @@ class _Joint:
         estimate = backend.finish()
         barred: set[int] = set()
         for _ in range(MAX_ROUNDS):
-            batch = BatchBackend(self._robust)
-            estimate = batch.solve(self._steps(believed), estimate, rough=True)
+            batch = Resolver(self._robust, self._steps(believed), estimate)
+            estimate = batch.solve(rough=True)
             d2 = {k: self._misfit(k, k in believed, batch, estimate) for k in candidates}
             wrong = sorted((k for k in believed if d2[k] > gate), key=lambda k: -d2[k])
             new = {k for k in candidates if k not in believed | barred and d2[k] <= gate}
@@ -330,7 +330,7 @@ class _Joint:
             gone = set(wrong[: max(1, len(wrong) // 4)])
             barred |= gone
             believed = believed - gone if gone else believed | new
-        return believed, BatchBackend(self._plain).solve(self._steps(believed), estimate)
+        return believed, Resolver(self._plain, self._steps(believed), estimate).solve()
 
     def _steps(self, believed: Iterable[int]) -> list[Step]:
         """Steps in the order of time, each closure where both of its ends are there."""

@@ -280,7 +280,8 @@ class Landmark:
 
     ``position`` (3,), heading NaN for a point; ``cov`` (2, 2) for a point, else (3, 3);
     ``extent`` (2, 2) its end points (a point repeats itself); ``line`` is (normal direction rad,
-    offset m, covariance (2, 2)) of the line through it, None for a point.
+    offset m, covariance (2, 2)) of the line through it, None for a point. ``frame``: the robot in
+    whose frame it is, None for the world.
     """
 
     id: int
@@ -293,6 +294,7 @@ class Landmark:
     first_ns: int
     last_ns: int
     identity: str | None
+    frame: str | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -137,6 +137,8 @@ def _remade(
     motions: list[dict[str, Motion]] = [{} for _ in steps]
     for robot, track in tracks.items():
         made = [(n, step.motions[robot]) for n, step in enumerate(steps) if robot in step.motions]
+        if not made:
+            continue  # it perceived nothing and was seen by nobody
         start_ns, end_ns = (
             np.array([getattr(m, name) for _, m in made], dtype=np.int64)
             for name in ("start_ns", "end_ns")

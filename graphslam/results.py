@@ -190,6 +190,8 @@ def landmark_json(landmark: Landmark) -> dict[str, Any]:
         "last_ns": landmark.last_ns,
         "identity": landmark.identity,
     }
+    if landmark.frame is not None:
+        entry["frame"] = landmark.frame
     if landmark.line is not None:
         normal, offset, cov = landmark.line
         entry["line"] = {
@@ -421,6 +423,7 @@ def _landmark(entry: Mapping[str, Any]) -> Landmark:
         int(entry["first_ns"]),
         int(entry["last_ns"]),
         entry["identity"],
+        entry.get("frame"),
     )
 
 

@@ -57,6 +57,12 @@ class RobotRun:
         self.causal_poses.append(pose)
         self.calibrations.append(self.track.used_calibration)
 
+    def move(self, along_m: float) -> None:
+        """Put the causal states elsewhere along the x axis."""
+        if along_m:
+            away = np.array([along_m, 0.0, 0.0])
+            self.causal_poses = [pose + away for pose in self.causal_poses]
+
     def learn(self, motion: Motion, pose: Array, observed: Array) -> None:
         """Improve the calibration from the motion to a new state.
 

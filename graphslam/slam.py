@@ -19,7 +19,14 @@ from graphslam.associator import Associator
 from graphslam.backends import BACKENDS
 from graphslam.backends.isam2 import Isam2Backend
 from graphslam.calibration import observed_information
-from graphslam.config import Config, KeyframeConfig, OdometryConfig, RobotConfig, load_config
+from graphslam.config import (
+    BackendConfig,
+    Config,
+    KeyframeConfig,
+    OdometryConfig,
+    RobotConfig,
+    load_config,
+)
 from graphslam.consolidating import Tamper, consolidate
 from graphslam.dead_reckoning import Track
 from graphslam.errors import ConfigError, EstimationError, LogError
@@ -28,12 +35,14 @@ from graphslam.frontend import FRONT_ENDS, scan_points
 from graphslam.frontend.sightings import sighting_observation
 from graphslam.gathering import Gathered, Sources, carried, gather, met, shared, ways
 from graphslam.geometry import (
+    Array,
     compose,
     compose_cov,
     inverse,
     inverse_cov,
     rotate_cov,
 )
+from graphslam.joining import Joined, View, join
 from graphslam.logs import LogSet
 from graphslam.models import transport
 from graphslam.recorded_closures import NOTHING_RECORDED, own_frame, verify
@@ -52,19 +61,25 @@ from graphslam.records import (
     Sighting,
     Start,
     Step,
+    Trajectory,
     TrueLandmark,
     Truth,
 )
 from graphslam.refining import refine
 from graphslam.robot_run import RobotRun
 from graphslam.scan_motion import beside_lines, checked, measured, scan_submap
-from graphslam.starts import start_poses
+from graphslam.starts import origin, start_poses
 from graphslam.summary import make_landmarks, summarise
 from graphslam.timeline import ODOMETRY, synchronise
-from graphslam.trajectories import in_world, origin_shift, step_in_world
+from graphslam.trajectories import Worlds, origin_shift
 
 #: scans in the picture at most
 MAX_PICTURES = 4000
+#: m: frames that nothing relates lie so far apart while they are estimated that no association can
+#: reach from one to another
+FRAMES_APART_M = 1e5
+#: between frame and identity of landmarks in other frames than the world's; in no name
+FRAME_MARK = "\0"
 
 Progress = Callable[[int], None]
 Settings = TypeVar("Settings", KeyframeConfig, OdometryConfig)
@@ -84,11 +99,6 @@ class Recorded:
     kept: frozenset[ClosureId]
     refused: Mapping[ClosureId, str]
 
-    def own_frames(self) -> dict[str, str]:
-        """Robots that stay in a frame of their own -> the robot in whose frame the world is."""
-        world = next(iter(self.frames.values()), "")
-        return {r: world for r, frame in self.frames.items() if frame == r != world}
-
     def told(self) -> dict[str, Any]:
         """For summary.json: number ``kept``, list of those ``refused``, and why."""
         refused = [
@@ -107,8 +117,17 @@ class Pipeline:
         config: Config,
         names: Mapping[str, str] | None = None,
         tamper: Tamper | None = None,
+        joined: Joined | None = None,
     ) -> None:
-        """Nothing read yet; ``names``: false name -> right name of what is sighted."""
+        """Nothing read yet.
+
+        Args:
+            log: opened logs.
+            config: settings.
+            names: false name -> right name of what is sighted.
+            tamper: see `graphslam.consolidating.Tamper`.
+            joined: where robots start and in which frames; None finds out.
+        """
         config = replace(config, keyframe=noted(config.keyframe, "keyframe", log.notes))
         self.log, self.config, self.names = log, config, names or {}
         self.tamper = tamper
@@ -120,15 +139,21 @@ class Pipeline:
             config.backend.name != "dead-reckoning" and config.front_end.name != "none"
         )
         self.runs = {name: RobotRun(track) for name, track in make_tracks(log, config).items()}
-        self.starts = start_poses(log, config)
-        self.recorded = verify_recorded(log, config, self.starts)
-        self.starts |= self.recorded.starts
+        began = time.perf_counter()
+        starts = start_poses(log, config) if joined is None else joined.starts
+        self.recorded = verify_recorded(log, config, starts)
+        self.joined = joined or placed(log, config, self.names, starts, self.recorded)
+        self.starts, self.frames = self.joined.starts, self.joined.frames
+        roots = sorted(set(self.frames.values()) - {self.joined.world})
+        self.places = {frame: (k + 1) * FRAMES_APART_M for k, frame in enumerate(roots)}
+        self.meetings: list[Sighting] = []  # of robots in frames that nothing relates
         self.steps: list[Step] = []
         self.sources: Sources = {}
         self.pictures: list[Picture] = []
         self.counts: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
         self.seconds: dict[str, float] = defaultdict(float)
+        self.seconds["starts"] = time.perf_counter() - began
         self.step_ms: list[float] = []
         self.first_ns, self.last_ns = 1 << 63, 0
 
@@ -172,8 +197,31 @@ class Pipeline:
                 self.dropped["sighting: a robot does not see itself"] += 1
             elif ignore and isinstance(message, Sighting) and message.seen_robot is not None:
                 self.dropped["sighting: of a robot, ignored by association.robots"] += 1
+            elif self.crosses_frames(message):
+                kind = type(message).__name__.lower()
+                self.dropped[f"{kind}: of a robot in a frame of its own"] += 1
+                if isinstance(message, Sighting):
+                    self.meetings.append(message)
+            elif self.places and isinstance(message, Sighting) and message.identity is not None:
+                yield replace(message, identity=self.framed(message.robot, message.identity))
             else:
                 yield message
+
+    def crosses_frames(self, message: Message) -> bool:
+        """Whether a message relates robots whose frames are not related."""
+        other = None
+        if isinstance(message, Sighting):
+            other = message.seen_robot
+        elif isinstance(message, RelativePose):
+            other = message.other
+        if other is None or other not in self.frames:
+            return False
+        return self.frames[message.robot] != self.frames[other]
+
+    def framed(self, robot: str, identity: str) -> str:
+        """An identity as it is known in the frame of ``robot``: each frame has a map of its own."""
+        frame = self.frames[robot]
+        return identity if frame == self.joined.world else f"{frame}{FRAME_MARK}{identity}"
 
     def take_gathered(self, gathered: Gathered) -> None:
         """All images of a span, in one step at its end.
@@ -295,12 +343,15 @@ class Pipeline:
                 f"robot {robot}: its start is unknown; give --start {robot}=x,y,phi (m, rad) or "
                 "--start truth"
             )
-        start = self.starts[robot]
-        if robot != min(self.starts):
+        start, frame = self.starts[robot], self.frames[robot]
+        if robot != frame:
             # priors are on the base, states on the sensor: where it sits is not known yet, nor is
             # where that of the first robot sits, to which the world is fixed
             cov = start.cov + rotate_cov(2 * self.runs[robot].track.mount_cov, start.pose[2])
             start = replace(start, cov=cov)
+        if frame in self.places:
+            away = np.array([self.places[frame], 0.0, 0.0])
+            start = replace(start, pose=start.pose + away)
         step = Step(time_ns, starts={robot: start})
         self.note_covariances()
         self.backend.add(step)
@@ -448,6 +499,9 @@ class Pipeline:
         if message.other == message.robot and message.start_ns >= message.time_ns:
             self.dropped["relative pose: it does not begin before it ends"] += 1
             return None
+        if other is not None and self.frames[message.other] != self.frames[message.robot]:
+            self.dropped["relative pose: between frames that nothing relates"] += 1
+            return None
         if other is None or not other.started or message.start_ns < other.times[0]:
             self.dropped["relative pose: its first end has no state"] += 1
             return None
@@ -526,6 +580,62 @@ class Pipeline:
             self.runs[name].refined = self.config.odometry.calibrate
         return done.estimate
 
+    def worlds(self) -> Worlds:
+        """What takes every robot and landmark from where it was estimated into its frame.
+
+        A prior is on the base of the robot at which a frame hangs, states are on its sensor.
+        """
+        by_frame: dict[str, Array] = {}
+        for frame in sorted(set(self.frames.values())):
+            shift = origin_shift(self.starts[frame].pose, self.runs[frame].track.mount)
+            away = np.array([-self.places.get(frame, 0.0), 0.0, 0.0])
+            by_frame[frame] = compose(shift, away)
+        return Worlds(
+            {robot: by_frame[frame] for robot, frame in self.frames.items()},
+            {number: by_frame[frame] for number, frame in self.landmark_frames().items()},
+        )
+
+    def landmark_frames(self) -> dict[int, str]:
+        """Landmark -> in whose frame it is: whoever saw it has the same one."""
+        entries = self.associator.map.entries
+        return {number: self.frames[min(entry.path_m)] for number, entry in entries.items()}
+
+    def views(self) -> dict[str, View]:
+        """What each robot knows by itself, after a run in which each had a frame of its own."""
+        estimate, worlds = self.backend.finish(), self.worlds()
+        moved, frames = worlds.estimate(estimate), self.landmark_frames()
+        marks: dict[str, dict[str, tuple[Array, Array]]] = defaultdict(dict)
+        for number, (mean, cov) in moved.landmarks.items():
+            identity = self.associator.map.entries[number].identity
+            if identity is not None:
+                name = identity.rpartition(FRAME_MARK)[2]
+                marks[frames[number]][name] = (mean[:2], cov[:2, :2])
+        views = {}
+        for robot, run in self.runs.items():
+            if len(run.track):
+                start = self.starts[robot]
+                first = np.array([run.track.first_ns], dtype=np.int64)
+                unseeing = Trajectory(first, start.pose[None], start.cov[None])
+                views[robot] = View(moved.states.get(robot, unseeing), run.track, marks[robot])
+        return views
+
+    def landmarks(self, estimate: Estimate, worlds: Worlds) -> tuple[Landmark, ...]:
+        """The final map; landmarks of other frames than the world's say whose it is."""
+        made = make_landmarks(self.associator.map.in_worlds(worlds.landmarks), estimate)
+        if not self.places:
+            return made
+        frames = self.landmark_frames()
+        return tuple(
+            mark
+            if frames[mark.id] == self.joined.world
+            else replace(
+                mark,
+                identity=mark.identity and mark.identity.rpartition(FRAME_MARK)[2],
+                frame=frames[mark.id],
+            )
+            for mark in made
+        )
+
     def exchanged(self, estimate: Estimate) -> dict[str, str]:
         """Names of what was sighted that turn out to be each other's: false -> right name."""
         if not self.sources or self.config.association.identities == "ignore":
@@ -570,20 +680,17 @@ def smooth(
     pipeline.seconds["final optimisation"] = time.perf_counter() - finishing
     finishing = time.perf_counter()
     runs = {name: run for name, run in sorted(pipeline.runs.items()) if run.started}
-    first = next(iter(runs))
-    start = pipeline.starts[first].pose
-    world = origin_shift(start, runs[first].track.mount)
+    worlds, frames = pipeline.worlds(), pipeline.frames
     causal_only = all(run.is_causal(estimate.states[name]) for name, run in runs.items())
-    estimate = in_world(estimate, world)
-    steps = tuple(step_in_world(step, world) for step in pipeline.steps)
-    robots = {
-        name: run.result(estimate.states[name], start, causal_only=causal_only)
-        for name, run in runs.items()
-    }
+    estimate = worlds.estimate(estimate)
+    steps = tuple(map(worlds.step, pipeline.steps))
+    robots = {}
+    for name, run in runs.items():
+        run.move(-pipeline.places.get(frames[name], 0.0))
+        start = pipeline.starts[frames[name]].pose
+        robots[name] = run.result(estimate.states[name], start, causal_only=causal_only)
     pipeline.seconds["trajectories"] = time.perf_counter() - finishing
-    landmarks: tuple[Landmark, ...] = make_landmarks(
-        pipeline.associator.map.in_world(world), estimate
-    )
+    landmarks = pipeline.landmarks(estimate, worlds)
     t0 = min(trajectory.stamps_ns[0] for trajectory in estimate.states.values())
     innovations = {
         model: np.array([((t - t0) * 1e-9, d2) for t, d2 in values]).reshape(-1, 2)
@@ -611,7 +718,7 @@ def smooth(
             for name, run in runs.items()
         },
         closures=pipeline.recorded.told(),
-        frames=pipeline.recorded.frames,
+        joined=pipeline.joined,
         warnings=run_warnings(pipeline),
         log_s=1e-9 * (pipeline.last_ns - pipeline.first_ns),
     )
@@ -635,6 +742,40 @@ def _passed(pipeline: Pipeline, progress: Progress) -> Pipeline:
         raise LogError(f"{path}: nothing in it could be used; see `graphslam info`")
     pipeline.note_covariances()
     return pipeline
+
+
+def placed(
+    log: LogSet,
+    config: Config,
+    names: Mapping[str, str],
+    starts: Mapping[str, Start],
+    recorded: Recorded,
+) -> Joined:
+    """Where robots start; where that is not known, as what they see in common has it.
+
+    That takes a pass over the log in which every robot is estimated by itself.
+
+    Args:
+        log: opened logs.
+        config: settings.
+        names: see `Pipeline`.
+        starts: those that are known.
+        recorded: what follows from the log's relative poses.
+    """
+    every = {**starts, **recorded.starts}
+    if set(log.robots) <= set(every):
+        return Joined(every, recorded.frames, min(starts, default=""))
+    starts = {r: s for r, s in every.items() if recorded.frames[r] == recorded.frames[min(starts)]}
+    own = origin(config)
+    views: Mapping[str, View] = {}
+    meetings: Sequence[Sighting] = ()
+    if any(topic.record is Sighting for topic in log.topics):
+        apart = Joined.apart(log.robots, own)
+        pipeline = Pipeline(log, replace(config, backend=BackendConfig()), names, joined=apart)
+        pipeline.run(lambda _count: None)
+        if pipeline.steps:
+            views, meetings = pipeline.views(), pipeline.meetings
+    return join(log.robots, views, meetings, starts, config.association, own)
 
 
 def robot_settings(name: str, config: Config, notes: Mapping[str, str]) -> RobotConfig:
@@ -762,9 +903,10 @@ def run_warnings(pipeline: Pipeline) -> list[str]:
         for reason, count in sorted(pipeline.backend.skipped.items())
     ]
     warnings += [
-        f"{name}: nothing says where it was in the frame of {world}; its poses are in a frame of "
-        "its own, which begins where it began"
-        for name, world in pipeline.recorded.own_frames().items()
+        f"{robot}: {pipeline.joined.undecided.get(robot, 'nothing says where it was')}; its poses "
+        f"are in a frame of its own, which begins where it began; --start {robot}=x,y,phi places it"
+        for robot, run in pipeline.runs.items()
+        if run.started and robot == pipeline.frames[robot] != pipeline.joined.world
     ]
     if pipeline.recorded.refused:
         warnings.append(

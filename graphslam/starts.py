@@ -14,7 +14,7 @@ MAX_TRUTH_LAG_NS = 500_000_000
 
 
 def start_poses(log: LogSet, config: Config) -> dict[str, Start]:
-    """Where each robot starts: as given, from one truth sample, or the origin for the first.
+    """Where robots start: as given, from one truth sample; the first at the origin if nothing is.
 
     Raises:
         EstimationError: truth was asked for and a robot has none, or a given pose is malformed.
@@ -31,10 +31,15 @@ def start_poses(log: LogSet, config: Config) -> dict[str, Start]:
                 f"--start {robot}: needs x,y,phi of one of the robots {', '.join(log.robots)}"
             )
         starts[robot] = Start(np.array(pose), given)
-    if log.robots and log.robots[0] not in starts:
-        origin = _cov(start.origin_sigma_m, start.origin_sigma_rad)
-        starts[log.robots[0]] = Start(np.zeros(3), origin)
+    if log.robots and not starts:
+        starts[log.robots[0]] = origin(config)
     return starts
+
+
+def origin(config: Config) -> Start:
+    """Start of a robot at whose first pose a frame has its origin."""
+    sigmas = config.start.origin_sigma_m, config.start.origin_sigma_rad
+    return Start(np.zeros(3), _cov(*sigmas))
 
 
 def _cov(sigma_m: float, sigma_rad: float) -> Array:

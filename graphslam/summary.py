@@ -14,6 +14,7 @@ import numpy as np
 from graphslam import __version__
 from graphslam.config import Config, dump_config
 from graphslam.geometry import Array, between, transform
+from graphslam.joining import Joined
 from graphslam.landmark_map import Entry, LandmarkMap
 from graphslam.logs import LogSet
 from graphslam.records import Estimate, Landmark
@@ -94,7 +95,7 @@ def summarise(
     calibration: Mapping[str, Mapping[str, tuple[float, float, bool]]],
     odometry: Mapping[str, Mapping[str, int]],
     closures: Mapping[str, Any],
-    frames: Mapping[str, str],
+    joined: Joined,
     warnings: Sequence[str],
     log_s: float,
 ) -> dict[str, Any]:
@@ -139,7 +140,9 @@ def summarise(
         },
         "consolidated": {name: counts[name] for name in CONSOLIDATED if name in counts},
         "closures": dict(closures),
-        "frames": dict(frames),
+        "world": joined.world,
+        "frames": dict(sorted(joined.frames.items())),
+        "starts_found": joined.told(),
         "rejected": dict(sorted(rejected.items())),
         "dropped": dict(sorted(all_dropped.items())),
         "repaired": dict(sorted(log.repaired.items())),

@@ -3,8 +3,8 @@
 And what it takes to move a whole result into another world frame.
 """
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -106,25 +106,31 @@ def moved_world(trajectory: Trajectory, world: Array) -> Trajectory:
     return Trajectory(trajectory.stamps_ns, poses, turn @ trajectory.covs @ turn.mT)
 
 
-def in_world(estimate: Estimate, world: Array) -> Estimate:
-    """The same estimate after its world frame was put at ``world`` (3,)."""
-    states = {name: moved_world(t, world) for name, t in estimate.states.items()}
-    turn = rotation3(world[2])
-    landmarks = {}
-    for number, (mean, cov) in estimate.landmarks.items():
-        M = turn[: len(mean), : len(mean)]
-        moved = compose(world, mean) if len(mean) == 3 else transform(world, mean)
-        landmarks[number] = (moved, M @ cov @ M.T)
-    return Estimate(states, landmarks, estimate.error, estimate.dof)
+@dataclass(frozen=True, slots=True, eq=False)
+class Worlds:
+    """World frames (3,) that robots, by name, and landmarks, by number, are put into."""
 
+    robots: Mapping[str, Array]
+    landmarks: Mapping[int, Array]
 
-def step_in_world(step: Step, world: Array) -> Step:
-    """The same step after the world frame was put at ``world`` (3,): its starts move along."""
-    starts = {
-        robot: Start(compose(world, start.pose), rotate_cov(start.cov, world[2]))
-        for robot, start in step.starts.items()
-    }
-    return replace(step, starts=starts)
+    def estimate(self, estimate: Estimate) -> Estimate:
+        """The same estimate after the frames of everything were put there."""
+        states = {n: moved_world(t, self.robots[n]) for n, t in estimate.states.items()}
+        landmarks = {}
+        for number, (mean, cov) in estimate.landmarks.items():
+            world = self.landmarks[number]
+            M = rotation3(world[2])[: len(mean), : len(mean)]
+            moved = compose(world, mean) if len(mean) == 3 else transform(world, mean)
+            landmarks[number] = (moved, M @ cov @ M.T)
+        return Estimate(states, landmarks, estimate.error, estimate.dof)
+
+    def step(self, step: Step) -> Step:
+        """The same step after the frames were put there: its starts move along."""
+        starts = {}
+        for robot, start in step.starts.items():
+            world = self.robots[robot]
+            starts[robot] = Start(compose(world, start.pose), rotate_cov(start.cov, world[2]))
+        return replace(step, starts=starts)
 
 
 def origin_shift(start: Array, mounts: Array) -> Array:

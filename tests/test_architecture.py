@@ -30,8 +30,9 @@ ROWS = (
     # estimators; order in time; poses at any time; worlds and their logs
     ("backends", "simulate", "timeline", "trajectories"),
     # what is known about landmarks beside their estimate; of a robot; where robots start; recorded
-    # steps through an estimator; sightings that share a step; names given to each other's bearers
-    ("exchanged", "gathering", "landmark_map", "replay", "robot_run", "starts"),
+    # steps through an estimator; sightings that share a step; names given to each other's bearers;
+    # robots joined by what they see
+    ("exchanged", "gathering", "joining", "landmark_map", "replay", "robot_run", "starts"),
     # decisions of one image; states and calibration together; places seen twice; duplicates in a
     # map; observations of walls anew; closures that a log brings along; a log of sightings solved
     # again; what a run adds up to

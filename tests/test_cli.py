@@ -319,13 +319,6 @@ def scan_without_odometry(folder):
         log.scan("robot", S, np.ones(181), **SCAN)
 
 
-def two_robots(folder):
-    with LogWriter(folder / "log.mcap") as log:
-        for k in range(10):
-            for robot in ("a", "b"):
-                log.odometry(robot, k * S, (k, 0, 0))
-
-
 def good_log(folder):
     drive(folder / "log.mcap", seconds=2, truth=False)
 
@@ -336,7 +329,6 @@ BAD_LOGS = {
     "empty log": (empty_log, "log.mcap: is an empty log"),
     "no usable topic": (no_usable_topic, r"no usable topic; the log has /camera"),
     "scan without odometry": (scan_without_odometry, "a scan without odometry: .*/scan"),
-    "a robot without a start": (two_robots, "robot b: its start is unknown; give --start b="),
 }
 
 

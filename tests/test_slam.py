@@ -394,9 +394,21 @@ def test_each_robot_starts_where_it_is_said_to(meeting):
         assert_same_pose(result.robots[robot].final.poses[0], start, atol=0.02)
 
 
-def test_an_unknown_start_names_the_robot_and_what_to_do(meeting):
-    with pytest.raises(EstimationError, match=r"robot b: its start is unknown.*--start b=x,y,phi"):
-        run(meeting)
+def test_a_start_that_is_not_given_is_found_by_sightings(meeting):
+    """As exactly as the sightings are, although b's odometry drifts by 0.03 rad/s."""
+    result = run(meeting)
+    assert set(result.summary["starts_found"]) == {"b"}
+    assert_same_pose(result.robots["b"].final.poses[0], START_B, atol=0.02)
+
+
+def test_a_start_that_nothing_tells_is_said_with_what_to_do(meeting):
+    (told,) = [
+        warning
+        for warning in run(meeting, "association.robots=ignore").summary["warnings"]
+        if warning.startswith("b: ")
+    ]
+    assert "frame of its own" in told
+    assert "--start b=x,y,phi" in told
 
 
 @pytest.mark.parametrize("pose", ["[1, 2]", "[1, 2, 3, 4]"])

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 from graphslam.backends.base import Backend, Joint
 from graphslam.backends.dead_reckoning import DeadReckoningBackend
+from graphslam.backends.decentralised import DecentralisedBackend
 from graphslam.backends.ekf import EkfBackend
 from graphslam.backends.factor_ekf import FactorEkfBackend
 from graphslam.backends.fixed_lag import FixedLagBackend
@@ -31,6 +32,7 @@ def with_horizon(config: Config) -> Backend:
 BACKENDS: dict[str, Callable[[Config], Backend]] = {
     "batch": BatchBackend,
     "dead-reckoning": DeadReckoningBackend,
+    "decentralised": DecentralisedBackend,
     "ekf": EkfBackend,
     "invariant-ekf": InvariantEkfBackend,
     "isam2": with_horizon,

@@ -132,7 +132,9 @@ def evaluation(found: Mapping[str, Any]) -> None:
     """Tables of errors: trajectories, landmarks, relations, as far as they were compared."""
     console = _console()
     robots = found.get("robots", {})
-    runs = [*robots.items()] + ([("all together", found["joint"])] if len(robots) > 1 else [])
+    runs = [*robots.items()] + (
+        [("all together", found["joint"])] if len(robots) > 1 and "joint" in found else []
+    )
     rows = [(name, kind, *_trajectory_row(both[kind])) for name, both in runs for kind in both]
     head = ["robot", "", "ATE, m", "aligned, m", "max, m", "heading, deg"]
     head += ["RPE 1 s, m", "RPE 10 m, m", "NEES/dof", "coverage"]
@@ -344,12 +346,12 @@ def _reasons(console: Console, what: str, reasons: Mapping[str, int]) -> None:
 
 
 def _trajectory_row(values: Mapping[str, Any]) -> tuple[object, ...]:
-    coverage = values["coverage"]
+    coverage, heading = values["coverage"], values["heading_rmse_rad"]
     return (
         values["ate_rmse_m"],
         values["ate_aligned_rmse_m"],
         values["max_m"],
-        degrees(values["heading_rmse_rad"]),
+        None if heading is None else degrees(heading),
         values["rpe"]["1_s"]["trans_rmse_m"],
         values["rpe"]["10_m"]["trans_rmse_m"],
         values["nees_per_dof"],

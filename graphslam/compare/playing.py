@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from graphslam.backends import BACKENDS
+from graphslam.backends.decentralised import exchanged_bytes
 from graphslam.config import Config
 from graphslam.errors import EstimationError
 from graphslam.geometry import Array
@@ -27,7 +28,8 @@ WARM_UP = 20
 class Played:
     """A replay, and the largest size of the process, MB, before and after it.
 
-    ``skipped``: what of the steps the back end could not use, counted by reason.
+    ``skipped``: what of the steps the back end could not use, counted by reason. ``exchanged``:
+    bytes that each robot sent and bytes that it measured; None where there is one estimate of all.
     """
 
     replay: Replay
@@ -35,6 +37,7 @@ class Played:
     skipped: Mapping[str, int]
     before_mb: float
     peak_mb: float
+    exchanged: tuple[Mapping[str, int], Mapping[str, int]] | None = None
 
 
 def play(steps: Sequence[Step], config: Config) -> Played:
@@ -49,7 +52,8 @@ def play(steps: Sequence[Step], config: Config) -> Played:
     before = _peak_mb()
     backend = BACKENDS[config.backend.name](config)
     done = replay(steps, backend)
-    return Played(done, backend.error_frame, dict(backend.skipped), before, _peak_mb())
+    told, skipped = exchanged_bytes(backend), dict(backend.skipped)
+    return Played(done, backend.error_frame, skipped, before, _peak_mb(), told)
 
 
 def play_apart(steps: Sequence[Step], config: Config) -> Played:

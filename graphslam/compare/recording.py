@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphslam.config import Config
-from graphslam.errors import LogError
+from graphslam.errors import EstimationError, LogError
 from graphslam.geometry import Array
 from graphslam.landmark_map import LandmarkMap
 from graphslam.logs import LogSet
@@ -17,19 +17,21 @@ from graphslam.results import SavedResult, SavedRobot
 from graphslam.robot_run import RobotRun
 from graphslam.slam import Pipeline, Progress, check_robots
 from graphslam.summary import make_landmarks
-from graphslam.trajectories import in_world, origin_shift
+from graphslam.trajectories import Worlds
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
     """The steps of one run over a log, and what turns states into trajectories and a map.
 
-    ``start`` (3,) is where the prior put the first robot; ``seconds`` the wall time of the run.
+    ``start`` (3,) is where the prior put the robot that defines the world frame, ``worlds`` what
+    takes estimates there; ``seconds`` the wall time of the run.
     """
 
     steps: tuple[Step, ...]
     runs: Mapping[str, RobotRun]
     start: Array
+    worlds: Worlds
     landmarks: LandmarkMap
     seconds: float
 
@@ -53,8 +55,7 @@ class Recording:
 
         The odometry between the states, the calibration and the mounts are those of the recording.
         """
-        world = origin_shift(self.start, next(iter(self.runs.values())).track.mount)
-        estimate = in_world(done.estimate, world)
+        estimate = self.worlds.estimate(done.estimate)
         runs = {
             name: replace(
                 run,
@@ -70,7 +71,8 @@ class Recording:
             robots[name] = SavedRobot(
                 found.final, found.causal, found.scan_final, found.scan_causal
             )
-        landmarks = make_landmarks(self.landmarks.in_world(world), estimate)
+        moved = self.landmarks.in_worlds(self.worlds.landmarks)
+        landmarks = make_landmarks(moved, estimate)
         return SavedResult(robots, landmarks, {}, config)
 
 
@@ -88,11 +90,17 @@ def record(log: LogSet, config: Config, progress: Progress = lambda _count: None
     pipeline.run(progress)
     if not pipeline.steps:
         raise LogError(f"{log.files[0].path}: nothing in it could be used; see `graphslam info`")
+    if pipeline.places:
+        raise EstimationError(
+            f"robot {min(pipeline.places)}: its start is unknown and nothing in the log tells it; "
+            f"back ends are compared in one frame: give --start {min(pipeline.places)}=x,y,phi"
+        )
     runs = {name: run for name, run in sorted(pipeline.runs.items()) if run.started}
     return Recording(
         tuple(pipeline.steps),
         runs,
-        pipeline.starts[next(iter(runs))].pose,
+        pipeline.starts[pipeline.joined.world].pose,
+        pipeline.worlds(),
         pipeline.associator.map,
         time.perf_counter() - began,
     )

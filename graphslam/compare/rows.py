@@ -176,6 +176,12 @@ class _Run:
                 "path": growth_exponent(self.path_m, done.step_ms),
             },
         }
+        if played.exchanged is not None:
+            sent, measured = played.exchanged
+            self.row["exchanged"] = {
+                robot: {"sent_bytes": sent[robot], "measured_bytes": measured[robot]}
+                for robot in sorted(sent)
+            }
         return self
 
     def judge(

@@ -10,7 +10,13 @@ from graphslam.config import Config, load_config
 from graphslam.errors import ConfigError
 
 #: how back ends are called in tables; others go by the name in `BACKENDS`
-NAMES = {"batch": "Batch", "dead-reckoning": "Dead reckoning", "ekf": "EKF", "isam2": "iSAM2"}
+NAMES = {
+    "batch": "Batch",
+    "dead-reckoning": "Dead reckoning",
+    "decentralised": "Decentralised",
+    "ekf": "EKF",
+    "isam2": "iSAM2",
+}
 
 
 @dataclass(frozen=True, slots=True)

@@ -185,7 +185,9 @@ def quality(evaluation: Mapping[str, Any]) -> str:
     parts = []
     robots = evaluation.get("robots", {})
     if robots:
-        runs = [*robots.items()] + ([("all", evaluation["joint"])] if len(robots) > 1 else [])
+        runs = [*robots.items()] + (
+            [("all", evaluation["joint"])] if len(robots) > 1 and "joint" in evaluation else []
+        )
         rows = [
             (f"{name}, {kind}", *_trajectory_row(both[kind]))
             for name, both in runs
@@ -217,12 +219,12 @@ def quality(evaluation: Mapping[str, Any]) -> str:
 
 
 def _trajectory_row(found: Mapping[str, Any]) -> tuple[object, ...]:
-    bounds = found["nees_bounds"]
+    bounds, heading = found["nees_bounds"], found["heading_rmse_rad"]
     return (
         found["ate_rmse_m"],
         found["ate_aligned_rmse_m"],
         found["max_m"],
-        float(np.degrees(found["heading_rmse_rad"])),
+        None if heading is None else float(np.degrees(heading)),
         found["rpe"]["1_s"]["trans_rmse_m"],
         found["rpe"]["10_m"]["trans_rmse_m"],
         found["nees_per_dof"],

@@ -1,0 +1,79 @@
+"""What a graph per robot and condensed messages cost against one graph of all robots.
+
+The same recorded steps go into both, by `graphslam compare`, for several times between messages:
+MRCLAM set 6, from the true start poses, and the thesis' two robots with lasers (simulated). Errors
+are root mean squares over all robots, from the centralised estimate ("loss") and from the truth, m;
+kB are what each robot sends on average, and what it measured; s is the time of the replay.
+
+Run: python benchmarks/decentralised.py [mrclam|two-robots ...] [SECONDS ...]
+The data are taken from GRAPHSLAM_DATA (default: ../shared/data beside the repository).
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+DATA = Path(os.environ.get("GRAPHSLAM_DATA", ROOT / "../shared/data"))
+LOGS = {
+    "mrclam": ["import", "mrclam", str(DATA / "mrclam/MRCLAM_Dataset6.tar.xz")],
+    "two-robots": ["simulate", "two-robots", "--seed", "0"],
+}
+PERIODS_S = ("10", "30", "120")
+
+
+def command(*arguments: str) -> str:
+    """Standard output of a graphslam command."""
+    return subprocess.run(
+        [sys.executable, "-m", "graphslam", *arguments], check=True, capture_output=True, text=True
+    ).stdout
+
+
+def show(row: dict) -> None:
+    """One line of the table."""
+    if row["error"]:
+        print(f"{row['label']:52} {row['error']}", flush=True)
+        return
+    final, causal = row["joint"]["final"], row["joint"]["causal"]
+    told = row.get("exchanged", {}).values()
+    sent, measured = (
+        f"{sum(one[key] for one in told) / len(told) / 1e3:7.0f}" if told else "      -"
+        for key in ("sent_bytes", "measured_bytes")
+    )
+    loss = row["difference"]["final"]["rmse_m"]
+    print(
+        f"{row['label']:52} {final['ate_rmse_m']:7.4f} {final['nees_per_dof']:6.2f} {loss:7.4f} "
+        f"{causal['ate_rmse_m']:7.4f} {causal['nees_per_dof']:6.2f} {sent} {measured} "
+        f"{row['total_s']:6.1f}",
+        flush=True,
+    )
+
+
+def main(names: list[str], periods_s: list[str]) -> None:
+    """Print the tables."""
+    specs = ["batch", *(f"decentralised+backend.exchange_s={t}" for t in periods_s)]
+    with tempfile.TemporaryDirectory() as scratch:
+        for name in names:
+            log = Path(scratch) / f"{name}.mcap"
+            command(*LOGS[name], "-o", str(log))
+            found = command(
+                *("compare", str(log), "--start", "truth", "--backends", ",".join(specs)),
+                *("-o", str(Path(scratch) / name), "--json"),
+            )
+            print(
+                f"{name:52}   final   NEES    loss  causal   NEES kB sent kB meas.      s",
+                flush=True,
+            )
+            for row in json.loads(found)["rows"]:
+                show(row)
+
+
+if __name__ == "__main__":
+    given = sys.argv[1:]
+    main(
+        [name for name in given if name in LOGS] or list(LOGS),
+        [name for name in given if name not in LOGS] or list(PERIODS_S),
+    )
