@@ -343,7 +343,7 @@ class _Joint:
             for t in sorted({*self._starts, *self._motions, *at})
         ]
 
-    def _misfit(self, k: int, used: bool, backend: BatchBackend, estimate: Estimate) -> float:
+    def _misfit(self, k: int, used: bool, backend: Resolver, estimate: Estimate) -> float:
         """Squared Mahalanobis distance of a closure from what all others say.
 
         In units of the closure's own sigmas, along directions in which the estimate is independent:
