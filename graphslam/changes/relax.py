@@ -144,7 +144,7 @@ def _rotations(angle: Array) -> Array:
 
 
 def _solved(blocks: list[tuple[Ints, Ints, Array]], right: Array) -> Array:
-    """Solution (s, 3) of a system of 3 x 3 blocks, each list of them with their rows and columns."""
+    """Solution (s, 3) of a system of 3 x 3 blocks, lists of them with rows and columns."""
     three = np.arange(3)
     parts = []
     for rows, columns, values in blocks:
