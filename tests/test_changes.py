@@ -14,6 +14,7 @@ from graphslam.changes import changes_between, compare, load_visit, visit_of
 from graphslam.changes.alignment import align
 from graphslam.changes.compare import lasers_differ, same_frame
 from graphslam.changes.evidence import past
+from graphslam.changes.flexed import flexed
 from graphslam.changes.grid import Grid, distinct, grid_over, nearest_of
 from graphslam.changes.localisation import overlays
 from graphslam.changes.overlay import overlay_map
@@ -275,6 +276,23 @@ def test_evidence_is_one_sided():
     assert past(new, a, new.incidence, SIGMA, CONFIG).passed.sum() > 100
 
 
+def test_what_is_tested_has_a_time_of_being_seen():
+    """A wall that went back by less than one beam can tell: every tested piece was met sometime.
+
+    Breaks if a piece that no single beam went clearly past keeps the largest integer as its time.
+    """
+    rng = np.random.default_rng(21)
+    low, high = box(5, 4, 0.6, 0.50), box(5, 4.1, 0.6, 0.4)
+    a, b = visit([low], drive(60), rng), visit([high], drive(60), rng)
+    grid = grid_over(a.ends, 0.025, 10**6)
+    old = surface_of(a, grid, SIGMA, CONFIG)
+    wide = replace(CONFIG, gate_m=0.3)
+    found = past(old, b, old.incidence, SIGMA, wide)
+    back = found.tested & (found.offset > 0.06)
+    assert back.any()
+    assert (found.first_ns[found.tested] <= b.stamps_ns.max()).all()
+
+
 def test_no_overlap_is_one_clear_line():
     rng = np.random.default_rng(9)
     a = visit([], drive(20), rng)
@@ -489,6 +507,38 @@ def test_a_bent_path_is_made_straight_by_its_scans():
     left = np.abs(wrap(straightened(crooked).poses[:, 2] - poses[:, 2])).max()
     assert away > 0.2
     assert left < 0.2 * away
+
+
+@pytest.mark.parametrize("turn_deg", [-12.0, 12.0])
+def test_the_shape_is_that_of_the_scans_wherever_the_path_jumped(turn_deg):
+    """A path that was torn by a wrong match: from either side the same shape comes out.
+
+    1 degree is a tenth of the jump; what is left is the scans' noise. Breaks if the smoothed motion
+    is believed where it jumps, or only the scans just before are asked.
+    """
+    rng = np.random.default_rng(22)
+    poses = drive(120)
+    a = visit([box(5, 4), box(1, 1, 0.8, 0.4)], poses, rng, (1e-4, 1e-4, 1e-5))
+    torn = a.poses.copy()
+    jump = compose(torn[59], np.array([0.0, 0.0, np.radians(turn_deg)]))
+    torn[60:] = compose(jump, between(torn[59], torn[60:]))
+    found = straightened(replace(a, poses=torn)).poses
+    assert np.abs(wrap(found[:, 2] - poses[:, 2])).max() < np.radians(1.0)
+    assert np.hypot(*(found - poses)[:, :2].T).max() < 0.05
+
+
+def test_a_path_follows_a_map_that_bends_within_a_few_metres():
+    """One motion for all scans leaves decimetres; bending the path by as little leaves few cm."""
+    rng = np.random.default_rng(23)
+    things = [box(5, 4), box(1, 1, 0.8, 0.4)]
+    a = visit(things, drive(120), rng, (1e-4, 1e-4, 1e-5))
+    crooked = bent(a, 0.03)
+    surface = surface_of(a, grid_over(a.ends, 0.025, 10**6), SIGMA, CONFIG)
+    placed = flexed(crooked, crooked.poses, surface, (0.5, 0.5, 0.4, 0.3, 0.2, 0.1))
+    off = np.hypot(*(crooked.poses - a.poses)[:, :2].T).max()
+    left = np.hypot(*(placed.poses - a.poses)[:, :2].T).max()
+    assert left < 0.03
+    assert left < 0.3 * off
 
 
 def test_maps_are_laid_over_each_other_from_any_pose():

@@ -37,25 +37,11 @@ def align(
     prior = np.linalg.inv(visit.covs + 1e-10 * np.eye(3))
     start, now, covs = visit.poses, visit, visit.covs
     for gate in gates_m:
-        ends = now.ends[beams]
-        row, e, found = offsets(surface, ends, gate)
-        scan = visit.scan[beams][found]
-        n, arm = surface.normals[row], ends[found] - now.poses[scan, :2]
-        J = np.column_stack([n, -n[:, 0] * arm[:, 1] + n[:, 1] * arm[:, 0]])
-        variance = _LEAST_SIGMA_M**2 + surface.noise[row]
-        weight = 1 / variance / (1 + (2 * e / gate) ** 2) ** 2
-        terms = [weight * J[:, a] * J[:, b] for a, b in _UPPER]
-        terms += [weight * J[:, a] * -e for a in range(3)]
-        sums = np.column_stack([np.bincount(scan, t, len(start)) for t in terms])
-        information, right = prior.copy(), sums[:, 6:]
-        for k, (a, b) in enumerate(_UPPER):
-            information[:, a, b] += sums[:, k]
-            if a != b:
-                information[:, b, a] += sums[:, k]
+        information, right = pulls(now, surface, beams, gate)
         away = start - now.poses
         away[:, 2] = wrap(away[:, 2])
+        covs = np.asarray(np.linalg.inv(prior + information))
         right = right + np.einsum("nij,nj->ni", prior, away)
-        covs = np.linalg.inv(information)
         poses = now.poses + np.einsum("nij,nj->ni", covs, right)
         poses[:, 2] = wrap(poses[:, 2])
         now = replace(now, poses=poses)
@@ -65,6 +51,34 @@ def align(
 
 
 _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+def pulls(visit: Visit, surface: Surface, beams: Ints, gate_m: float) -> tuple[Array, Array]:
+    """How beams pull their scans' poses onto a surface map: normal equations per scan.
+
+    Args:
+        visit: scans in the frame of the surfaces.
+        surface: what to agree with.
+        beams: (k,) which have a say.
+        gate_m: farthest a return may lie from its surface to count.
+
+    Returns:
+        Information (s, 3, 3) and right-hand side (s, 3); the step is the solution of both.
+    """
+    ends, size = visit.ends[beams], len(visit.poses)
+    row, e, found = offsets(surface, ends, gate_m)
+    scan = visit.scan[beams][found]
+    n, arm = surface.normals[row], ends[found] - visit.poses[scan, :2]
+    J = np.column_stack([n, -n[:, 0] * arm[:, 1] + n[:, 1] * arm[:, 0]])
+    variance = _LEAST_SIGMA_M**2 + surface.noise[row]
+    weight = 1 / variance / (1 + (2 * e / gate_m) ** 2) ** 2
+    information, right = np.empty((size, 3, 3)), np.empty((size, 3))
+    for a, b in _UPPER:
+        total = np.bincount(scan, weight * J[:, a] * J[:, b], size)
+        information[:, a, b] = information[:, b, a] = total
+    for a in range(3):
+        right[:, a] = np.bincount(scan, weight * J[:, a] * -e, size)
+    return information, right
 
 
 def offsets(surface: Surface, ends: Array, gate_m: float) -> tuple[Ints, Array, Ints]:

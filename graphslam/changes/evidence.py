@@ -46,7 +46,8 @@ class Evidence:
         count: (n,) beams in the window.
         passed: (n,) beams among them that went through.
         tested: (n,) whether enough beams tell.
-        first_ns: (n,) stamp of the first scan with a beam that went past; int64 max for none.
+        first_ns: (n,) stamp of the first scan with a beam that went clearly past, or else of the
+            first that met its window; int64 max only where nothing was tested.
     """
 
     beams: Ints
@@ -116,9 +117,15 @@ def past(
     bias = config.bias_sigma_m * (sum_cos / safe - incidence_of)
     variance = white + surface.offset_cov + pose + surface.pose_var + bias**2
     tested = surface.good & (count >= config.min_beams)
-    first = np.full(n, np.iinfo(np.int64).max)
+    never = np.iinfo(np.int64).max
+    first, met, stamps = np.full(n, never), np.full(n, never), visit.stamps_ns[visit.scan[beam]]
     beyond = e > 0.5 * config.gate_m
-    np.minimum.at(first, row[beyond], visit.stamps_ns[visit.scan[beam[beyond]]])
+    np.minimum.at(first, row[beyond], stamps[beyond])
+    np.minimum.at(met, row, stamps)
+    # what lies less far off than one beam can tell was first seen when its window was first met
+    padded = np.concatenate([met, [never]])
+    met = np.min([padded[place] for place in inner], axis=0)
+    first = np.where(first == never, met, first)
     return Evidence(beam, row, mean, variance, count, through, tested, first)
 
 

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from graphslam.changes.alignment import align
+from graphslam.changes.flexed import flexed
 from graphslam.changes.grid import grid_over
 from graphslam.changes.registration import Registration
 from graphslam.changes.straighten import straightened
@@ -28,6 +29,7 @@ _STEP_SIGMAS = np.array([0.08, 0.08, np.radians(2.0)])
 #: sigmas that are stated of a placed scan: of a map that bends they are no more than a bound
 _PLACED_SIGMAS = np.array([0.02, 0.02, np.radians(0.5)])
 _GATES = (0.5, 0.4, 0.3, 0.2, 0.15, 0.1)
+_FLEX_GATES = tuple(np.repeat([0.5, 0.4, 0.3, 0.2, 0.15, 0.1], 3))
 #: scans that are placed together, as the motion between them is known well enough, and with how
 #: many before them
 _TOGETHER, _WINDOW = 5, 30
@@ -69,6 +71,7 @@ def localise(
     best = (0.0, later, np.zeros(len(later.poses)))
     for pose, start in _starts(surface, reference, later):
         tracked = _tracked(surface, later, pose, start)
+        tracked = flexed(tracked, later.poses, surface, _FLEX_GATES)
         share = agreement(surface, tracked)
         if (share > _SCAN_SHARE).mean() > best[0]:
             best = (float((share > _SCAN_SHARE).mean()), tracked, share)
