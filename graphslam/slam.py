@@ -56,7 +56,7 @@ from graphslam.records import (
     Truth,
 )
 from graphslam.refining import refine
-from graphslam.robot_run import RobotRun
+from graphslam.robot_run import RobotRun, span_warnings
 from graphslam.starts import start_poses
 from graphslam.summary import make_landmarks, summarise
 from graphslam.timeline import ODOMETRY, synchronise
@@ -712,6 +712,10 @@ def run_warnings(pipeline: Pipeline) -> list[str]:
         for a, b in pipeline.names.items()
         if a < b
     ]
+    warnings += span_warnings(
+        {name: run.track for name, run in pipeline.runs.items()},
+        unplaced=pipeline.dropped["sighting: no odometry near it"] > 0,
+    )
     warnings += [
         f"the back end could not use {count} x {reason}"
         for reason, count in sorted(pipeline.backend.skipped.items())
