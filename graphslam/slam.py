@@ -642,8 +642,8 @@ def make_tracks(log: LogSet, config: Config) -> dict[str, Track]:
 def verify_recorded(log: LogSet, config: Config, starts: Mapping[str, Start]) -> Recorded:
     """Which relative poses of a log to believe, by all of it; starts that follow from them.
 
-    Robots that nothing else could place keep a frame of their own. That takes a pass over the
-    odometry, which is made only where there are relative poses.
+    In a log of nothing but relative poses, robots that these do not place keep a frame of their
+    own. That takes a pass over the odometry, which is made only where there are relative poses.
     """
     kinds = {topic.record for topic in log.topics}
     messages: list[RelativePose] = []
@@ -660,7 +660,7 @@ def verify_recorded(log: LogSet, config: Config, starts: Mapping[str, Start]) ->
     if kinds & {Scan, Sighting}:
         # these may place a robot too: its start is asked for where it is needed
         found = {robot: start for robot, start in found.items() if frames[robot] != robot}
-    else:
+    elif RelativePose in kinds:
         for robot in set(log.robots) - {*starts, *found}:
             found[robot], frames[robot] = own_frame(), robot
     world = min(starts, default="")
