@@ -1,11 +1,12 @@
 """What a run keeps for one robot while the log goes by, and the trajectories it becomes."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from graphslam.calibration import Calibrator, told
-from graphslam.dead_reckoning import Track
+from graphslam.dead_reckoning import EDGE_NS, Track
 from graphslam.geometry import Array, between, compose, inverse
 from graphslam.matching import Submap
 from graphslam.models.motion import Calibration
@@ -128,3 +129,28 @@ class RobotRun:
         period = round(1e9 / BASE_RATE_HZ)
         times = np.arange(self.track.first_ns, self.track.last_ns + 1, period)
         return times, times, np.zeros((0, 3))
+
+
+def span_warnings(tracks: Mapping[str, Track], *, unplaced: bool) -> list[str]:
+    """Robots whose odometry does not cover the time of the others', one line each.
+
+    Args:
+        tracks: of every robot, whole.
+        unplaced: whether sightings were dropped since no odometry is near them; without any it does
+            not matter that one robot was switched on before another.
+    """
+    spans = {name: (t.first_ns, t.last_ns) for name, t in tracks.items() if len(t)}
+    if len(spans) < 2:
+        return []
+    begin, end = min(a for a, _ in spans.values()), max(b for _, b in spans.values())
+    lines = []
+    for name, (a, b) in spans.items():
+        part = f"its odometry covers {1e-9 * (a - begin):.1f} to {1e-9 * (b - begin):.1f} s of "
+        part += f"{1e-9 * (end - begin):.1f} s"
+        if not any(a <= d and c <= b for other, (c, d) in spans.items() if other != name):
+            lines.append(f"{name}: {part}, no time of which is another robot's; are clocks right?")
+        elif unplaced and max(a - begin, end - b) > EDGE_NS:
+            lines.append(
+                f"{name}: {part}; what it saw, and who saw it, outside of that is not used"
+            )
+    return lines

@@ -66,7 +66,7 @@ from graphslam.records import (
     Truth,
 )
 from graphslam.refining import refine
-from graphslam.robot_run import RobotRun
+from graphslam.robot_run import RobotRun, span_warnings
 from graphslam.scan_motion import beside_lines, checked, measured, scan_submap
 from graphslam.starts import origin, start_poses
 from graphslam.summary import make_landmarks, summarise
@@ -822,8 +822,8 @@ def make_tracks(log: LogSet, config: Config) -> dict[str, Track]:
 def verify_recorded(log: LogSet, config: Config, starts: Mapping[str, Start]) -> Recorded:
     """Which relative poses of a log to believe, by all of it; starts that follow from them.
 
-    Robots that nothing else could place keep a frame of their own. That takes a pass over the
-    odometry, which is made only where there are relative poses.
+    In a log of nothing but relative poses, robots that these do not place keep a frame of their
+    own. That takes a pass over the odometry, which is made only where there are relative poses.
     """
     kinds = {topic.record for topic in log.topics}
     messages: list[RelativePose] = []
@@ -840,7 +840,7 @@ def verify_recorded(log: LogSet, config: Config, starts: Mapping[str, Start]) ->
     if kinds & {Scan, Sighting}:
         # these may place a robot too: its start is asked for where it is needed
         found = {robot: start for robot, start in found.items() if frames[robot] != robot}
-    else:
+    elif RelativePose in kinds:
         for robot in set(log.robots) - {*starts, *found}:
             found[robot], frames[robot] = own_frame(), robot
     world = min(starts, default="")
@@ -898,6 +898,10 @@ def run_warnings(pipeline: Pipeline) -> list[str]:
         for a, b in pipeline.names.items()
         if a < b
     ]
+    warnings += span_warnings(
+        {name: run.track for name, run in pipeline.runs.items()},
+        unplaced=pipeline.dropped["sighting: no odometry near it"] > 0,
+    )
     warnings += [
         f"the back end could not use {count} x {reason}"
         for reason, count in sorted(pipeline.backend.skipped.items())
