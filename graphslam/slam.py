@@ -50,6 +50,7 @@ from graphslam.records import (
     Result,
     Scan,
     Sighting,
+    Start,
     Step,
     Trajectory,
     TrueLandmark,
@@ -109,7 +110,7 @@ class Pipeline:
             for name in log.robots
         }
         began = time.perf_counter()
-        self.joined = joined or placed(log, config, self.names)
+        self.joined = joined or placed(log, config, self.names, start_poses(log, config))
         self.starts, self.frames = self.joined.starts, self.joined.frames
         roots = sorted(set(self.frames.values()) - {self.joined.world})
         self.places = {frame: (k + 1) * FRAMES_APART_M for k, frame in enumerate(roots)}
@@ -668,15 +669,17 @@ def _passed(pipeline: Pipeline, progress: Progress) -> Pipeline:
     return pipeline
 
 
-def placed(log: LogSet, config: Config, names: Mapping[str, str]) -> Joined:
-    """Where robots start; where that is not known, as what they see in common has it.
+def placed(
+    log: LogSet, config: Config, names: Mapping[str, str], starts: Mapping[str, Start]
+) -> Joined:
+    """Where all robots start, of which the ``starts`` of some are known.
 
-    That takes a pass over the log in which every robot is estimated by itself.
+    The others are put where what they see in common has them. That takes a pass over the log in
+    which every robot is estimated by itself.
 
     Raises:
-        EstimationError: truth was asked for and a robot has none, or a given pose is malformed.
+        EstimationError: the estimate of a robot by itself is indeterminate.
     """
-    starts = start_poses(log, config)
     if set(log.robots) <= set(starts):
         return Joined.known(starts)
     own = origin(config)
