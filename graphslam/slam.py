@@ -751,9 +751,10 @@ def placed(
     starts: Mapping[str, Start],
     recorded: Recorded,
 ) -> Joined:
-    """Where robots start; where that is not known, as what they see in common has it.
+    """Where all robots start, of which the ``starts`` of some are known.
 
-    That takes a pass over the log in which every robot is estimated by itself.
+    The others are put where what they see in common has them. That takes a pass over the log in
+    which every robot is estimated by itself.
 
     Args:
         log: opened logs.
@@ -761,6 +762,9 @@ def placed(
         names: see `Pipeline`.
         starts: those that are known.
         recorded: what follows from the log's relative poses.
+
+    Raises:
+        EstimationError: the estimate of a robot by itself is indeterminate.
     """
     every = {**starts, **recorded.starts}
     if set(log.robots) <= set(every):

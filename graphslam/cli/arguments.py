@@ -119,7 +119,7 @@ Starts = Annotated[
         metavar="truth|ROBOT=x,y,phi",
         callback=check_start,
         help="Where a robot starts (m, m, rad), or one true pose per robot from the log; "
-        "repeatable. Default: the first robot is the origin.",
+        "repeatable. Default: the first robot is the origin, others as their sightings have it.",
     ),
 ]
 ConfigFile = Annotated[Path | None, typer.Option("--config", metavar="FILE.toml", help="Settings.")]
