@@ -11,6 +11,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -24,9 +25,11 @@ from graphslam.dead_reckoning import Track
 from graphslam.errors import ConfigError, EstimationError, LogError
 from graphslam.exchanged import exchanged_names, renamed
 from graphslam.frontend import FRONT_ENDS, scan_points
+from graphslam.frontend.robots import outline_of
 from graphslam.frontend.sightings import sighting_observation
 from graphslam.gathering import Gathered, Sources, carried, gather, met, shared, ways
 from graphslam.geometry import (
+    Array,
     compose,
     compose_cov,
     inverse,
@@ -58,11 +61,16 @@ from graphslam.starts import start_poses
 from graphslam.summary import make_landmarks, summarise
 from graphslam.timeline import ODOMETRY, synchronise
 from graphslam.trajectories import in_world, origin_shift, step_in_world
+from graphslam.watching import Watcher
 
 #: scans in the picture at most
 MAX_PICTURES = 4000
 
+#: s: sigma of the difference of two robots' clocks before anything is known
+CLOCK_DOUBT_S = 0.5
+
 Progress = Callable[[int], None]
+Settings = TypeVar("Settings", OdometryConfig, RobotConfig)
 
 
 class Pipeline:
@@ -92,6 +100,9 @@ class Pipeline:
             for name in log.robots
         }
         self.starts = start_poses(log, config)
+        self.watcher = Watcher(
+            self.backend, self.runs, outlines(log, config), config.front_end, CLOCK_DOUBT_S
+        )
         self.steps: list[Step] = []
         self.sources: Sources = {}
         self.pictures: list[Picture] = []
@@ -111,6 +122,7 @@ class Pipeline:
             tracks,
             self.config.odometry.max_gap_s,
             self.dropped,
+            tuple(self.watcher.outlines),
         )
         # one robot has nobody to share a step with, and a scan makes its own
         alone = len(tracks) < 2 or any(map(self.log.has_scans, tracks))
@@ -221,7 +233,14 @@ class Pipeline:
             self.start(first.robot, min(run.track.first_ns, time_ns))
         run.scans += [(m.stamp_ns, m.time_ns, m.mount) for m in event if isinstance(m, Scan)]
         self.counts["scans"] += isinstance(first, Scan)
-        if not self.is_used(event):
+        used = self.is_used(event)
+        if isinstance(first, Scan):
+            event = self.watcher.look(first, used, self.has_started)
+            if self.config.association.robots == "ignore":
+                event = [m for m in event if isinstance(m, Scan)]
+        elif not used:
+            event = ()
+        if not event:
             return  # its pose follows from the states around it
         motion = self.motion_since_state(first.robot, time_ns)
         own_state = self.gets_state(event)
@@ -252,6 +271,13 @@ class Pipeline:
         self.backend.add(step)
         self.steps.append(step)
         self.note_state(robot, time_ns)
+
+    def has_started(self, robot: str, time_ns: int) -> bool:
+        """Whether a robot has a state at ``time_ns``, given one if it is known where it starts."""
+        run = self.runs[robot]
+        if not run.started and robot in self.starts and len(run.track):
+            self.start(robot, min(run.track.first_ns, time_ns))
+        return run.started
 
     def motion_since_state(self, robot: str, time_ns: int) -> Motion | None:
         """Motion since the robot's last state; None when it is at that very time."""
@@ -565,12 +591,16 @@ def _passed(pipeline: Pipeline, progress: Progress) -> Pipeline:
     return pipeline
 
 
+def outlines(log: LogSet, config: Config) -> dict[str, Array]:
+    """Robot -> corners (k, 2), m, of those whose outline is known."""
+    known = {name: robot_settings(name, config, log.notes).outline for name in log.robots}
+    return {name: outline_of(corners) for name, corners in known.items() if corners}
+
+
 def robot_settings(name: str, config: Config, notes: Mapping[str, str]) -> RobotConfig:
-    """Settings of a robot: the configuration's, else what the log's notes say of its geometry."""
-    if {name, "default"} & set(config.robots):
-        return config.robot(name)
+    """Settings of a robot: the configuration's where set, else what the log's notes say of it."""
     noted = [f"{key}={value}" for key, value in notes.items() if key.startswith(f"robots.{name}.")]
-    return load_config(overrides=noted).robot(name)
+    return _noted(config.robot(name), load_config(overrides=noted).robot(name), RobotConfig())
 
 
 def odometry_settings(config: OdometryConfig, notes: Mapping[str, str]) -> OdometryConfig:
@@ -580,9 +610,13 @@ def odometry_settings(config: OdometryConfig, notes: Mapping[str, str]) -> Odome
     whoever wrote the log knows, as with the noise of sightings.
     """
     noted = [f"{key}={value}" for key, value in notes.items() if key.startswith("odometry.")]
-    known, default = load_config(overrides=noted).odometry, OdometryConfig()
+    return _noted(config, load_config(overrides=noted).odometry, OdometryConfig())
+
+
+def _noted(config: Settings, noted: Settings, default: Settings) -> Settings:
+    """Settings as in ``config``, as in ``noted`` where they are the default."""
     changes = {
-        field.name: getattr(known, field.name)
+        field.name: getattr(noted, field.name)
         for field in dataclasses.fields(config)
         if getattr(config, field.name) == getattr(default, field.name)
     }
@@ -624,7 +658,8 @@ def run_warnings(pipeline: Pipeline) -> list[str]:
         f"{name}: its wheel radii and axle are not set; the defaults of robots.{name}.* were used"
         for name, run in pipeline.runs.items()
         if run.track.source == "wheels"
-        and robot_settings(name, pipeline.config, pipeline.log.notes) == RobotConfig()
+        and replace(robot_settings(name, pipeline.config, pipeline.log.notes), outline=())
+        == RobotConfig()
     ]
     warnings += [
         f"{a} and {b}: bore each other's code in all sightings; their names were exchanged back"

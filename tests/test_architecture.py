@@ -31,8 +31,8 @@ ROWS = (
     # steps through an estimator; sightings that share a step; names given to each other's bearers
     ("exchanged", "gathering", "landmark_map", "replay", "robot_run", "starts"),
     # decisions of one image; places seen twice; duplicates in a map; observations of walls anew; a
-    # log of sightings solved again; what a run adds up to
-    ("associator", "closing", "merging", "reassociating", "refining", "summary"),
+    # log of sightings solved again; what a run adds up to; robots in each other's scans
+    ("associator", "closing", "merging", "reassociating", "refining", "summary", "watching"),
     ("consolidating",),  # a log of scans solved again
     ("slam",),  # the pipeline
     ("results",),  # a result as a folder, and back
