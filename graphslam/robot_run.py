@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from graphslam.calibration import Calibrator, told
+from graphslam.clocks import Clock
 from graphslam.dead_reckoning import Track
 from graphslam.geometry import Array, between, compose, inverse
 from graphslam.models.motion import Calibration
@@ -22,7 +23,8 @@ class RobotRun:
     ``times`` of the states, ns; per state the causal pose, its covariance and the calibration that
     was known; ``scans`` (stamp, time, mount), ``scanned_ns`` the last one that was used. The
     states are rigid to the sensor: the base is where the calibration puts it. ``refined``: the
-    track's calibration is one that was estimated together with all states.
+    track's calibration is one that was estimated together with all states. Times are the common
+    clock's, stamps those of the robot's own ``clock``.
     """
 
     track: Track
@@ -35,6 +37,7 @@ class RobotRun:
     calibrations: list[Calibration] = field(default_factory=list)
     scans: list[tuple[int, int, Array]] = field(default_factory=list)
     refined: bool = False
+    clock: Clock = field(default_factory=Clock)
 
     @property
     def started(self) -> bool:
@@ -116,4 +119,4 @@ class RobotRun:
             return stamps, times, np.array([scan[2] for scan in scans])
         period = round(1e9 / BASE_RATE_HZ)
         times = np.arange(self.track.first_ns, self.track.last_ns + 1, period)
-        return times, times, np.zeros((0, 3))
+        return self.clock.own(times), times, np.zeros((0, 3))

@@ -19,6 +19,8 @@ from graphslam.associator import Associator
 from graphslam.backends import BACKENDS
 from graphslam.backends.isam2 import Isam2Backend
 from graphslam.calibration import observed_information
+from graphslam.clock_offsets import ClockFound, clocks_found
+from graphslam.clocks import Clock, on_one_clock
 from graphslam.config import Config, OdometryConfig, RobotConfig, load_config
 from graphslam.consolidating import Tamper, consolidate
 from graphslam.dead_reckoning import Track
@@ -66,6 +68,8 @@ from graphslam.watching import Watcher
 #: scans in the picture at most
 MAX_PICTURES = 4000
 
+#: times that the log is taken again by better clocks
+MAX_CLOCKS = 4
 #: s: sigma of the difference of two robots' clocks before anything is known
 CLOCK_DOUBT_S = 0.5
 
@@ -82,9 +86,18 @@ class Pipeline:
         config: Config,
         names: Mapping[str, str] | None = None,
         tamper: Tamper | None = None,
+        clocks: Mapping[str, Clock] | None = None,
     ) -> None:
-        """Nothing read yet; ``names``: false name -> right name of what is sighted."""
-        self.log, self.config, self.names = log, config, names or {}
+        """Nothing read yet.
+
+        Args:
+            log: opened logs.
+            config: settings.
+            names: false name -> right name of what is sighted.
+            tamper: for tests.
+            clocks: of robots whose clock is not that of the first.
+        """
+        self.log, self.config, self.names, self.clocks = log, config, names or {}, clocks or {}
         self.tamper = tamper
         self.backend = BACKENDS[config.backend.name](config)
         self.associator = Associator(config.association, self.backend)
@@ -95,7 +108,8 @@ class Pipeline:
                     sensing(odometry_settings(config.odometry, log.notes), log.has_scans(name)),
                     robot_settings(name, config, log.notes),
                     mounted=True,
-                )
+                ),
+                clock=self.clocks.get(name, Clock()),
             )
             for name in log.robots
         }
@@ -105,6 +119,7 @@ class Pipeline:
         )
         self.steps: list[Step] = []
         self.sources: Sources = {}
+        self.sightings: list[Sighting] = []  # of robots that entered at their own time
         self.pictures: list[Picture] = []
         self.counts: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
@@ -117,8 +132,9 @@ class Pipeline:
     def run(self, progress: Progress) -> None:
         """Take in every message of the log."""
         tracks = {name: run.track for name, run in self.runs.items()}
+        read = _counted(self.log.messages((Truth, TrueLandmark)), self.counts, progress)
         messages = synchronise(
-            self.wanted(_counted(self.log.messages((Truth, TrueLandmark)), self.counts, progress)),
+            self.wanted(on_one_clock(read, self.clocks)),
             tracks,
             self.config.odometry.max_gap_s,
             self.dropped,
@@ -394,6 +410,7 @@ class Pipeline:
         """A sighting of another robot: brings that robot's motion to the same time."""
         other = message.seen_robot
         assert other is not None
+        self.sightings.append(message)
         if not self.runs[other].started:
             self.start(other, min(self.runs[other].track.first_ns, state_ns))
         moved = self.motion_since_state(other, state_ns)
@@ -490,6 +507,15 @@ class Pipeline:
         self.counts.update(done.counts)
         return done.estimate
 
+    def clocks_found(self, estimate: Estimate) -> dict[str, ClockFound]:
+        """What the robots' sightings of each other say about their clocks."""
+        tracks = {name: run.track for name, run in self.runs.items() if run.started}
+        seen = {id(s): s for s in self.sources.values() if s.seen_robot}.values()
+        sightings = [*seen, *self.sightings]
+        return clocks_found(
+            self.steps, estimate, sightings, tracks, self.clocks, self.config.robust
+        )
+
     def exchanged(self, estimate: Estimate) -> dict[str, str]:
         """Names of what was sighted that turn out to be each other's: false -> right name."""
         if not self.sources or self.config.association.identities == "ignore":
@@ -527,8 +553,16 @@ def smooth(
     names = pipeline.exchanged(estimate)
     if names:
         pipeline = _passed(Pipeline(log, config, names, tamper), progress)
+        estimate, rough = pipeline.estimate()
+    clocks = pipeline.clocks_found(estimate)
+    for _ in range(MAX_CLOCKS):
+        if not any(found.differs for found in clocks.values()):
+            break
+        known = {robot: found.clock for robot, found in clocks.items()}
+        pipeline = _passed(Pipeline(log, config, names, tamper, known), progress)
         finishing = time.perf_counter()
         estimate, rough = pipeline.estimate()
+        clocks = pipeline.clocks_found(estimate)
     if rough:
         estimate = pipeline.reconsider(estimate)
     pipeline.seconds["final optimisation"] = time.perf_counter() - finishing
@@ -560,12 +594,13 @@ def smooth(
         estimate=estimate,
         counts=pipeline.counts,
         rejected=pipeline.associator.rejected,
-        dropped=pipeline.dropped,
+        dropped=pipeline.dropped + pipeline.watcher.counts,
         tentative_deleted=pipeline.associator.map.deleted,
         line_closures=pipeline.associator.closures,
         landmarks=len(landmarks),
         seconds=pipeline.seconds,
         calibration={name: run.calibration_found() for name, run in runs.items()},
+        clocks=clocks,
         warnings=run_warnings(pipeline),
         log_s=1e-9 * (pipeline.last_ns - pipeline.first_ns),
     )

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from graphslam import __version__
+from graphslam.clock_offsets import ClockFound
 from graphslam.config import Config, dump_config
 from graphslam.geometry import Array, between, transform
 from graphslam.landmark_map import Entry, LandmarkMap
@@ -92,6 +93,7 @@ def summarise(
     landmarks: int,
     seconds: Mapping[str, float],
     calibration: Mapping[str, Mapping[str, tuple[float, float, bool]]],
+    clocks: Mapping[str, ClockFound],
     warnings: Sequence[str],
     log_s: float,
 ) -> dict[str, Any]:
@@ -143,6 +145,17 @@ def summarise(
             f"{robot}.{name}": {"value": value, "sigma": sigma, "observable": observable}
             for robot, found in sorted(calibration.items())
             for name, (value, sigma, observable) in found.items()
+        },
+        "clocks": {
+            robot: {
+                "offset_s": found.clock.offset_s,
+                "offset_sigma_s": found.offset_sigma_s,
+                "drift_ppm": 1e6 * found.clock.drift,
+                "drift_sigma_ppm": 1e6 * found.drift_sigma,
+                "observable": found.observable,
+                "applied": found.applied.offset_s != 0.0,
+            }
+            for robot, found in sorted(clocks.items())
         },
         "warnings": [*log.warnings, *warnings],
     }

@@ -21,15 +21,17 @@ ROWS = (
     ("errors", "geometry"),  # how it fails; what a pose is
     # settings; what travels between the modules; Kalman filtering on arrays
     ("config", "kalman", "records"),
-    ("models",),  # motion, and one observation model per kind of target
+    # messages on one time line; motion, and one observation model per kind of target
+    ("clocks", "models"),
     # one job each, on records and arrays
     ("association", "calibration", "dead_reckoning", "export", "factors", "frontend", "logs"),
     ("matching",),  # where a place was seen from
     # estimators; order in time; poses at any time; worlds and their logs
     ("backends", "simulate", "timeline", "trajectories"),
     # what is known about landmarks beside their estimate; of a robot; where robots start; recorded
-    # steps through an estimator; sightings that share a step; names given to each other's bearers
-    ("exchanged", "gathering", "landmark_map", "replay", "robot_run", "starts"),
+    # steps through an estimator; sightings that share a step; names given to each other's bearers;
+    # how robots' clocks differ
+    ("clock_offsets", "exchanged", "gathering", "landmark_map", "replay", "robot_run", "starts"),
     # decisions of one image; places seen twice; duplicates in a map; observations of walls anew; a
     # log of sightings solved again; what a run adds up to; robots in each other's scans
     ("associator", "closing", "merging", "reassociating", "refining", "summary", "watching"),

@@ -34,6 +34,7 @@ class WholeGraph(GraphBuilder):
         super().__init__(kernel)
         self.graph = gtsam.NonlinearFactorGraph()
         self._lines: list[tuple[int, tuple[int, int, Association]]] = []  # place in graph, what
+        self.meetings: list[tuple[int, tuple[int, int, Association]]] = []  # the same of robots
 
     def expand(
         self, step: Step, current: Estimates
@@ -53,6 +54,8 @@ class WholeGraph(GraphBuilder):
                 graph.add(factor)
             if part.observed is not None and part.observed[2].model == "line":
                 self._lines.append((self.graph.size() + graph.size() - 1, part.observed))
+            elif part.observed is not None and isinstance(part.observed[2].target, str):
+                self.meetings.append((self.graph.size() + graph.size() - 1, part.observed))
         self.graph.push_back(graph)
         return graph, values
 
