@@ -6,15 +6,16 @@ be, and be the only one that does. Returns of unknown things that move leave the
 """
 
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 from scipy.special import chdtri
 
 from graphslam.backends import Backend, Joint
 from graphslam.config import FrontEndConfig
-from graphslam.frontend.moving import moving
+from graphslam.frontend.moving import moving, was_there
 from graphslam.frontend.robots import FEWEST, Fit, centres, clusters, fit_outline, reach
 from graphslam.frontend.sweep import Sweep, make_sweep
 from graphslam.geometry import (
@@ -47,9 +48,13 @@ KNOWN_M = 0.3
 AGAIN_M, AGAIN_RAD = 0.1, 0.1
 #: ns: over which a robot's speed is taken
 SPEED_NS = 300_000_000
-#: scans, the last ones that were used, in which things that move may have been looked through
+#: scans, the last ones, in which things that move may have been looked through
 EARLIER = 4
+#: scans that are kept, and ns between them where the observer stands
+STORED, STORED_NS = 8, 1_000_000_000
 
+#: an earlier scan, and the pose (3,) of the laser now in the frame of the laser then
+View = tuple[Sweep, Array]
 Flags = np.ndarray[tuple[int], np.dtype[np.bool_]]
 
 
@@ -108,6 +113,7 @@ def watched(
     robots: Mapping[str, Expected],
     outlines: Mapping[str, Array],
     config: FrontEndConfig,
+    elsewhere: Mapping[str, Sequence[View]] = MappingProxyType({}),
 ) -> Watched:
     """Find the robots of a scan.
 
@@ -116,6 +122,8 @@ def watched(
         robots: name -> where it should be.
         outlines: name -> corners (k, 2), m, base frame.
         config: of the front end.
+        elsewhere: name -> earlier scans at times when the robot was somewhere else: what stood
+            there then is not the robot.
     """
     sweep = make_sweep(scan, config.max_range_m)
     gone = np.zeros(len(sweep.beam), dtype=np.bool_)
@@ -123,7 +131,7 @@ def watched(
     for name, there in robots.items():
         pose = between(scan.mount, there.pose)
         cov = rotate_cov(there.cov, -float(scan.mount[2]))
-        fits = _fits(sweep, outlines[name], pose, cov, config)
+        fits = _fits(sweep, outlines[name], pose, cov, config, elsewhere.get(name, ()))
         one = fits[0] if fits else None
         if one is not None and (len(fits) == 1 or fits[1][0] > one[0] + RIVAL):
             sightings.append(_sighting(scan, name, one[1]))
@@ -138,7 +146,12 @@ def watched(
 
 
 def _fits(
-    sweep: Sweep, outline: Array, pose: Array, cov: Array, config: FrontEndConfig
+    sweep: Sweep,
+    outline: Array,
+    pose: Array,
+    cov: Array,
+    config: FrontEndConfig,
+    elsewhere: Sequence[View],
 ) -> list[tuple[float, Fit]]:
     """Clusters that can be the robot, as squared distance from what is expected and fit; by it."""
     size = 2 * reach(outline)
@@ -157,9 +170,11 @@ def _fits(
         n = 3 if fit.direction else 2
         off = fit.pose - pose
         off[2] = wrap(off[2])
-        S = cov[:n, :n] + fit.cov[:n, :n] + np.diag([SLACK_M**2] * 2 + [SLACK_M**2])[:n, :n]
+        S = cov[:n, :n] + fit.cov[:n, :n] + SLACK_M**2 * np.eye(n)
         d2 = float(off[:n] @ np.linalg.solve(S, off[:n]))
-        if d2 < float(chdtri(n, 1 - GATE_PROBABILITY)):
+        points = sweep.points[span[0] : span[1] + 1]
+        old = any(was_there(points, before, here) for before, here in elsewhere)
+        if d2 < float(chdtri(n, 1 - GATE_PROBABILITY)) and not old:
             fits.append((d2, fit))
     return sorted(fits, key=lambda one: one[0])
 
@@ -211,7 +226,7 @@ class Watcher:
         self._backend, self._runs, self._config, self._doubt_s = backend, runs, config, doubt_s
         self._looked: dict[tuple[str, str], int] = {}
         self._earlier: dict[str, deque[tuple[int, Sweep]]] = defaultdict(
-            lambda: deque(maxlen=EARLIER)
+            lambda: deque(maxlen=STORED)
         )
 
     def look(
@@ -236,14 +251,40 @@ class Watcher:
         }
         for name in others:
             self._looked[scan.robot, name] = scan.time_ns
-        found = watched(scan, others, self.outlines, self._config) if others else Watched(scan, ())
+        sweep = make_sweep(scan, self._config.max_range_m)
+        views = self._views(scan)
+        elsewhere = {name: self._elsewhere(scan, name, views) for name in others}
+        found = Watched(scan, ())
+        if others:
+            found = watched(scan, others, self.outlines, self._config, elsewhere)
         self.sightings += found.sightings
+        last = self._earlier[scan.robot]
+        if used or (others and (not last or scan.time_ns - last[-1][0] >= STORED_NS)):
+            last.append((scan.time_ns, sweep))
         if not used:
             return found.sightings
         self._count("robot", scan, found.scan)
-        still = self._still(found.scan)
+        if self._config.moving == "keep":
+            return (found.scan, *found.sightings)
+        still = self._still(found.scan, views)
         self._count("thing that moves", found.scan, still)
         return (still, *found.sightings)
+
+    def _views(self, scan: Scan) -> list[tuple[int, View]]:
+        """The observer's earlier scans, with their times."""
+        track = self._runs[scan.robot].track
+        out = []
+        for time_ns, before in self._earlier[scan.robot]:
+            moved = track.motion(time_ns, scan.time_ns).delta
+            laser = compose(compose(inverse(scan.mount), moved), scan.mount)
+            out.append((time_ns, (before, laser)))
+        return out
+
+    def _elsewhere(self, scan: Scan, name: str, views: Sequence[tuple[int, View]]) -> list[View]:
+        """Earlier scans at times when a robot was where it cannot be taken for itself of now."""
+        track, size = self._runs[name].track, 2 * reach(self.outlines[name])
+        gone = [track.moved(time_ns, scan.time_ns)[0] > size for time_ns, _ in views]
+        return [view for (_, view), away in zip(views, gone, strict=True) if away]
 
     def _count(self, what: str, before: Scan, after: Scan) -> None:
         if after is not before:
@@ -274,14 +315,10 @@ class Watcher:
         run = self._runs[robot]
         return run.track.motion(run.state_ns, time_ns) if time_ns > run.state_ns else None
 
-    def _still(self, scan: Scan) -> Scan:
+    def _still(self, scan: Scan, views: Sequence[tuple[int, View]]) -> Scan:
         """The scan without things that move."""
         sweep = make_sweep(scan, self._config.max_range_m)
-        track, earlier = self._runs[scan.robot].track, self._earlier[scan.robot]
         gone = np.zeros(len(sweep.beam), dtype=np.bool_)
-        for time_ns, before in earlier:
-            moved = track.motion(time_ns, scan.time_ns).delta
-            laser = compose(compose(inverse(scan.mount), moved), scan.mount)
+        for _, (before, laser) in views[-EARLIER:]:
             gone |= moving(sweep, before, laser)
-        earlier.append((scan.time_ns, sweep))
         return _without(scan, sweep, gone) if gone.any() else scan

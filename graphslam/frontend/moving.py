@@ -16,8 +16,38 @@ from graphslam.geometry import Array, transform
 WIDEST_M = 1.5
 #: m: an earlier beam must have gone so much farther
 BEHIND_M = 0.4
+#: m: an earlier beam that ended so near to a thing met the same
+SAME_M = 0.1
 #: of its returns, and returns at least
 SHARE, FEWEST = 0.8, 3
+
+
+def was_there(points: Array, earlier: Sweep, earlier_from_here: Array) -> bool:
+    """Whether an earlier scan saw a thing where it is now, so that it has not moved.
+
+    Args:
+        points: (n, 2) returns of the thing, laser frame.
+        earlier: the earlier scan.
+        earlier_from_here: (3,) pose of the laser in the frame of the earlier one's.
+    """
+    r, before = _ranges_there(points, earlier, earlier_from_here)
+    with np.errstate(invalid="ignore"):
+        same = np.any(np.abs(before - r[:, None]) < SAME_M, axis=1)
+    return bool(np.mean(same) >= SHARE)
+
+
+def _ranges_there(points: Array, earlier: Sweep, earlier_from_here: Array) -> tuple[Array, Array]:
+    """Ranges (n,) of points in the earlier frame; what its three beams nearest to each saw (n, 3).
+
+    NaN beside the earlier scan's field.
+    """
+    there = transform(earlier_from_here, points)
+    a = np.arctan2(there[:, 1], there[:, 0])
+    turn = np.mod(a - earlier.angles[0] + earlier.step_rad / 2, 2 * np.pi)
+    beam = np.floor(turn / earlier.step_rad).astype(np.int64)[:, None] + np.array([-1, 0, 1])
+    n = len(earlier.ranges)
+    seen = np.where((beam >= 0) & (beam < n), earlier.ranges[np.clip(beam, 0, n - 1)], np.nan)
+    return np.hypot(*there.T), seen
 
 
 def moving(sweep: Sweep, earlier: Sweep, earlier_from_here: Array) -> NDArray[np.bool_]:
@@ -32,15 +62,9 @@ def moving(sweep: Sweep, earlier: Sweep, earlier_from_here: Array) -> NDArray[np
     found = clusters(sweep, WIDEST_M)
     if not len(found) or not len(earlier.ranges):
         return gone
-    points = transform(earlier_from_here, sweep.points)
-    r, a = np.hypot(*points.T), np.arctan2(points[:, 1], points[:, 0])
-    turn = np.mod(a - earlier.angles[0] + earlier.step_rad / 2, 2 * np.pi)
-    beam = np.floor(turn / earlier.step_rad).astype(np.int64)
-    inside = beam < len(earlier.ranges)
-    beam = np.clip(beam, 1, max(len(earlier.ranges) - 2, 1))
+    r, before = _ranges_there(sweep.points, earlier, earlier_from_here)
     # both neighbours must have gone behind as well: the laser may have turned a little less
-    beyond = np.min(earlier.ranges[beam[:, None] + np.array([-1, 0, 1])], axis=1)
-    through = inside & (beyond > r + BEHIND_M)  # a missing return, NaN, compares False
+    through = np.min(before, axis=1) > r + BEHIND_M  # a missing return, NaN, compares False
     sums = np.concatenate([[0], np.cumsum(through)])
     count = found.last - found.first + 1
     share = (sums[found.last + 1] - sums[found.first]) / count

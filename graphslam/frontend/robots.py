@@ -10,7 +10,7 @@ Symbols: p = (x, y, phi) pose of the robot in the laser's frame, r range, a dire
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,18 +20,21 @@ from graphslam.config import FrontEndConfig
 from graphslam.frontend.sweep import Sweep
 from graphslam.geometry import Array, rotation, wrap
 
-#: m: returns farther apart are not of one thing that stands free
-APART_M = 0.25
+#: m, beams, m: returns farther apart are not of one thing that stands free; far away a side seen at
+#: grazing incidence has them farther apart, up to a limit
+APART_M, APART_BEAMS, APART_MOST_M = 0.25, 6.0, 0.5
 #: returns at least, of which a pose is to be found
 FEWEST = 3
 #: returns at least, of which a direction is to be found
 FEWEST_TO_TURN = 6
-#: of Gauss and Newton, before outliers are left out and after
-ITERATIONS = 6
-#: share of the angle between beams: sigma of an edge that lies between two of them
-EDGE_SHARE = 0.5
-#: a first or last return off by so many sigmas may be a mixed pixel and is left out
-OUTLIER_SIGMAS = 4.0
+#: steps of the search
+ITERATIONS = 8
+#: beams: sigma of an edge between two of them, for the last one may be a mixed pixel
+EDGE_SHARE = 1.0
+#: beams: by which both edges may be off the same way
+EDGES_ALIKE = 0.25
+#: m: sigma of the first and the last range, which may be mixed pixels
+MIXED_M = 0.15
 #: things that fit an outline worse than this share of robots would are none
 FIT_PROBABILITY = 0.001
 #: rad: a direction known less well is not linear enough to be told
@@ -88,7 +91,7 @@ class Fit:
 class _View:
     """A cluster: ranges ``r`` (n,) in directions ``a`` (n,), directions of its ``edges`` (2,).
 
-    ``w`` (n + 2,): weights of ranges and edges, 0 for what is not used.
+    ``w`` (n + 2,): weights of ranges and edges, 0 for an edge that is not its own.
     """
 
     outline: Array
@@ -135,7 +138,9 @@ def clusters(sweep: Sweep, widest_m: float) -> Clusters:
     x, y = sweep.points.T
     r = sweep.ranges[sweep.beam]
     step = np.hypot(x[1:] - x[:-1], y[1:] - y[:-1])
-    border = np.concatenate(([0], np.flatnonzero(step > APART_M) + 1, [k]))
+    near = np.minimum(r[1:], r[:-1])
+    apart = np.clip(APART_BEAMS * sweep.step_rad * near, APART_M, APART_MOST_M)
+    border = np.concatenate(([0], np.flatnonzero(step > apart) + 1, [k]))
     first, last = border[:-1], border[1:] - 1
     rise = np.concatenate(([np.inf], r[1:] - r[:-1], [-np.inf]))
     before, after = -rise[first], rise[last + 1]
@@ -216,9 +221,7 @@ def fit_outline(
     """
     view = _view(sweep, first, last, bare, outline, config)
     fixed = _solved(_placed(view, expected), 2, view)
-    view = _without_mixed_pixels(view, fixed, config)
-    fixed = _solved(fixed, 2, view)
-    floor = config.floor_normal_m**2 * np.eye(2)
+    floor = _floor(fixed, outline, sweep.step_rad, config)
     dof = int(np.count_nonzero(view.w)) - 2
     if len(view.r) >= FEWEST_TO_TURN and not is_round(outline):
         turned = _solved(fixed, 3, view)
@@ -227,16 +230,27 @@ def fit_outline(
         # one that is not where it is expected may be that of another face
         off2 = float(wrap(turned[2] - expected[2])) ** 2
         if P[2, 2] < SURE_RAD**2 and off2 < 9 * (heading_sigma**2 + P[2, 2]):
-            P[:2, :2] += floor
-            P[2, 2] += config.floor_angle_rad**2
-            return Fit(turned, P, True, float(view.w @ e**2), dof - 1)
+            return Fit(turned, P + floor, True, float(view.w @ e**2), dof - 1)
     e, J = _linearised(fixed, view)
     P = np.linalg.inv(J[:, :2].T @ (view.w[:, None] * J[:, :2]) + np.eye(2))
     # what the heading does to the position: it is the expected one
     lever = -P @ J[:, :2].T @ (view.w * J[:, 2])
     cov = np.diag([0.0, 0.0, heading_sigma**2])
-    cov[:2, :2] = P + floor + heading_sigma**2 * np.outer(lever, lever)
+    cov[:2, :2] = P + floor[:2, :2] + heading_sigma**2 * np.outer(lever, lever)
     return Fit(fixed, cov, False, float(view.w @ e**2), dof)
+
+
+def _floor(pose: Array, outline: Array, step_rad: float, config: FrontEndConfig) -> Array:
+    """Covariance (3, 3) of what no number of returns makes better.
+
+    The outline is known, and its surface measured, to ``floor_normal_m``; so is its direction, over
+    its size. Mixed pixels shift both edges the same way, by a share of the angle between beams.
+    """
+    flat = config.floor_normal_m
+    across = np.array([-pose[1], pose[0]]) * EDGES_ALIKE * step_rad
+    P = np.diag([flat, flat, 2 * flat / reach(outline)]) ** 2
+    P[:2, :2] += np.outer(across, across)
+    return P
 
 
 def _view(
@@ -245,16 +259,8 @@ def _view(
     beam = sweep.beam[first : last + 1]
     edges, sigma = _edges_seen(sweep, first, last)
     w = np.concatenate([np.full(len(beam), config.range_sigma_m**-2), bare * sigma**-2])
+    w[[0, len(beam) - 1]] = MIXED_M**-2
     return _View(outline, sweep.angles[beam], sweep.ranges[beam], edges, w)
-
-
-def _without_mixed_pixels(view: _View, pose: Array, config: FrontEndConfig) -> _View:
-    """The view without a first or last return that lies far off the outline at a pose."""
-    e, _ = _linearised(pose, view)
-    off = np.zeros(len(view.w), dtype=np.bool_)
-    for k in (0, len(view.r) - 1):
-        off[k] = abs(e[k]) > OUTLIER_SIGMAS * config.range_sigma_m
-    return replace(view, w=np.where(off, 0.0, view.w)) if len(view.r) > FEWEST else view
 
 
 def _edges_seen(sweep: Sweep, first: int, last: int) -> tuple[Array, Array]:
