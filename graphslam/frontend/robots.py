@@ -37,6 +37,8 @@ EDGES_ALIKE = 0.25
 MIXED_M = 0.15
 #: things that fit an outline worse than this share of robots would are none
 FIT_PROBABILITY = 0.001
+#: of an outline's width, at least seen
+SHARE = 0.5
 #: rad: a direction known less well is not linear enough to be told
 SURE_RAD = 0.1
 #: m, rad: step of difference quotients, and farthest step of the search
@@ -72,7 +74,7 @@ class Fit:
 
     ``pose`` (3,) in the laser's frame, ``cov`` (3, 3) of it; ``direction`` whether the heading was
     found, else it is the expected one and ``cov`` has the expectation's share in it. ``chi2`` of
-    ranges and edges with ``dof``.
+    ranges and edges with ``dof``; ``share`` of the outline's width that is seen.
     """
 
     pose: Array
@@ -80,11 +82,12 @@ class Fit:
     direction: bool
     chi2: float
     dof: int
+    share: float
 
     @property
     def good(self) -> bool:
-        """Whether what was seen can be the outline."""
-        return self.chi2 <= float(chdtri(max(self.dof, 1), FIT_PROBABILITY))
+        """Whether what was seen can be the outline; a small part of one may be of anything."""
+        return self.share > SHARE and self.chi2 <= float(chdtri(max(self.dof, 1), FIT_PROBABILITY))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -230,14 +233,20 @@ def fit_outline(
         # one that is not where it is expected may be that of another face
         off2 = float(wrap(turned[2] - expected[2])) ** 2
         if P[2, 2] < SURE_RAD**2 and off2 < 9 * (heading_sigma**2 + P[2, 2]):
-            return Fit(turned, P + floor, True, float(view.w @ e**2), dof - 1)
+            return Fit(turned, P + floor, True, float(view.w @ e**2), dof - 1, _share(turned, view))
     e, J = _linearised(fixed, view)
     P = np.linalg.inv(J[:, :2].T @ (view.w[:, None] * J[:, :2]) + np.eye(2))
     # what the heading does to the position: it is the expected one
     lever = -P @ J[:, :2].T @ (view.w * J[:, 2])
     cov = np.diag([0.0, 0.0, heading_sigma**2])
     cov[:2, :2] = P + floor[:2, :2] + heading_sigma**2 * np.outer(lever, lever)
-    return Fit(fixed, cov, False, float(view.w @ e**2), dof)
+    return Fit(fixed, cov, False, float(view.w @ e**2), dof, _share(fixed, view))
+
+
+def _share(pose: Array, view: _View) -> float:
+    """Share of the outline's width at a pose that the cluster has."""
+    _, sides = expected_ranges(view.outline, pose[None], view.a)
+    return float(wrap(view.edges[1] - view.edges[0]) / (sides[0, 1] - sides[0, 0]))
 
 
 def _floor(pose: Array, outline: Array, step_rad: float, config: FrontEndConfig) -> Array:
