@@ -251,6 +251,8 @@ class Watcher:
         }
         for name in others:
             self._looked[scan.robot, name] = scan.time_ns
+        if not (used or others):
+            return ()
         sweep = make_sweep(scan, self._config.max_range_m)
         views = self._views(scan)
         elsewhere = {name: self._elsewhere(scan, name, views) for name in others}
@@ -272,19 +274,20 @@ class Watcher:
 
     def _views(self, scan: Scan) -> list[tuple[int, View]]:
         """The observer's earlier scans, with their times."""
-        track = self._runs[scan.robot].track
-        out = []
-        for time_ns, before in self._earlier[scan.robot]:
-            moved = track.motion(time_ns, scan.time_ns).delta
-            laser = compose(compose(inverse(scan.mount), moved), scan.mount)
-            out.append((time_ns, (before, laser)))
-        return out
+        earlier = self._earlier[scan.robot]
+        if not earlier:
+            return []
+        begin = np.array([time_ns for time_ns, _ in earlier], dtype=np.int64)
+        moved = self._runs[scan.robot].track.motions(begin, np.full_like(begin, scan.time_ns)).delta
+        lasers = compose(compose(inverse(scan.mount), moved), scan.mount)
+        return [(t, (sweep, laser)) for (t, sweep), laser in zip(earlier, lasers, strict=True)]
 
     def _elsewhere(self, scan: Scan, name: str, views: Sequence[tuple[int, View]]) -> list[View]:
         """Earlier scans at times when a robot was where it cannot be taken for itself of now."""
         track, size = self._runs[name].track, 2 * reach(self.outlines[name])
-        gone = [track.moved(time_ns, scan.time_ns)[0] > size for time_ns, _ in views]
-        return [view for (_, view), away in zip(views, gone, strict=True) if away]
+        times = np.array([scan.time_ns, *(time_ns for time_ns, _ in views)], dtype=np.int64)
+        away = np.hypot(*(between(track.pose(times[:1]), track.pose(times[1:]))[:, :2]).T) > size
+        return [view for (_, view), far in zip(views, away, strict=True) if far]
 
     def _count(self, what: str, before: Scan, after: Scan) -> None:
         if after is not before:
