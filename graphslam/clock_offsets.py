@@ -27,11 +27,12 @@ SURE, SHOWS_S = 3.0, 0.01
 #: s: an offset known no better is not known
 OBSERVABLE_S = 1.0
 #: s: offsets that are tried, and their steps
-SEARCH_S, STEP_S = 5.0, 0.05
-#: s: spans over which odometry is good enough to compare paths, and sightings in one at least
-SPAN_S, FEWEST = 20.0, 6
+SEARCH_S, STEP_S = 5.0, 0.1
+#: s: spans over which odometry is good enough to compare paths; sightings in one at least; how many
+#: spans of two robots are compared, those with the most sightings
+SPAN_S, FEWEST, SPANS = 20.0, 6, 8
 #: s: grid on which paths are tabulated
-GRID_S = 0.05
+GRID_S = 0.1
 #: paths that fit so many times better at another offset decide for it
 DECIDED = 1.5
 #: scale by which odometry may be off
@@ -193,18 +194,19 @@ def _between_two(
 ) -> Offset | None:
     """How far the seen robot's clock is ahead of the observer's; None if that is not clear."""
     times = np.array([1e-9 * (s.time_ns - start_ns) for s in seen])
-    points = np.array([[*_place(s), 0.0] for s in seen])
-    p = compose(observer.at(times), points)[:, :2] @ np.array([1.0, 1j])
-    steps = np.arange(-round(SEARCH_S / STEP_S), round(SEARCH_S / STEP_S) + 1)
-    offsets = STEP_S * steps
-    q = other.at(times + offsets[:, None])[..., :2] @ np.array([1.0, 1j])
     span = np.floor(times / SPAN_S).astype(int)
+    numbers, counts = np.unique(span, return_counts=True)
+    offsets = STEP_S * np.arange(-round(SEARCH_S / STEP_S), round(SEARCH_S / STEP_S) + 1)
     cost, count = np.zeros(len(offsets)), 0
-    for number in np.unique(span):
-        use = span == number
-        if np.count_nonzero(use) >= FEWEST:
-            cost += _misfit(p[use], q[:, use])
-            count += int(np.count_nonzero(use)) - 2
+    for number in numbers[np.argsort(-counts, kind="stable")][:SPANS]:
+        which = np.flatnonzero(span == number)
+        if len(which) < FEWEST:
+            break
+        points = np.array([[*_place(seen[k]), 0.0] for k in which.tolist()])
+        p = compose(observer.at(times[which]), points)[:, :2] @ np.array([1.0, 1j])
+        q = other.at(times[which] + offsets[:, None])[..., :2] @ np.array([1.0, 1j])
+        cost += _misfit(p, q)
+        count += len(which) - 2
     if not count:
         return None
     best = int(np.clip(np.argmin(cost), 1, len(offsets) - 2))
