@@ -55,6 +55,8 @@ class RobotConfig:
     laser: [x m, y m, yaw rad] of the laser in the base frame, over what tf_static says.
     wheel_radius_left_m, wheel_radius_right_m, axle_m: the wheels' geometry for JointState logs.
     left_joint, right_joint: names in JointState; empty means the names that contain left/right.
+    outline: corners [[x m, y m], ...] of what others' lasers see of it, in its base frame, convex
+        and in order; [[radius m]] is a circle. With it the robot is found in others' scans.
     """
 
     laser: tuple[float, ...] = ()
@@ -63,11 +65,19 @@ class RobotConfig:
     axle_m: float = 0.5
     left_joint: str = ""
     right_joint: str = ""
+    outline: tuple[tuple[float, ...], ...] = ()
 
     def __post_init__(self) -> None:
-        """Raise ConfigError where `laser` is no pose."""
+        """Raise ConfigError where `laser` is no pose or `outline` no outline."""
         if len(self.laser) not in (0, 3):
             raise ConfigError(f"robots.*.laser: needs [x, y, yaw], got {list(self.laser)}")
+        sizes = [len(corner) for corner in self.outline]
+        a_circle = sizes == [1] and self.outline[0][0] > 0
+        if self.outline and not a_circle and (len(sizes) < 3 or set(sizes) != {2}):
+            raise ConfigError(
+                "robots.*.outline: needs three corners [x, y] or more, or one [radius], got "
+                f"{[list(corner) for corner in self.outline]}"
+            )
 
 
 @dataclass(frozen=True)
@@ -151,6 +161,8 @@ class FrontEndConfig:
     hough_threshold_m is the threshold of C with g = r times the angle between beams: metres of
     wall, as long as it were seen face on. cylinders: whether to look for them too;
     cylinder_min_radius_m, cylinder_max_radius_m: which radii; cylinder_points: fewest returns.
+    moving: what to do with free-standing things where an earlier scan looked through: `drop` keeps
+    them out of the map.
     """
 
     name: Literal["segments", "hough", "both", "none"] = "segments"
@@ -173,6 +185,7 @@ class FrontEndConfig:
     cylinder_min_radius_m: float = 0.03
     cylinder_max_radius_m: float = 0.5
     cylinder_points: int = 4
+    moving: Literal["drop", "keep"] = "drop"
 
 
 @dataclass(frozen=True)

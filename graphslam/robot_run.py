@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from graphslam.calibration import Calibrator, told
+from graphslam.clocks import Clock
 from graphslam.dead_reckoning import EDGE_NS, Track
 from graphslam.geometry import Array, between, compose, inverse
 from graphslam.matching import Submap
@@ -26,6 +27,7 @@ class RobotRun:
     states are rigid to the sensor: the base is where the calibration puts it. ``refined``: the
     track's calibration is one that was estimated together with all states. ``scan``: the time of
     the latest state that has a scan, and what that shows; ``contradicted`` motions of ``motions``.
+    Times are the common clock's, stamps those of the robot's own ``clock``.
     """
 
     track: Track
@@ -41,6 +43,7 @@ class RobotRun:
     scan: tuple[int, Submap] | None = None
     motions: int = 0
     contradicted: int = 0
+    clock: Clock = field(default_factory=Clock)
 
     @property
     def started(self) -> bool:
@@ -128,7 +131,7 @@ class RobotRun:
             return stamps, times, np.array([scan[2] for scan in scans])
         period = round(1e9 / BASE_RATE_HZ)
         times = np.arange(self.track.first_ns, self.track.last_ns + 1, period)
-        return times, times, np.zeros((0, 3))
+        return self.clock.own(times), times, np.zeros((0, 3))
 
 
 def span_warnings(tracks: Mapping[str, Track], *, unplaced: bool) -> list[str]:

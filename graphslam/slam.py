@@ -19,6 +19,8 @@ from graphslam.associator import Associator
 from graphslam.backends import BACKENDS
 from graphslam.backends.isam2 import Isam2Backend
 from graphslam.calibration import observed_information
+from graphslam.clock_offsets import ClockFound, clocks_found
+from graphslam.clocks import Clock, on_one_clock
 from graphslam.config import (
     BackendConfig,
     Config,
@@ -32,6 +34,7 @@ from graphslam.dead_reckoning import Track
 from graphslam.errors import ConfigError, EstimationError, LogError
 from graphslam.exchanged import exchanged_names, renamed
 from graphslam.frontend import FRONT_ENDS, scan_points
+from graphslam.frontend.robots import outline_of
 from graphslam.frontend.sightings import sighting_observation
 from graphslam.gathering import Gathered, Sources, carried, gather, met, shared, ways
 from graphslam.geometry import (
@@ -72,6 +75,7 @@ from graphslam.starts import origin, start_poses
 from graphslam.summary import make_landmarks, summarise
 from graphslam.timeline import ODOMETRY, synchronise
 from graphslam.trajectories import Worlds, origin_shift
+from graphslam.watching import Watcher
 
 #: scans in the picture at most
 MAX_PICTURES = 4000
@@ -81,8 +85,13 @@ FRAMES_APART_M = 1e5
 #: between frame and identity of landmarks in other frames than the world's; in no name
 FRAME_MARK = "\0"
 
+#: times that the log is taken again by better clocks
+MAX_CLOCKS = 4
+#: s: sigma of the difference of two robots' clocks before anything is known
+CLOCK_DOUBT_S = 0.5
+
 Progress = Callable[[int], None]
-Settings = TypeVar("Settings", KeyframeConfig, OdometryConfig)
+Settings = TypeVar("Settings", KeyframeConfig, OdometryConfig, RobotConfig)
 #: robot, time, other robot, its time, relative pose (as bytes): what a recorded closure is known by
 ClosureId = tuple[str, int, str, int, bytes]
 
@@ -118,6 +127,7 @@ class Pipeline:
         names: Mapping[str, str] | None = None,
         tamper: Tamper | None = None,
         joined: Joined | None = None,
+        clocks: Mapping[str, Clock] | None = None,
     ) -> None:
         """Nothing read yet.
 
@@ -127,9 +137,10 @@ class Pipeline:
             names: false name -> right name of what is sighted.
             tamper: see `graphslam.consolidating.Tamper`.
             joined: where robots start and in which frames; None finds out.
+            clocks: of robots whose clock is not that of the first.
         """
         config = replace(config, keyframe=noted(config.keyframe, "keyframe", log.notes))
-        self.log, self.config, self.names = log, config, names or {}
+        self.log, self.config, self.names, self.clocks = log, config, names or {}, clocks or {}
         self.tamper = tamper
         self.backend = BACKENDS[config.backend.name](config)
         self.associator = Associator(config.association, self.backend)
@@ -138,7 +149,10 @@ class Pipeline:
         self.matches_scans = config.odometry.scan_matching != "off" and (
             config.backend.name != "dead-reckoning" and config.front_end.name != "none"
         )
-        self.runs = {name: RobotRun(track) for name, track in make_tracks(log, config).items()}
+        self.runs = {
+            name: RobotRun(track, clock=self.clocks.get(name, Clock()))
+            for name, track in make_tracks(log, config).items()
+        }
         began = time.perf_counter()
         starts = start_poses(log, config) if joined is None else joined.starts
         self.recorded = verify_recorded(log, config, starts)
@@ -147,8 +161,12 @@ class Pipeline:
         roots = sorted(set(self.frames.values()) - {self.joined.world})
         self.places = {frame: (k + 1) * FRAMES_APART_M for k, frame in enumerate(roots)}
         self.meetings: list[Sighting] = []  # of robots in frames that nothing relates
+        self.watcher = Watcher(
+            self.backend, self.runs, outlines(log, config), config.front_end, CLOCK_DOUBT_S
+        )
         self.steps: list[Step] = []
         self.sources: Sources = {}
+        self.sightings: list[Sighting] = []  # of robots that entered at their own time
         self.pictures: list[Picture] = []
         self.counts: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
@@ -162,11 +180,13 @@ class Pipeline:
     def run(self, progress: Progress) -> None:
         """Take in every message of the log."""
         tracks = {name: run.track for name, run in self.runs.items()}
+        read = _counted(self.log.messages((Truth, TrueLandmark)), self.counts, progress)
         messages = synchronise(
-            self.wanted(_counted(self.log.messages((Truth, TrueLandmark)), self.counts, progress)),
+            self.wanted(on_one_clock(read, self.clocks)),
             tracks,
             self.config.odometry.max_gap_s,
             self.dropped,
+            tuple(self.watcher.outlines),
         )
         # one robot has nobody to share a step with, and a scan makes its own
         alone = len(tracks) < 2 or any(map(self.log.has_scans, tracks))
@@ -301,7 +321,14 @@ class Pipeline:
             self.start(first.robot, min(run.track.first_ns, time_ns))
         run.scans += [(m.stamp_ns, m.time_ns, m.mount) for m in event if isinstance(m, Scan)]
         self.counts["scans"] += isinstance(first, Scan)
-        if not self.is_used(event):
+        used = self.is_used(event)
+        if isinstance(first, Scan):
+            event = self.watcher.look(first, used, self.has_started)
+            if self.config.association.robots == "ignore":
+                event = [m for m in event if isinstance(m, Scan)]
+        elif not used:
+            event = ()
+        if not event:
             return  # its pose follows from the states around it
         motion = self.motion_since_state(first.robot, time_ns)
         own_state = self.gets_state(event)
@@ -357,6 +384,13 @@ class Pipeline:
         self.backend.add(step)
         self.steps.append(step)
         self.note_state(robot, time_ns)
+
+    def has_started(self, robot: str, time_ns: int) -> bool:
+        """Whether a robot has a state at ``time_ns``, given one if it is known where it starts."""
+        run = self.runs[robot]
+        if not run.started and robot in self.starts and len(run.track):
+            self.start(robot, min(run.track.first_ns, time_ns))
+        return run.started
 
     def motion_since_state(self, robot: str, time_ns: int) -> Motion | None:
         """Motion since the robot's last state; None when it is at that very time."""
@@ -475,6 +509,7 @@ class Pipeline:
         """A sighting of another robot: brings that robot's motion to the same time."""
         other = message.seen_robot
         assert other is not None
+        self.sightings.append(message)
         if not self.runs[other].started:
             self.start(other, min(self.runs[other].track.first_ns, state_ns))
         moved = self.motion_since_state(other, state_ns)
@@ -580,6 +615,15 @@ class Pipeline:
             self.runs[name].refined = self.config.odometry.calibrate
         return done.estimate
 
+    def clocks_found(self, estimate: Estimate) -> dict[str, ClockFound]:
+        """What the robots' sightings of each other say about their clocks."""
+        tracks = {name: run.track for name, run in self.runs.items() if run.started}
+        seen = {id(s): s for s in self.sources.values() if s.seen_robot}.values()
+        sightings = [*seen, *self.sightings]
+        return clocks_found(
+            self.steps, estimate, sightings, tracks, self.clocks, self.config.robust
+        )
+
     def worlds(self) -> Worlds:
         """What takes every robot and landmark from where it was estimated into its frame.
 
@@ -673,8 +717,16 @@ def smooth(
     names = pipeline.exchanged(estimate)
     if names:
         pipeline = _passed(Pipeline(log, config, names, tamper), progress)
+        estimate, rough = pipeline.estimate()
+    clocks = pipeline.clocks_found(estimate)
+    for _ in range(MAX_CLOCKS):
+        if not any(found.differs for found in clocks.values()):
+            break
+        known = {robot: found.clock for robot, found in clocks.items()}
+        pipeline = _passed(Pipeline(log, config, names, tamper, pipeline.joined, known), progress)
         finishing = time.perf_counter()
         estimate, rough = pipeline.estimate()
+        clocks = pipeline.clocks_found(estimate)
     if rough:
         estimate = pipeline.reconsider(estimate)
     pipeline.seconds["final optimisation"] = time.perf_counter() - finishing
@@ -703,7 +755,7 @@ def smooth(
         estimate=estimate,
         counts=pipeline.counts,
         rejected=pipeline.associator.rejected,
-        dropped=pipeline.dropped,
+        dropped=pipeline.dropped + pipeline.watcher.counts,
         tentative_deleted=pipeline.associator.map.deleted,
         line_closures=pipeline.associator.closures,
         landmarks=len(landmarks),
@@ -719,6 +771,7 @@ def smooth(
         },
         closures=pipeline.recorded.told(),
         joined=pipeline.joined,
+        clocks=clocks,
         warnings=run_warnings(pipeline),
         log_s=1e-9 * (pipeline.last_ns - pipeline.first_ns),
     )
@@ -782,12 +835,16 @@ def placed(
     return join(log.robots, views, meetings, starts, config.association, own)
 
 
+def outlines(log: LogSet, config: Config) -> dict[str, Array]:
+    """Robot -> corners (k, 2), m, of those whose outline is known."""
+    known = {name: robot_settings(name, config, log.notes).outline for name in log.robots}
+    return {name: outline_of(corners) for name, corners in known.items() if corners}
+
+
 def robot_settings(name: str, config: Config, notes: Mapping[str, str]) -> RobotConfig:
-    """Settings of a robot: the configuration's, else what the log's notes say of its geometry."""
-    if {name, "default"} & set(config.robots):
-        return config.robot(name)
+    """Settings of a robot: the configuration's where set, else what the log's notes say of it."""
     noted = [f"{key}={value}" for key, value in notes.items() if key.startswith(f"robots.{name}.")]
-    return load_config(overrides=noted).robot(name)
+    return _noted(config.robot(name), load_config(overrides=noted).robot(name), RobotConfig())
 
 
 def odometry_settings(config: OdometryConfig, notes: Mapping[str, str]) -> OdometryConfig:
@@ -802,9 +859,15 @@ def odometry_settings(config: OdometryConfig, notes: Mapping[str, str]) -> Odome
 def noted(config: Settings, table: str, notes: Mapping[str, str]) -> Settings:
     """A table of settings: those that are not the defaults, the others as a log's notes say."""
     lines = [f"{key}={value}" for key, value in notes.items() if key.startswith(f"{table}.")]
-    known, default = getattr(load_config(overrides=lines), table), getattr(Config(), table)
+    known: Settings = getattr(load_config(overrides=lines), table)
+    default: Settings = getattr(Config(), table)
+    return _noted(config, known, default)
+
+
+def _noted(config: Settings, noted: Settings, default: Settings) -> Settings:
+    """Settings as in ``config``, as in ``noted`` where they are the default."""
     changes = {
-        field.name: getattr(known, field.name)
+        field.name: getattr(noted, field.name)
         for field in dataclasses.fields(config)
         if getattr(config, field.name) == getattr(default, field.name)
     }
@@ -895,7 +958,8 @@ def run_warnings(pipeline: Pipeline) -> list[str]:
         f"{name}: its wheel radii and axle are not set; the defaults of robots.{name}.* were used"
         for name, run in pipeline.runs.items()
         if run.track.source == "wheels"
-        and robot_settings(name, pipeline.config, pipeline.log.notes) == RobotConfig()
+        and replace(robot_settings(name, pipeline.config, pipeline.log.notes), outline=())
+        == RobotConfig()
     ]
     warnings += [
         f"{a} and {b}: bore each other's code in all sightings; their names were exchanged back"

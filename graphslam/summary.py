@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from graphslam import __version__
+from graphslam.clock_offsets import ClockFound
 from graphslam.config import Config, dump_config
 from graphslam.geometry import Array, between, transform
 from graphslam.joining import Joined
@@ -96,6 +97,7 @@ def summarise(
     odometry: Mapping[str, Mapping[str, int]],
     closures: Mapping[str, Any],
     joined: Joined,
+    clocks: Mapping[str, ClockFound],
     warnings: Sequence[str],
     log_s: float,
 ) -> dict[str, Any]:
@@ -153,6 +155,17 @@ def summarise(
             for name, (value, sigma, observable) in found.items()
         },
         "odometry": {robot: dict(counts) for robot, counts in sorted(odometry.items())},
+        "clocks": {
+            robot: {
+                "offset_s": found.clock.offset_s,
+                "offset_sigma_s": found.offset_sigma_s,
+                "drift_ppm": 1e6 * found.clock.drift,
+                "drift_sigma_ppm": 1e6 * found.drift_sigma,
+                "observable": found.observable,
+                "applied": found.applied.offset_s != 0.0,
+            }
+            for robot, found in sorted(clocks.items())
+        },
         "warnings": [*log.warnings, *warnings],
     }
 

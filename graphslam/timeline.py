@@ -1,13 +1,14 @@
 """Messages in time order, each released once its robot's odometry reaches it."""
 
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from graphslam.dead_reckoning import Track
 from graphslam.records import (
     Message,
     OdometryIncrement,
     OdometryPose,
+    Scan,
     Sighting,
     TrueLandmark,
     Truth,
@@ -29,6 +30,7 @@ def synchronise(
     tracks: Mapping[str, Track],
     max_gap_s: float,
     dropped: Counter[str],
+    watched: Sequence[str] = (),
 ) -> Iterator[Message]:
     """Feed odometry into the tracks and hold everything else until the track covers its time.
 
@@ -36,7 +38,8 @@ def synchronise(
     time is kept over all robots, so one robot's silence may delay the others, by ``max_gap_s`` at
     most: what is farther than that from any odometry of its robot is dropped and counted, and so
     is, at once, a sighting of a robot that has no track. At the end of the log the robot is taken
-    to stand still after its last reading.
+    to stand still after its last reading. Scans may show the robots ``watched``, so they wait for
+    the odometry of these too.
     """
     waiting: deque[Message] = deque()
     max_gap_ns = round(max_gap_s * 1e9)
@@ -47,7 +50,8 @@ def synchronise(
             head = waiting[0]
             if not isinstance(head, ODOMETRY):
                 needed = [tracks.get(robot) for robot in _robots(head)]
-                covered = all(track and track.reaches(head.time_ns) for track in needed)
+                shown = [tracks[robot] for robot in watched] if isinstance(head, Scan) else []
+                covered = all(track and track.reaches(head.time_ns) for track in needed + shown)
                 if not covered and not final and now_ns - head.time_ns <= max_gap_ns:
                     return
                 if not all(track and track.near(head.time_ns, max_gap_ns) for track in needed):

@@ -22,7 +22,8 @@ ROWS = (
     ("gaussian",),  # what squared distances of normal errors may be
     # settings; what travels between the modules; Kalman filtering on arrays
     ("config", "kalman", "records"),
-    ("models",),  # motion, and one observation model per kind of target
+    # messages on one time line; motion, and one observation model per kind of target
+    ("clocks", "models"),
     # one job each, on records and arrays
     ("association", "calibration", "dead_reckoning", "export", "factors", "frontend", "logs"),
     ("matching",),  # where a place was seen from
@@ -31,11 +32,20 @@ ROWS = (
     ("backends", "simulate", "timeline", "trajectories"),
     # what is known about landmarks beside their estimate; of a robot; where robots start; recorded
     # steps through an estimator; sightings that share a step; names given to each other's bearers;
-    # robots joined by what they see
-    ("exchanged", "gathering", "joining", "landmark_map", "replay", "robot_run", "starts"),
+    # robots joined by what they see; how robots' clocks differ
+    (
+        "clock_offsets",
+        "exchanged",
+        "gathering",
+        "joining",
+        "landmark_map",
+        "replay",
+        "robot_run",
+        "starts",
+    ),
     # decisions of one image; states and calibration together; places seen twice; duplicates in a
     # map; observations of walls anew; closures that a log brings along; a log of sightings solved
-    # again; what a run adds up to
+    # again; what a run adds up to; robots in each other's scans
     (
         "associator",
         "calibrating",
@@ -45,6 +55,7 @@ ROWS = (
         "recorded_closures",
         "refining",
         "summary",
+        "watching",
     ),
     ("revisits",),  # landmarks by visit, and one again
     ("consolidating",),  # a log of scans solved again

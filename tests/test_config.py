@@ -177,8 +177,11 @@ def values(kind):
     if origin is tuple and typing.get_origin(arguments[0]) is typing.Literal:
         return st.lists(values(arguments[0]), max_size=3).map(tuple)
     if origin is tuple:
+        items = st.floats(-1e9, 1e9)
+        if typing.get_origin(arguments[0]) is tuple:  # corners
+            items = st.tuples(items, items)
         return st.sampled_from([0, 3]).flatmap(
-            lambda n: st.lists(st.floats(-1e9, 1e9), min_size=n, max_size=n).map(tuple)
+            lambda n: st.lists(items, min_size=n, max_size=n).map(tuple)
         )
     if origin is not None:  # a mapping
         return st.dictionaries(NAMES, values(arguments[1]), max_size=3)

@@ -40,6 +40,7 @@ class WholeGraph(GraphBuilder):
         self._faced_later = faced_later
         self._observed: list[tuple[int, int, Association]] = []  # lines, and their places in graph
         self._places: list[int] = []
+        self.meetings: list[tuple[int, tuple[int, int, Association]]] = []  # the same of robots
 
     def expand(
         self, step: Step, current: Estimates
@@ -59,6 +60,8 @@ class WholeGraph(GraphBuilder):
                 graph.add(factor)
             if self.note_line(part) and not self._faced_later:
                 self._places.append(self.graph.size() + graph.size() - 1)
+            elif part.observed is not None and isinstance(part.observed[2].target, str):
+                self.meetings.append((self.graph.size() + graph.size() - 1, part.observed))
         self.graph.push_back(graph)
         return graph, values
 

@@ -113,6 +113,8 @@ def smoothed(result: Result, directory: Path) -> None:
     console.print(f"{', '.join(parts)}; {summary['stages']['all']:.1f} s{speed}")
     if factor is None:  # the stamps are invented
         console.print(f"stamps: {summary['notes']['stamps']}")
+    for robot, found in summary["clocks"].items():
+        console.print(f"clock of {robot}: {_clock(found)}")
     _reasons(console, "rejected", summary["rejected"])
     _reasons(console, "dropped", summary["dropped"])
     _unobservable(console, summary["calibration"])
@@ -126,6 +128,15 @@ def _unobservable(console: Console, calibration: Mapping[str, Any]) -> None:
     names = [name for name, p in calibration.items() if not p["observable"] and p["sigma"] > 0]
     if names:
         console.print(f"calibration: not observable in this log: {', '.join(names)}")
+
+
+def _clock(found: Mapping[str, Any]) -> str:
+    """How far a clock is ahead of the first robot's, and whether that was made up for."""
+    if not found["observable"]:
+        return "not observable: too few sightings between moving robots"
+    told = f"{found['offset_s']:+.3f} ± {found['offset_sigma_s']:.3f} s"
+    told += f", {found['drift_ppm']:+.0f} ± {found['drift_sigma_ppm']:.0f} ppm"
+    return f"{told}; {'made up for' if found['applied'] else 'no different from zero, not applied'}"
 
 
 def evaluation(found: Mapping[str, Any]) -> None:

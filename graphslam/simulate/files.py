@@ -21,6 +21,7 @@ SCENARIOS: dict[str, Path] = {
         "lab",
         "corridor",
         "two-robots",
+        "robots-in-scans",
         "change",
         "office-loop",
         "long-corridor",
