@@ -316,9 +316,23 @@ class Track:
 
     def moved(self, start_ns: int, end_ns: int) -> tuple[float, float]:
         """Path (m) and net turning (rad, absolute) from ``start_ns`` to ``end_ns``; cheap."""
-        times = np.array([start_ns, end_ns])
-        poses, path = self.pose(times), self._at(times, self._path)
-        return float(path[1] - path[0]), abs(float(wrap(poses[1, 2] - poses[0, 2])))
+        self._settle()
+        if self._count < 2:
+            return 0.0, 0.0
+        (path, heading), (last_path, last_heading) = map(self._way, (start_ns, end_ns))
+        return last_path - path, abs(float(wrap(last_heading - heading)))
+
+    def _way(self, time_ns: int) -> tuple[float, float]:
+        """Path and heading at a time, by the same rule as `pose`; settle first."""
+        i = min(max(int(np.searchsorted(self.times, time_ns, side="left")), 1), self._count - 1)
+        begin, end = int(self._times[i - 1]), int(self._times[i])
+        share = min(max((time_ns - begin) / max(end - begin, 1), 0.0), 1.0)
+        if self._burst[i]:
+            share = float(share >= 1.0)
+        path, last_path = self._path[i - 1], self._path[i]
+        heading, last_heading = self._poses[i - 1, 2], self._poses[i, 2]
+        turned = float(wrap(last_heading - heading))
+        return float(path + share * (last_path - path)), float(heading + share * turned)
 
     def motion(self, start_ns: int, end_ns: int) -> Motion:
         """The motion from ``start_ns`` to ``end_ns`` with its covariance; thesis 4.4-4.15.

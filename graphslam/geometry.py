@@ -6,6 +6,8 @@ frame of ``a``, expressed in the frame that ``a`` is given in. Functions broadca
 axes unless they say otherwise. GTSAM's objects never appear here.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -20,6 +22,13 @@ def wrap(angle_rad: ArrayLike) -> Array:
     """
     angle = np.asarray(angle_rad, dtype=float)
     return np.asarray(angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi)))
+
+
+def _wrap(angle_rad: float) -> float:
+    """`wrap` of one angle."""
+    if not math.isfinite(angle_rad):
+        return math.nan
+    return angle_rad - 2 * math.pi * math.floor((angle_rad + math.pi) / (2 * math.pi))
 
 
 def rotation(angle_rad: float) -> Array:
@@ -42,6 +51,10 @@ def rotation3(angle_rad: ArrayLike) -> Array:
 def compose(a: Array, b: Array) -> Array:
     """``a`` followed by ``b`` given in the frame of ``a``: poses ``(..., 3)``, thesis eq. 4.4."""
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    if a.ndim == b.ndim == 1:  # one pose: most calls, and arrays of three numbers are dear
+        (ax, ay, at), (bx, by, bt) = a.tolist(), b.tolist()
+        cos, sin = math.cos(at), math.sin(at)
+        return np.array([ax + cos * bx - sin * by, ay + sin * bx + cos * by, _wrap(at + bt)])
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     return np.stack(
         [
@@ -69,6 +82,11 @@ def between(a: Array, b: Array) -> Array:
     """
     # the difference first: two equal poses give exactly zero, wherever they are
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    if a.ndim == b.ndim == 1:  # as in `compose`
+        (ax, ay, at), (bx, by, bt) = a.tolist(), b.tolist()
+        cos, sin = math.cos(at), math.sin(at)
+        east, north = bx - ax, by - ay
+        return np.array([cos * east + sin * north, -sin * east + cos * north, _wrap(bt - at)])
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     dx, dy = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
     return np.stack([c * dx + s * dy, -s * dx + c * dy, wrap(b[..., 2] - a[..., 2])], axis=-1)

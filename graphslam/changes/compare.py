@@ -183,21 +183,16 @@ def compare(
         OutputError: the two cannot be registered, or saw nothing in common.
     """
     warnings = lasers_differ(reference, later)
-    reference, placed, registration, bent = in_one_frame(reference, later, registration, config)
-    if bent:
+    laid = _laid(reference, later, registration, config)
+    if laid.broken and registration is None and max(reference.robots, later.robots) == 1:
+        # a motion that some landmarks agree on, while the rest of the maps lies elsewhere
+        laid = _laid_bent(reference, later, config)
+    reference, later, registration = laid.reference, laid.later, laid.registration
+    surfaces, evidence, sigmas, config = laid.surfaces, laid.evidence, laid.sigmas, laid.config
+    if laid.bent:
         warnings += (_BENT,)
-        config = replace(config, gate_m=max(config.gate_m, _BENT_GATE_M))
-    reference, later, surfaces, sigmas = aligned(reference, placed, config, bent)
-    a = surfaces[0]
-    evidence = _evidence(reference, later, surfaces, sigmas, config)
-    suspects = _suspects(later, surfaces, evidence)
-    if suspects.mean() > _MANY_SUSPECTS and not bent:
-        # what changed pulled at the scans that saw it: place them again without it
-        later = align(placed, a, _LATER_GATES, suspects)
-        surfaces = (a, surface_of(later, a.nearest.grid, sigmas[1], config))
-        evidence = _evidence(reference, later, surfaces, sigmas, config)
     # judged with all there is: of paths that are broken little seems solid
-    warnings += _plausible(spread(evidence), bent)
+    warnings += _plausible(spread(evidence), laid.bent)
     surfaces, evidence = _of_solid(surfaces, evidence, (reference, later), config)
     a, b = surfaces
     factor = spread(evidence)
@@ -227,10 +222,29 @@ def compare(
     )  # fmt: skip
 
 
-def in_one_frame(
+@dataclass(frozen=True, slots=True, eq=False)
+class _Laid:
+    """Two visits in one frame, and what each says of the other's surfaces; ``config`` for that."""
+
+    reference: Visit
+    later: Visit
+    registration: Registration
+    surfaces: tuple[Surface, Surface]
+    sigmas: tuple[float, float]
+    evidence: tuple[Evidence, Evidence]
+    config: ChangesConfig
+    bent: bool
+
+    @property
+    def broken(self) -> bool:
+        """Whether the visits disagree by more than can be."""
+        return spread(self.evidence) > _MOST_SPREAD[self.bent]
+
+
+def _laid(
     reference: Visit, later: Visit, registration: Registration | None, config: ChangesConfig
-) -> tuple[Visit, Visit, Registration, bool]:
-    """Both visits in the reference's frame, by landmarks, or else scan by scan as the maps bend.
+) -> _Laid:
+    """Both visits in the reference's frame, by landmarks, or else as the maps bend.
 
     Raises:
         OutputError: neither way works.
@@ -241,9 +255,31 @@ def in_one_frame(
         except OutputError:
             if max(reference.robots, later.robots) > 1:  # no path to follow from scan to scan
                 raise
-            reference, placed, registration = localise(reference, later, config)
-            return reference, placed, registration, True
-    return reference, later.placed(registration.pose, registration.cov), registration, False
+            return _laid_bent(reference, later, config)
+    placed = later.placed(registration.pose, registration.cov)
+    reference, later, surfaces, sigmas = aligned(reference, placed, config)
+    evidence = _evidence(reference, later, surfaces, sigmas, config)
+    suspects = _suspects(later, surfaces, evidence)
+    if suspects.mean() > _MANY_SUSPECTS:
+        # what changed pulled at the scans that saw it: place them again without it
+        a = surfaces[0]
+        later = align(placed, a, _LATER_GATES, suspects)
+        surfaces = (a, surface_of(later, a.nearest.grid, sigmas[1], config))
+        evidence = _evidence(reference, later, surfaces, sigmas, config)
+    return _Laid(reference, later, registration, surfaces, sigmas, evidence, config, False)
+
+
+def _laid_bent(reference: Visit, later: Visit, config: ChangesConfig) -> _Laid:
+    """Both visits in one frame although their maps bend differently.
+
+    Raises:
+        OutputError: they are hardly of one place.
+    """
+    reference, placed, registration = localise(reference, later, config)
+    config = replace(config, gate_m=max(config.gate_m, _BENT_GATE_M))
+    reference, later, surfaces, sigmas = aligned(reference, placed, config, bent=True)
+    evidence = _evidence(reference, later, surfaces, sigmas, config)
+    return _Laid(reference, later, registration, surfaces, sigmas, evidence, config, True)
 
 
 def lasers_differ(reference: Visit, later: Visit) -> tuple[str, ...]:
