@@ -717,6 +717,7 @@ def smooth(
     names = pipeline.exchanged(estimate)
     if names:
         pipeline = _passed(Pipeline(log, config, names, tamper), progress)
+        finishing = time.perf_counter()
         estimate, rough = pipeline.estimate()
     clocks = pipeline.clocks_found(estimate)
     for _ in range(MAX_CLOCKS):
