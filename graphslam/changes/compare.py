@@ -1,7 +1,7 @@
 """Change detection, top to bottom: one frame, surfaces, evidence, changes.
 
 1. the later run's frame lies in the reference's by landmarks of both (`registration`), or, where
-   the maps bend, each of its scans by the surfaces it sees (`localisation`);
+   the maps bend, its path by the surfaces its scans see (`localisation`);
 2. every scan is brought onto the surfaces of the reference, within its covariance (`alignment`);
 3. the beams of each visit are held against the surfaces of the other (`evidence`);
 4. flagged pieces of surface that hang together are changes (`regions`), of which some are one
@@ -65,13 +65,13 @@ _LINE_SAMPLES = 40  # points of a line that are asked for whether they lie on wh
 
 #: where maps bend: how far off a return is still compared, m, and what to say
 _BENT_GATE_M = 0.3
-#: factor on the stated sigmas from which on two maps are not of one place: where scans were placed
-#: one by one, anything that is left was free to fit; and from which on it is warned of
+#: factor on the stated sigmas from which on two maps are not of one place: where a path was
+#: bent to fit, anything that is left was free to fit; and from which on it is warned of
 _MOST_SPREAD, _WIDE_SPREAD = {False: 5.0, True: 1.8}, 1.5
 _BENT = (
     "the maps bend differently, so no one motion brings their landmarks together: both paths were "
-    "straightened by their scans and the later scans placed one after the other; only large "
-    "changes are found, and where they are is known to decimetres"
+    "straightened by their scans and the later one bent onto the reference; only large changes "
+    "are found, and where they are is known to decimetres"
 )
 
 

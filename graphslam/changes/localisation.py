@@ -2,45 +2,37 @@
 
 Two runs through the same place bend their maps differently where little holds them: odometry over
 a corridor, few loops. Each scan still fits the reference's surfaces somewhere. Where is found by
-laying one map over the other in all ways. From the scan that fits best the others follow one after
-another, forwards and backwards, predicted by the run's own motion and corrected by their beams.
+laying one map over the other in all ways, straightened; from the best of these the later path is
+bent onto the reference's surfaces as a whole (`flexed`), and the one that agrees most is taken.
 """
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import cv2
 import numpy as np
 
-from graphslam.changes.alignment import align
 from graphslam.changes.flexed import flexed
 from graphslam.changes.grid import grid_over
 from graphslam.changes.registration import Registration
 from graphslam.changes.straighten import straightened
 from graphslam.changes.surface import Surface, surface_of
-from graphslam.changes.visit import Bools, Ints, Visit
+from graphslam.changes.visit import Bools, Visit
 from graphslam.config import ChangesConfig
 from graphslam.errors import OutputError
 from graphslam.geometry import Array, compose, inverse, rotation, wrap
 
-#: sigmas of a scan's place before its beams are held against the map: of a vote, of a prediction
-_VOTE_SIGMAS = np.array([0.5, 0.5, 0.1])
-_STEP_SIGMAS = np.array([0.08, 0.08, np.radians(2.0)])
 #: sigmas that are stated of a placed scan: of a map that bends they are no more than a bound
-_PLACED_SIGMAS = np.array([0.02, 0.02, np.radians(0.5)])
-_GATES = (0.5, 0.4, 0.3, 0.2, 0.15, 0.1)
-_FLEX_GATES = tuple(np.repeat([0.5, 0.4, 0.3, 0.2, 0.15, 0.1], 3))
-#: scans that are placed together, as the motion between them is known well enough, and with how
-#: many before them
-_TOGETHER, _WINDOW = 5, 30
+_PLACED_COV = np.diag([0.02, 0.02, np.radians(0.5)]) ** 2
+#: farthest returns that pull, m, round by round; the widest is what straight maps differ by
+_GATES = tuple(np.repeat([1.0, 0.7, 0.5, 0.4, 0.3, 0.2, 0.15, 0.1], 3).tolist())
+#: a map is laid again as long as this share more of its returns agree
+_MOST_ROUNDS, _LEAST_GAIN = 6, 0.01
 _RANGE_SIGMA_M = 0.02
 #: a return this near to a surface of the reference, m, agrees with it
 _AGREES_M = 0.1
 #: shares of a scan's returns that must agree (legs and clutter are no surfaces); of scans that must
 _SCAN_SHARE, _RUN_SHARE = 0.3, 0.5
 _FEWEST = 20  # returns of a scan that may agree by chance
-#: every so many scans vote; so many of the best votes are followed
-_EVERY, _FOLLOWED = 10, 2
 #: pictures of the maps: cells, m, and how many a side; turns that are tried, rad; best of them kept
 _CELL_M, _MOST_CELLS, _TURN_RAD, _OVERLAYS = 0.1, 600, np.radians(2.0), 6
 
@@ -68,37 +60,52 @@ def localise(
     ends = reference.ends[reference.surface]
     grid = grid_over(ends, config.resolution_m, config.max_side_cells**2)
     surface = surface_of(reference, grid, _RANGE_SIGMA_M, config)
-    best = (0.0, later, np.zeros(len(later.poses)))
-    for pose, start in _starts(surface, reference, later):
-        tracked = _tracked(surface, later, pose, start)
-        tracked = flexed(tracked, later.poses, surface, _FLEX_GATES)
-        share = agreement(surface, tracked)
-        if (share > _SCAN_SHARE).mean() > best[0]:
-            best = (float((share > _SCAN_SHARE).mean()), tracked, share)
-    placed_share, tracked, share = best
+    placed, share = _laid(surface, later, overlays(ends, later.ends[later.surface]))
+    placed_share = float((share > _SCAN_SHARE).mean())
     if placed_share < _RUN_SHARE:
         raise OutputError(
             "the two runs cannot be registered: no motion brings their landmarks together, and "
-            f"only {100 * placed_share:.0f} % of the later scans fit the reference's surfaces "
-            "one by one; did both drive through the same place?"
+            f"only {100 * placed_share:.0f} % of the later scans fit the reference's surfaces, "
+            "however the path is bent; did both drive through the same place?"
         )
     kept: Bools = share > _SCAN_SHARE
-    motions = compose(tracked.poses[kept], inverse(started[kept]))
+    motions = compose(placed.poses[kept], inverse(started[kept]))
     mean = motions.mean(axis=0)
     mean[2] = np.arctan2(np.sin(motions[:, 2]).mean(), np.cos(motions[:, 2]).mean())
     away = motions - mean
     away[:, 2] = wrap(away[:, 2])
-    cov = away.T @ away / len(away) + np.diag(_PLACED_SIGMAS**2)
+    cov = away.T @ away / len(away) + _PLACED_COV
     none = np.zeros((0, 2), dtype=np.int64)
     return (
         _as_placed(reference),
-        _as_placed(tracked.chosen(kept)),
+        _as_placed(placed.chosen(kept)),
         Registration(mean, cov, none, np.zeros(0, dtype=np.int64)),
     )
 
 
+def _laid(surface: Surface, later: Visit, guesses: list[Array]) -> tuple[Visit, Array]:
+    """The visit laid onto the surfaces from one of ``guesses`` (3,), and what agrees per scan.
+
+    That from which most agrees is gone on with. What lies on the surfaces pulls in what comes
+    before and after, again and again while that helps.
+    """
+    tried = []
+    for guess in guesses:
+        laid = flexed(later.placed(guess, _PLACED_COV), later.poses, surface, _GATES)
+        tried.append((laid, agreement(surface, laid)))
+    # how much agrees in all counts: a scan may agree by chance
+    best, share = max(tried, key=lambda one: float(one[1].mean()))
+    for _ in range(_MOST_ROUNDS):
+        laid = flexed(best, later.poses, surface, _GATES)
+        now = agreement(surface, laid)
+        if now.mean() < share.mean() + _LEAST_GAIN:
+            break
+        best, share = laid, now
+    return best, share
+
+
 def _as_placed(visit: Visit) -> Visit:
-    covs = np.tile(np.diag(_PLACED_SIGMAS**2), (len(visit.poses), 1, 1))
+    covs = np.tile(_PLACED_COV, (len(visit.poses), 1, 1))
     return replace(visit, covs=covs, shared=covs)
 
 
@@ -111,23 +118,6 @@ def agreement(surface: Surface, visit: Visit) -> Array:
     returns = np.bincount(scan, minlength=size)
     share = np.bincount(scan, near, size) / np.maximum(returns, 1)
     return np.asarray(np.where(returns >= _FEWEST, share, 0.0))
-
-
-def _starts(surface: Surface, reference: Visit, later: Visit) -> Iterator[tuple[Array, int]]:
-    """World motions (3,) and a scan that each fits, the best first."""
-    some = np.zeros(len(later.poses), dtype=bool)
-    some[::_EVERY] = True
-    few, number = later.chosen(some), np.nonzero(some)[0]
-    found = []
-    for guess in overlays(reference.ends[reference.surface], later.ends[later.surface]):
-        placed = align(few.placed(guess, np.diag(_VOTE_SIGMAS**2)), surface, _GATES)
-        share = agreement(surface, placed)
-        at = int(share.argmax())
-        motion = compose(placed.poses[at], inverse(few.poses[at]))
-        # what many scans agree with counts, the start is where one fits best
-        found.append((float(np.sort(share)[-5:].mean()), motion, int(number[at])))
-    found.sort(key=lambda start: -start[0])
-    yield from ((motion, scan) for _, motion, scan in found[:_FOLLOWED])
 
 
 def overlays(reference: Array, later: Array) -> list[Array]:
@@ -162,43 +152,3 @@ def _picture(points: Array, cell_m: float, size: int) -> Array:
     image = np.zeros((size, size), dtype=np.float32)
     image[ij[:, 0], ij[:, 1]] = 1.0
     return np.asarray(cv2.GaussianBlur(image, (3, 3), 0), dtype=float)
-
-
-def _tracked(surface: Surface, later: Visit, motion: Array, start: int) -> Visit:
-    """The later scans, followed from scan ``start`` that lies where ``motion`` (3,) brings it."""
-    poses = np.zeros_like(later.poses)
-    scans = np.arange(len(poses))
-    for order in (scans[start:], scans[: start + 1][::-1]):
-        now = motion
-        for i in range(0, len(order), _TOGETHER):
-            new = order[i : i + _TOGETHER]
-            window = np.sort(order[max(i + _TOGETHER - _WINDOW, 0) : i + _TOGETHER])
-            now = _motion(surface, later, window, int(new[-1]), now)
-            poses[new] = compose(np.tile(now, (len(new), 1)), later.poses[new])
-    return replace(later, poses=poses)
-
-
-def _motion(surface: Surface, later: Visit, window: Ints, last: int, guess: Array) -> Array:
-    """The motion (3,) near ``guess`` that brings some neighbouring scans onto the surfaces.
-
-    They are one large scan from where the ``last`` of them stood: a single one may see too little.
-    """
-    low, high = np.searchsorted(later.scan, [window[0], window[-1] + 1])
-    used = low + np.nonzero(later.surface[low:high])[0]
-    away = _ends(later, used) - later.poses[last, :2]
-    angle = np.arctan2(away[:, 1], away[:, 0]) - later.poses[last, 2]
-    cov = np.diag(_STEP_SIGMAS**2)[None]
-    one = Visit(
-        later.stamps_ns[last : last + 1], compose(guess, later.poses[last])[None], cov, cov,
-        np.zeros(len(used), dtype=np.int64), angle, np.hypot(*away.T),
-        np.ones(len(used), dtype=bool), later.landmarks,
-    )  # fmt: skip
-    return compose(align(one, surface, _GATES).poses[0], inverse(later.poses[last]))
-
-
-def _ends(visit: Visit, beams: Ints) -> Array:
-    """World points (k, 2) m of some beams (k,)."""
-    pose = visit.poses[visit.scan[beams]]
-    heading = pose[:, 2] + visit.angle[beams]
-    d = np.column_stack([np.cos(heading), np.sin(heading)])
-    return np.asarray(pose[:, :2] + visit.range_m[beams, None] * d)
