@@ -363,6 +363,8 @@ class Track:
         `motion` takes the robot to stand then; by so much it may be wrong.
         """
         begin, end = start_ns - self.latency_ns, end_ns - self.latency_ns
+        if self.first_ns <= begin and end <= self.last_ns:
+            return np.zeros(3)
         most = min(end - begin, self.last_ns - self.first_ns)
         before, after = (
             min(max(ns, 0), most) for ns in (self.first_ns - begin, end - self.last_ns)

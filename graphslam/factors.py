@@ -25,14 +25,18 @@ LINE_GAUGE_SIGMA_M = 1.0
 FILTER_GAUGE_SIGMA_M = 1e-3
 
 
+#: a symbol's letter is in its highest byte, its number in the others
+FIRST_STATE, FIRST_LANDMARK = (int(gtsam.symbol(letter, 0)) for letter in "xl")
+
+
 def state_key(robot_index: int, number: int) -> int:
     """Key of a robot's state; up to 2^16 robots and 2^40 states each."""
-    return int(gtsam.symbol("x", robot_index << 40 | number))
+    return FIRST_STATE | robot_index << 40 | number
 
 
 def landmark_key(landmark: int) -> int:
     """Key of a landmark."""
-    return int(gtsam.symbol("l", landmark))
+    return FIRST_LANDMARK | landmark
 
 
 def pose2(pose: Array) -> gtsam.Pose2:
