@@ -35,7 +35,7 @@ demo: $(INSTALLED)
 	@echo '$(CURDIR)/$(OUT)/lab/report.html   a laser in a cluttered room, simulated, with truth'
 
 test: $(INSTALLED)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check

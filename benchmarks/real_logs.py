@@ -27,7 +27,7 @@ GRAPHSLAM = [sys.executable, "-m", "graphslam"]
 
 @dataclass(frozen=True)
 class Bar:
-    """A value of Intel must be at most ``limit``, or at least it."""
+    """A value must be at most ``limit``, or at least it."""
 
     name: str
     limit: float
@@ -38,14 +38,23 @@ class Bar:
         return value >= self.limit if self.at_least else value <= self.limit
 
 
-BARS = (
-    Bar("all, mean m", 1.2),
-    Bar("loops, median m", 0.3),
-    Bar("local, mean m", 0.0185),
+EVERY = (
+    Bar("wall s", 60.0),
     Bar("x real time", 20.0, at_least=True),
     Bar("peak memory MB", 1000.0),
     Bar("unmatched", 0),
 )
+#: what each log is held to; the errors are below those published for Cartographer
+BARS = {
+    "intel": (
+        Bar("all, mean m", 0.020),
+        Bar("all, mean deg", 0.7),
+        Bar("local, mean m", 0.0185),
+        Bar("loops, mean m", 0.030),
+        *EVERY,
+    ),
+    "aces": (Bar("all, mean m", 0.040), Bar("loops, mean m", 0.060), *EVERY),
+}
 
 
 @dataclass(frozen=True)
@@ -68,7 +77,9 @@ class Run:
         groups = self.relations
         return {
             "all, mean m": groups["all"]["trans_mean_m"],
-            "loops, median m": groups["loops"]["trans_median_m"],
+            "all, mean deg": groups["all"]["rot_mean_deg"],
+            "loops, mean m": groups["loops"]["trans_mean_m"],
+            "wall s": self.wall_s,
             "local, mean m": groups["local"]["trans_mean_m"],
             "x real time": self.times_real_time,
             "peak memory MB": self.peak_mb,
@@ -133,14 +144,14 @@ def print_bars(name: str, done: Run) -> bool:
     """Whether all hold."""
     values = done.values()
     print(f"\n{name + ': bar':30}{'limit':>10}{'found':>10}")
-    for bar in BARS:
+    for bar in BARS[name]:
         value = values[bar.name]
         sign = ">=" if bar.at_least else "<="
         print(
             f"  {bar.name:26}{sign} {bar.limit:<9g}{value:10.4g}"
             f"  {'held' if bar.held(value) else 'NOT HELD'}"
         )
-    return all(bar.held(values[bar.name]) for bar in BARS)
+    return all(bar.held(values[bar.name]) for bar in BARS[name])
 
 
 def main(names: list[str]) -> int:
@@ -153,8 +164,7 @@ def main(names: list[str]) -> int:
         for name in names:
             done = run(name, Path(folder))
             print_errors(name, done)
-            if name == "intel":
-                good = print_bars(name, done)
+            good &= print_bars(name, done)
     return 0 if good else 1
 
 

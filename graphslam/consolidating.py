@@ -172,7 +172,7 @@ def _closed(
         P = solve.backend.state_covariance([place.state for place in seen])
         new, same = loop_closures(moved(seen, now.states), P, looked)
         if tamper is not None:
-            new = tamper(new, seen)
+            new = [c for c in tamper([*new, *same], seen) if c not in same]
         # what did not agree before may do so now
         open_ones = refused | {c.pair: c for c in new}
         agreed = agreeing([*open_ones.values(), *same], moved(seen, loose.states), P)

@@ -1,0 +1,112 @@
+"""False loop closures among the verified ones: does the map stay what it is?
+
+After verification, closures are added to those that matching found (`smooth`'s hook ``tamper``),
+until they are 10, 30 or 50 % of all: half of them each for itself between places drawn at random,
+half in groups of three that agree with each other. Each is off by one to five metres and up to half
+a radian. The final error over all relations must stay within 10 % of the run without them.
+
+Run: python benchmarks/false_closures.py [--seeds N] [aces] [intel]     exit code 1 if it does not
+The data are taken as in real_logs.py.
+"""
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from real_logs import DATA, LOGS, command
+
+from graphslam.closing import Place
+from graphslam.config import Config
+from graphslam.consolidating import Tamper
+from graphslam.evaluate import read_relations, relation_errors
+from graphslam.geometry import between, compose
+from graphslam.logs import open_logs
+from graphslam.records import Closure
+from graphslam.slam import smooth
+
+SHARES, WITHIN, GROUP = (0.1, 0.3, 0.5), 1.1, 3
+COV = np.diag([0.03, 0.03, 0.005]) ** 2
+
+
+class Liar:
+    """Adds false closures, once, to those that were found first."""
+
+    def __init__(self, share: float, seed: int) -> None:
+        self._share, self._rng = share, np.random.default_rng(seed)
+        self.true = self.false = 0
+
+    def __call__(self, found: list[Closure], places: Sequence[Place]) -> list[Closure]:
+        """The closures, and the false ones behind them."""
+        if self.false or not found:
+            return found
+        self.true = len(found)
+        wanted = max(GROUP, round(len(found) * self._share / (1 - self._share)))
+        made: list[Closure] = []
+        while len(made) < wanted:
+            made += self._group(GROUP if len(made) < wanted / 2 else 1, places)
+        self.false = len(made)
+        return [*found, *made]
+
+    def _group(self, size: int, places: Sequence[Place]) -> list[Closure]:
+        """Closures from neighbouring places to one other, all wrong by the same motion."""
+        first = int(self._rng.integers(size, len(places) - size))
+        other = places[int(self._rng.integers(0, first))]
+        way = self._rng.uniform(-np.pi, np.pi)
+        far = self._rng.uniform(1.0, 5.0)
+        off = np.array([far * np.cos(way), far * np.sin(way), self._rng.uniform(-0.5, 0.5)])
+        return [
+            Closure(
+                *later.state,
+                *other.state,
+                compose(off, between(other.pose, later.pose)),
+                COV,
+            )
+            for later in places[first : first + size]
+        ]
+
+
+def run(log: Path, relations: Path, tamper: Tamper | None) -> tuple[float, float]:
+    """Mean error over all relations and over loops, m, final."""
+    config = Config()
+    result = smooth(open_logs([log], config), config, tamper=tamper)
+    known = read_relations(relations)
+    (robot,) = result.robots.values()
+    assert robot.scan_final is not None
+    errors = relation_errors(known, robot.scan_final)[:, 0]
+    return float(np.nanmean(errors)), float(np.nanmean(errors[~known.local]))
+
+
+def main() -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("logs", nargs="*", default=list(LOGS))
+    parser.add_argument("--seeds", type=int, default=2)
+    arguments = parser.parse_args()
+    bad = 0
+    print("log    share  seed  true  false  all, m  loops, m  of clean")
+    for name in arguments.logs:
+        with tempfile.TemporaryDirectory() as folder:
+            log = Path(folder) / f"{name}.mcap"
+            command("import", "carmen", str(DATA / f"{name}.clf.bz2"), "-o", str(log))
+            relations = DATA / f"{name}.relations"
+            clean, loops = run(log, relations, None)
+            print(f"{name:6} {0:5.0%}     -     -      -  {clean:.4f}    {loops:.4f}", flush=True)
+            for share in SHARES:
+                for seed in range(arguments.seeds):
+                    liar = Liar(share, seed)
+                    error, loops = run(log, relations, liar)
+                    bad += error > WITHIN * clean
+                    print(
+                        f"{name:6} {share:5.0%} {seed:5d} {liar.true:5d} {liar.false:6d}  "
+                        f"{error:.4f}    {loops:.4f}  {error / clean:8.2f}",
+                        flush=True,
+                    )
+    print("held" if not bad else f"{bad} runs are more than 10 % worse")
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
