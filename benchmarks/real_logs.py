@@ -5,10 +5,12 @@ of its own. The errors are those of Kümmerle et al. 2009 over hand-made relatio
 over all, over pairs at most 60 s apart (local), and farther apart (loops). Speed is the length of
 the log over the wall time of the whole `smooth` command, report and all; memory its peak.
 
-Run: python benchmarks/real_logs.py [intel] [aces]     exit code 1 if a bar is not held
+Run: python benchmarks/real_logs.py [intel] [aces] [--figures DIR]
+Exit code 1 if a bar is not held.
 The data are taken from GRAPHSLAM_DATA (default: ../shared/data beside the repository).
 """
 
+import argparse
 import json
 import os
 import subprocess
@@ -18,6 +20,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import real_logs_figures
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("GRAPHSLAM_DATA", ROOT / "../shared/data")) / "freiburg"
@@ -154,19 +158,29 @@ def print_bars(name: str, done: Run) -> bool:
     return all(bar.held(values[bar.name]) for bar in BARS[name])
 
 
-def main(names: list[str]) -> int:
-    for name in names:
+def main() -> int:
+    """Print errors and bars."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("logs", nargs="*", default=list(LOGS))
+    parser.add_argument("--figures", type=Path, help="folder for the figures of docs/real-logs.md")
+    arguments = parser.parse_args()
+    for name in arguments.logs:
         if name not in LOGS or not (DATA / f"{name}.clf.bz2").exists():
             print(f"real_logs: error: {DATA}/{name}.clf.bz2: no such log; set GRAPHSLAM_DATA")
             return 2
     good = True
     with tempfile.TemporaryDirectory() as folder:
-        for name in names:
+        for name in arguments.logs:
             done = run(name, Path(folder))
             print_errors(name, done)
             good &= print_bars(name, done)
+            if arguments.figures:
+                relations = DATA / f"{name}.relations"
+                print(
+                    real_logs_figures.draw(name, Path(folder) / name, relations, arguments.figures)
+                )
     return 0 if good else 1
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:] or list(LOGS)))
+    sys.exit(main())
