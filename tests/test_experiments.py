@@ -394,7 +394,10 @@ def test_ctrl_c_leaves_whole_lines_and_exit_code_130(tmp_path):
     path.write_text(SMALL.replace("runs = 2", "runs = 2000"))
     folder = tmp_path / "out"
     command = [sys.executable, "-m", "graphslam", "experiment", path, "-o", folder, "--jobs", "2"]
+    # a shell's background jobs ignore it, and so would what they start
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     process = subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True)
+    signal.signal(signal.SIGINT, before)
     rows = folder / "results.jsonl"
     until = time.monotonic() + 240
     while not (rows.exists() and rows.stat().st_size) and time.monotonic() < until:
