@@ -56,9 +56,8 @@ class RareLooksBackend(Isam2Backend):
             return None
         seen: list[Association] = []
         for a in step.associations:
-            if a.late:  # of a state that it has forgotten
-                continue
-            if a.robot not in known or not isinstance(a.target, int):
+            # late: of a state that it has forgotten
+            if a.late or a.robot not in known or not isinstance(a.target, int):
                 return None
             now = step.time_ns if a.robot in step.motions else known.latest_ns(a.robot)
             if a.time_ns != now or (
