@@ -36,7 +36,7 @@ class Counting(RareLooksBackend):
 def test_it_says_what_looking_every_time_says(steps):
     """Joint marginals of the pose and the landmarks of the step, at every step: poses within 0.6
     sigma (median: a fifth), lines within 1.5 (a tenth), sigmas within 40 % (5 %). The filter
-    linearises once, and its lines' gauge is narrower. Breaks with a step that the filter or the tree
+    linearises once, its lines have a narrower gauge. Breaks with a step that the filter or the tree
     misses, or takes twice, and if the filter goes on without evidence that is late."""
     (robot,) = steps[0].starts
     plain, rare = Isam2Backend(CONFIG), Counting(CONFIG)
