@@ -244,9 +244,7 @@ class BackendConfig:
     close loops that scans confirm. verify_closures: believe relative poses that a log brings along
     only if they agree with each other. horizon_s: how long a past pose stays in isam2's graph
     before it is marginalised out: inf = full smoothing, 0 = the extended Kalman filter.
-    look_every: isam2 with one robot answers from a filter in between, for so many steps at most; 1
-    = it looks into its tree at every step. exchange_s: time between two messages of a robot in
-    `decentralised`.
+    exchange_s: time between two messages of a robot in `decentralised`.
     """
 
     name: Literal[
@@ -256,7 +254,6 @@ class BackendConfig:
     exchange_s: float = 30.0
     relinearize_threshold: float = 0.05
     relinearize_every: int = 20
-    look_every: int = 10
     polish: bool = True
     reconsider: bool = True
     close_loops: bool = True

@@ -10,8 +10,7 @@ from graphslam.backends.ekf import EkfBackend
 from graphslam.backends.factor_ekf import FactorEkfBackend
 from graphslam.backends.fixed_lag import FixedLagBackend
 from graphslam.backends.invariant_ekf import InvariantEkfBackend
-from graphslam.backends.isam2 import BatchBackend
-from graphslam.backends.rare_looks import RareLooksBackend
+from graphslam.backends.isam2 import BatchBackend, Isam2Backend
 from graphslam.backends.rbpf import RbpfBackend
 from graphslam.config import Config
 
@@ -25,7 +24,7 @@ def with_horizon(config: Config) -> Backend:
     if config.backend.horizon_s == 0:
         return FactorEkfBackend(config)
     if math.isinf(config.backend.horizon_s):
-        return RareLooksBackend(config)
+        return Isam2Backend(config)
     return FixedLagBackend(config)
 
 

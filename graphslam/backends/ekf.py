@@ -34,7 +34,7 @@ from graphslam.geometry import (
     rotation3,
     wrap,
 )
-from graphslam.kalman import JointGaussian, symmetric, whiten
+from graphslam.kalman import JointGaussian, whiten
 from graphslam.models import MODELS
 from graphslam.models.observation import ObservationModel
 from graphslam.records import Association, Closure, Estimate, Motion, Start, Step, Trajectory
@@ -128,29 +128,6 @@ class EkfBackend:
         self.skipped: Counter[str] = Counter()
         self.smooths = False
         self.error_frame: Literal["body", "world"] = config.ekf.error
-
-    @classmethod
-    def from_joint(
-        cls, config: Config, robot: str, time_ns: int, joint: Joint, landmarks: Sequence[int]
-    ) -> "EkfBackend":
-        """A filter that knows what a joint marginal says of a robot at a time, and of landmarks."""
-        made, members = cls(config), list[Member]([robot, *landmarks])
-        made._states.append(robot, time_ns)
-        T = np.eye(len(joint.cov))
-        slices = (slice(0, 3), *joint.slices)
-        for name, mean, block in zip(members, (joint.pose, *joint.landmarks), slices, strict=True):
-            made._gaussian.add(name, mean, np.zeros((len(mean),) * 2))
-            T[block, block] = made._to_error(mean)
-        made._gaussian.P[:] = symmetric(T @ joint.cov @ T.T)
-        return made
-
-    def __contains__(self, member: object) -> bool:
-        """Whether it knows a landmark, by its number, or a robot's latest pose, by its name."""
-        return member in self._gaussian
-
-    def latest_ns(self, robot: str) -> int:
-        """Time of the robot's latest state."""
-        return self._states.times[robot][-1]
 
     # ------------------------------------------------------------ evidence in
 

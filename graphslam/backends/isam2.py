@@ -147,10 +147,7 @@ class Isam2Backend(GraphBackend):
     def add(self, step: Step) -> None:
         """See `Backend`."""
         self._settle()
-        self._update(*self._builder.expand(step, self.value))
-
-    def _update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-        """New factors and variables into the tree."""
+        graph, values = self._builder.expand(step, self.value)
         self._joints.clear()
         try:
             self._isam.update(graph, values)
