@@ -5,6 +5,7 @@ them a few millimetres apart. Instead all that the robots of a log see within a 
 step: one state per robot at its end, and every sighting carried there by odometry.
 """
 
+import itertools
 from collections import Counter, defaultdict, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -236,3 +237,15 @@ def shared(associations: Sequence[Association]) -> tuple[Association, ...]:
     """
     count = Counter((a.robot, a.target) for a in associations)
     return tuple(replace(a, cov=a.cov * count[a.robot, a.target]) for a in associations)
+
+
+def events(messages: Iterable[Message]) -> Iterator[list[Message]]:
+    """Messages grouped: the sightings of one robot at one time are one image."""
+
+    def key(message: Message) -> tuple[object, ...]:
+        if isinstance(message, Sighting):
+            return (message.robot, message.time_ns)
+        return (id(message),)
+
+    for _, group in itertools.groupby(messages, key):
+        yield list(group)

@@ -20,10 +20,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
 from graphslam.config import AssociationConfig
 from graphslam.dead_reckoning import IntArray, Track
+from graphslam.gaussian import chi2_quantile
 from graphslam.geometry import (
     Array,
     between,
@@ -196,7 +196,7 @@ def relate(
     spread = noise[:, None] + noise
     for end, name in zip(ends, (a, b), strict=True):
         spread = spread + end.relative_variance(views[name].track)
-    agree = (apart[0] - apart[1]) ** 2 <= chi2.ppf(AGREE, 1) * spread
+    agree = (apart[0] - apart[1]) ** 2 <= chi2_quantile(AGREE, 1) * spread
     np.fill_diagonal(agree, False)
     variance = p.variance + q.variance + noise
     best = _fitted(largest(agree, worth), p.points, q.points, variance)
@@ -214,7 +214,7 @@ def relate(
         if turned and _differ(pose, cov, other, other_cov):
             # some pairs may fit both
             behind = [
-                worth[_misses(move, p.points, q.points, variance) <= chi2.ppf(FIT, 2)].sum()
+                worth[_misses(move, p.points, q.points, variance) <= chi2_quantile(FIT, 2)].sum()
                 for move in (pose, other)
             ]
             if behind[1] > RIVAL * behind[0]:
@@ -348,7 +348,7 @@ def _fitted(members: IntArray, p: Array, q: Array, variance: Array) -> IntArray:
     while len(members) > 1:
         pose, _ = registered(p[members], q[members], variance[members])
         miss = _misses(pose, p[members], q[members], variance[members])
-        if miss.max() <= chi2.ppf(FIT, 2):
+        if miss.max() <= chi2_quantile(FIT, 2):
             break
         members = np.delete(members, miss.argmax())
     return members
@@ -381,7 +381,7 @@ def _drift(pose: Array, a: View, b: View, p: Ends, q: Ends, members: IntArray) -
 def _differ(a: Array, cov_a: Array, b: Array, cov_b: Array) -> bool:
     """Whether two poses (3,) are more apart than their covariances allow."""
     off = np.append(a[:2] - b[:2], wrap(a[2] - b[2]))
-    return bool(off @ np.linalg.solve(cov_a + cov_b, off) > chi2.ppf(FIT, 3))
+    return bool(off @ np.linalg.solve(cov_a + cov_b, off) > chi2_quantile(FIT, 3))
 
 
 # ---------------------------------------------------------------- all robots

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
 
+from graphslam.gaussian import chi2_quantile
 from graphslam.geometry import Array, rotation, wrap
 from graphslam.matching import Submap, align, fit, make_submap, match
 from graphslam.records import Closure, Motion, Observation
@@ -21,7 +21,7 @@ from graphslam.records import Closure, Motion, Observation
 #: points of a scan at least, to say anything
 FEWEST = 30
 #: squared Mahalanobis distance, 3 dof: worth a closer look; a contradiction
-LOOK, CONTRADICTED = chi2.ppf(0.9, 3), chi2.ppf(0.999, 3)
+LOOK, CONTRADICTED = chi2_quantile([0.9, 0.999], 3)
 #: m, rad: smaller disagreements are left to the landmarks
 SMALLEST_M, SMALLEST_RAD = 0.05, 0.03
 #: m, rad: directions in which scans are less sure are left to odometry

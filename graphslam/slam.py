@@ -1,693 +1,32 @@
-"""The pipeline: from the messages of a log to a `Result`, readable top to bottom.
+"""The main job: from a log to a `Result`.
 
-One event (a scan, or the sightings of one stamp) goes: motion since the robot's last state ->
-keyframe or not -> observations in the base frame -> association -> `Step` -> back end. It branches
-on no landmark kind, front end or back end; those are rows of tables.
+Mostly one pass (`pipeline`), after which the log is solved again. More passes where one shows that
+the next should begin with other starts, names or clocks.
 """
 
-import dataclasses
-import itertools
 import time
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, TypeVar
 
 import numpy as np
 
-from graphslam.associator import Associator
-from graphslam.backends import BACKENDS
-from graphslam.backends.isam2 import Isam2Backend
-from graphslam.calibration import observed_information
-from graphslam.clock_offsets import ClockFound, clocks_found
-from graphslam.clocks import Clock, on_one_clock
-from graphslam.config import (
-    BackendConfig,
-    Config,
-    KeyframeConfig,
-    OdometryConfig,
-    RobotConfig,
-    load_config,
-)
-from graphslam.consolidating import Tamper, consolidate
-from graphslam.dead_reckoning import Track
-from graphslam.errors import ConfigError, EstimationError, LogError
-from graphslam.exchanged import exchanged_names, renamed
-from graphslam.frontend import FRONT_ENDS, scan_points
-from graphslam.frontend.robots import outline_of
-from graphslam.frontend.sightings import sighting_observation
-from graphslam.gathering import Gathered, Sources, carried, gather, met, shared, ways
-from graphslam.geometry import (
-    Array,
-    compose,
-    compose_cov,
-    inverse,
-    inverse_cov,
-    rotate_cov,
-)
+from graphslam.config import BackendConfig, Config, RobotConfig
+from graphslam.consolidating import Tamper
+from graphslam.errors import LogError
 from graphslam.joining import Joined, View, join
+from graphslam.log_settings import check_robots, robot_settings
 from graphslam.logs import LogSet
-from graphslam.models import transport
-from graphslam.recorded_closures import NOTHING_RECORDED, own_frame, verify
-from graphslam.records import (
-    Association,
-    Closure,
-    Estimate,
-    Landmark,
-    Message,
-    Motion,
-    Observation,
-    Picture,
-    RelativePose,
-    Result,
-    Scan,
-    Sighting,
-    Start,
-    Step,
-    Trajectory,
-    TrueLandmark,
-    Truth,
-)
-from graphslam.refining import refine
-from graphslam.robot_run import RobotRun, span_warnings
-from graphslam.scan_motion import beside_lines, checked, measured, scan_submap
+from graphslam.pipeline import Known, Pipeline, Progress
+from graphslam.recorded import Recorded, recorded_in
+from graphslam.records import Result, Sighting, Start
+from graphslam.robot_run import span_warnings
 from graphslam.starts import origin, start_poses
 from graphslam.summary import make_landmarks, summarise
-from graphslam.timeline import ODOMETRY, synchronise
-from graphslam.trajectories import Worlds, origin_shift
-from graphslam.watching import Watcher
 
 #: scans in the picture at most
 MAX_PICTURES = 4000
-#: m: frames that nothing relates lie so far apart while they are estimated that no association can
-#: reach from one to another
-FRAMES_APART_M = 1e5
-#: between frame and identity of landmarks in other frames than the world's; in no name
-FRAME_MARK = "\0"
-
 #: times that the log is taken again by better clocks
 MAX_CLOCKS = 4
-#: s: sigma of the difference of two robots' clocks before anything is known
-CLOCK_DOUBT_S = 0.5
-
-Progress = Callable[[int], None]
-Settings = TypeVar("Settings", KeyframeConfig, OdometryConfig, RobotConfig)
-#: robot, time, other robot, its time, relative pose (as bytes): what a recorded closure is known by
-ClosureId = tuple[str, int, str, int, bytes]
-
-
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Recorded:
-    """What became of a log's relative poses, see `graphslam.recorded_closures.Verified`.
-
-    ``refused`` and ``kept`` by `closure_id`; ``frames`` of all robots that have a start.
-    """
-
-    starts: Mapping[str, Start]
-    frames: Mapping[str, str]
-    kept: frozenset[ClosureId]
-    refused: Mapping[ClosureId, str]
-
-    def told(self) -> dict[str, Any]:
-        """For summary.json: number ``kept``, list of those ``refused``, and why."""
-        refused = [
-            {"robot": r, "time_ns": t, "other": o, "other_time_ns": s, "reason": why}
-            for (r, t, o, s, _), why in self.refused.items()
-        ]
-        return {"kept": len(self.kept), "refused": refused}
-
-
-class Pipeline:
-    """One run over a log."""
-
-    def __init__(
-        self,
-        log: LogSet,
-        config: Config,
-        names: Mapping[str, str] | None = None,
-        tamper: Tamper | None = None,
-        joined: Joined | None = None,
-        clocks: Mapping[str, Clock] | None = None,
-    ) -> None:
-        """Nothing read yet.
-
-        Args:
-            log: opened logs.
-            config: settings.
-            names: false name -> right name of what is sighted.
-            tamper: see `graphslam.consolidating.Tamper`.
-            joined: where robots start and in which frames; None finds out.
-            clocks: of robots whose clock is not that of the first.
-        """
-        config = replace(config, keyframe=noted(config.keyframe, "keyframe", log.notes))
-        self.log, self.config, self.names, self.clocks = log, config, names or {}, clocks or {}
-        self.tamper = tamper
-        self.backend = BACKENDS[config.backend.name](config)
-        self.associator = Associator(config.association, self.backend)
-        self.front_end = FRONT_ENDS[config.front_end.name]
-        # dead reckoning is of odometry alone
-        self.matches_scans = config.odometry.scan_matching != "off" and (
-            config.backend.name != "dead-reckoning" and config.front_end.name != "none"
-        )
-        self.runs = {
-            name: RobotRun(track, clock=self.clocks.get(name, Clock()))
-            for name, track in make_tracks(log, config).items()
-        }
-        began = time.perf_counter()
-        starts = start_poses(log, config) if joined is None else joined.starts
-        self.recorded = verify_recorded(log, config, starts)
-        self.joined = joined or placed(log, config, self.names, starts, self.recorded)
-        self.starts, self.frames = self.joined.starts, self.joined.frames
-        roots = sorted(set(self.frames.values()) - {self.joined.world})
-        self.places = {frame: (k + 1) * FRAMES_APART_M for k, frame in enumerate(roots)}
-        self.meetings: list[Sighting] = []  # of robots in frames that nothing relates
-        self.watcher = Watcher(
-            self.backend, self.runs, outlines(log, config), config.front_end, CLOCK_DOUBT_S
-        )
-        self.steps: list[Step] = []
-        self.sources: Sources = {}
-        self.sightings: list[Sighting] = []  # of robots that entered at their own time
-        self.pictures: list[Picture] = []
-        self.counts: Counter[str] = Counter()
-        self.dropped: Counter[str] = Counter()
-        self.seconds: dict[str, float] = defaultdict(float)
-        self.seconds["starts"] = time.perf_counter() - began
-        self.step_ms: list[float] = []
-        self.first_ns, self.last_ns = 1 << 63, 0
-
-    # ------------------------------------------------------------ the loop
-
-    def run(self, progress: Progress) -> None:
-        """Take in every message of the log."""
-        tracks = {name: run.track for name, run in self.runs.items()}
-        read = _counted(self.log.messages((Truth, TrueLandmark)), self.counts, progress)
-        messages = synchronise(
-            self.wanted(on_one_clock(read, self.clocks)),
-            tracks,
-            self.config.odometry.max_gap_s,
-            self.dropped,
-            tuple(self.watcher.outlines),
-        )
-        # one robot has nobody to share a step with, and a scan makes its own
-        alone = len(tracks) < 2 or any(map(self.log.has_scans, tracks))
-        alone |= self.config.keyframe.mode == "all"
-        span_ns = 0 if alone else round(1e9 * self.config.keyframe.gather_s)
-        max_gap_ns = round(1e9 * self.config.odometry.max_gap_s)
-        clock = time.perf_counter()
-        for event in gather(events(messages), tracks, span_ns, max_gap_ns):
-            self.seconds["read"] += time.perf_counter() - clock
-            began = time.perf_counter()
-            steps = len(self.steps)
-            if isinstance(event, Gathered):
-                self.take_gathered(event)
-            else:
-                self.take(event)
-            clock = time.perf_counter()
-            if len(self.steps) > steps:
-                self.step_ms.append(1e3 * (clock - began))
-
-    def wanted(self, messages: Iterable[Message]) -> Iterator[Message]:
-        """Messages under right names, without sightings of robots where these are to be ignored."""
-        ignore = self.config.association.robots == "ignore"
-        for recorded in messages:
-            message = recorded
-            if self.names and isinstance(message, Sighting):
-                message = renamed(message, self.names, self.log.robots)
-            if isinstance(message, Sighting) and message.seen_robot == message.robot:
-                self.dropped["sighting: a robot does not see itself"] += 1
-            elif ignore and isinstance(message, Sighting) and message.seen_robot is not None:
-                self.dropped["sighting: of a robot, ignored by association.robots"] += 1
-            elif self.crosses_frames(message):
-                kind = type(message).__name__.lower()
-                self.dropped[f"{kind}: of a robot in a frame of its own"] += 1
-                if isinstance(message, Sighting):
-                    self.meetings.append(message)
-            elif self.places and isinstance(message, Sighting) and message.identity is not None:
-                yield replace(message, identity=self.framed(message.robot, message.identity))
-            else:
-                yield message
-
-    def crosses_frames(self, message: Message) -> bool:
-        """Whether a message relates robots whose frames are not related."""
-        other = None
-        if isinstance(message, Sighting):
-            other = message.seen_robot
-        elif isinstance(message, RelativePose):
-            other = message.other
-        if other is None or other not in self.frames:
-            return False
-        return self.frames[message.robot] != self.frames[other]
-
-    def framed(self, robot: str, identity: str) -> str:
-        """An identity as it is known in the frame of ``robot``: each frame has a map of its own."""
-        frame = self.frames[robot]
-        return identity if frame == self.joined.world else f"{frame}{FRAME_MARK}{identity}"
-
-    def take_gathered(self, gathered: Gathered) -> None:
-        """All images of a span, in one step at its end.
-
-        Robots that moved, saw a robot or were seen get a state there. Their sightings are carried
-        to it, those of others to their last state.
-        """
-        step_ns = gathered.time_ns
-        self.first_ns = min(self.first_ns, gathered.first_ns)
-        self.last_ns = max(self.last_ns, step_ns)
-        meeting: set[str] = set()
-        for image in gathered.images:
-            run = self.runs[image[0].robot]
-            if not run.started:
-                self.start(image[0].robot, min(run.track.first_ns, image[0].time_ns))
-            meeting |= {robot for s in image if s.seen_robot for robot in (s.robot, s.seen_robot)}
-        for robot in meeting:
-            if not self.runs[robot].started:
-                self.start(robot, min(self.runs[robot].track.first_ns, step_ns))
-        last_ns = {
-            robot: run.state_ns
-            for robot, run in ((robot, self.runs[robot]) for robot in gathered.robots)
-            if step_ns > run.state_ns
-            and (robot in meeting or self.has_moved(run, run.state_ns, step_ns))
-        }
-        at = {r: step_ns if r in last_ns else self.runs[r].state_ns for r in gathered.robots}
-        moved, new = ways(gathered, at, last_ns, {robot: self.runs[robot].track for robot in at})
-        motions = {robot: new[robot] for robot in last_ns}
-        for robot, motion in motions.items():
-            self.runs[robot].path_m += motion.length_m
-        began = time.perf_counter()
-        known = {i for i, entry in self.associator.map.entries.items() if entry.in_graph}
-        associations: tuple[Association, ...] = ()
-        every = [sighting for image in gathered.images for sighting in image]
-        observed = iter(carried(every, [moved[s.robot, s.time_ns] for s in every]))
-        for image in gathered.images:
-            run, robot = self.runs[image[0].robot], image[0].robot
-            state_ns = at[robot]
-            seen = list(itertools.islice(observed, len(image)))
-            for o, sighting in zip(seen, image, strict=True):
-                self.sources[robot, state_ns, o.z.tobytes()] = sighting
-            landmarks = [o for o, s in zip(seen, image, strict=True) if s.seen_robot is None]
-            self.counts["observations"] += len(seen)
-            if landmarks:
-                associations += self.associator.associate(
-                    robot,
-                    state_ns,
-                    landmarks,
-                    run.causal_poses[-1],
-                    motions.get(robot),
-                    run.track,
-                    run.path_m,
-                    gathering=True,
-                )
-            for o, s in zip(seen, image, strict=True):
-                if s.seen_robot is not None:
-                    other = self.runs[s.seen_robot]
-                    headings = [
-                        r.causal_poses[-1][2] + (motions[name].delta[2] if name in motions else 0.0)
-                        for name, r in ((s.seen_robot, other), (robot, run))
-                    ]
-                    turn = float(headings[0] - headings[1])
-                    way = moved[s.seen_robot, s.time_ns]
-                    association = met(o, s, state_ns, way, turn)
-                    self.sources[robot, state_ns, association.z.tobytes()] = s
-                    associations += (association,)
-        self.note_covariances()
-        self.seconds["association"] += time.perf_counter() - began
-        self.enter(Step(step_ns, {}, motions, shared(associations)), known)
-
-    def take(self, event: Sequence[Message]) -> None:
-        """One event: everything one robot perceived at one time."""
-        first = event[0]
-        run, time_ns = self.runs[first.robot], first.time_ns
-        self.first_ns, self.last_ns = min(self.first_ns, time_ns), max(self.last_ns, time_ns)
-        if not run.started:
-            self.start(first.robot, min(run.track.first_ns, time_ns))
-        run.scans += [(m.stamp_ns, m.time_ns, m.mount) for m in event if isinstance(m, Scan)]
-        self.counts["scans"] += isinstance(first, Scan)
-        used = self.is_used(event)
-        if isinstance(first, Scan):
-            event = self.watcher.look(first, used, self.has_started)
-            if self.config.association.robots == "ignore":
-                event = [m for m in event if isinstance(m, Scan)]
-        elif not used:
-            event = ()
-        if not event:
-            return  # its pose follows from the states around it
-        motion = self.motion_since_state(first.robot, time_ns)
-        own_state = self.gets_state(event)
-        began = time.perf_counter()
-        seen = self.observations(event, None if own_state else motion)
-        self.seconds["front end"] += time.perf_counter() - began
-        second = None
-        if own_state and isinstance(first, Scan) and self.matches_scans:
-            began = time.perf_counter()
-            motion, second = self.matched(first, motion, seen)
-            self.seconds["scan matching"] += time.perf_counter() - began
-        self.advance(first.robot, time_ns, event, seen, motion if own_state else None, second)
-
-    def matched(
-        self, scan: Scan, motion: Motion | None, seen: list[Observation]
-    ) -> tuple[Motion | None, Closure | None]:
-        """The motion to a scan as that of the state before allows it, and a second source of it."""
-        run = self.runs[scan.robot]
-        points = scan_points(scan, self.config.front_end.max_range_m)
-        now, last = scan_submap(points), run.scan
-        run.scan = None if now is None else (scan.time_ns, now)
-        if motion is None or now is None or last is None or last[0] != motion.start_ns:
-            return motion, None
-        run.motions += 1
-        motion = checked(motion, last[1], now)
-        run.contradicted += motion.matched
-        if self.config.odometry.scan_matching == "auto" or motion.matched:
-            return motion, None
-        return motion, measured(motion, last[1], scan.robot, beside_lines(points, seen))
-
-    def start(self, robot: str, time_ns: int) -> None:
-        """Give a robot its first state.
-
-        Raises:
-            EstimationError: it is not known where.
-        """
-        if robot not in self.starts:
-            raise EstimationError(
-                f"robot {robot}: its start is unknown; give --start {robot}=x,y,phi (m, rad) or "
-                "--start truth"
-            )
-        start, frame = self.starts[robot], self.frames[robot]
-        if robot != frame:
-            # priors are on the base, states on the sensor: where it sits is not known yet, nor is
-            # where that of the first robot sits, to which the world is fixed
-            cov = start.cov + rotate_cov(2 * self.runs[robot].track.mount_cov, start.pose[2])
-            start = replace(start, cov=cov)
-        if frame in self.places:
-            away = np.array([self.places[frame], 0.0, 0.0])
-            start = replace(start, pose=start.pose + away)
-        step = Step(time_ns, starts={robot: start})
-        self.note_covariances()
-        self.backend.add(step)
-        self.steps.append(step)
-        self.note_state(robot, time_ns)
-
-    def has_started(self, robot: str, time_ns: int) -> bool:
-        """Whether a robot has a state at ``time_ns``, given one if it is known where it starts."""
-        run = self.runs[robot]
-        if not run.started and robot in self.starts and len(run.track):
-            self.start(robot, min(run.track.first_ns, time_ns))
-        return run.started
-
-    def motion_since_state(self, robot: str, time_ns: int) -> Motion | None:
-        """Motion since the robot's last state; None when it is at that very time."""
-        run = self.runs[robot]
-        if time_ns <= run.state_ns:
-            return None
-        return run.track.motion(run.state_ns, time_ns)
-
-    def is_used(self, event: Sequence[Message]) -> bool:
-        """Whether the event is more than a place on the trajectory.
-
-        Scans overlap, so one is enough per stretch of motion since the last one used, whatever
-        states other observations have made in between; sightings are all used.
-        """
-        first = event[0]
-        if self.config.keyframe.mode == "all" or not isinstance(first, (Scan, *ODOMETRY)):
-            return True
-        run = self.runs[first.robot]
-        if isinstance(first, ODOMETRY) or not self.has_moved(run, run.scanned_ns, first.time_ns):
-            return False
-        run.scanned_ns = first.time_ns
-        return True
-
-    def gets_state(self, event: Sequence[Message]) -> bool:
-        """Whether a used event has a state at its own time, or is carried back to the last one."""
-        first, run = event[0], self.runs[event[0].robot]
-        return (
-            self.config.keyframe.mode == "all"
-            or isinstance(first, Scan)
-            or any(isinstance(m, Sighting) and m.seen_robot for m in event)
-            or self.has_moved(run, run.state_ns, first.time_ns)
-        )
-
-    def has_moved(self, run: RobotRun, since_ns: int | None, time_ns: int) -> bool:
-        """Whether the robot moved by a keyframe's distance or angle; True since None."""
-        if since_ns is None:
-            return True
-        path_m, turned_rad = run.track.moved(since_ns, time_ns)
-        keyframe = self.config.keyframe
-        return path_m >= keyframe.distance_m or turned_rad >= keyframe.angle_rad
-
-    def observations(self, event: Sequence[Message], since: Motion | None) -> list[Observation]:
-        """Landmarks seen, in the base frame of the state (``since`` carries back to it)."""
-        out = []
-        for message in event:
-            if isinstance(message, Scan):
-                found = self.front_end(message, self.config.front_end)
-            elif isinstance(message, Sighting) and message.seen_robot is None:
-                found = (sighting_observation(message),)
-            else:
-                continue
-            for o in found:
-                z, cov = transport(o.z, o.cov, message.mount, np.zeros((3, 3)))
-                if since is not None:
-                    z, cov = transport(z, cov, since.delta, since.cov)
-                out.append(Observation(o.kind, z, cov, o.extent, o.identity))
-        self.counts["observations"] += len(out)
-        return out
-
-    def advance(
-        self,
-        robot: str,
-        time_ns: int,
-        event: Sequence[Message],
-        seen: list[Observation],
-        motion: Motion | None,
-        second: Closure | None,
-    ) -> None:
-        """Associate, make the step, give it to the back end; ``second`` source of the motion."""
-        run = self.runs[robot]
-        motions: dict[str, Motion] = {robot: motion} if motion is not None else {}
-        state_ns = time_ns if motion is not None else run.state_ns
-        if motion is not None:
-            run.path_m += motion.length_m
-        began = time.perf_counter()
-        known = {i for i, entry in self.associator.map.entries.items() if entry.in_graph}
-        associations: tuple[Association, ...] = ()
-        if seen:
-            associations = self.associator.associate(
-                robot, state_ns, seen, run.causal_poses[-1], motion, run.track, run.path_m
-            )
-        for message in event:
-            if isinstance(message, Sighting) and message.seen_robot is not None:
-                associations += self.robot_sighting(message, state_ns, motions)
-        given = (self.closure(m, state_ns) for m in event if isinstance(m, RelativePose))
-        closures = tuple(c for c in (second, *given) if c)
-        self.note_covariances()
-        self.seconds["association"] += time.perf_counter() - began
-        if not (motions or associations or closures):
-            return
-        self.enter(Step(time_ns, {}, motions, associations, closures), known)
-        for message in event:
-            if isinstance(message, Scan):
-                points = scan_points(message, self.config.front_end.max_range_m)
-                self.pictures.append(
-                    Picture(robot, state_ns, points.astype(np.float32), message.mount)
-                )
-
-    def enter(self, step: Step, known: set[int]) -> None:
-        """Give a step to the back end, and learn from it; ``known`` landmarks were there before."""
-        if not (step.motions or step.associations or step.closures):
-            return
-        began = time.perf_counter()
-        self.backend.add(step)
-        self.associator.settle()
-        self.steps.append(step)
-        for name in step.motions:
-            if self.config.odometry.calibrate:
-                self.learn(name, step, known)
-            self.note_state(name, step.time_ns)
-        self.seconds["back end"] += time.perf_counter() - began
-
-    def robot_sighting(
-        self, message: Sighting, state_ns: int, motions: dict[str, Motion]
-    ) -> tuple[Association, ...]:
-        """A sighting of another robot: brings that robot's motion to the same time."""
-        other = message.seen_robot
-        assert other is not None
-        self.sightings.append(message)
-        if not self.runs[other].started:
-            self.start(other, min(self.runs[other].track.first_ns, state_ns))
-        moved = self.motion_since_state(other, state_ns)
-        if moved is not None and other not in motions:
-            motions[other] = moved
-            self.runs[other].path_m += moved.length_m
-        z, cov = message.z, message.cov
-        model = "robot-point"
-        if len(z) == 3:
-            o = sighting_observation(message)
-            z, cov, model = o.z, o.cov, "robot-pose"
-        z, cov = transport(z, cov, message.mount, np.zeros((3, 3)))
-        self.counts["observations"] += 1
-        return (Association(message.robot, state_ns, other, model, z, cov),)
-
-    def closure(self, message: RelativePose, state_ns: int) -> Closure | None:
-        """A measured relative pose, carried by odometry to the states nearest before its ends."""
-        other = self.runs.get(message.other)
-        if closure_id(message) in self.recorded.refused:
-            self.dropped["relative pose: not believed, see closures"] += 1
-            return None
-        if message.other == message.robot and message.start_ns >= message.time_ns:
-            self.dropped["relative pose: it does not begin before it ends"] += 1
-            return None
-        if other is not None and self.frames[message.other] != self.frames[message.robot]:
-            self.dropped["relative pose: between frames that nothing relates"] += 1
-            return None
-        if other is None or not other.started or message.start_ns < other.times[0]:
-            self.dropped["relative pose: its first end has no state"] += 1
-            return None
-        other_ns = other.times[int(np.searchsorted(other.times, message.start_ns, "right")) - 1]
-        delta, cov = message.delta, message.cov
-        if other_ns < message.start_ns:
-            lead = other.track.motion(other_ns, message.start_ns)
-            cov = compose_cov(lead.delta, lead.cov, delta, cov)
-            delta = compose(lead.delta, delta)
-        if state_ns < message.time_ns:
-            tail = self.runs[message.robot].track.motion(state_ns, message.time_ns)
-            back = inverse(tail.delta)
-            cov = compose_cov(delta, cov, back, inverse_cov(tail.delta, tail.cov))
-            delta = compose(delta, back)
-        self.counts["loop_closures"] += 1
-        verified = closure_id(message) in self.recorded.kept
-        return Closure(message.robot, state_ns, message.other, other_ns, delta, cov, verified)
-
-    def note_state(self, robot: str, time_ns: int) -> None:
-        """Book a new state."""
-        run = self.runs[robot]
-        run.append(time_ns, self.backend.state_mean(robot))
-        self.counts["keyframes"] += 1
-
-    def learn(self, robot: str, step: Step, known: set[int]) -> None:
-        """Improve the robot's calibration from a step; ``known`` landmarks were there before it."""
-        run, pose = self.runs[robot], self.backend.state_mean(robot)
-        seen = [
-            a
-            for a in step.associations
-            if a.robot == robot and a.target in known and a.time_ns == step.time_ns
-        ]
-        landmarks = self.backend.landmark_means([a.target for a in seen if a.target in known])
-        heading = float(run.causal_poses[-1][2])
-        observed = observed_information(seen, pose, landmarks, heading)
-        run.learn(step.motions[robot], pose, observed)
-
-    def note_covariances(self) -> None:
-        """Book the causal covariance of states that have none yet.
-
-        Asked for as late as possible, just before the next step: by then association has needed
-        the same marginal, and reading it from an incremental smoother is dear.
-        """
-        for robot, run in self.runs.items():
-            if len(run.causal_covs) < len(run.times):
-                run.causal_covs.append(self.backend.joint(robot, []).cov)
-
-    def estimate(self) -> tuple[Estimate, bool]:
-        """What the back end has at the end, and whether that is only where `reconsider` begins."""
-        settings = self.config.backend
-        if isinstance(self.backend, Isam2Backend) and settings.polish and settings.reconsider:
-            return self.backend.rough(), True
-        return self.backend.finish(), False
-
-    def reconsider(self, estimate: Estimate) -> Estimate:
-        """The log solved again from a rough estimate; the steps follow the result."""
-        tracks = {name: run.track for name, run in self.runs.items() if run.started}
-        if self.sources:
-            refined = refine(self.steps, estimate, tracks, self.sources, self.config)
-            self.steps = list(refined.steps)
-            for name in tracks:
-                self.runs[name].refined = self.config.odometry.calibrate
-            return refined.estimate
-        done = consolidate(
-            self.steps,
-            estimate,
-            tracks,
-            self.associator.map,
-            self.pictures,
-            self.config,
-            self.tamper,
-        )
-        self.steps = list(done.steps)
-        self.counts.update(done.counts)
-        for name in tracks:
-            self.runs[name].refined = self.config.odometry.calibrate
-        return done.estimate
-
-    def clocks_found(self, estimate: Estimate) -> dict[str, ClockFound]:
-        """What the robots' sightings of each other say about their clocks."""
-        tracks = {name: run.track for name, run in self.runs.items() if run.started}
-        seen = {id(s): s for s in self.sources.values() if s.seen_robot}.values()
-        sightings = [*seen, *self.sightings]
-        return clocks_found(
-            self.steps, estimate, sightings, tracks, self.clocks, self.config.robust
-        )
-
-    def worlds(self) -> Worlds:
-        """What takes every robot and landmark from where it was estimated into its frame.
-
-        A prior is on the base of the robot at which a frame hangs, states are on its sensor.
-        """
-        by_frame: dict[str, Array] = {}
-        for frame in sorted(set(self.frames.values())):
-            shift = origin_shift(self.starts[frame].pose, self.runs[frame].track.mount)
-            away = np.array([-self.places.get(frame, 0.0), 0.0, 0.0])
-            by_frame[frame] = compose(shift, away)
-        return Worlds(
-            {robot: by_frame[frame] for robot, frame in self.frames.items()},
-            {number: by_frame[frame] for number, frame in self.landmark_frames().items()},
-        )
-
-    def landmark_frames(self) -> dict[int, str]:
-        """Landmark -> in whose frame it is: whoever saw it has the same one."""
-        entries = self.associator.map.entries
-        return {number: self.frames[min(entry.path_m)] for number, entry in entries.items()}
-
-    def views(self) -> dict[str, View]:
-        """What each robot knows by itself, after a run in which each had a frame of its own."""
-        estimate, worlds = self.backend.finish(), self.worlds()
-        moved, frames = worlds.estimate(estimate), self.landmark_frames()
-        marks: dict[str, dict[str, tuple[Array, Array]]] = defaultdict(dict)
-        for number, (mean, cov) in moved.landmarks.items():
-            identity = self.associator.map.entries[number].identity
-            if identity is not None:
-                name = identity.rpartition(FRAME_MARK)[2]
-                marks[frames[number]][name] = (mean[:2], cov[:2, :2])
-        views = {}
-        for robot, run in self.runs.items():
-            if len(run.track):
-                start = self.starts[robot]
-                first = np.array([run.track.first_ns], dtype=np.int64)
-                unseeing = Trajectory(first, start.pose[None], start.cov[None])
-                views[robot] = View(moved.states.get(robot, unseeing), run.track, marks[robot])
-        return views
-
-    def landmarks(self, estimate: Estimate, worlds: Worlds) -> tuple[Landmark, ...]:
-        """The final map; landmarks of other frames than the world's say whose it is."""
-        made = make_landmarks(self.associator.map.in_worlds(worlds.landmarks), estimate)
-        if not self.places:
-            return made
-        frames = self.landmark_frames()
-        return tuple(
-            mark
-            if frames[mark.id] == self.joined.world
-            else replace(
-                mark,
-                identity=mark.identity and mark.identity.rpartition(FRAME_MARK)[2],
-                frame=frames[mark.id],
-            )
-            for mark in made
-        )
-
-    def exchanged(self, estimate: Estimate) -> dict[str, str]:
-        """Names of what was sighted that turn out to be each other's: false -> right name."""
-        if not self.sources or self.config.association.identities == "ignore":
-            return {}
-        tracks = {name: run.track for name, run in self.runs.items() if run.started}
-        sightings = {id(sighting): sighting for sighting in self.sources.values()}
-        pairs = exchanged_names(sightings.values(), estimate, tracks)
-        return {a: b for pair in pairs for a, b in (pair, pair[::-1])}
 
 
 def smooth(
@@ -711,25 +50,29 @@ def smooth(
     """
     began = time.perf_counter()
     check_robots(log, config)
-    pipeline = _passed(Pipeline(log, config, None, tamper), progress)
+    known = beforehand(log, config)
+    starts_s = time.perf_counter() - began
+    pipeline = _passed(Pipeline(log, config, known, tamper), progress)
     finishing = time.perf_counter()
     estimate, rough = pipeline.estimate()
     names = pipeline.exchanged(estimate)
     if names:
-        pipeline = _passed(Pipeline(log, config, names, tamper), progress)
+        known = with_names(known, log, config, names)
+        pipeline = _passed(Pipeline(log, config, known, tamper), progress)
         finishing = time.perf_counter()
         estimate, rough = pipeline.estimate()
     clocks = pipeline.clocks_found(estimate)
     for _ in range(MAX_CLOCKS):
         if not any(found.differs for found in clocks.values()):
             break
-        known = {robot: found.clock for robot, found in clocks.items()}
-        pipeline = _passed(Pipeline(log, config, names, tamper, pipeline.joined, known), progress)
+        known = replace(known, clocks={robot: found.clock for robot, found in clocks.items()})
+        pipeline = _passed(Pipeline(log, config, known, tamper), progress)
         finishing = time.perf_counter()
         estimate, rough = pipeline.estimate()
         clocks = pipeline.clocks_found(estimate)
     if rough:
         estimate = pipeline.reconsider(estimate)
+    pipeline.seconds["starts"] = starts_s
     pipeline.seconds["final optimisation"] = time.perf_counter() - finishing
     finishing = time.perf_counter()
     runs = {name: run for name, run in sorted(pipeline.runs.items()) if run.started}
@@ -739,11 +82,14 @@ def smooth(
     steps = tuple(map(worlds.step, pipeline.steps))
     robots = {}
     for name, run in runs.items():
-        run.move(-pipeline.places.get(frames[name], 0.0))
-        start = pipeline.starts[frames[name]].pose
+        frame = frames.of[name]
+        run.move(-frames.away.get(frame, 0.0))
+        start = pipeline.starts[frame].pose
         robots[name] = run.result(estimate.states[name], start, causal_only=causal_only)
     pipeline.seconds["trajectories"] = time.perf_counter() - finishing
-    landmarks = pipeline.landmarks(estimate, worlds)
+    entries = pipeline.associator.map
+    landmarks = make_landmarks(entries.in_worlds(worlds.landmarks), estimate)
+    landmarks = frames.told(landmarks, entries.entries.values())
     t0 = min(trajectory.stamps_ns[0] for trajectory in estimate.states.values())
     innovations = {
         model: np.array([((t - t0) * 1e-9, d2) for t, d2 in values]).reshape(-1, 2)
@@ -770,8 +116,8 @@ def smooth(
             }
             for name, run in runs.items()
         },
-        closures=pipeline.recorded.told(),
-        joined=pipeline.joined,
+        closures=known.recorded.told(),
+        joined=known.joined,
         clocks=clocks,
         warnings=run_warnings(pipeline),
         log_s=1e-9 * (pipeline.last_ns - pipeline.first_ns),
@@ -798,6 +144,24 @@ def _passed(pipeline: Pipeline, progress: Progress) -> Pipeline:
     return pipeline
 
 
+def beforehand(log: LogSet, config: Config) -> Known:
+    """What is known of a log before its first pass proper: starts, frames, recorded closures.
+
+    Raises:
+        EstimationError: truth was asked for and a robot has none, or a given pose is malformed.
+    """
+    starts = start_poses(log, config)
+    recorded = recorded_in(log, config, starts)
+    return Known(placed(log, config, {}, starts, recorded), recorded)
+
+
+def with_names(known: Known, log: LogSet, config: Config, names: Mapping[str, str]) -> Known:
+    """What is known by the right names: robots may have been placed by what bore false ones."""
+    starts = start_poses(log, config)
+    joined = placed(log, config, names, starts, known.recorded)
+    return replace(known, names=names, joined=joined)
+
+
 def placed(
     log: LogSet,
     config: Config,
@@ -813,7 +177,7 @@ def placed(
     Args:
         log: opened logs.
         config: settings.
-        names: see `Pipeline`.
+        names: see `Known`.
         starts: those that are known.
         recorded: what follows from the log's relative poses.
 
@@ -828,122 +192,17 @@ def placed(
     views: Mapping[str, View] = {}
     meetings: Sequence[Sighting] = ()
     if any(topic.record is Sighting for topic in log.topics):
-        apart = Joined.apart(log.robots, own)
-        pipeline = Pipeline(log, replace(config, backend=BackendConfig()), names, joined=apart)
+        apart = Known(Joined.apart(log.robots, own), recorded, names)
+        pipeline = Pipeline(log, replace(config, backend=BackendConfig()), apart)
         pipeline.run(lambda _count: None)
         if pipeline.steps:
             views, meetings = pipeline.views(), pipeline.meetings
     return join(log.robots, views, meetings, starts, config.association, own)
 
 
-def outlines(log: LogSet, config: Config) -> dict[str, Array]:
-    """Robot -> corners (k, 2), m, of those whose outline is known."""
-    known = {name: robot_settings(name, config, log.notes).outline for name in log.robots}
-    return {name: outline_of(corners) for name, corners in known.items() if corners}
-
-
-def robot_settings(name: str, config: Config, notes: Mapping[str, str]) -> RobotConfig:
-    """Settings of a robot: the configuration's where set, else what the log's notes say of it."""
-    noted = [f"{key}={value}" for key, value in notes.items() if key.startswith(f"robots.{name}.")]
-    return _noted(config.robot(name), load_config(overrides=noted).robot(name), RobotConfig())
-
-
-def odometry_settings(config: OdometryConfig, notes: Mapping[str, str]) -> OdometryConfig:
-    """Settings of odometry: the configuration's where set, else what the log's notes say of it.
-
-    How well velocities are driven that were only commanded is a property of the log's robots, which
-    whoever wrote the log knows, as with the noise of sightings.
-    """
-    return noted(config, "odometry", notes)
-
-
-def noted(config: Settings, table: str, notes: Mapping[str, str]) -> Settings:
-    """A table of settings: those that are not the defaults, the others as a log's notes say."""
-    lines = [f"{key}={value}" for key, value in notes.items() if key.startswith(f"{table}.")]
-    known: Settings = getattr(load_config(overrides=lines), table)
-    default: Settings = getattr(Config(), table)
-    return _noted(config, known, default)
-
-
-def _noted(config: Settings, noted: Settings, default: Settings) -> Settings:
-    """Settings as in ``config``, as in ``noted`` where they are the default."""
-    changes = {
-        field.name: getattr(noted, field.name)
-        for field in dataclasses.fields(config)
-        if getattr(config, field.name) == getattr(default, field.name)
-    }
-    return replace(config, **changes)
-
-
-def make_tracks(log: LogSet, config: Config) -> dict[str, Track]:
-    """An empty track for every robot of a log."""
-    return {
-        name: Track(
-            sensing(odometry_settings(config.odometry, log.notes), log.has_scans(name)),
-            robot_settings(name, config, log.notes),
-            mounted=True,
-        )
-        for name in log.robots
-    }
-
-
-def verify_recorded(log: LogSet, config: Config, starts: Mapping[str, Start]) -> Recorded:
-    """Which relative poses of a log to believe, by all of it; starts that follow from them.
-
-    In a log of nothing but relative poses, robots that these do not place keep a frame of their
-    own. That takes a pass over the odometry, which is made only where there are relative poses.
-    """
-    kinds = {topic.record for topic in log.topics}
-    messages: list[RelativePose] = []
-    verified = NOTHING_RECORDED
-    if RelativePose in kinds and config.backend.verify_closures:
-        tracks = make_tracks(log, config)
-        for message in log.messages((Truth, TrueLandmark, Scan, Sighting)):
-            if isinstance(message, ODOMETRY):
-                tracks[message.robot].add(message)
-            elif isinstance(message, RelativePose):
-                messages.append(message)
-        verified = verify(messages, tracks, starts, config)
-    found, frames = dict(verified.starts), dict(verified.frames)
-    if kinds & {Scan, Sighting}:
-        # these may place a robot too: its start is asked for where it is needed
-        found = {robot: start for robot, start in found.items() if frames[robot] != robot}
-    elif RelativePose in kinds:
-        for robot in set(log.robots) - {*starts, *found}:
-            found[robot], frames[robot] = own_frame(), robot
-    world = min(starts, default="")
-    kept = frozenset(closure_id(messages[k]) for k in verified.kept)
-    refused = {closure_id(messages[k]): why for k, why in verified.refused.items()}
-    frames = {robot: frames.get(robot, world) for robot in log.robots if robot in {*starts, *found}}
-    return Recorded(found, frames, kept, refused)
-
-
-def sensing(config: OdometryConfig, scans: bool) -> OdometryConfig:
-    """Settings of a robot's calibration: without a laser only the latency of its sightings."""
-    if scans:
-        return config
-    return replace(
-        config,
-        laser_sigma_m=0.0,
-        laser_sigma_rad=0.0,
-        laser_latency_sigma_s=config.sighting_latency_sigma_s,
-    )
-
-
-def check_robots(log: LogSet, config: Config) -> None:
-    """Refuse settings about robots that are not there.
-
-    Raises:
-        ConfigError: naming the key.
-    """
-    for name in config.robots:
-        if name not in (*log.robots, "default"):
-            known = ", ".join(log.robots)
-            raise ConfigError(f"robots.{name}: the log has no robot {name}, but {known}")
-
-
 def run_warnings(pipeline: Pipeline) -> list[str]:
     """What a user should know about a run although it went through."""
+    known = pipeline.known
     warnings = [
         f"{name}: its odometry jumped {run.track.resets} times; taken to have gone on as before"
         for name, run in pipeline.runs.items()
@@ -964,7 +223,7 @@ def run_warnings(pipeline: Pipeline) -> list[str]:
     ]
     warnings += [
         f"{a} and {b}: bore each other's code in all sightings; their names were exchanged back"
-        for a, b in pipeline.names.items()
+        for a, b in known.names.items()
         if a < b
     ]
     warnings += span_warnings(
@@ -976,44 +235,16 @@ def run_warnings(pipeline: Pipeline) -> list[str]:
         for reason, count in sorted(pipeline.backend.skipped.items())
     ]
     warnings += [
-        f"{robot}: {pipeline.joined.undecided.get(robot, 'nothing says where it was')}; its poses "
+        f"{robot}: {known.joined.undecided.get(robot, 'nothing says where it was')}; its poses "
         f"are in a frame of its own, which begins where it began; --start {robot}=x,y,phi places it"
         for robot, run in pipeline.runs.items()
-        if run.started and robot == pipeline.frames[robot] != pipeline.joined.world
+        if run.started and robot == pipeline.frames.of[robot] != known.joined.world
     ]
-    if pipeline.recorded.refused:
+    if known.recorded.refused:
         warnings.append(
-            f"{len(pipeline.recorded.refused)} recorded closures are not believed; closures.refused"
+            f"{len(known.recorded.refused)} recorded closures are not believed; closures.refused"
             " in summary.json lists them"
         )
     if not any(step.associations or step.closures for step in pipeline.steps):
         warnings.append("no observation entered the estimate: this is dead reckoning")
     return warnings
-
-
-def closure_id(message: RelativePose) -> ClosureId:
-    """What a recorded closure is known by in every pass over the log."""
-    ends = message.robot, message.time_ns, message.other, message.start_ns
-    return (*ends, message.delta.tobytes())
-
-
-def events(messages: Iterable[Message]) -> Iterator[list[Message]]:
-    """Messages grouped: the sightings of one robot at one time are one image."""
-
-    def key(message: Message) -> tuple[object, ...]:
-        if isinstance(message, Sighting):
-            return (message.robot, message.time_ns)
-        return (id(message),)
-
-    for _, group in itertools.groupby(messages, key):
-        yield list(group)
-
-
-def _counted(
-    messages: Iterable[Message], counts: Counter[str], progress: Progress
-) -> Iterator[Message]:
-    for message in messages:
-        counts["messages"] += 1
-        if counts["messages"] % 500 == 0:
-            progress(counts["messages"])
-        yield message

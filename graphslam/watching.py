@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
-from scipy.special import chdtri
 
 from graphslam.backends import Backend, Joint
 from graphslam.config import FrontEndConfig
 from graphslam.frontend.moving import moving, was_there
 from graphslam.frontend.robots import FEWEST, Fit, centres, clusters, fit_outline, reach
 from graphslam.frontend.sweep import Sweep, make_sweep
+from graphslam.gaussian import chi2_quantile
 from graphslam.geometry import (
     Array,
     between,
@@ -174,7 +174,7 @@ def _fits(
         d2 = float(off[:n] @ np.linalg.solve(S, off[:n]))
         points = sweep.points[span[0] : span[1] + 1]
         old = any(was_there(points, before, here) for before, here in elsewhere)
-        if d2 < float(chdtri(n, 1 - GATE_PROBABILITY)) and not old:
+        if d2 < chi2_quantile(GATE_PROBABILITY, n) and not old:
             fits.append((d2, fit))
     return sorted(fits, key=lambda one: one[0])
 

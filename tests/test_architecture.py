@@ -28,8 +28,9 @@ ROWS = (
     ("association", "calibration", "dead_reckoning", "export", "factors", "frontend", "logs"),
     ("matching",),  # where a place was seen from
     ("scan_motion",),  # what scans say of a motion
-    # estimators; order in time; poses at any time; worlds and their logs
-    ("backends", "simulate", "timeline", "trajectories"),
+    # estimators; what is set for a log's robots; order in time; poses at any time; worlds and their
+    # logs
+    ("backends", "log_settings", "simulate", "timeline", "trajectories"),
     # what is known about landmarks beside their estimate; of a robot; where robots start; recorded
     # steps through an estimator; sightings that share a step; names given to each other's bearers;
     # robots joined by what they see; how robots' clocks differ
@@ -43,13 +44,14 @@ ROWS = (
         "robot_run",
         "starts",
     ),
-    # decisions of one image; states and calibration together; places seen twice; duplicates in a
-    # map; observations of walls anew; closures that a log brings along; a log of sightings solved
-    # again; what a run adds up to; robots in each other's scans
+    # decisions of one image; states and calibration together; places seen twice; robots that
+    # nothing relates; duplicates in a map; observations of walls anew; closures that a log brings
+    # along; a log of sightings solved again; what a run adds up to; robots in each other's scans
     (
         "associator",
         "calibrating",
         "closing",
+        "frames",
         "merging",
         "reassociating",
         "recorded_closures",
@@ -57,9 +59,11 @@ ROWS = (
         "summary",
         "watching",
     ),
-    ("revisits",),  # landmarks by visit, and one again
+    # which recorded closures are believed; landmarks by visit, and one again
+    ("recorded", "revisits"),
     ("consolidating",),  # a log of scans solved again
-    ("slam",),  # the pipeline
+    ("pipeline",),  # one pass over a log
+    ("slam",),  # as many passes as it takes
     ("results",),  # a result as a folder, and back
     ("report", "truth"),  # pictures and tables of a result; where truth comes from
     ("changes", "evaluate"),  # a result against another one; against the truth

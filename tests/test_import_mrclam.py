@@ -12,9 +12,9 @@ from graphslam import records
 from graphslam.config import Config, OdometryConfig
 from graphslam.errors import LogError
 from graphslam.geometry import compose, exp
+from graphslam.log_settings import odometry_settings
 from graphslam.logs import IMPORTERS, open_logs, read_truth
 from graphslam.logs.importers.mrclam import COMMANDED, LONGEST_ARC_NS
-from graphslam.slam import odometry_settings
 
 DATA = Path(os.environ.get("GRAPHSLAM_DATA", Path(__file__).parents[1] / "../shared/data"))
 START = 1248444187

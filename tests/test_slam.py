@@ -14,9 +14,10 @@ from graphslam.evaluate import align
 from graphslam.geometry import between, compose, exp, inverse, transform, wrap
 from graphslam.logs import LogWriter, open_logs
 from graphslam.models import MODELS
+from graphslam.pipeline import Pipeline
 from graphslam.records import OdometryPose, RelativePose, Trajectory
 from graphslam.robot_run import RobotRun
-from graphslam.slam import Pipeline, smooth
+from graphslam.slam import beforehand, smooth
 from graphslam.trajectories import moved_world, origin_shift
 
 S = 1_000_000_000
@@ -301,7 +302,8 @@ def test_covariance_of_a_carried_closure_against_monte_carlo(tmp_path):
     correlation is known to 0.005 from those, a relative variance to 0.007; second-order terms add
     about as much."""
     path = closure_log(tmp_path / "log.mcap", [])
-    pipeline = Pipeline(open_logs([path], Config()), Config())
+    log = open_logs([path], Config())
+    pipeline = Pipeline(log, Config(), beforehand(log, Config()))
     pipeline.run(lambda _count: None)
     robot = pipeline.runs["robot"]
     assert robot.times == [T0]  # no event needed a state

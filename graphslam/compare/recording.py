@@ -10,12 +10,14 @@ from graphslam.config import Config
 from graphslam.errors import EstimationError, LogError
 from graphslam.geometry import Array
 from graphslam.landmark_map import LandmarkMap
+from graphslam.log_settings import check_robots
 from graphslam.logs import LogSet
+from graphslam.pipeline import Pipeline, Progress
 from graphslam.records import Step
 from graphslam.replay import Replay
 from graphslam.results import SavedResult, SavedRobot
 from graphslam.robot_run import RobotRun
-from graphslam.slam import Pipeline, Progress, check_robots
+from graphslam.slam import beforehand
 from graphslam.summary import make_landmarks
 from graphslam.trajectories import Worlds
 
@@ -86,20 +88,21 @@ def record(log: LogSet, config: Config, progress: Progress = lambda _count: None
     """
     check_robots(log, config)
     began = time.perf_counter()
-    pipeline = Pipeline(log, config)
+    pipeline = Pipeline(log, config, beforehand(log, config))
     pipeline.run(progress)
     if not pipeline.steps:
         raise LogError(f"{log.files[0].path}: nothing in it could be used; see `graphslam info`")
-    if pipeline.places:
+    apart = pipeline.frames.away
+    if apart:
         raise EstimationError(
-            f"robot {min(pipeline.places)}: its start is unknown and nothing in the log tells it; "
-            f"back ends are compared in one frame: give --start {min(pipeline.places)}=x,y,phi"
+            f"robot {min(apart)}: its start is unknown and nothing in the log tells it; "
+            f"back ends are compared in one frame: give --start {min(apart)}=x,y,phi"
         )
     runs = {name: run for name, run in sorted(pipeline.runs.items()) if run.started}
     return Recording(
         tuple(pipeline.steps),
         runs,
-        pipeline.starts[pipeline.joined.world].pose,
+        pipeline.starts[pipeline.frames.world].pose,
         pipeline.worlds(),
         pipeline.associator.map,
         time.perf_counter() - began,

@@ -13,10 +13,10 @@ from graphslam.errors import ConfigError, EstimationError, GraphSlamError, Outpu
 from graphslam.evaluate import Pairs, Relations, align, evaluate, nees, pair
 from graphslam.geometry import Array, transform, wrap
 from graphslam.logs import KnownTruth, LogSet
+from graphslam.pipeline import Progress
 from graphslam.records import Step, Trajectory
 from graphslam.report.comparison import Comparison, Curve, Lane
 from graphslam.results import SavedResult
-from graphslam.slam import Progress
 
 FORMAT = "graphslam-comparison-1"
 #: the same recorded steps for all, or each associates for itself
