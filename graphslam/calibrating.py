@@ -69,22 +69,28 @@ def calibrate(
 
 
 def remade(steps: Sequence[Step], tracks: Mapping[str, Track]) -> tuple[Step, ...]:
-    """Steps with motions by the calibration that the tracks have.
+    """Steps with motions by the calibration that the tracks have, but those from scans.
 
     With the latency held a motion at the edge of the odometry would be sure of what it does not
     cover.
     """
+    made: dict[str, dict[int, Motion]] = {}
+    for robot, track in tracks.items():
+        old = [step.motions[robot] for step in steps if robot in step.motions]
+        old = [motion for motion in old if not motion.matched]
+        made[robot] = dict(zip(map(id, old), _remade(old, track), strict=True))
     return tuple(
-        replace(
-            step, motions={robot: _remade(m, tracks[robot]) for robot, m in step.motions.items()}
-        )
+        replace(step, motions={r: made[r].get(id(m), m) for r, m in step.motions.items()})
         for step in steps
     )
 
 
-def _remade(motion: Motion, track: Track) -> Motion:
-    if motion.matched:
-        return motion
-    again = track.motion(motion.start_ns, motion.end_ns)
-    unseen = track.unseen(motion.start_ns, motion.end_ns)
-    return replace(again, cov=again.cov + np.diag(unseen**2)) if unseen.any() else again
+def _remade(motions: Sequence[Motion], track: Track) -> list[Motion]:
+    """Motions of one robot, made anew."""
+    if not motions:
+        return []
+    ends = np.array([(m.start_ns, m.end_ns) for m in motions], dtype=np.int64)
+    new = track.motions(ends[:, 0], ends[:, 1])
+    for k in np.flatnonzero(track.uncovered(ends[:, 0], ends[:, 1])):
+        new.cov[k] += np.diag(track.unseen(*ends[k].tolist()) ** 2)
+    return [new.one(k, m.start_ns, m.end_ns) for k, m in enumerate(motions)]

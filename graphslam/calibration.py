@@ -117,10 +117,13 @@ def observed_information(
         heading_rad: direction of the x axis that the result is wanted along.
     """
     info = np.zeros((3, 3))
-    for association, landmark in zip(seen, landmarks, strict=True):
-        model = MODELS[association.model]
-        H, _ = model.jacobians(association.z, pose, landmark)
-        R = model.noise(association.z, association.cov, pose, landmark)
-        info += H.T @ np.linalg.solve(R, H)
+    for name in {association.model for association in seen}:
+        model = MODELS[name]
+        group = [k for k, association in enumerate(seen) if association.model == name]
+        z, cov = (np.array([getattr(seen[k], what) for k in group]) for what in ("z", "cov"))
+        targets = np.array([landmarks[k] for k in group])
+        H, _ = model.jacobians(z, pose, targets)
+        R = model.noise(z, cov, pose, targets)
+        info += (H.mT @ np.linalg.solve(R, H)).sum(axis=0)
     turn = rotation3(heading_rad)
     return np.asarray(turn.T @ info @ turn)

@@ -141,7 +141,7 @@ class KeyframeConfig:
 
     mode: Literal["motion", "all"] = "motion"
     distance_m: float = 0.25
-    angle_rad: float = 0.15
+    angle_rad: float = 0.25
     gather_s: float = 0.8
 
 
@@ -253,7 +253,7 @@ class BackendConfig:
     horizon_s: float = math.inf
     exchange_s: float = 30.0
     relinearize_threshold: float = 0.05
-    relinearize_every: int = 20
+    relinearize_every: int = 60
     polish: bool = True
     reconsider: bool = True
     close_loops: bool = True

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphslam.backends.isam2 import Resolver
-from graphslam.calibrating import calibrate
+from graphslam.calibrating import calibrate, remade
 from graphslam.closing import (
     BORNE_OUT,
     CLOSED,
@@ -31,7 +31,14 @@ from graphslam.config import Config
 from graphslam.dead_reckoning import Track
 from graphslam.geometry import Array, between, wrap
 from graphslam.landmark_map import LandmarkMap
-from graphslam.merging import duplicates, merge_entries, merged_steps, seen_together, survivors
+from graphslam.merging import (
+    duplicates,
+    merge_entries,
+    merged_steps,
+    partners,
+    seen_together,
+    survivors,
+)
 from graphslam.reassociating import reassociate
 from graphslam.records import Closure, Estimate, Picture, Step
 from graphslam.revisits import opened, tied
@@ -82,7 +89,7 @@ def consolidate(
         EstimationError: the estimate is indeterminate.
     """
     solve = _Solver(config)
-    steps = tuple(_recalibrated(step, tracks) for step in steps)
+    steps = remade(steps, tracks)
     estimate = solve(steps, estimate)
     steps = _loosened(steps, estimate)
     estimate = solve(steps, estimate)
@@ -210,15 +217,6 @@ def _tightened(
     return estimate
 
 
-def _recalibrated(step: Step, tracks: Mapping[str, Track]) -> Step:
-    """The step with motions by the tracks' calibration, but for those that scans contradicted."""
-    motions = {
-        robot: motion if motion.matched else tracks[robot].motion(motion.start_ns, motion.end_ns)
-        for robot, motion in step.motions.items()
-    }
-    return replace(step, motions=motions)
-
-
 def _loosened(steps: Sequence[Step], estimate: Estimate) -> tuple[Step, ...]:
     """Steps with motions as noisy as the log shows them, if that is noisier than believed.
 
@@ -262,8 +260,12 @@ def _duplicates(
         for entry in landmarks.entries.values()
         if entry.id in estimate.landmarks and entry.kind != "point"
     ]
+    together = seen_together(steps)
+    walls = partners(walls, together)
+    if not walls:
+        return {}
     joint = backend.joint(min(estimate.states), [entry.id for entry in walls])
-    return survivors(duplicates(walls, joint, seen_together(steps)))
+    return survivors(duplicates(walls, joint, together))
 
 
 def _move(landmarks: LandmarkMap, estimate: Estimate) -> None:

@@ -35,6 +35,7 @@ from graphslam.models.motion import (
 from graphslam.records import Motion, OdometryIncrement, OdometryPose, WheelAngles
 
 IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 Odometry = OdometryPose | OdometryIncrement | WheelAngles
 
 #: m and rad: what a robot that reports no motion may still have moved between two states
@@ -357,14 +358,19 @@ class Track:
             cov = cov + self._floor(whole.length_m > 0 or delta[2] != 0)
         return Motion(start_ns, end_ns, delta, cov, d_cal, whole.length_m)
 
+    def uncovered(self, start_ns: IntArray | int, end_ns: IntArray | int) -> BoolArray:
+        """Whether motions (...,) are in part where there are no readings yet, or no more."""
+        late = self.latency_ns
+        return np.asarray((start_ns - late < self.first_ns) | (end_ns - late > self.last_ns))
+
     def unseen(self, start_ns: int, end_ns: int) -> Array:
         """What of a motion the readings do not cover, (3,), at the speed next to what is missing.
 
         `motion` takes the robot to stand then; by so much it may be wrong.
         """
-        begin, end = start_ns - self.latency_ns, end_ns - self.latency_ns
-        if self.first_ns <= begin and end <= self.last_ns:
+        if not self.uncovered(start_ns, end_ns):
             return np.zeros(3)
+        begin, end = start_ns - self.latency_ns, end_ns - self.latency_ns
         most = min(end - begin, self.last_ns - self.first_ns)
         before, after = (
             min(max(ns, 0), most) for ns in (self.first_ns - begin, end - self.last_ns)

@@ -86,7 +86,8 @@ def make_submap(poses: Array, clouds: Sequence[Array]) -> Submap:
     images = np.concatenate([np.roll(returns, turn, axis=2) for turn in (-1, 0, 1)])
     free = np.nan_to_num(images.min(axis=0))  # NaN if any of them is
     points = np.concatenate([transform(p, c) for p, c in zip(poses, clouds, strict=True)])
-    _, kept = np.unique(np.round(points / CELL_M).astype(np.int64), axis=0, return_index=True)
+    cell = np.round(points / CELL_M).astype(np.int64)
+    _, kept = np.unique((cell[:, 0] << 32) + cell[:, 1], return_index=True)
     points = points[np.sort(kept)]
     tree = cKDTree(points)
     return Submap(points, _information(points, tree), np.asarray(poses), images, free, tree)

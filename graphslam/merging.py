@@ -53,6 +53,20 @@ class _Map:
         )
 
 
+def partners(entries: Sequence[Entry], together: Iterable[frozenset[int]]) -> list[Entry]:
+    """Those walls that may have a duplicate, where they are: the others need no covariance.
+
+    Args:
+        entries: lines and segments.
+        together: pairs that one image showed side by side.
+    """
+    if len(entries) < 2:
+        return []
+    means = np.array([entry.mean for entry in entries])
+    near = np.concatenate(_near(_map(entries, means, np.zeros((0, 0)), together)))
+    return [entries[k] for k in np.unique(near)]
+
+
 def duplicates(
     entries: Sequence[Entry], joint: Joint, together: Iterable[frozenset[int]]
 ) -> list[tuple[int, int]]:
@@ -63,26 +77,10 @@ def duplicates(
         joint: their means and joint covariance, world axes (the pose in front is not used).
         together: pairs that one image showed side by side.
     """
-    n = len(entries)
-    if n < 2:
+    if len(entries) < 2:
         return []
-    place = {entry.id: k for k, entry in enumerate(entries)}
-    apart = np.zeros((n, n), dtype=bool)
-    for pair in together:
-        if pair <= place.keys():
-            a, b = (place[number] for number in pair)
-            apart[a, b] = apart[b, a] = True
-    walls = _Map(
-        np.array(joint.landmarks),
-        joint.cov[3:, 3:].copy(),
-        np.array([entry.extent for entry in entries]),
-        np.array([entry.kind == "segment" for entry in entries]),
-        np.arange(n),
-        apart,
-    )
-    i, j = np.triu_indices(n, 1)
-    near = _beside(walls, i, j) & ~apart[i, j]
-    i, j = i[near], j[near]
+    walls = _map(entries, np.array(joint.landmarks), joint.cov[3:, 3:].copy(), together)
+    i, j = _near(walls)
     found: list[tuple[int, int]] = []
     while len(i):
         r, H_i, H_j, rows = _compare(walls, i, j)
@@ -99,6 +97,31 @@ def duplicates(
         open_still = walls.group[i] != walls.group[j]
         i, j = i[open_still], j[open_still]
     return [(min(pair), max(pair)) for pair in found]
+
+
+def _map(entries: Sequence[Entry], x: Array, P: Array, together: Iterable[frozenset[int]]) -> _Map:
+    """Walls, none tied yet."""
+    place = {entry.id: k for k, entry in enumerate(entries)}
+    apart = np.zeros((len(entries), len(entries)), dtype=bool)
+    for pair in together:
+        if pair <= place.keys():
+            a, b = (place[number] for number in pair)
+            apart[a, b] = apart[b, a] = True
+    return _Map(
+        x,
+        P,
+        np.array([entry.extent for entry in entries]),
+        np.array([entry.kind == "segment" for entry in entries]),
+        np.arange(len(entries)),
+        apart,
+    )
+
+
+def _near(walls: _Map) -> tuple[IntArray, IntArray]:
+    """Pairs (m,) and (m,) that may be one wall, as far as means and extents can tell."""
+    i, j = np.triu_indices(len(walls.x), 1)
+    near = _beside(walls, i, j) & ~walls.apart[i, j]
+    return i[near], j[near]
 
 
 def _next_tie(walls: _Map, i: IntArray, j: IntArray, d2: Array, fits: BoolArray) -> int | None:

@@ -25,7 +25,7 @@ FACED, MAX_FACINGS, MAX_FACINGS_ROBUST = 1e-6, 4, 2
 #: relative decrease of the error at which optimising ends: without a kernel; with one (reweighting
 #: converges linearly: beyond 1e-6 hundreds of iterations move nothing that shows); and where
 #: another round follows anyway
-CONVERGED_ERROR, CONVERGED_ERROR_ROBUST, CONVERGED_ERROR_ROUGH = 1e-10, 1e-6, 1e-4
+CONVERGED_ERROR, CONVERGED_ERROR_ROBUST, CONVERGED_ERROR_ROUGH = 1e-10, 1e-6, 1e-3
 
 
 class WholeGraph(GraphBuilder):
@@ -72,15 +72,17 @@ class WholeGraph(GraphBuilder):
         self._observed.append(part.observed)
         return True
 
+    def make_room(self) -> None:
+        """Places in the graph for the factors of lines that were left to `face_lines`."""
+        size, missing = self.graph.size(), len(self._observed) - len(self._places)
+        self.graph.resize(size + missing)
+        self._places += range(size, size + missing)
+
     def face_lines(self, values: gtsam.Values) -> None:
         """Make the factors of all lines anew at ``values``; see `GraphBuilder.faced`."""
         if not self._observed:
             return
-        missing = len(self._observed) - len(self._places)
-        if missing:
-            size = self.graph.size()
-            self.graph.resize(size + missing)
-            self._places += range(size, size + missing)
+        self.make_room()
         keys, targets, seen = zip(*self._observed, strict=True)
         known = np.unique([keys, targets])
         poses = np.array([read(values, int(key), 3) for key in known])
@@ -298,7 +300,7 @@ class Resolver(Isam2Backend):
             _, new = self._builder.expand(step, lambda key, dim: read(values, key, dim))
             for key in new.keys():  # noqa: SIM118 (GTSAM's values are no mapping)
                 write(values, key, self._builder.value_in(start, key))
-        self._builder.face_lines(values)
+        self._builder.make_room()
         self._finished = values
         self._size, self._rows = self._builder.graph.size(), self._builder.rows
 
