@@ -89,9 +89,7 @@ def consolidate(
         EstimationError: the estimate is indeterminate.
     """
     solve = _Solver(config)
-    steps = remade(steps, tracks)
-    estimate = solve(steps, estimate)
-    steps = _loosened(steps, estimate)
+    steps = _loosened(remade(steps, tracks), estimate)
     estimate = solve(steps, estimate)
     counts: Counter[str] = Counter()
     closures: list[Closure] = []

@@ -135,32 +135,35 @@ class GraphBuilder:
             self.skipped["observation from a past state"] += 1
             return None
         key, model = self.state_key(seen.robot, number), MODELS[seen.model]
+        known = not isinstance(seen.target, int) or seen.target in self.landmark_dims
+        if isinstance(seen.target, int):
+            kind, target = "landmark", factors.landmark_key(seen.target)
+        else:
+            kind = "robot"
+            target = self.state_key(seen.target, self.states.number(seen.target, time_ns))
+        self.rows += model.rows
+        if known and seen.model == "line" and not self._lines:
+            return Part((), "", observed=(key, target, seen))  # its factor is made later
         # only new ones, and lines, are built at an estimate, which is dear to ask for
         x = t = np.zeros(3)
-        what = f"seen from robot {seen.robot} at {seen.time_ns} ns"
+        what = f"{kind} {seen.target}, seen from robot {seen.robot} at {seen.time_ns} ns"
         made: list[gtsam.NonlinearFactor] = []
         new = None
-        if isinstance(seen.target, int):
-            target, what = factors.landmark_key(seen.target), f"landmark {seen.target}, {what}"
-            if seen.target not in self.landmark_dims:
-                x = estimate(key, 3)
-                new = (target, model.invert(seen.z, x))
-        else:
-            number = self.states.number(seen.target, time_ns)
-            target, what = self.state_key(seen.target, number), f"robot {seen.target}, {what}"
-        if new is not None:
-            t = new[1]
-        elif self._lines and seen.model == "line":
+        if not known:
+            x = estimate(key, 3)
+            t = model.invert(seen.z, x)
+            new = (target, t)
+        elif seen.model == "line":
             x, t = estimate(key, 3), estimate(target, model.dim)
         with _named(what, seen.cov):
             if new is not None and seen.model == "line":
                 made.append(factors.line_gauge_factor(key, target, seen, wide=self._wide))
+                self.rows += 1
             if self._lines or seen.model != "line":
                 made.append(factors.observation_factor(key, target, seen, self.kernel, x, t))
         if new is not None and isinstance(seen.target, int):
             self.landmark_dims[seen.target] = model.dim
             self._first_seen[seen.target] = (seen.robot, seen.time_ns)
-        self.rows += model.rows + (new is not None and seen.model == "line")
         return Part(tuple(made), what, new, observed=(key, target, seen), robust=True)
 
     def _closure(self, closure: Closure) -> Part | None:
