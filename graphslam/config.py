@@ -238,13 +238,14 @@ class BackendConfig:
     """The estimator.
 
     name: which one. relinearize_threshold: largest change of a variable (m, rad) before it is
-    linearised anew; relinearize_every: steps between two looks for such variables. polish:
-    optimise to convergence at the end; reconsider: then apply the final calibration to all of the
-    log, merge landmarks that are one, and optimise again (smoothers only); close_loops: in between,
-    close loops that scans confirm. verify_closures: believe relative poses that a log brings along
-    only if they agree with each other. horizon_s: how long a past pose stays in isam2's graph
-    before it is marginalised out: inf = full smoothing, 0 = the extended Kalman filter.
-    exchange_s: time between two messages of a robot in `decentralised`.
+    linearised anew; relinearize_every: steps between two looks for such variables in the first
+    1000, twice as many in the next, and so on. polish: optimise to convergence at the end;
+    reconsider: then apply the final calibration to all of the log, merge landmarks that are one,
+    and optimise again (smoothers only); close_loops: in between, close loops that scans confirm.
+    verify_closures: believe relative poses that a log brings along only if they agree with each
+    other. horizon_s: how long a past pose stays in isam2's graph before it is marginalised out:
+    inf = full smoothing, 0 = the extended Kalman filter. exchange_s: time between two messages of a
+    robot in `decentralised`.
     """
 
     name: Literal[
@@ -253,7 +254,7 @@ class BackendConfig:
     horizon_s: float = math.inf
     exchange_s: float = 30.0
     relinearize_threshold: float = 0.05
-    relinearize_every: int = 60
+    relinearize_every: int = 20
     polish: bool = True
     reconsider: bool = True
     close_loops: bool = True

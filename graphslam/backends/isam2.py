@@ -28,6 +28,13 @@ FACED, MAX_FACINGS, MAX_FACINGS_ROBUST = 1e-6, 4, 2
 CONVERGED_ERROR, CONVERGED_ERROR_ROBUST, CONVERGED_ERROR_ROUGH = 1e-10, 1e-6, 1e-3
 
 
+#: linearising anew costs what there is by then: so many steps make the time between two looks for
+#: what moved as long again
+AS_LONG_AGAIN = 1000
+#: updates between two looks, for GTSAM, that will not be
+NEVER = 1 << 30
+
+
 class WholeGraph(GraphBuilder):
     """Keeps every factor there ever was, in ``graph``.
 
@@ -121,7 +128,7 @@ def isam2_parameters(config: Config, factorization: str) -> gtsam.ISAM2Params:
     """Settings of iSAM2; ``factorization`` CHOLESKY or QR."""
     parameters = gtsam.ISAM2Params()
     parameters.setRelinearizeThreshold(config.backend.relinearize_threshold)
-    parameters.relinearizeSkip = config.backend.relinearize_every
+    parameters.relinearizeSkip = NEVER  # `Isam2Backend` says when
     parameters.setFactorization(factorization)
     return parameters
 
@@ -138,6 +145,7 @@ class Isam2Backend(GraphBackend):
         self._factorization = "CHOLESKY"
         self._isam = gtsam.ISAM2(isam2_parameters(config, self._factorization))
         self._finished: gtsam.Values | None = None  # `finish` ended here; not asked since
+        self._steps = self._looked = 0  # steps taken; the one at which it was linearised anew
 
     def value(self, key: int, dim: int) -> Array:
         """Current estimate (dim,) of a variable."""
@@ -151,8 +159,13 @@ class Isam2Backend(GraphBackend):
         self._settle()
         graph, values = self._builder.expand(step, self.value)
         self._joints.clear()
+        self._steps += 1
+        every = self._config.backend.relinearize_every * (1 + self._steps // AS_LONG_AGAIN)
+        due = self._steps >= self._looked + every
+        if due:
+            self._looked = self._steps
         try:
-            self._isam.update(graph, values)
+            self._isam.update(graph, values, [], None, None, None, due)
         except RuntimeError as error:
             self._use_qr(error)
 
