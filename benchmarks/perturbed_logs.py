@@ -12,7 +12,7 @@ mirrored  left is right
 The first is run once as recorded too. Errors are those of `graphslam evaluate --relations`, over
 the relations whose scans are left; a run fails grossly if the mean over all of them exceeds 0.15 m.
 
-Run: python benchmarks/perturbed_logs.py [intel|aces[:as-recorded|late|half|noisy|wild|mirrored]] ...
+Run: python benchmarks/perturbed_logs.py [intel|aces[:PERTURBATION]] ...
 exit code 1 if a run fails grossly. GRAPHSLAM_DATA as in real_logs.py.
 """
 
