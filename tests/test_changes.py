@@ -12,10 +12,11 @@ from typer.testing import CliRunner
 
 from graphslam.changes import changes_between, compare, load_visit, visit_of
 from graphslam.changes.alignment import align
-from graphslam.changes.compare import lasers_differ, same_frame
+from graphslam.changes.compare import same_frame
 from graphslam.changes.evidence import past
 from graphslam.changes.flexed import flexed
 from graphslam.changes.grid import Grid, distinct, grid_over, nearest_of
+from graphslam.changes.laying import lasers_differ
 from graphslam.changes.localisation import overlays
 from graphslam.changes.overlay import overlay_map
 from graphslam.changes.picture import render_changes

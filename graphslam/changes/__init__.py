@@ -4,9 +4,10 @@
 method as printed, to compare with. See docs/change-detection.md.
 """
 
-from graphslam.changes.compare import Change, Comparison, compare
+from graphslam.changes.compare import Comparison, compare
 from graphslam.changes.files import changes_between, save_changes
 from graphslam.changes.picture import render_changes
+from graphslam.changes.things import Change
 from graphslam.changes.visit import Visit, load_visit, visit_of
 
 __all__ = [

@@ -7,8 +7,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from graphslam.changes.compare import Change, Comparison
+from graphslam.changes.compare import Comparison
 from graphslam.changes.grid import Grid
+from graphslam.changes.things import Change
 from graphslam.geometry import Array
 from graphslam.logs import schemas
 from graphslam.logs.writer import LogWriter
