@@ -47,6 +47,9 @@ from graphslam.revisits import opened, tied
 GATES = ((0.3, 0.15), (0.15, 0.1), (0.15, 0.1))
 #: motions from which their noise is told at least; median of the absolute value of a unit normal
 FEWEST_MOTIONS, MEDIAN_OF_NORMAL = 50, 0.6745
+ONE = np.ones(3)
+#: solutions that tell how noisy motions are, at most; more noise by less than this is none
+MAX_LOOSENINGS, LOOSE = 4, 1.1
 #: rounds of closing loops
 MAX_CLOSINGS = 8
 #: solutions from slack to tight closures; less progress than to this part is none
@@ -89,8 +92,15 @@ def consolidate(
         EstimationError: the estimate is indeterminate.
     """
     solve = _Solver(config)
-    steps = _loosened(remade(steps, tracks), estimate)
-    estimate = solve(steps, estimate)
+    steps = made = remade(steps, tracks)
+    scales: Mapping[str, Array] = {}
+    for _ in range(MAX_LOOSENINGS):
+        # motions that are believed too much hold the estimate back from showing how noisy they are
+        before, scales = scales, _noise_scales(made, estimate)
+        steps = _scaled(made, scales)
+        estimate = solve(steps, estimate)
+        if all(np.all(scale <= LOOSE * before.get(r, ONE)) for r, scale in scales.items()):
+            break
     counts: Counter[str] = Counter()
     closures: list[Closure] = []
     if config.backend.close_loops:
@@ -215,8 +225,8 @@ def _tightened(
     return estimate
 
 
-def _loosened(steps: Sequence[Step], estimate: Estimate) -> tuple[Step, ...]:
-    """Steps with motions as noisy as the log shows them, if that is noisier than believed.
+def _noise_scales(steps: Sequence[Step], estimate: Estimate) -> dict[str, Array]:
+    """Robot -> by how much (3,) its motions are noisier than believed, 1 if they are not.
 
     By the median of what the estimate makes of them, over all motions of a robot and axis by axis:
     what few motions got wrong is left to them.
@@ -233,7 +243,12 @@ def _loosened(steps: Sequence[Step], estimate: Estimate) -> tuple[Step, ...]:
         off = between(first, last) - np.array([m.delta for m in motions])
         off[:, 2] = wrap(off[:, 2])
         sigmas = np.sqrt([np.diag(m.cov) for m in motions])
-        scales[robot] = np.maximum(1.0, np.median(np.abs(off) / sigmas, axis=0) / MEDIAN_OF_NORMAL)
+        scales[robot] = np.maximum(ONE, np.median(np.abs(off) / sigmas, axis=0) / MEDIAN_OF_NORMAL)
+    return scales
+
+
+def _scaled(steps: Sequence[Step], scales: Mapping[str, Array]) -> tuple[Step, ...]:
+    """Steps with the sigmas of each robot's motions times its scales (3,)."""
     return tuple(
         replace(
             step,
@@ -246,6 +261,11 @@ def _loosened(steps: Sequence[Step], estimate: Estimate) -> tuple[Step, ...]:
         )
         for step in steps
     )
+
+
+def _loosened(steps: Sequence[Step], estimate: Estimate) -> tuple[Step, ...]:
+    """Steps with motions as noisy as the estimate shows them, if that is noisier than believed."""
+    return _scaled(steps, _noise_scales(steps, estimate))
 
 
 def _duplicates(
