@@ -16,6 +16,7 @@ import numpy as np
 from graphslam.gaussian import chi2_quantile
 from graphslam.geometry import (
     Array,
+    adjoint,
     between,
     compose,
     inverse,
@@ -50,6 +51,8 @@ RIVAL = 0.8
 #: closures agree with each other up to this probability, by covariances that may be too small by
 #: this factor (the estimate does not know of what it missed)
 AGREE, TRUST = 0.99, 16.0
+#: m, m, rad per root of a metre: what an estimate may have missed on the way
+MISSED = np.array([0.02, 0.02, 0.01])
 #: closures with which the search for those that agree begins: the ones that most agree with
 STARTS = 20
 #: m, rad: pairs that lie this well need no closure; closures that come out worse are taken back
@@ -241,7 +244,8 @@ def _near(a: Array, b: Array, limits: tuple[float, float]) -> bool:
 def agreeing(closures: Sequence[Closure], found: Sequence[Place], P: Array) -> list[Closure]:
     """The largest set found of closures that agree with the estimate and, in pairs, among them.
 
-    Two agree if, once either is believed, the other is what is to be expected. Of those that agree
+    By what the estimate knows, and what it may have missed. Two agree if, once either is believed,
+    the other is what is to be expected. Of those that agree
     in pairs the worst leaves until each is what is to be expected from all the others.
 
     Args:
@@ -251,7 +255,7 @@ def agreeing(closures: Sequence[Closure], found: Sequence[Place], P: Array) -> l
     """
     if not closures:
         return []
-    r, S = _innovations(closures, found, TRUST * P)
+    r, S = _innovations(closures, found, TRUST * P + _missed(found))
     n, gate = len(r), chi2_quantile(AGREE, 3)
     blocks = S.reshape(n, 3, n, 3).transpose(0, 2, 1, 3)
     own = blocks[np.arange(n), np.arange(n)]
@@ -276,6 +280,27 @@ def agreeing(closures: Sequence[Closure], found: Sequence[Place], P: Array) -> l
         if len(chosen) > len(best):
             best = chosen
     return [closures[k] for k in _standing(sorted(best), r, S)]
+
+
+def _missed(found: Sequence[Place]) -> Array:
+    """Joint covariance (3n, 3n) of what an estimate of places may have missed on the way.
+
+    A wall taken for the one beside it bends the path there, and everything after it follows: a
+    random walk along each robot's path, errors along each pose's own axes.
+    """
+    n = len(found)
+    poses, path = np.array([p.pose for p in found]), np.array([p.path_m for p in found])
+    robots = np.array([p.state[0] for p in found])
+    D = np.zeros((n, n, 3, 3))
+    for robot in np.unique(robots):
+        own = np.flatnonzero(robots == robot)
+        own = own[np.argsort(path[own], kind="stable")]
+        k, steps = len(own), np.diff(path[own], prepend=path[own[0]])
+        # how an error that arises at one place (second axis) moves a later one (first axis)
+        G = adjoint(between(poses[own][:, None], poses[own])) * np.tri(k)[:, :, None, None]
+        G = (G * np.sqrt(steps)[:, None, None] * MISSED).transpose(0, 2, 1, 3).reshape(3 * k, -1)
+        D[np.ix_(own, own)] = (G @ G.T).reshape(k, 3, k, 3).transpose(0, 2, 1, 3)
+    return D.transpose(0, 2, 1, 3).reshape(3 * n, 3 * n)
 
 
 def _standing(chosen: list[int], r: Array, S: Array) -> list[int]:
