@@ -92,15 +92,7 @@ def consolidate(
         EstimationError: the estimate is indeterminate.
     """
     solve = _Solver(config)
-    steps = made = remade(steps, tracks)
-    scales: Mapping[str, Array] = {}
-    for _ in range(MAX_LOOSENINGS):
-        # motions that are believed too much hold the estimate back from showing how noisy they are
-        before, scales = scales, _noise_scales(made, estimate)
-        steps = _scaled(made, scales)
-        estimate = solve(steps, estimate)
-        if all(np.all(scale <= LOOSE * before.get(r, ONE)) for r, scale in scales.items()):
-            break
+    steps, estimate = _as_noisy_as_shown(remade(steps, tracks), estimate, solve)
     counts: Counter[str] = Counter()
     closures: list[Closure] = []
     if config.backend.close_loops:
@@ -228,6 +220,24 @@ def _tightened(
     # kernels tell which of the two is
     held = solve(steps, estimate, [replace(closure, verified=True) for closure in closures])
     return solve(steps, held, closures)
+
+
+def _as_noisy_as_shown(
+    steps: tuple[Step, ...], estimate: Estimate, solve: _Solver
+) -> tuple[tuple[Step, ...], Estimate]:
+    """Steps with motions as noisy as the log shows them, and the estimate from them.
+
+    Motions that are believed too much hold an estimate back from showing how noisy they are, so it
+    is asked again until it shows no more.
+    """
+    loosened, scales = steps, dict.fromkeys(estimate.states, ONE)
+    for _ in range(MAX_LOOSENINGS):
+        before, scales = scales, scales | _noise_scales(steps, estimate)
+        loosened = _scaled(steps, scales)
+        estimate = solve(loosened, estimate)
+        if all(np.all(scale <= LOOSE * before[robot]) for robot, scale in scales.items()):
+            break
+    return loosened, estimate
 
 
 def _noise_scales(steps: Sequence[Step], estimate: Estimate) -> dict[str, Array]:
