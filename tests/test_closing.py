@@ -115,6 +115,25 @@ def test_what_makes_a_match_unbelievable(bad):
     assert verified(bad) is None
 
 
+def closed_loops(poses, true):
+    """Places along ``poses`` where ``true`` ones were driven, true poses of them, true closures."""
+    states, pictures = drive(poses, true)
+    found = places(states, pictures)
+    at = {int(t): k for k, t in enumerate(states["robot"].stamps_ns)}
+    where = np.array([true[at[p.state[1]]] for p in found])
+    good = [
+        Closure(*found[i].state, *found[i - 6].state, between(where[i - 6], where[i]), COV)
+        for i in range(6, len(found))
+    ]
+    return found, where, good
+
+
+def random_walk(n, sigmas):
+    """Joint covariance (3n, 3n) of n places; ``sigmas`` (3,) m, m, rad from place to place."""
+    walk = np.minimum.outer(np.arange(n) + 1.0, np.arange(n) + 1.0)
+    return np.kron(walk, np.diag(sigmas) ** 2)
+
+
 def random_closures(found, true, rng, groups):
     """False closures: ``groups`` of three that agree with each other, moved as one by metres."""
     made = []
@@ -135,19 +154,9 @@ def test_false_closures_are_left_out(share):
     wide here: it lets metres pass), or with the first consistent group instead of the largest."""
     rng = np.random.default_rng(7)
     true = round_trip()
-    poses = drifting(true)
-    states, pictures = drive(poses, true)
-    found = places(states, pictures)
-    at = {int(t): k for k, t in enumerate(states["robot"].stamps_ns)}
-    where = np.array([true[at[p.state[1]]] for p in found])
-    good = [
-        Closure(*found[i].state, *found[i - 6].state, between(where[i - 6], where[i]), COV)
-        for i in range(6, len(found))
-    ]
+    found, where, good = closed_loops(drifting(true), true)
     # a random walk, as wide as it gets: 0.5 m and 0.1 rad from place to place
-    n = len(found)
-    walk = np.minimum.outer(np.arange(n) + 1.0, np.arange(n) + 1.0)
-    P = np.kron(walk, np.diag([0.5, 0.5, 0.1]) ** 2) / 16
+    P = random_walk(len(found), [0.5, 0.5, 0.1]) / 16
     count = round(len(good) * share / (1 - share) / 3)
     false = random_closures(found, where, rng, max(1, count))
     mixed = [*good, *false]
@@ -166,19 +175,10 @@ def test_a_bend_that_the_estimate_does_not_know_of_is_believed_of_many_closures(
     bend = 70
     turned = compose(compose(true[bend], np.array([0.0, 0.0, 0.1])), between(true[bend], true))
     poses = np.where(np.arange(len(true))[:, None] < bend, true, turned)
-    states, pictures = drive(poses, true)
-    found = places(states, pictures)
-    at = {int(t): k for k, t in enumerate(states["robot"].stamps_ns)}
-    where = np.array([true[at[p.state[1]]] for p in found])
-    good = [
-        Closure(*found[i].state, *found[i - 6].state, between(where[i - 6], where[i]), COV)
-        for i in range(6, len(found))
-    ]
+    found, where, good = closed_loops(poses, true)
     across = [c for c in good if c.other_time_ns < found[0].state[1] + bend * 10**9 <= c.time_ns]
     assert len(across) >= 4
-    n = len(found)
-    walk = np.minimum.outer(np.arange(n) + 1.0, np.arange(n) + 1.0)
-    P = np.kron(walk, np.diag([0.002, 0.002, 0.0005]) ** 2)
+    P = random_walk(len(found), [0.002, 0.002, 0.0005])
     false = [c for _ in range(3) for c in random_closures(found, where, rng, 1)[:1]]
     kept = agreeing([*good, *false], found, P)
     assert all(c in kept for c in across)

@@ -2,49 +2,15 @@
 
 import numpy as np
 import pytest
+from test_joining import LANDMARKS, STARTS, T0, pose, write
 
 from graphslam.config import load_config
-from graphslam.geometry import between, compose, exp
-from graphslam.logs import LogWriter, open_logs
+from graphslam.logs import open_logs
 from graphslam.slam import smooth
-
-S, T0 = 1_000_000_000, 10_000_000_000
-STARTS = {"a": (0.0, 0.0, 0.0), "b": (5.0, 0.0, 2.0), "c": (2.0, 5.0, -1.5)}
-LANDMARKS = {"6": (3.0, 2.0), "7": (-1.0, 4.0), "8": (6.0, 5.0)}
-TWISTS = {"a": (0.3, 0.0, 0.2), "b": (0.25, 0.0, -0.15), "c": (0.3, 0.0, 0.1)}
-
-
-def pose(robot, seconds):
-    return compose(np.array(STARTS[robot]), exp(np.array(TWISTS[robot]) * seconds))
-
-
-def write(path, names, seed=4):
-    """Three robots on circles see each other and three landmarks, under ``names`` where given."""
-    rng = np.random.default_rng(seed)
-    sigmas = np.array([0.01, 0.05])
-    with LogWriter(path) as log:
-        for k in range(600):
-            stamp = T0 + k * S // 10
-            for robot in STARTS:
-                turned = exp(np.array([1.0, 1.0, 1.02]) * TWISTS[robot] * k / 10)
-                log.odometry(robot, stamp, turned)
-            if k % 5:
-                continue
-            for robot in STARTS:
-                x = pose(robot, k / 10)
-                for name, at in {**LANDMARKS, **{r: pose(r, k / 10)[:2] for r in STARTS}}.items():
-                    called = names.get(name, name)
-                    if robot in (name, called):  # nobody sees itself, or uses its own code
-                        continue
-                    seen = between(x, np.array([*at, 0.0]))
-                    z = np.array([np.arctan2(seen[1], seen[0]), np.hypot(*seen[:2])])
-                    z = z + sigmas * rng.normal(size=2)
-                    subject = {"seen_robot" if called in STARTS else "identity": called}
-                    log.sighting(robot, stamp, z, np.diag(sigmas**2), **subject)
 
 
 def run(tmp_path, names):
-    write(tmp_path / "log.mcap", names)
+    write(tmp_path / "log.mcap", seed=4, names=names)
     starts = [f"start.poses.{r}=[{x}, {y}, {phi}]" for r, (x, y, phi) in STARTS.items()]
     config = load_config(overrides=starts)
     return smooth(open_logs([tmp_path / "log.mcap"], config), config)
