@@ -134,14 +134,15 @@ class KeyframeConfig:
     """When a robot gets a state.
 
     mode: `motion` = at an observation, once the robot moved distance_m or turned angle_rad since
-    its last state; `all` = at every odometry, scan and sighting stamp. gather_s: in logs of
-    several robots without scans, sightings within this span enter together, carried to its end by
-    odometry.
+    its last state, for a scan scan_angle_rad: a laser sees most of what it saw before; `all` = at
+    every odometry, scan and sighting stamp. gather_s: in logs of several robots without scans,
+    sightings within this span enter together, carried to its end by odometry.
     """
 
     mode: Literal["motion", "all"] = "motion"
     distance_m: float = 0.25
-    angle_rad: float = 0.25
+    angle_rad: float = 0.15
+    scan_angle_rad: float = 0.25
     gather_s: float = 0.8
 
 

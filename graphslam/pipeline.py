@@ -181,11 +181,12 @@ class Pipeline:
         for robot in meeting:
             if not self.runs[robot].started:
                 self.start(robot, min(self.runs[robot].track.first_ns, step_ns))
+        angle = self.config.keyframe.angle_rad
         last_ns = {
             robot: run.state_ns
             for robot, run in ((robot, self.runs[robot]) for robot in gathered.robots)
             if step_ns > run.state_ns
-            and (robot in meeting or self.has_moved(run, run.state_ns, step_ns))
+            and (robot in meeting or self.has_moved(run, run.state_ns, step_ns, angle))
         }
         at = {r: step_ns if r in last_ns else self.runs[r].state_ns for r in gathered.robots}
         moved, new = ways(gathered, at, last_ns, {robot: self.runs[robot].track for robot in at})
@@ -326,7 +327,10 @@ class Pipeline:
         if self.config.keyframe.mode == "all" or not isinstance(first, (Scan, *ODOMETRY)):
             return True
         run = self.runs[first.robot]
-        if isinstance(first, ODOMETRY) or not self.has_moved(run, run.scanned_ns, first.time_ns):
+        angle = self.config.keyframe.scan_angle_rad
+        if isinstance(first, ODOMETRY) or not self.has_moved(
+            run, run.scanned_ns, first.time_ns, angle
+        ):
             return False
         run.scanned_ns = first.time_ns
         return True
@@ -338,16 +342,17 @@ class Pipeline:
             self.config.keyframe.mode == "all"
             or isinstance(first, Scan)
             or any(isinstance(m, Sighting) and m.seen_robot for m in event)
-            or self.has_moved(run, run.state_ns, first.time_ns)
+            or self.has_moved(run, run.state_ns, first.time_ns, self.config.keyframe.angle_rad)
         )
 
-    def has_moved(self, run: RobotRun, since_ns: int | None, time_ns: int) -> bool:
-        """Whether the robot moved by a keyframe's distance or angle; True since None."""
+    def has_moved(
+        self, run: RobotRun, since_ns: int | None, time_ns: int, angle_rad: float
+    ) -> bool:
+        """Whether the robot moved by a keyframe's distance or by an angle; True since None."""
         if since_ns is None:
             return True
         path_m, turned_rad = run.track.moved(since_ns, time_ns)
-        keyframe = self.config.keyframe
-        return path_m >= keyframe.distance_m or turned_rad >= keyframe.angle_rad
+        return path_m >= self.config.keyframe.distance_m or turned_rad >= angle_rad
 
     def observations(self, event: Sequence[Message], since: Motion | None) -> list[Observation]:
         """Landmarks seen, in the base frame of the state (``since`` carries back to it)."""
