@@ -3,17 +3,18 @@
 A wall that was not recognised when it was seen again is in the map twice. After all data are in,
 the joint covariance of the whole map says how far two landmarks may lie apart if they are one.
 Pairs are tied one after another, the most certain first, and every tie conditions the joint: what
-agrees with one tie must agree with the next. What one image showed side by side is never tied.
+agrees with one tie must agree with the next. What one image showed as two things is never tied.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
 from graphslam.backends import Joint
 from graphslam.gaussian import chi2_quantile
-from graphslam.geometry import Array, between, wrap
+from graphslam.geometry import Array, between, rotate_cov, wrap
 from graphslam.landmark_map import Entry, LandmarkMap
 from graphslam.records import Association, Step
 
@@ -212,16 +213,42 @@ def _tie(walls: _Map, a: int, b: int, r: Array, H_a: Array, H_b: Array) -> None:
 
 
 def seen_together(steps: Iterable[Step]) -> set[frozenset[int]]:
-    """Pairs of landmarks that one robot saw from one state."""
-    pairs: set[frozenset[int]] = set()
+    """Pairs of landmarks that one robot saw from one state, as two things.
+
+    Two lines that an image has in line with each other may be parts of one wall, with a door
+    between them.
+    """
+    images: dict[tuple[str, int], list[Association]] = {}
     for step in steps:
-        images: dict[tuple[str, int], set[int]] = {}
         for a in step.associations:
             if isinstance(a.target, int):
-                images.setdefault((a.robot, a.time_ns), set()).add(a.target)
-        for seen in images.values():
-            pairs |= {frozenset((p, q)) for p in seen for q in seen if p < q}
-    return pairs
+                images.setdefault((a.robot, a.time_ns), []).append(a)
+    pairs = [(a, b) for seen in images.values() for a, b in combinations(seen, 2)]
+    pairs = [(a, b) for a, b in pairs if a.target != b.target]
+    lines = np.array([a.model == b.model == "line" for a, b in pairs], dtype=bool)
+    apart = ~lines
+    apart[lines] = ~_in_line([pair for pair, line in zip(pairs, lines, strict=True) if line])
+    return {
+        frozenset((a.target, b.target))
+        for (a, b), two in zip(pairs, apart, strict=True)
+        if two and isinstance(a.target, int) and isinstance(b.target, int)
+    }
+
+
+def _in_line(pairs: Sequence[tuple[Association, Association]]) -> BoolArray:
+    """Which pairs (m,) of lines of one image each may lie on one straight line, by their noise."""
+    if not pairs:
+        return np.zeros(0, dtype=bool)
+    z = np.array([[a.z, b.z] for a, b in pairs])
+    cov = np.array([[a.cov, b.cov] for a, b in pairs])
+    # as each is seen along itself; the first column is the offset across it
+    own = rotate_cov(cov, -z[..., 2])
+    off = between(z[:, 0], z[:, 1])
+    turn = np.arctan(np.tan(off[:, 2]))  # a wall has no direction
+    variance = own[:, :, 2, 2].sum(axis=1) + FLOOR_RAD**2
+    across = own[:, :, 1, 1].sum(axis=1) + (off[:, 0] ** 2) * own[:, 0, 2, 2] + FLOOR_M**2
+    gate = chi2_quantile(GATE_PROBABILITY, 1)
+    return np.asarray((turn**2 <= gate * variance) & (off[:, 1] ** 2 <= gate * across))
 
 
 def survivors(pairs: Iterable[tuple[int, int]]) -> dict[int, int]:

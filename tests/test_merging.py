@@ -22,6 +22,7 @@ from graphslam.merging import (
     seen_together,
     survivors,
 )
+from graphslam.records import Association, Step
 
 WALLS = np.array([[0.0, 0.0, 0.0], [4.0, 2.0, 1.6], [0.0, 5.0, 3.1], [9.0, 1.0, -1.5]])
 EXTENT = np.array([-1.5, 1.5])
@@ -226,3 +227,25 @@ def test_an_extent_stays_where_it_is_when_the_origin_slides():
     wall.move(compose(wall.mean, np.array([3.0, 0.01, 0.0])))
     after = compose(wall.mean, np.array([wall.extent[0], 0.0, 0.0]))
     np.testing.assert_allclose(between(before, after), [0.0, 0.01, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("second", "two"),
+    [
+        ((2.5, 1.0, 0.0), False),
+        ((2.5, 1.01, np.pi), False),
+        ((2.5, 1.12, 0.0), True),
+        ((2.5, 1.0, 0.1), True),
+    ],
+    ids=["behind a door", "the other way round", "a niche", "turned"],
+)
+def test_lines_of_one_image_are_two_things_unless_in_line(second, two):
+    """A wall seen on both sides of a door is one wall. Breaks if what one image shows is taken for
+    different things whatever it is, or for one wall although it stands back by 12 cm."""
+    cov = np.diag([1.0, 0.01, 0.005]) ** 2
+    seen = [
+        Association("r", 7, number, "line", np.array(z), cov)
+        for number, z in enumerate([(0.5, 1.0, 0.0), second])
+    ]
+    expected = {frozenset((0, 1))} if two else set()
+    assert seen_together([Step(7, {}, {}, tuple(seen))]) == expected
