@@ -59,7 +59,7 @@ def test_two_real_visits_register_and_an_inserted_box_is_found(visits):
     reference, later = visits
     plain = compare(reference, later, ChangesConfig())
     assert len(plain.later.poses) > 0.7 * len(later.poses)
-    assert 0.9 <= plain.spread < 1.5  # the maps agree as far as is stated
+    assert plain.spread < 1.5  # the maps agree as far as is stated
     boxed = compare(
         reference, with_box(later, plain.later.stamps_ns, plain.later.poses), ChangesConfig()
     )
