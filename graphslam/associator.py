@@ -195,7 +195,7 @@ class Associator:
         graph_ids = sorted({e.id for e in wanted if e.in_graph and e.id not in self._unsettled})
         where = {landmark: n for n, landmark in enumerate(graph_ids)}
         joint = predicted_joint(self._backend.joint(robot, graph_ids), motion)
-        compared = self._compare(seen, pairs, entries, joint, where, track, time_ns)
+        compared = self._compare(seen, pairs, entries, joint, where, motion, track, time_ns)
         return Image(
             robot, time_ns, path_m, seen, pairs, tuple(entries), recent, joint, where, compared
         )
@@ -219,6 +219,7 @@ class Associator:
         entries: Sequence[Entry],
         joint: Joint,
         where: dict[int, int],
+        motion: Motion | None,
         track: Track,
         time_ns: int,
     ) -> Compared:
@@ -231,6 +232,8 @@ class Associator:
         P_xx, P_xt, P_tt = (np.zeros((k, 3, 3)) for _ in range(3))
         states = np.zeros((k, 3))
         since: dict[int, Array] = {}
+        if motion is not None:
+            since[motion.start_ns] = rotate_cov(motion.cov, joint.pose[2] - motion.delta[2])
         for n, entry in enumerate(entries):
             if entry.id in where:
                 block = joint.slices[where[entry.id]]

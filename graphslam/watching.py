@@ -254,7 +254,7 @@ class Watcher:
         if not (used or others):
             return ()
         sweep = make_sweep(scan, self._config.max_range_m)
-        views = self._views(scan)
+        views = self._views(scan, STORED if others else EARLIER)
         elsewhere = {name: self._elsewhere(scan, name, views) for name in others}
         found = Watched(scan, ())
         if others:
@@ -272,9 +272,9 @@ class Watcher:
         self._count("thing that moves", found.scan, still)
         return (still, *found.sightings)
 
-    def _views(self, scan: Scan) -> list[tuple[int, View]]:
-        """The observer's earlier scans, with their times."""
-        earlier = self._earlier[scan.robot]
+    def _views(self, scan: Scan, count: int) -> list[tuple[int, View]]:
+        """The observer's latest scans before, so many at most, with their times."""
+        earlier = list(self._earlier[scan.robot])[-count:]
         if not earlier:
             return []
         begin = np.array([time_ns for time_ns, _ in earlier], dtype=np.int64)
