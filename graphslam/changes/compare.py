@@ -42,7 +42,7 @@ class Comparison:
         surfaces: of the reference and of the later visit.
         evidence: later beams past reference surfaces; reference beams past later surfaces.
         compared, flagged: (n,) which later beams were compared, and flagged.
-        spread: factor on the stated sigmas with which the bulk of the scores is normal.
+        spread: factor on the stated sigmas that keeps the rate asked for where nothing changed.
         range_sigma_m: range noise of both visits as found.
         rate: the false-alarm rate that was asked for.
         warnings: what makes the result weaker than its numbers say, one line each.

@@ -246,7 +246,7 @@ def range_noise(surface: Surface, visit: Visit, gate_m: float) -> float:
 
 
 def spread(evidence: tuple[Evidence, ...]) -> float:
-    """Sigma of the scores of what did not change, by the bulk of them; 1 if all is as stated.
+    """Sigma of the scores of what did not change: of the bulk, widened for the tails.
 
     Most of what is seen has not changed, so the middle of the distribution is that of no change
     (an empirical null, doi:10.1198/016214504000000089). Its tails are not used, where changes are.
