@@ -290,6 +290,14 @@ class Track:
         twist = log(between(self._poses[i - 1], self._poses[i]))
         return compose(self._poses[i - 1], exp(share[..., None] * twist))
 
+    def mounted_pose(self, times_ns: IntArray) -> Array:
+        """Poses (n, 3) of the frame at ``mount``, the times ``latency_ns`` late; see `pose`.
+
+        What lies between two of them is `motion` but for the calibration of the odometry, and
+        cheap.
+        """
+        return compose(self.pose(times_ns - self.latency_ns), self.mount)
+
     def _share(self, i: IntArray, from_ns: IntArray | int, to_ns: IntArray | int) -> Array:
         """Share (..., ) of the interval that ends at reading i that lies in from_ns..to_ns."""
         begin, end = self._times[i - 1], self._times[i]

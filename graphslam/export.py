@@ -5,7 +5,8 @@ are numbered here and `graph_ids` says which is which. Robust kernels have no pl
 the file holds the plain Gaussian weights.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,9 +14,11 @@ import numpy as np
 from graphslam.errors import OutputError
 from graphslam.geometry import Array, between, rotate_cov, rotation, wrap
 from graphslam.models.observation import LineModel
-from graphslam.records import Association, Estimate, Step
+from graphslam.records import Estimate, Step
 
-_EdgeParts = tuple[str, Array, Array]  # tag, measurement, information
+# of n edges: tag, measurements (n, k), covariances (n, m, m) of the last m entries; nothing is
+# known of the entries before them
+_EdgeParts = tuple[str, Array, Array]
 
 # "No information" in a direction is written as this, not as zero: GTSAM refuses a zero on the
 # diagonal of an information matrix ("looks like this is not G2O matrix order"), and it as well as
@@ -76,134 +79,158 @@ def graph_g2o(steps: Sequence[Step], estimate: Estimate) -> str:
         OutputError: a covariance cannot be inverted; the message names the edge.
     """
     ids = number_vertices(estimate)
-    lines: list[str] = []
-    for robot in sorted(estimate.states):
-        for pose in estimate.states[robot].poses:
-            lines.append(_record("VERTEX_SE2", [len(lines)], pose))
-    for landmark in ids.landmarks:
-        state = estimate.landmarks[landmark][0]
-        tag = "VERTEX_XY" if len(state) == 2 else "VERTEX_SE2"
-        lines.append(_record(tag, [ids.landmarks[landmark]], state))
-    poses = {
-        (robot, stamp): pose
-        for robot, trajectory in estimate.states.items()
-        for stamp, pose in zip(trajectory.stamps_ns.tolist(), trajectory.poses, strict=True)
-    }
-    for step in steps:
-        lines += _structure_edges(step, ids)
-        for association in step.associations:
-            lines += _association_edge(association, ids, poses, estimate.landmarks)
-    return "\n".join(lines) + "\n"
+    states = [pose for robot in sorted(estimate.states) for pose in estimate.states[robot].poses]
+    states += [estimate.landmarks[landmark][0] for landmark in ids.landmarks]
+    lines = [_record(VERTICES[len(x)], (i,), x.tolist()) for i, x in enumerate(states)]
+    edges = [edge for step in steps for edge in _edges(step, ids)]
+    rows = [""] * len(edges)
+    alike: dict[str, list[int]] = defaultdict(list)
+    for place, edge in enumerate(edges):
+        alike[edge.model].append(place)
+    for model, places in alike.items():
+        group = [edges[place] for place in places]
+        z, cov = (np.array([getattr(edge, name) for edge in group]) for name in ("z", "cov"))
+        # the prior of a start has one end only, and its line needs neither
+        x, t = (_padded([states[edge.ends[end]] for edge in group]) for end in (0, -1))
+        tag, z, cov = EDGES[model](z, cov, x, t)
+        infos = _informations(cov, z.shape[1], group)
+        for place, edge, values, upper in zip(places, group, z.tolist(), infos, strict=True):
+            rows[place] = _record(tag, edge.ends, values, upper)
+    return "\n".join(lines + rows) + "\n"
 
 
-def _structure_edges(step: Step, ids: GraphIds) -> Iterable[str]:
-    """Priors, motions and closures of one step."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Edge:
+    """An edge before it is written: a row of `EDGES`, vertices, measurement and covariance."""
+
+    model: str
+    ends: tuple[int, ...]
+    z: Array
+    cov: Array
+    what: str
+
+
+def _edges(step: Step, ids: GraphIds) -> Iterator[_Edge]:
+    """Edges of one step; none of what has an end that is not in the estimate."""
+    states = ids.states
     for robot, start in sorted(step.starts.items()):
-        if (robot, step.time_ns) in ids.states:
-            i = ids.states[robot, step.time_ns]
-            # world axes -> the frame of the prior itself, like every other edge
-            cov = rotate_cov(start.cov, -start.pose[2])
-            yield _record("EDGE_PRIOR_SE2", [i], start.pose, _information(cov, f"start of {robot}"))
+        if (robot, step.time_ns) in states:
+            ends = (states[robot, step.time_ns],)
+            # world axes, those of the frame that the prior is given in
+            yield _Edge("start", ends, start.pose, start.cov, f"start of {robot}")
     for robot, motion in sorted(step.motions.items()):
-        ends = (robot, motion.start_ns), (robot, motion.end_ns)
-        if all(end in ids.states for end in ends):
+        a, b = states.get((robot, motion.start_ns)), states.get((robot, motion.end_ns))
+        if a is not None and b is not None:
             what = f"motion of {robot} to {motion.end_ns}"
-            info = _information(rotate_cov(motion.cov, -motion.delta[2]), what)
-            yield _record("EDGE_SE2", [ids.states[end] for end in ends], motion.delta, info)
+            yield _Edge("motion", (a, b), motion.delta, motion.cov, what)
     for closure in step.closures:
-        ends = (closure.other, closure.other_time_ns), (closure.robot, closure.time_ns)
-        if all(end in ids.states for end in ends):
+        a = states.get((closure.other, closure.other_time_ns))
+        b = states.get((closure.robot, closure.time_ns))
+        if a is not None and b is not None:
             what = f"closure of {closure.robot} at {closure.time_ns}"
-            info = _information(rotate_cov(closure.cov, -closure.delta[2]), what)
-            yield _record("EDGE_SE2", [ids.states[end] for end in ends], closure.delta, info)
+            yield _Edge("closure", (a, b), closure.delta, closure.cov, what)
+    for seen in step.associations:
+        a = states.get((seen.robot, seen.time_ns))
+        if isinstance(seen.target, str):
+            b = states.get((seen.target, seen.time_ns))
+        else:
+            b = ids.landmarks.get(seen.target)
+        if a is not None and b is not None:
+            what = f"{seen.model} seen by {seen.robot} at {seen.time_ns}"
+            yield _Edge(seen.model, (a, b), seen.z, seen.cov, what)
 
 
-def _association_edge(
-    association: Association,
-    ids: GraphIds,
-    poses: Mapping[tuple[str, int], Array],
-    landmarks: Mapping[int, tuple[Array, Array]],
-) -> Iterable[str]:
-    """The edge of one association, or nothing where an end of it is not in the estimate."""
-    source = (association.robot, association.time_ns)
-    if isinstance(association.target, str):
-        seen = (association.target, association.time_ns)
-        target, state = ids.states.get(seen), poses.get(seen)
-    else:
-        target = ids.landmarks.get(association.target)
-        state = landmarks[association.target][0] if target is not None else None
-    if source not in ids.states or target is None or state is None:
-        return
-    what = f"{association.model} seen by {association.robot} at {association.time_ns}"
-    tag, z, info = EDGES[association.model](association, poses[source], state, what)
-    yield _record(tag, [ids.states[source], target], z, info)
+def _padded(states: Sequence[Array]) -> Array:
+    """States (n, 3): points get a heading that nobody asks for."""
+    return np.array([state if len(state) == 3 else (*state, 0.0) for state in states])
 
 
-def _point_edge(seen: Association, pose: Array, state: Array, what: str) -> _EdgeParts:
+def _point_edges(z: Array, cov: Array, x: Array, t: Array) -> _EdgeParts:
     """Bearing and range as Cartesian."""
-    xy, cov = _cartesian(seen)
-    return "EDGE_SE2_XY", xy, _information(cov, what)
+    return "EDGE_SE2_XY", *_cartesian(z, cov)
 
 
-def _robot_point_edge(seen: Association, pose: Array, state: Array, what: str) -> _EdgeParts:
-    """A robot's position as a pose edge: no information on its heading.
+def _robot_point_edges(z: Array, cov: Array, x: Array, t: Array) -> _EdgeParts:
+    """Robots' positions as pose edges: no information on their headings.
 
     The residual of EDGE_SE2 is turned by the measured heading; there is none, so the estimate
     stands in for it, which is exact at the estimate and first order beside it.
     """
-    xy, cov = _cartesian(seen)
-    phi = float(between(pose, state)[2])
-    turned = rotation(-phi) @ cov @ rotation(-phi).T
-    info = np.diag([0.0, 0.0, NO_INFORMATION])
-    info[:2, :2] = _information(turned, what)
-    return "EDGE_SE2", np.array([*xy, phi]), info
+    xy, cov = _cartesian(z, cov)
+    phi = between(x, t)[:, 2]
+    R = np.array([rotation(-angle) for angle in phi.tolist()])
+    wide = np.zeros((len(xy), 3, 3))
+    wide[:, :2, :2] = R @ cov @ R.mT
+    wide[:, 2, 2] = 1.0 / NO_INFORMATION
+    return "EDGE_SE2", np.column_stack([xy, phi]), wide
 
 
-def _pose_edge(seen: Association, pose: Array, state: Array, what: str) -> _EdgeParts:
-    """A relative pose: segments, robots with direction."""
-    return "EDGE_SE2", seen.z, _information(rotate_cov(seen.cov, -float(seen.z[2])), what)
+def _pose_edges(z: Array, cov: Array, x: Array, t: Array) -> _EdgeParts:
+    """Relative poses: motions, closures, segments, robots with direction; priors likewise."""
+    return "EDGE_SE2", z, rotate_cov(cov, -z[:, 2])
 
 
-def _line_edge(seen: Association, pose: Array, state: Array, what: str) -> _EdgeParts:
-    """A line, moved along itself to face the landmark's origin; no information along it."""
+def _start_edges(z: Array, cov: Array, x: Array, t: Array) -> _EdgeParts:
+    """Priors on poses."""
+    return "EDGE_PRIOR_SE2", *_pose_edges(z, cov, x, t)[1:]
+
+
+def _line_edges(z: Array, cov: Array, x: Array, t: Array) -> _EdgeParts:
+    """Lines, moved along themselves to face the landmarks' origins; no information along them."""
     model = LineModel()
-    info = np.diag([NO_INFORMATION, 0.0, 0.0])
-    info[1:, 1:] = _information(model.noise(seen.z, seen.cov, pose, state), what)
-    return "EDGE_SE2", model.facing(seen.z, pose, state), info
+    return "EDGE_SE2", model.facing(z, x, t), model.noise(z, cov, x, t)
 
 
-def _cartesian(seen: Association) -> tuple[Array, Array]:
-    """Bearing and range as x and y (2,) in the base frame, with covariance (2, 2)."""
-    bearing, distance = seen.z
+def _cartesian(z: Array, cov: Array) -> tuple[Array, Array]:
+    """Bearings and ranges (n, 2) as x and y (n, 2) in the base frame, covariances (n, 2, 2)."""
+    bearing, distance = z.T
     c, s = np.cos(bearing), np.sin(bearing)
-    J = np.array([[-distance * s, c], [distance * c, s]])
-    return distance * np.array([c, s]), J @ seen.cov @ J.T
+    J = np.array([[-distance * s, c], [distance * c, s]]).transpose(2, 0, 1)
+    return distance[:, None] * np.column_stack([c, s]), J @ cov @ J.mT
 
 
-#: model of an association -> its edge; the rows are those of `graphslam.models`
-EDGES: Mapping[str, Callable[[Association, Array, Array, str], _EdgeParts]] = {
-    "point": _point_edge,
-    "line": _line_edge,
-    "segment": _pose_edge,
-    "robot-pose": _pose_edge,
-    "robot-point": _robot_point_edge,
+#: what a state of this size is called
+VERTICES: Mapping[int, str] = {2: "VERTEX_XY", 3: "VERTEX_SE2"}
+#: what says where a vertex is -> its edges, from measurements (n, k), their covariances, and the
+#: estimates (n, 3) of both ends; the rows are those of `graphslam.models` and what steps hold
+EDGES: Mapping[str, Callable[[Array, Array, Array, Array], _EdgeParts]] = {
+    "start": _start_edges,
+    "motion": _pose_edges,
+    "closure": _pose_edges,
+    "point": _point_edges,
+    "line": _line_edges,
+    "segment": _pose_edges,
+    "robot-pose": _pose_edges,
+    "robot-point": _robot_point_edges,
 }
 
 
-def _information(cov: Array, what: str) -> Array:
-    """Inverse of a covariance, exactly symmetric."""
+def _informations(cov: Array, size: int, edges: Sequence[_Edge]) -> list[list[float]]:
+    """Upper triangles, row by row, of the inverses of covariances (n, m, m), m <= ``size``."""
     try:
         half = np.linalg.inv(np.linalg.cholesky(cov))
     except np.linalg.LinAlgError as error:
+        what = next(edge.what for edge, P in zip(edges, cov, strict=True) if not _positive(P))
         raise OutputError(f"graph.g2o: the covariance of {what} is not positive") from error
-    return np.asarray(half.T @ half)
+    m = cov.shape[1]
+    info = np.zeros((len(cov), size, size))
+    info[:, range(size), range(size)] = NO_INFORMATION
+    info[:, size - m :, size - m :] = half.mT @ half
+    i, j = np.triu_indices(size)
+    upper: list[list[float]] = info[:, i, j].tolist()
+    return upper
 
 
-def _record(tag: str, ids: Sequence[int], values: Array, info: Array | None = None) -> str:
-    """One line: tag, vertex numbers, values (heading wrapped), upper triangle of ``info``."""
-    numbers = values.tolist()
-    if len(numbers) == 3:
-        numbers[2] = float(wrap(numbers[2]))
-    if info is not None:
-        numbers += [x for k, row in enumerate(info.tolist()) for x in row[k:]]
-    return " ".join([tag, *map(str, ids), *map(repr, numbers)])
+def _positive(cov: Array) -> bool:
+    try:
+        np.linalg.cholesky(cov)
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
+
+def _record(tag: str, ids: Sequence[int], values: list[float], upper: Sequence[float] = ()) -> str:
+    """One line: tag, vertex numbers, values (heading wrapped), upper triangle of information."""
+    if len(values) == 3:
+        values = [*values[:2], float(wrap(values[2]))]
+    return " ".join([tag, *map(str, ids), *map(repr, values), *map(repr, upper)])

@@ -9,6 +9,7 @@ and which they look through.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -41,24 +42,36 @@ STEP_M, STEP_RAD = 0.15, np.radians(1.5)
 SEARCHED, ALIGNED = 250, 300
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Submap:
     """What neighbouring scans saw, in one frame.
 
     ``points`` (n, 2) m; ``information`` (n, 2, 2), 1/m^2, of what each tells about where another
     one near it lies: across a surface, both ways where there is none, and nothing where there are
     too few neighbours to tell (where a wall leaves the laser's reach); ``poses`` (k, 3) of the
-    sensor; ``images`` (6, k, `BEAMS`), m, the nearest and the farthest return of each degree round
-    it and of both its neighbours, NaN without one; ``free`` (k, `BEAMS`) the nearest of these six,
-    0 where one is not known.
+    sensor and ``clouds``, k arrays (n, 2) of what it saw from there.
     """
 
     points: Array
     information: Array
     poses: Array
-    images: Array
-    free: Array
+    clouds: Sequence[Array]
     tree: cKDTree
+
+    # worked out when asked for: few single scans are ever compared with another one beam by beam
+    @cached_property
+    def images(self) -> Array:
+        """(6, k, `BEAMS`), m: nearest and farthest return of each degree and both its neighbours.
+
+        NaN without one.
+        """
+        returns = np.array([_range_image(cloud) for cloud in self.clouds]).transpose(2, 0, 1)
+        return np.concatenate([np.roll(returns, turn, axis=2) for turn in (-1, 0, 1)])
+
+    @cached_property
+    def free(self) -> Array:
+        """(k, `BEAMS`) m: the nearest of the six ``images``, 0 where one of them is not known."""
+        return np.asarray(np.nan_to_num(self.images.min(axis=0)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,15 +95,12 @@ def make_submap(poses: Array, clouds: Sequence[Array]) -> Submap:
         poses: (k, 3) of the sensor in the submap's frame.
         clouds: k arrays (n, 2) of points in the sensor's frame, m.
     """
-    returns = np.array([_range_image(cloud) for cloud in clouds]).transpose(2, 0, 1)
-    images = np.concatenate([np.roll(returns, turn, axis=2) for turn in (-1, 0, 1)])
-    free = np.nan_to_num(images.min(axis=0))  # NaN if any of them is
     points = np.concatenate([transform(p, c) for p, c in zip(poses, clouds, strict=True)])
     cell = np.round(points / CELL_M).astype(np.int64)
     _, kept = np.unique((cell[:, 0] << 32) + cell[:, 1], return_index=True)
     points = points[np.sort(kept)]
     tree = cKDTree(points)
-    return Submap(points, _information(points, tree), np.asarray(poses), images, free, tree)
+    return Submap(points, _information(points, tree), np.asarray(poses), clouds, tree)
 
 
 def _range_image(cloud: Array) -> Array:
@@ -246,15 +256,15 @@ def _drawn(points: Array, target: Submap, x: Array, reach: float) -> _Drawn | No
         return None
     near = near[ok]
     p, r = placed[ok], placed[ok] - target.points[near]
-    J = np.zeros((len(p), 2, 3))
-    J[:, 0, 0] = J[:, 1, 1] = 1.0
-    J[:, 0, 2], J[:, 1, 2] = -(p[:, 1] - x[1]), p[:, 0] - x[0]
-    M = target.information[near]
-    Mr = (M @ r[:, :, None])[..., 0]
-    w = 1.0 / (1.0 + (r * Mr).sum(axis=1) / 4.0)
-    JtM = (w[:, None, None] * (M @ J)).reshape(-1, 3).T
-    A = JtM @ J.reshape(-1, 3) + np.diag([1e-4, 1e-4, 1e-4])
-    return _Drawn(np.linalg.solve(A, JtM @ r.ravel()), A, float(w.sum()))
+    # J = [I | j], written out: many small matrices cost more than their products
+    (rx, ry), jx, jy = r.T, x[1] - p[:, 1], p[:, 0] - x[0]
+    xx, xy, yy = target.information[near].reshape(-1, 4).T[[0, 1, 3]]
+    ux, uy = xx * rx + xy * ry, xy * rx + yy * ry
+    mx, my = xx * jx + xy * jy, xy * jx + yy * jy
+    w = 1.0 / (1.0 + (rx * ux + ry * uy) / 4.0)
+    sums = np.stack([xx, xy, yy, mx, my, jx * mx + jy * my, ux, uy, jx * ux + jy * uy]) @ w
+    A = sums[[[0, 1, 3], [1, 2, 4], [3, 4, 5]]] + np.diag([1e-4, 1e-4, 1e-4])
+    return _Drawn(np.linalg.solve(A, sums[6:]), A, float(w.sum()))
 
 
 def _covariance(information: Array) -> Array:

@@ -277,8 +277,9 @@ class Watcher:
         earlier = list(self._earlier[scan.robot])[-count:]
         if not earlier:
             return []
-        begin = np.array([time_ns for time_ns, _ in earlier], dtype=np.int64)
-        moved = self._runs[scan.robot].track.motions(begin, np.full_like(begin, scan.time_ns)).delta
+        times = np.array([*(time_ns for time_ns, _ in earlier), scan.time_ns], dtype=np.int64)
+        poses = self._runs[scan.robot].track.mounted_pose(times)
+        moved = between(poses[:-1], poses[-1])
         lasers = compose(compose(inverse(scan.mount), moved), scan.mount)
         return [(t, (sweep, laser)) for (t, sweep), laser in zip(earlier, lasers, strict=True)]
 

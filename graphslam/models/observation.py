@@ -142,12 +142,19 @@ class LineModel(PoseModel):
 
     def along(self, z: Array, x: Array, t: Array) -> Array:
         """Distance (...,) along the measured line from z to the target's origin, m."""
-        return between(z, between(x, t))[..., 0]
+        direction = x[..., 2] + z[..., 2]
+        c, s = np.cos(direction), np.sin(direction)
+        ahead = c * (t[..., 0] - x[..., 0]) + s * (t[..., 1] - x[..., 1])
+        c, s = np.cos(z[..., 2]), np.sin(z[..., 2])
+        return np.asarray(ahead - c * z[..., 0] - s * z[..., 1])
 
     def facing(self, z: Array, x: Array, t: Array) -> Array:
         """The measurement moved along its own line to face the target's origin, (..., 3)."""
         along = self.along(z, x, t)
-        return compose(z, np.stack([along, 0 * along, 0 * along], axis=-1))
+        faced = np.broadcast_to(z, (*along.shape, 3)).copy()
+        faced[..., 0] += along * np.cos(z[..., 2])
+        faced[..., 1] += along * np.sin(z[..., 2])
+        return faced
 
     def residual(self, z: Array, x: Array, t: Array) -> Array:
         """(normal offset m, direction rad)."""
