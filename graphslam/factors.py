@@ -39,6 +39,13 @@ def landmark_key(landmark: int) -> int:
     return FIRST_LANDMARK | landmark
 
 
+def number_of(key: int) -> tuple[int | None, int]:
+    """Whose state a key is (index of the robot) and which, or None and the landmark's number."""
+    if key < FIRST_STATE:
+        return None, key - FIRST_LANDMARK
+    return divmod(key - FIRST_STATE, 1 << 40)
+
+
 def pose2(pose: Array) -> gtsam.Pose2:
     """Array (3,) to GTSAM."""
     return gtsam.Pose2(float(pose[0]), float(pose[1]), float(pose[2]))

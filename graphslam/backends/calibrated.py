@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 
 from graphslam import factors
-from graphslam.backends.graph import Part, read, write
+from graphslam.backends.graph import read
 from graphslam.backends.isam2 import WholeGraph
 from graphslam.config import RobustConfig
 from graphslam.geometry import Array, adjoint, between, inverse, log, rotate_cov, rotation3
@@ -67,9 +67,6 @@ def solve_calibrated(
             noise = factors.gaussian(prior.cov[np.ix_(use, use)])
             graph.add(gtsam.PriorFactorVector(key, prior.mean[use], noise))
 
-    def estimate(key: int, dim: int) -> Array:
-        return read(values, key, dim)
-
     places: dict[str, int] = dict.fromkeys(priors, 0)
     unit = gtsam.noiseModel.Unit.Create(3)
     linear = {
@@ -78,8 +75,7 @@ def solve_calibrated(
     }
     for step in steps:
         bare = Step(step.time_ns, step.starts, {}, (), ())
-        for part in builder.parts(bare, estimate):
-            _insert(values, part, start, builder)
+        builder.insert(bare, start, values)
         for robot, motion in step.motions.items():
             last = builder.latest_key(robot, step.time_ns)
             key = builder.state_key(robot, builder.states.append(robot, step.time_ns))
@@ -95,8 +91,7 @@ def solve_calibrated(
             else:
                 graph.add(factors.motion_factor(last, key, motion))
         rest = Step(step.time_ns, {}, {}, step.associations, step.closures)
-        for part in builder.parts(rest, estimate):
-            _insert(values, part, start, builder)
+        builder.insert(rest, start, values)
     builder.face_lines(values)
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(1e-5)
@@ -111,22 +106,6 @@ def solve_calibrated(
 
 def _key(number: int) -> int:
     return int(gtsam.symbol("c", number))
-
-
-def _insert(values: gtsam.Values, part: Part, start: Estimate, builder: WholeGraph) -> None:
-    """Add a part's factors, and its new variable at its value in ``start``."""
-    if part.new is not None:
-        key, first = part.new
-        symbol = gtsam.Symbol(key)
-        if chr(symbol.chr()) == "l":
-            first = start.landmarks[symbol.index()][0]
-        else:
-            robot, number = divmod(symbol.index(), 1 << 40)
-            first = start.states[builder.robots[robot]].poses[number]
-        write(values, key, first)
-    builder.note_line(part)
-    for factor in part.factors:
-        builder.graph.add(factor)
 
 
 def _linear_motions(

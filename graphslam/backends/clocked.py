@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from graphslam.backends.graph import read, write
 from graphslam.backends.isam2 import WholeGraph
 from graphslam.config import RobustConfig
 from graphslam.geometry import Array
@@ -66,11 +65,9 @@ def clock_errors(
     Raises:
         EstimationError: the estimate is indeterminate.
     """
-    builder, values = WholeGraph(kernel), gtsam.Values()
+    builder, values = WholeGraph(kernel, faced_later=True), gtsam.Values()
     for step in steps:
-        _, new = builder.expand(step, lambda key, dim: read(values, key, dim))
-        for key in new.keys():  # noqa: SIM118 (GTSAM's values are no mapping)
-            write(values, key, builder.value_in(estimate, key))
+        builder.insert(step, estimate, values)
     builder.face_lines(values)
     robots = tuple(sorted(prior))
     clock = int(gtsam.symbol("t", 0))

@@ -194,10 +194,9 @@ class GraphBuilder:
 
     def value_in(self, estimate: Estimate, key: int) -> Array:
         """Value (2,) or (3,) of a variable in an estimate of the same steps."""
-        symbol = gtsam.Symbol(key)
-        if chr(symbol.chr()) == "l":
-            return np.asarray(estimate.landmarks[symbol.index()][0])
-        robot, number = divmod(symbol.index(), 1 << 40)
+        robot, number = factors.number_of(key)
+        if robot is None:
+            return estimate.landmarks[number][0]
         return np.asarray(estimate.states[self.robots[robot]].poses[number])
 
     def explain(self, error: RuntimeError) -> EstimationError:

@@ -59,20 +59,32 @@ class WholeGraph(GraphBuilder):
         def estimate(key: int, dim: int) -> Array:
             return fresh[key] if key in fresh else current(key, dim)
 
+        begin = self.graph.size()
         for part in self.parts(step, estimate):
             if part.new is not None:
                 write(values, *part.new)
                 fresh.update([part.new])
-            for factor in part.factors:
-                graph.add(factor)
-            if self.note_line(part) and not self._faced_later:
-                self._places.append(self.graph.size() + graph.size() - 1)
-            elif part.observed is not None and isinstance(part.observed[2].target, str):
-                self.meetings.append((self.graph.size() + graph.size() - 1, part.observed))
-        self.graph.push_back(graph)
+            self._take(part)
+        for place in range(begin, self.graph.size()):
+            graph.add(self.graph.at(place))
         return graph, values
 
-    def note_line(self, part: Part) -> bool:
+    def insert(self, step: Step, start: Estimate, values: gtsam.Values) -> None:
+        """Take in a recorded step, its variables at their values in ``start``."""
+        for part in self.parts(step, lambda key, _dim: self.value_in(start, key)):
+            if part.new is not None:
+                write(values, part.new[0], self.value_in(start, part.new[0]))
+            self._take(part)
+
+    def _take(self, part: Part) -> None:
+        for factor in part.factors:
+            self.graph.add(factor)
+        if self._note_line(part) and not self._faced_later:
+            self._places.append(self.graph.size() - 1)
+        elif part.observed is not None and isinstance(part.observed[2].target, str):
+            self.meetings.append((self.graph.size() - 1, part.observed))
+
+    def _note_line(self, part: Part) -> bool:
         """Whether a part observes a line: noted for `face_lines`."""
         if part.observed is None or part.observed[2].model != "line":
             return False
@@ -310,9 +322,7 @@ class Resolver(Isam2Backend):
         super().__init__(config, WholeGraph(config.robust, faced_later=True))
         values = gtsam.Values()
         for step in steps:
-            _, new = self._builder.expand(step, lambda key, dim: read(values, key, dim))
-            for key in new.keys():  # noqa: SIM118 (GTSAM's values are no mapping)
-                write(values, key, self._builder.value_in(start, key))
+            self._builder.insert(step, start, values)
         self._builder.make_room()
         self._finished = values
         self._size, self._rows = self._builder.graph.size(), self._builder.rows
