@@ -288,17 +288,13 @@ def _duplicates(
 ) -> dict[int, int]:
     """Landmark that goes -> landmark that it becomes; the map moves to the estimate."""
     _move(landmarks, estimate)
-    walls = [
-        entry
-        for entry in landmarks.entries.values()
-        if entry.id in estimate.landmarks and entry.kind != "point"
-    ]
+    known = [entry for entry in landmarks.entries.values() if entry.id in estimate.landmarks]
     together = seen_together(steps)
-    walls = partners(walls, together)
-    if not walls:
+    known = partners(known, together)
+    if not known:
         return {}
-    joint = backend.joint(min(estimate.states), [entry.id for entry in walls])
-    return survivors(duplicates(walls, joint, together))
+    joint = backend.joint(min(estimate.states), [entry.id for entry in known])
+    return survivors(duplicates(known, joint, together))
 
 
 def _move(landmarks: LandmarkMap, estimate: Estimate) -> None:

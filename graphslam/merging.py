@@ -1,6 +1,7 @@
 """Duplicates in a map: which landmarks are one and the same, and what that makes of the steps.
 
-A wall that was not recognised when it was seen again is in the map twice. After all data are in,
+A wall or a tree that was not recognised when it was seen again is in the map twice. With all data
+in,
 the joint covariance of the whole map says how far two landmarks may lie apart if they are one.
 Pairs are tied one after another, the most certain first, and every tie conditions the joint: what
 agrees with one tie must agree with the next. What one image showed as two things is never tied.
@@ -22,11 +23,11 @@ IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 
 #: m, rad: by how much two images of one wall may differ beyond what the covariance says: across it,
-#: in direction, and in where its ends are
+#: in direction, and in where its ends are; of one point the first, both ways
 FLOOR_M, FLOOR_RAD, FLOOR_END_M = 0.02, 0.015, 0.08
 #: share of the shorter wall that must lie beside the longer one
 OVERLAP_SHARE = 0.5
-#: walls farther apart (m across, rad) are not looked at
+#: walls farther apart (m across, rad) are not looked at, nor points
 REACH_M, REACH_RAD = 1.5, 0.3
 GATE_PROBABILITY = 0.95
 #: a tie waits while another that contradicts it is not worse by more than this (squared distance)
@@ -35,35 +36,39 @@ RIVAL = 9.0
 
 @dataclass(slots=True, eq=False)
 class _Map:
-    """All walls: means (n, 3), joint covariance (3n, 3n), extents (n, 2), which are whole (n,).
+    """All landmarks: means (n, 3), joint covariance (3n, 3n), extents (n, 2).
 
-    ``group`` (n,) numbers what is tied already; ``apart`` (n, n) is true for different things.
+    ``whole`` (n,) segments whose ends are known; ``point`` (n,) points, with a heading of 0 that is
+    certain; ``group`` (n,) numbers what is tied already; ``apart`` (n, n) is true for different
+    things.
     """
 
     x: Array
     P: Array
     extents: Array
     whole: BoolArray
+    point: BoolArray
     group: IntArray
     apart: BoolArray
 
     def contradict(self, a: int, b: int) -> bool:
-        """Whether the groups of two walls hold things that are known to differ."""
+        """Whether the groups of two landmarks hold things that are known to differ."""
         return bool(
             self.apart[np.ix_(self.group == self.group[a], self.group == self.group[b])].any()
         )
 
 
 def partners(entries: Sequence[Entry], together: Iterable[frozenset[int]]) -> list[Entry]:
-    """Those walls that may have a duplicate, where they are: the others need no covariance.
+    """Those landmarks that may have a duplicate, where they are: the others need no covariance.
 
     Args:
-        entries: lines and segments.
+        entries: all of them.
         together: pairs that one image showed side by side.
     """
     if len(entries) < 2:
         return []
     means = np.array([entry.mean for entry in entries])
+    means[[entry.kind == "point" for entry in entries], 2] = 0.0
     near = np.concatenate(_near(_map(entries, means, np.zeros((0, 0)), together)))
     return [entries[k] for k in np.unique(near)]
 
@@ -74,18 +79,18 @@ def duplicates(
     """Pairs of landmarks that are one and the same, the older first, the most certain first.
 
     Args:
-        entries: lines and segments, in the order of ``joint``.
+        entries: landmarks, in the order of ``joint``.
         joint: their means and joint covariance, world axes (the pose in front is not used).
         together: pairs that one image showed side by side.
     """
     if len(entries) < 2:
         return []
-    walls = _map(entries, np.array(joint.landmarks), joint.cov[3:, 3:].copy(), together)
+    walls = _map(entries, *_padded(joint), together)
     i, j = _near(walls)
     found: list[tuple[int, int]] = []
     while len(i):
         r, H_i, H_j, rows = _compare(walls, i, j)
-        d2 = _distances(walls.P, i, j, r, H_i, H_j)
+        d2 = _distances(walls, i, j, r, H_i, H_j)
         # what is out of its gate may come back in when a tie has moved the map
         fits = d2 <= chi2_quantile(GATE_PROBABILITY, rows)
         k = _next_tie(walls, i, j, d2, fits)
@@ -100,10 +105,24 @@ def duplicates(
     return [(min(pair), max(pair)) for pair in found]
 
 
+def _padded(joint: Joint) -> tuple[Array, Array]:
+    """Means (n, 3) and joint covariance (3n, 3n) of landmarks; the heading of points is 0."""
+    x = np.zeros((len(joint.landmarks), 3))
+    places: list[int] = []
+    for k, mean in enumerate(joint.landmarks):
+        x[k, : len(mean)] = mean
+        places += range(3 * k, 3 * k + len(mean))
+    P = np.zeros((x.size, x.size))
+    P[np.ix_(places, places)] = joint.cov[3:, 3:]
+    return x, P
+
+
 def _map(entries: Sequence[Entry], x: Array, P: Array, together: Iterable[frozenset[int]]) -> _Map:
-    """Walls, none tied yet."""
+    """Landmarks, none tied yet; different names are of different things."""
     place = {entry.id: k for k, entry in enumerate(entries)}
-    apart = np.zeros((len(entries), len(entries)), dtype=bool)
+    names = np.array([entry.identity or "" for entry in entries])
+    named = names != ""
+    apart = named[:, None] & named & (names[:, None] != names)
     for pair in together:
         if pair <= place.keys():
             a, b = (place[number] for number in pair)
@@ -113,15 +132,19 @@ def _map(entries: Sequence[Entry], x: Array, P: Array, together: Iterable[frozen
         P,
         np.array([entry.extent for entry in entries]),
         np.array([entry.kind == "segment" for entry in entries]),
+        np.array([entry.kind == "point" for entry in entries]),
         np.arange(len(entries)),
         apart,
     )
 
 
 def _near(walls: _Map) -> tuple[IntArray, IntArray]:
-    """Pairs (m,) and (m,) that may be one wall, as far as means and extents can tell."""
+    """Pairs (m,) and (m,) that may be one landmark, as far as means and extents can tell."""
     i, j = np.triu_indices(len(walls.x), 1)
-    near = _beside(walls, i, j) & ~walls.apart[i, j]
+    points = walls.point[i]
+    near = (points == walls.point[j]) & ~walls.apart[i, j]
+    near[points] &= np.hypot(*(walls.x[j] - walls.x[i])[points, :2].T) < REACH_M
+    near[~points] &= _beside(walls, i[~points], j[~points])
     return i[near], j[near]
 
 
@@ -164,7 +187,8 @@ def _beside(walls: _Map, i: IntArray, j: IntArray) -> BoolArray:
 def _compare(walls: _Map, i: IntArray, j: IntArray) -> tuple[Array, Array, Array, IntArray]:
     """How pairs (m,) differ, with Jacobians (m, 3, 3) by either wall, and how many rows count.
 
-    Rows: distance across where both are, direction, and for whole walls where their middles are.
+    Rows: distance across where both are, direction, and for whole walls where their middles are;
+    of points along x and y.
     """
     along, across, turn, middle = _relative(walls, i, j)
     c, s = np.cos(walls.x[i, 2]), np.sin(walls.x[i, 2])
@@ -184,25 +208,33 @@ def _compare(walls: _Map, i: IntArray, j: IntArray) -> tuple[Array, Array, Array
     unknown = ~(walls.whole[i] & walls.whole[j])
     r[unknown, 2] = 0.0  # a row of zeros says nothing
     H_i[unknown, 2] = H_j[unknown, 2] = 0.0
+    points = walls.point[i]
+    r[points, :2] = (walls.x[j] - walls.x[i])[points, :2]
+    H_i[points], H_j[points] = np.diag([-1.0, -1.0, 0.0]), np.diag([1.0, 1.0, 0.0])
     return r, H_i, H_j, np.where(unknown, 2, 3)
 
 
-_FLOOR = np.diag([FLOOR_M**2, FLOOR_RAD**2, FLOOR_END_M**2])
+#: what two images differ by at least, of walls and of points
+_FLOORS = np.array([
+    np.diag([FLOOR_M**2, FLOOR_RAD**2, FLOOR_END_M**2]),
+    np.diag([FLOOR_M**2, FLOOR_M**2, FLOOR_END_M**2]),
+])  # fmt: skip
 
 
-def _distances(P: Array, i: IntArray, j: IntArray, r: Array, H_i: Array, H_j: Array) -> Array:
+def _distances(walls: _Map, i: IntArray, j: IntArray, r: Array, H_i: Array, H_j: Array) -> Array:
     """Squared Mahalanobis distances (m,), over the rows that count."""
+    P, floor = walls.P, _FLOORS[walls.point[i].astype(np.intp)]
     blocks = P.reshape(len(P) // 3, 3, -1, 3).transpose(0, 2, 1, 3)
     cross = H_i @ blocks[i, j] @ H_j.mT
-    S = H_i @ blocks[i, i] @ H_i.mT + H_j @ blocks[j, j] @ H_j.mT + cross + cross.mT + _FLOOR
+    S = H_i @ blocks[i, i] @ H_i.mT + H_j @ blocks[j, j] @ H_j.mT + cross + cross.mT + floor
     return np.asarray(np.sum(r * np.linalg.solve(S, r[..., None])[..., 0], axis=1))
 
 
 def _tie(walls: _Map, a: int, b: int, r: Array, H_a: Array, H_b: Array) -> None:
-    """Condition the joint on two walls being one: a Kalman update with ``r`` (k,) measured 0."""
-    P = walls.P
+    """Condition the joint on two landmarks being one: a Kalman update, ``r`` (k,) measured 0."""
+    P, floor = walls.P, _FLOORS[int(walls.point[a])]
     PHt = P[:, 3 * a : 3 * a + 3] @ H_a.T + P[:, 3 * b : 3 * b + 3] @ H_b.T
-    S = H_a @ PHt[3 * a : 3 * a + 3] + H_b @ PHt[3 * b : 3 * b + 3] + _FLOOR[: len(r), : len(r)]
+    S = H_a @ PHt[3 * a : 3 * a + 3] + H_b @ PHt[3 * b : 3 * b + 3] + floor[: len(r), : len(r)]
     L = np.linalg.cholesky(S)
     B = np.linalg.solve(L, PHt.T)
     walls.x -= (B.T @ np.linalg.solve(L, r)).reshape(-1, 3)
@@ -290,6 +322,9 @@ def merge_entries(landmarks: LandmarkMap, into: Mapping[int, int]) -> None:
         ends = relative[0] + np.cos(relative[2]) * old.extent
         if new.kind == "line":
             new.extent = np.array([min(new.extent[0], ends.min()), max(new.extent[1], ends.max())])
+        if old.identity is not None and new.identity is None:
+            new.identity = old.identity
+            landmarks.by_identity[old.identity] = kept
         new.sightings += old.sightings
         new.first_ns = min(new.first_ns, old.first_ns)
         new.last_ns = max(new.last_ns, old.last_ns)

@@ -123,6 +123,50 @@ def test_a_doubtful_tie_waits():
     assert ties(means, cov, together=[(0, 1)]) == [(0, 2)]
 
 
+def two_visits_to_trees(shift, sigma, own=0.005):
+    """As `two_visits`, of points."""
+    means, cov = two_visits(shift, sigma, own)
+    use = [3 * k + axis for k in range(8) for axis in (0, 1)]
+    return [mean[:2] for mean in means], cov[np.ix_(use, use)]
+
+
+def tied_trees(means, cov, names=(None,) * 8, together=()):
+    entries = [replace(entry(k, "point"), identity=name) for k, name in enumerate(names)]
+    whole = np.zeros((19, 19))
+    whole[3:, 3:] = cov
+    joint = Joint(np.zeros(3), tuple(means), whole, block_slices([2] * 8))
+    return sorted(duplicates(entries, joint, [frozenset(pair) for pair in together]))
+
+
+def test_trees_seen_twice_are_tied_all_of_them():
+    """Breaks if points are left out, or if the first ties do not help the others."""
+    assert tied_trees(*two_visits_to_trees([0.4, -0.3, 0.03], [0.4, 0.4, 0.03])) == [
+        (k, k + 4) for k in range(4)
+    ]
+    assert tied_trees(*two_visits_to_trees([0.4, -0.3, 0.03], [0.02, 0.02, 0.002])) == []
+
+
+def test_trees_of_two_names_and_of_one_image_stay_two():
+    visits = two_visits_to_trees([0.0, 0.0, 0.0], [0.1, 0.1, 0.01])
+    names = ("a", "b", None, None, "a", "c", "d", None)
+    assert tied_trees(*visits, names=names, together=[(3, 7)]) == [(0, 4), (2, 6)]
+
+
+def test_a_name_stays_with_what_an_older_unnamed_landmark_becomes():
+    landmarks = LandmarkMap()
+    landmarks.entries = {1: entry(1, "point"), 2: replace(entry(2, "point"), identity="oak")}
+    landmarks.by_identity = {"oak": 2}
+    merge_entries(landmarks, {2: 1})
+    assert landmarks.entries[1].identity == "oak"
+    assert landmarks.by_identity == {"oak": 1}
+
+
+def test_a_point_is_no_wall():
+    entries = [entry(0), replace(entry(1, "point"))]
+    joint = joint_of([np.zeros(3), np.zeros(3)], 1e-2 * np.eye(6))
+    assert duplicates(entries, joint, []) == []
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_jacobians_of_the_comparison(seed):
     """Against central differences, good to 1e-10 here."""
@@ -135,7 +179,8 @@ def test_jacobians_of_the_comparison(seed):
 
     def walls(pair):
         flags = np.zeros((2, 2), bool)
-        return _Map(pair, np.eye(6), extents, np.ones(2, bool), np.arange(2), flags)
+        whole, point = np.ones(2, bool), np.zeros(2, bool)
+        return _Map(pair, np.eye(6), extents, whole, point, np.arange(2), flags)
 
     _, H_i, H_j, _ = _compare(walls(x), i, j)
     # where the comparison is made is held: it is no part of the residual's dependence
