@@ -227,11 +227,16 @@ class Track:
         """
         if self.source == "given":
             return values
-        before = np.vstack([self._last, values[:-1]])
-        self._last = values[-1]
+        before, self._last = self._last, values[-1]
+        if len(values) == 1:  # the rule: a scan asks after each reading
+            value = values[0]
+            rows = value - before if self.source == "wheels" else log(between(before, value))
+            rows = rows[None]
+        else:
+            earlier = np.vstack([before, values[:-1]])
+            rows = values - earlier if self.source == "wheels" else log(between(earlier, values))
         if self.source == "wheels":
-            return values - before
-        rows = log(between(before, values))
+            return rows
         apart_ns = np.diff(times_ns)
         limit_m = RESET_SPEED_M_S * 1e-9 * apart_ns + 0.5
         jumped = (apart_ns >= SHORTEST_RESET_NS) & (np.hypot(rows[:, 0], rows[:, 1]) > limit_m)
@@ -243,15 +248,18 @@ class Track:
     def _enter(self, n: int, rows: Array) -> None:
         """Rows of the readings from the n-th on, n > 0, and what accumulates from them."""
         new = slice(n, n + len(rows))
-        step = exp(wheel_twist(rows, self._robot) if self.source == "wheels" else rows[:, :3])
-        path, turn = np.hypot(step[:, 0], step[:, 1]), np.abs(step[:, 2])
-        heading = self._poses[n - 1, 2] + np.concatenate([[0.0], np.cumsum(step[:, 2])])
-        c, s = np.cos(heading[:-1]), np.sin(heading[:-1])
-        x, y = c * step[:, 0] - s * step[:, 1], s * step[:, 0] + c * step[:, 1]
-        place = self._poses[n - 1, :2] + np.cumsum(np.column_stack([x, y]), axis=0)
+        twists = wheel_twist(rows, self._robot) if self.source == "wheels" else rows[:, :3]
+        step = exp(twists) if len(rows) > 1 else exp(twists[0])[None]
+        x, y, turned = step.T
+        path, turn = np.hypot(x, y), np.abs(turned)
+        heading = self._poses[n - 1, 2] + np.cumsum(turned)
+        before = heading - turned
+        c, s = np.cos(before), np.sin(before)
         self._rows[new] = rows
         self._sums[new] = self._sums[n - 1] + np.cumsum(rows, axis=0)
-        self._poses[new] = np.column_stack([place, wrap(heading[1:])])
+        self._poses[new, 0] = self._poses[n - 1, 0] + np.cumsum(c * x - s * y)
+        self._poses[new, 1] = self._poses[n - 1, 1] + np.cumsum(s * x + c * y)
+        self._poses[new, 2] = wrap(heading)
         self._effort[new] = self._effort[n - 1] + np.cumsum(path + TURNING_EFFORT_M * turn)
         self._path[new] = self._path[n - 1] + np.cumsum(path)
         seconds = 1e-9 * np.diff(self._times[n - 1 : n + len(rows)])

@@ -97,6 +97,13 @@ def transform(pose: Array, points: Array) -> Array:
     return np.asarray(points @ rotation(pose[2]).T + pose[:2])
 
 
+def _sinc(phi: float) -> float:
+    """``sin(phi)/phi``, 1 at zero."""
+    if not math.isfinite(phi):
+        return math.nan
+    return math.sin(phi) / phi if phi else 1.0
+
+
 def _sinc_terms(phi: Array) -> tuple[Array, Array]:
     """``sin(phi)/phi`` and ``(1 - cos phi)/phi`` without cancellation near zero.
 
@@ -110,6 +117,11 @@ def _sinc_terms(phi: Array) -> tuple[Array, Array]:
 def exp(twist: Array) -> Array:
     """Exponential map of SE(2): twist ``(..., 3)`` (v_x, v_y, omega) over unit time to a pose."""
     twist = np.asarray(twist, dtype=float)
+    if twist.ndim == 1:  # as in `compose`
+        vx, vy, phi = twist.tolist()
+        sinc, half = _sinc(phi), _sinc(phi / 2)
+        rise = 0.5 * phi * half * half
+        return np.array([sinc * vx - rise * vy, rise * vx + sinc * vy, _wrap(phi)])
     a, b = _sinc_terms(twist[..., 2])
     x, y = twist[..., 0], twist[..., 1]
     return np.stack([a * x - b * y, b * x + a * y, wrap(twist[..., 2])], axis=-1)
@@ -118,6 +130,11 @@ def exp(twist: Array) -> Array:
 def log(pose: Array) -> Array:
     """Inverse of `exp` for headings in (-pi, pi): pose ``(..., 3)`` to twist."""
     pose = np.asarray(pose, dtype=float)
+    if pose.ndim == 1:  # as in `compose`
+        east, north, angle = pose.tolist()
+        turn = _wrap(angle)
+        cot = math.cos(turn / 2) / _sinc(turn / 2)
+        return np.array([cot * east + turn / 2 * north, -turn / 2 * east + cot * north, turn])
     phi = wrap(pose[..., 2])
     half = np.asarray(phi) / 2
     # (phi/2) cot(phi/2): cos(h)/sinc(h) is exact at zero as well
