@@ -88,8 +88,8 @@ def changes_page(picture: ChangesPicture) -> str:
             _scores(picture),
             "Scores.",
             "How far the beams of one visit end behind each piece of the other's surfaces, in "
-            "stated sigmas; the line is the normal distribution that fits the bulk. Changes are "
-            "in the right tail.",
+            "stated sigmas; the line is the normal distribution by which they are judged. Changes "
+            "are in the right tail.",
         ),
     ]
     figures += [
