@@ -1,8 +1,7 @@
 """One robot's odometry as a continuous track: motions between any two times.
 
-The track keeps one small row per reading, so a motion over any interval, its covariance and its
-derivative by the calibration are computed when asked for and can be computed again with another
-calibration. Between two readings the robot is taken to move on a circle segment.
+A motion over any interval, its covariance and its derivative by the calibration are computed from
+the `readings` when asked for, and can be computed again with another calibration.
 """
 
 from collections.abc import Sequence
@@ -16,10 +15,8 @@ from graphslam.geometry import (
     between,
     compose,
     compose_jacobians,
-    exp,
     inverse,
     inverse_cov,
-    log,
     rotation3,
     wrap,
 )
@@ -30,35 +27,17 @@ from graphslam.models.motion import (
     Increments,
     mounted_motion,
     nominal_calibration,
-    wheel_twist,
 )
-from graphslam.records import Motion, OdometryIncrement, OdometryPose, WheelAngles
-
-IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
-BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
-Odometry = OdometryPose | OdometryIncrement | WheelAngles
+from graphslam.readings import BoolArray, IntArray, Readings
+from graphslam.records import Motion
 
 #: m and rad: what a robot that reports no motion may still have moved between two states
 STANDING_SIGMA = 1e-4
 
-#: m/s and rad/s: no wheeled robot's odometry says more. An interval that implies it was stamped
-#: in a burst (a logger that fell behind): its stamps do not tell when the motion took place, so a
-#: time inside it belongs to the reading before, as the order of recording has it
-MAX_SPEED_M_S, MAX_TURN_RAD_S = 20.0, 20.0
-#: m/s over at least this many ns (and half a metre): the odometry jumped, see `Track.resets`
-RESET_SPEED_M_S, SHORTEST_RESET_NS = 10.0, 10_000_000
-#: share of readings in bursts above which the stamps are not good enough to learn a latency
-MAX_BURST_SHARE = 0.01
 #: m of effort (see `Track.effort`): so short a motion is close enough to an arc to be one increment
 COARSE_M = 0.3
-#: ns: how long before the first reading or after the last a robot is taken to stand
-EDGE_NS = 500_000_000
 #: ns: step of the difference quotient by latency; about one period of common odometry
 LATENCY_STEP_NS = 50_000_000
-#: m per rad: how much path a turn counts for when a correction is spread over an interval
-TURNING_EFFORT_M = 0.3
-
-_ROW_SIZE = {"odometry": 3, "commands": 3, "given": 12, "wheels": 2}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,29 +55,23 @@ class Motions:
         return Motion(start_ns, end_ns, self.delta[k], self.cov[k], self.d_cal[k], length_m)
 
 
-class Track:
-    """Odometry readings of one robot, in time order, and the motions that they describe."""
+class Track(Readings):
+    """Odometry readings of one robot and its motions between any two times."""
 
     def __init__(
         self, config: OdometryConfig, robot: RobotConfig, *, mounted: bool = False
     ) -> None:
         """An empty track; ``mounted``: its motions are those of a sensor's frame, see `motion`."""
-        self.source = ""
+        super().__init__(config, robot)
         self.calibration = nominal_calibration("given", config, False)
         self.nominal = self.calibration  # before any data
-        self._mounted = mounted
-        self._config, self._robot = config, robot
-        self._count, self._p, self._bursts, self._resets = 0, 0, 0, 0
-        self._settled = 0  # readings that are worked out; the others' values wait in `_fresh`
-        self._fresh: list[Array] = []
-        self._times = np.empty(1024, dtype=np.int64)  # time of the end of each row's interval
-        self._rows = np.empty((1024, 0))
-        self._sums = np.empty((1024, 0))  # of the rows
-        self._poses = np.empty((1024, 3))  # by odometry alone, first reading = origin
-        self._effort = np.empty(1024)  # accumulated, see `effort`
-        self._path = np.empty(1024)  # accumulated, m
-        self._burst = np.empty(1024, dtype=bool)  # interval too short for its motion
-        self._last = np.zeros(0)  # the last reading that is worked out
+        self._mounted, self._p = mounted, 0
+
+    def _begin(self, source: str, time_ns: int) -> None:
+        super()._begin(source, time_ns)
+        mounted = self._mounted and source != "given"
+        self.calibration = self.nominal = nominal_calibration(source, self._config, mounted)
+        self._p = len(self.calibration.mean) - 4 * mounted  # parameters of the increments
 
     @property
     def mount(self) -> Array:
@@ -120,18 +93,6 @@ class Track:
         return np.zeros((3, 3))
 
     @property
-    def bursty(self) -> bool:
-        """Whether many readings were stamped in bursts: then a shift of time means nothing."""
-        self._settle()
-        return self._bursts > MAX_BURST_SHARE * self._count
-
-    @property
-    def resets(self) -> int:
-        """Times that the odometry jumped."""
-        self._settle()
-        return self._resets
-
-    @property
     def used_calibration(self) -> Calibration:
         """The calibration as it is applied: without latency where the stamps do not allow one."""
         known = self.calibration
@@ -146,157 +107,8 @@ class Track:
             return round(float(self.calibration.mean[-1]) * 1e9)
         return 0
 
-    def __len__(self) -> int:
-        return self._count
-
-    @property
-    def first_ns(self) -> int:
-        """Time of the first reading."""
-        return int(self._times[0])
-
-    @property
-    def last_ns(self) -> int:
-        """Time of the latest reading."""
-        return int(self._times[self._count - 1])
-
-    @property
-    def times(self) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-        """Times (n,) of the readings, ns."""
-        return self._times[: self._count]
-
-    def add(self, message: Odometry) -> None:
-        """Append a reading; readings come in time order."""
-        if isinstance(message, OdometryIncrement):
-            if not self._count:
-                self._begin("given", message.start_ns)
-            value = np.concatenate([log(message.delta), message.cov.ravel()])
-        elif isinstance(message, OdometryPose):
-            value = message.pose
-        else:
-            value = np.array([message.left_rad, message.right_rad])
-        if not self._count:
-            poses = "commands" if self._config.commanded else "odometry"
-            self._begin("wheels" if isinstance(message, WheelAngles) else poses, message.time_ns)
-            self._last = value
-        elif message.time_ns > self.last_ns:
-            if self._count == len(self._times):
-                self._grow()
-            self._times[self._count] = message.time_ns
-            self._count += 1
-            self._fresh.append(value)
-        else:
-            # a second reading of one time: its motion belongs to the interval that ends here
-            self._settle()
-            n = self._count - 1
-            (row,) = self._rows_between(value[None], self._times[[n, n]])
-            if n:
-                self._bursts -= int(self._burst[n])
-                self._enter(n, (self._rows[n] + row)[None])
-
-    def _begin(self, source: str, time_ns: int) -> None:
-        """The first reading, from which all motion counts."""
-        self.source, self._count, self._settled = source, 1, 1
-        mounted = self._mounted and source != "given"
-        self.calibration = self.nominal = nominal_calibration(source, self._config, mounted)
-        self._p = len(self.calibration.mean) - 4 * mounted  # parameters of the increments
-        self._rows = np.zeros((len(self._times), _ROW_SIZE[source]))
-        self._sums = np.zeros_like(self._rows)
-        self._times[0] = time_ns
-        self._poses[0], self._effort[0], self._path[0], self._burst[0] = 0.0, 0.0, 0.0, False
-
-    def _grow(self) -> None:
-        for name in ("_times", "_rows", "_sums", "_poses", "_effort", "_path", "_burst"):
-            full = getattr(self, name)
-            setattr(self, name, np.concatenate([full, np.empty_like(full)]))
-
-    def _settle(self) -> None:
-        """Work out the readings that came since it was last asked for any motion, all at once."""
-        n = self._settled
-        if n < self._count:
-            values = np.array(self._fresh)
-            self._fresh.clear()
-            self._settled = self._count
-            self._enter(n, self._rows_between(values, self._times[n - 1 : self._count]))
-
-    def _rows_between(self, values: Array, times_ns: IntArray) -> Array:
-        """Rows (n, k) of readings (n, k) that follow the last one, at times (n + 1) with its own.
-
-        A pose that is no continuation of the one before tells that the odometry was set anew: it is
-        faster than any robot over an interval that is no burst. The motion in it is unknown; the
-        robot is taken to have gone on as before.
-        """
-        if self.source == "given":
-            return values
-        before, self._last = self._last, values[-1]
-        if len(values) == 1:  # the rule: a scan asks after each reading
-            value = values[0]
-            rows = value - before if self.source == "wheels" else log(between(before, value))
-            rows = rows[None]
-        else:
-            earlier = np.vstack([before, values[:-1]])
-            rows = values - earlier if self.source == "wheels" else log(between(earlier, values))
-        if self.source == "wheels":
-            return rows
-        apart_ns = np.diff(times_ns)
-        limit_m = RESET_SPEED_M_S * 1e-9 * apart_ns + 0.5
-        jumped = (apart_ns >= SHORTEST_RESET_NS) & (np.hypot(rows[:, 0], rows[:, 1]) > limit_m)
-        for k in np.flatnonzero(jumped):
-            self._resets += 1
-            rows[k] = rows[k - 1] if k else self._rows[self._settled - len(values) - 1]
-        return rows
-
-    def _enter(self, n: int, rows: Array) -> None:
-        """Rows of the readings from the n-th on, n > 0, and what accumulates from them."""
-        new = slice(n, n + len(rows))
-        twists = wheel_twist(rows, self._robot) if self.source == "wheels" else rows[:, :3]
-        step = exp(twists) if len(rows) > 1 else exp(twists[0])[None]
-        x, y, turned = step.T
-        path, turn = np.hypot(x, y), np.abs(turned)
-        heading = self._poses[n - 1, 2] + np.cumsum(turned)
-        before = heading - turned
-        c, s = np.cos(before), np.sin(before)
-        self._rows[new] = rows
-        self._sums[new] = self._sums[n - 1] + np.cumsum(rows, axis=0)
-        self._poses[new, 0] = self._poses[n - 1, 0] + np.cumsum(c * x - s * y)
-        self._poses[new, 1] = self._poses[n - 1, 1] + np.cumsum(s * x + c * y)
-        self._poses[new, 2] = wrap(heading)
-        self._effort[new] = self._effort[n - 1] + np.cumsum(path + TURNING_EFFORT_M * turn)
-        self._path[new] = self._path[n - 1] + np.cumsum(path)
-        seconds = 1e-9 * np.diff(self._times[n - 1 : n + len(rows)])
-        burst = (path > MAX_SPEED_M_S * seconds) | (turn > MAX_TURN_RAD_S * seconds)
-        self._burst[new] = burst
-        self._bursts += int(burst.sum())
-
     def _increments(self, rows: Array, calibration: Array) -> Increments:
         return MOTION_SOURCES[self.source](rows, calibration, self._robot, self._config)
-
-    def reaches(self, time_ns: int) -> bool:
-        """Whether the motion up to ``time_ns`` is known without looking beyond a reading."""
-        return self._count > 0 and self.last_ns >= time_ns
-
-    def near(self, time_ns: int, gap_ns: int) -> bool:
-        """Whether ``time_ns`` lies between readings at most ``gap_ns`` apart, or just outside."""
-        if not self._count:
-            return False
-        i = int(np.searchsorted(self.times, time_ns))
-        if 0 < i < self._count:
-            return bool(self._times[i] - self._times[i - 1] <= gap_ns)
-        end_ns = self.first_ns if i == 0 else self.last_ns
-        return abs(time_ns - end_ns) <= EDGE_NS
-
-    def pose(self, times_ns: IntArray | int) -> Array:
-        """Poses (..., 3) by odometry alone, in the frame of the first reading.
-
-        Before the first reading and after the last one the robot is taken to stand still.
-        """
-        self._settle()
-        times = np.asarray(times_ns, dtype=np.int64)
-        i = np.clip(np.searchsorted(self.times, times, side="left"), 1, max(self._count - 1, 1))
-        if self._count < 2:
-            return np.zeros((*times.shape, 3))
-        share = self._share(i, self._times[i - 1], times)
-        twist = log(between(self._poses[i - 1], self._poses[i]))
-        return compose(self._poses[i - 1], exp(share[..., None] * twist))
 
     def mounted_pose(self, times_ns: IntArray) -> Array:
         """Poses (n, 3) of the frame at ``mount``, the times ``latency_ns`` late; see `pose`.
@@ -305,51 +117,6 @@ class Track:
         cheap.
         """
         return compose(self.pose(times_ns - self.latency_ns), self.mount)
-
-    def _share(self, i: IntArray, from_ns: IntArray | int, to_ns: IntArray | int) -> Array:
-        """Share (..., ) of the interval that ends at reading i that lies in from_ns..to_ns."""
-        begin, end = self._times[i - 1], self._times[i]
-
-        def reached(time_ns: IntArray | int) -> Array:
-            share = np.clip((time_ns - begin) / np.maximum(end - begin, 1), 0.0, 1.0)
-            return np.asarray(np.where(self._burst[i], share >= 1.0, share))
-
-        return reached(to_ns) - reached(from_ns)
-
-    def effort(self, times_ns: IntArray | int) -> Array:
-        """Accumulated motion (...,), m: path plus turning. Odometry errors grow with it."""
-        self._settle()
-        return self._at(np.asarray(times_ns, dtype=np.int64), self._effort)
-
-    def _at(self, times_ns: IntArray, accumulated: Array) -> Array:
-        """An accumulated quantity at any times, by the same rule as `pose`; settle first."""
-        if self._count < 2:
-            return np.zeros((*times_ns.shape, *accumulated.shape[1:]))
-        i = np.clip(np.searchsorted(self.times, times_ns, side="left"), 1, self._count - 1)
-        share = self._share(i, self._times[i - 1], times_ns)
-        if accumulated.ndim > 1:
-            share = share[..., None]
-        return accumulated[i - 1] + share * (accumulated[i] - accumulated[i - 1])
-
-    def moved(self, start_ns: int, end_ns: int) -> tuple[float, float]:
-        """Path (m) and net turning (rad, absolute) from ``start_ns`` to ``end_ns``; cheap."""
-        self._settle()
-        if self._count < 2:
-            return 0.0, 0.0
-        (path, heading), (last_path, last_heading) = map(self._way, (start_ns, end_ns))
-        return last_path - path, abs(float(wrap(last_heading - heading)))
-
-    def _way(self, time_ns: int) -> tuple[float, float]:
-        """Path and heading at a time, by the same rule as `pose`; settle first."""
-        i = min(max(int(np.searchsorted(self.times, time_ns, side="left")), 1), self._count - 1)
-        begin, end = int(self._times[i - 1]), int(self._times[i])
-        share = min(max((time_ns - begin) / max(end - begin, 1), 0.0), 1.0)
-        if self._burst[i]:
-            share = float(share >= 1.0)
-        path, last_path = self._path[i - 1], self._path[i]
-        heading, last_heading = self._poses[i - 1, 2], self._poses[i, 2]
-        turned = float(wrap(last_heading - heading))
-        return float(path + share * (last_path - path)), float(heading + share * turned)
 
     def motion(self, start_ns: int, end_ns: int) -> Motion:
         """The motion from ``start_ns`` to ``end_ns`` with its covariance; thesis 4.4-4.15.

@@ -14,8 +14,9 @@ from itertools import combinations
 
 import numpy as np
 
-from graphslam.dead_reckoning import IntArray, Track
+from graphslam.dead_reckoning import Track
 from graphslam.geometry import Array, compose
+from graphslam.readings import IntArray
 from graphslam.records import Estimate, Sighting
 
 #: sightings that a name must have to be judged

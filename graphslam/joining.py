@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from graphslam.config import AssociationConfig
-from graphslam.dead_reckoning import IntArray, Track
+from graphslam.dead_reckoning import Track
 from graphslam.gaussian import chi2_quantile
 from graphslam.geometry import (
     Array,
@@ -34,6 +34,7 @@ from graphslam.geometry import (
     transform,
     wrap,
 )
+from graphslam.readings import IntArray
 from graphslam.records import Sighting, Start, Trajectory
 
 #: probabilities up to which two distances agree, and up to which a point or a relation fits

@@ -14,12 +14,13 @@ import numpy as np
 
 from graphslam.backends.calibrated import solve_calibrated
 from graphslam.config import Config
-from graphslam.dead_reckoning import IntArray, Track
+from graphslam.dead_reckoning import Track
 from graphslam.frontend.sightings import sighting_observation
 from graphslam.gathering import Sources, met_by, transported
 from graphslam.geometry import Array, between, wrap
 from graphslam.models import MODELS, transport
 from graphslam.models.motion import Calibration
+from graphslam.readings import IntArray
 from graphslam.records import Estimate, Motion, Step
 
 #: times that motions and sightings are made anew

@@ -7,10 +7,11 @@ import numpy as np
 
 from graphslam.calibration import Calibrator, told
 from graphslam.clocks import Clock
-from graphslam.dead_reckoning import EDGE_NS, Track
+from graphslam.dead_reckoning import Track
 from graphslam.geometry import Array, between, compose, inverse
 from graphslam.matching import Submap
 from graphslam.models.motion import Calibration
+from graphslam.readings import EDGE_NS
 from graphslam.records import Motion, RobotResult, Trajectory
 from graphslam.trajectories import IntArray, causal_at, final_at, mounted, moved_world, origin_shift
 

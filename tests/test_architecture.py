@@ -24,6 +24,7 @@ ROWS = (
     ("config", "kalman", "records"),
     # messages on one time line; motion, and one observation model per kind of target
     ("clocks", "models"),
+    ("readings",),  # what odometry says by itself
     # one job each, on records and arrays
     ("association", "calibration", "dead_reckoning", "export", "factors", "frontend", "logs"),
     ("matching",),  # where a place was seen from

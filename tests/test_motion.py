@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graphslam.config import OdometryConfig, RobotConfig
-from graphslam.dead_reckoning import EDGE_NS, STANDING_SIGMA, Track
+from graphslam.dead_reckoning import STANDING_SIGMA, Track
 from graphslam.geometry import between, compose, compose_cov, exp, wrap
 from graphslam.models import MOTION_SOURCES, compound
 from graphslam.models.motion import (
@@ -21,6 +21,7 @@ from graphslam.models.motion import (
     wheel_jacobian,
     wheel_twist,
 )
+from graphslam.readings import EDGE_NS
 from graphslam.records import OdometryIncrement, OdometryPose, WheelAngles
 
 ROBOT = RobotConfig(wheel_radius_left_m=0.11, wheel_radius_right_m=0.1, axle_m=0.6)
