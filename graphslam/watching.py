@@ -322,7 +322,5 @@ class Watcher:
     def _still(self, scan: Scan, views: Sequence[tuple[int, View]]) -> Scan:
         """The scan without things that move."""
         sweep = make_sweep(scan, self._config.max_range_m)
-        gone = np.zeros(len(sweep.beam), dtype=np.bool_)
-        for _, (before, laser) in views[-EARLIER:]:
-            gone |= moving(sweep, before, laser)
+        gone = moving(sweep, [view for _, view in views[-EARLIER:]])
         return _without(scan, sweep, gone) if gone.any() else scan

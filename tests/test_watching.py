@@ -176,7 +176,7 @@ def test_what_stands_where_an_earlier_scan_looked_through_is_moving():
     before, now = scans(robot, things, {"someone": walker}, rng)
     laser = [compose(pose, before.mount) for pose in robot]
     sweeps = [make_sweep(scan, 30.0) for scan in (before, now)]
-    gone = moving(sweeps[1], sweeps[0], between(laser[0], laser[1]))
+    gone = moving(sweeps[1], [(sweeps[0], between(laser[0], laser[1]))])
     place = between(laser[1], np.array([6.0, -1.0, 0.0]))[:2]
     near = np.hypot(*(sweeps[1].points - place).T) < 0.4
     assert gone[near].mean() > 0.9
@@ -197,7 +197,7 @@ def test_nothing_of_a_building_is_moving():
     returns = flagged = 0
     for k in range(4, 40):
         for j in range(k - 4, k):
-            gone = moving(sweeps[k], sweeps[j], between(lasers[j], lasers[k]))
+            gone = moving(sweeps[k], [(sweeps[j], between(lasers[j], lasers[k]))])
             flagged, returns = flagged + int(gone.sum()), returns + len(gone)
     assert flagged < 0.002 * returns
 

@@ -5,6 +5,8 @@ stands free and lies where an earlier beam passed well behind it was not there t
 cautious: what an earlier scan did not see through stays.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -50,24 +52,25 @@ def _ranges_there(points: Array, earlier: Sweep, earlier_from_here: Array) -> tu
     return np.hypot(*there.T), seen
 
 
-def moving(sweep: Sweep, earlier: Sweep, earlier_from_here: Array) -> NDArray[np.bool_]:
+def moving(sweep: Sweep, views: Sequence[tuple[Sweep, Array]]) -> NDArray[np.bool_]:
     """Which returns (k,) of a scan belong to things that an earlier one looked through.
 
     Args:
         sweep: the scan.
-        earlier: one of the same laser, some motion ago.
-        earlier_from_here: (3,) pose of the scan's laser in the frame of the earlier one's.
+        views: earlier ones of the same laser, each with the pose (3,) of the scan's laser in the
+            frame of its own.
     """
     gone = np.zeros(len(sweep.beam), dtype=np.bool_)
     found = clusters(sweep, WIDEST_M)
-    if not len(found) or not len(earlier.ranges):
-        return gone
-    r, before = _ranges_there(sweep.points, earlier, earlier_from_here)
-    # both neighbours must have gone behind as well: the laser may have turned a little less
-    through = np.min(before, axis=1) > r + BEHIND_M  # a missing return, NaN, compares False
-    sums = np.concatenate([[0], np.cumsum(through)])
     count = found.last - found.first + 1
-    share = (sums[found.last + 1] - sums[found.first]) / count
-    for k in np.flatnonzero((count >= FEWEST) & (share >= SHARE)):
-        gone[found.first[k] : found.last[k] + 1] = True
+    for earlier, earlier_from_here in views:
+        if not len(found) or not len(earlier.ranges):
+            continue
+        r, before = _ranges_there(sweep.points, earlier, earlier_from_here)
+        # both neighbours must have gone behind as well: the laser may have turned a little less
+        through = np.min(before, axis=1) > r + BEHIND_M  # a missing return, NaN, compares False
+        sums = np.concatenate([[0], np.cumsum(through)])
+        share = (sums[found.last + 1] - sums[found.first]) / count
+        for k in np.flatnonzero((count >= FEWEST) & (share >= SHARE)):
+            gone[found.first[k] : found.last[k] + 1] = True
     return gone
