@@ -16,7 +16,8 @@ keeps their distances, so two pairs agree if they are as far apart in one frame 
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -57,12 +58,14 @@ UNTIMED = -1
 class View:
     """What one robot knows by itself, in the frame in which it begins at the origin.
 
-    ``landmarks``: identity -> mean (2,), covariance (2, 2).
+    ``landmarks``: identity -> mean (2,), covariance (2, 2); ``unnamed``: means (n, 2) and
+    covariances (n, 2, 2) of points without name.
     """
 
     states: Trajectory
     track: Track
     landmarks: Mapping[str, tuple[Array, Array]]
+    unnamed: tuple[Array, Array] = (np.zeros((0, 2)), np.zeros((0, 2, 2)))
 
     def at(self, times_ns: IntArray) -> tuple[Array, Array]:
         """Poses (n, 3) and covariances (n, 3, 3): the last state before, carried by odometry."""
@@ -109,7 +112,8 @@ class Ends:
 class Relation:
     """Where a robot began in the frame of another one.
 
-    ``pose`` (3,), ``cov`` (3, 3) along the axes of ``other``'s frame; ``weight`` is the evidence.
+    ``pose`` (3,), ``cov`` (3, 3) along the axes of ``other``'s frame; ``weight`` is the evidence;
+    ``wider``: by how much a start's sigmas are to be widened, see `WIDER`.
     """
 
     robot: str
@@ -117,11 +121,13 @@ class Relation:
     pose: Array
     cov: Array
     weight: float
+    wider: float = WIDER
 
     def reversed(self) -> "Relation":
         """The same from the other side."""
         cov = inverse_cov(self.pose, self.cov)
-        return Relation(self.other, self.robot, inverse(self.pose), cov, self.weight)
+        pose = inverse(self.pose)
+        return replace(self, robot=self.other, other=self.robot, pose=pose, cov=cov)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,7 +162,7 @@ class Joined:
         told = {}
         for robot, relation in sorted(self.found.items()):
             x, y, phi = self.starts[robot].pose.tolist()
-            sigmas = np.sqrt(np.diag(self.starts[robot].cov)) / WIDER
+            sigmas = np.sqrt(np.diag(self.starts[robot].cov)) / relation.wider
             told[robot] = {
                 "x": x,
                 "y": y,
@@ -394,6 +400,8 @@ def join(
     starts: Mapping[str, Start],
     config: AssociationConfig,
     origin: Start,
+    more: Sequence[Relation] = (),
+    doubts: Mapping[str, str] = MappingProxyType({}),
 ) -> Joined:
     """Put robots whose start is unknown where what they saw in common has them.
 
@@ -404,13 +412,15 @@ def join(
         starts: of the robots whose start is known, at least one.
         config: floors of what is seen.
         origin: start of what has a frame of its own.
+        more: relations by what bears no name.
+        doubts: robot -> why what bears no name does not say where it was.
     """
     names = sorted(views)
     by_pair: dict[tuple[str, str], list[Sighting]] = defaultdict(list)
     for s in meetings:
         by_pair[min(s.robot, str(s.seen_robot)), max(s.robot, str(s.seen_robot))].append(s)
-    relations: list[Relation] = []
-    undecided: dict[str, str] = {}
+    relations = [way for found in more for way in (found, found.reversed())]
+    undecided = dict(doubts)
     for n, a in enumerate(names):
         for b in names[n + 1 :]:
             if a in starts and b in starts:
@@ -440,7 +450,7 @@ def join(
             frames[name], start = name, origin
         placed[name] = start
     wide = {
-        name: Start(start.pose, WIDER**2 * start.cov) if name in by else start
+        name: Start(start.pose, by[name].wider ** 2 * start.cov) if name in by else start
         for name, start in placed.items()
     }
     alone = {name: why for name, why in undecided.items() if frames[name] == name != world}
@@ -477,7 +487,7 @@ def _way_in(
         undecided[name] = f"what {name} has in common with {others} contradicts itself"
         return None
     r, start = ways[k]
-    return Relation(name, r.other, r.pose, r.cov, support[k]), start
+    return replace(r, weight=support[k]), start
 
 
 __all__ = ["Joined", "Relation", "View", "join", "largest", "registered", "relate"]
