@@ -16,7 +16,7 @@ keeps their distances, so two pairs agree if they are as far apart in one frame 
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
@@ -112,8 +112,7 @@ class Ends:
 class Relation:
     """Where a robot began in the frame of another one.
 
-    ``pose`` (3,), ``cov`` (3, 3) along the axes of ``other``'s frame; ``weight`` is the evidence;
-    ``wider``: by how much a start's sigmas are to be widened, see `WIDER`.
+    ``pose`` (3,), ``cov`` (3, 3) along the axes of ``other``'s frame; ``weight`` is the evidence.
     """
 
     robot: str
@@ -121,13 +120,11 @@ class Relation:
     pose: Array
     cov: Array
     weight: float
-    wider: float = WIDER
 
     def reversed(self) -> "Relation":
         """The same from the other side."""
         cov = inverse_cov(self.pose, self.cov)
-        pose = inverse(self.pose)
-        return replace(self, robot=self.other, other=self.robot, pose=pose, cov=cov)
+        return Relation(self.other, self.robot, inverse(self.pose), cov, self.weight)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,7 +159,7 @@ class Joined:
         told = {}
         for robot, relation in sorted(self.found.items()):
             x, y, phi = self.starts[robot].pose.tolist()
-            sigmas = np.sqrt(np.diag(self.starts[robot].cov)) / relation.wider
+            sigmas = np.sqrt(np.diag(self.starts[robot].cov)) / WIDER
             told[robot] = {
                 "x": x,
                 "y": y,
@@ -450,7 +447,7 @@ def join(
             frames[name], start = name, origin
         placed[name] = start
     wide = {
-        name: Start(start.pose, by[name].wider ** 2 * start.cov) if name in by else start
+        name: Start(start.pose, WIDER**2 * start.cov) if name in by else start
         for name, start in placed.items()
     }
     alone = {name: why for name, why in undecided.items() if frames[name] == name != world}
@@ -487,7 +484,7 @@ def _way_in(
         undecided[name] = f"what {name} has in common with {others} contradicts itself"
         return None
     r, start = ways[k]
-    return replace(r, weight=support[k]), start
+    return Relation(name, r.other, r.pose, r.cov, support[k]), start
 
 
 __all__ = ["Joined", "Relation", "View", "join", "largest", "registered", "relate"]

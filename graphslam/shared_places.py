@@ -190,10 +190,15 @@ def decided(
     P_a: Array,
     P_b: Array,
 ) -> Relation | str:
-    """What meetings say of where ``b`` began in the frame of ``a``; see `relate_places`."""
+    """What meetings say of where ``b`` began in the frame of ``a``; see `relate_places`.
+
+    Which of them to believe is decided by what the estimates may have missed at worst, what these
+    say together by what the estimates say of themselves, or more where they differ by more.
+    """
     if len(found) < FEWEST:
         return ""
-    T, C = _starts(found, here, there, P_a, P_b)
+    worst = (TRUST * P + missed(places) for P, places in ((P_a, here), (P_b, there)))
+    T, C = _starts(found, here, there, *worst)
     off = T[:, None] - T
     off[..., 2] = wrap(off[..., 2])
     own = C[np.arange(len(T)), np.arange(len(T))]
@@ -201,30 +206,31 @@ def decided(
     place = np.array([m.there for m in found])
     other = place[:, None] != place
     S[~other] = np.eye(3)
-    agree = other & (_squared(off, S) <= chi2_quantile(AGREE, 3))
+    gate = chi2_quantile(AGREE, 3)
+    agree = other & (_squared(off, S) <= gate)
     one = np.ones(len(T))
     best = largest(agree, one)
     at_a = np.array([here[found[k].here].pose[:2] for k in best])
     at_b = np.array([there[found[k].there].pose[:2] for k in best])
     if len(best) < FEWEST or min(_extent(at_a), _extent(at_b)) < EXTENT_M:
         return ""
-    pose, cov, miss = _together(T, C, best)
-    rest = np.flatnonzero(miss > chi2_quantile(AGREE, 3))
+    rest = np.flatnonzero(_together(T, C, best)[2] > gate)
     rival = largest(agree[np.ix_(rest, rest)], one[rest])
     if len(rival) > RIVAL * len(best):
         return (
-            f"{a} and {b} saw places that look alike, {len(best)} if one began here, {len(rival)} "
-            "if there: that has two meanings"
+            f"{a} and {b} saw places that look alike, {len(best)} as if one began here, "
+            f"{len(rival)} as if there: that has two meanings"
         )
+    pose, cov, _ = _together(*_starts(found, here, there, P_a, P_b), best)
     return Relation(b, a, pose, cov, float(len(best)))
 
 
 def _starts(
-    found: Sequence[Meeting], here: Sequence[Place], there: Sequence[Place], P_a: Array, P_b: Array
+    found: Sequence[Meeting], here: Sequence[Place], there: Sequence[Place], D_a: Array, D_b: Array
 ) -> tuple[Array, Array]:
     """Where the other robot began by each of n meetings, (n, 3), and their covariance (n, n, 3, 3).
 
-    They share the errors of both robots' ways.
+    They share the errors ``D_a``, ``D_b`` of both robots' ways, see `relate_places`.
     """
     j, i = np.array([m.here for m in found]), np.array([m.there for m in found])
     A = np.array([p.pose for p in here])[j]
@@ -240,8 +246,7 @@ def _starts(
     G_a[:, :2, 2] += _across(X - A)
     G_a, G_b = lever @ G_a, -lever @ rotation3(X[:, 2])
     C = np.zeros((len(T), len(T), 3, 3))
-    for G, places, P, k in ((G_a, here, P_a, j), (G_b, there, P_b, i)):
-        D = TRUST * P + missed(places)
+    for G, places, D, k in ((G_a, here, D_a, j), (G_b, there, D_b, i)):
         blocks = D.reshape(len(places), 3, len(places), 3).transpose(0, 2, 1, 3)
         C += G[:, None] @ blocks[np.ix_(k, k)] @ G.mT
     R = np.array([m.match.cov for m in found])

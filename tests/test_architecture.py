@@ -47,8 +47,7 @@ ROWS = (
     # decisions of one image; states and calibration together; places seen twice; robots that
     # nothing relates; duplicates in a map; observations of walls anew; closures that a log brings
     # along; a log of sightings solved again; robots that saw the same points; what a run adds
-    # up to;
-    # robots in each other's scans
+    # up to; robots in each other's scans
     (
         "associator",
         "calibrating",
