@@ -35,9 +35,14 @@ WINDOW, VISITS = np.array([0.45, 0.45, 0.06]), 3
 #: two matches agree, and one is borne out by the others, up to this probability
 AGREE = 0.99
 #: fewest matches that must agree, and m that their places must extend over in both maps
-FEWEST, EXTENT_M = 4, 5.0
+FEWEST, EXTENT_M = 4, 8.0
 #: another meaning with more than this part of the matches leaves it undecided
 RIVAL = 0.5
+#: places that should be the same are not if this part of what either saw there was looked through
+#: by the other; m between them at most; of all matches, how many such places there may be; half the
+#: window in which they are matched (m, m, rad)
+LOOKED_THROUGH, NEAR_BY_M, AT_MOST = 0.1, 2.0, 0.2
+ROUND_THERE = np.array([1.0, 1.0, 0.1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -212,8 +217,10 @@ def decided(
     best = largest(agree, one)
     at_a = np.array([here[found[k].here].pose[:2] for k in best])
     at_b = np.array([there[found[k].there].pose[:2] for k in best])
-    if len(best) < FEWEST or min(_extent(at_a), _extent(at_b)) < EXTENT_M:
+    if len(best) < FEWEST:
         return ""
+    if min(_extent(at_a), _extent(at_b)) < EXTENT_M:
+        return f"{a} and {b} saw nothing alike but what is no larger than a room"
     rest = np.flatnonzero(_together(T, C, best)[2] > gate)
     rival = largest(agree[np.ix_(rest, rest)], one[rest])
     if len(rival) > RIVAL * len(best):
@@ -222,7 +229,35 @@ def decided(
             f"{len(rival)} as if there: that has two meanings"
         )
     pose, cov, _ = _together(*_starts(found, here, there, P_a, P_b), best)
+    if contradicting(pose, here, there) > AT_MOST * len(best):
+        return f"{a} and {b} saw places that look alike, but what is beside them differs"
     return Relation(b, a, pose, cov, float(len(best)))
+
+
+def contradicting(start: Array, here: Sequence[Place], there: Sequence[Place]) -> int:
+    """How many places of a robot are not what another one saw there, if it began at ``start``.
+
+    Args:
+        start: (3,) where the one began in the frame of the other.
+        here: places of the other one, in its frame.
+        there: places of the one, in its frame.
+    """
+    positions = np.array([p.pose[:2] for p in here])
+    count = 0
+    for place in there:
+        pose = compose(start, place.pose)
+        looked = [
+            matches[0]
+            for j in _visits(positions, pose)
+            for guess in [between(here[j].pose, pose)]
+            if np.hypot(guess[0], guess[1]) <= NEAR_BY_M
+            for matches in [match(place.submap, here[j].submap, guess, ROUND_THERE)]
+            if matches
+        ]
+        if looked:
+            best = max(looked, key=_score)
+            count += best.absent > LOOKED_THROUGH * (best.same + best.absent)
+    return count
 
 
 def _starts(
