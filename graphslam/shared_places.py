@@ -34,10 +34,15 @@ APART_M = 1.0
 WINDOW, VISITS = np.array([0.45, 0.45, 0.06]), 3
 #: two matches agree, and one is borne out by the others, up to this probability
 AGREE = 0.99
-#: fewest matches that must agree, and m that their places must extend over in both maps
-FEWEST, EXTENT_M = 4, 8.0
-#: another meaning with more than this part of the matches leaves it undecided
-RIVAL = 0.5
+#: an estimate that was not solved again is worse than it says by this factor, in variance: neither
+#: noise nor calibration are the final ones
+OWN = 4.0
+#: fewest matches that must agree, by the search alone and in the end, and m that their places must
+#: extend over in both maps
+FEWEST_FOUND, FEWEST, EXTENT_M = 2, 4, 6.0
+#: a place speaks for another meaning if that shows it with more than this part of its score, and
+#: another meaning with more than this part of all scores leaves it undecided
+CLEARLY, RIVAL = 0.8, 0.5
 #: places that should be the same are not if this part of what either saw there was looked through
 #: by the other; m between them at most; of all matches, how many such places there may be; half the
 #: window in which they are matched (m, m, rad)
@@ -79,10 +84,8 @@ def relate_places(
         P_a: (3n, 3n) joint covariance of the poses of ``here``, errors along each one's own axes.
         P_b: the same of ``there``.
     """
-    if not here or not there:
-        return ""
-    found = meetings(here, there)
-    return decided(a, b, found, here, there, P_a, P_b)
+    found = meetings(here, there) if here and there else []
+    return decided(a, b, found, here, there, P_a, P_b) if found else ""
 
 
 def meetings(here: Sequence[Place], there: Sequence[Place]) -> list[Meeting]:
@@ -197,13 +200,97 @@ def decided(
 ) -> Relation | str:
     """What meetings say of where ``b`` began in the frame of ``a``; see `relate_places`.
 
-    Which of them to believe is decided by what the estimates may have missed at worst, what these
-    say together by what the estimates say of themselves, or more where they differ by more.
+    Which of them to believe is decided by what the estimates may have missed at worst; what these
+    say together, by what the estimates say of themselves, times `OWN`.
+
+    Args:
+        a: name of a robot.
+        b: name of another one.
+        found: at least one, see `meetings`.
+        here: places of ``a``.
+        there: places of ``b``.
+        P_a: joint covariance of ``here``.
+        P_b: the same of ``there``.
     """
-    if len(found) < FEWEST:
+    worst = TRUST * P_a + missed(here), TRUST * P_b + missed(there)
+    T, C, agree = _compared(found, here, there, *worst)
+    best = largest(agree, _worth(found))
+    if len(best) < FEWEST_FOUND:
         return ""
-    worst = (TRUST * P + missed(places) for P, places in ((P_a, here), (P_b, there)))
-    T, C = _starts(found, here, there, *worst)
+    # the search may have overlooked places that are the same, or that should be
+    more, differing = looked_again(_together(T, C, best)[0], here, there)
+    found = [*found, *more]
+    T, C, agree = _compared(found, here, there, *worst)
+    worth = _worth(found)
+    best = largest(agree, worth)
+    if len(best) < FEWEST:
+        return ""
+    sides = (here, [m.here for m in found]), (there, [m.there for m in found])
+    if min(_extent([places[index[k]] for k in best]) for places, index in sides) < EXTENT_M:
+        return f"{a} and {b} saw nothing alike but what is no larger than a room"
+    # what a place shows half as well as it shows the best is no other meaning of it
+    shown = {found[k].there: worth[k] for k in best}
+    as_well = np.array([
+        score > CLEARLY * shown.get(m.there, 0.0) for m, score in zip(found, worth, strict=True)
+    ])  # fmt: skip
+    unlike = _together(T, C, best)[2] > chi2_quantile(AGREE, 3)
+    rest = np.flatnonzero(unlike & as_well)
+    rival = rest[largest(agree[np.ix_(rest, rest)], worth[rest])]
+    if worth[rival].sum() > RIVAL * worth[best].sum():
+        return (
+            f"{a} and {b} saw places that look alike, {len(best)} as if one began here, "
+            f"{len(rival)} as if there: that has two meanings"
+        )
+    if differing > AT_MOST * len(best):
+        return f"{a} and {b} saw places that look alike, but what is beside them differs"
+    pose, cov, _ = _together(*_starts(found, here, there, OWN * P_a, OWN * P_b), best)
+    return Relation(b, a, pose, cov, float(len(best)))
+
+
+def looked_again(
+    start: Array, here: Sequence[Place], there: Sequence[Place]
+) -> tuple[list[Meeting], int]:
+    """Places of a robot that are what another one saw there, if it began at ``start``.
+
+    Args:
+        start: (3,) where the one began in the frame of the other.
+        here: places of the other one, in its frame.
+        there: places of the one, in its frame.
+
+    Returns:
+        Those that are verified, and how many are of something else.
+    """
+    positions = np.array([p.pose[:2] for p in here])
+    same: list[Meeting] = []
+    differing = 0
+    for k, place in enumerate(there):
+        pose = compose(start, place.pose)
+        looked = []
+        for j in _visits(positions, pose):
+            guess = between(here[j].pose, pose)
+            if np.hypot(guess[0], guess[1]) <= NEAR_BY_M:
+                matches = match(place.submap, here[j].submap, guess, ROUND_THERE)
+                looked += [(_score(matches[0]), j, matches)] if matches else []
+        if not looked:
+            continue
+        _, j, matches = max(looked, key=lambda one: one[0])
+        best = verified(matches)
+        if best is not None:
+            same.append(Meeting(j, k, best))
+        seen = matches[0].same + matches[0].absent
+        differing += matches[0].absent > LOOKED_THROUGH * seen
+    return same, differing
+
+
+def _worth(found: Sequence[Meeting]) -> Array:
+    return np.array([_score(m.match) for m in found])
+
+
+def _compared(
+    found: Sequence[Meeting], here: Sequence[Place], there: Sequence[Place], D_a: Array, D_b: Array
+) -> tuple[Array, Array, Array]:
+    """What `_starts` says, and which of n meetings agree (n, n); of one place no two do."""
+    T, C = _starts(found, here, there, D_a, D_b)
     off = T[:, None] - T
     off[..., 2] = wrap(off[..., 2])
     own = C[np.arange(len(T)), np.arange(len(T))]
@@ -211,53 +298,7 @@ def decided(
     place = np.array([m.there for m in found])
     other = place[:, None] != place
     S[~other] = np.eye(3)
-    gate = chi2_quantile(AGREE, 3)
-    agree = other & (_squared(off, S) <= gate)
-    one = np.ones(len(T))
-    best = largest(agree, one)
-    at_a = np.array([here[found[k].here].pose[:2] for k in best])
-    at_b = np.array([there[found[k].there].pose[:2] for k in best])
-    if len(best) < FEWEST:
-        return ""
-    if min(_extent(at_a), _extent(at_b)) < EXTENT_M:
-        return f"{a} and {b} saw nothing alike but what is no larger than a room"
-    rest = np.flatnonzero(_together(T, C, best)[2] > gate)
-    rival = largest(agree[np.ix_(rest, rest)], one[rest])
-    if len(rival) > RIVAL * len(best):
-        return (
-            f"{a} and {b} saw places that look alike, {len(best)} as if one began here, "
-            f"{len(rival)} as if there: that has two meanings"
-        )
-    pose, cov, _ = _together(*_starts(found, here, there, P_a, P_b), best)
-    if contradicting(pose, here, there) > AT_MOST * len(best):
-        return f"{a} and {b} saw places that look alike, but what is beside them differs"
-    return Relation(b, a, pose, cov, float(len(best)))
-
-
-def contradicting(start: Array, here: Sequence[Place], there: Sequence[Place]) -> int:
-    """How many places of a robot are not what another one saw there, if it began at ``start``.
-
-    Args:
-        start: (3,) where the one began in the frame of the other.
-        here: places of the other one, in its frame.
-        there: places of the one, in its frame.
-    """
-    positions = np.array([p.pose[:2] for p in here])
-    count = 0
-    for place in there:
-        pose = compose(start, place.pose)
-        looked = [
-            matches[0]
-            for j in _visits(positions, pose)
-            for guess in [between(here[j].pose, pose)]
-            if np.hypot(guess[0], guess[1]) <= NEAR_BY_M
-            for matches in [match(place.submap, here[j].submap, guess, ROUND_THERE)]
-            if matches
-        ]
-        if looked:
-            best = max(looked, key=_score)
-            count += best.absent > LOOKED_THROUGH * (best.same + best.absent)
-    return count
+    return T, C, other & (_squared(off, S) <= chi2_quantile(AGREE, 3))
 
 
 def _starts(
@@ -331,9 +372,10 @@ def _together(T: Array, C: Array, members: IntArray) -> tuple[Array, Array, Arra
     return pose, np.asarray(scale * cov), miss
 
 
-def _extent(points: Array) -> float:
-    """The longest distance between any two of n points (n, 2), m."""
+def _extent(places: Sequence[Place]) -> float:
+    """The longest distance between any two places, m."""
+    points = np.array([p.pose[:2] for p in places])
     return float(np.linalg.norm(points[:, None] - points, axis=-1).max())
 
 
-__all__ = ["Meeting", "decided", "meetings", "relate_places"]
+__all__ = ["Meeting", "decided", "looked_again", "meetings", "relate_places"]
