@@ -40,13 +40,15 @@ OWN = 4.0
 #: fewest matches that must agree, by the search alone and in the end, and m that their places must
 #: extend over in both maps
 FEWEST_FOUND, FEWEST, EXTENT_M = 2, 4, 6.0
+#: what was looked through weighs so many times what is confirmed: many walls are alike
+DIFFERS = 5.0
 #: a place speaks for another meaning if that shows it with more than this part of its score, and
 #: another meaning with more than this part of all scores leaves it undecided
 CLEARLY, RIVAL = 0.8, 0.5
 #: places that should be the same are not if this part of what either saw there was looked through
 #: by the other; m between them at most; of all matches, how many such places there may be; half the
 #: window in which they are matched (m, m, rad)
-LOOKED_THROUGH, NEAR_BY_M, AT_MOST = 0.1, 2.0, 0.2
+LOOKED_THROUGH, NEAR_BY_M, AT_MOST = 0.07, 2.0, 0.2
 ROUND_THERE = np.array([1.0, 1.0, 0.1])
 
 
@@ -102,13 +104,13 @@ def meetings(here: Sequence[Place], there: Sequence[Place]) -> list[Meeting]:
                 seen = verified(match(there[k].submap, here[j].submap, guess, WINDOW))
                 if seen is not None and (best is None or _score(seen) > _score(best.match)):
                     best = Meeting(j, int(k), seen)
-            if best is not None:
+            if best is not None and _score(best.match) > 0:
                 found.append(best)
     return found
 
 
 def _score(m: Match) -> float:
-    return m.same - m.absent
+    return m.same - DIFFERS * m.absent
 
 
 def _visits(positions: Array, pose: Array) -> list[int]:
@@ -275,7 +277,7 @@ def looked_again(
             continue
         _, j, matches = max(looked, key=lambda one: one[0])
         best = verified(matches)
-        if best is not None:
+        if best is not None and _score(best) > 0:
             same.append(Meeting(j, k, best))
         seen = matches[0].same + matches[0].absent
         differing += matches[0].absent > LOOKED_THROUGH * seen
