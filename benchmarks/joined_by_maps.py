@@ -6,14 +6,20 @@ second robot's first scan is as seen from the first robot's first, by the run of
 that over the whole log, the start that was found with its sigmas, and the errors of Kümmerle et al.
 2009 over the hand-made relations, those across the halves apart.
 
-Run: python benchmarks/joined_by_maps.py [intel] [aces]
-Exit code 1 if a log is not joined. GRAPHSLAM_DATA as in real_logs.py.
+`parts` cuts each half's places into five stretches and compares any two of one half as if they were
+of two robots. Their frame is one, so that the start to be found is the origin. A pair overlaps if
+four places of one or more are within 2 m of one of the other's.
+
+Run: python benchmarks/joined_by_maps.py [parts] [intel] [aces]
+Exit code 1 if a log is not joined, or a part wrongly. GRAPHSLAM_DATA as in real_logs.py.
 """
 
 import json
 import sys
 import tempfile
+from collections import Counter
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +29,20 @@ from real_logs import DATA, LOGS, command, smooth
 from graphslam.config import Config
 from graphslam.evaluate import Relations, read_relations, relation_errors
 from graphslam.geometry import between
+from graphslam.joining import Joined, Relation
 from graphslam.logs import open_logs
+from graphslam.pipeline import Known, Pipeline
+from graphslam.recorded import recorded_in
 from graphslam.records import Message, OdometryPose, Trajectory
 from graphslam.results import load
+from graphslam.shared_places import relate_places
+from graphslam.starts import origin, start_poses
+from graphslam.unnamed import Surroundings
 
 NAMES = ("first", "second")
+#: stretches of each half; two overlap if so many places are so near, m; m, rad: a start is right
+PARTS, OVERLAPPING, OVERLAP_M = 5, 4, 2.0
+RIGHT_M, RIGHT_RAD = 0.5, 0.05
 #: of the table: headings and their widths
 HEADS = (
     ("wall s", 8), ("within: n", 11), ("m", 6), ("°", 8), ("across: n", 10), ("m", 5), ("°", 8)
@@ -93,12 +108,50 @@ def joined(name: str, folder: Path) -> bool:
     return len(set(summary["frames"].values())) == 1
 
 
-def main(names: list[str]) -> int:
-    """Print all; 0 if every log was joined."""
+def surroundings(log: Path) -> dict[str, Surroundings]:
+    """What each robot of a log saw by itself."""
+    config = Config()
+    opened = open_logs([log], config)
+    recorded = recorded_in(opened, config, start_poses(opened, config))
+    known = Known(Joined.apart(opened.robots, origin(config)), recorded)
+    pipeline = Pipeline(opened, config, known)
+    pipeline.run(lambda _count: None)
+    return pipeline.surroundings(pipeline.views())
+
+
+def parts(name: str, folder: Path) -> bool:
+    """Print what becomes of pairs of parts; whether none was joined wrongly."""
+    whole, cut = folder / f"{name}.mcap", folder / f"{name}-cut.mcap"
+    command("import", "carmen", str(DATA / f"{name}.clf.bz2"), "-o", str(whole))
+    write(halves(list(open_logs([whole], Config()).messages()))[0], cut)
+    counts: Counter[str] = Counter()
+    for seen in surroundings(cut).values():
+        stretches = np.array_split(np.arange(len(seen.places)), PARTS)
+        for pair in combinations(stretches, 2):
+            rows = [(3 * part[:, None] + np.arange(3)).ravel() for part in pair]
+            here, there = ([seen.places[k] for k in part] for part in pair)
+            P_a, P_b = (seen.cov[np.ix_(k, k)] for k in rows)
+            found = relate_places("a", "b", here, there, P_a, P_b)
+            positions = (np.array([p.pose[:2] for p in places]) for places in (here, there))
+            p, q = positions
+            near = np.linalg.norm(p[:, None] - q, axis=-1).min(axis=0) < OVERLAP_M
+            kind = "overlapping" if near.sum() >= OVERLAPPING else "others"
+            counts[kind] += 1
+            if isinstance(found, Relation):
+                right = np.hypot(*found.pose[:2]) < RIGHT_M and abs(found.pose[2]) < RIGHT_RAD
+                counts[f"{kind}, joined {'rightly' if right else 'WRONGLY'}"] += 1
+    print(f"\n{name}, pairs of parts:", dict(sorted(counts.items())), flush=True)
+    return not any("WRONGLY" in kind for kind in counts)
+
+
+def main(arguments: list[str]) -> int:
+    """Print all; 0 if every log was joined, or no part wrongly."""
+    names = [name for name in arguments if name in LOGS] or list(LOGS)
+    judge = parts if "parts" in arguments else joined
     with tempfile.TemporaryDirectory() as folder:
-        together = [joined(name, Path(folder)) for name in names]
-    return 0 if all(together) else 1
+        good = [judge(name, Path(folder)) for name in names]
+    return 0 if all(good) else 1
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:] or list(LOGS)))
+    sys.exit(main(sys.argv[1:]))
