@@ -7,7 +7,8 @@ the kind of search). The best few poses are matched and verified as loops are (`
 repeat themselves, so one match proves nothing: the largest set is looked for of which any two say
 the same of the frames, within what both robots' estimates may have missed on the way from one
 place to the other (J. Mangelson et al., ICRA 2018, DOI 10.1109/ICRA.2018.8460217). It must be of
-several places that are more than a room apart, and no other set may be nearly as large.
+several places that extend over more than a room, no other set may be worth nearly as much, and
+what must then be the same may not differ.
 """
 
 from collections.abc import Sequence
@@ -230,7 +231,7 @@ def decided(
     sides = (here, [m.here for m in found]), (there, [m.there for m in found])
     if min(_extent([places[index[k]] for k in best]) for places, index in sides) < EXTENT_M:
         return f"{a} and {b} saw nothing alike but what is no larger than a room"
-    # what a place shows half as well as it shows the best is no other meaning of it
+    # a place that shows the best clearly better than another meaning does not speak for that
     shown = {found[k].there: worth[k] for k in best}
     as_well = np.array([
         score > CLEARLY * shown.get(m.there, 0.0) for m, score in zip(found, worth, strict=True)
