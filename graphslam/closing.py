@@ -255,7 +255,7 @@ def agreeing(closures: Sequence[Closure], found: Sequence[Place], P: Array) -> l
     """
     if not closures:
         return []
-    r, S = _innovations(closures, found, TRUST * P + _missed(found))
+    r, S = _innovations(closures, found, TRUST * P + missed(found))
     n, gate = len(r), chi2_quantile(AGREE, 3)
     blocks = S.reshape(n, 3, n, 3).transpose(0, 2, 1, 3)
     own = blocks[np.arange(n), np.arange(n)]
@@ -282,7 +282,7 @@ def agreeing(closures: Sequence[Closure], found: Sequence[Place], P: Array) -> l
     return [closures[k] for k in _standing(sorted(best), r, S)]
 
 
-def _missed(found: Sequence[Place]) -> Array:
+def missed(found: Sequence[Place]) -> Array:
     """Joint covariance (3n, 3n) of what an estimate of places may have missed on the way.
 
     A wall taken for the one beside it bends the path there, and everything after it follows: a

@@ -17,6 +17,7 @@ keeps their distances, so two pairs agree if they are as far apart in one frame 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -58,12 +59,14 @@ UNTIMED = -1
 class View:
     """What one robot knows by itself, in the frame in which it begins at the origin.
 
-    ``landmarks``: identity -> mean (2,), covariance (2, 2).
+    ``landmarks``: identity -> mean (2,), covariance (2, 2); ``unnamed``: means (n, 2) and
+    covariances (n, 2, 2) of points without name.
     """
 
     states: Trajectory
     track: Track
     landmarks: Mapping[str, tuple[Array, Array]]
+    unnamed: tuple[Array, Array] = (np.zeros((0, 2)), np.zeros((0, 2, 2)))
 
     def at(self, times_ns: IntArray) -> tuple[Array, Array]:
         """Poses (n, 3) and covariances (n, 3, 3): the last state before, carried by odometry."""
@@ -395,6 +398,8 @@ def join(
     starts: Mapping[str, Start],
     config: AssociationConfig,
     origin: Start,
+    more: Sequence[Relation] = (),
+    doubts: Mapping[str, str] = MappingProxyType({}),
 ) -> Joined:
     """Put robots whose start is unknown where what they saw in common has them.
 
@@ -405,13 +410,15 @@ def join(
         starts: of the robots whose start is known, at least one.
         config: floors of what is seen.
         origin: start of what has a frame of its own.
+        more: relations by what bears no name.
+        doubts: robot -> why what bears no name does not say where it was.
     """
     names = sorted(views)
     by_pair: dict[tuple[str, str], list[Sighting]] = defaultdict(list)
     for s in meetings:
         by_pair[min(s.robot, str(s.seen_robot)), max(s.robot, str(s.seen_robot))].append(s)
-    relations: list[Relation] = []
-    undecided: dict[str, str] = {}
+    relations = [way for found in more for way in (found, found.reversed())]
+    undecided = dict(doubts)
     for n, a in enumerate(names):
         for b in names[n + 1 :]:
             if a in starts and b in starts:

@@ -19,6 +19,7 @@ from graphslam.backends.isam2 import Isam2Backend
 from graphslam.calibration import observed_information
 from graphslam.clock_offsets import ClockFound, clocks_found
 from graphslam.clocks import Clock, on_one_clock
+from graphslam.closing import places
 from graphslam.config import Config
 from graphslam.consolidating import Tamper, consolidate
 from graphslam.errors import EstimationError
@@ -54,6 +55,7 @@ from graphslam.robot_run import RobotRun
 from graphslam.scan_motion import beside_lines, checked, measured, scan_submap
 from graphslam.timeline import ODOMETRY, synchronise
 from graphslam.trajectories import Worlds
+from graphslam.unnamed import Surroundings
 from graphslam.watching import Watcher
 
 #: s: sigma of the difference of two robots' clocks before anything is known
@@ -554,18 +556,38 @@ class Pipeline:
         moved = self.worlds().estimate(estimate)
         frames = self.frames.of_landmarks(entries.values())
         marks: dict[str, dict[str, tuple[Array, Array]]] = defaultdict(dict)
+        unnamed: dict[str, list[tuple[Array, Array]]] = defaultdict(list)
         for number, (mean, cov) in moved.landmarks.items():
             name = without_mark(entries[number].identity)
             if name is not None:
                 marks[frames[number]][name] = (mean[:2], cov[:2, :2])
+            elif entries[number].kind == "point":
+                unnamed[frames[number]].append((mean, cov))
         views = {}
         for robot, run in self.runs.items():
             if len(run.track):
                 start = self.starts[robot]
                 first = np.array([run.track.first_ns], dtype=np.int64)
                 unseeing = Trajectory(first, start.pose[None], start.cov[None])
-                views[robot] = View(moved.states.get(robot, unseeing), run.track, marks[robot])
+                points = (
+                    np.array([mean for mean, _ in unnamed[robot]]).reshape(-1, 2),
+                    np.array([cov for _, cov in unnamed[robot]]).reshape(-1, 2, 2),
+                )
+                states = moved.states.get(robot, unseeing)
+                views[robot] = View(states, run.track, marks[robot], points)
         return views
+
+    def surroundings(self, views: Mapping[str, View]) -> dict[str, Surroundings]:
+        """What each robot saw that bears no name, in its own frame; after `views`, same run."""
+        assert isinstance(self.backend, Isam2Backend)
+        found = places({robot: view.states for robot, view in views.items()}, self.pictures)
+        seen = {}
+        for robot, view in views.items():
+            own = [place for place in found if place.state[0] == robot]
+            states = [place.state for place in own]
+            cov = self.backend.state_covariance(states) if own else np.zeros((0, 0))
+            seen[robot] = Surroundings(own, cov, view.unnamed)
+        return seen
 
     def exchanged(self, estimate: Estimate) -> dict[str, str]:
         """Names of what was sighted that turn out to be each other's: false -> right name."""

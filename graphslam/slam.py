@@ -18,10 +18,11 @@ from graphslam.log_settings import check_robots, robot_settings
 from graphslam.logs import LogSet
 from graphslam.pipeline import Known, Pipeline, Progress
 from graphslam.recorded import Recorded, recorded_in
-from graphslam.records import Result, Sighting, Start
+from graphslam.records import Result, Scan, Sighting, Start
 from graphslam.robot_run import span_warnings
 from graphslam.starts import origin, start_poses
 from graphslam.summary import make_landmarks, summarise
+from graphslam.unnamed import related
 
 #: scans in the picture at most
 MAX_PICTURES = 4000
@@ -191,13 +192,19 @@ def placed(
     own = origin(config)
     views: Mapping[str, View] = {}
     meetings: Sequence[Sighting] = ()
-    if any(topic.record is Sighting for topic in log.topics):
+    joined = join(log.robots, views, meetings, starts, config.association, own)
+    if any(topic.record in (Sighting, Scan) for topic in log.topics):
         apart = Known(Joined.apart(log.robots, own), recorded, names)
         pipeline = Pipeline(log, replace(config, backend=BackendConfig()), apart)
         pipeline.run(lambda _count: None)
         if pipeline.steps:
             views, meetings = pipeline.views(), pipeline.meetings
-    return join(log.robots, views, meetings, starts, config.association, own)
+            joined = join(log.robots, views, meetings, starts, config.association, own)
+            if len(set(joined.frames.values())) > 1:
+                seen = pipeline.surroundings(views)
+                more = related(seen, joined.frames, config.association)
+                joined = join(log.robots, views, meetings, starts, config.association, own, *more)
+    return joined
 
 
 def run_warnings(pipeline: Pipeline) -> list[str]:

@@ -47,7 +47,8 @@ ROWS = (
     ),
     # decisions of one image; states and calibration together; places seen twice; robots that
     # nothing relates; duplicates in a map; observations of walls anew; closures that a log brings
-    # along; a log of sightings solved again; what a run adds up to; robots in each other's scans
+    # along; a log of sightings solved again; robots that saw the same points; what a run adds
+    # up to; robots in each other's scans
     (
         "associator",
         "calibrating",
@@ -57,12 +58,15 @@ ROWS = (
         "reassociating",
         "recorded_closures",
         "refining",
+        "shared_points",
         "summary",
         "watching",
     ),
-    # which recorded closures are believed; landmarks by visit, and one again
-    ("recorded", "revisits"),
-    ("consolidating",),  # a log of scans solved again
+    # which recorded closures are believed; landmarks by visit, and one again; robots that were
+    # in the same places
+    ("recorded", "revisits", "shared_places"),
+    # a log of scans solved again; what robots have in common that bears no name
+    ("consolidating", "unnamed"),
     ("pipeline",),  # one pass over a log
     ("slam",),  # as many passes as it takes
     ("results",),  # a result as a folder, and back

@@ -1,0 +1,157 @@
+"""A real log cut into two robots' logs, nothing said of where the second starts: joined again?
+
+The first half of the log is one robot, the second half another, whose odometry begins at an origin
+of its own. They share a building, never meet, and nothing in it has a name. Printed are where the
+second robot's first scan is as seen from the first robot's first, by the run of two robots and by
+that over the whole log, the start that was found with its sigmas, and the errors of Kümmerle et al.
+2009 over the hand-made relations, those across the halves apart.
+
+`parts` cuts each half's places into five stretches and compares any two of one half as if they were
+of two robots. Their frame is one, so that the start to be found is the origin. A pair overlaps if
+four places of one or more are within 2 m of one of the other's.
+
+Run: python benchmarks/joined_by_maps.py [parts] [intel] [aces]
+Exit code 1 if a log is not joined, or a part wrongly. GRAPHSLAM_DATA as in real_logs.py.
+"""
+
+import json
+import sys
+import tempfile
+from collections import Counter
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+from perturbed_logs import write
+from real_logs import DATA, LOGS, command, smooth
+
+from graphslam.config import Config
+from graphslam.evaluate import Relations, read_relations, relation_errors
+from graphslam.geometry import between
+from graphslam.joining import Joined, Relation
+from graphslam.logs import open_logs
+from graphslam.pipeline import Known, Pipeline
+from graphslam.recorded import recorded_in
+from graphslam.records import Message, OdometryPose, Trajectory
+from graphslam.results import load
+from graphslam.shared_places import relate_places
+from graphslam.starts import origin, start_poses
+from graphslam.unnamed import Surroundings
+
+NAMES = ("first", "second")
+#: stretches of each half; two overlap if so many places are so near, m; m, rad: a start is right
+PARTS, OVERLAPPING, OVERLAP_M = 5, 4, 2.0
+RIGHT_M, RIGHT_RAD = 0.5, 0.05
+#: of the table: headings and their widths
+HEADS = (
+    ("wall s", 8), ("within: n", 11), ("m", 6), ("°", 8), ("across: n", 10), ("m", 5), ("°", 8)
+)  # fmt: skip
+
+
+def halves(messages: list[Message]) -> tuple[list[Message], int]:
+    """The messages as those of two robots, and when the second one begins, ns."""
+    middle = (messages[0].time_ns + messages[-1].time_ns) // 2
+    renamed = [replace(m, robot=NAMES[m.time_ns >= middle]) for m in messages]
+    origin = next(m.pose for m in renamed if isinstance(m, OdometryPose) and m.robot == NAMES[1])
+    return [
+        replace(m, pose=between(origin, m.pose))
+        if isinstance(m, OdometryPose) and m.robot == NAMES[1]
+        else m
+        for m in renamed
+    ], middle
+
+
+def scans_of(folder: Path) -> Trajectory:
+    """The laser's final poses, of all robots together, by their stamps."""
+    found = [r.scan_final for r in load(folder).robots.values() if r.scan_final is not None]
+    stamps, poses, covs = (
+        np.concatenate([getattr(t, name) for t in found]) for name in ("stamps_ns", "poses", "covs")
+    )
+    order = np.argsort(stamps, kind="stable")
+    return Trajectory(stamps[order], poses[order], covs[order])
+
+
+def errors(relations: Relations, scans: Trajectory, middle: int) -> str:
+    """Mean errors within the halves and across."""
+    off = relation_errors(relations, scans)
+    across = (relations.from_ns >= middle) != (relations.to_ns >= middle)
+    cells = []
+    for group in (~across, across):
+        mean_m, mean_deg = np.nanmean(off[group], axis=0)
+        cells.append(f"{np.isfinite(off[group, 0]).sum():6}{mean_m:9.4f}{mean_deg:8.3f}")
+    return "".join(cells)
+
+
+def joined(name: str, folder: Path) -> bool:
+    """Print what becomes of one log; whether it is one frame."""
+    whole, cut = folder / f"{name}.mcap", folder / f"{name}-cut.mcap"
+    command("import", "carmen", str(DATA / f"{name}.clf.bz2"), "-o", str(whole))
+    messages, middle = halves(list(open_logs([whole], Config()).messages()))
+    write(messages, cut)
+    relations = read_relations(DATA / f"{name}.relations")
+    heads = "".join(f"{head:>{width}}" for head, width in HEADS)
+    print(f"\n{name:24}{heads}")
+    seen = {}
+    for label, log in (("one robot", whole), ("two robots", cut)):
+        target = folder / f"{log.stem}-result"
+        wall_s, _ = smooth(log, target)
+        scans = scans_of(target)
+        k = int(np.searchsorted(scans.stamps_ns, middle))
+        seen[label] = between(scans.poses[0], scans.poses[k])
+        print(f"{label:24}{wall_s:8.1f}  {errors(relations, scans, middle)}")
+    summary = json.loads((folder / f"{cut.stem}-result" / "summary.json").read_text("utf-8"))
+    for label, pose in seen.items():
+        print(f"first scan of the second, {label:12}" + "".join(f"{v:10.4f}" for v in pose))
+    print("start found:", summary.get("starts_found"))
+    print("frames:", summary.get("frames"))
+    return len(set(summary["frames"].values())) == 1
+
+
+def surroundings(log: Path) -> dict[str, Surroundings]:
+    """What each robot of a log saw by itself."""
+    config = Config()
+    opened = open_logs([log], config)
+    recorded = recorded_in(opened, config, start_poses(opened, config))
+    known = Known(Joined.apart(opened.robots, origin(config)), recorded)
+    pipeline = Pipeline(opened, config, known)
+    pipeline.run(lambda _count: None)
+    return pipeline.surroundings(pipeline.views())
+
+
+def parts(name: str, folder: Path) -> bool:
+    """Print what becomes of pairs of parts; whether none was joined wrongly."""
+    whole, cut = folder / f"{name}.mcap", folder / f"{name}-cut.mcap"
+    command("import", "carmen", str(DATA / f"{name}.clf.bz2"), "-o", str(whole))
+    write(halves(list(open_logs([whole], Config()).messages()))[0], cut)
+    counts: Counter[str] = Counter()
+    for seen in surroundings(cut).values():
+        stretches = np.array_split(np.arange(len(seen.places)), PARTS)
+        for pair in combinations(stretches, 2):
+            rows = [(3 * part[:, None] + np.arange(3)).ravel() for part in pair]
+            here, there = ([seen.places[k] for k in part] for part in pair)
+            P_a, P_b = (seen.cov[np.ix_(k, k)] for k in rows)
+            found = relate_places("a", "b", here, there, P_a, P_b)
+            positions = (np.array([p.pose[:2] for p in places]) for places in (here, there))
+            p, q = positions
+            near = np.linalg.norm(p[:, None] - q, axis=-1).min(axis=0) < OVERLAP_M
+            kind = "overlapping" if near.sum() >= OVERLAPPING else "others"
+            counts[kind] += 1
+            if isinstance(found, Relation):
+                right = np.hypot(*found.pose[:2]) < RIGHT_M and abs(found.pose[2]) < RIGHT_RAD
+                counts[f"{kind}, joined {'rightly' if right else 'WRONGLY'}"] += 1
+    print(f"\n{name}, pairs of parts:", dict(sorted(counts.items())), flush=True)
+    return not any("WRONGLY" in kind for kind in counts)
+
+
+def main(arguments: list[str]) -> int:
+    """Print all; 0 if every log was joined, or no part wrongly."""
+    names = [name for name in arguments if name in LOGS] or list(LOGS)
+    judge = parts if "parts" in arguments else joined
+    with tempfile.TemporaryDirectory() as folder:
+        good = [judge(name, Path(folder)) for name in names]
+    return 0 if all(good) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
