@@ -369,8 +369,21 @@ def _drift(pose: Array, a: View, b: View, p: Ends, q: Ends, members: IntArray) -
     if len(timed) < len(members):
         return np.zeros((3, 3))  # both maps hold landmarks: their covariances are in the weights
     k = timed[np.argmin(p.variance[timed] + q.variance[timed])]
-    (x,), (P,) = a.at(p.times_ns[[k]])
-    (y,), (P_y,) = b.at(q.times_ns[[k]])
+    return drift(pose, a, b, int(p.times_ns[k]), int(q.times_ns[k]))
+
+
+def drift(pose: Array, a: View, b: View, a_ns: int, b_ns: int) -> Array:
+    """Covariance (3, 3) that two robots' ways to a meeting add to where one began.
+
+    Args:
+        pose: (3,) where ``b`` began in the frame of ``a``.
+        a: one robot.
+        b: the other.
+        a_ns: when ``a`` was there.
+        b_ns: when ``b`` was there.
+    """
+    (x,), (P,) = a.at(np.array([a_ns]))
+    (y,), (P_y,) = b.at(np.array([b_ns]))
     relative = between(x, compose(pose, y))
     back = inverse(y)
     nothing = np.zeros((3, 3))
@@ -394,6 +407,7 @@ def join(
     starts: Mapping[str, Start],
     config: AssociationConfig,
     origin: Start,
+    known: Sequence[Relation] = (),
 ) -> Joined:
     """Put robots whose start is unknown where what they saw in common has them.
 
@@ -404,12 +418,13 @@ def join(
         starts: of the robots whose start is known, at least one.
         config: floors of what is seen.
         origin: start of what has a frame of its own.
+        known: relations that were found in other ways.
     """
     names = sorted(views)
     by_pair: dict[tuple[str, str], list[Sighting]] = defaultdict(list)
     for s in meetings:
         by_pair[min(s.robot, str(s.seen_robot)), max(s.robot, str(s.seen_robot))].append(s)
-    relations: list[Relation] = []
+    relations = [way for found in known for way in (found, found.reversed())]
     undecided: dict[str, str] = {}
     for n, a in enumerate(names):
         for b in names[n + 1 :]:

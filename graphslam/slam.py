@@ -5,7 +5,7 @@ the next should begin with other starts, names or clocks.
 """
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,9 +14,10 @@ from graphslam.config import BackendConfig, Config, RobotConfig
 from graphslam.consolidating import Tamper
 from graphslam.errors import LogError
 from graphslam.joining import Joined, View, join
-from graphslam.log_settings import check_robots, robot_settings
+from graphslam.log_settings import check_robots, outlines, robot_settings
 from graphslam.logs import LogSet
-from graphslam.pipeline import Known, Pipeline, Progress
+from graphslam.meeting import Kept, Looked, meet
+from graphslam.pipeline import CLOCK_DOUBT_S, Known, Pipeline, Progress
 from graphslam.recorded import Recorded, recorded_in
 from graphslam.records import Result, Sighting, Start
 from graphslam.robot_run import span_warnings
@@ -191,13 +192,31 @@ def placed(
     own = origin(config)
     views: Mapping[str, View] = {}
     meetings: Sequence[Sighting] = ()
-    if any(topic.record is Sighting for topic in log.topics):
+    shapes = outlines(log, config) if config.association.robots != "ignore" else {}
+    looked = Looked((), {})
+    if any(topic.record is Sighting for topic in log.topics) or watchable(log, shapes, starts):
         apart = Known(Joined.apart(log.robots, own), recorded, names)
         pipeline = Pipeline(log, replace(config, backend=BackendConfig()), apart)
+        pipeline.kept = Kept({name: run.track for name, run in pipeline.runs.items()}, shapes)
         pipeline.run(lambda _count: None)
         if pipeline.steps:
             views, meetings = pipeline.views(), pipeline.meetings
-    return join(log.robots, views, meetings, starts, config.association, own)
+            scans = pipeline.kept.scans
+            looked = meet(
+                views, scans, shapes, tuple(starts), CLOCK_DOUBT_S, config.front_end,
+                config.association,
+            )  # fmt: skip
+    joined = join(log.robots, views, meetings, starts, config.association, own, looked.relations)
+    return replace(joined, undecided={**looked.undecided, **joined.undecided})
+
+
+def watchable(log: LogSet, outlines: Collection[str], placed: Collection[str]) -> bool:
+    """Whether a robot has scans in which another may show that is not placed relative to it."""
+    return any(
+        log.has_scans(observer) and name != observer and not {name, observer} <= set(placed)
+        for observer in log.robots
+        for name in outlines
+    )
 
 
 def run_warnings(pipeline: Pipeline) -> list[str]:

@@ -45,8 +45,9 @@ ROWS = (
         "starts",
     ),
     # decisions of one image; states and calibration together; places seen twice; robots that
-    # nothing relates; duplicates in a map; observations of walls anew; closures that a log brings
-    # along; a log of sightings solved again; what a run adds up to; robots in each other's scans
+    # nothing relates; where one began by its sightings; duplicates in a map; observations of walls
+    # anew; closures that a log brings along; a log of sightings solved again; what a run adds up
+    # to; robots in each other's scans
     (
         "associator",
         "calibrating",
@@ -54,14 +55,17 @@ ROWS = (
         "frames",
         "merging",
         "reassociating",
+        "registering",
         "recorded_closures",
         "refining",
         "summary",
         "watching",
     ),
-    # which recorded closures are believed; landmarks by visit, and one again
-    ("recorded", "revisits"),
-    ("consolidating",),  # a log of scans solved again
+    # which recorded closures are believed; landmarks by visit, and one again; where a robot may be
+    # in another's scans
+    ("recorded", "revisits", "supposing"),
+    # a log of scans solved again; robots found in scans wherever they began
+    ("consolidating", "meeting"),
     ("pipeline",),  # one pass over a log
     ("slam",),  # as many passes as it takes
     ("results",),  # a result as a folder, and back
