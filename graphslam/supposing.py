@@ -204,7 +204,10 @@ def shape(outline: Array) -> tuple[Array, float, float]:
 
 
 def places(watch: Watch, path: Path, outline: Array, seen: Supposed) -> list[Place]:
-    """Where the robot may have begun, the best confirmed first; no two by the same sightings."""
+    """Where the robot of ``outline`` (k, 2) may have begun, the best confirmed first.
+
+    No two are confirmed by the same sightings.
+    """
     middle, _, _ = shape(outline)
     seeds = sorted(_seeds(path, middle, seen), key=lambda seed: -seed[0])[:FOLLOWED]
     found = []
