@@ -23,7 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphslam.config import AssociationConfig, FrontEndConfig
+from graphslam.config import FrontEndConfig
 from graphslam.dead_reckoning import IntArray, Track
 from graphslam.frontend.robots import FEWEST, expected_ranges, reach
 from graphslam.frontend.sweep import Sweep
@@ -53,6 +53,8 @@ OWN_M = 0.25
 #: places that are looked at closely; scans searched for those where a robot should show; scans in
 #: which its outline is fitted
 LOOKED, SEARCHED, FITTED = 4, 1000, 100
+#: scans after which a place is given up that has the robot in less than half of `SHARE_SEEN`
+SOME = 12
 #: of the angle that an outline takes, where its beams must meet it; m: what is so much nearer hides
 #: it; of these beams, hidden at most
 WITHIN, HIDDEN_M, HIDDEN = 0.8, 0.3, 0.2
@@ -89,10 +91,11 @@ class Kept:
 class Found:
     """A place after a close look.
 
-    ``relation`` of the robot to its observer, its weight the number of sightings; ``turn_sigma``
-    rad; ``support`` is that number if all scans had been looked at; ``seen`` share of scans with a
-    sighting among those where the robot should show; ``own_m`` how far its path is from one that
-    goes straight at one speed. ``at``: scan's time -> where it was seen (2,), observer's frame.
+    ``relation`` of the robot to its observer, weighed by the number of sightings; ``seen`` share of
+    scans with a sighting among those where the robot should show; ``support`` those with one less
+    those without, if all of these scans had been looked at; ``own_m`` how far its path is from one
+    that goes straight at one speed. ``at``: scan's time -> where it was seen (2,), in the
+    observer's frame.
     """
 
     relation: Relation
@@ -126,8 +129,7 @@ def meet(
     outlines: Mapping[str, Array],
     placed: Sequence[str],
     doubt_s: float,
-    front_end: FrontEndConfig,
-    association: AssociationConfig,
+    config: FrontEndConfig,
 ) -> Looked:
     """Find robots in scans of others, wherever they began.
 
@@ -138,20 +140,19 @@ def meet(
         placed: robots whose start is known. They are looked for as well, for they may be taken for
             another one.
         doubt_s: sigma of the difference of two robots' clocks.
-        front_end: of scans.
-        association: floors of what is seen.
+        config: of the front end.
     """
     relations: list[Relation] = []
     undecided: dict[str, str] = {}
     for observer, own in scans_by_robot(scans).items():
         others = [name for name in outlines if name in views and name != observer]
-        if observer not in views or not set(others) - set(placed):
+        if observer not in views or {observer, *others} <= set(placed):
             continue
-        watch = Watch.of(views[observer], own, front_end.max_range_m)
+        watch = Watch.of(views[observer], own, config.max_range_m)
         found: dict[str, Found] = {}
         for name in others:
-            look = _Look(observer, name, watch, views[name], outlines[name], doubt_s, front_end)
-            one = look.found(association)
+            look = _Look(observer, name, watch, views[name], outlines[name], doubt_s, config)
+            one = look.found()
             if isinstance(one, Found):
                 found[name] = one
             elif one:
@@ -201,28 +202,31 @@ class _Look:
         _, first = np.unique(np.floor(way / APART_M), return_index=True)
         self.watch = watch.some(np.intersect1d(first, np.flatnonzero(known)))
 
-    def found(self, floors: AssociationConfig) -> Found | str:
+    def found(self) -> Found | str:
         """Where it began, or why that is not known ("" if nothing like it was seen)."""
         if len(self.watch.scans) < FEWEST_SEEN:
             return ""
         path = Path.of(self.view, self.watch.times_ns, self.doubt_s)
         seen = supposed(self.watch, path, self.outline)
-        every = places(self.watch, path, self.outline, seen)[:LOOKED]
-        looked = [found for place in every if (found := self._close(place, floors)) is not None]
+        every = places(self.watch, path, self.outline, seen)
+        looked: list[Found] = []
+        for place in every[:LOOKED]:
+            # the first has the highest score; what has not half of that is no rival
+            if looked and looked[0].told and place.score < RIVAL * every[0].score:
+                break
+            looked += [found for found in [self._close(place)] if found]
         looked.sort(key=lambda found: -found.support)
-        if not looked or looked[0].relation.weight < FEWEST_SEEN:
+        if not looked or looked[0].relation.weight < FEWEST_SEEN or looked[0].seen < SHARE_SEEN:
             return ""
         best, rest = looked[0], looked[1:]
         what = f"what {self.observer} saw in its scans"
-        if best.seen < SHARE_SEEN:
-            return ""
-        if best.own_m < OWN_M or best.relation.cov[2, 2] > MAX_TURN_SIGMA_RAD**2:
+        if not best.told:
             return f"{what} moved too simply to be known as {self.name}"
         if any(other.support > RIVAL * best.support and _differ(best, other) for other in rest):
             return f"{what} may be {self.name} in two ways"
         return best
 
-    def _close(self, place: Place, floors: AssociationConfig) -> Found | None:
+    def _close(self, place: Place) -> Found | None:
         """The outline fitted in every scan where a place has it, and what follows from that."""
         watch = self.watch
         there, _ = self.view.at(watch.times_ns + round(1e9 * place.shift_s))
@@ -240,7 +244,9 @@ class _Look:
         sightings: list[Sighting] = []
         numbers: list[int] = []
         turned = place.turn_sigma**2 + HEADING_RAD**2
-        for k in fitted:
+        for n, k in enumerate(_first_some(fitted)):
+            if n == SOME and len(sightings) < SHARE_SEEN / 2 * SOME:
+                return None
             cov = np.diag([place.spread[k] + SURE_M**2 / 9] * 2 + [turned])
             before = [
                 (watch.sweeps[j], between(watch.lasers[j], watch.lasers[k]))
@@ -255,11 +261,9 @@ class _Look:
             )
             sightings += found.sightings
             numbers += [k] * len(found.sightings)
-        if len(sightings) < FEWEST:
-            return None
-        began = began_at(
-            place.pose, place.shift_s, sightings, watch.view, self.view, self.doubt_s, floors
-        )
+        order = np.argsort(numbers, kind="stable")
+        numbers, sightings = [numbers[k] for k in order], [sightings[k] for k in order]
+        began = began_at(place.pose, place.shift_s, sightings, watch.view, self.view, self.doubt_s)
         if began is None:
             return None
         used = np.array(numbers)[began.used]
@@ -268,7 +272,7 @@ class _Look:
         at = compose(began.pose, q)[:, :2]
         return Found(
             Relation(self.name, self.observer, began.pose, began.cov, float(len(used))),
-            len(used) * len(shown) / len(fitted),
+            (len(used) + len(sightings) - len(fitted)) * len(shown) / len(fitted),
             share,
             _own_m(q[:, :2], t),
             dict(zip(t.tolist(), at, strict=True)),
@@ -291,6 +295,14 @@ def shows(sweep: Sweep, outline: Array, pose: Array) -> bool:
     with np.errstate(invalid="ignore"):
         free = sweep.ranges[beams] > h[0, beams] - HIDDEN_M
     return bool(np.mean(free) >= 1 - HIDDEN)
+
+
+def _first_some(numbers: IntArray) -> IntArray:
+    """``numbers``, first `SOME` of them that are spread over all."""
+    if len(numbers) <= SOME:
+        return numbers
+    first = np.linspace(0, len(numbers) - 1, SOME).round().astype(np.int64)
+    return np.concatenate([numbers[first], np.delete(numbers, first)])
 
 
 def _spread_out(numbers: IntArray, most: int) -> IntArray:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from graphslam.config import AssociationConfig
 from graphslam.dead_reckoning import IntArray
 from graphslam.gaussian import chi2_quantile
 from graphslam.geometry import Array, compose, rotation, rotation3, wrap
@@ -60,7 +59,6 @@ def began_at(
     observer: View,
     robot: View,
     doubt_s: float,
-    floors: AssociationConfig,
 ) -> Began | None:
     """Where a robot began in its observer's frame.
 
@@ -73,12 +71,13 @@ def began_at(
         observer: what the observer knows by itself.
         robot: what the robot knows by itself.
         doubt_s: sigma of the difference of the clocks.
-        floors: ``floor_m``, ``floor_rad`` of what is seen.
 
     Returns:
         None if too few sightings are left.
     """
-    points, theirs = _seen(sightings, observer, floors), wandered(robot, _times(sightings))
+    if len(sightings) < FEWEST:
+        return None
+    points, theirs = _seen(sightings, observer), wandered(robot, _times(sightings))
     use = np.arange(len(sightings))
     x = np.append(pose, late_s)
     while len(use) >= FEWEST:
@@ -86,9 +85,8 @@ def began_at(
         x = fit.x
         if fit.d2.max() <= chi2_quantile(FIT, 2):
             first_ns = int(points.times_ns[use[0]])
-            cov = fit.cov + np.diag([floors.floor_m**2, floors.floor_m**2, floors.floor_rad**2])
             late_ns = round(1e9 * x[3])
-            cov = cov + drift(x[:3], observer, robot, first_ns, first_ns + late_ns)
+            cov = fit.cov + drift(x[:3], observer, robot, first_ns, first_ns + late_ns)
             return Began(np.append(x[:2], wrap(x[2])), cov, float(x[3]), use)
         use = np.delete(use, fit.d2.argmax())
     return None
@@ -140,14 +138,13 @@ def _times(sightings: Sequence[Sighting]) -> IntArray:
     return np.array([s.time_ns for s in sightings], dtype=np.int64)
 
 
-def _seen(sightings: Sequence[Sighting], observer: View, floors: AssociationConfig) -> _Points:
+def _seen(sightings: Sequence[Sighting], observer: View) -> _Points:
     """Where a robot was seen in its observer's frame."""
     times = _times(sightings)
     poses, _ = observer.at(times)
     lasers = compose(poses, np.array([s.mount for s in sightings]))
     z = np.array([s.z[:2] for s in sightings])
     R = np.array([s.cov[:2, :2] for s in sightings])
-    R = R + np.diag([floors.floor_rad**2, floors.floor_m**2])
     c, s = np.cos(lasers[:, 2] + z[:, 0]), np.sin(lasers[:, 2] + z[:, 0])
     r = z[:, 1]
     at = lasers[:, :2] + r[:, None] * np.column_stack([c, s])

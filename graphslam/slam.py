@@ -202,10 +202,7 @@ def placed(
         if pipeline.steps:
             views, meetings = pipeline.views(), pipeline.meetings
             scans = pipeline.kept.scans
-            looked = meet(
-                views, scans, shapes, tuple(starts), CLOCK_DOUBT_S, config.front_end,
-                config.association,
-            )  # fmt: skip
+            looked = meet(views, scans, shapes, tuple(starts), CLOCK_DOUBT_S, config.front_end)
     joined = join(log.robots, views, meetings, starts, config.association, own, looked.relations)
     return replace(joined, undecided={**looked.undecided, **joined.undecided})
 
