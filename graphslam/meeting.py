@@ -19,7 +19,7 @@ robot: for that are outline, contradictions, rivals and the motion's own shape.
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -95,7 +95,7 @@ class Found:
     scans with a sighting among those where the robot should show; ``support`` those with one less
     those without, if all of these scans had been looked at; ``own_m`` how far its path is from one
     that goes straight at one speed. ``at``: scan's time -> where it was seen (2,), in the
-    observer's frame.
+    observer's frame; ``sightings`` in order of time; ``late_s`` see `registering.Began`.
     """
 
     relation: Relation
@@ -103,6 +103,8 @@ class Found:
     seen: float
     own_m: float
     at: Mapping[int, Array]
+    sightings: Sequence[Sighting]
+    late_s: float
 
     @property
     def told(self) -> bool:
@@ -224,7 +226,25 @@ class _Look:
             return f"{what} moved too simply to be known as {self.name}"
         if any(other.support > RIVAL * best.support and _differ(best, other) for other in rest):
             return f"{what} may be {self.name} in two ways"
-        return best
+        return self._united(best, [f for f in rest if f.told and not _differ(best, f)])
+
+    def _united(self, best: Found, same: Sequence[Found]) -> Found:
+        """One place that was followed from several stretches: from all their sightings."""
+        if not same:
+            return best
+        every = {s.time_ns: s for found in (*same, best) for s in found.sightings}
+        sightings = [every[time_ns] for time_ns in sorted(every)]
+        pose, late_s = best.relation.pose, best.late_s
+        began = began_at(pose, late_s, sightings, self.watch.view, self.view, self.doubt_s)
+        if began is None or len(began.used) < best.relation.weight:
+            return best
+        weight = float(len(began.used))
+        relation = Relation(self.name, self.observer, began.pose, began.cov, weight)
+        return replace(
+            best,
+            relation=relation,
+            at={t: at for found in (*same, best) for t, at in found.at.items()},
+        )
 
     def _close(self, place: Place) -> Found | None:
         """The outline fitted in every scan where a place has it, and what follows from that."""
@@ -276,6 +296,8 @@ class _Look:
             share,
             _own_m(q[:, :2], t),
             dict(zip(t.tolist(), at, strict=True)),
+            [sightings[k] for k in began.used],
+            began.late_s,
         )
 
 

@@ -77,7 +77,7 @@ def began_at(
     """
     if len(sightings) < FEWEST:
         return None
-    points, theirs = _seen(sightings, observer), wandered(robot, _times(sightings))
+    points, theirs = _seen(sightings, observer), wandered(robot, _times(sightings))[:, :, :2, :2]
     use = np.arange(len(sightings))
     x = np.append(pose, late_s)
     while len(use) >= FEWEST:
@@ -153,29 +153,21 @@ def _seen(sightings: Sequence[Sighting], observer: View) -> _Points:
     H = np.tile(np.eye(2, 3), (len(z), 1, 1))
     H[:, 0, 2], H[:, 1, 2] = -lever[:, 1], lever[:, 0]
     turn = rotation3(float(poses[0, 2]))
-    cov = H[:, None] @ (turn @ _wandered(observer, times) @ turn.T) @ H[None].mT
+    cov = H[:, None] @ (turn @ wandered(observer, times) @ turn.T) @ H[None].mT
     k = np.arange(len(z))
     cov[k, k] += J @ R @ J.mT
     return _Points(times, at, cov)
 
 
 def wandered(view: View, times_ns: IntArray) -> Array:
-    """How errors of a robot's place since the first of n times go together: (n, n, 2, 2), m².
+    """How errors of a robot's poses since the first of n times go together: (n, n, 3, 3).
 
-    Along its axes at the first.
+    By odometry, along its axes at the first. What went wrong up to one time stays wrong, its
+    heading with all that is driven afterwards; the calibration is wrong all the time.
 
     Args:
         view: what the robot knows by itself.
         times_ns: (n,), ascending.
-    """
-    return _wandered(view, times_ns)[:, :, :2, :2]
-
-
-def _wandered(view: View, times_ns: IntArray) -> Array:
-    """Errors of poses since the first of n times together: (n, n, 3, 3), by odometry.
-
-    What went wrong up to one time stays wrong, its heading with all that is driven afterwards; the
-    calibration is wrong all the time.
     """
     moved = view.track.motions(np.full_like(times_ns, times_ns[0]), times_ns)
     n, at = len(times_ns), moved.delta[:, :2]
