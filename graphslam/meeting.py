@@ -11,10 +11,10 @@ After every robot has been estimated by itself, for each observer and each robot
    straight at one speed, as anybody's), if no other place explains half as much, and if they are
    not as well those of another robot.
 
-Odds of chance: things that move about, and what is not recognised as standing, lie within the gate
-of a random place in about one scan of a hundred. Of thousands of places that are tried the best has
-some five such sightings, `FEWEST_SEEN` are asked for. What is left to be afraid of moves like the
-robot: for that are outline, contradictions, rivals and the motion's own shape.
+Odds of chance: in ten minutes of a real building with people in it, searched for robots of three
+outlines that were never there, the best place had 7 sightings, and most of the scans against it;
+`FEWEST_SEEN` are asked for. What is left to be afraid of moves like the robot: for that are the
+outline, contradictions, rivals and the shape of the motion itself.
 """
 
 from collections import defaultdict
@@ -52,7 +52,7 @@ FEWEST_SEEN, SHARE_SEEN = 12, 0.6
 OWN_M = 0.25
 #: places that are looked at closely; scans searched for those where a robot should show; scans in
 #: which its outline is fitted
-LOOKED, SEARCHED, FITTED = 4, 1000, 100
+LOOKED, SEARCHED, FITTED = 8, 1000, 100
 #: scans after which a place is given up that has the robot in less than half of `SHARE_SEEN`
 SOME = 12
 #: of the angle that an outline takes, where its beams must meet it; m: what is so much nearer hides
@@ -95,7 +95,8 @@ class Found:
     scans with a sighting among those where the robot should show; ``support`` those with one less
     those without, if all of these scans had been looked at; ``own_m`` how far its path is from one
     that goes straight at one speed. ``at``: scan's time -> where it was seen (2,), in the
-    observer's frame; ``sightings`` in order of time; ``late_s`` see `registering.Began`.
+    observer's frame; ``sightings`` in order of time; ``late_s``, ``turn_sigma``: see
+    `registering.Began`.
     """
 
     relation: Relation
@@ -105,6 +106,7 @@ class Found:
     at: Mapping[int, Array]
     sightings: Sequence[Sighting]
     late_s: float
+    turn_sigma: float
 
     @property
     def told(self) -> bool:
@@ -113,7 +115,7 @@ class Found:
             self.relation.weight >= FEWEST_SEEN
             and self.seen >= SHARE_SEEN
             and self.own_m >= OWN_M
-            and self.relation.cov[2, 2] <= MAX_TURN_SIGMA_RAD**2
+            and self.turn_sigma <= MAX_TURN_SIGMA_RAD
         )
 
 
@@ -210,23 +212,25 @@ class _Look:
             return ""
         path = Path.of(self.view, self.watch.times_ns, self.doubt_s)
         seen = supposed(self.watch, path, self.outline)
-        every = places(self.watch, path, self.outline, seen)
         looked: list[Found] = []
-        for place in every[:LOOKED]:
-            # the first has the highest score; what has not half of that is no rival
-            if looked and looked[0].told and place.score < RIVAL * every[0].score:
-                break
-            looked += [found for found in [self._close(place)] if found]
-        looked.sort(key=lambda found: -found.support)
-        if not looked or looked[0].relation.weight < FEWEST_SEEN or looked[0].seen < SHARE_SEEN:
+        most = 0.0
+        for place in places(self.watch, path, self.outline, seen)[:LOOKED]:
+            # what has not half as much to confirm it is no rival
+            if place.score >= RIVAL * most:
+                looked += [found for found in [self._close(place)] if found]
+                if looked and looked[-1].told:
+                    most = max(most, place.score)
+        seen_well = [f for f in looked if f.seen >= SHARE_SEEN and len(f.sightings) >= FEWEST_SEEN]
+        if not seen_well:
             return ""
-        best, rest = looked[0], looked[1:]
         what = f"what {self.observer} saw in its scans"
-        if not best.told:
+        told = sorted((f for f in seen_well if f.told), key=lambda f: -f.support)
+        if not told:
             return f"{what} moved too simply to be known as {self.name}"
-        if any(other.support > RIVAL * best.support and _differ(best, other) for other in rest):
+        best = self._united(told[0], [f for f in told[1:] if not _differ(told[0], f)])
+        if any(f.support > RIVAL * best.support and _differ(best, f) for f in looked):
             return f"{what} may be {self.name} in two ways"
-        return self._united(best, [f for f in rest if f.told and not _differ(best, f)])
+        return best
 
     def _united(self, best: Found, same: Sequence[Found]) -> Found:
         """One place that was followed from several stretches: from all their sightings."""
@@ -240,11 +244,8 @@ class _Look:
             return best
         weight = float(len(began.used))
         relation = Relation(self.name, self.observer, began.pose, began.cov, weight)
-        return replace(
-            best,
-            relation=relation,
-            at={t: at for found in (*same, best) for t, at in found.at.items()},
-        )
+        at = {time_ns: at for found in (*same, best) for time_ns, at in found.at.items()}
+        return replace(best, relation=relation, support=max(best.support, weight), at=at)
 
     def _close(self, place: Place) -> Found | None:
         """The outline fitted in every scan where a place has it, and what follows from that."""
@@ -298,6 +299,7 @@ class _Look:
             dict(zip(t.tolist(), at, strict=True)),
             [sightings[k] for k in began.used],
             began.late_s,
+            began.turn_sigma,
         )
 
 

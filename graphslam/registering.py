@@ -31,13 +31,14 @@ class Began:
     """Where a robot began in its observer's frame: ``pose`` (3,), ``cov`` (3, 3) along its axes.
 
     ``late_s``: what the robot's clock reads more when it is where it was seen; ``used``: which
-    sightings this is from.
+    sightings this is from; ``turn_sigma`` rad of how the robot was turned when it was seen.
     """
 
     pose: Array
     cov: Array
     late_s: float
     used: IntArray
+    turn_sigma: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,7 +88,8 @@ def began_at(
             first_ns = int(points.times_ns[use[0]])
             late_ns = round(1e9 * x[3])
             cov = fit.cov + drift(x[:3], observer, robot, first_ns, first_ns + late_ns)
-            return Began(np.append(x[:2], wrap(x[2])), cov, float(x[3]), use)
+            turn_sigma = float(np.sqrt(fit.cov[2, 2]))
+            return Began(np.append(x[:2], wrap(x[2])), cov, float(x[3]), use, turn_sigma)
         use = np.delete(use, fit.d2.argmax())
     return None
 

@@ -145,7 +145,8 @@ class Place:
 
     ``pose`` (3,); its clock is ``shift_s`` later than the observer's. ``hits``: which supposed
     sightings confirm it, and how well: ``score``. ``spread`` (m,) m²: variance of where it has the
-    robot in each scan, along each axis; ``turn_sigma`` rad.
+    robot in each scan, along each axis; ``turn_sigma`` rad. ``drift``: the least that both robots'
+    ways from their beginnings to a hit add to its covariance, m².
     """
 
     pose: Array
@@ -154,6 +155,17 @@ class Place:
     score: float
     spread: Array
     turn_sigma: float
+    drift: float
+
+    @property
+    def order(self) -> tuple[int, float]:
+        """Sorts places: the better confirmed first, of about equals those with less drift."""
+        return _rank(self.score), self.drift
+
+
+def _rank(count: float) -> int:
+    """Smaller for larger counts, the same for about equal ones."""
+    return -round(2 * float(np.log2(count)))
 
 
 def elsewhere(poses: Array, k: int, apart_m: float) -> list[int]:
@@ -209,9 +221,10 @@ def places(watch: Watch, path: Path, outline: Array, seen: Supposed) -> list[Pla
     No two are confirmed by the same sightings.
     """
     middle, _, _ = shape(outline)
-    seeds = sorted(_seeds(path, middle, seen), key=lambda seed: -seed[0])[:FOLLOWED]
+    # of equals the earlier: less drift is on the way to it
+    seeds = sorted(_seeds(path, middle, seen), key=lambda seed: (_rank(seed[0]), seed[1]))
     found = []
-    for _, k, pose in seeds:
+    for _, k, pose in seeds[:FOLLOWED]:
         follow = _Follow(watch, path, middle, seen, k)
         each = [follow.placed(pose, n) for n in range(len(path.shifts_s))]
         best = max((place for place in each if place), key=lambda p: p.score, default=None)
@@ -221,7 +234,7 @@ def places(watch: Watch, path: Path, outline: Array, seen: Supposed) -> list[Pla
     for place in sorted(found, key=lambda p: -p.score):
         if not any(_alike(place, better) for better in kept):
             kept.append(place)
-    return kept
+    return sorted(kept, key=lambda p: p.order)
 
 
 def _alike(place: Place, better: Place) -> bool:
@@ -299,6 +312,7 @@ class _Follow:
         own = _doubt(watch.view, watch.times_ns, watch.covs, k)
         theirs = _doubt(path.view, watch.times_ns, path.covs, k)
         self._drift = own[0] + theirs[0]
+        self._whole = (watch.covs + path.covs).trace(axis1=1, axis2=2)
         self._noise = seen.variance + self._drift[seen.scan] + lever**2 * own[1][seen.scan]
 
     def placed(self, pose: Array, number: int) -> Place | None:
@@ -322,7 +336,8 @@ class _Follow:
             turn_var, pivot = float(cov[2, 2]), np.average(at, axis=0, weights=1 / weight)
         spread = self._drift + turn_var * ((q - pivot) ** 2).sum(axis=1)
         shift = float(self._path.shifts_s[number])
-        return Place(start, shift, hits, score, spread, float(np.sqrt(turn_var)))
+        drift = float(self._whole[seen.scan[hits]].min())
+        return Place(start, shift, hits, score, spread, float(np.sqrt(turn_var)), drift)
 
 
 def _doubt(view: View, times_ns: IntArray, covs: Array, k: int) -> tuple[Array, Array]:
