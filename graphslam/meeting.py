@@ -224,10 +224,15 @@ class _Look:
         if not seen_well:
             return ""
         what = f"what {self.observer} saw in its scans"
-        told = sorted((f for f in seen_well if f.told), key=lambda f: -f.support)
+        told = [f for f in seen_well if f.told]
         if not told:
             return f"{what} moved too simply to be known as {self.name}"
-        best = self._united(told[0], [f for f in told[1:] if not _differ(told[0], f)])
+        enough = RIVAL * max(f.support for f in told)
+        # of equals the one to which both drifted least says best where the robot began
+        best = min(
+            (f for f in told if f.support >= enough), key=lambda f: float(f.relation.cov[2, 2])
+        )
+        best = self._united(best, [f for f in told if f is not best and not _differ(best, f)])
         if any(f.support > RIVAL * best.support and _differ(best, f) for f in looked):
             return f"{what} may be {self.name} in two ways"
         return best
