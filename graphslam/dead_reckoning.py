@@ -120,6 +120,11 @@ class Track:
         return np.zeros((3, 3))
 
     @property
+    def floor(self) -> Array:
+        """Covariance (3, 3) that a motion of any length has beside what its readings add up to."""
+        return np.zeros((3, 3)) if self.source == "given" else self._floor(True)
+
+    @property
     def bursty(self) -> bool:
         """Whether many readings were stamped in bursts: then a shift of time means nothing."""
         self._settle()

@@ -12,9 +12,9 @@ After every robot has been estimated by itself, for each observer and each robot
    not as well those of another robot.
 
 Odds of chance: in ten minutes of a real building with people in it, searched for robots of three
-outlines that were never there, the best place had 7 sightings, and most of the scans against it;
-`FEWEST_SEEN` are asked for. What is left to be afraid of moves like the robot: for that are the
-outline, contradictions, rivals and the shape of the motion itself.
+outlines that were never there, the best place had 7 sightings; `FEWEST_SEEN` are asked for. What is
+left to be afraid of moves like the robot: for that are the outline, contradictions, rivals and the
+shape of the motion itself.
 """
 
 from collections import defaultdict

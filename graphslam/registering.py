@@ -175,10 +175,15 @@ def wandered(view: View, times_ns: IntArray) -> Array:
     n, at = len(times_ns), moved.delta[:, :2]
     k = np.arange(n)
     calibration = moved.d_cal[:, None] @ view.track.calibration.cov @ moved.d_cal[None].mT
-    walk = moved.cov - calibration[k, k]
+    # what every motion has, however short, does not grow along the way
+    drove = (moved.length_m > 0) | (moved.delta[:, 2] != 0)
+    once = np.where(drove[:, None, None], view.track.floor, 0.0)
+    walk = moved.cov - calibration[k, k] - once
     F = np.tile(np.eye(3), (n, n, 1, 1))
     F[..., 0, 2] = at[:, None, 1] - at[None, :, 1]
     F[..., 1, 2] = at[None, :, 0] - at[:, None, 0]
     later = walk[:, None] @ F.mT  # the error at the first index with that at the second, later one
     upper = (k[:, None] <= k)[..., None, None]
-    return np.asarray(np.where(upper, later, later.transpose(1, 0, 3, 2)) + calibration)
+    together = np.where(upper, later, later.transpose(1, 0, 3, 2)) + calibration
+    together[k, k] += once
+    return np.asarray(together)

@@ -31,6 +31,7 @@ from graphslam.simulate.spec import (
 )
 from graphslam.slam import beforehand, smooth
 
+S = 1_000_000_000
 SHAPE = Body(length_m=0.45, width_m=0.38, rear_m=0.22)
 OUTLINE = corners(SHAPE).tolist()
 LASER = Laser(
@@ -255,13 +256,25 @@ def test_sightings_of_robots_may_be_ignored(tmp_path):
 # ------------------------------------------------------------ parts
 
 
-S = 1_000_000_000
+@pytest.mark.parametrize("exact", [1.0, 1e-6])
+def test_errors_of_a_way_are_a_covariance(exact):
+    """Positive definite, also where odometry adds nearly nothing to the floor of each motion."""
+    config = OdometryConfig()
+    tiny = {k: exact * getattr(config, k) for k in ("k_x_m", "k_y_m", "k_phi_m", "k_phi_rad")}
+    track = driven(30, replace(config, **tiny))
+    times = np.arange(1, 30) * S
+    one = Trajectory(times[:1], np.zeros((1, 3)), np.zeros((1, 3, 3)))
+    C = wandered(View(one, track, {}), times).transpose(0, 2, 1, 3).reshape(87, 87)
+    assert np.linalg.eigvalsh((C + C.T) / 2).min() > -1e-9
+    np.testing.assert_allclose(C, C.T, atol=1e-12)
 
 
-def driven(seconds):
+NO_FLOOR = OdometryConfig(floor_sigma_m=1e-9, floor_sigma_rad=1e-9)
+
+
+def driven(seconds, config=NO_FLOOR):
     """A track of 10 Hz: 0.3 m/s in a bend, standing after ``seconds``."""
     step = np.array([0.03, 0.0, 0.02])
-    config = OdometryConfig(floor_sigma_m=1e-9, floor_sigma_rad=1e-9)
     track, pose = Track(config, RobotConfig()), np.zeros(3)
     for k in range(301):
         track.add(OdometryPose("b", k * S // 10, k * S // 10, pose))
