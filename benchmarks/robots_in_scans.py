@@ -6,7 +6,11 @@ without the sightings (`association.robots=ignore`). Printed per seed: the Pione
 root mean square over the drive (world frame, unaligned, starts known), its standard deviation, and
 how far the clock's offset is from the truth, with its standard deviation; then all seeds together.
 
-Run: python benchmarks/robots_in_scans.py [--seeds 20]
+Then without the start of one of them, which the other must find in its scans, or find itself by
+what it sees, wherever it began: the same error, how far the start that was found is off, and its
+standard deviation.
+
+Run: python benchmarks/robots_in_scans.py [--seeds 20] [--unknown 10]
 """
 
 import argparse
@@ -17,22 +21,30 @@ from pathlib import Path
 import numpy as np
 
 from graphslam.config import Config, load_config
-from graphslam.evaluate import pair
+from graphslam.evaluate import evaluate, pair
+from graphslam.geometry import Array, wrap
 from graphslam.logs import open_logs, read_truth
 from graphslam.simulate import load_scenario, simulate
 from graphslam.simulate.body import corners
 from graphslam.slam import smooth
+from graphslam.starts import first_truth
 
 SCENARIO, OBSERVER, SEEN = "robots-in-scans", "vehicle", "pioneer"
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """One run: error and standard deviation of the robot that is seen, m, and the clock found."""
+    """One run: error and standard deviation of the robot that is seen, m, and the clock found.
+
+    ``aligned_m`` is the error of both robots once the world is where it fits best: what their
+    places among each other are worth.
+    """
 
     error_m: float
+    aligned_m: float
     sigma_m: float
     clock: dict[str, float]
+    starts: dict[str, dict[str, float]]
 
 
 def settings(*more: str) -> Config:
@@ -47,13 +59,16 @@ def outcome(log: Path, *more: str) -> Outcome:
     config = settings(*more)
     result = smooth(open_logs([log], config), config)
     found = result.robots[SEEN].final
-    pairs = pair(found, read_truth([log], config).trajectories[SEEN])
+    truth = read_truth([log], config).trajectories
+    pairs = pair(found, truth[SEEN])
     errors = pairs.estimate[:, :2] - pairs.truth[:, :2]
     covs = found.covs[np.isin(found.stamps_ns, pairs.stamps_ns)]
     return Outcome(
         float(np.sqrt(np.mean(np.sum(errors**2, axis=1)))),
+        evaluate(result, truth)["joint"]["final"]["ate_aligned_rmse_m"],
         float(np.sqrt(np.mean(covs[:, 0, 0] + covs[:, 1, 1]))),
         result.summary["clocks"][OBSERVER],
+        result.summary["starts_found"],
     )
 
 
@@ -71,11 +86,65 @@ def both(seed: int, folder: Path) -> tuple[Outcome, Outcome]:
     return outcome(log), outcome(log, "association.robots=ignore")
 
 
+def unknown(seed: int, other: str, folder: Path) -> tuple[Outcome, Outcome, Array, Array]:
+    """All starts known, and but one: that of ``other``, whose error and sigmas (3,) are found."""
+    log = folder / f"{seed}.mcap"
+    simulate(load_scenario(SCENARIO), log, seed=seed)
+    config = settings()
+    true = first_truth(open_logs([log], config))
+    (known,) = {OBSERVER, SEEN} - {other}
+    given = [
+        "start.from_truth=false",
+        f"start.poses.{known}={true[known].tolist()}",
+        f"start.given_sigma_m={config.start.truth_sigma_m}",
+        f"start.given_sigma_rad={config.start.truth_sigma_rad}",
+    ]
+    found = outcome(log, *given)
+    start = found.starts[other]
+    off = np.array([start["x"], start["y"], start["phi"]]) - true[other]
+    off[2] = wrap(off[2])
+    sigmas = np.array([start["sigma_m"], start["sigma_m"], start["sigma_rad"]])
+    return outcome(log), found, off, sigmas
+
+
+def print_unknown(count: int, other: str) -> None:
+    """The table of one robot whose start is unknown."""
+    print(f"\nstart of {other} unknown")
+    print("seed   error cm (known)   aligned cm (known)   start cm (sigma)   heading mrad (sigma)")
+    errors, starts = [], []
+    with tempfile.TemporaryDirectory() as scratch:
+        for seed in range(count):
+            known, found, off, sigmas = unknown(seed, other, Path(scratch))
+            errors.append((found.error_m, known.error_m, found.aligned_m, known.aligned_m))
+            starts.append(off / sigmas)
+            cm = [100 * value for value in errors[-1]]
+            print(
+                f"{seed:4} {cm[0]:9.2f} ({cm[1]:5.2f}) {cm[2]:13.2f} ({cm[3]:5.2f}) "
+                f"{100 * np.hypot(*off[:2]):13.2f} ({100 * np.hypot(*sigmas[:2]):5.2f}) "
+                f"{1e3 * off[2]:13.1f} ({1e3 * sigmas[2]:5.1f})",
+                flush=True,
+            )
+    rms = 100 * np.sqrt(np.mean(np.square(errors), axis=0))
+    for what, (found_cm, known_cm) in (("error", rms[:2]), ("aligned", rms[2:])):
+        ratio = 100 * found_cm / known_cm
+        print(f"{what}, pooled: {found_cm:.2f} cm, known {known_cm:.2f} cm, {ratio:.1f} %")
+    print(f"squared errors of starts in sigmas, mean: {np.mean(np.square(starts)):.2f}")
+
+
 def main() -> None:
-    """Print the table."""
+    """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=20)
-    count = parser.parse_args().seeds
+    parser.add_argument("--unknown", type=int, default=10)
+    arguments = parser.parse_args()
+    if arguments.seeds:
+        print_known(arguments.seeds)
+    for other in (SEEN, OBSERVER) if arguments.unknown else ():
+        print_unknown(arguments.unknown, other)
+
+
+def print_known(count: int) -> None:
+    """The table of cooperating and alone."""
     print("seed   error cm (alone)   sigma cm (alone)   offset off, ms   sigma, ms")
     rows = []
     with tempfile.TemporaryDirectory() as scratch:

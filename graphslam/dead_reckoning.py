@@ -93,6 +93,11 @@ class Track(Readings):
         return np.zeros((3, 3))
 
     @property
+    def floor(self) -> Array:
+        """Covariance (3, 3) that a motion of any length has beside what its readings add up to."""
+        return np.zeros((3, 3)) if self.source == "given" else self._floor(True)
+
+    @property
     def used_calibration(self) -> Calibration:
         """The calibration as it is applied: without latency where the stamps do not allow one."""
         known = self.calibration

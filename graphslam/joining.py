@@ -373,8 +373,21 @@ def _drift(pose: Array, a: View, b: View, p: Ends, q: Ends, members: IntArray) -
     if len(timed) < len(members):
         return np.zeros((3, 3))  # both maps hold landmarks: their covariances are in the weights
     k = timed[np.argmin(p.variance[timed] + q.variance[timed])]
-    (x,), (P,) = a.at(p.times_ns[[k]])
-    (y,), (P_y,) = b.at(q.times_ns[[k]])
+    return drift(pose, a, b, int(p.times_ns[k]), int(q.times_ns[k]))
+
+
+def drift(pose: Array, a: View, b: View, a_ns: int, b_ns: int) -> Array:
+    """Covariance (3, 3) that two robots' ways to a meeting add to where one began.
+
+    Args:
+        pose: (3,) where ``b`` began in the frame of ``a``.
+        a: one robot.
+        b: the other.
+        a_ns: when ``a`` was there.
+        b_ns: when ``b`` was there.
+    """
+    (x,), (P,) = a.at(np.array([a_ns]))
+    (y,), (P_y,) = b.at(np.array([b_ns]))
     relative = between(x, compose(pose, y))
     back = inverse(y)
     nothing = np.zeros((3, 3))
@@ -410,8 +423,8 @@ def join(
         starts: of the robots whose start is known, at least one.
         config: floors of what is seen.
         origin: start of what has a frame of its own.
-        more: relations by what bears no name.
-        doubts: robot -> why what bears no name does not say where it was.
+        more: relations that were found in other ways.
+        doubts: robot -> why those ways do not say where it was.
     """
     names = sorted(views)
     by_pair: dict[tuple[str, str], list[Sighting]] = defaultdict(list)

@@ -32,6 +32,7 @@ from graphslam.geometry import Array, compose, compose_cov, inverse, inverse_cov
 from graphslam.joining import Joined, View
 from graphslam.log_settings import make_tracks, noted, outlines
 from graphslam.logs import LogSet
+from graphslam.meeting import Kept
 from graphslam.models import transport
 from graphslam.recorded import Recorded, closure_id
 from graphslam.records import (
@@ -102,6 +103,7 @@ class Pipeline:
         }
         self.starts, self.frames = known.joined.starts, Frames(known.joined)
         self.meetings: list[Sighting] = []  # of robots in frames that nothing relates
+        self.kept: Kept | None = None  # scans in which these are looked for afterwards
         self.watcher = Watcher(
             self.backend, self.runs, outlines(log, config), config.front_end, CLOCK_DOUBT_S
         )
@@ -246,6 +248,8 @@ class Pipeline:
         self.counts["scans"] += isinstance(first, Scan)
         used = self.is_used(event)
         if isinstance(first, Scan):
+            if self.kept is not None:
+                self.kept.note(first)
             event = self.watcher.look(first, used, self.has_started)
             if self.config.association.robots == "ignore":
                 event = [m for m in event if isinstance(m, Scan)]

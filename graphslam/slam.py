@@ -5,24 +5,20 @@ the next should begin with other starts, names or clocks.
 """
 
 import time
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from graphslam.config import BackendConfig, Config, RobotConfig
+from graphslam.config import Config, RobotConfig
 from graphslam.consolidating import Tamper
 from graphslam.errors import LogError
-from graphslam.joining import Joined, View, join
 from graphslam.log_settings import check_robots, robot_settings
 from graphslam.logs import LogSet
-from graphslam.pipeline import Known, Pipeline, Progress
-from graphslam.recorded import Recorded, recorded_in
-from graphslam.records import Result, Scan, Sighting, Start
+from graphslam.pipeline import Pipeline, Progress
+from graphslam.placing import beforehand, with_names
+from graphslam.records import Result
 from graphslam.robot_run import span_warnings
-from graphslam.starts import origin, start_poses
 from graphslam.summary import make_landmarks, summarise
-from graphslam.unnamed import related
 
 #: scans in the picture at most
 MAX_PICTURES = 4000
@@ -143,68 +139,6 @@ def _passed(pipeline: Pipeline, progress: Progress) -> Pipeline:
         raise LogError(f"{path}: nothing in it could be used; see `graphslam info`")
     pipeline.note_covariances()
     return pipeline
-
-
-def beforehand(log: LogSet, config: Config) -> Known:
-    """What is known of a log before its first pass proper: starts, frames, recorded closures.
-
-    Raises:
-        EstimationError: truth was asked for and a robot has none, or a given pose is malformed.
-    """
-    starts = start_poses(log, config)
-    recorded = recorded_in(log, config, starts)
-    return Known(placed(log, config, {}, starts, recorded), recorded)
-
-
-def with_names(known: Known, log: LogSet, config: Config, names: Mapping[str, str]) -> Known:
-    """What is known by the right names: robots may have been placed by what bore false ones."""
-    starts = start_poses(log, config)
-    joined = placed(log, config, names, starts, known.recorded)
-    return replace(known, names=names, joined=joined)
-
-
-def placed(
-    log: LogSet,
-    config: Config,
-    names: Mapping[str, str],
-    starts: Mapping[str, Start],
-    recorded: Recorded,
-) -> Joined:
-    """Where all robots start, of which the ``starts`` of some are known.
-
-    The others are put where what they see in common has them. That takes a pass over the log in
-    which every robot is estimated by itself.
-
-    Args:
-        log: opened logs.
-        config: settings.
-        names: see `Known`.
-        starts: those that are known.
-        recorded: what follows from the log's relative poses.
-
-    Raises:
-        EstimationError: the estimate of a robot by itself is indeterminate.
-    """
-    every = {**starts, **recorded.starts}
-    if set(log.robots) <= set(every):
-        return Joined(every, recorded.frames, min(starts, default=""))
-    starts = {r: s for r, s in every.items() if recorded.frames[r] == recorded.frames[min(starts)]}
-    own = origin(config)
-    views: Mapping[str, View] = {}
-    meetings: Sequence[Sighting] = ()
-    joined = join(log.robots, views, meetings, starts, config.association, own)
-    if any(topic.record in (Sighting, Scan) for topic in log.topics):
-        apart = Known(Joined.apart(log.robots, own), recorded, names)
-        pipeline = Pipeline(log, replace(config, backend=BackendConfig()), apart)
-        pipeline.run(lambda _count: None)
-        if pipeline.steps:
-            views, meetings = pipeline.views(), pipeline.meetings
-            joined = join(log.robots, views, meetings, starts, config.association, own)
-            if len(set(joined.frames.values())) > 1:
-                seen = pipeline.surroundings(views)
-                more = related(seen, joined.frames, config.association)
-                joined = join(log.robots, views, meetings, starts, config.association, own, *more)
-    return joined
 
 
 def run_warnings(pipeline: Pipeline) -> list[str]:

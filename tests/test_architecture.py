@@ -46,9 +46,9 @@ ROWS = (
         "starts",
     ),
     # decisions of one image; states and calibration together; places seen twice; robots that
-    # nothing relates; duplicates in a map; observations of walls anew; closures that a log brings
-    # along; a log of sightings solved again; robots that saw the same points; what a run adds
-    # up to; robots in each other's scans
+    # nothing relates; where one began by its sightings; duplicates in a map; observations of walls
+    # anew; closures that a log brings along; a log of sightings solved again; robots that saw the
+    # same points; what a run adds up to; robots in each other's scans
     (
         "associator",
         "calibrating",
@@ -56,6 +56,7 @@ ROWS = (
         "frames",
         "merging",
         "reassociating",
+        "registering",
         "recorded_closures",
         "refining",
         "shared_points",
@@ -63,11 +64,13 @@ ROWS = (
         "watching",
     ),
     # which recorded closures are believed; landmarks by visit, and one again; robots that were
-    # in the same places
-    ("recorded", "revisits", "shared_places"),
-    # a log of scans solved again; what robots have in common that bears no name
-    ("consolidating", "unnamed"),
+    # in the same places; where a robot may be in another's scans
+    ("recorded", "revisits", "shared_places", "supposing"),
+    # a log of scans solved again; what robots have in common that bears no name; robots found in
+    # scans wherever they began
+    ("consolidating", "meeting", "unnamed"),
     ("pipeline",),  # one pass over a log
+    ("placing",),  # where robots begin, before the pass proper
     ("slam",),  # as many passes as it takes
     ("results",),  # a result as a folder, and back
     ("report", "truth"),  # pictures and tables of a result; where truth comes from

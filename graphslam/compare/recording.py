@@ -13,11 +13,11 @@ from graphslam.landmark_map import LandmarkMap
 from graphslam.log_settings import check_robots
 from graphslam.logs import LogSet
 from graphslam.pipeline import Pipeline, Progress
+from graphslam.placing import beforehand
 from graphslam.records import Step
 from graphslam.replay import Replay
 from graphslam.results import SavedResult, SavedRobot
 from graphslam.robot_run import RobotRun
-from graphslam.slam import beforehand
 from graphslam.summary import make_landmarks
 from graphslam.trajectories import Worlds
 

@@ -32,10 +32,14 @@ def was_there(points: Array, earlier: Sweep, earlier_from_here: Array) -> bool:
         earlier: the earlier scan.
         earlier_from_here: (3,) pose of the laser in the frame of the earlier one's.
     """
+    return bool(np.mean(stood_there(points, earlier, earlier_from_here)) >= SHARE)
+
+
+def stood_there(points: Array, earlier: Sweep, earlier_from_here: Array) -> NDArray[np.bool_]:
+    """Which points (n, 2), laser frame, an earlier scan met as well; poses as in `was_there`."""
     r, before = _ranges_there(points, earlier, earlier_from_here)
     with np.errstate(invalid="ignore"):
-        same = np.any(np.abs(before - r[:, None]) < SAME_M, axis=1)
-    return bool(np.mean(same) >= SHARE)
+        return np.asarray(np.any(np.abs(before - r[:, None]) < SAME_M, axis=1))
 
 
 def _ranges_there(points: Array, earlier: Sweep, earlier_from_here: Array) -> tuple[Array, Array]:
