@@ -90,7 +90,7 @@ def placed(
     if len(set(by_name.frames.values())) == 1:
         return by_name
     more, doubts = related(pipeline.surroundings(views), by_name.frames, config.association)
-    found = (*looked.relations, *more), {**looked.undecided, **doubts}
+    found = (*looked.relations, *more), {**doubts, **looked.undecided}
     return joined(views, meetings, found)
 
 

@@ -46,6 +46,9 @@ DIFFERS = 5.0
 #: a place speaks for another meaning if that shows it with more than this part of its score, and
 #: another meaning with more than this part of all scores leaves it undecided
 CLEARLY, RIVAL = 0.8, 0.5
+#: another way to lay all places on the map that does so nearly as well, farther off than `APART_M`
+#: or turned by more than this (rad), leaves it undecided
+AS_WELL, ELSEWHERE_RAD = 0.8, np.radians(15.0)
 #: places that should be the same are not if this part of what either saw there was looked through
 #: by the other; m between them at most; of all matches, how many such places there may be; half the
 #: window in which they are matched (m, m, rad)
@@ -88,12 +91,17 @@ def relate_places(
         P_b: the same of ``there``.
     """
     found = meetings(here, there) if here and there else []
-    return decided(a, b, found, here, there, P_a, P_b) if found else ""
+    relation = decided(a, b, found, here, there, P_a, P_b) if found else ""
+    if isinstance(relation, Relation) and any(
+        _stands(start, here, there) for start in elsewhere(relation.pose, here, there)
+    ):
+        return f"{a} and {b} saw places that look alike, but they lie as well in another way"
+    return relation
 
 
 def meetings(here: Sequence[Place], there: Sequence[Place]) -> list[Meeting]:
     """All places of one robot that look like one of another's, several of one if need be."""
-    field = _field(here)
+    field = _field(here, CLEAR_M)
     positions = np.array([p.pose[:2] for p in here])
     found = []
     some = np.unique(np.linspace(0, len(there) - 1, min(len(there), MOST)).round().astype(int))
@@ -126,10 +134,10 @@ def _visits(positions: Array, pose: Array) -> list[int]:
 # ---------------------------------------------------------------- the search
 
 
-def _field(places: Sequence[Place]) -> _Field:
-    """A map of all places, with room round it for what is looked for."""
+def _field(places: Sequence[Place], room_m: float) -> _Field:
+    """A map of all places, with room round it for what is looked for and goes so far."""
     points = np.concatenate([transform(p.pose, p.submap.points) for p in places])
-    margin = int(np.ceil(CLEAR_M / STEP_M)) + 1
+    margin = int(np.ceil(room_m / STEP_M)) + 1
     low = points.min(axis=0) - margin * STEP_M
     size = np.round((points.max(axis=0) - low) / STEP_M).astype(int) + margin + 1
     grid = np.zeros(size, dtype=np.float32)
@@ -163,6 +171,14 @@ def _looked_through(place: Place) -> Array:
     return np.asarray(sensors[scan, :2] + along[step][:, None] * ray)
 
 
+def _correlated(field: _Field, points: Array) -> Array:
+    """What a map says of points (n, 2) on the mean, with their origin in each of its cells."""
+    cells = np.round(points / STEP_M).astype(np.intp)
+    image = np.zeros(field.shape, dtype=np.float32)
+    np.add.at(image, (cells[:, 0], cells[:, 1]), np.float32(1.0 / len(cells)))
+    return np.asarray(fft.irfft2(field.transformed * fft.rfft2(image).conj(), field.shape))
+
+
 def _searched(field: _Field, points: Array) -> list[Array]:
     """Poses (3,), best first, at which points (n, 2) of a submap lie well in a map."""
     near = points[np.hypot(points[:, 0], points[:, 1]) < CLEAR_M]
@@ -173,10 +189,7 @@ def _searched(field: _Field, points: Array) -> list[Array]:
     best = np.full(field.shape, -np.inf, dtype=np.float32)
     turned = np.zeros(field.shape)
     for turn in turns:
-        cells = np.round(transform(np.array([0.0, 0.0, turn]), near) / STEP_M).astype(np.intp)
-        image = np.zeros(field.shape, dtype=np.float32)
-        np.add.at(image, (cells[:, 0], cells[:, 1]), np.float32(1.0 / len(cells)))
-        scores = fft.irfft2(field.transformed * fft.rfft2(image).conj(), field.shape)
+        scores = _correlated(field, transform(np.array([0.0, 0.0, turn]), near))
         better = scores > best
         best[better], turned[better] = scores[better], turn
     found: list[Array] = []
@@ -187,6 +200,50 @@ def _searched(field: _Field, points: Array) -> list[Array]:
         found.append(np.array([*at, turned[i, j]]))
         best[(x[:, None] - i) ** 2 + (y - j) ** 2 < (APART_M / STEP_M) ** 2] = -np.inf
     return found
+
+
+def elsewhere(start: Array, here: Sequence[Place], there: Sequence[Place]) -> list[Array]:
+    """Other starts (3,), at which all places together lie on a map nearly as well as at ``start``.
+
+    A hall looks the same the other way round, and of all its places few need show that.
+
+    Args:
+        start: (3,) where a robot began in the frame of another one.
+        here: places of the other one, in its frame.
+        there: places of the one, in its frame; what is not where the other one was says nothing.
+    """
+    positions = np.array([p.pose[:2] for p in here])
+    shared = [p for p in there if len(_visits(positions, compose(start, p.pose)))]
+    points = np.concatenate([transform(p.pose, p.submap.points) for p in shared])
+    middle = np.array([*points.mean(axis=0), 0.0])
+    points = np.unique(np.round((points - middle[:2]) / STEP_M), axis=0) * STEP_M
+    field = _field(here, float(np.hypot(*points.T).max()))
+    own = compose(start, middle)
+    x, y = (field.low[k] + STEP_M * np.arange(field.shape[k]) for k in (0, 1))
+    close = (x[:, None] - own[0]) ** 2 + (y - own[1]) ** 2 < APART_M**2
+    at_start, beside = 0.0, []
+    for turn in np.arange(0.0, 2 * np.pi, STEP_RAD):
+        heading = own[2] + turn
+        scores = _correlated(field, transform(np.array([0.0, 0.0, heading]), points))
+        if min(turn, 2 * np.pi - turn) < ELSEWHERE_RAD:
+            at_start = max(at_start, float(scores[close].max()))
+            scores = np.where(close, 0.0, scores)
+        i, j = np.unravel_index(int(scores.argmax()), scores.shape)
+        beside.append((float(scores[i, j]), np.array([x[i], y[j], heading])))
+    found: list[Array] = []
+    for score, pose in sorted(beside, key=lambda one: -one[0]):
+        if score <= AS_WELL * at_start or len(found) == LOOKS:
+            break
+        off = [between(other, pose) for other in found]
+        if all(np.hypot(d[0], d[1]) > APART_M or abs(d[2]) > ELSEWHERE_RAD for d in off):
+            found.append(pose)
+    return [compose(pose, inverse(middle)) for pose in found]
+
+
+def _stands(start: Array, here: Sequence[Place], there: Sequence[Place]) -> bool:
+    """Whether a start (3,) is borne out by some places, and by few contradicted."""
+    same, differing = looked_again(start, here, there)
+    return bool(same) and differing <= AT_MOST * len(same)
 
 
 # ---------------------------------------------------------------- which of the matches to believe
@@ -381,4 +438,4 @@ def _extent(places: Sequence[Place]) -> float:
     return float(np.linalg.norm(points[:, None] - points, axis=-1).max())
 
 
-__all__ = ["Meeting", "decided", "looked_again", "meetings", "relate_places"]
+__all__ = ["Meeting", "decided", "elsewhere", "looked_again", "meetings", "relate_places"]

@@ -10,14 +10,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from graphslam.closing import Place
 from graphslam.config import AssociationConfig, load_config
 from graphslam.evaluate import evaluate
 from graphslam.geometry import between, compose, inverse, transform, wrap
 from graphslam.joining import Relation, join
 from graphslam.logs import open_logs, read_truth
-from graphslam.matching import Match
+from graphslam.matching import Match, make_submap
 from graphslam.records import Start
-from graphslam.shared_places import Meeting, decided
+from graphslam.shared_places import Meeting, decided, elsewhere
 from graphslam.shared_points import relate_points
 from graphslam.simulate import load_scenario, simulate
 from graphslam.simulate.spec import Box, Leg, Things, Wall
@@ -302,3 +303,28 @@ def test_what_has_names_and_what_has_none_may_contradict():
     )  # fmt: skip
     assert joined.frames == {"a": "a", "b": "b"}
     assert "contradicts itself" in joined.undecided["b"]
+
+
+@pytest.mark.parametrize(("niche_m", "clear"), [(0.0, False), (4.0, True)])
+def test_a_hall_that_looks_the_same_the_other_way_round_is_undecided(niche_m, clear):
+    """A plain rectangle lies as well turned by half a turn, one with a niche does not."""
+    x, y = np.arange(-8.0, 8.0, 0.05), np.arange(-6.0, 6.0, 0.05)
+    sides = [(x, 6.0 + 0 * x), (x, -6.0 - niche_m * (x > 2.0)), (-8.0 + 0 * y, y), (8.0 + 0 * y, y)]
+    outline = np.concatenate([np.column_stack(side) for side in sides])
+
+    def places(start):
+        poses = [np.array([at, 1.0, 0.3]) for at in (-4.0, -1.0, 2.0, 5.0)]
+        clouds = [transform(inverse(pose), outline) for pose in poses]
+        submaps = [make_submap(np.zeros((1, 3)), [cloud]) for cloud in clouds]
+        return [
+            Place(("r", k), compose(inverse(start), pose), 3.0 * k, (k, k), submap)
+            for k, (pose, submap) in enumerate(zip(poses, submaps, strict=True))
+        ]
+
+    start = np.array([3.0, -2.0, 0.8])
+    others = elsewhere(start, places(np.zeros(3)), places(start))
+    assert (not others) == clear
+    if not clear:
+        # turned about the middle of the hall; the search's cells are 0.3 m and 2.5 degrees
+        half = compose(np.array([0.0, 0.0, np.pi]), start)
+        np.testing.assert_allclose(between(half, others[0]), 0.0, atol=0.3)

@@ -42,11 +42,12 @@ ENCODERS = Encoders(
     wheel_radius_m=0.08, axle_m=0.33, radius_error_left=0.004, radius_error_right=-0.004,
     slip_m=0.006,
 )  # fmt: skip
-#: furniture of the robot's size among other, in a hall; beside it another room
+#: furniture of the robot's size among other, in a hall; beside it another room, not quite as large,
+#: or it would be taken for the same
 HALL = Things(
     walls=(
         Wall("hall", ((-8.0, -6.0), (8.0, -6.0), (8.0, 6.0), (-8.0, 6.0)), True),
-        Wall("room", ((12.0, -6.0), (28.0, -6.0), (28.0, 6.0), (12.0, 6.0)), True),
+        Wall("room", ((12.0, -7.0), (30.0, -7.0), (30.0, 6.0), (12.0, 6.0)), True),
     ),
     boxes=(
         Box("desk", (-5.5, 4.5), (1.6, 0.8)),
