@@ -158,8 +158,8 @@ def test_robots_that_were_not_in_one_place_stay_apart(tmp_path, make, why):
 
 def test_starts_that_are_given_are_taken(tmp_path, monkeypatch):
     """Breaks if maps are compared where every start is known, which costs a pass over the log."""
-    monkeypatch.setattr("graphslam.slam.join", None)
-    monkeypatch.setattr("graphslam.slam.related", None)
+    monkeypatch.setattr("graphslam.placing.join", None)
+    monkeypatch.setattr("graphslam.placing.related", None)
     path = forest(tmp_path / "log.mcap", 1)
     result = run(path, "start.poses.a=[0, 0, 0]", f"start.poses.b={starts(path).tolist()}")
     assert result.summary["frames"] == {"a": "a", "b": "a"}
