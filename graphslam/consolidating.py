@@ -208,10 +208,9 @@ def _tightened(
     """Solved with closures that are slack first, and the tighter the nearer the estimate comes."""
     before = np.inf
     for _ in range(TIGHTENINGS):
-        drawn = slack(closures, estimate.states)
-        estimate = solve(steps, estimate, drawn)
-        if all(a is b for a, b in zip(drawn, closures, strict=True)):
-            return estimate
+        if not any(far_off(closures, estimate.states, BORNE_OUT)):
+            return solve(steps, estimate, closures)
+        estimate = solve(steps, estimate, slack(closures, estimate.states))
         left = float(np.abs(residuals(closures, estimate.states)).sum())
         if left > STUCK * before:
             break
