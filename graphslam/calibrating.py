@@ -59,9 +59,7 @@ def calibrate(
             still = np.diag(np.full(len(now[name].mean), 1e-18))
             track.calibration = Calibration(now[name].names, now[name].mean, still)
         made = loosen(remade(steps, tracks), estimate)
-        solved = solve_calibrated(
-            made, estimate, priors, now, config.robust, covariances=k == ROUNDS - 1
-        )
+        solved = solve_calibrated(made, estimate, priors, now, config.robust, rough=k < ROUNDS - 1)
         estimate = solved.estimate
         for name, track in tracks.items():
             track.calibration = solved.calibrations[name]

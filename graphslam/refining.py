@@ -74,9 +74,7 @@ def refine(
             inflation = variances(made, seen, estimate)
             slack = motion_variances(made, estimate)
         made = tuple(_inflated(step, inflation, slack) for step in made)
-        solved = solve_calibrated(
-            made, estimate, priors, now, config.robust, covariances=k == ROUNDS - 1
-        )
+        solved = solve_calibrated(made, estimate, priors, now, config.robust, rough=k < ROUNDS - 1)
         estimate = solved.estimate
         for name, track in tracks.items():
             track.calibration = solved.calibrations[name]

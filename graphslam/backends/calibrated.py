@@ -14,13 +14,16 @@ import numpy as np
 
 from graphslam import factors
 from graphslam.backends.graph import read
-from graphslam.backends.isam2 import WholeGraph
+from graphslam.backends.isam2 import CONVERGED_ERROR_ROUGH, WholeGraph
 from graphslam.config import RobustConfig
 from graphslam.geometry import Array, adjoint, between, inverse, log, rotate_cov, rotation3
 from graphslam.models.motion import HELD_SIGMA, Calibration
 from graphslam.records import Estimate, Step, Trajectory
 
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
+
+#: relative decrease of the error at which optimising ends
+CONVERGED_ERROR = 1e-5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,7 +41,7 @@ def solve_calibrated(
     now: Mapping[str, Calibration],
     kernel: RobustConfig,
     *,
-    covariances: bool = True,
+    rough: bool = False,
 ) -> CalibratedEstimate:
     """Optimise all states, landmarks and calibrations together.
 
@@ -51,7 +54,7 @@ def solve_calibrated(
         priors: per robot what is known of its calibration before any data.
         now: per robot the calibration that the motions were made with.
         kernel: for observations.
-        covariances: whether they are wanted, which takes its time; else they are NaN.
+        rough: to what a next round can go on from, in a fraction of the time: covariances are NaN.
 
     Raises:
         EstimationError: a covariance is not positive definite, or a state is unknown.
@@ -94,11 +97,11 @@ def solve_calibrated(
         builder.insert(rest, start, values)
     builder.face_lines(values)
     parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setRelativeErrorTol(1e-5)
+    parameters.setRelativeErrorTol(CONVERGED_ERROR_ROUGH if rough else CONVERGED_ERROR)
     parameters.setMaxIterations(50)
     try:
         values = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-        marginals = gtsam.Marginals(graph, values) if covariances else None
+        marginals = None if rough else gtsam.Marginals(graph, values)
         return _result(builder, graph, values, marginals, priors, free, numbers)
     except RuntimeError as error:
         raise builder.explain(error) from error
