@@ -32,6 +32,7 @@ from graphslam.geometry import between
 from graphslam.joining import Joined, Relation
 from graphslam.logs import open_logs
 from graphslam.pipeline import Known, Pipeline
+from graphslam.placing import surroundings, views_after
 from graphslam.recorded import recorded_in
 from graphslam.records import Message, OdometryPose, Trajectory
 from graphslam.results import load
@@ -108,7 +109,7 @@ def joined(name: str, folder: Path) -> bool:
     return len(set(summary["frames"].values())) == 1
 
 
-def surroundings(log: Path) -> dict[str, Surroundings]:
+def seen_alone(log: Path) -> dict[str, Surroundings]:
     """What each robot of a log saw by itself."""
     config = Config()
     opened = open_logs([log], config)
@@ -116,7 +117,7 @@ def surroundings(log: Path) -> dict[str, Surroundings]:
     known = Known(Joined.apart(opened.robots, origin(config)), recorded)
     pipeline = Pipeline(opened, config, known)
     pipeline.run(lambda _count: None)
-    return pipeline.surroundings(pipeline.views())
+    return surroundings(pipeline, views_after(pipeline))
 
 
 def parts(name: str, folder: Path) -> bool:
@@ -125,7 +126,7 @@ def parts(name: str, folder: Path) -> bool:
     command("import", "carmen", str(DATA / f"{name}.clf.bz2"), "-o", str(whole))
     write(halves(list(open_logs([whole], Config()).messages()))[0], cut)
     counts: Counter[str] = Counter()
-    for seen in surroundings(cut).values():
+    for seen in seen_alone(cut).values():
         stretches = np.array_split(np.arange(len(seen.places)), PARTS)
         for pair in combinations(stretches, 2):
             rows = [(3 * part[:, None] + np.arange(3)).ravel() for part in pair]

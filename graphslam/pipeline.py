@@ -19,17 +19,16 @@ from graphslam.backends.isam2 import Isam2Backend
 from graphslam.calibration import observed_information
 from graphslam.clock_offsets import ClockFound, clocks_found
 from graphslam.clocks import Clock, on_one_clock
-from graphslam.closing import places
 from graphslam.config import Config
 from graphslam.consolidating import Tamper, consolidate
 from graphslam.errors import EstimationError
 from graphslam.exchanged import exchanged_names, renamed
-from graphslam.frames import Frames, without_mark
+from graphslam.frames import Frames
 from graphslam.frontend import FRONT_ENDS, scan_points
 from graphslam.frontend.sightings import sighting_observation
 from graphslam.gathering import Gathered, Sources, carried, events, gather, met, shared, ways
-from graphslam.geometry import Array, compose, compose_cov, inverse, inverse_cov, rotate_cov
-from graphslam.joining import Joined, View
+from graphslam.geometry import compose, compose_cov, inverse, inverse_cov, rotate_cov
+from graphslam.joining import Joined
 from graphslam.log_settings import make_tracks, noted, outlines
 from graphslam.logs import LogSet
 from graphslam.meeting import Kept
@@ -47,7 +46,6 @@ from graphslam.records import (
     Scan,
     Sighting,
     Step,
-    Trajectory,
     TrueLandmark,
     Truth,
 )
@@ -56,7 +54,6 @@ from graphslam.robot_run import RobotRun
 from graphslam.scan_motion import beside_lines, checked, measured, scan_submap
 from graphslam.timeline import ODOMETRY, synchronise
 from graphslam.trajectories import Worlds
-from graphslam.unnamed import Surroundings
 from graphslam.watching import Watcher
 
 #: s: sigma of the difference of two robots' clocks before anything is known
@@ -203,39 +200,59 @@ class Pipeline:
         every = [sighting for image in gathered.images for sighting in image]
         observed = iter(carried(every, [moved[s.robot, s.time_ns] for s in every]))
         for image in gathered.images:
-            run, robot = self.runs[image[0].robot], image[0].robot
-            state_ns = at[robot]
             seen = list(itertools.islice(observed, len(image)))
-            for o, sighting in zip(seen, image, strict=True):
-                self.sources[robot, state_ns, o.z.tobytes()] = sighting
-            landmarks = [o for o, s in zip(seen, image, strict=True) if s.seen_robot is None]
-            self.counts["observations"] += len(seen)
-            if landmarks:
-                associations += self.associator.associate(
-                    robot,
-                    state_ns,
-                    landmarks,
-                    run.causal_poses[-1],
-                    motions.get(robot),
-                    run.track,
-                    run.path_m,
-                    gathering=True,
-                )
-            for o, s in zip(seen, image, strict=True):
-                if s.seen_robot is not None:
-                    other = self.runs[s.seen_robot]
-                    headings = [
-                        r.causal_poses[-1][2] + (motions[name].delta[2] if name in motions else 0.0)
-                        for name, r in ((s.seen_robot, other), (robot, run))
-                    ]
-                    turn = float(headings[0] - headings[1])
-                    way = moved[s.seen_robot, s.time_ns]
-                    association = met(o, s, state_ns, way, turn)
-                    self.sources[robot, state_ns, association.z.tobytes()] = s
-                    associations += (association,)
+            associations += self.seen_in(image, seen, at[image[0].robot], moved, motions)
         self.note_covariances()
         self.seconds["association"] += time.perf_counter() - began
         self.enter(Step(step_ns, {}, motions, shared(associations)), known)
+
+    def seen_in(
+        self,
+        image: Sequence[Sighting],
+        seen: Sequence[Observation],
+        state_ns: int,
+        moved: Mapping[tuple[str, int], Motion],
+        motions: Mapping[str, Motion],
+    ) -> tuple[Association, ...]:
+        """Associations of one image of a step of several.
+
+        Args:
+            image: sightings of one robot at one time.
+            seen: the same in its base frame at its state.
+            state_ns: time of that state.
+            moved: (robot, time) -> motion from the robot's state to that time.
+            motions: of the step, of robots that get a state.
+        """
+        robot = image[0].robot
+        run = self.runs[robot]
+        for o, sighting in zip(seen, image, strict=True):
+            self.sources[robot, state_ns, o.z.tobytes()] = sighting
+        landmarks = [o for o, s in zip(seen, image, strict=True) if s.seen_robot is None]
+        self.counts["observations"] += len(seen)
+        associations: tuple[Association, ...] = ()
+        if landmarks:
+            associations = self.associator.associate(
+                robot,
+                state_ns,
+                landmarks,
+                run.causal_poses[-1],
+                motions.get(robot),
+                run.track,
+                run.path_m,
+                gathering=True,
+            )
+        for o, s in zip(seen, image, strict=True):
+            if s.seen_robot is not None:
+                headings = [
+                    self.runs[name].causal_poses[-1][2]
+                    + (motions[name].delta[2] if name in motions else 0.0)
+                    for name in (s.seen_robot, robot)
+                ]
+                turn = float(headings[0] - headings[1])
+                association = met(o, s, state_ns, moved[s.seen_robot, s.time_ns], turn)
+                self.sources[robot, state_ns, association.z.tobytes()] = s
+                associations += (association,)
+        return associations
 
     def take(self, event: Sequence[Message]) -> None:
         """One event: everything one robot perceived at one time."""
@@ -553,45 +570,6 @@ class Pipeline:
         """What takes every robot and landmark from where it was estimated into its frame."""
         tracks = {name: run.track for name, run in self.runs.items()}
         return self.frames.worlds(tracks, self.associator.map.entries.values())
-
-    def views(self) -> dict[str, View]:
-        """What each robot knows by itself, after a run in which each had a frame of its own."""
-        estimate, entries = self.backend.finish(), self.associator.map.entries
-        moved = self.worlds().estimate(estimate)
-        frames = self.frames.of_landmarks(entries.values())
-        marks: dict[str, dict[str, tuple[Array, Array]]] = defaultdict(dict)
-        unnamed: dict[str, list[tuple[Array, Array]]] = defaultdict(list)
-        for number, (mean, cov) in moved.landmarks.items():
-            name = without_mark(entries[number].identity)
-            if name is not None:
-                marks[frames[number]][name] = (mean[:2], cov[:2, :2])
-            elif entries[number].kind == "point":
-                unnamed[frames[number]].append((mean, cov))
-        views = {}
-        for robot, run in self.runs.items():
-            if len(run.track):
-                start = self.starts[robot]
-                first = np.array([run.track.first_ns], dtype=np.int64)
-                unseeing = Trajectory(first, start.pose[None], start.cov[None])
-                points = (
-                    np.array([mean for mean, _ in unnamed[robot]]).reshape(-1, 2),
-                    np.array([cov for _, cov in unnamed[robot]]).reshape(-1, 2, 2),
-                )
-                states = moved.states.get(robot, unseeing)
-                views[robot] = View(states, run.track, marks[robot], points)
-        return views
-
-    def surroundings(self, views: Mapping[str, View]) -> dict[str, Surroundings]:
-        """What each robot saw that bears no name, in its own frame; after `views`, same run."""
-        assert isinstance(self.backend, Isam2Backend)
-        found = places({robot: view.states for robot, view in views.items()}, self.pictures)
-        seen = {}
-        for robot, view in views.items():
-            own = [place for place in found if place.state[0] == robot]
-            states = [place.state for place in own]
-            cov = self.backend.state_covariance(states) if own else np.zeros((0, 0))
-            seen[robot] = Surroundings(own, cov, view.unnamed)
-        return seen
 
     def exchanged(self, estimate: Estimate) -> dict[str, str]:
         """Names of what was sighted that turn out to be each other's: false -> right name."""

@@ -6,19 +6,26 @@ what bears a name, by how they show in each other's scans, and else by places an
 names.
 """
 
+from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
+
+from graphslam.backends.isam2 import Isam2Backend
+from graphslam.closing import places
 from graphslam.config import BackendConfig, Config
+from graphslam.frames import without_mark
+from graphslam.geometry import Array
 from graphslam.joining import Joined, Relation, View, join
 from graphslam.log_settings import outlines
 from graphslam.logs import LogSet
 from graphslam.meeting import Kept, Looked, meet
 from graphslam.pipeline import CLOCK_DOUBT_S, Known, Pipeline
 from graphslam.recorded import Recorded, recorded_in
-from graphslam.records import Scan, Sighting, Start
+from graphslam.records import Scan, Sighting, Start, Trajectory
 from graphslam.starts import origin, start_poses
-from graphslam.unnamed import related
+from graphslam.unnamed import Surroundings, related
 
 #: relations between robots found without names, and robot -> why there is none
 Found = tuple[Sequence[Relation], Mapping[str, str]]
@@ -82,16 +89,57 @@ def placed(
     pipeline.run(lambda _count: None)
     if not pipeline.steps:
         return joined({}, (), ((), {}))
-    views, meetings, looked = pipeline.views(), pipeline.meetings, Looked((), {})
+    views, meetings, looked = views_after(pipeline), pipeline.meetings, Looked((), {})
     if watchable(log, shapes, starts):
         scans = pipeline.kept.scans
         looked = meet(views, scans, shapes, tuple(starts), CLOCK_DOUBT_S, config.front_end)
     by_name = joined(views, meetings, (looked.relations, looked.undecided))
     if len(set(by_name.frames.values())) == 1:
         return by_name
-    more, doubts = related(pipeline.surroundings(views), by_name.frames, config.association)
+    more, doubts = related(surroundings(pipeline, views), by_name.frames, config.association)
     found = (*looked.relations, *more), {**doubts, **looked.undecided}
     return joined(views, meetings, found)
+
+
+def views_after(run: Pipeline) -> dict[str, View]:
+    """What each robot knows by itself, after a pass in which each had a frame of its own."""
+    estimate, entries = run.backend.finish(), run.associator.map.entries
+    moved = run.worlds().estimate(estimate)
+    frames = run.frames.of_landmarks(entries.values())
+    marks: dict[str, dict[str, tuple[Array, Array]]] = defaultdict(dict)
+    unnamed: dict[str, list[tuple[Array, Array]]] = defaultdict(list)
+    for number, (mean, cov) in moved.landmarks.items():
+        name = without_mark(entries[number].identity)
+        if name is not None:
+            marks[frames[number]][name] = (mean[:2], cov[:2, :2])
+        elif entries[number].kind == "point":
+            unnamed[frames[number]].append((mean, cov))
+    views = {}
+    for robot, own in run.runs.items():
+        if len(own.track):
+            start = run.starts[robot]
+            first = np.array([own.track.first_ns], dtype=np.int64)
+            unseeing = Trajectory(first, start.pose[None], start.cov[None])
+            points = (
+                np.array([mean for mean, _ in unnamed[robot]]).reshape(-1, 2),
+                np.array([cov for _, cov in unnamed[robot]]).reshape(-1, 2, 2),
+            )
+            states = moved.states.get(robot, unseeing)
+            views[robot] = View(states, own.track, marks[robot], points)
+    return views
+
+
+def surroundings(run: Pipeline, views: Mapping[str, View]) -> dict[str, Surroundings]:
+    """What each robot saw that bears no name, in its own frame, after the pass of ``views``."""
+    assert isinstance(run.backend, Isam2Backend)
+    found = places({robot: view.states for robot, view in views.items()}, run.pictures)
+    seen = {}
+    for robot, view in views.items():
+        own = [place for place in found if place.state[0] == robot]
+        states = [place.state for place in own]
+        cov = run.backend.state_covariance(states) if own else np.zeros((0, 0))
+        seen[robot] = Surroundings(own, cov, view.unnamed)
+    return seen
 
 
 def watchable(log: LogSet, outlines: Collection[str], placed: Collection[str]) -> bool:
