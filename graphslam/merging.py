@@ -7,6 +7,7 @@ Pairs are tied one after another, the most certain first, and every tie conditio
 agrees with one tie must agree with the next. What one image showed as two things is never tied.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -248,7 +249,8 @@ def seen_together(steps: Iterable[Step]) -> set[frozenset[int]]:
     """Pairs of landmarks that one robot saw from one state, as two things.
 
     Two lines that an image has in line with each other may be parts of one wall, with a door
-    between them.
+    between them. Of many images of one wall some have its parts out of line, by their noise; what
+    most have is believed.
     """
     images: dict[tuple[str, int], list[Association]] = {}
     for step in steps:
@@ -258,13 +260,14 @@ def seen_together(steps: Iterable[Step]) -> set[frozenset[int]]:
     pairs = [(a, b) for seen in images.values() for a, b in combinations(seen, 2)]
     pairs = [(a, b) for a, b in pairs if a.target != b.target]
     lines = np.array([a.model == b.model == "line" for a, b in pairs], dtype=bool)
-    apart = ~lines
-    apart[lines] = ~_in_line([pair for pair, line in zip(pairs, lines, strict=True) if line])
-    return {
-        frozenset((a.target, b.target))
-        for (a, b), two in zip(pairs, apart, strict=True)
-        if two and isinstance(a.target, int) and isinstance(b.target, int)
-    }
+    weight = np.where(lines, 1, len(pairs))  # segments end where they were seen to end
+    of_lines = [pair for pair, both in zip(pairs, lines, strict=True) if both]
+    weight[lines] = np.where(_in_line(of_lines), -1, 1)
+    votes: Counter[frozenset[int]] = Counter()
+    for (a, b), vote in zip(pairs, weight.tolist(), strict=True):
+        if isinstance(a.target, int) and isinstance(b.target, int):
+            votes[frozenset((a.target, b.target))] += vote
+    return {pair for pair, sum_of_votes in votes.items() if sum_of_votes > 0}
 
 
 def _in_line(pairs: Sequence[tuple[Association, Association]]) -> BoolArray:

@@ -294,3 +294,22 @@ def test_lines_of_one_image_are_two_things_unless_in_line(second, two):
     ]
     expected = {frozenset((0, 1))} if two else set()
     assert seen_together([Step(7, {}, {}, tuple(seen))]) == expected
+
+
+@pytest.mark.parametrize(("out_of_line", "two"), [(1, False), (4, False), (6, True), (10, True)])
+def test_what_most_images_have_in_line_is_not_two_things(out_of_line, two):
+    """Ten images of two parts of a wall. Breaks if a single noisy image of many makes them two."""
+    cov = np.diag([1.0, 0.01, 0.005]) ** 2
+    steps = []
+    for k in range(10):
+        turn = 0.1 if k < out_of_line else 0.0
+        seen = [
+            Association("r", k, number, "line", np.array(z), cov)
+            for number, z in enumerate([(0.5, 1.0, 0.0), (2.5, 1.0, turn)])
+        ]
+        steps.append(Step(k, {}, {}, tuple(seen)))
+    assert seen_together(steps) == ({frozenset((0, 1))} if two else set())
+    # what has been seen from end to end is another thing in whatever image
+    ends = [replace(a, model="segment") for a in steps[-1].associations]
+    whole = [*steps[:-1], replace(steps[-1], associations=tuple(ends))]
+    assert seen_together(whole) == {frozenset((0, 1))}
