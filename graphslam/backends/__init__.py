@@ -4,13 +4,13 @@ import math
 from collections.abc import Callable
 
 from graphslam.backends.base import Backend, Joint
+from graphslam.backends.compressed import BatchBackend, CompressedBackend
 from graphslam.backends.dead_reckoning import DeadReckoningBackend
 from graphslam.backends.decentralised import DecentralisedBackend
 from graphslam.backends.ekf import EkfBackend
 from graphslam.backends.factor_ekf import FactorEkfBackend
 from graphslam.backends.fixed_lag import FixedLagBackend
 from graphslam.backends.invariant_ekf import InvariantEkfBackend
-from graphslam.backends.isam2 import BatchBackend, Isam2Backend
 from graphslam.backends.rbpf import RbpfBackend
 from graphslam.config import Config
 
@@ -24,7 +24,7 @@ def with_horizon(config: Config) -> Backend:
     if config.backend.horizon_s == 0:
         return FactorEkfBackend(config)
     if math.isinf(config.backend.horizon_s):
-        return Isam2Backend(config)
+        return CompressedBackend(config)
     return FixedLagBackend(config)
 
 

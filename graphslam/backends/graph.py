@@ -79,6 +79,11 @@ class GraphBuilder:
         """Key of a robot's latest state, see `StateTable.latest`."""
         return self.state_key(robot, self.states.latest(robot, at_ns))
 
+    def dim(self, key: int) -> int:
+        """Size of a variable."""
+        robot, number = factors.number_of(key)
+        return self.landmark_dims[number] if robot is None else 3
+
     def dims(self) -> dict[int, int]:
         """Every variable there is, with its size."""
         found = {

@@ -1,8 +1,7 @@
 """Full smoothing with GTSAM: incrementally (iSAM2) and, at the end, to convergence.
 
-`Isam2Backend` is incremental smoothing over the whole past (horizon = infinity); `BatchBackend`
-is its converged limit: the same graph, optimised by Levenberg-Marquardt from iSAM2's estimate.
-`Resolver` solves what was recorded once more.
+`Isam2Backend` is incremental smoothing over the whole past (horizon = infinity), its tree updated
+at every step (`compressed` does so seldom). `Resolver` solves what was recorded once more.
 """
 
 from collections.abc import Iterable, Sequence
@@ -49,25 +48,20 @@ class WholeGraph(GraphBuilder):
         self._places: list[int] = []
         self.meetings: list[tuple[int, tuple[int, int, Association]]] = []  # the same of robots
 
-    def expand(
-        self, step: Step, current: Estimates
-    ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-        """Factors and new variables of a step; ``current`` is asked for existing estimates."""
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    def expand(self, step: Step, current: Estimates) -> list[Part]:
+        """The parts of a step, taken in; ``current`` is asked for existing estimates."""
         fresh: dict[int, Array] = {}
 
         def estimate(key: int, dim: int) -> Array:
             return fresh[key] if key in fresh else current(key, dim)
 
-        begin = self.graph.size()
+        parts = []
         for part in self.parts(step, estimate):
             if part.new is not None:
-                write(values, *part.new)
                 fresh.update([part.new])
             self._take(part)
-        for place in range(begin, self.graph.size()):
-            graph.add(self.graph.at(place))
-        return graph, values
+            parts.append(part)
+        return parts
 
     def insert(self, step: Step, start: Estimate, values: gtsam.Values) -> None:
         """Take in a recorded step, its variables at their values in ``start``."""
@@ -169,11 +163,24 @@ class Isam2Backend(GraphBackend):
     def add(self, step: Step) -> None:
         """See `Backend`."""
         self._settle()
-        graph, values = self._builder.expand(step, self.value)
         self._joints.clear()
         self._steps += 1
+        self._update(self._builder.expand(step, self.value))
+
+    def _due(self) -> bool:
+        """Whether it is time to look for what is to be linearised anew."""
         every = self._config.backend.relinearize_every * (1 + self._steps // AS_LONG_AGAIN)
-        due = self._steps >= self._looked + every
+        return self._steps >= self._looked + every
+
+    def _update(self, parts: Iterable[Part]) -> None:
+        """Let the tree take in parts."""
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for part in parts:
+            if part.new is not None:
+                write(values, *part.new)
+            for factor in part.factors:
+                graph.add(factor)
+        due = self._due()
         if due:
             self._looked = self._steps
         try:
@@ -190,10 +197,10 @@ class Isam2Backend(GraphBackend):
         if self._factorization == "QR":
             raise self._builder.explain(error) from error
         self._factorization = "QR"
-        values = self._isam.getLinearizationPoint()
+        graph, values = self._isam.getFactorsUnsafe(), self._isam.getLinearizationPoint()
         self._isam = gtsam.ISAM2(isam2_parameters(self._config, "QR"))
         try:
-            self._isam.update(self._builder.graph, values)
+            self._isam.update(graph, values)
         except RuntimeError as again:
             raise self._builder.explain(again) from again
 
@@ -295,14 +302,6 @@ class Isam2Backend(GraphBackend):
         covs = self._marginals(values)
         means = {key: read(values, key, len(cov)) for key, cov in covs.items()}
         return self._estimate(means, covs, float(self._builder.graph.error(values)))
-
-
-class BatchBackend(Isam2Backend):
-    """The converged limit, whatever `backend.polish` says; associations as with iSAM2."""
-
-    def finish(self) -> Estimate:
-        """See `Backend`."""
-        return self._result(self._optimised(self._isam.calculateBestEstimate()))
 
 
 class Resolver(Isam2Backend):

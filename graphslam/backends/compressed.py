@@ -1,0 +1,242 @@
+"""Full smoothing that updates its tree seldom: in between, a Kalman filter of what is in use.
+
+Between two updates of iSAM2 a robot deals with a few variables: its latest pose and the landmarks
+around it. The joint marginal of those at the last update, moved on by each step's factors, is all
+that the rest of the graph can say of them: `Active` is that filter. iSAM2 gets the steps of a
+stretch at once, when something is asked that is not in use, or when it is due to linearise anew.
+So a tree that holds thousands of poses is updated, solved and asked for marginals once in many
+steps, and nothing is lost: to first order the filter's answers are iSAM2's.
+
+Source: J. Guivant, E. Nebot, Optimization of the simultaneous localization and map-building
+algorithm for real-time implementation, IEEE T-RA 17(3), 2001, https://doi.org/10.1109/70.938382
+(the compressed filter; there a filter is behind it as well).
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+import gtsam
+import numpy as np
+
+from graphslam import factors
+from graphslam.backends.graph import Part, read, write
+from graphslam.backends.isam2 import Isam2Backend
+from graphslam.config import Config
+from graphslam.geometry import Array
+from graphslam.kalman import symmetric, whiten
+from graphslam.records import Estimate, Step
+
+#: landmarks in use: those last seen or asked for. A stretch ends where another one is asked for,
+#: and a larger filter costs less than an update of the tree
+REMEMBERED = 24
+
+
+class Active:
+    """Joint estimate of a few variables, by GTSAM's factors and in errors of body frames.
+
+    Every variable keeps the place at which the tree linearises, and z is how far, in the tangent
+    space there, it has moved from it: with Jacobians of now the filter would claim to know along a
+    line what nobody measured (see `fixed_lag`).
+    """
+
+    def __init__(self, places: Mapping[int, Array], z: Array, cov: Array) -> None:
+        """Begin.
+
+        Args:
+            places: where variables (2,) or (3,) are linearised, by key.
+            z: (D,) how far they are from there, in that order.
+            cov: (D, D) of that.
+        """
+        self._places = gtsam.Values()
+        self._slots: dict[int, slice] = {}
+        for key, place in places.items():
+            self._place(key, place)
+        self._z, self._cov = z, cov
+
+    def _place(self, key: int, place: Array) -> slice:
+        write(self._places, key, place)
+        begin = max((slot.stop for slot in self._slots.values()), default=0)
+        self._slots[key] = slice(begin, begin + len(place))
+        return self._slots[key]
+
+    def __contains__(self, key: object) -> bool:
+        """Whether a variable is in use."""
+        return key in self._slots
+
+    def value(self, key: int) -> Array:
+        """Estimate (2,) or (3,) of a variable in use."""
+        z = self._z[self._slots[key]]
+        if len(z) == 3:
+            return factors.array3(self._places.atPose2(key).retract(z))
+        return np.asarray(self._places.atPoint2(key) + z)
+
+    def covariance(self, keys: Sequence[int]) -> Array:
+        """Joint covariance (D, D) of variables in use, in this order."""
+        places = np.concatenate([np.r_[self._slots[key]] for key in keys])
+        return np.asarray(self._cov[np.ix_(places, places)])
+
+    def takes(self, parts: Iterable[Part]) -> bool:
+        """Whether ``parts`` are about nothing but variables in use and those that they bring."""
+        known = set(self._slots)
+        for part in parts:
+            if part.new is not None:
+                known.add(part.new[0])
+            if not all(known.issuperset(factor.keys()) for factor in part.factors):
+                return False
+        return True
+
+    def take(self, parts: Iterable[Part]) -> None:
+        """One step of the filter."""
+        measured: list[gtsam.NonlinearFactor] = []
+        for part in parts:
+            if part.new is not None:
+                self._enter(*part.new, part.factors)
+            else:
+                measured += part.factors
+        if measured:
+            self._update(measured)
+
+    def _enter(self, key: int, mean: Array, made_by: Iterable[gtsam.NonlinearFactor]) -> None:
+        """A new variable, as the factors that bring it have it: thesis 4.24-4.28."""
+        before = len(self._cov)
+        block = self._place(key, mean)
+        H, b = self._rows(made_by)
+        noise = np.linalg.pinv(H[:, block])  # square, but for a line's empty row
+        G = -noise @ H[:, :before]
+        self._z = np.append(self._z, noise @ (b - H[:, :before] @ self._z))
+        GP = G @ self._cov
+        corner = symmetric(GP @ G.T + noise @ noise.T)
+        self._cov = np.block([[self._cov, GP.T], [GP, corner]])
+
+    def _update(self, measured: Iterable[gtsam.NonlinearFactor]) -> None:
+        """Measurement update with all of a step's factors at once, thesis 3.5-3.8."""
+        H, b = self._rows(measured)
+        PHt = self._cov @ H.T
+        B, whitened, _ = whiten(PHt, H @ PHt + np.eye(len(H)), b - H @ self._z)
+        self._z = self._z + B.T @ whitened
+        self._cov = self._cov - B.T @ B
+
+    def _rows(self, measured: Iterable[gtsam.NonlinearFactor]) -> tuple[Array, Array]:
+        """Whitened Jacobians H (k, D) of factors, and b (k,): they say that H z = b."""
+        size = max(slot.stop for slot in self._slots.values())
+        found = []
+        for factor in measured:
+            A, b = factor.linearize(self._places).jacobian()
+            rows, begin = np.zeros((len(b), size + 1)), 0
+            for key in factor.keys():  # noqa: SIM118 (GTSAM's factors are no mappings)
+                slot = self._slots[key]
+                end = begin + slot.stop - slot.start
+                rows[:, slot] = A[:, begin:end]
+                begin = end
+            rows[:, -1] = b
+            found.append(rows)
+        stacked = np.concatenate(found)
+        return stacked[:, :-1], stacked[:, -1]
+
+    def forget(self, key: int) -> None:
+        """Marginalise a variable out."""
+        gone = self._slots.pop(key)
+        size = gone.stop - gone.start
+        keep = np.r_[0 : gone.start, gone.stop : len(self._cov)]
+        self._z, self._cov = self._z[keep], self._cov[np.ix_(keep, keep)]
+        self._places.erase(key)
+        for other, slot in self._slots.items():
+            if slot.start > gone.start:
+                self._slots[other] = slice(slot.start - size, slot.stop - size)
+
+
+class CompressedBackend(Isam2Backend):
+    """Incremental smoothing with a filter in front of it; see the module's docstring."""
+
+    def __init__(self, config: Config) -> None:
+        super().__init__(config)
+        self._active: Active | None = None
+        self._waiting: list[Part] = []  # what the filter has and the tree has not
+        self._used: dict[int, None] = {}  # keys of landmarks, the last used one last
+        # states that the sightings of a landmark's promotion belong to, as a rule
+        self._states = config.association.sightings_to_promote
+
+    def value(self, key: int, dim: int) -> Array:
+        """See `GraphBackend`."""
+        if self._active is not None and key in self._active:
+            return self._active.value(key)
+        self._flush()
+        return super().value(key, dim)
+
+    def add(self, step: Step) -> None:
+        """See `Backend`."""
+        self._joints.clear()
+        self._settle()
+        parts = self._builder.expand(step, self.value)
+        self._steps += 1
+        self._waiting += parts
+        self._use(part.observed[1] for part in parts if part.observed is not None)
+        if self._active is None or self._due() or not self._active.takes(parts):
+            self._flush()
+            return
+        self._active.take(parts)
+        for robot in step.motions:
+            number = self._builder.states.latest(robot) - self._states
+            before = self._builder.state_key(robot, number)
+            if number >= 0 and before in self._active:
+                self._active.forget(before)
+
+    def _use(self, keys: Iterable[int]) -> None:
+        for key in keys:
+            if factors.number_of(key)[0] is None:
+                self._used.pop(key, None)
+                self._used[key] = None
+
+    def _flush(self) -> None:
+        """The tree takes in what waits; it answers until a covariance is asked for."""
+        self._active = None
+        if self._waiting:
+            waiting, self._waiting = self._waiting, []
+            self._update(waiting)
+
+    def covariance(self, keys: list[int]) -> Array:
+        """See `GraphBackend`; what is asked for is in use from now on."""
+        self._use(keys)
+        if self._active is None or not all(key in self._active for key in keys):
+            self._flush()
+            self._used = dict.fromkeys(list(self._used)[-max(REMEMBERED, len(keys)) :])
+            self._active = self._marginal([*self._latest(), *self._used])
+        return self._active.covariance(keys)
+
+    def _latest(self) -> Iterator[int]:
+        """Keys of each robot's latest states."""
+        builder = self._builder
+        for robot in builder.robots:
+            latest = builder.states.latest(robot)
+            for number in range(max(0, latest + 1 - self._states), latest + 1):
+                yield builder.state_key(robot, number)
+
+    def _marginal(self, keys: list[int]) -> Active:
+        """What the tree says of variables."""
+        everywhere = self._isam.getLinearizationPoint()
+        places = {key: read(everywhere, key, self._builder.dim(key)) for key in keys}
+        z = self._isam.getDelta().vector(keys)
+        return Active(places, z, super().covariance(keys))
+
+    def state_covariance(self, states: Sequence[tuple[str, int]]) -> Array:
+        """See `Isam2Backend`."""
+        self._flush()
+        return super().state_covariance(states)
+
+    def finish(self) -> Estimate:
+        """See `Backend`."""
+        self._flush()
+        return super().finish()
+
+    def rough(self) -> Estimate:
+        """See `Isam2Backend`."""
+        self._flush()
+        return super().rough()
+
+
+class BatchBackend(CompressedBackend):
+    """The converged limit, whatever `backend.polish` says; associations as with iSAM2."""
+
+    def finish(self) -> Estimate:
+        """See `Backend`."""
+        self._flush()
+        return self._result(self._optimised(self._isam.calculateBestEstimate()))
