@@ -5,6 +5,8 @@ Between two readings the robot is taken to move on a circle segment. Nothing her
 calibration: that is `dead_reckoning`.
 """
 
+import math
+
 import numpy as np
 
 from graphslam.config import OdometryConfig, RobotConfig
@@ -155,7 +157,7 @@ class Readings:
             rows = values - earlier if self.source == "wheels" else log(between(earlier, values))
         if self.source == "wheels":
             return rows
-        apart_ns = np.diff(times_ns)
+        apart_ns = times_ns[1:] - times_ns[:-1]
         limit_m = RESET_SPEED_M_S * 1e-9 * apart_ns + 0.5
         jumped = (apart_ns >= SHORTEST_RESET_NS) & (np.hypot(rows[:, 0], rows[:, 1]) > limit_m)
         for k in np.flatnonzero(jumped):
@@ -165,10 +167,12 @@ class Readings:
 
     def _enter(self, n: int, rows: Array) -> None:
         """Rows of the readings from the n-th on, n > 0, and what accumulates from them."""
-        new = slice(n, n + len(rows))
         twists = wheel_twist(rows, self._robot) if self.source == "wheels" else rows[:, :3]
-        step = exp(twists) if len(rows) > 1 else exp(twists[0])[None]
-        x, y, turned = step.T
+        if len(rows) == 1:
+            self._enter_one(n, rows[0], exp(twists[0]).tolist())
+            return
+        new = slice(n, n + len(rows))
+        x, y, turned = exp(twists).T
         path, turn = np.hypot(x, y), np.abs(turned)
         heading = self._poses[n - 1, 2] + np.cumsum(turned)
         before = heading - turned
@@ -184,6 +188,19 @@ class Readings:
         burst = (path > MAX_SPEED_M_S * seconds) | (turn > MAX_TURN_RAD_S * seconds)
         self._burst[new] = burst
         self._bursts += int(burst.sum())
+
+    def _enter_one(self, n: int, row: Array, step: list[float]) -> None:
+        """The same of one reading, the rule where scans are: arrays of one cost ten times this."""
+        (x, y, turned), (east, north, heading) = step, self._poses[n - 1].tolist()
+        c, s, path, turn = math.cos(heading), math.sin(heading), math.hypot(x, y), abs(turned)
+        self._rows[n], self._sums[n] = row, self._sums[n - 1] + row
+        self._poses[n] = east + c * x - s * y, north + s * x + c * y, float(wrap(heading + turned))
+        self._effort[n] = self._effort[n - 1] + path + TURNING_EFFORT_M * turn
+        self._path[n] = self._path[n - 1] + path
+        seconds = 1e-9 * int(self._times[n] - self._times[n - 1])
+        burst = path > MAX_SPEED_M_S * seconds or turn > MAX_TURN_RAD_S * seconds
+        self._burst[n] = burst
+        self._bursts += burst
 
     def reaches(self, time_ns: int) -> bool:
         """Whether the motion up to ``time_ns`` is known without looking beyond a reading."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.stats import poisson
+from scipy.special import pdtrc
 
 from graphslam.config import AssociationConfig
 from graphslam.gaussian import chi2_quantile
@@ -188,7 +188,7 @@ def _fitted(
     share = count / AROUND_M**2 * chi2_quantile(0.99, 2) * (np.median(v) + w)
     by_chance = float(np.minimum(share, 1.0).sum())
     # two points made the move
-    chance = tried * float(poisson.sf(len(pairs) - 3, by_chance))
+    chance = tried * float(pdtrc(len(pairs) - 3, by_chance))
     return _Fit(pose, cov, pairs, chance)
 
 

@@ -458,6 +458,38 @@ def test_reaches_and_near_tell_what_odometry_covers():
     assert not track.near(first - 1, 9 * SECOND) and not track.near(last + 1, 9 * SECOND)
 
 
+@pytest.mark.parametrize("source", ["poses", "wheels"])
+def test_readings_asked_for_one_by_one_are_those_worked_out_at_once(source):
+    """With turns across the seam, a burst, and for poses a jump: everything that accumulates is the
+    same to rounding, some 1e-16 per reading."""
+    rng = np.random.default_rng(4)
+    moves = rng.normal(size=(200, 3)) * [0.2, 0.02, 0.3]
+    times = np.cumsum(rng.uniform(0.05, 0.15, 200))
+    times[120] = times[119] + 1e-6
+    poses = [np.zeros(3)]
+    for move in moves[1:]:
+        poses.append(compose(poses[-1], move))
+    poses[150] = poses[150] + [80.0, 0.0, 0.0]
+    tracks = [Track(NOISE, ROBOT), Track(NOISE, ROBOT)]
+    for k, t in enumerate(times):
+        ns = round(t * SECOND)
+        reading = OdometryPose("r", ns, ns, poses[k])
+        if source == "wheels":
+            reading = WheelAngles("r", ns, ns, *np.cumsum(moves, axis=0)[k, :2])
+        for track in tracks:
+            track.add(reading)
+        tracks[0].moved(tracks[0].first_ns, ns)
+    one, many = tracks
+    at = np.append(many.times, many.times[:-1] + SECOND // 50)
+    np.testing.assert_allclose(one.pose(at), many.pose(at), atol=1e-11)
+    np.testing.assert_allclose(one.effort(at), many.effort(at), atol=1e-11)
+    assert (one.resets, one.bursty) == (many.resets, many.bursty)
+    assert one.resets == (2 if source == "poses" else 0)
+    whole = many.first_ns, many.last_ns
+    assert one.moved(*whole) == pytest.approx(many.moved(*whole), abs=1e-11)
+    np.testing.assert_allclose(one.motion(*whole).cov, many.motion(*whole).cov, rtol=1e-9)
+
+
 def test_a_second_reading_of_one_time_belongs_to_the_interval_that_ends_there():
     """Nothing of the way is lost, and no interval is empty."""
     track = odometry_track([0, 1, 1, 2], [[0, 0, 0], [1, 0, 0], [1.5, 0, 0], [2, 0, 0]])

@@ -27,7 +27,7 @@ from graphslam.records import Estimate, Step
 
 #: landmarks in use: those last seen or asked for. A stretch ends where another one is asked for,
 #: and a larger filter costs less than an update of the tree
-REMEMBERED = 24
+REMEMBERED = 32
 
 
 class Active:
@@ -166,7 +166,7 @@ class CompressedBackend(Isam2Backend):
         """See `Backend`."""
         self._joints.clear()
         self._settle()
-        parts = self._builder.expand(step, self.value)
+        parts = self._builder.expand(step, self._begin)
         self._steps += 1
         self._waiting += parts
         self._use(part.observed[1] for part in parts if part.observed is not None)
@@ -179,6 +179,11 @@ class CompressedBackend(Isam2Backend):
             before = self._builder.state_key(robot, number)
             if number >= 0 and before in self._active:
                 self._active.forget(before)
+
+    def _begin(self, key: int, dim: int) -> Array:
+        """Where to linearise: of what is not in use, the tree's last estimate is near enough."""
+        known = self._active is not None and key not in self._active and self._isam.valueExists(key)
+        return super().value(key, dim) if known else self.value(key, dim)
 
     def _use(self, keys: Iterable[int]) -> None:
         for key in keys:
@@ -215,7 +220,7 @@ class CompressedBackend(Isam2Backend):
         everywhere = self._isam.getLinearizationPoint()
         places = {key: read(everywhere, key, self._builder.dim(key)) for key in keys}
         z = self._isam.getDelta().vector(keys)
-        return Active(places, z, super().covariance(keys))
+        return Active(places, z, self._tree_covariance(keys))
 
     def state_covariance(self, states: Sequence[tuple[str, int]]) -> Array:
         """See `Isam2Backend`."""

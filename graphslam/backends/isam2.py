@@ -220,6 +220,10 @@ class Isam2Backend(GraphBackend):
 
     def covariance(self, keys: list[int]) -> Array:
         """See `GraphBackend`."""
+        return self._tree_covariance(keys)
+
+    def _tree_covariance(self, keys: list[int]) -> Array:
+        """The same according to the tree."""
         self._settle()
         try:
             if len(keys) == 1:
@@ -245,7 +249,7 @@ class Isam2Backend(GraphBackend):
         """Joint covariance (3n, 3n) of states, by robot and time, errors along each one's axes."""
         builder = self._builder
         numbers = [(robot, builder.states.number(robot, t)) for robot, t in states]
-        return self.covariance([builder.state_key(*state) for state in numbers])
+        return self._tree_covariance([builder.state_key(*state) for state in numbers])
 
     def rough(self) -> Estimate:
         """What the tree has now, where solving again begins: covariances are NaN."""
