@@ -453,7 +453,7 @@ def test_final_states_of_a_linear_problem_know_what_came_within_the_horizon(name
 @pytest.mark.parametrize("kernel", ["none", "cauchy"])
 @pytest.mark.parametrize("late", [False, True])
 def test_the_filter_in_front_of_the_tree_says_what_the_tree_says(kernel, late):
-    """While nothing is linearised anew both are the same algebra, lines and meetings included: after
+    """While nothing is linearised anew both are one algebra, lines and meetings included: after
     each step, means and joint covariance of a robot and all landmarks agree to what iSAM2's
     back-substitution leaves out (it stops below 1e-3). Jacobians of now instead of the tree's would
     be 0.5 sigma off, by what a line leaves open."""
