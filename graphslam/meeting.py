@@ -29,10 +29,10 @@ from graphslam.frontend.robots import FEWEST, expected_ranges, reach
 from graphslam.frontend.sweep import Sweep
 from graphslam.gaussian import chi2_quantile
 from graphslam.geometry import Array, between, compose, wrap
-from graphslam.joining import FIT, MAX_TURN_SIGMA_RAD, RIVAL, Relation, View
 from graphslam.readings import IntArray
 from graphslam.records import Scan, Sighting
 from graphslam.registering import began_at
+from graphslam.relating import FIT, MAX_TURN_SIGMA_RAD, RIVAL, Relation, View
 from graphslam.supposing import (
     SURE_M,
     Path,

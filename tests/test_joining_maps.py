@@ -14,10 +14,11 @@ from graphslam.closing import Place
 from graphslam.config import AssociationConfig, load_config
 from graphslam.evaluate import evaluate
 from graphslam.geometry import between, compose, inverse, transform, wrap
-from graphslam.joining import Relation, join
+from graphslam.joining import join
 from graphslam.logs import open_logs, read_truth
 from graphslam.matching import Match, make_submap
 from graphslam.records import Start
+from graphslam.relating import Relation
 from graphslam.shared_places import Meeting, decided, elsewhere
 from graphslam.shared_points import relate_points
 from graphslam.simulate import load_scenario, simulate

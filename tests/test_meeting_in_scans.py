@@ -9,11 +9,12 @@ from graphslam.config import OdometryConfig, RobotConfig, load_config
 from graphslam.dead_reckoning import Track
 from graphslam.evaluate import evaluate
 from graphslam.geometry import compose, compose_jacobians, exp, wrap
-from graphslam.joining import WIDER, View
+from graphslam.joining import WIDER
 from graphslam.logs import open_logs, read_truth
 from graphslam.meeting import Kept
 from graphslam.records import OdometryPose, Scan, Trajectory
 from graphslam.registering import wandered
+from graphslam.relating import View
 from graphslam.simulate import simulate
 from graphslam.simulate.body import corners
 from graphslam.simulate.spec import (
