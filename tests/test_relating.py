@@ -33,3 +33,21 @@ def test_the_largest_set_is_found_among_pairs_that_agree_by_chance():
         agree[np.ix_(hidden, hidden)] = True
         np.fill_diagonal(agree, False)
         np.testing.assert_array_equal(largest(agree, np.ones(60)), hidden)
+
+
+def test_the_largest_set_that_agrees_in_pairs():
+    """Of two sets the larger one, though what has most links leads to the other."""
+    agree = np.zeros((11, 11), dtype=bool)
+    agree[:4, :4] = agree[4:10, 4:10] = True
+    agree[10, :7] = agree[:7, 10] = True
+    np.fill_diagonal(agree, False)
+    np.testing.assert_array_equal(largest(agree, np.ones(11)), range(4, 10))
+    assert largest(np.zeros((0, 0), dtype=bool), np.ones(0)).shape == (0,)
+
+
+def test_of_two_sets_that_agree_the_one_that_is_worth_more_is_taken():
+    """Two landmarks seen again and again, against three sightings."""
+    agree = np.zeros((5, 5), dtype=bool)
+    agree[:2, :2] = agree[2:, 2:] = True
+    np.fill_diagonal(agree, False)
+    np.testing.assert_array_equal(largest(agree, np.array([2.0, 2.0, 1.0, 1.0, 1.0])), [0, 1])
