@@ -44,7 +44,7 @@ ENCODERS = Encoders(
     slip_m=0.006,
 )  # fmt: skip
 #: furniture of the robot's size among other, in a hall; beside it another room, not quite as large,
-#: or it would be taken for the same
+#: or nothing could tell them apart
 HALL = Things(
     walls=(
         Wall("hall", ((-8.0, -6.0), (8.0, -6.0), (8.0, 6.0), (-8.0, 6.0)), True),
@@ -135,7 +135,6 @@ def test_a_robot_is_found_as_well_as_stated(tmp_path):
         e, P = off(found, "b", robots)
         d2.append(float(e @ np.linalg.solve(P, e)))
         # the given start's heading at 7 m is 0.2 m of it
-        print(seed, e, np.sqrt(np.diag(P)), d2[-1])
         assert np.sqrt(P[2, 2]) < 0.1
     assert 4.9 < sum(d2) < 42.3  # chi-square, 18 degrees of freedom
 
