@@ -140,23 +140,21 @@ def test_a_robot_is_found_as_well_as_stated(tmp_path):
 
 
 def test_a_found_start_costs_nothing_against_a_known_one(tmp_path):
-    """Clocks 0.4 s apart, two seeds together, as the map is aligned: within a tenth."""
-    squares = np.zeros(2)
+    """Clocks 0.4 s apart, as the map is aligned: within a tenth. Seeds differ by a hundredth."""
     few = replace(LASER, period_s=0.5, step_deg=1.0)
     robots = {"a": replace(A, laser=few), "b": replace(B, laser=few, clock=Clock(offset_s=0.4))}
-    for seed in range(2):
-        log = recorded(tmp_path, robots, seed)
-        truth = read_truth([log], load_config()).trajectories
-        for k, known in enumerate((("a", "b"), ("a",))):
-            config = settings(robots, known, ["b"])
-            result = smooth(open_logs([log], config), config)
-            error = evaluate(result, truth)["joint"]["final"]["ate_aligned_rmse_m"]
-            squares[k] += error**2
-            clock = result.summary["clocks"]["b"]
-            assert abs(clock["offset_s"] - 0.4) < 4 * clock["offset_sigma_s"] < 0.1
-        assert set(result.summary["starts_found"]) == {"b"}
-        assert not [w for w in result.summary["warnings"] if "frame of its own" in w]
-    assert squares[1] < 1.1**2 * squares[0]
+    log = recorded(tmp_path, robots)
+    truth = read_truth([log], load_config()).trajectories
+    errors = []
+    for known in (("a", "b"), ("a",)):
+        config = settings(robots, known, ["b"])
+        result = smooth(open_logs([log], config), config)
+        errors.append(evaluate(result, truth)["joint"]["final"]["ate_aligned_rmse_m"])
+        clock = result.summary["clocks"]["b"]
+        assert abs(clock["offset_s"] - 0.4) < 4 * clock["offset_sigma_s"] < 0.1
+    assert set(result.summary["starts_found"]) == {"b"}
+    assert not [w for w in result.summary["warnings"] if "frame of its own" in w]
+    assert errors[1] < 1.1 * errors[0]
 
 
 def test_the_observer_may_be_the_one_to_be_found(tmp_path):
