@@ -29,12 +29,13 @@ from real_logs import DATA, LOGS, command, smooth
 from graphslam.config import Config
 from graphslam.evaluate import Relations, read_relations, relation_errors
 from graphslam.geometry import between
-from graphslam.joining import Joined, Relation
+from graphslam.joining import Joined
 from graphslam.logs import open_logs
 from graphslam.pipeline import Known, Pipeline
 from graphslam.placing import surroundings, views_after
 from graphslam.recorded import recorded_in
 from graphslam.records import Message, OdometryPose, Trajectory
+from graphslam.relating import Relation
 from graphslam.results import load
 from graphslam.shared_places import relate_places
 from graphslam.starts import origin, start_poses

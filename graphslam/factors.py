@@ -39,9 +39,14 @@ def landmark_key(landmark: int) -> int:
     return FIRST_LANDMARK | landmark
 
 
+def is_state(key: int) -> bool:
+    """Whether a key is that of a state; that of a landmark else."""
+    return key >= FIRST_STATE
+
+
 def number_of(key: int) -> tuple[int | None, int]:
     """Whose state a key is (index of the robot) and which, or None and the landmark's number."""
-    if key < FIRST_STATE:
+    if not is_state(key):
         return None, key - FIRST_LANDMARK
     return divmod(key - FIRST_STATE, 1 << 40)
 

@@ -27,12 +27,11 @@ from graphslam.config import FrontEndConfig
 from graphslam.dead_reckoning import Track
 from graphslam.frontend.robots import FEWEST, expected_ranges, reach
 from graphslam.frontend.sweep import Sweep
-from graphslam.gaussian import chi2_quantile
 from graphslam.geometry import Array, between, compose, wrap
-from graphslam.joining import FIT, MAX_TURN_SIGMA_RAD, RIVAL, Relation, View
 from graphslam.readings import IntArray
 from graphslam.records import Scan, Sighting
 from graphslam.registering import began_at
+from graphslam.relating import MAX_TURN_SIGMA_RAD, RIVAL, Relation, View, differ
 from graphslam.supposing import (
     SURE_M,
     Path,
@@ -118,6 +117,11 @@ class Found:
             and self.own_m >= OWN_M
             and self.turn_sigma <= MAX_TURN_SIGMA_RAD
         )
+
+    def differs(self, other: "Found") -> bool:
+        """Whether two places are not one."""
+        one, two = self.relation, other.relation
+        return differ(one.pose, one.cov, two.pose, two.cov)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -233,8 +237,8 @@ class _Look:
         best = min(
             (f for f in told if f.support >= enough), key=lambda f: float(f.relation.cov[2, 2])
         )
-        best = self._united(best, [f for f in told if f is not best and not _differ(best, f)])
-        if any(f.support > RIVAL * best.support and _differ(best, f) for f in looked):
+        best = self._united(best, [f for f in told if f is not best and not best.differs(f)])
+        if any(f.support > RIVAL * best.support and best.differs(f) for f in looked):
             return f"{what} may be {self.name} in two ways"
         return best
 
@@ -348,14 +352,6 @@ def _own_m(q: Array, times_ns: IntArray) -> float:
     A = np.column_stack([np.ones_like(t), t])
     off = q - A @ np.linalg.lstsq(A, q, rcond=None)[0]
     return float(np.sqrt(np.mean((off**2).sum(axis=1))))
-
-
-def _differ(best: Found, other: Found) -> bool:
-    """Whether two places are not one, by more than their covariances allow."""
-    off = other.relation.pose - best.relation.pose
-    off[2] = wrap(off[2])
-    S = best.relation.cov + other.relation.cov
-    return bool(off @ np.linalg.solve(S, off) > chi2_quantile(FIT, 3))
 
 
 __all__ = ["Kept", "Looked", "meet", "shows"]

@@ -1,8 +1,7 @@
 """Duplicates in a map: which landmarks are one and the same, and what that makes of the steps.
 
 A wall or a tree that was not recognised when it was seen again is in the map twice. With all data
-in,
-the joint covariance of the whole map says how far two landmarks may lie apart if they are one.
+in, the joint covariance of the whole map says how far two landmarks may lie apart if they are one.
 Pairs are tied one after another, the most certain first, and every tie conditions the joint: what
 agrees with one tie must agree with the next. What one image showed as two things is never tied.
 """
@@ -86,22 +85,22 @@ def duplicates(
     """
     if len(entries) < 2:
         return []
-    walls = _map(entries, *_padded(joint), together)
-    i, j = _near(walls)
+    marks = _map(entries, *_padded(joint), together)
+    i, j = _near(marks)
     found: list[tuple[int, int]] = []
     while len(i):
-        r, H_i, H_j, rows = _compare(walls, i, j)
-        d2 = _distances(walls, i, j, r, H_i, H_j)
+        r, H_i, H_j, rows = _compare(marks, i, j)
+        d2 = _distances(marks, i, j, r, H_i, H_j)
         # what is out of its gate may come back in when a tie has moved the map
         fits = d2 <= chi2_quantile(GATE_PROBABILITY, rows)
-        k = _next_tie(walls, i, j, d2, fits)
+        k = _next_tie(marks, i, j, d2, fits)
         if k is None:
             break
         a, b = int(i[k]), int(j[k])
         found.append((entries[a].id, entries[b].id))
-        _tie(walls, a, b, r[k, : rows[k]], H_i[k, : rows[k]], H_j[k, : rows[k]])
-        walls.group[walls.group == walls.group[b]] = walls.group[a]
-        open_still = walls.group[i] != walls.group[j]
+        _tie(marks, a, b, r[k, : rows[k]], H_i[k, : rows[k]], H_j[k, : rows[k]])
+        marks.group[marks.group == marks.group[b]] = marks.group[a]
+        open_still = marks.group[i] != marks.group[j]
         i, j = i[open_still], j[open_still]
     return [(min(pair), max(pair)) for pair in found]
 
@@ -139,45 +138,45 @@ def _map(entries: Sequence[Entry], x: Array, P: Array, together: Iterable[frozen
     )
 
 
-def _near(walls: _Map) -> tuple[IntArray, IntArray]:
+def _near(marks: _Map) -> tuple[IntArray, IntArray]:
     """Pairs (m,) and (m,) that may be one landmark, as far as means and extents can tell."""
-    i, j = np.triu_indices(len(walls.x), 1)
-    points = walls.point[i]
-    near = (points == walls.point[j]) & ~walls.apart[i, j]
-    near[points] &= np.hypot(*(walls.x[j] - walls.x[i])[points, :2].T) < REACH_M
-    near[~points] &= _beside(walls, i[~points], j[~points])
+    i, j = np.triu_indices(len(marks.x), 1)
+    points = marks.point[i]
+    near = (points == marks.point[j]) & ~marks.apart[i, j]
+    near[points] &= np.hypot(*(marks.x[j] - marks.x[i])[points, :2].T) < REACH_M
+    near[~points] &= _beside(marks, i[~points], j[~points])
     return i[near], j[near]
 
 
-def _next_tie(walls: _Map, i: IntArray, j: IntArray, d2: Array, fits: BoolArray) -> int | None:
+def _next_tie(marks: _Map, i: IntArray, j: IntArray, d2: Array, fits: BoolArray) -> int | None:
     """The most certain pair that nothing contradicts, None when there is none."""
     order = np.flatnonzero(fits)
     for k in order[np.argsort(d2[order])]:
         a, b = int(i[k]), int(j[k])
-        if walls.contradict(a, b):
+        if marks.contradict(a, b):
             continue
-        tied = (walls.group == walls.group[a]) | (walls.group == walls.group[b])
+        tied = (marks.group == marks.group[a]) | (marks.group == marks.group[b])
         rival = fits & (tied[i] != tied[j]) & (d2 <= d2[k] + RIVAL)
         outside = np.where(tied[i[rival]], j[rival], i[rival])
-        if not any(walls.apart[walls.group == walls.group[o]][:, tied].any() for o in outside):
+        if not any(marks.apart[marks.group == marks.group[o]][:, tied].any() for o in outside):
             return int(k)
     return None
 
 
-def _relative(walls: _Map, i: IntArray, j: IntArray) -> tuple[Array, Array, Array, Array]:
+def _relative(marks: _Map, i: IntArray, j: IntArray) -> tuple[Array, Array, Array, Array]:
     """Wall j in the frame of wall i, (m,) each: along, across, turn; middle of the overlap."""
-    x, y = walls.x[i], walls.x[j]
+    x, y = marks.x[i], marks.x[j]
     c, s, d = np.cos(x[:, 2]), np.sin(x[:, 2]), y[:, :2] - x[:, :2]
     along, across = c * d[:, 0] + s * d[:, 1], -s * d[:, 0] + c * d[:, 1]
-    low = np.maximum(walls.extents[i, 0], along + walls.extents[j, 0])
-    high = np.minimum(walls.extents[i, 1], along + walls.extents[j, 1])
+    low = np.maximum(marks.extents[i, 0], along + marks.extents[j, 0])
+    high = np.minimum(marks.extents[i, 1], along + marks.extents[j, 1])
     return along, across, wrap(y[:, 2] - x[:, 2]), 0.5 * (low + high)
 
 
-def _beside(walls: _Map, i: IntArray, j: IntArray) -> BoolArray:
+def _beside(marks: _Map, i: IntArray, j: IntArray) -> BoolArray:
     """Which pairs (m,) are near, about parallel, and share much of their length."""
-    along, across, turn, middle = _relative(walls, i, j)
-    a, b = walls.extents[i], walls.extents[j] + along[:, None]
+    along, across, turn, middle = _relative(marks, i, j)
+    a, b = marks.extents[i], marks.extents[j] + along[:, None]
     shared = np.minimum(a[:, 1], b[:, 1]) - np.maximum(a[:, 0], b[:, 0])
     shorter = np.minimum(a[:, 1] - a[:, 0], b[:, 1] - b[:, 0])
     off = across + (middle - along) * turn
@@ -185,16 +184,16 @@ def _beside(walls: _Map, i: IntArray, j: IntArray) -> BoolArray:
     return np.asarray(near & (shared >= OVERLAP_SHARE * shorter))
 
 
-def _compare(walls: _Map, i: IntArray, j: IntArray) -> tuple[Array, Array, Array, IntArray]:
-    """How pairs (m,) differ, with Jacobians (m, 3, 3) by either wall, and how many rows count.
+def _compare(marks: _Map, i: IntArray, j: IntArray) -> tuple[Array, Array, Array, IntArray]:
+    """How pairs (m,) differ, with Jacobians (m, 3, 3) by either one, and how many rows count.
 
     Rows: distance across where both are, direction, and for whole walls where their middles are;
     of points along x and y.
     """
-    along, across, turn, middle = _relative(walls, i, j)
-    c, s = np.cos(walls.x[i, 2]), np.sin(walls.x[i, 2])
+    along, across, turn, middle = _relative(marks, i, j)
+    c, s = np.cos(marks.x[i, 2]), np.sin(marks.x[i, 2])
     zero, one, arm = np.zeros(len(i)), np.ones(len(i)), middle - along
-    ends = along + walls.extents[j].mean(axis=1) - walls.extents[i].mean(axis=1)
+    ends = along + marks.extents[j].mean(axis=1) - marks.extents[i].mean(axis=1)
     r = np.stack([across + arm * turn, turn, ends], axis=1)
 
     def rows_of(*rows: Sequence[Array]) -> Array:
@@ -206,11 +205,11 @@ def _compare(walls: _Map, i: IntArray, j: IntArray) -> tuple[Array, Array, Array
         [-c, -s, across],
     )
     H_j = rows_of([-s - turn * c, c - turn * s, arm], [zero, zero, one], [c, s, zero])
-    unknown = ~(walls.whole[i] & walls.whole[j])
+    unknown = ~(marks.whole[i] & marks.whole[j])
     r[unknown, 2] = 0.0  # a row of zeros says nothing
     H_i[unknown, 2] = H_j[unknown, 2] = 0.0
-    points = walls.point[i]
-    r[points, :2] = (walls.x[j] - walls.x[i])[points, :2]
+    points = marks.point[i]
+    r[points, :2] = (marks.x[j] - marks.x[i])[points, :2]
     H_i[points], H_j[points] = np.diag([-1.0, -1.0, 0.0]), np.diag([1.0, 1.0, 0.0])
     return r, H_i, H_j, np.where(unknown, 2, 3)
 
@@ -222,23 +221,23 @@ _FLOORS = np.array([
 ])  # fmt: skip
 
 
-def _distances(walls: _Map, i: IntArray, j: IntArray, r: Array, H_i: Array, H_j: Array) -> Array:
+def _distances(marks: _Map, i: IntArray, j: IntArray, r: Array, H_i: Array, H_j: Array) -> Array:
     """Squared Mahalanobis distances (m,), over the rows that count."""
-    P, floor = walls.P, _FLOORS[walls.point[i].astype(np.intp)]
+    P, floor = marks.P, _FLOORS[marks.point[i].astype(np.intp)]
     blocks = P.reshape(len(P) // 3, 3, -1, 3).transpose(0, 2, 1, 3)
     cross = H_i @ blocks[i, j] @ H_j.mT
     S = H_i @ blocks[i, i] @ H_i.mT + H_j @ blocks[j, j] @ H_j.mT + cross + cross.mT + floor
     return np.asarray(np.sum(r * np.linalg.solve(S, r[..., None])[..., 0], axis=1))
 
 
-def _tie(walls: _Map, a: int, b: int, r: Array, H_a: Array, H_b: Array) -> None:
+def _tie(marks: _Map, a: int, b: int, r: Array, H_a: Array, H_b: Array) -> None:
     """Condition the joint on two landmarks being one: a Kalman update, ``r`` (k,) measured 0."""
-    P, floor = walls.P, _FLOORS[int(walls.point[a])]
+    P, floor = marks.P, _FLOORS[int(marks.point[a])]
     PHt = P[:, 3 * a : 3 * a + 3] @ H_a.T + P[:, 3 * b : 3 * b + 3] @ H_b.T
     S = H_a @ PHt[3 * a : 3 * a + 3] + H_b @ PHt[3 * b : 3 * b + 3] + floor[: len(r), : len(r)]
     L = np.linalg.cholesky(S)
     B = np.linalg.solve(L, PHt.T)
-    walls.x -= (B.T @ np.linalg.solve(L, r)).reshape(-1, 3)
+    marks.x -= (B.T @ np.linalg.solve(L, r)).reshape(-1, 3)
     P -= B.T @ B
 
 

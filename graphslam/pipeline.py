@@ -100,7 +100,7 @@ class Pipeline:
         }
         self.starts, self.frames = known.joined.starts, Frames(known.joined)
         self.meetings: list[Sighting] = []  # of robots in frames that nothing relates
-        self.kept: Kept | None = None  # scans in which these are looked for afterwards
+        self.kept = Kept({}, {})  # scans in which these are looked for afterwards
         self.watcher = Watcher(
             self.backend, self.runs, outlines(log, config), config.front_end, CLOCK_DOUBT_S
         )
@@ -265,8 +265,7 @@ class Pipeline:
         self.counts["scans"] += isinstance(first, Scan)
         used = self.is_used(event)
         if isinstance(first, Scan):
-            if self.kept is not None:
-                self.kept.note(first)
+            self.kept.note(first)
             event = self.watcher.look(first, used, self.has_started)
             if self.config.association.robots == "ignore":
                 event = [m for m in event if isinstance(m, Scan)]

@@ -17,13 +17,14 @@ from graphslam.closing import places
 from graphslam.config import BackendConfig, Config
 from graphslam.frames import without_mark
 from graphslam.geometry import Array
-from graphslam.joining import Joined, Relation, View, join
+from graphslam.joining import Joined, join
 from graphslam.log_settings import outlines
 from graphslam.logs import LogSet
 from graphslam.meeting import Kept, Looked, meet
 from graphslam.pipeline import CLOCK_DOUBT_S, Known, Pipeline
 from graphslam.recorded import Recorded, recorded_in
 from graphslam.records import Scan, Sighting, Start, Trajectory
+from graphslam.relating import Relation, View
 from graphslam.starts import origin, start_poses
 from graphslam.unnamed import Surroundings, related
 

@@ -27,6 +27,7 @@ from graphslam.dead_reckoning import Track
 from graphslam.gaussian import chi2_quantile
 from graphslam.geometry import Array, adjoint, between, compose, inverse, log, rotate_cov
 from graphslam.records import Closure, Estimate, Motion, RelativePose, Start, Step, Trajectory
+from graphslam.relating import largest
 
 #: probability up to which two closures agree, and up to which one fits what all the others say:
 #: a true one is lost as rarely as that, and false ones miss by far more
@@ -107,9 +108,10 @@ def verify(
             chunk = numbers[part : part + CHUNK]
             E, agree = _loops([messages[k] for k in chunk], odometry)
             frames_seen.update(zip(chunk, E, strict=True))
-            best = largest(agree)
+            worth = np.ones(len(chunk), dtype=np.float32)
+            best = largest(agree, worth)
             rest = np.setdiff1d(np.arange(len(chunk)), best)
-            rival = largest(agree[np.ix_(rest, rest)])
+            rival = largest(agree[np.ix_(rest, rest)], worth[rest])
             sets[pair] = sets.get(pair, []) + [chunk[n] for n in best]
             if len(rival) <= RIVAL * len(best):
                 clear.add(pair)
@@ -220,27 +222,6 @@ def _loops(messages: Sequence[RelativePose], odometry: Mapping[str, _Chain]) -> 
     agree &= agree.T
     np.fill_diagonal(agree, False)
     return E, agree
-
-
-def largest(agree: Array) -> list[int]:
-    """Largest set found of which all agree in pairs: greedily, from each that might have a larger.
-
-    Args:
-        agree: (n, n) bool, symmetric, False on the diagonal.
-    """
-    best: list[int] = []
-    links, degree = agree.astype(np.float32), agree.sum(axis=1)
-    for first in np.argsort(-degree, kind="stable"):
-        if degree[first] < len(best):
-            break
-        chosen, free = [int(first)], agree[first].copy()
-        while free.any() and len(chosen) + free.sum() > len(best):
-            k = int(np.where(free, links @ free, -1.0).argmax())
-            chosen.append(k)
-            free &= agree[k]
-        if len(chosen) > len(best):
-            best = chosen
-    return sorted(best)
 
 
 # ---------------------------------------------------------------- frames

@@ -14,9 +14,9 @@ from scipy.linalg import cho_factor, cho_solve
 
 from graphslam.gaussian import chi2_quantile
 from graphslam.geometry import Array, compose, rotation, rotation3, wrap
-from graphslam.joining import FIT, View, drift
 from graphslam.readings import IntArray
 from graphslam.records import Sighting
+from graphslam.relating import FIT, View, drift
 
 #: Gauss-Newton steps
 STEPS = 6

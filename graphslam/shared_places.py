@@ -20,8 +20,8 @@ from scipy import fft
 from graphslam.closing import NEAR_M, TRUST, Place, missed, verified
 from graphslam.gaussian import chi2_quantile
 from graphslam.geometry import Array, between, compose, inverse, rotation3, transform, wrap
-from graphslam.joining import Relation, largest
 from graphslam.matching import ABSENT_M, IntArray, Match, match
+from graphslam.relating import Relation, largest
 
 #: m, rad: steps of the search; of what was looked through, only so near a laser, m
 STEP_M, STEP_RAD, CLEAR_M = 0.3, np.radians(2.5), 12.0

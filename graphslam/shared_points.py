@@ -18,8 +18,8 @@ from scipy.special import pdtrc
 from graphslam.config import AssociationConfig
 from graphslam.gaussian import chi2_quantile
 from graphslam.geometry import Array, between, transform, wrap
-from graphslam.joining import MAX_TURN_SIGMA_RAD, Relation, registered
 from graphslam.matching import IntArray
+from graphslam.relating import MAX_TURN_SIGMA_RAD, Relation, registered
 
 #: each point makes pairs with so many nearest ones
 NEIGHBOURS = 8

@@ -7,7 +7,7 @@ of it is not. Over each stretch of the robot's way, two supposed sightings that 
 odometry says put the whole stretch on the observer's map. The places that most others confirm are
 followed as far as both robots' estimates lead, for several differences of their clocks.
 
-A rigid move keeps distances: see `joining`, whose search for a largest set this replaces where
+A rigid move keeps distances: see `relating`, whose search for a largest set this replaces where
 nearly all pairs are false, by votes over short stretches.
 """
 
@@ -21,9 +21,9 @@ from graphslam.frontend.moving import stood_there
 from graphslam.frontend.robots import FEWEST, centres, clusters, reach
 from graphslam.frontend.sweep import Sweep, make_sweep
 from graphslam.geometry import Array, between, compose, inverse, rotation, transform
-from graphslam.joining import View, registered
 from graphslam.readings import IntArray
 from graphslam.records import Scan
+from graphslam.relating import View, registered
 from graphslam.watching import MARGIN_M
 
 #: of an outline's least width, at least seen

@@ -10,7 +10,7 @@ from itertools import combinations
 from graphslam.closing import Place
 from graphslam.config import AssociationConfig
 from graphslam.geometry import Array
-from graphslam.joining import Relation
+from graphslam.relating import Relation
 from graphslam.shared_places import relate_places
 from graphslam.shared_points import relate_points
 

@@ -205,6 +205,12 @@ def _without(scan: Scan, sweep: Sweep, gone: Flags) -> Scan:
     return replace(scan, ranges=ranges)
 
 
+def _still(scan: Scan, sweep: Sweep, views: Sequence[tuple[int, View]]) -> Scan:
+    """The scan, of which ``sweep`` is made, without things that move."""
+    gone = moving(sweep, [view for _, view in views[-EARLIER:]])
+    return _without(scan, sweep, gone) if gone.any() else scan
+
+
 class Watcher:
     """Looks at every scan for the other robots, and for what moves.
 
@@ -268,7 +274,9 @@ class Watcher:
         self._count("robot", scan, found.scan)
         if self._config.moving == "keep":
             return (found.scan, *found.sightings)
-        still = self._still(found.scan, views)
+        if found.scan is not scan:
+            sweep = make_sweep(found.scan, self._config.max_range_m)
+        still = _still(found.scan, sweep, views)
         self._count("thing that moves", found.scan, still)
         return (still, *found.sightings)
 
@@ -318,9 +326,3 @@ class Watcher:
         """Motion since the robot's latest state."""
         run = self._runs[robot]
         return run.track.motion(run.state_ns, time_ns) if time_ns > run.state_ns else None
-
-    def _still(self, scan: Scan, views: Sequence[tuple[int, View]]) -> Scan:
-        """The scan without things that move."""
-        sweep = make_sweep(scan, self._config.max_range_m)
-        gone = moving(sweep, [view for _, view in views[-EARLIER:]])
-        return _without(scan, sweep, gone) if gone.any() else scan

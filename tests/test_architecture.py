@@ -27,7 +27,7 @@ ROWS = (
     ("readings",),  # what odometry says by itself
     # one job each, on records and arrays
     ("association", "calibration", "dead_reckoning", "export", "factors", "frontend", "logs"),
-    ("matching",),  # where a place was seen from
+    ("matching", "relating"),  # where a place was seen from; how two robots' frames relate
     ("scan_motion",),  # what scans say of a motion
     # estimators; what is set for a log's robots; order in time; poses at any time; worlds and their
     # logs

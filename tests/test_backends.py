@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 import pytest
 
@@ -9,6 +10,7 @@ from graphslam.backends import BACKENDS
 from graphslam.backends.base import StateTable, block_slices
 from graphslam.config import BackendConfig, Config, RobustConfig
 from graphslam.errors import EstimationError
+from graphslam.factors import landmark_key
 from graphslam.geometry import (
     between,
     compose,
@@ -588,6 +590,22 @@ def test_indeterminate_landmark_is_named(name, when):
         backend.add(Step(0, associations=(point,)))
         backend.joint("r", [7]) if when == "joint" else backend.finish()
     assert "Symbol" not in str(error.value)
+
+
+@pytest.mark.parametrize("key", ["b", 2])
+def test_what_gtsam_complains_about_is_said_in_terms_of_the_log(scenario, key):
+    """A state of the second robot, of whose key GTSAM prints only the first digits; a landmark."""
+    builder = run("batch", scenario[0]).builder
+    at = builder.state_key("b", 3) if key == "b" else landmark_key(2)
+    unknown, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    nothing = gtsam.noiseModel.Gaussian.SqrtInformation(np.zeros((3, 3)), False)
+    unknown.add(gtsam.PriorFactorPose2(at, gtsam.Pose2(), nothing))
+    values.insert(at, gtsam.Pose2())
+    with pytest.raises(RuntimeError, match="Symbol") as error:
+        gtsam.Marginals(unknown, values).marginalCovariance(at)
+    said = {"b": "at robot b at 3 ns", 2: "at landmark 2, seen from robot a at 1 ns"}
+    assert said[key] in str(builder.explain(error.value))
+    assert "some variable" in str(builder.explain(RuntimeError("out of memory")))
 
 
 @pytest.mark.parametrize("name", [*SMOOTHERS, *HORIZONS])

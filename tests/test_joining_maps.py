@@ -14,11 +14,12 @@ from graphslam.closing import Place
 from graphslam.config import AssociationConfig, load_config
 from graphslam.evaluate import evaluate
 from graphslam.geometry import between, compose, inverse, transform, wrap
-from graphslam.joining import Relation, join
+from graphslam.joining import join
 from graphslam.logs import open_logs, read_truth
 from graphslam.matching import Match, make_submap
 from graphslam.records import Start
-from graphslam.shared_places import Meeting, decided, elsewhere
+from graphslam.relating import Relation
+from graphslam.shared_places import Meeting, decided, elsewhere, relate_places
 from graphslam.shared_points import relate_points
 from graphslam.simulate import load_scenario, simulate
 from graphslam.simulate.spec import Box, Leg, Things, Wall
@@ -305,26 +306,50 @@ def test_what_has_names_and_what_has_none_may_contradict():
     assert "contradicts itself" in joined.undecided["b"]
 
 
-@pytest.mark.parametrize(("niche_m", "clear"), [(0.0, False), (4.0, True)])
-def test_a_hall_that_looks_the_same_the_other_way_round_is_undecided(niche_m, clear):
-    """A plain rectangle lies as well turned by half a turn, one with a niche does not."""
-    x, y = np.arange(-8.0, 8.0, 0.05), np.arange(-6.0, 6.0, 0.05)
-    sides = [(x, 6.0 + 0 * x), (x, -6.0 - niche_m * (x > 2.0)), (-8.0 + 0 * y, y), (8.0 + 0 * y, y)]
+def in_hall(niche_m, length_m, at, start=(0.0, 0.0, 0.0)):
+    """Places at x = ``at`` in a hall 12 m wide, as a robot has them that began at ``start`` (3,).
+
+    A niche in its right half is ``niche_m`` deep. Every place shows all of the hall.
+    """
+    half = length_m / 2
+    x, y = np.arange(-half, half, 0.05), np.arange(-6.0, 6.0, 0.05)
+    niche = -6.0 - niche_m * (x > 0.25 * half)
+    sides = [(x, 6.0 + 0 * x), (x, niche), (-half + 0 * y, y), (half + 0 * y, y)]
     outline = np.concatenate([np.column_stack(side) for side in sides])
+    found = []
+    for k, place in enumerate(at):
+        pose = np.array([place, 0.9, 0.3])
+        submap = make_submap(np.zeros((1, 3)), [transform(inverse(pose), outline)])
+        own = compose(inverse(np.array(start)), pose)
+        found.append(Place(("r", k), own, place - at[0], (k, k), submap))
+    return found
 
-    def places(start):
-        poses = [np.array([at, 1.0, 0.3]) for at in (-4.0, -1.0, 2.0, 5.0)]
-        clouds = [transform(inverse(pose), outline) for pose in poses]
-        submaps = [make_submap(np.zeros((1, 3)), [cloud]) for cloud in clouds]
-        return [
-            Place(("r", k), compose(inverse(start), pose), 3.0 * k, (k, k), submap)
-            for k, (pose, submap) in enumerate(zip(poses, submaps, strict=True))
-        ]
 
-    start = np.array([3.0, -2.0, 0.8])
-    others = elsewhere(start, places(np.zeros(3)), places(start))
+START = np.array([3.0, -2.0, 0.8])
+
+
+@pytest.mark.parametrize(("niche_m", "clear"), [(0.0, False), (4.0, True)])
+def test_a_plain_hall_lies_as_well_the_other_way_round(niche_m, clear):
+    """Turned by half a turn; one with a niche does not."""
+    at = (-4.0, -1.0, 2.0, 5.0)
+    others = elsewhere(START, in_hall(niche_m, 16.0, at), in_hall(niche_m, 16.0, at, START))
     assert (not others) == clear
     if not clear:
         # turned about the middle of the hall; the search's cells are 0.3 m and 2.5 degrees
-        half = compose(np.array([0.0, 0.0, np.pi]), start)
+        half = compose(np.array([0.0, 0.0, np.pi]), START)
         np.testing.assert_allclose(between(half, others[0]), 0.0, atol=0.3)
+
+
+@pytest.mark.parametrize(("niche_m", "joined"), [(0.0, False), (4.0, True)])
+def test_robots_that_saw_a_plain_hall_are_not_joined(niche_m, joined):
+    """Both drove from its middle to its end, so only one of five places was seen the other way
+    round as well: that is no second meaning, but neither does anything contradict it."""
+    at = (0.0, 2.5, 5.0, 7.5, 10.0)
+    here, there = in_hall(niche_m, 28.0, at), in_hall(niche_m, 28.0, at, START)
+    P = np.kron(np.eye(len(at)), np.diag([0.02, 0.02, 0.005]) ** 2)
+    relation = relate_places("a", "b", here, there, P, P)
+    assert isinstance(relation, Relation) == joined
+    if joined:
+        np.testing.assert_allclose(between(START, relation.pose), 0.0, atol=0.05)
+    else:
+        assert "in another way" in relation

@@ -599,13 +599,13 @@ def test_filter_approaches_batch_with_the_square_of_the_noise(monkeypatch, name,
 
 
 def test_distance_to_batch_falls_as_the_horizon_grows():
-    """Mean over 16 seeds, horizons of 0 to 20 of 40 s and all. Each is the mean of as many runs
+    """Mean over 10 seeds, horizons of 0 to 20 of 40 s and all. Each is the mean of as many runs
     whose spread is as large as the mean, so one may exceed the one before by the standard error
     of their difference over the same seeds. From 0 to the shortest window is a jump: a filter
     linearises each factor where the estimate happens to be, a window keeps one place per variable
     and so never thinks that it knows how the whole map is turned."""
     horizons = (0.0, 0.5, *HORIZONS_S[1:])
-    apart = np.empty((16, len(horizons)))
+    apart = np.empty((10, len(horizons)))
     for seed in range(len(apart)):
         steps = drive(seed, 0.5, steps=40)
         batch = run(steps, "batch").estimate

@@ -162,7 +162,7 @@ def test_a_name_stays_with_what_an_older_unnamed_landmark_becomes():
 
 
 def test_a_point_is_no_wall():
-    entries = [entry(0), replace(entry(1, "point"))]
+    entries = [entry(0), entry(1, "point")]
     joint = joint_of([np.zeros(3), np.zeros(3)], 1e-2 * np.eye(6))
     assert duplicates(entries, joint, []) == []
 

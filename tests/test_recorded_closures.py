@@ -9,7 +9,7 @@ import pytest
 from graphslam.config import BackendConfig, Config, StartConfig
 from graphslam.geometry import between, compose
 from graphslam.logs import IMPORTERS, open_logs, pose_stamp_ns
-from graphslam.recorded_closures import UNLIKE, largest
+from graphslam.recorded_closures import UNLIKE
 from graphslam.slam import smooth
 
 DEFAULTS = Config()
@@ -164,13 +164,3 @@ def test_two_stories_of_the_same_size_place_nobody(seed, tmp_path):
     assert any("frame of its own" in warning for warning in result.summary["warnings"])
     assert ends(graph.false) | ends(between_robots[:9]) <= refused(result)
     np.testing.assert_allclose(result.robots["robot2"].final.poses[0], 0.0, atol=1e-3)
-
-
-def test_the_largest_set_that_agrees_in_pairs():
-    """Of two sets the larger one, though what has most links leads to the other."""
-    agree = np.zeros((11, 11), dtype=bool)
-    agree[:4, :4] = agree[4:10, 4:10] = True
-    agree[10, :7] = agree[:7, 10] = True
-    np.fill_diagonal(agree, False)
-    assert largest(agree) == [4, 5, 6, 7, 8, 9]
-    assert largest(np.zeros((0, 0), dtype=bool)) == []

@@ -146,7 +146,7 @@ def _stretches(
             key = root[key]
         return key
 
-    inner = [[k for k in m.keys() if _is_state(k) and k not in shared] for m in unsent]  # noqa: SIM118
+    inner = [[k for k in m.keys() if factors.is_state(k) and k not in shared] for m in unsent]  # noqa: SIM118
     for keys in inner:
         for key in keys:
             root.setdefault(key, key)
@@ -186,10 +186,6 @@ def _condensed(
         dim = sum(dims[key] for key in keys)
         size += NAME * len(keys) + NUMBER * (dim * (dim + 1) // 2 + dim)
     return every, size
-
-
-def _is_state(key: int) -> bool:
-    return chr(gtsam.Symbol(key).chr()) == "x"
 
 
 class DecentralisedBackend(GraphBackend):
@@ -236,13 +232,13 @@ class DecentralisedBackend(GraphBackend):
     def _take(self, part: Part) -> None:
         """A part of a step, to the robot that measured it."""
         keys = list(dict.fromkeys(key for f in part.factors for key in f.keys()))  # noqa: SIM118
-        states = [key for key in keys if _is_state(key)]
+        states = [key for key in keys if factors.is_state(key)]
         key = part.observed[0] if part.observed else states[-1]
         member = self._member(key)
         size = _measured_bytes(part)
         member.measured += size
-        late = [k for k in states if _number(k) < self._member(k).frontier]
-        if len({_robot(k) for k in states}) > 1:
+        late = [k for k in states if factors.number_of(k)[1] < self._member(k).frontier]
+        if len({factors.number_of(k)[0] for k in states}) > 1:
             if late:
                 self.builder.skipped[KEPT] += 1
             else:
@@ -293,7 +289,8 @@ class DecentralisedBackend(GraphBackend):
 
     def _member(self, key: int) -> Member:
         """The robot whose state it is."""
-        index = _robot(key)
+        index, _ = factors.number_of(key)
+        assert index is not None  # a landmark is nobody's
         while len(self._members) <= index:
             name = self.builder.robots[len(self._members)]
             tree = gtsam.ISAM2(isam2_parameters(self._config, "QR"))
@@ -304,7 +301,7 @@ class DecentralisedBackend(GraphBackend):
 
     def value(self, key: int, dim: int) -> Array:
         """Of a state, what its robot thinks; of a landmark, whoever was asked last or knows it."""
-        if _is_state(key):
+        if factors.is_state(key):
             self._asked = self._member(key)
             return self._asked.value(key)
         return self._knowing(key).value(key)
@@ -322,10 +319,12 @@ class DecentralisedBackend(GraphBackend):
         """See `GraphBackend`; what the first one's robot does not know comes as independent."""
         member = self._member(keys[0])
         known = [key for key in keys if key in member.dims]
-        owner = [
-            member if key in known else self._member(key) if _is_state(key) else self._knowing(key)
+        others = {
+            key: self._member(key) if factors.is_state(key) else self._knowing(key)
             for key in keys
-        ]
+            if key not in known
+        }
+        owner = [others.get(key, member) for key in keys]
         ends = np.cumsum([m.dims[key] for m, key in zip(owner, keys, strict=True)])
         place = {
             key: np.arange(end - m.dims[key], end)
@@ -383,20 +382,12 @@ class DecentralisedBackend(GraphBackend):
                 raise self.builder.explain(problem) from problem
             member.isam = isam
             for key, dim in member.dims.items():
-                own = _is_state(key) and _robot(key) == n
-                if own or (not _is_state(key) and key not in means):
+                robot, _ = factors.number_of(key)
+                if robot == n or (robot is None and key not in means):
                     means[key] = read(values, key, dim)
                     covs[key] = self._marginal(member, [key])
             error = error if n else float(member.graph.error(values))
         return self._estimate(means, covs, error)
-
-
-def _robot(key: int) -> int:
-    return int(gtsam.Symbol(key).index() >> 40)
-
-
-def _number(key: int) -> int:
-    return int(gtsam.Symbol(key).index() & ((1 << 40) - 1))
 
 
 def _measured_bytes(part: Part) -> int:

@@ -90,7 +90,8 @@ class FactorEkfBackend(GraphBackend):
         """The state that leaves with this part: its robot has a next one and enough others."""
         if part.replaces is None:
             return None
-        index, number = divmod(gtsam.Symbol(part.replaces).index(), 1 << 40)
+        index, number = factors.number_of(part.replaces)
+        assert index is not None  # only states are replaced
         robot, oldest = self.builder.robots[index], number - self._kept
         self.builder.oldest[robot] = max(oldest + 1, 0)
         return self.builder.state_key(robot, oldest) if oldest >= 0 else None
@@ -98,10 +99,10 @@ class FactorEkfBackend(GraphBackend):
     def _enter(self, key: int, value: Array, replaces: int | None) -> None:
         """Make room for a variable: a robot's next state behind the one before."""
         write(self._values, key, value)
-        poses = sum(gtsam.Symbol(k).chr() == ord("x") for k in self._order)
+        poses = sum(map(factors.is_state, self._order))
         if replaces is not None:
             self._order.insert(self._order.index(replaces) + 1, key)
-        elif gtsam.Symbol(key).chr() == ord("x"):
+        elif factors.is_state(key):
             self._order.insert(poses, key)
         else:
             self._order.append(key)

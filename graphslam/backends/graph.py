@@ -206,15 +206,15 @@ class GraphBuilder:
 
     def explain(self, error: RuntimeError) -> EstimationError:
         """GTSAM's complaint about a variable, said in terms of the log."""
-        found = re.search(r"Symbol: ([xl])(\d+)", str(error))
-        where = "some variable"
-        if found and found[1] == "l":
-            where = self.landmark_name(int(found[2]))
-        elif found:
-            robot, number = divmod(int(found[2]), 1 << 40)
-            name = self.robots[robot]
-            where = f"robot {name} at {self.states.times[name][number]} ns"
-        return indeterminate(where)
+        # as a symbol only the first digits of a key are told
+        found = re.search(r"(\d+) \(Symbol: [xl]", str(error))
+        if not found:
+            return indeterminate("some variable")
+        robot, number = factors.number_of(int(found[1]))
+        if robot is None:
+            return indeterminate(self.landmark_name(number))
+        name = self.robots[robot]
+        return indeterminate(f"robot {name} at {self.states.times[name][number]} ns")
 
     def landmark_name(self, landmark: int) -> str:
         """A landmark, and who saw it first and when."""
