@@ -24,6 +24,7 @@ BOX = np.array([[2.8, -0.4], [3.2, -0.1]])
 
 @pytest.fixture(scope="module")
 def visits(tmp_path_factory):
+    """Every second scan of both: one for every 0.13 m that the robot drives."""
     folder, found = tmp_path_factory.mktemp("tinyslam"), []
     for name in ("exp1", "exp2"):
         source = DATA / f"tinyslam/{name}.dat.xz"
@@ -32,7 +33,8 @@ def visits(tmp_path_factory):
         IMPORTERS["tinyslam"](source, folder / f"{name}.mcap")
         result = smooth(open_logs([folder / f"{name}.mcap"], Config()), Config())
         save(result, Config(), folder / name, force=False)
-        found.append(load_visit(load(folder / name), folder / name))
+        visit = load_visit(load(folder / name), folder / name)
+        found.append(visit.chosen(np.arange(len(visit.poses)) % 2 == 0))
     return found
 
 
@@ -55,11 +57,14 @@ def with_box(visit, stamps_ns, poses):
 
 
 def test_two_real_visits_register_and_an_inserted_box_is_found(visits):
-    """A box of 40 x 30 cm that hides what is behind it; without it nothing is there."""
+    """A box of 40 x 30 cm that hides what is behind it; without it nothing is there.
+
+    Bars lie half way to what comes out where scans are laid on the map one by one but neither visit
+    is made straight before: 71 % of them fit, and maps disagree by 1.2 of what is stated."""
     reference, later = visits
     plain = compare(reference, later, ChangesConfig())
-    assert len(plain.later.poses) > 0.7 * len(later.poses)
-    assert plain.spread < 1.5  # the maps agree as far as is stated
+    assert len(plain.later.poses) > 0.85 * len(later.poses)  # measured: 0.98
+    assert plain.spread < 1.05  # measured: 0.86
     boxed = compare(
         reference, with_box(later, plain.later.stamps_ns, plain.later.poses), ChangesConfig()
     )
