@@ -100,7 +100,8 @@ class Active:
         before = len(self._cov)
         block = self._place(key, mean)
         H, b = self._rows(made_by)
-        noise = np.linalg.pinv(H[:, block])  # square, but for a line's empty row
+        J = H[:, block]  # square, but for a line's empty row
+        noise = np.linalg.solve(J.T @ J, J.T)
         G = -noise @ H[:, :before]
         self._z = np.append(self._z, noise @ (b - H[:, :before] @ self._z))
         GP = G @ self._cov
