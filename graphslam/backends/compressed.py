@@ -174,7 +174,11 @@ class CompressedBackend(Isam2Backend):
         if self._active is None or self._due() or not self._active.takes(parts):
             self._flush()
             return
-        self._active.take(parts)
+        try:
+            self._active.take(parts)
+        except np.linalg.LinAlgError:
+            self._flush()  # what is wrong the tree says by name
+            return
         for robot in step.motions:
             number = self._builder.states.latest(robot) - self._states
             before = self._builder.state_key(robot, number)
@@ -188,7 +192,7 @@ class CompressedBackend(Isam2Backend):
 
     def _use(self, keys: Iterable[int]) -> None:
         for key in keys:
-            if factors.number_of(key)[0] is None:
+            if not factors.is_state(key):
                 self._used.pop(key, None)
                 self._used[key] = None
 
@@ -218,6 +222,7 @@ class CompressedBackend(Isam2Backend):
 
     def _marginal(self, keys: list[int]) -> Active:
         """What the tree says of variables."""
+        self._settle()
         everywhere = self._isam.getLinearizationPoint()
         places = {key: read(everywhere, key, self._builder.dim(key)) for key in keys}
         z = self._isam.getDelta().vector(keys)
