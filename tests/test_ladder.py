@@ -486,9 +486,17 @@ def test_the_filter_in_front_of_the_tree_says_what_the_tree_says(kernel, late):
     np.testing.assert_allclose(*ends, atol=1e-6)
 
 
-def test_what_the_filter_cannot_take_goes_into_the_tree_at_once():
-    """A closure to a state that is no longer in use: the estimate follows it in the same step, as
-    the tree's does."""
+@pytest.mark.parametrize("why", ["not in use", "not positive definite"])
+def test_what_the_filter_cannot_take_goes_into_the_tree_at_once(why, monkeypatch):
+    """A closure to a state that is no longer in use, or arithmetic that breaks down: the estimate
+    follows the closure in the same step, as the tree's does."""
+    if why != "not in use":
+
+        def breaks(*_):
+            raise np.linalg.LinAlgError
+
+        monkeypatch.setattr(compressed.Active, "take", breaks)
+        monkeypatch.setattr(compressed.Active, "takes", lambda *_: True)
     once = replace(PLAIN.backend, relinearize_every=1000)
     config = Config(robust=PLAIN.robust, backend=once)
     both = isam2.Isam2Backend(config), compressed.CompressedBackend(config)
