@@ -462,7 +462,7 @@ def test_the_filter_in_front_of_the_tree_says_what_the_tree_says(kernel, late):
     tree, filtered = isam2.Isam2Backend(config), compressed.CompressedBackend(config)
     taken = []
     update = filtered._update
-    filtered._update = lambda parts: taken.append(len(parts)) or update(parts)
+    filtered._update = lambda parts, anew: taken.append(len(parts)) or update(parts, anew)
     steps = drive(5, horizon_of_sight_m=15.0)
     if late:  # every landmark's first sighting enters two steps later
         steps = promoted_late(steps, 2)

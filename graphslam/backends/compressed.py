@@ -201,7 +201,9 @@ class CompressedBackend(Isam2Backend):
         self._active = None
         if self._waiting:
             waiting, self._waiting = self._waiting, []
-            self._update(waiting)
+            self._update(waiting, False)
+            if self._due():
+                self._update((), True)  # a second time: by what has moved with what waited
 
     def covariance(self, keys: list[int]) -> Array:
         """See `GraphBackend`; what is asked for is in use from now on."""

@@ -165,26 +165,25 @@ class Isam2Backend(GraphBackend):
         self._settle()
         self._joints.clear()
         self._steps += 1
-        self._update(self._builder.expand(step, self.value))
+        self._update(self._builder.expand(step, self.value), self._due())
 
     def _due(self) -> bool:
         """Whether it is time to look for what is to be linearised anew."""
         every = self._config.backend.relinearize_every * (1 + self._steps // AS_LONG_AGAIN)
         return self._steps >= self._looked + every
 
-    def _update(self, parts: Iterable[Part]) -> None:
-        """Let the tree take in parts."""
+    def _update(self, parts: Iterable[Part], anew: bool) -> None:
+        """Let the tree take in parts; ``anew``: after linearising anew what has moved before."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for part in parts:
             if part.new is not None:
                 write(values, *part.new)
             for factor in part.factors:
                 graph.add(factor)
-        due = self._due()
-        if due:
+        if anew:
             self._looked = self._steps
         try:
-            self._isam.update(graph, values, [], None, None, None, due)
+            self._isam.update(graph, values, [], None, None, None, anew)
         except RuntimeError as error:
             self._use_qr(error)
 
