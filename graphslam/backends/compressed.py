@@ -167,7 +167,7 @@ class CompressedBackend(Isam2Backend):
         """See `Backend`."""
         self._joints.clear()
         self._settle()
-        parts = self._builder.expand(step, self._begin)
+        parts = self._builder.expand(step, self._nearly)
         self._steps += 1
         self._waiting += parts
         self._use(part.observed[1] for part in parts if part.observed is not None)
@@ -185,8 +185,13 @@ class CompressedBackend(Isam2Backend):
             if number >= 0 and before in self._active:
                 self._active.forget(before)
 
-    def _begin(self, key: int, dim: int) -> Array:
-        """Where to linearise: of what is not in use, the tree's last estimate is near enough."""
+    def landmark_means(self, landmarks: Sequence[int]) -> list[Array]:
+        """See `Backend`; of what is not in use, as the tree has it without what waits."""
+        dims = self._builder.landmark_dims
+        return [self._nearly(factors.landmark_key(i), dims[i]) for i in landmarks]
+
+    def _nearly(self, key: int, dim: int) -> Array:
+        """`value`, but of what is not in use the tree's last one: near enough to begin with."""
         known = self._active is not None and key not in self._active and self._isam.valueExists(key)
         return super().value(key, dim) if known else self.value(key, dim)
 
