@@ -82,6 +82,19 @@ class JointGaussian(Generic[Name]):
         self._blocks: dict[int, np.ndarray[tuple[int, int], np.dtype[np.int64]]] = {}
         self._size = 0
 
+    @classmethod
+    def of(cls, sizes: Mapping[Name, int], x: Array, P: Array) -> "JointGaussian[Name]":
+        """Members of these ``sizes``, in order, with mean x (n,) and covariance P (n, n)."""
+        made = cls(room=max(2 * len(x), 1))
+        made._size = len(x)
+        made.x[:], made.P[:] = x, symmetric(P)
+        ends = np.cumsum(list(sizes.values()), dtype=int).tolist()
+        made._slots = {
+            name: slice(end - size, end)
+            for (name, size), end in zip(sizes.items(), ends, strict=True)
+        }
+        return made
+
     def __len__(self) -> int:
         """Size n of the state."""
         return self._size

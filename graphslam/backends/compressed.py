@@ -4,8 +4,8 @@ Between two updates of iSAM2 a robot deals with a few variables: its latest pose
 around it. The joint marginal of those at the last update, moved on by each step's factors, is all
 that the rest of the graph can say of them: `Active` is that filter. iSAM2 gets the steps of a
 stretch at once, when something is asked that is not in use, or when it is due to linearise anew.
-So a tree that holds thousands of poses is updated, solved and asked for marginals once in many
-steps, and nothing is lost: to first order the filter's answers are iSAM2's.
+So a tree that holds thousands of poses is updated, solved and asked for marginals once in several
+steps, and nothing is lost: in between, the filter's answers are iSAM2's.
 
 Source: J. Guivant, E. Nebot, Optimization of the simultaneous localization and map-building
 algorithm for real-time implementation, IEEE T-RA 17(3), 2001, https://doi.org/10.1109/70.938382
@@ -22,7 +22,7 @@ from graphslam.backends.graph import Part, read, write
 from graphslam.backends.isam2 import Isam2Backend
 from graphslam.config import Config
 from graphslam.geometry import Array
-from graphslam.kalman import symmetric, whiten
+from graphslam.kalman import JointGaussian, whiten
 from graphslam.records import Estimate, Step
 
 #: landmarks in use: those last seen or asked for. A stretch ends where another one is asked for,
@@ -47,36 +47,29 @@ class Active:
             cov: (D, D) of that.
         """
         self._places = gtsam.Values()
-        self._slots: dict[int, slice] = {}
         for key, place in places.items():
-            self._place(key, place)
-        self._z, self._cov = z, cov
-
-    def _place(self, key: int, place: Array) -> slice:
-        write(self._places, key, place)
-        begin = max((slot.stop for slot in self._slots.values()), default=0)
-        self._slots[key] = slice(begin, begin + len(place))
-        return self._slots[key]
+            write(self._places, key, place)
+        self._dims = {key: len(place) for key, place in places.items()}
+        self._moved: JointGaussian[int] = JointGaussian.of(self._dims, z, cov)
 
     def __contains__(self, key: object) -> bool:
         """Whether a variable is in use."""
-        return key in self._slots
+        return key in self._moved
 
     def value(self, key: int) -> Array:
         """Estimate (2,) or (3,) of a variable in use."""
-        z = self._z[self._slots[key]]
+        z = self._moved.x[self._moved.slot(key)]
         if len(z) == 3:
             return factors.array3(self._places.atPose2(key).retract(z))
         return np.asarray(self._places.atPoint2(key) + z)
 
     def covariance(self, keys: Sequence[int]) -> Array:
         """Joint covariance (D, D) of variables in use, in this order."""
-        places = np.concatenate([np.r_[self._slots[key]] for key in keys])
-        return np.asarray(self._cov[np.ix_(places, places)])
+        return self._moved.marginal(keys)
 
     def takes(self, parts: Iterable[Part]) -> bool:
         """Whether ``parts`` are about nothing but variables in use and those that they bring."""
-        known = set(self._slots)
+        known = set(self._moved)
         for part in parts:
             if part.new is not None:
                 known.add(part.new[0])
@@ -85,7 +78,12 @@ class Active:
         return True
 
     def take(self, parts: Iterable[Part]) -> None:
-        """One step of the filter."""
+        """One step of the filter.
+
+        Raises:
+            numpy.linalg.LinAlgError: rounding, or a part that does not determine what it brings,
+                made an end of it; this filter is of no use any more.
+        """
         measured: list[gtsam.NonlinearFactor] = []
         for part in parts:
             if part.new is not None:
@@ -95,54 +93,49 @@ class Active:
         if measured:
             self._update(measured)
 
-    def _enter(self, key: int, mean: Array, made_by: Iterable[gtsam.NonlinearFactor]) -> None:
+    def _enter(self, key: int, place: Array, made_by: Iterable[gtsam.NonlinearFactor]) -> None:
         """A new variable, as the factors that bring it have it: thesis 4.24-4.28."""
-        before = len(self._cov)
-        block = self._place(key, mean)
-        H, b = self._rows(made_by)
-        J = H[:, block]  # square, but for a line's empty row
+        write(self._places, key, place)
+        self._dims[key] = len(place)
+        H, b = self._linear(made_by)
+        J = H.pop(key)  # square, but for a line's empty row
         noise = np.linalg.solve(J.T @ J, J.T)
-        G = -noise @ H[:, :before]
-        self._z = np.append(self._z, noise @ (b - H[:, :before] @ self._z))
-        GP = G @ self._cov
-        corner = symmetric(GP @ G.T + noise @ noise.T)
-        self._cov = np.block([[self._cov, GP.T], [GP, corner]])
+        given = {other: -noise @ block for other, block in H.items()}
+        self._moved.add(key, noise @ (b - self._expected(H)), noise @ noise.T, given)
 
     def _update(self, measured: Iterable[gtsam.NonlinearFactor]) -> None:
         """Measurement update with all of a step's factors at once, thesis 3.5-3.8."""
-        H, b = self._rows(measured)
-        PHt = self._cov @ H.T
-        B, whitened, _ = whiten(PHt, H @ PHt + np.eye(len(H)), b - H @ self._z)
-        self._z = self._z + B.T @ whitened
-        self._cov = self._cov - B.T @ B
+        H, b = self._linear(measured)
+        PHt, HPHt = self._moved.project(H, len(b))
+        B, whitened, _ = whiten(PHt, HPHt + np.eye(len(b)), b - self._expected(H))
+        self._moved.x[:] += B.T @ whitened
+        self._moved.condition(B)
 
-    def _rows(self, measured: Iterable[gtsam.NonlinearFactor]) -> tuple[Array, Array]:
-        """Whitened Jacobians H (k, D) of factors, and b (k,): they say that H z = b."""
-        size = max(slot.stop for slot in self._slots.values())
-        found = []
-        for factor in measured:
-            A, b = factor.linearize(self._places).jacobian()
-            rows, begin = np.zeros((len(b), size + 1)), 0
-            for key in factor.keys():  # noqa: SIM118 (GTSAM's factors are no mappings)
-                slot = self._slots[key]
-                end = begin + slot.stop - slot.start
-                rows[:, slot] = A[:, begin:end]
+    def _linear(self, measured: Iterable[gtsam.NonlinearFactor]) -> tuple[dict[int, Array], Array]:
+        """Whitened Jacobians (k, d) of factors by variable, and b (k,): they say that H z = b."""
+        linear = [(f.keys(), *f.linearize(self._places).jacobian()) for f in measured]
+        b = np.concatenate([own for _, _, own in linear])
+        H: dict[int, Array] = {}
+        row = 0
+        for keys, A, own in linear:
+            rows, begin = slice(row, row + len(own)), 0
+            for key in keys:
+                end = begin + self._dims[key]
+                H.setdefault(key, np.zeros((len(b), end - begin)))[rows] = A[:, begin:end]
                 begin = end
-            rows[:, -1] = b
-            found.append(rows)
-        stacked = np.concatenate(found)
-        return stacked[:, :-1], stacked[:, -1]
+            row = rows.stop
+        return H, b
+
+    def _expected(self, H: Mapping[int, Array]) -> Array:
+        """H z (k,), for H by its blocks."""
+        parts = [block @ self._moved.x[self._moved.slot(key)] for key, block in H.items()]
+        return np.asarray(sum(parts, start=np.zeros(())))
 
     def forget(self, key: int) -> None:
         """Marginalise a variable out."""
-        gone = self._slots.pop(key)
-        size = gone.stop - gone.start
-        keep = np.r_[0 : gone.start, gone.stop : len(self._cov)]
-        self._z, self._cov = self._z[keep], self._cov[np.ix_(keep, keep)]
+        self._moved.remove(key)
         self._places.erase(key)
-        for other, slot in self._slots.items():
-            if slot.start > gone.start:
-                self._slots[other] = slice(slot.start - size, slot.stop - size)
+        del self._dims[key]
 
 
 class CompressedBackend(Isam2Backend):
@@ -153,8 +146,8 @@ class CompressedBackend(Isam2Backend):
         self._active: Active | None = None
         self._waiting: list[Part] = []  # what the filter has and the tree has not
         self._used: dict[int, None] = {}  # keys of landmarks, the last used one last
-        # states that the sightings of a landmark's promotion belong to, as a rule
-        self._states = config.association.sightings_to_promote
+        # states per robot: those that the sightings of a landmark's promotion belong to, as a rule
+        self._kept = config.association.sightings_to_promote
 
     def value(self, key: int, dim: int) -> Array:
         """See `GraphBackend`."""
@@ -180,7 +173,7 @@ class CompressedBackend(Isam2Backend):
             self._flush()  # what is wrong the tree says by name
             return
         for robot in step.motions:
-            number = self._builder.states.latest(robot) - self._states
+            number = self._builder.states.latest(robot) - self._kept
             before = self._builder.state_key(robot, number)
             if number >= 0 and before in self._active:
                 self._active.forget(before)
@@ -224,7 +217,7 @@ class CompressedBackend(Isam2Backend):
         builder = self._builder
         for robot in builder.robots:
             latest = builder.states.latest(robot)
-            for number in range(max(0, latest + 1 - self._states), latest + 1):
+            for number in range(max(0, latest + 1 - self._kept), latest + 1):
                 yield builder.state_key(robot, number)
 
     def _marginal(self, keys: list[int]) -> Active:
