@@ -44,6 +44,10 @@ SIGMAS = 3.0
 MARGIN, FARTHEST = np.array([0.6, 0.6, 0.08]), np.array([5.0, 5.0, 0.5])
 #: verified: shares of points confirmed at least, looked through at most (of both)
 SAME, ABSENT = 0.4, 0.15
+#: share of points on others in a coarse search below which `SAME` is out of reach: looked at no
+#: more closely. Of 167 searches in Intel, 64 end here; the most that any of those has the same is
+#: 0.30, and the worst search that led to a closure has a share of 0.34
+HOPELESS = 0.2
 #: how sure the position must be in every direction, m
 SURE_M = 0.08
 #: the second best must be worse than this part of the best
@@ -217,7 +221,7 @@ def loop_closures(
         if there is not None:
             confirmed.append(Closure(*later.state, *earlier.state, *there))
             continue
-        best = verified(match(later.submap, earlier.submap, guess, window))
+        best = verified(match(later.submap, earlier.submap, guess, window, HOPELESS))
         if best is not None:
             lost.append(Closure(*later.state, *earlier.state, best.pose, best.cov))
     return lost, confirmed

@@ -40,6 +40,8 @@ ITERATIONS = 12
 STEP_M, STEP_RAD = 0.15, np.radians(1.5)
 #: points of a submap that the search looks at, and that the alignment uses
 SEARCHED, ALIGNED = 250, 300
+#: places that a search finds at most, and how much of the best one's score they have at least
+FOUND, NEARLY = 4, 0.6
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +67,7 @@ class Submap:
 
         NaN without one.
         """
-        returns = np.array([_range_image(cloud) for cloud in self.clouds]).transpose(2, 0, 1)
+        returns = _range_images(self.clouds)
         return np.concatenate([np.roll(returns, turn, axis=2) for turn in (-1, 0, 1)])
 
     @cached_property
@@ -103,18 +105,21 @@ def make_submap(poses: Array, clouds: Sequence[Array]) -> Submap:
     return Submap(points, _information(points, tree), np.asarray(poses), clouds, tree)
 
 
-def _range_image(cloud: Array) -> Array:
-    """Nearest and farthest return (`BEAMS`, 2) per degree, NaN without one."""
-    r, beam = np.hypot(cloud[:, 0], cloud[:, 1]), _beam(cloud)
-    near, far = np.full(BEAMS, np.inf), np.full(BEAMS, -np.inf)
-    np.minimum.at(near, beam, r)
-    np.maximum.at(far, beam, r)
-    image = np.stack([near, far], axis=1)
-    return np.where(np.isfinite(image), image, np.nan)
+def _range_images(clouds: Sequence[Array]) -> Array:
+    """Nearest and farthest return (2, k, `BEAMS`) per degree of k scans, NaN without one."""
+    x, y = np.concatenate(clouds).T
+    scan = np.repeat(np.arange(len(clouds)), [len(cloud) for cloud in clouds])
+    r, at = np.hypot(x, y), scan * BEAMS + _beam(x, y)
+    images = np.full((2, len(clouds) * BEAMS), np.inf)
+    np.minimum.at(images[0], at, r)
+    np.minimum.at(images[1], at, -r)
+    images[1] *= -1.0
+    images[~np.isfinite(images)] = np.nan
+    return images.reshape(2, len(clouds), BEAMS)
 
 
-def _beam(points: Array) -> IntArray:
-    degrees = np.arctan2(points[..., 1], points[..., 0]) * (BEAMS / (2 * np.pi))
+def _beam(x: Array, y: Array) -> IntArray:
+    degrees = np.arctan2(y, x) * (BEAMS / (2 * np.pi))
     return np.asarray(np.round(degrees).astype(np.intp) % BEAMS)
 
 
@@ -140,7 +145,9 @@ def _information(points: Array, tree: cKDTree) -> Array:
     return np.asarray(found)
 
 
-def search(source: Submap, target: Submap, guess: Array, window: Array) -> list[Array]:
+def search(
+    source: Submap, target: Submap, guess: Array, window: Array, least: float = 0.0
+) -> list[Array]:
     """Poses (3,) of ``source`` in ``target`` at which many of its points lie on the other's.
 
     Args:
@@ -148,6 +155,7 @@ def search(source: Submap, target: Submap, guess: Array, window: Array) -> list[
         target: where.
         guess: (3,) middle of the window.
         window: (3,) m, m, rad: half its size.
+        least: share of its points that are to do so; those in the next cell count half.
 
     Returns:
         The best ones, best first, no two of them close together.
@@ -164,8 +172,8 @@ def search(source: Submap, target: Submap, guess: Array, window: Array) -> list[
         at = np.clip(np.round((placed - low) / STEP_M).astype(np.intp), 0, last)
         scores[row] = shifted[at[:, 0], at[:, 1]].mean(axis=0)
     found: list[Array] = []
-    best = float(scores.max())
-    while len(found) < 4 and scores.max() > 0.6 * best > 0:
+    least = max(NEARLY * float(scores.max()), least)
+    while len(found) < FOUND and scores.max() > least:
         k, i, j = map(int, np.unravel_index(int(scores.argmax()), scores.shape))
         found.append(guess + np.array([x[i], y[j], turns[k]]))
         near = np.hypot(x - x[i], (y - y[j])[:, None]).T < 0.6
@@ -295,21 +303,27 @@ def _seen_from(points: Array, submap: Submap) -> tuple[BoolArray, BoolArray]:
     poses = submap.poses
     c, s = np.cos(poses[:, 2])[:, None], np.sin(poses[:, 2])[:, None]
     dx, dy = points[:, 0] - poses[:, :1], points[:, 1] - poses[:, 1:2]
-    local = np.stack([c * dx + s * dy, c * dy - s * dx], axis=-1)
-    r, scan, beam = np.hypot(dx, dy), np.arange(len(poses))[:, None], _beam(local)
+    # not hypot: it takes as long as all of the rest
+    r = np.sqrt(dx * dx + dy * dy)
+    at = _beam(c * dx + s * dy, c * dy - s * dx) + BEAMS * np.arange(len(poses))[:, None]
+    near = np.zeros(r.shape, dtype=np.bool_)
     with np.errstate(invalid="ignore"):
-        near = (np.abs(submap.images[:, scan, beam] - r) < SAME_M).any(axis=0)
-        through = r < submap.free[scan, beam] - ABSENT_M
+        for image in submap.images:  # one by one they stay in the cache
+            near |= np.abs(image.ravel()[at] - r) < SAME_M
+        through = r < submap.free.ravel()[at] - ABSENT_M
     return np.asarray(near.any(axis=0)), np.asarray(through.any(axis=0))
 
 
-def match(source: Submap, target: Submap, guess: Array, window: Array) -> list[Match]:
+def match(
+    source: Submap, target: Submap, guess: Array, window: Array, least: float = 0.0
+) -> list[Match]:
     """All places of ``source`` in ``target`` within a window, the most agreeing first.
 
-    ``guess`` (3,) is the middle of the window, ``window`` (3,) half its size, m, m, rad.
+    ``guess`` (3,) is the middle of the window, ``window`` (3,) half its size, m, m, rad; for
+    ``least`` see `search`.
     """
     found: list[Match] = []
-    for start in search(source, target, guess, window):
+    for start in search(source, target, guess, window, least):
         pose, cov = align(source, target, start)
         if any(_close(pose, m.pose) for m in found):
             continue

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from graphslam.geometry import between, compose
-from graphslam.matching import agreement, align, make_submap, match
+from graphslam.matching import agreement, align, make_submap, match, search
 
 ANGLES = np.radians(np.arange(-180.0, 180.0, 1.0))
 ROOM = np.array([
@@ -51,6 +51,19 @@ def test_a_room_is_found_again_from_elsewhere():
         assert abs(found[0].pose[2] - truth[2]) < 0.005
         assert found[0].same > 0.7
         assert found[0].absent < 0.05
+
+
+def test_a_place_where_hardly_a_point_lies_on_another_is_none():
+    """Breaks with a search that forgets ``least``, or takes it of the best place instead of all
+    points. On the room itself 0.7 of them lie (a neighbouring cell counts half), on a corridor less
+    than a tenth: 0.5 is between the two."""
+    here, there = np.array([-2.0, 1.0, 0.3]), np.array([1.0, -1.5, -0.6])
+    source, same = submap(there, ROOM), submap(here, ROOM)
+    other = submap(np.zeros(3), CORRIDOR)
+    guess, window = between(here, there), np.array([0.6, 0.6, 0.1])
+    assert search(source, same, guess, window, 0.5)
+    assert search(source, other, np.zeros(3), np.array([3.0, 3.0, 0.1]))
+    assert not search(source, other, np.zeros(3), np.array([3.0, 3.0, 0.1]), 0.5)
 
 
 def test_the_covariance_of_a_match_covers_its_error():
