@@ -4,6 +4,7 @@ import contextlib
 import errno
 import io
 import json
+import os
 import re
 import subprocess
 import sys
@@ -565,3 +566,24 @@ def test_the_module_runs_and_answers_before_anything_heavy_is_imported():
 
 def test_the_version_is_that_of_the_package():
     assert call("--version").out == f"{version('coop-graphslam')}\n"
+
+
+def test_matrices_have_one_thread_unless_the_environment_says_otherwise():
+    """Breaks when numpy is loaded before that is said: its threads then wait for each other."""
+    code = (
+        "import sys, graphslam.cli; assert 'numpy' not in sys.modules\n"
+        "try: graphslam.cli.main(['--version'])\n"
+        "finally: import os; print(os.environ['OPENBLAS_NUM_THREADS'])"
+    )
+    for chosen in (None, "3"):
+        environment = {k: v for k, v in os.environ.items() if k != "OPENBLAS_NUM_THREADS"}
+        if chosen:
+            environment["OPENBLAS_NUM_THREADS"] = chosen
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            check=True,
+            capture_output=True,
+            text=True,
+            env=environment,
+        )
+        assert done.stdout.split()[-1] == (chosen or "1")
