@@ -211,8 +211,9 @@ class Track(Readings):
         else:
             cov = cov + np.where(moved[:, None, None], 0.0, self._floor(False))
         back = end_ns < start_ns
-        cov[back] = inverse_cov(delta[back], cov[back])
-        delta[back] = inverse(delta[back])
+        if back.any():
+            cov[back] = inverse_cov(delta[back], cov[back])
+            delta[back] = inverse(delta[back])
         return Motions(delta, cov, d_cal, length)
 
     def _walk(self, times: IntArray) -> Motions:
