@@ -146,7 +146,7 @@ class Associator:
                 self.rejected["identity: known as a landmark of another kind"] += 1
                 continue
             self.map.saw(entry, o, pose, time_ns, robot, path_m)
-            association = Association(robot, time_ns, entry.id, o.kind, o.z, o.cov)
+            association = Association(robot, time_ns, entry.id, o.kind, o.z, o.cov, extent=o.extent)
             out += self._admit(entry, association, True)
         return tuple(out)
 
@@ -309,7 +309,9 @@ class Associator:
                 o = replace(o, identity=identity)
                 entry, model = self.map.add(o, pose, image.time_ns), o.kind
             self.map.saw(entry, o, pose, image.time_ns, image.robot, image.path_m)
-            association = Association(image.robot, image.time_ns, entry.id, model, o.z, o.cov)
+            association = Association(
+                image.robot, image.time_ns, entry.id, model, o.z, o.cov, extent=o.extent
+            )
             out += self._admit(entry, association, self._has_identity(o))
         return tuple(out)
 

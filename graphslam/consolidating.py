@@ -126,7 +126,7 @@ def consolidate(
     else:
         estimate = solve(steps, estimate, closures, rough=False)
         steps = with_closures(steps, closures)
-    _move(landmarks, estimate)
+    landmarks.follow(steps, estimate)
     return Consolidated(estimate, steps, counts)
 
 
@@ -285,8 +285,8 @@ def _loosened(steps: Sequence[Step], estimate: Estimate) -> tuple[Step, ...]:
 def _duplicates(
     estimate: Estimate, backend: Resolver, landmarks: LandmarkMap, steps: Sequence[Step]
 ) -> dict[int, int]:
-    """Landmark that goes -> landmark that it becomes; the map moves to the estimate."""
-    _move(landmarks, estimate)
+    """Landmark that goes -> landmark that it becomes; the map follows the estimate."""
+    landmarks.follow(steps, estimate)
     known = [entry for entry in landmarks.entries.values() if entry.id in estimate.landmarks]
     together = seen_together(steps)
     known = partners(known, together)
@@ -294,15 +294,6 @@ def _duplicates(
         return {}
     joint = backend.joint(min(estimate.states), [entry.id for entry in known])
     return survivors(duplicates(known, joint, together))
-
-
-def _move(landmarks: LandmarkMap, estimate: Estimate) -> None:
-    """The map moves to the estimate; what nothing was seen of any more leaves it."""
-    for number, entry in list(landmarks.entries.items()):
-        if number in estimate.landmarks:
-            entry.move(estimate.landmarks[number][0])
-        elif entry.in_graph:
-            del landmarks.entries[number]
 
 
 def with_closures(steps: Iterable[Step], closures: Iterable[Closure]) -> tuple[Step, ...]:

@@ -5,7 +5,7 @@ together with its earlier sightings. Estimates are copies, refreshed from the ba
 may have changed: reading them is much of an incremental smoother's cost.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,7 +14,7 @@ from graphslam.association import BoolArray, IntArray
 from graphslam.backends import Backend
 from graphslam.geometry import Array, between, compose
 from graphslam.models import MODELS
-from graphslam.records import Association, Observation
+from graphslam.records import Association, Estimate, Observation, Step
 
 
 @dataclass(slots=True, eq=False)
@@ -39,13 +39,17 @@ class Entry:
     path_m: dict[str, float] = field(default_factory=dict)
     evidence: list[Association] = field(default_factory=list)
 
-    def move(self, mean: Array) -> None:
-        """A new estimate (2,) or (3,), in which the extent stays where it was.
+    def extent_at(self, mean: Array) -> Array:
+        """The extent (2,) at another estimate (2,) or (3,).
 
-        Where on its wall a line's origin sits means nothing, and it may slide by metres.
+        That of a line stays where it is in the world, as its origin may slide along it by metres;
+        a segment brings its own along. Where the wall itself has moved, see `LandmarkMap.follow`.
         """
-        if self.kind != "point":
-            self.extent = self.extent - between(self.mean, mean)[0]
+        return self.extent - between(self.mean, mean)[0] if self.kind == "line" else self.extent
+
+    def move(self, mean: Array) -> None:
+        """A new estimate (2,) or (3,)."""
+        self.extent = self.extent_at(mean)
         self.mean[: len(mean)] = mean
 
 
@@ -120,6 +124,22 @@ class LandmarkMap:
         for i, mean in zip(ids, backend.landmark_means(ids), strict=True):
             self.entries[i].move(mean)
 
+    def follow(self, steps: Sequence[Step], estimate: Estimate) -> None:
+        """Move to an estimate of steps; what nothing was seen of any more leaves the map.
+
+        Lines extend over what was seen of them, as it now lies: a map that is drawn straight takes
+        them along, by metres where a loop is closed.
+        """
+        for number, entry in list(self.entries.items()):
+            if number in estimate.landmarks:
+                entry.move(estimate.landmarks[number][0])
+            elif entry.in_graph:
+                del self.entries[number]
+        for number, extent in seen_extents(steps, estimate).items():
+            entry = self.entries[number]
+            if entry.kind == "line":  # a segment was seen whole, and brings its ends along
+                entry.extent = extent
+
     def split(self, number: int, new: int) -> None:
         """What was taken for one landmark is two: ``new`` looks like ``number`` for now."""
         old = self.entries[number]
@@ -148,3 +168,35 @@ class LandmarkMap:
         for i in gone:
             del self.entries[i]
         self.deleted += len(gone)
+
+
+def observed_from(seen: Sequence[Association], estimate: Estimate) -> Array:
+    """Estimated states (n, 3) from which associations were made."""
+    poses = np.empty((len(seen), 3))
+    robots, times = np.array([a.robot for a in seen]), np.array([a.time_ns for a in seen])
+    for robot, states in estimate.states.items():
+        own = robots == robot
+        poses[own] = states.poses[np.searchsorted(states.stamps_ns, times[own])]
+    return poses
+
+
+def seen_extents(steps: Sequence[Step], estimate: Estimate) -> dict[int, Array]:
+    """From where to where walls were seen in all, (2,) m along the x axis of each, by number."""
+    seen = [
+        a
+        for step in steps
+        for a in step.associations
+        if a.extent is not None and a.target in estimate.landmarks
+    ]
+    if not seen:
+        return {}
+    walls, wall = np.unique([int(a.target) for a in seen], return_inverse=True)
+    means = np.array([estimate.landmarks[int(number)][0] for number in walls])
+    world = compose(observed_from(seen, estimate), np.array([a.z for a in seen]))
+    relative = between(means[wall], world)
+    ends = relative[:, :1] + np.cos(relative[:, 2:]) * np.array([a.extent for a in seen])
+    ends.sort(axis=1)  # a wall may be described the other way round
+    low, high = np.full(len(walls), np.inf), np.full(len(walls), -np.inf)
+    np.minimum.at(low, wall, ends[:, 0])
+    np.maximum.at(high, wall, ends[:, 1])
+    return dict(zip(walls.tolist(), np.column_stack([low, high]), strict=True))

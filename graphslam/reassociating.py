@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphslam.geometry import Array, compose, wrap
-from graphslam.landmark_map import Entry
+from graphslam.landmark_map import Entry, observed_from
 from graphslam.records import Association, Estimate, Step
 
 #: m across, rad: how well an observation fits its own wall as a rule: the unit of competition
@@ -53,11 +53,7 @@ def reassociate(
     seen = [a for step in steps for a in step.associations if a.target in place]
     if not seen:
         return Reassociated(tuple(steps), 0, 0)
-    states = {robot: estimate.states[robot] for robot in {a.robot for a in seen}}
-    x = np.array([
-        states[a.robot].poses[np.searchsorted(states[a.robot].stamps_ns, a.time_ns)] for a in seen
-    ])  # fmt: skip
-    world = compose(x, np.array([a.z for a in seen]))
+    world = compose(observed_from(seen, estimate), np.array([a.z for a in seen]))
     own = np.array([place[a.target] for a in seen if isinstance(a.target, int)])
     best = np.concatenate([
         _best(world[k : k + CHUNK], own[k : k + CHUNK], walls, gate_m, gate_rad)

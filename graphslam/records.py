@@ -187,7 +187,8 @@ class Association:
     ``time_ns`` names the robot's state; ``target`` is a landmark's number or another robot's
     name; ``model`` is the row of `MODELS` that compares them. ``z`` and ``cov`` are in the
     robot's base frame at that state. ``late`` marks evidence from before the landmark's
-    promotion: filters skip it, smoothers use it.
+    promotion: filters skip it, smoothers use it. ``extent`` (2,) m is from where to where a wall
+    was seen, along the x axis of ``z``.
     """
 
     robot: str
@@ -197,6 +198,7 @@ class Association:
     z: Array
     cov: Array
     late: bool = False
+    extent: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,7 +14,7 @@ import numpy as np
 from graphslam import __version__
 from graphslam.clock_offsets import ClockFound
 from graphslam.config import Config, dump_config
-from graphslam.geometry import Array, between, transform
+from graphslam.geometry import Array, transform
 from graphslam.joining import Joined
 from graphslam.landmark_map import Entry, LandmarkMap
 from graphslam.logs import LogSet
@@ -55,7 +55,7 @@ def make_landmark(entry: Entry, mean: Array, cov: Array) -> Landmark:
         line = None
     else:
         position = mean
-        low, high = entry.extent - between(entry.mean, mean)[0]  # see `Entry.move`
+        low, high = entry.extent_at(mean)
         ends = np.array([[low, 0.0], [high, 0.0]])
         extent = transform(mean, ends)
         line = line_parameters(mean, cov)
