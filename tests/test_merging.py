@@ -22,7 +22,8 @@ from graphslam.merging import (
     seen_together,
     survivors,
 )
-from graphslam.records import Association, Step
+from graphslam.reassociating import reassociate
+from graphslam.records import Association, Estimate, Step, Trajectory
 
 WALLS = np.array([[0.0, 0.0, 0.0], [4.0, 2.0, 1.6], [0.0, 5.0, 3.1], [9.0, 1.0, -1.5]])
 EXTENT = np.array([-1.5, 1.5])
@@ -272,6 +273,43 @@ def test_an_extent_stays_where_it_is_when_the_origin_slides():
     wall.move(compose(wall.mean, np.array([3.0, 0.01, 0.0])))
     after = compose(wall.mean, np.array([wall.extent[0], 0.0, 0.0]))
     np.testing.assert_allclose(between(before, after), [0.0, 0.01, 0.0], atol=1e-12)
+
+
+def seen_along(map_moved, slid):
+    """A wall seen in five pieces of 1 m from states 1 m apart, each facing it, in a map that was
+    moved along the wall; and the wall's origin ``slid`` beyond that. Its steps and the estimate."""
+    poses = np.column_stack([np.arange(5.0) + map_moved, np.zeros(5), np.zeros(5)])
+    z, cov = np.array([0.0, 2.0, np.pi]), np.eye(3)
+    half = np.array([-0.5, 0.5])
+    steps = [
+        Step(k, {}, {}, (Association("r", k, 0, "line", z, cov, extent=half),)) for k in range(5)
+    ]
+    mean = np.array([0.4 + map_moved + slid, 2.0, np.pi])
+    states = {"r": Trajectory(np.arange(5), poses, np.zeros((5, 3, 3)))}
+    return steps, Estimate(states, {0: (mean, np.eye(3))}, 0.0, 1)
+
+
+@pytest.mark.parametrize("slid", [0.0, 1.7])
+@pytest.mark.parametrize("map_moved", [0.0, 4.0])
+def test_a_line_ends_where_its_observations_end(map_moved, slid):
+    """Breaks if ends stay where they were when a loop was closed and the map went elsewhere, or go
+    with an origin that slides along the wall; what is seen of it then lies beyond its ends, and
+    belongs to no wall. The wall's axis points against the states'."""
+    landmarks = LandmarkMap()
+    landmarks.entries[0] = replace(entry(0), kind="line", mean=np.array([0.4, 2.0, np.pi]))
+    steps, estimate = seen_along(map_moved, slid)
+    landmarks.follow(steps, estimate)
+    wall = landmarks.entries[0]
+    ends = [compose(wall.mean, np.array([end, 0.0, 0.0]))[0] for end in wall.extent]
+    np.testing.assert_allclose(ends, [4.5 + map_moved, -0.5 + map_moved], atol=1e-12)
+    assert not reassociate(steps, estimate, landmarks.entries, 0.1, 0.1).dropped
+
+
+def test_a_segment_brings_its_ends_along():
+    """Breaks if a segment, whose origin means something, is treated as a line that slides."""
+    wall = replace(entry(1), kind="segment", mean=np.array([1.0, 2.0, 0.5]))
+    wall.move(np.array([3.0, 2.5, 0.6]))
+    np.testing.assert_array_equal(wall.extent, EXTENT)
 
 
 @pytest.mark.parametrize(
