@@ -106,6 +106,17 @@ def targets(found):
 # ------------------------------------------------------------ from tentative to the graph
 
 
+def test_what_was_seen_of_a_wall_stays_with_its_associations():
+    """Breaks if the extent is lost on the way to the graph, or does not turn with a wall that is
+    taken the other way round: afterwards walls end where these say."""
+    run = Run(AssociationConfig(directed=False))
+    there = replace(wall(0.0, 2.0, 0.0), extent=np.array([-1.0, 3.0]))
+    back = replace(wall(0.0, 2.0, np.pi), extent=np.array([-3.0, 1.0]))
+    for a in [*run.learn(there), *run.look(back)]:
+        assert a.target == 0
+        np.testing.assert_array_equal(a.extent, [-1.0, 3.0])
+
+
 @pytest.mark.parametrize("needed", [1, 2, 3, 5])
 def test_promotion_brings_the_evidence_along(needed):
     """Nothing enters before the last sighting needed; then all do, each from its own state with its
