@@ -219,12 +219,17 @@ def loop_closures(
         looked[pair] = guess
         there = closed(later.submap, earlier.submap, guess)
         if there is not None:
-            confirmed.append(Closure(*later.state, *earlier.state, *there))
+            confirmed.append(_closure(later, earlier, *there))
             continue
         best = verified(match(later.submap, earlier.submap, guess, window, HOPELESS))
         if best is not None:
-            lost.append(Closure(*later.state, *earlier.state, best.pose, best.cov))
+            lost.append(_closure(later, earlier, best.pose, best.cov))
     return lost, confirmed
+
+
+def _closure(later: Place, earlier: Place, pose: Array, cov: Array) -> Closure:
+    images = min(len(place.submap.clouds) for place in (later, earlier))
+    return Closure(*later.state, *earlier.state, pose, cov, images=images)
 
 
 def closed(source: Submap, target: Submap, guess: Array) -> tuple[Array, Array] | None:

@@ -5,7 +5,9 @@ error is *expected minus measured*. Our covariances are of additive errors along
 frame a quantity is given in; the conversions are here.
 """
 
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -124,10 +126,15 @@ def motion_factor(key: int, next_key: int, motion: Motion) -> gtsam.NonlinearFac
 def closure_factor(
     key: int, other_key: int, closure: Closure, kernel: RobustConfig
 ) -> gtsam.NonlinearFactor:
-    """A measured relative pose: ``key`` seen from ``other_key``; under ``kernel`` if unverified."""
+    """A measured relative pose: ``key`` seen from ``other_key``; under ``kernel`` if unverified.
+
+    The kernel of n images' closure is wider by the root of n: far off, where a kernel's cost grows
+    with its scale squared, it then costs what n observations of one image each would.
+    """
+    wide = replace(kernel, scale=kernel.scale * math.sqrt(closure.images))
 
     def noise(cov: Array) -> gtsam.noiseModel.Base:
-        return gaussian(cov) if closure.verified else robust(gaussian(cov), kernel)
+        return gaussian(cov) if closure.verified else robust(gaussian(cov), wide)
 
     return relative_pose_factor(other_key, key, closure.delta, noise, closure.cov)
 

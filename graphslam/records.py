@@ -214,6 +214,7 @@ class Closure:
     """Pose (3,) of state (robot, time) in the frame of state (other, other_time), with cov.
 
     ``verified``: it was held against all that is known, so no robust kernel belongs on it.
+    ``images``: of how many it was made; where it contradicts what was seen it counts like so many.
     """
 
     robot: str
@@ -223,6 +224,7 @@ class Closure:
     delta: Array
     cov: Array
     verified: bool = False
+    images: int = 1
 
     @property
     def pair(self) -> tuple[tuple[str, int], tuple[str, int]]:

@@ -1,6 +1,7 @@
 """GTSAM factors say what our models say; a wall holds nothing along itself."""
 
 import typing
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -156,6 +157,23 @@ def test_closure_factor_is_the_pose_of_the_first_seen_from_the_other():
     np.testing.assert_allclose(squared_norm(factor, exact), 0, atol=EXACT)
     off = at(compose(other, delta + np.array([0.2, 0, 0])), other)
     np.testing.assert_allclose(squared_norm(factor, off), 1.0, rtol=1e-12)  # 0.2 m, sigma 0.2 m
+
+
+@pytest.mark.parametrize("images", [4, 15])
+def test_a_closure_of_n_images_costs_what_n_of_one_do(images):
+    """Breaks if a whole submap gives way to a few observations of one wall as if it were one more
+    of them: n rho(r / sqrt n) is what n closures of one image, each off by so much less, cost."""
+    closure = Closure("a", 5, "b", 0, np.zeros(3), np.diag([0.01, 0.01, 0.01]), images=images)
+    kernel = RobustConfig("cauchy", 2.0)
+    for off in (0.3, 30.0):
+        one, many = (
+            factors.closure_factor(X, T, each, kernel).error(at(np.array([r, 0, 0]), np.zeros(3)))
+            for each, r in (
+                (replace(closure, images=1), off / np.sqrt(images)),
+                (closure, off),
+            )
+        )
+        np.testing.assert_allclose(many, images * one, rtol=1e-12)
 
 
 def test_start_factor_takes_its_covariance_along_world_axes():
