@@ -91,7 +91,6 @@ def test_the_first_ten_minutes_of_intel_as_a_ros_2_log(intel):
     assert counts["loop_closures"] > 0
     # the models say what the residuals are: a factor of two in chi-square either way
     assert 0.25 < summary["graph"]["error"] / (0.5 * summary["graph"]["dof"]) < 2.0
-    assert summary["real_time_factor"] > 20
 
 
 def test_the_first_ten_minutes_of_intel_against_its_relations(intel):

@@ -4,7 +4,6 @@ import dataclasses
 import re
 import subprocess
 import sys
-import time
 import xml.etree.ElementTree as ET
 from html.parser import HTMLParser
 
@@ -220,13 +219,10 @@ def test_many_landmarks_are_drawn_but_few_numbered():
     assert 10 < max(labels) <= 40
 
 
-def test_many_points_stay_small_and_quick():
+def test_many_points_stay_small():
+    """Breaks if each of 270 000 points is drawn for itself."""
     result, _ = room(keyframes=1500, beams=181)
-    began = time.process_time()
-    html = render(result)
-    # about 1 s here for 270 000 points; shared machines are slower
-    assert time.process_time() - began < 8
-    assert len(html) < 6e6
+    assert len(render(result)) < 6e6
 
 
 def test_importing_the_package_does_not_import_matplotlib():
