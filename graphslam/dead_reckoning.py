@@ -4,7 +4,8 @@ A motion over any interval, its covariance and its derivative by the calibration
 the `readings` when asked for, and can be computed again with another calibration.
 """
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,7 +29,7 @@ from graphslam.models.motion import (
     mounted_motion,
     nominal_calibration,
 )
-from graphslam.readings import BoolArray, IntArray, Readings
+from graphslam.readings import BoolArray, IntArray, Readings, reached
 from graphslam.records import Motion
 
 #: m and rad: what a robot that reports no motion may still have moved between two states
@@ -53,6 +54,11 @@ class Motions:
         """The k-th of them, which is between these times."""
         length_m = float(self.length_m[k])
         return Motion(start_ns, end_ns, self.delta[k], self.cov[k], self.d_cal[k], length_m)
+
+    def part(self, i: int, j: int) -> "Motions":
+        """Those from the i-th up to the j-th."""
+        which = slice(i, j)
+        return Motions(self.delta[which], self.cov[which], self.d_cal[which], self.length_m[which])
 
 
 class Track(Readings):
@@ -176,81 +182,18 @@ class Track(Readings):
         return replace(forth, start_ns=start_ns, end_ns=end_ns, delta=inverse(forth.delta), cov=cov)
 
     def motions(self, start_ns: IntArray, end_ns: IntArray) -> Motions:
-        """What `between` gives, for times (n,) and (n,), at once.
+        """What `between` gives, for times (n,) and (n,), at once; see `motions_of`."""
+        return motions_of([(self, start_ns, end_ns)])[0]
 
-        Differences of sums over the whole track: with P_k the pose after increment k, its error e
-        moves the pose P at the end of an interval by T(P) F_k e, F_k (3, 3) as if the end were the
-        origin and T(P) its lever arm. So the sums of F_k C_k F_kᵀ and F_k D_k up to both ends
-        are all that an interval needs.
-        """
-        begin, end = np.minimum(start_ns, end_ns), np.maximum(start_ns, end_ns)
-        late = self.latency_ns
-        times, where = np.unique(np.concatenate([begin, end]) - late, return_inverse=True)
-        a, b = where[: len(begin)], where[len(begin) :]
-        both = np.concatenate([times, times - LATENCY_STEP_NS])
-        walk = self._walk(both)
-        delta = between(walk.delta[a], walk.delta[b])
-        # from the odometry's frame and origin to the axes of the start, lever arm at the end
-        T = rotation3(-walk.delta[a, 2]) @ _lever(walk.delta[b])
-        cov = T @ (walk.cov[b] - walk.cov[a]) @ T.mT
-        d_cal = T @ (walk.d_cal[b] - walk.d_cal[a])
-        length = walk.length_m[b] - walk.length_m[a]
-        if len(self.calibration.mean) > self._p:
-            lever = rotation3(-self.mount[2]) @ compose_jacobians(delta, self.mount)[0]
-            earlier = walk.delta[len(times) :]
-            change = between(earlier[a], earlier[b]) - delta
-            change[:, 2] = wrap(change[:, 2])
-            change *= 0.0 if self.bursty else 1e9 / LATENCY_STEP_NS
-            delta, d_mount = mounted_motion(delta, self.mount)
-            d_cal = np.concatenate([lever @ d_cal, d_mount, lever @ change[:, :, None]], axis=2)
-            cov = lever @ cov @ lever.mT
-        cov = (cov + cov.mT) / 2 + d_cal @ self.calibration.cov @ d_cal.mT
-        moved = (length > 0) | (delta[:, 2] != 0)
-        if self.source != "given":
-            cov = cov + np.where(moved[:, None, None], self._floor(True), self._floor(False))
-        else:
-            cov = cov + np.where(moved[:, None, None], 0.0, self._floor(False))
-        back = end_ns < start_ns
-        if back.any():
-            cov[back] = inverse_cov(delta[back], cov[back])
-            delta[back] = inverse(delta[back])
-        return Motions(delta, cov, d_cal, length)
+    @property
+    def _kind(self) -> Hashable:
+        """Tracks of one kind can be worked out together: they differ in readings and calibration.
 
-    def _walk(self, times: IntArray) -> Motions:
-        """Sums (n) up to times of the odometry's clock, from a reading before all of them.
-
-        ``cov`` and ``d_cal`` are the sums that `motions` speaks of: of the pose at the origin.
+        Those of wheels are each of its own kind, as calibration is of a robot's own wheels.
         """
         self._settle()
-        n = self._count
-        if n < 2:
-            zeros = np.zeros((len(times), 3))
-            wide = np.zeros((len(times), 3, self._p))
-            return Motions(zeros, np.zeros((len(times), 3, 3)), wide, zeros[:, 0])
-        mean = self.calibration.mean[: self._p]
-        i = np.clip(np.searchsorted(self.times, times, side="left"), 1, n - 1)
-        first, last = int(i.min()), int(i.max())
-        share = self._share(i, self._times[i - 1], times)
-        # the whole rows first..last-1, then the part of its row that each time has reached
-        rows = np.concatenate([self._rows[first:last], self._rows[i] * share[:, None]])
-        parts = self._increments(rows, mean)
-        whole = last - first
-        heading = np.concatenate([[0.0], np.cumsum(parts.delta[:whole, 2])])
-        step = rotation3(heading[:-1]) @ parts.delta[:whole, :, None]
-        place = np.vstack([np.zeros(2), np.cumsum(step[:, :2, 0], axis=0)])
-        poses = np.column_stack([place, heading])
-        k = np.concatenate([np.arange(whole), i - first])  # where each increment begins
-        turn = rotation3(poses[k, 2])
-        ends = poses[k] + (turn @ parts.delta[:, :, None])[:, :, 0]
-        F = _lever(-ends) @ turn  # what an increment's error does to the origin
-        covs, d_cals = F @ parts.cov @ F.mT, F @ parts.d_cal
-        lengths = np.hypot(parts.delta[:, 0], parts.delta[:, 1])
-
-        def upto(each: Array) -> Array:
-            sums = np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each[:whole], axis=0)])
-            return np.asarray(sums[i - first] + each[whole:])
-
-        return Motions(ends[whole:], upto(covs), upto(d_cals), upto(lengths))
+        own = self if self.source == "wheels" else None
+        return self.source, self._count > 1, len(self.calibration.mean), self._config, own
 
     def coarse_motions(
         self,
@@ -375,6 +318,139 @@ class Track(Readings):
         if not moved:
             return np.diag([STANDING_SIGMA**2] * 3)
         return np.diag([self._config.floor_sigma_m**2] * 2 + [self._config.floor_sigma_rad**2])
+
+
+def motions_of(asked: Sequence[tuple[Track, IntArray, IntArray]]) -> list[Motions]:
+    """What `Track.between` gives for many times and several robots, at once.
+
+    Differences of sums over each whole track: with P_k the pose after increment k, its error e
+    moves the pose P at the end of an interval by T(P) F_k e, F_k (3, 3) as if the end were the
+    origin and T(P) its lever arm. So the sums of F_k C_k F_kᵀ and F_k D_k up to both ends
+    are all that an interval needs.
+
+    Args:
+        asked: tracks with the times (n,) and (n,) between which their motions are wanted.
+
+    Returns:
+        Motions (n) of each.
+    """
+    of_track: dict[Track, list[int]] = defaultdict(list)
+    for k, (track, _, _) in enumerate(asked):
+        of_track[track].append(k)
+    alike: dict[Hashable, list[Track]] = defaultdict(list)
+    for track in of_track:
+        alike[track._kind].append(track)
+    found: dict[int, Motions] = {}
+    for tracks in alike.values():
+        order = [k for track in tracks for k in of_track[track]]
+        start_ns, end_ns = (
+            [np.concatenate([asked[k][which] for k in of_track[track]]) for track in tracks]
+            for which in (1, 2)
+        )
+        many = _motions(tracks, start_ns, end_ns)
+        done = 0
+        for k in order:
+            found[k] = many.part(done, done := done + len(asked[k][1]))
+    return [found[k] for k in range(len(asked))]
+
+
+def _motions(
+    tracks: Sequence[Track], start_ns: Sequence[IntArray], end_ns: Sequence[IntArray]
+) -> Motions:
+    """`motions_of` tracks of one kind, those of one after those of the other."""
+    times, starts, ends, earlier, passed = [], [], [], [], 0
+    for track, start, end in zip(tracks, start_ns, end_ns, strict=True):
+        both = np.concatenate([np.minimum(start, end), np.maximum(start, end)])
+        needed, at = np.unique(both, return_inverse=True)
+        needed = needed - track.latency_ns
+        times.append(np.concatenate([needed, needed - LATENCY_STEP_NS]))
+        starts.append(passed + at[: len(start)])
+        ends.append(passed + at[len(start) :])
+        earlier.append(np.full(len(start), len(needed)))
+        passed += 2 * len(needed)
+    a, b, back_by = (np.concatenate(each) for each in (starts, ends, earlier))
+    which = np.repeat(np.arange(len(tracks)), [len(start) for start in start_ns])
+    walk = _walks(tracks, times)
+    delta = between(walk.delta[a], walk.delta[b])
+    # from the odometry's frame and origin to the axes of the start, lever arm at the end
+    T = rotation3(-walk.delta[a, 2]) @ _lever(walk.delta[b])
+    cov = T @ (walk.cov[b] - walk.cov[a]) @ T.mT
+    d_cal = T @ (walk.d_cal[b] - walk.d_cal[a])
+    length = walk.length_m[b] - walk.length_m[a]
+    first = tracks[0]
+    if len(first.calibration.mean) > first._p:
+        mount = np.array([track.mount for track in tracks])[which]
+        lever = rotation3(-mount[:, 2]) @ compose_jacobians(delta, mount)[0]
+        change = between(walk.delta[a + back_by], walk.delta[b + back_by]) - delta
+        change[:, 2] = wrap(change[:, 2])
+        rate = np.array([0.0 if track.bursty else 1e9 / LATENCY_STEP_NS for track in tracks])
+        change *= rate[which, None]
+        delta, d_mount = mounted_motion(delta, mount)
+        d_cal = np.concatenate([lever @ d_cal, d_mount, lever @ change[:, :, None]], axis=2)
+        cov = lever @ cov @ lever.mT
+    known = np.array([track.calibration.cov for track in tracks])[which]
+    cov = (cov + cov.mT) / 2 + d_cal @ known @ d_cal.mT
+    moved = (length > 0) | (delta[:, 2] != 0)
+    floor = first._floor(True) if first.source != "given" else np.zeros((3, 3))
+    cov = cov + np.where(moved[:, None, None], floor, first._floor(False))
+    back = np.concatenate(end_ns) < np.concatenate(start_ns)
+    if back.any():
+        cov[back] = inverse_cov(delta[back], cov[back])
+        delta[back] = inverse(delta[back])
+    return Motions(delta, cov, d_cal, length)
+
+
+def _walks(tracks: Sequence[Track], times: Sequence[IntArray]) -> Motions:
+    """Sums up to times (n,) of each track's clock, from a reading before all of them.
+
+    ``cov`` and ``d_cal`` are the sums that `motions_of` speaks of: of the pose at the origin. The
+    tracks are of one kind; their sums follow each other.
+    """
+    p, counts = tracks[0]._p, [len(t) for t in times]
+    if tracks[0]._count < 2:
+        zeros = np.zeros((sum(counts), 3))
+        wide = np.zeros((len(zeros), 3, p))
+        return Motions(zeros, np.zeros((len(zeros), 3, 3)), wide, zeros[:, 0])
+    rows, last_rows, around, places, origins = [], [], [], [], []
+    whole = 0
+    for track, when in zip(tracks, times, strict=True):
+        # the index is that of the reading that ends the interval which a time is in
+        i = np.minimum(np.maximum(track.times.searchsorted(when), 1), track._count - 1)
+        first = int(i.min(initial=track._count - 1))
+        last = int(i.max(initial=first))
+        rows.append(track._rows[first:last])
+        last_rows.append(track._rows[i])
+        around.append((track._times[i - 1], track._times[i], track._burst[i]))
+        places.append(whole + i - first)  # where in all whole rows each part begins
+        origins.append(whole)
+        whole += last - first
+    # the whole rows first..last-1, then the part of its row that each time has reached
+    begins, ends, bursts = map(np.concatenate, zip(*around, strict=True))
+    share = reached(begins, ends, bursts, np.concatenate(times))
+    parts = np.concatenate(last_rows) * share[:, None]
+    lengths = [len(r) for r in rows]
+    at = np.concatenate([np.arange(whole), *places])
+    which = np.repeat(np.tile(np.arange(len(tracks)), 2), [*lengths, *counts])
+    origin = np.array(origins)[which]
+    mean = np.array([track.calibration.mean[:p] for track in tracks])
+    mean = mean[0] if len(tracks) == 1 else mean[which]
+    made = tracks[0]._increments(np.concatenate([*rows, parts]), mean)
+    heading = np.concatenate([[0.0], np.cumsum(made.delta[:whole, 2])])
+    step = rotation3((heading[at] - heading[origin])[:whole]) @ made.delta[:whole, :, None]
+    place = np.vstack([np.zeros(2), np.cumsum(step[:, :2, 0], axis=0)])
+    poses = np.column_stack([place, heading])
+    poses = poses[at] - poses[origin]  # where each increment begins
+    turn = rotation3(poses[:, 2])
+    after = poses + (turn @ made.delta[:, :, None])[:, :, 0]
+    F = _lever(-after) @ turn  # what an increment's error does to the origin
+    covs, d_cals = F @ made.cov @ F.mT, F @ made.d_cal
+
+    def upto(each: Array) -> Array:
+        sums = np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each[:whole], axis=0)])
+        return np.asarray(sums[at[whole:]] - sums[origin[whole:]] + each[whole:])
+
+    path = np.hypot(made.delta[:, 0], made.delta[:, 1])
+    return Motions(after[whole:], upto(covs), upto(d_cals), upto(path))
 
 
 def _lever(poses: Array) -> Array:

@@ -12,10 +12,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from graphslam.dead_reckoning import Track
+from graphslam.dead_reckoning import Track, motions_of
 from graphslam.frontend.sightings import sighting_observation
 from graphslam.geometry import Array, compose, compose_cov, inverse, inverse_cov, rotation3
 from graphslam.models import MODELS, transport
+from graphslam.readings import IntArray
 from graphslam.records import Association, Message, Motion, Observation, Sighting
 from graphslam.timeline import ODOMETRY
 
@@ -96,7 +97,7 @@ def ways(
     last_ns: Mapping[str, int],
     tracks: Mapping[str, Track],
 ) -> tuple[dict[tuple[str, int], Motion], dict[str, Motion]]:
-    """The motions of a step, those of one robot worked out together.
+    """The motions of a step, worked out together.
 
     Args:
         gathered: the images.
@@ -112,19 +113,19 @@ def ways(
     for image in gathered.images:
         for robot in {image[0].robot, *(s.seen_robot for s in image if s.seen_robot)}:
             times[robot].add(image[0].time_ns)
-    there, new = {}, {}
+    asked: list[tuple[Track, IntArray, IntArray]] = []
     for robot, needed in times.items():
-        images = sorted(needed)
-        starts, ends = [state_ns[robot]] * len(images), images
+        starts, ends = [state_ns[robot]] * len(needed), sorted(needed)
         if robot in last_ns:
             starts, ends = [*starts, last_ns[robot]], [*ends, state_ns[robot]]
-        moved = tracks[robot].motions(
-            np.array(starts, dtype=np.int64), np.array(ends, dtype=np.int64)
-        )
-        for k, time_ns in enumerate(images):
-            there[robot, time_ns] = moved.one(k, state_ns[robot], time_ns)
-        if robot in last_ns:
-            new[robot] = moved.one(-1, last_ns[robot], state_ns[robot])
+        asked.append((tracks[robot], np.array(starts), np.array(ends)))
+    there: dict[tuple[str, int], Motion] = {}
+    new: dict[str, Motion] = {}
+    for robot, (_, start_ns, end_ns), moved in zip(times, asked, motions_of(asked), strict=True):
+        made = map(moved.one, itertools.count(), start_ns.tolist(), end_ns.tolist())
+        images = itertools.islice(made, len(times[robot]))
+        there.update(((robot, motion.end_ns), motion) for motion in images)
+        new.update((robot, motion) for motion in made)
     return there, new
 
 
@@ -136,8 +137,10 @@ def carried(sightings: Sequence[Sighting], moved: Sequence[Motion]) -> list[Obse
     base = []
     for sighting in sightings:
         o = sighting_observation(sighting)
-        z, cov = transport(o.z, o.cov, sighting.mount, np.zeros((3, 3)))
-        base.append(replace(o, z=z, cov=cov))
+        if sighting.mount.any():
+            z, cov = transport(o.z, o.cov, sighting.mount, np.zeros((3, 3)))
+            o = replace(o, z=z, cov=cov)
+        base.append(o)
     away = [k for k, motion in enumerate(moved) if motion.start_ns != motion.end_ns]
     for size in (2, 3):
         which = [k for k in away if len(base[k].z) == size]
@@ -174,23 +177,39 @@ def transported(z: Array, cov: Array, delta: Array, delta_cov: Array) -> tuple[A
 
 
 def met(
-    o: Observation, sighting: Sighting, state_ns: int, moved: Motion, turn_rad: float
-) -> Association:
-    """A sighting of a robot, moved from where that robot was to where it is at its state.
+    seen: Sequence[Observation],
+    sightings: Sequence[Sighting],
+    state_ns: Sequence[int],
+    moved: Sequence[Motion],
+    turn_rad: Array,
+) -> list[Association]:
+    """Sightings of robots, moved from where those robots were to where they are at their states.
 
     Args:
-        o: the sighting in the observer's base frame at its state.
-        sighting: as recorded.
-        state_ns: time of the observer's state.
-        moved: motion of the robot that was seen, from its state to when it was seen.
-        turn_rad: heading of the seen robot relative to the observer's.
+        seen: the sightings in the observers' base frames at their states.
+        sightings: as recorded.
+        state_ns: times of the observers' states.
+        moved: motions of the robots that were seen, from their states to when they were seen.
+        turn_rad: (n,) headings of the seen robots relative to the observers'.
     """
-    other = sighting.seen_robot
-    assert other is not None  # callers ask for robots only
-    cov = moved.cov if moved.start_ns != moved.end_ns else np.zeros((3, 3))
-    z, cov = met_by(o.z, o.cov, moved.delta, cov, np.asarray(turn_rad))
-    model = "robot-point" if len(z) == 2 else "robot-pose"
-    return Association(sighting.robot, state_ns, other, model, z, cov)
+    made: dict[int, Association] = {}
+    for size, model in ((2, "robot-point"), (3, "robot-pose")):
+        which = [k for k, o in enumerate(seen) if len(o.z) == size]
+        if not which:
+            continue
+        apart = np.array([moved[k].start_ns != moved[k].end_ns for k in which])
+        z, cov = met_by(
+            np.array([seen[k].z for k in which]),
+            np.array([seen[k].cov for k in which]),
+            np.array([moved[k].delta for k in which]),
+            np.array([moved[k].cov for k in which]) * apart[:, None, None],
+            turn_rad[which],
+        )
+        for n, k in enumerate(which):
+            other = sightings[k].seen_robot
+            assert other is not None  # callers ask for robots only
+            made[k] = Association(sightings[k].robot, state_ns[k], other, model, z[n], cov[n])
+    return [made[k] for k in range(len(seen))]
 
 
 def met_by(

@@ -198,10 +198,13 @@ class Pipeline:
         known = {i for i, entry in self.associator.map.entries.items() if entry.in_graph}
         associations: tuple[Association, ...] = ()
         every = [sighting for image in gathered.images for sighting in image]
-        observed = iter(carried(every, [moved[s.robot, s.time_ns] for s in every]))
+        seen = carried(every, [moved[s.robot, s.time_ns] for s in every])
+        observed, robots = iter(seen), iter(self.met_in(every, seen, at, moved, motions))
         for image in gathered.images:
-            seen = list(itertools.islice(observed, len(image)))
-            associations += self.seen_in(image, seen, at[image[0].robot], moved, motions)
+            own = list(itertools.islice(observed, len(image)))
+            associations += self.seen_in(image, own, at[image[0].robot], motions)
+            met = sum(s.seen_robot is not None for s in image)
+            associations += tuple(itertools.islice(robots, met))
         self.note_covariances()
         self.seconds["association"] += time.perf_counter() - began
         self.enter(Step(step_ns, {}, motions, shared(associations)), known)
@@ -211,16 +214,14 @@ class Pipeline:
         image: Sequence[Sighting],
         seen: Sequence[Observation],
         state_ns: int,
-        moved: Mapping[tuple[str, int], Motion],
         motions: Mapping[str, Motion],
     ) -> tuple[Association, ...]:
-        """Associations of one image of a step of several.
+        """Associations of the landmarks in one image of a step of several.
 
         Args:
             image: sightings of one robot at one time.
             seen: the same in its base frame at its state.
             state_ns: time of that state.
-            moved: (robot, time) -> motion from the robot's state to that time.
             motions: of the step, of robots that get a state.
         """
         robot = image[0].robot
@@ -229,30 +230,57 @@ class Pipeline:
             self.sources[robot, state_ns, o.z.tobytes()] = sighting
         landmarks = [o for o, s in zip(seen, image, strict=True) if s.seen_robot is None]
         self.counts["observations"] += len(seen)
-        associations: tuple[Association, ...] = ()
-        if landmarks:
-            associations = self.associator.associate(
-                robot,
-                state_ns,
-                landmarks,
-                run.causal_poses[-1],
-                motions.get(robot),
-                run.track,
-                run.path_m,
-                gathering=True,
-            )
-        for o, s in zip(seen, image, strict=True):
-            if s.seen_robot is not None:
-                headings = [
-                    self.runs[name].causal_poses[-1][2]
-                    + (motions[name].delta[2] if name in motions else 0.0)
-                    for name in (s.seen_robot, robot)
-                ]
-                turn = float(headings[0] - headings[1])
-                association = met(o, s, state_ns, moved[s.seen_robot, s.time_ns], turn)
-                self.sources[robot, state_ns, association.z.tobytes()] = s
-                associations += (association,)
-        return associations
+        if not landmarks:
+            return ()
+        return self.associator.associate(
+            robot,
+            state_ns,
+            landmarks,
+            run.causal_poses[-1],
+            motions.get(robot),
+            run.track,
+            run.path_m,
+            gathering=True,
+        )
+
+    def met_in(
+        self,
+        sightings: Sequence[Sighting],
+        seen: Sequence[Observation],
+        at: Mapping[str, int],
+        moved: Mapping[tuple[str, int], Motion],
+        motions: Mapping[str, Motion],
+    ) -> list[Association]:
+        """Sightings of robots among those of a step.
+
+        Args:
+            sightings: of the step.
+            seen: the same in their observers' base frames at their states.
+            at: robot -> time of its state.
+            moved: (robot, time) -> motion from the robot's state to that time.
+            motions: of the step, of robots that get a state.
+        """
+        which = [k for k, s in enumerate(sightings) if s.seen_robot is not None]
+        if not which:
+            return []
+        robots = [sightings[k] for k in which]
+        pairs = [(str(s.seen_robot), s.robot) for s in robots]
+        heading = {
+            name: self.runs[name].causal_poses[-1][2]
+            + (motions[name].delta[2] if name in motions else 0.0)
+            for name in {robot for pair in pairs for robot in pair}
+        }
+        found = met(
+            [seen[k] for k in which],
+            robots,
+            [at[s.robot] for s in robots],
+            [moved[other, s.time_ns] for (other, _), s in zip(pairs, robots, strict=True)],
+            np.array([heading[other] - heading[own] for other, own in pairs]),
+        )
+        for association, sighting in zip(found, robots, strict=True):
+            where = association.robot, association.time_ns, association.z.tobytes()
+            self.sources[where] = sighting
+        return found
 
     def take(self, event: Sequence[Message]) -> None:
         """One event: everything one robot perceived at one time."""

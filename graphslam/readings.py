@@ -232,13 +232,8 @@ class Readings:
 
     def _share(self, i: IntArray, from_ns: IntArray | int, to_ns: IntArray | int) -> Array:
         """Share (..., ) of the interval that ends at reading i that lies in from_ns..to_ns."""
-        begin, end = self._times[i - 1], self._times[i]
-
-        def reached(time_ns: IntArray | int) -> Array:
-            share = np.clip((time_ns - begin) / np.maximum(end - begin, 1), 0.0, 1.0)
-            return np.asarray(np.where(self._burst[i], share >= 1.0, share))
-
-        return reached(to_ns) - reached(from_ns)
+        around = self._times[i - 1], self._times[i], self._burst[i]
+        return reached(*around, to_ns) - reached(*around, from_ns)
 
     def effort(self, times_ns: IntArray | int) -> Array:
         """Accumulated motion (...,), m: path plus turning. Odometry errors grow with it."""
@@ -274,3 +269,19 @@ class Readings:
         heading, last_heading = self._poses[i - 1, 2], self._poses[i, 2]
         turned = float(wrap(last_heading - heading))
         return float(path + share * (last_path - path)), float(heading + share * turned)
+
+
+def reached(
+    begin_ns: IntArray, end_ns: IntArray, burst: BoolArray, time_ns: IntArray | int
+) -> Array:
+    """Share (...,) of intervals that times have reached; of one in a burst nothing but at its end.
+
+    Args:
+        begin_ns: (...,) times of the readings before.
+        end_ns: (...,) times of the readings after.
+        burst: (...,) whether these were stamped in bursts, see `MAX_SPEED_M_S`.
+        time_ns: (...,) any times.
+    """
+    share = (time_ns - begin_ns) / np.maximum(end_ns - begin_ns, 1)
+    share = np.minimum(np.maximum(share, 0.0), 1.0)
+    return np.asarray(np.where(burst, share >= 1.0, share))

@@ -6,7 +6,7 @@ taken in once (again and again it would collapse).
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from graphslam.backends.calibrated import solve_calibrated
 from graphslam.config import Config
-from graphslam.dead_reckoning import Track
+from graphslam.dead_reckoning import Motions, Track, motions_of
 from graphslam.frontend.sightings import sighting_observation
 from graphslam.gathering import Sources, met_by, transported
 from graphslam.geometry import Array, between, wrap
@@ -127,24 +127,31 @@ def _remade(
     steps: Sequence[Step], estimate: Estimate, tracks: Mapping[str, Track], seen: Sequence[Seen]
 ) -> tuple[Step, ...]:
     """Steps with the tracks' calibration of now."""
-    associations = [list(step.associations) for step in steps]
-    for group in seen:
-        z, cov = _carried(group, estimate, tracks)
-        cov = cov * group.share[:, None, None]
-        for (n, k), z_k, cov_k in zip(group.where, z, cov, strict=True):
-            associations[n][k] = replace(associations[n][k], z=z_k, cov=cov_k)
+    made = {
+        robot: [(n, step.motions[robot]) for n, step in enumerate(steps) if robot in step.motions]
+        for robot in tracks
+    }
+    asked = [
+        (tracks[robot], _times(m.start_ns for _, m in new), _times(m.end_ns for _, m in new))
+        for robot, new in made.items()
+    ]
+    asked += [(tracks[group.robot], group.state_ns, group.seen_ns) for group in seen]
+    met = [group for group in seen if group.other is not None]
+    asked += [(tracks[str(group.other)], group.step_ns, group.seen_ns) for group in met]
+    moved = iter(motions_of(asked))
     motions: list[dict[str, Motion]] = [{} for _ in steps]
-    for robot, track in tracks.items():
-        made = [(n, step.motions[robot]) for n, step in enumerate(steps) if robot in step.motions]
-        if not made:
-            continue  # it perceived nothing and was seen by nobody
-        start_ns, end_ns = (
-            np.array([getattr(m, name) for _, m in made], dtype=np.int64)
-            for name in ("start_ns", "end_ns")
-        )
-        new = track.motions(start_ns, end_ns)
-        for i, (n, m) in enumerate(made):
-            motions[n][robot] = new.one(i, m.start_ns, m.end_ns)
+    for robot, new in made.items():
+        one = next(moved).one
+        for i, (n, m) in enumerate(new):
+            motions[n][robot] = one(i, m.start_ns, m.end_ns)
+    observers = [next(moved) for _ in seen]
+    others = dict(zip(map(id, met), moved, strict=True))
+    associations = [list(step.associations) for step in steps]
+    for group, observer in zip(seen, observers, strict=True):
+        z, cov = _carried(group, estimate, observer, others.get(id(group)))
+        cov = cov * group.share[:, None, None]
+        for (n, k), z_k, cov_k in zip(group.where.tolist(), z, cov, strict=True):
+            associations[n][k] = replace(associations[n][k], z=z_k, cov=cov_k)
     return tuple(
         # in the order of the step: it is the order of the states
         replace(step, motions={r: new[r] for r in step.motions}, associations=tuple(found))
@@ -152,20 +159,31 @@ def _remade(
     )
 
 
-def _carried(group: Seen, estimate: Estimate, tracks: Mapping[str, Track]) -> tuple[Array, Array]:
-    """Measurements (n, k) of a group between the states, and their covariances."""
-    moved = tracks[group.robot].motions(group.state_ns, group.seen_ns)
+def _times(times_ns: Iterable[int]) -> IntArray:
+    return np.array(list(times_ns), dtype=np.int64)
+
+
+def _carried(
+    group: Seen, estimate: Estimate, observer: Motions, other: Motions | None
+) -> tuple[Array, Array]:
+    """Measurements (n, k) of a group between the states, and their covariances.
+
+    Args:
+        group: as measured.
+        estimate: of all states.
+        observer: motions (n) from its states to when it saw something.
+        other: motions (n) of the robot that was seen, from its states to then.
+    """
     apart = (group.state_ns != group.seen_ns)[:, None, None]
-    z, cov = transported(group.z, group.cov, moved.delta, moved.cov * apart)
-    if group.other is None:
+    z, cov = transported(group.z, group.cov, observer.delta, observer.cov * apart)
+    if group.other is None or other is None:
         return z, cov
-    moved = tracks[group.other].motions(group.step_ns, group.seen_ns)
     apart = (group.step_ns != group.seen_ns)[:, None, None]
     turn = (
         _poses(estimate, group.other, group.step_ns)[:, 2]
         - _poses(estimate, group.robot, group.state_ns)[:, 2]
     )
-    return met_by(z, cov, moved.delta, moved.cov * apart, turn)
+    return met_by(z, cov, other.delta, other.cov * apart, turn)
 
 
 def _poses(estimate: Estimate, robot: str, times_ns: IntArray) -> Array:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from graphslam import records
+from graphslam.beside import Ahead
 from graphslam.config import Config
 from graphslam.errors import LogError
 from graphslam.logs import order, schemas
@@ -15,6 +16,9 @@ from graphslam.logs.recording import Recorded, place_late
 from graphslam.logs.survey import survey_topics
 from graphslam.logs.topics import ODOMETRY_KINDS, Topic, choose_topics, find_topics
 from graphslam.records import Message
+
+#: messages that are worth a second process to read them
+MANY = 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,21 +80,44 @@ class LogSet:
         Topics of the records ``without`` are passed over, which saves decoding them. Memory holds
         what falls into ``logs.reorder_s``, not the log. Every call starts anew.
         """
-        self.dropped.clear()
-        self.repaired.clear()
-        del self.warnings[self._opening_warnings :]
         topics = {topic.name: topic for topic in self.topics if topic.record not in without}
+        self._tell(_Told(Counter(), Counter(), []))
+        many = sum(topic.count for topic in topics.values()) >= MANY
+        for item in Ahead(lambda: self._read(topics)) if many else self._read(topics):
+            if isinstance(item, _Told):
+                self._tell(item)
+            else:
+                yield item
+
+    def _read(self, topics: Mapping[str, Topic]) -> Iterator["Message | _Told"]:
+        """Messages of ``topics`` and, last, what `messages` adds to the attributes."""
         readers = [
             _FileReader(file, topics, self._contexts, self._window_ns) for file in self._mcap
         ]
         yield from order.merge([reader.messages() for reader in readers])
+        told = _Told(Counter(), Counter(), [])
         for file, reader in zip(self._mcap, readers, strict=True):
-            self.dropped += reader.dropped
+            told.dropped.update(reader.dropped)
             for topic, counts in sorted(reader.line.counts.items()):
-                self.warnings += _warn_of_stamps(file, topic, counts)
-                self.dropped[order.TOO_LATE] += counts.pop(order.TOO_LATE, 0)
-                self.repaired += counts
-        self.dropped += Counter()  # without zeros
+                told.warnings.extend(_warn_of_stamps(file, topic, counts))
+                told.dropped[order.TOO_LATE] += counts.pop(order.TOO_LATE, 0)
+                told.repaired.update(counts)
+        yield told
+
+    def _tell(self, told: "_Told") -> None:
+        for counter, counts in ((self.dropped, told.dropped), (self.repaired, told.repaired)):
+            counter.clear()
+            counter.update(+counts)  # without zeros
+        self.warnings[self._opening_warnings :] = told.warnings
+
+
+@dataclass(frozen=True, slots=True)
+class _Told:
+    """What is known when all messages were read; see `LogSet`."""
+
+    dropped: Counter[str]
+    repaired: Counter[str]
+    warnings: list[str]
 
 
 def open_logs(paths: Sequence[Path], config: Config) -> LogSet:

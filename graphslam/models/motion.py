@@ -95,7 +95,7 @@ def odometry_increments(
     d_twist[:, :2, 0] = rows[:, :2]
     d_twist[:, 2, 1] = rows[:, 2]
     d_twist[:, 2, 2] = rows[:, 0]
-    twists = rows + d_twist @ calibration
+    twists = rows + (d_twist @ calibration[..., None])[..., 0]
     return Increments(exp(twists), model_error_cov(rows, config), exp_jacobian(twists) @ d_twist)
 
 
@@ -116,7 +116,7 @@ def command_increments(
     d_twist[:, 2, 1] = rows[:, 2]
     d_twist[:, 2, 2] = rows[:, 0]
     d_twist[:, :2, 3] = -rows[:, :2] * (curvature**2)[:, None]
-    twists = rows + d_twist @ calibration
+    twists = rows + (d_twist @ calibration[..., None])[..., 0]
     return Increments(exp(twists), model_error_cov(rows, config), exp_jacobian(twists) @ d_twist)
 
 

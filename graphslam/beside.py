@@ -1,0 +1,99 @@
+"""Work in a second process, while this one goes on.
+
+The second process is a fork: it begins with everything there is here, uncopied, and only what it
+makes is sent back. A fork must be the program's own decision, and its only thread must be this one,
+so nothing forks before `allow`; else, and wherever there is nothing to gain, the same work is done
+here. Nor is anything lost when the second process dies: the rest is made here.
+"""
+
+import gc
+import os
+import pickle
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
+from itertools import islice
+from typing import Generic, TypeVar
+
+_T = TypeVar("_T")
+
+#: items sent at once
+BATCH = 256
+
+_allowed = ContextVar("allowed", default=False)
+
+
+def allow(*, second: bool = True) -> None:
+    """Whether this process may fork from now on, where it can and has a second core."""
+    _allowed.set(second and sys.platform == "linux" and len(os.sched_getaffinity(0)) > 1)
+
+
+def possible() -> bool:
+    """Whether work begun now is done in a second process."""
+    return _allowed.get() and threading.active_count() == 1
+
+
+def begin(task: Callable[[], _T]) -> Callable[[], _T]:
+    """Begin a task; what is returned waits for its result.
+
+    Where there is no second process the task is done at once, so that it always finds things as
+    they are now. Its result must be picklable.
+    """
+    if not possible():
+        result = task()
+        return lambda: result
+    made = Ahead(lambda: iter([task()]))
+    return lambda: next(iter(made))
+
+
+class Ahead(Generic[_T]):
+    """What an iterator yields, made ahead of the one who takes it, as far as a pipe is long.
+
+    To be iterated over once. ``make`` is called again where the second process came to an end
+    before its work did, also because of an error, which is then raised here.
+    """
+
+    def __init__(self, make: Callable[[], Iterator[_T]]) -> None:
+        """Begin."""
+        self._make = make
+        self._pid, self._source = 0, -1
+        if possible():
+            self._fork()
+
+    def _fork(self) -> None:
+        self._source, sink = os.pipe()
+        self._pid = os.fork()
+        if self._pid:
+            os.close(sink)
+            return
+        done = 1
+        try:
+            os.close(self._source)
+            gc.freeze()  # or looking for cycles would copy what is shared
+            with os.fdopen(sink, "wb") as stream:
+                items = self._make()
+                while batch := list(islice(items, BATCH)):
+                    pickle.dump(batch, stream, pickle.HIGHEST_PROTOCOL)
+                pickle.dump([], stream)
+            done = 0
+        finally:
+            os._exit(done)  # nothing of the program that was forked may run on here
+
+    def __iter__(self) -> Iterator[_T]:
+        """The items."""
+        taken = 0
+        if self._pid:
+            try:
+                with os.fdopen(self._source, "rb") as stream:
+                    for batch in iter(lambda: pickle.load(stream), []):
+                        yield from batch
+                        taken += len(batch)
+                return
+            except (EOFError, pickle.UnpicklingError):
+                pass  # it died
+            finally:
+                os.kill(self._pid, signal.SIGKILL)
+                os.waitpid(self._pid, 0)
+        yield from islice(self._make(), taken, None)
