@@ -11,7 +11,6 @@ import os
 import pickle
 import signal
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from itertools import islice
@@ -31,21 +30,32 @@ def allow(*, second: bool = True) -> None:
 
 
 def possible() -> bool:
-    """Whether work begun now is done in a second process."""
-    return _allowed.get() and threading.active_count() == 1
+    """Whether work begun now is done in a second process.
 
-
-def begin(task: Callable[[], _T]) -> Callable[[], _T]:
-    """Begin a task; what is returned waits for its result.
-
-    Where there is no second process the task is done at once, so that it always finds things as
-    they are now. Its result must be picklable.
+    Not where a library runs threads of its own: a fork has none of them, but all of their locks.
     """
-    if not possible():
-        result = task()
-        return lambda: result
-    made = Ahead(lambda: iter([task()]))
-    return lambda: next(iter(made))
+    return _allowed.get() and len(os.listdir("/proc/self/task")) == 1
+
+
+class Task(Generic[_T]):
+    """A task that is begun, and its result; ``done`` where there is nothing to wait for.
+
+    Where there is no second process it is done at once, so that it always finds things as they
+    are when it begins. Its result must be picklable.
+    """
+
+    def __init__(self, task: Callable[[], _T]) -> None:
+        """Begin."""
+        self.done = not possible()
+        self._made = Ahead(lambda: iter([task()]))
+        if self.done:
+            self._result = next(iter(self._made))
+
+    def result(self) -> _T:
+        """What it returned; raises what it raised."""
+        if not self.done:
+            self._result, self.done = next(iter(self._made)), True
+        return self._result
 
 
 class Ahead(Generic[_T]):

@@ -560,10 +560,15 @@ class Pipeline:
             return self.backend.rough(), True
         return self.backend.finish(), False
 
+    @property
+    def is_refined(self) -> bool:
+        """Whether `reconsider` is `refining`, which is quick, and not `consolidating`."""
+        return bool(self.sources)
+
     def reconsider(self, estimate: Estimate) -> Estimate:
         """The log solved again from a rough estimate; the steps follow the result."""
         tracks = {name: run.track for name, run in self.runs.items() if run.started}
-        if self.sources:
+        if self.is_refined:
             refined = refine(self.steps, estimate, tracks, self.sources, self.config)
             self.steps = list(refined.steps)
             for name in tracks:

@@ -95,7 +95,7 @@ def save(
 ) -> None:
     """Write the result folder, see `write_folder`.
 
-    ``report`` renders report.html (without it there is none).
+    ``report`` renders report.html (without it there is none); it is asked last.
 
     Raises:
         OutputError: the target exists and may not be replaced, a number is not finite, or the

@@ -6,9 +6,11 @@ the next should begin with other starts, names or clocks.
 
 import time
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
+from graphslam.beside import Task
 from graphslam.config import Config, RobotConfig
 from graphslam.consolidating import Tamper
 from graphslam.errors import LogError
@@ -58,17 +60,20 @@ def smooth(
         pipeline = _passed(Pipeline(log, config, known, tamper), progress)
         finishing = time.perf_counter()
         estimate, rough = pipeline.estimate()
-    clocks = pipeline.clocks_found(estimate)
-    for _ in range(MAX_CLOCKS):
-        if not any(found.differs for found in clocks.values()):
+    for tries in range(MAX_CLOCKS, -1, -1):
+        finding = Task(partial(pipeline.clocks_found, estimate))
+        # clocks seldom differ, so solving again does not wait for them where it does not take long
+        meanwhile = not finding.done and pipeline.is_refined
+        final = pipeline.reconsider(estimate) if rough and meanwhile else None
+        clocks = finding.result()
+        if not tries or not any(found.differs for found in clocks.values()):
             break
         known = replace(known, clocks={robot: found.clock for robot, found in clocks.items()})
         pipeline = _passed(Pipeline(log, config, known, tamper), progress)
         finishing = time.perf_counter()
         estimate, rough = pipeline.estimate()
-        clocks = pipeline.clocks_found(estimate)
     if rough:
-        estimate = pipeline.reconsider(estimate)
+        estimate = final or pipeline.reconsider(estimate)
     pipeline.seconds["starts"] = starts_s
     pipeline.seconds["final optimisation"] = time.perf_counter() - finishing
     finishing = time.perf_counter()

@@ -73,17 +73,15 @@ def clock_errors(
     clock = int(gtsam.symbol("t", 0))
     size, units = 2 * len(robots), np.array([OFFSET_S, DRIFT])
     unit = gtsam.noiseModel.Unit.Create(size)
-    linear = gtsam.GaussianFactorGraph()
+    met = [builder.graph.at(place) for place, _ in builder.meetings]
+    for place, _ in builder.meetings:
+        builder.graph.remove(place)
+    linear = builder.graph.linearize(values)
     so_far = np.concatenate([prior[robot] / units for robot in robots])
     linear.add(gtsam.JacobianFactor(clock, np.eye(size), -so_far, unit))
     columns = np.column_stack([np.ones(len(after_s)), after_s]) * units
-    met = {place: (n, observed) for n, (place, observed) in enumerate(builder.meetings)}
-    for place in range(builder.graph.size()):
-        factor = builder.graph.at(place).linearize(values)
-        if place not in met:
-            linear.push_back(factor)
-            continue
-        n, (key, target, seen) = met[place]
+    for n, (_, (key, target, seen)) in enumerate(builder.meetings):
+        factor = met[n].linearize(values)
         A, b = factor.jacobian()
         first = factor.keys()[0] == key
         A_key, A_target = (A[:, :3], A[:, 3:]) if first else (A[:, 3:], A[:, :3])

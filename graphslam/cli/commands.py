@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from graphslam import __version__
+from graphslam.beside import Task
 from graphslam.cli import show
 from graphslam.cli.arguments import (
     Backend,
@@ -177,21 +178,22 @@ def smooth_command(
 
 def _smooth(log: LogSet, tree: Config, output: Path, force: bool) -> Result:
     """Run the pipeline and write the folder."""
+    from graphslam.truth import truth_of_logs
+
+    truth = Task(lambda: truth_of_logs(log, tree))
     from graphslam.report import render
     from graphslam.slam import smooth
 
     with progress_bar(sum(topic.count for topic in log.topics)) as progress:
         result = smooth(log, tree, progress)
-    quality = _quality(result, log, tree)
-    save(result, tree, output, force=force, report=lambda found: render(found, quality, tree))
+    quality = _quality(result, truth.result())
+    report = Task(lambda: render(result, quality, tree))
+    save(result, tree, output, force=force, report=lambda _: report.result())
     return result
 
 
-def _quality(result: Result, log: LogSet, tree: Config) -> dict[str, Any] | None:
+def _quality(result: Result, known: KnownTruth) -> dict[str, Any] | None:
     """What the truth in the logs says about the result; None without truth."""
-    from graphslam.truth import truth_of_logs
-
-    known = truth_of_logs(log, tree)
     if not known:
         return None
     from graphslam.evaluate import evaluate
