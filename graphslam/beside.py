@@ -14,10 +14,13 @@ import sys
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from itertools import islice
+from pathlib import Path
 from typing import Generic, TypeVar
 
 _T = TypeVar("_T")
 
+#: one entry per thread of this process
+THREADS = Path("/proc/self/task")
 #: items sent at once
 BATCH = 256
 
@@ -34,7 +37,7 @@ def possible() -> bool:
 
     Not where a library runs threads of its own: a fork has none of them, but all of their locks.
     """
-    return _allowed.get() and len(os.listdir("/proc/self/task")) == 1
+    return _allowed.get() and sum(1 for _ in THREADS.iterdir()) == 1
 
 
 class Task(Generic[_T]):

@@ -34,6 +34,7 @@ class Calibrator:
     def __init__(self) -> None:
         self._prior: Array | None = None
         self._info: Array = np.zeros((0, 0))
+        self._prior_info: Array = np.zeros((0, 0))
         self._vector = np.zeros(0)
         self._names: tuple[str, ...] = ()
 
@@ -57,7 +58,8 @@ class Calibrator:
             return current
         if self._prior is None:
             self._prior = current.cov
-            self._info = np.asarray(np.linalg.inv(self._prior), dtype=np.float64)
+            self._prior_info = np.asarray(np.linalg.inv(self._prior), dtype=np.float64)
+            self._info = self._prior_info
             self._vector = np.zeros(D.shape[1])
             self._names = current.names
         miss = moved - motion.delta
@@ -70,8 +72,7 @@ class Calibrator:
             return current
         weighted = D.T @ W
         # relative to nominal values: what is missing now plus what was already corrected
-        self._info = FORGET * self._info + (1 - FORGET) * np.linalg.inv(self._prior)
-        self._info += weighted @ D
+        self._info = FORGET * self._info + (1 - FORGET) * self._prior_info + weighted @ D
         self._vector = FORGET * self._vector + weighted @ (miss + D @ current.mean)
         cov = np.linalg.inv(self._info)
         return Calibration(current.names, cov @ self._vector, cov + REMAINING**2 * self._prior)

@@ -358,19 +358,17 @@ def _motions(
     tracks: Sequence[Track], start_ns: Sequence[IntArray], end_ns: Sequence[IntArray]
 ) -> Motions:
     """`motions_of` tracks of one kind, those of one after those of the other."""
-    times, starts, ends, earlier, passed = [], [], [], [], 0
+    times, starts, ends, passed = [], [], [], 0
     for track, start, end in zip(tracks, start_ns, end_ns, strict=True):
         both = np.concatenate([np.minimum(start, end), np.maximum(start, end)])
         needed, at = np.unique(both, return_inverse=True)
-        needed = needed - track.latency_ns
-        times.append(np.concatenate([needed, needed - LATENCY_STEP_NS]))
+        times.append(needed - track.latency_ns)
         starts.append(passed + at[: len(start)])
         ends.append(passed + at[len(start) :])
-        earlier.append(np.full(len(start), len(needed)))
-        passed += 2 * len(needed)
-    a, b, back_by = (np.concatenate(each) for each in (starts, ends, earlier))
+        passed += len(needed)
+    a, b = np.concatenate(starts), np.concatenate(ends)
     which = np.repeat(np.arange(len(tracks)), [len(start) for start in start_ns])
-    walk = _walks(tracks, times)
+    walk, earlier = _walks(tracks, times)
     delta = between(walk.delta[a], walk.delta[b])
     # from the odometry's frame and origin to the axes of the start, lever arm at the end
     T = rotation3(-walk.delta[a, 2]) @ _lever(walk.delta[b])
@@ -381,7 +379,7 @@ def _motions(
     if len(first.calibration.mean) > first._p:
         mount = np.array([track.mount for track in tracks])[which]
         lever = rotation3(-mount[:, 2]) @ compose_jacobians(delta, mount)[0]
-        change = between(walk.delta[a + back_by], walk.delta[b + back_by]) - delta
+        change = between(earlier[a], earlier[b]) - delta
         change[:, 2] = wrap(change[:, 2])
         rate = np.array([0.0 if track.bursty else 1e9 / LATENCY_STEP_NS for track in tracks])
         change *= rate[which, None]
@@ -400,41 +398,42 @@ def _motions(
     return Motions(delta, cov, d_cal, length)
 
 
-def _walks(tracks: Sequence[Track], times: Sequence[IntArray]) -> Motions:
+def _walks(tracks: Sequence[Track], times: Sequence[IntArray]) -> tuple[Motions, Array]:
     """Sums up to times (n,) of each track's clock, from a reading before all of them.
 
     ``cov`` and ``d_cal`` are the sums that `motions_of` speaks of: of the pose at the origin. The
-    tracks are of one kind; their sums follow each other.
+    tracks are of one kind; their sums follow each other, and so do the poses (n, 3) by which it was
+    `LATENCY_STEP_NS` earlier.
     """
     p, counts = tracks[0]._p, [len(t) for t in times]
+    n = sum(counts)
     if tracks[0]._count < 2:
-        zeros = np.zeros((sum(counts), 3))
-        wide = np.zeros((len(zeros), 3, p))
-        return Motions(zeros, np.zeros((len(zeros), 3, 3)), wide, zeros[:, 0])
-    rows, last_rows, around, places, origins = [], [], [], [], []
-    whole = 0
+        zeros, covs = np.zeros((n, 3)), np.zeros((n, 3, 3))
+        return Motions(zeros, covs, np.zeros((n, 3, p)), np.zeros(n)), zeros
+    rows, around, places, origins, whole = [], [], [], [], 0
     for track, when in zip(tracks, times, strict=True):
         # the index is that of the reading that ends the interval which a time is in
-        i = np.minimum(np.maximum(track.times.searchsorted(when), 1), track._count - 1)
+        i = track.times.searchsorted([when, when - LATENCY_STEP_NS])
+        i = np.minimum(np.maximum(i, 1), track._count - 1)
         first = int(i.min(initial=track._count - 1))
         last = int(i.max(initial=first))
         rows.append(track._rows[first:last])
-        last_rows.append(track._rows[i])
-        around.append((track._times[i - 1], track._times[i], track._burst[i]))
+        around.append((track._rows[i], track._times[i - 1], track._times[i], track._burst[i]))
         places.append(whole + i - first)  # where in all whole rows each part begins
         origins.append(whole)
         whole += last - first
     # the whole rows first..last-1, then the part of its row that each time has reached
-    begins, ends, bursts = map(np.concatenate, zip(*around, strict=True))
-    share = reached(begins, ends, bursts, np.concatenate(times))
-    parts = np.concatenate(last_rows) * share[:, None]
-    lengths = [len(r) for r in rows]
-    at = np.concatenate([np.arange(whole), *places])
-    which = np.repeat(np.tile(np.arange(len(tracks)), 2), [*lengths, *counts])
+    last_rows, begins, ends, bursts = (np.hstack(each) for each in zip(*around, strict=True))
+    now = np.concatenate(times)
+    share = reached(begins, ends, bursts, np.array([now, now - LATENCY_STEP_NS]))
+    rows.append((last_rows * share[:, :, None]).reshape(2 * n, -1))
+    at = np.concatenate([np.arange(whole), np.hstack(places).ravel()])
+    of_part = np.repeat(np.arange(len(tracks)), counts)
+    of_whole = np.repeat(np.arange(len(tracks)), [len(r) for r in rows[:-1]])
+    which = np.concatenate([of_whole, of_part, of_part])
     origin = np.array(origins)[which]
     mean = np.array([track.calibration.mean[:p] for track in tracks])
-    mean = mean[0] if len(tracks) == 1 else mean[which]
-    made = tracks[0]._increments(np.concatenate([*rows, parts]), mean)
+    made = tracks[0]._increments(np.concatenate(rows), mean[0] if len(tracks) == 1 else mean[which])
     heading = np.concatenate([[0.0], np.cumsum(made.delta[:whole, 2])])
     step = rotation3((heading[at] - heading[origin])[:whole]) @ made.delta[:whole, :, None]
     place = np.vstack([np.zeros(2), np.cumsum(step[:, :2, 0], axis=0)])
@@ -442,15 +441,18 @@ def _walks(tracks: Sequence[Track], times: Sequence[IntArray]) -> Motions:
     poses = poses[at] - poses[origin]  # where each increment begins
     turn = rotation3(poses[:, 2])
     after = poses + (turn @ made.delta[:, :, None])[:, :, 0]
-    F = _lever(-after) @ turn  # what an increment's error does to the origin
-    covs, d_cals = F @ made.cov @ F.mT, F @ made.d_cal
+    used = slice(whole + n)  # of what was earlier, nothing but the pose is
+    F = _lever(-after[used]) @ turn[used]  # what an increment's error does to the origin
+    covs, d_cals = F @ made.cov[used] @ F.mT, F @ made.d_cal[used]
+    up, base = at[whole : whole + n], origin[whole : whole + n]
 
     def upto(each: Array) -> Array:
         sums = np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each[:whole], axis=0)])
-        return np.asarray(sums[at[whole:]] - sums[origin[whole:]] + each[whole:])
+        return np.asarray(sums[up] - sums[base] + each[whole:])
 
-    path = np.hypot(made.delta[:, 0], made.delta[:, 1])
-    return Motions(after[whole:], upto(covs), upto(d_cals), upto(path))
+    path = np.hypot(made.delta[used, 0], made.delta[used, 1])
+    walk = Motions(after[whole : whole + n], upto(covs), upto(d_cals), upto(path))
+    return walk, after[whole + n :]
 
 
 def _lever(poses: Array) -> Array:

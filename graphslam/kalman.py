@@ -171,18 +171,21 @@ class JointGaussian(Generic[Name]):
         P[to] = P[of]
         P[:, to] = P[:, of]
 
-    def remove(self, name: Name) -> None:
-        """Forget a member: the others keep their joint marginal."""
-        gone = self._slots.pop(name)
-        n, d = self._size, gone.stop - gone.start
-        keep = np.r_[0 : gone.start, gone.stop : n]
-        self._x[: n - d] = self._x[keep]
-        self._P[: n - d, : n - d] = self._P[np.ix_(keep, keep)]
-        self._size = n - d
+    def remove(self, *names: Name) -> None:
+        """Forget members: the others keep their joint marginal."""
+        kept = np.ones(self._size, dtype=bool)
+        for name in names:
+            kept[self._slots.pop(name)] = False
+        keep = np.flatnonzero(kept)
+        n = len(keep)
+        self._x[:n] = self._x[keep]
+        self._P[:n, :n] = self._P[keep[:, None], keep]
+        self._size = n
         self._blocks.clear()
-        for other, slot in self._slots.items():
-            if slot.start > gone.start:
-                self._slots[other] = slice(slot.start - d, slot.stop - d)
+        end = 0
+        for other, slot in self._slots.items():  # in the order of their blocks
+            begin, end = end, end + slot.stop - slot.start
+            self._slots[other] = slice(begin, end)
 
     def move(self, name: Name, F: Array, Q: Array) -> None:
         """System update of one member, thesis 3.12: e becomes F e + noise of covariance Q (d, d).

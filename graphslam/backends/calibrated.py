@@ -14,7 +14,7 @@ import numpy as np
 
 from graphslam import factors
 from graphslam.backends.graph import read
-from graphslam.backends.isam2 import CONVERGED_ERROR_ROUGH, WholeGraph
+from graphslam.backends.isam2 import CONVERGED_ERROR_ROUGH, WholeGraph, marginals_of
 from graphslam.config import RobustConfig
 from graphslam.geometry import Array, adjoint, between, inverse, log, rotate_cov, rotation3
 from graphslam.models.motion import HELD_SIGMA, Calibration
@@ -142,19 +142,18 @@ def _result(
     numbers: Mapping[str, int],
 ) -> CalibratedEstimate:
     """Means and marginal covariances of everything, as records."""
+    covs = {} if marginals is None else marginals_of(marginals, graph.keyVector())
 
     def marginal(key: int, dim: int) -> Array:
-        if marginals is None:
-            return np.full((dim, dim), np.nan)
-        return np.asarray(marginals.marginalCovariance(key))
+        return covs[key] if covs else np.full((dim, dim), np.nan)
 
     states = {}
     for robot in sorted(builder.robots):
         keys = [builder.state_key(robot, n) for n in range(len(builder.states.times[robot]))]
         poses = np.array([read(values, k, 3) for k in keys])
-        covs = np.array([marginal(k, 3) for k in keys])
+        found = np.array([marginal(k, 3) for k in keys])
         states[robot] = Trajectory(
-            builder.states.stamps(robot), poses, rotate_cov(covs, poses[:, 2])
+            builder.states.stamps(robot), poses, rotate_cov(found, poses[:, 2])
         )
     landmarks = {}
     for landmark, dim in builder.landmark_dims.items():

@@ -131,11 +131,12 @@ class Active:
         parts = [block @ self._moved.x[self._moved.slot(key)] for key, block in H.items()]
         return np.asarray(sum(parts, start=np.zeros(())))
 
-    def forget(self, key: int) -> None:
-        """Marginalise a variable out."""
-        self._moved.remove(key)
-        self._places.erase(key)
-        del self._dims[key]
+    def forget(self, keys: Sequence[int]) -> None:
+        """Marginalise variables out."""
+        self._moved.remove(*keys)
+        for key in keys:
+            self._places.erase(key)
+            del self._dims[key]
 
 
 class CompressedBackend(Isam2Backend):
@@ -172,11 +173,11 @@ class CompressedBackend(Isam2Backend):
         except np.linalg.LinAlgError:
             self._flush()  # what is wrong the tree says by name
             return
-        for robot in step.motions:
-            number = self._builder.states.latest(robot) - self._kept
-            before = self._builder.state_key(robot, number)
-            if number >= 0 and before in self._active:
-                self._active.forget(before)
+        numbers = [
+            (robot, self._builder.states.latest(robot) - self._kept) for robot in step.motions
+        ]
+        before = [self._builder.state_key(*state) for state in numbers if state[1] >= 0]
+        self._active.forget([key for key in before if key in self._active])
 
     def landmark_means(self, landmarks: Sequence[int]) -> list[Array]:
         """See `Backend`; of what is not in use, as the tree has it without what waits."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from graphslam import factors
 from graphslam.backends.graph import Estimates, GraphBackend, GraphBuilder, Part, read, write
+from graphslam.beside import Task
 from graphslam.config import Config, RobustConfig
 from graphslam.errors import EstimationError
 from graphslam.geometry import Array
@@ -30,6 +31,8 @@ CONVERGED_ERROR, CONVERGED_ERROR_ROBUST, CONVERGED_ERROR_ROUGH = 1e-10, 1e-6, 1e
 #: linearising anew costs what there is by then: so many steps make the time between two looks for
 #: what moved as long again
 AS_LONG_AGAIN = 1000
+#: marginals that are worth a second process
+MANY = 500
 #: updates between two looks, for GTSAM, that will not be
 NEVER = 1 << 30
 
@@ -288,8 +291,7 @@ class Isam2Backend(GraphBackend):
         """Marginal covariance of every key: by Cholesky, or by QR where that gives up."""
         keys = values.keys()
         try:
-            marginals = gtsam.Marginals(self._builder.graph, values)
-            return {key: marginals.marginalCovariance(key) for key in keys}
+            return marginals_of(gtsam.Marginals(self._builder.graph, values), keys)
         except RuntimeError as error:
             isam = gtsam.ISAM2(isam2_parameters(self._config, "QR"))
             isam.update(self._builder.graph, values)
@@ -357,6 +359,23 @@ class Resolver(Isam2Backend):
 
     def _values(self) -> gtsam.Values:
         return self._isam.calculateBestEstimate() if self._finished is None else self._finished
+
+
+def marginals_of(marginals: gtsam.Marginals, keys: Sequence[int]) -> dict[int, Array]:
+    """Marginal covariance (dim, dim) of each key; a second process finds every other one.
+
+    Raises:
+        RuntimeError: one is indeterminate.
+    """
+
+    def some(which: Sequence[int]) -> list[Array]:
+        return [marginals.marginalCovariance(key) for key in which]
+
+    keys = list(keys)
+    others = Task(lambda: some(keys[1::2])) if len(keys) >= MANY else None
+    found = dict(zip(keys[::2], some(keys[::2]), strict=True))
+    found.update(zip(keys[1::2], others.result() if others else some(keys[1::2]), strict=True))
+    return found
 
 
 def optimise(

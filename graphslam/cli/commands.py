@@ -5,6 +5,7 @@ about arguments come at once.
 """
 
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -37,7 +38,7 @@ from graphslam.cli.arguments import (
 from graphslam.cli.terminal import errors_in_one_line, progress_bar
 from graphslam.config import Config, load_config
 from graphslam.errors import ConfigError, EstimationError, OutputError
-from graphslam.logs import IMPORTERS, KnownTruth, LogSet, inspect_logs, open_logs
+from graphslam.logs import IMPORTERS, KnownTruth, inspect_logs, open_logs
 from graphslam.records import Result
 from graphslam.results import check_target, load, save, to_json
 
@@ -169,21 +170,22 @@ def smooth_command(
         if horizon is not None and tree.backend.name != "isam2":
             raise ConfigError(f"--horizon: only isam2 has one, not {tree.backend.name}; leave it")
         check_target(output, force=force)
-        result = _smooth(open_logs(logs, tree), tree, output, force)
+        result = _smooth(logs, tree, output, force)
         if json:
             typer.echo(to_json(result.summary, "summary"), nl=False)
         else:
             show.smoothed(result, output)
 
 
-def _smooth(log: LogSet, tree: Config, output: Path, force: bool) -> Result:
+def _smooth(logs: Sequence[Path], tree: Config, output: Path, force: bool) -> Result:
     """Run the pipeline and write the folder."""
-    from graphslam.truth import truth_of_logs
-
-    truth = Task(lambda: truth_of_logs(log, tree))
+    opening = Task(lambda: open_logs(logs, tree))
     from graphslam.report import render
     from graphslam.slam import smooth
+    from graphslam.truth import truth_of_logs
 
+    log = opening.result()
+    truth = Task(lambda: truth_of_logs(log, tree))
     with progress_bar(sum(topic.count for topic in log.topics)) as progress:
         result = smooth(log, tree, progress)
     quality = _quality(result, truth.result())
