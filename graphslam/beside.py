@@ -11,12 +11,13 @@ import os
 import pickle
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
-from itertools import islice
+from itertools import islice, zip_longest
 from pathlib import Path
 from typing import Generic, TypeVar
 
+_S = TypeVar("_S")
 _T = TypeVar("_T")
 
 #: one entry per thread of this process
@@ -59,6 +60,13 @@ class Task(Generic[_T]):
         if not self.done:
             self._result, self.done = next(iter(self._made)), True
         return self._result
+
+
+def shared(function: Callable[[_S], _T], arguments: Sequence[_S]) -> list[_T]:
+    """Results of a function for each argument, every other one found by a second process."""
+    others = Task(lambda: [function(a) for a in arguments[1::2]])
+    found = [function(a) for a in arguments[::2]]
+    return [one for pair in zip_longest(found, others.result()) for one in pair][: len(arguments)]
 
 
 class Ahead(Generic[_T]):

@@ -119,7 +119,7 @@ class Pipeline:
     def run(self, progress: Progress) -> None:
         """Take in every message of the log."""
         tracks = {name: run.track for name, run in self.runs.items()}
-        read = _counted(self.log.messages((Truth, TrueLandmark)), self.counts, progress)
+        read = _counted(self.log.messages((Truth, TrueLandmark), ahead=True), self.counts, progress)
         messages = synchronise(
             self.wanted(on_one_clock(read, self.known.clocks)),
             tracks,

@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from graphslam.beside import Task
+from graphslam.beside import Task, shared
 from graphslam.config import Config, RobotConfig
 from graphslam.consolidating import Tamper
 from graphslam.errors import LogError
@@ -18,7 +18,7 @@ from graphslam.log_settings import check_robots, robot_settings
 from graphslam.logs import LogSet
 from graphslam.pipeline import Pipeline, Progress
 from graphslam.placing import beforehand, with_names
-from graphslam.records import Result
+from graphslam.records import Result, RobotResult
 from graphslam.robot_run import span_warnings
 from graphslam.summary import make_landmarks, summarise
 
@@ -82,12 +82,14 @@ def smooth(
     causal_only = all(run.is_causal(estimate.states[name]) for name, run in runs.items())
     estimate = worlds.estimate(estimate)
     steps = tuple(map(worlds.step, pipeline.steps))
-    robots = {}
     for name, run in runs.items():
-        frame = frames.of[name]
-        run.move(-frames.away.get(frame, 0.0))
-        start = pipeline.starts[frame].pose
-        robots[name] = run.result(estimate.states[name], start, causal_only=causal_only)
+        run.move(-frames.away.get(frames.of[name], 0.0))
+
+    def found(name: str) -> RobotResult:
+        start = pipeline.starts[frames.of[name]].pose
+        return runs[name].result(estimate.states[name], start, causal_only=causal_only)
+
+    robots = dict(zip(runs, shared(found, list(runs)), strict=True))
     pipeline.seconds["trajectories"] = time.perf_counter() - finishing
     entries = pipeline.associator.map
     landmarks = make_landmarks(entries.in_worlds(worlds.landmarks), estimate)

@@ -11,7 +11,7 @@ import numpy as np
 
 from graphslam import factors
 from graphslam.backends.graph import Estimates, GraphBackend, GraphBuilder, Part, read, write
-from graphslam.beside import Task
+from graphslam.beside import shared
 from graphslam.config import Config, RobustConfig
 from graphslam.errors import EstimationError
 from graphslam.geometry import Array
@@ -362,20 +362,15 @@ class Resolver(Isam2Backend):
 
 
 def marginals_of(marginals: gtsam.Marginals, keys: Sequence[int]) -> dict[int, Array]:
-    """Marginal covariance (dim, dim) of each key; a second process finds every other one.
+    """Marginal covariance (dim, dim) of each key.
 
     Raises:
         RuntimeError: one is indeterminate.
     """
-
-    def some(which: Sequence[int]) -> list[Array]:
-        return [marginals.marginalCovariance(key) for key in which]
-
+    covariance = marginals.marginalCovariance
     keys = list(keys)
-    others = Task(lambda: some(keys[1::2])) if len(keys) >= MANY else None
-    found = dict(zip(keys[::2], some(keys[::2]), strict=True))
-    found.update(zip(keys[1::2], others.result() if others else some(keys[1::2]), strict=True))
-    return found
+    found = shared(covariance, keys) if len(keys) >= MANY else list(map(covariance, keys))
+    return dict(zip(keys, found, strict=True))
 
 
 def optimise(

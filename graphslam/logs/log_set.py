@@ -74,16 +74,19 @@ class LogSet:
         """Range from which on a beam of ``topic`` means no return, m; inf when none was found."""
         return self._contexts[topic].no_return_m
 
-    def messages(self, without: tuple[type[Message], ...] = ()) -> Iterator[Message]:
+    def messages(
+        self, without: tuple[type[Message], ...] = (), *, ahead: bool = False
+    ) -> Iterator[Message]:
         """All messages in the order of ``time_ns``; at equal times odometry comes first.
 
         Topics of the records ``without`` are passed over, which saves decoding them. Memory holds
-        what falls into ``logs.reorder_s``, not the log. Every call starts anew.
+        what falls into ``logs.reorder_s``, not the log. Every call starts anew. ``ahead``: a second
+        process may read them, which pays where all are taken and something is done with them.
         """
         topics = {topic.name: topic for topic in self.topics if topic.record not in without}
         self._tell(_Told(Counter(), Counter(), []))
-        many = sum(topic.count for topic in topics.values()) >= MANY
-        for item in Ahead(lambda: self._read(topics)) if many else self._read(topics):
+        ahead &= sum(topic.count for topic in topics.values()) >= MANY
+        for item in Ahead(lambda: self._read(topics)) if ahead else self._read(topics):
             if isinstance(item, _Told):
                 self._tell(item)
             else:
