@@ -8,11 +8,11 @@ treats the errors as white). The estimate is itself pulled towards odometry, by 
 the learned values are used for the next motions, that share vanishes geometrically.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from graphslam.geometry import Array, rotation3, wrap
+from graphslam.geometry import Array, wrap
 from graphslam.models import MODELS
 from graphslam.models.motion import HELD_SIGMA, Calibration
 from graphslam.records import Association, Motion
@@ -107,24 +107,24 @@ def told(known: Calibration, prior: Array) -> dict[str, tuple[float, float, bool
 
 
 def observed_information(
-    seen: Sequence[Association], pose: Array, landmarks: Sequence[Array], heading_rad: float
-) -> Array:
-    """Information (3, 3) about a robot's pose in observations of landmarks that are known.
+    seen: Sequence[Association], poses: Mapping[str, Array], landmarks: Sequence[Array]
+) -> dict[str, Array]:
+    """Information (3, 3) about robots' poses in observations of landmarks that are known.
 
     Args:
-        seen: observations from this pose.
-        pose: (3,) world frame.
-        landmarks: their targets, world frame.
-        heading_rad: direction of the x axis that the result is wanted along.
+        seen: observations from these poses.
+        poses: robot -> (3,), world frame; along its axes the result is.
+        landmarks: targets of ``seen``, world frame.
     """
-    info = np.zeros((3, 3))
+    info = {robot: np.zeros((3, 3)) for robot in poses}
     for name in {association.model for association in seen}:
         model = MODELS[name]
         group = [k for k, association in enumerate(seen) if association.model == name]
         z, cov = (np.array([getattr(seen[k], what) for k in group]) for what in ("z", "cov"))
+        x = np.array([poses[seen[k].robot] for k in group])
         targets = np.array([landmarks[k] for k in group])
-        H, _ = model.jacobians(z, pose, targets)
-        R = model.noise(z, cov, pose, targets)
-        info += (H.mT @ np.linalg.solve(R, H)).sum(axis=0)
-    turn = rotation3(heading_rad)
-    return np.asarray(turn.T @ info @ turn)
+        H, _ = model.jacobians(z, x, targets)
+        R = model.noise(z, cov, x, targets)
+        for k, found in zip(group, H.mT @ np.linalg.solve(R, H), strict=True):
+            info[seen[k].robot] += found
+    return info

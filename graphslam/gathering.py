@@ -255,7 +255,10 @@ def shared(associations: Sequence[Association]) -> tuple[Association, ...]:
     consecutive images correlate by 0.8), so they get n times the covariance.
     """
     count = Counter((a.robot, a.target) for a in associations)
-    return tuple(replace(a, cov=a.cov * count[a.robot, a.target]) for a in associations)
+    return tuple(
+        replace(a, cov=a.cov * n) if (n := count[a.robot, a.target]) > 1 else a
+        for a in associations
+    )
 
 
 def events(messages: Iterable[Message]) -> Iterator[list[Message]]:

@@ -27,7 +27,15 @@ from graphslam.frames import Frames
 from graphslam.frontend import FRONT_ENDS, scan_points
 from graphslam.frontend.sightings import sighting_observation
 from graphslam.gathering import Gathered, Sources, carried, events, gather, met, shared, ways
-from graphslam.geometry import compose, compose_cov, inverse, inverse_cov, rotate_cov
+from graphslam.geometry import (
+    Array,
+    compose,
+    compose_cov,
+    inverse,
+    inverse_cov,
+    rotate_cov,
+    rotation3,
+)
 from graphslam.joining import Joined
 from graphslam.log_settings import make_tracks, noted, outlines
 from graphslam.logs import LogSet
@@ -351,7 +359,7 @@ class Pipeline:
         self.note_covariances()
         self.backend.add(step)
         self.steps.append(step)
-        self.note_state(robot, time_ns)
+        self.note_state(robot, time_ns, self.backend.state_mean(robot))
 
     def has_started(self, robot: str, time_ns: int) -> bool:
         """Whether a robot has a state at ``time_ns``, given one if it is known where it starts."""
@@ -469,10 +477,11 @@ class Pipeline:
         self.backend.add(step)
         self.associator.settle()
         self.steps.append(step)
-        for name in step.motions:
-            if self.config.odometry.calibrate:
-                self.learn(name, step, known)
-            self.note_state(name, step.time_ns)
+        poses = {name: self.backend.state_mean(name) for name in step.motions}
+        if self.config.odometry.calibrate:
+            self.learn(step, poses, known)
+        for name, pose in poses.items():
+            self.note_state(name, step.time_ns, pose)
         self.seconds["back end"] += time.perf_counter() - began
 
     def robot_sighting(
@@ -524,24 +533,29 @@ class Pipeline:
         verified = closure_id(message) in self.known.recorded.kept
         return Closure(message.robot, state_ns, message.other, other_ns, delta, cov, verified)
 
-    def note_state(self, robot: str, time_ns: int) -> None:
-        """Book a new state."""
-        run = self.runs[robot]
-        run.append(time_ns, self.backend.state_mean(robot))
+    def note_state(self, robot: str, time_ns: int, pose: Array) -> None:
+        """Book a new state, which is at ``pose`` (3,)."""
+        self.runs[robot].append(time_ns, pose)
         self.counts["keyframes"] += 1
 
-    def learn(self, robot: str, step: Step, known: set[int]) -> None:
-        """Improve the robot's calibration from a step; ``known`` landmarks were there before it."""
-        run, pose = self.runs[robot], self.backend.state_mean(robot)
+    def learn(self, step: Step, poses: Mapping[str, Array], known: set[int]) -> None:
+        """Improve robots' calibration from a step.
+
+        Args:
+            step: as the back end has it.
+            poses: (3,) estimates of the states that it made.
+            known: landmarks that were there before it.
+        """
         seen = [
             a
             for a in step.associations
-            if a.robot == robot and a.target in known and a.time_ns == step.time_ns
+            if a.robot in poses and a.time_ns == step.time_ns and a.target in known
         ]
         landmarks = self.backend.landmark_means([a.target for a in seen if a.target in known])
-        heading = float(run.causal_poses[-1][2])
-        observed = observed_information(seen, pose, landmarks, heading)
-        run.learn(step.motions[robot], pose, observed)
+        observed = observed_information(seen, poses, landmarks)
+        for robot, pose in poses.items():
+            turn = rotation3(-float(self.runs[robot].causal_poses[-1][2]))
+            self.runs[robot].learn(step.motions[robot], pose, turn @ observed[robot] @ turn.T)
 
     def note_covariances(self) -> None:
         """Book the causal covariance of states that have none yet.

@@ -61,8 +61,6 @@ def refine(
     if not config.odometry.calibrate:
         return Refined(estimate, tuple(steps))
     priors = {name: track.nominal for name, track in tracks.items()}
-    inflation: dict[str, Array] = {}
-    slack: dict[str, Array] = {}
     made, seen = tuple(steps), sightings_of(steps, sources)
     for k in range(ROUNDS):
         now = {name: track.calibration for name, track in tracks.items()}
@@ -73,7 +71,7 @@ def refine(
         if k:
             inflation = variances(made, seen, estimate)
             slack = motion_variances(made, estimate)
-        made = tuple(_inflated(step, inflation, slack) for step in made)
+            made = tuple(_inflated(step, inflation, slack) for step in made)
         solved = solve_calibrated(made, estimate, priors, now, config.robust, rough=k < ROUNDS - 1)
         estimate = solved.estimate
         for name, track in tracks.items():

@@ -11,6 +11,7 @@ from functools import partial
 import numpy as np
 
 from graphslam.beside import Task, shared
+from graphslam.clock_offsets import ClockFound
 from graphslam.config import Config, RobotConfig
 from graphslam.consolidating import Tamper
 from graphslam.errors import LogError
@@ -18,7 +19,7 @@ from graphslam.log_settings import check_robots, robot_settings
 from graphslam.logs import LogSet
 from graphslam.pipeline import Pipeline, Progress
 from graphslam.placing import beforehand, with_names
-from graphslam.records import Result, RobotResult
+from graphslam.records import Estimate, Result, RobotResult
 from graphslam.robot_run import span_warnings
 from graphslam.summary import make_landmarks, summarise
 
@@ -51,29 +52,24 @@ def smooth(
     check_robots(log, config)
     known = beforehand(log, config)
     starts_s = time.perf_counter() - began
-    pipeline = _passed(Pipeline(log, config, known, tamper), progress)
-    finishing = time.perf_counter()
-    estimate, rough = pipeline.estimate()
-    names = pipeline.exchanged(estimate)
-    if names:
-        known = with_names(known, log, config, names)
+    passes = 0
+    while True:
         pipeline = _passed(Pipeline(log, config, known, tamper), progress)
         finishing = time.perf_counter()
         estimate, rough = pipeline.estimate()
-    for tries in range(MAX_CLOCKS, -1, -1):
-        finding = Task(partial(pipeline.clocks_found, estimate))
-        # clocks seldom differ, so solving again does not wait for them where it does not take long
-        meanwhile = not finding.done and pipeline.is_refined
-        final = pipeline.reconsider(estimate) if rough and meanwhile else None
-        clocks = finding.result()
-        if not tries or not any(found.differs for found in clocks.values()):
+        finding = Task(partial(_misread, pipeline, estimate))
+        # mostly nothing is, so solving again does not wait to know where it does not take long
+        meanwhile = rough and pipeline.is_refined and not finding.done
+        final = pipeline.reconsider(estimate) if meanwhile else estimate
+        names, clocks = finding.result()
+        if names and not known.names:
+            known = with_names(known, log, config, names)
+        elif passes < MAX_CLOCKS and any(found.differs for found in clocks.values()):
+            passes += 1
+            known = replace(known, clocks={robot: found.clock for robot, found in clocks.items()})
+        else:
             break
-        known = replace(known, clocks={robot: found.clock for robot, found in clocks.items()})
-        pipeline = _passed(Pipeline(log, config, known, tamper), progress)
-        finishing = time.perf_counter()
-        estimate, rough = pipeline.estimate()
-    if rough:
-        estimate = final or pipeline.reconsider(estimate)
+    estimate = pipeline.reconsider(estimate) if rough and not meanwhile else final
     pipeline.seconds["starts"] = starts_s
     pipeline.seconds["final optimisation"] = time.perf_counter() - finishing
     finishing = time.perf_counter()
@@ -136,6 +132,13 @@ def smooth(
         np.array(pipeline.step_ms),
         summary,
     )
+
+
+def _misread(
+    pipeline: Pipeline, estimate: Estimate
+) -> tuple[dict[str, str], dict[str, ClockFound]]:
+    """By what the log was to be read, as an estimate has it: names (false -> right), and clocks."""
+    return pipeline.exchanged(estimate), pipeline.clocks_found(estimate)
 
 
 def _passed(pipeline: Pipeline, progress: Progress) -> Pipeline:

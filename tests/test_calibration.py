@@ -16,7 +16,7 @@ from graphslam.calibration import (
 )
 from graphslam.config import OdometryConfig, RobotConfig
 from graphslam.dead_reckoning import Track
-from graphslam.geometry import between, compose, exp, rotation3
+from graphslam.geometry import between, compose, exp
 from graphslam.models import MODELS
 from graphslam.models.motion import wheel_twist
 from graphslam.records import Association, OdometryIncrement, OdometryPose, WheelAngles
@@ -290,23 +290,29 @@ def test_a_corridor_does_not_show_the_scale_of_the_path():
 
 
 @pytest.mark.parametrize("heading_rad", [0.0, 0.7, -2.5])
-def test_information_of_observations_lies_along_the_axes_asked_for(heading_rad):
+def test_information_of_observations_lies_along_world_axes(heading_rad):
     """A post 4 m ahead in the world's x direction: range gives 1/sigma² along x, bearing that of
     4 m times its sigma across, whichever way the robot faces."""
-    pose = np.array([1.0, 2.0, 0.3])
-    post = np.array([5.0, 2.0])
-    model = MODELS["point"]
+    pose, post = np.array([1.0, 2.0, heading_rad]), np.array([5.0, 2.0])
     cov = np.diag([1e-4, 4e-4])
-    seen = Association("r", 0, 0, "point", model.predict(pose, post), cov)
-    info = observed_information([seen], pose, [post], heading_rad)
-    turn = rotation3(heading_rad)
-    along_world = turn @ info @ turn.T
-    np.testing.assert_allclose(along_world[0, 0], 1 / 4e-4, rtol=1e-9)
-    np.testing.assert_allclose(along_world[1, 1], 1 / (16 * 1e-4), rtol=1e-9)
-    np.testing.assert_allclose(along_world[2, 2], 1 / 1e-4, rtol=1e-9)
-    two = observed_information([seen, seen], pose, [post, post], heading_rad)
-    np.testing.assert_allclose(two, 2 * info, rtol=1e-12)
-    np.testing.assert_array_equal(observed_information([], pose, [], heading_rad), np.zeros((3, 3)))
+    seen = Association("r", 0, 0, "point", MODELS["point"].predict(pose, post), cov)
+    info = observed_information([seen], {"r": pose}, [post])["r"]
+    np.testing.assert_allclose(np.diag(info), [1 / 4e-4, 1 / (16 * 1e-4), 1 / 1e-4], rtol=1e-9)
+
+
+def test_every_robot_is_informed_by_what_it_saw_itself():
+    """Two robots at different places that saw one post, one of them twice, one robot that saw
+    nothing."""
+    poses = {"a": np.array([1.0, 2.0, 0.3]), "b": np.array([5.0, -1.0, 2.0]), "c": np.zeros(3)}
+    post, cov = np.array([5.0, 2.0]), np.diag([1e-4, 4e-4])
+    seen = [
+        Association(r, 0, 0, "point", MODELS["point"].predict(poses[r], post), cov) for r in "aba"
+    ]
+    info = observed_information(seen, poses, [post] * 3)
+    once = observed_information(seen[:1], {"a": poses["a"]}, [post])["a"]
+    np.testing.assert_allclose(info["a"], 2 * once, rtol=1e-12)
+    np.testing.assert_allclose(info["b"][1, 1], 1 / 4e-4, rtol=1e-9)  # it looks along y
+    np.testing.assert_array_equal(info["c"], np.zeros((3, 3)))
 
 
 # ------------------------------------------------------------ nothing to learn
