@@ -107,11 +107,11 @@ def _sinc(phi: float) -> float:
 def _sinc_terms(phi: Array) -> tuple[Array, Array]:
     """``sin(phi)/phi`` and ``(1 - cos phi)/phi`` without cancellation near zero.
 
-    1 - cos phi = 2 sin²(phi/2), so both are exact to rounding: sinc(phi) and phi/2 sinc²(phi/2).
+    sin phi = 2 sin(phi/2) cos(phi/2) and 1 - cos phi = 2 sin²(phi/2), so both are exact to
+    rounding: sinc(phi/2) cos(phi/2) and phi/2 sinc²(phi/2).
     """
-    sinc = np.sinc(phi / np.pi)
     half = np.sinc(phi / (2 * np.pi))
-    return np.asarray(sinc), np.asarray(0.5 * phi * half * half)
+    return np.asarray(half * np.cos(phi / 2)), np.asarray(0.5 * phi * half * half)
 
 
 def exp(twist: Array) -> Array:
@@ -119,7 +119,8 @@ def exp(twist: Array) -> Array:
     twist = np.asarray(twist, dtype=float)
     if twist.ndim == 1:  # as in `compose`
         vx, vy, phi = twist.tolist()
-        sinc, half = _sinc(phi), _sinc(phi / 2)
+        half = _sinc(phi / 2)
+        sinc = half * math.cos(phi / 2) if math.isfinite(phi) else math.nan
         rise = 0.5 * phi * half * half
         return np.array([sinc * vx - rise * vy, rise * vx + sinc * vy, _wrap(phi)])
     a, b = _sinc_terms(twist[..., 2])
@@ -202,7 +203,6 @@ def exp_jacobian(twist: Array) -> Array:
     w = twist[..., 2]
     a, b = _sinc_terms(w)
     small = np.abs(w) < 0.3
-    safe = np.where(small, 1.0, w)
     # a' = (w cos w - sin w)/w², b' = (w sin w - 1 + cos w)/w²: both cancel near zero, where six
     # terms of their series leave less than 1e-16 for |w| < 0.3
     w2 = w * w
@@ -210,8 +210,12 @@ def exp_jacobian(twist: Array) -> Array:
         -w / 3 * (1 - w2 / 10 * (1 - w2 / 28 * (1 - w2 / 54 * (1 - w2 / 88 * (1 - w2 / 130)))))
     )
     db_series = 0.5 - w2 / 8 * (1 - w2 / 18 * (1 - w2 / 40 * (1 - w2 / 70 * (1 - w2 / 108))))
-    da = np.where(small, da_series, (safe * np.cos(safe) - np.sin(safe)) / safe**2)
-    db = np.where(small, db_series, (safe * np.sin(safe) - 1 + np.cos(safe)) / safe**2)
+    da, db = da_series, db_series
+    if not small.all():  # increments of odometry hardly ever turn so far
+        safe = np.where(small, 1.0, w)
+        cos, sin = np.cos(safe), np.sin(safe)
+        da = np.where(small, da, (safe * cos - sin) / safe**2)
+        db = np.where(small, db, (safe * sin - 1 + cos) / safe**2)
     out = np.zeros((*twist.shape, 3))
     out[..., 0, 0] = out[..., 1, 1] = a
     out[..., 0, 1], out[..., 1, 0] = -b, b
