@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from graphslam.beside import shared
 from graphslam.errors import OutputError
 from graphslam.gaussian import chi2_quantile
 from graphslam.geometry import Array, between, interpolate, transform, wrap
@@ -481,19 +482,17 @@ def evaluate(
                 f"which is of {', '.join(truth)}"
             )
         apart = robots_apart(result.summary)
-        found["robots"] = {
-            name: {
-                kind: trajectory_metrics([p]) | (NO_PLACE if name in apart else {})
-                for kind, p in both.items()
-            }
-            for name, both in pairs.items()
-        }
+        asked = {(name, kind): [p] for name, both in pairs.items() for kind, p in both.items()}
         together = [both for name, both in pairs.items() if name not in apart]
         if together:
-            found["joint"] = {
-                kind: trajectory_metrics([both[kind] for both in together])
-                for kind in ("final", "causal")
-            }
+            asked |= {("", kind): [both[kind] for both in together] for kind in together[0]}
+        metrics = dict(zip(asked, shared(trajectory_metrics, list(asked.values())), strict=True))
+        found["robots"] = {
+            name: {kind: metrics[name, kind] | (NO_PLACE if name in apart else {}) for kind in both}
+            for name, both in pairs.items()
+        }
+        if together:
+            found["joint"] = {kind: metrics["", kind] for kind in together[0]}
     if true_landmarks:
         marks = [mark for mark in result.landmarks if mark.frame is None]
         found["landmarks"] = landmark_metrics(marks, true_landmarks)

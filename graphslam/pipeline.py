@@ -297,6 +297,8 @@ class Pipeline:
         self.first_ns, self.last_ns = min(self.first_ns, time_ns), max(self.last_ns, time_ns)
         if not run.started:
             self.start(first.robot, min(run.track.first_ns, time_ns))
+        elif isinstance(first, ODOMETRY) and self.config.keyframe.mode != "all":
+            return  # the rule, where odometry is most of a log
         run.scans += [(m.stamp_ns, m.time_ns, m.mount) for m in event if isinstance(m, Scan)]
         self.counts["scans"] += isinstance(first, Scan)
         used = self.is_used(event)

@@ -45,7 +45,8 @@ def synchronise(
     max_gap_ns = round(max_gap_s * 1e9)
     now_ns = 0
 
-    def release(final: bool) -> Iterator[Message]:
+    def next_of_waiting(final: bool) -> Message | None:
+        """The first that waits, taken out, unless it has to wait on."""
         while waiting:
             head = waiting[0]
             if not isinstance(head, ODOMETRY):
@@ -53,22 +54,25 @@ def synchronise(
                 shown = [tracks[robot] for robot in watched] if isinstance(head, Scan) else []
                 covered = all(track and track.reaches(head.time_ns) for track in needed + shown)
                 if not covered and not final and now_ns - head.time_ns <= max_gap_ns:
-                    return
+                    return None
                 if not all(track and track.near(head.time_ns, max_gap_ns) for track in needed):
                     waiting.popleft()
                     dropped[f"{type(head).__name__.lower()}: no odometry near it"] += 1
                     continue
-            yield waiting.popleft()
+            return waiting.popleft()
+        return None
 
     for message in messages:
-        if isinstance(message, Truth | TrueLandmark):
+        if isinstance(message, ODOMETRY):
+            tracks[message.robot].add(message)
+        elif isinstance(message, (Truth, TrueLandmark)):
             continue
-        if isinstance(message, Sighting) and message.seen_robot not in (None, *tracks):
+        elif isinstance(message, Sighting) and message.seen_robot not in (None, *tracks):
             dropped[f"sighting: robot {message.seen_robot} is not in the log"] += 1
             continue
         now_ns = max(now_ns, message.time_ns)
-        if isinstance(message, ODOMETRY):
-            tracks[message.robot].add(message)
         waiting.append(message)
-        yield from release(final=False)
-    yield from release(final=True)
+        while (ready := next_of_waiting(final=False)) is not None:
+            yield ready
+    while (ready := next_of_waiting(final=True)) is not None:
+        yield ready
