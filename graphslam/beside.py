@@ -41,57 +41,34 @@ def possible() -> bool:
     return _allowed.get() and sum(1 for _ in THREADS.iterdir()) == 1
 
 
-class Task(Generic[_T]):
-    """A task that is begun, and its result; ``done`` where there is nothing to wait for.
-
-    Where there is no second process it is done at once, so that it always finds things as they
-    are when it begins. Its result must be picklable.
-    """
-
-    def __init__(self, task: Callable[[], _T]) -> None:
-        """Begin."""
-        self.done = not possible()
-        self._made = Ahead(lambda: iter([task()]))
-        if self.done:
-            self._result = next(iter(self._made))
-
-    def result(self) -> _T:
-        """What it returned; raises what it raised."""
-        if not self.done:
-            self._result, self.done = next(iter(self._made)), True
-        return self._result
-
-
-def shared(function: Callable[[_S], _T], arguments: Sequence[_S]) -> list[_T]:
-    """Results of a function for each argument, every other one found by a second process."""
-    others = Task(lambda: [function(a) for a in arguments[1::2]])
-    found = [function(a) for a in arguments[::2]]
-    return [one for pair in zip_longest(found, others.result()) for one in pair][: len(arguments)]
-
-
 class Ahead(Generic[_T]):
     """What an iterator yields, made ahead of the one who takes it, as far as a pipe is long.
 
     To be iterated over once. ``make`` is called again where the second process came to an end
-    before its work did, also because of an error, which is then raised here.
+    before its work did, also because of an error, which is then raised here. ``forked``: whether
+    there is a second process.
     """
 
     def __init__(self, make: Callable[[], Iterator[_T]]) -> None:
         """Begin."""
         self._make = make
-        self._pid, self._source = 0, -1
-        if possible():
-            self._fork()
+        self.forked = possible() and self._fork()
 
-    def _fork(self) -> None:
+    def _fork(self) -> bool:
         self._source, sink = os.pipe()
-        self._pid = os.fork()
+        try:
+            self._pid = os.fork()
+        except OSError:  # no memory, or no process, to be had
+            os.close(self._source)
+            os.close(sink)
+            return False
         if self._pid:
             os.close(sink)
-            return
+            return True
         done = 1
         try:
             os.close(self._source)
+            allow(second=False)
             gc.freeze()  # or looking for cycles would copy what is shared
             with os.fdopen(sink, "wb") as stream:
                 items = self._make()
@@ -105,7 +82,7 @@ class Ahead(Generic[_T]):
     def __iter__(self) -> Iterator[_T]:
         """The items."""
         taken = 0
-        if self._pid:
+        if self.forked:
             try:
                 with os.fdopen(self._source, "rb") as stream:
                     for batch in iter(lambda: pickle.load(stream), []):
@@ -113,8 +90,39 @@ class Ahead(Generic[_T]):
                         taken += len(batch)
                 return
             except (EOFError, pickle.UnpicklingError):
-                pass  # it died
+                pass  # it came to an end too early
             finally:
                 os.kill(self._pid, signal.SIGKILL)
                 os.waitpid(self._pid, 0)
         yield from islice(self._make(), taken, None)
+
+
+class Task(Generic[_T]):
+    """A task that is begun, and its result; ``done`` where there is nothing to wait for.
+
+    Where there is no second process it is done at once, so that it always finds things as they
+    are when it begins. Its result must be picklable.
+    """
+
+    def __init__(self, task: Callable[[], _T]) -> None:
+        """Begin."""
+        self._made = Ahead(lambda: iter([task()]))
+        self.done = not self._made.forked
+        if self.done:
+            self._result = next(iter(self._made))
+
+    def result(self) -> _T:
+        """What it returned; raises what it raised."""
+        if not self.done:
+            (self._result,) = self._made
+            self.done = True
+        return self._result
+
+
+def shared(function: Callable[[_S], _T], arguments: Sequence[_S]) -> list[_T]:
+    """Results of a function for each argument, every other one found by a second process."""
+    if len(arguments) < 2 or not possible():
+        return [function(a) for a in arguments]
+    others = Task(lambda: [function(a) for a in arguments[1::2]])
+    found = [function(a) for a in arguments[::2]]
+    return [one for pair in zip_longest(found, others.result()) for one in pair][: len(arguments)]

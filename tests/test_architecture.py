@@ -18,7 +18,8 @@ ROOT = Path(graphslam.__file__).parent
 
 #: The rooms of the house, lowest row first. An import goes to a lower row, or stays in its room.
 ROWS = (
-    ("errors", "geometry"),  # how it fails; what a pose is
+    # how it fails; what a pose is; work in a second process
+    ("beside", "errors", "geometry"),
     ("gaussian",),  # what squared distances of normal errors may be
     # settings; what travels between the modules; Kalman filtering on arrays
     ("config", "kalman", "records"),

@@ -1,6 +1,8 @@
 """How a command talks while it works: one line for an error, a bar where someone is watching."""
 
+import math
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -10,6 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from graphslam.errors import GraphSlamError
 
+DRAWN_EVERY_S = 0.1
 INTERRUPTED = 130  # what shells give a program that Ctrl-C ended
 
 
@@ -55,6 +58,16 @@ def progress_bar(total: int, doing: str = "smoothing") -> Iterator[Callable[[int
         yield lambda _done: None
         return
     columns = TextColumn(doing), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+    # a thread that draws would keep work from being done `beside`
+    bar = Progress(*columns, console=Console(stderr=True), transient=True, auto_refresh=False)
+    drawn_s = -math.inf
+    with bar as progress:
         task = progress.add_task("", total=total)
-        yield lambda done: progress.update(task, completed=done)
+
+        def show(done: int) -> None:
+            nonlocal drawn_s
+            if time.monotonic() - drawn_s > DRAWN_EVERY_S:
+                drawn_s = time.monotonic()
+                progress.update(task, completed=done, refresh=True)
+
+        yield show
