@@ -362,7 +362,7 @@ class Resolver(Isam2Backend):
 
 
 def marginals_of(marginals: gtsam.Marginals, keys: Sequence[int]) -> dict[int, Array]:
-    """Marginal covariance (dim, dim) of each key.
+    """Marginal covariance (d, d) of each key, m and rad.
 
     Raises:
         RuntimeError: one is indeterminate.
