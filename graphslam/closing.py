@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graphslam.beside import shared
 from graphslam.gaussian import chi2_quantile
 from graphslam.geometry import (
     Array,
@@ -42,6 +43,8 @@ APART_M, NEAR_M = 15.0, 3.0
 #: the window searched: so many sigmas and this much more, at most so far (m, m, rad)
 SIGMAS = 3.0
 MARGIN, FARTHEST = np.array([0.6, 0.6, 0.08]), np.array([5.0, 5.0, 0.5])
+#: pairs of places that are worth a second process to compare them
+MANY = 16
 #: verified: shares of points confirmed at least, looked through at most (of both)
 SAME, ABSENT = 0.4, 0.15
 #: share of points on others in a coarse search below which `SAME` is out of reach: looked at no
@@ -209,7 +212,7 @@ def loop_closures(
         looked: relative poses (3,) at which pairs were looked at before, which need no second look;
             this adds to it.
     """
-    lost, confirmed = [], []
+    asked: list[tuple[Place, Place, Array, Array]] = []
     for i, j, window in candidates(found, TRUST * P):
         later, earlier = found[i], found[j]
         guess = between(earlier.pose, later.pose)
@@ -217,14 +220,31 @@ def loop_closures(
         if pair in looked and _near(looked[pair], guess, CLOSED):
             continue
         looked[pair] = guess
-        there = closed(later.submap, earlier.submap, guess)
+        asked.append((later, earlier, guess, window))
+    lost: list[Closure] = []
+    confirmed: list[Closure] = []
+    seen = shared(_seen_again, asked) if len(asked) >= MANY else map(_seen_again, asked)
+    for (later, earlier, _, _), there in zip(asked, seen, strict=True):
         if there is not None:
-            confirmed.append(_closure(later, earlier, *there))
-            continue
-        best = verified(match(later.submap, earlier.submap, guess, window, HOPELESS))
-        if best is not None:
-            lost.append(_closure(later, earlier, best.pose, best.cov))
+            was_lost, pose, cov = there
+            (lost if was_lost else confirmed).append(_closure(later, earlier, pose, cov))
     return lost, confirmed
+
+
+def _seen_again(
+    asked: tuple[Place, Place, Array, Array],
+) -> tuple[bool, Array, Array] | None:
+    """Whether a pair of places was lost, and how it lies (3,), (3, 3); None if it is no pair.
+
+    ``asked``: the later and the earlier place, where it is believed to lie (3,), and half the
+    window (3,) to search.
+    """
+    later, earlier, guess, window = asked
+    there = closed(later.submap, earlier.submap, guess)
+    if there is not None:
+        return False, *there
+    best = verified(match(later.submap, earlier.submap, guess, window, HOPELESS))
+    return None if best is None else (True, best.pose, best.cov)
 
 
 def _closure(later: Place, earlier: Place, pose: Array, cov: Array) -> Closure:
