@@ -125,6 +125,8 @@ def observed_information(
         targets = np.array([landmarks[k] for k in group])
         H, _ = model.jacobians(z, x, targets)
         R = model.noise(z, cov, x, targets)
-        for k, found in zip(group, H.mT @ np.linalg.solve(R, H), strict=True):
-            info[seen[k].robot] += found
+        found = H.mT @ np.linalg.solve(R, H)
+        robots = np.array([seen[k].robot for k in group])
+        for robot in set(robots.tolist()):
+            info[robot] += found[robots == robot].sum(axis=0)
     return info

@@ -14,7 +14,7 @@ import numpy as np
 
 from graphslam.config import RobustConfig
 from graphslam.errors import EstimationError
-from graphslam.geometry import Array, rotate_cov, rotation3
+from graphslam.geometry import Array, is_positive, rotate_cov, rotation3
 from graphslam.models.observation import LineModel
 from graphslam.records import Association, Closure, Motion, Start
 
@@ -74,28 +74,9 @@ def gaussian(cov: Array) -> gtsam.noiseModel.Base:
     Raises:
         EstimationError: the covariance is not positive definite.
     """
-    if not _is_positive(cov):
+    if not is_positive(cov):
         raise EstimationError(f"covariance is not positive definite: {cov.tolist()}")
     return gtsam.noiseModel.Gaussian.Covariance(cov)
-
-
-def _is_positive(cov: Array) -> bool:
-    """Whether a symmetric matrix is positive definite; by its minors, as most are 2 x 2 or 3 x 3.
-
-    LAPACK takes ten times as long for those, which shows where there are 100 000 of them.
-    """
-    if len(cov) == 2:
-        (a, b), (_, d) = cov.tolist()
-        return bool(a > 0 and a * d - b * b > 0)
-    if len(cov) == 3:
-        (a, b, c), (_, d, e), (_, _, f) = cov.tolist()
-        minor = a * d - b * b
-        return bool(a > 0 and minor > 0 and f * minor - a * e * e - d * c * c + 2 * b * c * e > 0)
-    try:
-        np.linalg.cholesky(cov)
-    except np.linalg.LinAlgError:
-        return False
-    return True
 
 
 _KERNELS: dict[str, Callable[[float], gtsam.noiseModel.mEstimator.Base]] = {

@@ -19,6 +19,7 @@ from graphslam.geometry import (
     exp_jacobian,
     interpolate,
     inverse,
+    is_positive,
     log,
     log_jacobian,
     rotate_cov,
@@ -242,3 +243,17 @@ def test_interpolate_keeps_one_twist_from_end_to_end(a, b, share):
     if turn < 3.1:  # beyond, the twist is ill-determined (see above)
         twist = log(between(a, b))
         np.testing.assert_allclose(log(between(a, middle)), share * twist, atol=CHAIN)
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 4])
+def test_positive_definite_is_what_eigenvalues_say(size):
+    """Spectra of either sign, also near zero but beyond rounding, 1e-9; NaN is not positive."""
+    rng = np.random.default_rng(size)
+    for _ in range(300):
+        q, _ = np.linalg.qr(rng.normal(size=(size, size)))
+        values = rng.choice([1.0, 1.0, 1.0, 1e-6, -1e-6, -1.0], size=size) * rng.uniform(
+            0.5, 2, size
+        )
+        cov = (q * values) @ q.T
+        assert is_positive((cov + cov.T) / 2) == (values.min() > 0)
+    assert not is_positive(np.full((size, size), np.nan))

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from graphslam import records
-from graphslam.geometry import Array
+from graphslam.geometry import Array, is_positive
 from graphslam.logs import schemas
 
 ABSURD_M = 1000.0  # no planar laser sees as far; some drivers write 1e6 or 65535 for an error
@@ -255,7 +255,7 @@ def _covariance(what: str, values: Any, size: int) -> Array:
     cov = np.asarray(values, dtype=float).reshape(3, 3)[:size, :size]
     cov = np.asarray((cov + cov.T) / 2)
     _check_finite(what, cov)
-    if np.linalg.eigvalsh(cov)[0] <= 0:
+    if not is_positive(cov):
         raise UnusableError(f"{what}: covariance is not positive definite")
     return cov
 
