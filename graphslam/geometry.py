@@ -202,10 +202,10 @@ def is_positive(cov: Array) -> bool:
         minor = a * d - b * b
         return bool(a > 0 and minor > 0 and f * minor - a * e * e - d * c * c + 2 * b * c * e > 0)
     try:
-        np.linalg.cholesky(cov)
+        factor = np.linalg.cholesky(cov)
     except np.linalg.LinAlgError:
         return False
-    return True
+    return bool(np.isfinite(factor).all())  # of NaN LAPACK makes NaN
 
 
 def interpolate(a: Array, b: Array, share: ArrayLike) -> Array:
