@@ -29,7 +29,7 @@ from graphslam.models.motion import (
     mounted_motion,
     nominal_calibration,
 )
-from graphslam.readings import BoolArray, IntArray, Readings, reached
+from graphslam.readings import BoolArray, IntArray, Readings, reached, settle
 from graphslam.records import Motion
 
 #: m and rad: what a robot that reports no motion may still have moved between two states
@@ -191,7 +191,6 @@ class Track(Readings):
 
         Those of wheels are each of its own kind, as calibration is of a robot's own wheels.
         """
-        self._settle()
         own = self if self.source == "wheels" else None
         return self.source, self._count > 1, len(self.calibration.mean), self._config, own
 
@@ -337,6 +336,7 @@ def motions_of(asked: Sequence[tuple[Track, IntArray, IntArray]]) -> list[Motion
     of_track: dict[Track, list[int]] = defaultdict(list)
     for k, (track, _, _) in enumerate(asked):
         of_track[track].append(k)
+    settle(of_track)
     alike: dict[Hashable, list[Track]] = defaultdict(list)
     for track in of_track:
         alike[track._kind].append(track)

@@ -41,6 +41,7 @@ from graphslam.log_settings import make_tracks, noted, outlines
 from graphslam.logs import LogSet
 from graphslam.meeting import Kept
 from graphslam.models import transport
+from graphslam.readings import settle
 from graphslam.recorded import Recorded, closure_id
 from graphslam.records import (
     Association,
@@ -190,6 +191,7 @@ class Pipeline:
         for robot in meeting:
             if not self.runs[robot].started:
                 self.start(robot, min(self.runs[robot].track.first_ns, step_ns))
+        settle(self.runs[robot].track for robot in gathered.robots)
         angle = self.config.keyframe.angle_rad
         last_ns = {
             robot: run.state_ns

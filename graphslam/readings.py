@@ -6,6 +6,8 @@ calibration: that is `dead_reckoning`.
 """
 
 import math
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -111,10 +113,10 @@ class Readings:
             # a second reading of one time: its motion belongs to the interval that ends here
             self._settle()
             n = self._count - 1
-            (row,) = self._rows_between(value[None], self._times[[n, n]])
+            row = self._row(value, 0)
             if n:
                 self._bursts -= int(self._burst[n])
-                self._enter(n, (self._rows[n] + row)[None])
+                self._enter(n, self._rows[n] + row)
 
     def _begin(self, source: str, time_ns: int) -> None:
         """The first reading, from which all motion counts."""
@@ -131,67 +133,26 @@ class Readings:
 
     def _settle(self) -> None:
         """Work out the readings that came since it was last asked for any motion, all at once."""
-        n = self._settled
-        if n < self._count:
-            values = np.array(self._fresh)
-            self._fresh.clear()
-            self._settled = self._count
-            self._enter(n, self._rows_between(values, self._times[n - 1 : self._count]))
+        if self._settled < self._count:
+            settle((self,))
 
-    def _rows_between(self, values: Array, times_ns: IntArray) -> Array:
-        """Rows (n, k) of readings (n, k) that follow the last one, at times (n + 1) with its own.
-
-        A pose that is no continuation of the one before tells that the odometry was set anew: it is
-        faster than any robot over an interval that is no burst. The motion in it is unknown; the
-        robot is taken to have gone on as before.
-        """
+    def _row(self, value: Array, apart_ns: int) -> Array:
+        """Row (k,) of a reading (k,) that follows the last one after ``apart_ns``; see `_rows`."""
         if self.source == "given":
-            return values
-        before, self._last = self._last, values[-1]
-        if len(values) == 1:  # the rule: a scan asks after each reading
-            value = values[0]
-            rows = value - before if self.source == "wheels" else log(between(before, value))
-            rows = rows[None]
-        else:
-            earlier = np.vstack([before, values[:-1]])
-            rows = values - earlier if self.source == "wheels" else log(between(earlier, values))
+            return value
+        before, self._last = self._last, value
         if self.source == "wheels":
-            return rows
-        apart_ns = times_ns[1:] - times_ns[:-1]
-        limit_m = RESET_SPEED_M_S * 1e-9 * apart_ns + 0.5
-        jumped = (apart_ns >= SHORTEST_RESET_NS) & (np.hypot(rows[:, 0], rows[:, 1]) > limit_m)
-        for k in np.flatnonzero(jumped):
+            return np.asarray(value - before)
+        row = log(between(before, value))
+        if _jumped(row, apart_ns):
             self._resets += 1
-            rows[k] = rows[k - 1] if k else self._rows[self._settled - len(values) - 1]
-        return rows
+            return np.asarray(self._rows[self._settled - 1])
+        return row
 
-    def _enter(self, n: int, rows: Array) -> None:
-        """Rows of the readings from the n-th on, n > 0, and what accumulates from them."""
-        twists = wheel_twist(rows, self._robot) if self.source == "wheels" else rows[:, :3]
-        if len(rows) == 1:
-            self._enter_one(n, rows[0], exp(twists[0]).tolist())
-            return
-        new = slice(n, n + len(rows))
-        x, y, turned = exp(twists).T
-        path, turn = np.hypot(x, y), np.abs(turned)
-        heading = self._poses[n - 1, 2] + np.cumsum(turned)
-        before = heading - turned
-        c, s = np.cos(before), np.sin(before)
-        self._rows[new] = rows
-        self._sums[new] = self._sums[n - 1] + np.cumsum(rows, axis=0)
-        self._poses[new, 0] = self._poses[n - 1, 0] + np.cumsum(c * x - s * y)
-        self._poses[new, 1] = self._poses[n - 1, 1] + np.cumsum(s * x + c * y)
-        self._poses[new, 2] = wrap(heading)
-        self._effort[new] = self._effort[n - 1] + np.cumsum(path + TURNING_EFFORT_M * turn)
-        self._path[new] = self._path[n - 1] + np.cumsum(path)
-        seconds = 1e-9 * np.diff(self._times[n - 1 : n + len(rows)])
-        burst = (path > MAX_SPEED_M_S * seconds) | (turn > MAX_TURN_RAD_S * seconds)
-        self._burst[new] = burst
-        self._bursts += int(burst.sum())
-
-    def _enter_one(self, n: int, row: Array, step: list[float]) -> None:
-        """The same of one reading, the rule where scans are: arrays of one cost ten times this."""
-        (x, y, turned), (east, north, heading) = step, self._poses[n - 1].tolist()
+    def _enter(self, n: int, row: Array) -> None:
+        """The row of the n-th reading, n > 0, and what accumulates from it."""
+        twist = wheel_twist(row[None], self._robot)[0] if self.source == "wheels" else row[:3]
+        (x, y, turned), (east, north, heading) = exp(twist).tolist(), self._poses[n - 1].tolist()
         c, s, path, turn = math.cos(heading), math.sin(heading), math.hypot(x, y), abs(turned)
         self._rows[n], self._sums[n] = row, self._sums[n - 1] + row
         self._poses[n] = east + c * x - s * y, north + s * x + c * y, float(wrap(heading + turned))
@@ -285,3 +246,106 @@ def reached(
     share = (time_ns - begin_ns) / np.maximum(end_ns - begin_ns, 1)
     share = np.minimum(np.maximum(share, 0.0), 1.0)
     return np.asarray(np.where(burst, share >= 1.0, share))
+
+
+def settle(many: Iterable[Readings]) -> None:
+    """Work out what readings of several robots say of motion, at once, as far as it is not known.
+
+    Arrays of few numbers are dear, so this takes not much longer for five robots than for one.
+    """
+    alike: dict[str, list[Readings]] = defaultdict(list)
+    for one in many:
+        if one._settled < one._count:
+            alike[one.source].append(one)
+    for group in alike.values():
+        if len(group) == 1 and len(group[0]._fresh) == 1:  # the rule where each scan asks
+            (one,) = group
+            n = one._settled
+            row = one._row(one._fresh.pop(), int(one._times[n] - one._times[n - 1]))
+            one._settled = one._count
+            one._enter(n, row)
+        else:
+            _settle_alike(group)
+
+
+def _settle_alike(group: Sequence[Readings]) -> None:
+    """`settle` of readings from one kind of source, those of one robot after those of the other."""
+    counts = [len(one._fresh) for one in group]
+    firsts = np.cumsum([0, *counts[:-1]])
+    times = [one._times[one._settled - 1 : one._count] for one in group]
+    apart_ns = np.concatenate([t[1:] - t[:-1] for t in times])
+    rows = _rows(group, firsts, apart_ns)
+    twists = rows[:, :3]
+    if group[0].source == "wheels":
+        parts = np.split(rows, firsts[1:])
+        robots = [one._robot for one in group]
+        twists = np.concatenate(list(map(wheel_twist, parts, robots)))
+    x, y, turned = exp(twists).T
+    path, turn = np.hypot(x, y), np.abs(turned)
+    of = np.repeat(np.arange(len(group)), counts)
+
+    def summed(each: Array, before: Array) -> Array:
+        """Sums (n, ...) of each robot's own, from what it had ``before`` (m, ...)."""
+        sums = np.cumsum(each, axis=0)
+        others = np.concatenate([np.zeros((1, *each.shape[1:])), sums[firsts[1:] - 1]])
+        # the difference first: who stands has exactly what it had
+        return np.asarray((sums - others[of]) + before[of])
+
+    last = [one._settled - 1 for one in group]
+    poses = np.array([one._poses[n] for one, n in zip(group, last, strict=True)])
+    heading = summed(turned, poses[:, 2])
+    c, s = np.cos(heading - turned), np.sin(heading - turned)
+    effort = path + TURNING_EFFORT_M * turn
+    step = np.column_stack([c * x - s * y, s * x + c * y, effort, path, rows])
+    known = [
+        [*one._poses[n, :2], one._effort[n], one._path[n], *one._sums[n]]
+        for one, n in zip(group, last, strict=True)
+    ]
+    sums = summed(step, np.array(known))
+    heading = wrap(heading)
+    seconds = 1e-9 * apart_ns
+    burst = (path > MAX_SPEED_M_S * seconds) | (turn > MAX_TURN_RAD_S * seconds)
+    for one, first, count in zip(group, firsts.tolist(), counts, strict=True):
+        new, own = slice(one._settled, one._count), slice(first, first + count)
+        one._rows[new], one._sums[new], one._burst[new] = rows[own], sums[own, 4:], burst[own]
+        one._poses[new, :2], one._poses[new, 2] = sums[own, :2], heading[own]
+        one._effort[new], one._path[new] = sums[own, 2], sums[own, 3]
+        one._bursts += int(np.count_nonzero(burst[own]))
+        one._settled = one._count
+        one._fresh.clear()
+
+
+def _rows(group: Sequence[Readings], firsts: IntArray, apart_ns: IntArray) -> Array:
+    """Rows (n, k) of fresh readings of one kind that follow each robot's last one.
+
+    A pose that is no continuation of the one before tells that the odometry was set anew: it is
+    faster than any robot over an interval that is no burst. The motion in it is unknown; the
+    robot is taken to have gone on as before.
+
+    Args:
+        group: the robots' readings.
+        firsts: (m,) where in n those of each begin.
+        apart_ns: (n,) since the reading before.
+    """
+    values = np.array([value for one in group for value in one._fresh])
+    if group[0].source == "given":
+        return values
+    earlier = np.roll(values, 1, axis=0)
+    earlier[firsts] = [one._last for one in group]
+    for one in group:
+        one._last = one._fresh[-1]
+    if group[0].source == "wheels":
+        return np.asarray(values - earlier)
+    rows = log(between(earlier, values))
+    for k in np.flatnonzero(_jumped(rows, apart_ns)).tolist():
+        g = int(np.searchsorted(firsts, k, side="right")) - 1
+        group[g]._resets += 1
+        rows[k] = rows[k - 1] if k > firsts[g] else group[g]._rows[group[g]._settled - 1]
+    return rows
+
+
+def _jumped(rows: Array, apart_ns: IntArray | int) -> BoolArray:
+    """Whether rows (..., 3) are faster than any robot, over intervals (...,) that are no bursts."""
+    limit_m = RESET_SPEED_M_S * 1e-9 * np.asarray(apart_ns) + 0.5
+    long = np.asarray(apart_ns) >= SHORTEST_RESET_NS
+    return np.asarray(long & (np.hypot(rows[..., 0], rows[..., 1]) > limit_m))

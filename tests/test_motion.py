@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graphslam.config import OdometryConfig, RobotConfig
-from graphslam.dead_reckoning import STANDING_SIGMA, Track
+from graphslam.dead_reckoning import STANDING_SIGMA, Track, motions_of
 from graphslam.geometry import between, compose, compose_cov, exp, wrap
 from graphslam.models import MOTION_SOURCES, compound
 from graphslam.models.motion import (
@@ -21,7 +21,7 @@ from graphslam.models.motion import (
     wheel_jacobian,
     wheel_twist,
 )
-from graphslam.readings import EDGE_NS
+from graphslam.readings import EDGE_NS, settle
 from graphslam.records import OdometryIncrement, OdometryPose, WheelAngles
 
 ROBOT = RobotConfig(wheel_radius_left_m=0.11, wheel_radius_right_m=0.1, axle_m=0.6)
@@ -551,6 +551,91 @@ def test_many_motions_at_once_are_the_single_ones(kind, mounted):
             # chords of parts of a circle segment: shorter by the square of its turn
             np.testing.assert_allclose(many.length_m[k], one.length_m, atol=1e-4)
             np.testing.assert_allclose(many.d_cal[k], one.d_delta_d_calibration, atol=1e-6)
+
+
+def fleet(rng):
+    """Tracks of several kinds, nothing read yet, and 150 readings of each."""
+    tracks, readings = [], []
+    for kind in ("odometry", "commands", "commands", "wheels", "wheels", "given"):
+        config = OdometryConfig(commanded=kind == "commands")
+        robot = replace(ROBOT, axle_m=rng.uniform(0.4, 0.7))
+        tracks.append(Track(config, robot, mounted=kind != "given" and len(tracks) != 1))
+        steps = rng.uniform(-0.02, 0.1, size=(150, 2))
+        steps[40:90] = 0.0  # it stands, while the others do not all
+        poses = [np.array([1e3, -1e3, 0.0])]
+        for along, turned in steps:
+            poses.append(compose(poses[-1], exp(np.array([along, 0.0, turned]))))
+        times = (SECOND // 10) * np.arange(1, 151) + int(rng.integers(SECOND))
+        times[100] = times[99] + 1_000_000  # in a burst
+        times[120] = times[119]  # a second reading of one time
+        own = []
+        for k, (ns, pose, angles) in enumerate(
+            zip(times.tolist(), poses, np.cumsum(steps, axis=0), strict=False)
+        ):
+            if kind == "wheels":
+                own.append(WheelAngles("r", ns, ns, *angles.tolist()))
+            elif kind == "given":
+                delta, cov = between(pose, poses[k + 1]), np.diag([1e-4, 1e-5, 1e-6])
+                own.append(OdometryIncrement("r", ns, ns, ns - SECOND // 10, delta, cov))
+            else:
+                jump = [50.0, 0.0, 0.0] if k > 130 and len(tracks) == 2 else [0.0] * 3
+                own.append(OdometryPose("r", ns, ns, pose + jump))
+        readings.append(own)
+    return tracks, readings
+
+
+def test_readings_of_several_robots_at_once_are_those_of_each():
+    """Turns, standing, a burst, a jump, a repeated time: worked out one by one, and all together
+    in three goes. Who stands has not moved, to the digit: else the floor of a motion is wrong."""
+    (single, readings), (together, _) = (fleet(np.random.default_rng(5)) for _ in range(2))
+    for track, own in zip(single, readings, strict=True):
+        for reading in own:
+            track.add(reading)
+            track.pose(reading.time_ns)
+    for part in (slice(60), slice(60, 61), slice(61, None)):
+        for track, own in zip(together, readings, strict=True):
+            for reading in own[part]:
+                track.add(reading)
+        settle(together)
+    for one, other, own in zip(single, together, readings, strict=True):
+        times = np.array([r.time_ns for r in own])
+        times = np.sort(np.concatenate([times, times + 37_000_000]))
+        # sums over 150 readings of places 1.4 km away
+        np.testing.assert_allclose(other.pose(times), one.pose(times), atol=1e-9)
+        np.testing.assert_allclose(other.effort(times), one.effort(times), atol=1e-11)
+        assert (other.resets, other._bursts) == (one.resets, one._bursts)
+        standing = np.array([r.time_ns for r in own[45:89]])
+        assert set(np.diff(other.effort(standing))) == {0.0}
+    assert [t.resets for t in together] == [0, 1, 0, 0, 0, 0]
+
+
+def test_motions_of_several_robots_at_once_are_those_of_each():
+    """Tracks of several kinds, one asked twice, one for nothing, one without readings; each by a
+    calibration of its own."""
+    rng = np.random.default_rng(6)
+    tracks, readings = fleet(rng)
+    for track, own in zip(tracks, readings, strict=True):
+        for reading in own:
+            track.add(reading)
+        known = track.calibration
+        mean = 0.3 * np.sqrt(np.diag(known.cov)) * rng.normal(size=len(known.mean))
+        track.calibration = Calibration(known.names, mean, known.cov)
+    still = Track(NOISE, ROBOT)
+    still.add(OdometryPose("r", SECOND, SECOND, np.zeros(3)))
+    asked = []
+    for track in [*tracks, tracks[1], tracks[3], still]:
+        asked.append((track, *rng.integers(-SECOND, 17 * SECOND, size=(2, 12))))
+    asked.append((tracks[2], *np.zeros((2, 0), dtype=np.int64)))
+    for (track, start, end), found in zip(asked, motions_of(asked), strict=True):
+        assert len(found.delta) == len(start)
+        if not len(start):
+            continue
+        alone = track.motions(start, end)
+        for what in ("delta", "cov", "d_cal", "length_m"):
+            # sums over what the others drove, too
+            np.testing.assert_allclose(
+                getattr(found, what), getattr(alone, what), rtol=1e-7, atol=1e-11, err_msg=what
+            )
 
 
 def test_a_robot_that_turns_drives_less_of_what_was_commanded():
