@@ -579,7 +579,7 @@ def fleet(rng):
                 delta, cov = between(pose, poses[k + 1]), np.diag([1e-4, 1e-5, 1e-6])
                 own.append(OdometryIncrement("r", ns, ns, ns - SECOND // 10, delta, cov))
             else:
-                jump = [50.0, 0.0, 0.0] if k > 60 and len(tracks) == 3 else [0.0] * 3
+                jump = [50.0, 0.0, 0.0] if k > 95 and len(tracks) == 3 else [0.0] * 3
                 own.append(OdometryPose("r", ns, ns, pose + jump))
         readings.append(own)
     return tracks, readings
