@@ -110,8 +110,13 @@ def _sinc_terms(phi: Array) -> tuple[Array, Array]:
     sin phi = 2 sin(phi/2) cos(phi/2) and 1 - cos phi = 2 sin²(phi/2), so both are exact to
     rounding: sinc(phi/2) cos(phi/2) and phi/2 sinc²(phi/2).
     """
-    half = np.sinc(phi / (2 * np.pi))
+    half = _sincs(phi / 2)
     return np.asarray(half * np.cos(phi / 2)), np.asarray(0.5 * phi * half * half)
+
+
+def _sincs(phi: Array) -> Array:
+    """`_sinc` of many angles (...,); NumPy's own takes twice as long for few."""
+    return np.divide(np.sin(phi), phi, out=np.ones_like(phi), where=phi != 0)
 
 
 def exp(twist: Array) -> Array:
@@ -139,7 +144,7 @@ def log(pose: Array) -> Array:
     phi = wrap(pose[..., 2])
     half = np.asarray(phi) / 2
     # (phi/2) cot(phi/2): cos(h)/sinc(h) is exact at zero as well
-    c = np.cos(half) / np.sinc(half / np.pi)
+    c = np.cos(half) / _sincs(half)
     x, y = pose[..., 0], pose[..., 1]
     return np.stack([c * x + half * y, -half * x + c * y, phi], axis=-1)
 

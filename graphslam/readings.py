@@ -171,7 +171,7 @@ class Readings:
         """Whether ``time_ns`` lies between readings at most ``gap_ns`` apart, or just outside."""
         if not self._count:
             return False
-        i = int(np.searchsorted(self.times, time_ns))
+        i = int(self.times.searchsorted(time_ns))
         if 0 < i < self._count:
             return bool(self._times[i] - self._times[i - 1] <= gap_ns)
         end_ns = self.first_ns if i == 0 else self.last_ns
@@ -184,7 +184,7 @@ class Readings:
         """
         self._settle()
         times = np.asarray(times_ns, dtype=np.int64)
-        i = np.clip(np.searchsorted(self.times, times, side="left"), 1, max(self._count - 1, 1))
+        i = np.clip(self.times.searchsorted(times), 1, max(self._count - 1, 1))
         if self._count < 2:
             return np.zeros((*times.shape, 3))
         share = self._share(i, self._times[i - 1], times)
@@ -205,7 +205,7 @@ class Readings:
         """An accumulated quantity at any times, by the same rule as `pose`; settle first."""
         if self._count < 2:
             return np.zeros((*times_ns.shape, *accumulated.shape[1:]))
-        i = np.clip(np.searchsorted(self.times, times_ns, side="left"), 1, self._count - 1)
+        i = np.clip(self.times.searchsorted(times_ns), 1, self._count - 1)
         share = self._share(i, self._times[i - 1], times_ns)
         if accumulated.ndim > 1:
             share = share[..., None]
@@ -221,7 +221,7 @@ class Readings:
 
     def _way(self, time_ns: int) -> tuple[float, float]:
         """Path and heading at a time, by the same rule as `pose`; settle first."""
-        i = min(max(int(np.searchsorted(self.times, time_ns, side="left")), 1), self._count - 1)
+        i = min(max(int(self.times.searchsorted(time_ns)), 1), self._count - 1)
         begin, end = int(self._times[i - 1]), int(self._times[i])
         share = min(max((time_ns - begin) / max(end - begin, 1), 0.0), 1.0)
         if self._burst[i]:

@@ -6,7 +6,7 @@ from graphslam.config import Config
 from graphslam.errors import EstimationError
 from graphslam.geometry import Array
 from graphslam.logs import LogSet
-from graphslam.records import Start, Truth
+from graphslam.records import Scan, Sighting, Start, Truth
 from graphslam.timeline import ODOMETRY
 
 #: ns: a truth sample this near to a robot's first odometry is taken as the truth of its start
@@ -54,7 +54,7 @@ def first_truth(log: LogSet) -> dict[str, Array]:
     """
     begins: dict[str, int] = {}
     nearest: dict[str, Truth] = {}
-    for message in log.messages():
+    for message in log.messages((Scan, Sighting)):
         if isinstance(message, ODOMETRY):
             begins.setdefault(message.robot, message.time_ns)
         elif isinstance(message, Truth):

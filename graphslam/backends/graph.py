@@ -282,6 +282,11 @@ class GraphBackend(ABC):
             return Joint(known.pose, (), known.cov[:3, :3], ())
         builder = self.builder
         key = builder.latest_key(robot)
+        if not landmarks and not others:
+            alone = self.value(key, 3)
+            cov = rotate_cov(self.covariance([key]), alone[2])
+            self._joints[robot] = Joint(alone, (), cov, ())
+            return self._joints[robot]
         dims = [builder.landmark_dims[i] for i in landmarks] + [3] * len(others)
         keys = [factors.landmark_key(i) for i in landmarks]
         keys += [builder.latest_key(other) for other in others]
