@@ -146,10 +146,7 @@ class JointGaussian(Generic[Name]):
             given: member i -> G_i (d, d_i); nothing: it is independent of all others.
         """
         n, d = self._size, len(cov)
-        if n + d > len(self._P):
-            grown = np.zeros((2 * (n + d),) * 2)
-            grown[:n, :n] = self.P
-            self._x, self._P = np.append(self.x, np.zeros(n + 2 * d)), grown
+        self._make_room(d)
         given = {} if given is None else given
         PGt, GPGt = self.project(given, d)
         block = slice(n, n + d)
@@ -159,6 +156,43 @@ class JointGaussian(Generic[Name]):
         self._slots[name] = block
         self._size += d
         self._blocks.clear()
+
+    def add_each(
+        self, names: Sequence[Name], sources: Sequence[Name], means: Array, covs: Array, G: Array
+    ) -> None:
+        """New members, the error of each is G_i times that of one other and fresh noise, as `add`.
+
+        Args:
+            names: of the m new members.
+            sources: the member that each comes from.
+            means: (m, d).
+            covs: covariances (m, d, d) of their fresh noise, independent of each other.
+            G: (m, d, d).
+        """
+        n, (m, d) = self._size, means.shape
+        self._make_room(m * d)
+        starts = np.array([self._slots[source].start for source in sources])
+        of = (starts[:, None] + np.arange(d)).ravel()
+        PGt = self.P[:, of].reshape(n, m, d).swapaxes(0, 1) @ G.mT
+        PGt = PGt.swapaxes(0, 1).reshape(n, m * d)
+        GPGt = (G @ PGt[of].reshape(m, d, m * d)).reshape(m, d, m, d)
+        each = np.arange(m)
+        GPGt[each, :, each] += covs
+        new = slice(n, n + m * d)
+        self._P[:n, new], self._P[new, :n] = PGt, PGt.T
+        self._P[new, new] = symmetric(GPGt.reshape(m * d, m * d))
+        self._x[new] = means.ravel()
+        for k, name in enumerate(names):
+            self._slots[name] = slice(n + k * d, n + (k + 1) * d)
+        self._size += m * d
+        self._blocks.clear()
+
+    def _make_room(self, d: int) -> None:
+        n = self._size
+        if n + d > len(self._P):
+            grown = np.zeros((2 * (n + d),) * 2)
+            grown[:n, :n] = self.P
+            self._x, self._P = np.append(self.x, np.zeros(n + 2 * d)), grown
 
     def copy(self, name: Name, source: Name) -> None:
         """A member becomes ``source`` as it is now, of the same size: the same mean, no own noise.

@@ -174,6 +174,28 @@ def test_removal_leaves_the_joint_marginal_of_the_rest(gone, rng):
     np.testing.assert_array_equal(gaussian.P[-3:, :-3], 0.0)
 
 
+def test_members_that_come_or_go_together_are_those_that_do_so_one_by_one(rng):
+    """Each new one from another, two from the same; then first, middle and last go."""
+    together, single = (members(np.random.default_rng(4)) for _ in range(2))
+    names, sources = ["a", "b", "c"], [3, 2, 3]
+    G = rng.normal(size=(3, 3, 3))
+    means, covs = rng.normal(size=(3, 3)), np.array([random_cov(rng, 3) for _ in range(3)])
+    together.add_each(names, sources, means, covs, G)
+    for k, name in enumerate(names):
+        single.add(name, means[k], covs[k], {sources[k]: G[k]})
+    np.testing.assert_array_equal(together.x, single.x)
+    np.testing.assert_allclose(together.P, single.P, atol=1e-12)
+    np.testing.assert_array_equal(together.P, together.P.T)
+    gone = [0, 4, "c"]
+    together.remove(*gone)
+    for name in gone:
+        single.remove(name)
+    assert list(together) == list(single)
+    for name in single:
+        assert together.slot(name) == single.slot(name)
+    np.testing.assert_allclose(together.P, single.P, atol=1e-12)
+
+
 def test_a_system_update_moves_one_member(rng):
     """3.12 with F and Q that are the identity and zero but for one block."""
     gaussian = members(rng)

@@ -13,6 +13,7 @@ algorithm for real-time implementation, IEEE T-RA 17(3), 2001, https://doi.org/1
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import groupby
 
 import gtsam
 import numpy as np
@@ -85,13 +86,32 @@ class Active:
                 made an end of it; this filter is of no use any more.
         """
         measured: list[gtsam.NonlinearFactor] = []
-        for part in parts:
-            if part.new is not None:
-                self._enter(*part.new, part.factors)
-            else:
-                measured += part.factors
+        for moves, some in groupby(parts, key=lambda part: part.replaces is not None):
+            if moves:
+                self._move(list(some))
+                continue
+            for part in some:
+                if part.new is not None:
+                    self._enter(*part.new, part.factors)
+                else:
+                    measured += part.factors
         if measured:
             self._update(measured)
+
+    def _move(self, parts: Sequence[Part]) -> None:
+        """New states of several robots, each by the motion from the one before, at once."""
+        news = [part.new for part in parts if part.new is not None]
+        for key, place in news:
+            write(self._places, key, place)
+            self._dims[key] = len(place)
+        befores = [part.replaces for part in parts if part.replaces is not None]
+        linear = [part.factors[0].linearize(self._places).jacobian() for part in parts]
+        A, b = np.array([A for A, _ in linear]), np.array([b for _, b in linear])
+        noise = np.linalg.inv(A[:, :, 3:])
+        G = -noise @ A[:, :, :3]
+        last = np.array([self._moved.x[self._moved.slot(before)] for before in befores])
+        means = (noise @ b[:, :, None] + G @ last[:, :, None])[:, :, 0]
+        self._moved.add_each([key for key, _ in news], befores, means, noise @ noise.mT, G)
 
     def _enter(self, key: int, place: Array, made_by: Iterable[gtsam.NonlinearFactor]) -> None:
         """A new variable, as the factors that bring it have it: thesis 4.24-4.28."""
