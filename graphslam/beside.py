@@ -38,7 +38,7 @@ def possible() -> bool:
 
     Not where a library runs threads of its own: a fork has none of them, but all of their locks.
     """
-    return _allowed.get() and sum(1 for _ in THREADS.iterdir()) == 1
+    return _allowed.get() and THREADS.is_dir() and sum(1 for _ in THREADS.iterdir()) == 1
 
 
 class Ahead(Generic[_T]):

@@ -125,7 +125,8 @@ def test_shared_results_are_in_the_order_of_the_arguments():
 
 
 def test_nothing_forks_unless_it_may():
-    """Neither before `allow`, nor beside a thread, nor in what was forked, nor without memory."""
+    """Neither before `allow`, nor beside a thread, nor in what was forked, nor where nothing tells
+    how many threads there are, nor without memory."""
     lines = printed("""
         import threading
         makes = lambda: Task(os.getpid).result() != here
@@ -141,12 +142,15 @@ def test_nothing_forks_unless_it_may():
         while not beside.possible():
             time.sleep(0.01)  # the system takes a moment to forget it
         print(makes(), Task(lambda: Task(os.getpid).done).result())
+        threads, beside.THREADS = beside.THREADS, beside.Path("/nowhere")
+        print(makes())
+        beside.THREADS = threads
         def refuses():
             raise BlockingIOError
         os.fork = refuses
         print(makes())
     """)
-    assert lines == ["False", "False", "True True", "False"]
+    assert lines == ["False", "False", "True True", "False", "False"]
 
 
 # ------------------------------------------------------------ where it is used
