@@ -118,7 +118,8 @@ def ways(
         starts, ends = [state_ns[robot]] * len(needed), sorted(needed)
         if robot in last_ns:
             starts, ends = [*starts, last_ns[robot]], [*ends, state_ns[robot]]
-        asked.append((tracks[robot], np.array(starts), np.array(ends)))
+        begin, end = np.array([starts, ends], dtype=np.int64)
+        asked.append((tracks[robot], begin, end))
     there: dict[tuple[str, int], Motion] = {}
     new: dict[str, Motion] = {}
     for robot, (_, start_ns, end_ns), moved in zip(times, asked, motions_of(asked), strict=True):

@@ -213,8 +213,8 @@ class Pipeline:
         for image in gathered.images:
             own = list(itertools.islice(observed, len(image)))
             associations += self.seen_in(image, own, at[image[0].robot], motions)
-            met = sum(s.seen_robot is not None for s in image)
-            associations += tuple(itertools.islice(robots, met))
+            count = sum(s.seen_robot is not None for s in image)
+            associations += tuple(itertools.islice(robots, count))
         self.note_covariances()
         self.seconds["association"] += time.perf_counter() - began
         self.enter(Step(step_ns, {}, motions, shared(associations)), known)
