@@ -39,7 +39,7 @@ from graphslam.cli.terminal import errors_in_one_line, progress_bar
 from graphslam.config import Config, load_config
 from graphslam.errors import ConfigError, EstimationError, OutputError
 from graphslam.logs import IMPORTERS, KnownTruth, inspect_logs, open_logs
-from graphslam.records import Result
+from graphslam.records import Result, TrueLandmark, Truth
 from graphslam.results import check_target, load, save, to_json
 
 app = typer.Typer(
@@ -186,7 +186,7 @@ def _smooth(logs: Sequence[Path], tree: Config, output: Path, force: bool) -> Re
 
     log = opening.result()
     truth = Task(lambda: truth_of_logs(log, tree))
-    with progress_bar(sum(topic.count for topic in log.topics)) as progress:
+    with progress_bar(log.count((Truth, TrueLandmark))) as progress:
         result = smooth(log, tree, progress)
     quality = _quality(result, truth.result())
     report = Task(lambda: render(result, quality, tree))
@@ -290,7 +290,7 @@ def compare_command(
         log = open_logs(logs, tree)
         known = truth_of_files(truth, log.robots) if truth else truth_of_logs(log, tree)
         reference = read_relations(relations) if relations else None
-        with progress_bar(sum(topic.count for topic in log.topics), "associating") as progress:
+        with progress_bar(log.count((Truth, TrueLandmark)), "associating") as progress:
             found = compare(
                 log, tree, rows, mode, truth=known, relations=reference, progress=progress,
                 say=show.stage,

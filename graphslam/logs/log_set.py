@@ -74,6 +74,10 @@ class LogSet:
         """Range from which on a beam of ``topic`` means no return, m; inf when none was found."""
         return self._contexts[topic].no_return_m
 
+    def count(self, without: tuple[type[Message], ...] = ()) -> int:
+        """How many messages the files hold of all topics but those of the records ``without``."""
+        return sum(topic.count for topic in self.topics if topic.record not in without)
+
     def messages(
         self, without: tuple[type[Message], ...] = (), *, ahead: bool = False
     ) -> Iterator[Message]:
@@ -85,7 +89,7 @@ class LogSet:
         """
         topics = {topic.name: topic for topic in self.topics if topic.record not in without}
         self._tell(_Told(Counter(), Counter(), []))
-        ahead &= sum(topic.count for topic in topics.values()) >= MANY
+        ahead &= self.count(without) >= MANY
         for item in Ahead(lambda: self._read(topics)) if ahead else self._read(topics):
             if isinstance(item, _Told):
                 self._tell(item)
