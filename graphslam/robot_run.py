@@ -62,12 +62,6 @@ class RobotRun:
         self.causal_poses.append(pose)
         self.calibrations.append(self.track.used_calibration)
 
-    def move(self, along_m: float) -> None:
-        """Put the causal states elsewhere along the x axis."""
-        if along_m:
-            away = np.array([along_m, 0.0, 0.0])
-            self.causal_poses = [pose + away for pose in self.causal_poses]
-
     def learn(self, motion: Motion, pose: Array, observed: Array) -> None:
         """Improve the calibration from the motion to a new state.
 
@@ -91,36 +85,46 @@ class RobotRun:
             return told(self.track.calibration, self.track.nominal.cov)
         return self.calibrator.found()
 
-    def result(self, states: Trajectory, start: Array, *, causal_only: bool = False) -> RobotResult:
+    def causal(self, start: Array, away_m: float = 0.0) -> "Causal":
+        """The causal trajectories.
+
+        Args:
+            start: (3,) where the prior put the robot that defines the world frame.
+            away_m: how far along x its frame lay while it was estimated.
+        """
+        stamps, times, laser = self._report_times()
+        poses = np.array(self.causal_poses) - np.array([away_m, 0.0, 0.0])
+        known = Trajectory(np.array(self.times, dtype=np.int64), poses, np.array(self.causal_covs))
+        causal = causal_at(known, self.calibrations, self.track, times, stamps)
+        # the mount that was known then, for the base and for the world that hangs on it
+        last = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, None)
+        mount = np.array([self.track.mount_of(c) for c in self.calibrations])[last]
+        causal = moved_world(causal, origin_shift(start, mount))
+        scan = mounted(causal, laser) if self.scans else None
+        return Causal(mounted(causal, inverse(mount)), scan)
+
+    def result(
+        self, states: Trajectory, causal: "Causal", *, causal_only: bool = False
+    ) -> RobotResult:
         """Trajectories of the robot at the stamps that it is reported at.
 
         Args:
             states: the final states, world frame.
-            start: (3,) where the prior put the robot that defines the world frame.
+            causal: the causal trajectories.
             causal_only: final poses are the causal ones, also between the states: what revises no
                 state knows nothing better about the way there either.
         """
         stamps, times, laser = self._report_times()
         final = final_at(states, self.track, times, stamps)
         base = mounted(final, inverse(self.track.mount))
-        known = Trajectory(
-            states.stamps_ns, np.array(self.causal_poses), np.array(self.causal_covs)
-        )
-        causal = causal_at(known, self.calibrations, self.track, times, stamps)
-        # the mount that was known then, for the base and for the world that hangs on it
-        last = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, None)
-        mount = np.array([self.track.mount_of(c) for c in self.calibrations])[last]
-        causal = moved_world(causal, origin_shift(start, mount))
         at_start = compose(states.poses[0], inverse(self.track.mount))
         odometry = between(self.track.pose(self.times[0]), self.track.pose(times))
         unknown = np.full((len(times), 3, 3), np.nan)
-        base_causal = mounted(causal, inverse(mount))
-        scan_causal = mounted(causal, laser) if self.scans else None
         return RobotResult(
-            base_causal if causal_only else base,
-            base_causal,
-            scan_causal if causal_only or not self.scans else mounted(final, laser),
-            scan_causal,
+            causal.base if causal_only else base,
+            causal.base,
+            causal.scan if causal_only or not self.scans else mounted(final, laser),
+            causal.scan,
             Trajectory(stamps, compose(at_start, odometry), unknown),
         )
 
@@ -133,6 +137,14 @@ class RobotRun:
         period = round(1e9 / BASE_RATE_HZ)
         times = np.arange(self.track.first_ns, self.track.last_ns + 1, period)
         return self.clock.own(times), times, np.zeros((0, 3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Causal:
+    """Causal trajectories of a robot's base and, if it has scans, of its sensor at those."""
+
+    base: Trajectory
+    scan: Trajectory | None
 
 
 def span_warnings(tracks: Mapping[str, Track], *, unplaced: bool) -> list[str]:

@@ -20,7 +20,7 @@ from graphslam.logs import LogSet
 from graphslam.pipeline import Pipeline, Progress
 from graphslam.placing import beforehand, with_names
 from graphslam.records import Estimate, Result, RobotResult
-from graphslam.robot_run import span_warnings
+from graphslam.robot_run import Causal, span_warnings
 from graphslam.summary import make_landmarks, summarise
 
 #: scans in the picture at most
@@ -57,11 +57,11 @@ def smooth(
         pipeline = _passed(Pipeline(log, config, known, tamper), progress)
         finishing = time.perf_counter()
         estimate, rough = pipeline.estimate()
-        finding = Task(partial(_misread, pipeline, estimate))
-        # mostly nothing is, so solving again does not wait to know where it does not take long
+        finding = Task(partial(_found, pipeline, estimate))
+        # it is seldom read again, so solving again, where that is quick, does not wait to know
         meanwhile = rough and pipeline.is_refined and not finding.done
         final = pipeline.reconsider(estimate) if meanwhile else estimate
-        names, clocks = finding.result()
+        names, clocks, causal = finding.result()
         if names and not known.names:
             known = with_names(known, log, config, names)
         elif passes < MAX_CLOCKS and any(found.differs for found in clocks.values()):
@@ -78,14 +78,11 @@ def smooth(
     causal_only = all(run.is_causal(estimate.states[name]) for name, run in runs.items())
     estimate = worlds.estimate(estimate)
     steps = tuple(map(worlds.step, pipeline.steps))
-    for name, run in runs.items():
-        run.move(-frames.away.get(frames.of[name], 0.0))
 
-    def found(name: str) -> RobotResult:
-        start = pipeline.starts[frames.of[name]].pose
-        return runs[name].result(estimate.states[name], start, causal_only=causal_only)
+    def told(name: str) -> RobotResult:
+        return runs[name].result(estimate.states[name], causal[name], causal_only=causal_only)
 
-    robots = dict(zip(runs, shared(found, list(runs)), strict=True))
+    robots = dict(zip(runs, shared(told, list(runs)), strict=True))
     pipeline.seconds["trajectories"] = time.perf_counter() - finishing
     entries = pipeline.associator.map
     landmarks = make_landmarks(entries.in_worlds(worlds.landmarks), estimate)
@@ -134,11 +131,22 @@ def smooth(
     )
 
 
-def _misread(
+def _found(
     pipeline: Pipeline, estimate: Estimate
-) -> tuple[dict[str, str], dict[str, ClockFound]]:
-    """By what the log was to be read, as an estimate has it: names (false -> right), and clocks."""
-    return pipeline.exchanged(estimate), pipeline.clocks_found(estimate)
+) -> tuple[dict[str, str], dict[str, ClockFound], dict[str, Causal]]:
+    """What follows from a pass and needs no better estimate.
+
+    Names (false -> right) and clocks by which the log was to be read, and causal trajectories.
+    """
+    frames = pipeline.frames
+    causal = {
+        name: run.causal(
+            pipeline.starts[frames.of[name]].pose, frames.away.get(frames.of[name], 0.0)
+        )
+        for name, run in sorted(pipeline.runs.items())
+        if run.started
+    }
+    return pipeline.exchanged(estimate), pipeline.clocks_found(estimate), causal
 
 
 def _passed(pipeline: Pipeline, progress: Progress) -> Pipeline:

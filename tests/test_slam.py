@@ -478,7 +478,7 @@ def test_base_is_found_from_states_that_are_rigid_to_the_laser():
     covs = np.array(robot.causal_covs)
     world = origin_shift(start, mount)
     final = moved_world(Trajectory(times, states, covs), world)
-    found = robot.result(final, start)
+    found = robot.result(final, robot.causal(start))
     at = np.isin(found.final.stamps_ns, times)
     assert_same_pose(found.final.poses[at], base, atol=1e-12)
     assert_same_pose(found.causal.poses[at][3:], base[3:], atol=1e-12)

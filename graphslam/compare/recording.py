@@ -69,7 +69,9 @@ class Recording:
         causal_only = all(run.is_causal(done.estimate.states[name]) for name, run in runs.items())
         robots = {}
         for name, run in runs.items():
-            found = run.result(estimate.states[name], self.start, causal_only=causal_only)
+            found = run.result(
+                estimate.states[name], run.causal(self.start), causal_only=causal_only
+            )
             robots[name] = SavedRobot(
                 found.final, found.causal, found.scan_final, found.scan_causal
             )
