@@ -257,7 +257,7 @@ def shared(associations: Sequence[Association]) -> tuple[Association, ...]:
     """
     count = Counter((a.robot, a.target) for a in associations)
     return tuple(
-        replace(a, cov=a.cov * n) if (n := count[a.robot, a.target]) > 1 else a
+        a.measured(a.z, a.cov * n) if (n := count[a.robot, a.target]) > 1 else a
         for a in associations
     )
 

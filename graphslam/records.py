@@ -200,6 +200,12 @@ class Association:
     late: bool = False
     extent: Array | None = None
 
+    def measured(self, z: Array, cov: Array) -> "Association":
+        """The same with another measurement (k,) and covariance (k, k)."""
+        # `dataclasses.replace` takes twice as long, and there are many
+        same = self.robot, self.time_ns, self.target, self.model
+        return Association(*same, z, cov, self.late, self.extent)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Start:

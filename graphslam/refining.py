@@ -69,9 +69,9 @@ def refine(
             track.calibration = Calibration(now[name].names, now[name].mean, still)
         made = _remade(steps, estimate, tracks, seen)
         if k:
-            inflation = variances(made, seen, estimate)
-            slack = motion_variances(made, estimate)
-            made = tuple(_inflated(step, inflation, slack) for step in made)
+            wider = _on_covariances(variances(made, seen, estimate))
+            looser = _on_covariances(motion_variances(made, estimate))
+            made = tuple(_inflated(step, wider, looser) for step in made)
         solved = solve_calibrated(made, estimate, priors, now, config.robust, rough=k < ROUNDS - 1)
         estimate = solved.estimate
         for name, track in tracks.items():
@@ -149,7 +149,7 @@ def _remade(
         z, cov = _carried(group, estimate, observer, others.get(id(group)))
         cov = cov * group.share[:, None, None]
         for (n, k), z_k, cov_k in zip(group.where.tolist(), z, cov, strict=True):
-            associations[n][k] = replace(associations[n][k], z=z_k, cov=cov_k)
+            associations[n][k] = associations[n][k].measured(z_k, cov_k)
     return tuple(
         # in the order of the step: it is the order of the states
         replace(step, motions={r: new[r] for r in step.motions}, associations=tuple(found))
@@ -240,18 +240,22 @@ def motion_variances(steps: Sequence[Step], estimate: Estimate) -> dict[str, Arr
     return factors
 
 
-def _inflated(step: Step, inflation: Mapping[str, Array], slack: Mapping[str, Array]) -> Step:
+def _inflated(step: Step, seen: Mapping[str, Array], moved: Mapping[str, Array]) -> Step:
+    """A step with wider sightings of points, and wider motions.
+
+    ``seen`` (2, 2) and ``moved`` (3, 3) are factors on the covariances of each robot's own.
+    """
     motions = {
-        robot: replace(m, cov=m.cov * np.sqrt(np.outer(slack[robot], slack[robot])))
-        if robot in slack
-        else m
+        robot: replace(m, cov=m.cov * moved[robot]) if robot in moved else m
         for robot, m in step.motions.items()
     }
-    associations = []
-    for a in step.associations:
-        wider = a
-        if a.robot in inflation and len(a.z) == 2:
-            s = np.sqrt(inflation[a.robot])
-            wider = replace(a, cov=a.cov * np.outer(s, s))
-        associations.append(wider)
-    return replace(step, motions=motions, associations=tuple(associations))
+    associations = tuple(
+        a.measured(a.z, a.cov * seen[a.robot]) if a.robot in seen and len(a.z) == 2 else a
+        for a in step.associations
+    )
+    return replace(step, motions=motions, associations=associations)
+
+
+def _on_covariances(factors: Mapping[str, Array]) -> dict[str, Array]:
+    """Robot -> factors (k, k) on covariances, from those (k,) on variances."""
+    return {robot: np.sqrt(np.outer(f, f)) for robot, f in factors.items()}
