@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from graphslam.geometry import Array, wrap
+from graphslam.kalman import solve
 from graphslam.models import MODELS
 from graphslam.models.motion import HELD_SIGMA, Calibration
 from graphslam.records import Association, Motion
@@ -66,15 +67,15 @@ class Calibrator:
         miss[2] = wrap(miss[2])
         noise = motion.cov - D @ current.cov @ D.T + np.diag(np.square(RELATIVE_SIGMA))
         # (noise + observed⁻¹)⁻¹, for an information matrix that may be singular
-        W = np.linalg.solve(np.eye(3) + observed @ noise, observed)
+        W = solve(np.eye(3) + observed @ noise, observed)
         total = noise + D @ self._prior @ D.T
-        if miss @ np.linalg.solve(total, miss) > OUTLIER or not W.any():
+        if miss @ solve(total, miss) > OUTLIER or not W.any():
             return current
         weighted = D.T @ W
         # relative to nominal values: what is missing now plus what was already corrected
         self._info = FORGET * self._info + (1 - FORGET) * self._prior_info + weighted @ D
         self._vector = FORGET * self._vector + weighted @ (miss + D @ current.mean)
-        cov = np.linalg.inv(self._info)
+        cov = solve(self._info, np.eye(len(self._info)))
         return Calibration(current.names, cov @ self._vector, cov + REMAINING**2 * self._prior)
 
     def found(self) -> dict[str, tuple[float, float, bool]]:

@@ -35,7 +35,7 @@ from graphslam.geometry import (
     rotation3,
     wrap,
 )
-from graphslam.kalman import JointGaussian, predict, update, whiten
+from graphslam.kalman import JointGaussian, predict, solve, update, whiten
 from graphslam.models import MODELS
 from graphslam.records import Association, Closure, Start, Step
 
@@ -119,6 +119,18 @@ def test_the_downdate_is_josephs_form(rng):
 
 
 # ------------------------------------------------------------ a Gaussian whose members come and go
+
+
+def test_small_systems_are_solved_as_numpy_does(rng):
+    A, B = rng.normal(size=(4, 4)), rng.normal(size=(4, 2))
+    before = A.copy(), B.copy()
+    np.testing.assert_allclose(A @ solve(A, B), B, atol=1e-12)
+    np.testing.assert_allclose(A @ solve(A, B[:, 0]), B[:, 0], atol=1e-12)
+    assert solve(A, B[:, 0]).shape == (4,)
+    np.testing.assert_array_equal(A, before[0])
+    np.testing.assert_array_equal(B, before[1])
+    with pytest.raises(np.linalg.LinAlgError):
+        solve(np.ones((2, 2)), np.ones(2))
 
 
 def members(rng, dims=(3, 2, 3, 3, 2)):
