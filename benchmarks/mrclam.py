@@ -89,8 +89,8 @@ def row(name: str, log: Path, folder: Path) -> str:
     return (
         f"{name:9} {final['ate_rmse_m']:7.3f} {final['ate_aligned_rmse_m']:8.3f} {worst:6.3f} "
         f"{final['max_m']:5.2f} {final['nees_per_dof']:6.2f} {causal['ate_rmse_m']:7.3f} "
-        f"{landmarks['rmse_m']:10.3f} {landmarks['missed']:7} {landmarks['extra']:6} {seconds:6.1f} "
-        f"{cpu:6.1f}"
+        f"{landmarks['rmse_m']:10.3f} {landmarks['missed']:7} {landmarks['extra']:6} "
+        f"{seconds:6.1f} {cpu:6.1f}"
     )
 
 
