@@ -101,7 +101,8 @@ class Task(Generic[_T]):
     """A task that is begun, and its result; ``done`` where there is nothing to wait for.
 
     Where there is no second process it is done at once, so that it always finds things as they
-    are when it begins. Its result must be picklable.
+    are when it begins; only if that process dies is it done by `result`, and finds them as they
+    are then. Its result must be picklable.
     """
 
     def __init__(self, task: Callable[[], _T]) -> None:
@@ -119,9 +120,12 @@ class Task(Generic[_T]):
         return self._result
 
 
-def shared(function: Callable[[_S], _T], arguments: Sequence[_S]) -> list[_T]:
-    """Results of a function for each argument, every other one found by a second process."""
-    if len(arguments) < 2 or not possible():
+def shared(function: Callable[[_S], _T], arguments: Sequence[_S], *, fewest: int = 2) -> list[_T]:
+    """Results of a function for each argument, every other one found by a second process.
+
+    ``fewest`` arguments are worth one.
+    """
+    if len(arguments) < fewest or not possible():
         return [function(a) for a in arguments]
     others = Task(lambda: [function(a) for a in arguments[1::2]])
     found = [function(a) for a in arguments[::2]]

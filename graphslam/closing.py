@@ -223,7 +223,7 @@ def loop_closures(
         asked.append((later, earlier, guess, window))
     lost: list[Closure] = []
     confirmed: list[Closure] = []
-    seen = shared(_seen_again, asked) if len(asked) >= MANY else map(_seen_again, asked)
+    seen = shared(_seen_again, asked, fewest=MANY)
     for (later, earlier, _, _), there in zip(asked, seen, strict=True):
         if there is not None:
             was_lost, pose, cov = there

@@ -482,17 +482,19 @@ def evaluate(
                 f"which is of {', '.join(truth)}"
             )
         apart = robots_apart(result.summary)
-        asked = {(name, kind): [p] for name, both in pairs.items() for kind, p in both.items()}
+        asked: dict[tuple[str | None, str], list[Pairs]] = {
+            (name, kind): [p] for name, both in pairs.items() for kind, p in both.items()
+        }
         together = [both for name, both in pairs.items() if name not in apart]
         if together:
-            asked |= {("", kind): [both[kind] for both in together] for kind in together[0]}
+            asked |= {(None, kind): [both[kind] for both in together] for kind in together[0]}
         metrics = dict(zip(asked, shared(trajectory_metrics, list(asked.values())), strict=True))
         found["robots"] = {
             name: {kind: metrics[name, kind] | (NO_PLACE if name in apart else {}) for kind in both}
             for name, both in pairs.items()
         }
         if together:
-            found["joint"] = {kind: metrics["", kind] for kind in together[0]}
+            found["joint"] = {kind: metrics[None, kind] for kind in together[0]}
     if true_landmarks:
         marks = [mark for mark in result.landmarks if mark.frame is None]
         found["landmarks"] = landmark_metrics(marks, true_landmarks)

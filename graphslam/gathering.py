@@ -178,39 +178,44 @@ def transported(z: Array, cov: Array, delta: Array, delta_cov: Array) -> tuple[A
 
 
 def met(
-    seen: Sequence[Observation],
     sightings: Sequence[Sighting],
-    state_ns: Sequence[int],
-    moved: Sequence[Motion],
-    turn_rad: Array,
+    seen: Sequence[Observation],
+    at: Mapping[str, int],
+    moved: Mapping[tuple[str, int], Motion],
+    heading: Mapping[str, float],
 ) -> list[Association]:
     """Sightings of robots, moved from where those robots were to where they are at their states.
 
     Args:
-        seen: the sightings in the observers' base frames at their states.
-        sightings: as recorded.
-        state_ns: times of the observers' states.
-        moved: motions of the robots that were seen, from their states to when they were seen.
-        turn_rad: (n,) headings of the seen robots relative to the observers'.
+        sightings: of a step, of landmarks as well.
+        seen: the same in their observers' base frames at their states.
+        at: robot -> time of its state.
+        moved: (robot, time) -> motion from the robot's state to that time.
+        heading: robot -> estimated heading of its state, rad.
+
+    Returns:
+        An association of each sighting of a robot, in their order.
     """
     made: dict[int, Association] = {}
     for size, model in ((2, "robot-point"), (3, "robot-pose")):
-        which = [k for k, o in enumerate(seen) if len(o.z) == size]
+        which = [
+            (k, s.robot, s.seen_robot, moved[s.seen_robot, s.time_ns])
+            for k, s in enumerate(sightings)
+            if s.seen_robot is not None and len(seen[k].z) == size
+        ]
         if not which:
             continue
-        apart = np.array([moved[k].start_ns != moved[k].end_ns for k in which])
+        apart = np.array([way.start_ns != way.end_ns for *_, way in which])
         z, cov = met_by(
-            np.array([seen[k].z for k in which]),
-            np.array([seen[k].cov for k in which]),
-            np.array([moved[k].delta for k in which]),
-            np.array([moved[k].cov for k in which]) * apart[:, None, None],
-            turn_rad[which],
+            np.array([seen[k].z for k, *_ in which]),
+            np.array([seen[k].cov for k, *_ in which]),
+            np.array([way.delta for *_, way in which]),
+            np.array([way.cov for *_, way in which]) * apart[:, None, None],
+            np.array([heading[other] - heading[robot] for _, robot, other, _ in which]),
         )
-        for n, k in enumerate(which):
-            other = sightings[k].seen_robot
-            assert other is not None  # callers ask for robots only
-            made[k] = Association(sightings[k].robot, state_ns[k], other, model, z[n], cov[n])
-    return [made[k] for k in range(len(seen))]
+        for n, (k, robot, other, _) in enumerate(which):
+            made[k] = Association(robot, at[robot], other, model, z[n], cov[n])
+    return [made[k] for k in sorted(made)]
 
 
 def met_by(

@@ -209,12 +209,20 @@ class Pipeline:
         associations: tuple[Association, ...] = ()
         every = [sighting for image in gathered.images for sighting in image]
         seen = carried(every, [moved[s.robot, s.time_ns] for s in every])
-        observed, robots = iter(seen), iter(self.met_in(every, seen, at, moved, motions))
+        heading = {
+            name: self.runs[name].causal_poses[-1][2]
+            + (motions[name].delta[2] if name in motions else 0.0)
+            for name in at
+        }
+        observed, robots = iter(seen), iter(met(every, seen, at, moved, heading))
         for image in gathered.images:
             own = list(itertools.islice(observed, len(image)))
             associations += self.seen_in(image, own, at[image[0].robot], motions)
-            count = sum(s.seen_robot is not None for s in image)
-            associations += tuple(itertools.islice(robots, count))
+            for sighting in image:
+                if sighting.seen_robot is not None:
+                    found = next(robots)
+                    self.sources[found.robot, found.time_ns, found.z.tobytes()] = sighting
+                    associations += (found,)
         self.note_covariances()
         self.seconds["association"] += time.perf_counter() - began
         self.enter(Step(step_ns, {}, motions, shared(associations)), known)
@@ -253,45 +261,6 @@ class Pipeline:
             gathering=True,
         )
 
-    def met_in(
-        self,
-        sightings: Sequence[Sighting],
-        seen: Sequence[Observation],
-        at: Mapping[str, int],
-        moved: Mapping[tuple[str, int], Motion],
-        motions: Mapping[str, Motion],
-    ) -> list[Association]:
-        """Sightings of robots among those of a step.
-
-        Args:
-            sightings: of the step.
-            seen: the same in their observers' base frames at their states.
-            at: robot -> time of its state.
-            moved: (robot, time) -> motion from the robot's state to that time.
-            motions: of the step, of robots that get a state.
-        """
-        which = [k for k, s in enumerate(sightings) if s.seen_robot is not None]
-        if not which:
-            return []
-        robots = [sightings[k] for k in which]
-        pairs = [(str(s.seen_robot), s.robot) for s in robots]
-        heading = {
-            name: self.runs[name].causal_poses[-1][2]
-            + (motions[name].delta[2] if name in motions else 0.0)
-            for name in {robot for pair in pairs for robot in pair}
-        }
-        found = met(
-            [seen[k] for k in which],
-            robots,
-            [at[s.robot] for s in robots],
-            [moved[other, s.time_ns] for (other, _), s in zip(pairs, robots, strict=True)],
-            np.array([heading[other] - heading[own] for other, own in pairs]),
-        )
-        for association, sighting in zip(found, robots, strict=True):
-            where = association.robot, association.time_ns, association.z.tobytes()
-            self.sources[where] = sighting
-        return found
-
     def take(self, event: Sequence[Message]) -> None:
         """One event: everything one robot perceived at one time."""
         first = event[0]
@@ -299,8 +268,8 @@ class Pipeline:
         self.first_ns, self.last_ns = min(self.first_ns, time_ns), max(self.last_ns, time_ns)
         if not run.started:
             self.start(first.robot, min(run.track.first_ns, time_ns))
-        elif isinstance(first, ODOMETRY) and self.config.keyframe.mode != "all":
-            return  # the rule, where odometry is most of a log
+        if isinstance(first, ODOMETRY) and self.config.keyframe.mode != "all":
+            return  # a place on the trajectory, no more; most of a log is this
         run.scans += [(m.stamp_ns, m.time_ns, m.mount) for m in event if isinstance(m, Scan)]
         self.counts["scans"] += isinstance(first, Scan)
         used = self.is_used(event)
@@ -386,13 +355,11 @@ class Pipeline:
         states other observations have made in between; sightings are all used.
         """
         first = event[0]
-        if self.config.keyframe.mode == "all" or not isinstance(first, (Scan, *ODOMETRY)):
+        if self.config.keyframe.mode == "all" or not isinstance(first, Scan):
             return True
         run = self.runs[first.robot]
         angle = self.config.keyframe.scan_angle_rad
-        if isinstance(first, ODOMETRY) or not self.has_moved(
-            run, run.scanned_ns, first.time_ns, angle
-        ):
+        if not self.has_moved(run, run.scanned_ns, first.time_ns, angle):
             return False
         run.scanned_ns = first.time_ns
         return True

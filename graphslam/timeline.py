@@ -65,10 +65,6 @@ def synchronise(
     for message in messages:
         if isinstance(message, ODOMETRY):
             tracks[message.robot].add(message)
-            if not waiting:  # most of a log is odometry
-                now_ns = max(now_ns, message.time_ns)
-                yield message
-                continue
         elif isinstance(message, (Truth, TrueLandmark)):
             continue
         elif isinstance(message, Sighting) and message.seen_robot not in (None, *tracks):

@@ -99,7 +99,10 @@ class Active:
             self._update(measured)
 
     def _move(self, parts: Sequence[Part]) -> None:
-        """New states of several robots, each by the motion from the one before, at once."""
+        """New states of several robots at once: `_enter` where each has one factor, of its motion.
+
+        That factor is between the state before and the new one, in this order.
+        """
         news = [part.new for part in parts if part.new is not None]
         for key, place in news:
             write(self._places, key, place)
@@ -193,10 +196,9 @@ class CompressedBackend(Isam2Backend):
         except np.linalg.LinAlgError:
             self._flush()  # what is wrong the tree says by name
             return
-        numbers = [
-            (robot, self._builder.states.latest(robot) - self._kept) for robot in step.motions
-        ]
-        before = [self._builder.state_key(*state) for state in numbers if state[1] >= 0]
+        builder = self._builder
+        states = ((robot, builder.states.latest(robot) - self._kept) for robot in step.motions)
+        before = [builder.state_key(robot, number) for robot, number in states if number >= 0]
         self._active.forget([key for key in before if key in self._active])
 
     def landmark_means(self, landmarks: Sequence[int]) -> list[Array]:

@@ -277,12 +277,12 @@ class GraphBackend(ABC):
 
     def joint(self, robot: str, landmarks: Sequence[int], others: Sequence[str] = ()) -> Joint:
         """See `Backend`; asked for the pose alone after more, it answers from what it has."""
-        if not landmarks and not others and robot in self._joints:
-            known = self._joints[robot]
-            return Joint(known.pose, (), known.cov[:3, :3], ())
         builder = self.builder
         key = builder.latest_key(robot)
         if not landmarks and not others:
+            if robot in self._joints:
+                known = self._joints[robot]
+                return Joint(known.pose, (), known.cov[:3, :3], ())
             alone = self.value(key, 3)
             cov = rotate_cov(self.covariance([key]), alone[2])
             self._joints[robot] = Joint(alone, (), cov, ())

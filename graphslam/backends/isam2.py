@@ -367,9 +367,8 @@ def marginals_of(marginals: gtsam.Marginals, keys: Sequence[int]) -> dict[int, A
     Raises:
         RuntimeError: one is indeterminate.
     """
-    covariance = marginals.marginalCovariance
     keys = list(keys)
-    found = shared(covariance, keys) if len(keys) >= MANY else list(map(covariance, keys))
+    found = shared(marginals.marginalCovariance, keys, fewest=MANY)
     return dict(zip(keys, found, strict=True))
 
 

@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from graphslam.errors import GraphSlamError
 
-DRAWN_EVERY_S = 0.1
+DRAWN_EVERY_S = 0.1  # smoother than the eye needs, and drawing takes no time to speak of
 INTERRUPTED = 130  # what shells give a program that Ctrl-C ended
 
 
