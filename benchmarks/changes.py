@@ -22,11 +22,11 @@ import cv2
 import numpy as np
 from scipy.stats import norm
 
-from graphslam.changes import Visit, compare, load_visit, visit_of
-from graphslam.changes.compare import Comparison
-from graphslam.changes.grid import grid_over
-from graphslam.changes.registration import Registration, register
-from graphslam.changes.thesis import (
+from graphslam.change_detection import Visit, compare, load_visit, visit_of
+from graphslam.change_detection.detect import Comparison
+from graphslam.change_detection.grid import grid_over
+from graphslam.change_detection.rigid_registration import Registration, register
+from graphslam.change_detection.thesis_method import (
     LaserNoise,
     changed_beams,
     make_dents,
@@ -34,15 +34,15 @@ from graphslam.changes.thesis import (
     point_covariances,
     scan_points,
 )
-from graphslam.config import ChangesConfig, Config
-from graphslam.geometry import Array, between, compose, inverse, transform
+from graphslam.core.config import ChangesConfig, Config
+from graphslam.core.geometry import Array, between, compose, inverse, transform
 from graphslam.logs import open_logs
-from graphslam.results import load, save
-from graphslam.simulate import load_scenario, simulate
-from graphslam.simulate.raycast import Fan, cast
-from graphslam.simulate.spec import Box, Later, Move, Scenario, Things
-from graphslam.simulate.world import Outline, make_world
-from graphslam.slam import smooth
+from graphslam.results.folder import load, save
+from graphslam.simulation import load_scenario, simulate
+from graphslam.simulation.raycast import Fan, cast
+from graphslam.simulation.scenario import Box, Later, Move, Scenario, Things
+from graphslam.simulation.world import Outline, make_world
+from graphslam.slam.smooth import smooth
 
 POSE_SIGMAS = np.array([0.05, 0.05, np.radians(1.0)])  # injected
 

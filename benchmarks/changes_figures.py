@@ -15,11 +15,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from thesis_figures import BLUE, GREY, INK, MARK, RED, WALL, legend, panels, path, scatter
 
-from graphslam.changes import Visit, compare, load_visit
-from graphslam.changes.compare import Comparison
-from graphslam.changes.grid import grid_over
-from graphslam.changes.registration import register
-from graphslam.changes.thesis import (
+from graphslam.change_detection import Visit, compare, load_visit
+from graphslam.change_detection.detect import Comparison
+from graphslam.change_detection.grid import grid_over
+from graphslam.change_detection.rigid_registration import register
+from graphslam.change_detection.thesis_method import (
     LaserNoise,
     changed_beams,
     expected_measurements,
@@ -28,12 +28,12 @@ from graphslam.changes.thesis import (
     point_covariances,
     scan_points,
 )
-from graphslam.config import ChangesConfig, Config
-from graphslam.geometry import Array, transform
+from graphslam.core.config import ChangesConfig, Config
+from graphslam.core.geometry import Array, transform
 from graphslam.logs import open_logs
 from graphslam.logs.importers import IMPORTERS
-from graphslam.results import load, save
-from graphslam.slam import smooth
+from graphslam.results.folder import load, save
+from graphslam.slam.smooth import smooth
 
 TARGET = Path(__file__).parents[1] / "docs/figures"
 KINDS = {"appeared": MARK, "vanished": WALL, "moved": "#aa3377"}

@@ -16,10 +16,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphslam.backends.ekf import EkfBackend
-from graphslam.config import Config, EkfConfig
-from graphslam.models import MODELS
-from graphslam.records import Association, Motion, Start, Step
+from graphslam.core.config import Config, EkfConfig
+from graphslam.core.observation_models import MODELS
+from graphslam.core.records import Association, Motion, Start, Step
+from graphslam.estimation.ekf import EkfBackend
 
 ROOM_M = 30.0
 COVS = {"point": np.diag([1e-4, 1e-3]), "segment": np.diag([1e-3, 1e-3, 1e-4])}

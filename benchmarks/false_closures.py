@@ -18,14 +18,14 @@ from pathlib import Path
 import numpy as np
 from real_logs import DATA, LOGS, command
 
-from graphslam.closing import Place
-from graphslam.config import Config
-from graphslam.consolidating import Tamper
-from graphslam.evaluate import read_relations, relation_errors
-from graphslam.geometry import between, compose
+from graphslam.core.config import Config
+from graphslam.core.geometry import between, compose
+from graphslam.core.records import Closure
+from graphslam.evaluation.metrics import read_relations, relation_errors
 from graphslam.logs import open_logs
-from graphslam.records import Closure
-from graphslam.slam import smooth
+from graphslam.mapping.loop_closure import SubmapPose
+from graphslam.slam.reoptimise_scans import Tamper
+from graphslam.slam.smooth import smooth
 
 SHARES, WITHIN, GROUP = (0.1, 0.3, 0.5), 1.1, 3
 COV = np.diag([0.03, 0.03, 0.005]) ** 2
@@ -38,7 +38,7 @@ class Liar:
         self._share, self._rng = share, np.random.default_rng(seed)
         self.true = self.false = 0
 
-    def __call__(self, found: list[Closure], places: Sequence[Place]) -> list[Closure]:
+    def __call__(self, found: list[Closure], places: Sequence[SubmapPose]) -> list[Closure]:
         """The closures, and the false ones behind them."""
         if self.false or not found:
             return found
@@ -50,7 +50,7 @@ class Liar:
         self.false = len(made)
         return [*found, *made]
 
-    def _group(self, size: int, places: Sequence[Place]) -> list[Closure]:
+    def _group(self, size: int, places: Sequence[SubmapPose]) -> list[Closure]:
         """Closures from neighbouring places to one other, all wrong by the same motion."""
         first = int(self._rng.integers(size, len(places) - size))
         other = places[int(self._rng.integers(0, first))]

@@ -16,15 +16,16 @@ from unittest.mock import patch
 
 import numpy as np
 
-from graphslam.backends import BACKENDS
-from graphslam.compare import Recording, record, variants
-from graphslam.config import load_config
-from graphslam.evaluate import evaluate
+from graphslam.core.config import load_config
+from graphslam.core.records import Step
+from graphslam.estimation.backends import BACKENDS
+from graphslam.estimation.replay import replay
+from graphslam.evaluation.compare_recording import Recording, record
+from graphslam.evaluation.compare_variants import variants
+from graphslam.evaluation.ground_truth import truth_of_logs
+from graphslam.evaluation.metrics import evaluate
 from graphslam.logs import KnownTruth, open_logs
-from graphslam.records import Step
-from graphslam.replay import replay
-from graphslam.simulate import load_scenario, simulate
-from graphslam.truth import truth_of_logs
+from graphslam.simulation import load_scenario, simulate
 
 START = ["start.from_truth=true"]
 #: label -> spec, whether late evidence is left out, and the gauge of filters' lines, m
@@ -61,7 +62,7 @@ def judge(recording: Recording, truth: KnownTruth, label: str, settings: list[st
     (variant,) = variants([spec], None, settings)
     gauge: AbstractContextManager[object] = nullcontext()
     if gauge_m is not None:
-        gauge = patch("graphslam.factors.FILTER_GAUGE_SIGMA_M", gauge_m)
+        gauge = patch("graphslam.estimation.factors.FILTER_GAUGE_SIGMA_M", gauge_m)
     with gauge:
         backend = BACKENDS[variant.config.backend.name](variant.config)
         done = replay(in_time(recording.steps) if strip else recording.steps, backend)

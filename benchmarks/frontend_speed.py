@@ -17,11 +17,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from graphslam.config import FrontEndConfig
-from graphslam.frontend import FRONT_ENDS
-from graphslam.frontend.hough import Votes
-from graphslam.frontend.sweep import Sweep, make_sweep
-from graphslam.records import Scan
+from graphslam.core.config import FrontEndConfig
+from graphslam.core.records import Scan
+from graphslam.perception.front_ends import FRONT_ENDS
+from graphslam.perception.hough import Votes
+from graphslam.perception.ordered_scan import Sweep, make_sweep
 
 DATA = Path(__file__).resolve().parents[1] / "../shared/data"
 

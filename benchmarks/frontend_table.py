@@ -26,16 +26,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from graphslam.config import Config, FrontEndConfig, StartConfig
-from graphslam.evaluate import evaluate, read_relations
-from graphslam.frontend import FRONT_ENDS
-from graphslam.geometry import Array, between, rotate_cov, transform, wrap
+from graphslam.core.config import Config, FrontEndConfig, StartConfig
+from graphslam.core.geometry import Array, between, rotate_cov, transform, wrap
+from graphslam.core.records import Observation, Result, Scan
+from graphslam.evaluation.ground_truth import truth_of_logs
+from graphslam.evaluation.metrics import evaluate, read_relations
 from graphslam.logs import open_logs
-from graphslam.records import Observation, Result, Scan
-from graphslam.simulate import load_scenario, simulate
-from graphslam.simulate.stage import visits
-from graphslam.slam import smooth
-from graphslam.truth import truth_of_logs
+from graphslam.perception.front_ends import FRONT_ENDS
+from graphslam.simulation import load_scenario, simulate
+from graphslam.simulation.scene import visits
+from graphslam.slam.smooth import smooth
 
 SEEDS = (0, 1, 2, 3)
 SCANS = 120

@@ -18,13 +18,13 @@ from pathlib import Path
 
 import numpy as np
 
-from graphslam.backends import BACKENDS
-from graphslam.config import Config
+from graphslam.core.config import Config
+from graphslam.core.records import Step, Trajectory
+from graphslam.estimation.backends import BACKENDS
+from graphslam.estimation.replay import Replay, replay
 from graphslam.logs import open_logs
-from graphslam.records import Step, Trajectory
-from graphslam.replay import Replay, replay
-from graphslam.simulate import load_scenario, simulate
-from graphslam.slam import smooth
+from graphslam.simulation import load_scenario, simulate
+from graphslam.slam.smooth import smooth
 
 SCENARIOS = ("lab", "forest")
 HORIZONS_S = (0.0, 1.0, 5.0, 20.0, 60.0, math.inf)

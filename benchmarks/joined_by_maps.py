@@ -26,20 +26,20 @@ import numpy as np
 from perturbed_logs import write
 from real_logs import DATA, LOGS, command, smooth
 
-from graphslam.config import Config
-from graphslam.evaluate import Relations, read_relations, relation_errors
-from graphslam.geometry import between
-from graphslam.joining import Joined
+from graphslam.core.config import Config
+from graphslam.core.geometry import between
+from graphslam.core.records import Message, OdometryPose, Trajectory
+from graphslam.evaluation.metrics import Relations, read_relations, relation_errors
 from graphslam.logs import open_logs
-from graphslam.pipeline import Known, Pipeline
-from graphslam.placing import surroundings, views_after
-from graphslam.recorded import recorded_in
-from graphslam.records import Message, OdometryPose, Trajectory
-from graphslam.relating import Relation
-from graphslam.results import load
-from graphslam.shared_places import relate_places
-from graphslam.starts import origin, start_poses
-from graphslam.unnamed import Surroundings
+from graphslam.multi_robot.anonymous_map import AnonymousMap
+from graphslam.multi_robot.frame_tree import FrameAssignment
+from graphslam.multi_robot.place_recognition import relate_places
+from graphslam.multi_robot.relative_frames import RelativeFrame
+from graphslam.results.folder import load
+from graphslam.slam.initialisation import anonymous_maps, views_after
+from graphslam.slam.pipeline import Pipeline, PriorKnowledge
+from graphslam.slam.recorded_closures import judge_recorded_closures
+from graphslam.slam.start_priors import origin, start_poses
 
 NAMES = ("first", "second")
 #: stretches of each half; two overlap if so many places are so near, m; m, rad: a start is right
@@ -110,15 +110,15 @@ def joined(name: str, folder: Path) -> bool:
     return len(set(summary["frames"].values())) == 1
 
 
-def seen_alone(log: Path) -> dict[str, Surroundings]:
+def seen_alone(log: Path) -> dict[str, AnonymousMap]:
     """What each robot of a log saw by itself."""
     config = Config()
     opened = open_logs([log], config)
-    recorded = recorded_in(opened, config, start_poses(opened, config))
-    known = Known(Joined.apart(opened.robots, origin(config)), recorded)
+    recorded = judge_recorded_closures(opened, config, start_poses(opened, config))
+    known = PriorKnowledge(FrameAssignment.apart(opened.robots, origin(config)), recorded)
     pipeline = Pipeline(opened, config, known)
     pipeline.run(lambda _count: None)
-    return surroundings(pipeline, views_after(pipeline))
+    return anonymous_maps(pipeline, views_after(pipeline))
 
 
 def parts(name: str, folder: Path) -> bool:
@@ -139,7 +139,7 @@ def parts(name: str, folder: Path) -> bool:
             near = np.linalg.norm(p[:, None] - q, axis=-1).min(axis=0) < OVERLAP_M
             kind = "overlapping" if near.sum() >= OVERLAPPING else "others"
             counts[kind] += 1
-            if isinstance(found, Relation):
+            if isinstance(found, RelativeFrame):
                 right = np.hypot(*found.pose[:2]) < RIGHT_M and abs(found.pose[2]) < RIGHT_RAD
                 counts[f"{kind}, joined {'rightly' if right else 'WRONGLY'}"] += 1
     print(f"\n{name}, pairs of parts:", dict(sorted(counts.items())), flush=True)

@@ -20,9 +20,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from graphslam.config import Config
+from graphslam.core.config import Config
 from graphslam.logs import open_logs
-from graphslam.starts import first_truth
+from graphslam.slam.start_priors import first_truth
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("GRAPHSLAM_DATA", ROOT / "../shared/data"))

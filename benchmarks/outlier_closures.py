@@ -22,11 +22,11 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from graphslam.config import Config
+from graphslam.core.config import Config
+from graphslam.core.records import Result
 from graphslam.logs import IMPORTERS, open_logs, pose_stamp_ns
-from graphslam.logs.importers.isam import Edge, read_pose_graph, split_chain
-from graphslam.records import Result
-from graphslam.slam import smooth
+from graphslam.logs.import_pose_graph import Edge, read_pose_graph, split_chain
+from graphslam.slam.smooth import smooth
 
 PRIOR_SIGMA = 1e-3
 #: the graph without false closures; one robot with them; two robots with them, and without

@@ -25,11 +25,11 @@ from pathlib import Path
 import numpy as np
 from real_logs import DATA, LOGS, command, smooth
 
-from graphslam.config import Config
-from graphslam.evaluate import Relations, read_relations, relation_errors
-from graphslam.geometry import Array, between, compose
+from graphslam.core.config import Config
+from graphslam.core.geometry import Array, between, compose
+from graphslam.core.records import Message, OdometryPose, Scan, Trajectory
+from graphslam.evaluation.metrics import Relations, read_relations, relation_errors
 from graphslam.logs import LogWriter, open_logs
-from graphslam.records import Message, OdometryPose, Scan, Trajectory
 
 GROSS_M, LATE_S, WORSE = 0.15, 20.0, 1.5
 SEEDS = (1, 2)

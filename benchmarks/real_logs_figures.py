@@ -10,10 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from thesis_figures import BLUE, GREY, INK, RED, panels
 
-from graphslam.changes import load_visit
-from graphslam.evaluate import read_relations, relation_errors
-from graphslam.geometry import Array
-from graphslam.results import load
+from graphslam.change_detection import load_visit
+from graphslam.core.geometry import Array
+from graphslam.evaluation.metrics import read_relations, relation_errors
+from graphslam.results.folder import load
 
 #: every so many points of the map are drawn
 THINNED = 7

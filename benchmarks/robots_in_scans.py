@@ -20,14 +20,14 @@ from pathlib import Path
 
 import numpy as np
 
-from graphslam.config import Config, load_config
-from graphslam.evaluate import evaluate, pair
-from graphslam.geometry import Array, wrap
+from graphslam.core.config import Config, load_config
+from graphslam.core.geometry import Array, wrap
+from graphslam.evaluation.metrics import evaluate, pair
 from graphslam.logs import open_logs, read_truth
-from graphslam.simulate import load_scenario, simulate
-from graphslam.simulate.body import corners
-from graphslam.slam import smooth
-from graphslam.starts import first_truth
+from graphslam.simulation import load_scenario, simulate
+from graphslam.simulation.robot_shapes import corners
+from graphslam.slam.smooth import smooth
+from graphslam.slam.start_priors import first_truth
 
 SCENARIO, OBSERVER, SEEN = "robots-in-scans", "vehicle", "pioneer"
 

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from graphslam.simulate import SCENARIOS, load_scenario, simulate
-from graphslam.simulate.raycast import Fan, cast
-from graphslam.simulate.world import Shapes
+from graphslam.simulation import SCENARIOS, load_scenario, simulate
+from graphslam.simulation.raycast import Fan, cast
+from graphslam.simulation.world import Shapes
 
 SCANS, WALLS, SIDE_M = 2000, 200, 40.0
 FAN = Fan(-np.pi / 2, np.pi / 360, 361)

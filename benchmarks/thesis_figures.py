@@ -25,8 +25,8 @@ from thesis_runs import (
     visits_of_the_start,
 )
 
-from graphslam.geometry import compose, transform
-from graphslam.simulate import load_scenario, simulate
+from graphslam.core.geometry import compose, transform
+from graphslam.simulation import load_scenario, simulate
 
 SEED = 0
 INK, WALL, MARK = "#1b1f24", "#c8601a", "#228833"

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from graphslam.config import load_config
-from graphslam.evaluate import align, pair
-from graphslam.geometry import between, compose, transform
+from graphslam.core.config import load_config
+from graphslam.core.geometry import between, compose, transform
+from graphslam.core.records import Result, Scan, TrueLandmark
+from graphslam.evaluation.metrics import align, pair
 from graphslam.logs import open_logs, read_true_associations, read_truth
-from graphslam.records import Result, Scan, TrueLandmark
-from graphslam.simulate import Scenario, load_scenario, simulate
-from graphslam.slam import smooth
+from graphslam.simulation import Scenario, load_scenario, simulate
+from graphslam.slam.smooth import smooth
 
 DEFAULTS = load_config()
 STARTS_KNOWN = load_config(overrides=["start.from_truth=true"])

@@ -15,11 +15,11 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from graphslam.config import load_config
-from graphslam.errors import GraphSlamError, OutputError
+from graphslam.core.config import load_config
+from graphslam.core.errors import GraphSlamError, OutputError
 from graphslam.logs import IMPORTERS, open_logs, pose_stamp_ns
-from graphslam.results import load, save
-from graphslam.slam import smooth
+from graphslam.results.folder import load, save
+from graphslam.slam.smooth import smooth
 
 SOURCE = gtsam.findExampleDataFile("victoria_park.txt")
 PRIOR_SIGMA = 1e-3

@@ -17,12 +17,12 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.config import load_config
-from graphslam.geometry import Array, between, compose, exp, log
+from graphslam.core.config import load_config
+from graphslam.core.geometry import Array, between, compose, exp, log
+from graphslam.core.records import Message, OdometryPose, Scan, Truth
 from graphslam.logs import LogWriter, open_logs
-from graphslam.records import Message, OdometryPose, Scan, Truth
-from graphslam.simulate import load_scenario, simulate
-from graphslam.slam import smooth
+from graphslam.simulation import load_scenario, simulate
+from graphslam.slam.smooth import smooth
 
 S = 1_000_000_000
 #: seconds since the start, length of the increment (s), its twist -> the twist that is reported,

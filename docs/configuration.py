@@ -1,4 +1,4 @@
-"""Writes docs/configuration.md from the dataclasses in `graphslam.config`.
+"""Writes docs/configuration.md from the dataclasses in `graphslam.core.config`.
 
 Run: python docs/configuration.py   (or `make docs`)
 """
@@ -12,14 +12,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from graphslam.config import Config
+from graphslam.core.config import Config
 
 PAGE = Path(__file__).with_suffix(".md")
 
 HEAD = """\
 # Configuration
 
-Made from `graphslam/config.py` by `make docs`; change it there.
+Made from `graphslam/core/config.py` by `make docs`; change it there.
 
 One tree of settings. `graphslam smooth` takes the defaults, then `--config FILE.toml`, then its
 own options (`--backend isam2` is `backend.name`, `--front-end` is `front_end.name`, `--start` is

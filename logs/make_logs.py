@@ -9,7 +9,7 @@ import hashlib
 import shutil
 from pathlib import Path
 
-from graphslam.simulate import SCENARIOS, load_scenario, simulate
+from graphslam.simulation import SCENARIOS, load_scenario, simulate
 
 HERE = Path(__file__).parent
 SEED = 0

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from graphslam.geometry import Array
+from graphslam.core.geometry import Array
 
 #: the truncation error h² f''' and the rounding error 1e-16 |f| / h are about equal here, 1e-11
 #: for functions of size ten

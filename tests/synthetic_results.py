@@ -9,8 +9,8 @@ import itertools
 
 import numpy as np
 
-from graphslam.geometry import between, compose, exp, wrap
-from graphslam.records import (
+from graphslam.core.geometry import between, compose, exp, wrap
+from graphslam.core.records import (
     Association,
     Estimate,
     Landmark,

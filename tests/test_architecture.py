@@ -10,83 +10,39 @@ from pathlib import Path
 import pytest
 
 import graphslam
-from graphslam.backends import BACKENDS
-from graphslam.config import BackendConfig, FrontEndConfig
-from graphslam.frontend import FRONT_ENDS
+from graphslam.core.config import BackendConfig, FrontEndConfig
+from graphslam.estimation.backends import BACKENDS
+from graphslam.perception.front_ends import FRONT_ENDS
 
 ROOT = Path(graphslam.__file__).parent
 
-#: The rooms of the house, lowest row first. An import goes to a lower row, or stays in its room.
-ROWS = (
-    # how it fails; what a pose is; work in a second process
-    ("beside", "errors", "geometry"),
-    ("gaussian",),  # what squared distances of normal errors may be
-    # settings; what travels between the modules; Kalman filtering on arrays
-    ("config", "kalman", "records"),
-    # messages on one time line; motion, and one observation model per kind of target
-    ("clocks", "models"),
-    ("readings",),  # what odometry says by itself
-    # one job each, on records and arrays
-    ("association", "calibration", "dead_reckoning", "export", "factors", "frontend", "logs"),
-    ("matching", "relating"),  # where a place was seen from; how two robots' frames relate
-    ("scan_motion",),  # what scans say of a motion
-    # estimators; what is set for a log's robots; order in time; poses at any time; worlds and their
-    # logs
-    ("backends", "log_settings", "simulate", "timeline", "trajectories"),
-    # what is known about landmarks beside their estimate; of a robot; where robots start; recorded
-    # steps through an estimator; sightings that share a step; names given to each other's bearers;
-    # robots joined by what they see; how robots' clocks differ
-    (
-        "clock_offsets",
-        "exchanged",
-        "gathering",
-        "joining",
-        "landmark_map",
-        "replay",
-        "robot_run",
-        "starts",
-    ),
-    # decisions of one image; states and calibration together; places seen twice; robots that
-    # nothing relates; where one began by its sightings; duplicates in a map; observations of walls
-    # anew; closures that a log brings along; a log of sightings solved again; robots that saw the
-    # same points; what a run adds up to; robots in each other's scans
-    (
-        "associator",
-        "calibrating",
-        "closing",
-        "frames",
-        "merging",
-        "reassociating",
-        "registering",
-        "recorded_closures",
-        "refining",
-        "shared_points",
-        "summary",
-        "watching",
-    ),
-    # which recorded closures are believed; landmarks by visit, and one again; robots that were
-    # in the same places; where a robot may be in another's scans
-    ("recorded", "revisits", "shared_places", "supposing"),
-    # a log of scans solved again; what robots have in common that bears no name; robots found in
-    # scans wherever they began
-    ("consolidating", "meeting", "unnamed"),
-    ("pipeline",),  # one pass over a log
-    ("placing",),  # where robots begin, before the pass proper
-    ("slam",),  # as many passes as it takes
-    ("results",),  # a result as a folder, and back
-    ("report", "truth"),  # pictures and tables of a result; where truth comes from
-    ("changes", "evaluate"),  # a result against another one; against the truth
-    ("compare", "experiments"),  # several back ends on one log; many seeded runs of several
-    ("cli",),  # arguments, progress, exit codes; no computation
-    ("__main__",),
+#: The packages, lowest first. An import goes to a lower one, or stays in its package. This is the
+#: only list; docs/architecture.md prints it.
+PACKAGES = (
+    "core",
+    "logs",
+    "simulation",
+    "perception",
+    "odometry",
+    "estimation",
+    "mapping",
+    "multi_robot",
+    "slam",
+    "results",
+    "change_detection",
+    "evaluation",
+    "cli",
 )
-ROW_OF = {room: n for n, row in enumerate(ROWS) for room in row}
+#: most pairs of packages of which one imports the other
+MOST_ARROWS = 100
+#: most lines of a module: what is longer has more than one responsibility
+MOST_LINES = 450
 
-#: library -> the rooms that may import it: everything else stays free of its types and its cost
+#: library -> the packages that may import it: everything else stays free of its types and its cost
 KEEPERS = {
-    "cv2": {"frontend", "report", "changes"},
-    "gtsam": {"factors", "backends"},
-    "matplotlib": {"report"},
+    "cv2": {"perception", "results", "change_detection"},
+    "gtsam": {"estimation"},
+    "matplotlib": {"results"},
     "mcap": {"logs"},
     "rich": {"cli"},
     "rosbags": {"logs"},
@@ -96,8 +52,8 @@ KEEPERS = {
 FILES = sorted(ROOT.rglob("*.py"))
 
 
-def room_of(path):
-    """First part of the module's name below the package; `__init__` is the package itself."""
+def package_of(path):
+    """First part of the module's name below the root; of a module at the root, its name."""
     return path.relative_to(ROOT).with_suffix("").parts[0]
 
 
@@ -122,46 +78,72 @@ def place(path, line):
     return f"{path.relative_to(ROOT.parent)}:{line}"
 
 
-# ------------------------------------------------------------ the layer rule
+# ------------------------------------------------------------ packages
 
 
-def test_every_module_has_its_row():
-    """A new room says where it stands; a room that is gone leaves the table."""
-    rooms = {room_of(path) for path in FILES} - {"__init__"}
-    # rooms of issues to come may be listed once they exist
-    assert rooms == set(ROW_OF)
+def package_imports():
+    """(file, line, importing package, imported package) of every import between packages."""
+    for path in FILES:
+        here = package_of(path)
+        for line, name in imports(path):
+            parts = name.split(".")
+            if parts[0] == "graphslam" and parts[1:] != ["__version__"] and parts[1] != here:
+                yield path, line, here, parts[1]
+
+
+def test_everything_is_in_a_package():
+    """A module at the root would belong nowhere; a package that is gone leaves the list."""
+    assert {path.name for path in ROOT.glob("*.py")} == {"__init__.py", "__main__.py"}
+    assert {path.parent.name for path in ROOT.glob("*/__init__.py")} == set(PACKAGES)
 
 
 def test_imports_go_only_downwards():
-    """Breaks with the first import upwards or sideways: `geometry` that knows a robot, a back end
-    that knows the pipeline. No cycle can hide in it either."""
-    wrong = []
-    for path in FILES:
-        here = room_of(path)
-        for line, name in imports(path):
-            parts = name.split(".")
-            if parts[0] != "graphslam" or parts[1:] == ["__version__"]:
-                continue
-            there = parts[1]
-            if here == "__init__" or (there != here and ROW_OF[there] >= ROW_OF[here]):
-                wrong.append(f"{place(path, line)} {here} imports {there}")
-    assert not wrong, "\n".join(wrong)
-
-
-@pytest.mark.parametrize("library", sorted(KEEPERS))
-def test_only_its_keepers_import_a_library(library):
-    """mcap by `logs`, cv2 by `frontend`, `report` and `changes`, gtsam by `factors` and
-    `backends`."""
+    """Breaks with the first import upwards or sideways: `core` that knows a robot, a back end
+    that knows the pipeline. No cycle between packages can hide in it either."""
     wrong = [
-        f"{place(path, line)} imports {name}"
-        for path in FILES
-        for line, name in imports(path)
-        if name.split(".")[0] == library and room_of(path) not in KEEPERS[library]
+        f"{place(path, line)} {here} imports {there}"
+        for path, line, here, there in package_imports()
+        if here in PACKAGES and PACKAGES.index(there) >= PACKAGES.index(here)
     ]
     assert not wrong, "\n".join(wrong)
 
 
-@pytest.mark.parametrize("module", ["graphslam", "graphslam.slam", "graphslam.results"])
+def test_few_packages_know_each_other():
+    """Prints how many pairs of packages import each other: what someone has to keep in mind."""
+    arrows = {(here, there) for _, _, here, there in package_imports() if here in PACKAGES}
+    print(f"{len(arrows)} import arrows between packages")
+    assert len(arrows) <= MOST_ARROWS
+
+
+def test_the_architecture_page_prints_this_order():
+    page = (ROOT.parent / "docs/architecture.md").read_text(encoding="utf-8")
+    assert " < ".join(PACKAGES) in " ".join(page.replace("`", "").split())
+
+
+def test_no_module_is_long():
+    long = {
+        str(path.relative_to(ROOT)): lines
+        for path in FILES
+        if (lines := len(path.read_text(encoding="utf-8").splitlines())) > MOST_LINES
+    }
+    assert not long
+
+
+@pytest.mark.parametrize("library", sorted(KEEPERS))
+def test_only_its_keepers_import_a_library(library):
+    """So that mcap stays in `logs`, gtsam in `estimation`."""
+    wrong = [
+        f"{place(path, line)} imports {name}"
+        for path in FILES
+        for line, name in imports(path)
+        if name.split(".")[0] == library and package_of(path) not in KEEPERS[library]
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize(
+    "module", ["graphslam", "graphslam.slam.smooth", "graphslam.results.folder"]
+)
 def test_importing_the_library_is_quiet_and_light(module):
     """A script that smooths pays neither for plots nor for a command line, and importing writes
     nothing. In a process of its own: this one has imported everything."""
@@ -261,7 +243,7 @@ def test_functions_that_raise_our_errors_say_so():
     ours = {"LogError", "ConfigError", "EstimationError", "OutputError", "ScenarioError"}
     missing = []
     for path in FILES:
-        if room_of(path) == "cli":
+        if package_of(path) == "cli":
             continue
         for name, node, _ in public(path):
             if isinstance(node, ast.ClassDef):
@@ -282,7 +264,7 @@ def test_functions_that_raise_our_errors_say_so():
 
 
 def below_cli():
-    return [path for path in FILES if room_of(path) not in ("cli", "__main__")]
+    return [path for path in FILES if package_of(path) not in ("cli", "__main__")]
 
 
 def test_nothing_prints_or_exits_below_the_command_line():
@@ -293,7 +275,7 @@ def test_nothing_prints_or_exits_below_the_command_line():
             if not isinstance(node, ast.Call):
                 continue
             name = ast.unparse(node.func)
-            if name == "os._exit" and room_of(path) == "beside":
+            if name == "os._exit" and package_of(path) == "core":
                 continue  # the process that it forked
             if name in ("print", "exit", "quit", "sys.exit", "os._exit", "breakpoint"):
                 wrong.append(f"{place(path, node.lineno)} {name}()")

@@ -7,9 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-from graphslam.config import BackendConfig, FrontEndConfig
+from graphslam.core.config import BackendConfig, FrontEndConfig
 from graphslam.logs import IMPORTERS
-from graphslam.simulate import SCENARIOS
+from graphslam.simulation import SCENARIOS
 
 
 def _choices(section: Any) -> list[str]:

@@ -13,7 +13,6 @@ from typing import Annotated, Any
 import typer
 
 from graphslam import __version__
-from graphslam.beside import Task
 from graphslam.cli import show
 from graphslam.cli.arguments import (
     Backend,
@@ -36,11 +35,12 @@ from graphslam.cli.arguments import (
     span_of,
 )
 from graphslam.cli.terminal import errors_in_one_line, progress_bar
-from graphslam.config import Config, load_config
-from graphslam.errors import ConfigError, EstimationError, OutputError
+from graphslam.core.config import Config, load_config
+from graphslam.core.errors import ConfigError, EstimationError, OutputError
+from graphslam.core.records import Result, TrueLandmark, Truth
+from graphslam.core.worker import Future
 from graphslam.logs import IMPORTERS, KnownTruth, inspect_logs, open_logs
-from graphslam.records import Result, TrueLandmark, Truth
-from graphslam.results import check_target, load, save, to_json
+from graphslam.results.folder import check_target, load, save, to_json
 
 app = typer.Typer(
     help="Logs of wheeled robots in; trajectories, a landmark map and their covariances out.",
@@ -130,7 +130,7 @@ def simulate_command(
     Equal scenarios and seeds give equal bytes.
     """
     with errors_in_one_line(debug):
-        from graphslam.simulate import load_scenario, simulate
+        from graphslam.simulation import load_scenario, simulate
 
         wanted = load_scenario(scenario)
         if os.path.lexists(output) and not force:
@@ -179,17 +179,17 @@ def smooth_command(
 
 def _smooth(logs: Sequence[Path], tree: Config, output: Path, force: bool) -> Result:
     """Run the pipeline and write the folder."""
-    opening = Task(lambda: open_logs(logs, tree))
-    from graphslam.report import render
-    from graphslam.slam import smooth
-    from graphslam.truth import truth_of_logs
+    opening = Future(lambda: open_logs(logs, tree))
+    from graphslam.evaluation.ground_truth import truth_of_logs
+    from graphslam.results.report import render
+    from graphslam.slam.smooth import smooth
 
     log = opening.result()
-    truth = Task(lambda: truth_of_logs(log, tree))
+    truth = Future(lambda: truth_of_logs(log, tree))
     with progress_bar(log.count((Truth, TrueLandmark))) as progress:
         result = smooth(log, tree, progress)
     quality = _quality(result, truth.result())
-    report = Task(lambda: render(result, quality, tree))
+    report = Future(lambda: render(result, quality, tree))
     save(result, tree, output, force=force, report=lambda _: report.result())
     return result
 
@@ -198,7 +198,7 @@ def _quality(result: Result, known: KnownTruth) -> dict[str, Any] | None:
     """What the truth in the logs says about the result; None without truth."""
     if not known:
         return None
-    from graphslam.evaluate import evaluate
+    from graphslam.evaluation.metrics import evaluate
 
     try:
         return evaluate(result, known.trajectories, known.landmarks)
@@ -230,8 +230,8 @@ def evaluate_command(
     That is true poses and landmarks, or reference relations between the scans.
     """
     with errors_in_one_line(debug):
-        from graphslam.evaluate import evaluate, read_relations
-        from graphslam.truth import truth_of_files, truth_of_run
+        from graphslam.evaluation.ground_truth import truth_of_files, truth_of_run
+        from graphslam.evaluation.metrics import evaluate, read_relations
 
         saved = load(directory)
         reference = read_relations(relations) if relations else None
@@ -278,9 +278,11 @@ def compare_command(
     Writes a folder with compare.json and report.html.
     """
     with errors_in_one_line(debug):
-        from graphslam.compare import compare, is_comparison, save_comparison, variants
-        from graphslam.evaluate import read_relations
-        from graphslam.truth import truth_of_files, truth_of_logs
+        from graphslam.evaluation.compare_folder import is_comparison, save_comparison
+        from graphslam.evaluation.compare_rows import compare
+        from graphslam.evaluation.compare_variants import variants
+        from graphslam.evaluation.ground_truth import truth_of_files, truth_of_logs
+        from graphslam.evaluation.metrics import read_relations
 
         options = [f"front_end.name={front_end}"] if front_end else []
         options += [*(start or ()), *(settings or ())]
@@ -330,8 +332,8 @@ def changes_command(
     one folder with two spans.
     """
     with errors_in_one_line(debug):
-        from graphslam.changes import changes_between, render_changes, save_changes
-        from graphslam.changes.files import check_changes_target
+        from graphslam.change_detection import changes_between, render_changes, save_changes
+        from graphslam.change_detection.folder import check_changes_target
 
         tree = load_config(config, settings or ()).changes
         check_changes_target(output, force=force)
@@ -380,13 +382,10 @@ def experiment_command(
     Stopped, it goes on where it was when it is called again.
     """
     with errors_in_one_line(debug):
-        from graphslam.experiments import (
-            jobs_of,
-            load_definition,
-            run_campaign,
-            save_summary,
-            summarise,
-        )
+        from graphslam.evaluation.monte_carlo_campaign import jobs_of, run_campaign
+        from graphslam.evaluation.monte_carlo_definition import load_definition
+        from graphslam.evaluation.monte_carlo_folder import save_summary
+        from graphslam.evaluation.monte_carlo_summary import summarise
 
         wanted = load_definition(experiment)
         wanted = replace(wanted, runs=runs or wanted.runs)

@@ -11,10 +11,10 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from graphslam.core.records import Result
 from graphslam.logs import ImportSummary, LogInfo, RobotInfo, TopicInfo
-from graphslam.records import Result
-from graphslam.report.comparison import AHEAD, ahead, filled, notes, sentence
-from graphslam.simulate import Simulation
+from graphslam.results.report_comparison import AHEAD, ahead, filled, notes, sentence
+from graphslam.simulation import Simulation
 
 _PIPE_WIDTH = 200  # a pipe has no width; tables take what they need of this
 

@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from graphslam.errors import GraphSlamError
+from graphslam.core.errors import GraphSlamError
 
 DRAWN_EVERY_S = 0.1  # smoother than the eye needs, and drawing takes no time to speak of
 INTERRUPTED = 130  # what shells give a program that Ctrl-C ended

@@ -3,8 +3,10 @@
 `mcap` and `rosbags` are known to this package only. See docs/logs.md.
 """
 
-from graphslam.logs.importers import IMPORTERS, ImportSummary, pose_stamp_ns
-from graphslam.logs.inspect import LogInfo, RobotInfo, TopicInfo, inspect_logs
+from graphslam.logs.import_pose_graph import pose_stamp_ns
+from graphslam.logs.import_summary import ImportSummary
+from graphslam.logs.importers import IMPORTERS
+from graphslam.logs.log_info import LogInfo, RobotInfo, TopicInfo, inspect_logs
 from graphslam.logs.log_set import LogFile, LogSet, open_logs
 from graphslam.logs.truth import KnownTruth, read_true_associations, read_truth, truth_in
 from graphslam.logs.writer import LogWriter

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from graphslam import records
-from graphslam.geometry import Array, is_positive
+from graphslam.core import records
+from graphslam.core.geometry import Array, is_positive
 from graphslam.logs import schemas
 
 ABSURD_M = 1000.0  # no planar laser sees as far; some drivers write 1e6 or 65535 for an error

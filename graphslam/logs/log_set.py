@@ -5,17 +5,17 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from graphslam import records
-from graphslam.beside import Ahead
-from graphslam.config import Config
-from graphslam.errors import LogError
-from graphslam.logs import order, schemas
+from graphslam.core import records
+from graphslam.core.config import Config
+from graphslam.core.errors import LogError
+from graphslam.core.records import Message
+from graphslam.core.worker import Prefetch
+from graphslam.logs import schemas, time_order
 from graphslam.logs.decoders import DECODERS, TopicContext, UnusableError
 from graphslam.logs.mcap_file import McapFile, RawMessage, open_mcap, raw_messages
-from graphslam.logs.recording import Recorded, place_late
+from graphslam.logs.stamp_repair import Recorded, place_late
 from graphslam.logs.survey import survey_topics
 from graphslam.logs.topics import ODOMETRY_KINDS, Topic, choose_topics, find_topics
-from graphslam.records import Message
 
 #: messages that are worth a second process to read them
 MANY = 10_000
@@ -90,7 +90,7 @@ class LogSet:
         topics = {topic.name: topic for topic in self.topics if topic.record not in without}
         self._tell(_Told(Counter(), Counter(), []))
         ahead &= self.count(without) >= MANY
-        for item in Ahead(lambda: self._read(topics)) if ahead else self._read(topics):
+        for item in Prefetch(lambda: self._read(topics)) if ahead else self._read(topics):
             if isinstance(item, _Told):
                 self._tell(item)
             else:
@@ -101,13 +101,13 @@ class LogSet:
         readers = [
             _FileReader(file, topics, self._contexts, self._window_ns) for file in self._mcap
         ]
-        yield from order.merge([reader.messages() for reader in readers])
+        yield from time_order.merge([reader.messages() for reader in readers])
         told = _Told(Counter(), Counter(), [])
         for file, reader in zip(self._mcap, readers, strict=True):
             told.dropped.update(reader.dropped)
             for topic, counts in sorted(reader.line.counts.items()):
                 told.warnings.extend(_warn_of_stamps(file, topic, counts))
-                told.dropped[order.TOO_LATE] += counts.pop(order.TOO_LATE, 0)
+                told.dropped[time_order.TOO_LATE] += counts.pop(time_order.TOO_LATE, 0)
                 told.repaired.update(counts)
         yield told
 
@@ -184,14 +184,14 @@ class _FileReader:
         window_ns: int,
     ) -> None:
         self.dropped: Counter[str] = Counter()
-        self.line = order.TimeLine(window_ns)
+        self.line = time_order.TimeLine(window_ns)
         self._file, self._topics = file, topics
         # beams are counted by the decoders, into this pass' own counter
         self._contexts = {n: replace(c, beams=self.dropped) for n, c in contexts.items()}
 
     def messages(self) -> Iterator[Message]:
         """Sorted messages of this file."""
-        for topic, message, _ in place_late(self._recorded(), order.SAMPLED):
+        for topic, message, _ in place_late(self._recorded(), time_order.SAMPLED):
             yield from self.line.push(topic, message)
         yield from self.line.finish()
 
@@ -208,16 +208,16 @@ def _warn_of_stamps(file: McapFile, topic: str, counts: Counter[str]) -> list[st
     """One line per kind of oddity among the stamps of a topic."""
     where = f"{file.path}: {topic}"
     lines = []
-    if counts[order.GLITCH]:
+    if counts[time_order.GLITCH]:
         lines.append(
-            f"{where}: {counts[order.GLITCH]} stamps contradict the order of recording; "
+            f"{where}: {counts[time_order.GLITCH]} stamps contradict the order of recording; "
             "placed between their neighbours"
         )
-    if counts[order.DUPLICATE]:
-        lines.append(f"{where}: {counts[order.DUPLICATE]} messages repeat a stamp; kept")
-    if counts[order.TOO_LATE]:
+    if counts[time_order.DUPLICATE]:
+        lines.append(f"{where}: {counts[time_order.DUPLICATE]} messages repeat a stamp; kept")
+    if counts[time_order.TOO_LATE]:
         lines.append(
-            f"{where}: {counts[order.TOO_LATE]} messages came too late and were dropped; "
+            f"{where}: {counts[time_order.TOO_LATE]} messages came too late and were dropped; "
             "raise logs.reorder_s to keep them"
         )
     return lines

@@ -34,7 +34,7 @@ from mcap.records import (
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.summary import Summary
 
-from graphslam.errors import LogError
+from graphslam.core.errors import LogError
 
 _T = TypeVar("_T")
 

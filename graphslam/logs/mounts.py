@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.geometry import Array
+from graphslam.core.geometry import Array
 
 # Transforms are parent_from_child, keyed by the child: a frame has one parent.
 Tree = Mapping[str, tuple[str, Array]]

@@ -15,8 +15,8 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from graphslam.errors import LogError
-from graphslam.geometry import Array
+from graphslam.core.errors import LogError
+from graphslam.core.geometry import Array
 
 #: pose, twist and their covariances
 _ODOMETRY_NUMBERS = 7 + 36 + 6 + 36

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from graphslam import records
-from graphslam.config import Config
-from graphslam.geometry import Array
+from graphslam.core import records
+from graphslam.core.config import Config
+from graphslam.core.geometry import Array
 from graphslam.logs import schemas
 from graphslam.logs.decoders import TopicContext, frame_of
 from graphslam.logs.mcap_file import McapFile, raw_messages, sample_messages

@@ -4,9 +4,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from graphslam import records
-from graphslam.config import Config
-from graphslam.errors import LogError
+from graphslam.core import records
+from graphslam.core.config import Config
+from graphslam.core.errors import LogError
 from graphslam.logs.decoders import DECODERS
 from graphslam.logs.mcap_file import McapFile
 from graphslam.logs.schemas import TF_MESSAGE

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from graphslam.config import Config
-from graphslam.geometry import Array
+from graphslam.core.config import Config
+from graphslam.core.geometry import Array
+from graphslam.core.records import Trajectory, TrueAssociations, TrueLandmark, Truth
 from graphslam.logs import schemas
 from graphslam.logs.decoders import TopicContext
 from graphslam.logs.log_set import decode_message
 from graphslam.logs.mcap_file import McapFile, open_mcap, raw_messages
 from graphslam.logs.topics import find_topics
-from graphslam.records import Trajectory, TrueAssociations, TrueLandmark, Truth
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,8 +15,8 @@ from mcap.writer import CompressionType, Writer
 from numpy.typing import ArrayLike
 
 from graphslam import __version__
-from graphslam.errors import OutputError
-from graphslam.geometry import Array
+from graphslam.core.errors import OutputError
+from graphslam.core.geometry import Array
 from graphslam.logs import schemas
 from graphslam.logs.mcap_file import NOTES
 

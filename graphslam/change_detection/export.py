@@ -1,0 +1,147 @@
+"""Changes for other tools: a map to lay over the reference's, and messages for a viewer."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from graphslam.change_detection.detect import Comparison
+from graphslam.change_detection.grid import Grid
+from graphslam.change_detection.objects import Change
+from graphslam.core.geometry import Array
+from graphslam.logs import schemas
+from graphslam.logs.writer import LogWriter
+
+#: grey values of nav2's map_server in mode trinary
+_OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
+_FRAME = "map"
+#: red, green, blue of the kinds, and of the points of reference and later visit
+_RGB = {"appeared": (0.16, 0.63, 0.17), "vanished": (0.89, 0.34, 0.1), "moved": (0.58, 0.2, 0.75)}
+_MOST_POINTS = 200_000
+_LINE_STRIP, _TEXT, _POINT_FLOAT32 = 4, 9, 7
+
+
+def overlay_map(found: Comparison) -> tuple[NDArray[np.uint8], str]:
+    """The changes as a picture (rows, columns), north up, and the YAML that belongs to it.
+
+    Occupied where something is now, free where something was before, unknown elsewhere: laid over
+    the map of the reference it gives the map of today.
+    """
+    grid = found.surfaces[0].nearest.grid
+    image = np.full(grid.shape[::-1], _UNKNOWN, dtype=np.uint8)
+    for gone in (True, False):  # what is there now is drawn over what was there before
+        for change in found.changes:
+            polygon = _old_place(change) if gone else _new_place(change)
+            if polygon is not None:
+                cells = (polygon - np.array(grid.origin_m)) / grid.cell_m - 0.5
+                value = _FREE if gone else _OCCUPIED
+                cv2.fillPoly(image, [np.round(cells).astype(np.int32)], value)
+    return np.ascontiguousarray(image[::-1]), _yaml(grid)
+
+
+def _old_place(change: Change) -> Array | None:
+    return change.polygon if change.kind == "vanished" else change.before
+
+
+def _new_place(change: Change) -> Array | None:
+    return None if change.kind == "vanished" else change.polygon
+
+
+def _yaml(grid: Grid) -> str:
+    x, y = grid.origin_m
+    return (
+        "# changes: occupied = appeared or moved here, free = vanished or moved away\n"
+        f"image: changes.pgm\nmode: trinary\nresolution: {grid.cell_m:.6g}\n"
+        f"origin: [{x:.6f}, {y:.6f}, 0.0]\nnegate: 0\n"
+        "occupied_thresh: 0.65\nfree_thresh: 0.196\n"
+    )
+
+
+def pgm(image: NDArray[np.uint8]) -> bytes:
+    """A grey picture (rows, columns) as binary PGM."""
+    return f"P5\n{image.shape[1]} {image.shape[0]}\n255\n".encode() + image.tobytes()
+
+
+def write_messages(found: Comparison, path: Path) -> None:
+    """MCAP for a viewer: `/changes` as markers, `/reference` and `/later` as point clouds.
+
+    Each change is stamped with when it was first seen.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    begin = int(found.later.stamps_ns.min())
+    with LogWriter(path) as log:
+        for name, visit in (("reference", found.reference), ("later", found.later)):
+            cloud = schemas.build(
+                "sensor_msgs/msg/PointCloud2", **_cloud(visit.ends[visit.surface], begin)
+            )
+            log.message(f"/{name}", "sensor_msgs/msg/PointCloud2", cloud, begin)
+        for stamp in sorted({change.first_seen_ns for change in found.changes}):
+            markers = [
+                marker
+                for number, change in enumerate(found.changes)
+                if change.first_seen_ns == stamp
+                for marker in _markers(number, change)
+            ]
+            kind = "visualization_msgs/msg/MarkerArray"
+            log.message("/changes", kind, schemas.build(kind, markers=markers), stamp)
+
+
+def _cloud(points: Array, stamp_ns: int) -> dict[str, Any]:
+    points = points[:: max(1, len(points) // _MOST_POINTS)]
+    data = np.zeros((len(points), 3), dtype="<f4")
+    data[:, :2] = points
+    fields = [
+        schemas.build(
+            "sensor_msgs/msg/PointField", name=axis, offset=4 * i, datatype=_POINT_FLOAT32, count=1
+        )
+        for i, axis in enumerate("xyz")
+    ]
+    return {
+        "header": schemas.header(stamp_ns, _FRAME), "height": 1, "width": len(points),
+        "fields": fields, "is_bigendian": False, "point_step": 12, "row_step": 12 * len(points),
+        "data": data.reshape(-1).view(np.uint8), "is_dense": True,
+    }  # fmt: skip
+
+
+def _markers(number: int, change: Change) -> list[Any]:
+    """The outline, the old one where it is known, and a word."""
+    lines = [_marker(3 * number, change, _LINE_STRIP, change.polygon, 0.03, "")]
+    if change.before is not None:
+        lines.append(_marker(3 * number + 1, change, _LINE_STRIP, change.before, 0.015, ""))
+    words = f"{number + 1} {change.kind}"
+    return [*lines, _marker(3 * number + 2, change, _TEXT, change.polygon, 0.25, words)]
+
+
+def _marker(
+    number: int, change: Change, kind: int, polygon: Array, size_m: float, text: str
+) -> Any:
+    def point(x: float, y: float) -> Any:
+        return schemas.build("geometry_msgs/msg/Point", x=float(x), y=float(y), z=0.0)
+
+    build = schemas.build
+    at = polygon.mean(axis=0) if text else np.zeros(2)
+    upright = build("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+    r, g, b = _RGB[change.kind]
+    return build(
+        "visualization_msgs/msg/Marker",
+        header=schemas.header(change.first_seen_ns, _FRAME),
+        ns="changes", id=number, type=kind, action=0,
+        pose=build("geometry_msgs/msg/Pose", position=point(*at), orientation=upright),
+        scale=build("geometry_msgs/msg/Vector3", x=size_m, y=0.0, z=size_m),
+        color=build("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=1.0),
+        lifetime=build("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
+        frame_locked=False,
+        points=[] if text else [point(x, y) for x, y in [*polygon, polygon[0]]],
+        colors=[], texture_resource="",
+        texture=build(
+            "sensor_msgs/msg/CompressedImage", header=schemas.header(0, ""), format="",
+            data=np.zeros(0, dtype=np.uint8),
+        ),
+        uv_coordinates=[], text=text, mesh_resource="",
+        mesh_file=build("visualization_msgs/msg/MeshFile", filename="", data=np.zeros(0, np.uint8)),
+        mesh_use_embedded_materials=False,
+    )  # fmt: skip

@@ -1,0 +1,104 @@
+"""Result folders in; changes.json, a map, messages and a report out."""
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+from graphslam.change_detection.detect import Comparison, compare, same_frame
+from graphslam.change_detection.export import overlay_map, pgm, write_messages
+from graphslam.change_detection.visit import load_visit, within
+from graphslam.core.config import ChangesConfig
+from graphslam.core.errors import OutputError
+from graphslam.results.folder import load, to_json
+
+Span = tuple[float, float]
+
+
+def changes_between(
+    reference: Path,
+    later: Path,
+    config: ChangesConfig,
+    reference_span_s: Span | None = None,
+    later_span_s: Span | None = None,
+) -> Comparison:
+    """Compare two result folders of `smooth`, or two time spans of one.
+
+    Args:
+        reference: result folder of the visit that the other is compared with.
+        later: result folder of the later visit; it may be the same one with other spans.
+        config: settings.
+        reference_span_s: scans to use, s since the first one.
+        later_span_s: the same of the later visit.
+
+    Raises:
+        OutputError: a folder is not a result, has no scans or covariances, or the two have nothing
+            in common.
+        LogError: a log is not where it was, or is another one now.
+    """
+    same = reference.resolve() == later.resolve()
+    if same and (reference_span_s is None or later_span_s is None):
+        raise OutputError(
+            f"{later}: is the reference itself; give --reference-span and --later-span"
+        )
+    a = load_visit(load(reference), reference)
+    b = a if same else load_visit(load(later), later)
+    registration = same_frame(a) if same else None
+    if reference_span_s is not None:
+        a = within(a, reference_span_s, "--reference-span")
+    if later_span_s is not None:
+        b = within(b, later_span_s, "--later-span")
+    return compare(a, b, config, registration)
+
+
+def check_changes_target(directory: Path, *, force: bool) -> None:
+    """Say before a long computation whether `save_changes` may write to ``directory``.
+
+    Raises:
+        OutputError: it is there and may not be replaced.
+    """
+    if os.path.lexists(directory):
+        ours = (directory / "changes.json").is_file()
+        empty = directory.is_dir() and not any(directory.iterdir())
+        if not force:
+            raise OutputError(f"{directory}: already exists; give --force to replace it")
+        if directory.is_symlink() or not (ours or empty):
+            raise OutputError(
+                f"{directory}: holds no changes.json, so it is not replaced; choose another name"
+            )
+
+
+def save_changes(
+    found: Comparison,
+    directory: Path,
+    *,
+    force: bool,
+    report: Callable[[Comparison], str] | None = None,
+) -> None:
+    """Write the folder of docs/formats.md, with report.html if ``report`` renders one.
+
+    It appears whole or not at all.
+
+    Raises:
+        OutputError: the target exists and may not be replaced, or the disk refuses.
+    """
+    check_changes_target(directory, force=force)
+    final = directory.absolute()
+    part = final.with_name(f".{final.name}.{os.getpid()}.part")
+    texts = {"changes.json": to_json(found.to_dict(), "changes.json")}
+    if report is not None:
+        texts["report.html"] = report(found)
+    image, texts["changes.yaml"] = overlay_map(found)
+    try:
+        part.mkdir(parents=True)
+        (part / "changes.pgm").write_bytes(pgm(image))
+        write_messages(found, part / "changes.mcap")
+        for name, text in texts.items():
+            (part / name).write_text(text, encoding="utf-8")
+        if final.exists():
+            shutil.rmtree(final)
+        part.rename(final)
+    except OSError as error:
+        raise OutputError(f"{directory}: cannot be written: {error.strerror}") from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)

@@ -1,0 +1,121 @@
+"""A grid over what was seen: cells, and the nearest cell of a set for any point."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from graphslam.change_detection.visit import Bools, Ints
+from graphslam.core.geometry import Array
+
+#: the nearest occupied cell is known for points up to this many cells outside of what was seen
+_MARGIN = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Square cells of ``cell_m``; cell (i, j) begins at ``origin_m`` + (i, j) cell_m."""
+
+    origin_m: tuple[float, float]
+    cell_m: float
+    shape: tuple[int, int]
+
+    def cells(self, points: Array) -> Ints:
+        """Flat numbers (n,) of the cells of ``points`` (n, 2) m; -1 outside."""
+        with np.errstate(invalid="ignore"):
+            ij = np.floor((points - np.array(self.origin_m)) / self.cell_m)
+            inside = ((ij >= 0) & (ij < np.array(self.shape))).all(axis=1)
+        ij = np.where(inside[:, None], ij, 0).astype(np.int64)
+        return np.where(inside, ij[:, 0] * self.shape[1] + ij[:, 1], -1)
+
+    def centers(self, cells: Ints) -> Array:
+        """Middles (n, 2) m of cells (n,)."""
+        ij = np.column_stack(np.divmod(cells, self.shape[1]))
+        return np.asarray(np.array(self.origin_m) + (ij + 0.5) * self.cell_m)
+
+    def occupied(self, cells: Ints) -> tuple[Ints, Ints]:
+        """The different ones (m,) of ``cells`` (n,), sorted, and for each cell its place there."""
+        number = np.zeros(self.shape[0] * self.shape[1], dtype=np.int64)
+        number[cells] = 1
+        different = np.flatnonzero(number)
+        number[different] = np.arange(len(different))
+        return different, number[cells]
+
+    def neighbours(self, cells: Ints, radius: int) -> list[Ints]:
+        """Per offset within ``radius`` cells the number of that neighbour of each cell (n,)."""
+        offsets = range(-radius, radius + 1)
+        return [cells + i * self.shape[1] + j for i in offsets for j in offsets]
+
+
+def distinct(numbers: Ints) -> Ints:
+    """The different ones of ``numbers`` (n,), sorted; np.unique's hash table is slower."""
+    numbers = np.sort(numbers)
+    first = np.ones(len(numbers), dtype=bool)
+    first[1:] = numbers[1:] != numbers[:-1]
+    return np.asarray(numbers[first])
+
+
+def grid_over(points: Array, cell_m: float, most_cells: int) -> Grid:
+    """A grid that holds ``points`` (n, 2) m; coarser than ``cell_m`` where it would be too large.
+
+    A few stray returns far outside are left out: they would blow up the grid.
+    """
+    low, high = np.quantile(points, [0.0005, 0.9995], axis=0)
+    low, high = low - 0.5, high + 0.5
+    size = high - low
+    cell = max(cell_m, float(np.sqrt(size.prod() / most_cells)))
+    count = np.ceil(size / cell).astype(int) + 2 * _MARGIN
+    origin = low - _MARGIN * cell
+    return Grid((float(origin[0]), float(origin[1])), cell, (int(count[0]), int(count[1])))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Nearest:
+    """For every cell of a grid the nearest member of a set of cells.
+
+    ``distance_m`` (cells,) float32 between middles, ``member`` (cells,) int32 its place in the set.
+    """
+
+    grid: Grid
+    distance_m: NDArray[np.float32]
+    member: NDArray[np.int32]
+
+
+def nearest_of(grid: Grid, cells: Ints, chosen: Bools) -> Nearest:
+    """Which of ``cells`` (n,), flat numbers, ``chosen`` among them, is nearest, everywhere."""
+    rows = np.nonzero(chosen)[0]
+    cells = cells[rows]
+    free = np.ones(grid.shape, dtype=np.uint8)
+    free.reshape(-1)[cells] = 0
+    distance, label = cv2.distanceTransformWithLabels(
+        free, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    member_of_label = np.zeros(int(label.max()) + 1, dtype=np.int32)
+    member_of_label[label.reshape(-1)[cells]] = rows
+    return Nearest(grid, (distance * grid.cell_m).reshape(-1), member_of_label[label].reshape(-1))
+
+
+def summed(rows: Ints, weights: Array, size: int) -> Array:
+    """Sum (size,) of ``weights`` (k,) per row; ``rows`` (k,)."""
+    return np.asarray(np.bincount(rows, weights, size), dtype=float)
+
+
+def pooled(values: Array, places: list[Ints]) -> Array:
+    """Sum of ``values`` (n, ...) over each row's neighbours; places (n,) of -1 add nothing."""
+    padded = np.concatenate([values, np.zeros((1, *values.shape[1:]))])
+    total = np.zeros_like(values)
+    for place in places:
+        total += padded[place]
+    return np.asarray(total)
+
+
+def neighbour_rows(grid: Grid, cells: Ints, radius: int) -> list[Ints]:
+    """Per offset the row of each cell's neighbour in ``cells`` (n,) itself; -1 for none."""
+    row = np.full(grid.shape[0] * grid.shape[1] + 1, -1, dtype=np.int32)
+    row[cells] = np.arange(len(cells), dtype=np.int32)
+    size = grid.shape[0] * grid.shape[1]
+    return [
+        row[np.where((n >= 0) & (n < size), n, size)].astype(np.int64)
+        for n in grid.neighbours(cells, radius)
+    ]

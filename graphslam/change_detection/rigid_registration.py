@@ -1,0 +1,293 @@
+"""Where the later run's world frame lies in that of the reference: from landmarks of both.
+
+Hypotheses come from pairs: two crossing lines, or two points, that look the same in both maps fix a
+rigid motion. Motions vote; the best are refined by weighted least squares with a redescending
+weight, so that landmarks that moved have no say, and the one that explains most wins.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from graphslam.change_detection.visit import Bools, Ints
+from graphslam.core.errors import OutputError
+from graphslam.core.geometry import Array, rotation, transform, wrap
+from graphslam.core.records import Landmark
+
+#: lines are taken to cross if their directions differ by more than this
+_CROSSING_RAD = 0.35
+#: how far the two visits may differ in what pairs they compare
+_ANGLE_RAD, _LENGTH_M = 0.06, 0.15
+#: bins of the vote
+_BIN = np.array([0.3, 0.3, 0.06])
+_CANDIDATES = 12
+#: what landmark maps leave out: flatness, association, sharpness
+_FLOOR_RAD, _FLOOR_M = 0.005, 0.01
+_GATE = float(chi2.ppf(0.999, 2))
+_MAX_PAIRS = 2500
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Registration:
+    """Pose (3,) of the later world frame in the reference's, with covariance (3, 3).
+
+    ``matched`` (k, 2) are indices of landmarks (reference, later) that agree; ``moved`` indices of
+    later landmarks that lie where the reference has none.
+    """
+
+    pose: Array
+    cov: Array
+    matched: Ints
+    moved: Ints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Lines:
+    """Lines of a map: ``normal`` (n,), ``offset`` (n,), ``cov`` (n, 2, 2), ``ends`` (n, 2, 2)."""
+
+    index: Ints
+    normal: Array
+    offset: Array
+    cov: Array
+    ends: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Points:
+    """Points of a map: ``xy`` (n, 2), ``cov`` (n, 2, 2)."""
+
+    index: Ints
+    xy: Array
+    cov: Array
+
+
+def register(reference: Sequence[Landmark], later: Sequence[Landmark]) -> Registration:
+    """The pose of the later world frame in the reference's.
+
+    Args:
+        reference: landmarks of the reference, in its world frame.
+        later: those of the later run, in its own.
+
+    Raises:
+        OutputError: there are not enough landmarks in common to fix a pose.
+    """
+    a, b = (_lines(reference), _points(reference)), (_lines(later), _points(later))
+    best: tuple[float, Registration] | None = None
+    for guess in guesses(reference, later):
+        refined = _refine(guess, a, b)
+        if refined is not None and (best is None or refined[0] > best[0]):
+            best = refined
+    if best is None:
+        raise OutputError(
+            "the two runs cannot be registered: their maps have no landmarks in common that fix a "
+            "pose (two crossing lines or two points); did both drive through the same place?"
+        )
+    return best[1]
+
+
+def guesses(reference: Sequence[Landmark], later: Sequence[Landmark]) -> list[Array]:
+    """Poses (3,) of the later frame that most pairs of landmarks vote for."""
+    a, b = (_lines(reference), _points(reference)), (_lines(later), _points(later))
+    return _peaks(np.concatenate([_from_lines(a[0], b[0]), _from_points(a[1], b[1])]))
+
+
+def _lines(landmarks: Sequence[Landmark]) -> _Lines:
+    found = [(i, m, m.line) for i, m in enumerate(landmarks) if m.line is not None]
+    return _Lines(
+        np.array([i for i, _, _ in found], dtype=np.int64),
+        np.array([line[0] for _, _, line in found]),
+        np.array([line[1] for _, _, line in found]),
+        np.array([line[2] for _, _, line in found]).reshape(-1, 2, 2),
+        np.array([m.extent for _, m, _ in found]).reshape(-1, 2, 2),
+    )
+
+
+def _points(landmarks: Sequence[Landmark]) -> _Points:
+    found = [(i, m) for i, m in enumerate(landmarks) if m.line is None]
+    return _Points(
+        np.array([i for i, _ in found], dtype=np.int64),
+        np.array([m.position[:2] for _, m in found]).reshape(-1, 2),
+        np.array([m.cov[:2, :2] for _, m in found]).reshape(-1, 2, 2),
+    )
+
+
+def _pairs(n: int, weight: Array) -> tuple[Ints, Ints]:
+    """Ordered pairs of different things, those of the strongest first where they are many."""
+    limit = int(np.sqrt(_MAX_PAIRS))
+    chosen = np.argsort(-weight, kind="stable")[: limit if n > limit else n]
+    i, j = np.meshgrid(chosen, chosen, indexing="ij")
+    different = i != j
+    return i[different], j[different]
+
+
+def _from_lines(a: _Lines, b: _Lines) -> Array:
+    """Motions (k, 3) that bring two crossing lines of b onto two of a."""
+    parts = []
+    for m in (a, b):
+        length = np.hypot(*(m.ends[:, 1] - m.ends[:, 0]).T) if len(m.index) else np.zeros(0)
+        i, j = _pairs(len(m.index), length)
+        angle = wrap(m.normal[j] - m.normal[i])
+        crossing = np.abs(np.sin(angle)) > np.sin(_CROSSING_RAD)
+        i, j, angle = i[crossing], j[crossing], angle[crossing]
+        n = np.stack([np.cos(m.normal), np.sin(m.normal)], axis=-1)
+        N = np.stack([n[i], n[j]], axis=-2)
+        at = np.linalg.solve(N, np.stack([m.offset[i], m.offset[j]], axis=-1)[..., None])[..., 0]
+        parts.append((m.normal[i], angle, at))
+    (normal_a, angle_a, at_a), (normal_b, angle_b, at_b) = parts
+    p, q = np.nonzero(np.abs(wrap(angle_a[:, None] - angle_b[None, :])) < _ANGLE_RAD)
+    # the mean over both lines: half of the difference of the angles goes to each
+    phi = wrap(normal_a[p] - normal_b[q] + wrap(angle_a[p] - angle_b[q]) / 2)
+    return _motions(phi, at_a[p], at_b[q])
+
+
+def _from_points(a: _Points, b: _Points) -> Array:
+    """Motions (k, 3) that bring two points of b onto two of a."""
+    parts = []
+    for m in (a, b):
+        i, j = _pairs(len(m.index), np.ones(len(m.index)))
+        d = m.xy[j] - m.xy[i]
+        parts.append(((m.xy[i] + m.xy[j]) / 2, np.hypot(*d.T), np.arctan2(d[:, 1], d[:, 0])))
+    (mid_a, long_a, way_a), (mid_b, long_b, way_b) = parts
+    p, q = np.nonzero(np.abs(long_a[:, None] - long_b[None, :]) < _LENGTH_M)
+    return _motions(wrap(way_a[p] - way_b[q]), mid_a[p], mid_b[q])
+
+
+def _motions(phi: Array, to: Array, start: Array) -> Array:
+    """Motions (k, 3) that turn by ``phi`` and bring ``start`` (k, 2) to ``to`` (k, 2)."""
+    c, s = np.cos(phi), np.sin(phi)
+    turned = np.column_stack([c * start[:, 0] - s * start[:, 1], s * start[:, 0] + c * start[:, 1]])
+    return np.column_stack([to - turned, phi])
+
+
+def _peaks(votes: Array) -> list[Array]:
+    """Centres of the fullest bins; bins are laid twice, shifted by half, so none cuts a peak."""
+    found = []
+    for shift in (0.0, 0.5):
+        if not len(votes):
+            break
+        bins = np.floor(votes / _BIN + shift).astype(np.int64)
+        _, inverse, counts = np.unique(bins, axis=0, return_inverse=True, return_counts=True)
+        inverse = inverse.ravel()
+        for peak in np.argsort(-counts, kind="stable")[:_CANDIDATES]:
+            found.append(np.median(votes[inverse == peak], axis=0))
+    return found
+
+
+def _refine(
+    pose: Array, a: tuple[_Lines, _Points], b: tuple[_Lines, _Points]
+) -> tuple[float, Registration] | None:
+    """Least squares over matched landmarks, matched anew each round; its score is what agrees."""
+    cov: Array = np.eye(3)
+    pairs, score = np.zeros((0, 2), dtype=np.int64), 0.0
+    for slack in (8.0, 4.0, 2.0, 1.0, 1.0, 1.0):
+        line_pairs, line_rows = _match_lines(pose, a[0], b[0], slack)
+        point_pairs, point_rows = _match_points(pose, a[1], b[1], slack)
+        pairs = np.concatenate([line_pairs, point_pairs])
+        information, gradient = np.zeros((3, 3)), np.zeros(3)
+        score = 0.0
+        for r, H, S, size in (line_rows, point_rows):
+            W = np.linalg.inv(S)
+            d2 = np.einsum("ni,nij,nj->n", r, W, r)
+            weight = 1 / (1 + d2 / 4) ** 2  # Geman-McClure: what is far off has no say
+            information += np.einsum("n,nia,nij,njb->ab", weight, H, W, H)
+            gradient += np.einsum("n,nia,nij,nj->a", weight, H, W, r)
+            # what agrees counts, not how well: a lucky few must not outweigh many
+            score += float((size * np.maximum(1 - d2 / (2 * _GATE), 0.0)).sum())
+        if np.linalg.eigvalsh(information)[0] < 1e2:  # a direction known worse than to 0.1 m, rad
+            return None
+        cov = np.asarray(np.linalg.inv(information), dtype=float)
+        step = cov @ gradient
+        pose = np.array([*(pose[:2] + step[:2]), wrap(pose[2] + step[2])])
+    if len(pairs) < 2:
+        return None
+    everything = np.concatenate([b[0].index, b[1].index])
+    moved = np.setdiff1d(everything, pairs[:, 1])
+    return score, Registration(pose, cov, pairs, moved)
+
+
+_Rows = tuple[Array, Array, Array, Array]
+
+
+def _match_lines(pose: Array, a: _Lines, b: _Lines, slack: float) -> tuple[Ints, _Rows]:
+    """Pairs (k, 2) of landmark indices that agree, and (residual, Jacobian, covariance, length).
+
+    The residual is a's direction and offset minus b's after the motion, the offset taken where
+    b's middle lands: at the origin it would hang on the direction by a long lever.
+    """
+    x, y = pose[:2]
+    normal = b.normal + pose[2]
+    n = np.column_stack([np.cos(normal), np.sin(normal)])
+    t = np.column_stack([-n[:, 1], n[:, 0]])
+    ends = transform(pose, b.ends.reshape(-1, 2)).reshape(-1, 2, 2)
+    middle = ends.mean(axis=1)
+    i, j = np.nonzero(np.abs(wrap(a.normal[:, None] - normal[None])) < 0.03 * slack + 0.03)
+    na = np.column_stack([np.cos(a.normal), np.sin(a.normal)])[i]
+    ta = np.column_stack([-na[:, 1], na[:, 0]])
+    angle = np.asarray(wrap(a.normal[i] - normal[j]))
+    # distance from b's middle to line a, along a's normal
+    across = a.offset[i] - np.einsum("ni,ni->n", na, middle[j])
+    r = np.column_stack([angle, across])
+    lever_a = np.einsum("ni,ni->n", ta, middle[j])
+    lever_b = np.einsum("ni,ni->n", t[j], middle[j] - np.array([x, y]))
+    S = _carried(a.cov[i], lever_a) + _carried(b.cov[j], lever_b)
+    S += np.diag([_FLOOR_RAD**2, _FLOOR_M**2])
+    # d(predicted)/d(pose): direction by phi; the middle moves with the frame
+    H = np.zeros((len(i), 2, 3))
+    H[:, 0, 2] = 1.0
+    H[:, 1, 0], H[:, 1, 1] = na[:, 0], na[:, 1]
+    arm = middle[j] - np.array([x, y])
+    H[:, 1, 2] = -na[:, 0] * arm[:, 1] + na[:, 1] * arm[:, 0]
+    overlap = _overlap(a.ends[i], ends[j], ta)
+    d2 = np.einsum("ni,nij,nj->n", r, np.linalg.inv(S), r) if len(i) else np.zeros(0)
+    near = (np.abs(across) < 0.1 * slack) & (d2 < _GATE * slack**2) & (overlap > 0.1)
+    keep = _best_of_each(j, i, d2, near)
+    size = np.minimum(overlap[keep], 3.0)
+    pairs = np.column_stack([a.index[i[keep]], b.index[j[keep]]])
+    return pairs, (r[keep], H[keep], S[keep], size)
+
+
+def _carried(cov: Array, lever: Array) -> Array:
+    """Covariance (n, 2, 2) of (direction, distance to a point at ``lever`` (n,) m along the line).
+
+    The point's distance is offset - lever * direction.
+    """
+    J = np.zeros((len(lever), 2, 2))
+    J[:, 0, 0] = J[:, 1, 1] = 1.0
+    J[:, 1, 0] = -lever
+    return np.asarray(J @ cov @ J.mT)
+
+
+def _overlap(a: Array, b: Array, along: Array) -> Array:
+    """Length (n,) m that extents a, b (n, 2, 2) share along directions (n, 2)."""
+    sa = np.sort(np.einsum("nki,ni->nk", a, along), axis=1)
+    sb = np.sort(np.einsum("nki,ni->nk", b, along), axis=1)
+    return np.asarray(np.minimum(sa[:, 1], sb[:, 1]) - np.maximum(sa[:, 0], sb[:, 0]))
+
+
+def _match_points(pose: Array, a: _Points, b: _Points, slack: float) -> tuple[Ints, _Rows]:
+    """The same for points: the residual is the difference of positions."""
+    xy = transform(pose, b.xy)
+    R = rotation(pose[2])
+    r_all = a.xy[:, None] - xy[None]
+    i, j = np.nonzero(np.hypot(r_all[..., 0], r_all[..., 1]) < 0.2 * slack)
+    r = r_all[i, j]
+    S = a.cov[i] + R @ b.cov[j] @ R.T + _FLOOR_M**2 * np.eye(2)
+    arm = xy[j] - pose[:2]
+    H = np.zeros((len(i), 2, 3))
+    H[:, 0, 0] = H[:, 1, 1] = 1.0
+    H[:, 0, 2], H[:, 1, 2] = -arm[:, 1], arm[:, 0]
+    d2 = np.einsum("ni,nij,nj->n", r, np.linalg.inv(S), r) if len(i) else np.zeros(0)
+    keep = _best_of_each(j, i, d2, d2 < _GATE * slack**2)
+    pairs = np.column_stack([a.index[i[keep]], b.index[j[keep]]])
+    return pairs, (r[keep], H[keep], S[keep], np.full(len(keep), 0.5))
+
+
+def _best_of_each(j: Ints, i: Ints, d2: Array, allowed: Bools) -> Ints:
+    """Rows of the best partner of every j."""
+    rows = np.nonzero(allowed)[0]
+    rows = rows[np.lexsort((i[rows], d2[rows], j[rows]))]
+    first = np.ones(len(rows), dtype=bool)
+    first[1:] = j[rows][1:] != j[rows][:-1]
+    return np.asarray(rows[first])

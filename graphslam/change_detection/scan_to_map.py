@@ -1,0 +1,107 @@
+"""Each scan's pose by the surfaces it sees, within what its covariance allows.
+
+The pose error is shared by all beams of a scan. Its posterior given the scan's own beams is what
+is left of it, which marginalises the shared error: a beam is then judged by what the others leave
+open. The prior keeps a scan where nothing holds it, and a redescending weight keeps changes out.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from graphslam.change_detection.surface_map import Surface
+from graphslam.change_detection.visit import Bools, Ints, Visit
+from graphslam.core.geometry import Array, wrap
+
+#: noise of a beam against a surface beside its own, m: neighbouring beams share the surface's
+#: error, so they must not count as independent without end
+_LEAST_SIGMA_M = 0.008
+#: beams per scan that are enough to place it
+_BEAMS = 150
+
+
+def align(
+    visit: Visit, surface: Surface, gates_m: tuple[float, ...], changed: Bools | None = None
+) -> Visit:
+    """The visit with poses and covariances that agree with a surface map.
+
+    Args:
+        visit: scans in the frame of the surfaces, covariances as known so far.
+        surface: what to agree with.
+        gates_m: farthest a return may lie from its surface to count, one per iteration.
+        changed: (n,) beams that have no say, as they are known to have met what changed.
+    """
+    usable = visit.surface if changed is None else visit.surface & ~changed
+    beams = np.nonzero(usable)[0]
+    beams = beams[:: max(1, len(beams) // (_BEAMS * len(visit.poses)))]
+    prior = np.linalg.inv(visit.covs + 1e-10 * np.eye(3))
+    start, now, covs = visit.poses, visit, visit.covs
+    for gate in gates_m:
+        information, right = pulls(now, surface, beams, gate)
+        away = start - now.poses
+        away[:, 2] = wrap(away[:, 2])
+        covs = np.asarray(np.linalg.inv(prior + information))
+        right = right + np.einsum("nij,nj->ni", prior, away)
+        poses = now.poses + np.einsum("nij,nj->ni", covs, right)
+        poses[:, 2] = wrap(poses[:, 2])
+        now = replace(now, poses=poses)
+    # the error is P prior⁻¹ (error of the prior) + (a part of this scan's noise): the first may be
+    # common to all scans, and has the covariance P prior⁻¹ P
+    return replace(now, covs=covs, shared=covs @ prior @ covs)
+
+
+_UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+def pulls(visit: Visit, surface: Surface, beams: Ints, gate_m: float) -> tuple[Array, Array]:
+    """How beams pull their scans' poses onto a surface map: normal equations per scan.
+
+    Args:
+        visit: scans in the frame of the surfaces.
+        surface: what to agree with.
+        beams: (k,) which have a say.
+        gate_m: farthest a return may lie from its surface to count.
+
+    Returns:
+        Information (s, 3, 3) and right-hand side (s, 3); the step is the solution of both.
+    """
+    ends, size = visit.ends[beams], len(visit.poses)
+    row, e, found = offsets(surface, ends, gate_m)
+    scan = visit.scan[beams][found]
+    n, arm = surface.normals[row], ends[found] - visit.poses[scan, :2]
+    J = np.column_stack([n, -n[:, 0] * arm[:, 1] + n[:, 1] * arm[:, 0]])
+    variance = _LEAST_SIGMA_M**2 + surface.noise[row]
+    weight = 1 / variance / (1 + (2 * e / gate_m) ** 2) ** 2
+    information, right = np.empty((size, 3, 3)), np.empty((size, 3))
+    for a, b in _UPPER:
+        total = np.bincount(scan, weight * J[:, a] * J[:, b], size)
+        information[:, a, b] = information[:, b, a] = total
+    for a in range(3):
+        right[:, a] = np.bincount(scan, weight * J[:, a] * -e, size)
+    return information, right
+
+
+def offsets(surface: Surface, ends: Array, gate_m: float) -> tuple[Ints, Array, Ints]:
+    """Where points lie against the surface next to them.
+
+    Args:
+        surface: pieces.
+        ends: (k, 2) m.
+        gate_m: farthest from the piece.
+
+    Returns:
+        Rows (f,) of pieces and signed distances (f,) m along their normals, for those points
+        (f,) whose nearest piece is good, near enough, and not ending before them.
+    """
+    grid = surface.nearest.grid
+    cell = grid.cells(ends)
+    near = cell >= 0
+    row = np.where(near, surface.nearest.member[cell], 0)
+    d = ends - surface.points[row]
+    n = surface.normals[row]
+    e = np.einsum("ni,ni->n", d, n)
+    along = np.abs(d[:, 0] * n[:, 1] - d[:, 1] * n[:, 0])
+    found = np.nonzero(
+        near & surface.good[row] & (np.abs(e) < gate_m) & (along < 1.5 * grid.cell_m)
+    )[0]
+    return row[found].astype(np.int64), np.asarray(e[found]), np.asarray(found, dtype=np.int64)

@@ -1,0 +1,180 @@
+"""The surfaces that a visit saw: in every cell a small straight piece with its uncertainty."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphslam.change_detection.grid import (
+    Grid,
+    Nearest,
+    distinct,
+    nearest_of,
+    neighbour_rows,
+    pooled,
+    summed,
+)
+from graphslam.change_detection.visit import Bools, Ints, Visit
+from graphslam.core.config import ChangesConfig
+from graphslam.core.geometry import Array
+
+#: half width, in cells, of the window over which a piece is fitted and evidence is summed
+WINDOW = 2
+#: a piece is straight if its length exceeds its thickness by this factor (of variances)
+_STRAIGHT = 4.0
+#: and if its variance is what the noise explains times this, and the spread of the estimate
+_SLACK = 1.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """Straight pieces, one per cell in which enough returns ended.
+
+    Attributes:
+        cells: (n,) flat numbers on the grid, sorted.
+        windows: per offset the rows of the neighbours, see `neighbour_rows`.
+        points: (n, 2) m, on the fitted line, in the cell's middle.
+        normals: (n, 2) unit vectors; their sign means nothing.
+        noise: (n,) m², variance of the returns of the window about the line.
+        offset_cov: (n,) m², of the piece's place along its normal, by white noise and by how much
+            the surface bends within the window.
+        pose_var: (n,) m², of the piece's place along its normal, by its scans' poses.
+        incidence: (n,) mean of the cosine between beam and normal.
+        returns: (n,) in the window.
+        first_ns: (n,) when it was first seen.
+        good: (n,) whether it is straight and seen often enough to be compared.
+        nearest: the nearest piece for any place.
+        beams: (b,) for every beam of the visit the row of its piece, -1 for none.
+    """
+
+    cells: Ints
+    windows: list[Ints]
+    points: Array
+    normals: Array
+    noise: Array
+    offset_cov: Array
+    pose_var: Array
+    incidence: Array
+    returns: Array
+    first_ns: Ints
+    good: Bools
+    nearest: Nearest
+    beams: Ints
+
+
+def surface_of(visit: Visit, grid: Grid, sigma_m: float, config: ChangesConfig) -> Surface:
+    """The surfaces of a visit on a grid.
+
+    Args:
+        visit: what was seen.
+        grid: cells; only those with returns take memory.
+        sigma_m: range noise; a piece that scatters more than it explains is not straight.
+        config: settings.
+    """
+    used = np.nonzero(visit.surface & (visit.range_m <= config.max_range_m))[0]
+    ends = visit.ends[used]
+    place = grid.cells(ends)
+    used, ends, place = used[place >= 0], ends[place >= 0], place[place >= 0]
+    cells, row = grid.occupied(place)
+    n = len(cells)
+    windows = neighbour_rows(grid, cells, WINDOW)
+    local = ends - grid.centers(cells)[row]  # small numbers: no cancellation in the moments
+    x, y = local.T
+    sums: list[Array] = [summed(row, w, n) for w in (np.ones(len(x)), x, y, x * x, x * y, y * y)]
+    moments = np.column_stack(sums)
+    m, mean, cov = _window_moments(moments, windows, grid.cell_m)
+    values, vectors = np.linalg.eigh(cov)
+    normals = vectors[:, :, 0]
+    # the cell's own middle, brought onto the line through the window's mean
+    t = np.einsum("ni,ni->n", -mean, vectors[:, :, 1])
+    points = grid.centers(cells) + mean + t[:, None] * vectors[:, :, 1]
+    noise = np.maximum(values[:, 0], 0.0) * m / np.maximum(m - 2, 1)
+    leverage = 1 / m + t**2 / np.maximum(m * values[:, 1], 1e-12)
+    bend = 0.25 * ((WINDOW + 0.5) * grid.cell_m) ** 2 * _bending(normals, m, windows)
+    scans = different_scans(row, visit.scan[used], len(visit.poses), n)
+    scans_in_window = pooled(scans.astype(float), windows)
+    directions = visit.directions[used]
+    cosine = np.abs(np.einsum("ni,ni->n", directions, normals[row]))
+    own, common = pose_variance(visit, used, ends, normals[row])
+    sums = [summed(row, w, n) for w in (cosine, own, common)]
+    cosine_sum, own_sum, common_sum = pooled(np.column_stack(sums), windows).T
+    pose_var = common_sum / m + own_sum / m / np.maximum(most(scans, windows), 1)
+    first = np.full(n, np.iinfo(np.int64).max)
+    np.minimum.at(first, row, visit.stamps_ns[visit.scan[used]])
+    expected = (sigma_m * cosine_sum / m) ** 2 + config.flatness_m**2
+    expected += (own_sum + common_sum) / m
+    # The line passes through the cell. Returns that noise threw into other cells belong to the
+    # piece next to them: a piece of their own would collect what lies off the line, no more.
+    aside = np.einsum("ni,ni->n", mean, normals)
+    crossed = np.abs(aside) <= 0.5 * grid.cell_m * np.abs(normals).sum(axis=1)
+    good = (
+        crossed
+        & (m >= config.min_returns)
+        & (scans_in_window >= config.min_scans)
+        & (values[:, 1] > _STRAIGHT * values[:, 0])
+        & (noise < expected * (_SLACK + 3 * np.sqrt(2 / m)))
+    )
+    beams = np.full(len(visit.range_m), -1, dtype=np.int64)
+    beams[used] = row
+    offset_cov, incidence = noise * leverage + bend, cosine_sum / m
+    return Surface(
+        cells, windows, points, normals, noise, offset_cov, pose_var, incidence, m, first, good,
+        nearest_of(grid, cells, good), beams,
+    )  # fmt: skip
+
+
+def most(values: Ints, windows: list[Ints]) -> Array:
+    """Largest of ``values`` (n,) in each window."""
+    padded = np.concatenate([values, [0]])
+    return np.asarray(np.max([padded[place] for place in windows], axis=0), dtype=float)
+
+
+def _bending(normals: Array, weight: Array, windows: list[Ints]) -> Array:
+    """Variance (n,) rad² of the directions of the pieces in each window."""
+    double = np.array([2.0]) * np.arctan2(normals[:, 1], normals[:, 0])[:, None]
+    parts = weight[:, None] * np.hstack([np.cos(double), np.sin(double), np.ones_like(double)])
+    x, y, total = pooled(parts, windows).T
+    # 1 - R of doubled angles is half of their variance, which is four times that of the angles
+    return np.asarray(np.maximum(1 - np.hypot(x, y) / total, 0.0) / 2)
+
+
+def pose_variance(visit: Visit, beams: Ints, ends: Array, normals: Array) -> tuple[Array, Array]:
+    """Variances (k,) m² of ``ends`` (k, 2) along ``normals`` (k, 2) by their scans' poses.
+
+    The first is each scan's own, the second may be common to all scans.
+
+    The end of a beam moves with the laser and turns about it: J = [n, n · perp(end - laser)].
+    """
+    scan = visit.scan[beams]
+    arm = ends - visit.poses[scan, :2]
+    J = np.column_stack([normals, -normals[:, 0] * arm[:, 1] + normals[:, 1] * arm[:, 0]])
+    every = np.einsum("ni,nij,nj->n", J, visit.covs[scan], J)
+    common = np.einsum("ni,nij,nj->n", J, visit.shared[scan], J)
+    return np.maximum(every - common, 0.0), common
+
+
+def _window_moments(moments: Array, windows: list[Ints], cell_m: float) -> tuple[Array, ...]:
+    """Count (n,), mean (n, 2) and covariance (n, 2, 2) over windows, about the cell's middle."""
+    padded = np.concatenate([moments, np.zeros((1, 6))])
+    total = np.zeros_like(moments)
+    offsets = range(-WINDOW, WINDOW + 1)
+    shifts = [(i * cell_m, j * cell_m) for i in offsets for j in offsets]
+    for (dx, dy), place in zip(shifts, windows, strict=True):
+        c, x, y, xx, xy, yy = padded[place].T
+        total[:, 0] += c
+        total[:, 1] += x + dx * c
+        total[:, 2] += y + dy * c
+        total[:, 3] += xx + 2 * dx * x + dx * dx * c
+        total[:, 4] += xy + dx * y + dy * x + dx * dy * c
+        total[:, 5] += yy + 2 * dy * y + dy * dy * c
+    m = total[:, 0]
+    x, y, xx, xy, yy = (total[:, 1:] / m[:, None]).T
+    cov = np.empty((len(m), 2, 2))
+    cov[:, 0, 0], cov[:, 1, 1] = xx - x * x, yy - y * y
+    cov[:, 0, 1] = cov[:, 1, 0] = xy - x * y
+    return m, np.column_stack([x, y]), cov
+
+
+def different_scans(row: Ints, scan: Ints, scans: int, rows: int) -> Ints:
+    """How many different scans (rows,) ended in each cell."""
+    pairs = distinct(row * scans + scan)
+    return np.asarray(np.bincount(pairs // scans, minlength=rows))

@@ -1,0 +1,259 @@
+"""Change detection as the thesis has it (chapter 5): one scan against a map of dents.
+
+Corrections to what is printed are named where they are made; docs/change-detection.md says what
+the method reaches. `compare` is what to use.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from graphslam.change_detection.grid import Grid
+from graphslam.change_detection.visit import Bools, Ints
+from graphslam.core.geometry import Array
+
+#: V_0 of 5.10, m³; it cancels out of every comparison
+VOLUME = 1.0
+#: steps per cell along a beam when looking for the first dent
+_STEPS_PER_CELL = 2
+
+
+@dataclass(frozen=True, slots=True)
+class LaserNoise:
+    """Standard deviations of a beam: range m, and across it ``phi1`` m and ``phi2`` rad (5.3)."""
+
+    range_m: float = 0.015
+    phi1_m: float = 0.001
+    phi2_rad: float = 0.0044
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DentMap:
+    """The reference map: per cell of a grid the deepest dent that covers it.
+
+    Attributes:
+        grid: cells.
+        depth: (cells,) of the winning dent in that cell, 0 where there is none.
+        winner: (cells,) number of the point whose dent it is, -1 for none.
+        bottom: (n,) depth of every point's dent at its own bottom.
+        threshold: d²_thres of 5.7.
+    """
+
+    grid: Grid
+    depth: Array
+    winner: Ints
+    bottom: Array
+    threshold: float
+
+
+def scan_points(pose: Array, angles: Array, ranges: Array) -> Array:
+    """World points (n, 2) m of a scan from ``pose`` (3,); NaN where there is no return."""
+    heading = pose[2] + angles
+    along = np.column_stack([np.cos(heading), np.sin(heading)])
+    return np.asarray(pose[:2] + ranges[:, None] * along)
+
+
+def point_covariances(
+    pose: Array, cov: Array, angles: Array, ranges: Array, noise: LaserNoise
+) -> Array:
+    """Covariances (n, 2, 2) m² of the points of a scan, world axes (5.1-5.6).
+
+    Args:
+        pose: (3,) of the laser in the world.
+        cov: (3, 3) of it.
+        angles: (n,) rad in the laser's frame.
+        ranges: (n,) m.
+        noise: of a beam.
+    """
+    across = noise.phi1_m + (noise.phi2_rad + np.sqrt(cov[2, 2])) * ranges
+    c, s = np.cos(pose[2] + angles), np.sin(pose[2] + angles)
+    R = np.moveaxis(np.array([[c, -s], [s, c]]), 2, 0)
+    local = np.zeros((len(ranges), 2, 2))
+    local[:, 0, 0], local[:, 1, 1] = noise.range_m**2, across**2
+    return np.asarray(R @ local @ R.mT + cov[:2, :2])
+
+
+def make_dents(grid: Grid, points: Array, covs: Array, threshold: float = 9.0) -> DentMap:
+    """The reference map of dents (5.7-5.12): equal volume, the deeper one wins.
+
+    A dent is the paraboloid c (1 - d²/d²_thres) with d² = (z - m)' cov⁻¹ (z - m); its depth at
+    the bottom is c = 2 V_0 / (π a b), a and b being the semi-axes *at the rim*, √(λ d²_thres).
+
+    Args:
+        grid: cells of the map.
+        points: (n, 2) m; rows with NaN leave no dent.
+        covs: (n, 2, 2) m².
+        threshold: d²_thres.
+    """
+    usable = np.nonzero(np.isfinite(points).all(axis=1))[0]
+    determinant = np.full(len(points), np.inf)
+    determinant[usable] = np.linalg.det(covs[usable])
+    bottom = 2 * VOLUME / (np.pi * threshold * np.sqrt(determinant))
+    information = np.linalg.inv(covs[usable])
+    size = grid.shape[0] * grid.shape[1]
+    depth, winner = np.zeros(size), np.full(size, -1, dtype=np.int64)
+    home = grid.cells(points[usable])
+    # over the offsets of the largest dent, not over points or cells
+    widest = np.sqrt(threshold * max(float(np.linalg.eigvalsh(covs[usable]).max()), 0.0))
+    radius = int(np.ceil(widest / grid.cell_m)) + 1
+    for offset in grid.neighbours(np.zeros(1, dtype=np.int64), radius):
+        cell = home + offset[0]
+        inside = (home >= 0) & (cell >= 0) & (cell < size)
+        away = grid.centers(np.where(inside, cell, 0)) - points[usable]
+        d2 = np.einsum("ni,nij,nj->n", away, information, away)
+        # the cell that holds the point belongs to its dent however narrow that is
+        share = 1 - d2 / threshold
+        share = np.maximum(share, 1e-3) if offset[0] == 0 else share
+        value = bottom[usable] * share
+        chosen = np.nonzero(inside & (value > 0))[0]
+        np.maximum.at(depth, cell[chosen], value[chosen])
+        won = chosen[depth[cell[chosen]] == value[chosen]]
+        winner[cell[won]] = usable[won]
+    return DentMap(grid, depth, winner, bottom, threshold)
+
+
+def dent_covariance(depth: Array, threshold: float) -> Array:
+    """Covariance (n, 2, 2) m² that a dent of ``depth`` (n,) at its bottom stands for (5.13).
+
+    The printed a² = 2 V_0/(π c) is the semi-axis at the rim; the covariance is that over d²_thres.
+    A round covariance comes back as it went in.
+    """
+    variance = 2 * VOLUME / (np.pi * depth * threshold)
+    return np.asarray(variance[:, None, None] * np.eye(2))
+
+
+def expected_measurements(
+    dents: DentMap, pose: Array, angles: Array, reach_m: float
+) -> tuple[Array, Array]:
+    """Along each beam the first dent's deepest cell on it, and that dent's covariance (5.2).
+
+    The covariance is of the winning dent at its own bottom, not of where the beam crosses it.
+
+    Args:
+        dents: the reference map.
+        pose: (3,) of the laser.
+        angles: (n,) rad in its frame.
+        reach_m: how far to look.
+
+    Returns:
+        Ranges (n,) m, NaN where no dent is met, and covariances (n, 2, 2) m².
+    """
+    step = dents.grid.cell_m / _STEPS_PER_CELL
+    r = np.arange(1, int(reach_m / step) + 1) * step
+    heading = pose[2] + angles
+    d = np.column_stack([np.cos(heading), np.sin(heading)])
+    along = pose[:2] + r[None, :, None] * d[:, None, :]
+    cell = dents.grid.cells(along.reshape(-1, 2)).reshape(len(angles), len(r))
+    depth = np.where(cell >= 0, dents.depth[cell], 0.0)
+    # the first minimum: the last step before the map gets shallower again
+    ahead = np.column_stack([depth[:, 1:], np.zeros(len(angles))])
+    minimum = (depth > 0) & (ahead < depth)
+    first = minimum.argmax(axis=1)
+    beam = np.arange(len(angles))
+    met = minimum[beam, first]
+    # a plateau of one cell: its middle
+    level = depth[beam, first]
+    begin = (depth == level[:, None]) & (np.arange(len(r)) <= first[:, None])
+    width = np.minimum(begin.sum(axis=1), 2 * _STEPS_PER_CELL)
+    ranges = np.where(met, r[first] - step * (width - 1) / 2, np.nan)
+    point = dents.winner[cell[beam, first]]
+    bottom = np.where(met, dents.bottom[point], np.nan)
+    return ranges, dent_covariance(bottom, dents.threshold)
+
+
+def distances(points: Array, covs: Array, expected: Array, expected_covs: Array) -> Array:
+    """Mahalanobis distances squared (n,) of measured and expected points (5.14); NaN if none."""
+    r = points - expected
+    S = covs + expected_covs
+    usable = np.isfinite(r).all(axis=1) & np.isfinite(S).all(axis=(1, 2))
+    d2 = np.full(len(points), np.nan)
+    d2[usable] = np.einsum("ni,nij,nj->n", r[usable], np.linalg.inv(S[usable]), r[usable])
+    return d2
+
+
+def occlusion_map(grid: Grid, pose: Array, angles: Array, ranges: Array, margin_m: float) -> Bools:
+    """Cells (cells,) that the reference scan saw, free or hit; the rest is occluded (5.4).
+
+    Args:
+        grid: cells.
+        pose: (3,) of the laser.
+        angles: (n,) rad, evenly spaced and ascending.
+        ranges: (n,) m, NaN where nothing came back (then nothing is known to have been seen).
+        margin_m: how far behind its return a surface still extends.
+    """
+    centers = grid.centers(np.arange(grid.shape[0] * grid.shape[1]))
+    away = centers - pose[:2]
+    bearing = np.arctan2(away[:, 1], away[:, 0]) - pose[2] - angles[0]
+    bearing = np.mod(bearing + np.pi, 2 * np.pi) - np.pi
+    beam = np.round(bearing / (angles[1] - angles[0])).astype(int)
+    inside = (beam >= 0) & (beam < len(angles))
+    seen = ranges[np.clip(beam, 0, len(angles) - 1)] + margin_m
+    return np.asarray(inside & (np.hypot(*away.T) <= np.nan_to_num(seen, nan=-1.0)))
+
+
+def changed_beams(
+    dents: DentMap,
+    visible: Bools,
+    pose: Array,
+    cov: Array,
+    angles: Array,
+    ranges: Array,
+    noise: LaserNoise,
+    gate: float,
+    consecutive: int = 1,
+) -> tuple[Bools, Bools]:
+    """The thesis' detector for one scan.
+
+    Args:
+        dents: reference map.
+        visible: (cells,) see `occlusion_map`.
+        pose: (3,) of the laser.
+        cov: (3, 3) of it.
+        angles: (n,) rad.
+        ranges: (n,) m, NaN without a return.
+        noise: of a beam.
+        gate: on the squared distance of 5.14.
+        consecutive: flagged neighbours that it takes; 1 = the rule is off.
+
+    Returns:
+        Which beams (n,) could be compared, and which of them show a change.
+    """
+    reach = float(np.nanmax(ranges)) + 1.0
+    expected, expected_covs = expected_measurements(dents, pose, angles, reach)
+    points = scan_points(pose, angles, ranges)
+    covs = point_covariances(pose, cov, angles, np.nan_to_num(ranges, nan=1.0), noise)
+    d2 = distances(points, covs, scan_points(pose, angles, expected), expected_covs)
+    compared = np.isfinite(d2)
+    cell = dents.grid.cells(points)
+    hidden = (cell < 0) | ~visible[cell]
+    # what was hidden from the reference and stands in front may have been there all along
+    dismissed = hidden & (ranges < np.nan_to_num(expected))
+    marked = compared & (np.nan_to_num(d2) > gate) & ~dismissed
+    return compared, marked & runs(marked, consecutive)
+
+
+def runs(marked: Bools, least: int) -> Bools:
+    """Which of ``marked`` (n,) are in a run of at least ``least`` (5.3)."""
+    edges = np.diff(np.concatenate([[0], marked.astype(int), [0]]))
+    begin, end = np.nonzero(edges == 1)[0], np.nonzero(edges == -1)[0]
+    out = np.zeros(len(marked) + 1, dtype=int)
+    long = end - begin >= least
+    np.add.at(out, begin[long], 1)
+    np.add.at(out, end[long], -1)
+    return np.asarray(np.cumsum(out)[:-1] > 0)
+
+
+def stable(points: Array, others: list[Array], within_m: float, least: int) -> Bools:
+    """Which points (n, 2) m lie near some point of at least ``least`` of the ``others`` (k, 2).
+
+    The rule of 5.3 that points be stable over time before they enter map or comparison.
+    """
+    usable = np.isfinite(points).all(axis=1)
+    count = np.zeros(len(points), dtype=int)
+    for other in others:
+        tree = cKDTree(other[np.isfinite(other).all(axis=1)])
+        near = np.zeros(len(points), dtype=bool)
+        near[usable] = np.isfinite(tree.query(points[usable], distance_upper_bound=within_m)[0])
+        count += near
+    return np.asarray(usable & (count >= least))

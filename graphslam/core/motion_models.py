@@ -1,0 +1,252 @@
+"""From what wheels and odometry report to motions with covariance (thesis ch. 2.1 and 4.8-4.15).
+
+Every source of motion is brought to *twists*: motion on a circle segment, ``exp(twist)``. A twist
+has two kinds of error. The white one is fresh in every increment, so its variance adds up. The
+calibration error (a wrong wheel radius, a scale, a drift per metre) is one constant for much
+longer than an interval between two states, so within an interval its *effect* adds up; the thesis
+treats it as white (see docs/thesis.md for why that misstates it).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphslam.core.config import OdometryConfig, RobotConfig
+from graphslam.core.geometry import Array, compose, exp, exp_jacobian, inverse, rotation3
+
+#: a calibration parameter whose prior sigma is smaller, in any unit, is held
+HELD_SIGMA = 1e-6
+#: 1/m: robots that turn more tightly lose no more of their path; they hardly drive at all
+TIGHTEST_PER_M = 6.0
+
+
+def wheel_twist(angles_rad: Array, robot: RobotConfig) -> Array:
+    """Twists ``(n, 3)`` (path m, 0, turning rad) of wheel rotations ``(n, 2)`` (left, right) rad.
+
+    Thesis eq. 2.6 and 2.7, counter-clockwise positive: right wheel minus left.
+    """
+    left = robot.wheel_radius_left_m * angles_rad[:, 0]
+    right = robot.wheel_radius_right_m * angles_rad[:, 1]
+    return np.column_stack([(left + right) / 2, np.zeros(len(left)), (right - left) / robot.axle_m])
+
+
+def wheel_jacobian(angles_rad: Array, robot: RobotConfig) -> Array:
+    """Derivative ``(n, 3, 5)`` of the twists by (r_l, r_r, turn_l, turn_r, axle), eq. 4.11-4.13.
+
+    The thesis differentiates the relative pose; that is this times `exp_jacobian` of the twist.
+    """
+    left, right = angles_rad[:, 0], angles_rad[:, 1]
+    r_l, r_r, axle = robot.wheel_radius_left_m, robot.wheel_radius_right_m, robot.axle_m
+    J = np.zeros((len(left), 3, 5))
+    J[:, 0, 0], J[:, 0, 1], J[:, 0, 2], J[:, 0, 3] = left / 2, right / 2, r_l / 2, r_r / 2
+    J[:, 2, 0], J[:, 2, 1] = -left / axle, right / axle
+    J[:, 2, 2], J[:, 2, 3] = -r_l / axle, r_r / axle
+    J[:, 2, 4] = -(r_r * right - r_l * left) / axle**2
+    return J
+
+
+def model_error_cov(twists: Array, config: OdometryConfig) -> Array:
+    """Covariance ``(n, 3, 3)`` of the white model error of motions ``(n, 3)``, eq. 4.14.
+
+    Along the axes of each increment's start frame; linear in path and turning, so it does not
+    depend on how finely the odometry is sampled.
+    """
+    path = np.hypot(twists[:, 0], twists[:, 1])
+    turn = np.abs(twists[:, 2])
+    cov = np.zeros((len(twists), 3, 3))
+    cov[:, 0, 0] = config.k_x_m * path + config.k_x_rad * turn
+    cov[:, 1, 1] = config.k_y_m * path + config.k_y_rad * turn
+    cov[:, 2, 2] = config.k_phi_m * path + config.k_phi_rad * turn
+    return cov
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Increments:
+    """Consecutive motions: ``delta`` (n, 3), white ``cov`` (n, 3, 3), ``d_cal`` (n, 3, p).
+
+    ``cov`` is along the axes of each increment's start frame, ``d_cal`` the derivative by the
+    source's p calibration parameters.
+    """
+
+    delta: Array
+    cov: Array
+    d_cal: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """Calibration errors of a motion source: ``mean`` (p,), ``cov`` (p, p); nominal is zero."""
+
+    names: tuple[str, ...]
+    mean: Array
+    cov: Array
+
+
+def odometry_increments(
+    rows: Array, calibration: Array, _robot: RobotConfig, config: OdometryConfig
+) -> Increments:
+    """Increments of an odometry that reports poses: ``rows`` (n, 3) are twists.
+
+    Calibration parameters: relative scale of translation, relative scale of rotation, turning per
+    metre driven forwards (rad/m): wheels of unequal size turn the robot the other way in reverse.
+    """
+    d_twist = np.zeros((len(rows), 3, 3))
+    d_twist[:, :2, 0] = rows[:, :2]
+    d_twist[:, 2, 1] = rows[:, 2]
+    d_twist[:, 2, 2] = rows[:, 0]
+    twists = rows + (d_twist @ calibration[..., None])[..., 0]
+    return Increments(exp(twists), model_error_cov(rows, config), exp_jacobian(twists) @ d_twist)
+
+
+def command_increments(
+    rows: Array, calibration: Array, _robot: RobotConfig, config: OdometryConfig
+) -> Increments:
+    """Increments of commanded velocities, compounded to poses: ``rows`` (n, 3) are twists.
+
+    Calibration parameters: those of `odometry_increments`, and by how much less a robot drives
+    while it turns, in m²: the path is shorter by this times the squared curvature. So it is where
+    the speed meant is that of a point at distance d from the middle of the axle, hypot(v, d ω):
+    to second order too large by d²/2 times the squared curvature.
+    """
+    path = np.maximum(np.hypot(rows[:, 0], rows[:, 1]), 1e-12)
+    curvature = np.minimum(np.abs(rows[:, 2]) / path, TIGHTEST_PER_M)
+    d_twist = np.zeros((len(rows), 3, 4))
+    d_twist[:, :2, 0] = rows[:, :2]
+    d_twist[:, 2, 1] = rows[:, 2]
+    d_twist[:, 2, 2] = rows[:, 0]
+    d_twist[:, :2, 3] = -rows[:, :2] * (curvature**2)[:, None]
+    twists = rows + (d_twist @ calibration[..., None])[..., 0]
+    return Increments(exp(twists), model_error_cov(rows, config), exp_jacobian(twists) @ d_twist)
+
+
+def given_increments(
+    rows: Array, _calibration: Array, _robot: RobotConfig, _config: OdometryConfig
+) -> Increments:
+    """Increments that bring their own covariance: ``rows`` (n, 12) are twist and covariance.
+
+    Nothing to calibrate: p = 0.
+    """
+    n = len(rows)
+    return Increments(exp(rows[:, :3]), rows[:, 3:].reshape(n, 3, 3), np.zeros((n, 3, 0)))
+
+
+def wheel_increments(
+    rows: Array, calibration: Array, robot: RobotConfig, config: OdometryConfig
+) -> Increments:
+    """Increments of wheel rotations: ``rows`` (n, 2) left and right, rad.
+
+    Calibration parameters: what is to be added to left radius, right radius and axle length, m.
+    The counting error of one reading enters two neighbouring increments with opposite signs and
+    nearly cancels; it is treated as white here (cautious), thesis eq. 4.9.
+    """
+    robot = replace(
+        robot,
+        wheel_radius_left_m=robot.wheel_radius_left_m + calibration[0],
+        wheel_radius_right_m=robot.wheel_radius_right_m + calibration[1],
+        axle_m=robot.axle_m + calibration[2],
+    )
+    twists = wheel_twist(rows, robot)
+    J = exp_jacobian(twists) @ wheel_jacobian(rows, robot)
+    moved = np.any(rows != 0, axis=1)
+    counting = (config.count_sigma_rad**2 * moved)[:, None, None]
+    cov = model_error_cov(twists, config) + counting * (J[:, :, 2:4] @ J[:, :, 2:4].mT)
+    return Increments(exp(twists), cov, J[:, :, [0, 1, 4]])
+
+
+def mounted_motion(delta: Array, mount: Array) -> tuple[Array, Array]:
+    """The motion of a frame that sits at ``mount`` (..., 3) in a body that moves by ``delta``.
+
+    Returns:
+        ``inverse(mount) delta mount`` (..., 3), and its derivative (..., 3, 3) by the mount.
+        Turning in place shows the mount's position, driving straight its direction.
+    """
+    moved = compose(inverse(mount), compose(delta, mount))
+    D = rotation3(-mount[..., 2]) @ (rotation3(delta[..., 2]) - np.eye(3))
+    D[..., 0, 2], D[..., 1, 2] = moved[..., 1], -moved[..., 0]
+    return moved, D
+
+
+def nominal_calibration(source: str, config: OdometryConfig, mounted: bool) -> Calibration:
+    """What is known about a source's calibration before any data: zero, with prior sigmas.
+
+    With ``mounted`` the last four parameters are where the sensor really sits, relative to where
+    the log says (x m, y m, yaw rad, base axes), and by how long its stamps are late against the
+    odometry's (s): the estimated states are rigid to the sensor and its clock.
+    """
+    sigmas = {
+        "given": {},
+        "odometry": {
+            "translation_scale": config.translation_scale_sigma,
+            "rotation_scale": config.rotation_scale_sigma,
+            "drift_rad_per_m": config.drift_sigma_rad_per_m,
+        },
+        "commands": {
+            "translation_scale": config.translation_scale_sigma,
+            "rotation_scale": config.rotation_scale_sigma,
+            "drift_rad_per_m": config.drift_sigma_rad_per_m,
+            "turning_loss_m2": config.turning_lever_sigma_m**2 / 2,
+        },
+        "wheels": {
+            "wheel_radius_left_m": config.wheel_radius_sigma_m,
+            "wheel_radius_right_m": config.wheel_radius_sigma_m,
+            "axle_m": config.axle_sigma_m,
+        },
+    }[source]
+    if mounted:
+        sigmas |= {
+            "laser_x_m": config.laser_sigma_m,
+            "laser_y_m": config.laser_sigma_m,
+            "laser_yaw_rad": config.laser_sigma_rad,
+            "laser_latency_s": config.laser_latency_sigma_s,
+        }
+    known = [0.0 if name in config.fixed else sigma for name, sigma in sigmas.items()]
+    # a parameter whose sigma is 0 is held, without making the covariance singular
+    values = np.maximum(np.array(known, dtype=float), 1e-9)
+    return Calibration(tuple(sigmas), np.zeros(len(values)), np.diag(values**2))
+
+
+#: motion source -> increments of its rows; rows scale with the share of an interval that is used
+MOTION_SOURCES: dict[str, Callable[[Array, Array, RobotConfig, OdometryConfig], Increments]] = {
+    "given": given_increments,
+    "odometry": odometry_increments,
+    "commands": command_increments,
+    "wheels": wheel_increments,
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Compounded:
+    """A chain of increments as one motion; see `compound`. ``length_m`` is the path."""
+
+    delta: Array
+    cov: Array
+    d_cal: Array
+    length_m: float
+
+
+def compound(parts: Increments) -> Compounded:
+    """One motion from consecutive increments, eq. 4.4 and 4.7 applied n times, without a loop.
+
+    With p_k the pose after k increments in the frame of the first, an additive error e of
+    increment k moves the end by ``rotation3(heading of p_(k-1)) e`` and, through its heading part,
+    by that times the vector from p_k to the end, turned a quarter.
+
+    Returns:
+        ``delta`` (3,), white ``cov`` (3, 3) along the start frame's axes, ``d_cal`` (3, p).
+    """
+    n = len(parts.delta)
+    before = np.concatenate([[0.0], np.cumsum(parts.delta[:, 2])])
+    c, s = np.cos(before[:-1]), np.sin(before[:-1])
+    dx, dy = parts.delta[:, 0], parts.delta[:, 1]
+    x = np.cumsum(c * dx - s * dy)
+    y = np.cumsum(s * dx + c * dy)
+    E = np.zeros((n, 3, 3))
+    E[:, 0, 0] = E[:, 1, 1] = c
+    E[:, 0, 1], E[:, 1, 0] = -s, s
+    E[:, 0, 2], E[:, 1, 2] = -(y[-1] - y), x[-1] - x
+    E[:, 2, 2] = 1.0
+    cov = (E @ parts.cov @ E.mT).sum(axis=0)
+    d_cal = (E @ parts.d_cal).sum(axis=0)
+    length_m = float(np.hypot(dx, dy).sum())
+    return Compounded(np.array([x[-1], y[-1], before[-1]]), cov, d_cal, length_m)

@@ -1,0 +1,346 @@
+"""The frozen records that travel between the modules.
+
+All arrays are float64. Poses are ``(3,)``: x m, y m, heading rad. Covariances are of *additive*
+errors (x, y, heading) along the axes of the frame that the quantity is given in, unless a field
+says otherwise. Time is integer nanoseconds.
+
+A message has two times. ``stamp_ns`` is its header stamp to the digit, which names it in every
+output. ``time_ns`` is where it is placed on the time line: equal to the stamp except where the
+stamp contradicts the order of recording (see `graphslam.logs.time_order`).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from graphslam.core.geometry import Array
+
+# ---------------------------------------------------------------- what a log says
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Message:
+    """What every message of a log has: the robot that recorded it and its two times."""
+
+    robot: str
+    stamp_ns: int
+    time_ns: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OdometryPose(Message):
+    """Pose (3,) of the base in the odometry frame; only differences of it mean anything."""
+
+    pose: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OdometryIncrement(Message):
+    """Pose of the base at ``time_ns`` in the base frame at ``start_ns``.
+
+    ``cov`` (3, 3) is along the axes of the base frame at ``start_ns``.
+    """
+
+    start_ns: int
+    delta: Array
+    cov: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WheelAngles(Message):
+    """Accumulated angles of the left and right wheel, rad, forward positive, never wrapped."""
+
+    left_rad: float
+    right_rad: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan(Message):
+    """One sweep of a planar laser.
+
+    ``ranges`` (n,) m, NaN where the beam gave nothing usable; beam i points along
+    ``angle_min_rad + i * angle_step_rad`` in the laser frame; ``mount`` (3,) is the pose of the
+    laser in the base frame.
+    """
+
+    ranges: Array
+    angle_min_rad: float
+    angle_step_rad: float
+    mount: Array
+
+    @property
+    def angles(self) -> Array:
+        """Beam directions (n,), rad, in the laser frame."""
+        return self.angle_min_rad + self.angle_step_rad * np.arange(len(self.ranges), dtype=float)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting(Message):
+    """A landmark or another robot measured by bearing and range, perhaps with its direction.
+
+    ``z`` is (bearing rad, range m) or (bearing, range, direction rad) in the sensor's frame, the
+    direction being the heading of the thing seen relative to the sensor. ``cov`` is (2, 2) or
+    (3, 3). ``identity`` is None when unknown. ``seen_robot`` names a robot, None for a landmark.
+    Sightings of one robot at one stamp form one image: they exclude each other.
+    """
+
+    z: Array
+    cov: Array
+    identity: str | None
+    seen_robot: str | None
+    mount: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RelativePose(Message):
+    """Pose (3,) of ``robot`` at ``time_ns`` in the frame of ``other`` at ``start_ns``.
+
+    A loop closure (``other`` is the robot itself, long ago) or a meeting of two robots.
+    ``cov`` (3, 3) is along the axes of the frame at ``start_ns``.
+    """
+
+    other: str
+    start_ns: int
+    delta: Array
+    cov: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth(Message):
+    """True pose (3,) of a robot's base in the world frame; used by evaluation only."""
+
+    pose: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrueLandmark(Message):
+    """A landmark as it truly is; ``robot`` is empty. ``kind`` point | segment | line.
+
+    ``pose`` (3,) in the world frame (heading NaN for a point), ``extent`` (2, 2) its end points
+    or None.
+    """
+
+    identity: str
+    kind: str
+    pose: Array
+    extent: Array | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrueAssociations(Message):
+    """What the beams of a scan, or the sightings of one stamp, truly met.
+
+    ``targets`` (n,) are places in ``names`` (landmarks' identities, robots' names), -1 for nothing.
+    """
+
+    names: tuple[str, ...]
+    targets: np.ndarray[tuple[int], np.dtype[np.int64]]
+
+
+# ---------------------------------------------------------------- what the pipeline passes on
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """How a robot moved from ``start_ns`` to ``end_ns`` according to its own sensors.
+
+    ``delta`` (3,) is the end pose in the frame of the start pose, ``cov`` (3, 3) along the start
+    frame's axes. ``d_delta_d_calibration`` (3, p) is its derivative with respect to the motion
+    source's p calibration parameters (see `graphslam.core.motion_models`); its part of ``cov`` is
+    already included. ``length_m`` is the path driven. ``matched``: the sensors were contradicted by
+    scans, and this is what the scans make of it (`graphslam.odometry.scan_odometry`).
+    """
+
+    start_ns: int
+    end_ns: int
+    delta: Array
+    cov: Array
+    d_delta_d_calibration: Array
+    length_m: float
+    matched: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observation:
+    """One landmark as a front end saw it, in the frame of the sensor.
+
+    ``kind`` says what ``z`` is: ``point`` (bearing, range); ``segment`` and ``line`` a pose on
+    the line (its middle, x axis along the line, the sensor on its left). ``cov`` has z's size;
+    for a ``line`` its first row and column mean nothing (no information along the line).
+    ``extent`` (2,) is where the observed part begins and ends along the line, measured from z,
+    m; None for points.
+    """
+
+    kind: str
+    z: Array
+    cov: Array
+    extent: Array | None = None
+    identity: str | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Association:
+    """An observation made from a robot's state, with the target it belongs to.
+
+    ``time_ns`` names the robot's state; ``target`` is a landmark's number or another robot's
+    name; ``model`` is the row of `MODELS` that compares them. ``z`` and ``cov`` are in the
+    robot's base frame at that state. ``late`` marks evidence from before the landmark's
+    promotion: filters skip it, smoothers use it. ``extent`` (2,) m is from where to where a wall
+    was seen, along the x axis of ``z``.
+    """
+
+    robot: str
+    time_ns: int
+    target: int | str
+    model: str
+    z: Array
+    cov: Array
+    late: bool = False
+    extent: Array | None = None
+
+    def measured(self, z: Array, cov: Array) -> "Association":
+        """The same with another measurement (k,) and covariance (k, k)."""
+        # `dataclasses.replace` takes twice as long, and there are many
+        same = self.robot, self.time_ns, self.target, self.model
+        return Association(*same, z, cov, self.late, self.extent)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """Prior of a robot's first state: pose (3,), covariance (3, 3) along world axes."""
+
+    pose: Array
+    cov: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Closure:
+    """Pose (3,) of state (robot, time) in the frame of state (other, other_time), with cov.
+
+    ``verified``: it was held against all that is known, so no robust kernel belongs on it.
+    ``images``: of how many it was made; where it contradicts what was seen it counts like so many.
+    """
+
+    robot: str
+    time_ns: int
+    other: str
+    other_time_ns: int
+    delta: Array
+    cov: Array
+    verified: bool = False
+    images: int = 1
+
+    @property
+    def pair(self) -> tuple[tuple[str, int], tuple[str, int]]:
+        """The two states."""
+        return (self.robot, self.time_ns), (self.other, self.other_time_ns)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """Everything that enters an estimator together, at one time.
+
+    ``starts`` holds robots that appear for the first time, ``motions`` those that get a new
+    state at ``time_ns``. Steps are recorded and can be replayed into another back end.
+    """
+
+    time_ns: int
+    starts: Mapping[str, Start] = field(default_factory=dict)
+    motions: Mapping[str, Motion] = field(default_factory=dict)
+    associations: tuple[Association, ...] = ()
+    closures: tuple[Closure, ...] = ()
+
+
+# ---------------------------------------------------------------- what comes out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Poses (n, 3) at stamps (n,) int64 ns, covariances (n, 3, 3) of additive world-axis errors."""
+
+    stamps_ns: np.ndarray[tuple[int], np.dtype[np.int64]]
+    poses: Array
+    covs: Array
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """What a back end knows at the end: every state and every landmark, world frame.
+
+    ``states[robot]`` is over the robot's states; ``landmarks[id]`` is (state, covariance): (2,)
+    and (2, 2) for points, (3,) and (3, 3) for lines and segments, additive world-axis errors.
+    ``error`` is half the weighted squared residual (robust weights applied), ``dof`` rows minus
+    unknowns.
+    """
+
+    states: Mapping[str, Trajectory]
+    landmarks: Mapping[int, tuple[Array, Array]]
+    error: float
+    dof: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Landmark:
+    """A landmark of the map, world frame.
+
+    ``position`` (3,), heading NaN for a point; ``cov`` (2, 2) for a point, else (3, 3);
+    ``extent`` (2, 2) its end points (a point repeats itself); ``line`` is (normal direction rad,
+    offset m, covariance (2, 2)) of the line through it, None for a point. ``frame``: the robot in
+    whose frame it is, None for the world.
+    """
+
+    id: int
+    kind: str
+    position: Array
+    cov: Array
+    extent: Array
+    line: tuple[float, float, Array] | None
+    sightings: int
+    first_ns: int
+    last_ns: int
+    identity: str | None
+    frame: str | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RobotResult:
+    """One robot's trajectories; every pair final (all data) and causal (data up to its time).
+
+    ``base`` poses of the base frame, ``scan`` poses of the laser at each scan (None without
+    scans), ``dead_reckoning`` the base by odometry alone, at the same stamps as ``base``.
+    """
+
+    final: Trajectory
+    causal: Trajectory
+    scan_final: Trajectory | None
+    scan_causal: Trajectory | None
+    dead_reckoning: Trajectory
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Picture:
+    """Points of a keyframe's scan: (n, 2) in the frame of its state, seen from ``sensor`` (3,)."""
+
+    robot: str
+    time_ns: int
+    points: Array
+    sensor: Array = field(default_factory=lambda: np.zeros(3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Result:
+    """All that `smooth` found; `graphslam.results.folder` writes and reads it."""
+
+    robots: Mapping[str, RobotResult]
+    landmarks: tuple[Landmark, ...]
+    estimate: Estimate
+    steps: tuple[Step, ...]
+    pictures: tuple[Picture, ...]
+    innovations: Mapping[str, Array]
+    step_ms: Array
+    summary: Mapping[str, Any]

@@ -1,0 +1,236 @@
+"""The factor graph as text that other tools open: g2o, and the table that names its vertices.
+
+g2o knows no robots and no stamps, and readers differ in what they make of comments, so vertices
+are numbered here and `graph_ids` says which is which. Robust kernels have no place in the format:
+the file holds the plain Gaussian weights.
+"""
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphslam.core.errors import OutputError
+from graphslam.core.geometry import Array, between, rotate_cov, rotation, wrap
+from graphslam.core.observation_models import LineModel
+from graphslam.core.records import Estimate, Step
+
+# of n edges: tag, measurements (n, k), covariances (n, m, m) of the last m entries; nothing is
+# known of the entries before them
+_EdgeParts = tuple[str, Array, Array]
+
+# "No information" in a direction is written as this, not as zero: GTSAM refuses a zero on the
+# diagonal of an information matrix ("looks like this is not G2O matrix order"), and it as well as
+# Ceres take a Cholesky factor, which needs a positive matrix. One sigma is then 1000 km.
+NO_INFORMATION = 1e-12
+
+
+@dataclass(frozen=True, slots=True)
+class GraphIds:
+    """Vertex numbers: ``states[robot, stamp_ns]`` and ``landmarks[landmark id]``.
+
+    States come first, robots in alphabetical order, each in order of time; then landmarks.
+    """
+
+    states: Mapping[tuple[str, int], int]
+    landmarks: Mapping[int, int]
+
+
+def number_vertices(estimate: Estimate) -> GraphIds:
+    """Running numbers for every state and landmark of the estimate, the same for equal input."""
+    states = [
+        (robot, stamp)
+        for robot in sorted(estimate.states)
+        for stamp in estimate.states[robot].stamps_ns.tolist()
+    ]
+    landmarks = sorted(estimate.landmarks)
+    return GraphIds(
+        {state: i for i, state in enumerate(states)},
+        {landmark: len(states) + i for i, landmark in enumerate(landmarks)},
+    )
+
+
+def graph_ids(estimate: Estimate) -> str:
+    """CSV ``id,robot,stamp_ns,landmark`` naming the vertices of `graph_g2o`; unused cells empty."""
+    ids = number_vertices(estimate)
+    rows = [f'{i},"{robot}",{stamp},' for (robot, stamp), i in ids.states.items()]
+    rows += [f"{i},,,{landmark}" for landmark, i in ids.landmarks.items()]
+    return "\n".join(["id,robot,stamp_ns,landmark", *rows]) + "\n"
+
+
+def graph_g2o(steps: Sequence[Step], estimate: Estimate) -> str:
+    """The graph at its estimate in g2o's text format, every number to full double precision.
+
+    Vertices are the estimate's states (VERTEX_SE2) and landmarks (VERTEX_XY for points,
+    VERTEX_SE2 for lines and segments). Edges: EDGE_PRIOR_SE2 for starts, EDGE_SE2 for motions,
+    closures, segments, lines and robots seen, EDGE_SE2_XY for points. Information matrices are
+    the inverse covariance along the axes of the *end* frame of an edge, because g2o's residual
+    ``z^-1 * (x_i^-1 * x_j)`` lives there, while the records hold it along the start frame's.
+    A direction without information has 1e-12 in its place (see the module). Associations whose
+    state or landmark is not in the estimate (a landmark deleted later) have no edge.
+
+    `gtsam.readG2o` reads vertices and EDGE_SE2; it skips EDGE_SE2_XY and EDGE_PRIOR_SE2.
+
+    Source: R. Kümmerle et al., g2o: A general framework for graph optimization, ICRA 2011,
+    DOI 10.1109/ICRA.2011.5979949.
+
+    Raises:
+        OutputError: a covariance cannot be inverted; the message names the edge.
+    """
+    ids = number_vertices(estimate)
+    states = [pose for robot in sorted(estimate.states) for pose in estimate.states[robot].poses]
+    states += [estimate.landmarks[landmark][0] for landmark in ids.landmarks]
+    lines = [_record(VERTICES[len(x)], (i,), x.tolist()) for i, x in enumerate(states)]
+    edges = [edge for step in steps for edge in _edges(step, ids)]
+    rows = [""] * len(edges)
+    alike: dict[str, list[int]] = defaultdict(list)
+    for place, edge in enumerate(edges):
+        alike[edge.model].append(place)
+    for model, places in alike.items():
+        group = [edges[place] for place in places]
+        z, cov = (np.array([getattr(edge, name) for edge in group]) for name in ("z", "cov"))
+        # the prior of a start has one end only, and its line needs neither
+        x, t = (_padded([states[edge.ends[end]] for edge in group]) for end in (0, -1))
+        tag, z, cov = EDGES[model](z, cov, x, t)
+        infos = _informations(cov, z.shape[1], group)
+        for place, edge, values, upper in zip(places, group, z.tolist(), infos, strict=True):
+            rows[place] = _record(tag, edge.ends, values, upper)
+    return "\n".join(lines + rows) + "\n"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Edge:
+    """An edge before it is written: a row of `EDGES`, vertices, measurement and covariance."""
+
+    model: str
+    ends: tuple[int, ...]
+    z: Array
+    cov: Array
+    what: str
+
+
+def _edges(step: Step, ids: GraphIds) -> Iterator[_Edge]:
+    """Edges of one step; none of what has an end that is not in the estimate."""
+    states = ids.states
+    for robot, start in sorted(step.starts.items()):
+        if (robot, step.time_ns) in states:
+            ends = (states[robot, step.time_ns],)
+            # world axes, those of the frame that the prior is given in
+            yield _Edge("start", ends, start.pose, start.cov, f"start of {robot}")
+    for robot, motion in sorted(step.motions.items()):
+        a, b = states.get((robot, motion.start_ns)), states.get((robot, motion.end_ns))
+        if a is not None and b is not None:
+            what = f"motion of {robot} to {motion.end_ns}"
+            yield _Edge("motion", (a, b), motion.delta, motion.cov, what)
+    for closure in step.closures:
+        a = states.get((closure.other, closure.other_time_ns))
+        b = states.get((closure.robot, closure.time_ns))
+        if a is not None and b is not None:
+            what = f"closure of {closure.robot} at {closure.time_ns}"
+            yield _Edge("closure", (a, b), closure.delta, closure.cov, what)
+    for seen in step.associations:
+        a = states.get((seen.robot, seen.time_ns))
+        if isinstance(seen.target, str):
+            b = states.get((seen.target, seen.time_ns))
+        else:
+            b = ids.landmarks.get(seen.target)
+        if a is not None and b is not None:
+            what = f"{seen.model} seen by {seen.robot} at {seen.time_ns}"
+            yield _Edge(seen.model, (a, b), seen.z, seen.cov, what)
+
+
+def _padded(states: Sequence[Array]) -> Array:
+    """States (n, 3): points get a heading that nobody asks for."""
+    return np.array([state if len(state) == 3 else (*state, 0.0) for state in states])
+
+
+def _point_edges(z: Array, cov: Array, x: Array, t: Array) -> _EdgeParts:
+    """Bearing and range as Cartesian."""
+    return "EDGE_SE2_XY", *_cartesian(z, cov)
+
+
+def _robot_point_edges(z: Array, cov: Array, x: Array, t: Array) -> _EdgeParts:
+    """Robots' positions as pose edges: no information on their headings.
+
+    The residual of EDGE_SE2 is turned by the measured heading; there is none, so the estimate
+    stands in for it, which is exact at the estimate and first order beside it.
+    """
+    xy, cov = _cartesian(z, cov)
+    phi = between(x, t)[:, 2]
+    R = np.array([rotation(-angle) for angle in phi.tolist()])
+    wide = np.zeros((len(xy), 3, 3))
+    wide[:, :2, :2] = R @ cov @ R.mT
+    wide[:, 2, 2] = 1.0 / NO_INFORMATION
+    return "EDGE_SE2", np.column_stack([xy, phi]), wide
+
+
+def _pose_edges(z: Array, cov: Array, x: Array, t: Array) -> _EdgeParts:
+    """Relative poses: motions, closures, segments, robots with direction; priors likewise."""
+    return "EDGE_SE2", z, rotate_cov(cov, -z[:, 2])
+
+
+def _start_edges(z: Array, cov: Array, x: Array, t: Array) -> _EdgeParts:
+    """Priors on poses."""
+    return "EDGE_PRIOR_SE2", *_pose_edges(z, cov, x, t)[1:]
+
+
+def _line_edges(z: Array, cov: Array, x: Array, t: Array) -> _EdgeParts:
+    """Lines, moved along themselves to face the landmarks' origins; no information along them."""
+    model = LineModel()
+    return "EDGE_SE2", model.facing(z, x, t), model.noise(z, cov, x, t)
+
+
+def _cartesian(z: Array, cov: Array) -> tuple[Array, Array]:
+    """Bearings and ranges (n, 2) as x and y (n, 2) in the base frame, covariances (n, 2, 2)."""
+    bearing, distance = z.T
+    c, s = np.cos(bearing), np.sin(bearing)
+    J = np.array([[-distance * s, c], [distance * c, s]]).transpose(2, 0, 1)
+    return distance[:, None] * np.column_stack([c, s]), J @ cov @ J.mT
+
+
+#: what a state of this size is called
+VERTICES: Mapping[int, str] = {2: "VERTEX_XY", 3: "VERTEX_SE2"}
+#: what says where a vertex is -> its edges, from measurements (n, k), their covariances, and the
+#: estimates (n, 3) of both ends; the rows are those of `graphslam.models` and what steps hold
+EDGES: Mapping[str, Callable[[Array, Array, Array, Array], _EdgeParts]] = {
+    "start": _start_edges,
+    "motion": _pose_edges,
+    "closure": _pose_edges,
+    "point": _point_edges,
+    "line": _line_edges,
+    "segment": _pose_edges,
+    "robot-pose": _pose_edges,
+    "robot-point": _robot_point_edges,
+}
+
+
+def _informations(cov: Array, size: int, edges: Sequence[_Edge]) -> list[list[float]]:
+    """Upper triangles, row by row, of the inverses of covariances (n, m, m), m <= ``size``."""
+    try:
+        half = np.linalg.inv(np.linalg.cholesky(cov))
+    except np.linalg.LinAlgError as error:
+        what = next(edge.what for edge, P in zip(edges, cov, strict=True) if not _positive(P))
+        raise OutputError(f"graph.g2o: the covariance of {what} is not positive") from error
+    m = cov.shape[1]
+    info = np.zeros((len(cov), size, size))
+    info[:, range(size), range(size)] = NO_INFORMATION
+    info[:, size - m :, size - m :] = half.mT @ half
+    i, j = np.triu_indices(size)
+    upper: list[list[float]] = info[:, i, j].tolist()
+    return upper
+
+
+def _positive(cov: Array) -> bool:
+    try:
+        np.linalg.cholesky(cov)
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
+
+def _record(tag: str, ids: Sequence[int], values: list[float], upper: Sequence[float] = ()) -> str:
+    """One line: tag, vertex numbers, values (heading wrapped), upper triangle of information."""
+    if len(values) == 3:
+        values = [*values[:2], float(wrap(values[2]))]
+    return " ".join([tag, *map(str, ids), *map(repr, values), *map(repr, upper)])

@@ -1,0 +1,35 @@
+"""The folder of a comparison: compare.json, config.toml and report.html."""
+
+import json
+from pathlib import Path
+
+from graphslam.core.config import Config, dump_config
+from graphslam.results.folder import check_target, to_json, write_folder
+from graphslam.results.report_comparison import Comparison, render_comparison
+
+
+def is_comparison(directory: Path) -> bool:
+    """Whether `save_comparison` wrote this folder: nothing else is replaced by another one."""
+    try:
+        found = json.loads((directory / "compare.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(found, dict) and str(found.get("format", "")).startswith("graphslam-comp")
+
+
+def save_comparison(
+    comparison: Comparison, config: Config, directory: Path, *, force: bool
+) -> None:
+    """Write compare.json, config.toml and report.html, all or nothing.
+
+    Raises:
+        OutputError: the target exists and may not be replaced, or the disk refuses.
+    """
+    check_target(directory, force=force, replaceable=is_comparison)
+    settings = dump_config(config)
+    files = [
+        ("compare.json", to_json(comparison.found, "compare.json")),
+        ("config.toml", settings),
+        ("report.html", render_comparison(comparison, settings)),
+    ]
+    write_folder(directory, files)

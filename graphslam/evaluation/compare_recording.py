@@ -1,0 +1,111 @@
+"""One run over a log, kept as steps, and the way from states to trajectories and a map."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphslam.core.config import Config
+from graphslam.core.errors import EstimationError, LogError
+from graphslam.core.geometry import Array
+from graphslam.core.records import Step
+from graphslam.estimation.replay import Replay
+from graphslam.logs import LogSet
+from graphslam.mapping.landmark_map import LandmarkMap
+from graphslam.odometry.interpolation import FrameTransforms
+from graphslam.results.folder import SavedResult, SavedRobot
+from graphslam.slam.initialisation import initialise
+from graphslam.slam.pipeline import Pipeline, Progress
+from graphslam.slam.robot_settings import check_robots
+from graphslam.slam.robot_state import RobotState
+from graphslam.slam.summary import make_landmarks
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording:
+    """The steps of one run over a log, and what turns states into trajectories and a map.
+
+    ``start`` (3,) is where the prior put the robot that defines the world frame, ``worlds`` what
+    takes estimates there; ``seconds`` the wall time of the run.
+    """
+
+    steps: tuple[Step, ...]
+    runs: Mapping[str, RobotState]
+    start: Array
+    worlds: FrameTransforms
+    landmarks: LandmarkMap
+    seconds: float
+
+    @property
+    def associations(self) -> int:
+        """Number of associations in all steps, late ones included."""
+        return sum(len(step.associations) for step in self.steps)
+
+    def growth(self) -> tuple[Array, Array]:
+        """Landmarks in the map and path driven by all robots, m, (n,) after each step."""
+        known: set[int | str] = set()
+        counts, driven = [], []
+        for step in self.steps:
+            known |= {seen.target for seen in step.associations if isinstance(seen.target, int)}
+            counts.append(float(len(known)))
+            driven.append(sum(motion.length_m for motion in step.motions.values()))
+        return np.array(counts), np.cumsum(driven)
+
+    def result(self, done: Replay, config: Config) -> SavedResult:
+        """Trajectories and map from what a back end made of the steps, as `smooth` has them.
+
+        The odometry between the states, the calibration and the mounts are those of the recording.
+        """
+        estimate = self.worlds.estimate(done.estimate)
+        runs = {
+            name: replace(
+                run,
+                causal_poses=list(done.causal[name].poses),
+                causal_covs=list(done.causal[name].covs),
+            )
+            for name, run in self.runs.items()
+        }
+        causal_only = all(run.is_causal(done.estimate.states[name]) for name, run in runs.items())
+        robots = {}
+        for name, run in runs.items():
+            found = run.result(
+                estimate.states[name], run.causal(self.start), causal_only=causal_only
+            )
+            robots[name] = SavedRobot(
+                found.final, found.causal, found.scan_final, found.scan_causal
+            )
+        moved = self.landmarks.in_worlds(self.worlds.landmarks)
+        landmarks = make_landmarks(moved, estimate)
+        return SavedResult(robots, landmarks, {}, config)
+
+
+def record(log: LogSet, config: Config, progress: Progress = lambda _count: None) -> Recording:
+    """Run over the log with the back end of ``config`` and keep the steps; optimise nothing.
+
+    Raises:
+        LogError: no message of the log could be used.
+        ConfigError: a setting is about a robot that is not in the log.
+        EstimationError: the estimate is indeterminate, or a robot's start is unknown.
+    """
+    check_robots(log, config)
+    began = time.perf_counter()
+    pipeline = Pipeline(log, config, initialise(log, config))
+    pipeline.run(progress)
+    if not pipeline.steps:
+        raise LogError(f"{log.files[0].path}: nothing in it could be used; see `graphslam info`")
+    apart = pipeline.frames.away
+    if apart:
+        raise EstimationError(
+            f"robot {min(apart)}: its start is unknown and nothing in the log tells it; "
+            f"back ends are compared in one frame: give --start {min(apart)}=x,y,phi"
+        )
+    runs = {name: run for name, run in sorted(pipeline.runs.items()) if run.started}
+    return Recording(
+        tuple(pipeline.steps),
+        runs,
+        pipeline.starts[pipeline.frames.world].pose,
+        pipeline.worlds(),
+        pipeline.associator.map,
+        time.perf_counter() - began,
+    )

@@ -1,0 +1,114 @@
+"""Recorded steps through one back end, with what that costs."""
+
+import resource
+import signal
+import sys
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+
+from graphslam.core.config import Config
+from graphslam.core.errors import EstimationError
+from graphslam.core.geometry import Array
+from graphslam.core.records import Step
+from graphslam.estimation.backends import BACKENDS
+from graphslam.estimation.decentralised import exchanged_bytes
+from graphslam.estimation.replay import Replay, replay
+
+#: steps given to a back end before the one that counts: libraries load and caches fill meanwhile
+WARM_UP = 20
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Played:
+    """A replay, and the largest size of the process, MB, before and after it.
+
+    ``skipped``: what of the steps the back end could not use, counted by reason. ``exchanged``:
+    bytes that each robot sent and bytes that it measured; None where there is one estimate of all.
+    """
+
+    replay: Replay
+    error_frame: str
+    skipped: Mapping[str, int]
+    before_mb: float
+    peak_mb: float
+    exchanged: tuple[Mapping[str, int], Mapping[str, int]] | None = None
+
+
+def play(steps: Sequence[Step], config: Config) -> Played:
+    """Replay ``steps`` into the back end of ``config``, in this process.
+
+    Raises:
+        EstimationError: the steps make the estimate indeterminate.
+    """
+    warm = BACKENDS[config.backend.name](config)
+    for step in steps[:WARM_UP]:
+        warm.add(step)
+    before = _peak_mb()
+    backend = BACKENDS[config.backend.name](config)
+    done = replay(steps, backend)
+    told, skipped = exchanged_bytes(backend), dict(backend.skipped)
+    return Played(done, backend.error_frame, skipped, before, _peak_mb(), told)
+
+
+def play_apart(steps: Sequence[Step], config: Config) -> Played:
+    """`play` in a fresh process, so that memory and time are of this back end alone.
+
+    The process is spawned: a script that calls this needs ``if __name__ == "__main__":``.
+
+    Raises:
+        EstimationError: the steps make the estimate indeterminate, or the process died.
+    """
+    # the default handler: a child that Ctrl-C ends says nothing, this process does
+    with ProcessPoolExecutor(
+        1,
+        mp_context=get_context("spawn"),
+        initializer=signal.signal,
+        initargs=(signal.SIGINT, signal.SIG_DFL),
+    ) as pool:
+        try:
+            return pool.submit(play, steps, config).result()
+        except BrokenProcessPool as error:
+            raise EstimationError("its process died; perhaps memory ran out") from error
+
+
+def _peak_mb() -> float:
+    """Largest resident size of this process so far.
+
+    From /proc where there is one: ru_maxrss of a spawned process starts at its parent's.
+    """
+    try:
+        lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+        return next(float(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 1e3
+    except (OSError, StopIteration):
+        peak = float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+        return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
+
+
+def growth_exponent(size: Array, ms: Array) -> float | None:
+    """Exponent b of ms ~ size^b: a line through medians of bins on logarithmic axes.
+
+    Args:
+        size: (n,) landmarks in the map or m driven, at each step.
+        ms: (n,) wall time of the step.
+
+    Returns:
+        None where size does not grow by a factor of two over five bins of ten steps.
+    """
+    use = (size > 0) & (ms > 0)
+    order = np.argsort(size[use], kind="stable")
+    count = min(20, len(order) // 10)
+    if count < 5:
+        return None
+    x, y = (
+        np.array([np.median(part) for part in np.array_split(np.log(values[use][order]), count)])
+        for values in (size, ms)
+    )
+    if x[-1] - x[0] < np.log(2.0):
+        return None
+    return float(np.polyfit(x, y, 1)[0])

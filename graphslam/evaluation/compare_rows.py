@@ -1,0 +1,263 @@
+"""Every back end judged: its row of numbers, and what the report draws of it."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from graphslam.core.config import Config
+from graphslam.core.errors import ConfigError, EstimationError, GraphSlamError, OutputError
+from graphslam.core.geometry import Array, transform, wrap
+from graphslam.core.records import Step, Trajectory
+from graphslam.evaluation.compare_recording import Recording, record
+from graphslam.evaluation.compare_replay import Played, growth_exponent, play_apart
+from graphslam.evaluation.compare_variants import NAMES, Variant
+from graphslam.evaluation.metrics import Pairs, Relations, align, evaluate, nees, pair
+from graphslam.logs import KnownTruth, LogSet
+from graphslam.results.folder import SavedResult
+from graphslam.results.report_comparison import Comparison, Curve, Lane
+from graphslam.slam.pipeline import Progress
+
+FORMAT = "graphslam-comparison-1"
+#: the same recorded steps for all, or each associates for itself
+MODES = ("replay", "associate")
+#: the settings that recorded steps follow from: in mode `replay` they are the same for all
+PERCEPTION = ("logs", "robots", "odometry", "keyframe", "front_end", "association", "start")
+
+
+def compare(
+    log: LogSet,
+    config: Config,
+    rows: Sequence[Variant],
+    mode: str = "replay",
+    *,
+    truth: KnownTruth | None = None,
+    relations: Relations | None = None,
+    progress: Progress = lambda _count: None,
+    say: Callable[[str], None] = lambda _text: None,
+    run: Callable[[Sequence[Step], Config], Played] = play_apart,
+) -> Comparison:
+    """Every back end of ``rows`` on one log, one after another, in the order given.
+
+    A back end that fails has its error in its row, and the others go on.
+
+    Args:
+        log: opened logs.
+        config: settings of the recording in mode ``replay``.
+        rows: see `variants`.
+        mode: one of `MODES`, see the package.
+        truth: true poses and landmarks; without, rows are compared with each other only.
+        relations: reference relations between scans, see `evaluate`.
+        progress: called with the number of messages read so far.
+        say: told what is done next.
+        run: how a back end is run: `play_apart`, or `play`, where memory then means nothing.
+
+    Raises:
+        LogError: no message of the log could be used.
+        ConfigError: no such mode, or rows differ in more than estimation in mode ``replay``.
+        EstimationError: the log cannot be associated, or no back end came to an end.
+        OutputError: the truth is of other robots.
+    """
+    if mode not in MODES:
+        raise ConfigError(f"--mode {mode}: is not one of {', '.join(MODES)}")
+    truth = truth or KnownTruth({}, ())
+    if truth.trajectories and not set(truth.trajectories) & set(log.robots):
+        raise OutputError(
+            f"the truth is of {', '.join(truth.trajectories)}, "
+            f"the log of {', '.join(log.robots)}; write --truth ROBOT=FILE.tum"
+        )
+    shared = None
+    if mode == "replay":
+        _check_perception(config, rows)
+        say(f"associating with {NAMES.get(config.backend.name, config.backend.name)}")
+        shared = record(log, config, progress)
+    runs: list[_Run] = []
+    for variant in rows:
+        say(variant.label)
+        try:
+            recording = shared or record(log, variant.config, progress)
+            runs.append(_Run.of(variant, recording, run(recording.steps, variant.config)))
+        except GraphSlamError as error:
+            runs.append(_Run(variant, error=str(error)))
+    done = [run for run in runs if run.result is not None]
+    if not done:
+        raise EstimationError(
+            f"no back end came to an end; {runs[0].variant.spec}: {runs[0].error}"
+        )
+    # the best that is there: batch, else what revises the past, else the first
+    reference = min(
+        done,
+        key=lambda one: (
+            one.variant.config.backend.name != "batch",
+            bool(one.row["final_is_causal"]),
+        ),
+    )
+    warnings: list[str] = []
+    for one in done:
+        one.judge(truth, relations, reference, warnings)
+    given = config.start.from_truth or bool(config.start.poses)
+    if truth.trajectories and not given:
+        warnings.append(
+            "the start was not given: only aligned errors mean something (give --start truth)"
+        )
+    known = {
+        name: path
+        for name, path in truth.trajectories.items()
+        if any(name in one.row.get("robots", {}) for one in done)
+    }
+    found = {
+        "format": FORMAT,
+        "mode": mode,
+        "recorded_by": config.backend.name if mode == "replay" else None,
+        "logs": [{"path": str(file.path), "sha256": file.sha256} for file in log.files],
+        "start_given": given,
+        "reference": reference.variant.spec,
+        "rows": [run.row for run in runs],
+        "warnings": [*log.warnings, *dict.fromkeys(warnings)],
+    }
+    lanes = [one.lane(known, reference, in_place=given) for one in done]
+    return Comparison(found, tuple(lanes), {name: t.poses[:, :2] for name, t in known.items()})
+
+
+def _check_perception(config: Config, rows: Sequence[Variant]) -> None:
+    for variant in rows:
+        for table in PERCEPTION:
+            if getattr(variant.config, table) != getattr(config, table):
+                raise ConfigError(
+                    f"--backends {variant.spec}: {table}.* belongs to the recording, which is the "
+                    "same for all; give it by --set, or compare with --mode associate"
+                )
+
+
+class _Run:
+    """One back end of a comparison: its row, and what the report draws of it."""
+
+    def __init__(self, variant: Variant, error: str | None = None) -> None:
+        self.variant = variant
+        self.result: SavedResult | None = None
+        self.row: dict[str, Any] = {"spec": variant.spec, "label": variant.label, "error": error}
+        self.step_ms = self.landmarks = self.path_m = np.empty(0)
+
+    @property
+    def error(self) -> str | None:
+        """Why it did not come to an end."""
+        found: str | None = self.row["error"]
+        return found
+
+    @classmethod
+    def of(cls, variant: Variant, recording: Recording, played: Played) -> "_Run":
+        """A run that came to an end."""
+        self, done = cls(variant), played.replay
+        result = recording.result(done, variant.config)
+        is_filter = all(robot.final is robot.causal for robot in result.robots.values())
+        self.result, self.step_ms = result, done.step_ms
+        self.landmarks, self.path_m = recording.growth()
+        p50, p99, most = np.quantile(done.step_ms, [0.5, 0.99, 1.0]).tolist()
+        name = variant.config.backend.name
+        if name == "ekf" or (is_filter and name != "dead-reckoning"):
+            # filters differ by it as much as from a smoother
+            self.row["label"] += f", {played.error_frame}-frame errors"
+        self.row |= {
+            "error_frame": played.error_frame,
+            "final_is_causal": is_filter,
+            "steps": len(recording.steps),
+            "states": sum(map(len, done.causal.values())),
+            "map_landmarks": len(result.landmarks),
+            "associations": recording.associations,
+            "late": done.late,
+            "skipped": dict(played.skipped),
+            "recording_s": recording.seconds,
+            "ms_per_step": {"p50": p50, "p99": p99, "max": most},
+            "finish_ms": done.finish_ms,
+            "total_s": 1e-3 * (float(done.step_ms.sum()) + done.finish_ms),
+            "memory_mb": {"peak": played.peak_mb, "growth": played.peak_mb - played.before_mb},
+            "growth_exponent": {
+                "landmarks": growth_exponent(self.landmarks, done.step_ms),
+                "path": growth_exponent(self.path_m, done.step_ms),
+            },
+        }
+        if played.exchanged is not None:
+            sent, measured = played.exchanged
+            self.row["exchanged"] = {
+                robot: {"sent_bytes": sent[robot], "measured_bytes": measured[robot]}
+                for robot in sorted(sent)
+            }
+        return self
+
+    def judge(
+        self,
+        truth: KnownTruth,
+        relations: Relations | None,
+        reference: "_Run",
+        warnings: list[str],
+    ) -> None:
+        """Put the errors and the distance to the reference into the row."""
+        assert self.result is not None  # only runs that came to an end are judged
+        try:
+            self.row |= evaluate(self.result, truth.trajectories, truth.landmarks, relations)
+        except OutputError as error:
+            # of another time, or relations without scans: no reason to lose the rest
+            warnings.append(f"not evaluated: {error}")
+        self.row["difference"] = {
+            kind: _difference([pairs for _, pairs in self.pairs(kind, reference.final())])
+            for kind in ("final", "causal")
+        }
+
+    def final(self) -> dict[str, Trajectory]:
+        """The final trajectory of each robot."""
+        assert self.result is not None  # see `judge`
+        return {name: robot.final for name, robot in self.result.robots.items()}
+
+    def pairs(self, kind: str, other: Mapping[str, Trajectory]) -> Iterator[tuple[str, Pairs]]:
+        """Poses of each robot beside those of ``other``, as far as there are any."""
+        assert self.result is not None  # see `judge`
+        for name, robot in self.result.robots.items():
+            if name in other and len(found := pair(getattr(robot, kind), other[name])):
+                yield name, found
+
+    def lane(self, truth: Mapping[str, Trajectory], reference: "_Run", *, in_place: bool) -> Lane:
+        """What the report draws; aligned with the truth unless the estimate is in its place."""
+        assert self.result is not None  # see `judge`
+        paths, curves = {}, {}
+        for kind in ("final", "causal"):
+            moved = np.zeros(3)
+            found = dict(self.pairs(kind, truth or reference.final()))
+            if truth and not in_place and found:
+                moved = align(
+                    np.concatenate([p.estimate[:, :2] for p in found.values()]),
+                    np.concatenate([p.truth[:, :2] for p in found.values()]),
+                )
+            curves[kind] = {
+                name: _curve(p, moved, consistency=bool(truth) and in_place)
+                for name, p in found.items()
+            }
+            paths[kind] = {
+                name: transform(moved, getattr(robot, kind).poses[:, :2])
+                for name, robot in self.result.robots.items()
+            }
+        return Lane(
+            self.row["spec"], self.row["label"], self.row["final_is_causal"], paths, curves,
+            self.step_ms, self.landmarks, self.path_m,
+        )  # fmt: skip
+
+
+def _difference(pairs: Sequence[Pairs]) -> dict[str, float] | None:
+    """Distance between two estimates of the same poses, over all robots."""
+    if not pairs:
+        return None
+    off = np.concatenate([p.estimate - p.truth for p in pairs])
+    distance = np.hypot(off[:, 0], off[:, 1])
+    return {
+        "rmse_m": float(np.sqrt(np.mean(distance**2))),
+        "max_m": float(distance.max()),
+        "heading_rmse_rad": float(np.sqrt(np.mean(wrap(off[:, 2]) ** 2))),
+    }
+
+
+def _curve(pairs: Pairs, moved: Array, *, consistency: bool) -> Curve:
+    """Errors over time after the estimate was put at ``moved`` (3,)."""
+    off = pairs.estimate - pairs.truth
+    off[:, 2] = wrap(off[:, 2] + moved[2])
+    off[:, :2] = transform(moved, pairs.estimate[:, :2]) - pairs.truth[:, :2]
+    values = nees(off, pairs.covs) / 3 if consistency else np.full(len(off), np.nan)
+    return Curve(pairs.stamps_ns, np.hypot(off[:, 0], off[:, 1]), np.abs(off[:, 2]), values)

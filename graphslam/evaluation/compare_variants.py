@@ -1,0 +1,72 @@
+"""What is compared: specs of back ends and the settings they mean."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from graphslam.core.config import Config, load_config
+from graphslam.core.errors import ConfigError
+from graphslam.estimation.backends import BACKENDS
+
+#: how back ends are called in tables; others go by the name in `BACKENDS`
+NAMES = {
+    "batch": "Batch",
+    "dead-reckoning": "Dead reckoning",
+    "decentralised": "Decentralised",
+    "ekf": "EKF",
+    "isam2": "iSAM2",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """One row: the spec as asked for, its name for people, the settings it means."""
+
+    spec: str
+    label: str
+    config: Config
+
+    @property
+    def horizon_s(self) -> float | None:
+        """How long it keeps past poses; None where the back end has no horizon."""
+        return self.config.backend.horizon_s if self.config.backend.name == "isam2" else None
+
+
+def variants(
+    specs: Sequence[str], path: Path | None = None, overrides: Sequence[str] = ()
+) -> tuple[Variant, ...]:
+    """The rows that ``specs`` ask for, over the settings of ``path`` and ``overrides``.
+
+    Raises:
+        ConfigError: a spec is unknown, malformed or there twice; it names the spec.
+    """
+    found = tuple(_variant(spec, path, overrides) for spec in specs)
+    if not found:
+        raise ConfigError("--backends: names no back end")
+    for number, variant in enumerate(found):
+        if variant.config in [other.config for other in found[:number]]:
+            raise ConfigError(f"--backends: {variant.spec} is there twice")
+    return found
+
+
+def _variant(spec: str, path: Path | None, overrides: Sequence[str]) -> Variant:
+    head, *settings = spec.split("+")
+    name, colon, horizon = head.partition(":")
+    if name not in BACKENDS:
+        raise ConfigError(f"--backends: {spec!r} is not one of {', '.join(sorted(BACKENDS))}")
+    if colon and name != "isam2":
+        raise ConfigError(f"--backends {spec}: only isam2 has a horizon")
+    if colon:
+        settings.insert(0, f"backend.horizon_s={horizon}")
+    try:
+        config = load_config(path, [*overrides, f"backend.name={name}", *settings])
+    except ConfigError as error:
+        raise ConfigError(f"--backends {spec}: {error}") from error
+    label = NAMES.get(name, name)
+    if name == "isam2" and math.isfinite(config.backend.horizon_s):
+        label += f", horizon {config.backend.horizon_s:g} s"
+    # the horizon is said, the error frame is added to what a filter is called
+    said = ("backend.horizon_s=", "ekf.error=") if name == "ekf" else ("backend.horizon_s=",)
+    extra = [text for text in settings if not text.startswith(said)]
+    return Variant(spec, ", ".join([label, *extra]), config)

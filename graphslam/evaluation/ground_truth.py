@@ -1,0 +1,72 @@
+"""Where evaluation takes its truth from: the logs of a run, another log, or TUM files."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from graphslam.core.config import Config
+from graphslam.core.errors import LogError, OutputError
+from graphslam.core.records import Trajectory, TrueLandmark, Truth
+from graphslam.logs import KnownTruth, LogSet, read_truth, truth_in
+from graphslam.results.folder import SavedResult, read_trajectory
+
+_NO_TRUTH = "holds no true poses or landmarks; give --truth or --relations"
+
+
+def truth_of_logs(log: LogSet, config: Config) -> KnownTruth:
+    """What open logs say about the truth, perhaps nothing."""
+    if not any(topic.record in (Truth, TrueLandmark) for topic in log.topics):
+        return KnownTruth({}, ())  # spares reading them once more
+    return truth_in(log.opened, config)
+
+
+def truth_of_run(saved: SavedResult) -> KnownTruth:
+    """What the logs that a result came from say about the truth.
+
+    Raises:
+        LogError: a log is not where it was or is another one now, or none holds any truth.
+    """
+    logs = saved.summary["logs"]
+    found = read_truth([Path(log["path"]) for log in logs], saved.config)
+    for log, sha256 in zip(logs, found.sha256, strict=True):
+        if log["sha256"] != sha256:
+            raise LogError(f"{log['path']}: is not the log that was smoothed; give --truth")
+    if not found:
+        raise LogError(f"{', '.join(log['path'] for log in logs)}: {_NO_TRUTH}")
+    return found
+
+
+def truth_of_files(sources: Sequence[str], robots: Sequence[str]) -> KnownTruth:
+    """Truth from logs (``LOG.mcap``) and TUM files (``FILE.tum``, ``ROBOT=FILE.tum``).
+
+    Args:
+        sources: files as given on the command line; several add up.
+        robots: names of the result's robots; a TUM file may go without one if there is only one.
+
+    Raises:
+        LogError: a log cannot be read or holds no truth.
+        OutputError: a TUM file cannot be read, or it is not clear whose it is.
+    """
+    trajectories: dict[str, Trajectory] = {}
+    landmarks: list[TrueLandmark] = []
+    for source in sources:
+        if source.endswith(".mcap"):
+            found = read_truth([Path(source)], Config())
+            if not found:
+                raise LogError(f"{source}: {_NO_TRUTH}")
+            trajectories |= found.trajectories
+            landmarks += found.landmarks
+        else:
+            robot, path = _robot_and_path(source, robots)
+            trajectories[robot] = read_trajectory(path)
+    return KnownTruth(trajectories, tuple(landmarks))
+
+
+def _robot_and_path(source: str, robots: Sequence[str]) -> tuple[str, Path]:
+    name, separator, path = source.partition("=")
+    if separator and name in robots:
+        return name, Path(path)
+    if len(robots) == 1 and (not separator or Path(source).exists()):
+        return robots[0], Path(source)
+    raise OutputError(
+        f"--truth {source}: whose is it? write ROBOT=FILE.tum with one of {', '.join(robots)}"
+    )

@@ -1,0 +1,141 @@
+"""Steps of robots in a room, drawn from exactly the noise that they state; no log, no front end.
+
+The robots follow a planned path; only where they start is drawn from the prior, so the first
+motion differs from run to run and every later pose is as planned. Every run therefore has the same
+graph, and one Cramér-Rao bound holds for all of them (see `graphslam.evaluation.cramer_rao_bound`).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphslam.core.geometry import Array, between, compose, inverse, rotate_cov
+from graphslam.core.observation_models import MODELS
+from graphslam.core.records import Association, Motion, Start, Step
+from graphslam.evaluation.monte_carlo_definition import Bench, BenchRobot
+
+STEP_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BenchRun:
+    """The steps of a run and the truth behind them.
+
+    ``truth[robot]`` (K+1, 3) is the true pose at each step, the start first; ``landmarks[id]`` is
+    (2,) of a point, (3,) of a line: a pose on it, where it is first seen, x axis along it. Points
+    have the first numbers. World frame.
+    """
+
+    steps: tuple[Step, ...]
+    truth: Mapping[str, Array]
+    landmarks: Mapping[int, Array]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Noise:
+    """Covariances (3, 3) or (2, 2) of what a run draws: m and rad, along the axes of each frame."""
+
+    start: Array
+    motion: Array
+    point: Array
+    line: Array
+    robot: Array
+
+    @classmethod
+    def of(cls, bench: Bench, scale: float) -> "Noise":
+        """At a noise scale, which multiplies every standard deviation."""
+        s = bench.sigma
+
+        def cov(*sigmas: float) -> Array:
+            return np.diag(np.square(scale * np.array(sigmas)))
+
+        return cls(
+            start=cov(s.start_m, s.start_m, np.radians(s.start_deg)),
+            motion=cov(s.along_m, s.across_m, np.radians(s.turn_deg)),
+            point=cov(np.radians(s.bearing_deg), s.range_m),
+            # along a line there is no information; what stands there must not matter
+            line=cov(s.line_m, s.line_m, np.radians(s.line_deg)),
+            robot=cov(s.robot_m, s.robot_m, np.radians(s.robot_deg)),
+        )
+
+
+def planned_path(robot: BenchRobot) -> Array:
+    """Poses (K+1, 3) of the plan, world frame."""
+    poses = [np.array([*robot.start_m, np.radians(robot.start_deg)])]
+    for leg in robot.path:
+        delta = np.array([leg.forward_m, 0.0, np.radians(leg.turn_deg)])
+        for _ in range(leg.steps):
+            poses.append(compose(poses[-1], delta))
+    return np.array(poses)
+
+
+def seed_of(seed: int, scale: float, run: int) -> np.random.SeedSequence:
+    """The randomness of a run: of the experiment, the scale and the run alone.
+
+    Not of the variant, nor of which process runs it when: all variants get the same draws.
+    """
+    return np.random.SeedSequence(seed, spawn_key=(round(1e6 * scale), run))
+
+
+def draw(bench: Bench, scale: float, rng: np.random.Generator | None) -> BenchRun:
+    """A run; without ``rng`` the one in which every error happens to be zero.
+
+    Start and motions get additive errors, sightings of points too; the pose of a line or a robot
+    is disturbed along its own axes, as its covariance is given.
+    """
+    noise = Noise.of(bench, scale)
+
+    def error(cov: Array) -> Array:
+        sigmas = np.sqrt(np.diag(cov))
+        return sigmas * rng.standard_normal(len(cov)) if rng is not None else 0.0 * sigmas
+
+    plans = {name: planned_path(robot) for name, robot in sorted(bench.robots.items())}
+    truth = {name: plan.copy() for name, plan in plans.items()}
+    for poses in truth.values():
+        poses[0] += error(noise.start)
+    landmarks: dict[int, Array] = {
+        i: np.array(point, dtype=float) for i, point in enumerate(bench.points_m)
+    }
+    names, first = list(plans), next(iter(plans))
+    steps = [Step(0, {name: Start(plans[name][0], noise.start) for name in names})]
+    for k in range(1, len(plans[first])):
+        now = k * STEP_NS
+        motions, seen = {}, []
+        for name in names:
+            delta = between(truth[name][k - 1], truth[name][k]) + error(noise.motion)
+            length = float(np.hypot(delta[0], delta[1]))
+            motions[name] = Motion(
+                now - STEP_NS, now, delta, noise.motion, np.zeros((3, 0)), length
+            )
+            x = truth[name][k]
+            for i, point in enumerate(bench.points_m):
+                if np.hypot(*(np.array(point) - x[:2])) <= bench.point_reach_m:
+                    z = MODELS["point"].predict(x, landmarks[i]) + error(noise.point)
+                    seen.append(Association(name, now, i, "point", z, noise.point))
+            for i, wall in enumerate(bench.walls_m, start=len(bench.points_m)):
+                spot = _nearest(np.array(wall), x[:2])
+                if np.hypot(*(spot[:2] - x[:2])) <= bench.line_reach_m:
+                    landmarks.setdefault(i, spot)
+                    z = _disturbed(between(x, spot), error(noise.line))
+                    cov = rotate_cov(noise.line, z[2])
+                    seen.append(Association(name, now, i, "line", z, cov))
+        if bench.meet_every and k % bench.meet_every == 0:
+            for other in names[1:]:
+                z = _disturbed(between(truth[first][k], truth[other][k]), error(noise.robot))
+                cov = rotate_cov(noise.robot, z[2])
+                seen.append(Association(first, now, other, "robot-pose", z, cov))
+        steps.append(Step(now, {}, motions, tuple(seen)))
+    return BenchRun(tuple(steps), truth, landmarks)
+
+
+def _nearest(wall: Array, place: Array) -> Array:
+    """The point of a wall (2, 2) that is nearest to ``place`` (2,), as a pose along the wall."""
+    along = wall[1] - wall[0]
+    share = np.clip((place - wall[0]) @ along / (along @ along), 0.0, 1.0)
+    return np.array([*(wall[0] + share * along), np.arctan2(along[1], along[0])])
+
+
+def _disturbed(z: Array, error: Array) -> Array:
+    """The measured pose (3,), from which the true one ``z`` is off by ``error`` in its own axes."""
+    return compose(z, inverse(error))

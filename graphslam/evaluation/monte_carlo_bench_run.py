@@ -1,0 +1,82 @@
+"""One run on the bench: the drawn steps through one estimator, judged against the truth."""
+
+from typing import Any
+
+import numpy as np
+
+from graphslam.core.config import Config
+from graphslam.core.geometry import Array, wrap
+from graphslam.core.records import Estimate
+from graphslam.estimation.backend import Backend
+from graphslam.estimation.backends import BACKENDS
+from graphslam.evaluation.monte_carlo_bench import BenchRun
+from graphslam.evaluation.monte_carlo_consistency import (
+    joint_errors,
+    landmark_squares,
+    squared_error,
+)
+
+
+def run_bench(run: BenchRun, config: Config) -> dict[str, Any]:
+    """What an estimator makes of a run, as plain numbers for a row of results.jsonl.
+
+    ``nees`` of the final joint state with ``dof`` degrees of freedom: the robots' latest poses and
+    all landmarks, at the final estimate. ``final`` and ``causal``: mean over the robots of squared
+    errors at each step (K+1,), position m² and heading rad²; ``causal.nees`` of the robots' latest
+    poses together, 3 degrees of freedom each. ``landmarks``: mean squares of the final map.
+    ``end``: final poses at the last step. ``error_frame``: in which the errors are taken.
+
+    Raises:
+        EstimationError: the estimate is indeterminate.
+    """
+    backend = BACKENDS[config.backend.name](config)
+    causal: dict[str, Any] = {name: [] for name in ("nees", "position_m2", "heading_rad2")}
+    for k, step in enumerate(run.steps):
+        backend.add(step)
+        errors, nees = _latest(backend, run, k)
+        causal["nees"].append(nees)
+        _note(causal, errors[:, None])
+    estimate = backend.finish()
+    nees, dof = _joint(backend, run, estimate)
+    truth = np.array(list(run.truth.values()))
+    poses = np.array([estimate.states[name].poses for name in run.truth])
+    final: dict[str, Any] = {"position_m2": [], "heading_rad2": []}
+    _note(final, poses - truth)
+    return {
+        "error_frame": backend.error_frame,
+        "dof": dof,
+        "nees": nees,
+        "final": final,
+        "causal": causal,
+        "landmarks": landmark_squares(estimate.landmarks, run.landmarks),
+        "end": poses[:, -1].tolist(),
+    }
+
+
+def _note(curves: dict[str, Any], errors: Array) -> None:
+    """Append means over the robots of errors (robots, steps, 3)."""
+    curves["position_m2"] += np.square(errors[..., :2]).sum(axis=2).mean(axis=0).tolist()
+    curves["heading_rad2"] += np.square(wrap(errors[..., 2])).mean(axis=0).tolist()
+
+
+def _latest(backend: Backend, run: BenchRun, k: int) -> tuple[Array, float]:
+    """Additive errors (robots, 3) of the latest poses, and the NEES of all together."""
+    first, *others = run.truth
+    joint = backend.joint(first, [], others)
+    truth = [run.truth[name][k] for name in run.truth]
+    errors, cov = joint_errors(joint, truth[0], [], truth[1:], backend.error_frame)
+    return np.array([joint.pose, *joint.others]) - np.array(truth), squared_error(errors, cov)
+
+
+def _joint(backend: Backend, run: BenchRun, estimate: Estimate) -> tuple[float, int]:
+    """NEES and degrees of freedom of the final joint state."""
+    first, *others = run.truth
+    ids = sorted(estimate.landmarks)
+    errors, cov = joint_errors(
+        backend.joint(first, ids, others),
+        run.truth[first][-1],
+        [run.landmarks[i] for i in ids],
+        [run.truth[name][-1] for name in others],
+        backend.error_frame,
+    )
+    return squared_error(errors, cov), len(errors)

@@ -1,0 +1,262 @@
+"""All runs of an experiment, on all cores, kept as they end, and taken up again where they stopped.
+
+The folder of an experiment holds definition.json (what it is) and results.jsonl (a row per run).
+A run's randomness is of its seed alone, so neither the number of processes nor the order in which
+runs end changes a row.
+"""
+
+import hashlib
+import json
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from functools import cache
+from multiprocessing import get_context, resource_tracker
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graphslam import __version__
+from graphslam.core.errors import OutputError
+from graphslam.evaluation.monte_carlo_bench import draw, seed_of
+from graphslam.evaluation.monte_carlo_bench_run import run_bench
+from graphslam.evaluation.monte_carlo_definition import Definition
+from graphslam.evaluation.monte_carlo_log_run import run_log
+
+Row = dict[str, Any]
+
+ROWS, DEFINITION = "results.jsonl", "definition.json"
+
+
+@dataclass(frozen=True)
+class Job:
+    """Which run. ``scenario`` and ``front_end`` are empty on the bench."""
+
+    scenario: str
+    front_end: str
+    scale: float
+    variant: str
+    run: int
+
+
+def jobs_of(definition: Definition) -> list[Job]:
+    """Every run of an experiment; all variants of a run follow each other."""
+    if definition.logs is None:
+        sources = [("", "")]
+    else:
+        sources = [(s, f) for s in definition.logs.scenarios for f in definition.logs.front_ends]
+    return [
+        Job(scenario, front_end, scale, variant, run)
+        for run in range(definition.runs)
+        for scenario, front_end in sources
+        for scale in definition.noise_scales
+        for variant in definition.variants
+    ]
+
+
+def run_job(definition: Definition, job: Job) -> Row:
+    """The row of a run, without what says which run it is.
+
+    Raises:
+        GraphSlamError: the run failed.
+    """
+    sequence = seed_of(definition.seed, job.scale, job.run)
+    if definition.bench is not None:
+        rng = np.random.default_rng(sequence)
+        run = draw(definition.bench, job.scale, rng)
+        return run_bench(run, definition.config(job.variant))
+    config = definition.config(job.variant, f"front_end.name={job.front_end}")
+    return run_log(job.scenario, job.scale, int(sequence.generate_state(1)[0]), config)
+
+
+def run_campaign(
+    definition: Definition,
+    directory: Path,
+    *,
+    jobs: int | None = None,
+    force: bool = False,
+    progress: Callable[[int], None] = lambda _done: None,
+) -> list[Row]:
+    """Run what is not in ``directory`` yet; all rows, in the order of `jobs_of`.
+
+    A run that fails is a row with its error. Rows are appended whole, one at a time; after an
+    interruption the rest is run by calling again.
+
+    Args:
+        definition: the experiment.
+        directory: its folder, made if it is not there.
+        jobs: processes; None = one per core.
+        force: throw away what is there instead of taking it up.
+        progress: called with the number of runs that are done.
+
+    Raises:
+        OutputError: the folder holds another experiment or something else, cannot be written, or a
+            process died.
+    """
+    wanted = jobs_of(definition)
+    try:
+        _prepare(definition, directory, force)
+        found = {key: row for key, row in _read(directory / ROWS) if key in set(wanted)}
+        progress(len(found))
+        with (directory / ROWS).open("a", encoding="utf-8") as file:
+            missing = [job for job in wanted if job not in found]
+            for job, row in _run(definition, missing, jobs):
+                file.write(json.dumps(row, allow_nan=False) + "\n")
+                file.flush()
+                found[job] = row
+                progress(len(found))
+    except OSError as error:
+        raise OutputError(f"{directory}: cannot be written: {error.strerror}") from error
+    return [found[job] for job in wanted]
+
+
+def _run(
+    definition: Definition, missing: list[Job], processes: int | None
+) -> Iterator[tuple[Job, Row]]:
+    if not missing:
+        return
+    with _one_thread_each():
+        pool = ProcessPoolExecutor(
+            min(processes or os.cpu_count() or 1, len(missing)), get_context("spawn")
+        )
+        with _without_ctrl_c():  # processes start as runs are submitted
+            futures = {pool.submit(_timed, definition, job): job for job in missing}
+        try:
+            for future in as_completed(futures):
+                yield futures[future], _row(definition, futures[future], future)
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _timed(definition: Definition, job: Job) -> Row:
+    began = time.perf_counter()
+    row = run_job(definition, job)
+    return {"seconds": round(time.perf_counter() - began, 4), **row}
+
+
+def _row(definition: Definition, job: Job, future: "Future[Row]") -> Row:
+    """A whole row: which run, by which code, and what came out of it or went wrong."""
+    error = future.exception()
+    if isinstance(error, BrokenProcessPool):
+        raise OutputError(
+            "a process of the experiment died (out of memory?); run it again with fewer --jobs: "
+            "it goes on where it stopped"
+        ) from error
+    row: Row = {
+        **asdict(job),
+        "seed": [definition.seed, *seed_of(definition.seed, job.scale, job.run).spawn_key],
+        "settings": [*definition.settings, *definition.variants[job.variant]],
+        "version": __version__,
+        "code": code_version(),
+        "error": None if error is None else f"{type(error).__name__}: {error}",
+    }
+    return row if error is not None else {**row, **_finite(future.result())}
+
+
+def _finite(value: Any) -> Any:
+    """Plain JSON: seven digits, and null where a number is not finite."""
+    if isinstance(value, dict):
+        return {key: _finite(v) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    if isinstance(value, float):
+        return float(f"{value:.7g}") if np.isfinite(value) else None
+    return value
+
+
+@contextmanager
+def _without_ctrl_c() -> Iterator[None]:
+    """Processes started inside never notice Ctrl-C, which reaches all of a terminal's.
+
+    Only the parent is to act on it, and does as soon as this is over: children inherit the mask.
+    """
+    resource_tracker.ensure_running()  # lifts the mask when it starts, so it starts before
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Children use one thread each: as many processes as cores leave nothing for more."""
+    names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+    before = {name: os.environ.get(name) for name in names}
+    os.environ.update(dict.fromkeys(names, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+@cache
+def code_version() -> str:
+    """First digits of the SHA-256 of the package's sources: which code made a row."""
+    root = Path(__file__).parents[1]
+    digest = hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+# ---------------------------------------------------------------- the folder
+
+
+def _prepare(definition: Definition, directory: Path, force: bool) -> None:
+    """Make the folder, or see that it belongs to this very experiment."""
+    text = _identity(definition)
+    known = directory / DEFINITION
+    if directory.exists() and not directory.is_dir():
+        raise OutputError(f"{directory}: is not a folder")
+    if directory.is_dir() and any(directory.iterdir()):
+        if not known.is_file():
+            raise OutputError(
+                f"{directory}: is not the folder of an experiment; choose another name"
+            )
+        if not force and known.read_text(encoding="utf-8") != text:
+            raise OutputError(
+                f"{directory}: holds another experiment or an earlier definition of this one; "
+                "choose another folder, or give --force to throw its runs away"
+            )
+        if force:
+            (directory / ROWS).unlink(missing_ok=True)
+    directory.mkdir(parents=True, exist_ok=True)
+    known.write_text(text, encoding="utf-8")
+
+
+def _identity(definition: Definition) -> str:
+    """What makes two definitions the same: all but how many runs, which may grow, and the words."""
+    tree = {
+        key: value
+        for key, value in asdict(definition).items()
+        if key not in ("runs", "description", "name")
+    }
+    return json.dumps(tree, indent=1, sort_keys=True) + "\n"
+
+
+def _read(path: Path) -> Iterator[tuple[Job, Row]]:
+    """Rows that are there. A last line that was cut short, by a power cut say, is taken off."""
+    if not path.is_file():
+        return
+    data = path.read_bytes()
+    whole = data[: data.rfind(b"\n") + 1]
+    if len(whole) < len(data):
+        path.write_bytes(whole)
+    for number, line in enumerate(whole.splitlines(), start=1):
+        try:
+            row = json.loads(line)
+            key = Job(**{name: row[name] for name in Job.__dataclass_fields__})
+        except (ValueError, KeyError, TypeError) as error:
+            raise OutputError(f"{path}:{number}: is not a row of an experiment") from error
+        yield key, row

@@ -1,0 +1,179 @@
+"""What an experiment is: a TOML file, or the name of one that comes with the package.
+
+Bounds of the numbers are in the fields' metadata and are checked as those of scenarios are. Angles
+in files are degrees, since people write them.
+"""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from graphslam.core.config import Config, load_config
+from graphslam.core.errors import ConfigError
+from graphslam.simulation import load_scenario
+from graphslam.simulation.errors import ScenarioError
+from graphslam.simulation.scenario import NOT_NEGATIVE, POSITIVE, Point
+from graphslam.simulation.scenario_parser import build
+
+_FOLDER = Path(__file__).parent / "experiments"
+
+#: name -> file of an experiment that comes with the package
+EXPERIMENTS: dict[str, Path] = {
+    name: _FOLDER / f"{name}.toml" for name in ("ekf-versus-smoothing", "filters", "thesis")
+}
+
+
+@dataclass(frozen=True)
+class Motions:
+    """A stretch of a planned path: ``steps`` equal motions, ahead and then turning."""
+
+    steps: int = field(metadata={"least": 1})
+    forward_m: float
+    turn_deg: float = 0.0
+
+
+@dataclass(frozen=True)
+class BenchRobot:
+    """A robot on the bench: where its prior lies, and how it drives."""
+
+    start_m: Point
+    path: tuple[Motions, ...]
+    start_deg: float = 0.0
+
+
+@dataclass(frozen=True)
+class Sigmas:
+    """Standard deviations at noise scale 1; those of motions are per step.
+
+    start_m, start_deg: of the start. along_m, across_m, turn_deg: of a motion. bearing_deg,
+    range_m: of a sighted point. line_m, line_deg: normal offset and direction of a line where it
+    is seen. robot_m, robot_deg: position and direction of another robot.
+    """
+
+    start_m: float = field(metadata=POSITIVE)
+    start_deg: float = field(metadata=POSITIVE)
+    along_m: float = field(metadata=POSITIVE)
+    across_m: float = field(metadata=POSITIVE)
+    turn_deg: float = field(metadata=POSITIVE)
+    bearing_deg: float = field(metadata=POSITIVE)
+    range_m: float = field(metadata=POSITIVE)
+    line_m: float = field(metadata=POSITIVE)
+    line_deg: float = field(metadata=POSITIVE)
+    robot_m: float = field(default=0.1, metadata=POSITIVE)
+    robot_deg: float = field(default=3.0, metadata=POSITIVE)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A room, robots and noise, from which steps are drawn without a log.
+
+    point_reach_m, line_reach_m: how far points and lines are seen; which are seen follows from the
+    planned path, so every run has the same graph. meet_every: the alphabetically first robot sees
+    the others every so many steps; 0 = never.
+    """
+
+    robots: Mapping[str, BenchRobot]
+    points_m: tuple[Point, ...]
+    walls_m: tuple[tuple[Point, Point], ...]
+    sigma: Sigmas
+    point_reach_m: float = field(default=5.0, metadata=POSITIVE)
+    line_reach_m: float = field(default=5.0, metadata=POSITIVE)
+    meet_every: int = field(default=0, metadata=NOT_NEGATIVE)
+
+
+@dataclass(frozen=True)
+class Logs:
+    """Simulated logs: scenarios by name or file, and front ends."""
+
+    scenarios: tuple[str, ...]
+    front_ends: tuple[str, ...] = ("segments",)
+
+
+@dataclass(frozen=True)
+class Definition:
+    """An experiment: every variant at every noise scale, ``runs`` seeds each.
+
+    variants: name -> settings as for ``--set``, over the common ``settings``. Exactly one of
+    ``bench`` (steps drawn directly, true associations) and ``logs`` (simulate, smooth, evaluate).
+    name: the file's; it is not a key.
+    """
+
+    variants: Mapping[str, tuple[str, ...]]
+    description: str = ""
+    runs: int = field(default=100, metadata={"least": 1})
+    seed: int = field(default=0, metadata=NOT_NEGATIVE)
+    noise_scales: tuple[float, ...] = field(default=(1.0,), metadata=POSITIVE)
+    settings: tuple[str, ...] = ()
+    bench: Bench | None = None
+    logs: Logs | None = None
+    name: str = field(default="", metadata={"hidden": True})
+
+    def config(self, variant: str, *more: str) -> Config:
+        """The configuration of a variant, with ``more`` settings over its own.
+
+        Raises:
+            ConfigError: a setting is wrong.
+        """
+        return load_config(None, [*self.settings, *self.variants[variant], *more])
+
+
+def load_definition(name: str | Path) -> Definition:
+    """An experiment by its name in `EXPERIMENTS`, or from a TOML file.
+
+    Raises:
+        ConfigError: no such name or file, not TOML, or a key or value is wrong; the message names
+            the file and the key.
+    """
+    path = EXPERIMENTS.get(str(name), Path(name))
+    try:
+        tree = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ConfigError(f"{name}: neither a file nor one of {', '.join(EXPERIMENTS)}") from error
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}") from error
+    try:
+        found: Definition = _plain(build(Definition, tree))
+    except ScenarioError as error:
+        raise ConfigError(f"{path.name}: {error}") from error
+    problem = _problem(found)
+    if problem:
+        raise ConfigError(f"{path.name}: {problem}")
+    for scenario in found.logs.scenarios if found.logs else ():
+        try:
+            load_scenario(scenario)
+        except ScenarioError as error:
+            raise ConfigError(f"{path.name}: logs.scenarios: {error}") from error
+    for variant in found.variants:
+        try:
+            found.config(variant)
+        except ConfigError as error:
+            raise ConfigError(f"{path.name}: variants.{variant}: {error}") from error
+    return replace(found, name=path.stem)
+
+
+def _plain(node: Any) -> Any:
+    """With dictionaries for read-only mappings, which cannot be sent to another process."""
+    if is_dataclass(node) and not isinstance(node, type):
+        return replace(node, **{f.name: _plain(getattr(node, f.name)) for f in fields(node)})
+    if isinstance(node, Mapping):
+        return {key: _plain(value) for key, value in node.items()}
+    return node
+
+
+def _problem(found: Definition) -> str:
+    """What the single keys allow and their combination does not; empty if nothing."""
+    if not found.variants:
+        return "variants: is empty; give at least one, for example isam2 = []"
+    if (found.bench is None) == (found.logs is None):
+        return "give exactly one of the tables bench and logs"
+    if not found.noise_scales or len(set(found.noise_scales)) < len(found.noise_scales):
+        return "noise_scales: give at least one, each once"
+    if found.bench is not None:
+        lengths = {sum(leg.steps for leg in r.path) for r in found.bench.robots.values()}
+        if len(lengths) != 1 or lengths == {0}:
+            return "bench.robots: all paths must have the same number of steps, at least one"
+    return ""

@@ -1,0 +1,31 @@
+"""What an experiment's folder holds beside the rows: the summary, the page, the figures."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from graphslam.core.errors import OutputError
+from graphslam.results.folder import to_json
+
+
+def save_summary(summary: Mapping[str, Any], directory: Path) -> None:
+    """Write summary.json, report.html and figures/*.svg; each appears when it is whole.
+
+    Raises:
+        OutputError: nothing can be written there.
+    """
+    # matplotlib takes half a second to import, and the processes that run need none
+    from graphslam.results.report_experiment import experiment_figures, experiment_page  # noqa: PLC0415
+
+    files = {"summary.json": to_json(summary, "summary"), "report.html": experiment_page(summary)}
+    figures = experiment_figures(summary)
+    files |= {f"figures/{name}.svg": text for name, text in figures.items()}
+    try:
+        for name, text in files.items():
+            path = directory / name
+            path.parent.mkdir(exist_ok=True)
+            part = path.with_name(f".{path.name}.part")
+            part.write_text(text, encoding="utf-8")
+            part.replace(path)
+    except OSError as error:
+        raise OutputError(f"{directory}: cannot be written: {error.strerror}") from error

@@ -1,0 +1,169 @@
+"""CARMEN logs (the format of the Radish and Freiburg data sets) to MCAP.
+
+FLASER lines become LaserScan, ODOM lines Odometry, PARAM robot_frontlaser_offset the laser's
+mount. The ipc time (third field from the end) is the stamp, to the digit, since the published
+relations refer to it.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from decimal import Decimal, DecimalException
+from itertools import accumulate
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphslam.core.errors import LogError
+from graphslam.logs.import_summary import ImportSummary, text_lines
+from graphslam.logs.no_return import find_no_return
+from graphslam.logs.writer import DEFAULT_ROBOT, LogWriter
+
+Ranges = NDArray[np.float32]
+
+_ROBOT = DEFAULT_ROBOT
+_TRAILER = 3  # ipc time, host, logger time
+_SCAN_TAIL = 6  # laser pose and odometry pose behind the ranges
+_SAMPLE_EVERY = 20  # scans that are looked at for the no-return value
+_BEYOND_M = 1000.0  # range limit of a laser that never reports "no return"
+
+
+@dataclass(frozen=True, slots=True)
+class _Odometry:
+    stamp_ns: int
+    pose: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class _Scan:
+    stamp_ns: int
+    ranges: Ranges
+
+
+@dataclass(frozen=True, slots=True)
+class _Offset:
+    forward_m: float
+
+
+def import_carmen(source: Path, target: Path) -> ImportSummary:
+    """Convert the CARMEN log ``source`` (plain, .gz, .bz2, .xz) to the MCAP file ``target``.
+
+    The ranges stay as they are (float32); ``range_max`` is set just below the range with which
+    the log says "no return", so that ROS tools take it for what it is. The order of the file is
+    kept by the log times, its stamps jump back and forth.
+
+    Raises:
+        LogError: ``source`` cannot be read, or holds neither scans nor odometry.
+        OutputError: ``target`` cannot be written.
+    """
+    malformed: Counter[str] = Counter()
+    # kept whole, about 4 bytes per beam: the log times need what comes last first
+    entries = list(_entries(source, malformed))
+    offsets = [entry.forward_m for entry in entries if isinstance(entry, _Offset)]
+    stamped = [entry for entry in entries if not isinstance(entry, _Offset)]
+    if not stamped:
+        raise LogError(f"{source}: has no FLASER or ODOM line that can be read; is it CARMEN?")
+    log_times = _recording_times([entry.stamp_ns for entry in stamped])
+    range_max = _range_max([entry.ranges for entry in stamped if isinstance(entry, _Scan)])
+    notes = {"format": "carmen", "source": source.name, "stamps": "ipc time, exact"}
+    with LogWriter(target, notes) as log:
+        log.mount(_ROBOT, log_times[0], (offsets[-1] if offsets else 0.0, 0.0, 0.0))
+        for entry, log_time_ns in zip(stamped, log_times, strict=True):
+            if isinstance(entry, _Odometry):
+                log.odometry(_ROBOT, entry.stamp_ns, entry.pose, log_time_ns=log_time_ns)
+            else:
+                start, step = _beam_angles(len(entry.ranges))
+                log.scan(
+                    _ROBOT,
+                    entry.stamp_ns,
+                    entry.ranges,
+                    angle_min_rad=start,
+                    angle_step_rad=step,
+                    range_max_m=range_max,
+                    log_time_ns=log_time_ns,
+                )
+    warnings = [f"{source}: {n} {tag} lines cannot be read" for tag, n in sorted(malformed.items())]
+    return ImportSummary(source, target, log.counts, tuple(warnings))
+
+
+def _recording_times(stamps_ns: Sequence[int]) -> list[int]:
+    """Times of recording: they never decrease, so that readers keep the order of the file.
+
+    The line was written before all lines behind it, so not after the earliest of their stamps.
+    """
+    return list(accumulate(reversed(stamps_ns), min))[::-1]
+
+
+def _range_max(scans: Sequence[Ranges]) -> float:
+    """Just below the range that means no return, as float32 like the ranges."""
+    no_return = find_no_return(scans[::_SAMPLE_EVERY])
+    return _BEYOND_M if no_return is None else float(np.nextafter(np.float32(no_return), 0))
+
+
+def parse_stamp_ns(text: str) -> int:
+    """Nanoseconds of decimal seconds, exact to the ninth digit, never through a float.
+
+    Raises:
+        ValueError: it is not a decimal number, or more than the 32 bits of a ROS stamp hold.
+    """
+    try:
+        seconds = Decimal(text)
+        if not 0 <= seconds < 2**31:
+            raise ValueError(f"{text!r} is not a time")
+        return int(seconds.scaleb(9).to_integral_value())
+    except DecimalException as error:
+        raise ValueError(f"{text!r} is not a time") from error
+
+
+def _beam_angles(beams: int) -> tuple[float, float]:
+    """First angle and step, rad, of a laser that looks 180 degrees ahead.
+
+    CARMEN's convention: the first beam points to -90 degrees. An odd number of beams includes
+    +90 degrees (181 at 1, 361 at 0.5), an even number stops one step short of it (180 at 1).
+    """
+    return -np.pi / 2, np.pi / (beams - beams % 2) if beams > 1 else np.pi
+
+
+def _entries(source: Path, malformed: Counter[str]) -> Iterator[_Odometry | _Scan | _Offset]:
+    """What the lines of a log say, in the order of the file; counts those that say nonsense."""
+    for line in text_lines(source):
+        fields = line.split()
+        if not fields or fields[0] not in _PARSERS:
+            continue
+        try:
+            entry = _PARSERS[fields[0]](fields)
+        except (ValueError, IndexError):
+            malformed[fields[0]] += 1
+            continue
+        if entry is not None:
+            yield entry
+
+
+def _odometry(fields: list[str]) -> _Odometry:
+    """ODOM x y theta tv rv accel ipc_timestamp ipc_hostname logger_timestamp."""
+    if len(fields) < 4 + _TRAILER:
+        raise ValueError("too few fields")
+    x, y, theta = map(float, fields[1:4])
+    return _Odometry(parse_stamp_ns(fields[-_TRAILER]), (x, y, theta))
+
+
+def _scan(fields: list[str]) -> _Scan:
+    """FLASER n r1..rn x y theta odom_x odom_y odom_theta ipc_timestamp host logger_timestamp."""
+    beams = int(fields[1])
+    if len(fields) != 2 + beams + _SCAN_TAIL + _TRAILER:
+        raise ValueError("the number of ranges is not what the line says")
+    ranges = np.array([float(field) for field in fields[2 : 2 + beams]], dtype=np.float32)
+    return _Scan(parse_stamp_ns(fields[-_TRAILER]), ranges)
+
+
+def _parameter(fields: list[str]) -> _Offset | None:
+    """PARAM name value ipc_timestamp host logger_timestamp."""
+    return _Offset(float(fields[2])) if fields[1] == "robot_frontlaser_offset" else None
+
+
+_PARSERS: dict[str, Callable[[list[str]], _Odometry | _Scan | _Offset | None]] = {
+    "ODOM": _odometry,
+    "FLASER": _scan,
+    "PARAM": _parameter,
+}

@@ -1,0 +1,299 @@
+"""Pose graphs (iSAM text, TORO .graph, g2o) to MCAP.
+
+Measured values and noise mean exactly what gtsam's `load2D` (`readG2o` for g2o files) makes of
+them, so that our results can be judged by the file's own factors. Such files have no times:
+stamps are invented, one second apart, and the log says so.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from graphslam.core.errors import LogError
+from graphslam.core.geometry import Array, inverse, rotate_cov, rotation, wrap
+from graphslam.logs.import_summary import ImportSummary, text_lines
+from graphslam.logs.writer import DEFAULT_ROBOT, LogWriter
+
+_T = TypeVar("_T")
+
+_SECOND_NS = 1_000_000_000
+_STAMPS = "invented: the source has none; pose number k (from 0) is stamped k+1 seconds"
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """Pose (3,) of ``end`` in the frame of ``start``; ``cov`` (3, 3) along the axes of *end*.
+
+    That is gtsam's convention: the error is the logarithm of measured^-1 * predicted.
+    """
+
+    start: int
+    end: int
+    delta: Array
+    cov: Array
+
+
+@dataclass(frozen=True, slots=True)
+class LandmarkEdge:
+    """Bearing and range (2,) of a landmark from a pose, with their covariance (2, 2)."""
+
+    pose: int
+    landmark: int
+    z: Array
+    cov: Array
+
+
+@dataclass
+class PoseGraph:
+    """What a file holds, in its order; ``ignored`` counts lines by tag, ``odd`` by reason."""
+
+    edges: list[Edge] = field(default_factory=list)
+    sightings: list[LandmarkEdge] = field(default_factory=list)
+    ignored: Counter[str] = field(default_factory=Counter)
+    odd: Counter[str] = field(default_factory=Counter)
+
+
+def pose_stamp_ns(number: int) -> int:
+    """Invented stamp of the ``number``-th pose of the odometry chain, from 0."""
+    return (number + 1) * _SECOND_NS
+
+
+def import_isam(source: Path, target: Path) -> ImportSummary:
+    """Convert a pose graph to the MCAP file ``target``.
+
+    Edges between consecutive poses become OdometryIncrement, others RelativePose, landmarks
+    Sighting with the landmark's number as its identity. Initial values (VERTEX) are ignored.
+    Where two consecutive poses have no edge the odometry of a robot ends, and that of the next
+    begins: robots are told apart by nothing else, and are called ``robot1``, ``robot2``...
+
+    Raises:
+        LogError: ``source`` cannot be read, its noise or a line makes no sense, it has no edges,
+            or a pose has no odometry.
+        OutputError: ``target`` cannot be written.
+    """
+    graph = read_pose_graph(source)
+    poses = sorted({pose for edge in graph.edges for pose in (edge.start, edge.end)})
+    if not poses:
+        raise LogError(f"{source}: has no edge between two poses; is it a pose graph in 2-D?")
+    number = {pose: k for k, pose in enumerate(poses)}
+    odometry, others = split_chain(graph.edges, poses)
+    robots = name_robots(source, odometry, poses)
+    closures = _by_pose(others, lambda edge: edge.end)
+    sightings = _by_pose(graph.sightings, lambda seen: seen.pose)
+    notes = {"format": "pose graph", "source": source.name, "stamps": _STAMPS}
+    if others:
+        # what closures refer to was chosen by whoever made the graph
+        notes["keyframe.mode"] = "all"
+    with LogWriter(target, notes) as log:
+        for pose in poses:
+            robot = robots[pose]
+            if pose in odometry:
+                _write(partial(log.increment, robot), number, odometry[pose])
+            for edge in closures.get(pose, ()):
+                other = robots[edge.start] if robots[edge.start] != robot else None
+                _write(partial(log.relative_pose, robot, other=other), number, edge)
+            for seen in sightings.get(pose, ()):
+                stamp_ns = pose_stamp_ns(number[pose])
+                log.sighting(robot, stamp_ns, seen.z, seen.cov, identity=str(seen.landmark))
+    warnings = [f"{source}: {n} {tag} lines are not used" for tag, n in graph.ignored.items()]
+    warnings += [f"{source}: {n} {reason}" for reason, n in graph.odd.items()]
+    warnings += [
+        f"{source}: no edge from pose {a} to pose {b}: taken for the start of {robots[b]}"
+        for a, b in pairwise(poses)
+        if robots[a] != robots[b]
+    ]
+    strangers = sum(len(seen) for pose, seen in sightings.items() if pose not in number)
+    if strangers:
+        warnings.append(f"{source}: {strangers} sightings from poses without an edge are not used")
+    return ImportSummary(source, target, log.counts, (*warnings, f"{source}: stamps are {_STAMPS}"))
+
+
+def _by_pose(items: Iterable[_T], pose: Callable[[_T], int]) -> dict[int, list[_T]]:
+    table: dict[int, list[_T]] = {}
+    for item in items:
+        table.setdefault(pose(item), []).append(item)
+    return table
+
+
+def _write(write: Callable[..., None], number: dict[int, int], edge: Edge) -> None:
+    """Write an edge; our covariance is along the axes of its start, gtsam's of its end."""
+    start_ns, end_ns = pose_stamp_ns(number[edge.start]), pose_stamp_ns(number[edge.end])
+    cov = rotate_cov(edge.cov, float(edge.delta[2]))
+    write(start_ns, end_ns, delta=edge.delta, cov=cov)
+
+
+# ---------------------------------------------------------------- the graph
+
+
+def split_chain(edges: Iterable[Edge], poses: Sequence[int]) -> tuple[dict[int, Edge], list[Edge]]:
+    """The odometry, by the pose that each of its edges leads to, and all other edges.
+
+    The first edge between two neighbours of ``poses`` is the odometry. All edges are turned to lead
+    from the earlier pose to the later one, see `turned`.
+    """
+    following = dict(pairwise(poses))
+    odometry: dict[int, Edge] = {}
+    others = []
+    for edge in edges:
+        forward = edge if edge.start < edge.end else turned(edge)
+        if following.get(forward.start) == forward.end and forward.end not in odometry:
+            odometry[forward.end] = forward
+        else:
+            others.append(forward)
+    return odometry, others
+
+
+def name_robots(source: Path, odometry: Mapping[int, Edge], poses: Sequence[int]) -> dict[int, str]:
+    """Pose -> its robot: a new one begins where no odometry leads to a pose.
+
+    Raises:
+        LogError: a pose has neither odometry before it nor after it; named with its number.
+    """
+    begins = [pose for pose in poses if pose not in odometry]
+    for pose, following in pairwise([*poses, -1]):
+        if pose not in odometry and following not in odometry:
+            raise LogError(
+                f"{source}: the odometry has a break on either side of pose {pose}: no edge leads "
+                "to or from its neighbours; leave it out or give it one"
+            )
+    if len(begins) == 1:
+        return dict.fromkeys(poses, DEFAULT_ROBOT)
+    number = np.searchsorted(begins, poses, side="right")
+    digits = len(str(len(begins)))
+    return {p: f"robot{n:0{digits}}" for p, n in zip(poses, number, strict=True)}
+
+
+def turned(edge: Edge) -> Edge:
+    """The same measurement seen from its other end: pose of ``start`` in the frame of ``end``.
+
+    Exact for gtsam's error: with h = z exp(e) the inverse is h^-1 = z^-1 exp(-Ad_z e).
+    """
+    x, y, phi = edge.delta
+    adjoint = np.eye(3)
+    adjoint[:2, :2] = rotation(phi)
+    adjoint[:2, 2] = y, -x
+    cov = np.asarray(adjoint @ edge.cov @ adjoint.T)
+    return Edge(edge.end, edge.start, inverse(edge.delta), cov)
+
+
+# ---------------------------------------------------------------- the file
+
+
+def read_pose_graph(source: Path) -> PoseGraph:
+    """Read the lines of a pose graph.
+
+    Raises:
+        LogError: the file cannot be read, or a line's numbers make no sense; the line is named.
+    """
+    graph = PoseGraph()
+    is_g2o = ".g2o" in source.suffixes
+    lines = enumerate(text_lines(source), start=1)
+    for count, line in ((n, part) for n, whole in lines for part in _JOINED.split(whole)):
+        fields = line.split()
+        if not fields or fields[0].startswith("#"):
+            continue
+        tag = fields[0]
+        if tag not in _LINES:
+            graph.ignored[tag] += 1
+            continue
+        try:
+            _LINES[tag](graph, fields[1:], is_g2o or tag in _G2O_TAGS)
+        except (ValueError, IndexError, np.linalg.LinAlgError) as error:
+            raise LogError(f"{source}: line {count} ({tag}): {error}; correct the file") from error
+    return graph
+
+
+def _edge(graph: PoseGraph, fields: Sequence[str], is_g2o: bool) -> None:
+    """Tag start end x y phi and six numbers of noise."""
+    start, end, delta, noise = int(fields[0]), int(fields[1]), _numbers(fields[2:5], 3), fields[5:]
+    if start == end:
+        raise ValueError("leads from a pose to itself")
+    graph.edges.append(Edge(start, end, delta, _pose_covariance(_numbers(noise, 6), is_g2o)))
+
+
+def _landmark(graph: PoseGraph, fields: Sequence[str], is_g2o: bool) -> None:
+    """Tag pose landmark x y and three numbers of noise: the landmark's place in the pose's frame.
+
+    load2D: "in our experience, the x-y covariance on landmark sightings is not very good, so
+    assume it describes the uncertainty at a range of 10 m". Sigmas are sqrt(v/10) and sqrt(v), or
+    1 where the two variances differ. It has no such rule for g2o, whose information matrix
+    (which `readG2o` drops with its line) is transported to bearing and range.
+    """
+    (x, y), noise = _numbers(fields[2:4], 2), _numbers(fields[4:7], 3)
+    squared = x * x + y * y
+    if not squared > 0:
+        raise ValueError("the landmark is at the pose itself")
+    if is_g2o:
+        cov_xy = np.linalg.inv(np.array([[noise[0], noise[1]], [noise[1], noise[2]]]))
+        J = np.array([[-y / squared, x / squared], [x, y] / np.sqrt(squared)])
+        cov = np.asarray(J @ cov_xy @ J.T)
+    elif abs(noise[0] - noise[2]) < 1e-4:
+        cov = np.diag([noise[0] / 10.0, noise[0]])
+    else:
+        cov = np.eye(2)
+        graph.odd["landmark lines have unequal variances; sigmas of 1 rad and 1 m are used"] += 1
+    z = np.array([np.arctan2(y, x), np.sqrt(squared)])
+    graph.sightings.append(LandmarkEdge(int(fields[0]), int(fields[1]), z, _checked(cov)))
+
+
+def _bearing_range(graph: PoseGraph, fields: Sequence[str], _is_g2o: bool) -> None:
+    """BR pose landmark bearing range and their sigmas, rad and m."""
+    (bearing, distance), sigmas = _numbers(fields[2:4], 2), _numbers(fields[4:6], 2)
+    z, cov = np.array([wrap(bearing), distance]), _checked(np.diag(sigmas**2))
+    graph.sightings.append(LandmarkEdge(int(fields[0]), int(fields[1]), z, cov))
+
+
+def _pose_covariance(v: Array, is_g2o: bool) -> Array:
+    """Covariance (3, 3) from six numbers of noise, with load2D's guess at what they are.
+
+    g2o has the upper triangle of the information matrix. Otherwise zeros tell: [a 0 b c 0 0] is
+    TORO's order xx xy yy phiphi xphi yphi, [a 0 0 b 0 c] the upper triangle, and load2D takes
+    either for a covariance.
+    """
+    upper = np.array([[v[0], v[1], v[2]], [v[1], v[3], v[4]], [v[2], v[4], v[5]]])
+    if is_g2o:
+        return _checked(np.asarray(np.linalg.inv(_checked(upper))))
+    zero = tuple(v == 0)
+    if zero == (False, True, False, False, True, True):
+        return _checked(np.array([[v[0], v[1], v[4]], [v[1], v[2], v[5]], [v[4], v[5], v[3]]]))
+    if zero == (False, True, True, False, True, False):
+        return _checked(upper)
+    raise ValueError(
+        "the noise is neither TORO's nor a diagonal covariance (g2o files end in .g2o)"
+    )
+
+
+def _checked(matrix: Array) -> Array:
+    if np.linalg.eigvalsh(matrix)[0] <= 0:
+        raise ValueError("the noise is not positive definite")
+    return matrix
+
+
+def _numbers(fields: Sequence[str], count: int) -> Array:
+    values = np.array([float(field) for field in fields[:count]])
+    if len(values) != count or not np.isfinite(values).all():
+        raise ValueError(f"needs {count} finite numbers where it has {' '.join(fields) or 'none'}")
+    return values
+
+
+#: files put together, of which one did not end its last line: a tag follows a number at once
+_JOINED = re.compile(r"(?<=[0-9])(?=[A-Z]{2})")
+# the tags that load2D reads, and the names that g2o and its relatives give to the same
+_LINES: dict[str, Callable[[PoseGraph, Sequence[str], bool], None]] = {
+    "ODOMETRY": _edge,
+    "EDGE": _edge,
+    "EDGE2": _edge,
+    "EDGE_SE2": _edge,
+    "LANDMARK": _landmark,
+    "LANDMARK2": _landmark,
+    "EDGE_SE2_XY": _landmark,
+    "BR": _bearing_range,
+}
+_G2O_TAGS = frozenset({"EDGE_SE2", "EDGE_SE2_XY", "LANDMARK2"})

@@ -1,0 +1,353 @@
+"""Relative poses that a log brings along: which of them are believed, and where robots start.
+
+Whoever recorded them may have been mistaken, so nothing is believed for what it says alone.
+
+1. Two closures between the same robots and the odometry between their ends make a loop; they agree
+   if it closes within its uncertainty. Of all closures between two robots (or of one with itself)
+   the largest set found that agrees in pairs goes on: J. Mangelson et al., ICRA 2018, DOI
+   10.1109/ICRA.2018.8460217. No start is needed for it: each closure says where one robot's
+   odometry began in the frame of the other's.
+2. Robots whose start is unknown are put where such a set has them, if it is clearly larger than
+   what else agrees; otherwise they stay in a frame of their own.
+3. Everything is solved together under a kernel that redescends, and each closure is held against
+   what all the others leave of it: those that contradict are taken back, the worst first; those
+   left out that fit come in; until nothing changes.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from graphslam.core.config import BackendConfig, Config, RobustConfig
+from graphslam.core.consistency import greedy_max_clique
+from graphslam.core.gaussian import chi2_quantile
+from graphslam.core.geometry import Array, adjoint, between, compose, inverse, log, rotate_cov
+from graphslam.core.records import Closure, Estimate, Motion, RelativePose, Start, Step, Trajectory
+from graphslam.estimation.isam2 import Isam2Backend, Resolver
+from graphslam.odometry.preintegration import Track
+
+#: probability up to which two closures agree, and up to which one fits what all the others say:
+#: a true one is lost as rarely as that, and false ones miss by far more
+AGREE, FIT = 0.99, 0.9999
+#: a set places a robot if nothing beside it that agrees has more than this part of its size
+RIVAL = 0.5
+#: the prior of a robot that was placed is so many times as wide as the closures leave it: they
+#: enter the estimate themselves
+WIDER = 10.0
+#: closures compared with each other at once, in the order of time: the work is their square
+CHUNK = 1000
+#: sigmas at which the kernel of the joint solution turns
+KERNEL_SIGMAS = 3.0
+#: part of what is known in a direction that the others must say for a closure to be held against it
+LEAST_TOLD = 1e-3
+#: rounds of taking back and letting in
+MAX_ROUNDS = 30
+#: m, rad: where a frame of its own begins
+ORIGIN = np.diag([1e-3, 1e-3, 1e-3]) ** 2
+
+UNLIKE = "it contradicts the others"
+ALONE = "nothing bears it out"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verified:
+    """What was decided: ``refused`` (place in the sequence given -> why), the places ``kept``.
+
+    ``starts`` are those of the robots that had none; ``frames`` says in whose frame each robot is,
+    the one whose start it hangs on; both only of robots that have a relative pose.
+    """
+
+    refused: Mapping[int, str]
+    kept: frozenset[int]
+    starts: Mapping[str, Start]
+    frames: Mapping[str, str]
+
+
+NOTHING_RECORDED = Verified({}, frozenset(), {}, {})
+
+
+def own_frame() -> Start:
+    """Start of a robot in a frame of its own."""
+    return Start(np.zeros(3), ORIGIN)
+
+
+def verify(
+    messages: Sequence[RelativePose],
+    tracks: Mapping[str, Track],
+    starts: Mapping[str, Start],
+    config: Config,
+) -> Verified:
+    """Decide which relative poses to believe.
+
+    Args:
+        messages: all of a log. Those of which an end lies outside of the odometry are not judged.
+        tracks: the odometry of every robot, whole.
+        starts: of the robots whose start is known.
+        config: settings.
+
+    Raises:
+        EstimationError: a covariance is not positive definite.
+    """
+    judged = [k for k, m in enumerate(messages) if _has_ends(m, tracks)]
+    if not judged:
+        return NOTHING_RECORDED
+    odometry = _odometry([messages[k] for k in judged], tracks)
+    groups: dict[tuple[str, str], list[int]] = defaultdict(list)
+    for k in judged:
+        groups[messages[k].other, messages[k].robot].append(k)
+    sets: dict[tuple[str, str], list[int]] = {}
+    clear: set[tuple[str, str]] = set()
+    frames_seen: dict[int, Array] = {}
+    for pair, numbers in groups.items():
+        numbers.sort(key=lambda k: messages[k].time_ns)
+        E = np.zeros((0, 3))
+        for part in range(0, len(numbers), CHUNK):
+            chunk = numbers[part : part + CHUNK]
+            E, agree = _loops([messages[k] for k in chunk], odometry)
+            frames_seen.update(zip(chunk, E, strict=True))
+            worth = np.ones(len(chunk), dtype=np.float32)
+            best = greedy_max_clique(agree, worth)
+            rest = np.setdiff1d(np.arange(len(chunk)), best)
+            rival = greedy_max_clique(agree[np.ix_(rest, rest)], worth[rest])
+            sets[pair] = sets.get(pair, []) + [chunk[n] for n in best]
+            if len(rival) <= RIVAL * len(best):
+                clear.add(pair)
+    placed, frames = _placed(sets, clear, frames_seen, odometry, starts)
+    believed = {
+        k
+        for (a, b), numbers in sets.items()
+        for k in numbers
+        if frames[a] == frames[b] and (a == b or (a, b) in clear or {a, b} <= set(starts))
+    }
+    unknown = [robot for robot in odometry if robot not in starts]
+    solver = _Joint(messages, odometry, {**placed, **starts}, config)
+    candidates = [k for k in judged if frames[messages[k].robot] == frames[messages[k].other]]
+    believed, estimate = solver.settle(believed, candidates)
+    refused = {k: UNLIKE if k in candidates else ALONE for k in judged if k not in believed}
+    found = {}
+    for robot in unknown:
+        first = estimate.states[robot]
+        wide = ORIGIN if frames[robot] == robot else WIDER**2 * first.covs[0]
+        found[robot] = Start(first.poses[0], wide)
+    return Verified(refused, frozenset(believed), found, frames)
+
+
+def _has_ends(m: RelativePose, tracks: Mapping[str, Track]) -> bool:
+    if m.robot == m.other and m.start_ns >= m.time_ns:
+        return False
+    return all(
+        robot in tracks and len(tracks[robot]) > 0 and tracks[robot].first_ns <= time_ns
+        for robot, time_ns in ((m.robot, m.time_ns), (m.other, m.start_ns))
+    )
+
+
+# ---------------------------------------------------------------- odometry
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Chain:
+    """A robot's odometry at the ends of closures: times (n,), poses (n, 3) from its first reading.
+
+    ``spread`` (n, 3, 3) is the covariance of what odometry has gathered up to there, of errors
+    that move the rest of the world about the first pose (the left tangent space of SE(2)): that of
+    a stretch is the difference of its ends'.
+    """
+
+    times_ns: np.ndarray[tuple[int], np.dtype[np.int64]]
+    poses: Array
+    spread: Array
+    motions: tuple[Motion, ...]
+
+    def at(self, times_ns: Iterable[int]) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+        """Places (k,) of times in the chain."""
+        return np.searchsorted(self.times_ns, np.array(list(times_ns), dtype=np.int64))
+
+
+def _odometry(messages: Iterable[RelativePose], tracks: Mapping[str, Track]) -> dict[str, _Chain]:
+    """Robot -> its odometry between the ends of closures, beginning with its first reading."""
+    times: dict[str, set[int]] = defaultdict(set)
+    for m in messages:
+        times[m.robot] |= {tracks[m.robot].first_ns, m.time_ns}
+        times[m.other] |= {tracks[m.other].first_ns, m.start_ns}
+    chains = {}
+    for robot, needed in sorted(times.items()):
+        at = np.array(sorted(needed), dtype=np.int64)
+        moved = tracks[robot].motions(at[:-1], at[1:])
+        poses = np.zeros((len(at), 3))
+        for k, delta in enumerate(moved.delta):
+            poses[k + 1] = compose(poses[k], delta)
+        A = adjoint(poses[1:])
+        steps = A @ rotate_cov(moved.cov, -moved.delta[:, 2]) @ A.mT
+        spread = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(steps, axis=0)])
+        motions = tuple(moved.one(k, int(a), int(b)) for k, (a, b) in enumerate(pairwise(at)))
+        chains[robot] = _Chain(at, poses, spread, motions)
+    return chains
+
+
+# ---------------------------------------------------------------- pairs
+
+
+def _loops(messages: Sequence[RelativePose], odometry: Mapping[str, _Chain]) -> tuple[Array, Array]:
+    """Closures between the same two robots, held against each other.
+
+    Closure a sees the first pose of its robot's odometry at E_a in the frame of the other's. The
+    loop of two is E_a E_b⁻¹; its errors are those of both closures and of the odometry between
+    their ends, all in the tangent space at the first pose of the other robot.
+
+    Returns:
+        E (n, 3), and which agree (n, n) bool.
+    """
+    other, own = odometry[messages[0].other], odometry[messages[0].robot]
+    i, j = other.at(m.start_ns for m in messages), own.at(m.time_ns for m in messages)
+    z = np.array([m.delta for m in messages])
+    seen = compose(other.poses[i], z)
+    E = compose(seen, inverse(own.poses[j]))
+    A = adjoint(seen)
+    R = A @ rotate_cov(np.array([m.cov for m in messages]), -z[:, 2]) @ A.mT
+    gate = chi2_quantile(AGREE, 3)
+    agree = np.zeros((len(z), len(z)), dtype=bool)
+    A = adjoint(E)
+    for a in range(len(z)):  # row by row: a matrix of 3 x 3 blocks would not fit
+        loop = compose(E[a], inverse(E))
+        turn = adjoint(loop)
+        there, back = other.spread[i] - other.spread[i[a]], own.spread[j] - own.spread[j[a]]
+        there *= np.sign(i - i[a])[:, None, None]
+        back *= np.sign(j - j[a])[:, None, None]
+        S = there + A[a] @ back @ A[a].T + R[a] + turn @ R @ turn.mT
+        e = log(loop)[:, :, None]
+        agree[a] = (e.mT @ np.linalg.solve(S, e)).ravel() <= gate
+    agree &= agree.T
+    np.fill_diagonal(agree, False)
+    return E, agree
+
+
+# ---------------------------------------------------------------- frames
+
+
+def _placed(
+    sets: Mapping[tuple[str, str], Sequence[int]],
+    clear: set[tuple[str, str]],
+    seen: Mapping[int, Array],
+    odometry: Mapping[str, _Chain],
+    starts: Mapping[str, Start],
+) -> tuple[dict[str, Start], dict[str, str]]:
+    """First guesses of unknown starts, and in whose frame each robot is.
+
+    The largest set that connects a robot without a place to one with a place is followed first;
+    when there is none, the next robot begins a frame of its own.
+    """
+    world = min(starts, default="")
+    frames = {robot: world for robot in odometry if robot in starts}
+    poses = {robot: starts[robot].pose for robot in frames}
+    ways = sorted(
+        ((a, b) for a, b in sets if a != b and (a, b) in clear), key=lambda p: -len(sets[p])
+    )
+    while len(frames) < len(odometry):
+        way = next(((a, b) for a, b in ways if (a in frames) != (b in frames)), None)
+        if way is None:
+            robot = next(r for r in odometry if r not in frames)
+            frames[robot], poses[robot] = robot, np.zeros(3)
+            continue
+        a, b = way
+        E = seen[sets[way][0]]  # of b, in the frame of a
+        if a in frames:
+            poses[b], frames[b] = compose(poses[a], E), frames[a]
+        else:
+            poses[a], frames[a] = compose(poses[b], inverse(E)), frames[b]
+    wide = np.diag([1e3, 1e3, 3.0]) ** 2
+    return {
+        robot: Start(pose, ORIGIN if frames[robot] == robot else wide)
+        for robot, pose in poses.items()
+        if robot not in starts
+    }, frames
+
+
+# ---------------------------------------------------------------- everything together
+
+
+class _Joint:
+    """Odometry between the ends of closures, and any of the closures, solved together."""
+
+    def __init__(
+        self,
+        messages: Sequence[RelativePose],
+        odometry: Mapping[str, _Chain],
+        starts: Mapping[str, Start],
+        config: Config,
+    ) -> None:
+        kernel = RobustConfig("geman-mcclure", KERNEL_SIGMAS)
+        self._plain = replace(config, robust=RobustConfig("none"), backend=BackendConfig())
+        self._robust = replace(self._plain, robust=kernel)
+        self._closures = [
+            Closure(m.robot, m.time_ns, m.other, m.start_ns, m.delta, m.cov) for m in messages
+        ]
+        self._starts: dict[int, dict[str, Start]] = defaultdict(dict)
+        self._motions: dict[int, dict[str, Motion]] = defaultdict(dict)
+        for robot, chain in odometry.items():
+            self._starts[int(chain.times_ns[0])][robot] = starts[robot]
+            for motion in chain.motions:
+                self._motions[motion.end_ns][robot] = motion
+
+    def settle(self, believed: set[int], candidates: Sequence[int]) -> tuple[set[int], Estimate]:
+        """Those of the candidates that bear each other out, beginning with some; the estimate."""
+        gate = chi2_quantile(FIT, 3)
+        backend: Isam2Backend = Isam2Backend(self._plain)
+        for step in self._steps(believed):
+            backend.add(step)
+        estimate = backend.finish()
+        barred: set[int] = set()
+        for _ in range(MAX_ROUNDS):
+            batch = Resolver(self._robust, self._steps(believed), estimate)
+            estimate = batch.solve(rough=True)
+            d2 = {k: self._misfit(k, k in believed, batch, estimate) for k in candidates}
+            wrong = sorted((k for k in believed if d2[k] > gate), key=lambda k: -d2[k])
+            new = {k for k in candidates if k not in believed | barred and d2[k] <= gate}
+            if not wrong and not new:
+                break
+            # one that is wrong makes others look it
+            gone = set(wrong[: max(1, len(wrong) // 4)])
+            barred |= gone
+            believed = believed - gone if gone else believed | new
+        return believed, Resolver(self._plain, self._steps(believed), estimate).solve()
+
+    def _steps(self, believed: Iterable[int]) -> list[Step]:
+        """Steps in the order of time, each closure where both of its ends are there."""
+        at: dict[int, list[Closure]] = defaultdict(list)
+        for k in sorted(believed):
+            closure = self._closures[k]
+            at[max(closure.time_ns, closure.other_time_ns)].append(closure)
+        return [
+            Step(t, self._starts.get(t, {}), self._motions.get(t, {}), (), tuple(at[t]))
+            for t in sorted({*self._starts, *self._motions, *at})
+        ]
+
+    def _misfit(self, k: int, used: bool, backend: Resolver, estimate: Estimate) -> float:
+        """Squared Mahalanobis distance of a closure from what all others say.
+
+        In units of the closure's own sigmas, along directions in which the estimate is independent:
+        with m the variance of the relative pose by the estimate, r the residual and w the weight
+        that the closure has in it (0 unless used), all others together say r / (1 - w m) with
+        variance m / (1 - w m). Directions of which they know next to nothing are left out.
+        """
+        c = self._closures[k]
+        ends = (c.other, c.other_time_ns), (c.robot, c.time_ns)
+        x, y = (_pose(estimate.states[robot], t) for robot, t in ends)
+        h = between(x, y)
+        L = np.linalg.cholesky(rotate_cov(c.cov, -float(c.delta[2])))
+        r = np.linalg.solve(L, log(between(c.delta, h)))
+        if ends[0] == ends[1]:
+            return float(r @ r)
+        J = np.linalg.solve(L, np.hstack([-adjoint(inverse(h)), np.eye(3)]))
+        m, Q = np.linalg.eigh(J @ backend.state_covariance(ends) @ J.T)
+        w = (KERNEL_SIGMAS**2 / (KERNEL_SIGMAS**2 + r @ r)) ** 2 if used else 0.0
+        rest = 1.0 - w * m
+        told = rest > LEAST_TOLD
+        r, m, rest = (Q.T @ r)[told], m[told], rest[told]
+        return float(np.sum(r**2 / (rest * (rest + m))))
+
+
+def _pose(states: Trajectory, time_ns: int) -> Array:
+    return np.asarray(states.poses[np.searchsorted(states.stamps_ns, time_ns)])

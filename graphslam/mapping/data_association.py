@@ -1,0 +1,382 @@
+"""Data association of one image (scan or set of sightings) at a time, and the life of a landmark.
+
+Order of decisions for an observation: known identity; a landmark of the graph that was seen
+recently; landmarks not seen for long, only when enough of them agree *together* (a loop closure);
+a tentative landmark; a new one; else rejected, with the reason.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphslam.core.config import AssociationConfig
+from graphslam.core.geometry import Array, compose, compose_jacobians, rotate_cov
+from graphslam.core.records import Association, Motion, Observation
+from graphslam.estimation.backend import Backend, Joint
+from graphslam.mapping.gating import (
+    BoolArray,
+    Compared,
+    Pairs,
+    assign,
+    candidate_pairs,
+    compare,
+    fixes_pose,
+    flip,
+    gate_distance,
+    jointly_compatible,
+)
+from graphslam.mapping.landmark_map import Entry, LandmarkMap
+from graphslam.odometry.preintegration import Track
+
+#: images between two refreshes of all landmark estimates; those compared are always fresh
+REFRESH_EVERY = 50
+#: landmarks per observation whose joint marginal is asked for, the crudely nearest: recently seen
+#: ones, and old ones (whose distance says less, as the pose has drifted)
+NEAREST_RECENT, NEAREST_OLD = 3, 4
+
+
+def predicted_joint(joint: Joint, motion: Motion | None) -> Joint:
+    """The joint after the robot moved on: system update of the pose block, thesis 4.4-4.7."""
+    if motion is None:
+        return joint
+    F, W = compose_jacobians(joint.pose, motion.delta)
+    P = joint.cov.copy()
+    P[:3] = F @ P[:3]
+    P[:, :3] = P[:, :3] @ F.T
+    P[:3, :3] += W @ motion.cov @ W.T
+    return replace(joint, pose=compose(joint.pose, motion.delta), cov=P)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Image:
+    """One image under association: what was seen, and its candidate pairs with landmarks.
+
+    ``entries`` (k) is the landmark of each pair, ``recent`` (k,) whether this robot saw it lately;
+    ``joint`` is over the predicted pose and the graph's landmarks among them, ``where[id]`` their
+    place in it.
+    """
+
+    robot: str
+    time_ns: int
+    path_m: float
+    seen: Sequence[Observation]
+    pairs: Pairs
+    entries: tuple[Entry, ...]
+    recent: BoolArray
+    joint: Joint
+    where: dict[int, int]
+    compared: Compared
+
+
+class Associator:
+    """Keeps the landmark map and decides where each observation belongs."""
+
+    def __init__(self, config: AssociationConfig, backend: Backend) -> None:
+        self.map = LandmarkMap()
+        self.rejected: Counter[str] = Counter()
+        self.closures = 0
+        self.innovations: dict[str, list[tuple[int, float]]] = {}
+        self._config, self._backend = config, backend
+        self._images = 0
+        self._unsettled: set[int] = set()  # admitted, but not yet in the back end
+        m2, rad2 = config.floor_m**2, config.floor_rad**2
+        self._floor = {
+            "line": np.diag([m2, rad2]),
+            "point": np.diag([rad2, m2]),
+            "segment": np.diag([m2, m2, rad2]),
+        }
+
+    def associate(
+        self,
+        robot: str,
+        time_ns: int,
+        seen: Sequence[Observation],
+        pose: Array,
+        motion: Motion | None,
+        track: Track,
+        path_m: float,
+        gathering: bool = False,
+    ) -> tuple[Association, ...]:
+        """Associations of one image.
+
+        Args:
+            robot: who saw it.
+            time_ns: time of the robot's state that the observations belong to.
+            seen: observations in the robot's base frame at that state.
+            pose: (3,) estimate of the robot's latest state in the back end.
+            motion: from the robot's latest state in the back end to this one; None if it is it.
+            track: the robot's odometry.
+            path_m: how far the robot has driven.
+            gathering: more images follow before the back end takes the step (`settle` then).
+                Innovations of sightings with an identity, which need the dear joint marginal, are
+                not booked.
+
+        Returns:
+            What is to enter the graph, including earlier sightings of landmarks that this image
+            promotes (marked late).
+        """
+        config = self._config
+        if self._images % REFRESH_EVERY == 0:
+            ids = [i for i in self.map.graph_ids() if i not in self._unsettled]
+            self.map.refresh(self._backend, ids)
+        self._images += 1
+        self.map.expire(time_ns, robot, path_m, round(config.tentative_s * 1e9), config.tentative_m)
+        if motion is not None:
+            pose = compose(pose, motion.delta)
+        if gathering and all(map(self._has_identity, seen)):
+            return self._named_only(robot, time_ns, seen, pose, path_m)
+        image = self._image(robot, time_ns, seen, pose, motion, track, path_m, gathering)
+        associations = self._book(image, self._choose(image))
+        if not gathering:
+            self.settle()
+        return associations
+
+    def _named_only(
+        self, robot: str, time_ns: int, seen: Sequence[Observation], pose: Array, path_m: float
+    ) -> tuple[Association, ...]:
+        """An image in which everything says what it is: nothing to compare."""
+        out: list[Association] = []
+        for o in seen:
+            entry = self._named(o)
+            if entry is None:
+                entry = self.map.add(o, pose, time_ns)
+            elif (entry.kind == "point") != (o.kind == "point"):
+                self.rejected["identity: known as a landmark of another kind"] += 1
+                continue
+            self.map.saw(entry, o, pose, time_ns, robot, path_m)
+            association = Association(robot, time_ns, entry.id, o.kind, o.z, o.cov, extent=o.extent)
+            out += self._admit(entry, association, True)
+        return tuple(out)
+
+    def settle(self) -> None:
+        """Note that the back end has taken the step of all associations so far."""
+        self._unsettled.clear()
+
+    def _image(
+        self,
+        robot: str,
+        time_ns: int,
+        seen: Sequence[Observation],
+        pose: Array,
+        motion: Motion | None,
+        track: Track,
+        path_m: float,
+        gathering: bool,
+    ) -> Image:
+        """Candidate pairs, compared."""
+        ids, means, extents, is_point, whole = self.map.arrays()
+        free = [n for n, o in enumerate(seen) if not self._has_identity(o)]
+        pairs = candidate_pairs(
+            [seen[n] for n in free], pose, means, extents, is_point, whole, self._config
+        )
+        entries = [self.map.entries[int(ids[j])] for j in pairs.landmark]
+        recent = np.array([self._is_recent(e, robot, path_m) for e in entries], dtype=bool)
+        keep = _worth_comparing(pairs, entries, recent, self._config.reacquire_min)
+        pairs, recent = pairs.only(keep), recent[keep]
+        entries = [e for e, k in zip(entries, keep, strict=True) if k]
+        # observations with an identity bring their pair along, ungated
+        known = [
+            (n, entry)
+            for n, o in enumerate(seen)
+            if (entry := self._named(o)) and (entry.kind == "point") == (o.kind == "point")
+        ]
+        pairs = Pairs(
+            np.array([free[i] for i in pairs.observation] + [n for n, _ in known], dtype=np.int64),
+            np.array([e.id for e in entries] + [e.id for _, e in known], dtype=np.int64),
+            pairs.model + tuple(seen[n].kind for n, _ in known),
+            np.append(pairs.flipped, np.zeros(len(known), dtype=bool)),
+            np.append(pairs.miss, np.zeros(len(known))),
+        )
+        entries += [e for _, e in known]
+        recent = np.append(recent, np.ones(len(known), dtype=bool))
+        wanted = entries[: len(entries) - len(known)] if gathering else entries
+        graph_ids = sorted({e.id for e in wanted if e.in_graph and e.id not in self._unsettled})
+        where = {landmark: n for n, landmark in enumerate(graph_ids)}
+        joint = predicted_joint(self._backend.joint(robot, graph_ids), motion)
+        compared = self._compare(seen, pairs, entries, joint, where, motion, track, time_ns)
+        return Image(
+            robot, time_ns, path_m, seen, pairs, tuple(entries), recent, joint, where, compared
+        )
+
+    def _has_identity(self, o: Observation) -> bool:
+        return o.identity is not None and self._config.identities == "use"
+
+    def _named(self, o: Observation) -> Entry | None:
+        """The landmark that bears the observation's identity."""
+        if not self._has_identity(o) or o.identity not in self.map.by_identity:
+            return None
+        return self.map.entries[self.map.by_identity[str(o.identity)]]
+
+    def _is_recent(self, entry: Entry, robot: str, path_m: float) -> bool:
+        return path_m - entry.path_m.get(robot, -np.inf) <= self._config.reacquire_m
+
+    def _compare(
+        self,
+        seen: Sequence[Observation],
+        pairs: Pairs,
+        entries: Sequence[Entry],
+        joint: Joint,
+        where: dict[int, int],
+        motion: Motion | None,
+        track: Track,
+        time_ns: int,
+    ) -> Compared:
+        """Distances of all candidate pairs.
+
+        A tentative landmark is known relative to the robot that saw it, so what separates it from
+        now is its own measurement noise and the motion since, not the robot's place in the world.
+        """
+        k = len(entries)
+        P_xx, P_xt, P_tt = (np.zeros((k, 3, 3)) for _ in range(3))
+        states = np.zeros((k, 3))
+        since: dict[int, Array] = {}
+        if motion is not None:
+            since[motion.start_ns] = rotate_cov(motion.cov, joint.pose[2] - motion.delta[2])
+        for n, entry in enumerate(entries):
+            if entry.id in where:
+                block = joint.slices[where[entry.id]]
+                size = block.stop - block.start
+                states[n, :size] = joint.landmarks[where[entry.id]]
+                P_xx[n] = joint.cov[:3, :3]
+                P_xt[n, :, :size] = joint.cov[:3, block]
+                P_tt[n, :size, :size] = joint.cov[block, block]
+            else:
+                if entry.last_ns not in since:
+                    moved = track.motion(entry.last_ns, time_ns)
+                    start_heading = joint.pose[2] - moved.delta[2]
+                    since[entry.last_ns] = rotate_cov(moved.cov, start_heading)
+                states[n], P_xx[n], P_tt[n] = entry.mean, since[entry.last_ns], entry.cov
+        return compare(seen, pairs, joint.pose, states, P_xx, P_xt, P_tt, self._floor)
+
+    def _choose(self, image: Image) -> dict[int, int]:
+        """Observation -> pair."""
+        config, pairs, compared = self._config, image.pairs, image.compared
+        known = np.array([self._has_identity(image.seen[i]) for i in pairs.observation], dtype=bool)
+        in_graph = np.array([e.in_graph for e in image.entries], dtype=bool)
+        gate = gate_distance(config.gate_probability, np.maximum(compared.dof, 1))
+
+        def best(which: BoolArray) -> dict[int, int]:
+            return _assign_pairs(pairs, compared, gate, which, len(image.seen), config.method)
+
+        # sightings of one image exclude each other: what a named one sees is taken
+        free = ~known & ~np.isin(pairs.landmark, pairs.landmark[known])
+        chosen = best(free & in_graph & image.recent)
+        # one that the back end does not have yet closes no loop
+        settled = np.array([e.id in image.where for e in image.entries], dtype=bool)
+        old = best(free & in_graph & ~image.recent & settled)
+        if self._closes_loop(image, list(old.values())):
+            chosen |= old
+            self.closures += 1
+        taken = np.array([int(i) in chosen for i in pairs.observation], dtype=bool)
+        chosen |= best(free & ~in_graph & ~taken)
+        return chosen | {int(pairs.observation[k]): int(k) for k in np.flatnonzero(known)}
+
+    def _closes_loop(self, image: Image, picks: list[int]) -> bool:
+        """Whether pairs with landmarks not seen for long are believed: only many, and together."""
+        if len(picks) < self._config.reacquire_min:
+            return False
+        slices = [image.joint.slices[image.where[image.entries[k].id]] for k in picks]
+        return fixes_pose(image.compared, picks) and jointly_compatible(
+            image.compared, picks, slices, image.joint.cov, self._config.gate_probability
+        )
+
+    def _book(self, image: Image, chosen: dict[int, int]) -> tuple[Association, ...]:
+        """Turn the choices into associations; make, promote and reject."""
+        pairs, compared, pose = image.pairs, image.compared, image.joint.pose
+        new_gate = gate_distance(self._config.new_probability, np.maximum(compared.dof, 1))
+        close = image.recent & (compared.d2 < new_gate)
+        out: list[Association] = []
+        for n, seen in enumerate(image.seen):
+            o = seen
+            if n in chosen:
+                k = chosen[n]
+                entry, model = image.entries[k], pairs.model[k]
+                o = flip(o) if pairs.flipped[k] else o
+                if entry.id in image.where or not entry.in_graph:
+                    self.innovations.setdefault(model, []).append(
+                        (image.time_ns, float(compared.d2[k] / compared.dof[k]))
+                    )
+            elif not self._has_identity(o) and np.any(close & (pairs.observation == n)):
+                self.rejected["between the thresholds: neither a match nor new"] += 1
+                continue
+            elif self._named(o) is not None:
+                self.rejected["identity: known as a landmark of another kind"] += 1
+                continue
+            else:
+                identity = o.identity if self._has_identity(o) else None
+                o = replace(o, identity=identity)
+                entry, model = self.map.add(o, pose, image.time_ns), o.kind
+            self.map.saw(entry, o, pose, image.time_ns, image.robot, image.path_m)
+            association = Association(
+                image.robot, image.time_ns, entry.id, model, o.z, o.cov, extent=o.extent
+            )
+            out += self._admit(entry, association, self._has_identity(o))
+        return tuple(out)
+
+    def _admit(self, entry: Entry, seen: Association, certain: bool) -> list[Association]:
+        """What enters the graph with this sighting: nothing, it alone, or all so far."""
+        if entry.in_graph:
+            return [seen]
+        entry.evidence.append(seen)
+        if not certain and entry.sightings < self._config.sightings_to_promote:
+            return []
+        entry.in_graph = True
+        self._unsettled.add(entry.id)
+        if entry.kind == "segment" and any(e.model != "segment" for e in entry.evidence):
+            entry.kind = "line"
+        waiting, entry.evidence = entry.evidence, []
+        return [replace(e, model=entry.kind, late=e.time_ns != seen.time_ns) for e in waiting]
+
+
+def _worth_comparing(
+    pairs: Pairs, entries: Sequence[Entry], recent: BoolArray, reacquire_min: int
+) -> BoolArray:
+    """Pairs (k,) whose joint marginal is worth its price.
+
+    Tentative landmarks need none. Of the graph's, the crudely nearest few per observation; old ones
+    only where enough observations have some, else no loop could be closed by them.
+    """
+    in_graph = np.array([e.in_graph for e in entries], dtype=bool)
+    keep = ~in_graph
+    old = in_graph & ~recent
+    if len(set(pairs.observation[old].tolist())) < reacquire_min:
+        old = np.zeros_like(old)
+    for group, limit in ((in_graph & recent, NEAREST_RECENT), (old, NEAREST_OLD)):
+        members = np.flatnonzero(group)
+        members = members[np.lexsort((pairs.miss[members], pairs.observation[members]))]
+        rank = np.arange(len(members)) - np.searchsorted(
+            pairs.observation[members], pairs.observation[members]
+        )
+        keep[members[rank < limit]] = True
+    return keep
+
+
+def _assign_pairs(
+    pairs: Pairs, compared: Compared, gate: Array, which: BoolArray, n: int, method: str
+) -> dict[int, int]:
+    """Observation -> pair among the pairs ``which``.
+
+    One-to-one first. Then a line may be seen in several parts (a pillar hides its middle): a
+    line observation left alone joins its nearest landmark even if that has one already.
+    """
+    use = np.flatnonzero(which & (compared.d2 < gate))
+    if not len(use):
+        return {}
+    columns = {int(j): c for c, j in enumerate(np.unique(pairs.landmark[use]))}
+    cost = np.full((n, len(columns)), np.inf)
+    limit = np.zeros_like(cost)
+    number = np.full(cost.shape, -1, dtype=np.int64)
+    for k in use:
+        cell = int(pairs.observation[k]), columns[int(pairs.landmark[k])]
+        cost[cell], limit[cell], number[cell] = compared.d2[k], gate[k], k
+    chosen = {i: int(number[i, c]) for i, c in assign(cost, limit, method)}
+    for k in use[np.argsort(compared.d2[use], kind="stable")]:
+        i = int(pairs.observation[k])
+        if i not in chosen and pairs.model[k] == "line":
+            chosen[i] = int(k)
+    return chosen
+
+
+__all__ = ["Associator", "predicted_joint"]

@@ -1,0 +1,332 @@
+"""Duplicates in a map: which landmarks are one and the same, and what that makes of the steps.
+
+A wall or a tree that was not recognised when it was seen again is in the map twice. With all data
+in, the joint covariance of the whole map says how far two landmarks may lie apart if they are one.
+Pairs are tied one after another, the most certain first, and every tie conditions the joint: what
+agrees with one tie must agree with the next. What one image showed as two things is never tied.
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from graphslam.core.gaussian import chi2_quantile
+from graphslam.core.geometry import Array, between, rotate_cov, wrap
+from graphslam.core.records import Association, Step
+from graphslam.estimation.backend import Joint
+from graphslam.mapping.landmark_map import Entry, LandmarkMap
+
+IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
+
+#: m, rad: by how much two images of one wall may differ beyond what the covariance says: across it,
+#: in direction, and in where its ends are; of one point the first, both ways
+FLOOR_M, FLOOR_RAD, FLOOR_END_M = 0.02, 0.015, 0.08
+#: share of the shorter wall that must lie beside the longer one
+OVERLAP_SHARE = 0.5
+#: walls farther apart (m across, rad) are not looked at, nor points
+REACH_M, REACH_RAD = 1.5, 0.3
+GATE_PROBABILITY = 0.95
+#: a tie waits while another that contradicts it is not worse by more than this (squared distance)
+RIVAL = 9.0
+
+
+@dataclass(slots=True, eq=False)
+class _Map:
+    """All landmarks: means (n, 3), joint covariance (3n, 3n), extents (n, 2).
+
+    ``whole`` (n,) segments whose ends are known; ``point`` (n,) points, with a heading of 0 that is
+    certain; ``group`` (n,) numbers what is tied already; ``apart`` (n, n) is true for different
+    things.
+    """
+
+    x: Array
+    P: Array
+    extents: Array
+    whole: BoolArray
+    point: BoolArray
+    group: IntArray
+    apart: BoolArray
+
+    def contradict(self, a: int, b: int) -> bool:
+        """Whether the groups of two landmarks hold things that are known to differ."""
+        return bool(
+            self.apart[np.ix_(self.group == self.group[a], self.group == self.group[b])].any()
+        )
+
+
+def partners(entries: Sequence[Entry], together: Iterable[frozenset[int]]) -> list[Entry]:
+    """Those landmarks that may have a duplicate, where they are: the others need no covariance.
+
+    Args:
+        entries: all of them.
+        together: pairs that one image showed side by side.
+    """
+    if len(entries) < 2:
+        return []
+    means = np.array([entry.mean for entry in entries])
+    means[[entry.kind == "point" for entry in entries], 2] = 0.0
+    near = np.concatenate(_near(_map(entries, means, np.zeros((0, 0)), together)))
+    return [entries[k] for k in np.unique(near)]
+
+
+def duplicates(
+    entries: Sequence[Entry], joint: Joint, together: Iterable[frozenset[int]]
+) -> list[tuple[int, int]]:
+    """Pairs of landmarks that are one and the same, the older first, the most certain first.
+
+    Args:
+        entries: landmarks, in the order of ``joint``.
+        joint: their means and joint covariance, world axes (the pose in front is not used).
+        together: pairs that one image showed side by side.
+    """
+    if len(entries) < 2:
+        return []
+    marks = _map(entries, *_padded(joint), together)
+    i, j = _near(marks)
+    found: list[tuple[int, int]] = []
+    while len(i):
+        r, H_i, H_j, rows = _compare(marks, i, j)
+        d2 = _distances(marks, i, j, r, H_i, H_j)
+        # what is out of its gate may come back in when a tie has moved the map
+        fits = d2 <= chi2_quantile(GATE_PROBABILITY, rows)
+        k = _next_tie(marks, i, j, d2, fits)
+        if k is None:
+            break
+        a, b = int(i[k]), int(j[k])
+        found.append((entries[a].id, entries[b].id))
+        _tie(marks, a, b, r[k, : rows[k]], H_i[k, : rows[k]], H_j[k, : rows[k]])
+        marks.group[marks.group == marks.group[b]] = marks.group[a]
+        open_still = marks.group[i] != marks.group[j]
+        i, j = i[open_still], j[open_still]
+    return [(min(pair), max(pair)) for pair in found]
+
+
+def _padded(joint: Joint) -> tuple[Array, Array]:
+    """Means (n, 3) and joint covariance (3n, 3n) of landmarks; the heading of points is 0."""
+    x = np.zeros((len(joint.landmarks), 3))
+    places: list[int] = []
+    for k, mean in enumerate(joint.landmarks):
+        x[k, : len(mean)] = mean
+        places += range(3 * k, 3 * k + len(mean))
+    P = np.zeros((x.size, x.size))
+    P[np.ix_(places, places)] = joint.cov[3:, 3:]
+    return x, P
+
+
+def _map(entries: Sequence[Entry], x: Array, P: Array, together: Iterable[frozenset[int]]) -> _Map:
+    """Landmarks, none tied yet; different names are of different things."""
+    place = {entry.id: k for k, entry in enumerate(entries)}
+    names = np.array([entry.identity or "" for entry in entries])
+    named = names != ""
+    apart = named[:, None] & named & (names[:, None] != names)
+    for pair in together:
+        if pair <= place.keys():
+            a, b = (place[number] for number in pair)
+            apart[a, b] = apart[b, a] = True
+    return _Map(
+        x,
+        P,
+        np.array([entry.extent for entry in entries]),
+        np.array([entry.kind == "segment" for entry in entries]),
+        np.array([entry.kind == "point" for entry in entries]),
+        np.arange(len(entries)),
+        apart,
+    )
+
+
+def _near(marks: _Map) -> tuple[IntArray, IntArray]:
+    """Pairs (m,) and (m,) that may be one landmark, as far as means and extents can tell."""
+    i, j = np.triu_indices(len(marks.x), 1)
+    points = marks.point[i]
+    near = (points == marks.point[j]) & ~marks.apart[i, j]
+    near[points] &= np.hypot(*(marks.x[j] - marks.x[i])[points, :2].T) < REACH_M
+    near[~points] &= _beside(marks, i[~points], j[~points])
+    return i[near], j[near]
+
+
+def _next_tie(marks: _Map, i: IntArray, j: IntArray, d2: Array, fits: BoolArray) -> int | None:
+    """The most certain pair that nothing contradicts, None when there is none."""
+    order = np.flatnonzero(fits)
+    for k in order[np.argsort(d2[order])]:
+        a, b = int(i[k]), int(j[k])
+        if marks.contradict(a, b):
+            continue
+        tied = (marks.group == marks.group[a]) | (marks.group == marks.group[b])
+        rival = fits & (tied[i] != tied[j]) & (d2 <= d2[k] + RIVAL)
+        outside = np.where(tied[i[rival]], j[rival], i[rival])
+        if not any(marks.apart[marks.group == marks.group[o]][:, tied].any() for o in outside):
+            return int(k)
+    return None
+
+
+def _relative(marks: _Map, i: IntArray, j: IntArray) -> tuple[Array, Array, Array, Array]:
+    """Wall j in the frame of wall i, (m,) each: along, across, turn; middle of the overlap."""
+    x, y = marks.x[i], marks.x[j]
+    c, s, d = np.cos(x[:, 2]), np.sin(x[:, 2]), y[:, :2] - x[:, :2]
+    along, across = c * d[:, 0] + s * d[:, 1], -s * d[:, 0] + c * d[:, 1]
+    low = np.maximum(marks.extents[i, 0], along + marks.extents[j, 0])
+    high = np.minimum(marks.extents[i, 1], along + marks.extents[j, 1])
+    return along, across, wrap(y[:, 2] - x[:, 2]), 0.5 * (low + high)
+
+
+def _beside(marks: _Map, i: IntArray, j: IntArray) -> BoolArray:
+    """Which pairs (m,) are near, about parallel, and share much of their length."""
+    along, across, turn, middle = _relative(marks, i, j)
+    a, b = marks.extents[i], marks.extents[j] + along[:, None]
+    shared = np.minimum(a[:, 1], b[:, 1]) - np.maximum(a[:, 0], b[:, 0])
+    shorter = np.minimum(a[:, 1] - a[:, 0], b[:, 1] - b[:, 0])
+    off = across + (middle - along) * turn
+    near = (np.abs(turn) < REACH_RAD) & (np.abs(off) < REACH_M)
+    return np.asarray(near & (shared >= OVERLAP_SHARE * shorter))
+
+
+def _compare(marks: _Map, i: IntArray, j: IntArray) -> tuple[Array, Array, Array, IntArray]:
+    """How pairs (m,) differ, with Jacobians (m, 3, 3) by either one, and how many rows count.
+
+    Rows: distance across where both are, direction, and for whole walls where their middles are;
+    of points along x and y.
+    """
+    along, across, turn, middle = _relative(marks, i, j)
+    c, s = np.cos(marks.x[i, 2]), np.sin(marks.x[i, 2])
+    zero, one, arm = np.zeros(len(i)), np.ones(len(i)), middle - along
+    ends = along + marks.extents[j].mean(axis=1) - marks.extents[i].mean(axis=1)
+    r = np.stack([across + arm * turn, turn, ends], axis=1)
+
+    def rows_of(*rows: Sequence[Array]) -> Array:
+        return np.stack([np.stack(row, axis=1) for row in rows], axis=1)
+
+    H_i = rows_of(
+        [s + turn * c, -c + turn * s, -along - arm - turn * across],
+        [zero, zero, -one],
+        [-c, -s, across],
+    )
+    H_j = rows_of([-s - turn * c, c - turn * s, arm], [zero, zero, one], [c, s, zero])
+    unknown = ~(marks.whole[i] & marks.whole[j])
+    r[unknown, 2] = 0.0  # a row of zeros says nothing
+    H_i[unknown, 2] = H_j[unknown, 2] = 0.0
+    points = marks.point[i]
+    r[points, :2] = (marks.x[j] - marks.x[i])[points, :2]
+    H_i[points], H_j[points] = np.diag([-1.0, -1.0, 0.0]), np.diag([1.0, 1.0, 0.0])
+    return r, H_i, H_j, np.where(unknown, 2, 3)
+
+
+#: what two images differ by at least, of walls and of points
+_FLOORS = np.array([
+    np.diag([FLOOR_M**2, FLOOR_RAD**2, FLOOR_END_M**2]),
+    np.diag([FLOOR_M**2, FLOOR_M**2, FLOOR_END_M**2]),
+])  # fmt: skip
+
+
+def _distances(marks: _Map, i: IntArray, j: IntArray, r: Array, H_i: Array, H_j: Array) -> Array:
+    """Squared Mahalanobis distances (m,), over the rows that count."""
+    P, floor = marks.P, _FLOORS[marks.point[i].astype(np.intp)]
+    blocks = P.reshape(len(P) // 3, 3, -1, 3).transpose(0, 2, 1, 3)
+    cross = H_i @ blocks[i, j] @ H_j.mT
+    S = H_i @ blocks[i, i] @ H_i.mT + H_j @ blocks[j, j] @ H_j.mT + cross + cross.mT + floor
+    return np.asarray(np.sum(r * np.linalg.solve(S, r[..., None])[..., 0], axis=1))
+
+
+def _tie(marks: _Map, a: int, b: int, r: Array, H_a: Array, H_b: Array) -> None:
+    """Condition the joint on two landmarks being one: a Kalman update, ``r`` (k,) measured 0."""
+    P, floor = marks.P, _FLOORS[int(marks.point[a])]
+    PHt = P[:, 3 * a : 3 * a + 3] @ H_a.T + P[:, 3 * b : 3 * b + 3] @ H_b.T
+    S = H_a @ PHt[3 * a : 3 * a + 3] + H_b @ PHt[3 * b : 3 * b + 3] + floor[: len(r), : len(r)]
+    L = np.linalg.cholesky(S)
+    B = np.linalg.solve(L, PHt.T)
+    marks.x -= (B.T @ np.linalg.solve(L, r)).reshape(-1, 3)
+    P -= B.T @ B
+
+
+# ---------------------------------------------------------------- what it makes of steps and map
+
+
+def seen_together(steps: Iterable[Step]) -> set[frozenset[int]]:
+    """Pairs of landmarks that one robot saw from one state, as two things.
+
+    Two lines that an image has in line with each other may be parts of one wall, with a door
+    between them. Of many images of one wall some have its parts out of line, by their noise; what
+    most have is believed.
+    """
+    images: dict[tuple[str, int], list[Association]] = {}
+    for step in steps:
+        for a in step.associations:
+            if isinstance(a.target, int):
+                images.setdefault((a.robot, a.time_ns), []).append(a)
+    pairs = [(a, b) for seen in images.values() for a, b in combinations(seen, 2)]
+    pairs = [(a, b) for a, b in pairs if a.target != b.target]
+    lines = np.array([a.model == b.model == "line" for a, b in pairs], dtype=bool)
+    weight = np.where(lines, 1, len(pairs))  # segments end where they were seen to end
+    of_lines = [pair for pair, both in zip(pairs, lines, strict=True) if both]
+    weight[lines] = np.where(_in_line(of_lines), -1, 1)
+    votes: Counter[frozenset[int]] = Counter()
+    for (a, b), vote in zip(pairs, weight.tolist(), strict=True):
+        if isinstance(a.target, int) and isinstance(b.target, int):
+            votes[frozenset((a.target, b.target))] += vote
+    return {pair for pair, sum_of_votes in votes.items() if sum_of_votes > 0}
+
+
+def _in_line(pairs: Sequence[tuple[Association, Association]]) -> BoolArray:
+    """Which pairs (m,) of lines of one image each may lie on one straight line, by their noise."""
+    if not pairs:
+        return np.zeros(0, dtype=bool)
+    z = np.array([[a.z, b.z] for a, b in pairs])
+    cov = np.array([[a.cov, b.cov] for a, b in pairs])
+    # as each is seen along itself; the first column is the offset across it
+    own = rotate_cov(cov, -z[..., 2])
+    off = between(z[:, 0], z[:, 1])
+    turn = np.arctan(np.tan(off[:, 2]))  # a wall has no direction
+    variance = own[:, :, 2, 2].sum(axis=1) + FLOOR_RAD**2
+    across = own[:, :, 1, 1].sum(axis=1) + (off[:, 0] ** 2) * own[:, 0, 2, 2] + FLOOR_M**2
+    gate = chi2_quantile(GATE_PROBABILITY, 1)
+    return np.asarray((turn**2 <= gate * variance) & (off[:, 1] ** 2 <= gate * across))
+
+
+def merge_targets(pairs: Iterable[tuple[int, int]]) -> dict[int, int]:
+    """Landmark that goes -> landmark that it becomes: the oldest of all that are one."""
+    into: dict[int, int] = {}
+
+    def last(i: int) -> int:
+        return last(into[i]) if i in into else i
+
+    for pair in pairs:
+        a, b = sorted(map(last, pair))
+        if a != b:
+            into[b] = a
+    return {gone: last(gone) for gone in into}
+
+
+def merged_steps(
+    steps: Iterable[Step], into: Mapping[int, int], kinds: Mapping[int, str]
+) -> tuple[Step, ...]:
+    """Steps with landmarks renamed; what was seen of a segment that becomes a line is a line's."""
+
+    def renamed(a: Association) -> Association:
+        target = into.get(a.target) if isinstance(a.target, int) else None
+        if target is None:
+            return a
+        line = a.model == "segment" and kinds[target] == "line"
+        return replace(a, target=target, model="line" if line else a.model)
+
+    return tuple(
+        replace(step, associations=tuple(renamed(a) for a in step.associations)) for step in steps
+    )
+
+
+def merge_entries(landmarks: LandmarkMap, into: Mapping[int, int]) -> None:
+    """Book in the map what merging makes of extents, counts and times."""
+    for gone, kept in into.items():
+        old, new = landmarks.entries.pop(gone), landmarks.entries[kept]
+        relative = between(new.mean, old.mean)
+        ends = relative[0] + np.cos(relative[2]) * old.extent
+        if new.kind == "line":
+            new.extent = np.array([min(new.extent[0], ends.min()), max(new.extent[1], ends.max())])
+        if old.identity is not None and new.identity is None:
+            new.identity = old.identity
+            landmarks.by_identity[old.identity] = kept
+        new.sightings += old.sightings
+        new.first_ns = min(new.first_ns, old.first_ns)
+        new.last_ns = max(new.last_ns, old.last_ns)

@@ -1,0 +1,303 @@
+"""Which observation belongs to which landmark: gate, assign, reject with a reason.
+
+Thesis 3.21-3.25 (a variant of the nearest neighbour standard filter) and section 4.6 (new objects
+between two thresholds). Pure functions on arrays; what is known about the landmarks comes in as
+`Candidates`, made by `graphslam.mapping.landmark_map`.
+"""
+
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from graphslam.core.config import AssociationConfig
+from graphslam.core.gaussian import chi2_quantile
+from graphslam.core.geometry import Array, between, compose, wrap
+from graphslam.core.observation_models import MODELS
+from graphslam.core.records import Observation
+
+IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
+
+#: rad: lines that differ more in direction are never compared, however uncertain the heading
+MAX_ANGLE_RAD = 0.6
+#: m, rad: scale of how far a right pair is apart before any covariance is known
+TYPICAL_M, TYPICAL_RAD = 0.1, 0.05
+#: m: lengths of a segment seen whole twice agree within this; else only its line is used
+LENGTH_TOLERANCE_M = 0.15
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pairs:
+    """Candidate pairs (k,) of observation and landmark that passed the cheap gates.
+
+    ``model`` names the row of `MODELS` per pair; ``flipped``: the measured direction is to be
+    turned by pi before it is compared (eq. 3.24). ``miss`` is a crude distance, without covariance:
+    how many times `TYPICAL_M` and `TYPICAL_RAD` the two are apart.
+    """
+
+    observation: IntArray
+    landmark: IntArray
+    model: tuple[str, ...]
+    flipped: BoolArray
+    miss: Array
+
+    def only(self, keep: BoolArray) -> "Pairs":
+        """The pairs for which ``keep`` (k,) holds."""
+        models = tuple(m for m, k in zip(self.model, keep, strict=True) if k)
+        return Pairs(
+            self.observation[keep], self.landmark[keep], models, self.flipped[keep], self.miss[keep]
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Compared:
+    """Squared Mahalanobis distances (k,) of pairs, with what a joint test needs.
+
+    ``residuals``, ``H_x`` and ``H_t`` hold one array per pair.
+    """
+
+    d2: Array
+    dof: IntArray
+    residuals: tuple[Array, ...]
+    H_x: tuple[Array, ...]
+    H_t: tuple[Array, ...]
+    noise: tuple[Array, ...]
+
+
+def gate_distance(probability: float, dof: IntArray | int) -> Array:
+    """Chi-square quantiles, shaped like ``dof``: what a true pair's d² (0-d or (k,)) stays below.
+
+    Thesis eq. 3.25; 1 to 9 degrees of freedom.
+    """
+    return np.asarray(_quantiles(probability)[np.asarray(dof) - 1])
+
+
+@functools.cache
+def _quantiles(probability: float) -> Array:
+    """Chi-square quantiles (9,) of 1 to 9 degrees of freedom."""
+    return np.asarray(chi2_quantile(probability, range(1, 10)))
+
+
+def flip(seen: Observation) -> Observation:
+    """The same line described in the opposite direction."""
+    assert seen.extent is not None
+    z = np.array([seen.z[0], seen.z[1], wrap(seen.z[2] + np.pi)])
+    return Observation(seen.kind, z, seen.cov, -seen.extent[::-1], seen.identity)
+
+
+def candidate_pairs(
+    seen: Sequence[Observation],
+    pose: Array,
+    means: Array,
+    extents: Array,
+    is_point: BoolArray,
+    whole: BoolArray,
+    config: AssociationConfig,
+) -> Pairs:
+    """Pairs that pass the gates that need no covariance: distance, direction, overlap.
+
+    Args:
+        seen: n observations in the robot's base frame.
+        pose: predicted pose (3,) of the robot, world frame.
+        means: landmarks (m, 3), world frame; the heading of points is ignored.
+        extents: (m, 2) where each line begins and ends along its own x axis, m.
+        is_point: (m,) points rather than lines.
+        whole: (m,) segments whose both ends are known.
+        config: gates.
+
+    Returns:
+        The candidate pairs, sorted by observation.
+    """
+    if not len(seen) or not len(means):
+        nothing = np.zeros(0, np.int64)
+        return Pairs(nothing, nothing, (), np.zeros(0, bool), np.zeros(0))
+    points = np.array([o.kind == "point" for o in seen])
+    world = np.zeros((len(seen), 3))
+    ends = np.zeros((len(seen), 2))
+    for n, o in enumerate(seen):
+        if points[n]:
+            world[n, :2] = MODELS["point"].invert(o.z, pose)
+        else:
+            world[n] = compose(pose, o.z)
+            ends[n] = o.extent if o.extent is not None else 0.0
+    both_points = points[:, None] & is_point[None]
+    both_lines = ~points[:, None] & ~is_point[None]
+    # the landmark's origin and direction as seen from each observation
+    relative = between(world[:, None], means[None])
+    turned = wrap(relative[..., 2])
+    flipped = np.zeros_like(turned, dtype=bool)
+    if not config.directed:
+        flipped = both_lines & (np.abs(turned) > np.pi / 2)
+        turned = np.where(flipped, wrap(turned + np.pi), turned)
+    # the observed middle in the landmark's frame: along the line, and its distance from it
+    middle = between(means[None], world[:, None])
+    begin = middle[..., 0] + np.cos(middle[..., 2]) * ends[:, None, 0]
+    end = middle[..., 0] + np.cos(middle[..., 2]) * ends[:, None, 1]
+    begin, end = np.minimum(begin, end), np.maximum(begin, end)
+    gap = np.maximum(begin - extents[None, :, 1], extents[None, :, 0] - end)
+    line_ok = (
+        (np.abs(middle[..., 1]) < config.max_distance_m)
+        & (np.abs(turned) < MAX_ANGLE_RAD)
+        & (gap < config.overlap_gap_m)
+    )
+    near = np.hypot(middle[..., 0], middle[..., 1]) < config.max_distance_m
+    i, j = np.nonzero((both_points & near) | (both_lines & line_ok))
+    length = ends[:, 1] - ends[:, 0]
+    known = extents[:, 1] - extents[:, 0]
+    models = tuple(
+        "point"
+        if points[a]
+        else "segment"
+        if seen[a].kind == "segment" and whole[b] and abs(length[a] - known[b]) < LENGTH_TOLERANCE_M
+        else "line"
+        for a, b in zip(i.tolist(), j.tolist(), strict=True)
+    )
+    across, turn = middle[i, j, 1] / TYPICAL_M, turned[i, j] / TYPICAL_RAD
+    apart = np.hypot(middle[i, j, 0], middle[i, j, 1]) / TYPICAL_M
+    miss = np.where(is_point[j], apart, np.hypot(across, turn))
+    return Pairs(i.astype(np.int64), j.astype(np.int64), models, flipped[i, j], miss)
+
+
+def compare(
+    seen: Sequence[Observation],
+    pairs: Pairs,
+    pose: Array,
+    states: Array,
+    P_xx: Array,
+    P_xt: Array,
+    P_tt: Array,
+    floor: Mapping[str, Array],
+) -> Compared:
+    """Squared Mahalanobis distance of each pair, eq. 3.22, vectorised over pairs of one model.
+
+    Args:
+        seen: observations in the base frame.
+        pairs: k candidate pairs.
+        pose: predicted pose (3,).
+        states: landmark estimate (k, 3) of each pair; the third entry of a point is not used.
+        P_xx: covariance (k, 3, 3) of the pose, P_xt: (k, 3, 3) cross covariance with the
+            landmark, P_tt: (k, 3, 3) of the landmark; world axes, points padded with zeros.
+        P_xt: see P_xx.
+        P_tt: see P_xx.
+        floor: model name -> covariance (rows, rows) added to every innovation: what the models
+            leave out (walls that are not flat, stamps that are not exact). It widens the gates and
+            never enters the estimate.
+    """
+    k = len(pairs.observation)
+    d2, dof = np.full(k, np.inf), np.zeros(k, dtype=np.int64)
+    residuals: list[Array] = [np.zeros(0)] * k
+    H_xs: list[Array] = [np.zeros((0, 3))] * k
+    H_ts: list[Array] = [np.zeros((0, 3))] * k
+    noises: list[Array] = [np.zeros((0, 0))] * k
+    oriented = [
+        flip(seen[i]) if f else seen[i]
+        for i, f in zip(pairs.observation, pairs.flipped, strict=True)
+    ]
+    for name in sorted(set(pairs.model)):
+        model = MODELS[name]
+        which = np.array([n for n, m in enumerate(pairs.model) if m == name])
+        z = np.array([oriented[n].z for n in which])
+        cov = np.array([oriented[n].cov for n in which])
+        t = states[which][:, : model.dim]
+        x = np.broadcast_to(pose, (len(which), 3))
+        r = model.residual(z, x, t)
+        R = model.noise(z, cov, x, t) + floor[name]
+        H_x, H_t = model.jacobians(z, x, t)
+        tt, xt = P_tt[which][:, : model.dim, : model.dim], P_xt[which][:, :, : model.dim]
+        cross = H_x @ xt @ H_t.mT
+        S = H_x @ P_xx[which] @ H_x.mT + cross + cross.mT + H_t @ tt @ H_t.mT + R
+        d2[which] = np.einsum("ki,ki->k", r, np.linalg.solve(S, r[..., None])[..., 0])
+        dof[which] = model.rows
+        for place, n in enumerate(which):
+            residuals[n], noises[n] = r[place], R[place]
+            H_xs[n], H_ts[n] = H_x[place], H_t[place]
+    return Compared(d2, dof, tuple(residuals), tuple(H_xs), tuple(H_ts), tuple(noises))
+
+
+def assign(cost: Array, gate: Array, method: str) -> list[tuple[int, int]]:
+    """One-to-one assignment of observations (rows) to landmarks (columns).
+
+    Args:
+        cost: squared distances (n, m), inf where a pair is impossible.
+        gate: largest acceptable cost per pair (n, m).
+        method: `optimal` minimises the sum of costs, leaving a row alone costing its gate (the
+            NNSF of thesis 3.21); `greedy` takes the smallest element, strikes its row and column,
+            and repeats (the thesis' fast variant).
+
+    Returns:
+        Pairs (row, column), sorted by row.
+    """
+    allowed = np.where(cost < gate, cost, np.inf)
+    n, m = allowed.shape
+    if not np.isfinite(allowed).any():
+        return []
+    if method == "greedy":
+        found = []
+        left = allowed.copy()
+        while np.isfinite(left).any():
+            i, j = divmod(int(np.argmin(left)), m)
+            found.append((i, j))
+            left[i, :], left[:, j] = np.inf, np.inf
+        return sorted(found)
+    # one private column per row stands for "belongs to none": so the problem is always feasible
+    alone = np.full((n, n), np.inf)
+    finite_gate = np.where(np.isfinite(allowed), gate, 0.0).max(axis=1)
+    np.fill_diagonal(alone, finite_gate)
+    big = 1e9
+    table = np.concatenate([np.where(np.isfinite(allowed), allowed, big), alone], axis=1)
+    rows, columns = linear_sum_assignment(np.where(np.isfinite(table), table, big))
+    return [
+        (int(i), int(j))
+        for i, j in zip(rows, columns, strict=True)
+        if j < m and np.isfinite(allowed[i, j])
+    ]
+
+
+def jointly_compatible(
+    compared: Compared,
+    chosen: Sequence[int],
+    slices: Sequence[slice],
+    P: Array,
+    probability: float,
+) -> bool:
+    """Whether several pairs agree *together*: their stacked innovation under its own covariance.
+
+    Individually compatible pairs may contradict each other: a false closure usually consists of
+    such. (Neira, Tardós: joint compatibility, DOI 10.1109/70.976019.)
+
+    Args:
+        compared: the pairs.
+        chosen: which of them.
+        slices: for each chosen pair, where its landmark lies in ``P``.
+        P: joint covariance (D, D), pose first.
+        probability: of the chi-square gate.
+    """
+    r = np.concatenate([compared.residuals[k] for k in chosen])
+    H = np.zeros((len(r), len(P)))
+    R = np.zeros((len(r), len(r)))
+    row = 0
+    for k, where in zip(chosen, slices, strict=True):
+        rows = slice(row, row + len(compared.residuals[k]))
+        H[rows, :3], H[rows, where] = compared.H_x[k], compared.H_t[k]
+        R[rows, rows] = compared.noise[k]
+        row = rows.stop
+    d2 = float(r @ np.linalg.solve(H @ P @ H.T + R, r))
+    return d2 < float(chi2_quantile(probability, len(r)))
+
+
+def fixes_pose(compared: Compared, chosen: Sequence[int]) -> bool:
+    """Whether the chosen pairs determine the robot's whole pose.
+
+    Parallel walls, or a single point, leave a direction free. The information that the pairs
+    alone give about the pose must be regular: its weakest direction of position is known to
+    better than 0.2 m (two walls that differ by 5° in direction just miss it).
+    """
+    info = np.zeros((3, 3))
+    for k in chosen:
+        H = compared.H_x[k]
+        info += H.T @ np.linalg.solve(compared.noise[k], H)
+    position = info[:2, :2] - np.outer(info[:2, 2], info[2, :2]) / max(info[2, 2], 1e-12)
+    return bool(np.linalg.eigvalsh(position)[0] > 1 / 0.2**2)

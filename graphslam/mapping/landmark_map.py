@@ -1,0 +1,202 @@
+"""What the pipeline knows about landmarks beside their estimate: kind, extent, sightings, age.
+
+A landmark is *tentative* until it has been seen often enough; only then does it enter the graph,
+together with its earlier sightings. Estimates are copies, refreshed from the back end when they
+may have changed: reading them is much of an incremental smoother's cost.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from graphslam.core.geometry import Array, between, compose
+from graphslam.core.observation_models import MODELS
+from graphslam.core.records import Association, Estimate, Observation, Step
+from graphslam.estimation.backend import Backend
+from graphslam.mapping.gating import BoolArray, IntArray
+
+
+@dataclass(slots=True, eq=False)
+class Entry:
+    """One landmark, tentative or in the graph.
+
+    ``mean`` (3,) world frame (heading 0 for points); ``extent`` (2,) along its x axis, m;
+    ``cov`` (3, 3) of a tentative one relative to the robot that saw it; ``path_m[robot]`` is how
+    far the robot had driven when it last saw it; ``evidence`` the associations that wait.
+    """
+
+    id: int
+    kind: str
+    mean: Array
+    cov: Array
+    extent: Array
+    first_ns: int
+    last_ns: int
+    identity: str | None
+    sightings: int = 0
+    in_graph: bool = False
+    path_m: dict[str, float] = field(default_factory=dict)
+    evidence: list[Association] = field(default_factory=list)
+
+    def extent_at(self, mean: Array) -> Array:
+        """The extent (2,) at another estimate (2,) or (3,).
+
+        That of a line stays where it is in the world, as its origin may slide along it by metres;
+        a segment brings its own along. Where the wall itself has moved, see `LandmarkMap.follow`.
+        """
+        return self.extent - between(self.mean, mean)[0] if self.kind == "line" else self.extent
+
+    def move(self, mean: Array) -> None:
+        """A new estimate (2,) or (3,)."""
+        self.extent = self.extent_at(mean)
+        self.mean[: len(mean)] = mean
+
+
+class LandmarkMap:
+    """All landmarks by number, with arrays over them for the vectorised gates."""
+
+    def __init__(self) -> None:
+        self.entries: dict[int, Entry] = {}
+        self.by_identity: dict[str, int] = {}
+        self.deleted = 0
+        self._next = 0
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    def graph_ids(self) -> list[int]:
+        """Numbers of the landmarks in the graph."""
+        return [i for i, entry in self.entries.items() if entry.in_graph]
+
+    def arrays(self) -> tuple[IntArray, Array, Array, BoolArray, BoolArray]:
+        """Numbers (m,), means (m, 3), extents (m, 2), flags (m,): points, whole segments."""
+        entries = list(self.entries.values())
+        m = len(entries)
+        return (
+            np.array([e.id for e in entries], dtype=np.int64),
+            np.array([e.mean for e in entries]).reshape(m, 3),
+            np.array([e.extent for e in entries]).reshape(m, 2),
+            np.array([e.kind == "point" for e in entries], dtype=bool),
+            np.array([e.kind == "segment" for e in entries], dtype=bool),
+        )
+
+    def add(self, seen: Observation, pose: Array, time_ns: int) -> Entry:
+        """A new tentative landmark from an observation made at ``pose`` (3,), in its frame."""
+        model = MODELS[seen.kind]
+        mean, extent = np.zeros(3), np.zeros(2)
+        state = model.invert(seen.z, pose)
+        mean[: len(state)] = state
+        cov = np.zeros((3, 3))
+        _, G_z = model.invert_jacobians(seen.z, pose)
+        cov[: len(state), : len(state)] = G_z @ seen.cov @ G_z.T
+        if seen.extent is not None:
+            extent = seen.extent.copy()
+        entry = Entry(self._next, seen.kind, mean, cov, extent, time_ns, time_ns, seen.identity)
+        self.entries[entry.id] = entry
+        if seen.identity is not None:
+            self.by_identity[seen.identity] = entry.id
+        self._next += 1
+        return entry
+
+    def saw(
+        self, entry: Entry, seen: Observation, pose: Array, time_ns: int, robot: str, path_m: float
+    ) -> None:
+        """Book a sighting: count it and let the extent grow to what was seen.
+
+        ``seen`` is in the base frame of the robot's ``pose`` (3,), which is in the world frame;
+        ``path_m`` is how far ``robot`` has driven.
+        """
+        entry.sightings += 1
+        entry.last_ns = max(entry.last_ns, time_ns)
+        entry.path_m[robot] = path_m
+        if seen.extent is not None and entry.kind != "point":
+            relative = between(entry.mean, compose(pose, seen.z))
+            ends = relative[0] + np.cos(relative[2]) * seen.extent
+            # a segment seen whole keeps its own ends; a line grows
+            if entry.kind == "line" or entry.sightings == 1:
+                entry.extent = np.array(
+                    [min(entry.extent[0], ends.min()), max(entry.extent[1], ends.max())]
+                )
+
+    def refresh(self, backend: Backend, ids: list[int]) -> None:
+        """Copy the back end's current estimates of these landmarks."""
+        for i, mean in zip(ids, backend.landmark_means(ids), strict=True):
+            self.entries[i].move(mean)
+
+    def follow(self, steps: Sequence[Step], estimate: Estimate) -> None:
+        """Move to an estimate of steps; what nothing was seen of any more leaves the map.
+
+        Lines extend over what was seen of them, as it now lies: a map that is drawn straight takes
+        them along, by metres where a loop is closed.
+        """
+        for number, entry in list(self.entries.items()):
+            if number in estimate.landmarks:
+                entry.move(estimate.landmarks[number][0])
+            elif entry.in_graph:
+                del self.entries[number]
+        for number, extent in seen_extents(steps, estimate).items():
+            entry = self.entries[number]
+            if entry.kind == "line":  # a segment was seen whole, and brings its ends along
+                entry.extent = extent
+
+    def split(self, number: int, new: int) -> None:
+        """What was taken for one landmark is two: ``new`` looks like ``number`` for now."""
+        old = self.entries[number]
+        self.entries[new] = replace(
+            old, id=new, mean=old.mean.copy(), extent=old.extent.copy(), identity=None
+        )
+        self._next = max(self._next, new + 1)
+
+    def in_worlds(self, worlds: Mapping[int, Array]) -> "LandmarkMap":
+        """The same map after the frame of each landmark was put at ``worlds[id]`` (3,)."""
+        moved = LandmarkMap()
+        for i, entry in self.entries.items():
+            moved.entries[i] = replace(entry, mean=compose(worlds[i], entry.mean))
+        return moved
+
+    def expire(self, time_ns: int, robot: str, path_m: float, age_ns: int, age_m: float) -> None:
+        """Delete tentative landmarks that this robot has not seen for long, in time *and* path."""
+        gone = [
+            i
+            for i, e in self.entries.items()
+            if not e.in_graph
+            and robot in e.path_m
+            and time_ns - e.last_ns > age_ns
+            and path_m - e.path_m[robot] > age_m
+        ]
+        for i in gone:
+            del self.entries[i]
+        self.deleted += len(gone)
+
+
+def observed_from(seen: Sequence[Association], estimate: Estimate) -> Array:
+    """Estimated states (n, 3) from which associations were made."""
+    poses = np.empty((len(seen), 3))
+    robots, times = np.array([a.robot for a in seen]), np.array([a.time_ns for a in seen])
+    for robot, states in estimate.states.items():
+        own = robots == robot
+        poses[own] = states.poses[np.searchsorted(states.stamps_ns, times[own])]
+    return poses
+
+
+def seen_extents(steps: Sequence[Step], estimate: Estimate) -> dict[int, Array]:
+    """From where to where walls were seen in all, (2,) m along the x axis of each, by number."""
+    seen = [
+        a
+        for step in steps
+        for a in step.associations
+        if a.extent is not None and a.target in estimate.landmarks
+    ]
+    if not seen:
+        return {}
+    walls, wall = np.unique([int(a.target) for a in seen], return_inverse=True)
+    means = np.array([estimate.landmarks[int(number)][0] for number in walls])
+    world = compose(observed_from(seen, estimate), np.array([a.z for a in seen]))
+    relative = between(means[wall], world)
+    ends = relative[:, :1] + np.cos(relative[:, 2:]) * np.array([a.extent for a in seen])
+    ends.sort(axis=1)  # a wall may be described the other way round
+    low, high = np.full(len(walls), np.inf), np.full(len(walls), -np.inf)
+    np.minimum.at(low, wall, ends[:, 0])
+    np.maximum.at(high, wall, ends[:, 1])
+    return dict(zip(walls.tolist(), np.column_stack([low, high]), strict=True))

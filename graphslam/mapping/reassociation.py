@@ -1,0 +1,127 @@
+"""All observations of walls anew: each to the wall that it fits best, now that everything is known.
+
+On the way an observation went to what the map was then; of a wall that was drawn elsewhere, or
+drawn twice, it may have gone to the wrong one. What fits no wall any more belongs to none.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphslam.core.geometry import Array, compose, wrap
+from graphslam.core.records import Association, Estimate, Step
+from graphslam.mapping.landmark_map import Entry, observed_from
+
+#: m across, rad: how well an observation fits its own wall as a rule: the unit of competition
+SIGMA_M, SIGMA_RAD = 0.03, 0.02
+#: squared distance by which another wall must be better than the present one
+BETTER = 4.0
+#: m beyond the ends of a wall at which the middle of an observation may lie
+BEYOND_M = 0.3
+#: observations compared with all walls at once
+CHUNK = 2000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reassociated:
+    """Steps, and how many observations went to another wall, or to none."""
+
+    steps: tuple[Step, ...]
+    moved: int
+    dropped: int
+
+
+def reassociate(
+    steps: Sequence[Step],
+    estimate: Estimate,
+    entries: Mapping[int, Entry],
+    gate_m: float,
+    gate_rad: float,
+) -> Reassociated:
+    """Observations of lines and segments with the walls that they fit best.
+
+    Args:
+        steps: as recorded.
+        estimate: of their states and landmarks.
+        entries: kinds, means and extents of the landmarks, as estimated.
+        gate_m: how far off a wall the middle of an observation may lie.
+        gate_rad: how far its direction may differ.
+    """
+    walls = [e for i, e in entries.items() if i in estimate.landmarks and e.kind != "point"]
+    place = {e.id: k for k, e in enumerate(walls)}
+    seen = [a for step in steps for a in step.associations if a.target in place]
+    if not seen:
+        return Reassociated(tuple(steps), 0, 0)
+    world = compose(observed_from(seen, estimate), np.array([a.z for a in seen]))
+    own = np.array([place[a.target] for a in seen if isinstance(a.target, int)])
+    best = np.concatenate([
+        _best(world[k : k + CHUNK], own[k : k + CHUNK], walls, gate_m, gate_rad)
+        for k in range(0, len(seen), CHUNK)
+    ])  # fmt: skip
+    best = _exclusive(seen, own, best)
+    new = {
+        id(a): None if b < 0 else _retarget(a, walls[b]) for a, b in zip(seen, best, strict=True)
+    }
+    made = tuple(
+        replace(
+            step,
+            associations=tuple(
+                b for a in step.associations if (b := new.get(id(a), a)) is not None
+            ),
+        )
+        for step in steps
+    )
+    return Reassociated(made, int(((best != own) & (best >= 0)).sum()), int((best < 0).sum()))
+
+
+def _best(
+    seen: Array, own: Array, walls: Sequence[Entry], gate_m: float, gate_rad: float
+) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+    """For observed middles and directions (n, 3) in the world the fitting wall, -1 for none."""
+    means, extents = np.array([e.mean for e in walls]), np.array([e.extent for e in walls])
+    c, s = np.cos(means[:, 2]), np.sin(means[:, 2])
+    dx, dy = seen[:, None, 0] - means[:, 0], seen[:, None, 1] - means[:, 1]
+    along, across = c * dx + s * dy, c * dy - s * dx
+    turn = wrap(seen[:, None, 2] - means[:, 2])
+    fits = (
+        (np.abs(across) <= gate_m)
+        & (np.abs(turn) <= gate_rad)
+        & (along >= extents[:, 0] - BEYOND_M)
+        & (along <= extents[:, 1] + BEYOND_M)
+    )
+    d2 = np.where(fits, (across / SIGMA_M) ** 2 + (turn / SIGMA_RAD) ** 2, np.inf)
+    rows = np.arange(len(seen))
+    best = d2.argmin(axis=1)
+    stays = ~(d2[rows, best] + BETTER < d2[rows, own])
+    best = np.where(stays, own, best)
+    return np.where(np.isfinite(d2[rows, best]), best, -1)
+
+
+def _exclusive(seen: Sequence[Association], own: Array, best: Array) -> Array:
+    """No wall twice in one image: who comes anew to a wall that another one has stays where it was.
+
+    Args:
+        seen: the observations.
+        own: (n,) walls that they had.
+        best: (n,) walls that they fit best, -1 for none.
+    """
+    taken: dict[tuple[str, int, int], int] = {}
+    order = np.argsort(best != own, kind="stable")  # those that stay choose first
+    out = best.copy()
+    for k in order:
+        wall = int(best[k])
+        if wall < 0:
+            continue
+        key = seen[k].robot, seen[k].time_ns, wall
+        if key in taken and best[k] != own[k]:
+            out[k] = own[k]
+        taken[key] = int(k)
+    return out
+
+
+def _retarget(a: Association, wall: Entry) -> Association:
+    if a.target == wall.id:
+        return a
+    line = a.model == "segment" and wall.kind == "line"
+    return replace(a, target=wall.id, model="line" if line else a.model, late=False)

@@ -1,0 +1,127 @@
+"""Landmarks taken apart where a robot came back to them, and put together again.
+
+What was tied on the way, when little was known, may be tied wrongly: one of two parallel walls is
+taken for the other, and the whole map follows. So loops are judged and closed with every visit's
+landmarks for themselves; afterwards those of one landmark that lie where they should are one again.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphslam.core.geometry import Array, between
+from graphslam.core.records import Estimate, Step, Trajectory
+from graphslam.mapping.duplicate_landmarks import merged_steps
+from graphslam.mapping.landmark_map import LandmarkMap
+
+#: m of path without a sighting, after which the next one is another visit's
+APART_M = 15.0
+#: m, rad: visits' landmarks that lie farther apart are not one
+SAME_M, SAME_RAD = 0.3, 0.15
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SplitVisits:
+    """Steps in which every visit has its own landmarks; ``origin``: new landmark -> what it was."""
+
+    steps: tuple[Step, ...]
+    origin: Mapping[int, int]
+
+    def start(self, estimate: Estimate) -> Estimate:
+        """An estimate of the steps as they were, with the new landmarks where the old ones are."""
+        landmarks = dict(estimate.landmarks)
+        landmarks.update((new, landmarks[old]) for new, old in self.origin.items())
+        return replace(estimate, landmarks=landmarks)
+
+
+def split_by_visit(
+    steps: Sequence[Step], states: Mapping[str, Trajectory], landmarks: LandmarkMap
+) -> SplitVisits:
+    """Steps with the landmarks of every robot's every visit for themselves.
+
+    Args:
+        steps: as recorded.
+        states: estimates of all states.
+        landmarks: those with an identity stay as they are.
+    """
+    named = set(landmarks.by_identity.values())
+    seen = [
+        (n, k, a.target, a)
+        for n, step in enumerate(steps)
+        for k, a in enumerate(step.associations)
+        if isinstance(a.target, int) and a.target not in named
+    ]
+    if not seen:
+        return SplitVisits(tuple(steps), {})
+    robots = sorted(states)
+    driven = {robot: _driven(states[robot]) for robot in robots}
+    path = np.array([
+        driven[a.robot][np.searchsorted(states[a.robot].stamps_ns, a.time_ns)]
+        for _, _, _, a in seen
+    ])  # fmt: skip
+    robot = np.array([robots.index(a.robot) for _, _, _, a in seen])
+    target = np.array([t for _, _, t, _ in seen])
+    order = np.lexsort((path, robot, target))
+    known = np.diff(target[order]) == 0
+    again = known & ((np.diff(robot[order]) != 0) | (np.diff(path[order]) > APART_M))
+    fresh = max(target.max(), max(landmarks.entries, default=0)) + 1
+    number = np.concatenate([[0], np.cumsum(again)])  # of separations so far
+    before = np.maximum.accumulate(np.where(np.append(True, ~known), number, 0))
+    new = np.where(number > before, fresh + number - 1, target[order])
+    changed: dict[int, dict[int, int]] = {}
+    origin: dict[int, int] = {}
+    for at, name in zip(order, new, strict=True):
+        n, k, old, _ = seen[at]
+        if name != old:
+            changed.setdefault(n, {})[k] = int(name)
+            origin[int(name)] = old
+    made = list(steps)
+    for n, renamed in changed.items():
+        associations = list(steps[n].associations)
+        for k, name in renamed.items():
+            associations[k] = replace(associations[k], target=name)
+        made[n] = replace(steps[n], associations=tuple(associations))
+    return SplitVisits(tuple(made), origin)
+
+
+def _driven(states: Trajectory) -> Array:
+    """How far the robot had driven at each state, m."""
+    moves = between(states.poses[:-1], states.poses[1:])
+    return np.concatenate([[0.0], np.cumsum(np.hypot(moves[:, 0], moves[:, 1]))])
+
+
+def rejoin_visits(
+    taken_apart: SplitVisits, estimate: Estimate, landmarks: LandmarkMap
+) -> tuple[Step, ...]:
+    """Steps in which visits' landmarks that lie where they should are one again.
+
+    Args:
+        taken_apart: what `opened` made.
+        estimate: of its steps.
+        landmarks: those that are not one with what they were enter the map.
+    """
+    groups: dict[int, list[int]] = {}
+    into: dict[int, int] = {}
+    for new, old in sorted(taken_apart.origin.items()):
+        entry = landmarks.entries[old]
+        mean = estimate.landmarks[new][0]
+        for leader in groups.setdefault(old, [old]):
+            if _one(estimate.landmarks[leader][0], mean, entry.kind):
+                into[new] = leader
+                break
+        else:
+            groups[old].append(new)
+            landmarks.split(old, new)
+            landmarks.entries[new].move(mean)
+    kinds = {leader: landmarks.entries[leader].kind for leader in into.values()}
+    return merged_steps(taken_apart.steps, into, kinds)
+
+
+def _one(a: Array, b: Array, kind: str) -> bool:
+    """Whether two landmarks (2,) or (3,) are one and the same, a line whatever lies along it."""
+    if kind == "point":
+        return bool(np.hypot(*(b - a)) <= SAME_M)
+    off = between(a, b)
+    across = abs(off[1]) if kind == "line" else np.hypot(off[0], off[1])
+    return bool(across <= SAME_M and abs(off[2]) <= SAME_RAD)

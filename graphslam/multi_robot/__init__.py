@@ -1,0 +1,1 @@
+"""Several robots: how their frames relate, robots detected in scans, place recognition."""

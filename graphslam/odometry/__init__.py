@@ -1,0 +1,1 @@
+"""Motion between two times: odometry readings, preintegration, calibration, scan odometry."""

@@ -1,0 +1,148 @@
+"""Trajectories at any stamps, from the states that an estimator keeps and the odometry between.
+
+And what it takes to move a whole result into another world frame.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphslam.core.geometry import (
+    Array,
+    between,
+    compose,
+    compose_cov,
+    compose_jacobians,
+    exp,
+    inverse,
+    log,
+    rotate_cov,
+    rotation3,
+    transform,
+)
+from graphslam.core.motion_models import Calibration
+from graphslam.core.records import Estimate, Start, Step, Trajectory
+from graphslam.odometry.preintegration import Track
+
+IntArray = np.ndarray[tuple[int], np.dtype[np.int64]]
+
+
+def causal_at(
+    states: Trajectory,
+    calibrations: Sequence[Calibration],
+    track: Track,
+    times_ns: IntArray,
+    stamps_ns: IntArray,
+) -> Trajectory:
+    """Poses at ``times_ns``: the last state before it, carried on by odometry.
+
+    Nothing after the time is used if the states are causal: ``calibrations[i]`` is what was known
+    when state i was made. The covariance grows by odometry.
+
+    Args:
+        states: the states, stamped with their times.
+        calibrations: of the odometry, one per state.
+        track: the robot's odometry.
+        times_ns: (n,) when.
+        stamps_ns: (n,) what the result is stamped with.
+    """
+    i = _state_before(states, times_ns)
+    delta, noise = track.coarse_motions(states.stamps_ns[i], times_ns, calibrations, i)
+    covs = compose_cov(states.poses[i], states.covs[i], delta, noise)
+    return Trajectory(stamps_ns, compose(states.poses[i], delta), covs)
+
+
+def final_at(
+    states: Trajectory, track: Track, times_ns: IntArray, stamps_ns: IntArray
+) -> Trajectory:
+    """Poses at ``times_ns`` between final states.
+
+    The disagreement between odometry and the *next* state is spread over the interval in proportion
+    to the motion in it, and the covariance is that of a bridge between both states.
+
+    Args:
+        states: the states, stamped with their times.
+        track: the robot's odometry, its calibration the final one.
+        times_ns: (n,) when.
+        stamps_ns: (n,) what the result is stamped with.
+    """
+    at, known = states.stamps_ns, [track.used_calibration]
+    i = _state_before(states, times_ns)
+    following = np.minimum(i + 1, len(at) - 1)
+    same = np.zeros(len(i), dtype=np.int64)
+    delta, noise = track.coarse_motions(at[i], times_ns, known, same)
+    whole, whole_noise = track.coarse_motions(at[i], at[following], known, same)
+    inside = following > i
+    effort = track.effort(at)
+    driven = np.where(inside, effort[following] - effort[i], 0.0)
+    share = (track.effort(times_ns) - effort[i]) / np.where(driven > 0, driven, 1.0)
+    share = np.clip(np.where(driven > 0, share, 0.0), 0.0, 1.0)
+    miss = log(between(compose(states.poses[i], whole), states.poses[following]))
+    poses = compose(states.poses[i], delta)
+    poses = compose(poses, exp(share[:, None] * np.where(inside[:, None], miss, 0.0)))
+    F, _ = compose_jacobians(states.poses[i], between(states.poses[i], poses))
+    s, turn = share[:, None, None], rotation3(states.poses[i, 2])
+    carried = F @ states.covs[i] @ F.mT
+    bridge = (
+        (1 - s) * carried
+        + s * states.covs[following]
+        + turn @ (s * (1 - s) * whole_noise) @ turn.mT
+    )
+    beyond = carried + turn @ noise @ turn.mT
+    return Trajectory(stamps_ns, poses, np.where(inside[:, None, None], bridge, beyond))
+
+
+def mounted(base: Trajectory, mounts: Array) -> Trajectory:
+    """Trajectory of frames that sit at ``mounts`` (n, 3) or (3,) in the base frame, rigidly."""
+    F, _ = compose_jacobians(base.poses, mounts)
+    return Trajectory(base.stamps_ns, compose(base.poses, mounts), F @ base.covs @ F.mT)
+
+
+def moved_world(trajectory: Trajectory, world: Array) -> Trajectory:
+    """The same trajectory after its world frame was put at ``world`` (3,) or (n, 3)."""
+    turn = rotation3(world[..., 2])
+    poses = compose(np.broadcast_to(world, trajectory.poses.shape), trajectory.poses)
+    return Trajectory(trajectory.stamps_ns, poses, turn @ trajectory.covs @ turn.mT)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameTransforms:
+    """World frames (3,) that robots, by name, and landmarks, by number, are put into."""
+
+    robots: Mapping[str, Array]
+    landmarks: Mapping[int, Array]
+
+    def estimate(self, estimate: Estimate) -> Estimate:
+        """The same estimate after the frames of everything were put there."""
+        states = {n: moved_world(t, self.robots[n]) for n, t in estimate.states.items()}
+        landmarks = {}
+        for number, (mean, cov) in estimate.landmarks.items():
+            world = self.landmarks[number]
+            M = rotation3(world[2])[: len(mean), : len(mean)]
+            moved = compose(world, mean) if len(mean) == 3 else transform(world, mean)
+            landmarks[number] = (moved, M @ cov @ M.T)
+        return Estimate(states, landmarks, estimate.error, estimate.dof)
+
+    def step(self, step: Step) -> Step:
+        """The same step after the frames were put there: its starts move along."""
+        starts = {}
+        for robot, start in step.starts.items():
+            world = self.robots[robot]
+            starts[robot] = Start(compose(world, start.pose), rotate_cov(start.cov, world[2]))
+        return replace(step, starts=starts)
+
+
+def origin_shift(start: Array, mounts: Array) -> Array:
+    """World frames ``(..., 3)`` that bring a robot's *base* to its start pose.
+
+    A prior puts the first state at ``start`` (3,), but states are rigid to the sensor, which sits
+    at ``mounts`` (..., 3) from the base: ``start ∘ mount ∘ start⁻¹`` makes up for it.
+    """
+    return compose(compose(np.broadcast_to(start, mounts.shape), mounts), inverse(start))
+
+
+def _state_before(states: Trajectory, times_ns: IntArray) -> IntArray:
+    """Index (n,) of the last state at or before each time (the first for earlier times)."""
+    found = np.searchsorted(states.stamps_ns, times_ns, side="right") - 1
+    return np.clip(found, 0, len(states) - 1)

@@ -1,0 +1,133 @@
+"""Learning a motion source's calibration errors while the estimate grows.
+
+A wrong wheel radius is one constant of the whole run. Left unmodelled, part of it leaks into the
+heading whenever landmarks are handed over to new ones, and the map bends. So after every state the
+motion that the estimate found is compared with what odometry said, and a recursive least-squares
+filter keeps the parameters that explain the difference (thesis 4.8-4.13 has the derivatives, but
+treats the errors as white). The estimate is itself pulled towards odometry, by some per cent; as
+the learned values are used for the next motions, that share vanishes geometrically.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from graphslam.core.gaussian import solve
+from graphslam.core.geometry import Array, wrap
+from graphslam.core.motion_models import HELD_SIGMA, Calibration
+from graphslam.core.observation_models import MODELS
+from graphslam.core.records import Association, Motion
+
+#: m and rad: what landmarks cannot know better about one motion (stamps, walls that are not flat)
+RELATIVE_SIGMA = (0.02, 0.02, 0.01)
+#: weight of the past per state: remembers about 1/(1 - FORGET) states, so tyres may warm up
+FORGET = 0.995
+#: share of the prior sigma that always remains in a motion's covariance: no constant is constant
+REMAINING = 0.5
+#: squared Mahalanobis distance, 3 dof, beyond which a difference is no calibration error but a
+#: jump of the estimate (a loop closure) or a slip: 99.9 %
+OUTLIER = 16.3
+
+
+class Calibrator:
+    """Recursive least squares over one robot's motions."""
+
+    def __init__(self) -> None:
+        self._prior: Array | None = None
+        self._info: Array = np.zeros((0, 0))
+        self._prior_info: Array = np.zeros((0, 0))
+        self._vector = np.zeros(0)
+        self._names: tuple[str, ...] = ()
+
+    def learn(
+        self, current: Calibration, motion: Motion, moved: Array, observed: Array
+    ) -> Calibration:
+        """The calibration after one more motion.
+
+        Args:
+            current: what ``motion`` was computed with.
+            motion: what odometry said.
+            moved: (3,) the same motion according to the estimate, in the frame of its start.
+            observed: (3, 3) information about the motion's end that came from landmarks, along the
+                axes of its start. Without any the estimate *is* odometry and teaches nothing.
+
+        Returns:
+            Mean, and the covariance to be used for coming motions.
+        """
+        D = motion.d_delta_d_calibration
+        if motion.matched or not D.shape[1] or (motion.length_m == 0 and motion.delta[2] == 0):
+            return current
+        if self._prior is None:
+            self._prior = current.cov
+            self._prior_info = np.asarray(np.linalg.inv(self._prior), dtype=np.float64)
+            self._info = self._prior_info
+            self._vector = np.zeros(D.shape[1])
+            self._names = current.names
+        miss = moved - motion.delta
+        miss[2] = wrap(miss[2])
+        noise = motion.cov - D @ current.cov @ D.T + np.diag(np.square(RELATIVE_SIGMA))
+        # (noise + observed⁻¹)⁻¹, for an information matrix that may be singular
+        W = solve(np.eye(3) + observed @ noise, observed)
+        total = noise + D @ self._prior @ D.T
+        if miss @ solve(total, miss) > OUTLIER or not W.any():
+            return current
+        weighted = D.T @ W
+        # relative to nominal values: what is missing now plus what was already corrected
+        self._info = FORGET * self._info + (1 - FORGET) * self._prior_info + weighted @ D
+        self._vector = FORGET * self._vector + weighted @ (miss + D @ current.mean)
+        cov = solve(self._info, np.eye(len(self._info)))
+        return Calibration(current.names, cov @ self._vector, cov + REMAINING**2 * self._prior)
+
+    def found(self) -> dict[str, tuple[float, float, bool]]:
+        """What the data say so far, see `told`.
+
+        The sigma is that of the remembered stretch, so it does not shrink for ever.
+        """
+        if self._prior is None:
+            return {}
+        cov: Array = np.asarray(np.linalg.inv(self._info), dtype=np.float64)
+        known = Calibration(self._names, cov @ self._vector, cov)
+        return to_summary(known, self._prior)
+
+
+def to_summary(known: Calibration, prior: Array) -> dict[str, tuple[float, float, bool]]:
+    """Parameter -> (value, sigma, observable); ``prior`` (p, p) is the covariance before data.
+
+    Observable: the data halve the prior's sigma at least. One that is held has the sigma 0.
+    """
+    sigmas, before = np.sqrt(np.diag(known.cov)), np.sqrt(np.diag(prior))
+    held = before < HELD_SIGMA
+    sigmas[held] = 0.0
+    seen = ~held & (sigmas < 0.5 * before)
+    return {
+        name: (float(value), float(sigma), bool(observable))
+        for name, value, sigma, observable in zip(
+            known.names, np.where(held, 0.0, known.mean), sigmas, seen, strict=True
+        )
+    }
+
+
+def observed_information(
+    seen: Sequence[Association], poses: Mapping[str, Array], landmarks: Sequence[Array]
+) -> dict[str, Array]:
+    """Information (3, 3) about robots' poses in observations of landmarks that are known.
+
+    Args:
+        seen: observations from these poses.
+        poses: robot -> (3,), world frame; along its axes the result is.
+        landmarks: targets of ``seen``, world frame.
+    """
+    info = {robot: np.zeros((3, 3)) for robot in poses}
+    for name in {association.model for association in seen}:
+        model = MODELS[name]
+        group = [k for k, association in enumerate(seen) if association.model == name]
+        z, cov = (np.array([getattr(seen[k], what) for k in group]) for what in ("z", "cov"))
+        x = np.array([poses[seen[k].robot] for k in group])
+        targets = np.array([landmarks[k] for k in group])
+        H, _ = model.jacobians(z, x, targets)
+        R = model.noise(z, cov, x, targets)
+        found = H.mT @ np.linalg.solve(R, H)
+        robots = np.array([seen[k].robot for k in group])
+        for robot in set(robots.tolist()):
+            info[robot] += found[robots == robot].sum(axis=0)
+    return info

@@ -1,0 +1,137 @@
+"""What two neighbouring scans say about the motion between them, beside odometry.
+
+Wheels slip, counters are unsigned, clocks jump: then odometry is wrong by far more than its
+covariance says, and the lines of the next scan are looked for in the wrong places. So every scan is
+laid on the one before by the motion that odometry tells. Where that does not fit and another motion
+does, odometry is contradicted: its covariance grows by the disagreement, and the scans' motion
+with its own covariance is fused with it. Directions that the scans do not show (along a corridor)
+stay odometry's.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from graphslam.core.gaussian import chi2_quantile
+from graphslam.core.geometry import Array, rotation, wrap
+from graphslam.core.records import Closure, Motion, Observation
+from graphslam.perception.scan_matching import Submap, align, fit, make_submap, match
+
+#: points of a scan at least, to say anything
+FEWEST = 30
+#: squared Mahalanobis distance, 3 dof: worth a closer look; a contradiction
+LOOK, CONTRADICTED = chi2_quantile([0.9, 0.999], 3)
+#: m, rad: smaller disagreements are left to the landmarks
+SMALLEST_M, SMALLEST_RAD = 0.05, 0.03
+#: m, rad: directions in which scans are less sure are left to odometry
+SURE = 0.08
+#: share of points that lie on the scan before: fewer are worth a closer look; at least at another
+#: motion, and so many more than at odometry's
+USUAL, FITS, BETTER = 0.6, 0.5, 0.05
+#: m, rad: window searched beside twice the motion (an unsigned counter reports it reversed)
+MARGIN = np.array([0.5, 0.5, 0.2])
+#: m: no nearer to a line than this is what lies on no line
+BESIDE_M = 0.1
+
+
+def scan_submap(points: Array) -> Submap | None:
+    """The points (n, 2) of one scan, in the frame of its state; None where there are few."""
+    if len(points) < FEWEST:
+        return None
+    return make_submap(np.zeros((1, 3)), [np.asarray(points, dtype=float)])
+
+
+def checked_against_scans(motion: Motion, before: Submap, now: Submap) -> Motion:
+    """The motion, or what scans make of it if they contradict it (``matched``).
+
+    Args:
+        motion: according to odometry.
+        before: scan of the state where it starts, in that state's frame.
+        now: scan of the state where it ends.
+    """
+    here, step, cov = fit(now, before, motion.delta)
+    if here >= USUAL and _distance(step, motion.cov + cov) < LOOK:
+        return motion
+    guesses = [align(now, before, motion.delta)]
+    if fit(now, before, guesses[0][0])[0] < max(FITS, here + BETTER):
+        window = MARGIN + 2 * np.abs(motion.delta)
+        found = match(now, before, motion.delta, window)
+        guesses += [(m.pose, m.cov) for m in found]
+    there, (pose, cov) = max(
+        ((fit(now, before, pose)[0], (pose, cov)) for pose, cov in guesses), key=lambda g: g[0]
+    )
+    off, information = _sure(_difference(pose, motion.delta), cov)
+    if (
+        there < max(FITS, here + BETTER)
+        or (np.hypot(off[0], off[1]) < SMALLEST_M and abs(off[2]) < SMALLEST_RAD)
+        or _distance(off, motion.cov + cov) < CONTRADICTED
+    ):
+        return motion
+    return fused(replace(motion, cov=motion.cov + np.outer(off, off)), off, information)
+
+
+def fused(motion: Motion, off: Array, information: Array) -> Motion:
+    """A motion and a measurement of it as one.
+
+    Args:
+        motion: the motion. Calibration errors no longer tell what the result is off by.
+        off: (3,) how the measurement differs from it.
+        information: (3, 3) of the measurement, along the same axes; may be singular.
+    """
+    P = np.linalg.inv(np.linalg.inv(motion.cov) + information)
+    delta = motion.delta + P @ information @ off
+    delta[2] = wrap(delta[2])
+    D = np.zeros_like(motion.d_delta_d_calibration)
+    return replace(motion, delta=delta, cov=(P + P.T) / 2, d_delta_d_calibration=D, matched=True)
+
+
+def _difference(a: Array, b: Array) -> Array:
+    off = a - b
+    off[2] = wrap(off[2])
+    return np.asarray(off)
+
+
+def _sure(off: Array, cov: Array) -> tuple[Array, Array]:
+    """A difference and its information in the directions whose sigma is below `SURE`.
+
+    The noise of points looks like a little structure, also along a corridor.
+    """
+    values, axes = np.linalg.eigh(cov)
+    axes, values = axes[:, values < SURE**2], values[values < SURE**2]
+    return axes @ (axes.T @ off), (axes / values) @ axes.T
+
+
+def measured(motion: Motion, before: Submap, robot: str, points: Array) -> Closure | None:
+    """A second source of a motion: from points that lie on no line, so nothing counts twice.
+
+    Args:
+        motion: according to odometry, where the search begins.
+        before: scan of the state where it starts, in that state's frame.
+        robot: whose.
+        points: (n, 2) of the scan where it ends, in that state's frame, see `beside_lines`.
+    """
+    source = scan_submap(points)
+    if source is None:
+        return None
+    pose, cov = align(source, before, motion.delta)
+    if _distance(_difference(pose, motion.delta), motion.cov + cov) > CONTRADICTED:
+        return None
+    return Closure(robot, motion.end_ns, robot, motion.start_ns, pose, cov)
+
+
+def beside_lines(points: Array, seen: Sequence[Observation]) -> Array:
+    """Those of the points (n, 2) that lie on none of the observed lines; both in one frame."""
+    free = np.ones(len(points), dtype=np.bool_)
+    for o in seen:
+        if o.extent is None:
+            continue
+        back = rotation(-float(o.z[2]))
+        x, y = back @ (points - o.z[:2]).T
+        near = (x > o.extent[0] - BESIDE_M) & (x < o.extent[1] + BESIDE_M)
+        free &= ~(near & (np.abs(y) < BESIDE_M))
+    return points[free]
+
+
+def _distance(off: Array, cov: Array) -> float:
+    return float(off @ np.linalg.solve(cov, off))

@@ -1,0 +1,1 @@
+"""From one laser scan to observations: front ends, robot outlines, scan matching."""

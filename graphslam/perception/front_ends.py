@@ -1,0 +1,50 @@
+"""Front ends: what one scan says about landmarks. A new one is a function and a row here.
+
+A front end is a pure function of the scan and the settings. It returns its observations in the
+frame of the LASER; moving them to the base frame through ``scan.mount`` is the caller's business.
+"""
+
+from collections.abc import Callable
+
+from graphslam.core.config import FrontEndConfig
+from graphslam.core.records import Observation, Scan
+from graphslam.perception.cylinders import cylinders
+from graphslam.perception.hough import hough_lines
+from graphslam.perception.ordered_scan import Sweep, make_sweep, scan_points
+from graphslam.perception.segments import segments
+from graphslam.perception.segments_and_hough import both
+
+__all__ = ["FRONT_ENDS", "scan_points"]
+
+FrontEnd = Callable[[Scan, FrontEndConfig], tuple[Observation, ...]]
+
+
+def _front_end(
+    lines: Callable[[Sweep, FrontEndConfig], tuple[Observation, ...]],
+) -> FrontEnd:
+    """A front end from a way to find lines: cylinders come first, and their returns make no line.
+
+    Otherwise a thick tree would be a point and a short segment at once.
+    """
+
+    def front_end(scan: Scan, config: FrontEndConfig) -> tuple[Observation, ...]:
+        sweep = make_sweep(scan, config.max_range_m)
+        points: tuple[Observation, ...] = ()
+        if config.cylinders:
+            points, sweep = cylinders(sweep, config)
+        return (*lines(sweep, config), *points)
+
+    return front_end
+
+
+def _none(scan: Scan, config: FrontEndConfig) -> tuple[Observation, ...]:
+    """No observations: for logs whose landmarks come as sightings."""
+    return ()
+
+
+FRONT_ENDS: dict[str, FrontEnd] = {
+    "segments": _front_end(segments),
+    "hough": _front_end(hough_lines),
+    "both": _front_end(both),
+    "none": _none,
+}

@@ -1,0 +1,251 @@
+"""Lines by the range-weighted Hough transform, thesis 4.7.1-4.7.4.
+
+Every return votes for the lines that it may lie on; the line with most votes is taken, its returns
+stop voting, and so on. A wall seen in pieces, between things that stand before it or on both
+sides of a door, is ONE line: its pieces vote together.
+
+The grid is coarse. A peak is therefore only where the search for a line's returns begins: returns
+close to the line fitted to those so far are taken in until nothing changes, so the line grows along
+the wall. What is taken in comes in runs, and each run must fit the line: the front of a cupboard
+does not become a part of the wall beside it.
+"""
+
+import math
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphslam.core.config import FrontEndConfig
+from graphslam.core.geometry import Array
+from graphslam.core.records import Observation
+from graphslam.perception.line_fit import fit_lines, observations
+from graphslam.perception.line_moments import fitted_line, fitted_lines, mean_square, point_moments
+from graphslam.perception.ordered_scan import Sweep
+from graphslam.perception.segments import MISSING_BEAMS, allowed_rms, fewest_points, valid_lines
+
+SEED_POINTS = 3
+"""A peak has at least so many returns: any two are on a line, and far ones have much weight."""
+
+RUN_POINTS = 3
+"""A run has at least so many returns: one or two are where another wall crosses the line."""
+
+BLOCK_POINTS = 16
+"""Runs are tested in blocks of at most so many returns: a run that bends fits its own line badly,
+but each of its blocks shows by how much it is off."""
+
+RUN_GATE = 18.42
+"""Chi-square, two degrees of freedom, 99.99 %: a line has many blocks, and one that is left out
+wrongly may come back as a second line of the same wall."""
+
+FLATNESS = 1 / 8
+"""The part of its deviation that a run's own line does not have may be this share of what a segment
+may deviate (mean squares), beside noise: walls of several materials, doors in their frames."""
+
+ROUNDS = 8
+"""Largest number of times that a line is fitted anew while it grows; three are usual."""
+
+Indices = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+
+def hough_lines(sweep: Sweep, config: FrontEndConfig) -> tuple[Observation, ...]:
+    """Hough lines of one scan, all of kind ``line``.
+
+    Args:
+        sweep: one scan, in order.
+        config: thresholds and noise.
+
+    Returns:
+        Observations, laser frame, the line with most votes first; ``extent`` reaches from the
+        first to the last return.
+    """
+    rows, starts = find_lines(sweep, np.ones(len(sweep.beam), dtype=np.bool_), config)
+    if not len(starts):
+        return ()
+    fits = fit_lines(sweep.points[rows], starts, config)
+    fits = fits[valid_lines(fits, config)]
+    return observations(fits, np.zeros(len(fits.z), dtype=np.bool_), config)
+
+
+def find_lines(sweep: Sweep, free: Mask, config: FrontEndConfig) -> tuple[Indices, Indices]:
+    """The returns of each line: no return belongs to two.
+
+    Args:
+        sweep: one scan, in order.
+        free: (k,) which returns may be used.
+        config: thresholds and noise.
+
+    Returns:
+        Rows of `Sweep.points`, one line after the other, those of a line in the order of the
+        beams; and where each line begins.
+    """
+    free = free.copy()
+    lines: list[Indices] = []
+    if np.count_nonzero(free) >= fewest_points(config):
+        moments = point_moments(sweep.points)
+        votes = Votes(sweep.points, sweep.ranges[sweep.beam] * sweep.step_rad, free, config)
+        while len(seed := votes.peak()):
+            rows = _grow(seed, sweep, moments, free, config)
+            # a peak that is no line stops voting too, but its returns may belong to another line
+            votes.remove(np.union1d(seed, rows))
+            if len(rows) >= fewest_points(config):
+                lines.append(rows)
+                free[rows] = False
+    if not lines:
+        none = np.zeros(0, dtype=np.intp)
+        return none, none
+    sizes = [len(rows) for rows in lines]
+    return np.concatenate(lines), np.cumsum([0, *sizes[:-1]])
+
+
+class Votes:
+    """C(d, γ) of eq. 4.29-4.31 for the returns that still vote.
+
+    A line at (d, γ + π) is the one at (-d, γ): angles cover half a turn, distances both signs.
+    Stripes touch (Δd = 2a), so at each angle a return is in one stripe.
+    """
+
+    def __init__(self, points: Array, weights: Array, voting: Mask, config: FrontEndConfig) -> None:
+        """Count the votes.
+
+        Args:
+            points: (k, 2), m, laser frame.
+            weights: (k,) g of each return.
+            voting: (k,) which returns vote.
+            config: the ``hough_`` settings.
+        """
+        normals = _normals(config.hough_gamma_steps)
+        reach = min(config.hough_d_max_m, float(np.abs(points).sum(axis=1).max()))
+        half = round(reach / config.hough_delta_d_m)
+        self._width = 2 * half + 1
+        size = self._width * normals.shape[1]
+        stripe = np.rint(points @ normals / config.hough_delta_d_m).astype(np.intp)
+        outside = np.abs(stripe) > half
+        stripe += half + self._width * np.arange(normals.shape[1])
+        stripe[outside] = size  # one cell more, which is not looked at
+        self._stripe, self._weights, self._voting = stripe, weights, voting.copy()
+        self._threshold = config.hough_threshold_m
+        cells = stripe[voting]
+        each = np.repeat(weights[voting], stripe.shape[1])
+        self.C = np.bincount(cells.ravel(), each, minlength=size + 1)[:-1]
+        few = np.bincount(cells.ravel(), minlength=size + 1)[:-1] < SEED_POINTS
+        self.C[few] = 0.0
+
+    def peak(self) -> Indices:
+        """Rows of the returns in the fullest stripe; none if it is not above the threshold."""
+        while True:
+            cell = int(np.argmax(self.C))
+            if self.C[cell] <= self._threshold:
+                return np.zeros(0, dtype=np.intp)
+            inside = self._stripe[:, cell // self._width] == cell
+            rows = np.flatnonzero(inside & self._voting)
+            if len(rows) >= SEED_POINTS:
+                return rows
+            self.C[cell] = 0.0
+
+    def remove(self, rows: Indices) -> None:
+        """These returns stop voting."""
+        rows = rows[self._voting[rows]]
+        self._voting[rows] = False
+        cells = self._stripe[rows]
+        each = np.repeat(self._weights[rows], cells.shape[1])
+        inside = cells.ravel() < len(self.C)
+        np.subtract.at(self.C, cells.ravel()[inside], each[inside])
+
+
+@lru_cache(maxsize=8)
+def _normals(gamma_steps: int) -> Array:
+    """Unit normals (2, t) of half a turn of γ; an odd number of steps is rounded up."""
+    t = (gamma_steps + 1) // 2
+    gamma = np.pi / t * np.arange(t)
+    return np.array((np.cos(gamma), np.sin(gamma)))
+
+
+def _grow(
+    seed: Indices, sweep: Sweep, moments: Array, free: Mask, config: FrontEndConfig
+) -> Indices:
+    """Rows of the returns of the line that those of a stripe begin, in the order of the beams."""
+    line, direction = fitted_line(moments[:, seed].sum(axis=1))
+    before = seed
+    for _ in range(ROUNDS):
+        rows = np.flatnonzero((line @ moments <= config.split_m**2) & free)
+        rows = _fitting_runs(rows, line, direction, sweep, moments, config)
+        if len(rows) < SEED_POINTS or np.array_equal(rows, before):
+            return rows
+        line, direction = fitted_line(moments[:, rows].sum(axis=1))
+        before = rows
+    return rows
+
+
+def _fitting_runs(
+    rows: Indices,
+    line: Array,
+    direction: float,
+    sweep: Sweep,
+    moments: Array,
+    config: FrontEndConfig,
+) -> Indices:
+    """Of the returns near a line, those in runs that fit it.
+
+    A run ends where the line goes on farther away than a chain would, with other returns between.
+    First its blocks are tested, so that a run of two things loses the one that is not on the line;
+    then what is left of it as a whole, which shows smaller differences.
+    """
+    if len(rows) < SEED_POINTS:
+        return rows
+    borders = _borders(rows, direction, sweep, config)
+    blocks = _blocks(borders)
+    fits = _fit(rows, np.concatenate((blocks, borders[:-1])), line, sweep, moments, config)
+    if fits.all():
+        return rows
+    sizes = np.diff(np.append(blocks, len(rows)))
+    rows = rows[np.repeat(fits[: len(blocks)], sizes)]
+    if len(rows) < SEED_POINTS:
+        return rows
+    borders = _borders(rows, direction, sweep, config)
+    fits = _fit(rows, borders[:-1], line, sweep, moments, config)
+    return rows[np.repeat(fits, np.diff(borders))]
+
+
+def _fit(
+    rows: Indices,
+    starts: Indices,
+    line: Array,
+    sweep: Sweep,
+    moments: Array,
+    config: FrontEndConfig,
+) -> Mask:
+    """Which parts of ``rows`` lie on the line; ``starts`` may begin anew, for another division."""
+    r = sweep.ranges[sweep.beam[rows]]
+    # along the normal; line[0] is the squared offset, so the factor is cos² of the incidence
+    var = config.range_sigma_m**2 * line[0] / (r * r)
+    sums = np.cumsum(np.concatenate((moments[:, rows], var[None])), axis=1)
+    stops = np.append(starts[1:], 0)
+    stops[stops == 0] = len(rows)  # the last part of each division
+    M = sums[:, stops - 1]
+    M[:, starts > 0] -= sums[:, starts[starts > 0] - 1]
+    M, noise = M[:-1], M[-1] / M[0]
+    excess = mean_square(line[:, None], M) - mean_square(fitted_lines(M), M)
+    good = excess <= FLATNESS * allowed_rms(config) ** 2 + RUN_GATE * noise / M[0]
+    return np.asarray(good & (M[0] >= RUN_POINTS))
+
+
+def _borders(rows: Indices, direction: float, sweep: Sweep, config: FrontEndConfig) -> Indices:
+    """Where runs of ``rows`` begin, and the end of the last."""
+    along = sweep.points[rows] @ np.array((math.cos(direction), math.sin(direction)))
+    beam = sweep.beam[rows]
+    r = sweep.ranges[beam]
+    gap = config.gap_m + config.gap_share * np.minimum(r[1:], r[:-1])
+    between = (rows[1:] - rows[:-1] > 1) | (beam[1:] - beam[:-1] > MISSING_BEAMS + 1)
+    ends = np.flatnonzero((np.abs(along[1:] - along[:-1]) > gap) & between) + 1
+    return np.concatenate(([0], ends, [len(rows)]))
+
+
+def _blocks(borders: Indices) -> Indices:
+    """Where blocks of at most BLOCK_POINTS begin that divide the runs between borders evenly."""
+    size = borders[1:] - borders[:-1]
+    parts = -(-size // BLOCK_POINTS)
+    run = np.repeat(np.arange(len(size)), parts)
+    number = np.arange(len(run)) - np.repeat(np.cumsum(parts) - parts, parts)
+    return np.asarray(borders[run] + number * size[run] // parts[run])

@@ -1,0 +1,42 @@
+"""Sums over returns that say how well a line fits them, without touching the returns again.
+
+The moments of returns are the sums of 1, x, y, x², xy, y²: M (6,). A line is a vector q (6,) such
+that q·M / M[0] is the mean square deviation of those returns from it. So one product tests any
+set of returns against any line, and the moments of a union are a sum.
+"""
+
+import math
+
+import numpy as np
+
+from graphslam.core.geometry import Array
+
+
+def point_moments(points: Array) -> Array:
+    """1, x, y, x², xy, y² of each of ``points`` (k, 2): (6, k)."""
+    x, y = points.T
+    return np.array((np.ones(len(x)), x, y, x * x, x * y, y * y))
+
+
+def fitted_lines(moments: Array) -> Array:
+    """The least-squares lines q (6, p) of p sets of returns with ``moments`` (6, p)."""
+    x, y, xx, xy, yy = moments[1:] / moments[0]
+    direction = 0.5 * np.arctan2(2 * (xy - x * y), xx - x * x - yy + y * y)
+    a, b = -np.sin(direction), np.cos(direction)
+    d = a * x + b * y
+    return np.array((d * d, -2 * d * a, -2 * d * b, a * a, 2 * a * b, b * b))
+
+
+def fitted_line(moments: Array) -> tuple[Array, float]:
+    """One of `fitted_lines`, q (6,), and its direction in rad: a tenth of the time for one."""
+    n, sx, sy, sxx, sxy, syy = moments.tolist()
+    x, y = sx / n, sy / n
+    direction = 0.5 * math.atan2(2 * (sxy / n - x * y), sxx / n - x * x - syy / n + y * y)
+    a, b = -math.sin(direction), math.cos(direction)
+    d = a * x + b * y
+    return np.array((d * d, -2 * d * a, -2 * d * b, a * a, 2 * a * b, b * b)), direction
+
+
+def mean_square(lines: Array, moments: Array) -> Array:
+    """Mean square deviation (p,), m², of returns with ``moments`` (6, p) from ``lines`` (6, p)."""
+    return np.asarray((lines * moments).sum(axis=0) / moments[0])

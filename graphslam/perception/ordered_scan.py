@@ -1,0 +1,64 @@
+"""One scan put in order: beams counter-clockwise, usable returns as points."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphslam.core.geometry import Array, transform
+from graphslam.core.records import Scan
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sweep:
+    """A scan whose beams turn counter-clockwise, so that every wall has the sensor on its left.
+
+    ``ranges`` (n,) m, NaN for a missing return, and ``angles`` (n,) rad hold all beams, for what
+    lies beside a segment. ``beam`` (k,) and ``points`` (k, 2) m, laser frame, hold the returns
+    that lines may be made of. ``step_rad`` > 0 is the angle between beams.
+    """
+
+    ranges: Array
+    angles: Array
+    beam: NDArray[np.intp]
+    points: Array
+    step_rad: float
+
+
+def make_sweep(scan: Scan, max_range_m: float) -> Sweep:
+    """The scan's beams in counter-clockwise order and its returns nearer than ``max_range_m``."""
+    ranges, angles = scan.ranges, scan.angles
+    if scan.angle_step_rad < 0:
+        ranges, angles = ranges[::-1], angles[::-1]
+    step = abs(scan.angle_step_rad)
+    if len(ranges) * step > 2 * np.pi - 0.5 * step:
+        ranges, angles = _open_circle(ranges, angles)
+    with np.errstate(invalid="ignore"):
+        ranges = np.where((ranges > 0) & np.isfinite(ranges), ranges, np.nan)
+        beam = np.flatnonzero(ranges < max_range_m)  # at the maximum a laser saturates
+    r, a = ranges[beam], angles[beam]
+    points = np.array((r * np.cos(a), r * np.sin(a))).T
+    return Sweep(ranges, angles, beam, np.ascontiguousarray(points), step)
+
+
+def _open_circle(ranges: Array, angles: Array) -> tuple[Array, Array]:
+    """A full circle cut at its largest jump in range: at its seam it may cut a wall in two."""
+    known = np.nan_to_num(ranges, nan=0.0, posinf=0.0, neginf=0.0)
+    start = int(np.argmax(np.abs(known - np.roll(known, 1))))
+    return np.roll(ranges, -start), np.roll(angles, -start)
+
+
+def scan_points(scan: Scan, max_range_m: float) -> Array:
+    """Returns of a scan for pictures.
+
+    Args:
+        scan: the scan, with its mount.
+        max_range_m: returns at this range or farther are left out.
+
+    Returns:
+        Points (n, 2), m, in the robot's base frame, in the scan's order; missing returns left out.
+    """
+    with np.errstate(invalid="ignore"):
+        kept = (scan.ranges > 0) & (scan.ranges < max_range_m)
+    r, a = scan.ranges[kept], scan.angles[kept]
+    return transform(scan.mount, np.column_stack((r * np.cos(a), r * np.sin(a))))

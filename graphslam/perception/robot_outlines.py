@@ -1,0 +1,336 @@
+"""Robots of known outline in a scan: which returns are theirs, where they are, how sure that is.
+
+A robot stands free: a few consecutive returns, nearer than what is beside them. Its outline, put at
+a pose, predicts the range of every beam that meets it and the directions between which beams do.
+The pose is fitted to both by weighted least squares, as `frontend.cylinders` does with circles, so
+the covariance follows from what is seen: one face tells how far the robot is, its two edges in what
+direction, two faces which way it looks. Thesis 4.5 and 6.1.3 take robots for objects like others.
+
+Symbols: p = (x, y, phi) pose of the robot in the laser's frame, r range, a direction of a beam.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from graphslam.core.config import FrontEndConfig
+from graphslam.core.geometry import Array, rotation, wrap
+from graphslam.perception.ordered_scan import Sweep
+
+#: m, beams, m: returns farther apart are not of one thing that stands free; far away a side seen at
+#: grazing incidence has them farther apart, up to a limit
+APART_M, APART_BEAMS, APART_MOST_M = 0.25, 6.0, 0.5
+#: returns at least, of which a pose is to be found
+FEWEST = 3
+#: returns at least, of which a direction is to be found
+FEWEST_TO_TURN = 6
+#: steps of the search
+ITERATIONS = 8
+#: beams: sigma of an edge between two of them, for the last one may be a mixed pixel
+EDGE_SHARE = 1.0
+#: beams: by which both edges may be off the same way
+EDGES_ALIKE = 0.25
+#: m: sigma of the first and the last range, which may be mixed pixels
+MIXED_M = 0.15
+#: things that fit an outline worse than this share of robots would are none
+FIT_PROBABILITY = 0.001
+#: of an outline's width, at least seen
+SHARE = 0.5
+#: rad: a direction known less well is not linear enough to be told
+SURE_RAD = 0.1
+#: m, rad: step of difference quotients, and farthest step of the search
+STEP, FARTHEST = 1e-4, 0.3
+#: in squared sigmas: the search ends when it gains less
+CONVERGED = 1e-3
+#: sides of the polygon that stands for a circle
+ROUND_SIDES = 24
+
+Indices = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Clusters:
+    """What stands free in a scan: (m,) each, in the order of the beams.
+
+    ``first`` and ``last`` row of `Sweep.points`, both included. ``bare`` (m, 2): on the right, on
+    the left nothing nearer hides where it ends.
+    """
+
+    first: Indices
+    last: Indices
+    bare: Mask
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """An outline fitted to a cluster.
+
+    ``pose`` (3,) in the laser's frame, ``cov`` (3, 3) of it; ``direction`` whether the heading was
+    found, else it is the expected one and ``cov`` has the expectation's share in it. ``chi2`` of
+    ranges and edges with ``dof``; ``share`` of the outline's width that is seen.
+    """
+
+    pose: Array
+    cov: Array
+    direction: bool
+    chi2: float
+    dof: int
+    share: float
+
+    @property
+    def good(self) -> bool:
+        """Whether what was seen can be the outline; a small part of one may be of anything."""
+        return self.share > SHARE and self.chi2 <= float(chdtri(max(self.dof, 1), FIT_PROBABILITY))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _View:
+    """A cluster: ranges ``r`` (n,) in directions ``a`` (n,), directions of its ``edges`` (2,).
+
+    ``w`` (n + 2,): weights of ranges and edges, 0 for an edge that is not its own.
+    """
+
+    outline: Array
+    a: Array
+    r: Array
+    edges: Array
+    w: Array
+
+
+def outline_of(corners: Sequence[Sequence[float]]) -> Array:
+    """Corners (k, 2), m, base frame, of an outline as the configuration has it.
+
+    One number alone is the radius of a circle about the base's origin.
+    """
+    if len(corners) == 1 and len(corners[0]) == 1:
+        a = np.linspace(0.0, 2 * np.pi, ROUND_SIDES, endpoint=False)
+        # the polygon has the circle's area: half of it lies outside
+        radius = corners[0][0] * np.sqrt(2 * np.pi / ROUND_SIDES / np.sin(2 * np.pi / ROUND_SIDES))
+        return np.asarray(radius * np.column_stack([np.cos(a), np.sin(a)]))
+    return np.array(corners, dtype=float)
+
+
+def reach(outline: Array) -> float:
+    """How far the outline (k, 2) goes from the base's origin, m."""
+    return float(np.hypot(*outline.T).max())
+
+
+def is_round(outline: Array) -> bool:
+    """Whether an outline (k, 2) looks the same from all sides of the base's origin."""
+    r = np.hypot(*outline.T)
+    return bool(len(outline) >= ROUND_SIDES and r.max() - r.min() < 1e-6)
+
+
+def clusters(sweep: Sweep, widest_m: float) -> Clusters:
+    """Things no wider than ``widest_m`` that stand free.
+
+    On both sides what is next is farther away, or nearer (then it may hide a part), or there is
+    nothing. Something is free if at least one of its sides is bare.
+    """
+    k = len(sweep.beam)
+    if not k:
+        none = np.zeros(0, dtype=np.intp)
+        return Clusters(none, none, np.zeros((0, 2), dtype=np.bool_))
+    x, y = sweep.points.T
+    r = sweep.ranges[sweep.beam]
+    step = np.hypot(x[1:] - x[:-1], y[1:] - y[:-1])
+    near = np.minimum(r[1:], r[:-1])
+    apart = np.clip(APART_BEAMS * sweep.step_rad * near, APART_M, APART_MOST_M)
+    border = np.concatenate(([0], np.flatnonzero(step > apart) + 1, [k]))
+    first, last = border[:-1], border[1:] - 1
+    rise = np.concatenate(([np.inf], r[1:] - r[:-1], [-np.inf]))
+    before, after = -rise[first], rise[last + 1]
+    # the scan's own ends hide what is beyond them
+    before[0] = after[-1] = -np.inf
+    if sweep.beam[0] > 0:
+        before[0] = np.inf
+    if sweep.beam[-1] < len(sweep.ranges) - 1:
+        after[-1] = np.inf
+    bare = np.array((before > 0, after > 0)).T
+    width = np.hypot(x[last] - x[first], y[last] - y[first])
+    keep = (width <= widest_m) & bare.any(axis=1)
+    return Clusters(first[keep], last[keep], bare[keep])
+
+
+def centres(sweep: Sweep, found: Clusters) -> Array:
+    """Mean points (m, 2) of clusters, m, laser frame."""
+    sums = np.concatenate([np.zeros((1, 2)), np.cumsum(sweep.points, axis=0)])
+    count = (found.last - found.first + 1)[:, None]
+    return np.asarray((sums[found.last + 1] - sums[found.first]) / count)
+
+
+def expected_ranges(outline: Array, poses: Array, angles: Array) -> tuple[Array, Array]:
+    """What a laser at the origin sees of an outline.
+
+    Args:
+        outline: (k, 2) corners in the base frame.
+        poses: (m, 3) of the base.
+        angles: (n,) directions of beams.
+
+    Returns:
+        Ranges (m, n) of the beams, those that miss taken to graze the nearer edge, and the
+        directions (m, 2) of both edges, right then left.
+    """
+    c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
+    X = poses[:, :1] + c * outline[:, 0] - s * outline[:, 1]
+    Y = poses[:, 1:2] + s * outline[:, 0] + c * outline[:, 1]
+    middle = np.arctan2(poses[:, 1:2], poses[:, :1])
+    bearing = middle + wrap(np.arctan2(Y, X) - middle)
+    edges = np.stack([bearing.min(axis=1), bearing.max(axis=1)], axis=1)
+    inset = 1e-3 * (edges[:, 1] - edges[:, 0])
+    a = edges[:, :1] + wrap(angles - edges[:, :1])
+    a = np.clip(a, (edges[:, 0] + inset)[:, None], (edges[:, 1] - inset)[:, None])
+    ca, sa = np.cos(a)[:, :, None], np.sin(a)[:, :, None]
+    # across a beam and along it, of each corner; a side is met where `across` changes sign
+    across = ca * Y[:, None] - sa * X[:, None]
+    along = ca * X[:, None] + sa * Y[:, None]
+    across2, along2 = np.roll(across, -1, axis=2), np.roll(along, -1, axis=2)
+    met = (across > 0) != (across2 > 0)
+    gap = np.where(met, across - across2, 1.0)
+    r = np.where(met, along + (along2 - along) * across / gap, np.inf)
+    return r.min(axis=2), edges
+
+
+def fit_outline(
+    sweep: Sweep,
+    first: int,
+    last: int,
+    bare: Mask,
+    outline: Array,
+    expected: Array,
+    heading_sigma: float,
+    config: FrontEndConfig,
+) -> Fit:
+    """The pose of an outline that explains a cluster best.
+
+    Only where the search begins comes from what is expected, and the heading where it is not seen.
+
+    Args:
+        sweep: one scan, in order.
+        first: row of the cluster's first return in `Sweep.points`.
+        last: row of its last return, inclusive.
+        bare: (2,) whether its edges are its own.
+        outline: (k, 2) corners in the robot's base frame.
+        expected: (3,) pose in the laser's frame.
+        heading_sigma: of its heading, rad.
+        config: ``range_sigma_m``, ``floor_normal_m``.
+    """
+    view = _view(sweep, first, last, bare, outline, config)
+    fixed = _solved(_placed(view, expected), 2, view)
+    floor = _floor(fixed, outline, sweep.step_rad, config)
+    dof = int(np.count_nonzero(view.w)) - 2
+    if len(view.r) >= FEWEST_TO_TURN and not is_round(outline):
+        turned = _solved(fixed, 3, view)
+        e, J = _linearised(turned, view)
+        P = np.asarray(np.linalg.inv(J.T @ (view.w[:, None] * J) + np.eye(3)))
+        # one that is not where it is expected may be that of another face
+        off2 = float(wrap(turned[2] - expected[2])) ** 2
+        if P[2, 2] < SURE_RAD**2 and off2 < 9 * (heading_sigma**2 + P[2, 2]):
+            return Fit(turned, P + floor, True, float(view.w @ e**2), dof - 1, _share(turned, view))
+    e, J = _linearised(fixed, view)
+    P = np.linalg.inv(J[:, :2].T @ (view.w[:, None] * J[:, :2]) + np.eye(2))
+    # what the heading does to the position: it is the expected one
+    lever = -P @ J[:, :2].T @ (view.w * J[:, 2])
+    cov = np.diag([0.0, 0.0, heading_sigma**2])
+    cov[:2, :2] = P + floor[:2, :2] + heading_sigma**2 * np.outer(lever, lever)
+    return Fit(fixed, cov, False, float(view.w @ e**2), dof, _share(fixed, view))
+
+
+def _share(pose: Array, view: _View) -> float:
+    """Share of the outline's width at a pose that the cluster has."""
+    _, sides = expected_ranges(view.outline, pose[None], view.a)
+    return float(wrap(view.edges[1] - view.edges[0]) / (sides[0, 1] - sides[0, 0]))
+
+
+def _floor(pose: Array, outline: Array, step_rad: float, config: FrontEndConfig) -> Array:
+    """Covariance (3, 3) of what no number of returns makes better.
+
+    The outline is known, and its surface measured, to ``floor_normal_m``; so is its direction, over
+    its size. Mixed pixels shift both edges the same way, by a share of the angle between beams.
+    """
+    flat = config.floor_normal_m
+    across = np.array([-pose[1], pose[0]]) * EDGES_ALIKE * step_rad
+    P = np.diag([flat, flat, 2 * flat / reach(outline)]) ** 2
+    P[:2, :2] += np.outer(across, across)
+    return P
+
+
+def _view(
+    sweep: Sweep, first: int, last: int, bare: Mask, outline: Array, config: FrontEndConfig
+) -> _View:
+    beam = sweep.beam[first : last + 1]
+    edges, sigma = _edges_seen(sweep, first, last)
+    w = np.concatenate([np.full(len(beam), config.range_sigma_m**-2), bare * sigma**-2])
+    w[[0, len(beam) - 1]] = MIXED_M**-2
+    return _View(outline, sweep.angles[beam], sweep.ranges[beam], edges, w)
+
+
+def _edges_seen(sweep: Sweep, first: int, last: int) -> tuple[Array, Array]:
+    """Directions (2,) of a cluster's edges and their sigmas: between its last beam and the next.
+
+    Where the next beam has no return it is unknown which side of it the edge lies.
+    """
+    out, sigma = np.zeros(2), np.zeros(2)
+    known = np.isfinite(sweep.ranges)
+    for k, (row, way) in enumerate(((first, -1), (last, 1))):
+        beam = int(sweep.beam[row])
+        beyond = beam + way
+        while 0 <= beyond < len(known) and not known[beyond] and abs(beyond - beam) < 3:
+            beyond += way
+        apart = sweep.step_rad * max(abs(beyond - beam), 1)
+        out[k] = sweep.angles[beam] + way * apart / 2
+        sigma[k] = EDGE_SHARE * apart
+    return out, sigma
+
+
+def _placed(view: _View, expected: Array) -> Array:
+    """The expected pose moved, not turned, so that the outline stands where the returns are."""
+    a, r, pose = view.a, view.r, expected.copy()
+    seen = np.array([np.mean(r * np.cos(a)), np.mean(r * np.sin(a))])
+    pose[:2] = seen + reach(view.outline) / 2 * seen / max(float(np.hypot(*seen)), 1e-6)
+    for _ in range(2):
+        _, edges = expected_ranges(view.outline, pose[None], a)
+        turn = float(wrap((a[0] + a[-1]) / 2 - edges[0].mean()))
+        pose[:2] = rotation(turn) @ pose[:2]
+        middle = a[len(a) // 2]
+        miss = float(np.median(r - expected_ranges(view.outline, pose[None], a)[0][0]))
+        pose[:2] += miss * np.array([np.cos(middle), np.sin(middle)])
+    return pose
+
+
+def _linearised(pose: Array, view: _View) -> tuple[Array, Array]:
+    """Measured minus expected (n + 2,), derivatives (n + 2, 3) of what is expected."""
+    shifts = STEP * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    h = np.concatenate(expected_ranges(view.outline, pose + shifts, view.a), axis=1)
+    e = np.concatenate([view.r, view.edges]) - h[0]
+    e[-2:] = wrap(e[-2:])
+    return e, ((h[1:4] - h[4:7]) / (2 * STEP)).T
+
+
+def _solved(pose: Array, free: int, view: _View) -> Array:
+    """Levenberg-Marquardt steps over the first ``free`` parts of the pose."""
+    damping = 1e-3
+    e, J = _linearised(pose, view)
+    cost = float(view.w @ e**2)
+    for _ in range(ITERATIONS):
+        J = J[:, :free]
+        N = J.T @ (view.w[:, None] * J)
+        N += damping * np.diag(np.diag(N)) + 1e-6 * np.eye(free)
+        trial = pose.copy()
+        trial[:free] += np.clip(np.linalg.solve(N, J.T @ (view.w * e)), -FARTHEST, FARTHEST)
+        new_e, new_J = _linearised(trial, view)
+        less = cost - float(view.w @ new_e**2)
+        if less < 0:
+            damping = max(10 * damping, 1e-2)
+            continue
+        pose, e, J, cost, damping = trial, new_e, new_J, cost - less, damping / 10
+        if less < CONVERGED:
+            break
+    return pose

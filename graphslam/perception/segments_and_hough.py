@@ -1,0 +1,84 @@
+"""Segments and Hough lines together: one wall gives one observation, no return counts twice.
+
+Segments know where a wall ends; Hough lines hold together what hides behind furniture or goes on
+beyond a door. So segments with two real ends come first and keep their returns; Hough lines are
+made of the others; a segment that was cut stays where no Hough line took its returns.
+"""
+
+import numpy as np
+
+from graphslam.core.config import FrontEndConfig
+from graphslam.core.records import Observation
+from graphslam.perception.hough import find_lines
+from graphslam.perception.line_fit import fit_lines, observations
+from graphslam.perception.ordered_scan import Sweep
+from graphslam.perception.segments import (
+    Indices,
+    Segments,
+    fewest_points,
+    find_segments,
+    valid_lines,
+)
+
+SHARED = 0.5
+"""A cut segment that lost a larger share of its returns to Hough lines is a part of them."""
+
+
+def both(sweep: Sweep, config: FrontEndConfig) -> tuple[Observation, ...]:
+    """Whole segments, Hough lines of the other returns, and segments that no Hough line covers.
+
+    Args:
+        sweep: one scan, in order.
+        config: thresholds and noise.
+
+    Returns:
+        Observations, laser frame: whole segments in the order of the beams, then Hough lines, then
+        what is left of cut segments, of kind ``line``.
+    """
+    found = find_segments(sweep, config)
+    free = np.ones(len(sweep.beam), dtype=np.bool_)
+    whole: tuple[Observation, ...] = ()
+    if found is not None:
+        take = found.whole & found.valid
+        free[found.rows[take[_owner(found.rows, found.starts)]]] = False
+        whole = observations(found.fits[take], found.whole[take], config)
+    rows, starts = find_lines(sweep, free, config)
+    hough, used = _cut_lines(sweep, rows, starts, config)
+    free[used] = False
+    if found is None:
+        return hough
+    left, _ = _cut_lines(sweep, *_left_over(found, free, config), config)
+    return (*whole, *hough, *left)
+
+
+def _owner(rows: Indices, starts: Indices) -> Indices:
+    """Number of the line that each of ``rows`` belongs to."""
+    return np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(rows))))
+
+
+def _cut_lines(
+    sweep: Sweep, rows: Indices, starts: Indices, config: FrontEndConfig
+) -> tuple[tuple[Observation, ...], Indices]:
+    """Observations of kind ``line`` of those that are valid, and the rows that they are made of."""
+    if not len(starts):
+        return (), rows
+    fits = fit_lines(sweep.points[rows], starts, config)
+    valid = valid_lines(fits, config)
+    seen = observations(fits[valid], np.zeros(np.count_nonzero(valid), dtype=np.bool_), config)
+    return seen, rows[valid[_owner(rows, starts)]]
+
+
+def _left_over(
+    found: Segments, free: np.ndarray[tuple[int], np.dtype[np.bool_]], config: FrontEndConfig
+) -> tuple[Indices, Indices]:
+    """Rows and starts of the cut segments that mostly consist of ``free`` returns, of those."""
+    owner = _owner(found.rows, found.starts)
+    is_free = free[found.rows]
+    count = np.bincount(owner, minlength=len(found.starts))
+    left = np.bincount(owner[is_free], minlength=len(found.starts))
+    stays = found.valid & ~found.whole & (left >= fewest_points(config))
+    stays &= left >= (1 - SHARED) * count
+    kept = is_free & stays[owner]
+    rows, owner = found.rows[kept], owner[kept]
+    begins = np.flatnonzero(owner[1:] != owner[:-1]) + 1
+    return rows, np.concatenate(([0], begins)) if len(rows) else begins

@@ -1,0 +1,1 @@
+"""What is written: the result folder, and the report pages with their figures."""

@@ -1,0 +1,357 @@
+# ruff: noqa: RUF001 -- σ and – are meant: people read them
+"""The page of an experiment, and its figures as files of their own.
+
+Everything comes from the summary that `graphslam.experiments.summarise` makes; `FIGURES` is the
+list of what is drawn of an experiment on the bench.
+"""
+
+from collections.abc import Callable, Mapping
+from html import escape
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from graphslam.core.geometry import Array
+from graphslam.results.report_figure import ACCENT, FAINT, INK, legend, robot_color, svg
+from graphslam.results.report_page import document, figure, section
+from graphslam.results.report_tables import number, table
+
+Summary = Mapping[str, Any]
+
+
+def experiment_page(summary: Summary) -> str:
+    """The report of an experiment as one self-contained HTML document."""
+    sections = [_header(summary), _warnings(summary)]
+    if summary["kind"] == "bench":
+        sections += [
+            _section("Consistency", _consistency(summary)),
+            _section("Errors against the Cramér-Rao bound", _errors(summary)),
+            section("Figures", [figure(draw(summary), *text) for draw, *text in FIGURES.values()]),
+        ]
+    else:
+        sections.append(_section("Errors over logs", _logs(summary)))
+    sections.append(_reproduce(summary))
+    return document(str(summary["name"]), sections)
+
+
+def experiment_figures(summary: Summary) -> dict[str, str]:
+    """Name -> SVG file of every figure; none for an experiment over logs."""
+    if summary["kind"] != "bench":
+        return {}
+    return {name: _standalone(draw(summary)) for name, (draw, *_) in FIGURES.items()}
+
+
+def _standalone(drawing: str) -> str:
+    """SVG of a page as a file: with its name space, light colours and a ground of its own."""
+    colors = {"var(--grid)": FAINT, "var(--accent)": ACCENT, "currentColor": INK}
+    colors |= {f"var(--robot{i})": robot_color(i) for i in range(6)}
+    for variable, color in colors.items():
+        drawing = drawing.replace(variable, color)
+    style = ' style="background: #ffffff" '
+    if "xmlns=" not in drawing:
+        style += 'xmlns="http://www.w3.org/2000/svg" '
+    return drawing.replace("<svg ", f"<svg{style}", 1) + "\n"
+
+
+# ---------------------------------------------------------------- words and tables
+
+
+def _section(title: str, content: str) -> str:
+    return f"<section><h2>{escape(title)}</h2>{content}</section>"
+
+
+def _header(summary: Summary) -> str:
+    counts = (
+        ("runs", summary["rows"]),
+        ("variants", len(summary["variants"])),
+        ("noise scales", len(summary["noise_scales"])),
+        ("failed", sum(row["failed"] for row in summary["table"])),
+        ("diverged", sum(row.get("diverged", 0) for row in summary["table"])),
+        ("run time, s", summary["seconds"]),
+    )
+    tiles = "".join(f"<div><dt>{name}</dt><dd>{number(value)}</dd></div>" for name, value in counts)
+    return (
+        f"<header><p class=brand>graphslam experiment</p><h1>{escape(str(summary['name']))}</h1>\n"
+        f"<p class=lead>{escape(str(summary['description']))}.</p>\n"
+        f"<dl class=tiles>{tiles}</dl>"
+        f"<p class=note>A run has diverged if: {escape(str(summary['diverged_if']))}. Failed runs "
+        "are in no mean, diverged ones in all.</p></header>"
+    )
+
+
+def _warnings(summary: Summary) -> str:
+    lines = [*summary["warnings"], *(f"{n} × {text}" for text, n in summary["errors"].items())]
+    items = "".join(f"<li>{escape(str(text))}</li>" for text in lines)
+    return f'<section class="warn"><h2>Warnings</h2><ul>{items}</ul></section>' if items else ""
+
+
+def _consistency(summary: Summary) -> str:
+    rows: list[tuple[object, ...]] = []
+    for row in summary["table"]:
+        head = (f"{row['variant']}, noise × {row['scale']:g}", row["runs"], row["failed"])
+        if "nees_per_dof" not in row:
+            rows.append((*head, None, None, None, None, None, None))
+            continue
+        low, high = row["nees_bounds"]
+        rows.append(
+            (
+                *head,
+                row["diverged"],
+                row["error_frame"],
+                row["dof"],
+                row["nees_per_dof"],
+                f"{low:.3f}…{high:.3f}",
+                row["nees_verdict"],
+            )
+        )
+    columns = ["", "runs", "failed", "diverged", "errors in frame", "dof", "NEES/dof", "bounds", ""]
+    note = (
+        f"<p class=note>Final joint state: latest poses 3, points 2, lines 2 degrees of freedom. "
+        f"Bounds: two-sided chi-square, {100 * summary['level']:g} % over all noise scales "
+        "together. Of a filter, final is causal.</p>"
+    )
+    return table(columns, rows) + note
+
+
+def _errors(summary: Summary) -> str:
+    parts = {
+        "final position": ("final", "position_m2"),
+        "final heading": ("final", "heading_rad2"),
+        "causal position": ("causal", "position_m2"),
+        "causal heading": ("causal", "heading_rad2"),
+        "points": ("landmarks", "points_m2"),
+        "line offsets": ("landmarks", "lines_m2"),
+        "line directions": ("landmarks", "lines_rad2"),
+    }
+    rows = []
+    for row in summary["table"]:
+        if "final" not in row:
+            continue
+        cells = [row[kind].get(name) for kind, name in parts.values()]
+        texts = [
+            None if c is None else f"{c['over_bound']:.3f} ± {c['over_bound_sigma']:.3f}"
+            for c in cells
+        ]
+        name = f"{row['variant']}, noise × {row['scale']:g}"
+        rows.append((name, cells[0]["rmse"], *texts, row["from_reference_m"]))
+    columns = ["", "position RMSE, m", *parts, f"from {summary['reference']}, m"]
+    note = (
+        "<p class=note>Root mean square error over its Cramér-Rao bound, with its standard error: "
+        "final against the bound of all data, causal against that of the data up to each time.</p>"
+    )
+    return table(columns, rows) + note
+
+
+def _logs(summary: Summary) -> str:
+    rows = []
+    for row in summary["table"]:
+        name = f"{row['scenario']}, {row['front_end']}, {row['variant']}, noise × {row['scale']:g}"
+        cells: list[object] = [name, row["runs"], row["failed"], row.get("diverged")]
+        for kind in ("final", "causal"):
+            ate = row.get(kind, {}).get("ate_rmse_m", {})
+            cells += [_plus_minus(ate), ate.get("max"), _mean(row, kind, "nees_per_dof")]
+        cells += [_mean(row, "landmarks", name) for name in ("rmse_m", "matched", "extra")]
+        rows.append(cells)
+    columns = ["", "runs", "failed", "diverged", "final ATE, m", "worst", "NEES/dof"]
+    columns += ["causal ATE, m", "worst", "NEES/dof", "landmark RMSE, m", "matched", "extra"]
+    return table(columns, rows) + "<p class=note>Mean ± standard deviation over the runs.</p>"
+
+
+def _plus_minus(found: Mapping[str, Any]) -> str | None:
+    if found.get("mean") is None:
+        return None
+    return f"{found['mean']:.4f} ± {found['std'] or 0.0:.4f}"
+
+
+def _mean(row: Mapping[str, Any], kind: str, name: str) -> float | None:
+    value = row.get(kind, {}).get(name, {}).get("mean")
+    return None if value is None else float(value)
+
+
+def _reproduce(summary: Summary) -> str:
+    settings = [(name, " ".join(values)) for name, values in summary["variants"].items()]
+    command = f"graphslam experiment {summary['name']} --runs {summary['runs']} -o DIR"
+    return (
+        "<section><details><summary>How to reproduce this</summary>"
+        f"<p><code>{escape(command)}</code></p>"
+        f"<p class=note>Seed {summary['seed']}; code {escape(', '.join(summary['code']))}; "
+        f"settings of all: {escape(' '.join(summary['settings']) or 'none')}</p>"
+        f"{table(['variant', 'settings'], settings)}</details></section>"
+    )
+
+
+# ---------------------------------------------------------------- figures
+
+
+def _panels(summary: Summary, draw: Callable[[Axes, str], None], label: str) -> str:
+    """A panel per noise scale, two in a row."""
+    scales = list(summary["curves"])
+    rows = (len(scales) + 1) // 2
+
+    def whole(fig: Figure) -> None:
+        grid = fig.subplots(rows, min(2, len(scales)), squeeze=False, sharex=True)
+        for axes, scale in zip(grid.flat, scales, strict=False):
+            draw(axes, scale)
+            axes.set_title(f"noise × {scale}", loc="left", fontsize=8)
+        for axes in grid.flat[len(scales) :]:
+            axes.set_visible(False)
+        for axes in grid[-1]:
+            axes.set_xlabel("step", labelpad=1)
+        handles, names = grid.flat[0].get_legend_handles_labels()
+        fig.legend(handles, names, loc="upper center", ncols=min(len(names), 6), fontsize=7,
+                   handlelength=1.4, columnspacing=1.0)  # fmt: skip
+        fig.subplots_adjust(0.1, 0.46 / fig.get_figheight(), 0.98, 1 - 0.5 / fig.get_figheight(),
+                            wspace=0.36, hspace=0.28)  # fmt: skip
+
+    return svg(label, 0.9 + 1.45 * rows, whole)
+
+
+def _styles(summary: Summary) -> dict[str, dict[str, Any]]:
+    """Colour and stroke of each variant; strokes differ, since some curves lie on each other."""
+    strokes = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)))
+    return {
+        name: {"color": robot_color(i), "linestyle": strokes[i % 3], "linewidth": 1.1}
+        for i, name in enumerate(summary["variants"])
+    }
+
+
+def _curve(axes: Axes, band: Mapping[str, Any], label: str, style: dict[str, Any]) -> None:
+    steps = np.arange(len(band["mean"]))
+    axes.fill_between(steps, band["low"], band["high"], color=style["color"], alpha=0.18, lw=0)
+    axes.plot(steps, band["mean"], label=label, **style)
+
+
+def nees_over_time(summary: Summary) -> str:
+    """Mean NEES of the robots' latest poses together, causal, with both bounds."""
+    styles = _styles(summary)
+
+    def draw(axes: Axes, scale: str) -> None:
+        found = summary["curves"][scale]
+        axes.axhspan(*found["nees_bounds"], color=ACCENT, alpha=0.2, lw=0)
+        for name, curves in found["variants"].items():
+            _curve(axes, curves["nees_per_dof"], name, styles[name])
+        axes.set_ylabel("NEES / dof", labelpad=1)
+
+    return _panels(summary, draw, "Mean NEES over time")
+
+
+def _rmse_over_time(summary: Summary, kind: str, label: str) -> str:
+    styles = _styles(summary)
+
+    def draw(axes: Axes, scale: str) -> None:
+        found = summary["curves"][scale]
+        for name, curves in found["variants"].items():
+            _curve(axes, curves[f"{kind}_position_m"], name, styles[name])
+        bound = found["bound"][f"{kind}_position_m"]
+        axes.plot(np.arange(len(bound)), bound, color=INK, linewidth=1.4, label="bound", zorder=4)
+        axes.set_ylabel("RMSE, m", labelpad=1)
+        axes.set_ylim(bottom=0.0)
+
+    return _panels(summary, draw, label)
+
+
+def causal_rmse(summary: Summary) -> str:
+    """Root mean square position error by data up to each time, over the filtering bound."""
+    return _rmse_over_time(summary, "causal", "Causal position error over time")
+
+
+def final_rmse(summary: Summary) -> str:
+    """Root mean square position error by all data, over the smoothing bound."""
+    return _rmse_over_time(summary, "final", "Final position error over time")
+
+
+def error_against_noise(summary: Summary) -> str:
+    """Final position error, its bound, and the distance from the reference, over the noise."""
+    styles = _styles(summary)
+    lines = {name: _of_variant(summary, name) for name in summary["variants"]}
+
+    def draw(fig: Figure) -> None:
+        left, right = fig.subplots(1, 2)
+        for name, rows in lines.items():
+            scales = [row["scale"] for row in rows]
+            rmse = [row["final"]["position_m2"]["rmse"] for row in rows]
+            gap = np.array([row["from_reference_m"] or np.nan for row in rows], dtype=float)
+            left.plot(scales, rmse, marker=".", label=name, **styles[name])
+            if np.nanmax(gap, initial=0.0) > 0:
+                right.plot(scales, _positive(gap), marker=".", label=name, **styles[name])
+        rows = next((rows for rows in lines.values() if rows), [])
+        bound = [row["final"]["position_m2"]["bound"] for row in rows]
+        scales = [row["scale"] for row in rows]
+        left.plot(scales, bound, color=INK, label="bound", linewidth=1.4)
+        left.set_ylabel("final position RMSE, m")
+        right.set_ylabel(f"end's distance from {summary['reference']}, m")
+        for axes in (left, right):
+            axes.set_xscale("log")
+            axes.set_yscale("log")
+            axes.set_xlabel("noise scale", labelpad=1)
+        handles, names = left.get_legend_handles_labels()
+        fig.legend(handles, names, loc="upper center", ncols=6, fontsize=7, handlelength=1.4,
+                   columnspacing=1.0)  # fmt: skip
+        fig.subplots_adjust(0.12, 0.16, 0.98, 0.87, wspace=0.38)
+
+    return svg("Error against noise", 2.6, draw)
+
+
+def _of_variant(summary: Summary, name: str) -> list[Mapping[str, Any]]:
+    return [row for row in summary["table"] if row["variant"] == name and "final" in row]
+
+
+def _positive(values: Array) -> Array:
+    return np.where(values > 0, values, np.nan)
+
+
+def consistency_against_noise(summary: Summary) -> str:
+    """NEES of the final joint state over the noise, with the bounds of the test."""
+    styles = _styles(summary)
+
+    def draw(fig: Figure) -> None:
+        axes = fig.add_axes((0.12, 0.16, 0.86, 0.71))
+        low = high = 1.0
+        for name in summary["variants"]:
+            rows = [row for row in _of_variant(summary, name) if row["nees_per_dof"] is not None]
+            values = [row["nees_per_dof"] for row in rows]
+            axes.plot([row["scale"] for row in rows], values, marker=".", label=name,
+                      **styles[name])  # fmt: skip
+            for row in rows:
+                low, high = row["nees_bounds"]
+        axes.axhspan(low, high, color=ACCENT, alpha=0.2, lw=0)
+        axes.set_xscale("log")
+        axes.set_xlabel("noise scale", labelpad=1)
+        axes.set_ylabel("final joint NEES / dof")
+        legend(axes)
+
+    return svg("Consistency against noise", 2.6, draw)
+
+
+#: name -> (drawing, title, caption)
+FIGURES: dict[str, tuple[Callable[[Summary], str], str, str]] = {
+    "consistency": (
+        consistency_against_noise,
+        "Consistency against noise.",
+        "Mean NEES per degree of freedom of the final joint state; the bar is the test's bounds.",
+    ),
+    "error": (
+        error_against_noise,
+        "Error against noise.",
+        "Left: final position error and its bound. Right: how far the last poses are from the "
+        "reference's; a slope of two says that both linearise rightly.",
+    ),
+    "nees": (
+        nees_over_time,
+        "NEES over time.",
+        "Latest poses of all robots together, from data up to each time; 95 % bands of the mean, "
+        "the bar is the 95 % chi-square bounds.",
+    ),
+    "causal": (
+        causal_rmse,
+        "Causal position error over time.",
+        "Root mean square over runs and robots, 95 % bands, over the filtering bound.",
+    ),
+    "final": (
+        final_rmse,
+        "Final position error over time.",
+        "The same by all data, over the smoothing bound; a filter's is its causal one.",
+    ),
+}

@@ -1,0 +1,264 @@
+"""Plans seen from above: scans, trajectories with uncertainty, landmarks with numbers."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from graphslam.core.gaussian import chi2_quantile
+from graphslam.core.geometry import Array, interpolate
+from graphslam.core.records import Landmark, Result, Trajectory
+from graphslam.results.report_figure import (
+    ACCENT,
+    INK,
+    WIDTH_IN,
+    density,
+    legend,
+    map_axes,
+    robot_color,
+    svg,
+)
+
+MAX_LABELS = 40
+MAX_ELLIPSES = 400
+_SIGMAS_95_2D = float(np.sqrt(chi2_quantile(0.95, 2)))
+_SIGMAS_95_1D = float(np.sqrt(chi2_quantile(0.95, 1)))
+
+
+def poses_at(trajectory: Trajectory, stamps_ns: Sequence[int]) -> Array:
+    """Poses (n, 3) of a sorted trajectory at stamps, on the twist between neighbours.
+
+    Before its start and after its end the first and the last pose stand.
+    """
+    known = trajectory.stamps_ns
+    wanted = np.clip(np.array(stamps_ns, dtype=np.int64), known[0], known[-1])
+    after = np.searchsorted(known, wanted)
+    before = np.maximum(after - 1, 0)
+    share = (wanted - known[before]) / np.maximum(known[after] - known[before], 1)
+    return interpolate(trajectory.poses[before], trajectory.poses[after], share)
+
+
+def overview(result: Result, *, dead_reckoning: bool) -> str:
+    """All scans and paths on the final trajectory, or on odometry alone.
+
+    Without scans the landmarks take their place beside the final trajectory.
+    """
+    paths = {
+        name: robot.dead_reckoning if dead_reckoning else robot.final
+        for name, robot in sorted(result.robots.items())
+    }
+    clouds = {name: _cloud(result, name, path, dead_reckoning) for name, path in paths.items()}
+    marks = () if result.pictures or dead_reckoning else result.landmarks
+    extents = [landmark.extent for landmark in marks]
+    limits = _limits([*(p.poses[:, :2] for p in paths.values()), *clouds.values(), *extents])
+
+    def draw(figure: Figure) -> None:
+        axes = map_axes(figure, limits)
+        for i, cloud in enumerate(clouds.values()):
+            if len(cloud):
+                axes.imshow(
+                    density(cloud, limits, robot_color(i)),
+                    extent=(limits[0, 0], limits[0, 1], limits[1, 0], limits[1, 1]),
+                    origin="lower",
+                    interpolation="none",
+                    aspect="auto",  # the axes have equal scales already
+                )
+        for i, (name, path) in enumerate(paths.items()):
+            color = ACCENT if len(paths) == 1 else robot_color(i)
+            axes.plot(*path.poses[:, :2].T, color=color, linewidth=0.9, label=name)
+        _draw_landmarks(axes, marks, 1.0)
+        if len(paths) > 1:
+            legend(axes)
+
+    what = "odometry alone" if dead_reckoning else "the final trajectory"
+    return svg(f"Scans and paths on {what}", map_height(result), draw)
+
+
+def landmark_map(result: Result) -> tuple[str, int]:
+    """Landmarks with the numbers of the strongest and 95 % bounds, and how much those are enlarged.
+
+    An ellipse bounds a point; a bar across each end bounds where a line runs there.
+    """
+    landmarks = result.landmarks
+    paths = [robot.final.poses[:, :2] for robot in result.robots.values()]
+    limits = _limits([*paths, *(landmark.extent for landmark in landmarks)])
+    strongest = sorted(landmarks, key=lambda m: (-m.sightings, m.id))
+    shown = strongest[:MAX_ELLIPSES]
+    factor = _enlargement([_size(m) for m in shown], limits)
+
+    def draw(figure: Figure) -> None:
+        axes = map_axes(figure, limits)
+        for path in paths:
+            axes.plot(*path.T, color=INK, linewidth=0.5, alpha=0.35)
+        _draw_landmarks(axes, landmarks, 1.6)
+        bounds = [b for landmark in shown for b in _bounds(landmark, factor)]
+        axes.add_collection(LineCollection(bounds, colors=ACCENT, linewidths=0.8))
+        for landmark, (x, y) in _spread(strongest, limits):
+            axes.annotate(
+                str(landmark.id),
+                (x, y),
+                (3, 3),
+                textcoords="offset points",
+                fontsize=7.5,
+                gid=f"halo{landmark.id}",
+            )
+
+    return svg("Landmarks with numbers and 95 % bounds", map_height(result), draw), factor
+
+
+def trajectory_map(result: Result) -> tuple[str, int]:
+    """Final and causal paths with 95 % ellipses along the final one, and their enlargement."""
+    robots = sorted(result.robots.items())
+    # the causal path may stray far and is cut off where it does
+    limits = _limits([robot.final.poses[:, :2] for _, robot in robots])
+    samples = {name: _every(robot.final, max(40 // len(robots), 12)) for name, robot in robots}
+    factor = _enlargement([float(s) for _, c in samples.values() for s in _semi_axes(c)], limits)
+
+    def draw(figure: Figure) -> None:
+        axes = map_axes(figure, limits)
+        for i, (name, robot) in enumerate(robots):
+            color = robot_color(i)
+            label = name if len(robots) > 1 else "final"
+            axes.plot(
+                *robot.causal.poses[:, :2].T,
+                color=INK if len(robots) == 1 else color,
+                linewidth=0.5,
+                alpha=0.4,
+                label="causal" if len(robots) == 1 else None,
+            )
+            axes.plot(*robot.final.poses[:, :2].T, color=color, linewidth=1.1, label=label)
+            axes.plot(*robot.final.poses[0, :2], marker="o", color=color, markersize=5.5)
+            means, covs = samples[name]
+            ellipses = [_ellipse(m, c, factor) for m, c in zip(means, covs, strict=True)]
+            axes.add_collection(LineCollection(ellipses, colors=ACCENT, linewidths=0.7))
+        legend(axes)
+
+    return svg("Trajectory with 95 % ellipses", map_height(result), draw), factor
+
+
+def map_height(result: Result) -> float:
+    """Height in inches of the maps of a result: its own proportions, within reason."""
+    paths = [robot.final for robot in result.robots.values()]
+    clouds = [_cloud(result, name, r.final, False) for name, r in result.robots.items()]
+    (x0, x1), (y0, y1) = _limits([*(p.poses[:, :2] for p in paths), *clouds])
+    return WIDTH_IN * float(np.clip((y1 - y0) / (x1 - x0), 0.6, 1.15))
+
+
+def _cloud(result: Result, robot: str, path: Trajectory, dead_reckoning: bool) -> Array:
+    """All points (n, 2) of a robot's pictures in the world frame."""
+    pictures = [p for p in result.pictures if p.robot == robot and len(p.points)]
+    if not pictures:
+        return np.empty((0, 2))
+    source = path if dead_reckoning else result.estimate.states.get(robot, path)
+    poses = poses_at(source, [p.time_ns for p in pictures])
+    poses = np.repeat(poses, [len(p.points) for p in pictures], axis=0)
+    points = np.concatenate([p.points for p in pictures])
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    return np.column_stack(
+        [
+            poses[:, 0] + c * points[:, 0] - s * points[:, 1],
+            poses[:, 1] + s * points[:, 0] + c * points[:, 1],
+        ]
+    )
+
+
+def _limits(parts: Iterable[Array]) -> Array:
+    """[[x_min, x_max], [y_min, y_max]] around most of all points; a few stray returns do not count.
+
+    Each part counts for itself: a path stays whole however many points its scans have.
+    """
+    boxes = []
+    for points in parts:
+        if len(points) > 1000:
+            boxes.append(np.quantile(points, [0.002, 0.998], axis=0))
+        elif len(points):
+            boxes.append(np.stack([points.min(axis=0), points.max(axis=0)]))
+    low = np.min([box[0] for box in boxes], axis=0)
+    high = np.max([box[1] for box in boxes], axis=0)
+    margin = 0.03 * max(float((high - low).max()), 1.0)
+    return np.column_stack([low - margin, high + margin])
+
+
+def _draw_landmarks(axes: Axes, landmarks: Sequence[Landmark], width: float) -> None:
+    """Points as triangles, lines over the extent seen."""
+    points = np.array([m.position[:2] for m in landmarks if m.kind == "point"]).reshape(-1, 2)
+    axes.plot(*points.T, "^", color=INK, markersize=2.5, markeredgewidth=0)
+    walls = [m.extent for m in landmarks if m.kind != "point"]
+    axes.add_collection(LineCollection(walls, colors=INK, linewidths=width))
+
+
+def _spread(strongest: Sequence[Landmark], limits: Array) -> list[tuple[Landmark, Array]]:
+    """The strongest landmarks whose numbers do not lie on each other, with where to write them."""
+    room = np.array([0.05, 0.035]) * (limits[:, 1] - limits[:, 0]).max()
+    placed: list[tuple[Landmark, Array]] = []
+    for landmark in strongest:
+        spot = landmark.extent.mean(axis=0)
+        if len(placed) < MAX_LABELS and all((np.abs(spot - p) > room).any() for _, p in placed):
+            placed.append((landmark, spot))
+    return placed
+
+
+def _enlargement(sizes: Sequence[float], limits: Array) -> int:
+    """How much to enlarge 95 % bounds so that the median one is visible: 1, 2, 5, 10, 20, ..."""
+    sizes = [s for s in sizes if np.isfinite(s) and s > 0]
+    if not sizes:
+        return 1
+    wanted = 0.008 * float((limits[:, 1] - limits[:, 0]).max()) / float(np.median(sizes))
+    steps: list[int] = [m * int(10**e) for e in range(4) for m in (1, 2, 5)]
+    return next((step for step in steps if step >= wanted), steps[-1])
+
+
+def _every(trajectory: Trajectory, count: int) -> tuple[Array, Array]:
+    """Positions (k, 2) and covariances (k, 2, 2) at even intervals of path."""
+    xy = trajectory.poses[:, :2]
+    path = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
+    index = np.unique(np.searchsorted(path, np.linspace(0, path[-1], count)))
+    index = index[np.isfinite(trajectory.covs[index]).all(axis=(1, 2))]
+    return xy[index], trajectory.covs[index, :2, :2]
+
+
+def _semi_axes(covs: Array) -> Array:
+    """Longer semi-axes (k,) of the 95 % ellipses of covariances (k, 2, 2), m."""
+    values = np.linalg.eigvalsh(covs)[:, -1] if len(covs) else np.empty(0)
+    return np.asarray(_SIGMAS_95_2D * np.sqrt(np.maximum(values, 0.0)))
+
+
+def _ellipse(mean: Array, cov: Array, factor: float) -> Array:
+    """The 95 % ellipse, enlarged, as a closed line (25, 2)."""
+    values, vectors = np.linalg.eigh(cov)
+    t = np.linspace(0, 2 * np.pi, 25)
+    circle = np.stack([np.cos(t), np.sin(t)])
+    axes = factor * _SIGMAS_95_2D * np.sqrt(np.maximum(values, 0.0))
+    return np.asarray(mean + (vectors @ (axes[:, None] * circle)).T)
+
+
+def _across(landmark: Landmark) -> Array:
+    """95 % half widths (2,) across a line at its two ends, m.
+
+    The normal offset of a point at ``t`` along the line varies as offset error - t * direction
+    error: [-t, 1] C [-t, 1]^T.
+    """
+    assert landmark.line is not None  # callers ask for lines
+    normal, _, cov = landmark.line
+    t = landmark.extent @ np.array([-np.sin(normal), np.cos(normal)])
+    a = np.column_stack([-t, np.ones(2)])
+    variances = np.einsum("ni,ij,nj->n", a, cov, a)
+    return np.asarray(_SIGMAS_95_1D * np.sqrt(np.maximum(variances, 0.0)))
+
+
+def _size(landmark: Landmark) -> float:
+    if landmark.line is not None:
+        return float(_across(landmark).mean())
+    return float(_semi_axes(landmark.cov[None, :2, :2])[0])
+
+
+def _bounds(landmark: Landmark, factor: float) -> list[Array]:
+    """Lines to draw for the uncertainty of a landmark."""
+    if landmark.line is None:
+        return [_ellipse(landmark.position[:2], landmark.cov[:2, :2], factor)]
+    normal = landmark.line[0]
+    n = np.array([np.cos(normal), np.sin(normal)])
+    half = factor * _across(landmark)[:, None] * n
+    return [np.stack([e - h, e + h]) for e, h in zip(landmark.extent, half, strict=True)]

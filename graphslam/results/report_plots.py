@@ -1,0 +1,170 @@
+# ruff: noqa: RUF001 -- σ and – are meant: people read them
+"""Curves over time: uncertainty, revision of the past, innovations, time per keyframe."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from graphslam.core.gaussian import chi2_quantile
+from graphslam.core.geometry import Array, wrap
+from graphslam.core.observation_models import MODELS
+from graphslam.core.records import Result, Trajectory
+from graphslam.results.report_figure import (
+    ACCENT,
+    INK,
+    legend,
+    log_scale,
+    robot_color,
+    svg,
+    time_rows,
+)
+
+_SMALLEST = 1e-6  # m or degrees: nothing below it is worth a decade of a logarithmic axis
+_MAX_DOTS = 4000
+
+
+def uncertainty(result: Result) -> str:
+    """Standard deviations of position (worst direction) and heading over time."""
+    clock = _Clock.of(result)
+
+    def draw(figure: Figure) -> None:
+        top, bottom = time_rows(figure, 2, clock.label)
+        for i, (name, robot) in enumerate(sorted(result.robots.items())):
+            both = ((robot.final, 1.0, 3, "final"), (robot.causal, 0.5, 2, "causal"))
+            for path, alpha, layer, kind in both:
+                label = _label(name, kind, len(result.robots))
+                t = clock.time(path)
+                style: dict[str, Any] = {"color": robot_color(i), "alpha": alpha, "zorder": layer}
+                top.plot(t, _worst_sigma(path), label=label, **style)
+                bottom.plot(t, np.degrees(_root(path.covs[:, 2, 2])), **style)
+        log_scale(top, "position σ, m")
+        log_scale(bottom, "heading σ, °")
+        legend(top)
+
+    return svg("Uncertainty over time", 3.5, draw)
+
+
+def revision(result: Result) -> str:
+    """How far causal estimates and dead reckoning are from the final trajectory, over time."""
+    clock = _Clock.of(result)
+
+    def draw(figure: Figure) -> None:
+        top, bottom = time_rows(figure, 2, clock.label)
+        for i, (name, robot) in enumerate(sorted(result.robots.items())):
+            others: tuple[tuple[Trajectory, dict[str, Any], str], ...] = (
+                (robot.causal, {"zorder": 3}, "causal"),
+                (robot.dead_reckoning, {"linestyle": (0, (2, 1.2)), "alpha": 0.8}, "odometry"),
+            )
+            for path, style, kind in others:
+                if len(path) != len(robot.final):
+                    continue  # not at the same stamps: nothing to compare
+                off = path.poses - robot.final.poses
+                t, color = clock.time(path), robot_color(i)
+                label = _label(name, kind, len(result.robots))
+                distance = np.hypot(off[:, 0], off[:, 1])
+                top.plot(t, _positive(distance), color=color, label=label, linewidth=1, **style)
+                turn = np.degrees(np.abs(wrap(off[:, 2])))
+                bottom.plot(t, _positive(turn), color=color, linewidth=1, **style)
+        log_scale(top, "position, m")
+        log_scale(bottom, "heading, °")
+        legend(top)
+
+    return svg("Distance from the final trajectory over time", 3.5, draw)
+
+
+def innovations(found: Mapping[str, Array]) -> str:
+    """Normalised innovation squared per degree of freedom of each model, over time.
+
+    ``found[model]`` (n, 2) has a row per innovation: time s, d² / dof.
+    Its expectation is 1; the dashed line is the 95 % quantile of chi-square for one innovation.
+    """
+    found = {model: values for model, values in sorted(found.items()) if len(values)}
+
+    def draw(figure: Figure) -> None:
+        rows = time_rows(figure, len(found), "time, s")
+        for axes, (model, values) in zip(rows, found.items(), strict=True):
+            dots = values[:: max(1, len(values) // _MAX_DOTS)]
+            axes.plot(
+                dots[:, 0], _positive(dots[:, 1], 1e-3), ".", color=robot_color(0), markersize=2.5,
+                alpha=0.55, markeredgewidth=0, rasterized=True,
+            )  # fmt: skip
+            axes.plot(*_running(values, np.mean), color=INK, linewidth=1.2)
+            axes.axhline(1.0, color=ACCENT, linewidth=1.0)
+            title = f"{model}: n {len(values)}, mean {values[:, 1].mean():.2f}"
+            if model in MODELS:
+                limit = float(chi2_quantile(0.95, MODELS[model].rows)) / MODELS[model].rows
+                axes.axhline(limit, color=ACCENT, linewidth=0.8, linestyle="--")
+                title += f", {100 * np.mean(values[:, 1] > limit):.1f} % above the dashes"
+            axes.set_title(title, loc="left", pad=3)
+            axes.set_ylim(bottom=max(1e-3, float(np.quantile(values[:, 1], 0.005)) / 2))
+            log_scale(axes, "NIS / dof")
+
+    return svg("Innovations per observation model", 0.75 + 1.35 * len(found), draw)
+
+
+def timing(step_ms: Array) -> str:
+    """Wall time ``step_ms`` (n,), ms, of every keyframe with its running median."""
+    number = np.arange(len(step_ms))
+    dots = slice(None, None, max(1, len(step_ms) // _MAX_DOTS))
+
+    def draw(figure: Figure) -> None:
+        (axes,) = time_rows(figure, 1, "keyframe")
+        axes.plot(
+            number[dots], _positive(step_ms[dots], 1e-3), ".", color=robot_color(0), markersize=3,
+            alpha=0.6, markeredgewidth=0, rasterized=True,
+        )  # fmt: skip
+        axes.plot(
+            *_running(np.column_stack([number, step_ms]), np.median), color=INK, linewidth=1.2
+        )
+        log_scale(axes, "ms")
+
+    return svg("Wall time per keyframe", 2.6, draw)
+
+
+class _Clock:
+    """Time since the first pose of any robot, in a unit that suits the span."""
+
+    def __init__(self, start_ns: int, span_s: float) -> None:
+        minutes = span_s > 900
+        self._start_ns, self._unit_ns = start_ns, 60e9 if minutes else 1e9
+        self.label = "time, min" if minutes else "time, s"
+
+    @classmethod
+    def of(cls, result: Result) -> "_Clock":
+        stamps = [robot.final.stamps_ns for robot in result.robots.values()]
+        first, last = min(s[0] for s in stamps), max(s[-1] for s in stamps)
+        return cls(int(first), float(last - first) / 1e9)
+
+    def time(self, path: Trajectory) -> Array:
+        return np.asarray((path.stamps_ns - self._start_ns) / self._unit_ns)
+
+
+def _worst_sigma(path: Trajectory) -> Array:
+    """Square root of the larger eigenvalue of the position's covariance, closed form for 2x2."""
+    a, b, c = path.covs[:, 0, 0], path.covs[:, 0, 1], path.covs[:, 1, 1]
+    return _root((a + c) / 2 + np.hypot((a - c) / 2, b))
+
+
+def _root(variance: Array) -> Array:
+    return _positive(np.sqrt(np.maximum(variance, 0.0)))
+
+
+def _positive(values: Array, smallest: float = _SMALLEST) -> Array:
+    """Values for a logarithmic axis: what is below the smallest leaves a gap."""
+    return np.where(values > smallest, values, np.nan)
+
+
+def _running(
+    values: Array, statistic: Callable[[Array], Any], bins: int = 60
+) -> tuple[Array, Array]:
+    """Mean abscissa and a statistic of the ordinate in bins of equally many samples."""
+    parts = np.array_split(values, min(bins, max(1, len(values) // 5)))
+    x = np.array([part[:, 0].mean() for part in parts])
+    return x, np.array([statistic(part[:, 1]) for part in parts])
+
+
+def _label(name: str, kind: str, robots: int) -> str:
+    """Legend text: colours tell several robots apart, strokes the kinds of one robot."""
+    return kind if robots == 1 else name

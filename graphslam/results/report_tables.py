@@ -1,0 +1,233 @@
+# ruff: noqa: RUF001 -- σ and – are meant: people read them
+"""Numbers as HTML: the headline, tables of counts and reasons, quality, landmarks."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from graphslam.core.records import Landmark, Result
+
+_SPACE = "\u202f"  # narrow, no break: 13 631
+
+
+def number(value: object, digits: int = 3) -> str:
+    """A number for reading: integers in groups of three, others to ``digits`` significant ones."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int | np.integer):
+        return f"{int(value):,}".replace(",", _SPACE)
+    if isinstance(value, float | np.floating):
+        return _decimal(float(value), digits)
+    return "–" if value is None else escape(str(value))
+
+
+def _decimal(value: float, digits: int) -> str:
+    if not np.isfinite(value):
+        return "–"
+    if 0 < abs(value) < 1e-4:
+        return f"{value:.{digits - 1}e}"
+    places = digits - 1 - int(np.floor(np.log10(abs(value)))) if value else 0
+    return f"{value:,.{max(places, 0)}f}".replace(",", _SPACE)
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[object]], caption: str = "") -> str:
+    """An HTML table; the first column is a heading, the rest is right-aligned.
+
+    Cells that are numbers are formatted with `number`, texts are escaped.
+    """
+    top = "".join(f'<th scope="col">{escape(name)}</th>' for name in head)
+    body = "".join(
+        f'<tr><th scope="row">{number(first)}</th>'
+        + "".join(f"<td>{number(cell)}</td>" for cell in rest)
+        + "</tr>\n"
+        for first, *rest in rows
+    )
+    title = f"<caption>{escape(caption)}</caption>" if caption else ""
+    return (
+        f'<div class="scroll"><table>{title}<thead><tr>{top}</tr></thead>\n'
+        f"<tbody>{body}</tbody></table></div>"
+    )
+
+
+def headline(result: Result) -> str:
+    """One sentence: what went in, what came out, how certain, how fast."""
+    counts = result.summary.get("counts", {})
+    robots = len(result.robots)
+    fleet = "one robot" if robots == 1 else f"{robots} robots"
+    paths = [robot.final for robot in result.robots.values()]
+    # of the states: they are in the order of time, which late stamps in a trajectory are not
+    driven = result.estimate.states.values()
+    metres = sum(float(np.hypot(*np.diff(p.poses[:, :2], axis=0).T).sum()) for p in driven)
+    span = (max(p.stamps_ns[-1] for p in paths) - min(p.stamps_ns[0] for p in paths)) / 1e9
+    source = f"{number(counts['scans'])} scans of {fleet}" if counts.get("scans") else fleet
+    kinds = {landmark.kind for landmark in result.landmarks}
+    kind = {frozenset({"point"}): "point ", frozenset({"line"}): "line "}.get(frozenset(kinds), "")
+    parts = [
+        f"From {source} over {number(float(metres))} m and {number(float(span))} s: "
+        f"{number(counts.get('keyframes'))} keyframes and {number(len(result.landmarks))} "
+        f"{kind}landmarks"
+    ]
+    if counts.get("loop_closures"):
+        parts.append(f", {number(counts['loop_closures'])} loop closures")
+    sigma = median_sigma(result)
+    if sigma is not None:
+        parts.append(f"; position known to {number(100 * sigma, 2)} cm (median 1σ)")
+    factor = result.summary.get("real_time_factor")
+    if factor:
+        parts.append(f", computed {number(factor, 2)} times faster than real time")
+    return "".join(parts) + "."
+
+
+def median_sigma(result: Result) -> float | None:
+    """Median over all final poses of the position's larger standard deviation, m."""
+    covs = np.concatenate([robot.final.covs[:, :2, :2] for robot in result.robots.values()])
+    covs = covs[np.isfinite(covs).all(axis=(1, 2))]
+    if not len(covs):
+        return None
+    return float(np.sqrt(np.median(np.maximum(np.linalg.eigvalsh(covs)[:, -1], 0.0))))
+
+
+def counts(summary: Mapping[str, Any]) -> str:
+    """What went in and came out."""
+    rows = [(name.replace("_", " "), value) for name, value in summary.get("counts", {}).items()]
+    graph = summary.get("graph", {})
+    if graph:
+        rows += [("graph error (½ χ²)", float(graph["error"])), ("graph dof", graph["dof"])]
+    return table(["count", ""], rows, "Counts")
+
+
+def reasons(summary: Mapping[str, Any]) -> str:
+    """Observations rejected and data dropped, with why; says so where there was none."""
+    parts = []
+    for key, caption in (("rejected", "Observations rejected"), ("dropped", "Data dropped")):
+        found = sorted(summary.get(key, {}).items(), key=lambda item: (-item[1], item[0]))
+        rows = found or [("nothing", 0)]
+        parts.append(table(["reason", "n"], rows, caption))
+    return "\n".join(parts)
+
+
+def stages(summary: Mapping[str, Any]) -> str:
+    """Seconds per stage with a bar each."""
+    found = {name: float(value) for name, value in summary.get("stages", {}).items()}
+    longest = max(found.values(), default=0.0) or 1.0
+    rows = "".join(
+        f'<tr><th scope="row">{escape(name)}</th><td>{number(value)}</td>'
+        f'<td class="bar"><i style="width:{100 * value / longest:.1f}%"></i></td></tr>\n'
+        for name, value in found.items()
+    )
+    memory = summary.get("peak_memory_mb")
+    note = f"<p class=note>Peak memory {number(float(memory))} MB.</p>" if memory else ""
+    return (
+        '<div class="scroll"><table><caption>Time per stage</caption><thead><tr>'
+        '<th scope="col">stage</th><th scope="col">s</th><th></th></tr></thead>\n'
+        f"<tbody>{rows}</tbody></table></div>{note}"
+    )
+
+
+def calibration(summary: Mapping[str, Any]) -> str:
+    """Calibrated parameters; empty text where there are none."""
+    found = summary.get("calibration", {})
+    rows = [
+        (
+            name.replace(".", " · ").replace("_", " "),
+            _calibrated(p),
+        )
+        for name, p in found.items()
+    ]
+    return table(["parameter", "value ± σ"], rows, "Calibration") if rows else ""
+
+
+def _calibrated(found: Mapping[str, Any]) -> str:
+    if found["observable"]:
+        return f"{found['value']:.4f} ± {found['sigma']:.4f}"
+    return "not observable" if found["sigma"] else "fixed"
+
+
+def landmarks(found: Sequence[Landmark]) -> str:
+    """Every landmark with its position and uncertainty."""
+    rows = [
+        [
+            str(m.id),
+            m.kind,
+            m.identity or "",
+            f"{m.position[0]:.3f}",
+            f"{m.position[1]:.3f}",
+            "–" if m.line is None else f"{np.degrees(m.position[2]):.2f}",
+            "–" if m.line is None else f"{np.hypot(*(m.extent[1] - m.extent[0])):.2f}",
+            100 * landmark_sigma(m),
+            m.sightings,
+        ]
+        for m in found
+    ]
+    head = ["no", "kind", "identity", "x, m", "y, m", "heading, °", "length, m", "σ, cm", "seen"]
+    return table(head, rows)
+
+
+def landmark_sigma(landmark: Landmark) -> float:
+    """Standard deviation, m: of a point in its worst direction, of a line across its seen middle.
+
+    At ``t`` along the line its normal offset varies as offset error - t * direction error.
+    """
+    if landmark.line is None:
+        variance = float(np.linalg.eigvalsh(landmark.cov[:2, :2])[-1])
+    else:
+        normal, _, cov = landmark.line
+        t = float(landmark.extent.mean(axis=0) @ np.array([-np.sin(normal), np.cos(normal)]))
+        a = np.array([-t, 1.0])
+        variance = float(a @ cov @ a)
+    return float(np.sqrt(max(variance, 0.0)))
+
+
+def quality(evaluation: Mapping[str, Any]) -> str:
+    """The evaluation against truth and relations, as far as there is one."""
+    parts = []
+    robots = evaluation.get("robots", {})
+    if robots:
+        runs = [*robots.items()] + (
+            [("all", evaluation["joint"])] if len(robots) > 1 and "joint" in evaluation else []
+        )
+        rows = [
+            (f"{name}, {kind}", *_trajectory_row(both[kind]))
+            for name, both in runs
+            for kind in ("final", "causal")
+        ]
+        head = ["trajectory", "ATE, m", "aligned, m", "max, m", "heading, °"]
+        head += ["RPE 1 s, m", "RPE 10 m, m", "NEES/dof", "95 % bounds", "coverage"]
+        parts.append(table(head, rows, "Against true poses"))
+    relations = evaluation.get("relations", {})
+    if relations:
+        keys = ["n", "unmatched", "trans_mean_m", "trans_std_m", "trans_median_m"]
+        keys += ["rot_mean_deg", "rot_std_deg"]
+        rows = [
+            (f"{group}, {kind}", *(found[group][key] for key in keys))
+            for kind, found in (("final", relations), ("causal", relations.get("causal", {})))
+            for group in ("all", "local", "loops")
+            if group in found
+        ]
+        head = ["pairs", "n", "unmatched", "mean, m", "std, m", "median, m", "mean, °", "std, °"]
+        parts.append(table(head, rows, "Against reference relations"))
+    marks = evaluation.get("landmarks", {})
+    if marks:
+        keys = ["rmse_m", "nees_per_dof", "matched", "missed", "extra"]
+        head = ["", "RMSE, m", "NEES/dof", "matched", "missed", "extra"]
+        parts.append(
+            table(head, [("map", *(marks[key] for key in keys))], "Against true landmarks")
+        )
+    return "\n".join(parts)
+
+
+def _trajectory_row(found: Mapping[str, Any]) -> tuple[object, ...]:
+    bounds, heading = found["nees_bounds"], found["heading_rmse_rad"]
+    return (
+        found["ate_rmse_m"],
+        found["ate_aligned_rmse_m"],
+        found["max_m"],
+        None if heading is None else float(np.degrees(heading)),
+        found["rpe"]["1_s"]["trans_rmse_m"],
+        found["rpe"]["10_m"]["trans_rmse_m"],
+        found["nees_per_dof"],
+        None if bounds is None else f"{bounds[0]:.3f}…{bounds[1]:.3f}",
+        None if found["coverage"] is None else f"{100 * found['coverage']:.1f} %",
+    )

@@ -1,7 +1,0 @@
-"""What is wrong with a scenario."""
-
-from graphslam.errors import GraphSlamError
-
-
-class ScenarioError(GraphSlamError):
-    """A scenario cannot be read or cannot take place; the message names file and key or place."""

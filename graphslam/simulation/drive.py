@@ -1,0 +1,179 @@
+"""A drive in time: where a robot is, and how far its wheels have carried it, at any time.
+
+Legs begin and end at rest; along a leg the speed is a trapezoid.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import sqrt
+
+import numpy as np
+
+from graphslam.core.geometry import Array, wrap
+from graphslam.simulation.path import Curve, rounded
+from graphslam.simulation.scenario import Leg, Robot
+
+_ALIGNED_RAD = 1e-9  # a smaller turn on the spot is none
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class States:
+    """What is true of a robot's base at n times.
+
+    ``poses`` (n, 3) world frame; ``travel`` (n,) m, signed along the robot's x axis, and
+    ``turned`` (n,) rad, both since the start and never wrapped: they move the wheels.
+    """
+
+    poses: Array
+    travel: Array
+    turned: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Trapezoid:
+    """A distance covered from rest to rest with one acceleration and one top speed (any unit)."""
+
+    distance: float
+    speed: float
+    acceleration: float
+
+    @property
+    def _ramp_s(self) -> float:
+        return min(self.speed / self.acceleration, sqrt(self.distance / self.acceleration))
+
+    @property
+    def duration_s(self) -> float:
+        """Time from rest to rest."""
+        ramp = self._ramp_s
+        return 2 * ramp + max(0.0, self.distance / (self.acceleration * ramp) - ramp)
+
+    def at(self, time_s: Array) -> Array:
+        """Distance covered (n,) at times (n,) s; 0 before the start, all of it after the end."""
+        ramp, whole = self._ramp_s, self.duration_s
+        t = np.clip(time_s, 0.0, whole)
+        up = np.minimum(t, ramp)
+        down = np.clip(t - (whole - ramp), 0.0, None)
+        level = np.clip(t - ramp, 0.0, whole - 2 * ramp)
+        a, top = self.acceleration, self.acceleration * ramp
+        return np.asarray(a * up**2 / 2 + top * level + top * down - a * down**2 / 2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Follow:
+    """Along a curve, forwards or backwards."""
+
+    curve: Curve
+    profile: Trapezoid
+    backwards: bool
+
+    @property
+    def duration_s(self) -> float:
+        """Time from rest to rest."""
+        return self.profile.duration_s
+
+    def at(self, time_s: Array) -> States:
+        """States at times (n,) s since the leg began; ``travel`` and ``turned`` since then too."""
+        s = np.minimum(self.profile.at(time_s), self.curve.length_m)
+        position, tangent = self.curve.at(s)
+        heading = wrap(tangent + np.pi * self.backwards)
+        turned = tangent - self.curve.heading[0]
+        return States(np.column_stack([position, heading]), -s if self.backwards else s, turned)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Turn:
+    """On the spot, from ``start`` (3,) by ``angle_rad``; a turn of nothing is a wait."""
+
+    start: Array
+    angle_rad: float
+    profile: Trapezoid | None
+    wait_s: float = 0.0
+
+    @property
+    def duration_s(self) -> float:
+        """Time from rest to rest."""
+        return self.profile.duration_s if self.profile else self.wait_s
+
+    def at(self, time_s: Array) -> States:
+        """States at times (n,) s since the leg began; see `Follow.at`."""
+        turned = np.zeros(len(time_s))
+        if self.profile:
+            turned = np.sign(self.angle_rad) * self.profile.at(time_s)
+        poses = np.tile(self.start, (len(time_s), 1))
+        poses[:, 2] = wrap(poses[:, 2] + turned)
+        return States(poses, np.zeros(len(time_s)), turned)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drive:
+    """Motions one after the other; ``begins_s``, ``travel`` and ``turned`` are at their starts."""
+
+    motions: tuple[Follow | Turn, ...]
+    begins_s: tuple[float, ...]
+    travel: tuple[float, ...]
+    turned: tuple[float, ...]
+
+    @property
+    def duration_s(self) -> float:
+        """Time at which the robot has arrived for good."""
+        return self.begins_s[-1] + self.motions[-1].duration_s
+
+    @property
+    def path_m(self) -> float:
+        """Length of the path, forwards and backwards."""
+        return sum(m.curve.length_m for m in self.motions if isinstance(m, Follow))
+
+    def at(self, time_s: Array) -> States:
+        """States at times (n,) s; the robot stands before the first motion and after the last."""
+        times = np.asarray(time_s, dtype=float)
+        which = np.clip(np.searchsorted(self.begins_s, times, side="right") - 1, 0, None)
+        poses = np.zeros((len(times), 3))
+        travel, turned = np.zeros(len(times)), np.zeros(len(times))
+        for number in np.unique(which):
+            rows = which == number
+            found = self.motions[number].at(times[rows] - self.begins_s[number])
+            poses[rows] = found.poses
+            travel[rows] = self.travel[number] + found.travel
+            turned[rows] = self.turned[number] + found.turned
+        return States(poses, travel, turned)
+
+
+def plan(start: Array, legs: Sequence[Leg], robot: Robot) -> Drive:
+    """The drive of a ``robot`` from pose ``start`` (3,) along ``legs``.
+
+    Raises:
+        ScenarioError: a leg's points coincide or turn back sharply.
+    """
+    motions: list[Follow | Turn] = []
+    pose = start
+    for leg in legs:
+        for motion in _motions(pose, leg, robot):
+            motions.append(motion)
+            pose = motion.at(np.array([motion.duration_s])).poses[0]
+    motions.append(Turn(pose, 0.0, None))  # stands for good
+    ends = [m.at(np.array([m.duration_s])) for m in motions[:-1]]
+    return Drive(
+        tuple(motions),
+        tuple(np.cumsum([0.0, *(m.duration_s for m in motions[:-1])]).tolist()),
+        tuple(np.cumsum([0.0, *(float(e.travel[0]) for e in ends)]).tolist()),
+        tuple(np.cumsum([0.0, *(float(e.turned[0]) for e in ends)]).tolist()),
+    )
+
+
+def _motions(pose: Array, leg: Leg, robot: Robot) -> list[Follow | Turn]:
+    """The motions of one leg; a path that begins in another direction brings its turn along."""
+    if leg.wait_s:
+        return [Turn(pose, 0.0, None, leg.wait_s)]
+    rate = np.radians(robot.turn_rate_deg_s)
+    if leg.turn_deg:
+        angle = np.radians(leg.turn_deg)
+        return [Turn(pose, angle, Trapezoid(abs(angle), rate, 2 * rate))]
+    points = [pose[:2].tolist(), *leg.through_m]
+    curve = rounded(points, robot.corner_m)
+    angle = float(wrap(curve.heading[0] + np.pi * leg.reverse - pose[2]))
+    speed = leg.speed_m_s or robot.speed_m_s
+    profile = Trapezoid(curve.length_m, speed, robot.acceleration_m_s2)
+    follow = Follow(curve, profile, leg.reverse)
+    if abs(angle) < _ALIGNED_RAD:
+        return [follow]
+    return [Turn(pose, angle, Trapezoid(abs(angle), rate, 2 * rate)), follow]

@@ -1,0 +1,41 @@
+"""From true motion to counted wheel pulses, and to the odometry that a robot makes of them."""
+
+import numpy as np
+
+from graphslam.core.config import RobotConfig
+from graphslam.core.geometry import Array, compose, exp
+from graphslam.core.motion_models import wheel_twist
+from graphslam.simulation.drive import States
+from graphslam.simulation.scenario import Encoders
+
+
+def wheel_angles(states: States, encoders: Encoders, rng: np.random.Generator) -> Array:
+    """Accumulated wheel angles (n, 2) rad, left and right, as read at n successive states.
+
+    The true wheels have the true radii and the true axle; what they turn more or less than they
+    roll is slip. A reading is the number of whole counts, from an unknown angle of the wheel.
+    """
+    half = encoders.axle_m * (1 + encoders.axle_error) / 2
+    rolled = states.travel[:, None] + half * states.turned[:, None] * np.array([-1.0, 1.0])
+    step = np.abs(np.diff(rolled, axis=0))
+    slip = encoders.slip_m * np.sqrt(step) * rng.normal(size=step.shape)
+    rolled[1:] += np.cumsum(slip, axis=0)
+    errors = np.array([encoders.radius_error_left, encoders.radius_error_right])
+    angles = rolled / (encoders.wheel_radius_m * (1 + errors))
+    count = 2 * np.pi / encoders.counts_per_turn
+    return np.asarray(np.floor(angles / count + rng.random(2)) * count)
+
+
+def odometry(angles: Array, encoders: Encoders) -> Array:
+    """Poses (n, 3) from wheel angles (n, 2) by what the robot believes its geometry to be.
+
+    In the frame of the first reading; thesis eq. 2.6-2.12.
+    """
+    radius = encoders.wheel_radius_m
+    believed = RobotConfig(
+        wheel_radius_left_m=radius, wheel_radius_right_m=radius, axle_m=encoders.axle_m
+    )
+    poses = np.zeros((len(angles), 3))
+    for i, step in enumerate(exp(wheel_twist(np.diff(angles, axis=0), believed)), start=1):
+        poses[i] = compose(poses[i - 1], step)
+    return poses

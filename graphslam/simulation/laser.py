@@ -1,0 +1,81 @@
+"""A laser's scans: exact ranges first, then everything that a real one does to them."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from graphslam.core.geometry import Array, compose
+from graphslam.simulation.raycast import NOTHING, Fan, Hits, cast, nearest
+from graphslam.simulation.robot_shapes import outline_shapes
+from graphslam.simulation.scenario import Body, Laser
+from graphslam.simulation.world import World
+
+# Beyond the range limit a wall is not reported but still hides what is behind it, and a mixed
+# pixel may pull it inside; this much farther is looked.
+_BEYOND_M = 5.0
+
+
+def fan_of(laser: Laser) -> Fan:
+    """The beams of a laser in its own frame, symmetric about its x axis."""
+    step = np.radians(laser.step_deg)
+    return Fan(-step * (laser.beams - 1) / 2, step, laser.beams)
+
+
+def mount_of(laser: Laser) -> Array:
+    """Pose (3,) of the laser in the base frame."""
+    return np.array([*laser.mount_m, np.radians(laser.mount_deg)])
+
+
+def clean_scans(
+    poses: Array, laser: Laser, world: World, others: Mapping[str, tuple[Body, Array]]
+) -> Hits:
+    """What noise-free beams meet, from bases at ``poses`` (n, 3).
+
+    ``others`` are the other robots with their poses (n, 3) at the same times. Surfaces are those
+    of ``world``; robot number i has the number ``len(world.names) + i`` for its whole outline.
+    """
+    at, fan = compose(poses, mount_of(laser)), fan_of(laser)
+    reach = laser.range_max_m + _BEYOND_M
+    hits = cast(at, fan, world.shapes, reach)
+    for number, (body, where) in enumerate(others.values()):
+        seen = cast(at, fan, outline_shapes(body, where), reach)
+        robot = np.where(seen.surfaces == NOTHING, NOTHING, 0)
+        hits = nearest(hits, Hits(seen.ranges, robot), len(world.names) + number)
+    return hits
+
+
+def noisy_ranges(hits: Hits, biases: Array, laser: Laser, rng: np.random.Generator) -> Array:
+    """Ranges (n, beams) m as the laser reports them; inf where it reports nothing.
+
+    ``biases`` (surfaces,) m are added to what is measured on a surface. All random numbers are
+    drawn in one order whatever the shares are: one kind of error does not change the others.
+    """
+    clean, shape = hits.ranges, hits.ranges.shape
+    bias = np.where(hits.surfaces == NOTHING, 0.0, np.append(biases, 0.0)[hits.surfaces])
+    ranges = clean + bias + laser.range_sigma_m * rng.normal(size=shape)
+    ranges = _mixed(ranges, hits, laser, rng)
+    spurious = rng.random(shape) < laser.spurious_share
+    farthest = np.minimum(np.where(np.isfinite(clean), clean, np.inf), laser.range_max_m)
+    somewhere = laser.range_min_m + (farthest - laser.range_min_m) * rng.random(shape)
+    ranges = np.where(spurious, somewhere, ranges)
+    ranges[rng.random(shape) < laser.dropout_share] = np.inf
+    if laser.resolution_m:
+        ranges = np.round(ranges / laser.resolution_m) * laser.resolution_m
+    reported = (ranges >= laser.range_min_m) & (ranges <= laser.range_max_m)
+    return np.where(reported, ranges, np.inf)
+
+
+def _mixed(ranges: Array, hits: Hits, laser: Laser, rng: np.random.Generator) -> Array:
+    """Some beams at range edges return a mixture of what is on both sides of the edge.
+
+    A beam has a width: at an edge it meets the near and the far surface, and a time-of-flight
+    laser reports something between them.
+    """
+    share, chosen = rng.random(hits.ranges.shape), rng.random(hits.ranges.shape)
+    following = np.roll(hits.ranges, -1, axis=1)
+    with np.errstate(invalid="ignore"):  # two beams that meet nothing
+        jump = following - hits.ranges
+    edge = (np.abs(jump) > laser.mixed_gap_m) & np.isfinite(jump)
+    edge[:, -1] = False  # the last beam has no neighbour
+    mixed = edge & (chosen < laser.mixed_share)
+    return np.where(mixed, ranges + share * np.where(mixed, jump, 0.0), ranges)

@@ -1,0 +1,300 @@
+"""One visit as a log: every sensor of every robot sampled, spoiled, stamped and written."""
+
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from graphslam.core.geometry import Array, compose
+from graphslam.logs import LogWriter
+from graphslam.simulation.encoders import odometry, wheel_angles
+from graphslam.simulation.laser import clean_scans, fan_of, mount_of, noisy_ranges
+from graphslam.simulation.raycast import NOTHING, Hits
+from graphslam.simulation.scenario import Body, Laser, Scenario
+from graphslam.simulation.scene import Actor, Visit
+from graphslam.simulation.sensor_clock import sample_times, stamps
+from graphslam.simulation.sightings import LANDMARKS, see, targets
+
+
+class Event(NamedTuple):
+    """A message to be written: its stamp, and what writes it."""
+
+    stamp_ns: int
+    write: Callable[[LogWriter], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sweep:
+    """Noise-free scans of a robot: laser ``poses`` (n, 3) and what their beams met."""
+
+    laser: Laser
+    poses: Array
+    hits: Hits
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RobotFacts:
+    """What a robot did; ``dead_reckoning_end_m`` is how far off its odometry ends."""
+
+    path_m: float
+    duration_s: float
+    scans: int
+    sightings: int
+    dead_reckoning_end_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording:
+    """A log that was written, and what only the simulator knows."""
+
+    path: Path
+    counts: Mapping[str, int]
+    robots: Mapping[str, RobotFacts]
+    sweeps: Mapping[str, Sweep]
+
+
+def generator(seed: int, *names: str) -> np.random.Generator:
+    """Random numbers of one sensor: they do not change when another sensor is added."""
+    return np.random.default_rng([seed, *(zlib.crc32(name.encode()) for name in names)])
+
+
+def record(scenario: Scenario, visit: Visit, path: Path, seed: int) -> Recording:
+    """Simulate a visit and write it to ``path``.
+
+    Raises:
+        OutputError: the log cannot be written.
+    """
+    events: list[Event] = []
+    robots: dict[str, RobotFacts] = {}
+    sweeps: dict[str, Sweep] = {}
+    sighted: set[str] = set()
+    for name, actor in visit.actors.items():
+        wheels, end_m = _wheels(name, actor, visit, seed)
+        scans, sweep = _scans(name, actor, visit, seed)
+        seen = list(_sightings(name, actor, visit, seed))
+        true = sample_times(visit.duration_s, scenario.truth_period_s)
+        truth = [
+            Event(int(t), partial(LogWriter.truth, robot=name, stamp_ns=int(t), pose=pose))
+            for t, pose in zip(
+                stamps(true, actor.robot.clock), actor.drive.at(true).poses, strict=True
+            )
+        ]
+        events += [*wheels, *truth, *scans, *(event for event, _ in seen)]
+        if sweep is not None:
+            events += _met(name, visit, sweep, scans)
+        events += _identities(name, seen)
+        sighted |= {landmark for _, landmark in seen}
+        if sweep is not None:
+            sweeps[name] = sweep
+        robots[name] = RobotFacts(
+            actor.drive.path_m, visit.duration_s, len(scans), len(seen), end_m
+        )
+    events.sort(key=lambda event: event.stamp_ns)  # stable: robots in order, odometry first
+    first_ns = min(event.stamp_ns for event in events)
+    with LogWriter(path, _notes(scenario, visit, seed)) as log:
+        for name, actor in visit.actors.items():
+            if actor.robot.laser is not None:
+                log.mount(name, first_ns, mount_of(actor.robot.laser))
+        for event in _landmarks(visit, sweeps, sighted, first_ns):
+            event.write(log)
+        for event in events:
+            event.write(log)
+    return Recording(path, log.counts, robots, sweeps)
+
+
+def _notes(scenario: Scenario, visit: Visit, seed: int) -> dict[str, str]:
+    """What the file says about itself: everything that is needed to write it again."""
+    notes = {"format": "simulation", "scenario": scenario.name, "seed": str(seed)}
+    if visit.name:
+        notes["visit"] = visit.name
+    for name, actor in visit.actors.items():
+        clock = actor.robot.clock
+        if clock.offset_s or clock.drift_ppm:
+            notes[f"clock {name}"] = f"{clock.offset_s:+g} s, {clock.drift_ppm:+g} ppm"
+    return notes
+
+
+# ---------------------------------------------------------------- sensors
+
+
+def _others(visit: Visit, name: str, times: Array) -> dict[str, tuple[Body, Array]]:
+    """The other robots' bodies and poses (n, 3) at ``times`` (n,) s."""
+    return {
+        other: (actor.robot.body, actor.drive.at(times).poses)
+        for other, actor in visit.actors.items()
+        if other != name
+    }
+
+
+def _wheels(name: str, actor: Actor, visit: Visit, seed: int) -> tuple[list[Event], float]:
+    """The encoders' messages, and how far off dead reckoning ends, m."""
+    encoders = actor.robot.encoders
+    times = sample_times(visit.duration_s, encoders.period_s, encoders.phase_s)
+    states = actor.drive.at(times)
+    angles = wheel_angles(states, encoders, generator(seed, visit.name, name, "encoders"))
+    poses = odometry(angles, encoders)
+    events = []
+    for t, pose, (left, right) in zip(
+        stamps(times, actor.robot.clock, encoders.latency_s).tolist(), poses, angles, strict=True
+    ):
+        if encoders.odometry:
+            events.append(Event(t, partial(LogWriter.odometry, robot=name, stamp_ns=t, pose=pose)))
+        if encoders.joint_states:
+            write = partial(
+                LogWriter.wheel_angles,
+                robot=name,
+                stamp_ns=t,
+                left_rad=float(left),
+                right_rad=float(right),
+            )
+            events.append(Event(t, write))
+    ends = compose(states.poses[0], poses[-1])
+    return events, float(np.hypot(*(ends - states.poses[-1])[:2]))
+
+
+def _scans(name: str, actor: Actor, visit: Visit, seed: int) -> tuple[list[Event], Sweep | None]:
+    """The laser's messages and the noise-free scans behind them."""
+    laser = actor.robot.laser
+    if laser is None:
+        return [], None
+    times = sample_times(visit.duration_s, laser.period_s, laser.phase_s)
+    poses = actor.drive.at(times).poses
+    hits = clean_scans(poses, laser, visit.world, _others(visit, name, times))
+    rng = generator(seed, visit.name, name, "laser")
+    ranges = noisy_ranges(hits, _biases(visit, name, laser, seed), laser, rng)
+    fan = fan_of(laser)
+    events = [
+        Event(
+            t,
+            partial(
+                LogWriter.scan,
+                robot=name,
+                stamp_ns=t,
+                ranges=row,
+                angle_min_rad=fan.start_rad,
+                angle_step_rad=fan.step_rad,
+                range_min_m=laser.range_min_m,
+                range_max_m=laser.range_max_m,
+            ),
+        )
+        for t, row in zip(
+            stamps(times, actor.robot.clock, laser.latency_s).tolist(), ranges, strict=True
+        )
+    ]
+    return events, Sweep(laser, compose(poses, mount_of(laser)), hits)
+
+
+def _biases(visit: Visit, name: str, laser: Laser, seed: int) -> Array:
+    """By how much each surface (n,) is measured too far, m; the other robots' come last.
+
+    A material has its bias at every visit and for every laser: what differs is the laser's scale.
+    Each stretch of a wall is a material of its own, all faces of a box are one.
+    """
+    world = visit.world
+    materials = [
+        name if not world.outlines[thing].solid else world.outlines[thing].name
+        for name, thing in zip(world.names, world.things, strict=True)
+    ]
+    materials += [f"robot {other}" for other in visit.actors if other != name]
+    draws = [generator(seed, "material", material).normal() for material in materials]
+    return laser.bias_sigma_m * np.array(draws, dtype=float)
+
+
+def _sightings(name: str, actor: Actor, visit: Visit, seed: int) -> Iterator[tuple[Event, str]]:
+    """The sightings' messages, each with the name of what was seen."""
+    for number, seer in enumerate(actor.robot.sightings):
+        times = sample_times(visit.duration_s, seer.period_s, seer.phase_s)
+        poses = actor.drive.at(times).poses
+        candidates = list(targets(seer, visit.world, _others(visit, name, times), len(times)))
+        rng = generator(seed, visit.name, name, f"sightings {number}")
+        at = stamps(times, actor.robot.clock, seer.latency_s).tolist()
+        for seen in see(poses, seer, candidates, rng):
+            t, landmark = at[seen.sample], seer.of == LANDMARKS
+            write = partial(
+                LogWriter.sighting,
+                robot=name,
+                stamp_ns=t,
+                z=seen.z,
+                cov=seen.cov,
+                identity=seen.name if landmark and seer.identified else None,
+                seen_robot=None if landmark else seen.name,
+            )
+            yield Event(t, write), seen.name
+
+
+# ---------------------------------------------------------------- truth
+
+
+def _met(name: str, visit: Visit, sweep: Sweep, scans: list[Event]) -> Iterator[Event]:
+    """What each beam met; a spurious return still belongs to what it should have met."""
+    everything = np.array([*visit.world.names, *(other for other in visit.actors if other != name)])
+    for scan, surfaces in zip(scans, sweep.hits.surfaces, strict=True):
+        met, places = np.unique(surfaces, return_inverse=True)
+        nothing = int(NOTHING in met)  # sorted first, as it is negative
+        write = partial(
+            LogWriter.true_associations,
+            robot=name,
+            stamp_ns=scan.stamp_ns,
+            of="scan",
+            names=everything[met[nothing:]].tolist(),
+            targets=places - nothing,
+        )
+        yield Event(scan.stamp_ns, write)
+
+
+def _identities(name: str, seen: list[tuple[Event, str]]) -> Iterator[Event]:
+    """Who was sighted: one message per image, in the order in which the sightings are written."""
+    images: dict[int, list[str]] = {}
+    for event, target in seen:
+        images.setdefault(event.stamp_ns, []).append(target)
+    for stamp_ns, names in images.items():
+        write = partial(
+            LogWriter.true_associations,
+            robot=name,
+            stamp_ns=stamp_ns,
+            of="sightings",
+            names=names,
+            targets=np.arange(len(names)),
+        )
+        yield Event(stamp_ns, write)
+
+
+def _landmarks(
+    visit: Visit, sweeps: Mapping[str, Sweep], sighted: set[str], first_ns: int
+) -> Iterator[Event]:
+    """True landmarks: the surfaces that some noise-free beam or some sighting reached."""
+    world = visit.world
+    reached = set(sighted)
+    for sweep in sweeps.values():
+        numbers = np.unique(sweep.hits.surfaces)
+        inside = (numbers != NOTHING) & (numbers < len(world.names))  # the rest are robots
+        reached |= {world.names[number] for number in numbers[inside]}
+    for number, name in enumerate(world.names):
+        if name not in reached:
+            continue
+        straight = number < len(world.shapes.segments)
+        ends = world.shapes.segments[number] if straight else None
+        write = partial(
+            LogWriter.true_landmark,
+            stamp_ns=first_ns,
+            identity=name,
+            kind="segment" if straight else "point",
+            pose=_middle(ends) if ends is not None else _center(visit, number),
+            extent=ends,
+        )
+        yield Event(first_ns, write)
+
+
+def _middle(ends: Array) -> Array:
+    """Pose (3,) in the middle of a face (2, 2), x along it."""
+    along = ends[1] - ends[0]
+    return np.array([*ends.mean(axis=0), np.arctan2(along[1], along[0])])
+
+
+def _center(visit: Visit, number: int) -> Array:
+    x, y, _ = visit.world.shapes.circles[number - len(visit.world.shapes.segments)]
+    return np.array([x, y, np.nan])

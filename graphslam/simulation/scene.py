@@ -1,0 +1,152 @@
+"""A scenario made ready: worlds with surfaces, robots with drives, and no collisions."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphslam.core.geometry import Array
+from graphslam.simulation.drive import Drive, plan
+from graphslam.simulation.errors import ScenarioError
+from graphslam.simulation.robot_shapes import encloses, outline_shapes, touches
+from graphslam.simulation.scenario import Body, Later, Robot, Scenario
+from graphslam.simulation.world import (
+    Outline,
+    Shapes,
+    World,
+    crossing,
+    displacement,
+    make_world,
+    outlines_of,
+    too_short,
+)
+
+REFERENCE, LATER = "reference", "later"
+
+_CHECK_S = 0.05  # collisions are looked for this often; robots drive well below 1 m/s
+_CHUNK = 500
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Actor:
+    """A robot of one visit with its drive."""
+
+    robot: Robot
+    drive: Drive
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Visit:
+    """One recording to be: ``name`` is empty unless there are two."""
+
+    name: str
+    world: World
+    actors: Mapping[str, Actor]
+    duration_s: float
+
+
+def visits(scenario: Scenario) -> tuple[Visit, ...]:
+    """The recordings of a scenario, one or two, checked for collisions.
+
+    Raises:
+        ScenarioError: things cross each other, a drive is impossible, a robot starts in something
+            or drives through it.
+    """
+    outlines = tuple(outlines_of(scenario.world))
+    first = _visit(scenario, REFERENCE if scenario.later else "", outlines, scenario.robots)
+    if scenario.later is None:
+        return (first,)
+    later = scenario.later
+    robots = {
+        name: replace(robot, start_m=again.start_m, start_deg=again.start_deg, drive=again.drive)
+        if (again := later.robots.get(name))
+        else robot
+        for name, robot in scenario.robots.items()
+    }
+    return first, _visit(scenario, LATER, tuple(_rearranged(outlines, later)), robots)
+
+
+def _visit(
+    scenario: Scenario, name: str, outlines: Sequence[Outline], robots: Mapping[str, Robot]
+) -> Visit:
+    where = f"{scenario.name}: " + (f"{name} visit: " if name else "")
+    if short := too_short(outlines):
+        raise ScenarioError(f"{where}{short}: needs two different points")
+    world = make_world(outlines)
+    if pair := crossing(world):
+        raise ScenarioError(
+            f"{where}{pair[0]} and {pair[1]} cross; move one, or set may_cross = true"
+        )
+    actors = {}
+    for robot_name, robot in sorted(robots.items()):
+        start = np.array([*robot.start_m, np.radians(robot.start_deg)])
+        try:
+            actors[robot_name] = Actor(robot, plan(start, robot.drive, robot))
+        except ScenarioError as error:
+            raise ScenarioError(f"{where}robots.{robot_name}: {error}") from error
+    end = max(actor.drive.duration_s for actor in actors.values())
+    duration = scenario.duration_s or end
+    if not duration:
+        raise ScenarioError(f"{where}no robot drives; set duration_s")
+    for problem in _collisions(world, actors, min(duration, end)):
+        raise ScenarioError(f"{where}{problem}")
+    return Visit(name, world, actors, duration)
+
+
+def _rearranged(outlines: Sequence[Outline], later: Later) -> Iterator[Outline]:
+    """The world of the second visit."""
+    motions = {move.name: displacement(move) for move in later.moved}
+    for outline in outlines:
+        if outline.name in motions:
+            yield outline.moved(motions[outline.name])
+        elif outline.name not in later.vanished:
+            yield outline
+    yield from outlines_of(later.appeared)
+
+
+# ---------------------------------------------------------------- collisions
+
+
+def _collisions(world: World, actors: Mapping[str, Actor], end_s: float) -> Iterator[str]:
+    """What robots bump into, one line each, in the order of robots."""
+    times = np.append(np.arange(0.0, end_s, _CHECK_S), end_s)
+    poses = {name: actor.drive.at(times).poses for name, actor in actors.items()}
+    for name, actor in actors.items():
+        hit = _bump(actor.robot.body, poses[name], world)
+        if hit is not None:
+            sample, surface = hit
+            yield _told(name, poses[name][sample], times[sample], world.names[surface])
+        for other, theirs in poses.items():
+            if other > name:
+                body = actors[other].robot.body
+                met = _touched(actor.robot.body, poses[name], outline_shapes(body, theirs))
+                if met is not None:
+                    yield _told(name, poses[name][met[0]], times[met[0]], f"robot {other}")
+
+
+def _told(name: str, pose: Array, time_s: float, what: str) -> str:
+    when = "starts in" if time_s == 0 else f"after {time_s:.1f} s drives into"
+    return f"robots.{name}: {when} {what} at ({pose[0]:.2f}, {pose[1]:.2f}); move one of them"
+
+
+def _bump(body: Body, poses: Array, world: World) -> tuple[int, int] | None:
+    """First (sample, surface) at which a body meets a thing or is inside a solid one."""
+    first = _touched(body, poses, world.shapes)
+    for number, outline in enumerate(world.outlines):
+        if outline.solid and not outline.radius_m:
+            inside = np.flatnonzero(encloses(outline.points, poses[:, :2]))
+            if len(inside) and (first is None or inside[0] < first[0]):
+                first = int(inside[0]), int(np.argmax(world.things == number))
+    return first
+
+
+def _touched(body: Body, poses: Array, shapes: Shapes) -> tuple[int, int] | None:
+    """First (sample, surface) at which a body meets one of the shapes; in parts, to save memory."""
+    for begin in range(0, len(poses), _CHUNK):
+        part = slice(begin, begin + _CHUNK)
+        moving = shapes.segments.ndim == 4
+        here = Shapes(shapes.segments[part], shapes.circles[part]) if moving else shapes
+        met = np.argwhere(touches(body, poses[part], here))
+        if len(met):
+            return begin + int(met[0, 0]), int(met[0, 1])
+    return None

@@ -1,0 +1,166 @@
+"""Where robots begin: what is known of a log before its pass proper.
+
+Robots whose start is not given are put where what they have in common with others has them. That
+takes a pass over the log in which every robot is estimated by itself: afterwards they are joined by
+what bears a name, by how they show in each other's scans, and else by places and points without
+names.
+"""
+
+from collections import defaultdict
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from graphslam.core.config import BackendConfig, Config
+from graphslam.core.geometry import Array
+from graphslam.core.records import Scan, Sighting, Start, Trajectory
+from graphslam.estimation.isam2 import Isam2Backend
+from graphslam.logs import LogSet
+from graphslam.mapping.loop_closure import build_submaps
+from graphslam.multi_robot.anonymous_map import AnonymousMap, relate_anonymous_maps
+from graphslam.multi_robot.frame_tree import FrameAssignment, build_frame_tree
+from graphslam.multi_robot.frames import without_mark
+from graphslam.multi_robot.mutual_detection import (
+    MutualDetections,
+    ScanBuffer,
+    find_robots_in_scans,
+)
+from graphslam.multi_robot.relative_frames import RelativeFrame, RobotEstimate
+from graphslam.slam.pipeline import CLOCK_DOUBT_S, Pipeline, PriorKnowledge
+from graphslam.slam.recorded_closures import RecordedClosures, judge_recorded_closures
+from graphslam.slam.robot_settings import outlines
+from graphslam.slam.start_priors import origin, start_poses
+
+#: relations between robots found without names, and robot -> why there is none
+Found = tuple[Sequence[RelativeFrame], Mapping[str, str]]
+
+
+def initialise(log: LogSet, config: Config) -> PriorKnowledge:
+    """What is known of a log before its first pass proper: starts, frames, recorded closures.
+
+    Raises:
+        EstimationError: truth was asked for and a robot has none, or a given pose is malformed.
+    """
+    starts = start_poses(log, config)
+    recorded = judge_recorded_closures(log, config, starts)
+    return PriorKnowledge(estimate_start_poses(log, config, {}, starts, recorded), recorded)
+
+
+def with_names(
+    known: PriorKnowledge, log: LogSet, config: Config, names: Mapping[str, str]
+) -> PriorKnowledge:
+    """What is known by the right names: robots may have been placed by what bore false ones."""
+    starts = start_poses(log, config)
+    joined = estimate_start_poses(log, config, names, starts, known.recorded)
+    return replace(known, names=names, joined=joined)
+
+
+def estimate_start_poses(
+    log: LogSet,
+    config: Config,
+    names: Mapping[str, str],
+    starts: Mapping[str, Start],
+    recorded: RecordedClosures,
+) -> FrameAssignment:
+    """Where all robots start, of which the ``starts`` of some are known.
+
+    The others are put where what they see in common has them. That takes a pass over the log in
+    which every robot is estimated by itself.
+
+    Args:
+        log: opened logs.
+        config: settings.
+        names: see `Known`.
+        starts: those that are known.
+        recorded: what follows from the log's relative poses.
+
+    Raises:
+        EstimationError: the estimate of a robot by itself is indeterminate.
+    """
+    every = {**starts, **recorded.starts}
+    if set(log.robots) <= set(every):
+        return FrameAssignment(every, recorded.frames, min(starts, default=""))
+    starts = {r: s for r, s in every.items() if recorded.frames[r] == recorded.frames[min(starts)]}
+    own = origin(config)
+
+    def joined(
+        views: Mapping[str, RobotEstimate], meetings: Sequence[Sighting], found: Found
+    ) -> FrameAssignment:
+        return build_frame_tree(
+            log.robots, views, meetings, starts, config.association, own, *found
+        )
+
+    if not any(topic.record in (Sighting, Scan) for topic in log.topics):
+        return joined({}, (), ((), {}))
+    apart = PriorKnowledge(FrameAssignment.apart(log.robots, own), recorded, names)
+    pipeline = Pipeline(log, replace(config, backend=BackendConfig()), apart)
+    shapes = outlines(log, config) if config.association.robots != "ignore" else {}
+    pipeline.kept = ScanBuffer({name: run.track for name, run in pipeline.runs.items()}, shapes)
+    pipeline.run(lambda _count: None)
+    if not pipeline.steps:
+        return joined({}, (), ((), {}))
+    views, meetings, looked = views_after(pipeline), pipeline.meetings, MutualDetections((), {})
+    if watchable(log, shapes, starts):
+        scans = pipeline.kept.scans
+        looked = find_robots_in_scans(
+            views, scans, shapes, tuple(starts), CLOCK_DOUBT_S, config.front_end
+        )
+    by_name = joined(views, meetings, (looked.relations, looked.undecided))
+    if len(set(by_name.frames.values())) == 1:
+        return by_name
+    more, doubts = relate_anonymous_maps(
+        anonymous_maps(pipeline, views), by_name.frames, config.association
+    )
+    found = (*looked.relations, *more), {**doubts, **looked.undecided}
+    return joined(views, meetings, found)
+
+
+def views_after(run: Pipeline) -> dict[str, RobotEstimate]:
+    """What each robot knows by itself, after a pass in which each had a frame of its own."""
+    estimate, entries = run.backend.finish(), run.associator.map.entries
+    moved = run.worlds().estimate(estimate)
+    frames = run.frames.of_landmarks(entries.values())
+    marks: dict[str, dict[str, tuple[Array, Array]]] = defaultdict(dict)
+    unnamed: dict[str, list[tuple[Array, Array]]] = defaultdict(list)
+    for number, (mean, cov) in moved.landmarks.items():
+        name = without_mark(entries[number].identity)
+        if name is not None:
+            marks[frames[number]][name] = (mean[:2], cov[:2, :2])
+        elif entries[number].kind == "point":
+            unnamed[frames[number]].append((mean, cov))
+    views = {}
+    for robot, own in run.runs.items():
+        if len(own.track):
+            start = run.starts[robot]
+            first = np.array([own.track.first_ns], dtype=np.int64)
+            unseeing = Trajectory(first, start.pose[None], start.cov[None])
+            points = (
+                np.array([mean for mean, _ in unnamed[robot]]).reshape(-1, 2),
+                np.array([cov for _, cov in unnamed[robot]]).reshape(-1, 2, 2),
+            )
+            states = moved.states.get(robot, unseeing)
+            views[robot] = RobotEstimate(states, own.track, marks[robot], points)
+    return views
+
+
+def anonymous_maps(run: Pipeline, views: Mapping[str, RobotEstimate]) -> dict[str, AnonymousMap]:
+    """What each robot saw that bears no name, in its own frame, after the pass of ``views``."""
+    assert isinstance(run.backend, Isam2Backend)
+    found = build_submaps({robot: view.states for robot, view in views.items()}, run.pictures)
+    seen = {}
+    for robot, view in views.items():
+        own = [place for place in found if place.state[0] == robot]
+        states = [place.state for place in own]
+        cov = run.backend.state_covariance(states) if own else np.zeros((0, 0))
+        seen[robot] = AnonymousMap(own, cov, view.unnamed)
+    return seen
+
+
+def watchable(log: LogSet, outlines: Collection[str], placed: Collection[str]) -> bool:
+    """Whether a robot has scans in which another may show that is not placed relative to it."""
+    return any(
+        log.has_scans(observer) and name != observer and not {name, observer} <= set(placed)
+        for observer in log.robots
+        for name in outlines
+    )

@@ -1,0 +1,75 @@
+"""What becomes of the relative poses that a log brings along, in every pass over it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from graphslam.core.config import Config
+from graphslam.core.records import RelativePose, Scan, Sighting, Start, TrueLandmark, Truth
+from graphslam.logs import LogSet
+from graphslam.mapping.closure_verification import NOTHING_RECORDED, own_frame, verify
+from graphslam.slam.robot_settings import make_tracks
+from graphslam.slam.synchronisation import ODOMETRY
+
+#: robot, time, other robot, its time, relative pose (as bytes): what a recorded closure is known by
+ClosureId = tuple[str, int, str, int, bytes]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedClosures:
+    """What became of a log's relative poses, see `graphslam.mapping.closure_verification.Verified`.
+
+    ``refused`` and ``kept`` by `closure_id`; ``frames`` of all robots that have a start.
+    """
+
+    starts: Mapping[str, Start]
+    frames: Mapping[str, str]
+    kept: frozenset[ClosureId]
+    refused: Mapping[ClosureId, str]
+
+    def to_summary(self) -> dict[str, Any]:
+        """For summary.json: number ``kept``, list of those ``refused``, and why."""
+        refused = [
+            {"robot": r, "time_ns": t, "other": o, "other_time_ns": s, "reason": why}
+            for (r, t, o, s, _), why in self.refused.items()
+        ]
+        return {"kept": len(self.kept), "refused": refused}
+
+
+def judge_recorded_closures(
+    log: LogSet, config: Config, starts: Mapping[str, Start]
+) -> RecordedClosures:
+    """Which relative poses of a log to believe, by all of it; starts that follow from them.
+
+    In a log of nothing but relative poses, robots that these do not place keep a frame of their
+    own. That takes a pass over the odometry, which is made only where there are relative poses.
+    """
+    kinds = {topic.record for topic in log.topics}
+    messages: list[RelativePose] = []
+    verified = NOTHING_RECORDED
+    if RelativePose in kinds and config.backend.verify_closures:
+        tracks = make_tracks(log, config)
+        for message in log.messages((Truth, TrueLandmark, Scan, Sighting)):
+            if isinstance(message, ODOMETRY):
+                tracks[message.robot].add(message)
+            elif isinstance(message, RelativePose):
+                messages.append(message)
+        verified = verify(messages, tracks, starts, config)
+    found, frames = dict(verified.starts), dict(verified.frames)
+    if kinds & {Scan, Sighting}:
+        # these may place a robot too: its start is asked for where it is needed
+        found = {robot: start for robot, start in found.items() if frames[robot] != robot}
+    elif RelativePose in kinds:
+        for robot in set(log.robots) - {*starts, *found}:
+            found[robot], frames[robot] = own_frame(), robot
+    world = min(starts, default="")
+    kept = frozenset(closure_id(messages[k]) for k in verified.kept)
+    refused = {closure_id(messages[k]): why for k, why in verified.refused.items()}
+    frames = {robot: frames.get(robot, world) for robot in log.robots if robot in {*starts, *found}}
+    return RecordedClosures(found, frames, kept, refused)
+
+
+def closure_id(message: RelativePose) -> ClosureId:
+    """What a recorded closure is known by in every pass over the log."""
+    ends = message.robot, message.time_ns, message.other, message.start_ns
+    return (*ends, message.delta.tobytes())

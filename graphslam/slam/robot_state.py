@@ -1,0 +1,179 @@
+"""What a run keeps for one robot while the log goes by, and the trajectories it becomes."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from graphslam.core.geometry import Array, between, compose, inverse
+from graphslam.core.motion_models import Calibration
+from graphslam.core.records import Motion, RobotResult, Trajectory
+from graphslam.logs.clock import Clock
+from graphslam.odometry.interpolation import (
+    IntArray,
+    causal_at,
+    final_at,
+    mounted,
+    moved_world,
+    origin_shift,
+)
+from graphslam.odometry.online_calibration import Calibrator, to_summary
+from graphslam.odometry.preintegration import Track
+from graphslam.odometry.readings import EDGE_NS
+from graphslam.perception.scan_matching import Submap
+
+#: Hz at which the base of a robot without scans is reported
+BASE_RATE_HZ = 10
+
+
+@dataclass(slots=True, eq=False)
+class RobotState:
+    """One robot's odometry, its states so far and its scans.
+
+    ``times`` of the states, ns; per state the causal pose, its covariance and the calibration that
+    was known; ``scans`` (stamp, time, mount), ``scanned_ns`` the last one that was used. The
+    states are rigid to the sensor: the base is where the calibration puts it. ``refined``: the
+    track's calibration is one that was estimated together with all states. ``scan``: the time of
+    the latest state that has a scan, and what that shows; ``contradicted`` motions of ``motions``.
+    Times are the common clock's, stamps those of the robot's own ``clock``.
+    """
+
+    track: Track
+    calibrator: Calibrator = field(default_factory=Calibrator)
+    path_m: float = 0.0
+    scanned_ns: int | None = None
+    times: list[int] = field(default_factory=list)
+    causal_poses: list[Array] = field(default_factory=list)
+    causal_covs: list[Array] = field(default_factory=list)
+    calibrations: list[Calibration] = field(default_factory=list)
+    scans: list[tuple[int, int, Array]] = field(default_factory=list)
+    refined: bool = False
+    scan: tuple[int, Submap] | None = None
+    motions: int = 0
+    contradicted: int = 0
+    clock: Clock = field(default_factory=Clock)
+
+    @property
+    def started(self) -> bool:
+        """Whether the robot has a state."""
+        return bool(self.times)
+
+    @property
+    def state_ns(self) -> int:
+        """Time of the latest state; -1 before the first."""
+        return self.times[-1] if self.times else -1
+
+    def append(self, time_ns: int, pose: Array) -> None:
+        """Book a new state; its covariance follows."""
+        self.times.append(time_ns)
+        self.causal_poses.append(pose)
+        self.calibrations.append(self.track.used_calibration)
+
+    def learn(self, motion: Motion, pose: Array, observed: Array) -> None:
+        """Improve the calibration from the motion to a new state.
+
+        Args:
+            motion: according to odometry.
+            pose: (3,) estimate of the new state.
+            observed: (3, 3) see `Calibrator.learn`.
+        """
+        moved = between(self.causal_poses[-1], pose)
+        self.track.calibration = self.calibrator.learn(
+            self.track.calibration, motion, moved, observed
+        )
+
+    def is_causal(self, states: Trajectory) -> bool:
+        """Whether final ``states`` are what each was at its own time: a filter's."""
+        return np.array_equal(states.poses, self.causal_poses)
+
+    def calibration_found(self) -> dict[str, tuple[float, float, bool]]:
+        """Parameter -> (value, sigma, observable): what the log says of the odometry."""
+        if self.refined:
+            return to_summary(self.track.calibration, self.track.nominal.cov)
+        return self.calibrator.found()
+
+    def causal(self, start: Array, away_m: float = 0.0) -> "Causal":
+        """The causal trajectories.
+
+        Args:
+            start: (3,) where the prior put the robot that defines the world frame.
+            away_m: how far along x its frame lay while it was estimated.
+        """
+        stamps, times, laser = self._report_times()
+        poses = np.array(self.causal_poses) - np.array([away_m, 0.0, 0.0])
+        known = Trajectory(np.array(self.times, dtype=np.int64), poses, np.array(self.causal_covs))
+        causal = causal_at(known, self.calibrations, self.track, times, stamps)
+        # the mount that was known then, for the base and for the world that hangs on it
+        last = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, None)
+        mount = np.array([self.track.mount_of(c) for c in self.calibrations])[last]
+        causal = moved_world(causal, origin_shift(start, mount))
+        scan = mounted(causal, laser) if self.scans else None
+        return Causal(mounted(causal, inverse(mount)), scan)
+
+    def result(
+        self, states: Trajectory, causal: "Causal", *, causal_only: bool = False
+    ) -> RobotResult:
+        """Trajectories of the robot at the stamps that it is reported at.
+
+        Args:
+            states: the final states, world frame.
+            causal: the causal trajectories.
+            causal_only: final poses are the causal ones, also between the states: what revises no
+                state knows nothing better about the way there either.
+        """
+        stamps, times, laser = self._report_times()
+        final = final_at(states, self.track, times, stamps)
+        base = mounted(final, inverse(self.track.mount))
+        at_start = compose(states.poses[0], inverse(self.track.mount))
+        odometry = between(self.track.pose(self.times[0]), self.track.pose(times))
+        unknown = np.full((len(times), 3, 3), np.nan)
+        return RobotResult(
+            causal.base if causal_only else base,
+            causal.base,
+            causal.scan if causal_only or not self.scans else mounted(final, laser),
+            causal.scan,
+            Trajectory(stamps, compose(at_start, odometry), unknown),
+        )
+
+    def _report_times(self) -> tuple[IntArray, IntArray, Array]:
+        """Stamps (n,), times (n,) and, for scans, laser mounts (n, 3), sorted by stamp."""
+        if self.scans:
+            scans = sorted(self.scans, key=lambda scan: scan[0])
+            stamps, times = (np.array([scan[k] for scan in scans], dtype=np.int64) for k in (0, 1))
+            return stamps, times, np.array([scan[2] for scan in scans])
+        period = round(1e9 / BASE_RATE_HZ)
+        times = np.arange(self.track.first_ns, self.track.last_ns + 1, period)
+        return self.clock.own(times), times, np.zeros((0, 3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Causal:
+    """Causal trajectories of a robot's base and, if it has scans, of its sensor at those."""
+
+    base: Trajectory
+    scan: Trajectory | None
+
+
+def span_warnings(tracks: Mapping[str, Track], *, unplaced: bool) -> list[str]:
+    """Robots whose odometry does not cover the time of the others', one line each.
+
+    Args:
+        tracks: of every robot, whole.
+        unplaced: whether sightings were dropped since no odometry is near them; without any it does
+            not matter that one robot was switched on before another.
+    """
+    spans = {name: (t.first_ns, t.last_ns) for name, t in tracks.items() if len(t)}
+    if len(spans) < 2:
+        return []
+    begin, end = min(a for a, _ in spans.values()), max(b for _, b in spans.values())
+    lines = []
+    for name, (a, b) in spans.items():
+        part = f"its odometry covers {1e-9 * (a - begin):.1f} to {1e-9 * (b - begin):.1f} s of "
+        part += f"{1e-9 * (end - begin):.1f} s"
+        if not any(a <= d and c <= b for other, (c, d) in spans.items() if other != name):
+            lines.append(f"{name}: {part}, no time of which is another robot's; are clocks right?")
+        elif unplaced and max(a - begin, end - b) > EDGE_NS:
+            lines.append(
+                f"{name}: {part}; what it saw, and who saw it, outside of that is not used"
+            )
+    return lines

@@ -1,0 +1,80 @@
+"""Where the robots start: the prior of each robot's first state."""
+
+import numpy as np
+
+from graphslam.core.config import Config
+from graphslam.core.errors import EstimationError
+from graphslam.core.geometry import Array
+from graphslam.core.records import Scan, Sighting, Start, Truth
+from graphslam.logs import LogSet
+from graphslam.slam.synchronisation import ODOMETRY
+
+#: ns: a truth sample this near to a robot's first odometry is taken as the truth of its start
+MAX_TRUTH_LAG_NS = 500_000_000
+
+
+def start_poses(log: LogSet, config: Config) -> dict[str, Start]:
+    """Where robots start: as given, from one truth sample; the first at the origin if nothing is.
+
+    Raises:
+        EstimationError: truth was asked for and a robot has none, or a given pose is malformed.
+    """
+    start = config.start
+    given = _cov(start.given_sigma_m, start.given_sigma_rad)
+    starts: dict[str, Start] = {}
+    if start.from_truth:
+        truth = _cov(start.truth_sigma_m, start.truth_sigma_rad)
+        starts = {robot: Start(pose, truth) for robot, pose in first_truth(log).items()}
+    for robot, pose in start.poses.items():
+        if len(pose) != 3 or robot not in log.robots:
+            raise EstimationError(
+                f"--start {robot}: needs x,y,phi of one of the robots {', '.join(log.robots)}"
+            )
+        starts[robot] = Start(np.array(pose), given)
+    if log.robots and not starts:
+        starts[log.robots[0]] = origin(config)
+    return starts
+
+
+def origin(config: Config) -> Start:
+    """Start of a robot at whose first pose a frame has its origin."""
+    sigmas = config.start.origin_sigma_m, config.start.origin_sigma_rad
+    return Start(np.zeros(3), _cov(*sigmas))
+
+
+def _cov(sigma_m: float, sigma_rad: float) -> Array:
+    return np.diag([sigma_m**2, sigma_m**2, sigma_rad**2])
+
+
+def first_truth(log: LogSet) -> dict[str, Array]:
+    """The true pose (3,) of each robot when its odometry begins: one sample each.
+
+    Raises:
+        EstimationError: a robot has no truth within `MAX_TRUTH_LAG_NS` of its first odometry.
+    """
+    begins: dict[str, int] = {}
+    nearest: dict[str, Truth] = {}
+    for message in log.messages((Scan, Sighting)):
+        if isinstance(message, ODOMETRY):
+            begins.setdefault(message.robot, message.time_ns)
+        elif isinstance(message, Truth):
+            known = nearest.get(message.robot)
+            begin = begins.get(message.robot, message.time_ns)
+            if known is None or abs(message.time_ns - begin) < abs(known.time_ns - begin):
+                nearest[message.robot] = message
+        if all(
+            robot in begins and message.time_ns > begins[robot] + MAX_TRUTH_LAG_NS
+            for robot in log.robots
+        ):
+            break
+    for robot in log.robots:
+        truth = nearest.get(robot)
+        if truth is None:
+            raise EstimationError(f"--start truth: the log has no truth for {robot} at its start")
+        begin = begins.get(robot, truth.time_ns)
+        if abs(truth.time_ns - begin) > MAX_TRUTH_LAG_NS:
+            raise EstimationError(
+                f"--start truth: {robot} starts at {begin} ns and its truth nearest to that is of "
+                f"{truth.time_ns} ns; give --start {robot}=x,y,phi"
+            )
+    return {robot: nearest[robot].pose for robot in log.robots}

@@ -1,0 +1,78 @@
+"""Messages in time order, each released once its robot's odometry reaches it."""
+
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+from graphslam.core.records import (
+    Message,
+    OdometryIncrement,
+    OdometryPose,
+    Scan,
+    Sighting,
+    TrueLandmark,
+    Truth,
+    WheelAngles,
+)
+from graphslam.odometry.preintegration import Track
+
+ODOMETRY = (OdometryPose, OdometryIncrement, WheelAngles)
+
+
+def _robots(message: Message) -> tuple[str, ...]:
+    """Robots that get a state at the message's time."""
+    if isinstance(message, Sighting) and message.seen_robot is not None:
+        return message.robot, message.seen_robot
+    return (message.robot,)
+
+
+def synchronise(
+    messages: Iterable[Message],
+    tracks: Mapping[str, Track],
+    max_gap_s: float,
+    dropped: Counter[str],
+    watched: Sequence[str] = (),
+) -> Iterator[Message]:
+    """Feed odometry into the tracks and hold everything else until the track covers its time.
+
+    A scan stamped between two odometry readings needs the later one to be placed. The order of
+    time is kept over all robots, so one robot's silence may delay the others, by ``max_gap_s`` at
+    most: what is farther than that from any odometry of its robot is dropped and counted, and so
+    is, at once, a sighting of a robot that has no track. At the end of the log the robot is taken
+    to stand still after its last reading. Scans may show the robots ``watched``, so they wait for
+    the odometry of these too.
+    """
+    waiting: deque[Message] = deque()
+    max_gap_ns = round(max_gap_s * 1e9)
+    now_ns = 0
+
+    def next_of_waiting(final: bool) -> Message | None:
+        """The first that waits, taken out, unless it has to wait on."""
+        while waiting:
+            head = waiting[0]
+            if not isinstance(head, ODOMETRY):
+                needed = [tracks.get(robot) for robot in _robots(head)]
+                shown = [tracks[robot] for robot in watched] if isinstance(head, Scan) else []
+                covered = all(track and track.reaches(head.time_ns) for track in needed + shown)
+                if not covered and not final and now_ns - head.time_ns <= max_gap_ns:
+                    return None
+                if not all(track and track.near(head.time_ns, max_gap_ns) for track in needed):
+                    waiting.popleft()
+                    dropped[f"{type(head).__name__.lower()}: no odometry near it"] += 1
+                    continue
+            return waiting.popleft()
+        return None
+
+    for message in messages:
+        if isinstance(message, ODOMETRY):
+            tracks[message.robot].add(message)
+        elif isinstance(message, (Truth, TrueLandmark)):
+            continue
+        elif isinstance(message, Sighting) and message.seen_robot not in (None, *tracks):
+            dropped[f"sighting: robot {message.seen_robot} is not in the log"] += 1
+            continue
+        now_ns = max(now_ns, message.time_ns)
+        waiting.append(message)
+        while (ready := next_of_waiting(final=False)) is not None:
+            yield ready
+    while (ready := next_of_waiting(final=True)) is not None:
+        yield ready

@@ -1,0 +1,198 @@
+"""Loops that are closed by matching: which closures are believed, and what they do to a run."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_scan_matching import ROOM, cloud
+
+from graphslam.core.geometry import between, compose
+from graphslam.core.records import Closure, Picture, Trajectory
+from graphslam.mapping.loop_closure import (
+    build_submaps,
+    candidates,
+    consistent_closures,
+    inflate_covariances,
+    loop_closures,
+    verify_match,
+    violated,
+)
+from graphslam.perception.scan_matching import Match
+
+COV = np.diag([0.02, 0.02, 0.005]) ** 2
+
+
+def drive(poses, seen_from):
+    """Trajectory at ``poses`` (n, 3) and pictures of what is seen from ``seen_from`` (n, 3)."""
+    stamps = np.arange(len(poses), dtype=np.int64) * 1_000_000_000
+    states = {"robot": Trajectory(stamps, poses, np.zeros((len(poses), 3, 3)))}
+    pictures = [
+        Picture("robot", int(t), cloud(p, ROOM).astype(np.float32))
+        for t, p in zip(stamps, seen_from, strict=True)
+    ]
+    return states, pictures
+
+
+def round_trip():
+    """36 m in circles of 1 m radius about (-2.5, 1): true poses (n, 3)."""
+    angle = np.arange(0.0, 36.0, 0.25)
+    return np.column_stack([
+        -2.5 + np.cos(angle), 1.0 + np.sin(angle), angle + np.pi / 2
+    ])  # fmt: skip
+
+
+def drifting(true, per_metre=0.004):
+    """The same path by an odometry that turns too much."""
+    moves = between(true[:-1], true[1:])
+    moves[:, 2] += per_metre * np.hypot(moves[:, 0], moves[:, 1])
+    out = [true[0]]
+    for move in moves:
+        out.append(compose(out[-1], move))
+    return np.array(out)
+
+
+def test_a_drifted_run_meets_itself():
+    """Breaks if closures are of the wrong pair, the wrong way round, or not found at all: each one
+    found says where the later place truly lies in the earlier."""
+    true = round_trip()
+    states, pictures = drive(drifting(true), true)
+    found = build_submaps(states, pictures)
+    P = np.kron(np.eye(len(found)), np.diag([0.05, 0.05, 0.03]) ** 2)
+    closures, _ = loop_closures(found, P, {})
+    assert len(closures) >= 3
+    at = {int(t): k for k, t in enumerate(states["robot"].stamps_ns)}
+    for c in closures:
+        truth = between(true[at[c.other_time_ns]], true[at[c.time_ns]])
+        off = between(truth, c.delta)
+        # a submap is bent by the drift within its 6 m: 0.004 * 6 rad at most
+        assert np.hypot(off[0], off[1]) < 0.06
+        assert abs(off[2]) < 0.024
+
+
+def test_a_run_that_is_right_needs_no_closure():
+    """Breaks with closures where nothing is to be closed: what is there is only confirmed."""
+    true = round_trip()
+    states, pictures = drive(true, true)
+    found = build_submaps(states, pictures)
+    P = np.kron(np.eye(len(found)), np.diag([0.05, 0.05, 0.03]) ** 2)
+    assert candidates(found, P)
+    lost, confirmed = loop_closures(found, P, {})
+    assert lost == []
+    for c in confirmed:
+        at = {place.state: place.pose for place in found}
+        off = between(c.delta, between(at[c.pair[1]], at[c.pair[0]]))
+        assert np.hypot(off[0], off[1]) < 0.05  # what the matching is allowed to be off
+
+
+def test_a_pair_is_looked_at_once():
+    """Breaks if rounds cost as much as the first one where nothing has moved."""
+    true = round_trip()
+    states, pictures = drive(drifting(true), true)
+    found = build_submaps(states, pictures)
+    P = np.kron(np.eye(len(found)), np.diag([0.05, 0.05, 0.03]) ** 2)
+    looked = {}
+    assert loop_closures(found, P, looked)[0]
+    assert loop_closures(found, P, looked) == ([], [])
+
+
+GOOD = Match(np.zeros(3), COV, same=0.7, absent=0.03)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        [replace(GOOD, same=0.3)],
+        [replace(GOOD, absent=0.2)],
+        [replace(GOOD, cov=np.diag([1.0, 0.02, 0.005]) ** 2)],
+        [GOOD, replace(GOOD, pose=np.ones(3), same=0.65)],
+        [],
+    ],
+    ids=["little overlap", "looked through", "free along a wall", "a second place", "nothing"],
+)
+def test_what_makes_a_match_unbelievable(bad):
+    """Breaks with any of the conditions left out."""
+    assert verify_match([GOOD]) is GOOD
+    assert verify_match(bad) is None
+
+
+def closed_loops(poses, true):
+    """Places along ``poses`` where ``true`` ones were driven, true poses of them, true closures."""
+    states, pictures = drive(poses, true)
+    found = build_submaps(states, pictures)
+    at = {int(t): k for k, t in enumerate(states["robot"].stamps_ns)}
+    where = np.array([true[at[p.state[1]]] for p in found])
+    good = [
+        Closure(*found[i].state, *found[i - 6].state, between(where[i - 6], where[i]), COV)
+        for i in range(6, len(found))
+    ]
+    return found, where, good
+
+
+def random_walk(n, sigmas):
+    """Joint covariance (3n, 3n) of n places; ``sigmas`` (3,) m, m, rad from place to place."""
+    walk = np.minimum.outer(np.arange(n) + 1.0, np.arange(n) + 1.0)
+    return np.kron(walk, np.diag(sigmas) ** 2)
+
+
+def random_closures(found, true, rng, groups):
+    """False closures: ``groups`` of three that agree with each other, moved as one by metres."""
+    made = []
+    for _ in range(groups):
+        i, j = (int(k) for k in rng.choice(len(found) - 3, 2, replace=False))
+        shift = np.array([*rng.uniform(1.0, 3.0, 2), rng.uniform(0.2, 0.6)])
+        for k in range(3):
+            later, earlier = found[i + k], found[j]
+            delta = compose(shift, between(true[j], true[i + k]))
+            made.append(Closure(*later.state, *earlier.state, delta, COV))
+    return made
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.5])
+def test_false_closures_are_left_out(share):
+    """10, 30 and 50 % false ones among true ones, in groups of three that agree with each other:
+    all true ones are kept, no false one. Breaks with a gate on single closures alone (the joint is
+    wide here: it lets metres pass), or with the first consistent group instead of the largest."""
+    rng = np.random.default_rng(7)
+    true = round_trip()
+    found, where, good = closed_loops(drifting(true), true)
+    # a random walk, as wide as it gets: 0.5 m and 0.1 rad from place to place
+    P = random_walk(len(found), [0.5, 0.5, 0.1]) / 16
+    count = round(len(good) * share / (1 - share) / 3)
+    false = random_closures(found, where, rng, max(1, count))
+    mixed = [*good, *false]
+    order = rng.permutation(len(mixed))
+    kept = consistent_closures([mixed[k] for k in order], found, P)
+    assert not any(c in kept for c in false)
+    assert sum(c in kept for c in good) >= 0.95 * len(good)
+
+
+def test_a_bend_that_the_estimate_does_not_know_of_is_believed_of_many_closures():
+    """The path turns by 0.1 rad halfway, where a wall was taken for another, and the estimate is
+    sure of it to less than a hundredth of that. True closures across the bend are kept; closures
+    off by metres, each for itself, are not. Breaks if only the estimate's own covariance counts."""
+    rng = np.random.default_rng(3)
+    true = round_trip()
+    bend = 70
+    turned = compose(compose(true[bend], np.array([0.0, 0.0, 0.1])), between(true[bend], true))
+    poses = np.where(np.arange(len(true))[:, None] < bend, true, turned)
+    found, where, good = closed_loops(poses, true)
+    across = [c for c in good if c.other_time_ns < found[0].state[1] + bend * 10**9 <= c.time_ns]
+    assert len(across) >= 4
+    P = random_walk(len(found), [0.002, 0.002, 0.0005])
+    false = [c for _ in range(3) for c in random_closures(found, where, rng, 1)[:1]]
+    kept = consistent_closures([*good, *false], found, P)
+    assert all(c in kept for c in across)
+    assert not any(c in kept for c in false)
+
+
+def test_slack_closures_draw_within_three_sigmas():
+    """Breaks if a verified closure enters so tight that a robust kernel takes it for wrong, or if
+    one that fits is widened."""
+    states = {"robot": Trajectory(np.array([0, 1]), np.zeros((2, 3)), np.zeros((2, 3, 3)))}
+    far = Closure("robot", 1, "robot", 0, np.array([1.0, 0.0, 0.3]), COV)
+    near = Closure("robot", 1, "robot", 0, np.array([0.01, 0.0, 0.0]), COV)
+    drawn = inflate_covariances([far, near], states)
+    assert drawn[1] is near
+    assert violated([far, near], states, (0.1, 0.1)) == [True, False]
+    r = np.array([1.0, 0.0, 0.3])
+    assert r @ np.linalg.solve(drawn[0].cov, r) == pytest.approx(9.0, rel=0.1)

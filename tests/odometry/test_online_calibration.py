@@ -1,0 +1,345 @@
+"""Calibration learned from the motions that the estimate found: recursive least squares."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from graphslam.core.config import OdometryConfig, RobotConfig
+from graphslam.core.geometry import between, compose, exp
+from graphslam.core.motion_models import wheel_twist
+from graphslam.core.observation_models import MODELS
+from graphslam.core.records import Association, OdometryIncrement, OdometryPose, WheelAngles
+from graphslam.odometry.online_calibration import (
+    FORGET,
+    OUTLIER,
+    RELATIVE_SIGMA,
+    REMAINING,
+    Calibrator,
+    observed_information,
+)
+from graphslam.odometry.preintegration import Track
+
+SECOND = 1_000_000_000
+PERIOD_NS = 50_000_000  # of odometry
+STATE_NS = 500_000_000
+#: what is wrong with the robot: scales, drift rad/m; where the laser sits, how late it is
+SCALES = {"translation_scale": 0.03, "rotation_scale": -0.04, "drift_rad_per_m": 0.02}
+LASER = {"laser_x_m": 0.08, "laser_y_m": -0.06, "laser_yaw_rad": 0.02, "laser_latency_s": 0.04}
+NOTHING = dict.fromkeys(SCALES, 0.0)
+CENTRED = dict.fromkeys(LASER, 0.0)
+#: information from landmarks that show a motion as well as `RELATIVE_SIGMA` lets them
+PLENTY = 1e12 * np.eye(3)
+#: sigmas of the prior, from the settings
+PRIOR = {
+    "translation_scale": OdometryConfig().translation_scale_sigma,
+    "rotation_scale": OdometryConfig().rotation_scale_sigma,
+    "drift_rad_per_m": OdometryConfig().drift_sigma_rad_per_m,
+    "laser_x_m": OdometryConfig().laser_sigma_m,
+    "laser_y_m": OdometryConfig().laser_sigma_m,
+    "laser_yaw_rad": OdometryConfig().laser_sigma_rad,
+    "laser_latency_s": OdometryConfig().laser_latency_sigma_s,
+}
+
+
+def weaving(n, rng):
+    """Odometry twists (n, 3) of a robot that speeds up, slows down and turns both ways."""
+    t = np.arange(n) * PERIOD_NS / SECOND
+    speed = 0.5 + 0.3 * np.sin(0.9 * t + rng.uniform(0, 6))
+    turning = 0.5 * np.sin(0.37 * t + rng.uniform(0, 6)) + 0.2 * np.sin(1.7 * t)
+    return np.column_stack([speed, 0 * t, turning]) * PERIOD_NS / SECOND
+
+
+def straight(n):
+    return np.tile([0.5 * PERIOD_NS / SECOND, 0.0, 0.0], (n, 1))
+
+
+def chain(twists):
+    poses = [np.zeros(3)]
+    for twist in twists:
+        poses.append(compose(poses[-1], exp(twist)))
+    return np.array(poses)
+
+
+class Drive:
+    """A robot whose odometry says ``twists``, and the true motions of its laser between states."""
+
+    def __init__(self, twists, scales=SCALES, laser=LASER, *, mounted=True, rng=None):
+        scale, turn_scale, drift = scales.values()
+        true = twists * [1 + scale, 1 + scale, 1 + turn_scale]
+        true[:, 2] += drift * twists[:, 0]
+        self.rng = rng
+        self.track = Track(OdometryConfig(), RobotConfig(), mounted=mounted)
+        self._truth = Track(OdometryConfig(), RobotConfig())
+        said, real = chain(twists), chain(true)
+        for k in range(len(said)):
+            ns = k * PERIOD_NS
+            self.track.add(OdometryPose("r", ns, ns, said[k]))
+            self._truth.add(OdometryPose("r", ns, ns, real[k]))
+        *mount, late = laser.values()
+        self._mount, self._late_ns = np.array(mount), round(late * SECOND)
+        self.states = np.arange(SECOND, len(twists) * PERIOD_NS - SECOND, STATE_NS)
+        self.calibrator = Calibrator()
+
+    def moved(self, start_ns, end_ns):
+        """True motion of the laser, as landmarks show it: noise `RELATIVE_SIGMA` if any."""
+        times = np.array([start_ns, end_ns]) - self._late_ns
+        start, end = compose(self._truth.pose(times), self._mount)
+        noise = 0.0 if self.rng is None else self.rng.normal(0, RELATIVE_SIGMA)
+        return between(start, end) + noise
+
+    def learn(self):
+        for start, end in zip(self.states[:-1], self.states[1:], strict=True):
+            motion = self.track.motion(int(start), int(end))
+            moved = self.moved(start, end)
+            self.track.calibration = self.calibrator.learn(
+                self.track.calibration, motion, moved, PLENTY
+            )
+        return self.calibrator.found()
+
+
+def test_known_errors_are_found_from_perfect_motions():
+    """Scale, drift, mount and latency at once, to 0.3 of the sigma found: the prior takes its share
+    of the value, (sigma / prior)², and the latency is a one-sided difference over 50 ms."""
+    found = Drive(weaving(6000, np.random.default_rng(0))).learn()
+    for name, value in (SCALES | LASER).items():
+        estimate, sigma, observable = found[name]
+        assert estimate == pytest.approx(value, abs=0.3 * sigma), name
+        assert observable and sigma < 0.3 * PRIOR[name], name
+
+
+def test_what_is_found_lies_within_its_sigmas():
+    """Over 8 runs with noise, truth drawn from the prior: squared errors over variances average to
+    no more than the upper 99.9 % bound of chi-square. (Only the upper one: a filter that forgets
+    claims a little more than the scatter that it has, by up to a half.)"""
+    total, n = np.zeros(len(PRIOR)), 8
+    for seed in range(n):
+        rng = np.random.default_rng(seed)
+        drawn = {name: rng.normal(0, sigma) for name, sigma in PRIOR.items()}
+        scales = {name: drawn[name] for name in SCALES}
+        laser = {name: drawn[name] for name in LASER}
+        found = Drive(weaving(2500, rng), scales, laser, rng=rng).learn()
+        total += [((found[name][0] - drawn[name]) / found[name][1]) ** 2 for name in PRIOR]
+    assert np.all(total / n < chi2.ppf(0.999, n) / n), dict(zip(PRIOR, total / n, strict=True))
+    assert np.all(total / n > 0.1)  # nor are the sigmas so wide that they say nothing
+
+
+def test_one_step_is_the_information_filter_by_hand():
+    """Prior and motion, each by its own covariance: the motion's without its calibration part,
+    which is what is being learned, plus what the estimate of a motion is off by."""
+    drive = Drive(weaving(100, np.random.default_rng(1)), mounted=False)
+    prior, motion = drive.track.calibration, drive.track.motion(SECOND, 3 * SECOND)
+    moved = motion.delta + np.array([0.02, 0.01, -0.01])
+    after = drive.calibrator.learn(prior, motion, moved, PLENTY)
+    D = motion.d_delta_d_calibration
+    noise = motion.cov - D @ prior.cov @ D.T + np.diag(np.square(RELATIVE_SIGMA))
+    info = np.linalg.inv(prior.cov) + D.T @ np.linalg.solve(noise, D)
+    expected = np.linalg.solve(info, D.T @ np.linalg.solve(noise, moved - motion.delta))
+    np.testing.assert_allclose(after.mean, expected, rtol=1e-7)
+    found = [sigma for _, sigma, _ in drive.calibrator.found().values()]
+    np.testing.assert_allclose(found, np.sqrt(np.diag(np.linalg.inv(info))), rtol=1e-7)
+
+
+def test_wheels_of_unequal_size_are_found():
+    """Tyres 4 mm and 2 mm larger than configured, the axle 1 cm longer: within three sigmas, and
+    the difference of the radii, which bends the path, to 0.3 mm (0.01 rad over 0.25 m and 200
+    states, times the axle)."""
+    rng = np.random.default_rng(3)
+    config = OdometryConfig(wheel_radius_sigma_m=3e-3, axle_sigma_m=0.02)
+    nominal = RobotConfig()
+    real = replace(nominal, wheel_radius_left_m=0.104, wheel_radius_right_m=0.102, axle_m=0.51)
+    n = 4000
+    t = np.arange(n) * 0.05
+    steps = np.column_stack([5 + 2 * np.sin(0.6 * t), 5 + 2 * np.cos(0.45 * t)]) * 0.05
+    track = Track(config, nominal)
+    for k, (left, right) in enumerate(np.cumsum(np.vstack([[0, 0], steps]), axis=0)):
+        track.add(WheelAngles("r", k * PERIOD_NS, k * PERIOD_NS, left, right))
+    true = chain(wheel_twist(steps, real))
+    calibrator = Calibrator()
+    for k in range(0, n, 10):
+        motion = track.motion(k * PERIOD_NS, (k + 10) * PERIOD_NS)
+        moved = between(true[k], true[k + 10]) + rng.normal(0, RELATIVE_SIGMA)
+        track.calibration = calibrator.learn(track.calibration, motion, moved, PLENTY)
+    found = calibrator.found()
+    errors = {"wheel_radius_left_m": 4e-3, "wheel_radius_right_m": 2e-3, "axle_m": 0.01}
+    assert set(found) == set(errors)
+    for name, value in errors.items():
+        assert abs(found[name][0] - value) < 3 * found[name][1], name
+    left, right = (found[f"wheel_radius_{side}_m"][0] for side in ("left", "right"))
+    assert left - right == pytest.approx(2e-3, abs=3e-4)
+
+
+@pytest.mark.parametrize("jump", [[1.0, 0, 0], [0, -0.5, 0], [0, 0, 0.3], [0, 0, 2 * np.pi - 0.3]])
+def test_a_jump_of_the_estimate_teaches_nothing(jump):
+    """A loop closure moves the new state by a metre: no motion of the robot. The calibration stays
+    the very object that it was, and later learning goes on as if nothing had been."""
+    drive = Drive(weaving(1000, np.random.default_rng(1)))
+    before = drive.learn()
+    motion = drive.track.motion(2 * SECOND, 2 * SECOND + STATE_NS)
+    current = drive.track.calibration
+    moved = drive.moved(2 * SECOND, 2 * SECOND + STATE_NS) + jump
+    assert drive.calibrator.learn(current, motion, moved, PLENTY) is current
+    assert drive.calibrator.found() == before
+
+
+def test_the_gate_of_jumps_is_chi_square():
+    """Three degrees of freedom, 99.9 %."""
+    assert chi2.sf(OUTLIER, 3) == pytest.approx(1e-3, rel=0.02)
+
+
+def test_headings_are_compared_the_short_way_round():
+    """A motion of pi - 0.01 that was estimated as -pi + 0.01 is off by 0.02 and no outlier."""
+    track = Track(OdometryConfig(), RobotConfig())
+    for k, phi in enumerate(np.linspace(0, np.pi - 0.01, 50)):
+        track.add(OdometryPose("r", k * PERIOD_NS, k * PERIOD_NS, np.array([0, 0, phi])))
+    motion = track.motion(0, 49 * PERIOD_NS)
+    calibrator = Calibrator()
+    after = calibrator.learn(track.calibration, motion, np.array([0, 0, -np.pi + 0.01]), PLENTY)
+    assert 0 < after.mean[1] < 0.02 / np.pi
+
+
+# ------------------------------------------------------------ what cannot be seen
+
+
+def test_driving_straight_never_shows_where_the_laser_is():
+    """Nor the scale of rotation, nor the latency at constant speed: they keep the prior, to the
+    digit, and say so. Scale, drift and yaw do show."""
+    drive = Drive(straight(2000), NOTHING, CENTRED)
+    found = drive.learn()
+    for name in ("laser_x_m", "laser_y_m", "rotation_scale", "laser_latency_s"):
+        value, sigma, observable = found[name]
+        assert value == pytest.approx(0.0, abs=1e-9) and not observable, name
+        assert sigma == pytest.approx(PRIOR[name], rel=1e-9), name
+    for name in ("translation_scale", "drift_rad_per_m", "laser_yaw_rad"):
+        assert found[name][2], name
+
+
+def test_turning_in_place_shows_the_lasers_place_and_not_its_yaw():
+    drive = Drive(straight(2000) @ np.array([[0, 0, 1.0], [0] * 3, [0] * 3]), NOTHING, LASER)
+    found = drive.learn()
+    assert found["laser_x_m"][2] and found["laser_y_m"][2] and found["rotation_scale"][2]
+    for name in ("laser_x_m", "laser_y_m"):
+        assert abs(found[name][0] - LASER[name]) < found[name][1]
+    for name in ("translation_scale", "drift_rad_per_m"):
+        value, sigma, observable = found[name]
+        assert value == pytest.approx(0.0, abs=1e-9) and not observable, name
+        assert sigma == pytest.approx(PRIOR[name], rel=1e-9), name
+
+
+def test_what_was_learned_is_not_forgotten_below_the_prior():
+    """After a stretch that shows the laser's place, a long one that does not: the value goes back
+    to the prior with it, the sigma grows to the prior's and never beyond."""
+    drive = Drive(weaving(2000, np.random.default_rng(5)), NOTHING, CENTRED)
+    learned = drive.learn()["laser_x_m"][1]
+    going_on = Drive(straight(8000), NOTHING, CENTRED)
+    going_on.calibrator, going_on.track.calibration = drive.calibrator, drive.track.calibration
+    sigma = going_on.learn()["laser_x_m"][1]
+    prior = PRIOR["laser_x_m"]
+    assert learned < 0.2 * prior and 0.5 * prior < sigma <= prior * (1 + 1e-9)
+
+
+def test_tyres_may_warm_up():
+    """The scale changes by 2 % half way: after 3 / (1 - FORGET) states 5 % of the old one is left,
+    and the prior takes 4 %."""
+    n = round(3 / (1 - FORGET)) * STATE_NS // PERIOD_NS + 100
+    cold = Drive(weaving(n, np.random.default_rng(6)), NOTHING, CENTRED, mounted=False)
+    cold.learn()
+    warm_scales = NOTHING | {"translation_scale": 0.02}
+    warm = Drive(weaving(n, np.random.default_rng(7)), warm_scales, CENTRED, mounted=False)
+    warm.calibrator, warm.track.calibration = cold.calibrator, cold.track.calibration
+    assert warm.learn()["translation_scale"][0] == pytest.approx(0.02, rel=0.12)
+
+
+def test_coming_motions_stay_uncertain():
+    """What is used for them is wider than what the data say, by a share of the prior: a constant is
+    none, and the filter takes noise of neighbouring states for independent."""
+    drive = Drive(weaving(3000, np.random.default_rng(2)))
+    found = drive.learn()
+    used = np.sqrt(np.diag(drive.track.calibration.cov))
+    for sigma, (_, known, _), prior in zip(used, found.values(), PRIOR.values(), strict=True):
+        assert sigma == pytest.approx(np.hypot(known, REMAINING * prior), rel=1e-9)
+
+
+# ------------------------------------------------------------ what landmarks show of a motion
+
+
+def test_without_landmarks_nothing_is_learned():
+    """The estimate is odometry then: agreement with itself is no evidence."""
+    drive = Drive(weaving(100, np.random.default_rng(1)))
+    current, motion = drive.track.calibration, drive.track.motion(SECOND, 3 * SECOND)
+    after = drive.calibrator.learn(current, motion, motion.delta, np.zeros((3, 3)))
+    np.testing.assert_array_equal(after.mean, current.mean)
+    np.testing.assert_array_equal(after.cov, current.cov)
+
+
+def test_a_corridor_does_not_show_the_scale_of_the_path():
+    """Its walls give the offset across and the heading: along them the estimate is odometry."""
+    drive = Drive(straight(200), mounted=False)
+    walls = np.diag([0.0, 1e8, 1e8])
+    for start, end in zip(drive.states[:-1], drive.states[1:], strict=True):
+        motion = drive.track.motion(int(start), int(end))
+        moved = drive.moved(start, end)
+        moved[0] = motion.delta[0]
+        drive.track.calibration = drive.calibrator.learn(
+            drive.track.calibration, motion, moved, walls
+        )
+    found = drive.calibrator.found()
+    assert found["translation_scale"][1] == pytest.approx(PRIOR["translation_scale"], rel=1e-4)
+    assert found["drift_rad_per_m"][2] and not found["translation_scale"][2]
+
+
+@pytest.mark.parametrize("heading_rad", [0.0, 0.7, -2.5])
+def test_information_of_observations_lies_along_world_axes(heading_rad):
+    """A post 4 m ahead in the world's x direction: range gives 1/sigma² along x, bearing that of
+    4 m times its sigma across, whichever way the robot faces."""
+    pose, post = np.array([1.0, 2.0, heading_rad]), np.array([5.0, 2.0])
+    cov = np.diag([1e-4, 4e-4])
+    seen = Association("r", 0, 0, "point", MODELS["point"].predict(pose, post), cov)
+    info = observed_information([seen], {"r": pose}, [post])["r"]
+    np.testing.assert_allclose(np.diag(info), [1 / 4e-4, 1 / (16 * 1e-4), 1 / 1e-4], rtol=1e-9)
+
+
+def test_every_robot_is_informed_by_what_it_saw_itself():
+    """Two robots at different places that saw one post, one of them twice, one robot that saw
+    nothing."""
+    poses = {"a": np.array([1.0, 2.0, 0.3]), "b": np.array([5.0, -1.0, 2.0]), "c": np.zeros(3)}
+    post, cov = np.array([5.0, 2.0]), np.diag([1e-4, 4e-4])
+    seen = [
+        Association(r, 0, 0, "point", MODELS["point"].predict(poses[r], post), cov) for r in "aba"
+    ]
+    info = observed_information(seen, poses, [post] * 3)
+    once = observed_information(seen[:1], {"a": poses["a"]}, [post])["a"]
+    np.testing.assert_allclose(info["a"], 2 * once, rtol=1e-12)
+    np.testing.assert_allclose(info["b"][1, 1], 1 / 4e-4, rtol=1e-9)  # it looks along y
+    np.testing.assert_array_equal(info["c"], np.zeros((3, 3)))
+
+
+# ------------------------------------------------------------ nothing to learn
+
+
+def test_given_increments_are_left_alone():
+    """They bring their own covariance and have no parameters; a mount changes nothing."""
+    track = Track(OdometryConfig(), RobotConfig(), mounted=True)
+    for k in range(20):
+        start, end = k * SECOND, (k + 1) * SECOND
+        step = np.array([0.5, 0, 0.1])
+        track.add(OdometryIncrement("r", end, end, start, step, 1e-4 * np.eye(3)))
+    calibrator, current = Calibrator(), track.calibration
+    for k in range(20):
+        motion = track.motion(k * SECOND, (k + 1) * SECOND)
+        assert calibrator.learn(current, motion, np.array([0.6, 0.05, 0.2]), PLENTY) is current
+    assert calibrator.found() == {}
+    np.testing.assert_array_equal(track.mount, 0)
+
+
+def test_a_robot_that_stands_teaches_nothing():
+    """Whatever the estimate says: no parameter of odometry makes a standing robot move."""
+    track = Track(OdometryConfig(), RobotConfig(), mounted=True)
+    for k in range(100):
+        track.add(OdometryPose("r", k * PERIOD_NS, k * PERIOD_NS, np.ones(3)))
+    calibrator, current = Calibrator(), track.calibration
+    for k in range(4):
+        motion = track.motion(k * SECOND, (k + 1) * SECOND)
+        assert calibrator.learn(current, motion, np.array([0.01, 0.0, 0.005]), PLENTY) is current
+    assert calibrator.found() == {}

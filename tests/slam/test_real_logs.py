@@ -1,0 +1,121 @@
+"""Real logs from end to end: the bars that the README names, where a test can afford them.
+
+The long logs (intel and aces whole) are run by benchmarks/real_logs.py.
+"""
+
+import importlib.util
+
+import numpy as np
+import pytest
+from paths import DATA, ROOT
+
+from graphslam.core.config import Config
+from graphslam.core.records import Trajectory
+from graphslam.estimation.isam2 import Isam2Backend
+from graphslam.evaluation.metrics import read_relations, relation_metrics
+from graphslam.logs import open_logs
+from graphslam.slam.smooth import smooth
+
+
+def data(name):
+    path = DATA / name
+    if not path.exists():
+        pytest.skip(f"{path} is not there; set GRAPHSLAM_DATA")
+    return path
+
+
+def benchmark(name):
+    spec = importlib.util.spec_from_file_location(name, ROOT / f"benchmarks/{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def error_of_all_poses(source, folder):
+    """GTSAM's error of the file's own factors at our result."""
+    victoria_park = benchmark("victoria_park")
+    graph, own = victoria_park.file_graph(source)
+    directory = victoria_park.smooth_all_poses(source, folder)
+    return graph.error(victoria_park.values_of(directory, own))
+
+
+def test_victoria_park_reaches_its_optimum(tmp_path):
+    """The optimum is 2339.22; Levenberg-Marquardt from odometry stops at 106 084. 0.1 % more is
+    allowed: our sightings are transported to the base frame, and stamps and poses go through
+    text."""
+    victoria_park = benchmark("victoria_park")
+    assert error_of_all_poses(victoria_park.SOURCE, tmp_path) <= victoria_park.BAR
+
+
+def test_mit_reaches_its_optimum_though_cholesky_fails_on_the_way(tmp_path, monkeypatch):
+    """The optimum is 20.60347; plain Levenberg-Marquardt ends at 385. iSAM2 calls the graph
+    indeterminate with Cholesky at pose 165 and goes on with QR."""
+    source = data("graphs/MIT.g2o")
+    fallbacks = []
+    use_qr = Isam2Backend._use_qr
+
+    def counted(backend, error):
+        fallbacks.append(str(error))
+        use_qr(backend, error)
+
+    monkeypatch.setattr(Isam2Backend, "_use_qr", counted)
+    assert error_of_all_poses(str(source), tmp_path) <= 20.7
+    assert fallbacks
+
+
+@pytest.fixture(scope="module")
+def intel():
+    log = open_logs([data("mcap/intel_first600s.mcap")], Config())
+    return smooth(log, Config())
+
+
+def test_the_first_ten_minutes_of_intel_as_a_ros_2_log(intel):
+    """Read through the same path as our own logs: every scan has a pose, lines are found and found
+    again (several observations per landmark), nothing is dropped but what was never seen again."""
+    summary, counts = intel.summary, intel.summary["counts"]
+    found = intel.robots["robot"]
+    assert counts["messages"] == 9036
+    assert counts["scans"] == 3035 == len(found.scan_final) == len(found.scan_causal)
+    assert np.all(np.diff(found.scan_final.stamps_ns) > 0)
+    assert 300 < counts["keyframes"] < 1500
+    assert 50 < counts["landmarks"] < 250 and counts["observations"] > 10 * counts["landmarks"]
+    assert set(summary["dropped"]) <= {
+        "tentative landmark: not seen often enough",
+        "range: of a thing that moves",  # people
+    }
+    assert sum(summary["rejected"].values()) < 0.1 * counts["observations"]
+    assert counts["loop_closures"] > 0
+    # the models say what the residuals are: a factor of two in chi-square either way
+    assert 0.25 < summary["graph"]["error"] / (0.5 * summary["graph"]["dof"]) < 2.0
+
+
+def test_the_first_ten_minutes_of_intel_against_its_relations(intel):
+    """Ten minutes do better than the bars of the whole log (loops' median 0.3 m, local 0.0185 m).
+
+    The file's stamps went through a float, so they match the relations' to 1 µs; and it was sorted
+    by stamp, so scans that were stamped late stand where their stamps say and cannot be placed:
+    they are the tail that takes the mean of 0.017 m (from the CARMEN log) to 0.026 m."""
+    relations = read_relations(data("freiburg/intel.relations"))
+    scans = intel.robots["robot"].scan_final
+    stamps = (scans.stamps_ns + 500) // 1000 * 1000
+    metrics = relation_metrics(relations, Trajectory(stamps, scans.poses, scans.covs))
+    assert metrics["local"]["n"] > 200 and metrics["loops"]["n"] > 100
+    assert metrics["local"]["trans_median_m"] < 0.0185
+    assert metrics["local"]["trans_mean_m"] < 0.035
+    assert metrics["loops"]["trans_median_m"] < 0.1
+    assert metrics["all"]["rot_mean_deg"] < 2.0
+
+
+@pytest.mark.parametrize("robots", [1, 2])
+def test_csail_among_250_false_closures(robots):
+    """All false closures are refused and all true ones kept, whether the graph is of one robot or
+    of two of which the second starts nobody knows where, and what comes out is the optimum (20.275
+    with the odometry from 522 to 523, which the two robots' files lack; 20.159 without). 0.01 is
+    more than the digits and the convergence of either."""
+    outliers = benchmark("outlier_closures")
+    data(f"graphs/{outliers.CLEAN}")
+    folder = DATA / "graphs"
+    run = outliers.run(folder, outliers.ONE if robots == 1 else outliers.TWO)
+    assert (run.true, run.kept, run.false, run.believed) == (128, 128, 250, 0)
+    assert run.error <= run.best + 0.01
+    assert run.best == pytest.approx(20.275 if robots == 1 else 20.159, abs=1e-3)

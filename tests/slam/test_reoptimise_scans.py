@@ -1,0 +1,106 @@
+"""What closures do to an estimate that is wrong and sure of itself, and what false ones do not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from graphslam.core.config import Config
+from graphslam.core.geometry import between, compose
+from graphslam.core.records import Association, Closure, Motion, Start, Step
+from graphslam.estimation.isam2 import Isam2Backend
+from graphslam.mapping.loop_closure import residuals, violated
+from graphslam.slam.reoptimise_scans import _as_noisy_as_shown, _Solver, _tightened
+
+SECOND = 10**9
+MOTION_COV = np.diag([0.01, 0.01, 0.02]) ** 2
+CLOSURE_COV = np.diag([0.03, 0.03, 0.005]) ** 2
+#: m, rad: closures that come out worse than this are taken back
+BORNE_OUT = (0.2, 0.03)
+
+
+def corridor(turn_rad, steps=40):
+    """A corridor with a bend halfway, its two walls taken for one; true poses (n, 3) and steps.
+
+    Each state sees the wall on its left, 1 m off, to 2 cm and 5 mrad; odometry is right.
+    """
+    true = [np.zeros(3)]
+    for k in range(steps):
+        bend = turn_rad if k == steps // 2 else 0.0
+        true.append(compose(true[-1], np.array([0.5, 0.0, bend])))
+    walls = [compose(true[k], np.array([0.0, 1.0, 0.0])) for k in (0, steps // 2 + 1)]
+    made = [Step(0, {"r": Start(np.zeros(3), 1e-6 * np.eye(3))})]
+    for k in range(1, steps + 1):
+        delta = between(true[k - 1], true[k])
+        motion = Motion((k - 1) * SECOND, k * SECOND, delta, MOTION_COV, np.zeros((3, 0)), 0.5)
+        z = between(true[k], walls[k > steps // 2])
+        seen = Association("r", k * SECOND, 0, "line", z, np.diag([1.0, 0.02, 0.005]) ** 2)
+        made.append(Step(k * SECOND, {}, {"r": motion}, (seen,)))
+    return np.array(true), tuple(made)
+
+
+def closures(true, off=(0.0, 0.0, 0.0)):
+    """Closures between both ends, true but for ``off`` (m, m, rad) of the last one."""
+    n = len(true) - 1
+    pairs = [(n - 2 * k, 2 * k) for k in range(4)]
+    found = [
+        Closure("r", i * SECOND, "r", j * SECOND, between(true[j], true[i]), CLOSURE_COV)
+        for i, j in pairs
+    ]
+    return [*found[:-1], replace(found[-1], delta=compose(found[-1].delta, np.array(off)))]
+
+
+def solved(steps):
+    """An estimate of the steps and what solves them again."""
+    backend = Isam2Backend(Config())
+    for step in steps:
+        backend.add(step)
+    solve = _Solver(Config())
+    return solve, solve(steps, backend.finish())
+
+
+@pytest.mark.parametrize("turn_rad", [0.15, 0.3])
+def test_true_closures_undo_what_is_wrong_and_sure_of_itself(turn_rad):
+    """The wall pulls the bend straight, metres off at the ends. Breaks if closures are only drawn
+    as far as they fit the estimate: then none of them moves it, and all are taken back."""
+    true, steps = corridor(turn_rad)
+    solve, estimate = solved(steps)
+    told = closures(true)
+    assert all(violated(told, estimate.states, BORNE_OUT))
+    estimate = _tightened(steps, told, estimate, solve)
+    assert not any(violated(told, estimate.states, BORNE_OUT))
+
+
+def test_a_false_closure_moves_nothing():
+    """A straight corridor, one closure a metre off: the true ones hold, it is missed by a metre.
+    Breaks if what is held first stays as it was held."""
+    true, steps = corridor(0.0)
+    solve, estimate = solved(steps)
+    told = closures(true, off=(0.0, 1.0, 0.1))
+    estimate = _tightened(steps, told, estimate, solve)
+    assert violated(told, estimate.states, BORNE_OUT) == [False, False, False, True]
+    # 0.2: a fifth of how far off it is
+    assert np.abs(residuals(told, estimate.states)[-1, 1]) == pytest.approx(1.0, abs=0.2)
+
+
+def test_motions_become_as_noisy_as_they_are():
+    """Headings three times as noisy as believed, beside a wall that is known well. Breaks if the
+    estimate is asked once: it believed the motions, and shows them twice as noisy as they say."""
+    rng = np.random.default_rng(1)
+    _, steps = corridor(0.0, steps=200)
+    noisy = tuple(
+        replace(
+            step,
+            motions={
+                robot: replace(m, delta=m.delta + np.array([0.0, 0.0, 0.06 * rng.normal()]))
+                for robot, m in step.motions.items()
+            },
+        )
+        for step in steps
+    )
+    solve, estimate = solved(noisy)
+    made, _ = _as_noisy_as_shown(noisy, estimate, solve)
+    scale = np.sqrt(np.diag(made[1].motions["r"].cov) / np.diag(MOTION_COV))
+    # the median of 200 is good to 0.2; asking ends where a tenth more would come
+    assert scale[2] == pytest.approx(3.0, abs=0.5)
+    assert scale[0] == pytest.approx(1.0, abs=0.1)
