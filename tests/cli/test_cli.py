@@ -23,7 +23,7 @@ from graphslam.core.config import load_config
 from graphslam.core.geometry import between, compose
 from graphslam.logs import IMPORTERS, LogWriter
 from graphslam.results.folder import load, read_trajectory
-from graphslam.slam.smooth import smooth as slam
+from graphslam.slam import smooth as smooth_module
 
 S = 1_000_000_000
 START_NS = 1_700_000_000 * S + 123_456_789
@@ -512,10 +512,10 @@ def fail_with(error):
         (RuntimeError("two\nlines"), 1, r"unexpected RuntimeError: two lines; .*--debug.*\n"),
     ],
 )
-def test_whatever_happens_is_told_in_one_line(error, code, text, tmp_path, monkeypatch):
+def test_any_error_is_reported_in_one_line(error, code, text, tmp_path, monkeypatch):
     good_log(tmp_path)
     before = listing(tmp_path)
-    monkeypatch.setattr(slam, "smooth", fail_with(error))
+    monkeypatch.setattr(smooth_module, "smooth", fail_with(error))
     done = call("smooth", tmp_path / "log.mcap", "-o", tmp_path / "out")
     assert (done.code, done.out) == (code, "")
     assert re.fullmatch(rf"graphslam: error: {text}" if text else "", done.err)
