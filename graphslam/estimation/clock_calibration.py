@@ -2,8 +2,8 @@
 
 A robot that drives at v is seen v times the offset away from where its own clock puts it. First
 roughly: over short spans the path of a robot as others saw it must fit the path of its odometry,
-moved and turned as is best, at the right offset (`rough_offsets`). Then exactly: offsets and drifts
-are unknowns of the linearised problem of all states (`backends.clocked`). The thesis synchronised
+moved and turned as is best, at the right offset (`offsets_from_paths`). Then exactly: offsets and
+drifts are unknowns of the linearised problem of all states (`clock_graph`). The thesis synchronised
 its clocks over a wireless network and could not tell how well (6.1.3).
 """
 
@@ -17,7 +17,7 @@ from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array, compose, log
 from graphslam.core.observation_models import transport
 from graphslam.core.records import Association, Estimate, Sighting, Step
-from graphslam.estimation.clock_graph import DRIFT, OFFSET_S, clock_errors, met_in
+from graphslam.estimation.clock_graph import DRIFT, OFFSET_S, clock_errors, robot_associations
 from graphslam.logs.clock import Clock
 from graphslam.odometry.preintegration import Track
 from graphslam.perception.sightings import sighting_observation
@@ -60,7 +60,7 @@ class ClockEstimate:
     applied: Clock
 
     @property
-    def differs(self) -> bool:
+    def needs_correction(self) -> bool:
         """Whether the clock is not what the log was read by, so that it shows.
 
         A clock that is right so far must be wrong beyond doubt.
@@ -93,12 +93,12 @@ def estimate_clocks(
     first, *others = sorted(tracks)
     epoch_ns = min(track.first_ns for track in tracks.values())
     known = {robot: applied.get(robot, Clock(0.0, 0.0, epoch_ns)) for robot in others}
-    met = met_in(steps)
+    met = robot_associations(steps)
     seen = {name for _, a in met for name in (a.robot, str(a.target))}
     unseen = {r: ClockEstimate(known[r], OFFSET_S, DRIFT, False, known[r]) for r in others}
     if first not in seen:
         return unseen
-    rough = rough_offsets(sightings, tracks) if not applied else {}
+    rough = offsets_from_paths(sightings, tracks) if not applied else {}
     errors = clock_errors(
         steps,
         estimate,
@@ -154,7 +154,9 @@ class _Path:
         return np.stack([np.interp(times_s, self.times_s, x) for x in self.poses.T], axis=-1)
 
 
-def rough_offsets(sightings: Iterable[Sighting], tracks: Mapping[str, Track]) -> dict[str, Offset]:
+def offsets_from_paths(
+    sightings: Iterable[Sighting], tracks: Mapping[str, Track]
+) -> dict[str, Offset]:
     """How far each robot's clock is ahead of the first robot's, as far as sightings tell.
 
     Args:

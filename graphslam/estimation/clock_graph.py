@@ -35,7 +35,7 @@ class ClockErrors:
         return self.mean[at], self.cov[at, at]
 
 
-def met_in(steps: Sequence[Step]) -> list[tuple[int, Association]]:
+def robot_associations(steps: Sequence[Step]) -> list[tuple[int, Association]]:
     """Sightings of robots in steps, with the time of the state that was seen."""
     return [
         (step.time_ns, a) for step in steps for a in step.associations if isinstance(a.target, str)
@@ -56,7 +56,7 @@ def clock_errors(
         steps: as recorded.
         estimate: of all their states and landmarks.
         speeds: (n, 3) twists per second of the robots that were seen, along their own axes, in the
-            order of `met_in`.
+            order of `robot_associations`.
         after_s: (n,) time since the clocks' epoch.
         prior: robot -> what its clock has been corrected by so far (2,), of those whose clock is
             unknown; the others' are right.

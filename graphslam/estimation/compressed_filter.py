@@ -261,10 +261,10 @@ class CompressedBackend(Isam2Backend):
         self._flush()
         return super().finish()
 
-    def rough(self) -> Estimate:
+    def current_estimate(self) -> Estimate:
         """See `Isam2Backend`."""
         self._flush()
-        return super().rough()
+        return super().current_estimate()
 
 
 class BatchBackend(CompressedBackend):

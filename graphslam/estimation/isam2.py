@@ -1,7 +1,7 @@
 """Full smoothing with GTSAM: incrementally (iSAM2) and, at the end, to convergence.
 
 `Isam2Backend` is incremental smoothing over the whole past (horizon = infinity), its tree updated
-at every step (`compressed` does so seldom). `Resolver` solves what was recorded once more.
+at every step (`compressed` does so seldom). `Reoptimiser` solves what was recorded once more.
 """
 
 from collections.abc import Iterable, Sequence
@@ -260,7 +260,7 @@ class Isam2Backend(GraphBackend):
         numbers = [(robot, builder.states.number(robot, t)) for robot, t in states]
         return self._tree_covariance([builder.state_key(*state) for state in numbers])
 
-    def rough(self) -> Estimate:
+    def current_estimate(self) -> Estimate:
         """What the tree has now, where solving again begins: covariances are NaN."""
         return self._rough(self._isam.calculateBestEstimate())
 
@@ -316,7 +316,7 @@ class Isam2Backend(GraphBackend):
         return self._estimate(means, covs, float(self._builder.graph.error(values)))
 
 
-class Resolver(Isam2Backend):
+class Reoptimiser(Isam2Backend):
     """Solves recorded steps again and again, with more closures or fewer."""
 
     def __init__(self, config: Config, steps: Iterable[Step], start: Estimate) -> None:

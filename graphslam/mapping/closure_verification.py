@@ -26,7 +26,7 @@ from graphslam.core.consistency import greedy_max_clique
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, adjoint, between, compose, inverse, log, rotate_cov
 from graphslam.core.records import Closure, Estimate, Motion, RelativePose, Start, Step, Trajectory
-from graphslam.estimation.isam2 import Isam2Backend, Resolver
+from graphslam.estimation.isam2 import Isam2Backend, Reoptimiser
 from graphslam.odometry.preintegration import Track
 
 #: probability up to which two closures agree, and up to which one fits what all the others say:
@@ -300,7 +300,7 @@ class _Joint:
         estimate = backend.finish()
         barred: set[int] = set()
         for _ in range(MAX_ROUNDS):
-            batch = Resolver(self._robust, self._steps(believed), estimate)
+            batch = Reoptimiser(self._robust, self._steps(believed), estimate)
             estimate = batch.solve(rough=True)
             d2 = {k: self._misfit(k, k in believed, batch, estimate) for k in candidates}
             wrong = sorted((k for k in believed if d2[k] > gate), key=lambda k: -d2[k])
@@ -311,7 +311,7 @@ class _Joint:
             gone = set(wrong[: max(1, len(wrong) // 4)])
             barred |= gone
             believed = believed - gone if gone else believed | new
-        return believed, Resolver(self._plain, self._steps(believed), estimate).solve()
+        return believed, Reoptimiser(self._plain, self._steps(believed), estimate).solve()
 
     def _steps(self, believed: Iterable[int]) -> list[Step]:
         """Steps in the order of time, each closure where both of its ends are there."""
@@ -324,7 +324,7 @@ class _Joint:
             for t in sorted({*self._starts, *self._motions, *at})
         ]
 
-    def _misfit(self, k: int, used: bool, backend: Resolver, estimate: Estimate) -> float:
+    def _misfit(self, k: int, used: bool, backend: Reoptimiser, estimate: Estimate) -> float:
         """Squared Mahalanobis distance of a closure from what all others say.
 
         In units of the closure's own sigmas, along directions in which the estimate is independent:

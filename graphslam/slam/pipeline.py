@@ -559,7 +559,7 @@ class Pipeline:
         """What the back end has at the end, and whether that is only where `reconsider` begins."""
         settings = self.config.backend
         if isinstance(self.backend, Isam2Backend) and settings.polish and settings.reconsider:
-            return self.backend.rough(), True
+            return self.backend.current_estimate(), True
         return self.backend.finish(), False
 
     @property

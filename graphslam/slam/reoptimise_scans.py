@@ -16,7 +16,7 @@ from graphslam.core.config import Config
 from graphslam.core.geometry import Array, between, wrap
 from graphslam.core.records import Closure, Estimate, Picture, Step
 from graphslam.estimation.batch_calibration import calibrate, recompute_motions
-from graphslam.estimation.isam2 import Resolver
+from graphslam.estimation.isam2 import Reoptimiser
 from graphslam.mapping.duplicate_landmarks import (
     duplicates,
     merge_entries,
@@ -147,7 +147,7 @@ class _Solver:
     ) -> Estimate:
         """The estimate; the graph stays as long as steps are the same and go on from the last."""
         if self._solved is None or self._solved[0] is not steps or self._solved[1] is not start:
-            self.backend = Resolver(self._config, steps, start)
+            self.backend = Reoptimiser(self._config, steps, start)
         estimate = self.backend.solve(closures, rough=rough)
         self._solved = steps, estimate
         return estimate
@@ -285,7 +285,7 @@ def _loosened(steps: Sequence[Step], estimate: Estimate) -> tuple[Step, ...]:
 
 
 def _duplicates(
-    estimate: Estimate, backend: Resolver, landmarks: LandmarkMap, steps: Sequence[Step]
+    estimate: Estimate, backend: Reoptimiser, landmarks: LandmarkMap, steps: Sequence[Step]
 ) -> dict[int, int]:
     """Landmark that goes -> landmark that it becomes; the map follows the estimate."""
     landmarks.follow(steps, estimate)

@@ -64,7 +64,7 @@ def smooth(
         names, clocks, causal = finding.result()
         if names and not known.names:
             known = with_names(known, log, config, names)
-        elif passes < MAX_CLOCKS and any(found.differs for found in clocks.values()):
+        elif passes < MAX_CLOCKS and any(found.needs_correction for found in clocks.values()):
             passes += 1
             known = replace(known, clocks={robot: found.clock for robot, found in clocks.items()})
         else:

@@ -11,7 +11,7 @@ from graphslam.core.geometry import between, compose
 from graphslam.core.records import Association, Estimate, Step, Trajectory
 from graphslam.estimation.backend import Joint, block_slices
 from graphslam.estimation.backends import BACKENDS
-from graphslam.estimation.isam2 import Resolver
+from graphslam.estimation.isam2 import Reoptimiser
 from graphslam.mapping.duplicate_landmarks import (
     _compare,
     _Map,
@@ -228,7 +228,7 @@ def test_merged_steps_give_the_estimate_that_never_knew_of_two(landmark):
         twice.add(step)
     expected, before = whole.finish(), twice.finish()
     kinds = {1: "line", 2: "segment", 7: "line" if landmark == 1 else "segment"}
-    after = Resolver(
+    after = Reoptimiser(
         PLAIN, merged_steps(split(steps, landmark, 4, 7), {7: landmark}, kinds), before
     ).solve()
     assert sorted(after.landmarks) == [0, 1, 2]
