@@ -7,8 +7,8 @@
     filter -> batch                                 with the square of the noise
 
 The models' Jacobians against finite differences are in test_observation_models.py, GTSAM's factors
-against the models in test_factors.py. What makes the ladder worth having is at the end: a Jacobian with one
-entry wrong by 5 %, which every NEES would swallow, breaks it.
+against the models in test_factors.py. What makes the ladder worth having is at the end: a Jacobian
+with one entry wrong by 5 %, which every NEES would swallow, breaks it.
 """
 
 import math
