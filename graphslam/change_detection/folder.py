@@ -1,7 +1,6 @@
 """Result folders in; changes.json, a map, messages and a report out."""
 
 import os
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +9,7 @@ from graphslam.change_detection.export import overlay_map, pgm, write_messages
 from graphslam.change_detection.visit import load_visit, within
 from graphslam.core.config import ChangesConfig
 from graphslam.core.errors import OutputError
+from graphslam.core.output_folder import atomic_folder
 from graphslam.results.folder import load, to_json
 
 Span = tuple[float, float]
@@ -83,22 +83,12 @@ def save_changes(
         OutputError: the target exists and may not be replaced, or the disk refuses.
     """
     check_changes_target(directory, force=force)
-    final = directory.absolute()
-    part = final.with_name(f".{final.name}.{os.getpid()}.part")
     texts = {"changes.json": to_json(found.to_dict(), "changes.json")}
     if report is not None:
         texts["report.html"] = report(found)
     image, texts["changes.yaml"] = overlay_map(found)
-    try:
-        part.mkdir(parents=True)
+    with atomic_folder(directory) as part:
         (part / "changes.pgm").write_bytes(pgm(image))
         write_messages(found, part / "changes.mcap")
         for name, text in texts.items():
             (part / name).write_text(text, encoding="utf-8")
-        if final.exists():
-            shutil.rmtree(final)
-        part.rename(final)
-    except OSError as error:
-        raise OutputError(f"{directory}: cannot be written: {error.strerror}") from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)

@@ -70,7 +70,10 @@ def import_mrclam(source: Path, target: Path) -> ImportSummary:
     texts = text_files(source, _FILES)
     numbers = [int(f[2]) for name in texts if (f := _FILES.fullmatch(name)) and f[3] == "Odometry"]
     if not numbers:
-        raise LogError(f"{source}: has no RobotN_Odometry.dat in it; is it MRCLAM?")
+        raise LogError(
+            f"{source}: has no RobotN_Odometry.dat; is it MRCLAM? Name the folder or "
+            "archive of one data set"
+        )
     if "Barcodes.dat" not in texts:
         raise LogError(f"{source}: has no Barcodes.dat, the table of who bears which barcode")
     odd: Counter[str] = Counter()

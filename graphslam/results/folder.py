@@ -6,9 +6,7 @@ graph.g2o (with graph_ids.csv naming its vertices) and report.html.
 
 import json
 import os
-import shutil
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -20,6 +18,7 @@ import numpy as np
 from graphslam.core.config import Config, dump_config, load_config
 from graphslam.core.errors import OutputError
 from graphslam.core.geometry import Array
+from graphslam.core.output_folder import atomic_folder
 from graphslam.core.records import Landmark, Result, Trajectory
 from graphslam.estimation.g2o import graph_g2o, graph_ids
 
@@ -106,36 +105,16 @@ def save(
 
 
 def write_folder(directory: Path, files: Sequence[tuple[str, str]]) -> None:
-    """Write files (name, text) as a folder: beside its final name first, renamed when whole.
-
-    What is there (see `check_target`) is moved away, replaced and only then deleted, so that one
-    of the two is there at any time.
+    """Write files (name, text) as a folder that appears whole or not at all.
 
     Raises:
         OutputError: the disk refuses; nothing is left behind.
     """
-    final = directory.absolute()
-    part = final.with_name(f".{final.name}.{os.getpid()}.part")
-    old = final.with_name(f".{final.name}.{os.getpid()}.old")
-    try:
-        part.mkdir(parents=True)
+    with atomic_folder(directory) as part:
         for name, text in files:
             path = part / name
             path.parent.mkdir(exist_ok=True)
             path.write_text(text, encoding="utf-8")
-        if final.exists():
-            final.rename(old)
-        try:
-            part.rename(final)
-        except OSError:
-            with suppress(FileNotFoundError):
-                old.rename(final)
-            raise
-    except OSError as error:
-        raise OutputError(f"{directory}: cannot be written: {error.strerror}") from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
-    shutil.rmtree(old, ignore_errors=True)
 
 
 def tum_text(trajectory: Trajectory) -> str:

@@ -1,12 +1,12 @@
 """A scenario and a seed in; a log with its truth out."""
 
 import json
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from graphslam.core.errors import OutputError
+from graphslam.core.output_folder import atomic_folder
 from graphslam.simulation.recording import Recording, record
 from graphslam.simulation.scenario import Scenario
 from graphslam.simulation.scene import Visit, visits
@@ -57,23 +57,13 @@ def _two_visits(
 ) -> Simulation:
     if target.is_file() or target.suffix == ".mcap":
         raise OutputError(f"{target}: this scenario makes two logs; name a folder: -o DIR")
-    partial = target.with_name(f".{target.name}.partial")
-    try:
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
+    with atomic_folder(target) as part:
         first, second = (
-            record(scenario, visit, partial / f"{visit.name}.mcap", seed) for visit in ready
+            record(scenario, visit, part / f"{visit.name}.mcap", seed) for visit in ready
         )
         assert scenario.later is not None  # that is what makes two visits
         truth = truth_of_changes(scenario, scenario.later, ready, (first, second), seed)
         text = json.dumps(truth, indent=1, allow_nan=False) + "\n"
-        (partial / "truth.json").write_text(text, encoding="utf-8")
-        if target.exists():
-            shutil.rmtree(target)
-        partial.replace(target)
-    except OSError as error:
-        raise OutputError(f"{target}: cannot be written: {error.strerror}") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        (part / "truth.json").write_text(text, encoding="utf-8")
     written = tuple(replace(r, path=target / r.path.name) for r in (first, second))
     return Simulation(scenario.name, seed, target, written, len(truth["cells"]))
