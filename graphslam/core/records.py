@@ -170,7 +170,8 @@ class Observation:
     the line (its middle, x axis along the line, the sensor on its left). ``cov`` has z's size;
     for a ``line`` its first row and column mean nothing (no information along the line).
     ``extent`` (2,) is where the observed part begins and ends along the line, measured from z,
-    m; None for points.
+    m; None for points. ``source`` is the number of the recorded sighting that it was made from,
+    where that is kept.
     """
 
     kind: str
@@ -178,6 +179,7 @@ class Observation:
     cov: Array
     extent: Array | None = None
     identity: str | None = None
+    source: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,7 +190,7 @@ class Association:
     name; ``model`` is the row of `MODELS` that compares them. ``z`` and ``cov`` are in the
     robot's base frame at that state. ``late`` marks evidence from before the landmark's
     promotion: filters skip it, smoothers use it. ``extent`` (2,) m is from where to where a wall
-    was seen, along the x axis of ``z``.
+    was seen, along the x axis of ``z``. ``source``: see `Observation`.
     """
 
     robot: str
@@ -199,12 +201,13 @@ class Association:
     cov: Array
     late: bool = False
     extent: Array | None = None
+    source: int | None = None
 
     def measured(self, z: Array, cov: Array) -> "Association":
         """The same with another measurement (k,) and covariance (k, k)."""
         # `dataclasses.replace` takes twice as long, and there are many
         same = self.robot, self.time_ns, self.target, self.model
-        return Association(*same, z, cov, self.late, self.extent)
+        return Association(*same, z, cov, self.late, self.extent, self.source)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -72,19 +72,21 @@ def recompute_motions(steps: Sequence[Step], tracks: Mapping[str, Track]) -> tup
     With the latency held a motion at the edge of the odometry would be sure of what it does not
     cover.
     """
-    made: dict[str, dict[int, Motion]] = {}
+    motions: list[dict[str, Motion]] = [dict(step.motions) for step in steps]
     for robot, track in tracks.items():
-        old = [step.motions[robot] for step in steps if robot in step.motions]
-        old = [motion for motion in old if not motion.matched]
-        made[robot] = dict(zip(map(id, old), _remade(old, track), strict=True))
-    return tuple(
-        replace(step, motions={r: made[r].get(id(m), m) for r, m in step.motions.items()})
-        for step in steps
-    )
+        which = [
+            n
+            for n, step in enumerate(steps)
+            if robot in step.motions and not step.motions[robot].matched
+        ]
+        recomputed = _recomputed([steps[n].motions[robot] for n in which], track)
+        for n, motion in zip(which, recomputed, strict=True):
+            motions[n][robot] = motion
+    return tuple(replace(step, motions=made) for step, made in zip(steps, motions, strict=True))
 
 
-def _remade(motions: Sequence[Motion], track: Track) -> list[Motion]:
-    """Motions of one robot, made anew."""
+def _recomputed(motions: Sequence[Motion], track: Track) -> list[Motion]:
+    """Motions of one robot by its track's calibration."""
     if not motions:
         return []
     ends = np.array([(m.start_ns, m.end_ns) for m in motions], dtype=np.int64)

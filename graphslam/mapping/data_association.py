@@ -146,8 +146,7 @@ class Associator:
                 self.rejected["identity: known as a landmark of another kind"] += 1
                 continue
             self.map.saw(entry, o, pose, time_ns, robot, path_m)
-            association = Association(robot, time_ns, entry.id, o.kind, o.z, o.cov, extent=o.extent)
-            out += self._admit(entry, association, True)
+            out += self._admit(entry, _association(robot, time_ns, entry, o.kind, o), True)
         return tuple(out)
 
     def settle(self) -> None:
@@ -309,9 +308,7 @@ class Associator:
                 o = replace(o, identity=identity)
                 entry, model = self.map.add(o, pose, image.time_ns), o.kind
             self.map.saw(entry, o, pose, image.time_ns, image.robot, image.path_m)
-            association = Association(
-                image.robot, image.time_ns, entry.id, model, o.z, o.cov, extent=o.extent
-            )
+            association = _association(image.robot, image.time_ns, entry, model, o)
             out += self._admit(entry, association, self._has_identity(o))
         return tuple(out)
 
@@ -328,6 +325,13 @@ class Associator:
             entry.kind = "line"
         waiting, entry.evidence = entry.evidence, []
         return [replace(e, model=entry.kind, late=e.time_ns != seen.time_ns) for e in waiting]
+
+
+def _association(robot: str, time_ns: int, entry: Entry, model: str, o: Observation) -> Association:
+    """The observation ``o`` from a robot's state at ``time_ns`` as one of a landmark."""
+    return Association(
+        robot, time_ns, entry.id, model, o.z, o.cov, extent=o.extent, source=o.source
+    )
 
 
 def _worth_comparing(

@@ -85,7 +85,7 @@ def flip(seen: Observation) -> Observation:
     """The same line described in the opposite direction."""
     assert seen.extent is not None
     z = np.array([seen.z[0], seen.z[1], wrap(seen.z[2] + np.pi)])
-    return Observation(seen.kind, z, seen.cov, -seen.extent[::-1], seen.identity)
+    return Observation(seen.kind, z, seen.cov, -seen.extent[::-1], seen.identity, seen.source)
 
 
 def candidate_pairs(

@@ -60,19 +60,21 @@ def reassociate(
         for k in range(0, len(seen), CHUNK)
     ])  # fmt: skip
     best = _exclusive(seen, own, best)
-    new = {
-        id(a): None if b < 0 else _retarget(a, walls[b]) for a, b in zip(seen, best, strict=True)
-    }
-    made = tuple(
-        replace(
-            step,
-            associations=tuple(
-                b for a in step.associations if (b := new.get(id(a), a)) is not None
-            ),
-        )
-        for step in steps
+    # `seen` goes through the steps in order, so one iterator pairs each with its result
+    results = iter(best.tolist())
+    made = []
+    for step in steps:
+        kept: list[Association] = []
+        for a in step.associations:
+            wall = next(results) if a.target in place else None
+            if wall is None:
+                kept.append(a)
+            elif wall >= 0:
+                kept.append(_retarget(a, walls[wall]))
+        made.append(replace(step, associations=tuple(kept)))
+    return Reassociated(
+        tuple(made), int(((best != own) & (best >= 0)).sum()), int((best < 0).sum())
     )
-    return Reassociated(made, int(((best != own) & (best >= 0)).sum()), int((best < 0).sum()))
 
 
 def _best(

@@ -70,7 +70,6 @@ from graphslam.slam.robot_settings import make_tracks, noted, outlines
 from graphslam.slam.robot_state import RobotState
 from graphslam.slam.sighting_batches import (
     SightingBatch,
-    Sources,
     batch_motions,
     batch_sightings,
     events,
@@ -129,7 +128,7 @@ class Pipeline:
             self.backend, self.runs, outlines(log, config), config.front_end, CLOCK_DOUBT_S
         )
         self.steps: list[Step] = []
-        self.sources: Sources = {}
+        self.sources: list[Sighting] = []  # of steps of several images, see `Association.source`
         self.sightings: list[Sighting] = []  # of robots that entered at their own time
         self.pictures: list[Picture] = []
         self.counts: Counter[str] = Counter()
@@ -203,7 +202,7 @@ class Pipeline:
             if not run.started:
                 self.start(image[0].robot, min(run.track.first_ns, image[0].time_ns))
             meeting |= {robot for s in image if s.seen_robot for robot in (s.robot, s.seen_robot)}
-        for robot in meeting:
+        for robot in sorted(meeting):  # states in an order that no hash decides
             if not self.runs[robot].started:
                 self.start(robot, min(self.runs[robot].track.first_ns, step_ns))
         settle(self.runs[robot].track for robot in gathered.robots)
@@ -225,7 +224,8 @@ class Pipeline:
         known = {i for i, entry in self.associator.map.entries.items() if entry.in_graph}
         associations: tuple[Association, ...] = ()
         every = [sighting for image in gathered.images for sighting in image]
-        seen = to_state_frame(every, [moved[s.robot, s.time_ns] for s in every])
+        seen = to_state_frame(every, [moved[s.robot, s.time_ns] for s in every], len(self.sources))
+        self.sources += every
         heading = {
             name: self.runs[name].causal_poses[-1][2]
             + (motions[name].delta[2] if name in motions else 0.0)
@@ -237,9 +237,7 @@ class Pipeline:
             associations += self.seen_in(image, own, at[image[0].robot], motions)
             for sighting in image:
                 if sighting.seen_robot is not None:
-                    found = next(robots)
-                    self.sources[found.robot, found.time_ns, found.z.tobytes()] = sighting
-                    associations += (found,)
+                    associations += (next(robots),)
         self.note_covariances()
         self.seconds["association"] += time.perf_counter() - began
         self.enter(Step(step_ns, {}, motions, inflate_repeated(associations)), known)
@@ -261,8 +259,6 @@ class Pipeline:
         """
         robot = image[0].robot
         run = self.runs[robot]
-        for o, sighting in zip(seen, image, strict=True):
-            self.sources[robot, state_ns, o.z.tobytes()] = sighting
         landmarks = [o for o, s in zip(seen, image, strict=True) if s.seen_robot is None]
         self.counts["observations"] += len(seen)
         if not landmarks:
@@ -596,8 +592,7 @@ class Pipeline:
     def estimate_clocks(self, estimate: Estimate) -> dict[str, ClockEstimate]:
         """What the robots' sightings of each other say about their clocks."""
         tracks = {name: run.track for name, run in self.runs.items() if run.started}
-        seen = {id(s): s for s in self.sources.values() if s.seen_robot}.values()
-        sightings = [*seen, *self.sightings]
+        sightings = [*(s for s in self.sources if s.seen_robot), *self.sightings]
         return estimate_clocks(
             self.steps, estimate, sightings, tracks, self.known.clocks, self.config.robust
         )
@@ -612,8 +607,7 @@ class Pipeline:
         if not self.sources or self.config.association.identities == "ignore":
             return {}
         tracks = {name: run.track for name, run in self.runs.items() if run.started}
-        sightings = {id(sighting): sighting for sighting in self.sources.values()}
-        pairs = find_swapped_identities(sightings.values(), estimate, tracks)
+        pairs = find_swapped_identities(self.sources, estimate, tracks)
         return {a: b for pair in pairs for a, b in (pair, pair[::-1])}
 
 

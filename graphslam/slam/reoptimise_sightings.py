@@ -16,12 +16,12 @@ from graphslam.core.config import Config
 from graphslam.core.geometry import Array, between, wrap
 from graphslam.core.motion_models import Calibration
 from graphslam.core.observation_models import MODELS, transport
-from graphslam.core.records import Estimate, Motion, Step
+from graphslam.core.records import Estimate, Motion, Sighting, Step
 from graphslam.estimation.calibration_graph import solve_calibrated
 from graphslam.odometry.preintegration import Motions, Track, motions_of
 from graphslam.odometry.readings import IntArray
 from graphslam.perception.sightings import sighting_observation
-from graphslam.slam.sighting_batches import Sources, transport_batch, transport_target
+from graphslam.slam.sighting_batches import transport_batch, transport_target
 
 #: times that motions and sightings are made anew
 ROUNDS = 2
@@ -46,7 +46,7 @@ def reoptimise_sighting_log(
     steps: Sequence[Step],
     estimate: Estimate,
     tracks: Mapping[str, Track],
-    sources: Sources,
+    sources: Sequence[Sighting],
     config: Config,
 ) -> ReoptimisedSightingLog:
     """Solve a log of sightings again, `ROUNDS` times.
@@ -55,7 +55,7 @@ def reoptimise_sighting_log(
         steps: as recorded.
         estimate: of all their states and landmarks.
         tracks: odometry of every robot; their calibration is set to what is found.
-        sources: the sightings behind associations.
+        sources: recorded sightings; `Association.source` is an index into them.
         config: settings.
     """
     if not config.odometry.calibrate:
@@ -100,15 +100,15 @@ class Seen:
     share: Array
 
 
-def sightings_of(steps: Sequence[Step], sources: Sources) -> list[Seen]:
+def sightings_of(steps: Sequence[Step], sources: Sequence[Sighting]) -> list[Seen]:
     """All sightings behind the associations of steps, in groups to be carried at once."""
     groups: dict[tuple[str, str | None, int], list[tuple[Any, ...]]] = defaultdict(list)
     for n, step in enumerate(steps):
         count = Counter((a.robot, a.target) for a in step.associations)
         for k, a in enumerate(step.associations):
-            sighting = sources.get((a.robot, a.time_ns, a.z.tobytes()))
-            if sighting is None:
+            if a.source is None:
                 continue
+            sighting = sources[a.source]
             o = sighting_observation(sighting)
             z, cov = transport(o.z, o.cov, sighting.mount, np.zeros((3, 3)))
             other = a.target if isinstance(a.target, str) else None
@@ -134,8 +134,11 @@ def _remade(
         for robot, new in made.items()
     ]
     asked += [(tracks[group.robot], group.state_ns, group.seen_ns) for group in seen]
-    met = [group for group in seen if group.other is not None]
-    asked += [(tracks[str(group.other)], group.step_ns, group.seen_ns) for group in met]
+    asked += [
+        (tracks[group.other], group.step_ns, group.seen_ns)
+        for group in seen
+        if group.other is not None
+    ]
     moved = iter(motions_of(asked))
     motions: list[dict[str, Motion]] = [{} for _ in steps]
     for robot, new in made.items():
@@ -143,10 +146,10 @@ def _remade(
         for i, (n, m) in enumerate(new):
             motions[n][robot] = one(i, m.start_ns, m.end_ns)
     observers = [next(moved) for _ in seen]
-    others = dict(zip(map(id, met), moved, strict=True))
+    others = [None if group.other is None else next(moved) for group in seen]
     associations = [list(step.associations) for step in steps]
-    for group, observer in zip(seen, observers, strict=True):
-        z, cov = _carried(group, estimate, observer, others.get(id(group)))
+    for group, observer, other in zip(seen, observers, others, strict=True):
+        z, cov = _carried(group, estimate, observer, other)
         cov = cov * group.share[:, None, None]
         for (n, k), z_k, cov_k in zip(group.where.tolist(), z, cov, strict=True):
             associations[n][k] = associations[n][k].measured(z_k, cov_k)

@@ -23,9 +23,6 @@ from graphslam.slam.synchronisation import ODOMETRY
 #: rad: how well the relative heading of two robots is known that turns a short motion
 HEADING_SIGMA_RAD = 0.1
 
-#: robot, time of its state and measurement there (as bytes) -> the sighting behind it
-Sources = dict[tuple[str, int, bytes], Sighting]
-
 
 @dataclass(slots=True, eq=False)
 class SightingBatch:
@@ -111,7 +108,7 @@ def batch_motions(
     """
     times: dict[str, set[int]] = defaultdict(set)
     for image in gathered.images:
-        for robot in {image[0].robot, *(s.seen_robot for s in image if s.seen_robot)}:
+        for robot in sorted({image[0].robot, *(s.seen_robot for s in image if s.seen_robot)}):
             times[robot].add(image[0].time_ns)
     asked: list[tuple[Track, IntArray, IntArray]] = []
     for robot, needed in times.items():
@@ -130,14 +127,17 @@ def batch_motions(
     return there, new
 
 
-def to_state_frame(sightings: Sequence[Sighting], moved: Sequence[Motion]) -> list[Observation]:
+def to_state_frame(
+    sightings: Sequence[Sighting], moved: Sequence[Motion], first_source: int = 0
+) -> list[Observation]:
     """Sightings in the base frames at the starts of ``moved``, each of which ends when it was made.
 
-    What is seen from the state itself keeps its own covariance.
+    What is seen from the state itself keeps its own covariance. Observations are numbered from
+    ``first_source`` on.
     """
     base = []
-    for sighting in sightings:
-        o = sighting_observation(sighting)
+    for number, sighting in enumerate(sightings, first_source):
+        o = replace(sighting_observation(sighting), source=number)
         if sighting.mount.any():
             z, cov = transport(o.z, o.cov, sighting.mount, np.zeros((3, 3)))
             o = replace(o, z=z, cov=cov)
@@ -214,7 +214,9 @@ def robot_observations(
             np.array([heading[other] - heading[robot] for _, robot, other, _ in which]),
         )
         for n, (k, robot, other, _) in enumerate(which):
-            made[k] = Association(robot, at[robot], other, model, z[n], cov[n])
+            made[k] = Association(
+                robot, at[robot], other, model, z[n], cov[n], source=seen[k].source
+            )
     return [made[k] for k in sorted(made)]
 
 
