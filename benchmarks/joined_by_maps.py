@@ -115,7 +115,7 @@ def seen_alone(log: Path) -> dict[str, AnonymousMap]:
     config = Config()
     opened = open_logs([log], config)
     recorded = judge_recorded_closures(opened, config, start_poses(opened, config))
-    known = PriorKnowledge(FrameAssignment.apart(opened.robots, origin(config)), recorded)
+    known = PriorKnowledge(FrameAssignment.separate_frames(opened.robots, origin(config)), recorded)
     pipeline = Pipeline(opened, config, known)
     pipeline.run(lambda _count: None)
     return anonymous_maps(pipeline, views_after(pipeline))

@@ -161,15 +161,15 @@ class StartHypothesis:
     @property
     def order(self) -> tuple[int, float]:
         """Sorts places: the better confirmed first, of about equals those with less drift."""
-        return _rank(self.score), self.drift
+        return _support_rank(self.score), self.drift
 
 
-def _rank(count: float) -> int:
+def _support_rank(count: float) -> int:
     """Smaller for larger counts, the same for about equal ones."""
     return -round(2 * float(np.log2(count)))
 
 
-def elsewhere(poses: Array, k: int, apart_m: float) -> list[int]:
+def scans_with_robot_away(poses: Array, k: int, apart_m: float) -> list[int]:
     """The scans next before and after scan ``k`` with the robot, at ``poses`` (m, 3), elsewhere."""
     far = np.hypot(*(poses[:, :2] - poses[k, :2]).T) > apart_m
     before, after = np.flatnonzero(far[:k]), np.flatnonzero(far[k + 1 :])
@@ -178,7 +178,7 @@ def elsewhere(poses: Array, k: int, apart_m: float) -> list[int]:
 
 def candidate_detections(watch: ScanSequence, path: Path, outline: Array) -> CandidateDetections:
     """Everything in the scans that has about the size of ``outline`` (k, 2) and moves about."""
-    size, (_, thin, wide) = reach(outline), shape(outline)
+    size, (_, thin, wide) = reach(outline), outline_extent(outline)
     depth, shaped = DEPTH * (thin + wide) / 2, (wide - thin) / 2
     number, points, variance = [], [], []
     for k, sweep in enumerate(watch.sweeps):
@@ -187,7 +187,7 @@ def candidate_detections(watch: ScanSequence, path: Path, outline: Array) -> Can
             continue
         standing = np.zeros(len(found), dtype=np.bool_)
         count = found.last - found.first + 1
-        for j in elsewhere(path.now, k, 2 * size):
+        for j in scans_with_robot_away(path.now, k, 2 * size):
             then = between(watch.lasers[j], watch.lasers[k])
             same = stood_there(sweep.points, watch.sweeps[j], then)
             sums = np.concatenate([[0], np.cumsum(same)])
@@ -206,7 +206,7 @@ def candidate_detections(watch: ScanSequence, path: Path, outline: Array) -> Can
     return CandidateDetections(*map(np.concatenate, (number, points, variance)))
 
 
-def shape(outline: Array) -> tuple[Array, float, float]:
+def outline_extent(outline: Array) -> tuple[Array, float, float]:
     """Middle (2,) of an outline's corners (k, 2), and its least and greatest distance to them."""
     low, high = outline.min(axis=0), outline.max(axis=0)
     middle = (low + high) / 2
@@ -223,24 +223,26 @@ def start_hypotheses(
 
     No two are confirmed by the same sightings.
     """
-    middle, _, _ = shape(outline)
+    middle, _, _ = outline_extent(outline)
     # of equals the earlier: less drift is on the way to it
-    seeds = sorted(_seeds(path, middle, seen), key=lambda seed: (_rank(seed[0]), seed[1]))
+    seeds = sorted(
+        _path_seeds(path, middle, seen), key=lambda seed: (_support_rank(seed[0]), seed[1])
+    )
     found = []
     for _, k, pose in seeds[:FOLLOWED]:
-        follow = _Follow(watch, path, middle, seen, k)
+        follow = _PathFitter(watch, path, middle, seen, k)
         each = [follow.placed(pose, n) for n in range(len(path.shifts_s))]
         best = max((place for place in each if place), key=lambda p: p.score, default=None)
         if best is not None:
             found.append(best)
     kept: list[StartHypothesis] = []
     for place in sorted(found, key=lambda p: -p.score):
-        if not any(_alike(place, better) for better in kept):
+        if not any(_share_detections(place, better) for better in kept):
             kept.append(place)
     return sorted(kept, key=lambda p: p.order)
 
 
-def _alike(place: StartHypothesis, better: StartHypothesis) -> bool:
+def _share_detections(place: StartHypothesis, better: StartHypothesis) -> bool:
     shared = len(np.intersect1d(place.hits, better.hits))
     return shared > ALIKE * min(len(place.hits), len(better.hits))
 
@@ -252,7 +254,9 @@ def _at(poses: Array, middle: Array) -> Array:
     return np.asarray(poses[:, :2] + np.column_stack([c * x - s * y, s * x + c * y]))
 
 
-def _seeds(path: Path, middle: Array, seen: CandidateDetections) -> list[tuple[int, int, Array]]:
+def _path_seeds(
+    path: Path, middle: Array, seen: CandidateDetections
+) -> list[tuple[int, int, Array]]:
     """Stretches put on the map: by how many confirmed, a scan amid it, the robot's pose then."""
     q = _at(path.now, middle)
     out = []
@@ -263,7 +267,7 @@ def _seeds(path: Path, middle: Array, seen: CandidateDetections) -> list[tuple[i
         if len(np.unique(seen.scan[low:high])) < CONFIRMED:
             continue
         k = int((first + min(last, len(q) - 1)) // 2)
-        for votes, turn, at in _stretch(
+        for votes, turn, at in _vote(
             seen.points[low:high], q[seen.scan[low:high]], q[k], seen, slice(low, high)
         ):
             heading = path.now[k, 2] + turn
@@ -272,7 +276,7 @@ def _seeds(path: Path, middle: Array, seen: CandidateDetections) -> list[tuple[i
     return out
 
 
-def _stretch(
+def _vote(
     p: Array, q: Array, pivot: Array, seen: CandidateDetections, part: slice
 ) -> list[tuple[int, float, Array]]:
     """Ways to put points ``q`` (n, 2) where ``p`` (n, 2) are: votes, turn, where ``pivot`` gets."""
@@ -306,7 +310,7 @@ def _stretch(
     return out
 
 
-class _Follow:
+class _PathFitter:
     """From one scan, where a robot is supposed to be at a pose, to all others."""
 
     def __init__(
@@ -314,8 +318,8 @@ class _Follow:
     ) -> None:
         self._path, self._middle, self._seen, self._k = path, middle, seen, k
         lever = np.hypot(*(seen.points - watch.poses[seen.scan, :2]).T)
-        own = _doubt(watch.view, watch.times_ns, watch.covs, k)
-        theirs = _doubt(path.view, watch.times_ns, path.covs, k)
+        own = _relative_variance(watch.view, watch.times_ns, watch.covs, k)
+        theirs = _relative_variance(path.view, watch.times_ns, path.covs, k)
         self._drift = own[0] + theirs[0]
         self._whole = (watch.covs + path.covs).trace(axis1=1, axis2=2)
         self._noise = seen.variance + self._drift[seen.scan] + lever**2 * own[1][seen.scan]
@@ -345,7 +349,9 @@ class _Follow:
         return StartHypothesis(start, shift, hits, score, spread, float(np.sqrt(turn_var)), drift)
 
 
-def _doubt(view: RobotEstimate, times_ns: IntArray, covs: Array, k: int) -> tuple[Array, Array]:
+def _relative_variance(
+    view: RobotEstimate, times_ns: IntArray, covs: Array, k: int
+) -> tuple[Array, Array]:
     """Variances (m,) of position, m², and heading, rad², relative to the k-th of m times.
 
     By odometry or by the estimates, whichever is less.

@@ -22,12 +22,12 @@ from graphslam.multi_robot.relative_frames import (
     RIVAL,
     RelativeFrame,
     RobotEstimate,
-    relative_frame,
+    estimate_relative_frame,
 )
 
 #: sigmas of a start that was found are so many times as wide as the relation has them: what it
 #: was found from enters the estimate again
-WIDER = 10.0
+PRIOR_INFLATION = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,13 +46,13 @@ class FrameAssignment:
     undecided: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def known(cls, starts: Mapping[str, Start]) -> "FrameAssignment":
+    def one_frame(cls, starts: Mapping[str, Start]) -> "FrameAssignment":
         """All robots in one frame, the starts of all of them given."""
         world = min(starts, default="")
         return cls(starts, dict.fromkeys(starts, world), world)
 
     @classmethod
-    def apart(cls, robots: Iterable[str], origin: Start) -> "FrameAssignment":
+    def separate_frames(cls, robots: Iterable[str], origin: Start) -> "FrameAssignment":
         """Every robot in a frame of its own, at whose ``origin`` it starts."""
         frames = {robot: robot for robot in robots}
         return cls(dict.fromkeys(frames, origin), frames, min(frames, default=""))
@@ -62,7 +62,7 @@ class FrameAssignment:
         told = {}
         for robot, relation in sorted(self.found.items()):
             x, y, phi = self.starts[robot].pose.tolist()
-            sigmas = np.sqrt(np.diag(self.starts[robot].cov)) / WIDER
+            sigmas = np.sqrt(np.diag(self.starts[robot].cov)) / PRIOR_INFLATION
             told[robot] = {
                 "x": x,
                 "y": y,
@@ -107,7 +107,7 @@ def build_frame_tree(
         for b in names[n + 1 :]:
             if a in starts and b in starts:
                 continue
-            found = relative_frame(a, b, views, by_pair[a, b], config)
+            found = estimate_relative_frame(a, b, views, by_pair[a, b], config)
             if isinstance(found, RelativeFrame):
                 relations += [found, found.reversed()]
             elif found:
@@ -120,7 +120,7 @@ def build_frame_tree(
             way
             for name in robots
             if name not in placed
-            for way in [_way_in(name, relations, placed, undecided)]
+            for way in [_strongest_relation(name, relations, placed, undecided)]
             if way is not None
         ]
         if ways:
@@ -132,14 +132,14 @@ def build_frame_tree(
             frames[name], start = name, origin
         placed[name] = start
     wide = {
-        name: Start(start.pose, WIDER**2 * start.cov) if name in by else start
+        name: Start(start.pose, PRIOR_INFLATION**2 * start.cov) if name in by else start
         for name, start in placed.items()
     }
     alone = {name: why for name, why in undecided.items() if frames[name] == name != world}
     return FrameAssignment(wide, frames, world, by, alone)
 
 
-def _way_in(
+def _strongest_relation(
     name: str,
     relations: Sequence[RelativeFrame],
     placed: Mapping[str, Start],

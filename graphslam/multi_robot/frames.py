@@ -18,12 +18,12 @@ from graphslam.odometry.interpolation import FrameTransforms, origin_shift
 from graphslam.odometry.preintegration import Track
 
 #: m: how far apart frames lie while they are estimated
-APART_M = 1e5
+FRAME_SPACING_M = 1e5
 #: between frame and identity of landmarks in other frames than the world's; in no name
-MARK = "\0"
+IDENTITY_SEPARATOR = "\0"
 
 
-class Frames:
+class RobotFrames:
     """Which robot is in which frame (``of``), and where frames other than the world's lie.
 
     A frame bears the name of the robot at whose start it hangs; ``away`` (m, along x) is where it
@@ -33,9 +33,9 @@ class Frames:
     def __init__(self, joined: FrameAssignment) -> None:
         self.of, self.world, self._starts = joined.frames, joined.world, joined.starts
         others = sorted(set(self.of.values()) - {self.world})
-        self.away = {frame: (k + 1) * APART_M for k, frame in enumerate(others)}
+        self.away = {frame: (k + 1) * FRAME_SPACING_M for k, frame in enumerate(others)}
 
-    def crossed_by(self, message: Message) -> bool:
+    def crosses_frames(self, message: Message) -> bool:
         """Whether a message relates robots whose frames are not related."""
         other = None
         if isinstance(message, Sighting):
@@ -46,24 +46,28 @@ class Frames:
             return False
         return self.of[message.robot] != self.of[other]
 
-    def named(self, message: Message) -> Message:
+    def with_frame_identity(self, message: Message) -> Message:
         """A message in which a landmark bears the name that it has in the frame of the robot."""
         if not self.away or not isinstance(message, Sighting) or message.identity is None:
             return message
         frame = self.of[message.robot]
-        own = message.identity if frame == self.world else f"{frame}{MARK}{message.identity}"
+        own = (
+            message.identity
+            if frame == self.world
+            else f"{frame}{IDENTITY_SEPARATOR}{message.identity}"
+        )
         return replace(message, identity=own)
 
-    def put(self, robot: str, start: Start) -> Start:
+    def offset_start(self, robot: str, start: Start) -> Start:
         """A robot's start where its frame lies while it is estimated."""
         away = np.array([self.away.get(self.of[robot], 0.0), 0.0, 0.0])
         return replace(start, pose=start.pose + away)
 
-    def of_landmarks(self, entries: Iterable[Entry]) -> dict[int, str]:
+    def landmark_frames(self, entries: Iterable[Entry]) -> dict[int, str]:
         """Landmark -> in whose frame it is: whoever saw it has the same one."""
         return {entry.id: self.of[min(entry.path_m)] for entry in entries}
 
-    def worlds(self, tracks: Mapping[str, Track], entries: Iterable[Entry]) -> FrameTransforms:
+    def transforms(self, tracks: Mapping[str, Track], entries: Iterable[Entry]) -> FrameTransforms:
         """What takes every robot and landmark from where it was estimated into its frame.
 
         A prior is on the base of the robot at which a frame hangs, states are on its sensor.
@@ -75,24 +79,24 @@ class Frames:
             by_frame[frame] = compose(shift, away)
         return FrameTransforms(
             {robot: by_frame[frame] for robot, frame in self.of.items()},
-            {number: by_frame[frame] for number, frame in self.of_landmarks(entries).items()},
+            {number: by_frame[frame] for number, frame in self.landmark_frames(entries).items()},
         )
 
-    def to_summary(
+    def label_landmarks(
         self, landmarks: tuple[Landmark, ...], entries: Iterable[Entry]
     ) -> tuple[Landmark, ...]:
         """The final map, in which landmarks of other frames than the world's say whose it is."""
         if not self.away:
             return landmarks
-        frames = self.of_landmarks(entries)
+        frames = self.landmark_frames(entries)
         return tuple(
             mark
             if frames[mark.id] == self.world
-            else replace(mark, identity=without_mark(mark.identity), frame=frames[mark.id])
+            else replace(mark, identity=logged_identity(mark.identity), frame=frames[mark.id])
             for mark in landmarks
         )
 
 
-def without_mark(identity: str | None) -> str | None:
+def logged_identity(identity: str | None) -> str | None:
     """The name that a landmark bears in the log."""
-    return identity and identity.rpartition(MARK)[2]
+    return identity and identity.rpartition(IDENTITY_SEPARATOR)[2]

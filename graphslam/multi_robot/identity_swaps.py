@@ -20,13 +20,13 @@ from graphslam.odometry.preintegration import Track
 from graphslam.odometry.readings import IntArray
 
 #: sightings that a name must have to be judged
-FEWEST = 20
+MIN_SIGHTINGS = 20
 #: names are exchanged if sightings lie this many times nearer to where they then belong, both ways
-TIMES_NEARER = 3.0
+MIN_DISTANCE_RATIO = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Places:
+class _SightedPoints:
     """Where sightings of one name lie, (n, 2) m in the world frame, and when (n,) ns."""
 
     points: Array
@@ -46,7 +46,7 @@ def find_swapped_identities(
         estimate: of all states.
         tracks: odometry of every robot.
     """
-    places = _places(sightings, estimate, tracks)
+    places = _sighted_points(sightings, estimate, tracks)
     robots = [name for name in sorted(places) if name in tracks]
     pairs = list(combinations(robots, 2))
     pairs += [(robot, name) for robot in robots for name in sorted(places) if name not in tracks]
@@ -69,7 +69,7 @@ def find_swapped_identities(
         if a in taken or b in taken:
             continue
         ways = ((off(a, a), off(a, b)), (off(b, b), off(b, a)))
-        if all(own > TIMES_NEARER * other for own, other in ways):
+        if all(own > MIN_DISTANCE_RATIO * other for own, other in ways):
             out.append((a, b))
             taken |= {a, b}
     return out
@@ -87,9 +87,9 @@ def rename_identities(
     return replace(sighting, seen_robot=None, identity=name)
 
 
-def _places(
+def _sighted_points(
     sightings: Iterable[Sighting], estimate: Estimate, tracks: Mapping[str, Track]
-) -> dict[str, _Places]:
+) -> dict[str, _SightedPoints]:
     """Name -> where its sightings lie, of names with enough of them."""
     by_robot: dict[str, list[Sighting]] = defaultdict(list)
     for sighting in sightings:
@@ -112,7 +112,7 @@ def _places(
             points[name].append(point)
             times[name].append(sighting.time_ns)
     return {
-        name: _Places(np.array(points[name]), np.array(times[name], dtype=np.int64))
+        name: _SightedPoints(np.array(points[name]), np.array(times[name], dtype=np.int64))
         for name in points
-        if len(points[name]) >= FEWEST
+        if len(points[name]) >= MIN_SIGHTINGS
     }

@@ -72,18 +72,21 @@ def relate_points(
         return ""
     floor = config.floor_m**2
     v, w = (_largest_variance(cov) + 0.5 * floor for cov in (P, Q))
-    moves = _moves(p, v, q, w)
+    moves = _candidate_transforms(p, v, q, w)
     if not len(moves):
         return ""
     tree = cKDTree(p)
-    fits = [_fitted(move, p, v, q, w, tree, len(moves)) for move in _best(moves, p, v, q, w)]
+    fits = [
+        _refine(move, p, v, q, w, tree, len(moves))
+        for move in _select_transforms(moves, p, v, q, w)
+    ]
     sound = sorted((f for f in fits if f is not None), key=lambda f: -len(f.pairs))
     if not sound or sound[0].chance > CHANCE:
         return ""
     best = sound[0]
     if best.cov[2, 2] > MAX_TURN_SIGMA_RAD**2:
         return ""
-    others = [f for f in sound if _apart(best.pose, f.pose)]
+    others = [f for f in sound if _are_distinct(best.pose, f.pose)]
     if any(f.chance <= CHANCE or len(f.pairs) > RIVAL * len(best.pairs) for f in others):
         return (
             f"{len(best.pairs)} points that {a} and {b} saw lie alike, and "
@@ -96,12 +99,12 @@ def _largest_variance(cov: Array) -> Array:
     return np.asarray(np.linalg.eigvalsh(cov)[:, -1], dtype=float)
 
 
-def _apart(a: Array, b: Array) -> bool:
+def _are_distinct(a: Array, b: Array) -> bool:
     off = between(a, b)
     return bool(np.hypot(off[0], off[1]) > APART_M or abs(off[2]) > APART_RAD)
 
 
-def _moves(p: Array, v: Array, q: Array, w: Array) -> Array:
+def _candidate_transforms(p: Array, v: Array, q: Array, w: Array) -> Array:
     """Moves (m, 3) that take two points of ``q`` to two of ``p`` that are as far apart."""
     near = cKDTree(q).query(q, k=min(NEIGHBOURS + 1, len(q)))[1][:, 1:]
     first = np.repeat(np.arange(len(q)), near.shape[1])
@@ -133,7 +136,7 @@ def _moves(p: Array, v: Array, q: Array, w: Array) -> Array:
     return np.column_stack([to.mean(axis=1) - rotated, turn])
 
 
-def _best(moves: Array, p: Array, v: Array, q: Array, w: Array) -> Array:
+def _select_transforms(moves: Array, p: Array, v: Array, q: Array, w: Array) -> Array:
     """Those moves (k, 3) that bring most points ``q`` near points ``p``, roughly."""
     gate = SIGMAS * np.sqrt(np.median(v) + np.median(w))
     low = p.min(axis=0) - gate - CELL_M
@@ -163,7 +166,7 @@ def _best(moves: Array, p: Array, v: Array, q: Array, w: Array) -> Array:
     return moves[chosen]
 
 
-def _fitted(
+def _refine(
     move: Array, p: Array, v: Array, q: Array, w: Array, tree: cKDTree, tried: int
 ) -> _Fit | None:
     """A move fitted to the points that it brings together, these found anew each time."""

@@ -33,8 +33,8 @@ from graphslam.multi_robot.detection_hypotheses import (
     ScanSequence,
     StartHypothesis,
     candidate_detections,
-    elsewhere,
     scans_by_robot,
+    scans_with_robot_away,
     start_hypotheses,
 )
 from graphslam.multi_robot.relative_frames import (
@@ -43,7 +43,7 @@ from graphslam.multi_robot.relative_frames import (
     RelativeFrame,
     RobotEstimate,
 )
-from graphslam.multi_robot.robot_detection import Expected, detect_robots
+from graphslam.multi_robot.robot_detection import ExpectedPose, detect_robots
 from graphslam.multi_robot.track_registration import fit_start
 from graphslam.odometry.preintegration import Track
 from graphslam.odometry.readings import IntArray
@@ -81,7 +81,7 @@ class ScanBuffer:
         self._tracks, self._outlines = tracks, outlines
         self._last: dict[str, dict[str, int]] = defaultdict(dict)
 
-    def note(self, scan: Scan) -> None:
+    def add(self, scan: Scan) -> None:
         """Take in the next scan of a log."""
         last = self._last[scan.robot]
         others = [name for name in self._outlines if name != scan.robot and self._tracks[name]]
@@ -166,14 +166,18 @@ def find_robots_in_scans(
         watch = ScanSequence.of(views[observer], own, config.max_range_m)
         found: dict[str, DetectionCandidate] = {}
         for name in others:
-            look = _Look(observer, name, watch, views[name], outlines[name], doubt_s, config)
+            look = _RobotSearch(observer, name, watch, views[name], outlines[name], doubt_s, config)
             one = look.found()
             if isinstance(one, DetectionCandidate):
                 found[name] = one
             elif one:
                 undecided[name] = one
         for name, one in found.items():
-            rivals = [n for n in found if n != name and _same(one, found[n], reach(outlines[name]))]
+            rivals = [
+                n
+                for n in found
+                if n != name and _is_same_object(one, found[n], reach(outlines[name]))
+            ]
             if rivals:
                 undecided[name] = f"what {observer} saw may be {' or '.join([name, *rivals])}"
             elif not {name, observer} <= set(placed):
@@ -181,7 +185,7 @@ def find_robots_in_scans(
     return MutualDetections(tuple(relations), undecided)
 
 
-def _same(one: DetectionCandidate, other: DetectionCandidate, near_m: float) -> bool:
+def _is_same_object(one: DetectionCandidate, other: DetectionCandidate, near_m: float) -> bool:
     """Whether sightings of a robot are as well those of another, seen as often or nearly so."""
     shared = sum(
         bool(np.hypot(*(at - other.at[time_ns])) < near_m)
@@ -192,7 +196,7 @@ def _same(one: DetectionCandidate, other: DetectionCandidate, near_m: float) -> 
     return alike and other.support > RIVAL * one.support
 
 
-class _Look:
+class _RobotSearch:
     """One observer looks for one robot."""
 
     def __init__(
@@ -274,12 +278,14 @@ class _Look:
         shown = np.array(
             [
                 k
-                for k in _spread_out(known, SEARCHED)
-                if shows(watch.sweeps[k], self.outline, between(watch.scans[k].mount, poses[k]))
+                for k in _evenly(known, SEARCHED)
+                if is_visible(
+                    watch.sweeps[k], self.outline, between(watch.scans[k].mount, poses[k])
+                )
             ],
             dtype=np.int64,
         )
-        fitted = _spread_out(shown, FITTED)
+        fitted = _evenly(shown, FITTED)
         sightings: list[Sighting] = []
         numbers: list[int] = []
         turned = place.turn_sigma**2 + HEADING_RAD**2
@@ -289,11 +295,11 @@ class _Look:
             cov = np.diag([place.spread[k] + SURE_M**2 / 9] * 2 + [turned])
             before = [
                 (watch.sweeps[j], between(watch.lasers[j], watch.lasers[k]))
-                for j in elsewhere(there, k, 2 * reach(self.outline))
+                for j in scans_with_robot_away(there, k, 2 * reach(self.outline))
             ]
             found = detect_robots(
                 watch.scans[k],
-                {self.name: Expected(poses[k], cov)},
+                {self.name: ExpectedPose(poses[k], cov)},
                 {self.name: self.outline},
                 self.config,
                 {self.name: before},
@@ -313,7 +319,7 @@ class _Look:
             RelativeFrame(self.name, self.observer, began.pose, began.cov, float(len(used))),
             (len(used) + len(sightings) - len(fitted)) * len(shown) / len(fitted),
             share,
-            _own_m(q[:, :2], t),
+            _straight_line_residual(q[:, :2], t),
             dict(zip(t.tolist(), at, strict=True)),
             [sightings[k] for k in began.used],
             began.late_s,
@@ -321,7 +327,7 @@ class _Look:
         )
 
 
-def shows(sweep: Sweep, outline: Array, pose: Array) -> bool:
+def is_visible(sweep: Sweep, outline: Array, pose: Array) -> bool:
     """Whether a robot at ``pose`` (3,), laser frame, would be seen: nothing nearer hides it.
 
     Beams without a return do not tell.
@@ -347,14 +353,14 @@ def _first_some(numbers: IntArray) -> IntArray:
     return np.concatenate([numbers[first], np.delete(numbers, first)])
 
 
-def _spread_out(numbers: IntArray, most: int) -> IntArray:
+def _evenly(numbers: IntArray, most: int) -> IntArray:
     """So many of ``numbers`` at most, evenly."""
     if len(numbers) <= most:
         return numbers
     return numbers[np.linspace(0, len(numbers) - 1, most).round().astype(np.int64)]
 
 
-def _own_m(q: Array, times_ns: IntArray) -> float:
+def _straight_line_residual(q: Array, times_ns: IntArray) -> float:
     """How far points (n, 2) are from going straight at one speed, root mean square, m."""
     t = 1e-9 * (times_ns - times_ns[0])
     A = np.column_stack([np.ones_like(t), t])

@@ -70,7 +70,7 @@ class PlaceMatch:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Field:
+class _OccupancySpectrum:
     """What a map says of each cell, and its Fourier transform; ``low`` (2,) m is the first cell."""
 
     transformed: Array
@@ -94,7 +94,8 @@ def relate_places(
     found = match_places(here, there) if here and there else []
     relation = choose_alignment(a, b, found, here, there, P_a, P_b) if found else ""
     if isinstance(relation, RelativeFrame) and any(
-        _stands(start, here, there) for start in elsewhere(relation.pose, here, there)
+        _is_supported(start, here, there)
+        for start in alternative_alignments(relation.pose, here, there)
     ):
         return f"{a} and {b} saw places that look alike, but they lie as well in another way"
     return relation
@@ -102,14 +103,14 @@ def relate_places(
 
 def match_places(here: Sequence[SubmapPose], there: Sequence[SubmapPose]) -> list[PlaceMatch]:
     """All places of one robot that look like one of another's, several of one if need be."""
-    field = _field(here, CLEAR_M)
+    field = _occupancy_spectrum(here, CLEAR_M)
     positions = np.array([p.pose[:2] for p in here])
     found = []
     some = np.unique(np.linspace(0, len(there) - 1, min(len(there), MOST)).round().astype(int))
     for k in some:
-        for pose in _searched(field, there[k].submap.points):
+        for pose in _search_poses(field, there[k].submap.points):
             best: PlaceMatch | None = None
-            for j in _visits(positions, pose):
+            for j in _nearest_of_each_pass(positions, pose):
                 guess = between(here[j].pose, pose)
                 seen = verify_match(match(there[k].submap, here[j].submap, guess, WINDOW))
                 if seen is not None and (best is None or _score(seen) > _score(best.match)):
@@ -123,7 +124,7 @@ def _score(m: Match) -> float:
     return m.same - DIFFERS * m.absent
 
 
-def _visits(positions: Array, pose: Array) -> list[int]:
+def _nearest_of_each_pass(positions: Array, pose: Array) -> list[int]:
     """Of each stretch of places (n, 2) near a pose (3,) the nearest, `VISITS` at most."""
     distance = np.hypot(*(positions - pose[:2]).T)
     near = np.flatnonzero(distance <= NEAR_M)
@@ -135,7 +136,7 @@ def _visits(positions: Array, pose: Array) -> list[int]:
 # ---------------------------------------------------------------- the search
 
 
-def _field(places: Sequence[SubmapPose], room_m: float) -> _Field:
+def _occupancy_spectrum(places: Sequence[SubmapPose], room_m: float) -> _OccupancySpectrum:
     """A map of all places, with room round it for what is looked for and goes so far."""
     points = np.concatenate([transform(p.pose, p.submap.points) for p in places])
     margin = int(np.ceil(room_m / STEP_M)) + 1
@@ -143,7 +144,7 @@ def _field(places: Sequence[SubmapPose], room_m: float) -> _Field:
     size = np.round((points.max(axis=0) - low) / STEP_M).astype(int) + margin + 1
     grid = np.zeros(size, dtype=np.float32)
     for place in places:
-        x, y = _cells(_looked_through(place), low).T
+        x, y = _cells(_free_points(place), low).T
         inside = (x >= 0) & (y >= 0) & (x < size[0]) & (y < size[1])
         grid[x[inside], y[inside]] = THROUGH
     x, y = _cells(points, low).T
@@ -152,14 +153,14 @@ def _field(places: Sequence[SubmapPose], room_m: float) -> _Field:
             for j in range(-reach, reach + 1):
                 grid[x + i, y + j] = weight
     shape = (fft.next_fast_len(int(size[0]), real=True), fft.next_fast_len(int(size[1]), real=True))
-    return _Field(fft.rfft2(grid, shape), low, shape)
+    return _OccupancySpectrum(fft.rfft2(grid, shape), low, shape)
 
 
 def _cells(points: Array, low: Array) -> IntArray:
     return np.asarray(np.round((points - low) / STEP_M).astype(np.intp))
 
 
-def _looked_through(place: SubmapPose) -> Array:
+def _free_points(place: SubmapPose) -> Array:
     """Points (n, 2) m in the robot's frame that its scans of a place looked through."""
     submap = place.submap
     free = submap.free[:, ::2]
@@ -172,7 +173,7 @@ def _looked_through(place: SubmapPose) -> Array:
     return np.asarray(sensors[scan, :2] + along[step][:, None] * ray)
 
 
-def _correlated(field: _Field, points: Array) -> Array:
+def _correlate(field: _OccupancySpectrum, points: Array) -> Array:
     """What a map says of points (n, 2) on the mean, with their origin in each of its cells."""
     cells = np.round(points / STEP_M).astype(np.intp)
     image = np.zeros(field.shape, dtype=np.float32)
@@ -180,7 +181,7 @@ def _correlated(field: _Field, points: Array) -> Array:
     return np.asarray(fft.irfft2(field.transformed * fft.rfft2(image).conj(), field.shape))
 
 
-def _searched(field: _Field, points: Array) -> list[Array]:
+def _search_poses(field: _OccupancySpectrum, points: Array) -> list[Array]:
     """Poses (3,), best first, at which points (n, 2) of a submap lie well in a map."""
     near = points[np.hypot(points[:, 0], points[:, 1]) < CLEAR_M]
     if not len(near):
@@ -190,7 +191,7 @@ def _searched(field: _Field, points: Array) -> list[Array]:
     best = np.full(field.shape, -np.inf, dtype=np.float32)
     turned = np.zeros(field.shape)
     for turn in turns:
-        scores = _correlated(field, transform(np.array([0.0, 0.0, turn]), near))
+        scores = _correlate(field, transform(np.array([0.0, 0.0, turn]), near))
         better = scores > best
         best[better], turned[better] = scores[better], turn
     found: list[Array] = []
@@ -203,7 +204,9 @@ def _searched(field: _Field, points: Array) -> list[Array]:
     return found
 
 
-def elsewhere(start: Array, here: Sequence[SubmapPose], there: Sequence[SubmapPose]) -> list[Array]:
+def alternative_alignments(
+    start: Array, here: Sequence[SubmapPose], there: Sequence[SubmapPose]
+) -> list[Array]:
     """Other starts (3,), at which all places together lie on a map nearly as well as at ``start``.
 
     A hall looks the same the other way round, and of all its places few need show that.
@@ -214,18 +217,18 @@ def elsewhere(start: Array, here: Sequence[SubmapPose], there: Sequence[SubmapPo
         there: places of the one, in its frame; what is not where the other one was says nothing.
     """
     positions = np.array([p.pose[:2] for p in here])
-    shared = [p for p in there if len(_visits(positions, compose(start, p.pose)))]
+    shared = [p for p in there if len(_nearest_of_each_pass(positions, compose(start, p.pose)))]
     points = np.concatenate([transform(p.pose, p.submap.points) for p in shared])
     middle = np.array([*points.mean(axis=0), 0.0])
     points = np.unique(np.round((points - middle[:2]) / STEP_M), axis=0) * STEP_M
-    field = _field(here, float(np.hypot(*points.T).max()))
+    field = _occupancy_spectrum(here, float(np.hypot(*points.T).max()))
     own = compose(start, middle)
     x, y = (field.low[k] + STEP_M * np.arange(field.shape[k]) for k in (0, 1))
     close = (x[:, None] - own[0]) ** 2 + (y - own[1]) ** 2 < APART_M**2
     at_start, beside = 0.0, []
     for turn in np.arange(0.0, 2 * np.pi, STEP_RAD):
         heading = own[2] + turn
-        scores = _correlated(field, transform(np.array([0.0, 0.0, heading]), points))
+        scores = _correlate(field, transform(np.array([0.0, 0.0, heading]), points))
         if min(turn, 2 * np.pi - turn) < ELSEWHERE_RAD:
             at_start = max(at_start, float(scores[close].max()))
             scores = np.where(close, 0.0, scores)
@@ -241,7 +244,7 @@ def elsewhere(start: Array, here: Sequence[SubmapPose], there: Sequence[SubmapPo
     return [compose(pose, inverse(middle)) for pose in found]
 
 
-def _stands(start: Array, here: Sequence[SubmapPose], there: Sequence[SubmapPose]) -> bool:
+def _is_supported(start: Array, here: Sequence[SubmapPose], there: Sequence[SubmapPose]) -> bool:
     """Whether a start (3,) is borne out by some places, and by few contradicted."""
     same, differing = verify_places(start, here, there)
     return bool(same) and differing <= AT_MOST * len(same)
@@ -274,15 +277,15 @@ def choose_alignment(
         P_b: the same of ``there``.
     """
     worst = TRUST * P_a + drift_covariance(here), TRUST * P_b + drift_covariance(there)
-    T, C, agree = _compared(found, here, there, *worst)
-    best = greedy_max_clique(agree, _worth(found))
+    T, C, agree = _pairwise_agreement(found, here, there, *worst)
+    best = greedy_max_clique(agree, _scores(found))
     if len(best) < FEWEST_FOUND:
         return ""
     # the search may have overlooked places that are the same, or that should be
     more, differing = verify_places(_together(T, C, best)[0], here, there)
     found = [*found, *more]
-    T, C, agree = _compared(found, here, there, *worst)
-    worth = _worth(found)
+    T, C, agree = _pairwise_agreement(found, here, there, *worst)
+    worth = _scores(found)
     best = greedy_max_clique(agree, worth)
     if len(best) < FEWEST:
         return ""
@@ -304,7 +307,7 @@ def choose_alignment(
         )
     if differing > AT_MOST * len(best):
         return f"{a} and {b} saw places that look alike, but what is beside them differs"
-    pose, cov, _ = _together(*_starts(found, here, there, OWN * P_a, OWN * P_b), best)
+    pose, cov, _ = _together(*_start_estimates(found, here, there, OWN * P_a, OWN * P_b), best)
     return RelativeFrame(b, a, pose, cov, float(len(best)))
 
 
@@ -327,7 +330,7 @@ def verify_places(
     for k, place in enumerate(there):
         pose = compose(start, place.pose)
         looked = []
-        for j in _visits(positions, pose):
+        for j in _nearest_of_each_pass(positions, pose):
             guess = between(here[j].pose, pose)
             if np.hypot(guess[0], guess[1]) <= NEAR_BY_M:
                 matches = match(place.submap, here[j].submap, guess, ROUND_THERE)
@@ -343,11 +346,11 @@ def verify_places(
     return same, differing
 
 
-def _worth(found: Sequence[PlaceMatch]) -> Array:
+def _scores(found: Sequence[PlaceMatch]) -> Array:
     return np.array([_score(m.match) for m in found])
 
 
-def _compared(
+def _pairwise_agreement(
     found: Sequence[PlaceMatch],
     here: Sequence[SubmapPose],
     there: Sequence[SubmapPose],
@@ -355,7 +358,7 @@ def _compared(
     D_b: Array,
 ) -> tuple[Array, Array, Array]:
     """What `_starts` says, and which of n meetings agree (n, n); of one place no two do."""
-    T, C = _starts(found, here, there, D_a, D_b)
+    T, C = _start_estimates(found, here, there, D_a, D_b)
     off = T[:, None] - T
     off[..., 2] = wrap(off[..., 2])
     own = C[np.arange(len(T)), np.arange(len(T))]
@@ -366,7 +369,7 @@ def _compared(
     return T, C, other & (_squared(off, S) <= chi2_quantile(AGREE, 3))
 
 
-def _starts(
+def _start_estimates(
     found: Sequence[PlaceMatch],
     here: Sequence[SubmapPose],
     there: Sequence[SubmapPose],

@@ -120,7 +120,7 @@ class RelativeFrame:
         return RelativeFrame(self.other, self.robot, inverse(self.pose), cov, self.weight)
 
 
-def relative_frame(
+def estimate_relative_frame(
     a: str,
     b: str,
     views: Mapping[str, RobotEstimate],
@@ -136,7 +136,7 @@ def relative_frame(
         meetings: sightings of robots by robots, any of them.
         config: floors of what is seen.
     """
-    ends, noise, worth = _coincidences(a, b, views, meetings, config)
+    ends, noise, worth = _correspondences(a, b, views, meetings, config)
     if worth.sum() < FEWEST:
         return ""
     p, q = ends
@@ -147,7 +147,7 @@ def relative_frame(
     agree = (apart[0] - apart[1]) ** 2 <= chi2_quantile(AGREE, 1) * spread
     np.fill_diagonal(agree, False)
     variance = p.variance + q.variance + noise
-    best = _fitted(greedy_max_clique(agree, worth), p.points, q.points, variance)
+    best = _remove_outliers(greedy_max_clique(agree, worth), p.points, q.points, variance)
     if worth[best].sum() < FEWEST:
         return f"too little of what {a} and {b} saw in common agrees"
     pose, cov = fit_rigid_transform(p.points[best], q.points[best], variance[best])
@@ -155,24 +155,26 @@ def relative_frame(
         return f"what {a} and {b} saw in common does not tell how they were turned"
     rest = np.setdiff1d(np.arange(len(worth)), best)
     members = greedy_max_clique(agree[np.ix_(rest, rest)], worth[rest])
-    rival = _fitted(rest[members], p.points, q.points, variance)
+    rival = _remove_outliers(rest[members], p.points, q.points, variance)
     if len(rival) > 1:
         other, other_cov = fit_rigid_transform(p.points[rival], q.points[rival], variance[rival])
         turned = other_cov[2, 2] < MAX_TURN_SIGMA_RAD**2
         if turned and poses_differ(pose, cov, other, other_cov):
             # some pairs may fit both
             behind = [
-                worth[_misses(move, p.points, q.points, variance) <= chi2_quantile(FIT, 2)].sum()
+                worth[
+                    _normalised_squares(move, p.points, q.points, variance) <= chi2_quantile(FIT, 2)
+                ].sum()
                 for move in (pose, other)
             ]
             if behind[1] > RIVAL * behind[0]:
                 return f"what {a} and {b} saw in common has two meanings"
     floor = np.diag([config.floor_m**2, config.floor_m**2, config.floor_rad**2])
-    cov = cov + floor + _drift(pose, views[a], views[b], p, q, best)
+    cov = cov + floor + _drift_covariance(pose, views[a], views[b], p, q, best)
     return RelativeFrame(b, a, pose, cov, float(worth[best].sum()))
 
 
-def _coincidences(
+def _correspondences(
     a: str,
     b: str,
     views: Mapping[str, RobotEstimate],
@@ -206,7 +208,7 @@ def _coincidences(
         sensor = compose(x, np.array([s.mount for s in found]))
         direction = sensor[:, 2] + z[:, 0]
         at = sensor[:, :2] + z[:, 1:] * np.column_stack([np.cos(direction), np.sin(direction)])
-        use = _spread_out(at, y[:, :2])
+        use = _subsample(at, y[:, :2])
         reach = z[use, 1]
         bearing = cov[use, 0, 0] + config.floor_rad**2
         noises.append(np.maximum(cov[use, 1, 1], reach**2 * bearing) + config.floor_m**2)
@@ -218,10 +220,10 @@ def _coincidences(
         )
     noise = np.concatenate(noises)
     worth = np.where(np.arange(len(noise)) < len(shared), float(LANDMARK_COUNTS), 1.0)
-    return (_stacked(sides[0]), _stacked(sides[1])), noise, worth
+    return (_concatenate(sides[0]), _concatenate(sides[1])), noise, worth
 
 
-def _stacked(ends: Sequence[CorrespondenceSide]) -> CorrespondenceSide:
+def _concatenate(ends: Sequence[CorrespondenceSide]) -> CorrespondenceSide:
     return CorrespondenceSide(
         *(
             np.concatenate([getattr(e, name) for e in ends])
@@ -230,7 +232,7 @@ def _stacked(ends: Sequence[CorrespondenceSide]) -> CorrespondenceSide:
     )
 
 
-def _spread_out(p: Array, q: Array) -> IntArray:
+def _subsample(p: Array, q: Array) -> IntArray:
     """Which of n pairs of points to use: not what repeats the one before, and not too many."""
     kept = [0]
     for k in range(1, len(p)):
@@ -241,23 +243,23 @@ def _spread_out(p: Array, q: Array) -> IntArray:
     return np.array(kept, dtype=np.int64)[every]
 
 
-def _fitted(members: IntArray, p: Array, q: Array, variance: Array) -> IntArray:
+def _remove_outliers(members: IntArray, p: Array, q: Array, variance: Array) -> IntArray:
     """Those of a set that also lie where a rigid move takes them; a mirror image does not."""
     while len(members) > 1:
         pose, _ = fit_rigid_transform(p[members], q[members], variance[members])
-        miss = _misses(pose, p[members], q[members], variance[members])
+        miss = _normalised_squares(pose, p[members], q[members], variance[members])
         if miss.max() <= chi2_quantile(FIT, 2):
             break
         members = np.delete(members, miss.argmax())
     return members
 
 
-def _misses(pose: Array, p: Array, q: Array, variance: Array) -> Array:
+def _normalised_squares(pose: Array, p: Array, q: Array, variance: Array) -> Array:
     """Squared distances (n,) of points from where a move takes them, normalised."""
     return np.asarray(((p - transform(pose, q)) ** 2).sum(axis=1) / variance)
 
 
-def _drift(
+def _drift_covariance(
     pose: Array,
     a: RobotEstimate,
     b: RobotEstimate,
@@ -274,10 +276,10 @@ def _drift(
     if len(timed) < len(members):
         return np.zeros((3, 3))  # both maps hold landmarks: their covariances are in the weights
     k = timed[np.argmin(p.variance[timed] + q.variance[timed])]
-    return meeting_covariance(pose, a, b, int(p.times_ns[k]), int(q.times_ns[k]))
+    return encounter_covariance(pose, a, b, int(p.times_ns[k]), int(q.times_ns[k]))
 
 
-def meeting_covariance(
+def encounter_covariance(
     pose: Array, a: RobotEstimate, b: RobotEstimate, a_ns: int, b_ns: int
 ) -> Array:
     """Covariance (3, 3) that two robots' ways to a meeting add to where one began.

@@ -60,7 +60,7 @@ Flags = np.ndarray[tuple[int], np.dtype[np.bool_]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Expected:
+class ExpectedPose:
     """Where a robot should be: ``pose`` (3,) and ``cov`` (3, 3) in the observer's base frame."""
 
     pose: Array
@@ -75,7 +75,9 @@ class DetectedRobots:
     sightings: tuple[Sighting, ...]
 
 
-def expected(joint: Joint, motion: Motion | None, other: Motion | None, doubt: Array) -> Expected:
+def expected_pose(
+    joint: Joint, motion: Motion | None, other: Motion | None, doubt: Array
+) -> ExpectedPose:
     """Where another robot should be seen, from the joint estimate of both robots' latest states.
 
     Args:
@@ -106,12 +108,12 @@ def expected(joint: Joint, motion: Motion | None, other: Motion | None, doubt: A
     cov = rotate_cov(H @ P @ H.T, h[2])
     v = rotation(float(h[2])) @ doubt
     cov[:2, :2] += np.outer(v, v)
-    return Expected(h, cov)
+    return ExpectedPose(h, cov)
 
 
 def detect_robots(
     scan: Scan,
-    robots: Mapping[str, Expected],
+    robots: Mapping[str, ExpectedPose],
     outlines: Mapping[str, Array],
     config: FrontEndConfig,
     elsewhere: Mapping[str, Sequence[View]] = MappingProxyType({}),
@@ -132,7 +134,7 @@ def detect_robots(
     for name, there in robots.items():
         pose = between(scan.mount, there.pose)
         cov = rotate_cov(there.cov, -float(scan.mount[2]))
-        fits = _fits(sweep, outlines[name], pose, cov, config, elsewhere.get(name, ()))
+        fits = _fit_clusters(sweep, outlines[name], pose, cov, config, elsewhere.get(name, ()))
         one = fits[0] if fits else None
         if one is not None and (len(fits) == 1 or fits[1][0] > one[0] + RIVAL):
             sightings.append(_sighting(scan, name, one[1]))
@@ -143,10 +145,10 @@ def detect_robots(
             gone |= _near(sweep, place, reach(outlines[name]) + MARGIN_M)
     if not gone.any():
         return DetectedRobots(scan, tuple(sightings))
-    return DetectedRobots(_without(scan, sweep, gone), tuple(sightings))
+    return DetectedRobots(_without_returns(scan, sweep, gone), tuple(sightings))
 
 
-def _fits(
+def _fit_clusters(
     sweep: Sweep,
     outline: Array,
     pose: Array,
@@ -197,7 +199,7 @@ def _near(sweep: Sweep, pose: Array, radius_m: float) -> Flags:
     return np.asarray(np.hypot(*(sweep.points - pose[:2]).T) < radius_m)
 
 
-def _without(scan: Scan, sweep: Sweep, gone: Flags) -> Scan:
+def _without_returns(scan: Scan, sweep: Sweep, gone: Flags) -> Scan:
     """The scan without returns of rows ``gone`` (k,) of its sweep."""
     angles = sweep.angles[sweep.beam[gone]]
     beams = np.rint((angles - scan.angle_min_rad) / scan.angle_step_rad).astype(np.int64)
@@ -206,10 +208,10 @@ def _without(scan: Scan, sweep: Sweep, gone: Flags) -> Scan:
     return replace(scan, ranges=ranges)
 
 
-def _still(scan: Scan, sweep: Sweep, views: Sequence[tuple[int, View]]) -> Scan:
+def _without_moving(scan: Scan, sweep: Sweep, views: Sequence[tuple[int, View]]) -> Scan:
     """The scan, of which ``sweep`` is made, without things that move."""
     gone = moving(sweep, [view for _, view in views[-EARLIER:]])
-    return _without(scan, sweep, gone) if gone.any() else scan
+    return _without_returns(scan, sweep, gone) if gone.any() else scan
 
 
 class TrackedRobot(Protocol):
@@ -248,7 +250,7 @@ class RobotDetector:
             lambda: deque(maxlen=STORED)
         )
 
-    def look(
+    def process(
         self, scan: Scan, used: bool, start: Callable[[str, int], bool]
     ) -> tuple[Scan | Sighting, ...]:
         """What of a scan is to be used.
@@ -289,7 +291,7 @@ class RobotDetector:
             return (found.scan, *found.sightings)
         if found.scan is not scan:
             sweep = make_sweep(found.scan, self._config.max_range_m)
-        still = _still(found.scan, sweep, views)
+        still = _without_moving(found.scan, sweep, views)
         self._count("thing that moves", found.scan, still)
         return (still, *found.sightings)
 
@@ -327,13 +329,13 @@ class RobotDetector:
                 return True
         return False
 
-    def _expected(self, scan: Scan, name: str) -> Expected:
+    def _expected(self, scan: Scan, name: str) -> ExpectedPose:
         other = self._runs[name].track
         around = scan.time_ns - SPEED_NS, scan.time_ns + SPEED_NS
         doubt = other.motion(*around).delta[:2] * self._doubt_s / (2e-9 * SPEED_NS)
         joint = self._backend.joint(scan.robot, [], [name])
         since = (self._since(scan.robot, scan.time_ns), self._since(name, scan.time_ns))
-        return expected(joint, since[0], since[1], doubt)
+        return expected_pose(joint, since[0], since[1], doubt)
 
     def _since(self, robot: str, time_ns: int) -> Motion | None:
         """Motion since the robot's latest state."""

@@ -16,7 +16,7 @@ from graphslam.core.consistency import FIT
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, compose, rotation, rotation3, wrap
 from graphslam.core.records import Sighting
-from graphslam.multi_robot.relative_frames import RobotEstimate, meeting_covariance
+from graphslam.multi_robot.relative_frames import RobotEstimate, encounter_covariance
 from graphslam.odometry.readings import IntArray
 
 #: Gauss-Newton steps
@@ -43,15 +43,15 @@ class FittedStart:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Points:
+class _ObservedPath:
     """Where a robot was seen at n times: ``at`` (n, 2), ``cov`` (n, n, 2, 2) of all together."""
 
     times_ns: IntArray
     at: Array
     cov: Array
 
-    def some(self, use: IntArray) -> "_Points":
-        return _Points(self.times_ns[use], self.at[use], self.cov[np.ix_(use, use)])
+    def some(self, use: IntArray) -> "_ObservedPath":
+        return _ObservedPath(self.times_ns[use], self.at[use], self.cov[np.ix_(use, use)])
 
 
 def fit_start(
@@ -80,18 +80,20 @@ def fit_start(
     if len(sightings) < FEWEST:
         return None
     points, theirs = (
-        _seen(sightings, observer),
+        _observed_path(sightings, observer),
         odometry_cross_covariance(robot, _times(sightings))[:, :, :2, :2],
     )
     use = np.arange(len(sightings))
     x = np.append(pose, late_s)
     while len(use) >= FEWEST:
-        fit = _fitted(x, points.some(use), theirs[np.ix_(use, use)], robot, doubt_s)
+        fit = _gauss_newton(x, points.some(use), theirs[np.ix_(use, use)], robot, doubt_s)
         x = fit.x
         if fit.d2.max() <= chi2_quantile(FIT, 2):
             first_ns = int(points.times_ns[use[0]])
             late_ns = round(1e9 * x[3])
-            cov = fit.cov + meeting_covariance(x[:3], observer, robot, first_ns, first_ns + late_ns)
+            cov = fit.cov + encounter_covariance(
+                x[:3], observer, robot, first_ns, first_ns + late_ns
+            )
             turn_sigma = float(np.sqrt(fit.cov[2, 2]))
             return FittedStart(np.append(x[:2], wrap(x[2])), cov, float(x[3]), use, turn_sigma)
         use = np.delete(use, fit.d2.argmax())
@@ -110,7 +112,9 @@ class _Fit:
     d2: Array
 
 
-def _fitted(x: Array, points: _Points, theirs: Array, robot: RobotEstimate, doubt_s: float) -> _Fit:
+def _gauss_newton(
+    x: Array, points: _ObservedPath, theirs: Array, robot: RobotEstimate, doubt_s: float
+) -> _Fit:
     """Gauss-Newton steps from ``x`` (4,); ``theirs`` (n, n, 2, 2) along the robot's first axes."""
     count, apart_ns = len(points.at), round(1e9 * SPEED_S / 2)
     prior = np.diag([0.0, 0.0, 0.0, doubt_s**-2])
@@ -144,7 +148,7 @@ def _times(sightings: Sequence[Sighting]) -> IntArray:
     return np.array([s.time_ns for s in sightings], dtype=np.int64)
 
 
-def _seen(sightings: Sequence[Sighting], observer: RobotEstimate) -> _Points:
+def _observed_path(sightings: Sequence[Sighting], observer: RobotEstimate) -> _ObservedPath:
     """Where a robot was seen in its observer's frame."""
     times = _times(sightings)
     poses, _ = observer.at(times)
@@ -162,7 +166,7 @@ def _seen(sightings: Sequence[Sighting], observer: RobotEstimate) -> _Points:
     cov = H[:, None] @ (turn @ odometry_cross_covariance(observer, times) @ turn.T) @ H[None].mT
     k = np.arange(len(z))
     cov[k, k] += J @ R @ J.mT
-    return _Points(times, at, cov)
+    return _ObservedPath(times, at, cov)
 
 
 def odometry_cross_covariance(view: RobotEstimate, times_ns: IntArray) -> Array:

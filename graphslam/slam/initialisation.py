@@ -20,7 +20,7 @@ from graphslam.logs import LogSet
 from graphslam.mapping.loop_closure import build_submaps
 from graphslam.multi_robot.anonymous_map import AnonymousMap, relate_anonymous_maps
 from graphslam.multi_robot.frame_tree import FrameAssignment, build_frame_tree
-from graphslam.multi_robot.frames import without_mark
+from graphslam.multi_robot.frames import logged_identity
 from graphslam.multi_robot.mutual_detection import (
     MutualDetections,
     ScanBuffer,
@@ -93,7 +93,7 @@ def estimate_start_poses(
 
     if not any(topic.record in (Sighting, Scan) for topic in log.topics):
         return joined({}, (), ((), {}))
-    apart = PriorKnowledge(FrameAssignment.apart(log.robots, own), recorded, names)
+    apart = PriorKnowledge(FrameAssignment.separate_frames(log.robots, own), recorded, names)
     pipeline = Pipeline(log, replace(config, backend=BackendConfig()), apart)
     shapes = outlines(log, config) if config.association.robots != "ignore" else {}
     pipeline.kept = ScanBuffer({name: run.track for name, run in pipeline.runs.items()}, shapes)
@@ -120,11 +120,11 @@ def views_after(run: Pipeline) -> dict[str, RobotEstimate]:
     """What each robot knows by itself, after a pass in which each had a frame of its own."""
     estimate, entries = run.backend.finish(), run.associator.map.entries
     moved = run.worlds().estimate(estimate)
-    frames = run.frames.of_landmarks(entries.values())
+    frames = run.frames.landmark_frames(entries.values())
     marks: dict[str, dict[str, tuple[Array, Array]]] = defaultdict(dict)
     unnamed: dict[str, list[tuple[Array, Array]]] = defaultdict(list)
     for number, (mean, cov) in moved.landmarks.items():
-        name = without_mark(entries[number].identity)
+        name = logged_identity(entries[number].identity)
         if name is not None:
             marks[frames[number]][name] = (mean[:2], cov[:2, :2])
         elif entries[number].kind == "point":

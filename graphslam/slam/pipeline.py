@@ -47,7 +47,7 @@ from graphslam.logs import LogSet
 from graphslam.logs.clock import Clock, on_one_clock
 from graphslam.mapping.data_association import Associator
 from graphslam.multi_robot.frame_tree import FrameAssignment
-from graphslam.multi_robot.frames import Frames
+from graphslam.multi_robot.frames import RobotFrames
 from graphslam.multi_robot.identity_swaps import find_swapped_identities, rename_identities
 from graphslam.multi_robot.mutual_detection import ScanBuffer
 from graphslam.multi_robot.robot_detection import RobotDetector
@@ -121,7 +121,7 @@ class Pipeline:
             name: RobotState(track, clock=known.clocks.get(name, Clock()))
             for name, track in make_tracks(log, config).items()
         }
-        self.starts, self.frames = known.joined.starts, Frames(known.joined)
+        self.starts, self.frames = known.joined.starts, RobotFrames(known.joined)
         self.meetings: list[Sighting] = []  # of robots in frames that nothing relates
         self.kept = ScanBuffer({}, {})  # scans in which these are looked for afterwards
         self.watcher = RobotDetector(
@@ -179,13 +179,13 @@ class Pipeline:
                 self.dropped["sighting: a robot does not see itself"] += 1
             elif ignore and isinstance(message, Sighting) and message.seen_robot is not None:
                 self.dropped["sighting: of a robot, ignored by association.robots"] += 1
-            elif self.frames.crossed_by(message):
+            elif self.frames.crosses_frames(message):
                 kind = type(message).__name__.lower()
                 self.dropped[f"{kind}: of a robot in a frame of its own"] += 1
                 if isinstance(message, Sighting):
                     self.meetings.append(message)
             else:
-                yield self.frames.named(message)
+                yield self.frames.with_frame_identity(message)
 
     def add_sighting_batch(self, gathered: SightingBatch) -> None:
         """All images of a span, in one step at its end.
@@ -287,8 +287,8 @@ class Pipeline:
         self.counts["scans"] += isinstance(first, Scan)
         used = self.is_used(event)
         if isinstance(first, Scan):
-            self.kept.note(first)
-            event = self.watcher.look(first, used, self.has_started)
+            self.kept.add(first)
+            event = self.watcher.process(first, used, self.has_started)
             if self.config.association.robots == "ignore":
                 event = [m for m in event if isinstance(m, Scan)]
         elif not used:
@@ -335,7 +335,7 @@ class Pipeline:
                 f"robot {robot}: its start is unknown; give --start {robot}=x,y,phi (m, rad) or "
                 "--start truth"
             )
-        start = self.frames.put(robot, self.starts[robot])
+        start = self.frames.offset_start(robot, self.starts[robot])
         if robot != self.frames.of[robot]:
             # priors are on the base, states on the sensor: where it sits is not known yet, nor is
             # where that of the first robot sits, to which the world is fixed
@@ -600,7 +600,7 @@ class Pipeline:
     def worlds(self) -> FrameTransforms:
         """What takes every robot and landmark from where it was estimated into its frame."""
         tracks = {name: run.track for name, run in self.runs.items()}
-        return self.frames.worlds(tracks, self.associator.map.entries.values())
+        return self.frames.transforms(tracks, self.associator.map.entries.values())
 
     def exchanged(self, estimate: Estimate) -> dict[str, str]:
         """Names of what was sighted that turn out to be each other's: false -> right name."""

@@ -86,7 +86,7 @@ def smooth(
     pipeline.seconds["trajectories"] = time.perf_counter() - finishing
     entries = pipeline.associator.map
     landmarks = make_landmarks(entries.in_worlds(worlds.landmarks), estimate)
-    landmarks = frames.to_summary(landmarks, entries.entries.values())
+    landmarks = frames.label_landmarks(landmarks, entries.entries.values())
     t0 = min(trajectory.stamps_ns[0] for trajectory in estimate.states.values())
     innovations = {
         model: np.array([((t - t0) * 1e-9, d2) for t, d2 in values]).reshape(-1, 2)

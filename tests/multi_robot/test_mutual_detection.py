@@ -10,7 +10,7 @@ from graphslam.core.geometry import compose, compose_jacobians, exp, wrap
 from graphslam.core.records import OdometryPose, Scan, Trajectory
 from graphslam.evaluation.metrics import evaluate
 from graphslam.logs import open_logs, read_truth
-from graphslam.multi_robot.frame_tree import WIDER
+from graphslam.multi_robot.frame_tree import PRIOR_INFLATION
 from graphslam.multi_robot.mutual_detection import ScanBuffer
 from graphslam.multi_robot.relative_frames import RobotEstimate
 from graphslam.multi_robot.track_registration import odometry_cross_covariance
@@ -104,7 +104,7 @@ def off(found, name, robots):
     """By how much a found start is off, and its covariance."""
     e = found.starts[name].pose - start_of(robots[name])
     e[2] = wrap(e[2])
-    return e, found.starts[name].cov / WIDER**2
+    return e, found.starts[name].cov / PRIOR_INFLATION**2
 
 
 def fits(found, name, robots):
@@ -291,7 +291,7 @@ def test_only_scans_between_which_a_robot_drove_are_kept():
     """One for every 0.1 m of 3 m, none of where it stands."""
     kept = ScanBuffer({"a": driven(0), "b": driven(10)}, {"b": np.array(OUTLINE)})
     for k in range(300):
-        kept.note(Scan("a", k * S // 10, k * S // 10, np.ones(3), 0.0, 0.1, np.zeros(3)))
+        kept.add(Scan("a", k * S // 10, k * S // 10, np.ones(3), 0.0, 0.1, np.zeros(3)))
     assert 24 <= len(kept.scans) <= 31
     assert kept.scans[-1].time_ns <= 10 * S
 

@@ -20,8 +20,8 @@ from graphslam.multi_robot.frame_tree import build_frame_tree
 from graphslam.multi_robot.landmark_constellations import relate_points
 from graphslam.multi_robot.place_recognition import (
     PlaceMatch,
+    alternative_alignments,
     choose_alignment,
-    elsewhere,
     relate_places,
 )
 from graphslam.multi_robot.relative_frames import RelativeFrame
@@ -337,7 +337,9 @@ START = np.array([3.0, -2.0, 0.8])
 def test_a_plain_hall_lies_as_well_the_other_way_round(niche_m, clear):
     """Turned by half a turn; one with a niche does not."""
     at = (-4.0, -1.0, 2.0, 5.0)
-    others = elsewhere(START, in_hall(niche_m, 16.0, at), in_hall(niche_m, 16.0, at, START))
+    others = alternative_alignments(
+        START, in_hall(niche_m, 16.0, at), in_hall(niche_m, 16.0, at, START)
+    )
     assert (not others) == clear
     if not clear:
         # turned about the middle of the hall; the search's cells are 0.3 m and 2.5 degrees

@@ -9,7 +9,7 @@ from graphslam.core.config import ConfigError, load_config
 from graphslam.core.geometry import between, compose, wrap
 from graphslam.core.records import Scan
 from graphslam.logs import open_logs
-from graphslam.multi_robot.robot_detection import Expected, detect_robots
+from graphslam.multi_robot.robot_detection import ExpectedPose, detect_robots
 from graphslam.perception.dynamic_objects import moving
 from graphslam.perception.ordered_scan import make_sweep
 from graphslam.perception.robot_outlines import outline_of
@@ -67,7 +67,7 @@ def one_robot(body, distance_m, seed, laser=LASER):
         np.array([distance_m * np.cos(bearing), distance_m * np.sin(bearing), heading]),
     )
     sigmas = np.array([0.15, 0.15, 0.08])
-    expected = Expected(truth + sigmas * rng.normal(size=3), np.diag(sigmas**2))
+    expected = ExpectedPose(truth + sigmas * rng.normal(size=3), np.diag(sigmas**2))
     (scan,) = scans(np.zeros((1, 3)), HALL, {"b": (body, truth[None])}, rng, laser)
     return scan, truth, expected
 
@@ -143,7 +143,7 @@ def test_no_robot_is_found_where_there_is_none():
         for where in ((4.0, 3.0), (3.0, 0.0), (6.0, -1.5), (8.0, 8.0)):
             pose = np.array([*where, rng.uniform(-3, 3)]) + 0.3 * rng.normal(size=3)
             for body in BODIES.values():
-                known = {"b": Expected(pose, P)}, {"b": outline(body)}
+                known = {"b": ExpectedPose(pose, P)}, {"b": outline(body)}
                 found += len(detect_robots(scan, *known, CONFIG).sightings)
     assert found <= 2  # of 400
 
@@ -158,7 +158,7 @@ def test_what_was_there_while_the_robot_was_elsewhere_is_not_the_robot():
     lasers = [compose(pose, now.mount) for pose in here]
     base = np.array([5.0, 1.0, np.radians(30.0)])
     base[:2] += (body.rear_m - body.length_m / 2) * np.array([np.cos(base[2]), np.sin(base[2])])
-    known = {"b": Expected(between(here[1], base), np.diag([0.2, 0.2, 0.1]) ** 2)}
+    known = {"b": ExpectedPose(between(here[1], base), np.diag([0.2, 0.2, 0.1]) ** 2)}
     outlines = {"b": outline(body)}
     view = make_sweep(before, 30.0), between(lasers[0], lasers[1])
     assert len(detect_robots(now, known, outlines, CONFIG).sightings) == 1  # it looks like one
@@ -170,7 +170,7 @@ def test_two_like_robots_side_by_side_are_not_told_apart():
     body, rng = BODIES["round"], np.random.default_rng(2)
     at = {name: np.array([[4.0, y, 0.0]]) for name, y in (("b", 0.5), ("c", -0.5))}
     (scan,) = scans(np.zeros((1, 3)), HALL, {n: (body, p) for n, p in at.items()}, rng)
-    expected = Expected(np.array([4.0, 0.0, 0.0]), np.diag([0.3, 0.3, 0.1]) ** 2)
+    expected = ExpectedPose(np.array([4.0, 0.0, 0.0]), np.diag([0.3, 0.3, 0.1]) ** 2)
     seen = detect_robots(scan, {"b": expected}, {"b": outline(body)}, CONFIG)
     assert not seen.sightings
     # no more than a mixed pixel beside each edge is left
