@@ -30,7 +30,8 @@ from graphslam.core.config import Config, FrontEndConfig, StartConfig
 from graphslam.core.geometry import Array, between, rotate_cov, transform, wrap
 from graphslam.core.records import Observation, Result, Scan
 from graphslam.evaluation.ground_truth import truth_of_logs
-from graphslam.evaluation.metrics import evaluate, read_relations
+from graphslam.evaluation.metrics import evaluate
+from graphslam.evaluation.relation_metrics import read_relations
 from graphslam.logs import open_logs
 from graphslam.perception.front_ends import FRONT_ENDS
 from graphslam.simulation import load_scenario, simulate

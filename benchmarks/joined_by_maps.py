@@ -29,7 +29,7 @@ from real_logs import DATA, LOGS, command, smooth
 from graphslam.core.config import Config
 from graphslam.core.geometry import between
 from graphslam.core.records import Message, OdometryPose, Trajectory
-from graphslam.evaluation.metrics import Relations, read_relations, relation_errors
+from graphslam.evaluation.relation_metrics import Relations, read_relations, relation_errors
 from graphslam.logs import open_logs
 from graphslam.multi_robot.anonymous_map import AnonymousMap
 from graphslam.multi_robot.frame_tree import FrameAssignment

@@ -28,7 +28,7 @@ from real_logs import DATA, LOGS, command, smooth
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array, between, compose
 from graphslam.core.records import Message, OdometryPose, Scan, Trajectory
-from graphslam.evaluation.metrics import Relations, read_relations, relation_errors
+from graphslam.evaluation.relation_metrics import Relations, read_relations, relation_errors
 from graphslam.logs import LogWriter, open_logs
 
 GROSS_M, LATE_S, WORSE = 0.15, 20.0, 1.5

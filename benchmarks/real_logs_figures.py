@@ -12,7 +12,7 @@ from thesis_figures import BLUE, GREY, INK, RED, panels
 
 from graphslam.change_detection import load_visit
 from graphslam.core.geometry import Array
-from graphslam.evaluation.metrics import read_relations, relation_errors
+from graphslam.evaluation.relation_metrics import read_relations, relation_errors
 from graphslam.results.folder import load
 
 #: every so many points of the map are drawn

@@ -22,7 +22,7 @@ import numpy as np
 
 from graphslam.core.config import Config, load_config
 from graphslam.core.geometry import Array, wrap
-from graphslam.evaluation.metrics import evaluate, pair
+from graphslam.evaluation.metrics import evaluate
 from graphslam.logs import open_logs, read_truth
 from graphslam.simulation import load_scenario, simulate
 from graphslam.simulation.robot_shapes import corners
@@ -60,7 +60,7 @@ def outcome(log: Path, *more: str) -> Outcome:
     result = smooth(open_logs([log], config), config)
     found = result.robots[SEEN].final
     truth = read_truth([log], config).trajectories
-    pairs = pair(found, truth[SEEN])
+    pairs = pair_poses(found, truth[SEEN])
     errors = pairs.estimate[:, :2] - pairs.truth[:, :2]
     covs = found.covs[np.isin(found.stamps_ns, pairs.stamps_ns)]
     return Outcome(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from graphslam.core.config import load_config
 from graphslam.core.geometry import between, compose, transform
 from graphslam.core.records import Result, Scan, TrueLandmark
-from graphslam.evaluation.metrics import align, pair
+from graphslam.evaluation.trajectory_metrics import align
 from graphslam.logs import open_logs, read_true_associations, read_truth
 from graphslam.simulation import Scenario, load_scenario, simulate
 from graphslam.slam.smooth import smooth
@@ -89,7 +89,7 @@ def run(log: Path, known_starts: bool = False) -> Run:
     }
     truth, kept = {}, {}
     for robot, found in result.robots.items():
-        pairs = pair(found.final, known.trajectories[robot])
+        pairs = pair_poses(found.final, known.trajectories[robot])
         truth[robot] = pairs.truth
         kept[robot] = np.isin(found.final.stamps_ns, pairs.stamps_ns)
         if robot in scans:

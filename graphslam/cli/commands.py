@@ -231,7 +231,8 @@ def evaluate_command(
     """
     with errors_in_one_line(debug):
         from graphslam.evaluation.ground_truth import truth_of_files, truth_of_run
-        from graphslam.evaluation.metrics import evaluate, read_relations
+        from graphslam.evaluation.metrics import evaluate
+        from graphslam.evaluation.relation_metrics import read_relations
 
         saved = load(directory)
         reference = read_relations(relations) if relations else None
@@ -282,7 +283,7 @@ def compare_command(
         from graphslam.evaluation.compare_rows import compare
         from graphslam.evaluation.compare_variants import variants
         from graphslam.evaluation.ground_truth import truth_of_files, truth_of_logs
-        from graphslam.evaluation.metrics import read_relations
+        from graphslam.evaluation.relation_metrics import read_relations
 
         options = [f"front_end.name={front_end}"] if front_end else []
         options += [*(start or ()), *(settings or ())]

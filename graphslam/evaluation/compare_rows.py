@@ -12,7 +12,10 @@ from graphslam.core.records import Step, Trajectory
 from graphslam.evaluation.compare_recording import Recording, record
 from graphslam.evaluation.compare_replay import Played, growth_exponent, play_apart
 from graphslam.evaluation.compare_variants import NAMES, Variant
-from graphslam.evaluation.metrics import Pairs, Relations, align, evaluate, nees, pair
+from graphslam.evaluation.error_statistics import nees
+from graphslam.evaluation.metrics import evaluate
+from graphslam.evaluation.relation_metrics import Relations
+from graphslam.evaluation.trajectory_metrics import align
 from graphslam.logs import KnownTruth, LogSet
 from graphslam.results.folder import SavedResult
 from graphslam.results.report_comparison import Comparison, Curve, Lane
@@ -208,11 +211,11 @@ class _Run:
         assert self.result is not None  # see `judge`
         return {name: robot.final for name, robot in self.result.robots.items()}
 
-    def pairs(self, kind: str, other: Mapping[str, Trajectory]) -> Iterator[tuple[str, Pairs]]:
+    def pairs(self, kind: str, other: Mapping[str, Trajectory]) -> Iterator[tuple[str, PosePairs]]:
         """Poses of each robot beside those of ``other``, as far as there are any."""
         assert self.result is not None  # see `judge`
         for name, robot in self.result.robots.items():
-            if name in other and len(found := pair(getattr(robot, kind), other[name])):
+            if name in other and len(found := pair_poses(getattr(robot, kind), other[name])):
                 yield name, found
 
     def lane(self, truth: Mapping[str, Trajectory], reference: "_Run", *, in_place: bool) -> Lane:
@@ -241,7 +244,7 @@ class _Run:
         )  # fmt: skip
 
 
-def _difference(pairs: Sequence[Pairs]) -> dict[str, float] | None:
+def _difference(pairs: Sequence[PosePairs]) -> dict[str, float] | None:
     """Distance between two estimates of the same poses, over all robots."""
     if not pairs:
         return None
@@ -254,7 +257,7 @@ def _difference(pairs: Sequence[Pairs]) -> dict[str, float] | None:
     }
 
 
-def _curve(pairs: Pairs, moved: Array, *, consistency: bool) -> Curve:
+def _curve(pairs: PosePairs, moved: Array, *, consistency: bool) -> Curve:
     """Errors over time after the estimate was put at ``moved`` (3,)."""
     off = pairs.estimate - pairs.truth
     off[:, 2] = wrap(off[:, 2] + moved[2])

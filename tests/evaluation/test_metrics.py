@@ -10,17 +10,17 @@ from graphslam.core.config import Config
 from graphslam.core.errors import OutputError
 from graphslam.core.geometry import between, compose, exp, transform, wrap
 from graphslam.core.records import Landmark, Trajectory, TrueLandmark
-from graphslam.evaluation.metrics import (
+from graphslam.evaluation.error_statistics import nees
+from graphslam.evaluation.landmark_metrics import landmark_metrics
+from graphslam.evaluation.metrics import evaluate
+from graphslam.evaluation.relation_metrics import (
     Relations,
-    align,
-    consistency,
-    evaluate,
-    landmark_metrics,
-    nees,
-    pair,
     read_relations,
     relation_errors,
     relation_metrics,
+)
+from graphslam.evaluation.trajectory_metrics import (
+    align,
     relative_errors,
     trajectory_metrics,
 )
@@ -53,7 +53,7 @@ def landmark(number, kind, position, cov, extent=None, line=None, identity=None)
 def test_truth_between_its_samples_lies_on_the_constant_twist():
     dense = circle(101)
     sparse = trajectory(dense.stamps_ns[::5], dense.poses[::5])
-    pairs = pair(dense, sparse)
+    pairs = pair_poses(dense, sparse)
     assert len(pairs) == 101
     # the path is one constant twist, so interpolation is exact to rounding
     assert np.abs(pairs.truth[:, :2] - dense.poses[:, :2]).max() < 1e-12
@@ -63,7 +63,7 @@ def test_truth_between_its_samples_lies_on_the_constant_twist():
 def test_no_truth_is_invented_outside_its_span_or_in_its_gaps():
     truth = trajectory([0, S // 2, 3 * S, 4 * S], np.zeros((4, 3)))
     stamps = [-1, 0, S // 4, S // 2, S // 2 + 1, 2 * S, 3 * S, 3 * S + 1, 4 * S, 4 * S + 1]
-    pairs = pair(trajectory(stamps, np.zeros((10, 3))), truth)
+    pairs = pair_poses(trajectory(stamps, np.zeros((10, 3))), truth)
     # 3 s..4 s is a gap of exactly 1 s, which is too long; exact hits always count
     assert pairs.stamps_ns.tolist() == [0, S // 4, S // 2, 3 * S, 4 * S]
 
@@ -102,7 +102,7 @@ def test_a_shifted_trajectory_has_that_error_and_none_aligned():
     truth = circle(50)
     pose = np.array([3.0, 4.0, 0.0])
     moved = trajectory(truth.stamps_ns, truth.poses + pose)
-    found = trajectory_metrics([pair(moved, truth)])
+    found = trajectory_metrics([pair_poses(moved, truth)])
     assert found["ate_rmse_m"] == pytest.approx(5.0, abs=1e-12)
     assert found["max_m"] == pytest.approx(5.0, abs=1e-12)
     assert found["ate_aligned_rmse_m"] == pytest.approx(0.0, abs=1e-12)
@@ -113,14 +113,14 @@ def test_a_shifted_trajectory_has_that_error_and_none_aligned():
 def test_heading_errors_are_taken_around_the_circle():
     truth = trajectory([0, 1, 2], [[0, 0, np.pi - 0.01]] * 3)
     turned = trajectory([0, 1, 2], [[0, 0, -np.pi + 0.01]] * 3)
-    found = trajectory_metrics([pair(turned, truth)])
+    found = trajectory_metrics([pair_poses(turned, truth)])
     assert found["heading_rmse_rad"] == pytest.approx(0.02, abs=1e-12)
 
 
 def test_relative_errors_of_a_scale_error_are_that_share_of_the_span():
     truth = circle(400)  # 2 m/s
     scaled = exp(np.outer(np.arange(400), [0.2 * 1.01, 0.0, 0.02]))
-    pairs = pair(trajectory(truth.stamps_ns, scaled), truth)
+    pairs = pair_poses(trajectory(truth.stamps_ns, scaled), truth)
     for span, count, chord in [
         ({"seconds": 1.0}, 390, 2.0 * np.sinc(0.1 / np.pi)),
         # measured along chords of 0.2 m arcs: 10 m are 50 steps and a bit, the nearest is 50
@@ -134,7 +134,7 @@ def test_relative_errors_of_a_scale_error_are_that_share_of_the_span():
 
 
 def test_relative_errors_need_partners():
-    pairs = pair(circle(5, step_ns=10 * S), circle(5, step_ns=10 * S))
+    pairs = pair_poses(circle(5, step_ns=10 * S), circle(5, step_ns=10 * S))
     assert relative_errors(pairs, seconds=1.0).shape == (0, 3)
     assert relative_errors(pairs, metres=10.0).shape == (0, 3)
     found = trajectory_metrics([pairs])
@@ -152,7 +152,7 @@ def test_honest_covariances_have_nees_one_and_cover_95_percent():
     A = rng.normal(size=(n, 3, 3))
     covs = A @ A.mT + 0.1 * np.eye(3)
     errors = np.einsum("nij,nj->ni", np.linalg.cholesky(covs), rng.normal(size=(n, 3)))
-    found = consistency(errors, covs)
+    found = nees_statistics(errors, covs)
     low, high = found["nees_bounds"]
     assert low < 1 < high
     # independent errors, so the average leaves 99.99 % bounds for one seed in 10 000
@@ -163,8 +163,8 @@ def test_honest_covariances_have_nees_one_and_cover_95_percent():
 
 def test_stated_sigmas_half_as_large_show_as_four_times_the_nees():
     errors, covs = np.ones((5, 3)), np.tile(np.eye(3), (5, 1, 1))
-    assert consistency(errors, covs)["nees_per_dof"] == pytest.approx(1.0)
-    assert consistency(errors, covs / 4)["nees_per_dof"] == pytest.approx(4.0)
+    assert nees_statistics(errors, covs)["nees_per_dof"] == pytest.approx(1.0)
+    assert nees_statistics(errors, covs / 4)["nees_per_dof"] == pytest.approx(4.0)
 
 
 def test_unusable_covariances_are_left_out():
@@ -172,7 +172,7 @@ def test_unusable_covariances_are_left_out():
     values = nees(np.ones((4, 3)), covs)
     assert values[0] == pytest.approx(3.0)
     assert np.isnan(values[1:]).all()
-    nothing = consistency(np.ones((2, 3)), np.full((2, 3, 3), np.nan))
+    nothing = nees_statistics(np.ones((2, 3)), np.full((2, 3, 3), np.nan))
     assert nothing == {"nees_per_dof": None, "nees_bounds": None, "coverage": None}
 
 
@@ -429,9 +429,9 @@ def test_one_alignment_of_all_robots_leaves_what_is_between_them(tmp_path):
     truth = circle(50)
     pose = np.array([5.0, 1.0, 0.4])
     moved = trajectory(truth.stamps_ns, compose(pose, truth.poses))
-    both = [pair(moved, truth), pair(moved, truth)]
+    both = [pair_poses(moved, truth), pair_poses(moved, truth)]
     assert trajectory_metrics(both)["ate_aligned_rmse_m"] < 1e-12
-    both[1] = pair(
+    both[1] = pair_poses(
         trajectory(truth.stamps_ns, compose(pose, truth.poses) + np.array([0, 1, 0])), truth
     )
     assert trajectory_metrics(both)["ate_aligned_rmse_m"] > 0.4  # half of the metre each

@@ -12,7 +12,7 @@ from paths import DATA, ROOT
 from graphslam.core.config import Config
 from graphslam.core.records import Trajectory
 from graphslam.estimation.isam2 import Isam2Backend
-from graphslam.evaluation.metrics import read_relations, relation_metrics
+from graphslam.evaluation.relation_metrics import read_relations, relation_metrics
 from graphslam.logs import open_logs
 from graphslam.slam.smooth import smooth
 

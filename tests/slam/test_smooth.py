@@ -12,7 +12,7 @@ from graphslam.core.errors import EstimationError, GraphSlamError
 from graphslam.core.geometry import between, compose, exp, inverse, transform, wrap
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import OdometryPose, RelativePose, Trajectory
-from graphslam.evaluation.metrics import align
+from graphslam.evaluation.trajectory_metrics import align
 from graphslam.logs import LogWriter, open_logs
 from graphslam.odometry.interpolation import moved_world, origin_shift
 from graphslam.odometry.preintegration import Track

@@ -1,0 +1,150 @@
+"""Errors of a landmark map against true landmarks."""
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from graphslam.core.geometry import Array, between, wrap
+from graphslam.core.records import Landmark, TrueLandmark
+from graphslam.evaluation.error_statistics import nees, rms
+
+#: A landmark matches a true one within this distance, and a line within this angle modulo pi. Both
+#: define the metric: changing them would make numbers of different runs incomparable.
+MATCH_DISTANCE_M, MATCH_ANGLE_RAD = 1.0, 0.35
+#: the names of two points are exchanged if each is this many times nearer to the other's true place
+EXCHANGE_RATIO = 3.0
+
+
+def landmark_metrics(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]) -> dict[str, Any]:
+    """``rmse_m``, ``nees_per_dof``, ``worst``, ``matched``, ``missed``, ``extra`` of a map.
+
+    Landmarks match by identity where both have one. Other points match by the assignment with the
+    smallest sum of distances among pairs within 1 m. Other lines and segments each match the
+    nearest true one within 1 m and 0.35 rad modulo pi, since a wall may be seen in several pieces.
+
+    The error of a point is its distance. The error of a line or segment is the distance of the
+    middle of its extent from the true line; its NEES has two degrees of freedom (direction and
+    offset of the normal), since a position along a wall is a gauge.
+
+    ``missed`` counts true landmarks without a match, ``extra`` estimated ones. ``worst`` has
+    ``id``, ``nees_per_dof`` and ``error_m`` of the landmark with the largest NEES per degree of
+    freedom: one wrong association can dominate the mean. ``exchanged`` lists pairs of identities
+    of points that each lie at the other's true place: their names are wrong, not their positions,
+    and they are matched by position.
+    """
+    pairs, exchanged = _undo_exchanges(_match(estimated, true), estimated, true)
+    errors, values, dofs = [], [], []
+    for i, j in pairs:
+        error, difference, cov = _landmark_error(estimated[i], true[j])
+        errors.append(error)
+        values.append(float(nees(difference[None], cov[None])[0]))
+        dofs.append(len(difference))
+    squares, dof = np.array(values), np.array(dofs)
+    usable = np.flatnonzero(np.isfinite(squares))
+    mean = worst = None
+    if len(usable):
+        mean = float(squares[usable].sum() / dof[usable].sum())
+        k = usable[(squares[usable] / dof[usable]).argmax()]
+        worst = {
+            "id": estimated[pairs[k][0]].id,
+            "nees_per_dof": float(squares[k] / dof[k]),
+            "error_m": errors[k],
+        }
+    return {
+        "rmse_m": rms(np.array(errors)),
+        "nees_per_dof": mean,
+        "worst": worst,
+        "matched": len(pairs),
+        "missed": len(true) - len({j for _, j in pairs}),
+        "extra": len(estimated) - len(pairs),
+        "exchanged": exchanged,
+    }
+
+
+def _undo_exchanges(
+    pairs: Sequence[tuple[int, int]], estimated: Sequence[Landmark], true: Sequence[TrueLandmark]
+) -> tuple[list[tuple[int, int]], list[tuple[str, str]]]:
+    """Matches with exchanged names undone, and the pairs of those names."""
+    match = dict(pairs)
+    named = [i for i, j in pairs if estimated[i].identity and estimated[i].kind == "point"]
+    exchanged = []
+    for a, b in itertools.combinations(named, 2):
+        if all(
+            _point_distance(estimated[i], true[match[i]])
+            > EXCHANGE_RATIO * _point_distance(estimated[i], true[match[k]])
+            for i, k in ((a, b), (b, a))
+        ):
+            match[a], match[b] = match[b], match[a]
+            exchanged.append((str(estimated[a].identity), str(estimated[b].identity)))
+    return [(i, match[i]) for i, _ in pairs], exchanged
+
+
+def _point_distance(estimated: Landmark, true: TrueLandmark) -> float:
+    return float(np.hypot(*(estimated.position[:2] - true.pose[:2])))
+
+
+def _match(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]) -> list[tuple[int, int]]:
+    """Indices (estimated, true) of the matches, see `landmark_metrics`."""
+    named = {landmark.identity: j for j, landmark in enumerate(true) if landmark.identity}
+    pairs, taken = [], set()
+    for i, landmark in enumerate(estimated):
+        j = named.get(landmark.identity or "")
+        if j is not None and j not in taken:
+            pairs.append((i, j))
+            taken.add(j)
+    rows = [i for i, landmark in enumerate(estimated) if landmark.identity not in named]
+    columns = [j for j in range(len(true)) if j not in taken]
+    if not rows or not columns:
+        return pairs
+    cost = np.array([[_match_distance(estimated[i], true[j]) for j in columns] for i in rows])
+    wall = np.array([estimated[i].kind != "point" for i in rows])
+    nearest = cost.argmin(axis=1)
+    pairs += [
+        (rows[r], columns[nearest[r]]) for r in np.flatnonzero(wall & np.isfinite(cost.min(axis=1)))
+    ]
+    rows, cost = [i for i, is_wall in zip(rows, wall, strict=True) if not is_wall], cost[~wall]
+    if not rows:
+        return pairs
+    # a forbidden pair costs more than all allowed ones together, so as many as possible match
+    forbidden = MATCH_DISTANCE_M * (1 + min(cost.shape))
+    chosen = linear_sum_assignment(np.where(np.isfinite(cost), cost, forbidden))
+    matched = [
+        (rows[r], columns[c]) for r, c in zip(*chosen, strict=True) if np.isfinite(cost[r, c])
+    ]
+    return pairs + matched
+
+
+def _match_distance(estimated: Landmark, true: TrueLandmark) -> float:
+    """Distance between a landmark and a true one, m; infinite where they cannot match."""
+    if (estimated.kind == "point") != (true.kind == "point"):
+        return np.inf
+    if estimated.kind == "point":
+        distance = _point_distance(estimated, true)
+    else:
+        turn = float(wrap(2 * (estimated.position[2] - true.pose[2]))) / 2  # modulo pi
+        x, y = between(true.pose, np.array([*estimated.extent.mean(axis=0), 0.0]))[:2]
+        beyond = 0.0
+        if true.extent is not None:
+            ends = between(true.pose, np.column_stack([true.extent, np.zeros(2)]))[:, 0]
+            beyond = float(x - np.clip(x, ends.min(), ends.max()))
+        distance = float(np.hypot(beyond, y)) if abs(turn) <= MATCH_ANGLE_RAD else np.inf
+    return distance if distance <= MATCH_DISTANCE_M else np.inf
+
+
+def _landmark_error(estimated: Landmark, true: TrueLandmark) -> tuple[float, Array, Array]:
+    """Error in m; difference (2,) of the parameters that can be compared; its covariance."""
+    if estimated.line is None or estimated.kind == "point":
+        difference = estimated.position[:2] - true.pose[:2]
+        return float(np.hypot(*difference)), difference, estimated.cov[:2, :2]
+    normal, offset, cov = estimated.line
+    # a line has two normals: the true one nearer to the estimate's is taken
+    true_normal = true.pose[2] + np.pi / 2
+    true_normal += np.pi * np.round((normal - true_normal) / np.pi)
+    n = np.array([np.cos(true_normal), np.sin(true_normal)])
+    true_offset = float(n @ true.pose[:2])
+    error = abs(float(n @ estimated.extent.mean(axis=0)) - true_offset)
+    difference = np.array([normal - true_normal, offset - true_offset])
+    return error, difference, cov

@@ -1,0 +1,138 @@
+"""Errors of trajectories against true poses: absolute, aligned, relative, and consistency.
+
+The world frame of the estimate is taken as that of the truth. What is not called *aligned* is
+meaningful only where the start was given (``smooth --start truth``).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from graphslam.core.consistency import fit_rigid_transform
+from graphslam.core.geometry import Array, between, interpolate, transform, wrap
+from graphslam.core.records import Trajectory
+from graphslam.evaluation.error_statistics import nees_statistics, rms
+
+#: true poses farther apart than this in time are not interpolated between
+MAX_TRUTH_GAP_S = 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosePairs:
+    """Estimated and true poses (n, 3) at the same stamps (n,) ns, covariances (n, 3, 3)."""
+
+    stamps_ns: np.ndarray[Any, np.dtype[np.int64]]
+    estimate: Array
+    covs: Array
+    truth: Array
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+
+def pair_poses(
+    estimate: Trajectory, truth: Trajectory, max_gap_s: float = MAX_TRUTH_GAP_S
+) -> PosePairs:
+    """Truth at the estimate's stamps, along the constant twist between its neighbours.
+
+    Stamps outside the truth's span, or between two true poses ``max_gap_s`` or more apart, have no
+    pair; a stamp that the truth holds exactly always has one. Both must be sorted by stamp.
+    """
+    stamps, true_stamps = estimate.stamps_ns, truth.stamps_ns
+    after = np.searchsorted(true_stamps, stamps, side="left")
+    inside = (after < len(true_stamps)) & (stamps >= true_stamps[0])
+    after = np.minimum(after, len(true_stamps) - 1)
+    exact = true_stamps[after] == stamps
+    before = np.where(exact, after, np.maximum(after - 1, 0))
+    gap = true_stamps[after] - true_stamps[before]
+    use = inside & (exact | (gap < max_gap_s * 1e9))
+    share = (stamps - true_stamps[before]) / np.maximum(gap, 1)
+    poses = interpolate(truth.poses[before[use]], truth.poses[after[use]], share[use])
+    return PosePairs(stamps[use], estimate.poses[use], estimate.covs[use], poses)
+
+
+def align(source: Array, target: Array) -> Array:
+    """Pose (3,) that moves points ``source`` (n, 2) best onto ``target`` (n, 2), no scale.
+
+    Least squares over positions, all with the same weight.
+    """
+    return fit_rigid_transform(target, source, np.ones(len(source)))[0]
+
+
+def relative_errors(
+    pairs: PosePairs, *, seconds: float | None = None, metres: float | None = None
+) -> Array:
+    """Errors (k, 3) of the motion over ``seconds`` or over ``metres`` of true path (give one).
+
+    The partner of a pose is the one nearest to that time or path later, if it is off by less than
+    half of it in time or a tenth in path. The error is the estimated motion in the frame of the
+    true one.
+
+    Source: time: J. Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS 2012,
+    DOI 10.1109/IROS.2012.6385773; path: A. Geiger, P. Lenz, R. Urtasun, CVPR 2012,
+    DOI 10.1109/CVPR.2012.6248074.
+    """
+    if (seconds is None) == (metres is None):
+        raise ValueError("give seconds or metres")
+    if len(pairs) < 2:
+        return np.empty((0, 3))
+    if seconds is not None:
+        axis, delta, slack = (pairs.stamps_ns - pairs.stamps_ns[0]) / 1e9, seconds, 0.5 * seconds
+    else:
+        assert metres is not None  # narrows the type; checked above
+        steps = np.hypot(*np.diff(pairs.truth[:, :2], axis=0).T)
+        axis, delta, slack = np.concatenate([[0.0], np.cumsum(steps)]), metres, 0.1 * metres
+    wanted = axis + delta
+    after = np.clip(np.searchsorted(axis, wanted), 1, len(axis) - 1)
+    nearer = np.abs(axis[after - 1] - wanted) < np.abs(axis[after] - wanted)
+    end = np.where(nearer, after - 1, after)
+    # otherwise the last pose would be the partner of many poses at once
+    reached = wanted <= axis[-1] + 1e-9
+    start = np.flatnonzero(reached & (np.abs(axis[end] - wanted) <= slack))
+    end = end[start]
+    true_motion = between(pairs.truth[start], pairs.truth[end])
+    return between(true_motion, between(pairs.estimate[start], pairs.estimate[end]))
+
+
+def trajectory_metrics(robots: Sequence[PosePairs]) -> dict[str, Any]:
+    """All trajectory numbers of one robot, or of several under one common alignment.
+
+    Absolute errors: ``ate_rmse_m`` and ``max_m`` as estimated, ``ate_aligned_rmse_m`` after one
+    `align` of all positions. Heading and consistency are of the poses as estimated. ``rpe`` as in
+    `relative_errors`, over 1 s and over 10 m. A number without data is None.
+
+    Raises:
+        ValueError: there is no pair at all.
+    """
+    estimate = np.concatenate([p.estimate for p in robots])
+    truth = np.concatenate([p.truth for p in robots])
+    if not len(truth):
+        raise ValueError("no pair of poses")
+    errors = estimate - truth
+    errors[:, 2] = wrap(errors[:, 2])
+    distance = np.hypot(errors[:, 0], errors[:, 1])
+    moved = transform(align(estimate[:, :2], truth[:, :2]), estimate[:, :2])
+    spans: dict[str, dict[str, float]] = {"1_s": {"seconds": 1.0}, "10_m": {"metres": 10.0}}
+    rpe = {
+        name: _rpe(np.concatenate([relative_errors(p, **span) for p in robots]))
+        for name, span in spans.items()
+    }
+    return {
+        "poses": len(truth),
+        "ate_rmse_m": rms(distance),
+        "ate_aligned_rmse_m": rms(np.hypot(*(moved - truth[:, :2]).T)),
+        "max_m": float(distance.max()),
+        "heading_rmse_rad": rms(errors[:, 2]),
+        "rpe": rpe,
+        **nees_statistics(errors, np.concatenate([p.covs for p in robots])),
+    }
+
+
+def _rpe(errors: Array) -> dict[str, Any]:
+    return {
+        "pairs": len(errors),
+        "trans_rmse_m": rms(np.hypot(errors[:, 0], errors[:, 1])),
+        "rot_rmse_rad": rms(errors[:, 2]),
+    }
