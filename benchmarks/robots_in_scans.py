@@ -23,6 +23,7 @@ import numpy as np
 from graphslam.core.config import Config, load_config
 from graphslam.core.geometry import Array, wrap
 from graphslam.evaluation.metrics import evaluate
+from graphslam.evaluation.trajectory_metrics import pair_poses
 from graphslam.logs import open_logs, read_truth
 from graphslam.simulation import load_scenario, simulate
 from graphslam.simulation.robot_shapes import corners

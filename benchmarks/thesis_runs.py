@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from graphslam.core.config import load_config
 from graphslam.core.geometry import between, compose, transform
 from graphslam.core.records import Result, Scan, TrueLandmark
-from graphslam.evaluation.trajectory_metrics import align
+from graphslam.evaluation.trajectory_metrics import align, pair_poses
 from graphslam.logs import open_logs, read_true_associations, read_truth
 from graphslam.simulation import Scenario, load_scenario, simulate
 from graphslam.slam.smooth import smooth

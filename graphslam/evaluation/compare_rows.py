@@ -15,7 +15,7 @@ from graphslam.evaluation.compare_variants import NAMES, Variant
 from graphslam.evaluation.error_statistics import nees
 from graphslam.evaluation.metrics import evaluate
 from graphslam.evaluation.relation_metrics import Relations
-from graphslam.evaluation.trajectory_metrics import align
+from graphslam.evaluation.trajectory_metrics import PosePairs, align, pair_poses
 from graphslam.logs import KnownTruth, LogSet
 from graphslam.results.folder import SavedResult
 from graphslam.results.report_comparison import Comparison, Curve, Lane

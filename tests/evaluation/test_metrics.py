@@ -10,7 +10,7 @@ from graphslam.core.config import Config
 from graphslam.core.errors import OutputError
 from graphslam.core.geometry import between, compose, exp, transform, wrap
 from graphslam.core.records import Landmark, Trajectory, TrueLandmark
-from graphslam.evaluation.error_statistics import nees
+from graphslam.evaluation.error_statistics import nees, nees_statistics
 from graphslam.evaluation.landmark_metrics import landmark_metrics
 from graphslam.evaluation.metrics import evaluate
 from graphslam.evaluation.relation_metrics import (
@@ -21,6 +21,7 @@ from graphslam.evaluation.relation_metrics import (
 )
 from graphslam.evaluation.trajectory_metrics import (
     align,
+    pair_poses,
     relative_errors,
     trajectory_metrics,
 )
