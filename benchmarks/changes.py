@@ -22,8 +22,8 @@ import cv2
 import numpy as np
 from scipy.stats import norm
 
-from graphslam.change_detection import Visit, compare, load_visit, visit_of
-from graphslam.change_detection.detect import Comparison
+from graphslam.change_detection import Visit, detect_changes, load_visit, visit_from_scans
+from graphslam.change_detection.detect import ChangeResult
 from graphslam.change_detection.grid import grid_over
 from graphslam.change_detection.rigid_registration import Registration, register
 from graphslam.change_detection.thesis_method import (
@@ -134,7 +134,7 @@ def false_alarms(seeds: Sequence[int], folder: Path) -> None:
             for seed in seeds:
                 a, b, *_ = case("nothing", seed, folder)
                 b = disturbed(b, seed) if disturb else b
-                found = compare(a, b, ChangesConfig(false_alarm_rate=rate))
+                found = detect_changes(a, b, ChangesConfig(false_alarm_rate=rate))
                 rates.append(found.flagged.sum() / found.compared.sum())
                 runs += bool(found.changes)
                 poses += len(b.poses)
@@ -180,7 +180,7 @@ def detection(seeds: Sequence[int], folder: Path) -> Array:
     thesis_hits, thesis_total, promised = hits.copy(), total.copy(), hits.copy()
     for seed in seeds:
         a, b, truth, sweeps = case("table", seed, folder)
-        found = compare(a, b, ChangesConfig())
+        found = detect_changes(a, b, ChangesConfig())
         moved, beams = table_beams(truth, sweeps[1])
         usable = found.compared[beams]
         k = np.digitize(moved[usable], BINS) - 1
@@ -210,7 +210,7 @@ def detection(seeds: Sequence[int], folder: Path) -> Array:
     return np.array(rows)
 
 
-def _promised(found: Comparison, moved: Array, beams: Array) -> Array:
+def _promised(found: ChangeResult, moved: Array, beams: Array) -> Array:
     """Probability (k,) that a displacement ``moved`` (k,) is flagged, by the stated sigmas."""
     surface, evidence = found.surfaces[1], found.evidence[1]
     cell = surface.cells[np.maximum(surface.beams[beams], 0)]
@@ -234,7 +234,7 @@ def table(seeds: Sequence[int], folder: Path) -> None:
         for seed in seeds:
             a, b, truth, _ = case(name.partition(",")[0], seed, folder)
             b = disturbed(b, seed) if "disturbed" in name else b
-            found = compare(a, b, ChangesConfig())
+            found = detect_changes(a, b, ChangesConfig())
             frame = true_frame(truth)
             kinds += ["+".join(sorted(c.kind for c in found.changes)) or "none"]
             there = [_at_truth(change.polygon, truth, frame) for change in found.changes]
@@ -260,7 +260,7 @@ def _at_truth(polygon: Array, truth: dict[str, Any], frame: Array) -> bool:
     )
 
 
-def _overlap(found: Comparison, truth: dict[str, Any], frame: Array) -> float:
+def _overlap(found: ChangeResult, truth: dict[str, Any], frame: Array) -> float:
     """IoU of cells with flagged surface and the truth's cells; one cell of tolerance each way.
 
     A surface near the border of a cell falls into either cell: a cell counts as common if the
@@ -285,7 +285,7 @@ def _overlap(found: Comparison, truth: dict[str, Any], frame: Array) -> float:
     return hit / union if union else 1.0
 
 
-def _surface_in(found: Comparison, polygon: Array) -> Array:
+def _surface_in(found: ChangeResult, polygon: Array) -> Array:
     """Pieces (k, 2) of flagged surface inside a polygon."""
     parts = []
     for surface, evidence in zip(found.surfaces, found.evidence, strict=True):
@@ -297,7 +297,7 @@ def _surface_in(found: Comparison, polygon: Array) -> Array:
     return points[np.array(inside, dtype=bool)] if len(points) else points
 
 
-def _nees(found: Comparison, truth: dict[str, Any], frame: Array) -> list[float]:
+def _nees(found: ChangeResult, truth: dict[str, Any], frame: Array) -> list[float]:
     """NEES / 3 of each displacement, moved to the thing's middle: at the origin levers hide it."""
     out = []
     for change in found.changes:
@@ -322,7 +322,7 @@ def _nees(found: Comparison, truth: dict[str, Any], frame: Array) -> list[float]
 def thesis_run(a: Visit, b: Visit, gate: float, consecutive: int = 1) -> tuple[Any, Any, int]:
     """Every 10th later scan against the dents of the nearest reference scan, as in 6.2."""
     registration = register(a.landmarks, b.landmarks)
-    b = b.placed(registration.pose, registration.cov)
+    b = b.transformed(registration.pose, registration.cov)
     noise = LaserNoise()
     compared, marked = np.zeros(len(b.range_m), bool), np.zeros(len(b.range_m), bool)
     grid = grid_over(np.concatenate([a.ends[a.surface], b.ends[b.surface]]), 0.025, 1_000_000)
@@ -377,11 +377,11 @@ def speed(seeds: Sequence[int], folder: Path) -> None:
         covs = np.broadcast_to(np.diag([0.01, 0.01, 0.004]) ** 2, (1000, 3, 3)).copy()
         poses = poses + rng.normal(size=poses.shape) * [0.01, 0.01, 0.004]
         stamps = np.arange(1000, dtype=np.int64)
-        visits.append(visit_of(stamps, poses, covs, [(fan.angles, r) for r in ranges]))
+        visits.append(visit_from_scans(stamps, poses, covs, [(fan.angles, r) for r in ranges]))
     known = Registration(np.zeros(3), 1e-6 * np.eye(3), np.zeros((0, 2), int), np.zeros(0, int))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     began, cpu = time.perf_counter(), time.process_time()
-    found = compare(visits[0], visits[1], ChangesConfig(), known)
+    found = detect_changes(visits[0], visits[1], ChangesConfig(), known)
     seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     cell = found.surfaces[0].nearest.grid.cell_m

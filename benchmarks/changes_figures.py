@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from thesis_figures import BLUE, GREY, INK, MARK, RED, WALL, legend, panels, path, scatter
 
-from graphslam.change_detection import Visit, compare, load_visit
-from graphslam.change_detection.detect import Comparison
+from graphslam.change_detection import Visit, detect_changes, load_visit
+from graphslam.change_detection.detect import ChangeResult
 from graphslam.change_detection.grid import grid_over
 from graphslam.change_detection.rigid_registration import register
 from graphslam.change_detection.thesis_method import (
@@ -62,10 +62,10 @@ def one_scan(visit: Visit, scan: int) -> tuple[Array, Array]:
 def table(folder: Path) -> dict[str, Figure]:
     """Thesis figures 6-14 to 6-18, seed 0, in the lab's frame, and the same by all scans."""
     a, b, truth, sweeps = case("table", 0, folder)
-    found = compare(a, b, ChangesConfig())
+    found = detect_changes(a, b, ChangesConfig())
     frame, move = true_frame(truth), truth["changes"][0]
     registration = register(a.landmarks, b.landmarks)
-    b = b.placed(registration.pose, registration.cov)
+    b = b.transformed(registration.pose, registration.cov)
     scans = table_beams(truth, sweeps[1])[1] // len(one_scan(b, 0)[0])
     later = int(np.bincount(scans).argmax())
     apart = np.abs(np.angle(np.exp(1j * (a.poses[:, 2] - b.poses[later, 2]))))
@@ -127,7 +127,7 @@ def table(folder: Path) -> dict[str, Figure]:
     return {"changes-visits": visits, "changes-scan": scan, "changes-all": every}
 
 
-def overlay(ax: Axes, found: Comparison, title: str, frame: Array) -> None:
+def overlay(ax: Axes, found: ChangeResult, title: str, frame: Array) -> None:
     """Reference grey, later blue, changes outlined."""
     for visit, color in ((found.reference, GREY), (found.later, BLUE)):
         scatter(ax, transform(frame, visit.ends[visit.surface])[::3], title, color)
@@ -175,7 +175,7 @@ def real(data: Path, folder: Path) -> Figure:
             IMPORTERS["tinyslam"](data / f"{name}.dat.xz", log)
             save(smooth(open_logs([log], Config()), Config()), Config(), folder / name, force=True)
         visits.append(load_visit(load(folder / name), folder / name))
-    found = compare(*visits, ChangesConfig())
+    found = detect_changes(*visits, ChangesConfig())
     figure, axes = panels(2, (12, 6))
     for visit, color, name in zip(visits, (GREY, BLUE), ("first", "second"), strict=True):
         scatter(

@@ -4,20 +4,20 @@
 method as printed, to compare with. See docs/change-detection.md.
 """
 
-from graphslam.change_detection.detect import Comparison, compare
+from graphslam.change_detection.detect import ChangeResult, detect_changes
 from graphslam.change_detection.folder import changes_between, save_changes
 from graphslam.change_detection.objects import Change
 from graphslam.change_detection.report import render_changes
-from graphslam.change_detection.visit import Visit, load_visit, visit_of
+from graphslam.change_detection.visit import Visit, load_visit, visit_from_scans
 
 __all__ = [
     "Change",
-    "Comparison",
+    "ChangeResult",
     "Visit",
     "changes_between",
-    "compare",
+    "detect_changes",
     "load_visit",
     "render_changes",
     "save_changes",
-    "visit_of",
+    "visit_from_scans",
 ]

@@ -13,15 +13,15 @@ import numpy as np
 from graphslam.change_detection.beam_evidence import (
     Evidence,
     beams_past_surfaces,
+    half_beam_spacing,
+    null_sigma,
     range_noise,
-    spread,
-    visit_step,
 )
 from graphslam.change_detection.grid import grid_over
-from graphslam.change_detection.nonrigid_registration import localise
+from graphslam.change_detection.nonrigid_registration import register_nonrigid
 from graphslam.change_detection.rigid_registration import Registration, register
-from graphslam.change_detection.scan_to_map import align
-from graphslam.change_detection.surface_map import Surface, surface_of
+from graphslam.change_detection.scan_to_map import align_scans
+from graphslam.change_detection.surface_map import Surface, fit_surfaces
 from graphslam.change_detection.visit import Bools, Ints, Visit
 from graphslam.core.config import ChangesConfig
 from graphslam.core.errors import OutputError
@@ -58,7 +58,7 @@ class AlignedVisits:
     @property
     def broken(self) -> bool:
         """Whether the visits disagree by more than can be."""
-        return spread(self.evidence) > _MOST_SPREAD[self.bent]
+        return null_sigma(self.evidence) > _MOST_SPREAD[self.bent]
 
 
 def align_visits(
@@ -75,27 +75,27 @@ def align_visits(
         except OutputError:
             if max(reference.robots, later.robots) > 1:  # no path to follow from scan to scan
                 raise
-            return align_bent_visits(reference, later, config)
-    placed = later.placed(registration.pose, registration.cov)
+            return align_visits_nonrigid(reference, later, config)
+    placed = later.transformed(registration.pose, registration.cov)
     reference, later, surfaces, sigmas = _aligned(reference, placed, config)
     evidence = _evidence(reference, later, surfaces, sigmas, config)
     suspects = _suspects(later, surfaces, evidence)
     if suspects.mean() > _MANY_SUSPECTS:
         # what changed pulled at the scans that saw it: place them again without it
         a = surfaces[0]
-        later = align(placed, a, _LATER_GATES, suspects)
-        surfaces = (a, surface_of(later, a.nearest.grid, sigmas[1], config))
+        later = align_scans(placed, a, _LATER_GATES, suspects)
+        surfaces = (a, fit_surfaces(later, a.nearest.grid, sigmas[1], config))
         evidence = _evidence(reference, later, surfaces, sigmas, config)
     return AlignedVisits(reference, later, registration, surfaces, sigmas, evidence, config, False)
 
 
-def align_bent_visits(reference: Visit, later: Visit, config: ChangesConfig) -> AlignedVisits:
+def align_visits_nonrigid(reference: Visit, later: Visit, config: ChangesConfig) -> AlignedVisits:
     """Both visits in one frame although their maps bend differently.
 
     Raises:
         OutputError: they are hardly of one place.
     """
-    reference, placed, registration = localise(reference, later, config)
+    reference, placed, registration = register_nonrigid(reference, later, config)
     config = replace(config, gate_m=max(config.gate_m, _BENT_GATE_M))
     reference, later, surfaces, sigmas = _aligned(reference, placed, config, bent=True)
     evidence = _evidence(reference, later, surfaces, sigmas, config)
@@ -116,10 +116,10 @@ def _aligned(
     grid = grid_over(ends, config.resolution_m, config.max_side_cells**2)
     sigma = _FIRST_SIGMA_M
     first = reference
-    a = surface_of(reference, grid, sigma, config)
+    a = fit_surfaces(reference, grid, sigma, config)
     for _ in range(_REFERENCE_ROUNDS):
-        reference = first if bent else align(first, a, _REFERENCE_GATES)
-        a = surface_of(reference, grid, sigma, config)
+        reference = first if bent else align_scans(first, a, _REFERENCE_GATES)
+        a = fit_surfaces(reference, grid, sigma, config)
         sigma = range_noise(a, reference, config.gate_m)
     at = grid.cells(later.ends[later.surface])
     near = (at >= 0) & (a.nearest.distance_m[at] < _LATER_GATES[0])
@@ -128,9 +128,9 @@ def _aligned(
             f"nothing to compare: {100 * near.mean():.0f} % of the later returns lie on surfaces "
             "of the reference; did both runs see the same place?"
         )
-    later = later if bent else align(later, a, _LATER_GATES)
+    later = later if bent else align_scans(later, a, _LATER_GATES)
     sigmas = (sigma, range_noise(a, later, config.gate_m))
-    return reference, later, (a, surface_of(later, grid, sigmas[1], config)), sigmas
+    return reference, later, (a, fit_surfaces(later, grid, sigmas[1], config)), sigmas
 
 
 def _evidence(
@@ -155,12 +155,12 @@ def _suspects(
     suspect = np.zeros(len(later.range_m), dtype=bool)
     odd = [np.abs(e.scores(1.0)) > _SUSPECT for e in evidence]
     suspect[evidence[0].beams[odd[0][evidence[0].rows]]] = True
-    beams, rows = on_pieces(surfaces[1], later)
+    beams, rows = beams_on_surface(surfaces[1], later)
     suspect[beams[odd[1][rows]]] = True
     return suspect
 
 
-def on_pieces(surface: Surface, visit: Visit) -> tuple[Ints, Ints]:
+def beams_on_surface(surface: Surface, visit: Visit) -> tuple[Ints, Ints]:
     """Beams (k,) of a visit and the good piece (k,) of its own surfaces next to their ends."""
     beams = np.nonzero(surface.beams >= 0)[0]
     cell = surface.cells[surface.beams[beams]]
@@ -168,9 +168,9 @@ def on_pieces(surface: Surface, visit: Visit) -> tuple[Ints, Ints]:
     return beams[near], surface.nearest.member[cell[near]].astype(np.int64)
 
 
-def lasers_differ(reference: Visit, later: Visit) -> tuple[str, ...]:
+def laser_warnings(reference: Visit, later: Visit) -> tuple[str, ...]:
     """A warning if the two visits were made with different lasers."""
-    steps = [2 * np.degrees(visit_step(v)) for v in (reference, later)]
+    steps = [2 * np.degrees(half_beam_spacing(v)) for v in (reference, later)]
     beams = [int(np.median(np.bincount(v.scan))) for v in (reference, later)]
     if abs(steps[0] - steps[1]) < 0.02 * steps[0] and abs(beams[0] - beams[1]) < 0.02 * beams[0]:
         return ()
@@ -180,7 +180,7 @@ def lasers_differ(reference: Visit, later: Visit) -> tuple[str, ...]:
     )
 
 
-def plausible(factor: float, bent: bool) -> tuple[str, ...]:
+def consistency_warnings(factor: float, bent: bool) -> tuple[str, ...]:
     """A warning if the visits disagree all over by more than is stated.
 
     Raises:

@@ -15,14 +15,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import norm
 
-from graphslam.change_detection.grid import distinct, pooled, summed
-from graphslam.change_detection.scan_to_map import offsets
+from graphslam.change_detection.grid import row_sums, sorted_unique, window_sums
+from graphslam.change_detection.scan_to_map import surface_offsets
 from graphslam.change_detection.surface_map import (
     WINDOW,
     Surface,
-    different_scans,
-    most,
     pose_variance,
+    scans_per_cell,
+    window_max,
 )
 from graphslam.change_detection.visit import Bools, Ints, Visit
 from graphslam.core.config import ChangesConfig
@@ -87,7 +87,7 @@ def beams_past_surfaces(
     """
     used = np.nonzero(visit.surface & (visit.range_m <= config.max_range_m))[0]
     ends, directions = visit.ends[used], visit.directions[used]
-    row, e, found = offsets(surface, ends, config.gate_m)
+    row, e, found = surface_offsets(surface, ends, config.gate_m)
     cosine = np.einsum("ni,ni->n", surface.normals[row], directions[found])
     near = (row, used[found], np.sign(cosine) * e, np.abs(cosine))
     far = crossings(surface, visit, used, config.gate_m)
@@ -111,17 +111,19 @@ def beams_past_surfaces(
         weight**2 * e,
         weight**2 * e**2,
     )
-    sums = np.column_stack([summed(row, t, n) for t in terms])
+    sums = np.column_stack([row_sums(row, t, n) for t in terms])
     inner = inner_windows(surface)
-    total, sum_e, sum_own, sum_common, sum_cos, count, through, *squares = pooled(sums, inner).T
+    total, sum_e, sum_own, sum_common, sum_cos, count, through, *squares = window_sums(
+        sums, inner
+    ).T
     safe = np.where(total > 0, total, 1.0)
     mean = sum_e / safe
     # Beams that contradict each other (most stop at a surface, a few graze past its edge) tell
     # less than as many that agree: the variance is no smaller than their scatter makes it.
     scatter = (squares[2] - 2 * mean * squares[1] + mean**2 * squares[0]) / safe**2
     white = np.maximum(1 / safe, scatter)
-    scans = different_scans(row, visit.scan[beam], len(visit.poses), n)
-    pose = (sum_common + sum_own / np.maximum(most(scans, inner), 1)) / safe
+    scans = scans_per_cell(row, visit.scan[beam], len(visit.poses), n)
+    pose = (sum_common + sum_own / np.maximum(window_max(scans, inner), 1)) / safe
     bias = config.bias_sigma_m * (sum_cos / safe - incidence_of)
     variance = white + surface.offset_cov + pose + surface.pose_var + bias**2
     tested = surface.good & (count >= config.min_beams)
@@ -190,7 +192,7 @@ def _crossings(
     # inside of its edges, on both sides
     P = visit.covs[scan[hit]]
     sideways = P[:, 0, 0] + P[:, 1, 1] + P[:, 2, 2] * reach[hit] ** 2
-    margin = _INSIDE_SIGMAS * np.sqrt(sideways) + visit_step(visit) * reach[hit]
+    margin = _INSIDE_SIGMAS * np.sqrt(sideways) + half_beam_spacing(visit) * reach[hit]
     margin = np.maximum(margin / np.abs(cosine[hit]), 2 * grid.cell_m)[:, None]
     inside = np.ones(len(hit), dtype=bool)
     for way in (-1.0, 1.0):
@@ -200,7 +202,7 @@ def _crossings(
     return row[hit], beam[hit], np.abs(cosine[hit])
 
 
-def visit_step(visit: Visit) -> float:
+def half_beam_spacing(visit: Visit) -> float:
     """Half the angle between neighbouring beams, rad: how far a beam's ray is known."""
     step = np.diff(visit.angle[: int(np.searchsorted(visit.scan, visit.scan[0] + 1))])
     return float(np.median(step)) / 2 if len(step) else 0.0
@@ -236,14 +238,14 @@ def _candidates(surface: Surface, visit: Visit, used: Ints) -> tuple[Ints, Ints]
         going = s < end
         active, s, end = active[going], s[going], end[going]
         ox, oy, dx, dy = ox[going], oy[going], dx[going], dy[going]
-    found = distinct(np.concatenate(pairs)) if pairs else np.zeros(0, dtype=np.int64)
+    found = sorted_unique(np.concatenate(pairs)) if pairs else np.zeros(0, dtype=np.int64)
     return used[found // width], found % width
 
 
 def range_noise(surface: Surface, visit: Visit, gate_m: float) -> float:
     """Sigma of ranges, m, from how returns scatter about the surfaces they are on; robust."""
     beams = np.nonzero(visit.surface)[0]
-    row, e, found = offsets(surface, visit.ends[beams], gate_m)
+    row, e, found = surface_offsets(surface, visit.ends[beams], gate_m)
     cosine = np.abs(np.einsum("ni,ni->n", surface.normals[row], visit.directions[beams[found]]))
     face_on = cosine > 0.5
     if not face_on.any():
@@ -251,7 +253,7 @@ def range_noise(surface: Surface, visit: Visit, gate_m: float) -> float:
     return float(np.median(np.abs(e[face_on] / cosine[face_on])) / norm.ppf(0.75))
 
 
-def spread(evidence: tuple[Evidence, ...]) -> float:
+def null_sigma(evidence: tuple[Evidence, ...]) -> float:
     """Sigma of the scores of what did not change: of the bulk, widened for the tails.
 
     Most of what is seen has not changed, so the middle of the distribution is that of no change

@@ -12,26 +12,26 @@ from typing import Any
 import numpy as np
 
 from graphslam.change_detection.alignment import (
-    align_bent_visits,
     align_visits,
-    lasers_differ,
-    on_pieces,
-    plausible,
+    align_visits_nonrigid,
+    beams_on_surface,
+    consistency_warnings,
+    laser_warnings,
 )
-from graphslam.change_detection.beam_evidence import Evidence, repeatability, spread
+from graphslam.change_detection.beam_evidence import Evidence, null_sigma, repeatability
 from graphslam.change_detection.objects import (
     Change,
     Lines,
-    changes_of,
-    pairs_of_segments,
-    pairs_of_shapes,
+    assemble_changes,
+    match_segments,
+    match_shapes,
 )
-from graphslam.change_detection.regions import flagged, regions
+from graphslam.change_detection.regions import find_regions, flag_pieces
 from graphslam.change_detection.rigid_registration import Registration
-from graphslam.change_detection.shapes import Known, shape_of
+from graphslam.change_detection.shapes import MotionSettings, extract_shape
 from graphslam.change_detection.surface_map import Surface
-from graphslam.change_detection.transparency import solid
-from graphslam.change_detection.visit import Bools, Visit, dictionary
+from graphslam.change_detection.transparency import without_transparent
+from graphslam.change_detection.visit import Bools, Visit, pose_to_dict
 from graphslam.change_detection.wall_motion import segment_motions
 from graphslam.core.config import ChangesConfig
 from graphslam.core.geometry import transform
@@ -44,7 +44,7 @@ _BENT = (
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Comparison:
+class ChangeResult:
     """All that a comparison found.
 
     Attributes:
@@ -80,7 +80,7 @@ class Comparison:
             "beams_compared": int(self.compared.sum()),
             "beams_flagged": int(self.flagged.sum()),
             "false_alarm_rate_requested": self.rate,
-            "registration": dictionary(self.registration.pose, self.registration.cov)
+            "registration": pose_to_dict(self.registration.pose, self.registration.cov)
             | {"landmarks": len(self.registration.matched)},
             "spread": self.spread,
             "range_sigma_m": list(self.range_sigma_m),
@@ -88,7 +88,7 @@ class Comparison:
         }
 
 
-def same_frame(visit: Visit) -> Registration:
+def identity_registration(visit: Visit) -> Registration:
     """The registration of two spans of one run: they share its world frame."""
     every = np.arange(len(visit.landmarks))
     return Registration(
@@ -96,12 +96,12 @@ def same_frame(visit: Visit) -> Registration:
     )
 
 
-def compare(
+def detect_changes(
     reference: Visit,
     later: Visit,
     config: ChangesConfig,
     registration: Registration | None = None,
-) -> Comparison:
+) -> ChangeResult:
     """Find what is different in the later visit.
 
     Args:
@@ -113,41 +113,49 @@ def compare(
     Raises:
         OutputError: the two cannot be registered, or saw nothing in common.
     """
-    warnings = lasers_differ(reference, later)
+    warnings = laser_warnings(reference, later)
     laid = align_visits(reference, later, registration, config)
     if laid.broken and registration is None and max(reference.robots, later.robots) == 1:
         # a motion that some landmarks agree on, while the rest of the maps lies elsewhere
-        laid = align_bent_visits(reference, later, config)
+        laid = align_visits_nonrigid(reference, later, config)
     reference, later, registration = laid.reference, laid.later, laid.registration
     surfaces, evidence, sigmas, config = laid.surfaces, laid.evidence, laid.sigmas, laid.config
     if laid.bent:
         warnings += (_BENT,)
     # judged with all there is: of paths that are broken little seems solid
-    warnings += plausible(spread(evidence), laid.bent)
+    warnings += consistency_warnings(null_sigma(evidence), laid.bent)
     surfaces, evidence = _of_solid(surfaces, evidence, (reference, later), config)
     a, b = surfaces
-    factor = spread(evidence)
-    flags = tuple(flagged(e, factor, config.false_alarm_rate / 2) for e in evidence)
+    factor = null_sigma(evidence)
+    flags = tuple(flag_pieces(e, factor, config.false_alarm_rate / 2) for e in evidence)
     compared, marked = _beams(later, surfaces, evidence, (flags[0], flags[1]))
     seen = np.nonzero(b.beams >= 0)[0]
-    vanished = regions(
+    vanished = find_regions(
         a, evidence[0], evidence[0].beams, evidence[0].rows, evidence[0].first_ns, factor, config
     )
-    appeared = regions(b, evidence[1], seen, b.beams[seen], b.first_ns, factor, config)
+    appeared = find_regions(b, evidence[1], seen, b.beams[seen], b.first_ns, factor, config)
     shapes = (
-        [shape_of(a, reference, evidence[0], factor, r.points) for r in vanished],
-        [shape_of(b, later, evidence[1], factor, r.points) for r in appeared],
+        [extract_shape(a, reference, evidence[0], factor, r.points) for r in vanished],
+        [extract_shape(b, later, evidence[1], factor, r.points) for r in appeared],
     )
-    known = Known(config.bias_sigma_m, repeatability(evidence), a.nearest.grid.cell_m)
-    fits = pairs_of_shapes(*shapes, known)
+    known = MotionSettings(
+        config.bias_sigma_m,
+        repeatability(evidence),
+        a.nearest.grid.cell_m,
+        config.max_displacement_m,
+    )
+    fits = match_shapes(*shapes, known)
     marks = (reference.landmarks, later.landmarks)
     moves = segment_motions(
         marks, registration, surfaces, (reference, later), evidence, known, factor
     )
-    stretches = pairs_of_segments(vanished, appeared, moves)
-    lines = (_placed_lines(reference, same_frame(reference)), _placed_lines(later, registration))
-    changes = changes_of(vanished, appeared, fits, stretches, lines)
-    return Comparison(
+    stretches = match_segments(vanished, appeared, moves)
+    lines = (
+        _placed_lines(reference, identity_registration(reference)),
+        _placed_lines(later, registration),
+    )
+    changes = assemble_changes(vanished, appeared, fits, stretches, lines)
+    return ChangeResult(
         changes, registration, reference, later, surfaces, evidence, compared, marked,
         factor, sigmas, config.false_alarm_rate, warnings,
     )  # fmt: skip
@@ -160,7 +168,7 @@ def _of_solid(
     config: ChangesConfig,
 ) -> tuple[tuple[Surface, Surface], tuple[Evidence, Evidence]]:
     """Surfaces and evidence without what a visit itself looked through."""
-    a, b = solid(surfaces, visits, config)
+    a, b = without_transparent(surfaces, visits, config)
     left = [replace(e, tested=e.tested & s.good) for e, s in zip(evidence, (a, b), strict=True)]
     return (a, b), (left[0], left[1])
 
@@ -176,7 +184,7 @@ def _beams(
     marked = compared.copy()
     for beams, rows, e, flag in (
         (evidence[0].beams, evidence[0].rows, evidence[0], flags[0]),
-        (*on_pieces(surfaces[1], later), evidence[1], flags[1]),
+        (*beams_on_surface(surfaces[1], later), evidence[1], flags[1]),
     ):
         compared[beams[e.tested[rows]]] = True
         marked[beams[flag[rows]]] = True

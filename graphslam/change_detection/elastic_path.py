@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import solveh_banded
 
-from graphslam.change_detection.scan_to_map import pulls
+from graphslam.change_detection.scan_to_map import scan_normal_equations
 from graphslam.change_detection.surface_map import Surface
 from graphslam.change_detection.visit import Visit
 from graphslam.core.geometry import Array, between, compose, wrap
@@ -35,7 +35,7 @@ def fit_elastic_path(
     beams = np.nonzero(visit.surface)[0]
     steps = between(shape[:-1], shape[1:])
     for gate in gates_m:
-        information, right = pulls(visit, surface, beams, gate)
+        information, right = scan_normal_equations(visit, surface, beams, gate)
         diagonal, beside, held = motion_terms(visit.poses, steps, _STEP_SIGMAS)
         step = _solved(diagonal + _SHARE * information, beside, held + _SHARE * right)
         poses = visit.poses + step

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from graphslam.change_detection.detect import Comparison
+from graphslam.change_detection.detect import ChangeResult
 from graphslam.change_detection.grid import Grid
 from graphslam.change_detection.objects import Change
 from graphslam.core.geometry import Array
@@ -23,7 +23,7 @@ _MOST_POINTS = 200_000
 _LINE_STRIP, _TEXT, _POINT_FLOAT32 = 4, 9, 7
 
 
-def overlay_map(found: Comparison) -> tuple[NDArray[np.uint8], str]:
+def overlay_map(found: ChangeResult) -> tuple[NDArray[np.uint8], str]:
     """The changes as a picture (rows, columns), north up, and the YAML that belongs to it.
 
     Occupied where something is now, free where something was before, unknown elsewhere: laid over
@@ -64,7 +64,7 @@ def pgm(image: NDArray[np.uint8]) -> bytes:
     return f"P5\n{image.shape[1]} {image.shape[0]}\n255\n".encode() + image.tobytes()
 
 
-def write_messages(found: Comparison, path: Path) -> None:
+def write_mcap(found: ChangeResult, path: Path) -> None:
     """MCAP for a viewer: `/changes` as markers, `/reference` and `/later` as point clouds.
 
     Each change is stamped with when it was first seen.

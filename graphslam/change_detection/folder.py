@@ -4,9 +4,9 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from graphslam.change_detection.detect import Comparison, compare, same_frame
-from graphslam.change_detection.export import overlay_map, pgm, write_messages
-from graphslam.change_detection.visit import load_visit, within
+from graphslam.change_detection.detect import ChangeResult, detect_changes, identity_registration
+from graphslam.change_detection.export import overlay_map, pgm, write_mcap
+from graphslam.change_detection.visit import load_visit, select_time_span
 from graphslam.core.config import ChangesConfig
 from graphslam.core.errors import OutputError
 from graphslam.core.output_folder import atomic_folder
@@ -21,7 +21,7 @@ def changes_between(
     config: ChangesConfig,
     reference_span_s: Span | None = None,
     later_span_s: Span | None = None,
-) -> Comparison:
+) -> ChangeResult:
     """Compare two result folders of `smooth`, or two time spans of one.
 
     Args:
@@ -43,12 +43,12 @@ def changes_between(
         )
     a = load_visit(load(reference), reference)
     b = a if same else load_visit(load(later), later)
-    registration = same_frame(a) if same else None
+    registration = identity_registration(a) if same else None
     if reference_span_s is not None:
-        a = within(a, reference_span_s, "--reference-span")
+        a = select_time_span(a, reference_span_s, "--reference-span")
     if later_span_s is not None:
-        b = within(b, later_span_s, "--later-span")
-    return compare(a, b, config, registration)
+        b = select_time_span(b, later_span_s, "--later-span")
+    return detect_changes(a, b, config, registration)
 
 
 def check_changes_target(directory: Path, *, force: bool) -> None:
@@ -69,11 +69,11 @@ def check_changes_target(directory: Path, *, force: bool) -> None:
 
 
 def save_changes(
-    found: Comparison,
+    found: ChangeResult,
     directory: Path,
     *,
     force: bool,
-    report: Callable[[Comparison], str] | None = None,
+    report: Callable[[ChangeResult], str] | None = None,
 ) -> None:
     """Write the folder of docs/formats.md, with report.html if ``report`` renders one.
 
@@ -89,6 +89,6 @@ def save_changes(
     image, texts["changes.yaml"] = overlay_map(found)
     with atomic_folder(directory) as part:
         (part / "changes.pgm").write_bytes(pgm(image))
-        write_messages(found, part / "changes.mcap")
+        write_mcap(found, part / "changes.mcap")
         for name, text in texts.items():
             (part / name).write_text(text, encoding="utf-8")

@@ -48,7 +48,7 @@ class Grid:
         return [cells + i * self.shape[1] + j for i in offsets for j in offsets]
 
 
-def distinct(numbers: Ints) -> Ints:
+def sorted_unique(numbers: Ints) -> Ints:
     """The different ones of ``numbers`` (n,), sorted; np.unique's hash table is slower."""
     numbers = np.sort(numbers)
     first = np.ones(len(numbers), dtype=bool)
@@ -71,7 +71,7 @@ def grid_over(points: Array, cell_m: float, most_cells: int) -> Grid:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Nearest:
+class DistanceMap:
     """For every cell of a grid the nearest member of a set of cells.
 
     ``distance_m`` (cells,) float32 between middles, ``member`` (cells,) int32 its place in the set.
@@ -82,7 +82,7 @@ class Nearest:
     member: NDArray[np.int32]
 
 
-def nearest_of(grid: Grid, cells: Ints, chosen: Bools) -> Nearest:
+def distance_map(grid: Grid, cells: Ints, chosen: Bools) -> DistanceMap:
     """Which of ``cells`` (n,), flat numbers, ``chosen`` among them, is nearest, everywhere."""
     rows = np.nonzero(chosen)[0]
     cells = cells[rows]
@@ -93,15 +93,17 @@ def nearest_of(grid: Grid, cells: Ints, chosen: Bools) -> Nearest:
     )
     member_of_label = np.zeros(int(label.max()) + 1, dtype=np.int32)
     member_of_label[label.reshape(-1)[cells]] = rows
-    return Nearest(grid, (distance * grid.cell_m).reshape(-1), member_of_label[label].reshape(-1))
+    return DistanceMap(
+        grid, (distance * grid.cell_m).reshape(-1), member_of_label[label].reshape(-1)
+    )
 
 
-def summed(rows: Ints, weights: Array, size: int) -> Array:
+def row_sums(rows: Ints, weights: Array, size: int) -> Array:
     """Sum (size,) of ``weights`` (k,) per row; ``rows`` (k,)."""
     return np.asarray(np.bincount(rows, weights, size), dtype=float)
 
 
-def pooled(values: Array, places: list[Ints]) -> Array:
+def window_sums(values: Array, places: list[Ints]) -> Array:
     """Sum of ``values`` (n, ...) over each row's neighbours; places (n,) of -1 add nothing."""
     padded = np.concatenate([values, np.zeros((1, *values.shape[1:]))])
     total = np.zeros_like(values)

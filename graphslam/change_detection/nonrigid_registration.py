@@ -15,7 +15,7 @@ from graphslam.change_detection.elastic_path import fit_elastic_path
 from graphslam.change_detection.grid import grid_over
 from graphslam.change_detection.path_refinement import refine_path
 from graphslam.change_detection.rigid_registration import Registration
-from graphslam.change_detection.surface_map import Surface, surface_of
+from graphslam.change_detection.surface_map import Surface, fit_surfaces
 from graphslam.change_detection.visit import Bools, Visit
 from graphslam.core.config import ChangesConfig
 from graphslam.core.errors import OutputError
@@ -37,7 +37,7 @@ _FEWEST = 20  # returns of a scan that may agree by chance
 _CELL_M, _MOST_CELLS, _TURN_RAD, _OVERLAYS = 0.1, 600, np.radians(2.0), 6
 
 
-def localise(
+def register_nonrigid(
     reference: Visit, later: Visit, config: ChangesConfig
 ) -> tuple[Visit, Visit, Registration]:
     """Both visits, straightened, in one frame: that in which the reference's first scan stays.
@@ -59,8 +59,8 @@ def localise(
     reference, later = refine_path(reference), refine_path(later)
     ends = reference.ends[reference.surface]
     grid = grid_over(ends, config.resolution_m, config.max_side_cells**2)
-    surface = surface_of(reference, grid, _RANGE_SIGMA_M, config)
-    placed, share = _laid(surface, later, overlays(ends, later.ends[later.surface]))
+    surface = fit_surfaces(reference, grid, _RANGE_SIGMA_M, config)
+    placed, share = _laid(surface, later, correlate_maps(ends, later.ends[later.surface]))
     placed_share = float((share > _SCAN_SHARE).mean())
     if placed_share < _RUN_SHARE:
         raise OutputError(
@@ -78,7 +78,7 @@ def localise(
     none = np.zeros((0, 2), dtype=np.int64)
     return (
         _as_placed(reference),
-        _as_placed(placed.chosen(kept)),
+        _as_placed(placed.select(kept)),
         Registration(mean, cov, none, np.zeros(0, dtype=np.int64)),
     )
 
@@ -91,7 +91,7 @@ def _laid(surface: Surface, later: Visit, guesses: list[Array]) -> tuple[Visit, 
     """
     tried = []
     for guess in guesses:
-        laid = fit_elastic_path(later.placed(guess, _PLACED_COV), later.poses, surface, _GATES)
+        laid = fit_elastic_path(later.transformed(guess, _PLACED_COV), later.poses, surface, _GATES)
         tried.append((laid, agreement(surface, laid)))
     # how much agrees in all counts: a scan may agree by chance
     best, share = max(tried, key=lambda one: float(one[1].mean()))
@@ -120,7 +120,7 @@ def agreement(surface: Surface, visit: Visit) -> Array:
     return np.asarray(np.where(returns >= _FEWEST, share, 0.0))
 
 
-def overlays(reference: Array, later: Array) -> list[Array]:
+def correlate_maps(reference: Array, later: Array) -> list[Array]:
     """Motions (3,) with which the two maps' points (n, 2), (m, 2) m overlap most.
 
     All turns and shifts are tried: the correlation of two pictures is a product of their spectra.

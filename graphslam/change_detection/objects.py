@@ -11,13 +11,13 @@ from graphslam.change_detection.regions import Region
 from graphslam.change_detection.shape_motion import motion_between
 from graphslam.change_detection.shapes import (
     Displacement,
-    Known,
+    MotionSettings,
     Shape,
-    close_to,
     is_straight,
     moved_points,
+    near_segment,
 )
-from graphslam.change_detection.visit import dictionary
+from graphslam.change_detection.visit import pose_to_dict
 from graphslam.core.geometry import Array, inverse
 
 Kind = Literal["appeared", "vanished", "moved"]
@@ -58,7 +58,7 @@ class Change:
             "polygon": self.polygon.tolist(),
             "before": None if self.before is None else self.before.tolist(),
             "probability": self.probability,
-            "displacement": None if moved is None else dictionary(moved.motion, moved.cov),
+            "displacement": None if moved is None else pose_to_dict(moved.motion, moved.cov),
             "beams": self.beams,
             "first_seen_ns": self.first_seen_ns,
             "lines_before": list(self.lines_before),
@@ -75,8 +75,8 @@ class Pair:
     motion: Displacement
 
 
-def pairs_of_shapes(
-    before: list[Shape | None], after: list[Shape | None], known: Known
+def match_shapes(
+    before: list[Shape | None], after: list[Shape | None], known: MotionSettings
 ) -> tuple[list[Pair], list[Pair]]:
     """Pairs of like shape, the most alike first; those with corners, and straight ones."""
     found = []
@@ -93,7 +93,7 @@ def pairs_of_shapes(
     return cornered, straight
 
 
-def pairs_of_segments(
+def match_segments(
     vanished: list[Region], appeared: list[Region], moves: list[tuple[Array, Array, Displacement]]
 ) -> list[Pair]:
     """Regions along lines of the maps that moved; of each its ends before and now, (2, 2) m."""
@@ -107,7 +107,7 @@ def pairs_of_segments(
     ]
 
 
-def changes_of(
+def assemble_changes(
     vanished: list[Region],
     appeared: list[Region],
     fits: tuple[list[Pair], list[Pair]],
@@ -180,7 +180,7 @@ def _lands(points: Array, parts: list[Array]) -> bool:
 
 
 def _mostly_at(region: Region, ends: Array) -> bool:
-    return len(close_to(region.points, ends, _AT_SEGMENT_M)) > 0.5 * len(region.points)
+    return len(near_segment(region.points, ends, _AT_SEGMENT_M)) > 0.5 * len(region.points)
 
 
 def _moved(new: list[Region], old: list[Region], motion: Displacement) -> Change:

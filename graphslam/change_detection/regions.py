@@ -36,12 +36,12 @@ class Region:
     first_ns: int
 
 
-def flagged(evidence: Evidence, spread: float, rate: float) -> Bools:
+def flag_pieces(evidence: Evidence, spread: float, rate: float) -> Bools:
     """Pieces (n,) that beams go past: one-sided, ``rate`` of those that did not change."""
     return np.asarray(evidence.scores(spread) > norm.isf(rate))
 
 
-def regions(
+def find_regions(
     surface: Surface,
     evidence: Evidence,
     told_by: Ints,
@@ -61,7 +61,7 @@ def regions(
         told_by: (p,) later beams that tell, with ``told_rows`` (p,) their pieces.
         told_rows: see above.
         first_ns: (n,) when a piece was first told of by the later visit.
-        spread: see `graphslam.change_detection.beam_evidence.spread`.
+        spread: see `graphslam.change_detection.beam_evidence.null_sigma`.
         config: settings.
     """
     # stated sigmas are a bound here: what is reported must be sure
@@ -70,8 +70,8 @@ def regions(
     places = max(int(evidence.tested.sum()) / (2 * WINDOW + 1), 1.0)
     sure = norm.isf(0.5 * config.run_false_alarm_rate / places)
     enough = max(int(np.ceil(config.min_length_m / grid.cell_m)), 1)
-    rows = np.nonzero(flagged(evidence, spread, config.false_alarm_rate / 2))[0]
-    label = connected(grid, surface.cells[rows])
+    rows = np.nonzero(flag_pieces(evidence, spread, config.false_alarm_rate / 2))[0]
+    label = connected_components(grid, surface.cells[rows])
     found = []
     for number in range(1, int(label.max(initial=0)) + 1):
         members = rows[label == number]
@@ -97,7 +97,7 @@ def regions(
     return found
 
 
-def connected(grid: Grid, cells: Ints, join_cells: int = _JOIN_CELLS) -> Ints:
+def connected_components(grid: Grid, cells: Ints, join_cells: int = _JOIN_CELLS) -> Ints:
     """Label (k,) from 1 of the cluster of each cell (k,); gaps up to ``join_cells`` are closed."""
     if not len(cells):
         return np.zeros(0, dtype=np.int64)

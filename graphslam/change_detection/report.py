@@ -5,7 +5,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from graphslam.change_detection.detect import Comparison
+from graphslam.change_detection.detect import ChangeResult
 from graphslam.change_detection.shapes import Displacement, moved_points
 from graphslam.change_detection.visit import Bools, Visit
 from graphslam.core.config import ChangesConfig
@@ -16,7 +16,7 @@ _SQUARE_M, _SQUARES, _SCANS = 0.1, 400, 300
 
 
 def render_changes(
-    found: Comparison, config: ChangesConfig, names: tuple[str, str] = ("reference", "later")
+    found: ChangeResult, config: ChangesConfig, names: tuple[str, str] = ("reference", "later")
 ) -> str:
     """The report as one self-contained HTML document; ``names`` of the two visits."""
     # matplotlib takes half a second to import, and --json may do without

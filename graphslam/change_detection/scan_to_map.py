@@ -20,7 +20,7 @@ _LEAST_SIGMA_M = 0.008
 _BEAMS = 150
 
 
-def align(
+def align_scans(
     visit: Visit, surface: Surface, gates_m: tuple[float, ...], changed: Bools | None = None
 ) -> Visit:
     """The visit with poses and covariances that agree with a surface map.
@@ -37,7 +37,7 @@ def align(
     prior = np.linalg.inv(visit.covs + 1e-10 * np.eye(3))
     start, now, covs = visit.poses, visit, visit.covs
     for gate in gates_m:
-        information, right = pulls(now, surface, beams, gate)
+        information, right = scan_normal_equations(now, surface, beams, gate)
         away = start - now.poses
         away[:, 2] = wrap(away[:, 2])
         covs = np.asarray(np.linalg.inv(prior + information))
@@ -53,7 +53,9 @@ def align(
 _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
-def pulls(visit: Visit, surface: Surface, beams: Ints, gate_m: float) -> tuple[Array, Array]:
+def scan_normal_equations(
+    visit: Visit, surface: Surface, beams: Ints, gate_m: float
+) -> tuple[Array, Array]:
     """How beams pull their scans' poses onto a surface map: normal equations per scan.
 
     Args:
@@ -66,7 +68,7 @@ def pulls(visit: Visit, surface: Surface, beams: Ints, gate_m: float) -> tuple[A
         Information (s, 3, 3) and right-hand side (s, 3); the step is the solution of both.
     """
     ends, size = visit.ends[beams], len(visit.poses)
-    row, e, found = offsets(surface, ends, gate_m)
+    row, e, found = surface_offsets(surface, ends, gate_m)
     scan = visit.scan[beams][found]
     n, arm = surface.normals[row], ends[found] - visit.poses[scan, :2]
     J = np.column_stack([n, -n[:, 0] * arm[:, 1] + n[:, 1] * arm[:, 0]])
@@ -81,7 +83,7 @@ def pulls(visit: Visit, surface: Surface, beams: Ints, gate_m: float) -> tuple[A
     return information, right
 
 
-def offsets(surface: Surface, ends: Array, gate_m: float) -> tuple[Ints, Array, Ints]:
+def surface_offsets(surface: Surface, ends: Array, gate_m: float) -> tuple[Ints, Array, Ints]:
     """Where points lie against the surface next to them.
 
     Args:

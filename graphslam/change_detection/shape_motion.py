@@ -3,9 +3,15 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
-from graphslam.change_detection.shapes import SHARED, Displacement, Known, Shape, is_straight
+from graphslam.change_detection.shapes import (
+    PIECES_PER_WINDOW,
+    Displacement,
+    MotionSettings,
+    Shape,
+    is_straight,
+)
 from graphslam.change_detection.visit import Bools, Ints
-from graphslam.change_detection.wall_motion import FARTHEST_M, straight_motion
+from graphslam.change_detection.wall_motion import straight_motion
 from graphslam.core.geometry import Array, compose, compose_jacobians, rotation, transform, wrap
 
 #: shapes are alike if what is left between them is less than this, m, for these shares of one and
@@ -22,7 +28,7 @@ _NORMAL_M, _FACING = 0.3, 0.7
 _LARGEST_TURN_RAD = np.radians(60.0)
 
 
-def motion_between(a: Shape, b: Shape, known: Known) -> tuple[float, Displacement] | None:
+def motion_between(a: Shape, b: Shape, known: MotionSettings) -> tuple[float, Displacement] | None:
     """The motion that brings shape a onto shape b; None if they are not alike.
 
     Of motions that fit about as well the one that turns least is taken: a square box looks the
@@ -38,7 +44,7 @@ def motion_between(a: Shape, b: Shape, known: Known) -> tuple[float, Displacemen
         Share of both that agrees, and the motion.
     """
     away = b.points.mean(axis=0) - a.points.mean(axis=0)
-    if min(len(a.points), len(b.points)) < _FEWEST or np.hypot(*away) > FARTHEST_M:
+    if min(len(a.points), len(b.points)) < _FEWEST or np.hypot(*away) > known.max_displacement_m:
         return None
     straight = [is_straight(s) for s in (a, b)]
     if all(straight):
@@ -54,7 +60,9 @@ def motion_between(a: Shape, b: Shape, known: Known) -> tuple[float, Displacemen
     return min(good, key=lambda fit: abs(float(wrap(fit[1].motion[2]))))
 
 
-def _icp(a: Shape, b: Shape, turn: float, known: Known) -> tuple[float, Displacement] | None:
+def _icp(
+    a: Shape, b: Shape, turn: float, known: MotionSettings
+) -> tuple[float, Displacement] | None:
     """Offsets along the normals of b, again and again; only sides that face alike are matched."""
     tree = cKDTree(np.hstack([b.points, _NORMAL_M * b.normals]))
     center = a.points.mean(axis=0)
@@ -65,7 +73,7 @@ def _icp(a: Shape, b: Shape, turn: float, known: Known) -> tuple[float, Displace
         if used.sum() < _FEWEST:
             return None
         white = a.white[used] + b.white[near[used]]
-        weight = 1 / (SHARED * white)
+        weight = 1 / (PIECES_PER_WINDOW * white)
         information = np.einsum("n,na,nb->ab", weight, J[used], J[used])
         values = np.linalg.eigvalsh(information)
         if values[0] < 1e2:  # a direction known worse than to 0.1 m, rad
@@ -82,7 +90,7 @@ def _icp(a: Shape, b: Shape, turn: float, known: Known) -> tuple[float, Displace
     # What a side shares is not averaged over its pieces: the poses. The material's bias is one for
     # the thing, and counts as far as the two visits saw it at other angles.
     white = a.white[used] + b.white[near[used]]
-    pull = J[used] / (SHARED * white)[:, None]
+    pull = J[used] / (PIECES_PER_WINDOW * white)[:, None]
     common = np.sqrt(a.common[used] + b.common[near[used]] + known.repeatability_m**2)
     n = b.normals[near[used]]
     side = np.floor((np.arctan2(n[:, 1], n[:, 0]) + np.pi) / (np.pi / 4)).astype(np.int64)

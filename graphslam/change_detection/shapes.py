@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from graphslam.change_detection.beam_evidence import Evidence, visit_step
-from graphslam.change_detection.grid import summed
-from graphslam.change_detection.regions import connected
+from graphslam.change_detection.beam_evidence import Evidence, half_beam_spacing
+from graphslam.change_detection.grid import row_sums
+from graphslam.change_detection.regions import connected_components
 from graphslam.change_detection.surface_map import Surface
 from graphslam.change_detection.visit import Ints, Visit
 from graphslam.core.geometry import Array, rotation
@@ -20,7 +20,7 @@ _REACH_M, _GAP_M = 1.0, 0.3
 #: beams along a surface are as far apart as if they met it at this cosine
 _LEAST_COSINE = 0.2
 #: how many pieces share one window; least variance of a piece's offset, m2, that is believed
-SHARED, _LEAST_VAR = 5.0, 1e-8
+PIECES_PER_WINDOW, _LEAST_VAR = 5.0, 1e-8
 #: normals that differ by less than this are those of a straight stretch
 _STRAIGHT = 0.05
 
@@ -34,16 +34,18 @@ class Displacement:
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
-    """How well places are known.
+class MotionSettings:
+    """What the estimates of displacements share.
 
     ``bias_m``: how much too far a material may be measured; ``repeatability_m``: see
-    `graphslam.change_detection.beam_evidence.repeatability`; ``cell_m``: size of a piece.
+    `graphslam.change_detection.beam_evidence.repeatability`; ``cell_m``: size of a piece;
+    ``max_displacement_m``: things that moved farther are not recognised.
     """
 
     bias_m: float
     repeatability_m: float
     cell_m: float
+    max_displacement_m: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,7 +66,7 @@ class Shape:
     spacing_m: Array
 
 
-def shape_of(
+def extract_shape(
     surface: Surface, visit: Visit, evidence: Evidence, spread: float, core: Array
 ) -> Shape | None:
     """The surface that hangs together with a place and that the other visit does not confirm.
@@ -77,7 +79,7 @@ def shape_of(
         surface: of the visit that saw the shape.
         visit: that visit.
         evidence: the other visit's beams on that surface.
-        spread: see `graphslam.change_detection.beam_evidence.spread`.
+        spread: see `graphslam.change_detection.beam_evidence.null_sigma`.
         core: (c, 2) m, the place.
 
     Returns:
@@ -89,13 +91,13 @@ def shape_of(
     away = tree.query(surface.points[rows], distance_upper_bound=_REACH_M)[0]
     rows, away = rows[np.isfinite(away)], away[np.isfinite(away)]
     grid = surface.nearest.grid
-    label = connected(grid, surface.cells[rows], int(np.ceil(_GAP_M / grid.cell_m)))
+    label = connected_components(grid, surface.cells[rows], int(np.ceil(_GAP_M / grid.cell_m)))
     here = away < 2 * grid.cell_m
     rows = rows[np.isin(label, label[here])]
-    return shape_from(surface, visit, rows) if len(rows) else None
+    return shape_of_rows(surface, visit, rows) if len(rows) else None
 
 
-def shape_from(surface: Surface, visit: Visit, rows: Ints) -> Shape:
+def shape_of_rows(surface: Surface, visit: Visit, rows: Ints) -> Shape:
     """The shape that some pieces ``rows`` (k,) of a visit's surface are."""
     place = np.full(len(surface.cells), -1, dtype=np.int64)
     place[rows] = np.arange(len(rows))
@@ -103,10 +105,10 @@ def shape_from(surface: Surface, visit: Visit, rows: Ints) -> Shape:
     beams = beams[place[surface.beams[beams]] >= 0]
     d, row = visit.directions[beams], place[surface.beams[beams]]
     n = surface.normals[rows]
-    seen = np.column_stack([summed(row, d[:, k], len(rows)) for k in (0, 1)])
+    seen = np.column_stack([row_sums(row, d[:, k], len(rows)) for k in (0, 1)])
     n = np.where((np.einsum("ni,ni->n", n, seen) > 0)[:, None], -n, n)
     cosine = np.maximum(np.abs(np.einsum("ni,ni->n", d, n[row])), _LEAST_COSINE)
-    spacing = summed(row, 2 * visit_step(visit) * visit.range_m[beams] / cosine, len(rows))
+    spacing = row_sums(row, 2 * half_beam_spacing(visit) * visit.range_m[beams] / cosine, len(rows))
     white = np.maximum(surface.offset_cov[rows], _LEAST_VAR)
     return Shape(
         surface.points[rows], n, white, surface.pose_var[rows],
@@ -125,7 +127,7 @@ def moved_points(points: Array, by: Displacement) -> Array:
     return np.asarray(points @ rotation(by.motion[2]).T + by.motion[:2])
 
 
-def close_to(points: Array, ends: Array, within_m: float) -> Ints:
+def near_segment(points: Array, ends: Array, within_m: float) -> Ints:
     """Which points (n, 2) m lie within a distance of the stretch between ``ends`` (2, 2) m."""
     along = ends[1] - ends[0]
     t = np.clip((points - ends[0]) @ along / float(along @ along), 0.0, 1.0)

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphslam.change_detection.grid import (
+    DistanceMap,
     Grid,
-    Nearest,
-    distinct,
-    nearest_of,
+    distance_map,
     neighbour_rows,
-    pooled,
-    summed,
+    row_sums,
+    sorted_unique,
+    window_sums,
 )
 from graphslam.change_detection.visit import Bools, Ints, Visit
 from graphslam.core.config import ChangesConfig
@@ -57,11 +57,11 @@ class Surface:
     returns: Array
     first_ns: Ints
     good: Bools
-    nearest: Nearest
+    nearest: DistanceMap
     beams: Ints
 
 
-def surface_of(visit: Visit, grid: Grid, sigma_m: float, config: ChangesConfig) -> Surface:
+def fit_surfaces(visit: Visit, grid: Grid, sigma_m: float, config: ChangesConfig) -> Surface:
     """The surfaces of a visit on a grid.
 
     Args:
@@ -79,7 +79,7 @@ def surface_of(visit: Visit, grid: Grid, sigma_m: float, config: ChangesConfig) 
     windows = neighbour_rows(grid, cells, WINDOW)
     local = ends - grid.centers(cells)[row]  # small numbers: no cancellation in the moments
     x, y = local.T
-    sums: list[Array] = [summed(row, w, n) for w in (np.ones(len(x)), x, y, x * x, x * y, y * y)]
+    sums: list[Array] = [row_sums(row, w, n) for w in (np.ones(len(x)), x, y, x * x, x * y, y * y)]
     moments = np.column_stack(sums)
     m, mean, cov = _window_moments(moments, windows, grid.cell_m)
     values, vectors = np.linalg.eigh(cov)
@@ -90,14 +90,14 @@ def surface_of(visit: Visit, grid: Grid, sigma_m: float, config: ChangesConfig) 
     noise = np.maximum(values[:, 0], 0.0) * m / np.maximum(m - 2, 1)
     leverage = 1 / m + t**2 / np.maximum(m * values[:, 1], 1e-12)
     bend = 0.25 * ((WINDOW + 0.5) * grid.cell_m) ** 2 * _bending(normals, m, windows)
-    scans = different_scans(row, visit.scan[used], len(visit.poses), n)
-    scans_in_window = pooled(scans.astype(float), windows)
+    scans = scans_per_cell(row, visit.scan[used], len(visit.poses), n)
+    scans_in_window = window_sums(scans.astype(float), windows)
     directions = visit.directions[used]
     cosine = np.abs(np.einsum("ni,ni->n", directions, normals[row]))
     own, common = pose_variance(visit, used, ends, normals[row])
-    sums = [summed(row, w, n) for w in (cosine, own, common)]
-    cosine_sum, own_sum, common_sum = pooled(np.column_stack(sums), windows).T
-    pose_var = common_sum / m + own_sum / m / np.maximum(most(scans, windows), 1)
+    sums = [row_sums(row, w, n) for w in (cosine, own, common)]
+    cosine_sum, own_sum, common_sum = window_sums(np.column_stack(sums), windows).T
+    pose_var = common_sum / m + own_sum / m / np.maximum(window_max(scans, windows), 1)
     first = np.full(n, np.iinfo(np.int64).max)
     np.minimum.at(first, row, visit.stamps_ns[visit.scan[used]])
     expected = (sigma_m * cosine_sum / m) ** 2 + config.flatness_m**2
@@ -118,11 +118,11 @@ def surface_of(visit: Visit, grid: Grid, sigma_m: float, config: ChangesConfig) 
     offset_cov, incidence = noise * leverage + bend, cosine_sum / m
     return Surface(
         cells, windows, points, normals, noise, offset_cov, pose_var, incidence, m, first, good,
-        nearest_of(grid, cells, good), beams,
+        distance_map(grid, cells, good), beams,
     )  # fmt: skip
 
 
-def most(values: Ints, windows: list[Ints]) -> Array:
+def window_max(values: Ints, windows: list[Ints]) -> Array:
     """Largest of ``values`` (n,) in each window."""
     padded = np.concatenate([values, [0]])
     return np.asarray(np.max([padded[place] for place in windows], axis=0), dtype=float)
@@ -132,7 +132,7 @@ def _bending(normals: Array, weight: Array, windows: list[Ints]) -> Array:
     """Variance (n,) rad² of the directions of the pieces in each window."""
     double = np.array([2.0]) * np.arctan2(normals[:, 1], normals[:, 0])[:, None]
     parts = weight[:, None] * np.hstack([np.cos(double), np.sin(double), np.ones_like(double)])
-    x, y, total = pooled(parts, windows).T
+    x, y, total = window_sums(parts, windows).T
     # 1 - R of doubled angles is half of their variance, which is four times that of the angles
     return np.asarray(np.maximum(1 - np.hypot(x, y) / total, 0.0) / 2)
 
@@ -174,7 +174,7 @@ def _window_moments(moments: Array, windows: list[Ints], cell_m: float) -> tuple
     return m, np.column_stack([x, y]), cov
 
 
-def different_scans(row: Ints, scan: Ints, scans: int, rows: int) -> Ints:
+def scans_per_cell(row: Ints, scan: Ints, scans: int, rows: int) -> Ints:
     """How many different scans (rows,) ended in each cell."""
-    pairs = distinct(row * scans + scan)
+    pairs = sorted_unique(row * scans + scan)
     return np.asarray(np.bincount(pairs // scans, minlength=rows))

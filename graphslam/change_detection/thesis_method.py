@@ -162,7 +162,7 @@ def expected_measurements(
     return ranges, dent_covariance(bottom, dents.threshold)
 
 
-def distances(points: Array, covs: Array, expected: Array, expected_covs: Array) -> Array:
+def squared_mahalanobis(points: Array, covs: Array, expected: Array, expected_covs: Array) -> Array:
     """Mahalanobis distances squared (n,) of measured and expected points (5.14); NaN if none."""
     r = points - expected
     S = covs + expected_covs
@@ -223,17 +223,17 @@ def changed_beams(
     expected, expected_covs = expected_measurements(dents, pose, angles, reach)
     points = scan_points(pose, angles, ranges)
     covs = point_covariances(pose, cov, angles, np.nan_to_num(ranges, nan=1.0), noise)
-    d2 = distances(points, covs, scan_points(pose, angles, expected), expected_covs)
+    d2 = squared_mahalanobis(points, covs, scan_points(pose, angles, expected), expected_covs)
     compared = np.isfinite(d2)
     cell = dents.grid.cells(points)
     hidden = (cell < 0) | ~visible[cell]
     # what was hidden from the reference and stands in front may have been there all along
     dismissed = hidden & (ranges < np.nan_to_num(expected))
     marked = compared & (np.nan_to_num(d2) > gate) & ~dismissed
-    return compared, marked & runs(marked, consecutive)
+    return compared, marked & consecutive_runs(marked, consecutive)
 
 
-def runs(marked: Bools, least: int) -> Bools:
+def consecutive_runs(marked: Bools, least: int) -> Bools:
     """Which of ``marked`` (n,) are in a run of at least ``least`` (5.3)."""
     edges = np.diff(np.concatenate([[0], marked.astype(int), [0]]))
     begin, end = np.nonzero(edges == 1)[0], np.nonzero(edges == -1)[0]
@@ -244,7 +244,7 @@ def runs(marked: Bools, least: int) -> Bools:
     return np.asarray(np.cumsum(out)[:-1] > 0)
 
 
-def stable(points: Array, others: list[Array], within_m: float, least: int) -> Bools:
+def stable_points(points: Array, others: list[Array], within_m: float, least: int) -> Bools:
     """Which points (n, 2) m lie near some point of at least ``least`` of the ``others`` (k, 2).
 
     The rule of 5.3 that points be stable over time before they enter map or comparison.

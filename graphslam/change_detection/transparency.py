@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from graphslam.change_detection.beam_evidence import crossings, inner_windows
-from graphslam.change_detection.grid import pooled
+from graphslam.change_detection.grid import window_sums
 from graphslam.change_detection.surface_map import WINDOW, Surface
 from graphslam.change_detection.visit import Bools, Visit
 from graphslam.core.config import ChangesConfig
@@ -35,12 +35,12 @@ def seen_through(surface: Surface, visit: Visit, config: ChangesConfig) -> Bools
     through = crossings(surface, visit, used, config.gate_m)[0]
     met = surface.beams[surface.beams >= 0]
     counts = [np.bincount(row, minlength=len(surface.cells)) for row in (through, met)]
-    passed, stopped = pooled(np.column_stack(counts).astype(float), inner_windows(surface)).T
+    passed, stopped = window_sums(np.column_stack(counts).astype(float), inner_windows(surface)).T
     enough = passed >= np.maximum(_FEWEST, _LEAST_SHARE * (passed + stopped))
     return np.asarray(surface.good & enough)
 
 
-def solid(
+def without_transparent(
     surfaces: tuple[Surface, Surface], visits: tuple[Visit, Visit], config: ChangesConfig
 ) -> tuple[Surface, Surface]:
     """The surfaces of two visits without what either of them looked through.

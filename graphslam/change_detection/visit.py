@@ -66,13 +66,13 @@ class Visit:
         """World points (n, 2) m that the beams reached."""
         return np.asarray(self.poses[self.scan, :2] + self.range_m[:, None] * self.directions)
 
-    def placed(self, pose: Array, cov: Array) -> "Visit":
+    def transformed(self, pose: Array, cov: Array) -> "Visit":
         """The same visit after its world frame was put at ``pose`` (3,) with ``cov`` (3, 3)."""
         at = np.broadcast_to(pose, self.poses.shape)
         covs = compose_cov(at, np.broadcast_to(cov, self.covs.shape), self.poses, self.covs)
         return replace(self, poses=compose(at, self.poses), covs=covs, shared=covs)
 
-    def chosen(self, scans: Bools) -> "Visit":
+    def select(self, scans: Bools) -> "Visit":
         """Only some scans; ``scans`` (s,) says which."""
         number = np.cumsum(scans) - 1
         beams = scans[self.scan]
@@ -90,7 +90,7 @@ class Visit:
         )
 
 
-def visit_of(
+def visit_from_scans(
     stamps_ns: Ints,
     poses: Array,
     covs: Array,
@@ -172,13 +172,13 @@ def load_visit(saved: SavedResult, directory: Path) -> Visit:
             sweeps.append((message.angles[order], message.ranges[order]))
     if not stamps:
         raise OutputError(f"{directory}: has no laser scans to compare")
-    visit = visit_of(
+    visit = visit_from_scans(
         np.array(stamps, dtype=np.int64), np.array(poses), np.array(covs), sweeps, saved.landmarks
     )
     return replace(visit, robots=len({name for name, _ in known}))
 
 
-def within(visit: Visit, span_s: tuple[float, float], what: str) -> Visit:
+def select_time_span(visit: Visit, span_s: tuple[float, float], what: str) -> Visit:
     """The scans of a time span, s since the visit's first scan.
 
     Raises:
@@ -190,10 +190,10 @@ def within(visit: Visit, span_s: tuple[float, float], what: str) -> Visit:
         raise OutputError(
             f"{what} {span_s[0]:g}:{span_s[1]:g}: no scan in it; the scans span 0:{seconds.max():g}"
         )
-    return visit.chosen(chosen)
+    return visit.select(chosen)
 
 
-def dictionary(pose: Array, cov: Array) -> dict[str, Any]:
+def pose_to_dict(pose: Array, cov: Array) -> dict[str, Any]:
     """A pose (3,) m, rad with covariance (3, 3) as in changes.json."""
     x, y, phi = pose.tolist()
     return {"x": x, "y": y, "phi": phi, "covariance": cov.tolist()}

@@ -12,13 +12,13 @@ import numpy as np
 from graphslam.change_detection.beam_evidence import Evidence
 from graphslam.change_detection.rigid_registration import Registration
 from graphslam.change_detection.shapes import (
-    SHARED,
+    PIECES_PER_WINDOW,
     Displacement,
-    Known,
+    MotionSettings,
     Shape,
-    close_to,
     is_straight,
-    shape_from,
+    near_segment,
+    shape_of_rows,
 )
 from graphslam.change_detection.surface_map import Surface
 from graphslam.change_detection.visit import Visit
@@ -33,8 +33,6 @@ from graphslam.core.geometry import (
 )
 from graphslam.core.records import Landmark
 
-#: things that went farther are taken for others
-FARTHEST_M = 5.0
 #: stretches whose lengths differ by less are alike, m; shorter ones than _LEAST_M are too many
 _LENGTH_M, _LEAST_M = 0.12, 0.48
 #: pieces this near to a landmark, m, and facing as it does, are of it; they may be longer than it
@@ -65,7 +63,7 @@ class WallSegment:
         return transform(self.pose, half)
 
 
-def wall_segment_of(shape: Shape, cell_m: float) -> WallSegment:
+def fit_wall_segment(shape: Shape, cell_m: float) -> WallSegment:
     """The straight line through a shape's pieces, from end to end.
 
     Returns at an end are not used, as they may be mixed pixels: how far it lies beyond the last
@@ -86,7 +84,7 @@ def wall_segment_of(shape: Shape, cell_m: float) -> WallSegment:
     half = (t[first] + t[last]) / 2
     # least squares of offset and direction about the middle
     H = np.column_stack([np.ones_like(t), t - half])
-    W = 1 / (SHARED * shape.white)
+    W = 1 / (PIECES_PER_WINDOW * shape.white)
     P = np.linalg.inv(H.T @ (W[:, None] * H))
     gain = P @ (H * W[:, None]).T
     offset, turn = gain @ e
@@ -104,7 +102,7 @@ def wall_segment_of(shape: Shape, cell_m: float) -> WallSegment:
     )  # fmt: skip
 
 
-def motion_between_segments(a: WallSegment, b: WallSegment, known: Known) -> Displacement:
+def motion_between_segments(a: WallSegment, b: WallSegment, known: MotionSettings) -> Displacement:
     """The motion that takes a to b; the bias counts as far as it differs between the visits."""
     differs = known.bias_m * (b.bias - a.bias)
     cov = a.cov + b.cov + np.outer(differs, differs)
@@ -116,9 +114,9 @@ def motion_between_segments(a: WallSegment, b: WallSegment, known: Known) -> Dis
     return Displacement(compose(b.pose, back), F @ R @ cov @ R.T @ F.T)
 
 
-def straight_motion(a: Shape, b: Shape, known: Known) -> tuple[float, Displacement] | None:
+def straight_motion(a: Shape, b: Shape, known: MotionSettings) -> tuple[float, Displacement] | None:
     """Of two straight shapes of the same length: how alike they are, and the motion."""
-    one, other = wall_segment_of(a, known.cell_m), wall_segment_of(b, known.cell_m)
+    one, other = fit_wall_segment(a, known.cell_m), fit_wall_segment(b, known.cell_m)
     if not _alike(one, other):
         return None
     share = min(one.length, other.length) / max(one.length, other.length)
@@ -135,7 +133,7 @@ def segment_motions(
     surfaces: tuple[Surface, Surface],
     visits: tuple[Visit, Visit],
     evidence: tuple[Evidence, Evidence],
-    known: Known,
+    known: MotionSettings,
     spread: float,
 ) -> list[tuple[Array, Array, Displacement]]:
     """Lines of the maps that are in both runs with the same length, but not in the same place.
@@ -150,7 +148,7 @@ def segment_motions(
         visits: both, in the reference's frame.
         evidence: the other visit's beams on those surfaces.
         known: how well a piece is known.
-        spread: see `graphslam.change_detection.beam_evidence.spread`.
+        spread: see `graphslam.change_detection.beam_evidence.null_sigma`.
 
     Returns:
         Per moved stretch its ends (2, 2) m before and after, and its displacement.
@@ -169,7 +167,7 @@ def segment_motions(
     for i, a in enumerate(sides[0]):
         for j, b in enumerate(sides[1]):
             way = float(np.hypot(*(b.pose[:2] - a.pose[:2])))
-            if _alike(a, b) and way < FARTHEST_M:
+            if _alike(a, b) and way < known.max_displacement_m:
                 pairs.append((abs(a.length - b.length) + 0.1 * way, i, j))
     moved, taken = [], (set[int](), set[int]())
     for _, i, j in sorted(pairs):
@@ -188,15 +186,15 @@ def _at(
     along = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
     longer = ends + _LONGER_M * np.array([-along, along])
     facing = np.abs(surface.normals @ np.array([-along[1], along[0]])) > _FACING
-    near = close_to(surface.points, longer, _AT_M)
+    near = near_segment(surface.points, longer, _AT_M)
     rows = near[(surface.good & facing)[near]]
     if len(rows) * surface.nearest.grid.cell_m < _LEAST_M:
         return None
-    shape = shape_from(surface, visit, rows)
+    shape = shape_of_rows(surface, visit, rows)
     as_before = evidence.tested[rows] & (evidence.scores(spread)[rows] < _AS_BEFORE)
     if as_before.mean() > _MOST_AS_BEFORE or not is_straight(shape):
         return None
-    found = wall_segment_of(shape, surface.nearest.grid.cell_m)
+    found = fit_wall_segment(shape, surface.nearest.grid.cell_m)
     return found if ends_seen(found, visit) else None
 
 

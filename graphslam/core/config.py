@@ -329,7 +329,7 @@ class ChangesConfig:
     bias_sigma_m: how much too far a material may be measured. gate_m: returns within this distance
     are compared with a surface by how far they lie off it; beams that end farther behind it passed
     through. min_length_m: smallest change that is reported. min_beams: fewest beams that must tell
-    of it.
+    of it. max_displacement_m: what moved farther is reported as vanished and appeared.
     """
 
     false_alarm_rate: float = 0.01
@@ -344,6 +344,7 @@ class ChangesConfig:
     gate_m: float = 0.15
     min_length_m: float = 0.1
     min_beams: int = 5
+    max_displacement_m: float = 5.0
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from paths import DATA
 
-from graphslam.change_detection import compare, load_visit
+from graphslam.change_detection import detect_changes, load_visit
 from graphslam.change_detection.visit import on_surface
 from graphslam.core.config import ChangesConfig, Config
 from graphslam.logs import open_logs
@@ -32,7 +32,7 @@ def visits(tmp_path_factory):
         result = smooth(open_logs([folder / f"{name}.mcap"], Config()), Config())
         save(result, Config(), folder / name, force=False)
         visit = load_visit(load(folder / name), folder / name)
-        found.append(visit.chosen(np.arange(len(visit.poses)) % 2 == 0))
+        found.append(visit.select(np.arange(len(visit.poses)) % 2 == 0))
     return found
 
 
@@ -60,10 +60,10 @@ def test_two_real_visits_register_and_an_inserted_box_is_found(visits):
     Bars lie half way to what comes out where scans are laid on the map one by one but neither visit
     is made straight before: 71 % of them fit, and maps disagree by 1.2 of what is stated."""
     reference, later = visits
-    plain = compare(reference, later, ChangesConfig())
+    plain = detect_changes(reference, later, ChangesConfig())
     assert len(plain.later.poses) > 0.85 * len(later.poses)  # measured: 0.98
     assert plain.spread < 1.05  # measured: 0.86
-    boxed = compare(
+    boxed = detect_changes(
         reference, with_box(later, plain.later.stamps_ns, plain.later.poses), ChangesConfig()
     )
     assert not at_box(plain)

@@ -11,21 +11,21 @@ from paths import ROOT
 from scipy.stats import chi2
 from typer.testing import CliRunner
 
-from graphslam.change_detection import changes_between, compare, load_visit, visit_of
-from graphslam.change_detection.alignment import lasers_differ
+from graphslam.change_detection import changes_between, detect_changes, load_visit, visit_from_scans
+from graphslam.change_detection.alignment import laser_warnings
 from graphslam.change_detection.beam_evidence import beams_past_surfaces
-from graphslam.change_detection.detect import same_frame
+from graphslam.change_detection.detect import identity_registration
 from graphslam.change_detection.elastic_path import fit_elastic_path
 from graphslam.change_detection.export import overlay_map
-from graphslam.change_detection.grid import Grid, distinct, grid_over, nearest_of
-from graphslam.change_detection.nonrigid_registration import overlays
+from graphslam.change_detection.grid import Grid, distance_map, grid_over, sorted_unique
+from graphslam.change_detection.nonrigid_registration import correlate_maps
 from graphslam.change_detection.path_refinement import refine_path
 from graphslam.change_detection.regions import counter_clockwise, outline
 from graphslam.change_detection.report import render_changes
 from graphslam.change_detection.rigid_registration import register
-from graphslam.change_detection.scan_to_map import align
-from graphslam.change_detection.surface_map import surface_of
-from graphslam.change_detection.visit import on_surface, within
+from graphslam.change_detection.scan_to_map import align_scans
+from graphslam.change_detection.surface_map import fit_surfaces
+from graphslam.change_detection.visit import on_surface, select_time_span
 from graphslam.cli.commands import app
 from graphslam.core.config import ChangesConfig, Config
 from graphslam.core.errors import OutputError
@@ -63,7 +63,9 @@ def visit(things, poses, rng, pose_sigmas=(0.005, 0.005, 0.002), landmarks=()):
     stated = poses + sigmas * rng.normal(size=poses.shape)
     covs = np.tile(np.diag(sigmas**2), (len(poses), 1, 1))
     stamps = np.arange(len(poses), dtype=np.int64) * 100_000_000
-    return visit_of(stamps, stated, covs, [(FAN.angles, r) for r in ranges], tuple(landmarks))
+    return visit_from_scans(
+        stamps, stated, covs, [(FAN.angles, r) for r in ranges], tuple(landmarks)
+    )
 
 
 def walls(pose=(0, 0, 0), moved=None, rng=None):
@@ -96,7 +98,7 @@ def walls(pose=(0, 0, 0), moved=None, rng=None):
 def same(a, b, **changes):
     """Compare two visits that share a frame: registered by the room's walls, known well."""
     marks = tuple(walls())
-    return compare(
+    return detect_changes(
         replace(a, landmarks=marks), replace(b, landmarks=marks), replace(CONFIG, **changes)
     )
 
@@ -147,7 +149,7 @@ def test_alignment_takes_out_the_error_that_a_scan_shares():
     poses = drive(40, 0.1)
     b = visit([box(5, 4)], poses, rng, (0.05, 0.05, np.radians(1)))
     grid = grid_over(a.ends, 0.025, 10**6)
-    done = align(b, surface_of(a, grid, 0.02, CONFIG), (0.5, 0.3, 0.2, 0.1, 0.1))
+    done = align_scans(b, fit_surfaces(a, grid, 0.02, CONFIG), (0.5, 0.3, 0.2, 0.1, 0.1))
     error = done.poses - poses
     error[:, 2] = wrap(error[:, 2])
     # the reference's own poses are good to 5 mm / sqrt(60); a scan's 361 beams to a millimetre
@@ -256,7 +258,7 @@ def test_walls_that_were_removed_and_added_are_named():
         ends = np.array([start, end], float)
         return Landmark(number, "segment", middle, 1e-4 * np.eye(3), ends, line, 9, 0, 1, None)
 
-    found = compare(
+    found = detect_changes(
         replace(a, landmarks=(*walls(), wall(70, (5.5, 1.0), (5.5, 2.6)))),
         replace(b, landmarks=(*walls(), wall(80, (5.0, 4.4), (6.6, 4.4)))),
         CONFIG,
@@ -273,7 +275,7 @@ def test_evidence_is_one_sided():
     poses = drive(40)
     a, b = visit([], poses, rng), visit([box(5, 4)], poses, rng)
     grid = grid_over(a.ends, 0.025, 10**6)
-    old, new = (surface_of(v, grid, SIGMA, CONFIG) for v in (a, b))
+    old, new = (fit_surfaces(v, grid, SIGMA, CONFIG) for v in (a, b))
     assert beams_past_surfaces(old, b, old.incidence, SIGMA, CONFIG).passed.sum() == 0
     assert beams_past_surfaces(new, a, new.incidence, SIGMA, CONFIG).passed.sum() > 100
 
@@ -287,7 +289,7 @@ def test_what_is_tested_has_a_time_of_being_seen():
     low, high = box(5, 4, 0.6, 0.50), box(5, 4.1, 0.6, 0.4)
     a, b = visit([low], drive(60), rng), visit([high], drive(60), rng)
     grid = grid_over(a.ends, 0.025, 10**6)
-    old = surface_of(a, grid, SIGMA, CONFIG)
+    old = fit_surfaces(a, grid, SIGMA, CONFIG)
     wide = replace(CONFIG, gate_m=0.3)
     found = beams_past_surfaces(old, b, old.incidence, SIGMA, wide)
     back = found.tested & (found.offset > 0.06)
@@ -299,7 +301,7 @@ def test_no_overlap_is_one_clear_line():
     rng = np.random.default_rng(9)
     a = visit([], drive(20), rng)
     b = visit([], drive(20), rng)
-    away = b.placed(np.array([100.0, 0, 0]), np.zeros((3, 3)))
+    away = b.transformed(np.array([100.0, 0, 0]), np.zeros((3, 3)))
     with pytest.raises(OutputError, match="nothing to compare"):
         same(a, away)
 
@@ -319,9 +321,9 @@ def test_returns_at_edges_are_on_no_surface():
 def test_the_nearest_member_is_the_nearest():
     grid = Grid((0.0, 0.0), 0.1, (40, 30))
     rng = np.random.default_rng(0)
-    cells = distinct(rng.integers(0, 1200, 25))
+    cells = sorted_unique(rng.integers(0, 1200, 25))
     chosen = rng.random(len(cells)) < 0.6
-    near = nearest_of(grid, cells, chosen)
+    near = distance_map(grid, cells, chosen)
     points, every = grid.centers(cells[chosen]), grid.centers(np.arange(1200))
     true = np.hypot(*(every[:, None] - points[None]).transpose(2, 0, 1)).min(axis=1)
     # the 5 x 5 distance mask is good to 2 % and a cell
@@ -345,7 +347,7 @@ def test_moving_a_visit_moves_its_ends():
     rng = np.random.default_rng(2)
     a = visit([], drive(5), rng)
     pose = np.array([1.0, -2.0, 0.7])
-    moved = a.placed(pose, np.zeros((3, 3)))
+    moved = a.transformed(pose, np.zeros((3, 3)))
     np.testing.assert_allclose(moved.ends, transform(pose, a.ends), atol=1e-9)
     np.testing.assert_allclose(moved.poses[0], compose(pose, a.poses[0]))
 
@@ -423,19 +425,22 @@ def test_two_spans_of_a_run_in_which_something_appears():
     """A box is put down half-way: one run, one frame, no registration."""
     rng = np.random.default_rng(20)
     parts = [visit(things, drive(50, 0.1 * i), rng) for i, things in enumerate(([], [box(5, 4)]))]
-    run = visit_of(
+    run = visit_from_scans(
         np.arange(100) * 100_000_000,
         *(np.concatenate([getattr(p, k) for p in parts]) for k in ("poses", "covs")),
         [(FAN.angles, r) for p in parts for r in p.range_m.reshape(50, -1)],
     )
-    first, second = within(run, (0, 4.95), "first"), within(run, (5, 10), "second")
+    first, second = (
+        select_time_span(run, (0, 4.95), "first"),
+        select_time_span(run, (5, 10), "second"),
+    )
     assert len(first.poses) == len(second.poses) == 50
-    (change,) = compare(first, second, CONFIG, same_frame(run)).changes
+    (change,) = detect_changes(first, second, CONFIG, identity_registration(run)).changes
     assert change.kind == "appeared"
     np.testing.assert_allclose(change.polygon.mean(axis=0), [5.2, 4.2], atol=0.2)
     # half-way through the second span the box has long been there: nothing is new
-    halves = within(run, (5, 7.45), "a"), within(run, (7.5, 10), "b")
-    assert not compare(*halves, CONFIG, same_frame(run)).changes
+    halves = select_time_span(run, (5, 7.45), "a"), select_time_span(run, (7.5, 10), "b")
+    assert not detect_changes(*halves, CONFIG, identity_registration(run)).changes
 
 
 def test_the_command_from_logs_to_json(tmp_path):
@@ -535,7 +540,7 @@ def test_a_path_follows_a_map_that_bends_within_a_few_metres():
     things = [box(5, 4), box(1, 1, 0.8, 0.4)]
     a = visit(things, drive(120), rng, (1e-4, 1e-4, 1e-5))
     crooked = bent(a, 0.03)
-    surface = surface_of(a, grid_over(a.ends, 0.025, 10**6), SIGMA, CONFIG)
+    surface = fit_surfaces(a, grid_over(a.ends, 0.025, 10**6), SIGMA, CONFIG)
     placed = fit_elastic_path(crooked, crooked.poses, surface, (0.5, 0.5, 0.4, 0.3, 0.2, 0.1))
     off = np.hypot(*(crooked.poses - a.poses)[:, :2].T).max()
     left = np.hypot(*(placed.poses - a.poses)[:, :2].T).max()
@@ -547,7 +552,7 @@ def test_maps_are_laid_over_each_other_from_any_pose():
     rng = np.random.default_rng(12)
     ends = visit([box(5, 4), box(1, 1, 0.8, 0.4)], drive(40), rng).ends
     pose = np.array([4.0, -3.0, 2.2])
-    found = overlays(transform(pose, ends), ends)
+    found = correlate_maps(transform(pose, ends), ends)
     error = np.array([between(pose, one) for one in found])
     # turns are tried every 2 degrees, shifts every 10 cm
     assert (np.hypot(*error[:, :2].T)[np.abs(wrap(error[:, 2])) < np.radians(2)] < 0.2).any()
@@ -559,7 +564,7 @@ def test_bent_maps_are_registered_scan_by_scan_and_say_so():
     things = [box(1, 1, 0.8, 0.4), box(6.6, 0.3, 1.1, 0.3)]
     a = bent(visit(things, drive(120), rng, (1e-4, 1e-4, 1e-5)), 0.02)
     b = bent(visit([*things, box(5, 4)], drive(120, 0.1), rng, (1e-4, 1e-4, 1e-5)), -0.02)
-    found = compare(a, b.placed(np.array([2.0, 1.0, 0.8]), np.zeros((3, 3))), CONFIG)
+    found = detect_changes(a, b.transformed(np.array([2.0, 1.0, 0.8]), np.zeros((3, 3))), CONFIG)
     assert "straightened" in found.warnings[0]
     largest = found.changes[0]
     assert largest.kind == "appeared"
@@ -575,7 +580,7 @@ def test_other_rooms_are_not_registered():
     clean = cast(poses, FAN, make_world([hall]).shapes, 30.0).ranges
     b = replace(a, range_m=clean.ravel(), poses=poses)
     with pytest.raises(OutputError, match="cannot be registered"):
-        compare(a, b, CONFIG)
+        detect_changes(a, b, CONFIG)
 
 
 def test_maps_that_disagree_all_over_are_refused():
@@ -608,19 +613,19 @@ def test_several_robots_are_not_followed_from_scan_to_scan():
     rng = np.random.default_rng(19)
     a = replace(visit([], drive(20), rng), robots=2)
     with pytest.raises(OutputError, match="no landmarks in common"):
-        compare(a, a, CONFIG)
+        detect_changes(a, a, CONFIG)
 
 
 def test_other_lasers_are_warned_of():
     rng = np.random.default_rng(15)
     a, b = visit([], drive(30), rng), visit([], drive(30, 0.1), rng)
-    assert lasers_differ(a, b) == ()
+    assert laser_warnings(a, b) == ()
     every_second = np.arange(len(b.range_m)) % 361 % 2 == 0
     coarse = replace(
         b, scan=b.scan[every_second], angle=b.angle[every_second],
         range_m=b.range_m[every_second], surface=b.surface[every_second],
     )  # fmt: skip
-    (warning,) = lasers_differ(a, coarse)
+    (warning,) = laser_warnings(a, coarse)
     assert "361 beams" in warning
     assert "181" in warning
 
@@ -652,7 +657,7 @@ def turned_board(seed, before=90.0, now=112.0, more=()):
         thing = board(angle)
         seen = visit([thing, *more], drive(50, turn), rng)
         found.append(replace(seen, landmarks=(*walls(), board_line(50, thing.points))))
-    return compare(*found, CONFIG)
+    return detect_changes(*found, CONFIG)
 
 
 def test_a_board_that_hides_its_old_place_has_moved_by_as_much_as_is_said():

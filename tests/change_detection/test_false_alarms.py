@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graphslam.change_detection import compare, visit_of
-from graphslam.change_detection.detect import same_frame
+from graphslam.change_detection import detect_changes, visit_from_scans
+from graphslam.change_detection.detect import identity_registration
 from graphslam.core.config import ChangesConfig
 from graphslam.core.geometry import wrap
 from graphslam.simulation.laser import clean_scans, fan_of, noisy_ranges
@@ -60,14 +60,14 @@ def seen(things, poses, rng, laser=LASER, panes=(), angle_deg=25.0, share=1.0):
     sweeps = [(fan_of(laser).angles, r) for r in np.where(np.isfinite(ranges), ranges, np.nan)]
     stated = poses + SIGMAS * rng.normal(size=poses.shape)
     covs = np.tile(np.diag(SIGMAS**2), (len(poses), 1, 1))
-    return visit_of(np.arange(len(poses)) * 100_000_000, stated, covs, sweeps)
+    return visit_from_scans(np.arange(len(poses)) * 100_000_000, stated, covs, sweeps)
 
 
 def found_in(seed, first, second, **glass):
     """What is found between two visits; of each its things and its drive."""
     rng = np.random.default_rng(seed)
     a, b = (seen(things, poses, rng, **glass) for things, poses in (first, second))
-    return compare(a, b, ChangesConfig(), same_frame(a))
+    return detect_changes(a, b, ChangesConfig(), identity_registration(a))
 
 
 ROOM = [box("cupboard", 2, 4.5, 1, 0.4), box("crate", 6.5, 0.3, 0.6, 0.5)]

@@ -8,14 +8,14 @@ from graphslam.change_detection.thesis_method import (
     VOLUME,
     LaserNoise,
     changed_beams,
-    distances,
+    consecutive_runs,
     expected_measurements,
     make_dents,
     occlusion_map,
     point_covariances,
-    runs,
     scan_points,
-    stable,
+    squared_mahalanobis,
+    stable_points,
 )
 from graphslam.core.geometry import rotation
 
@@ -87,7 +87,7 @@ def test_a_narrow_dent_is_not_lost_between_cells():
 def test_the_distance_is_that_of_mahalanobis():
     z, e = np.array([[1.0, 2.0], [0, 0], [np.nan, 0]]), np.array([[1.1, 2.0], [0, 0], [0, 0]])
     S = np.tile(np.diag([0.005, 0.1]), (3, 1, 1))
-    d2 = distances(z, S, e, S)
+    d2 = squared_mahalanobis(z, S, e, S)
     np.testing.assert_allclose(d2[:2], [0.01 / 0.01, 0.0], atol=1e-12)
     assert np.isnan(d2[2])
 
@@ -129,14 +129,14 @@ def test_what_was_hidden_in_front_of_the_expected_is_dismissed():
 
 def test_consecutive_beams():
     marked = np.array([1, 0, 1, 1, 0, 1, 1, 1], dtype=bool)
-    assert list(runs(marked, 1)) == list(marked)
-    assert list(np.nonzero(runs(marked, 2))[0]) == [2, 3, 5, 6, 7]
-    assert list(np.nonzero(runs(marked, 3))[0]) == [5, 6, 7]
-    assert not runs(np.zeros(0, dtype=bool), 2).any()
+    assert list(consecutive_runs(marked, 1)) == list(marked)
+    assert list(np.nonzero(consecutive_runs(marked, 2))[0]) == [2, 3, 5, 6, 7]
+    assert list(np.nonzero(consecutive_runs(marked, 3))[0]) == [5, 6, 7]
+    assert not consecutive_runs(np.zeros(0, dtype=bool), 2).any()
 
 
 def test_points_that_are_stable_over_time():
     points = np.array([[1.0, 0], [2.0, 0], [np.nan, 0]])
     others = [np.array([[1.01, 0], [5.0, 0]]), np.array([[0.99, 0], [np.nan, 0]]),
               np.array([[2.01, 0.0]])]  # fmt: skip
-    assert list(stable(points, others, 0.05, 2)) == [True, False, False]
+    assert list(stable_points(points, others, 0.05, 2)) == [True, False, False]
