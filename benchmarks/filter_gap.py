@@ -16,7 +16,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from graphslam.core.config import load_config
+from graphslam.core.config_io import load_config
 from graphslam.core.records import Step
 from graphslam.estimation.backends import BACKENDS
 from graphslam.estimation.replay import replay

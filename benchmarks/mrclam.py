@@ -30,9 +30,9 @@ SOURCE = DATA / "mrclam/MRCLAM_Dataset6.tar.xz"
 GRAPHSLAM = [sys.executable, "-m", "graphslam"]
 RUNS = {
     "robots": [],
-    "alone": ["--set", "association.robots=ignore"],
+    "alone": ["--set", "association.robot_sightings=ignore"],
     "ekf": ["--backend", "ekf"],
-    "ekf-alone": ["--backend", "ekf", "--set", "association.robots=ignore"],
+    "ekf-alone": ["--backend", "ekf", "--set", "association.robot_sightings=ignore"],
     "unnamed": ["--set", "association.identities=ignore"],
     "exchanged": [],
     **{f"start{k}": [] for k in range(1, 6)},

@@ -2,9 +2,9 @@
 
 The scenario `robots-in-scans` is the thesis' experiment 6.1.3 without a sensor for robots: the
 vehicle knows the Pioneer's outline and finds it in its laser's scans. Smoothed as it is, and
-without the sightings (`association.robots=ignore`). Printed per seed: the Pioneer's position error,
-root mean square over the drive (world frame, unaligned, starts known), its standard deviation, and
-how far the clock's offset is from the truth, with its standard deviation; then all seeds together.
+without the sightings (`association.robot_sightings=ignore`). Printed per seed: the Pioneer's
+position error, root mean square over the drive (world frame, unaligned, starts known), its standard
+deviation, and the error of the clock offset with its standard deviation; then all seeds together.
 
 Then without the start of one of them, which the other must find in its scans, or find itself by
 what it sees, wherever it began: the same error, how far the start that was found is off, and its
@@ -20,7 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from graphslam.core.config import Config, load_config
+from graphslam.core.config import Config
+from graphslam.core.config_io import load_config
 from graphslam.core.geometry import Array, wrap
 from graphslam.evaluation.metrics import evaluate
 from graphslam.evaluation.trajectory_metrics import pair_poses
@@ -84,7 +85,7 @@ def both(seed: int, folder: Path) -> tuple[Outcome, Outcome]:
     """Cooperating and alone."""
     log = folder / f"{seed}.mcap"
     simulate(load_scenario(SCENARIO), log, seed=seed)
-    return outcome(log), outcome(log, "association.robots=ignore")
+    return outcome(log), outcome(log, "association.robot_sightings=ignore")
 
 
 def unknown(seed: int, other: str, folder: Path) -> tuple[Outcome, Outcome, Array, Array]:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from graphslam.core.config import load_config
+from graphslam.core.config_io import load_config
 from graphslam.core.geometry import between, compose, transform
 from graphslam.core.records import Result, Scan, TrueLandmark
 from graphslam.evaluation.trajectory_metrics import align, pair_poses

@@ -15,7 +15,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from graphslam.core.config import load_config
+from graphslam.core.config_io import load_config
 from graphslam.core.errors import GraphSlamError, OutputError
 from graphslam.logs import IMPORTERS, open_logs, pose_stamp_ns
 from graphslam.results.folder import load, save

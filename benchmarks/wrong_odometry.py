@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.core.config import load_config
+from graphslam.core.config_io import load_config
 from graphslam.core.geometry import Array, between, compose, exp, log
 from graphslam.core.records import Message, OdometryPose, Scan, Truth
 from graphslam.logs import LogWriter, open_logs

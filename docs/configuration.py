@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from graphslam.core.config import Config
+from graphslam.core.config_io import RENAMED_KEYS, settings_of
 
 PAGE = Path(__file__).with_suffix(".md")
 
@@ -32,17 +33,26 @@ graphslam smooth LOG.mcap -o DIR --set keyframe.mode=all --set robust.kernel=non
 ```
 """
 
+RENAMED = """\
+## Renamed keys
+
+An old name is accepted with a warning; one setting may not be given by both names.
+
+| old name | name |
+|---|---|"""
+
 
 def page() -> str:
     """The whole page."""
-    hints = typing.get_type_hints(Config)
     parts = [HEAD]
-    for field in dataclasses.fields(Config):
-        kind, title = hints[field.name], f"[{field.name}]"
+    for name, kind in settings_of(Config).items():
         if typing.get_origin(kind) is Mapping:  # one table per name
-            kind, title = typing.get_args(kind)[1], f"[{field.name}.NAME]"
-        parts.append(section(title, kind))
-    return "\n".join(parts)
+            parts.append(section(f"[{name}.NAME]", typing.get_args(kind)[1]))
+        else:
+            parts.append(section(f"[{name}]", kind))
+    return "\n".join(
+        [*parts, RENAMED, *(f"| `{a}` | `{b}` |" for a, b in RENAMED_KEYS.items()), ""]
+    )
 
 
 def section(title: str, kind: Any) -> str:
@@ -77,8 +87,14 @@ def values(kind: Any) -> str:
     if origin is tuple and typing.get_origin(arguments[0]) is Literal:
         return f"list, any of {values(arguments[0])}"
     if origin is tuple:
-        return f"list of {values(arguments[0])}s"
+        return f"list of {plural(values(arguments[0]))}"
     return {float: "number", int: "whole number", bool: "`true`, `false`", str: "text"}[kind]
+
+
+def plural(text: str) -> str:
+    """The plural of what `values` says of a list's items."""
+    noun, of, items = text.partition(" of ")
+    return f"{noun}s{of}{items}"
 
 
 def default(defaults: Any, name: str) -> str:

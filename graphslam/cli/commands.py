@@ -35,7 +35,8 @@ from graphslam.cli.arguments import (
     span_of,
 )
 from graphslam.cli.terminal import errors_in_one_line, progress_bar
-from graphslam.core.config import Config, load_config
+from graphslam.core.config import Config
+from graphslam.core.config_io import load_config
 from graphslam.core.errors import ConfigError, EstimationError, OutputError
 from graphslam.core.records import Result, TrueLandmark, Truth
 from graphslam.core.worker import Future
@@ -235,6 +236,8 @@ def evaluate_command(
         from graphslam.evaluation.relation_metrics import read_relations
 
         saved = load(directory)
+        for warning in saved.config.warnings:
+            typer.echo(f"warning: {directory / 'config.toml'}: {warning}", err=True)
         reference = read_relations(relations) if relations else None
         if truth:
             known = truth_of_files(truth, list(saved.robots))
@@ -336,13 +339,17 @@ def changes_command(
         from graphslam.change_detection import changes_between, render_changes, save_changes
         from graphslam.change_detection.folder import check_changes_target
 
-        tree = load_config(config, settings or ()).changes
+        tree = load_config(config, settings or ())
         check_changes_target(output, force=force)
         spans = (span_of(reference_span), span_of(later_span))
-        found = changes_between(reference, later, tree, *spans)
+        found = changes_between(reference, later, tree.changes, *spans)
+        found = replace(found, warnings=(*tree.warnings, *found.warnings))
         names = (reference.name, later.name)
         save_changes(
-            found, output, force=force, report=lambda done: render_changes(done, tree, names)
+            found,
+            output,
+            force=force,
+            report=lambda done: render_changes(done, tree.changes, names),
         )
         if json:
             typer.echo(to_json(found.to_dict(), "changes"), nl=False)

@@ -1,25 +1,17 @@
-"""The one tree of settings: frozen dataclasses, read from TOML and ``key=value`` overrides.
+"""The tree of settings: one frozen dataclass per table; `graphslam.core.config_io` reads them.
 
-Every key carries its unit in its name. An unknown key, a wrong type or a value out of range is a
-`ConfigError` that names the key. There are no per-log settings: the defaults are meant for
-everything of a kind.
+Every key carries its unit in its name. There are no settings for a single log: the defaults are
+meant for all logs.
 """
 
-import dataclasses
-import difflib
-import json
 import math
-import tomllib
-import types
-import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from graphslam.core.errors import ConfigError
 
-#: what calibration estimates of a robot, see `graphslam.core.motion_models.nominal_calibration`
+#: what calibration estimates of a robot; see `graphslam.core.motion_models.nominal_calibration`
 CalibrationParameter = Literal[
     "translation_scale",
     "rotation_scale",
@@ -39,9 +31,9 @@ CalibrationParameter = Literal[
 class LogsConfig:
     """How logs are read.
 
-    reorder_s: messages may arrive this much out of order, by their stamps, and still be placed.
-    topics: topics to use, name -> robot; empty means every topic whose schema is known, the robot
-        being the topic's namespace.
+    reorder_s: how much out of order, by their stamps, messages may arrive and still be sorted.
+    topics: topics to use, name -> robot; empty = every topic whose schema is known, with the
+        topic's namespace as robot.
     """
 
     reorder_s: float = 2.0
@@ -52,11 +44,12 @@ class LogsConfig:
 class RobotConfig:
     """What the log does not say about a robot; the table [robots.NAME], NAME or `default`.
 
-    laser: [x m, y m, yaw rad] of the laser in the base frame, over what tf_static says.
+    laser: [x m, y m, yaw rad] of the laser in the base frame; overrides tf_static.
     wheel_radius_left_m, wheel_radius_right_m, axle_m: the wheels' geometry for JointState logs.
-    left_joint, right_joint: names in JointState; empty means the names that contain left/right.
-    outline: corners [[x m, y m], ...] of what others' lasers see of it, in its base frame, convex
-        and in order; [[radius m]] is a circle. With it the robot is found in others' scans.
+    left_joint, right_joint: names in JointState; empty = the names that contain left or right.
+    outline: corners [[x m, y m], ...] of the robot's cross-section at the height of other robots'
+        lasers, in its base frame, convex and in order; [[radius m]] is a circle. A robot with an
+        outline is detected in other robots' scans.
     """
 
     laser: tuple[float, ...] = ()
@@ -68,7 +61,7 @@ class RobotConfig:
     outline: tuple[tuple[float, ...], ...] = ()
 
     def __post_init__(self) -> None:
-        """Raise ConfigError where `laser` is no pose or `outline` no outline."""
+        """Raise ConfigError where `laser` is not a pose or `outline` not an outline."""
         if len(self.laser) not in (0, 3):
             raise ConfigError(f"robots.*.laser: needs [x, y, yaw], got {list(self.laser)}")
         sizes = [len(corner) for corner in self.outline]
@@ -84,23 +77,25 @@ class RobotConfig:
 class OdometryConfig:
     """Noise of the motion between two states (thesis 4.8-4.15, see docs/thesis.md).
 
-    The model error is white, its variance grows with path and turning (4.14): k_x_m and k_y_m in
+    The model error is white; its variance grows with path and turning (4.14): k_x_m and k_y_m in
     m² per m, k_x_rad and k_y_rad in m² per rad, k_phi_m in rad² per m, k_phi_rad in rad² per rad.
-    The calibration errors are constant within one interval: translation_scale_sigma and
-    rotation_scale_sigma are relative, drift_sigma_rad_per_m is turning per metre driven forwards;
-    for wheel angles wheel_radius_sigma_m and axle_sigma_m, and count_sigma_rad per reading.
-    laser_sigma_m, laser_sigma_rad: how far the laser may sit from where the log says;
-    laser_latency_sigma_s: how far its clock may be from the odometry's;
+    Calibration errors are constant; their prior sigmas: translation_scale_sigma and
+    rotation_scale_sigma are relative, drift_sigma_rad_per_m is rotation per metre driven forwards;
+    for wheel angles wheel_radius_sigma_m and axle_sigma_m, and count_sigma_rad per reading (white).
+    laser_sigma_m, laser_sigma_rad: error of the laser's mounting pose given by the log;
+    laser_latency_sigma_s: offset of its clock from the odometry's;
     sighting_latency_sigma_s: the same for a robot without a laser, whose odometry may be commands
     that the motion follows later.
-    commanded: poses of odometry are what commanded velocities compound to; turning_lever_sigma_m:
-    how far from the middle of the axle the point may be whose speed was commanded.
+    commanded_velocities: the odometry poses integrate commanded, not measured, velocities;
+    turning_lever_sigma_m: distance between the middle of the axle and the point whose speed was
+    commanded.
     floor_sigma_m and floor_sigma_rad are added once per interval in which the robot moved.
-    calibrate: learn the calibration errors from the estimate while it grows, at the end together
-    with it. fixed: those of them that are held at what the log and [robots.*] say.
+    calibrate: estimate the calibration errors online, and at the end jointly with the trajectory.
+    fixed_calibration: parameters held at what the log and [robots.*] say.
     max_gap_s: longest span without odometry that is bridged.
-    scan_matching: whether consecutive scans are matched: `auto` = motions that they contradict are
-    taken from them; `on` = besides, what lies on no line is a second source of every motion; `off`.
+    scan_matching: use of relative motions from matching consecutive scans: `auto` = they replace
+    odometry motions that they contradict; `on` = in addition every motion is fused with the match
+    of the returns that lie on no line; `off`.
     """
 
     k_x_m: float = 1e-4
@@ -119,57 +114,58 @@ class OdometryConfig:
     laser_sigma_rad: float = 0.02
     laser_latency_sigma_s: float = 0.05
     sighting_latency_sigma_s: float = 0.2
-    commanded: bool = False
+    commanded_velocities: bool = False
     turning_lever_sigma_m: float = 0.2
     floor_sigma_m: float = 0.005
     floor_sigma_rad: float = 0.005
     calibrate: bool = True
-    fixed: tuple[CalibrationParameter, ...] = ()
+    fixed_calibration: tuple[CalibrationParameter, ...] = ()
     max_gap_s: float = 5.0
     scan_matching: Literal["auto", "on", "off"] = "auto"
 
 
 @dataclass(frozen=True)
 class KeyframeConfig:
-    """When a robot gets a state.
+    """When a robot gets a state (a keyframe).
 
-    mode: `motion` = at an observation, once the robot moved distance_m or turned angle_rad since
-    its last state, for a scan scan_angle_rad: a laser sees most of what it saw before; `all` = at
-    every odometry, scan and sighting stamp. gather_s: in logs of several robots without scans,
-    sightings within this span enter together, carried to its end by odometry.
+    mode: `motion` = at an observation, once the robot has moved distance_m or turned angle_rad
+    since its last state (scan_angle_rad for a scan, which overlaps more with the one before);
+    `all` = at every odometry, scan and sighting stamp.
+    sighting_window_s: in logs of several robots without scans, sightings within this span enter as
+    one step, transported to its end by odometry.
     """
 
     mode: Literal["motion", "all"] = "motion"
     distance_m: float = 0.25
     angle_rad: float = 0.15
     scan_angle_rad: float = 0.25
-    gather_s: float = 0.8
+    sighting_window_s: float = 0.8
 
 
 @dataclass(frozen=True)
 class FrontEndConfig:
     """Lines and cylinders from scans (thesis 4.7, docs/front-ends.md).
 
-    name: which front end; `both` takes whole segments first, then Hough lines. max_range_m: farther
-    returns are not used for lines. gap_m: neighbouring returns farther apart than gap_m + gap_share
-    * range start a new chain. split_m: largest orthogonal deviation inside one segment. min_points,
-    min_length_m: smaller ones are dropped. range_sigma_m: white range noise. floor_normal_m,
-    floor_angle_rad: what a wall's material, flatness and the laser's bias leave however many points
-    there are. end_sigma_m: how sharp a segment's real end is. covariance: `incidence` weights each
-    point by its own normal noise, `thesis` uses eq. 4.32 as printed. Hough lines (4.7.1-4.7.3):
-    hough_delta_d_m is the distance step Δd, equal to the stripe width 2a; hough_gamma_steps the
-    number of angles γ in a full turn; hough_d_max_m the largest distance d of a line.
-    hough_threshold_m is the threshold of C with g = r times the angle between beams: metres of
-    wall, as long as it were seen face on. cylinders: whether to look for them too;
-    cylinder_min_radius_m, cylinder_max_radius_m: which radii; cylinder_points: fewest returns.
-    moving: what to do with free-standing things where an earlier scan looked through: `drop` keeps
-    them out of the map.
+    name: which front end; `both` extracts segments first, then Hough lines from the other returns.
+    max_range_m: farther returns are not used for lines. gap_m: neighbouring returns farther apart
+    than gap_m + gap_ratio * range start a new chain. split_m: largest orthogonal deviation inside
+    one segment. min_points, min_length_m: smaller segments are dropped. range_sigma_m: white range
+    noise. floor_normal_m, floor_angle_rad: error of a line that does not shrink with the number of
+    points (material, flatness, bias of the laser). end_sigma_m: error of a segment's end where the
+    wall ends. covariance: `incidence` weights each point by its noise along the normal, `thesis`
+    uses eq. 4.32 as printed. Hough lines (4.7.1-4.7.3): hough_delta_d_m is the distance step Δd,
+    equal to the stripe width 2a; hough_gamma_steps the number of angles γ in a full turn;
+    hough_d_max_m the largest distance d of a line. hough_threshold_m is the threshold of C with
+    g = r times the angle between beams: metres of wall at normal incidence. cylinders: whether to
+    extract them; cylinder_min_radius_m, cylinder_max_radius_m: their radii; cylinder_points: fewest
+    returns. dynamic_objects: `drop` removes free-standing objects in space that an earlier scan saw
+    as free; `keep` leaves them in.
     """
 
     name: Literal["segments", "hough", "both", "none"] = "segments"
     max_range_m: float = 30.0
     gap_m: float = 0.3
-    gap_share: float = 0.05
+    gap_ratio: float = 0.05
     split_m: float = 0.05
     min_points: int = 6
     min_length_m: float = 0.4
@@ -186,35 +182,36 @@ class FrontEndConfig:
     cylinder_min_radius_m: float = 0.03
     cylinder_max_radius_m: float = 0.5
     cylinder_points: int = 4
-    moving: Literal["drop", "keep"] = "drop"
+    dynamic_objects: Literal["drop", "keep"] = "drop"
 
 
 @dataclass(frozen=True)
 class AssociationConfig:
     """Which observation belongs to which landmark (thesis 3.21-3.25 and section 4.6).
 
-    method: `greedy` is the thesis' variant of the NNSF, `optimal` minimises the sum. identities:
-    `use` those in the log or `ignore` them. robots: `use` sightings of other robots or `ignore`
-    them. max_distance_m: eq. 3.23. directed: a line has two
-    sides; false takes directions modulo pi (3.24). gate_probability: chi-square gate (3.25).
-    floor_m, floor_rad: added to the innovations' sigmas before gating, for what the models leave
-    out; never enters the estimate. new_probability: an observation is a new landmark only if its
+    method: `greedy` is the thesis' variant of the NNSF, `optimal` minimises the sum of distances.
+    identities: `use` or `ignore` those in the log. robot_sightings: `use` or `ignore` sightings of
+    other robots. max_distance_m: eq. 3.23. directed: a line has two sides; false compares
+    directions modulo pi (3.24). gate_probability: of the chi-square gate (3.25).
+    floor_m, floor_rad: added to the innovations' sigmas before gating, for model errors; they never
+    enter the estimate. new_landmark_probability: an observation is a new landmark only if its
     distance to every landmark exceeds this second, higher quantile. overlap_gap_m: largest gap
-    along the line between an observed part and the known extent. sightings_to_promote: a tentative
-    landmark enters the graph at this many. tentative_s, tentative_m: one not seen again after this
-    time and path is deleted. reacquire_m: a landmark not seen for this much path counts as old;
-    old lines are taken up again only if reacquire_min of them that are not all parallel agree.
+    along the line between an observed segment and the landmark's extent. sightings_to_promote: a
+    tentative landmark enters the graph at this many sightings. tentative_s, tentative_m: one not
+    observed again within this time and path is deleted. reacquire_m: a landmark not observed for
+    this much path counts as old; old lines are matched again only if reacquire_min of them, not all
+    parallel, agree.
     """
 
     method: Literal["optimal", "greedy"] = "optimal"
     identities: Literal["use", "ignore"] = "use"
-    robots: Literal["use", "ignore"] = "use"
+    robot_sightings: Literal["use", "ignore"] = "use"
     max_distance_m: float = 1.5
     directed: bool = True
     gate_probability: float = 0.99
     floor_m: float = 0.05
     floor_rad: float = 0.03
-    new_probability: float = 0.9999
+    new_landmark_probability: float = 0.9999
     overlap_gap_m: float = 0.3
     sightings_to_promote: int = 3
     tentative_s: float = 20.0
@@ -227,7 +224,7 @@ class AssociationConfig:
 class RobustConfig:
     """How observation factors treat outliers.
 
-    kernel: which M-estimator. scale: its parameter, in sigmas (Cauchy: 95 % efficient at 2.385).
+    kernel: the M-estimator. scale: its parameter, in sigmas (Cauchy: 95 % efficient at 2.385).
     """
 
     kernel: Literal["none", "huber", "cauchy", "geman-mcclure"] = "cauchy"
@@ -238,15 +235,15 @@ class RobustConfig:
 class BackendConfig:
     """The estimator.
 
-    name: which one. relinearize_threshold: largest change of a variable (m, rad) before it is
-    linearised anew; relinearize_every: steps between two looks for such variables in the first
-    1000, twice as many in the next, and so on. polish: optimise to convergence at the end;
-    reconsider: then apply the final calibration to all of the log, merge landmarks that are one,
-    and optimise again (smoothers only); close_loops: in between, close loops that scans confirm.
-    verify_closures: believe relative poses that a log brings along only if they agree with each
-    other. horizon_s: how long a past pose stays in isam2's graph before it is marginalised out:
-    inf = full smoothing, 0 = the extended Kalman filter. exchange_s: time between two messages of a
-    robot in `decentralised`.
+    name: which one. relinearize_threshold: change of a variable (m, rad) above which it is
+    relinearised; relinearize_every: steps between two checks for that in the first 1000 steps,
+    twice as many in the next 1000, and so on. optimise_at_end: optimise to convergence at the end;
+    reoptimise: then apply the final calibration to the whole log, merge duplicate landmarks and
+    optimise again (smoothers only); close_loops: before that, add loop closures verified by scans.
+    verify_closures: use relative poses recorded in a log only if they are mutually consistent.
+    horizon_s: how long a past pose stays in isam2's graph before it is marginalised out: inf = full
+    smoothing, 0 = the extended Kalman filter. exchange_s: time between two messages of a robot in
+    `decentralised`.
     """
 
     name: Literal[
@@ -256,8 +253,8 @@ class BackendConfig:
     exchange_s: float = 30.0
     relinearize_threshold: float = 0.05
     relinearize_every: int = 20
-    polish: bool = True
-    reconsider: bool = True
+    optimise_at_end: bool = True
+    reoptimise: bool = True
     close_loops: bool = True
     verify_closures: bool = True
 
@@ -267,12 +264,12 @@ class EkfConfig:
     """The extended Kalman filter of the thesis, and the invariant one (which has its own error).
 
     error: which errors are Gaussian: `world` = additive along world axes, as in the thesis; `body`
-    = of the exponential map at each pose, as in GTSAM. lines: `model` = no row along a line, as the
-    smoother has it; `thesis` = eq. 4.33-4.34, a large variance along it (along_sigma_m).
-    iterations: how often each observation is linearised; more than 1 = the iterated filter (1 in
-    the invariant one).
+    = in the tangent space at each pose, as in GTSAM. lines: `model` = no row along a line, as in
+    the smoother; `thesis` = eq. 4.33-4.34, a large variance along it (along_sigma_m).
+    iterations: linearisations per observation; more than 1 = the iterated filter (always 1 in the
+    invariant one).
     past_states: how many of each robot's last poses stay in the state, also of isam2 with horizon
-    0. Sightings from before a landmark's promotion belong to them; it may wait for
+    0. Sightings from before a landmark's promotion refer to them; promotion may take
     association.tentative_m, which is 20 keyframes. 0 = the state of the thesis.
     """
 
@@ -285,11 +282,11 @@ class EkfConfig:
 
 @dataclass(frozen=True)
 class RbpfConfig:
-    """The Rao-Blackwellised particle filter.
+    """The Rao-Blackwellised particle filter; it has no robust kernel.
 
-    particles: how many paths it samples. seed: of its random numbers; the same seed gives the same
-    estimate. proposal: what a pose is drawn from: `observation` = motion and sightings of the step
-    (FastSLAM 2.0), `motion` = motion alone (FastSLAM 1.0). It has no robust kernel.
+    particles: number of sampled paths. seed: of the random numbers; equal seeds give equal
+    estimates. proposal: what a pose is drawn from: `observation` = motion and observations of the
+    step (FastSLAM 2.0), `motion` = motion alone (FastSLAM 1.0).
     """
 
     particles: int = 500
@@ -301,10 +298,10 @@ class RbpfConfig:
 class StartConfig:
     """Where the robots start.
 
+    poses: robot -> [x m, y m, phi rad]. from_truth: use one truth sample of each robot instead.
     origin_sigma_m, origin_sigma_rad: prior of the robot whose first pose is the world's origin.
-    given_sigma_m, given_sigma_rad: prior of a start that is given. truth_sigma_m,
-    truth_sigma_rad: of one read from truth (a motion capture sample). poses: robot -> [x m, y m,
-    phi rad]. from_truth: read one truth sample of each robot instead.
+    given_sigma_m, given_sigma_rad: prior of a start in poses. truth_sigma_m, truth_sigma_rad: prior
+    of a start from truth (a motion capture sample).
     """
 
     origin_sigma_m: float = 1e-3
@@ -321,15 +318,15 @@ class StartConfig:
 class ChangesConfig:
     """Change detection (thesis chapter 5).
 
-    false_alarm_rate: share of the later beams that may be flagged where nothing changed.
+    false_alarm_rate: share of the later beams that are flagged where nothing changed.
     run_false_alarm_rate: probability that a run without any change reports one. resolution_m: of
-    the map; it gets coarser where it would have more than max_side_cells squared. max_range_m:
-    farther returns are not compared. min_returns, min_scans: a surface is compared if so many
-    returns of so many scans lie on it. flatness_m: how far a straight surface strays from a line.
-    bias_sigma_m: how much too far a material may be measured. gate_m: returns within this distance
-    are compared with a surface by how far they lie off it; beams that end farther behind it passed
-    through. min_length_m: smallest change that is reported. min_beams: fewest beams that must tell
-    of it. max_displacement_m: what moved farther is reported as vanished and appeared.
+    the map; coarser where the map would have more than max_side_cells squared cells. max_range_m:
+    farther returns are not compared. min_returns, min_scans: a surface is compared if it has so
+    many returns from so many scans. flatness_m: deviation of a straight surface from a line.
+    bias_sigma_m: range bias that depends on the material. gate_m: returns within this distance
+    of a surface are compared with it; beams that end farther behind it passed through it.
+    min_length_m: smallest change that is reported. min_beams: fewest beams that support one.
+    max_displacement_m: what moved farther is reported as vanished and appeared.
     """
 
     false_alarm_rate: float = 0.01
@@ -349,7 +346,10 @@ class ChangesConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """The whole tree; `config.toml` in a result folder is this, written out."""
+    """The whole tree; `config.toml` in a result folder is this, written out.
+
+    warnings: one line for each key that was given by an old name; no setting itself.
+    """
 
     logs: LogsConfig = field(default_factory=LogsConfig)
     robots: Mapping[str, RobotConfig] = field(default_factory=dict)
@@ -363,216 +363,8 @@ class Config:
     rbpf: RbpfConfig = field(default_factory=RbpfConfig)
     start: StartConfig = field(default_factory=StartConfig)
     changes: ChangesConfig = field(default_factory=ChangesConfig)
+    warnings: tuple[str, ...] = field(default=(), compare=False, metadata={"setting": False})
 
     def robot(self, name: str) -> RobotConfig:
         """Settings of robot ``name``: its own table, else [robots.default], else the defaults."""
         return self.robots.get(name, self.robots.get("default", RobotConfig()))
-
-    def __reduce__(self) -> tuple[Any, tuple[str]]:
-        """Pickled as its TOML text: read-only mappings have no pickle of their own."""
-        return parse_config, (dump_config(self),)
-
-
-def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Config:
-    """Default settings, then the TOML file, then ``key=value`` overrides (dotted keys).
-
-    Raises:
-        ConfigError: the file cannot be read, a key is unknown, a value has the wrong type.
-    """
-    tree: dict[str, Any] = {}
-    if path is not None:
-        try:
-            tree = tomllib.loads(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise ConfigError(f"{path}: not valid TOML: {error}") from error
-    for text in overrides:
-        key, separator, value = text.partition("=")
-        if not separator or not key.strip():
-            raise ConfigError(f"--set {text}: write it as key=value, for example keyframe.mode=all")
-        _set(tree, _split_key(key.strip()), _parse_value(value.strip()))
-    config = _build(Config, tree, "")
-    assert isinstance(config, Config)  # narrows the type; _build returns what it is asked for
-    return config
-
-
-def parse_config(text: str) -> Config:
-    """Settings from the TOML text that `dump_config` writes.
-
-    Raises:
-        ConfigError: a key is unknown, a value has the wrong type.
-    """
-    config = _build(Config, tomllib.loads(text), "")
-    assert isinstance(config, Config)  # narrows the type; _build returns what it is asked for
-    return config
-
-
-def dump_config(config: Config) -> str:
-    """The effective configuration as TOML text that `load_config` reads back to an equal tree."""
-    lines: list[str] = []
-    _dump(config, (), lines)
-    return "\n".join(lines).strip() + "\n"
-
-
-def _split_key(text: str) -> list[str]:
-    """The parts of a dotted key; a part with a dot of its own is quoted, as in TOML."""
-    try:
-        node: Any = tomllib.loads(f"{text} = 0")
-    except tomllib.TOMLDecodeError:
-        return text.split(".")
-    keys = []
-    while isinstance(node, dict):
-        ((key, node),) = node.items()
-        keys.append(key)
-    return keys
-
-
-def _set(tree: dict[str, Any], keys: list[str], value: object) -> None:
-    for depth, key in enumerate(keys[:-1]):
-        tree = tree.setdefault(key, {})
-        if not isinstance(tree, dict):
-            raise ConfigError(f"{'.'.join(keys)}: {'.'.join(keys[: depth + 1])} is not a table")
-    tree[keys[-1]] = value
-
-
-def _parse_value(text: str) -> object:
-    """A TOML value; what is not valid TOML is taken as a string, so quotes may be left out."""
-    try:
-        return tomllib.loads(f"v = {text}")["v"]
-    except tomllib.TOMLDecodeError:
-        return text
-
-
-def _build(kind: Any, value: Any, key: str) -> Any:
-    """The value of type ``kind`` (dataclass, mapping, tuple, literal or scalar) at ``key``."""
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if dataclasses.is_dataclass(kind):
-        return _build_table(kind, value, key)
-    if origin is Literal:
-        if value not in arguments:
-            raise ConfigError(f"{key}: {value!r} is not one of {', '.join(map(str, arguments))}")
-        return value
-    if origin is Mapping:
-        if not isinstance(value, dict):
-            raise ConfigError(f"{key}: expected a table, got {value!r}")
-        return types.MappingProxyType(
-            {name: _build(arguments[1], item, f"{key}.{name}") for name, item in value.items()}
-        )
-    if origin is tuple:
-        if not isinstance(value, list | tuple):
-            raise ConfigError(f"{key}: expected a list, got {value!r}")
-        return tuple(_build(arguments[0], item, f"{key}[{i}]") for i, item in enumerate(value))
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value) if abs(value) < 2**1000 else float("inf")
-    if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
-        raise ConfigError(f"{key}: expected {kind.__name__}, got {value!r}")
-    if kind is float and not abs(value) < math.inf and not (value == math.inf and key in _INFINITE):
-        raise ConfigError(f"{key}: must be finite, got {value!r}")
-    if kind in (int, float) and "[" not in key:
-        _check_range(key, value)
-    return value
-
-
-def _check_range(key: str, value: float) -> None:
-    """Numbers are between 0 and a million, zero excluded for some, probabilities between 0 and 1.
-
-    Raises:
-        ConfigError: the value is outside.
-    """
-    name = key.rpartition(".")[2]
-    if name.endswith(("_probability", "_rate")):
-        if not 0 < value < 1:
-            raise ConfigError(f"{key}: must be between 0 and 1, got {value!r}")
-    elif value < 0:
-        raise ConfigError(f"{key}: must not be negative, got {value!r}")
-    elif value == 0 and name in _NOT_ZERO:
-        raise ConfigError(f"{key}: must be greater than 0")
-    elif value > 1e6 and key not in _INFINITE:
-        raise ConfigError(f"{key}: must not exceed a million, got {value!r}")
-
-
-#: settings that may be infinite
-_INFINITE = {"backend.horizon_s"}
-
-#: settings that divide, or weld states together, at 0
-_NOT_ZERO = {
-    "scale",
-    "split_m",
-    "hough_delta_d_m",
-    "hough_gamma_steps",
-    "range_sigma_m",
-    "max_range_m",
-    "max_distance_m",
-    "relinearize_every",
-    "relinearize_threshold",
-    "origin_sigma_m",
-    "origin_sigma_rad",
-    "given_sigma_m",
-    "given_sigma_rad",
-    "truth_sigma_m",
-    "truth_sigma_rad",
-    "wheel_radius_left_m",
-    "wheel_radius_right_m",
-    "axle_m",
-    "floor_sigma_m",
-    "floor_sigma_rad",
-    "sightings_to_promote",
-    "resolution_m",
-    "max_side_cells",
-    "gate_m",
-    "along_sigma_m",
-    "iterations",
-    "particles",
-}
-
-
-def _build_table(kind: Any, value: Any, key: str) -> Any:
-    if not isinstance(value, dict):
-        raise ConfigError(f"{key}: is a table of settings, got {value!r}")
-    hints = typing.get_type_hints(kind)
-    for name in value:
-        if name not in hints:
-            close = difflib.get_close_matches(name, hints, n=1)
-            hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(hints)}"
-            raise ConfigError(f"{f'{key}.{name}'.lstrip('.')}: unknown key; {hint}")
-    return kind(
-        **{n: _build(hints[n], item, f"{key}.{n}".lstrip(".")) for n, item in value.items()}
-    )
-
-
-def _dump(node: Any, path: tuple[str, ...], lines: list[str]) -> None:
-    items = (
-        [(f.name, getattr(node, f.name)) for f in dataclasses.fields(node)]
-        if dataclasses.is_dataclass(node)
-        else list(node.items())
-    )
-    plain = [(n, v) for n, v in items if not dataclasses.is_dataclass(v) and not _is_table(v)]
-    if path and (plain or not items):
-        lines += ["", f"[{'.'.join(map(_key, path))}]"]
-    lines += [f"{_key(name)} = {_value(value)}" for name, value in plain]
-    for name, value in items:
-        if dataclasses.is_dataclass(value) or _is_table(value):
-            _dump(value, (*path, name), lines)
-
-
-def _is_table(value: object) -> bool:
-    return isinstance(value, Mapping)
-
-
-def _key(name: str) -> str:
-    bare = name.replace("_", "").replace("-", "")
-    return name if bare.isalnum() and bare.isascii() else _quote(name)
-
-
-def _quote(text: str) -> str:
-    # JSON's escapes are TOML's as well, and DEL is the one control character that JSON leaves alone
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, tuple):
-        return f"[{', '.join(map(_value, value))}]"
-    return _quote(value) if isinstance(value, str) else repr(value)

@@ -200,7 +200,7 @@ def nominal_calibration(source: str, config: OdometryConfig, mounted: bool) -> C
             "laser_yaw_rad": config.laser_sigma_rad,
             "laser_latency_s": config.laser_latency_sigma_s,
         }
-    known = [0.0 if name in config.fixed else sigma for name, sigma in sigmas.items()]
+    known = [0.0 if name in config.fixed_calibration else sigma for name, sigma in sigmas.items()]
     # a parameter whose sigma is 0 is held, without making the covariance singular
     values = np.maximum(np.array(known, dtype=float), 1e-9)
     return Calibration(tuple(sigmas), np.zeros(len(values)), np.diag(values**2))

@@ -268,7 +268,7 @@ class CompressedBackend(Isam2Backend):
 
 
 class BatchBackend(CompressedBackend):
-    """The converged limit, whatever `backend.polish` says; associations as with iSAM2."""
+    """The converged limit, whatever `backend.optimise_at_end` says; associations as with iSAM2."""
 
     def finish(self) -> Estimate:
         """See `Backend`."""

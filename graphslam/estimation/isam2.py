@@ -250,7 +250,7 @@ class Isam2Backend(GraphBackend):
 
         What is asked afterwards, a joint marginal for example, is answered at that estimate.
         """
-        if self._config.backend.polish:
+        if self._config.backend.optimise_at_end:
             return self._result(self._optimised(self._isam.calculateBestEstimate()))
         return self._result(self._converged())
 

@@ -3,7 +3,8 @@
 import json
 from pathlib import Path
 
-from graphslam.core.config import Config, dump_config
+from graphslam.core.config import Config
+from graphslam.core.config_io import dump_config
 from graphslam.results.folder import check_target, to_json, write_folder
 from graphslam.results.report_comparison import Comparison, render_comparison
 

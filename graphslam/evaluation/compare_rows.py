@@ -95,7 +95,7 @@ def compare(
             bool(one.row["final_is_causal"]),
         ),
     )
-    warnings: list[str] = []
+    warnings = [text for variant in rows for text in variant.config.warnings]
     for one in done:
         one.judge(truth, relations, reference, warnings)
     given = config.start.from_truth or bool(config.start.poses)
@@ -116,7 +116,7 @@ def compare(
         "start_given": given,
         "reference": reference.variant.spec,
         "rows": [run.row for run in runs],
-        "warnings": [*log.warnings, *dict.fromkeys(warnings)],
+        "warnings": list(dict.fromkeys([*log.warnings, *warnings])),
     }
     lanes = [one.lane(known, reference, in_place=given) for one in done]
     return Comparison(found, tuple(lanes), {name: t.poses[:, :2] for name, t in known.items()})

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from graphslam.core.config import Config, load_config
+from graphslam.core.config import Config
+from graphslam.core.config_io import load_config
 from graphslam.core.errors import ConfigError
 from graphslam.estimation.backends import BACKENDS
 

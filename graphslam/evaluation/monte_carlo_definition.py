@@ -10,7 +10,8 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from graphslam.core.config import Config, load_config
+from graphslam.core.config import Config
+from graphslam.core.config_io import load_config
 from graphslam.core.errors import ConfigError
 from graphslam.simulation import load_scenario
 from graphslam.simulation.errors import ScenarioError

@@ -46,7 +46,8 @@ def summarise(definition: Definition, rows: Sequence[Row]) -> dict[str, Any]:
         if row["error"]:
             errors[f"{row['variant']}: {row['error']}"] += 1
     codes = sorted({row["code"] for row in rows})
-    warnings = []
+    settings = [text for name in definition.variants for text in definition.config(name).warnings]
+    warnings = list(dict.fromkeys(settings))
     if len(codes) > 1:
         warnings.append(f"the rows are of {len(codes)} versions of the code: {', '.join(codes)}")
     if errors:

@@ -35,7 +35,7 @@ RANGE_SIGMA_M, RANGE_SIGMA_SHARE = 0.05, 0.03
 #: after 0.1 to 0.3 s, not always the same, so a turn of some tenths of a rad misses by some
 #: hundredths; speeds are met to a few per cent.
 COMMANDED = {
-    "odometry.commanded": "true",
+    "odometry.commanded_velocities": "true",
     "odometry.k_x_m": "2e-3",
     "odometry.k_y_m": "5e-4",
     "odometry.k_phi_m": "2e-3",

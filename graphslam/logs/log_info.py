@@ -119,7 +119,7 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
         LogError: a file is missing, not MCAP or without a message.
     """
     files = [open_mcap(Path(path)) for path in paths]
-    warnings = [describe_damage(file) for file in files if file.damage]
+    warnings = [*config.warnings, *(describe_damage(file) for file in files if file.damage)]
     topics: list[Topic] = []
     chosen: list[Topic] = []
     problem = ""

@@ -150,7 +150,12 @@ def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
         files=tuple(LogFile(f.path, f.sha256, f.messages, f.lost) for f in files),
         topics=tuple(topics),
         notes=notes,
-        warnings=[describe_damage(file) for file in files if file.damage] + warnings + assumed,
+        warnings=[
+            *config.warnings,
+            *(describe_damage(file) for file in files if file.damage),
+            *warnings,
+            *assumed,
+        ],
         dropped=Counter(),
         repaired=Counter(),
         _mcap=files,

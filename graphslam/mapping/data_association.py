@@ -284,7 +284,7 @@ class Associator:
     def _book(self, image: Image, chosen: dict[int, int]) -> tuple[Association, ...]:
         """Turn the choices into associations; make, promote and reject."""
         pairs, compared, pose = image.pairs, image.compared, image.joint.pose
-        new_gate = gate_distance(self._config.new_probability, np.maximum(compared.dof, 1))
+        new_gate = gate_distance(self._config.new_landmark_probability, np.maximum(compared.dof, 1))
         close = image.recent & (compared.d2 < new_gate)
         out: list[Association] = []
         for n, seen in enumerate(image.seen):

@@ -287,7 +287,7 @@ class RobotDetector:
         if not used:
             return found.sightings
         self._count("robot", scan, found.scan)
-        if self._config.moving == "keep":
+        if self._config.dynamic_objects == "keep":
             return (found.scan, *found.sightings)
         if found.scan is not scan:
             sweep = make_sweep(found.scan, self._config.max_range_m)

@@ -100,7 +100,7 @@ class Readings:
         else:
             value = np.array([message.left_rad, message.right_rad])
         if not self._count:
-            poses = "commands" if self._config.commanded else "odometry"
+            poses = "commands" if self._config.commanded_velocities else "odometry"
             self._begin("wheels" if isinstance(message, WheelAngles) else poses, message.time_ns)
             self._last = value
         elif message.time_ns > self.last_ns:

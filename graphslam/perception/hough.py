@@ -236,7 +236,7 @@ def _borders(rows: Indices, direction: float, sweep: Sweep, config: FrontEndConf
     along = sweep.points[rows] @ np.array((math.cos(direction), math.sin(direction)))
     beam = sweep.beam[rows]
     r = sweep.ranges[beam]
-    gap = config.gap_m + config.gap_share * np.minimum(r[1:], r[:-1])
+    gap = config.gap_m + config.gap_ratio * np.minimum(r[1:], r[:-1])
     between = (rows[1:] - rows[:-1] > 1) | (beam[1:] - beam[:-1] > MISSING_BEAMS + 1)
     ends = np.flatnonzero((np.abs(along[1:] - along[:-1]) > gap) & between) + 1
     return np.concatenate(([0], ends, [len(rows)]))

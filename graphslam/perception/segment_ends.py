@@ -34,7 +34,7 @@ def fully_visible(
         first: (m,) beam of each segment's first point, in increasing order.
         last: (m,) beam of its last point.
         fits: the m lines, laser frame.
-        config: ``split_m``, ``gap_m`` and ``gap_share``.
+        config: ``split_m``, ``gap_m`` and ``gap_ratio``.
 
     Returns:
         (m,) True where neither end is cut off or unknown.
@@ -79,7 +79,7 @@ def _ends_real(
     offset = y * np.cos(direction) - x * np.sin(direction)
     from_line = after * np.sin(sweep.angles[beams[..., 1:]] - direction) - offset
     end = r[..., :1]
-    far = np.abs(after - end) > config.gap_m + config.gap_share * end
+    far = np.abs(after - end) > config.gap_m + config.gap_ratio * end
     goes_on = far & (np.abs(from_line) < 2 * config.split_m)
     cut = np.isnan(after) | occluded | goes_on
     return np.asarray(~cut.any(axis=(0, 2)))

@@ -153,7 +153,7 @@ def _chain_starts(sweep: Sweep, config: FrontEndConfig) -> Indices:
     dx, dy = x[1:] - x[:-1], y[1:] - y[:-1]
     length = np.sqrt(dx * dx + dy * dy)
     r = sweep.ranges[sweep.beam]
-    cut = length > config.gap_m + config.gap_share * np.minimum(r[1:], r[:-1])
+    cut = length > config.gap_m + config.gap_ratio * np.minimum(r[1:], r[:-1])
     aside = np.abs(dx[:-1] * dy[1:] - dy[:-1] * dx[1:])  # how far off straight, times the base
     ahead = dx[:-1] * dx[1:] + dy[:-1] * dy[1:] > 0
     into, out_of = length[:-1], length[1:]

@@ -15,7 +15,8 @@ from urllib.parse import quote, unquote
 
 import numpy as np
 
-from graphslam.core.config import Config, dump_config, load_config
+from graphslam.core.config import Config
+from graphslam.core.config_io import dump_config, load_config
 from graphslam.core.errors import OutputError
 from graphslam.core.geometry import Array
 from graphslam.core.output_folder import atomic_folder

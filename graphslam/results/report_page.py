@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.core.config import Config, dump_config
+from graphslam.core.config import Config
+from graphslam.core.config_io import dump_config
 from graphslam.core.records import Result
 from graphslam.results import report_maps as maps
 from graphslam.results import report_plots as plots

@@ -95,7 +95,7 @@ def estimate_start_poses(
         return joined({}, (), ((), {}))
     apart = PriorKnowledge(FrameAssignment.separate_frames(log.robots, own), recorded, names)
     pipeline = Pipeline(log, replace(config, backend=BackendConfig()), apart)
-    shapes = outlines(log, config) if config.association.robots != "ignore" else {}
+    shapes = outlines(log, config) if config.association.robot_sightings != "ignore" else {}
     pipeline.kept = ScanBuffer({name: run.track for name, run in pipeline.runs.items()}, shapes)
     pipeline.run(lambda _count: None)
     if not pipeline.steps:

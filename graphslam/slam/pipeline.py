@@ -153,7 +153,7 @@ class Pipeline:
         # one robot has nobody to share a step with, and a scan makes its own
         alone = len(tracks) < 2 or any(map(self.log.has_scans, tracks))
         alone |= self.config.keyframe.mode == "all"
-        span_ns = 0 if alone else round(1e9 * self.config.keyframe.gather_s)
+        span_ns = 0 if alone else round(1e9 * self.config.keyframe.sighting_window_s)
         max_gap_ns = round(1e9 * self.config.odometry.max_gap_s)
         clock = time.perf_counter()
         for event in batch_sightings(events(messages), tracks, span_ns, max_gap_ns):
@@ -170,7 +170,7 @@ class Pipeline:
 
     def wanted(self, messages: Iterable[Message]) -> Iterator[Message]:
         """Messages under right names, without sightings of robots where these are to be ignored."""
-        ignore = self.config.association.robots == "ignore"
+        ignore = self.config.association.robot_sightings == "ignore"
         for recorded in messages:
             message = recorded
             if self.known.names and isinstance(message, Sighting):
@@ -178,7 +178,7 @@ class Pipeline:
             if isinstance(message, Sighting) and message.seen_robot == message.robot:
                 self.dropped["sighting: a robot does not see itself"] += 1
             elif ignore and isinstance(message, Sighting) and message.seen_robot is not None:
-                self.dropped["sighting: of a robot, ignored by association.robots"] += 1
+                self.dropped["sighting: of a robot, ignored by association.robot_sightings"] += 1
             elif self.frames.crosses_frames(message):
                 kind = type(message).__name__.lower()
                 self.dropped[f"{kind}: of a robot in a frame of its own"] += 1
@@ -289,7 +289,7 @@ class Pipeline:
         if isinstance(first, Scan):
             self.kept.add(first)
             event = self.watcher.process(first, used, self.has_started)
-            if self.config.association.robots == "ignore":
+            if self.config.association.robot_sightings == "ignore":
                 event = [m for m in event if isinstance(m, Scan)]
         elif not used:
             event = ()
@@ -552,15 +552,19 @@ class Pipeline:
                 run.causal_covs.append(self.backend.joint(robot, []).cov)
 
     def estimate(self) -> tuple[Estimate, bool]:
-        """What the back end has at the end, and whether that is only where `reconsider` begins."""
+        """What the back end has at the end, and whether that is only where `reoptimise` begins."""
         settings = self.config.backend
-        if isinstance(self.backend, Isam2Backend) and settings.polish and settings.reconsider:
+        if (
+            isinstance(self.backend, Isam2Backend)
+            and settings.optimise_at_end
+            and settings.reoptimise
+        ):
             return self.backend.current_estimate(), True
         return self.backend.finish(), False
 
     @property
     def is_refined(self) -> bool:
-        """Whether `reconsider` is `refining`, which is quick, and not `consolidating`."""
+        """Whether `reoptimise` is `refining`, which is quick, and not `consolidating`."""
         return bool(self.sources)
 
     def reoptimise(self, estimate: Estimate) -> Estimate:

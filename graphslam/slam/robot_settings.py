@@ -5,7 +5,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import TypeVar
 
-from graphslam.core.config import Config, KeyframeConfig, OdometryConfig, RobotConfig, load_config
+from graphslam.core.config import Config, KeyframeConfig, OdometryConfig, RobotConfig
+from graphslam.core.config_io import load_config
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam.logs import LogSet

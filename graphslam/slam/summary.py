@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from graphslam import __version__
-from graphslam.core.config import Config, dump_config
+from graphslam.core.config import Config
+from graphslam.core.config_io import dump_config
 from graphslam.core.geometry import Array, transform
 from graphslam.core.records import Estimate, Landmark
 from graphslam.estimation.clock_calibration import ClockEstimate

@@ -19,7 +19,7 @@ from paths import ROOT
 from synthetic_results import cast, corners
 
 from graphslam.cli import main, terminal
-from graphslam.core.config import load_config
+from graphslam.core.config_io import load_config
 from graphslam.core.geometry import between, compose
 from graphslam.logs import IMPORTERS, LogWriter
 from graphslam.results.folder import load, read_trajectory
@@ -278,7 +278,9 @@ def test_a_horizon_is_refused_where_it_would_do_nothing(chosen, tmp_path):
 
 def test_options_become_settings_over_the_file_and_set_has_the_last_word(room, tmp_path):
     file = tmp_path / "c.toml"
-    file.write_text("[backend]\nname = 'batch'\npolish = false\n[keyframe]\ndistance_m = 0.5\n")
+    file.write_text(
+        "[backend]\nname = 'batch'\noptimise_at_end = false\n[keyframe]\ndistance_m = 0.5\n"
+    )
     done = call(
         *("smooth", room.log, "-o", tmp_path / "out", "--config", file, "--backend"),
         *("dead-reckoning", "--front-end", "none", "--start", "robot=1,-2,0.5"),
@@ -286,12 +288,22 @@ def test_options_become_settings_over_the_file_and_set_has_the_last_word(room, t
     )
     assert done.code == 0, done.err
     written = load_config(tmp_path / "out" / "config.toml")
-    assert (written.backend.name, written.backend.polish) == ("dead-reckoning", False)
+    assert (written.backend.name, written.backend.optimise_at_end) == ("dead-reckoning", False)
     assert written.front_end.name == "none"
     assert written.keyframe.distance_m == 0.7
     assert dict(written.start.poses) == {"robot": (1.0, -2.0, 0.5)}
     first = read_trajectory(tmp_path / "out/trajectories/robot.tum").poses[0]
     np.testing.assert_allclose(first, [1, -2, 0.5], atol=1e-3)
+
+
+def test_an_old_key_is_used_and_its_new_name_is_said_once(room, tmp_path):
+    out = tmp_path / "out"
+    done = call("smooth", room.log, "-o", out, "--set", "backend.polish=false")
+    assert done.code == 0, done.err
+    said = "backend.polish is now called backend.optimise_at_end"
+    assert done.out.count(said) == 1
+    assert json.loads((out / "summary.json").read_text())["warnings"].count(said) == 1
+    assert load_config(out / "config.toml").backend.optimise_at_end is False
 
 
 # ---------------------------------------------------------------- what goes wrong
@@ -347,7 +359,10 @@ def test_a_bad_log_is_one_line_and_leaves_nothing(case, tmp_path):
 BAD_OPTIONS = {
     "unknown key": (("--set", "keyframe.distanse_m=1"), "unknown key; did you mean distance_m"),
     "no value": (("--set", "keyframe"), "write it as key=value"),
-    "wrong type": (("--set", "backend.polish=3"), "backend.polish: expected bool"),
+    "wrong type": (
+        ("--set", "backend.optimise_at_end=3"),
+        "backend.optimise_at_end: expected bool",
+    ),
     "no config file": (("--config", "missing.toml"), "missing.toml: cannot be read"),
     "start of a stranger": (
         ("--start", "nobody=1,2,3"),

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import pickle
 import typing
 from pathlib import Path
 
@@ -10,10 +11,30 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graphslam.core import config as module
-from graphslam.core.config import Config, RobotConfig, dump_config, load_config
+from graphslam.core.config import Config, RobotConfig
+from graphslam.core.config_io import (
+    RENAMED_KEYS,
+    dump_config,
+    load_config,
+    parse_config,
+    settings_of,
+)
 from graphslam.core.errors import ConfigError
 
-TABLES = {f.name: f.default_factory for f in dataclasses.fields(Config) if f.name != "robots"}
+TABLES = {name: kind for name, kind in settings_of(Config).items() if name != "robots"}
+
+#: a value of the type of each renamed key, by its present name, that is not the default
+RENAMED_VALUES = {
+    "association.new_landmark_probability": "0.999",
+    "association.robot_sightings": "'ignore'",
+    "backend.optimise_at_end": "false",
+    "backend.reoptimise": "false",
+    "front_end.dynamic_objects": "'keep'",
+    "front_end.gap_ratio": "0.07",
+    "keyframe.sighting_window_s": "0.5",
+    "odometry.commanded_velocities": "true",
+    "odometry.fixed_calibration": "['axle_m']",
+}
 
 
 def from_text(tmp_path, text):
@@ -40,7 +61,7 @@ def one_line(error):
         ("robots.r.lazer=[0,0,0]", "robots.r.lazer: unknown key; did you mean laser?"),
         ("keyframe.distance_m=far", "keyframe.distance_m: expected float, got 'far'"),
         ("keyframe.distance_m=true", "keyframe.distance_m: expected float, got True"),
-        ("backend.polish=1", "backend.polish: expected bool, got 1"),
+        ("backend.optimise_at_end=1", "backend.optimise_at_end: expected bool, got 1"),
         ("front_end.min_points=2.5", "front_end.min_points: expected int, got 2.5"),
         ("front_end.min_points=true", "front_end.min_points: expected int, got True"),
         ("robust.scale=-1", "robust.scale: must not be negative, got -1.0"),
@@ -132,7 +153,7 @@ def test_set_wins_over_the_file_and_the_file_over_the_default(tmp_path):
         (' keyframe.mode = "all" ', lambda c: c.keyframe.mode, "all"),
         ("keyframe.distance_m=1", lambda c: c.keyframe.distance_m, 1.0),
         ("keyframe.distance_m=1e-3", lambda c: c.keyframe.distance_m, 1e-3),
-        ("backend.polish=false", lambda c: c.backend.polish, False),
+        ("backend.optimise_at_end=false", lambda c: c.backend.optimise_at_end, False),
         ("front_end.min_points=9", lambda c: c.front_end.min_points, 9),
         ("robots.r.laser=[0.1, -2, 0]", lambda c: c.robot("r").laser, (0.1, -2.0, 0.0)),
         ("robots.r.left_joint=a=b", lambda c: c.robot("r").left_joint, "a=b"),
@@ -196,7 +217,7 @@ def values(kind):
 
 
 def tables(kind):
-    hints = typing.get_type_hints(kind)
+    hints = settings_of(kind)
     odds = {name for name in hints if name.endswith(("_probability", "_rate"))}
     strategies = {name: values(hint) for name, hint in hints.items() if name not in odds}
     strategies |= {name: st.floats(1e-9, 1 - 1e-9) for name in odds}
@@ -207,11 +228,7 @@ def tables(kind):
 def test_dump_then_load_is_the_same_configuration(config):
     """config.toml in a result folder repeats the run: every type, to the last digit of every
     float."""
-    import tomllib
-
-    text = dump_config(config)
-    tree = tomllib.loads(text)
-    assert module._build(Config, tree, "") == config
+    assert parse_config(dump_config(config)) == config
 
 
 def test_the_default_configuration_survives_a_file(tmp_path):
@@ -226,13 +243,85 @@ def test_the_dump_names_every_setting():
             assert field.name in text or field.type == "Mapping[str, str]", (table, field.name)
 
 
+# ------------------------------------------------------------ renamed keys
+
+
+def setting(config, key):
+    table, name = key.split(".")
+    return getattr(getattr(config, table), name)
+
+
+@pytest.mark.parametrize("form", ["override", "table override", "file"])
+@pytest.mark.parametrize(("old", "new"), RENAMED_KEYS.items())
+def test_an_old_key_sets_the_new_one_with_one_warning(tmp_path, old, new, form):
+    value = RENAMED_VALUES[new]
+    table, key = old.split(".")
+    if form == "file":
+        config = from_text(tmp_path, f"[{table}]\n{key} = {value}\n")
+    elif form == "override":
+        config = load_config(overrides=[f"{old}={value}"])
+    else:
+        config = load_config(overrides=[f"{table}={{{key} = {value}}}"])
+    expected = load_config(overrides=[f"{new}={value}"])
+    assert setting(config, new) != setting(Config(), new)
+    assert (config, expected.warnings) == (expected, ())
+    assert config.warnings == (f"{old} is now called {new}",)
+
+
+def test_an_old_key_in_the_file_and_among_the_overrides_is_one_warning(tmp_path):
+    path = tmp_path / "c.toml"
+    path.write_text("[keyframe]\ngather_s = 0.1\n", encoding="utf-8")
+    config = load_config(path, ["keyframe.gather_s=0.2", "keyframe.gather_s=0.3"])
+    assert config.keyframe.sighting_window_s == 0.3
+    assert config.warnings == ("keyframe.gather_s is now called keyframe.sighting_window_s",)
+
+
+def test_an_override_by_the_new_name_wins_over_a_file_with_the_old_one(tmp_path):
+    """The config.toml of an older result, repeated with one setting changed."""
+    path = tmp_path / "c.toml"
+    path.write_text("[backend]\npolish = true\n", encoding="utf-8")
+    config = load_config(path, ["backend.optimise_at_end=false"])
+    assert config.backend.optimise_at_end is False
+    assert len(config.warnings) == 1
+
+
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize(("old", "new"), RENAMED_KEYS.items())
+def test_a_setting_by_both_names_is_refused(tmp_path, old, new, first):
+    value = RENAMED_VALUES[new]
+    both = [f"{old}={value}", f"{new}={value}"]
+    says = f"{old}: is the old name of {new}, which is given too"
+    with pytest.raises(ConfigError) as error:
+        load_config(overrides=[both[first], both[1 - first]])
+    assert one_line(error) == says
+    with pytest.raises(ConfigError) as error:
+        from_text(tmp_path, "\n".join([both[first], both[1 - first]]))
+    assert one_line(error) == says
+
+
+def test_old_names_are_no_settings_and_new_ones_are():
+    for old, new in RENAMED_KEYS.items():
+        (table, key), (new_table, new_key) = old.split("."), new.split(".")
+        assert table == new_table
+        assert new_key in settings_of(TABLES[table]) and key not in settings_of(TABLES[table])
+
+
+def test_warnings_are_no_setting_and_reach_another_process():
+    with pytest.raises(ConfigError, match="warnings: unknown key"):
+        load_config(overrides=["warnings=['a']"])
+    config = load_config(overrides=["backend.polish=false", "robots.a.axle_m=1"])
+    assert "warnings" not in dump_config(config)
+    again = pickle.loads(pickle.dumps(config))
+    assert (again, again.warnings) == (config, config.warnings)
+
+
 # ------------------------------------------------------------ the tree itself
 
 
 @pytest.mark.parametrize("table", sorted(TABLES))
 def test_every_float_bears_its_unit(table):
-    """Metres, radians or seconds at the end of the name; or a share, a scale or a probability."""
-    plain = ("share", "scale", "probability", "rate", "threshold", "sigma")
+    """Metres, radians or seconds at the end of the name; or a ratio, a scale or a probability."""
+    plain = ("ratio", "scale", "probability", "rate", "threshold", "sigma")
     for field in dataclasses.fields(TABLES[table]):
         if isinstance(field.default, float):
             unit = field.name.rsplit("_", 1)[-1]

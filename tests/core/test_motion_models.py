@@ -516,7 +516,7 @@ def test_many_motions_at_once_are_the_single_ones(kind, mounted):
     """Forth and back, inside readings and beyond both ends; a lever arm from the wrong end, or the
     time of another clock, breaks it."""
     rng = np.random.default_rng(8)
-    config = OdometryConfig(commanded=kind == "commands")
+    config = OdometryConfig(commanded_velocities=kind == "commands")
     track = Track(config, ROBOT, mounted=mounted)
     steps = rng.uniform(-0.02, 0.1, size=(200, 2))
     steps[60:90] = 0.0  # it stands for a while
@@ -558,7 +558,7 @@ def fleet(rng):
     """Tracks of several kinds, nothing read yet, and 150 readings of each."""
     tracks, readings = [], []
     for kind in ("odometry", "commands", "commands", "wheels", "wheels", "given"):
-        config = OdometryConfig(commanded=kind == "commands")
+        config = OdometryConfig(commanded_velocities=kind == "commands")
         robot = replace(ROBOT, axle_m=rng.uniform(0.4, 0.7))
         tracks.append(Track(config, robot, mounted=kind != "given"))
         steps = rng.uniform(-0.02, 0.1, size=(150, 2))

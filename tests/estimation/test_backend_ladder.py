@@ -559,7 +559,9 @@ def test_isam2_with_everything_relinearised_is_batch_after_empty_updates(monkeyp
         return found
 
     monkeypatch.setattr(isam2, "isam2_parameters", exact)
-    backend = configured("isam2", relinearize_threshold=0.0, relinearize_every=1, polish=False)
+    backend = configured(
+        "isam2", relinearize_threshold=0.0, relinearize_every=1, optimise_at_end=False
+    )
     for step in drive(4):
         backend.add(step)
     graph = backend.builder.graph

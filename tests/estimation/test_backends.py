@@ -264,7 +264,7 @@ def test_isam2_converges_to_batch(scenario):
     together."""
     steps = without_lines(scenario[0])
     batch = run("batch", steps).finish()
-    exact = BackendConfig(polish=False, relinearize_threshold=0.0, relinearize_every=1)
+    exact = BackendConfig(optimise_at_end=False, relinearize_threshold=0.0, relinearize_every=1)
     estimate = run("isam2", steps, Config(robust=PLAIN.robust, backend=exact)).finish()
     for robot in ("a", "b"):
         np.testing.assert_allclose(
@@ -281,7 +281,9 @@ def test_isam2_with_default_thresholds_is_near_batch(scenario):
     rad are not linearised anew), and causally, before convergence, within a tenth."""
     steps, _ = scenario
     batch = run("batch", steps).finish()
-    backend = run("isam2", steps, Config(robust=PLAIN.robust, backend=BackendConfig(polish=False)))
+    backend = run(
+        "isam2", steps, Config(robust=PLAIN.robust, backend=BackendConfig(optimise_at_end=False))
+    )
     causal, estimate = backend.joint("b", []), backend.finish()
     for robot in ("a", "b"):
         sigmas = np.sqrt(np.diagonal(batch.states[robot].covs, axis1=1, axis2=2))

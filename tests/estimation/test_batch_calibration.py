@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from graphslam.core.config import CalibrationParameter, OdometryConfig, RobotConfig, load_config
+from graphslam.core.config import CalibrationParameter, OdometryConfig, RobotConfig
+from graphslam.core.config_io import load_config
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import between, wrap
 from graphslam.core.motion_models import nominal_calibration
@@ -115,7 +116,7 @@ def test_a_fixed_parameter_stays_and_the_others_are_found(tmp_path):
     not called observable; drift and latency, which are off, are found beside them."""
     errors = {"drift_rad_per_m": 0.02, "laser_latency_s": 0.05}
     scenario, laser = wrong(load_scenario("lab"), errors)
-    fixed = "odometry.fixed=['translation_scale', 'laser_y_m']"
+    fixed = "odometry.fixed_calibration=['translation_scale', 'laser_y_m']"
     found = run(scenario, 7, tmp_path, laser, fixed).found
     for name in ("translation_scale", "laser_y_m"):
         assert found[name] == {"value": 0.0, "sigma": 0.0, "observable": False}
@@ -132,11 +133,13 @@ def test_every_parameter_can_be_fixed():
     assert names == set(typing.get_args(CalibrationParameter))
     for source in sources:
         for name in nominal_calibration(source, config, True).names:
-            held = nominal_calibration(source, replace(config, fixed=(name,)), True)
+            held = nominal_calibration(source, replace(config, fixed_calibration=(name,)), True)
             small = np.sqrt(np.diag(held.cov)) < 1e-6
             assert [n for n, is_small in zip(held.names, small, strict=True) if is_small] == [name]
-    with pytest.raises(ConfigError, match=r"odometry.fixed\[0\]: 'wheel' is not one of"):
-        load_config(overrides=["odometry.fixed=['wheel']"])
+    with pytest.raises(
+        ConfigError, match=r"odometry.fixed_calibration\[0\]: 'wheel' is not one of"
+    ):
+        load_config(overrides=["odometry.fixed_calibration=['wheel']"])
 
 
 def test_what_odometry_does_not_cover_is_no_standstill():

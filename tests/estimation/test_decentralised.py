@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_backends import MOTION_COV, PLAIN, assert_covariance, motion, see, two_robots
 
-from graphslam.core.config import load_config
+from graphslam.core.config_io import load_config
 from graphslam.core.geometry import compose
 from graphslam.core.records import Association, Start, Step
 from graphslam.estimation.backends import BACKENDS

@@ -7,7 +7,8 @@ import pytest
 from scipy.stats import multivariate_normal
 from test_backends import MOTION_COV, PLAIN, WORLD, motion, run, see, two_robots
 
-from graphslam.core.config import ConfigError, RbpfConfig, load_config
+from graphslam.core.config import ConfigError, RbpfConfig
+from graphslam.core.config_io import load_config
 from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import compose
 from graphslam.core.observation_models import MODELS

@@ -13,7 +13,8 @@ import pytest
 from test_cli import call, check_one_line, drive
 
 import graphslam.evaluation.compare_rows
-from graphslam.core.config import Config, load_config
+from graphslam.core.config import Config
+from graphslam.core.config_io import load_config
 from graphslam.core.errors import ConfigError, EstimationError, LogError, OutputError
 from graphslam.estimation.backends import BACKENDS
 from graphslam.evaluation.compare_folder import is_comparison, save_comparison
@@ -85,7 +86,7 @@ def assert_equal_numbers(one, other):
 def test_a_row_is_what_smooth_and_evaluate_say(two, mode, backend):
     """Breaks if states become trajectories or landmarks in another way than in `smooth`: another
     mount, another world, another calibration. Reconsidering is no part of a back end."""
-    config = load_config(None, [*START, f"backend.name={backend}", "backend.reconsider=false"])
+    config = load_config(None, [*START, f"backend.name={backend}", "backend.reoptimise=false"])
     alone = evaluate(
         smooth(open_logs([two.path], config), config), two.truth.trajectories, two.truth.landmarks
     )

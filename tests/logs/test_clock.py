@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from robots_in_scans import both, true_offset_s
 
-from graphslam.core.config import load_config
+from graphslam.core.config_io import load_config
 from graphslam.core.geometry import between, compose, exp
 from graphslam.core.records import OdometryIncrement, OdometryPose
 from graphslam.logs import LogWriter, open_logs

@@ -73,7 +73,7 @@ def test_the_log_says_that_its_odometry_is_commanded(folder, tmp_path):
     imported(folder, tmp_path / "log.mcap")
     notes = open_logs([tmp_path / "log.mcap"], Config()).notes
     found = odometry_settings(OdometryConfig(k_x_m=0.5), notes)
-    assert found.commanded
+    assert found.commanded_velocities
     assert found.k_x_m == 0.5
     assert found.k_phi_rad == float(COMMANDED["odometry.k_phi_rad"]) != OdometryConfig().k_phi_rad
     assert odometry_settings(OdometryConfig(), {"format": "carmen"}) == OdometryConfig()

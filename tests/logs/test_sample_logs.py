@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from paths import LOGS
 
-from graphslam.core.config import load_config
+from graphslam.core.config_io import load_config
 from graphslam.core.records import OdometryPose, Scan, Sighting
 from graphslam.logs import open_logs, read_true_associations, read_truth
 from graphslam.simulation import SCENARIOS, load_scenario, simulate

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from paths import DATA
 
-from graphslam.core.config import load_config
+from graphslam.core.config_io import load_config
 from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import between, compose, exp, wrap
 from graphslam.core.records import Trajectory

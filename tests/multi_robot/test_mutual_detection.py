@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graphslam.core.config import OdometryConfig, RobotConfig, load_config
+from graphslam.core.config import OdometryConfig, RobotConfig
+from graphslam.core.config_io import load_config
 from graphslam.core.geometry import compose, compose_jacobians, exp, wrap
 from graphslam.core.records import OdometryPose, Scan, Trajectory
 from graphslam.evaluation.metrics import evaluate
@@ -249,7 +250,7 @@ def test_a_robot_that_nobody_sees_keeps_a_frame_of_its_own(tmp_path):
 def test_sightings_of_robots_may_be_ignored(tmp_path):
     log = recorded(tmp_path, {"a": A, "b": B})
     config = settings({"a": A}, ["a"], ["b"])
-    config = replace(config, association=replace(config.association, robots="ignore"))
+    config = replace(config, association=replace(config.association, robot_sightings="ignore"))
     found = initialise(open_logs([log], config), config).joined
     assert found.frames == {"a": "a", "b": "b"}
 

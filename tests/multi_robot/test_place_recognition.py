@@ -10,7 +10,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from graphslam.core.config import AssociationConfig, load_config
+from graphslam.core.config import AssociationConfig
+from graphslam.core.config_io import load_config
 from graphslam.core.geometry import between, compose, inverse, transform, wrap
 from graphslam.core.records import Start
 from graphslam.evaluation.metrics import evaluate

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graphslam.core.config import ConfigError, load_config
+from graphslam.core.config import ConfigError
+from graphslam.core.config_io import load_config
 from graphslam.core.geometry import between, compose, wrap
 from graphslam.core.records import Scan
 from graphslam.logs import open_logs
@@ -258,7 +259,7 @@ def test_no_landmark_is_made_of_a_robot(tmp_path):
 def test_what_moves_leaves_the_scans(tmp_path):
     """Nobody knows its outline, but where it is now the laser looked through before."""
     scenario = beside((7.0, -6.0), (7.0, 2.0), 0.5)
-    kept, told = inside(tmp_path, scenario, "front_end.moving=keep")
+    kept, told = inside(tmp_path, scenario, "front_end.dynamic_objects=keep")
     found, summary = inside(tmp_path, scenario)
     assert found <= kept
     assert not [reason for reason in told["dropped"] if "moves" in reason]

@@ -6,7 +6,7 @@ from scipy.stats import chi2
 from test_scan_matching import CORRIDOR, ROOM, cloud
 from wrong_odometry import CHANGES, recorded, run
 
-from graphslam.core.config import load_config
+from graphslam.core.config_io import load_config
 from graphslam.core.geometry import compose, wrap
 from graphslam.core.records import Motion, Observation
 from graphslam.logs import open_logs

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from test_front_ends import cast, ends, make_scan, near, normal_cov, normal_error, see
 
-from graphslam.core.config import FrontEndConfig, load_config
+from graphslam.core.config import FrontEndConfig
+from graphslam.core.config_io import load_config
 from graphslam.core.geometry import rotation, wrap
 from graphslam.logs import open_logs
 from graphslam.perception.front_ends import FRONT_ENDS

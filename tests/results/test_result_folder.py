@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from synthetic_results import START_NS, orchard, room
 
-from graphslam.core.config import Config, load_config
+from graphslam.core.config import Config
+from graphslam.core.config_io import load_config
 from graphslam.core.errors import OutputError
 from graphslam.core.geometry import rotate_cov, wrap
 from graphslam.core.observation_models import MODELS

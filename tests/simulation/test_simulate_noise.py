@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from graphslam.core.config import load_config
+from graphslam.core.config_io import load_config
 from graphslam.core.geometry import between, compose, wrap
 from graphslam.core.records import OdometryPose, Scan, Sighting, WheelAngles
 from graphslam.logs import open_logs, read_truth

@@ -9,7 +9,7 @@ import pytest
 from paths import ROOT
 from test_cli import call
 
-from graphslam.core.config import load_config
+from graphslam.core.config_io import load_config
 from graphslam.core.records import OdometryPose, Scan, Sighting
 from graphslam.logs import LogWriter, open_logs, read_true_associations, read_truth
 from graphslam.simulation import SCENARIOS, ScenarioError, load_scenario, simulate

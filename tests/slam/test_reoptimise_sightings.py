@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from graphslam.core.config import load_config
+from graphslam.core.config_io import load_config
 from graphslam.core.geometry import between, compose, exp
 from graphslam.logs import LogWriter, open_logs
 from graphslam.slam.smooth import smooth
@@ -12,7 +12,11 @@ S, T0 = 1_000_000_000, 10_000_000_000
 LATENCY_S, LOSS_M2, SCALE = 0.2, 0.02, 0.95
 LANDMARKS = {str(k): (3 * np.cos(k), 3 * np.sin(k)) for k in range(10, 16)}
 STARTS = {"a": (0.0, 0.0, 0.0), "b": (1.0, -1.0, 2.0)}
-NOTES = {"odometry.commanded": "true", "odometry.k_x_m": "1e-3", "odometry.k_phi_rad": "1e-3"}
+NOTES = {
+    "odometry.commanded_velocities": "true",
+    "odometry.k_x_m": "1e-3",
+    "odometry.k_phi_rad": "1e-3",
+}
 STEP_S, STEPS = 0.1, 3000
 
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from synthetic_results import cast, corners
 
-from graphslam.core.config import Config, OdometryConfig, RobotConfig, load_config
+from graphslam.core.config import Config, OdometryConfig, RobotConfig
+from graphslam.core.config_io import load_config
 from graphslam.core.errors import EstimationError, GraphSlamError
 from graphslam.core.geometry import between, compose, exp, inverse, transform, wrap
 from graphslam.core.observation_models import MODELS
@@ -406,7 +407,7 @@ def test_a_start_that_is_not_given_is_found_by_sightings(meeting):
 def test_a_start_that_nothing_tells_is_said_with_what_to_do(meeting):
     (told,) = [
         warning
-        for warning in run(meeting, "association.robots=ignore").summary["warnings"]
+        for warning in run(meeting, "association.robot_sightings=ignore").summary["warnings"]
         if warning.startswith("b: ")
     ]
     assert "frame of its own" in told
