@@ -8,6 +8,7 @@ the result states, so its consistency is known.
 import itertools
 
 import numpy as np
+from walls import cast, rectangles
 
 from graphslam.core.geometry import between, compose, exp, wrap
 from graphslam.core.records import (
@@ -27,31 +28,8 @@ START_NS = 976_052_857_337_284_123
 CONFIG_SHA = "c0ffee" * 10 + "beef"
 
 
-def corners(x0, y0, x1, y1):
-    return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]])
-
-
-WALLS = np.concatenate(
-    [
-        np.stack([c[:-1], c[1:]], axis=1)
-        for c in (corners(-8, -5, 8, 5), corners(-3, -1.5, 4, 1.5), corners(5, 3.5, 6.5, 5))
-    ]
-)
-
+WALLS = rectangles((-8, -5, 8, 5), (-3, -1.5, 4, 1.5), (5, 3.5, 6.5, 5))
 ROOM_PATH = (6.0, 3.0)
-
-
-def cast(pose, angles, walls=WALLS, limit=30.0):
-    """Distances to the nearest wall along each beam; NaN where none is within the limit."""
-    directions = pose[2] + angles
-    d = np.column_stack([np.cos(directions), np.sin(directions)])[:, None]
-    a, e = walls[:, 0] - pose[:2], walls[:, 1] - walls[:, 0]
-    cross = d[..., 0] * e[:, 1] - d[..., 1] * e[:, 0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        t = (a[:, 0] * e[:, 1] - a[:, 1] * e[:, 0]) / cross
-        u = (a[:, 0] * d[..., 1] - a[:, 1] * d[..., 0]) / cross
-    t = np.where((t > 0) & (u >= 0) & (u <= 1), t, np.inf).min(axis=1)
-    return np.where(t < limit, t, np.nan)
 
 
 def loop_path(n, laps, a, b, phase=0.0):
@@ -208,7 +186,7 @@ def room(keyframes=300, beams=181, seed=3):
     pictures = []
     for stamp, pose in zip(stamps.tolist(), truth, strict=True):
         laser = compose(compose(origin, pose), mount)
-        ranges = cast(laser, angles) + rng.normal(0, 0.02, beams)
+        ranges = cast(WALLS, angles, laser, 30.0) + rng.normal(0, 0.02, beams)
         ok = np.isfinite(ranges)
         points = np.column_stack([ranges * np.cos(angles), ranges * np.sin(angles)])[ok] + mount[:2]
         pictures.append(Picture("robot", stamp, points))

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from paths import DATA
+from paths import real_data
 
 from graphslam.change_detection import detect_changes, load_visit
 from graphslam.change_detection.visit import on_surface
@@ -25,10 +25,7 @@ def visits(tmp_path_factory):
     """Every second scan of both: one for every 0.13 m that the robot drives."""
     folder, found = tmp_path_factory.mktemp("tinyslam"), []
     for name in ("exp1", "exp2"):
-        source = DATA / f"tinyslam/{name}.dat.xz"
-        if not source.exists():
-            pytest.skip(f"{source} is not there; set GRAPHSLAM_DATA")
-        IMPORTERS["tinyslam"](source, folder / f"{name}.mcap")
+        IMPORTERS["tinyslam"](real_data(f"tinyslam/{name}.dat.xz"), folder / f"{name}.mcap")
         result = smooth(open_logs([folder / f"{name}.mcap"], Config()), Config())
         save(result, Config(), folder / name, force=False)
         visit = load_visit(load(folder / name), folder / name)

@@ -1,8 +1,6 @@
 """The command line: what scripts rely on. Exit codes, one-line errors, JSON, and a whole run."""
 
-import contextlib
 import errno
-import io
 import json
 import os
 import re
@@ -14,9 +12,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from command_line import call, check_one_line
 from mcap.writer import Writer
 from paths import ROOT
-from synthetic_results import cast, corners
+from room_log import MOUNT, SCAN, SCANS, START_NS, S, drive, true_pose
 
 from graphslam.cli import main, terminal
 from graphslam.core.config_io import load_config
@@ -24,61 +23,6 @@ from graphslam.core.geometry import between, compose
 from graphslam.logs import IMPORTERS, LogWriter
 from graphslam.results.folder import load, read_trajectory
 from graphslam.slam import smooth as smooth_module
-
-S = 1_000_000_000
-START_NS = 1_700_000_000 * S + 123_456_789
-BEAMS = np.radians(np.arange(-90, 91.0))
-SCAN = {"angle_min_rad": float(BEAMS[0]), "angle_step_rad": np.radians(1), "range_max_m": 20.0}
-MOUNT = np.array([0.2, 0.0, 0.0])
-ROOM = np.concatenate(
-    [np.stack([c[:-1], c[1:]], axis=1) for c in (corners(0, 0, 10, 8), corners(4, 3.5, 6, 4.5))]
-)
-SECONDS, SCANS = 30, 60
-
-
-def call(*arguments):
-    """Exit code, stdout and stderr of one command, in this process."""
-    out, err = io.StringIO(), io.StringIO()
-    with (
-        contextlib.redirect_stdout(out),
-        contextlib.redirect_stderr(err),
-        pytest.raises(SystemExit) as leaving,
-    ):
-        main([str(argument) for argument in arguments])
-    return SimpleNamespace(code=leaving.value.code or 0, out=out.getvalue(), err=err.getvalue())
-
-
-def true_pose(seconds):
-    """Once round the box in the room, on an ellipse."""
-    a = 2 * np.pi * seconds / SECONDS - np.pi / 2
-    return np.array(
-        [5 + 3 * np.cos(a), 4 + 2.3 * np.sin(a), np.arctan2(2.3 * np.cos(a), -3 * np.sin(a))]
-    )
-
-
-def drive(path, *, seconds=SECONDS, robot="robot", ranges=lambda found, _k: found, truth=True):
-    """A log of the room with two scans a second; odometry errs by 3 % and drifts by 0.02 rad/m.
-
-    ``ranges`` may spoil scan number k.
-    """
-    rng = np.random.default_rng(7)
-    odometry = np.zeros(3)
-    with LogWriter(path) as log:
-        log.mount(robot, START_NS, MOUNT)
-        for k in range(seconds * 10 + 1):
-            stamp, pose = START_NS + k * S // 10, true_pose(k / 10)
-            if k:
-                moved = between(true_pose((k - 1) / 10), pose)
-                path_m = np.hypot(*moved[:2])
-                moved = moved * [1.03, 1.0, 1.0] + [0, 0, 0.02 * path_m]
-                odometry = compose(odometry, moved + rng.normal(0, 2e-4, 3))
-            log.odometry(robot, stamp, odometry)
-            if truth:
-                log.truth(robot, stamp, pose)
-            if k % 5 == 0:
-                found = cast(compose(pose, MOUNT), BEAMS, ROOM) + rng.normal(0, 0.01, len(BEAMS))
-                log.scan(robot, stamp + 7, ranges(found, k // 5), **SCAN)
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -94,13 +38,6 @@ def room(tmp_path_factory):
 def listing(folder):
     """Every file under a folder with its content."""
     return {p: p.read_bytes() if p.is_file() else None for p in sorted(folder.rglob("*"))}
-
-
-def check_one_line(done):
-    assert done.code == 1
-    assert done.out == ""
-    assert re.fullmatch(r"graphslam: error: [^\n]+\n", done.err), done.err
-    return done.err
 
 
 # ---------------------------------------------------------------- a whole run

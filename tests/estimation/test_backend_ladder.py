@@ -6,9 +6,9 @@
     iSAM2, every variable linearised anew = batch   after enough empty updates
     filter -> batch                                 with the square of the noise
 
-The models' Jacobians against finite differences are in test_observation_models.py, GTSAM's factors
-against the models in test_factors.py. What makes the ladder worth having is at the end: a Jacobian
-with one entry wrong by 5 %, which every NEES would swallow, breaks it.
+The models' Jacobians against finite differences are in test_observation_models.py, GTSAM's
+factors against the models in test_factors.py. The last test shows what the ladder is worth: a
+Jacobian with one entry wrong by 5 %, which no NEES would notice, breaks it.
 """
 
 import math

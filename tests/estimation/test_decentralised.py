@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_backends import MOTION_COV, PLAIN, assert_covariance, motion, see, two_robots
+from backend_cases import MOTION_COV, PLAIN, assert_covariance, motion, see, two_robots
 
 from graphslam.core.config_io import load_config
 from graphslam.core.geometry import compose

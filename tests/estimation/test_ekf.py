@@ -5,20 +5,21 @@ from collections import Counter
 import gtsam
 import numpy as np
 import pytest
-from finite_differences import jacobian
-from scipy.optimize import least_squares
-from scipy.stats import chi2
-from test_backends import (
+from backend_cases import (
     MODEL_OF,
     MOTION_COV,
     PLAIN,
     WORLD,
+    drive,
     motion,
     run,
     see,
     two_robots,
     without_lines,
 )
+from finite_differences import jacobian
+from scipy.optimize import least_squares
+from scipy.stats import chi2
 
 from graphslam.core.config import Config, EkfConfig, RobustConfig
 from graphslam.core.errors import EstimationError
@@ -566,37 +567,6 @@ def test_error_and_degrees_of_freedom_are_the_smoothers():
 
 
 # ------------------------------------------------------------ consistency
-
-
-def drive(rng, scale):
-    """Two robots among three landmarks for ten steps, all noise (sigmas times ``scale``) as
-    claimed, starts drawn from their priors: (steps, true poses)."""
-    cov = scale**2 * np.diag([4e-2, 1e-2, 1e-2])
-    claim = {2: scale**2 * np.diag([1e-2, 1e-2]), 3: scale**2 * np.diag([4e-2, 1e-2, 1e-2])}
-    starts = {"a": np.array([0.0, 0.0, 0.3]), "b": np.array([2.0, -1.0, 2.0])}
-    prior = scale**2 * np.diag([4e-2, 4e-2, 1e-2])
-    true = {r: x + rng.multivariate_normal(np.zeros(3), prior) for r, x in starts.items()}
-    steps = [Step(0, {r: Start(x, prior) for r, x in starts.items()})]
-    for k in range(1, 11):
-        motions, seen = {}, []
-        for robot, delta in (("a", [0.4, 0.0, 0.15]), ("b", [0.3, 0.0, -0.3])):
-            true[robot] = compose(true[robot], delta)
-            measured = delta + rng.multivariate_normal(np.zeros(3), cov)
-            motions[robot] = motion(k - 1, k, measured, cov)
-        for robot in "ab":
-            pairs = [(i, MODEL_OF[i], WORLD[i]) for i in (0, 1, 2)]
-            if robot == "a":
-                pairs.append(("b", "robot-point", true["b"]))
-            for target, model, t in pairs:
-                z = MODELS[model].predict(true[robot], t)
-                R = claim[len(z)]
-                if model == "line":  # another part of the wall each time; nothing known along it
-                    z = compose(z, np.array([rng.normal(), 0.0, 0.0]))
-                    R = rotate_cov(R, z[2])
-                noise = rng.multivariate_normal(np.zeros(len(z)), R)
-                seen.append(Association(robot, k, target, model, z + noise, R))
-        steps.append(Step(k, {}, motions, tuple(seen)))
-    return steps, true
 
 
 @pytest.mark.parametrize("error", FRAMES)

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_backends import MODEL_OF, MOTION_COV, PLAIN, WORLD, motion, run, see, without_lines
-from test_ekf import drive
+from backend_cases import MODEL_OF, MOTION_COV, PLAIN, WORLD, drive, motion, run, see, without_lines
 
 from graphslam.core.config import EkfConfig
 from graphslam.core.errors import ConfigError

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from backend_cases import MOTION_COV, PLAIN, WORLD, motion, run, see, two_robots
 from scipy.stats import multivariate_normal
-from test_backends import MOTION_COV, PLAIN, WORLD, motion, run, see, two_robots
 
 from graphslam.core.config import ConfigError, RbpfConfig
 from graphslam.core.config_io import load_config

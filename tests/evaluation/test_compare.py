@@ -10,7 +10,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_cli import call, check_one_line, drive
+from command_line import call, check_one_line
+from room_log import drive
 
 import graphslam.evaluation.compare_rows
 from graphslam.core.config import Config

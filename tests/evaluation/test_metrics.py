@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from paths import DATA
+from paths import real_data
 from scipy.stats import chi2
 from synthetic_results import START_NS, orchard, room, room_walls
 
@@ -379,10 +379,9 @@ def test_malformed_relations_name_file_and_line(tmp_path, text, message):
 def test_intel_raw_odometry_has_the_known_relation_error():
     import bz2
 
-    if not (DATA / "freiburg" / "intel.relations").exists():
-        pytest.skip(f"real logs are not at {DATA}; set GRAPHSLAM_DATA")
+    folder = real_data("freiburg")
     stamps, poses = [], []
-    with bz2.open(DATA / "freiburg" / "intel.clf.bz2", "rt") as log:
+    with bz2.open(folder / "intel.clf.bz2", "rt") as log:
         for line in log:
             if line.startswith("FLASER"):
                 fields = line.rsplit(maxsplit=9)
@@ -391,7 +390,7 @@ def test_intel_raw_odometry_has_the_known_relation_error():
                 poses.append([float(v) for v in fields[-6:-3]])
     order = np.argsort(stamps, kind="stable")
     scans = trajectory(np.array(stamps)[order], np.array(poses)[order])
-    found = relation_metrics(read_relations(DATA / "freiburg" / "intel.relations"), scans)
+    found = relation_metrics(read_relations(folder / "intel.relations"), scans)
     # published figures of raw odometry, quoted to these digits
     assert (found["all"]["n"], found["all"]["unmatched"]) == (2984, 0)
     assert found["all"]["trans_mean_m"] == pytest.approx(7.37, abs=0.005)

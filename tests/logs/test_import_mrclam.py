@@ -5,7 +5,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from paths import DATA
+from paths import real_data
 
 from graphslam.core import records
 from graphslam.core.config import Config, OdometryConfig
@@ -176,9 +176,7 @@ def test_two_sets_in_one_archive_are_refused(folder, tmp_path):
 
 def test_real_set(tmp_path):
     """Set 6: five robots, fifteen landmarks; every sighting but the six unknown barcodes."""
-    source = DATA / "mrclam/MRCLAM_Dataset6.tar.xz"
-    if not source.exists():
-        pytest.skip(f"{source} is not there; set GRAPHSLAM_DATA")
+    source = real_data("mrclam/MRCLAM_Dataset6.tar.xz")
     summary = IMPORTERS["mrclam"](source, tmp_path / "log.mcap")
     counts = summary.counts
     assert [counts[f"/robot{k}/sightings"] for k in range(1, 6)] == [1941, 4031, 5625, 2396, 5378]

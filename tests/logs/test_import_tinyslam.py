@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from paths import DATA
+from paths import real_data
 
 from graphslam.core import records
 from graphslam.core.config import Config
@@ -58,9 +58,6 @@ def test_other_lines_are_counted(tmp_path):
 @pytest.mark.parametrize(("name", "scans"), [("exp1.dat.xz", 756), ("exp2.dat.xz", 641)])
 def test_real_logs(name, scans, tmp_path):
     """Every line is a scan and a pair of ticks."""
-    source = DATA / "tinyslam" / name
-    if not source.exists():
-        pytest.skip(f"{source} is not there; set GRAPHSLAM_DATA")
-    summary, _, _ = imported(source, tmp_path / "log.mcap")
+    summary, _, _ = imported(real_data(f"tinyslam/{name}"), tmp_path / "log.mcap")
     assert summary.counts["/scan"] == summary.counts["/joint_states"] == scans
     assert not summary.warnings

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from paths import DATA
+from paths import real_data
 
 from graphslam.core import geometry, records
 from graphslam.core.config import Config
@@ -20,13 +20,6 @@ from graphslam.core.geometry import rotation3
 from graphslam.logs import IMPORTERS, open_logs, pose_stamp_ns
 from graphslam.logs.import_carmen import parse_stamp_ns
 from graphslam.logs.import_pose_graph import Edge, turned
-
-
-def data(name: str) -> Path:
-    path = DATA / name
-    if not path.exists():
-        pytest.skip(f"{path} is not there; set GRAPHSLAM_DATA")
-    return path
 
 
 def example(name: str) -> Path:
@@ -87,7 +80,7 @@ def covariance(factor: gtsam.NonlinearFactor) -> np.ndarray:
 @pytest.mark.parametrize("name", GRAPHS)
 def test_factors_are_those_that_gtsam_reads(name, tmp_path):
     """Measured values and covariances of all edges and sightings, compared one by one."""
-    source = data(name) if "/" in name else example(name)
+    source = real_data(name) if "/" in name else example(name)
     messages = run("isam", source, tmp_path / "log.mcap")
     graph = gtsam_graph(source)
     keys, between, sighted = set(), [], []
@@ -301,7 +294,7 @@ def test_beams_are_spread_over_half_a_turn_from_the_right(beams, step_deg, tmp_p
 
 def test_intel_is_read_whole_with_its_stamps_and_in_the_order_of_the_recording(tmp_path):
     """Its late stamps, believed, make dead reckoning 675 m long; as recorded it is 509 m."""
-    source, relations = data("freiburg/intel.clf.bz2"), data("freiburg/intel.relations")
+    source, relations = real_data("freiburg/intel.clf.bz2"), real_data("freiburg/intel.relations")
     target = tmp_path / "intel.mcap"
     IMPORTERS["carmen"](source, target)
     logs = open_logs([target], Config())

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
-from paths import DATA
+from paths import real_data
 
 from graphslam.core import records
 from graphslam.core.config import Config, LogsConfig, RobotConfig
@@ -607,10 +607,7 @@ def test_info_reports_what_keeps_a_log_from_being_smoothed(tmp_path):
 
 
 def test_info_on_a_real_log():
-    path = DATA / "mcap" / "intel_first600s.mcap"
-    if not path.exists():
-        pytest.skip(f"{path} is not there; set GRAPHSLAM_DATA")
-    info = inspect_logs([path], Config())
+    info = inspect_logs([real_data("mcap/intel_first600s.mcap")], Config())
     scan = next(topic for topic in info.topics if topic.name == "/scan")
     assert scan.count == 3035 and scan.no_return_m == pytest.approx(81.83)
     assert info.robots[0].reverses and not info.problem

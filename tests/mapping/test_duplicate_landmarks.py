@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from backend_cases import PLAIN, two_robots
 from finite_differences import jacobian
-from test_backends import PLAIN, two_robots
 
 from graphslam.core.geometry import between, compose
 from graphslam.core.records import Association, Estimate, Step, Trajectory

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_scan_matching import ROOM, cloud
+from walls import L_ROOM, cloud
 
 from graphslam.core.geometry import between, compose
 from graphslam.core.records import Closure, Picture, Trajectory
@@ -27,7 +27,7 @@ def drive(poses, seen_from):
     stamps = np.arange(len(poses), dtype=np.int64) * 1_000_000_000
     states = {"robot": Trajectory(stamps, poses, np.zeros((len(poses), 3, 3)))}
     pictures = [
-        Picture("robot", int(t), cloud(p, ROOM).astype(np.float32))
+        Picture("robot", int(t), cloud(p, L_ROOM).astype(np.float32))
         for t, p in zip(stamps, seen_from, strict=True)
     ]
     return states, pictures

@@ -2,24 +2,17 @@
 
 import numpy as np
 import pytest
+from three_robots import LANDMARKS, SIGMAS, STARTS, T0, TWISTS, S, pose
 
 from graphslam.core.config import Config, StartConfig
-from graphslam.core.geometry import between, compose, exp
+from graphslam.core.geometry import between, exp
 from graphslam.logs import LogWriter, open_logs
 from graphslam.slam.smooth import smooth
 
-S, T0, SECONDS = 1_000_000_000, 10_000_000_000, 60
-STARTS = {"a": (0.0, 0.0, 0.0), "b": (5.0, 0.0, 2.0), "c": (2.0, 5.0, -1.5)}
-TWISTS = {"a": (0.3, 0.0, 0.2), "b": (0.25, 0.0, -0.15), "c": (0.3, 0.0, 0.1)}
-LANDMARKS = {"6": (3.0, 2.0), "7": (-1.0, 4.0), "8": (6.0, 5.0)}
-SIGMAS = np.array([0.01, 0.05])
+SECONDS = 60
 UNPLACED = "sighting: no odometry near it"
 #: m: sightings of 0.05 m and more than 100 of them per robot; without any the error is metres
 NEAR_M = 0.1
-
-
-def pose(robot, seconds):
-    return compose(np.array(STARTS[robot]), exp(np.array(TWISTS[robot]) * seconds))
 
 
 def write(path, robots, *, odometry=None, sees=None, shift_s=0):

@@ -5,58 +5,20 @@ import tarfile
 
 import numpy as np
 import pytest
-from paths import DATA
+from paths import real_data
+from three_robots import LANDMARKS, STARTS, T0, S, pose, write
 
 from graphslam.core.config_io import load_config
 from graphslam.core.errors import EstimationError
-from graphslam.core.geometry import between, compose, exp, wrap
+from graphslam.core.geometry import between, compose, wrap
 from graphslam.core.records import Trajectory
 from graphslam.evaluation.metrics import evaluate
-from graphslam.logs import IMPORTERS, LogWriter, open_logs, read_truth
+from graphslam.logs import IMPORTERS, open_logs, read_truth
 from graphslam.results.folder import load, save
 from graphslam.slam.smooth import smooth
 from graphslam.slam.start_priors import first_truth
 
-S, T0 = 1_000_000_000, 10_000_000_000
-STARTS = {"a": (0.0, 0.0, 0.0), "b": (5.0, 0.0, 2.0), "c": (2.0, 5.0, -1.5)}
-LANDMARKS = {"6": (3.0, 2.0), "7": (-1.0, 4.0), "8": (6.0, 5.0)}
-TWISTS = {"a": (0.3, 0.0, 0.2), "b": (0.25, 0.0, -0.15), "c": (0.3, 0.0, 0.1)}
-SIGMAS = np.array([0.01, 0.05])
 SEEDS = (1, 2, 3)
-
-
-def pose(robot, seconds):
-    return compose(np.array(STARTS[robot]), exp(np.array(TWISTS[robot]) * seconds))
-
-
-def write(path, seed=1, marks=LANDMARKS, meets=lambda a, b: True, names=None, spoil=None):
-    """Three robots on circles, their odometry 2 % off in turns, see landmarks and each other.
-
-    ``meets(observer, seen)`` says who sees whom or what; ``names`` are exchanged; ``spoil(z, rng,
-    observer, seen, seconds)`` may return something else than what was measured.
-    """
-    rng = np.random.default_rng(seed)
-    names = names or {}
-    with LogWriter(path) as log:
-        for k in range(600):
-            stamp = T0 + k * S // 10
-            for robot in STARTS:
-                turned = exp(np.array([1.0, 1.0, 1.02]) * TWISTS[robot] * k / 10)
-                log.odometry(robot, stamp, turned)
-            if k % 5:
-                continue
-            for robot in STARTS:
-                x = pose(robot, k / 10)
-                for name, at in {**marks, **{r: pose(r, k / 10)[:2] for r in STARTS}}.items():
-                    called = names.get(name, name)
-                    if robot in (name, called) or not meets(robot, name):
-                        continue
-                    seen = between(x, np.array([*at, 0.0]))
-                    z = np.array([np.arctan2(seen[1], seen[0]), np.hypot(*seen[:2])])
-                    z = z + SIGMAS * rng.normal(size=2)
-                    z = spoil(z, rng, robot, name, k / 10) if spoil else z
-                    subject = {"seen_robot" if called in STARTS else "identity": called}
-                    log.sighting(robot, stamp, z, np.diag(SIGMAS**2), **subject)
 
 
 def run(tmp_path, *overrides, **log):
@@ -230,17 +192,15 @@ def test_exchanged_names_are_put_right_all_the_same(tmp_path, pair):
     assert max(misfit(result, robot) for robot in STARTS) < 0.15
 
 
-SET = DATA / "mrclam/MRCLAM_Dataset6.tar.xz"
 EXCERPT_S = 150.0
 
 
 @pytest.fixture(scope="module")
 def real(tmp_path_factory):
     """The first minutes of MRCLAM set 6: five robots with commanded odometry."""
-    if not SET.exists():
-        pytest.skip(f"{SET} is not there; set GRAPHSLAM_DATA")
+    source = real_data("mrclam/MRCLAM_Dataset6.tar.xz")
     folder = tmp_path_factory.mktemp("mrclam")
-    with tarfile.open(SET) as archive:
+    with tarfile.open(source) as archive:
         archive.extractall(folder / "whole", filter="data")
     (folder / "set").mkdir()
     first = 0.0

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_frame_tree import LANDMARKS, STARTS, T0, pose, write
+from three_robots import LANDMARKS, STARTS, T0, pose, write
 
 from graphslam.core.config_io import load_config
 from graphslam.logs import open_logs

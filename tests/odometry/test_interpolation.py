@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pose_checks import assert_same_pose
 from scipy.linalg import eigh
 
 from graphslam.core.config import OdometryConfig, RobotConfig
-from graphslam.core.geometry import between, compose, compose_cov, exp, inverse, wrap
+from graphslam.core.geometry import between, compose, compose_cov, exp, inverse
 from graphslam.core.records import OdometryPose, Trajectory
 from graphslam.odometry.interpolation import (
     causal_at,
@@ -69,11 +70,6 @@ def at(times_s, *, causal, given=STATES, track=TRACK, known=None, stamps=None):
         known = [track.calibration] * len(given) if known is None else known
         return causal_at(given, known, track, times, stamps)
     return final_at(given, track, times, stamps)
-
-
-def assert_same_pose(a, b, atol=1e-12):
-    np.testing.assert_allclose(a[..., :2], b[..., :2], atol=atol)
-    np.testing.assert_allclose(wrap(a[..., 2] - b[..., 2]), 0, atol=atol)
 
 
 @pytest.mark.parametrize("causal", [True, False])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from test_scan_matching import CORRIDOR, ROOM, cloud
+from walls import CORRIDOR, L_ROOM, cloud
 from wrong_odometry import CHANGES, recorded, run
 
 from graphslam.core.config_io import load_config
@@ -45,7 +45,7 @@ def test_good_odometry_is_left_alone():
     for seed in range(20):
         rng = np.random.default_rng(seed)
         motion = said(STEP + rng.normal(0, SIGMAS))
-        assert checked_against_scans(motion, *scans(ROOM, rng)) is motion
+        assert checked_against_scans(motion, *scans(L_ROOM, rng)) is motion
 
 
 @pytest.mark.parametrize(
@@ -58,7 +58,7 @@ def test_a_wrong_motion_is_taken_from_the_scans(wrong):
     has no say left. It teaches no calibration."""
     for seed in range(5):
         rng = np.random.default_rng(seed)
-        found = checked_against_scans(said(STEP + wrong), *scans(ROOM, rng))
+        found = checked_against_scans(said(STEP + wrong), *scans(L_ROOM, rng))
         off = found.delta - STEP
         assert found.matched
         assert np.hypot(off[0], off[1]) < 0.02 and abs(off[2]) < 0.01
@@ -82,7 +82,7 @@ def test_along_a_corridor_odometry_stays():
 
 def test_scans_of_different_places_contradict_nothing():
     """A scan of another room fits nowhere: that is no evidence against odometry."""
-    before, _ = scans(ROOM)
+    before, _ = scans(L_ROOM)
     _, now = scans(CORRIDOR, None, STEP, np.array([20.0, 0.0, 1.0]))
     motion = said(STEP)
     assert checked_against_scans(motion, before, now) is motion

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_front_ends import cast, make_scan
+from walls import cast, make_scan
 
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import wrap

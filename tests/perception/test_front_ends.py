@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from line_checks import ends, near, normal_cov, normal_error
 from scipy.stats import chi2
+from walls import cast, make_scan, scan_of
 
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.errors import EstimationError
-from graphslam.core.geometry import compose, rotate_cov, rotation, transform, wrap
-from graphslam.core.records import Scan
+from graphslam.core.geometry import compose, rotate_cov, rotation, wrap
 from graphslam.perception.front_ends import FRONT_ENDS
 from graphslam.perception.line_fit import fit_line, fit_lines
 from graphslam.perception.ordered_scan import scan_points
@@ -22,62 +23,12 @@ BACK_WALL = [[8.0, -60.0], [8.0, 60.0]]
 ROOM = [[[-1, -2], [4, -2]], [[4, -2], [4, 3]], [[4, 3], [-1, 3]], [[-1, 3], [-1, -2]]]
 
 
-def make_scan(ranges, angle_min=-np.pi / 2, step=np.pi / 180, mount=(0, 0, 0)):
-    return Scan("r", 0, 0, np.asarray(ranges, float), angle_min, step, np.array(mount, float))
-
-
-def cast(walls, angles):
-    """Ranges (n,) of the nearest wall (w, 2, 2) along each beam from the origin; NaN if none."""
-    a, b = np.moveaxis(np.asarray(walls, float), 1, 0)
-    c, s = np.cos(angles)[:, None], np.sin(angles)[:, None]
-    side_a, side_b = c * a[:, 1] - s * a[:, 0], c * b[:, 1] - s * b[:, 0]
-    share = side_a / np.where(side_a == side_b, np.inf, side_a - side_b)
-    hit = a + share[..., None] * (b - a)
-    r = c * hit[..., 0] + s * hit[..., 1]
-    r[(side_a * side_b > 0) | (side_a == side_b) | (r <= 0)] = np.inf
-    r = r.min(axis=1)
-    return np.where(np.isfinite(r), r, np.nan)
-
-
-def see(walls, step_deg=0.5, sigma=0.0, seed=0):
-    n = int(180 / step_deg) + 1
-    step = np.radians(step_deg)
-    ranges = cast(walls, -np.pi / 2 + step * np.arange(n))
-    return make_scan(ranges + sigma * np.random.default_rng(seed).normal(size=n), step=step)
-
-
-def ends(observation):
-    """End points (2, 2), first the one that the line's direction comes from."""
-    along = np.stack([observation.extent, np.zeros(2)], axis=1)
-    return transform(observation.z, along)
-
-
-def near(observations, wall, tolerance=0.05):
-    """The observations that lie on a wall (2, 2)."""
-    a, b = np.asarray(wall, float)
-    normal = np.array([a[1] - b[1], b[0] - a[0]]) / np.hypot(*(b - a))
-    return [o for o in observations if np.all(np.abs((ends(o) - a) @ normal) < tolerance)]
-
-
-def normal_error(observation, wall):
-    """(offset along the observed line's left, direction) of an observation against a wall."""
-    a, b = np.asarray(wall, float)
-    truth = np.arctan2(b[1] - a[1], b[0] - a[0])
-    left = np.array([-np.sin(truth), np.cos(truth)])
-    return np.array([(observation.z[:2] - a) @ left, wrap(observation.z[2] - truth)])
-
-
-def normal_cov(observation):
-    """Covariance (2, 2) of (normal, direction) in the line's own frame."""
-    return rotate_cov(observation.cov, -observation.z[2])[1:, 1:]
-
-
 # ---------------------------------------------------------------- the table's contract
 
 
 @pytest.mark.parametrize("name", FRONT_ENDS)
 def test_every_front_end_keeps_the_contract_of_observations(name):
-    for observation in FRONT_ENDS[name](see(ROOM, sigma=0.02), CONFIG):
+    for observation in FRONT_ENDS[name](scan_of(ROOM, sigma=0.02), CONFIG):
         assert observation.kind in ("segment", "line")
         assert observation.z.shape == (3,) and -np.pi <= observation.z[2] < np.pi
         assert observation.cov.shape == (3, 3) and observation.extent.shape == (2,)
@@ -104,7 +55,7 @@ def test_a_scan_that_shows_nothing_gives_nothing(name, ranges, step):
 @pytest.mark.parametrize("step_deg", [1.0, 0.5])
 @pytest.mark.parametrize("turn", np.radians([0.0, 17.0, -50.0]))
 def test_a_wall_without_noise_is_found_exactly(step_deg, turn):
-    scan = see([np.array(FRONT_WALL) @ rotation(turn).T, np.array(BACK_WALL)], step_deg)
+    scan = scan_of([np.array(FRONT_WALL) @ rotation(turn).T, np.array(BACK_WALL)], step_deg)
     wall = np.array(FRONT_WALL) @ rotation(turn).T
     (found,) = near(segments(scan, CONFIG), wall, 1e-9)
     points = scan_points(scan, 30.0)
@@ -117,7 +68,7 @@ def test_a_wall_without_noise_is_found_exactly(step_deg, turn):
 
 
 def test_every_wall_of_a_room_is_found_once_and_exactly():
-    found = segments(see(ROOM), CONFIG)
+    found = segments(scan_of(ROOM), CONFIG)
     assert len(found) == 3  # the one behind is not in view
     for wall in ROOM[:3]:
         (line,) = near(found, wall, 1e-9)
@@ -126,7 +77,7 @@ def test_every_wall_of_a_room_is_found_once_and_exactly():
 
 def test_the_sensor_is_on_the_left_of_what_it_sees_from_either_side():
     # separates the two sides of a thin wall: a direction modulo pi would make them equal
-    (far_side,) = near(segments(see([FRONT_WALL, BACK_WALL]), CONFIG), FRONT_WALL)
+    (far_side,) = near(segments(scan_of([FRONT_WALL, BACK_WALL]), CONFIG), FRONT_WALL)
     mirrored = np.array([FRONT_WALL, BACK_WALL]) * [-1, 1]
     n = 361
     scan = make_scan(
@@ -203,21 +154,21 @@ def test_a_full_circle_has_no_seam_inside_a_wall():
 
 
 def test_walls_between_corners_are_segments_and_walls_cut_by_the_border_are_lines():
-    kinds = {i: near(segments(see(ROOM), CONFIG), ROOM[i])[0].kind for i in range(3)}
+    kinds = {i: near(segments(scan_of(ROOM), CONFIG), ROOM[i])[0].kind for i in range(3)}
     assert kinds == {0: "line", 1: "segment", 2: "line"}
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_a_wall_cut_by_a_nearer_thing_is_a_line(side):
     screen = [[1.5, side * 0.35], [1.5, side * 0.8]]  # hides the end, seen from the origin
-    (found,) = near(segments(see([FRONT_WALL, screen, BACK_WALL]), CONFIG), FRONT_WALL)
+    (found,) = near(segments(scan_of([FRONT_WALL, screen, BACK_WALL]), CONFIG), FRONT_WALL)
     assert found.kind == "line"
     assert np.diff(found.extent) < 1.9
 
 
 @pytest.mark.parametrize("mixed_m", [2.9, 2.2])
 def test_a_mixed_pixel_at_the_occluding_edge_does_not_make_the_end_real(mixed_m):
-    scan = see([FRONT_WALL, [[1.5, 0.35], [1.5, 0.8]], BACK_WALL])
+    scan = scan_of([FRONT_WALL, [[1.5, 0.35], [1.5, 0.8]], BACK_WALL])
     edge = np.flatnonzero(scan.ranges < 2.0)[0]
     scan.ranges[edge] = mixed_m
     (found,) = near(segments(scan, CONFIG), FRONT_WALL)
@@ -225,7 +176,7 @@ def test_a_mixed_pixel_at_the_occluding_edge_does_not_make_the_end_real(mixed_m)
 
 
 def test_an_end_beside_a_missing_return_is_not_known():
-    scan = see([FRONT_WALL, BACK_WALL])
+    scan = scan_of([FRONT_WALL, BACK_WALL])
     scan.ranges[np.flatnonzero(scan.ranges < 3.2)[-1] + 1] = np.nan
     (found,) = near(segments(scan, CONFIG), FRONT_WALL)
     assert found.kind == "line"
@@ -235,7 +186,7 @@ def test_a_bend_is_not_the_end_of_a_wall():
     # where a round wall is cut into chords depends on the view, so no chord has real ends
     angle = np.radians(np.arange(-60, 61, 2.0))
     arc = np.column_stack([2 + 3 * np.cos(angle), 3 * np.sin(angle)])
-    found = segments(see(np.stack([arc[:-1], arc[1:]], axis=1)), CONFIG)
+    found = segments(scan_of(np.stack([arc[:-1], arc[1:]], axis=1)), CONFIG)
     assert len(found) >= 3
     assert {o.kind for o in found} == {"line"}
 
@@ -244,7 +195,7 @@ def test_a_bend_is_not_the_end_of_a_wall():
 
 
 def test_drop_outs_do_not_split_a_wall():
-    scan = see([FRONT_WALL, BACK_WALL], sigma=0.01)
+    scan = scan_of([FRONT_WALL, BACK_WALL], sigma=0.01)
     on_wall = np.flatnonzero(scan.ranges < 3.3)
     scan.ranges[on_wall[4:-4:5]] = np.nan  # single ones
     scan.ranges[on_wall[20] : on_wall[30]] = np.nan  # 0.26 m of glass
@@ -255,10 +206,10 @@ def test_drop_outs_do_not_split_a_wall():
 
 def test_a_pole_in_front_does_not_split_a_wall_and_a_door_does():
     pole = [[1.5, -0.03], [1.5, 0.03]]
-    (whole,) = near(segments(see([FRONT_WALL, pole, BACK_WALL]), CONFIG), FRONT_WALL, 1e-9)
+    (whole,) = near(segments(scan_of([FRONT_WALL, pole, BACK_WALL]), CONFIG), FRONT_WALL, 1e-9)
     assert np.diff(whole.extent) > 1.9
     left, right = [[3, -1], [3, -0.3]], [[3, 0.3], [3, 1]]
-    parts = near(segments(see([left, right, BACK_WALL]), CONFIG), FRONT_WALL, 1e-9)
+    parts = near(segments(scan_of([left, right, BACK_WALL]), CONFIG), FRONT_WALL, 1e-9)
     assert [o.kind for o in parts] == ["segment", "segment"]
 
 
@@ -267,7 +218,7 @@ def test_noise_does_not_split_a_wall():
     # on average into 5 pieces. The gate of the merge is 99.9 % but the pieces' ends are extremes.
     wall = [[2.0, -3.0], [2.0, 3.0]]
     parts = [
-        len(near(segments(see([wall], sigma=0.02, seed=seed), CONFIG), wall, 0.2))
+        len(near(segments(scan_of([wall], sigma=0.02, seed=seed), CONFIG), wall, 0.2))
         for seed in range(60)
     ]
     assert np.mean(parts) < 1.1
@@ -276,18 +227,18 @@ def test_noise_does_not_split_a_wall():
 @pytest.mark.parametrize("offset_m, parts", [(0.0, 1), (0.1, 2)])
 def test_a_recess_in_a_wall_is_its_own_segment(offset_m, parts):
     walls = [[[3.0, -2.0], [3.0, 0.0]], [[3 + offset_m, 0.0], [3 + offset_m, 1.5]]]
-    assert len(segments(see(walls, sigma=0.01), CONFIG)) == parts
+    assert len(segments(scan_of(walls, sigma=0.01), CONFIG)) == parts
 
 
 def test_a_grazing_corridor_wall_is_followed_although_its_returns_are_far_apart():
     # 12 m at 1°: the last returns are 2 m apart, more than the range discontinuity of a chain
     wall = [[-1.0, 1.0], [12.0, 1.0]]
-    (found,) = segments(see([wall], step_deg=1.0, sigma=0.005), CONFIG)
+    (found,) = segments(scan_of([wall], step_deg=1.0, sigma=0.005), CONFIG)
     assert np.diff(found.extent) > 9.0
 
 
 def test_a_thin_pole_and_scattered_returns_give_nothing():
-    assert segments(see([[[2, -0.05], [2, 0.05]]]), CONFIG) == ()
+    assert segments(scan_of([[[2, -0.05], [2, 0.05]]]), CONFIG) == ()
     scattered = np.random.default_rng(3).uniform(1.0, 10.0, 181)
     assert segments(make_scan(scattered), CONFIG) == ()
 
@@ -350,7 +301,7 @@ def test_the_whole_front_end_is_honest_on_a_noisy_room():
     config = FrontEndConfig(floor_normal_m=0.0, floor_angle_rad=0.0, range_sigma_m=0.01)
     nees = []
     for seed in range(150):
-        found = segments(see(ROOM, sigma=0.01, seed=seed), config)
+        found = segments(scan_of(ROOM, sigma=0.01, seed=seed), config)
         for wall in ROOM[:3]:
             (line,) = near(found, wall, 0.1)
             error = normal_error(line, wall)

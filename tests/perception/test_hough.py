@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_front_ends import cast, ends, make_scan, near, normal_cov, normal_error, see
+from line_checks import ends, near, normal_cov, normal_error
+from walls import cast, make_scan, scan_of
 
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.config_io import load_config
@@ -74,7 +75,7 @@ def test_removed_returns_stop_voting():
 def test_far_walls_count_as_much_as_near_ones():
     """g = r: a wall face on has its length in C, at whatever distance. ±15 %: beams are counted."""
     for distance in (2.0, 4.0, 8.0, 16.0):
-        scan = see([[[distance, -0.5], [distance, 0.5]]], step_deg=0.25)
+        scan = scan_of([[[distance, -0.5], [distance, 0.5]]], step_deg=0.25)
         sweep = everything(scan)
         votes = votes_of(sweep.points, weights=scan.ranges[sweep.beam] * sweep.step_rad)
         np.testing.assert_allclose(votes.C.max(), 1.0, rtol=0.15)
@@ -106,7 +107,7 @@ def test_the_fullest_stripe_holds_the_guaranteed_length(gamma_steps, length):
 @pytest.mark.parametrize("turn", np.radians([0.0, 1.5, 17.0, -50.0]))
 def test_a_long_wall_is_found_whole_though_its_peak_holds_a_part(turn):
     wall = np.array(WALL) @ rotation(turn).T
-    (found,) = hough(see([wall]), CONFIG)
+    (found,) = hough(scan_of([wall]), CONFIG)
     assert found.kind == "line"
     np.testing.assert_allclose(normal_error(found, wall), 0.0, atol=1e-9)
     assert np.diff(found.extent) > 0.95 * min(6.0, np.ptp(cast_ends(wall)))
@@ -125,8 +126,8 @@ def test_a_wall_behind_furniture_and_with_a_door_is_one_line():
     left, right = [[4.0, -3.0], [4.0, 0.5]], [[4.0, 1.4], [4.0, 3.0]]
     cupboard = [[2.5, -1.5], [2.5, -0.7]]
     scene = [left, right, cupboard, [[7.0, -9.0], [7.0, 9.0]]]
-    pieces = near(segments(see(scene, sigma=0.01), CONFIG), WALL)
-    (whole,) = near(hough(see(scene, sigma=0.01), CONFIG), WALL)
+    pieces = near(segments(scan_of(scene, sigma=0.01), CONFIG), WALL)
+    (whole,) = near(hough(scan_of(scene, sigma=0.01), CONFIG), WALL)
     assert len(pieces) >= 3  # what the segments make of it
     np.testing.assert_allclose(np.sort(ends(whole)[:, 1]), [-3.0, 3.0], atol=0.1)
 
@@ -136,7 +137,7 @@ def test_a_cupboard_before_the_wall_does_not_become_a_part_of_it(step_m):
     """Parallel, 6 cm before it: 3 sigma. Merged, the line would be turned and moved by 2 cm."""
     wall, front = [[4.0, 0.5], [4.0, 3.0]], [[4.0 - step_m, -1.5], [4.0 - step_m, 0.5]]
     for seed in range(10):
-        found = hough(see([wall, front], sigma=0.01, seed=seed), CONFIG)
+        found = hough(scan_of([wall, front], sigma=0.01, seed=seed), CONFIG)
         assert len(found) == 2
         for thing in (wall, front):
             best = min(np.abs(normal_error(o, thing)[0]) for o in found)
@@ -145,7 +146,7 @@ def test_a_cupboard_before_the_wall_does_not_become_a_part_of_it(step_m):
 
 def test_returns_that_another_wall_has_between_do_not_bend_a_line():
     crossing = [[3.0, 1.0], [6.0, 1.0]]  # stands on the wall's line and runs through it
-    (found,) = near(hough(see([WALL, crossing], sigma=0.005), CONFIG), WALL)
+    (found,) = near(hough(scan_of([WALL, crossing], sigma=0.005), CONFIG), WALL)
     np.testing.assert_allclose(normal_error(found, WALL), 0.0, atol=0.01)
 
 
@@ -153,7 +154,7 @@ def test_no_return_belongs_to_two_lines():
     rng = np.random.default_rng(1)
     for seed in range(20):
         walls = rng.uniform([1, -4], [8, 4], (6, 2, 2))
-        sweep = everything(see(walls, sigma=0.01, seed=seed))
+        sweep = everything(scan_of(walls, sigma=0.01, seed=seed))
         rows, starts = find_lines(sweep, np.ones(len(sweep.beam), bool), CONFIG)
         assert len(rows) == len(set(rows.tolist()))
         assert np.all(np.diff(np.append(starts, len(rows))) >= CONFIG.min_points)
@@ -169,7 +170,7 @@ def test_the_covariance_is_honest_on_noisy_walls():
     walls = [[[1, -3], [6, -3.2]], [[6.5, -2.7], [6.8, 2.7]], [[6, 3.2], [1, 3]]]  # no corners
     nees = []
     for seed in range(300):
-        found = hough(see(walls, sigma=0.01, seed=seed), config)
+        found = hough(scan_of(walls, sigma=0.01, seed=seed), config)
         for wall in walls:
             for line in near(found, wall, 0.1):
                 error = normal_error(line, wall)
@@ -193,14 +194,14 @@ def scenes():
         room = np.array([[[-1, -3], [7, -3]], [[7, -3], [7, 3]], [[7, 3], [-1, 3]]], float)
         middle, half = rng.uniform([1, -2.5], [6, 2.5], (5, 2)), 0.3 * rng.normal(size=(5, 2))
         things = np.stack((middle - half, middle + half), axis=1)
-        yield see(np.concatenate((room, things)), sigma=0.01, seed=seed)
+        yield scan_of(np.concatenate((room, things)), sigma=0.01, seed=seed)
 
 
 def test_both_keeps_the_whole_segments_and_joins_what_was_cut():
     left, right = [[4.0, -9.0], [4.0, -0.7]], [[4.0, 0.2], [4.0, 9.0]]
     whole, back = [[2.0, 1.2], [2.3, 2.4]], [[9.0, -30.0], [9.0, 30.0]]
     screen = [[2.0, -1.6], [2.0, -1.2]]
-    found = both(see([left, right, whole, screen, back], sigma=0.005), CONFIG)
+    found = both(scan_of([left, right, whole, screen, back], sigma=0.005), CONFIG)
     assert [o.kind for o in near(found, whole)] == ["segment"]
     assert [o.kind for o in near(found, [[4, -9], [4, 9]])] == ["line"]
 
@@ -252,7 +253,7 @@ def test_cut_segments_without_a_hough_line_stay():
 def test_the_thesis_covariance_is_an_option_for_hough_lines():
     """`front_end.covariance = "thesis"`: eq. 4.32 as printed, every return with sigma_r; on a wall
     seen at 45° on average that is more than the incidence angle leaves."""
-    scan = see([WALL], sigma=0.0)
+    scan = scan_of([WALL], sigma=0.0)
     plain = replace(CONFIG, floor_normal_m=0.0, floor_angle_rad=0.0)
     (found,) = hough(scan, replace(plain, covariance="thesis"))
     points = everything(scan).points

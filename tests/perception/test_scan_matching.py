@@ -1,34 +1,11 @@
-"""Scan matching: rooms of straight walls, seen by a laser that this file casts itself."""
+"""Scan matching in rooms of straight walls."""
 
 import numpy as np
 import pytest
+from walls import CORRIDOR, L_ROOM, cloud
 
 from graphslam.core.geometry import between, compose
 from graphslam.perception.scan_matching import agreement, align, make_submap, match, search
-
-ANGLES = np.radians(np.arange(-180.0, 180.0, 1.0))
-ROOM = np.array([
-    [[-4, -3], [5, -3]], [[5, -3], [5, 2]], [[5, 2], [1, 2]], [[1, 2], [1, 4]], [[1, 4], [-4, 4]],
-    [[-4, 4], [-4, -3]], [[-1, -1], [0, -1]], [[0, -1], [0, 0.5]],
-], dtype=float)  # fmt: skip
-#: only parallel walls, longer than the laser reaches
-CORRIDOR = np.array([[[-60, -1], [60, -1]], [[60, 1], [-60, 1]]], dtype=float)
-
-
-def cloud(pose, walls, rng=None, reach=20.0):
-    """Points (n, 2) of a scan at ``pose`` in its own frame, by crossing rays and walls."""
-    p, d = walls[:, 0], walls[:, 1] - walls[:, 0]
-    directions = np.column_stack([np.cos(ANGLES + pose[2]), np.sin(ANGLES + pose[2])])
-    cross = directions[:, None, 0] * d[:, 1] - directions[:, None, 1] * d[:, 0]
-    q = p - pose[:2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        r = (q[:, 0] * d[:, 1] - q[:, 1] * d[:, 0]) / cross
-        u = (q[:, 0] * directions[:, None, 1] - q[:, 1] * directions[:, None, 0]) / cross
-    r = np.where((r > 0) & (u >= 0) & (u <= 1), r, np.inf).min(axis=1)
-    if rng is not None:
-        r = r + rng.normal(0.0, 0.01, len(r))
-    seen = r < reach
-    return r[seen, None] * np.column_stack([np.cos(ANGLES[seen]), np.sin(ANGLES[seen])])
 
 
 def submap(middle, walls, rng=None, shift=0.5):
@@ -40,11 +17,11 @@ def submap(middle, walls, rng=None, shift=0.5):
 def test_a_room_is_found_again_from_elsewhere():
     """Breaks with a sign in the search, the alignment, or the frames of a match. The guess is 1.1 m
     and 10 degrees off; with 1 cm of noise it ends within 2 cm and 0.3 degrees."""
-    target = submap(np.array([-2.0, 1.0, 0.3]), ROOM)
+    target = submap(np.array([-2.0, 1.0, 0.3]), L_ROOM)
     for seed in range(5):
         there = np.array([1.0, -1.5, -0.6])
         truth = between(np.array([-2.0, 1.0, 0.3]), there)
-        source = submap(there, ROOM, np.random.default_rng(seed))
+        source = submap(there, L_ROOM, np.random.default_rng(seed))
         guess = truth + np.array([0.8, -0.8, 0.17])
         found = match(source, target, guess, np.array([1.5, 1.5, 0.3]))
         assert np.hypot(*(found[0].pose - truth)[:2]) < 0.02
@@ -58,7 +35,7 @@ def test_a_place_where_hardly_a_point_lies_on_another_is_none():
     points. On the room itself 0.7 of them lie (a neighbouring cell counts half), on a corridor less
     than a tenth: 0.5 is between the two."""
     here, there = np.array([-2.0, 1.0, 0.3]), np.array([1.0, -1.5, -0.6])
-    source, same = submap(there, ROOM), submap(here, ROOM)
+    source, same = submap(there, L_ROOM), submap(here, L_ROOM)
     other = submap(np.zeros(3), CORRIDOR)
     guess, window = between(here, there), np.array([0.6, 0.6, 0.1])
     assert search(source, same, guess, window, 0.5)
@@ -74,7 +51,7 @@ def test_the_covariance_of_a_match_covers_its_error():
     truth, d2 = between(target_at, there), []
     for seed in range(20):
         rng = np.random.default_rng(seed)
-        source, target = submap(there, ROOM, rng), submap(target_at, ROOM, rng)
+        source, target = submap(there, L_ROOM, rng), submap(target_at, L_ROOM, rng)
         pose, cov = align(source, target, truth + np.array([0.1, -0.1, 0.03]))
         d2.append((pose - truth) @ np.linalg.solve(cov, pose - truth) / 3)
     assert np.mean(d2) < 1.66
@@ -94,7 +71,7 @@ def test_along_a_corridor_nothing_is_known():
 def test_what_is_looked_through_counts_against_a_place(moved, absent):
     """Breaks with an agreement that counts matches only: the same room put a metre off confirms
     less, and is looked through a lot."""
-    a, b = (submap(np.array([x, 1.0, 0.0]), ROOM) for x in (-2.0, -1.0))
+    a, b = (submap(np.array([x, 1.0, 0.0]), L_ROOM) for x in (-2.0, -1.0))
     same, missing = agreement(b, a, np.array([1.0 + moved, 0.0, 0.0]))
     assert (missing < absent) if moved == 0 else (missing > absent)
     assert (same > 0.8) if moved == 0 else (same < 0.7)

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from command_line import call
 from paths import ROOT
-from test_cli import call
 
 from graphslam.core.config_io import load_config
 from graphslam.core.records import OdometryPose, Scan, Sighting

@@ -7,7 +7,7 @@ import importlib.util
 
 import numpy as np
 import pytest
-from paths import DATA, ROOT
+from paths import ROOT, real_data
 
 from graphslam.core.config import Config
 from graphslam.core.records import Trajectory
@@ -15,13 +15,6 @@ from graphslam.estimation.isam2 import Isam2Backend
 from graphslam.evaluation.relation_metrics import read_relations, relation_metrics
 from graphslam.logs import open_logs
 from graphslam.slam.smooth import smooth
-
-
-def data(name):
-    path = DATA / name
-    if not path.exists():
-        pytest.skip(f"{path} is not there; set GRAPHSLAM_DATA")
-    return path
 
 
 def benchmark(name):
@@ -50,7 +43,7 @@ def test_victoria_park_reaches_its_optimum(tmp_path):
 def test_mit_reaches_its_optimum_though_cholesky_fails_on_the_way(tmp_path, monkeypatch):
     """The optimum is 20.60347; plain Levenberg-Marquardt ends at 385. iSAM2 calls the graph
     indeterminate with Cholesky at pose 165 and goes on with QR."""
-    source = data("graphs/MIT.g2o")
+    source = real_data("graphs/MIT.g2o")
     fallbacks = []
     use_qr = Isam2Backend._use_qr
 
@@ -65,7 +58,7 @@ def test_mit_reaches_its_optimum_though_cholesky_fails_on_the_way(tmp_path, monk
 
 @pytest.fixture(scope="module")
 def intel():
-    log = open_logs([data("mcap/intel_first600s.mcap")], Config())
+    log = open_logs([real_data("mcap/intel_first600s.mcap")], Config())
     return smooth(log, Config())
 
 
@@ -95,7 +88,7 @@ def test_the_first_ten_minutes_of_intel_against_its_relations(intel):
     The file's stamps went through a float, so they match the relations' to 1 µs; and it was sorted
     by stamp, so scans that were stamped late stand where their stamps say and cannot be placed:
     they are the tail that takes the mean of 0.017 m (from the CARMEN log) to 0.026 m."""
-    relations = read_relations(data("freiburg/intel.relations"))
+    relations = read_relations(real_data("freiburg/intel.relations"))
     scans = intel.robots["robot"].scan_final
     stamps = (scans.stamps_ns + 500) // 1000 * 1000
     metrics = relation_metrics(relations, Trajectory(stamps, scans.poses, scans.covs))
@@ -113,9 +106,8 @@ def test_csail_among_250_false_closures(robots):
     with the odometry from 522 to 523, which the two robots' files lack; 20.159 without). 0.01 is
     more than the digits and the convergence of either."""
     outliers = benchmark("outlier_closures")
-    data(f"graphs/{outliers.CLEAN}")
-    folder = DATA / "graphs"
-    run = outliers.run(folder, outliers.ONE if robots == 1 else outliers.TWO)
+    real_data(f"graphs/{outliers.CLEAN}")
+    run = outliers.run(real_data("graphs"), outliers.ONE if robots == 1 else outliers.TWO)
     assert (run.true, run.kept, run.false, run.believed) == (128, 128, 250, 0)
     assert run.error <= run.best + 0.01
     assert run.best == pytest.approx(20.275 if robots == 1 else 20.159, abs=1e-3)

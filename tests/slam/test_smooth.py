@@ -5,7 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from synthetic_results import cast, corners
+from pose_checks import assert_same_pose
+from walls import cast, rectangles
 
 from graphslam.core.config import Config, OdometryConfig, RobotConfig
 from graphslam.core.config_io import load_config
@@ -32,21 +33,11 @@ def run(path, *settings, config=None):
     return smooth(open_logs([path], tree), tree)
 
 
-def assert_same_pose(a, b, atol):
-    np.testing.assert_allclose(a[..., :2], b[..., :2], atol=atol)
-    np.testing.assert_allclose(wrap(a[..., 2] - b[..., 2]), 0, atol=atol)
-
-
 # ------------------------------------------------------------ a laser that sits elsewhere
 
 BEAMS = np.radians(np.arange(-135, 136.0))
 SCAN = {"angle_min_rad": float(BEAMS[0]), "angle_step_rad": np.radians(1), "range_max_m": 30.0}
-ROOM = np.concatenate(
-    [
-        np.stack([c[:-1], c[1:]], axis=1)
-        for c in (corners(-6, -5, 7, 5), corners(0, -1, 1, 1), corners(-6, 3, -4, 5))
-    ]
-)
+ROOM = rectangles((-6, -5, 7, 5), (0, -1, 1, 1), (-6, 3, -4, 5))
 SAID, REAL = np.array([0.2, 0.0, 0.0]), np.array([0.27, -0.04, 0.01])
 LATE_NS = 60_000_000  # the laser's clock against the odometry's
 LASER_S = 60
@@ -75,7 +66,7 @@ def laser(tmp_path_factory):
             log.odometry("robot", T0 + k * S // 20, odometry)
             if k % 5 == 0:
                 at = compose(driven(k / 20 - LATE_NS / S), REAL)
-                ranges = cast(at, BEAMS, ROOM) + rng.normal(0, 0.01, len(BEAMS))
+                ranges = cast(ROOM, BEAMS, at, 30.0) + rng.normal(0, 0.01, len(BEAMS))
                 stamps.append(T0 + k * S // 20 + (k % 7))
                 log.scan("robot", stamps[-1], ranges, **SCAN)
     return SimpleNamespace(path=path, stamps=np.array(stamps), result=run(path))
@@ -160,7 +151,7 @@ def test_the_first_state_is_where_the_odometry_starts_even_if_the_scan_comes_lat
             log.odometry("robot", T0 + k * S // 20, [0.025 * k, 0, 0])
             if k >= 20 and k % 5 == 0:
                 at = np.array([0.025 * k, 0, 0]) - [3, 3, 0]
-                log.scan("robot", T0 + k * S // 20, cast(at, BEAMS, ROOM), **SCAN)
+                log.scan("robot", T0 + k * S // 20, cast(ROOM, BEAMS, at, 30.0), **SCAN)
     found = run(path)
     assert found.estimate.states["robot"].stamps_ns[0] == T0
     assert_same_pose(found.robots["robot"].final.poses[0], np.array([0.5, 0, 0]), atol=0.02)
