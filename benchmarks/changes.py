@@ -39,8 +39,8 @@ from graphslam.core.geometry import Array, between, compose, inverse, transform
 from graphslam.logs import open_logs
 from graphslam.results.folder import load, save
 from graphslam.simulation import load_scenario, simulate
-from graphslam.simulation.raycast import Fan, cast
-from graphslam.simulation.scenario import Box, Later, Move, Scenario, Things
+from graphslam.simulation.raycast import BeamFan, cast_beams
+from graphslam.simulation.scenario import Box, LaterVisit, Move, Scenario, StaticObjects
 from graphslam.simulation.world import Outline, make_world
 from graphslam.slam.smooth import smooth
 
@@ -53,7 +53,7 @@ def variants() -> dict[str, Scenario]:
     assert table.later is not None
     nothing = replace(table.later, moved=())
 
-    def with_later(name: str, later: Later) -> Scenario:
+    def with_later(name: str, later: LaterVisit) -> Scenario:
         return replace(table, name=name, later=later)
 
     box = Box("new box", (3.4, 2.9), (0.5, 0.4), 20.0)
@@ -64,7 +64,7 @@ def variants() -> dict[str, Scenario]:
     return {
         "nothing": with_later("nothing", nothing),
         "table": table,
-        "appears": with_later("appears", replace(nothing, appeared=Things(boxes=(box,)))),
+        "appears": with_later("appears", replace(nothing, appeared=StaticObjects(boxes=(box,)))),
         "vanishes": with_later("vanishes", replace(nothing, vanished=("pallet",))),
         "moves": with_later("moves", replace(nothing, moved=(pallet,))),
         "moves far": with_later("moves far", replace(nothing, moved=(far,))),
@@ -371,8 +371,8 @@ def speed(seeds: Sequence[int], folder: Path) -> None:
         t = np.linspace(0, 2 * np.pi, 1000, endpoint=False)
         radius = 12 + number + 4 * np.sin(3 * t)
         poses = np.column_stack([20 + radius * np.cos(t), 20 + radius * np.sin(t), t + np.pi / 2])
-        fan = Fan(-np.pi / 2, np.pi / 360, 361)
-        ranges = cast(poses, fan, world.shapes, 80.0).ranges
+        fan = BeamFan(-np.pi / 2, np.pi / 360, 361)
+        ranges = cast_beams(poses, fan, world.shapes, 80.0).ranges
         ranges = ranges + 0.015 * rng.normal(size=ranges.shape)
         covs = np.broadcast_to(np.diag([0.01, 0.01, 0.004]) ** 2, (1000, 3, 3)).copy()
         poses = poses + rng.normal(size=poses.shape) * [0.01, 0.01, 0.004]

@@ -24,7 +24,7 @@ from graphslam.evaluation.compare_recording import Recording, record
 from graphslam.evaluation.compare_variants import variants
 from graphslam.evaluation.ground_truth import truth_of_logs
 from graphslam.evaluation.metrics import evaluate
-from graphslam.logs import KnownTruth, open_logs
+from graphslam.logs import GroundTruth, open_logs
 from graphslam.simulation import load_scenario, simulate
 
 START = ["start.from_truth=true"]
@@ -56,7 +56,7 @@ def in_time(steps: tuple[Step, ...]) -> tuple[Step, ...]:
     )
 
 
-def judge(recording: Recording, truth: KnownTruth, label: str, settings: list[str]) -> list[float]:
+def judge(recording: Recording, truth: GroundTruth, label: str, settings: list[str]) -> list[float]:
     """Causal and final position error, m; causal NEES per degree of freedom; landmarks, m."""
     spec, strip, gauge_m = ROWS[label]
     (variant,) = variants([spec], None, settings)

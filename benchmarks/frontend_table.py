@@ -35,7 +35,7 @@ from graphslam.evaluation.relation_metrics import read_relations
 from graphslam.logs import open_logs
 from graphslam.perception.front_ends import FRONT_ENDS
 from graphslam.simulation import load_scenario, simulate
-from graphslam.simulation.scene import visits
+from graphslam.simulation.scene import prepare_visits
 from graphslam.slam.smooth import smooth
 
 SEEDS = (0, 1, 2, 3)
@@ -91,7 +91,7 @@ class Score:
 def seen(name: str, seed: int, folder: Path, scans: int = SCANS) -> Iterator[Seen]:
     """Scans of all robots of a scenario, with their truth."""
     scenario = load_scenario(name)
-    world = visits(scenario)[0].world
+    world = prepare_visits(scenario)[0].world
     recording = simulate(scenario, folder / f"{name}.mcap", seed).recordings[0]
     log = open_logs([recording.path], Config())
     by_robot: dict[str, list[Scan]] = {}

@@ -25,7 +25,7 @@ import numpy as np
 from graphslam.core.config import Config
 from graphslam.core.records import Result
 from graphslam.logs import IMPORTERS, open_logs, pose_stamp_ns
-from graphslam.logs.import_pose_graph import Edge, read_pose_graph, split_chain
+from graphslam.logs.import_pose_graph import Edge, read_pose_graph, split_odometry
 from graphslam.slam.smooth import smooth
 
 PRIOR_SIGMA = 1e-3
@@ -91,7 +91,7 @@ def run(folder: Path, names: tuple[str, ...]) -> Run:
     result = smoothed([folder / name for name in names])
     seconds = time.perf_counter() - began
     edges = [e for name in names for e in read_pose_graph(folder / name).edges]
-    _, closures = split_chain(edges, sorted({pose for e in edges for pose in (e.start, e.end)}))
+    _, closures = split_odometry(edges, sorted({pose for e in edges for pose in (e.start, e.end)}))
     true = {(*ends(e), *e.delta) for e in read_pose_graph(folder / TRUE).edges}
     refused = [(c["other_time_ns"], c["time_ns"]) for c in result.summary["closures"]["refused"]]
     is_true = np.array([(*ends(e), *e.delta) in true for e in closures])

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from graphslam.simulation import SCENARIOS, load_scenario, simulate
-from graphslam.simulation.raycast import Fan, cast
+from graphslam.simulation.raycast import BeamFan, cast_beams
 from graphslam.simulation.world import Shapes
 
 SCANS, WALLS, SIDE_M = 2000, 200, 40.0
-FAN = Fan(-np.pi / 2, np.pi / 360, 361)
+FAN = BeamFan(-np.pi / 2, np.pi / 360, 361)
 
 
 def world(rng: np.random.Generator) -> Shapes:
@@ -34,7 +34,7 @@ def main() -> None:
     seconds = np.inf
     for _ in range(5):
         start = time.process_time()
-        cast(poses, FAN, shapes, 32.0)
+        cast_beams(poses, FAN, shapes, 32.0)
         seconds = min(seconds, time.process_time() - start)
     print(f"ray casting: {FAN.count} beams, {WALLS} walls: {SCANS / seconds:.0f} scans/s")
     with tempfile.TemporaryDirectory() as folder:

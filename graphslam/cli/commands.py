@@ -40,7 +40,7 @@ from graphslam.core.config_io import load_config
 from graphslam.core.errors import ConfigError, EstimationError, OutputError
 from graphslam.core.records import Result, TrueLandmark, Truth
 from graphslam.core.worker import Future
-from graphslam.logs import IMPORTERS, KnownTruth, inspect_logs, open_logs
+from graphslam.logs import IMPORTERS, GroundTruth, inspect_logs, open_logs
 from graphslam.results.folder import check_target, load, save, to_json
 
 app = typer.Typer(
@@ -195,7 +195,7 @@ def _smooth(logs: Sequence[Path], tree: Config, output: Path, force: bool) -> Re
     return result
 
 
-def _quality(result: Result, known: KnownTruth) -> dict[str, Any] | None:
+def _quality(result: Result, known: GroundTruth) -> dict[str, Any] | None:
     """What the truth in the logs says about the result; None without truth."""
     if not known:
         return None
@@ -242,7 +242,7 @@ def evaluate_command(
         if truth:
             known = truth_of_files(truth, list(saved.robots))
         else:
-            known = KnownTruth({}, ()) if reference else truth_of_run(saved)
+            known = GroundTruth({}, ()) if reference else truth_of_run(saved)
         found = evaluate(saved, known.trajectories, known.landmarks, reference)
         if json:
             typer.echo(to_json(found, "evaluation"), nl=False)

@@ -114,7 +114,7 @@ def estimate_clocks(
         if robot in rough:
             mean, offset_sigma = np.array([rough[robot].value_s, 0.0]), rough[robot].sigma_s
         observable = offset_sigma < OBSERVABLE_S
-        better = clock.plus(*mean.tolist()) if observable else clock
+        better = clock.adjusted(*mean.tolist()) if observable else clock
         out[robot] = ClockEstimate(better, offset_sigma, drift_sigma, observable, clock)
     return out
 

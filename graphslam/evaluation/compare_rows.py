@@ -16,7 +16,7 @@ from graphslam.evaluation.error_statistics import nees
 from graphslam.evaluation.metrics import evaluate
 from graphslam.evaluation.relation_metrics import Relations
 from graphslam.evaluation.trajectory_metrics import PosePairs, align, pair_poses
-from graphslam.logs import KnownTruth, LogSet
+from graphslam.logs import GroundTruth, LogSet
 from graphslam.results.folder import SavedResult
 from graphslam.results.report_comparison import Comparison, Curve, Lane
 from graphslam.slam.pipeline import Progress
@@ -34,7 +34,7 @@ def compare(
     rows: Sequence[Variant],
     mode: str = "replay",
     *,
-    truth: KnownTruth | None = None,
+    truth: GroundTruth | None = None,
     relations: Relations | None = None,
     progress: Progress = lambda _count: None,
     say: Callable[[str], None] = lambda _text: None,
@@ -63,7 +63,7 @@ def compare(
     """
     if mode not in MODES:
         raise ConfigError(f"--mode {mode}: is not one of {', '.join(MODES)}")
-    truth = truth or KnownTruth({}, ())
+    truth = truth or GroundTruth({}, ())
     if truth.trajectories and not set(truth.trajectories) & set(log.robots):
         raise OutputError(
             f"the truth is of {', '.join(truth.trajectories)}, "
@@ -189,7 +189,7 @@ class _Run:
 
     def judge(
         self,
-        truth: KnownTruth,
+        truth: GroundTruth,
         relations: Relations | None,
         reference: "_Run",
         warnings: list[str],

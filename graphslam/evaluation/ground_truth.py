@@ -6,20 +6,20 @@ from pathlib import Path
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError, OutputError
 from graphslam.core.records import Trajectory, TrueLandmark, Truth
-from graphslam.logs import KnownTruth, LogSet, read_truth, truth_in
+from graphslam.logs import GroundTruth, LogSet, read_truth, truth_from_mcap
 from graphslam.results.folder import SavedResult, read_trajectory
 
 _NO_TRUTH = "holds no true poses or landmarks; give --truth or --relations"
 
 
-def truth_of_logs(log: LogSet, config: Config) -> KnownTruth:
+def truth_of_logs(log: LogSet, config: Config) -> GroundTruth:
     """What open logs say about the truth, perhaps nothing."""
     if not any(topic.record in (Truth, TrueLandmark) for topic in log.topics):
-        return KnownTruth({}, ())  # spares reading them once more
-    return truth_in(log.opened, config)
+        return GroundTruth({}, ())  # spares reading them once more
+    return truth_from_mcap(log.opened, config)
 
 
-def truth_of_run(saved: SavedResult) -> KnownTruth:
+def truth_of_run(saved: SavedResult) -> GroundTruth:
     """What the logs that a result came from say about the truth.
 
     Raises:
@@ -35,7 +35,7 @@ def truth_of_run(saved: SavedResult) -> KnownTruth:
     return found
 
 
-def truth_of_files(sources: Sequence[str], robots: Sequence[str]) -> KnownTruth:
+def truth_of_files(sources: Sequence[str], robots: Sequence[str]) -> GroundTruth:
     """Truth from logs (``LOG.mcap``) and TUM files (``FILE.tum``, ``ROBOT=FILE.tum``).
 
     Args:
@@ -58,7 +58,7 @@ def truth_of_files(sources: Sequence[str], robots: Sequence[str]) -> KnownTruth:
         else:
             robot, path = _robot_and_path(source, robots)
             trajectories[robot] = read_trajectory(path)
-    return KnownTruth(trajectories, tuple(landmarks))
+    return GroundTruth(trajectories, tuple(landmarks))
 
 
 def _robot_and_path(source: str, robots: Sequence[str]) -> tuple[str, Path]:

@@ -8,13 +8,13 @@ from graphslam.logs.import_summary import ImportSummary
 from graphslam.logs.importers import IMPORTERS
 from graphslam.logs.log_info import LogInfo, RobotInfo, TopicInfo, inspect_logs
 from graphslam.logs.log_set import LogFile, LogSet, open_logs
-from graphslam.logs.truth import KnownTruth, read_true_associations, read_truth, truth_in
+from graphslam.logs.truth import GroundTruth, read_true_associations, read_truth, truth_from_mcap
 from graphslam.logs.writer import LogWriter
 
 __all__ = [
     "IMPORTERS",
+    "GroundTruth",
     "ImportSummary",
-    "KnownTruth",
     "LogFile",
     "LogInfo",
     "LogSet",
@@ -26,5 +26,5 @@ __all__ = [
     "pose_stamp_ns",
     "read_true_associations",
     "read_truth",
-    "truth_in",
+    "truth_from_mcap",
 ]

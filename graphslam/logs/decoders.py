@@ -16,10 +16,11 @@ from graphslam.core import records
 from graphslam.core.geometry import Array, is_positive
 from graphslam.logs import schemas
 
-ABSURD_M = 1000.0  # no planar laser sees as far; some drivers write 1e6 or 65535 for an error
+# No planar laser measures farther; some drivers write 1e6 or 65535 for an error.
+MAX_RANGE_M = 1000.0
 
 
-class UnusableError(Exception):
+class UnusableMessageError(Exception):
     """A message that must be dropped; its text is the reason under which it is counted."""
 
 
@@ -64,11 +65,11 @@ def scan(message: Any, topic: TopicContext) -> records.Scan:
     ranges = np.asarray(message.ranges, dtype=float)
     start, step = float(message.angle_min), float(message.angle_increment)
     if not len(ranges):
-        raise UnusableError("scan: no beams")
+        raise UnusableMessageError("scan: no beams")
     if not (np.isfinite(start) and np.isfinite(step) and step):
-        raise UnusableError("scan: angle increment is zero or angles are not finite")
+        raise UnusableMessageError("scan: angle increment is zero or angles are not finite")
     finite = np.isfinite(ranges)
-    negative, absurd = finite & (ranges < 0), finite & (ranges > ABSURD_M)
+    negative, absurd = finite & (ranges < 0), finite & (ranges > MAX_RANGE_M)
     if not finite.all():
         nan = int(np.isnan(ranges).sum())
         infinite = len(ranges) - int(finite.sum()) - nan
@@ -79,7 +80,7 @@ def scan(message: Any, topic: TopicContext) -> records.Scan:
     if absurd.any():
         topic.beams["range: absurd"] += int(absurd.sum())
     low, high = float(message.range_min), float(message.range_max)
-    usable = finite & (ranges > 0) & (ranges <= ABSURD_M) & (ranges < topic.no_return_m)
+    usable = finite & (ranges > 0) & (ranges <= MAX_RANGE_M) & (ranges < topic.no_return_m)
     # a driver that leaves the limits at 0, or writes NaN or inf, does not limit anything
     if low > 0:
         usable &= ranges >= low
@@ -107,9 +108,9 @@ def odometry(message: schemas.PlanarOdometry, topic: TopicContext) -> records.Od
     stamp, x, y, (q_x, q_y, q_z, q_w) = message
     norm = q_x * q_x + q_y * q_y + q_z * q_z + q_w * q_w
     if not 0.5 < norm < 2.0:  # also false for NaN
-        raise UnusableError("odometry: quaternion is not a rotation")
+        raise UnusableMessageError("odometry: quaternion is not a rotation")
     if not math.isfinite(x + y):
-        raise UnusableError("odometry: not finite")
+        raise UnusableMessageError("odometry: not finite")
     yaw = math.atan2(2 * (q_w * q_z + q_x * q_y), norm - 2 * (q_y * q_y + q_z * q_z))
     return records.OdometryPose(topic.robot, stamp, stamp, np.array([x, y, yaw]))
 
@@ -139,7 +140,7 @@ def sighting(message: Any, topic: TopicContext) -> records.Sighting:
     cov = _covariance("sighting", message.covariance, size)
     _check_finite("sighting", z)
     if z[1] <= 0:
-        raise UnusableError("sighting: range is not positive")
+        raise UnusableMessageError("sighting: range is not positive")
     stamp = stamp_of(message)
     mount = topic.mounts.get(frame_of(message), _NO_MOUNT)
     identity, seen = message.identity or None, message.robot or None
@@ -154,7 +155,7 @@ def odometry_increment(message: Any, topic: TopicContext) -> records.OdometryInc
     """
     start, stamp = schemas.stamp_ns(message.start), stamp_of(message)
     if stamp <= start:
-        raise UnusableError("increment: does not end after its start")
+        raise UnusableMessageError("increment: does not end after its start")
     delta = _pose("increment", message)
     cov = _covariance("increment", message.covariance, 3)
     return records.OdometryIncrement(topic.robot, stamp, stamp, start, delta, cov)
@@ -190,12 +191,12 @@ def true_landmark(message: Any, _topic: TopicContext) -> records.TrueLandmark:
         UnusableError: an unknown kind, a position that is not finite, an extent of a wrong size.
     """
     if message.kind not in ("point", "segment", "line"):
-        raise UnusableError("true landmark: kind is not point, segment or line")
+        raise UnusableMessageError("true landmark: kind is not point, segment or line")
     pose = np.array([message.x, message.y, message.phi])
     _check_finite("true landmark", pose[:2] if message.kind == "point" else pose)
     extent = np.asarray(message.extent, dtype=float)
     if len(extent) not in (0, 4):
-        raise UnusableError("true landmark: extent is not x1 y1 x2 y2")
+        raise UnusableMessageError("true landmark: extent is not x1 y1 x2 y2")
     ends = extent.reshape(2, 2) if len(extent) else None
     stamp = stamp_of(message)
     return records.TrueLandmark("", stamp, stamp, message.identity, message.kind, pose, ends)
@@ -209,7 +210,7 @@ def true_associations(message: Any, topic: TopicContext) -> records.TrueAssociat
     """
     names, targets = tuple(message.names), np.asarray(message.targets, dtype=np.int64)
     if len(targets) and not -1 <= targets.min() <= targets.max() < len(names):
-        raise UnusableError("true associations: a target is not among the names")
+        raise UnusableMessageError("true associations: a target is not among the names")
     stamp = stamp_of(message)
     return records.TrueAssociations(topic.robot, stamp, stamp, names, targets)
 
@@ -241,7 +242,7 @@ def frame_of(message: Any) -> str:
 
 def _check_finite(what: str, values: Array) -> None:
     if not np.isfinite(values).all():
-        raise UnusableError(f"{what}: not finite")
+        raise UnusableMessageError(f"{what}: not finite")
 
 
 def _pose(what: str, message: Any) -> Array:
@@ -256,14 +257,14 @@ def _covariance(what: str, values: Any, size: int) -> Array:
     cov = np.asarray((cov + cov.T) / 2)
     _check_finite(what, cov)
     if not is_positive(cov):
-        raise UnusableError(f"{what}: covariance is not positive definite")
+        raise UnusableMessageError(f"{what}: covariance is not positive definite")
     return cov
 
 
 def _joint(positions: Mapping[str, float], name: str, side: str) -> float:
     names = [name] if name else [n for n in positions if side in n.lower()]
     if len(names) != 1 or names[0] not in positions:
-        raise UnusableError(
+        raise UnusableMessageError(
             f"joints: {side} wheel missing or ambiguous; set robots.NAME.{side}_joint"
         )
     return positions[names[0]]

@@ -20,9 +20,9 @@ import numpy as np
 
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import Array, compose, exp
-from graphslam.logs.import_archive import text_files
 from graphslam.logs.import_carmen import parse_stamp_ns
 from graphslam.logs.import_summary import ImportSummary
+from graphslam.logs.source_files import text_files
 from graphslam.logs.writer import LogWriter
 
 #: subjects up to this number are robots, the others landmarks

@@ -65,7 +65,7 @@ def pose_stamp_ns(number: int) -> int:
     return (number + 1) * _SECOND_NS
 
 
-def import_isam(source: Path, target: Path) -> ImportSummary:
+def import_pose_graph(source: Path, target: Path) -> ImportSummary:
     """Convert a pose graph to the MCAP file ``target``.
 
     Edges between consecutive poses become OdometryIncrement, others RelativePose, landmarks
@@ -83,8 +83,8 @@ def import_isam(source: Path, target: Path) -> ImportSummary:
     if not poses:
         raise LogError(f"{source}: has no edge between two poses; is it a pose graph in 2-D?")
     number = {pose: k for k, pose in enumerate(poses)}
-    odometry, others = split_chain(graph.edges, poses)
-    robots = name_robots(source, odometry, poses)
+    odometry, others = split_odometry(graph.edges, poses)
+    robots = assign_robots(source, odometry, poses)
     closures = _by_pose(others, lambda edge: edge.end)
     sightings = _by_pose(graph.sightings, lambda seen: seen.pose)
     notes = {"format": "pose graph", "source": source.name, "stamps": _STAMPS}
@@ -132,7 +132,9 @@ def _write(write: Callable[..., None], number: dict[int, int], edge: Edge) -> No
 # ---------------------------------------------------------------- the graph
 
 
-def split_chain(edges: Iterable[Edge], poses: Sequence[int]) -> tuple[dict[int, Edge], list[Edge]]:
+def split_odometry(
+    edges: Iterable[Edge], poses: Sequence[int]
+) -> tuple[dict[int, Edge], list[Edge]]:
     """The odometry, by the pose that each of its edges leads to, and all other edges.
 
     The first edge between two neighbours of ``poses`` is the odometry. All edges are turned to lead
@@ -142,7 +144,7 @@ def split_chain(edges: Iterable[Edge], poses: Sequence[int]) -> tuple[dict[int, 
     odometry: dict[int, Edge] = {}
     others = []
     for edge in edges:
-        forward = edge if edge.start < edge.end else turned(edge)
+        forward = edge if edge.start < edge.end else reverse_edge(edge)
         if following.get(forward.start) == forward.end and forward.end not in odometry:
             odometry[forward.end] = forward
         else:
@@ -150,7 +152,9 @@ def split_chain(edges: Iterable[Edge], poses: Sequence[int]) -> tuple[dict[int, 
     return odometry, others
 
 
-def name_robots(source: Path, odometry: Mapping[int, Edge], poses: Sequence[int]) -> dict[int, str]:
+def assign_robots(
+    source: Path, odometry: Mapping[int, Edge], poses: Sequence[int]
+) -> dict[int, str]:
     """Pose -> its robot: a new one begins where no odometry leads to a pose.
 
     Raises:
@@ -170,7 +174,7 @@ def name_robots(source: Path, odometry: Mapping[int, Edge], poses: Sequence[int]
     return {p: f"robot{n:0{digits}}" for p, n in zip(poses, number, strict=True)}
 
 
-def turned(edge: Edge) -> Edge:
+def reverse_edge(edge: Edge) -> Edge:
     """The same measurement seen from its other end: pose of ``start`` in the frame of ``end``.
 
     Exact for gtsam's error: with h = z exp(e) the inverse is h^-1 = z^-1 exp(-Ad_z e).

@@ -2,14 +2,14 @@
 
 from graphslam.logs.import_carmen import import_carmen
 from graphslam.logs.import_mrclam import import_mrclam
-from graphslam.logs.import_pose_graph import import_isam, pose_stamp_ns
+from graphslam.logs.import_pose_graph import import_pose_graph, pose_stamp_ns
 from graphslam.logs.import_summary import Importer, ImportSummary
 from graphslam.logs.import_tinyslam import import_tinyslam
 
 IMPORTERS: dict[str, Importer] = {
     "carmen": import_carmen,
-    "g2o": import_isam,
-    "isam": import_isam,
+    "g2o": import_pose_graph,
+    "isam": import_pose_graph,
     "mrclam": import_mrclam,
     "tinyslam": import_tinyslam,
 }

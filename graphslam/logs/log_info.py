@@ -15,11 +15,11 @@ from graphslam.core.errors import LogError
 from graphslam.core.geometry import Array, between
 from graphslam.logs import time_order
 from graphslam.logs.decoders import TopicContext
+from graphslam.logs.future_stamps import repair_future_stamps
 from graphslam.logs.log_set import LogFile, decode_message, describe_damage
 from graphslam.logs.mcap_file import McapFile, open_mcap, raw_messages
 from graphslam.logs.schemas import SIGHTING
-from graphslam.logs.stamp_repair import place_late
-from graphslam.logs.survey import ScanShape, scan_shape, survey_topics
+from graphslam.logs.topic_context import ScanShape, scan_shape, topic_contexts
 from graphslam.logs.topics import (
     ODOMETRY_KINDS,
     Topic,
@@ -129,7 +129,7 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
         warnings += choices
     except LogError as error:
         problem = str(error)
-    contexts, assumed = survey_topics(files, topics, config)
+    contexts, assumed = topic_contexts(files, topics, config)
     dropped: Counter[str] = Counter()
     readings = {
         topic.name: _read_topic(files, topic, contexts[topic.name], config, dropped)
@@ -184,13 +184,13 @@ def _read_topic(
 ) -> _Reading:
     reading = _Reading([], [], [], 0, 0, Counter())
     for file in files:
-        line = time_order.TimeLine(round(config.logs.reorder_s * 1e9))
+        line = time_order.MessageSorter(round(config.logs.reorder_s * 1e9))
         decoded = (
             (topic.name, message, raw.log_time_ns)
             for raw in raw_messages(file, {topic.name})
             if (message := decode_message(raw, topic, context, dropped)) is not None
         )
-        for _, message, _ in place_late(decoded, time_order.SAMPLED):
+        for _, message, _ in repair_future_stamps(decoded, time_order.SAMPLED):
             reading.stamps_ns.append(message.stamp_ns)
             if isinstance(message, records.Scan):
                 reading.beams += len(message.ranges)

@@ -11,14 +11,14 @@ from graphslam.core.errors import LogError
 from graphslam.core.records import Message
 from graphslam.core.worker import Prefetch
 from graphslam.logs import schemas, time_order
-from graphslam.logs.decoders import DECODERS, TopicContext, UnusableError
+from graphslam.logs.decoders import DECODERS, TopicContext, UnusableMessageError
+from graphslam.logs.future_stamps import Recorded, repair_future_stamps
 from graphslam.logs.mcap_file import McapFile, RawMessage, open_mcap, raw_messages
-from graphslam.logs.stamp_repair import Recorded, place_late
-from graphslam.logs.survey import survey_topics
+from graphslam.logs.topic_context import topic_contexts
 from graphslam.logs.topics import ODOMETRY_KINDS, Topic, choose_topics, find_topics
 
 #: messages that are worth a second process to read them
-MANY = 10_000
+WORKER_MIN_MESSAGES = 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,7 @@ class LogSet:
         """
         topics = {topic.name: topic for topic in self.topics if topic.record not in without}
         self._tell(_Told(Counter(), Counter(), []))
-        ahead &= self.count(without) >= MANY
+        ahead &= self.count(without) >= WORKER_MIN_MESSAGES
         for item in Prefetch(lambda: self._read(topics)) if ahead else self._read(topics):
             if isinstance(item, _Told):
                 self._tell(item)
@@ -141,7 +141,7 @@ def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
         if file.sha256 in {other.sha256 for other in files[:n]}:
             raise LogError(f"{file.path}: is given twice; each log counts once")
     topics, warnings = choose_topics(files, find_topics(files, config))
-    contexts, assumed = survey_topics(files, topics, config)
+    contexts, assumed = topic_contexts(files, topics, config)
     notes: dict[str, str] = {}
     for file in files:
         notes |= file.notes
@@ -171,7 +171,7 @@ def decode_message(
     try:
         _, decode, read = DECODERS[topic.schema]
         return decode(read(raw.data) if read else schemas.decode(topic.schema, raw.data), context)
-    except UnusableError as reason:
+    except UnusableMessageError as reason:
         dropped[str(reason)] += 1
     except schemas.CdrError:
         dropped[f"{topic.schema}: cannot be decoded"] += 1
@@ -189,14 +189,14 @@ class _FileReader:
         window_ns: int,
     ) -> None:
         self.dropped: Counter[str] = Counter()
-        self.line = time_order.TimeLine(window_ns)
+        self.line = time_order.MessageSorter(window_ns)
         self._file, self._topics = file, topics
         # beams are counted by the decoders, into this pass' own counter
         self._contexts = {n: replace(c, beams=self.dropped) for n, c in contexts.items()}
 
     def messages(self) -> Iterator[Message]:
         """Sorted messages of this file."""
-        for topic, message, _ in place_late(self._recorded(), time_order.SAMPLED):
+        for topic, message, _ in repair_future_stamps(self._recorded(), time_order.SAMPLED):
             yield from self.line.push(topic, message)
         yield from self.line.finish()
 

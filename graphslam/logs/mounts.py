@@ -9,7 +9,7 @@ import numpy as np
 from graphslam.core.geometry import Array
 
 # Transforms are parent_from_child, keyed by the child: a frame has one parent.
-Tree = Mapping[str, tuple[str, Array]]
+TransformTree = Mapping[str, tuple[str, Array]]
 
 # A laser tilted by less than this still sees a planar slice to about one per mille.
 _LEVEL = np.cos(np.deg2rad(3.0))
@@ -39,7 +39,7 @@ def transform_tree(messages: Iterable[Any]) -> dict[str, tuple[str, Array]]:
     return tree
 
 
-def find_mount(tree: Tree, base: str, sensor: str) -> Mount | None:
+def find_mount(tree: TransformTree, base: str, sensor: str) -> Mount | None:
     """Mount of frame ``sensor`` on frame ``base``; None when the tree does not connect them.
 
     Either may be the other's ancestor, or both hang below a common one (base_footprint).
@@ -67,7 +67,7 @@ def is_level(mount: Mount) -> bool:
     return bool(np.cos(mount.tilt_rad) >= _LEVEL)
 
 
-def _ancestors(tree: Tree, frame: str) -> dict[str, Array]:
+def _ancestors(tree: TransformTree, frame: str) -> dict[str, Array]:
     """``frame`` and everything above it, with the transform (4, 4) ancestor from ``frame``."""
     found = {frame: np.eye(4)}
     while frame in tree:

@@ -49,7 +49,7 @@ def sort_key(message: Message) -> tuple[int, int]:
     return message.time_ns, rank
 
 
-class TimeLine:
+class MessageSorter:
     """Sorts the messages of one file, given in the order of recording.
 
     A stamp that a later message of its topic contradicts by being earlier is a *glitch*: stamped

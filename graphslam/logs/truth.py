@@ -18,7 +18,7 @@ from graphslam.logs.topics import find_topics
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class KnownTruth:
+class GroundTruth:
     """True trajectories of robots' bases and true landmarks, world frame; either may be empty.
 
     Covariances are NaN. ``sha256`` are those of the logs it was read from, in their order.
@@ -33,7 +33,7 @@ class KnownTruth:
         return bool(self.trajectories or self.landmarks)
 
 
-def read_truth(paths: Sequence[Path], config: Config) -> KnownTruth:
+def read_truth(paths: Sequence[Path], config: Config) -> GroundTruth:
     """All TruePose and TrueLandmark messages of ``paths``; both may be empty.
 
     Poses are sorted by header stamp. A landmark told more than once (one per robot or file) is
@@ -42,10 +42,10 @@ def read_truth(paths: Sequence[Path], config: Config) -> KnownTruth:
     Raises:
         LogError: a file is missing, not MCAP, empty, or without any topic that can be decoded.
     """
-    return truth_in([open_mcap(path) for path in paths], config)
+    return truth_from_mcap([open_mcap(path) for path in paths], config)
 
 
-def truth_in(files: Sequence[McapFile], config: Config) -> KnownTruth:
+def truth_from_mcap(files: Sequence[McapFile], config: Config) -> GroundTruth:
     """`read_truth` of files that are open already."""
     topics = {t.name: t for t in find_topics(files, config) if t.record in (Truth, TrueLandmark)}
     poses: dict[str, list[bytes]] = {}
@@ -61,7 +61,7 @@ def truth_in(files: Sequence[McapFile], config: Config) -> KnownTruth:
             if isinstance(message, TrueLandmark):
                 landmarks[message.identity or f"without identity {len(landmarks)}"] = message
     trajectories = {robot: _trajectory(found) for robot, found in sorted(poses.items())}
-    return KnownTruth(
+    return GroundTruth(
         {robot: found for robot, found in trajectories.items() if len(found)},
         tuple(landmarks.values()),
         tuple(file.sha256 for file in files),

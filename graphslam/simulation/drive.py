@@ -10,14 +10,14 @@ from math import sqrt
 import numpy as np
 
 from graphslam.core.geometry import Array, wrap
-from graphslam.simulation.path import Curve, rounded
+from graphslam.simulation.path import Curve, round_corners
 from graphslam.simulation.scenario import Leg, Robot
 
 _ALIGNED_RAD = 1e-9  # a smaller turn on the spot is none
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class States:
+class BaseStates:
     """What is true of a robot's base at n times.
 
     ``poses`` (n, 3) world frame; ``travel`` (n,) m, signed along the robot's x axis, and
@@ -30,7 +30,7 @@ class States:
 
 
 @dataclass(frozen=True, slots=True)
-class Trapezoid:
+class TrapezoidalProfile:
     """A distance covered from rest to rest with one acceleration and one top speed (any unit)."""
 
     distance: float
@@ -59,11 +59,11 @@ class Trapezoid:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Follow:
+class CurveMotion:
     """Along a curve, forwards or backwards."""
 
     curve: Curve
-    profile: Trapezoid
+    profile: TrapezoidalProfile
     backwards: bool
 
     @property
@@ -71,22 +71,22 @@ class Follow:
         """Time from rest to rest."""
         return self.profile.duration_s
 
-    def at(self, time_s: Array) -> States:
+    def at(self, time_s: Array) -> BaseStates:
         """States at times (n,) s since the leg began; ``travel`` and ``turned`` since then too."""
         s = np.minimum(self.profile.at(time_s), self.curve.length_m)
         position, tangent = self.curve.at(s)
         heading = wrap(tangent + np.pi * self.backwards)
         turned = tangent - self.curve.heading[0]
-        return States(np.column_stack([position, heading]), -s if self.backwards else s, turned)
+        return BaseStates(np.column_stack([position, heading]), -s if self.backwards else s, turned)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Turn:
+class TurnOnSpot:
     """On the spot, from ``start`` (3,) by ``angle_rad``; a turn of nothing is a wait."""
 
     start: Array
     angle_rad: float
-    profile: Trapezoid | None
+    profile: TrapezoidalProfile | None
     wait_s: float = 0.0
 
     @property
@@ -94,21 +94,21 @@ class Turn:
         """Time from rest to rest."""
         return self.profile.duration_s if self.profile else self.wait_s
 
-    def at(self, time_s: Array) -> States:
+    def at(self, time_s: Array) -> BaseStates:
         """States at times (n,) s since the leg began; see `Follow.at`."""
         turned = np.zeros(len(time_s))
         if self.profile:
             turned = np.sign(self.angle_rad) * self.profile.at(time_s)
         poses = np.tile(self.start, (len(time_s), 1))
         poses[:, 2] = wrap(poses[:, 2] + turned)
-        return States(poses, np.zeros(len(time_s)), turned)
+        return BaseStates(poses, np.zeros(len(time_s)), turned)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
     """Motions one after the other; ``begins_s``, ``travel`` and ``turned`` are at their starts."""
 
-    motions: tuple[Follow | Turn, ...]
+    motions: tuple[CurveMotion | TurnOnSpot, ...]
     begins_s: tuple[float, ...]
     travel: tuple[float, ...]
     turned: tuple[float, ...]
@@ -121,9 +121,9 @@ class Drive:
     @property
     def path_m(self) -> float:
         """Length of the path, forwards and backwards."""
-        return sum(m.curve.length_m for m in self.motions if isinstance(m, Follow))
+        return sum(m.curve.length_m for m in self.motions if isinstance(m, CurveMotion))
 
-    def at(self, time_s: Array) -> States:
+    def at(self, time_s: Array) -> BaseStates:
         """States at times (n,) s; the robot stands before the first motion and after the last."""
         times = np.asarray(time_s, dtype=float)
         which = np.clip(np.searchsorted(self.begins_s, times, side="right") - 1, 0, None)
@@ -135,22 +135,22 @@ class Drive:
             poses[rows] = found.poses
             travel[rows] = self.travel[number] + found.travel
             turned[rows] = self.turned[number] + found.turned
-        return States(poses, travel, turned)
+        return BaseStates(poses, travel, turned)
 
 
-def plan(start: Array, legs: Sequence[Leg], robot: Robot) -> Drive:
+def plan_drive(start: Array, legs: Sequence[Leg], robot: Robot) -> Drive:
     """The drive of a ``robot`` from pose ``start`` (3,) along ``legs``.
 
     Raises:
         ScenarioError: a leg's points coincide or turn back sharply.
     """
-    motions: list[Follow | Turn] = []
+    motions: list[CurveMotion | TurnOnSpot] = []
     pose = start
     for leg in legs:
         for motion in _motions(pose, leg, robot):
             motions.append(motion)
             pose = motion.at(np.array([motion.duration_s])).poses[0]
-    motions.append(Turn(pose, 0.0, None))  # stands for good
+    motions.append(TurnOnSpot(pose, 0.0, None))  # stands for good
     ends = [m.at(np.array([m.duration_s])) for m in motions[:-1]]
     return Drive(
         tuple(motions),
@@ -160,20 +160,20 @@ def plan(start: Array, legs: Sequence[Leg], robot: Robot) -> Drive:
     )
 
 
-def _motions(pose: Array, leg: Leg, robot: Robot) -> list[Follow | Turn]:
+def _motions(pose: Array, leg: Leg, robot: Robot) -> list[CurveMotion | TurnOnSpot]:
     """The motions of one leg; a path that begins in another direction brings its turn along."""
     if leg.wait_s:
-        return [Turn(pose, 0.0, None, leg.wait_s)]
+        return [TurnOnSpot(pose, 0.0, None, leg.wait_s)]
     rate = np.radians(robot.turn_rate_deg_s)
     if leg.turn_deg:
         angle = np.radians(leg.turn_deg)
-        return [Turn(pose, angle, Trapezoid(abs(angle), rate, 2 * rate))]
+        return [TurnOnSpot(pose, angle, TrapezoidalProfile(abs(angle), rate, 2 * rate))]
     points = [pose[:2].tolist(), *leg.through_m]
-    curve = rounded(points, robot.corner_m)
+    curve = round_corners(points, robot.corner_m)
     angle = float(wrap(curve.heading[0] + np.pi * leg.reverse - pose[2]))
     speed = leg.speed_m_s or robot.speed_m_s
-    profile = Trapezoid(curve.length_m, speed, robot.acceleration_m_s2)
-    follow = Follow(curve, profile, leg.reverse)
+    profile = TrapezoidalProfile(curve.length_m, speed, robot.acceleration_m_s2)
+    follow = CurveMotion(curve, profile, leg.reverse)
     if abs(angle) < _ALIGNED_RAD:
         return [follow]
-    return [Turn(pose, angle, Trapezoid(abs(angle), rate, 2 * rate)), follow]
+    return [TurnOnSpot(pose, angle, TrapezoidalProfile(abs(angle), rate, 2 * rate)), follow]

@@ -5,11 +5,11 @@ import numpy as np
 from graphslam.core.config import RobotConfig
 from graphslam.core.geometry import Array, compose, exp
 from graphslam.core.motion_models import wheel_twist
-from graphslam.simulation.drive import States
+from graphslam.simulation.drive import BaseStates
 from graphslam.simulation.scenario import Encoders
 
 
-def wheel_angles(states: States, encoders: Encoders, rng: np.random.Generator) -> Array:
+def wheel_angles(states: BaseStates, encoders: Encoders, rng: np.random.Generator) -> Array:
     """Accumulated wheel angles (n, 2) rad, left and right, as read at n successive states.
 
     The true wheels have the true radii and the true axle; what they turn more or less than they

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from graphslam.core.geometry import Array, compose
-from graphslam.simulation.raycast import NOTHING, Fan, Hits, cast, nearest
+from graphslam.simulation.raycast import NO_SURFACE, BeamFan, Hits, cast_beams, nearest_hits
 from graphslam.simulation.robot_shapes import outline_shapes
 from graphslam.simulation.scenario import Body, Laser
 from graphslam.simulation.world import World
@@ -15,18 +15,18 @@ from graphslam.simulation.world import World
 _BEYOND_M = 5.0
 
 
-def fan_of(laser: Laser) -> Fan:
+def beam_fan(laser: Laser) -> BeamFan:
     """The beams of a laser in its own frame, symmetric about its x axis."""
     step = np.radians(laser.step_deg)
-    return Fan(-step * (laser.beams - 1) / 2, step, laser.beams)
+    return BeamFan(-step * (laser.beams - 1) / 2, step, laser.beams)
 
 
-def mount_of(laser: Laser) -> Array:
+def laser_mount(laser: Laser) -> Array:
     """Pose (3,) of the laser in the base frame."""
     return np.array([*laser.mount_m, np.radians(laser.mount_deg)])
 
 
-def clean_scans(
+def noise_free_scans(
     poses: Array, laser: Laser, world: World, others: Mapping[str, tuple[Body, Array]]
 ) -> Hits:
     """What noise-free beams meet, from bases at ``poses`` (n, 3).
@@ -34,13 +34,13 @@ def clean_scans(
     ``others`` are the other robots with their poses (n, 3) at the same times. Surfaces are those
     of ``world``; robot number i has the number ``len(world.names) + i`` for its whole outline.
     """
-    at, fan = compose(poses, mount_of(laser)), fan_of(laser)
+    at, fan = compose(poses, laser_mount(laser)), beam_fan(laser)
     reach = laser.range_max_m + _BEYOND_M
-    hits = cast(at, fan, world.shapes, reach)
+    hits = cast_beams(at, fan, world.shapes, reach)
     for number, (body, where) in enumerate(others.values()):
-        seen = cast(at, fan, outline_shapes(body, where), reach)
-        robot = np.where(seen.surfaces == NOTHING, NOTHING, 0)
-        hits = nearest(hits, Hits(seen.ranges, robot), len(world.names) + number)
+        seen = cast_beams(at, fan, outline_shapes(body, where), reach)
+        robot = np.where(seen.surfaces == NO_SURFACE, NO_SURFACE, 0)
+        hits = nearest_hits(hits, Hits(seen.ranges, robot), len(world.names) + number)
     return hits
 
 
@@ -51,7 +51,7 @@ def noisy_ranges(hits: Hits, biases: Array, laser: Laser, rng: np.random.Generat
     drawn in one order whatever the shares are: one kind of error does not change the others.
     """
     clean, shape = hits.ranges, hits.ranges.shape
-    bias = np.where(hits.surfaces == NOTHING, 0.0, np.append(biases, 0.0)[hits.surfaces])
+    bias = np.where(hits.surfaces == NO_SURFACE, 0.0, np.append(biases, 0.0)[hits.surfaces])
     ranges = clean + bias + laser.range_sigma_m * rng.normal(size=shape)
     ranges = _mixed(ranges, hits, laser, rng)
     spurious = rng.random(shape) < laser.spurious_share

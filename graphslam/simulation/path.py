@@ -73,7 +73,7 @@ def curve_from_curvature(
     return replace(shape, position=start + np.vstack([np.zeros(2), np.cumsum(steps, axis=0)]))
 
 
-def rounded(points: Sequence[Sequence[float]], corner_m: float) -> Curve:
+def round_corners(points: Sequence[Sequence[float]], corner_m: float) -> Curve:
     """The polyline through ``points`` (k, 2) m with its inner corners rounded.
 
     Each corner is cut by at most ``corner_m`` on both sides, and by no more than half of a

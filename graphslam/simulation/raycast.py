@@ -15,7 +15,7 @@ from graphslam.simulation.world import Shapes
 
 Ints = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
-NOTHING = -1  # surface number of a beam that met nothing
+NO_SURFACE = -1  # surface number of a beam that met nothing
 # scans x surfaces at a time: the arrays of a chunk stay in the processor's cache
 _CHUNK = 20_000
 # Share of a face's length by which beams may miss its ends: neighbouring faces must not leak.
@@ -23,7 +23,7 @@ _SEAM = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
-class Fan:
+class BeamFan:
     """Beams at ``start_rad + i step_rad``, i < count, in the laser's frame; at most one turn."""
 
     start_rad: float
@@ -44,14 +44,16 @@ class Hits:
     surfaces: Ints
 
 
-def cast(poses: Array, fan: Fan, shapes: Shapes, reach_m: float) -> Hits:
+def cast_beams(poses: Array, fan: BeamFan, shapes: Shapes, reach_m: float) -> Hits:
     """The first surface on each beam, for lasers at ``poses`` (n, 3) in the frame of ``shapes``.
 
     Surfaces beyond ``reach_m`` may be left out. Shapes with a leading axis of n move: those of
     scan i are ``segments[i]``, ``circles[i]``. A laser inside a circle does not see it.
     """
     n = len(poses)
-    hits = Hits(np.full((n, fan.count), np.inf), np.full((n, fan.count), NOTHING, dtype=np.int64))
+    hits = Hits(
+        np.full((n, fan.count), np.inf), np.full((n, fan.count), NO_SURFACE, dtype=np.int64)
+    )
     size = max(1, _CHUNK // max(shapes.count, 1))
     for first in range(0, n, size):
         part = slice(first, first + size)
@@ -61,7 +63,7 @@ def cast(poses: Array, fan: Fan, shapes: Shapes, reach_m: float) -> Hits:
     return hits
 
 
-def nearest(first: Hits, second: Hits, offset: int) -> Hits:
+def nearest_hits(first: Hits, second: Hits, offset: int) -> Hits:
     """The nearer of two hits per beam; ``offset`` is added to the second's surface numbers."""
     nearer = second.ranges < first.ranges
     return Hits(
@@ -70,9 +72,11 @@ def nearest(first: Hits, second: Hits, offset: int) -> Hits:
     )
 
 
-def _cast(poses: Array, fan: Fan, shapes: Shapes, reach_m: float, hits: Hits, part: slice) -> None:
+def _cast(
+    poses: Array, fan: BeamFan, shapes: Shapes, reach_m: float, hits: Hits, part: slice
+) -> None:
     ranges = np.full(len(poses) * fan.count, np.inf)
-    surfaces = np.full(len(poses) * fan.count, NOTHING, dtype=np.int64)
+    surfaces = np.full(len(poses) * fan.count, NO_SURFACE, dtype=np.int64)
     beams = np.column_stack([np.cos(fan.angles), np.sin(fan.angles)])
     straight = shapes.segments.shape[-3]
     for place, surface, r in (
@@ -86,7 +90,7 @@ def _cast(poses: Array, fan: Fan, shapes: Shapes, reach_m: float, hits: Hits, pa
     hits.surfaces[part] = surfaces.reshape(len(poses), -1)
 
 
-def seen_from(poses: Array, points: Array) -> Array:
+def points_in_frames(poses: Array, points: Array) -> Array:
     """World points (..., k, 2) in the frames of ``poses`` (n, 3): (n, k, 2)."""
     c, s = np.cos(poses[:, 2])[:, None], np.sin(poses[:, 2])[:, None]
     dx, dy = points[..., 0] - poses[:, 0, None], points[..., 1] - poses[:, 1, None]
@@ -94,13 +98,13 @@ def seen_from(poses: Array, points: Array) -> Array:
 
 
 def _segments(
-    poses: Array, fan: Fan, beams: Array, segments: Array, reach_m: float
+    poses: Array, fan: BeamFan, beams: Array, segments: Array, reach_m: float
 ) -> Iterator[tuple[Ints, Ints, Array]]:
     """(place, surface, range) of every beam that meets a face, in flat arrays."""
     if not segments.shape[-3]:
         return
-    a = seen_from(poses, segments[..., 0, :])
-    b = seen_from(poses, segments[..., 1, :])
+    a = points_in_frames(poses, segments[..., 0, :])
+    b = points_in_frames(poses, segments[..., 1, :])
     e = b - a
     middle, half = (a + b) / 2, np.hypot(e[..., 0], e[..., 1]) / 2
     near = np.hypot(middle[..., 0], middle[..., 1]) - half < reach_m
@@ -121,12 +125,12 @@ def _segments(
 
 
 def _circles(
-    poses: Array, fan: Fan, beams: Array, circles: Array, reach_m: float, offset: int
+    poses: Array, fan: BeamFan, beams: Array, circles: Array, reach_m: float, offset: int
 ) -> Iterator[tuple[Ints, Ints, Array]]:
     """The same for circles (..., m, 3), whose surfaces are numbered from ``offset``."""
     if not circles.shape[-2]:
         return
-    c = seen_from(poses, circles[..., :2])
+    c = points_in_frames(poses, circles[..., :2])
     radius = np.broadcast_to(circles[..., 2], c.shape[:2])
     distance = np.hypot(c[..., 0], c[..., 1])
     near = (distance - radius < reach_m) & (distance > radius)
@@ -143,7 +147,7 @@ def _circles(
     yield (scan[pair] * fan.count + beam)[met], surface[pair][met] + offset, r
 
 
-def _beams_between(fan: Fan, begin_rad: Array, width_rad: Array) -> tuple[Ints, Ints]:
+def _beams_between(fan: BeamFan, begin_rad: Array, width_rad: Array) -> tuple[Ints, Ints]:
     """Pairs (sector, beam) of the beams in sectors (n,), each up to one beam wider than it is.
 
     The wider margin leaves rounding to the exact intersection that follows.

@@ -12,12 +12,12 @@ import numpy as np
 from graphslam.core.geometry import Array, compose
 from graphslam.logs import LogWriter
 from graphslam.simulation.encoders import odometry, wheel_angles
-from graphslam.simulation.laser import clean_scans, fan_of, mount_of, noisy_ranges
-from graphslam.simulation.raycast import NOTHING, Hits
+from graphslam.simulation.laser import beam_fan, laser_mount, noise_free_scans, noisy_ranges
+from graphslam.simulation.raycast import NO_SURFACE, Hits
 from graphslam.simulation.scenario import Body, Laser, Scenario
-from graphslam.simulation.scene import Actor, Visit
+from graphslam.simulation.scene import SimulatedRobot, SimulatedVisit
 from graphslam.simulation.sensor_clock import sample_times, stamps
-from graphslam.simulation.sightings import LANDMARKS, see, targets
+from graphslam.simulation.sightings import LANDMARKS, sighting_targets, simulate_sightings
 
 
 class Event(NamedTuple):
@@ -28,7 +28,7 @@ class Event(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sweep:
+class NoiseFreeScans:
     """Noise-free scans of a robot: laser ``poses`` (n, 3) and what their beams met."""
 
     laser: Laser
@@ -37,7 +37,7 @@ class Sweep:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RobotFacts:
+class RobotSummary:
     """What a robot did; ``dead_reckoning_end_m`` is how far off its odometry ends."""
 
     path_m: float
@@ -53,24 +53,24 @@ class Recording:
 
     path: Path
     counts: Mapping[str, int]
-    robots: Mapping[str, RobotFacts]
-    sweeps: Mapping[str, Sweep]
+    robots: Mapping[str, RobotSummary]
+    sweeps: Mapping[str, NoiseFreeScans]
 
 
-def generator(seed: int, *names: str) -> np.random.Generator:
+def sensor_rng(seed: int, *names: str) -> np.random.Generator:
     """Random numbers of one sensor: they do not change when another sensor is added."""
     return np.random.default_rng([seed, *(zlib.crc32(name.encode()) for name in names)])
 
 
-def record(scenario: Scenario, visit: Visit, path: Path, seed: int) -> Recording:
+def record_visit(scenario: Scenario, visit: SimulatedVisit, path: Path, seed: int) -> Recording:
     """Simulate a visit and write it to ``path``.
 
     Raises:
         OutputError: the log cannot be written.
     """
     events: list[Event] = []
-    robots: dict[str, RobotFacts] = {}
-    sweeps: dict[str, Sweep] = {}
+    robots: dict[str, RobotSummary] = {}
+    sweeps: dict[str, NoiseFreeScans] = {}
     sighted: set[str] = set()
     for name, actor in visit.actors.items():
         wheels, end_m = _wheels(name, actor, visit, seed)
@@ -90,7 +90,7 @@ def record(scenario: Scenario, visit: Visit, path: Path, seed: int) -> Recording
         sighted |= {landmark for _, landmark in seen}
         if sweep is not None:
             sweeps[name] = sweep
-        robots[name] = RobotFacts(
+        robots[name] = RobotSummary(
             actor.drive.path_m, visit.duration_s, len(scans), len(seen), end_m
         )
     events.sort(key=lambda event: event.stamp_ns)  # stable: robots in order, odometry first
@@ -98,7 +98,7 @@ def record(scenario: Scenario, visit: Visit, path: Path, seed: int) -> Recording
     with LogWriter(path, _notes(scenario, visit, seed)) as log:
         for name, actor in visit.actors.items():
             if actor.robot.laser is not None:
-                log.mount(name, first_ns, mount_of(actor.robot.laser))
+                log.mount(name, first_ns, laser_mount(actor.robot.laser))
         for event in _landmarks(visit, sweeps, sighted, first_ns):
             event.write(log)
         for event in events:
@@ -106,7 +106,7 @@ def record(scenario: Scenario, visit: Visit, path: Path, seed: int) -> Recording
     return Recording(path, log.counts, robots, sweeps)
 
 
-def _notes(scenario: Scenario, visit: Visit, seed: int) -> dict[str, str]:
+def _notes(scenario: Scenario, visit: SimulatedVisit, seed: int) -> dict[str, str]:
     """What the file says about itself: everything that is needed to write it again."""
     notes = {"format": "simulation", "scenario": scenario.name, "seed": str(seed)}
     if visit.name:
@@ -121,7 +121,7 @@ def _notes(scenario: Scenario, visit: Visit, seed: int) -> dict[str, str]:
 # ---------------------------------------------------------------- sensors
 
 
-def _others(visit: Visit, name: str, times: Array) -> dict[str, tuple[Body, Array]]:
+def _others(visit: SimulatedVisit, name: str, times: Array) -> dict[str, tuple[Body, Array]]:
     """The other robots' bodies and poses (n, 3) at ``times`` (n,) s."""
     return {
         other: (actor.robot.body, actor.drive.at(times).poses)
@@ -130,12 +130,14 @@ def _others(visit: Visit, name: str, times: Array) -> dict[str, tuple[Body, Arra
     }
 
 
-def _wheels(name: str, actor: Actor, visit: Visit, seed: int) -> tuple[list[Event], float]:
+def _wheels(
+    name: str, actor: SimulatedRobot, visit: SimulatedVisit, seed: int
+) -> tuple[list[Event], float]:
     """The encoders' messages, and how far off dead reckoning ends, m."""
     encoders = actor.robot.encoders
     times = sample_times(visit.duration_s, encoders.period_s, encoders.phase_s)
     states = actor.drive.at(times)
-    angles = wheel_angles(states, encoders, generator(seed, visit.name, name, "encoders"))
+    angles = wheel_angles(states, encoders, sensor_rng(seed, visit.name, name, "encoders"))
     poses = odometry(angles, encoders)
     events = []
     for t, pose, (left, right) in zip(
@@ -156,17 +158,19 @@ def _wheels(name: str, actor: Actor, visit: Visit, seed: int) -> tuple[list[Even
     return events, float(np.hypot(*(ends - states.poses[-1])[:2]))
 
 
-def _scans(name: str, actor: Actor, visit: Visit, seed: int) -> tuple[list[Event], Sweep | None]:
+def _scans(
+    name: str, actor: SimulatedRobot, visit: SimulatedVisit, seed: int
+) -> tuple[list[Event], NoiseFreeScans | None]:
     """The laser's messages and the noise-free scans behind them."""
     laser = actor.robot.laser
     if laser is None:
         return [], None
     times = sample_times(visit.duration_s, laser.period_s, laser.phase_s)
     poses = actor.drive.at(times).poses
-    hits = clean_scans(poses, laser, visit.world, _others(visit, name, times))
-    rng = generator(seed, visit.name, name, "laser")
+    hits = noise_free_scans(poses, laser, visit.world, _others(visit, name, times))
+    rng = sensor_rng(seed, visit.name, name, "laser")
     ranges = noisy_ranges(hits, _biases(visit, name, laser, seed), laser, rng)
-    fan = fan_of(laser)
+    fan = beam_fan(laser)
     events = [
         Event(
             t,
@@ -185,10 +189,10 @@ def _scans(name: str, actor: Actor, visit: Visit, seed: int) -> tuple[list[Event
             stamps(times, actor.robot.clock, laser.latency_s).tolist(), ranges, strict=True
         )
     ]
-    return events, Sweep(laser, compose(poses, mount_of(laser)), hits)
+    return events, NoiseFreeScans(laser, compose(poses, laser_mount(laser)), hits)
 
 
-def _biases(visit: Visit, name: str, laser: Laser, seed: int) -> Array:
+def _biases(visit: SimulatedVisit, name: str, laser: Laser, seed: int) -> Array:
     """By how much each surface (n,) is measured too far, m; the other robots' come last.
 
     A material has its bias at every visit and for every laser: what differs is the laser's scale.
@@ -200,19 +204,23 @@ def _biases(visit: Visit, name: str, laser: Laser, seed: int) -> Array:
         for name, thing in zip(world.names, world.things, strict=True)
     ]
     materials += [f"robot {other}" for other in visit.actors if other != name]
-    draws = [generator(seed, "material", material).normal() for material in materials]
+    draws = [sensor_rng(seed, "material", material).normal() for material in materials]
     return laser.bias_sigma_m * np.array(draws, dtype=float)
 
 
-def _sightings(name: str, actor: Actor, visit: Visit, seed: int) -> Iterator[tuple[Event, str]]:
+def _sightings(
+    name: str, actor: SimulatedRobot, visit: SimulatedVisit, seed: int
+) -> Iterator[tuple[Event, str]]:
     """The sightings' messages, each with the name of what was seen."""
     for number, seer in enumerate(actor.robot.sightings):
         times = sample_times(visit.duration_s, seer.period_s, seer.phase_s)
         poses = actor.drive.at(times).poses
-        candidates = list(targets(seer, visit.world, _others(visit, name, times), len(times)))
-        rng = generator(seed, visit.name, name, f"sightings {number}")
+        candidates = list(
+            sighting_targets(seer, visit.world, _others(visit, name, times), len(times))
+        )
+        rng = sensor_rng(seed, visit.name, name, f"sightings {number}")
         at = stamps(times, actor.robot.clock, seer.latency_s).tolist()
-        for seen in see(poses, seer, candidates, rng):
+        for seen in simulate_sightings(poses, seer, candidates, rng):
             t, landmark = at[seen.sample], seer.of == LANDMARKS
             write = partial(
                 LogWriter.sighting,
@@ -229,12 +237,14 @@ def _sightings(name: str, actor: Actor, visit: Visit, seed: int) -> Iterator[tup
 # ---------------------------------------------------------------- truth
 
 
-def _met(name: str, visit: Visit, sweep: Sweep, scans: list[Event]) -> Iterator[Event]:
+def _met(
+    name: str, visit: SimulatedVisit, sweep: NoiseFreeScans, scans: list[Event]
+) -> Iterator[Event]:
     """What each beam met; a spurious return still belongs to what it should have met."""
     everything = np.array([*visit.world.names, *(other for other in visit.actors if other != name)])
     for scan, surfaces in zip(scans, sweep.hits.surfaces, strict=True):
         met, places = np.unique(surfaces, return_inverse=True)
-        nothing = int(NOTHING in met)  # sorted first, as it is negative
+        nothing = int(NO_SURFACE in met)  # sorted first, as it is negative
         write = partial(
             LogWriter.true_associations,
             robot=name,
@@ -264,14 +274,14 @@ def _identities(name: str, seen: list[tuple[Event, str]]) -> Iterator[Event]:
 
 
 def _landmarks(
-    visit: Visit, sweeps: Mapping[str, Sweep], sighted: set[str], first_ns: int
+    visit: SimulatedVisit, sweeps: Mapping[str, NoiseFreeScans], sighted: set[str], first_ns: int
 ) -> Iterator[Event]:
     """True landmarks: the surfaces that some noise-free beam or some sighting reached."""
     world = visit.world
     reached = set(sighted)
     for sweep in sweeps.values():
         numbers = np.unique(sweep.hits.surfaces)
-        inside = (numbers != NOTHING) & (numbers < len(world.names))  # the rest are robots
+        inside = (numbers != NO_SURFACE) & (numbers < len(world.names))  # the rest are robots
         reached |= {world.names[number] for number in numbers[inside]}
     for number, name in enumerate(world.names):
         if name not in reached:
@@ -295,6 +305,6 @@ def _middle(ends: Array) -> Array:
     return np.array([*ends.mean(axis=0), np.arctan2(along[1], along[0])])
 
 
-def _center(visit: Visit, number: int) -> Array:
+def _center(visit: SimulatedVisit, number: int) -> Array:
     x, y, _ = visit.world.shapes.circles[number - len(visit.world.shapes.segments)]
     return np.array([x, y, np.nan])

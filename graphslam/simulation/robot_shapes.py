@@ -3,7 +3,7 @@
 import numpy as np
 
 from graphslam.core.geometry import Array, rotation
-from graphslam.simulation.raycast import seen_from
+from graphslam.simulation.raycast import points_in_frames
 from graphslam.simulation.scenario import Body
 from graphslam.simulation.world import Shapes
 
@@ -27,14 +27,14 @@ def outline_shapes(body: Body, poses: Array) -> Shapes:
     return Shapes(np.stack([points, np.roll(points, -1, axis=1)], axis=2), np.zeros((n, 0, 3)))
 
 
-def touches(body: Body, poses: Array, shapes: Shapes) -> Flags:
+def contacts(body: Body, poses: Array, shapes: Shapes) -> Flags:
     """Which surfaces (n, surfaces) the body, with all that is inside it, meets at poses (n, 3).
 
     Standing in the middle of a circle counts; standing inside a polygon does not, see `encloses`.
     """
-    a = seen_from(poses, shapes.segments[..., 0, :])
-    b = seen_from(poses, shapes.segments[..., 1, :])
-    centers = seen_from(poses, shapes.circles[..., :2])
+    a = points_in_frames(poses, shapes.segments[..., 0, :])
+    b = points_in_frames(poses, shapes.segments[..., 1, :])
+    centers = points_in_frames(poses, shapes.circles[..., :2])
     radii = np.broadcast_to(shapes.circles[..., 2], centers.shape[:2])
     if body.radius_m:
         straight = _distance(a, b) < body.radius_m

@@ -78,7 +78,7 @@ class Door:
 
 
 @dataclass(frozen=True)
-class Things:
+class StaticObjects:
     """Everything that stands still."""
 
     walls: tuple[Wall, ...] = ()
@@ -118,7 +118,7 @@ class Leg:
 
 
 @dataclass(frozen=True)
-class Clock:
+class RobotClock:
     """What the robot's clock reads: true time plus offset plus drift per second."""
 
     offset_s: float = 0.0
@@ -184,7 +184,7 @@ class Laser:
 
 
 @dataclass(frozen=True)
-class Seer:
+class SightingSensor:
     """A sensor that sees cylinders or other robots as such, from the robot's base.
 
     names: what it sees; empty = all that the scenario has. direction_sigma_deg: 0 = the direction
@@ -219,10 +219,10 @@ class Robot:
     acceleration_m_s2: float = field(default=0.3, metadata=POSITIVE)
     turn_rate_deg_s: float = field(default=45.0, metadata=POSITIVE)
     corner_m: float = field(default=0.5, metadata=POSITIVE)
-    clock: Clock = field(default_factory=Clock)
+    clock: RobotClock = field(default_factory=RobotClock)
     encoders: Encoders = field(default_factory=Encoders)
     laser: Laser | None = None
-    sightings: tuple[Seer, ...] = ()
+    sightings: tuple[SightingSensor, ...] = ()
 
 
 # ---------------------------------------------------------------- a second visit
@@ -239,7 +239,7 @@ class Move:
 
 
 @dataclass(frozen=True)
-class Again:
+class LaterDrive:
     """Another start and drive of a robot."""
 
     start_m: Point
@@ -248,13 +248,13 @@ class Again:
 
 
 @dataclass(frozen=True)
-class Later:
+class LaterVisit:
     """The second visit: what moved, vanished or appeared, and who drives differently."""
 
     moved: tuple[Move, ...] = ()
     vanished: tuple[str, ...] = ()
-    appeared: Things = field(default_factory=Things)
-    robots: Mapping[str, Again] = field(default_factory=dict)
+    appeared: StaticObjects = field(default_factory=StaticObjects)
+    robots: Mapping[str, LaterDrive] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -266,10 +266,10 @@ class Scenario:
     """
 
     robots: Mapping[str, Robot]
-    world: Things = field(default_factory=Things)
+    world: StaticObjects = field(default_factory=StaticObjects)
     world_of: str = ""
     description: str = ""
     duration_s: float = field(default=0.0, metadata=NOT_NEGATIVE)
     truth_period_s: float = field(default=0.1, metadata=POSITIVE)
-    later: Later | None = None
+    later: LaterVisit | None = None
     name: str = field(default="", metadata={"hidden": True})

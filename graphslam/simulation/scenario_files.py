@@ -8,7 +8,15 @@ from dataclasses import replace
 from pathlib import Path
 
 from graphslam.simulation.errors import ScenarioError
-from graphslam.simulation.scenario import Laser, Later, Leg, Robot, Scenario, Seer, Things
+from graphslam.simulation.scenario import (
+    Laser,
+    LaterVisit,
+    Leg,
+    Robot,
+    Scenario,
+    SightingSensor,
+    StaticObjects,
+)
 from graphslam.simulation.scenario_parser import build
 from graphslam.simulation.sightings import LANDMARKS, ROBOTS
 
@@ -62,7 +70,7 @@ def load_scenario(scenario: str | Path) -> Scenario:
 
 def _with_world_of(scenario: Scenario, path: Path) -> Scenario:
     """The scenario in another one's world, whose file may lie beside its own."""
-    if scenario.world != Things():
+    if scenario.world != StaticObjects():
         raise ScenarioError(f"{path.name}: give either world or world_of")
     beside = path.parent / scenario.world_of
     if beside == path:
@@ -86,7 +94,7 @@ def _contradictions(scenario: Scenario) -> Iterator[str]:
         yield from _later(scenario.later, scenario)
 
 
-def _later(later: Later, scenario: Scenario) -> Iterator[str]:
+def _later(later: LaterVisit, scenario: Scenario) -> Iterator[str]:
     names = list(_names(scenario.world))
     for name in (*(move.name for move in later.moved), *later.vanished):
         if name not in names:
@@ -132,7 +140,7 @@ def _laser(laser: Laser) -> Iterator[str]:
         yield ".laser.range_min_m: is not below range_max_m"
 
 
-def _seer(seer: Seer, scenario: Scenario) -> Iterator[str]:
+def _seer(seer: SightingSensor, scenario: Scenario) -> Iterator[str]:
     known = {
         LANDMARKS: [cylinder.name for cylinder in scenario.world.cylinders],
         ROBOTS: list(scenario.robots),
@@ -144,6 +152,6 @@ def _seer(seer: Seer, scenario: Scenario) -> Iterator[str]:
             yield f".names: {name!r} is not one of the {seer.of}"
 
 
-def _names(things: Things) -> Iterator[str]:
+def _names(things: StaticObjects) -> Iterator[str]:
     for kind in (things.walls, things.boxes, things.boards, things.cylinders, things.doors):
         yield from (thing.name for thing in kind)

@@ -6,19 +6,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphslam.core.geometry import Array
-from graphslam.simulation.drive import Drive, plan
+from graphslam.simulation.drive import Drive, plan_drive
 from graphslam.simulation.errors import ScenarioError
-from graphslam.simulation.robot_shapes import encloses, outline_shapes, touches
-from graphslam.simulation.scenario import Body, Later, Robot, Scenario
+from graphslam.simulation.robot_shapes import contacts, encloses, outline_shapes
+from graphslam.simulation.scenario import Body, LaterVisit, Robot, Scenario
 from graphslam.simulation.world import (
     Outline,
     Shapes,
     World,
-    crossing,
     displacement,
+    find_crossing,
+    find_degenerate,
     make_world,
     outlines_of,
-    too_short,
 )
 
 REFERENCE, LATER = "reference", "later"
@@ -28,7 +28,7 @@ _CHUNK = 500
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Actor:
+class SimulatedRobot:
     """A robot of one visit with its drive."""
 
     robot: Robot
@@ -36,16 +36,16 @@ class Actor:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Visit:
+class SimulatedVisit:
     """One recording to be: ``name`` is empty unless there are two."""
 
     name: str
     world: World
-    actors: Mapping[str, Actor]
+    actors: Mapping[str, SimulatedRobot]
     duration_s: float
 
 
-def visits(scenario: Scenario) -> tuple[Visit, ...]:
+def prepare_visits(scenario: Scenario) -> tuple[SimulatedVisit, ...]:
     """The recordings of a scenario, one or two, checked for collisions.
 
     Raises:
@@ -68,12 +68,12 @@ def visits(scenario: Scenario) -> tuple[Visit, ...]:
 
 def _visit(
     scenario: Scenario, name: str, outlines: Sequence[Outline], robots: Mapping[str, Robot]
-) -> Visit:
+) -> SimulatedVisit:
     where = f"{scenario.name}: " + (f"{name} visit: " if name else "")
-    if short := too_short(outlines):
+    if short := find_degenerate(outlines):
         raise ScenarioError(f"{where}{short}: needs two different points")
     world = make_world(outlines)
-    if pair := crossing(world):
+    if pair := find_crossing(world):
         raise ScenarioError(
             f"{where}{pair[0]} and {pair[1]} cross; move one, or set may_cross = true"
         )
@@ -81,7 +81,7 @@ def _visit(
     for robot_name, robot in sorted(robots.items()):
         start = np.array([*robot.start_m, np.radians(robot.start_deg)])
         try:
-            actors[robot_name] = Actor(robot, plan(start, robot.drive, robot))
+            actors[robot_name] = SimulatedRobot(robot, plan_drive(start, robot.drive, robot))
         except ScenarioError as error:
             raise ScenarioError(f"{where}robots.{robot_name}: {error}") from error
     end = max(actor.drive.duration_s for actor in actors.values())
@@ -90,10 +90,10 @@ def _visit(
         raise ScenarioError(f"{where}no robot drives; set duration_s")
     for problem in _collisions(world, actors, min(duration, end)):
         raise ScenarioError(f"{where}{problem}")
-    return Visit(name, world, actors, duration)
+    return SimulatedVisit(name, world, actors, duration)
 
 
-def _rearranged(outlines: Sequence[Outline], later: Later) -> Iterator[Outline]:
+def _rearranged(outlines: Sequence[Outline], later: LaterVisit) -> Iterator[Outline]:
     """The world of the second visit."""
     motions = {move.name: displacement(move) for move in later.moved}
     for outline in outlines:
@@ -107,7 +107,7 @@ def _rearranged(outlines: Sequence[Outline], later: Later) -> Iterator[Outline]:
 # ---------------------------------------------------------------- collisions
 
 
-def _collisions(world: World, actors: Mapping[str, Actor], end_s: float) -> Iterator[str]:
+def _collisions(world: World, actors: Mapping[str, SimulatedRobot], end_s: float) -> Iterator[str]:
     """What robots bump into, one line each, in the order of robots."""
     times = np.append(np.arange(0.0, end_s, _CHECK_S), end_s)
     poses = {name: actor.drive.at(times).poses for name, actor in actors.items()}
@@ -146,7 +146,7 @@ def _touched(body: Body, poses: Array, shapes: Shapes) -> tuple[int, int] | None
         part = slice(begin, begin + _CHUNK)
         moving = shapes.segments.ndim == 4
         here = Shapes(shapes.segments[part], shapes.circles[part]) if moving else shapes
-        met = np.argwhere(touches(body, poses[part], here))
+        met = np.argwhere(contacts(body, poses[part], here))
         if len(met):
             return begin + int(met[0, 0]), int(met[0, 1])
     return None

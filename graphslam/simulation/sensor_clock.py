@@ -7,7 +7,7 @@ is integer nanoseconds of the robot's own clock.
 import numpy as np
 
 from graphslam.core.geometry import Array
-from graphslam.simulation.scenario import Clock
+from graphslam.simulation.scenario import RobotClock
 
 Stamps = np.ndarray[tuple[int], np.dtype[np.int64]]
 
@@ -20,7 +20,7 @@ def sample_times(duration_s: float, period_s: float, phase_s: float = 0.0) -> Ar
     return np.asarray(phase_s + period_s * np.arange(max(count, 0)), dtype=float)
 
 
-def stamps(time_s: Array, clock: Clock, latency_s: float = 0.0) -> Stamps:
+def stamps(time_s: Array, clock: RobotClock, latency_s: float = 0.0) -> Stamps:
     """Stamps (n,) ns of what was measured at true times (n,) s and came in ``latency_s`` later."""
     true_ns = np.round((time_s + latency_s) * 1e9).astype(np.int64)
     drift_ns = np.round(true_ns * (clock.drift_ppm * 1e-6)).astype(np.int64)

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphslam.core.geometry import Array, between, wrap
-from graphslam.simulation.raycast import Fan, cast
+from graphslam.simulation.raycast import BeamFan, cast_beams
 from graphslam.simulation.robot_shapes import Flags, outline_shapes
-from graphslam.simulation.scenario import Body, Seer
+from graphslam.simulation.scenario import Body, SightingSensor
 from graphslam.simulation.world import Shapes, World
 
 LANDMARKS, ROBOTS = "landmarks", "robots"
-_ONE_BEAM = Fan(0.0, 1.0, 1)
+_ONE_BEAM = BeamFan(0.0, 1.0, 1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,7 +29,7 @@ class Target:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
+class SimulatedSighting:
     """One sighting: sample number, whom, ``z`` (2,) or (3,) and its covariance.
 
     ``z`` is bearing rad, range m and perhaps direction rad, in the base frame of the seer.
@@ -41,8 +41,8 @@ class Seen:
     cov: Array
 
 
-def targets(
-    seer: Seer, world: World, others: Mapping[str, tuple[Body, Array]], samples: int
+def sighting_targets(
+    seer: SightingSensor, world: World, others: Mapping[str, tuple[Body, Array]], samples: int
 ) -> Iterator[Target]:
     """What a sensor may see at its ``samples`` times: cylinders, or robots (their poses (n, 3))."""
     outlines = {name: outline_shapes(*other) for name, other in others.items()}
@@ -59,9 +59,9 @@ def targets(
         yield Target(name, pose, float(radius), (static, *outlines.values()))
 
 
-def see(
-    poses: Array, seer: Seer, candidates: Sequence[Target], rng: np.random.Generator
-) -> list[Seen]:
+def simulate_sightings(
+    poses: Array, seer: SightingSensor, candidates: Sequence[Target], rng: np.random.Generator
+) -> list[SimulatedSighting]:
     """All sightings from bases at ``poses`` (n, 3), in the order of time.
 
     A target is seen when its centre is in the field of view and within range, and nothing stands
@@ -71,7 +71,7 @@ def see(
     if seer.of == ROBOTS and seer.direction_sigma_deg:
         sigmas.append(np.radians(seer.direction_sigma_deg))
     sigma = np.array(sigmas)
-    found: list[Seen] = []
+    found: list[SimulatedSighting] = []
     for target in candidates:
         if seer.names and target.name not in seer.names:
             continue
@@ -86,7 +86,9 @@ def see(
         visible &= (distance <= seer.range_max_m) & (z[:, 1] > 0)
         visible &= _line_of_sight(poses, bearing, distance, target)
         cov = np.diag(sigma**2)
-        found += [Seen(int(i), target.name, z[i], cov) for i in np.flatnonzero(visible)]
+        found += [
+            SimulatedSighting(int(i), target.name, z[i], cov) for i in np.flatnonzero(visible)
+        ]
     return sorted(found, key=lambda seen: seen.sample)
 
 
@@ -96,7 +98,7 @@ def _line_of_sight(poses: Array, bearing: Array, distance: Array, target: Target
     free = np.full(len(poses), np.inf)
     for shapes in target.blockers:
         reach = float(distance.max(initial=0.0))
-        free = np.minimum(free, cast(towards, _ONE_BEAM, shapes, reach).ranges[:, 0])
+        free = np.minimum(free, cast_beams(towards, _ONE_BEAM, shapes, reach).ranges[:, 0])
     return np.asarray(free > distance - target.radius_m)
 
 

@@ -10,20 +10,20 @@ from typing import Any
 import numpy as np
 
 from graphslam.core.geometry import Array, between, inverse, transform
-from graphslam.simulation.raycast import NOTHING
-from graphslam.simulation.recording import Recording, Sweep
-from graphslam.simulation.scenario import Later, Scenario
-from graphslam.simulation.scene import Visit
+from graphslam.simulation.raycast import NO_SURFACE
+from graphslam.simulation.recording import NoiseFreeScans, Recording
+from graphslam.simulation.scenario import LaterVisit, Scenario
+from graphslam.simulation.scene import SimulatedVisit
 from graphslam.simulation.world import displacement
 
 CELL_M = 0.05
 _CORNERS = 24  # of the polygon that stands for a circle
 
 
-def truth_of_changes(
+def true_changes(
     scenario: Scenario,
-    later: Later,
-    visits: tuple[Visit, Visit],
+    later: LaterVisit,
+    visits: tuple[SimulatedVisit, SimulatedVisit],
     recordings: tuple[Recording, Recording],
     seed: int,
 ) -> dict[str, Any]:
@@ -61,25 +61,25 @@ def truth_of_changes(
     }
 
 
-def _kinds(later: Later) -> Iterator[tuple[str, str]]:
+def _kinds(later: LaterVisit) -> Iterator[tuple[str, str]]:
     yield from ((move.name, "moved") for move in later.moved)
     yield from ((name, "vanished") for name in later.vanished)
     yield from ((name, "appeared") for name in _added(later))
 
 
-def _added(later: Later) -> Iterator[str]:
+def _added(later: LaterVisit) -> Iterator[str]:
     things = later.appeared
     for kind in (things.walls, things.boxes, things.boards, things.cylinders, things.doors):
         yield from (thing.name for thing in kind)
 
 
-def _names(later: Later, kind: str) -> set[str]:
+def _names(later: LaterVisit, kind: str) -> set[str]:
     """Things of which a visit saw surfaces that the other one did not have."""
     only = later.vanished if kind == "vanished" else tuple(_added(later))
     return {*(move.name for move in later.moved), *only}
 
 
-def _polygon(visit: Visit, name: str) -> list[list[float]] | None:
+def _polygon(visit: SimulatedVisit, name: str) -> list[list[float]] | None:
     """Corners, m, of a thing's outline; None at the visit at which it is not there."""
     for outline in visit.world.outlines:
         if outline.name == name:
@@ -96,7 +96,7 @@ def _named(pose: Array) -> dict[str, float]:
 
 
 def _cells(
-    visit: Visit, sweeps: Mapping[str, Sweep], names: set[str]
+    visit: SimulatedVisit, sweeps: Mapping[str, NoiseFreeScans], names: set[str]
 ) -> dict[tuple[int, int], str]:
     """Cells in which noise-free beams ended on one of the named things -> the thing."""
     world = visit.world
@@ -113,19 +113,19 @@ def _cells(
     return dict(sorted(cells.items()))
 
 
-def _within(sweep: Sweep) -> np.ndarray[Any, np.dtype[np.bool_]]:
+def _within(sweep: NoiseFreeScans) -> np.ndarray[Any, np.dtype[np.bool_]]:
     """Which beams (scans, beams) would be reported."""
     reported = sweep.hits.ranges <= sweep.laser.range_max_m
-    return np.asarray(reported & (sweep.hits.surfaces != NOTHING))
+    return np.asarray(reported & (sweep.hits.surfaces != NO_SURFACE))
 
 
-def _angles(sweep: Sweep) -> Array:
+def _angles(sweep: NoiseFreeScans) -> Array:
     """Directions (beams,) rad in the laser's frame."""
     beams = sweep.hits.ranges.shape[1]
     return np.asarray(np.radians(sweep.laser.step_deg) * (np.arange(beams) - (beams - 1) / 2))
 
 
-def _ends(sweep: Sweep, scan: Any, beam: Any) -> Array:
+def _ends(sweep: NoiseFreeScans, scan: Any, beam: Any) -> Array:
     """World points (n, 2) where beams ended."""
     direction = sweep.poses[scan, 2] + _angles(sweep)[beam]
     along = np.column_stack([np.cos(direction), np.sin(direction)])
@@ -135,7 +135,7 @@ def _ends(sweep: Sweep, scan: Any, beam: Any) -> Array:
 def _rows(
     kind: str,
     cells: Mapping[tuple[int, int], str],
-    other: Mapping[str, Sweep],
+    other: Mapping[str, NoiseFreeScans],
     motions: Mapping[str, Array],
     *,
     back: bool,
@@ -159,7 +159,7 @@ def _rows(
     return rows
 
 
-def _looked_through(sweep: Sweep, centers: Array) -> np.ndarray[Any, np.dtype[np.bool_]]:
+def _looked_through(sweep: NoiseFreeScans, centers: Array) -> np.ndarray[Any, np.dtype[np.bool_]]:
     """Which cells (n,) some beam crossed well inside and ended behind."""
     found = np.zeros(len(centers), dtype=bool)
     step = np.radians(sweep.laser.step_deg)

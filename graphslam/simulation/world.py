@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphslam.core.geometry import Array, compose, rotation, transform
-from graphslam.simulation.scenario import Box, Move, Things
+from graphslam.simulation.scenario import Box, Move, StaticObjects
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +71,7 @@ class World:
         return self.names[len(self.shapes.segments) :]
 
 
-def outlines_of(things: Things) -> Iterator[Outline]:
+def outlines_of(things: StaticObjects) -> Iterator[Outline]:
     """The outline of everything in a scenario's list of things."""
     for wall in things.walls:
         yield Outline(wall.name, np.array(wall.points_m), 0.0, wall.closed, False, wall.may_cross)
@@ -132,7 +132,7 @@ def displacement(move: Move) -> Array:
     return compose(np.array([*move.shift_m, 0.0]), compose(about, compose(turn, back)))
 
 
-def crossing(world: World) -> tuple[str, str] | None:
+def find_crossing(world: World) -> tuple[str, str] | None:
     """Names of two faces that cut through each other; None where none do.
 
     Touching is allowed (a wall that ends on another one, a cupboard against a wall), and so is
@@ -160,7 +160,7 @@ def _cross(a: Array, b: Array) -> Array:
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
 
-def too_short(outlines: Sequence[Outline]) -> str | None:
+def find_degenerate(outlines: Sequence[Outline]) -> str | None:
     """Name of a thing with a face of no length, or a wall of less than two points."""
     for outline in outlines:
         along = outline.faces[:, 1] - outline.faces[:, 0]

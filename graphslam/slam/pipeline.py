@@ -44,7 +44,7 @@ from graphslam.estimation.backends import BACKENDS
 from graphslam.estimation.clock_calibration import ClockEstimate, estimate_clocks
 from graphslam.estimation.isam2 import Isam2Backend
 from graphslam.logs import LogSet
-from graphslam.logs.clock import Clock, on_one_clock
+from graphslam.logs.clock import Clock, to_common_clock
 from graphslam.mapping.data_association import Associator
 from graphslam.multi_robot.frame_tree import FrameAssignment
 from graphslam.multi_robot.frames import RobotFrames
@@ -144,7 +144,7 @@ class Pipeline:
         tracks = {name: run.track for name, run in self.runs.items()}
         read = _counted(self.log.messages((Truth, TrueLandmark), ahead=True), self.counts, progress)
         messages = synchronise(
-            self.wanted(on_one_clock(read, self.known.clocks)),
+            self.wanted(to_common_clock(read, self.known.clocks)),
             tracks,
             self.config.odometry.max_gap_s,
             self.dropped,

@@ -143,7 +143,7 @@ class RobotState:
             return stamps, times, np.array([scan[2] for scan in scans])
         period = round(1e9 / BASE_RATE_HZ)
         times = np.arange(self.track.first_ns, self.track.last_ns + 1, period)
-        return self.clock.own(times), times, np.zeros((0, 3))
+        return self.clock.to_local(times), times, np.zeros((0, 3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

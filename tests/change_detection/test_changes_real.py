@@ -12,7 +12,7 @@ from graphslam.core.config import ChangesConfig, Config
 from graphslam.logs import open_logs
 from graphslam.logs.importers import IMPORTERS
 from graphslam.results.folder import load, save
-from graphslam.simulation.raycast import Fan, cast
+from graphslam.simulation.raycast import BeamFan, cast_beams
 from graphslam.simulation.world import Outline, make_world
 from graphslam.slam.smooth import smooth
 
@@ -44,7 +44,9 @@ def with_box(visit, stamps_ns, poses):
         beams = np.nonzero(visit.scan == scan)[0]
         angles = visit.angle[beams]
         pose = poses[stamps_ns == visit.stamps_ns[scan]]
-        hit = cast(pose, Fan(angles[0], np.diff(angles).mean(), len(angles)), world.shapes, 5.6)
+        hit = cast_beams(
+            pose, BeamFan(angles[0], np.diff(angles).mean(), len(angles)), world.shapes, 5.6
+        )
         met = np.isfinite(hit.ranges[0]) & ~(ranges[beams] <= hit.ranges[0])
         ranges[beams[met]] = hit.ranges[0][met] + 0.015 * rng.normal(size=met.sum())
         surface[beams] = on_surface(angles, ranges[beams])

@@ -34,11 +34,11 @@ from graphslam.core.records import Landmark
 from graphslam.logs import open_logs
 from graphslam.results.folder import load, save
 from graphslam.simulation import load_scenario, simulate
-from graphslam.simulation.raycast import Fan, cast
+from graphslam.simulation.raycast import BeamFan, cast_beams
 from graphslam.simulation.world import Outline, make_world
 from graphslam.slam.smooth import smooth
 
-FAN = Fan(-np.pi / 2, np.pi / 360, 361)
+FAN = BeamFan(-np.pi / 2, np.pi / 360, 361)
 ROOM = Outline("room", np.array([[0, 0], [8, 0], [8, 6], [0, 6]], float), closed=True)
 SIGMA = 0.015
 CONFIG = ChangesConfig()
@@ -57,7 +57,7 @@ def drive(n, turn=0.0):
 
 def visit(things, poses, rng, pose_sigmas=(0.005, 0.005, 0.002), landmarks=()):
     """Scans of a world from poses that are known up to their covariance, as it says."""
-    clean = cast(poses, FAN, make_world([ROOM, *things]).shapes, 30.0).ranges
+    clean = cast_beams(poses, FAN, make_world([ROOM, *things]).shapes, 30.0).ranges
     ranges = clean + SIGMA * rng.normal(size=clean.shape)
     sigmas = np.array(pose_sigmas)
     stated = poses + sigmas * rng.normal(size=poses.shape)
@@ -577,7 +577,7 @@ def test_other_rooms_are_not_registered():
     a = visit([box(5, 4)], drive(60), rng)
     hall = Outline("hall", np.array([[0, 0], [25, 0], [19, 17], [3, 21]], float), closed=True)
     poses = drive(60) + np.array([8.0, 5.0, 0.0])
-    clean = cast(poses, FAN, make_world([hall]).shapes, 30.0).ranges
+    clean = cast_beams(poses, FAN, make_world([hall]).shapes, 30.0).ranges
     b = replace(a, range_m=clean.ravel(), poses=poses)
     with pytest.raises(OutputError, match="cannot be registered"):
         detect_changes(a, b, CONFIG)
@@ -590,7 +590,7 @@ def test_maps_that_disagree_all_over_are_refused():
     poses = drive(40, 0.1)
     middle = ROOM.points.mean(axis=0)
     smaller = Outline("room", middle + 0.97 * (ROOM.points - middle), closed=True)
-    clean = cast(poses, FAN, make_world([smaller]).shapes, 30.0).ranges
+    clean = cast_beams(poses, FAN, make_world([smaller]).shapes, 30.0).ranges
     sharp = np.tile(np.diag([1e-4, 1e-4, 1e-4]) ** 2, (40, 1, 1))
     b = replace(a, poses=poses, range_m=clean.ravel(), covs=sharp, shared=sharp)
     with pytest.raises(OutputError, match="disagree by"):

@@ -9,7 +9,7 @@ from graphslam.change_detection import detect_changes, visit_from_scans
 from graphslam.change_detection.detect import identity_registration
 from graphslam.core.config import ChangesConfig
 from graphslam.core.geometry import wrap
-from graphslam.simulation.laser import clean_scans, fan_of, noisy_ranges
+from graphslam.simulation.laser import beam_fan, noise_free_scans, noisy_ranges
 from graphslam.simulation.raycast import Hits
 from graphslam.simulation.scenario import Laser
 from graphslam.simulation.world import Outline, make_world
@@ -44,9 +44,9 @@ def seen(things, poses, rng, laser=LASER, panes=(), angle_deg=25.0, share=1.0):
     Those that meet a pane within ``angle_deg`` of its normal, and of these a ``share``.
     """
     solid, glazed = (make_world([HALL, *part]) for part in (things, (*things, *panes)))
-    clean, met = (clean_scans(poses, laser, world, {}) for world in (solid, glazed))
+    clean, met = (noise_free_scans(poses, laser, world, {}) for world in (solid, glazed))
     back = rng.random(met.ranges.shape) < share
-    heading = poses[:, 2, None] + fan_of(laser).angles
+    heading = poses[:, 2, None] + beam_fan(laser).angles
     for pane in panes:
         across = np.arctan2(*(pane.points[1] - pane.points[0])[::-1]) + np.pi / 2
         thrown = np.abs(np.cos(heading - across)) > np.cos(np.radians(angle_deg))
@@ -57,7 +57,7 @@ def seen(things, poses, rng, laser=LASER, panes=(), angle_deg=25.0, share=1.0):
     # a material's bias is the same at both visits
     biases = laser.bias_sigma_m * np.random.default_rng(99).normal(size=len(glazed.names))
     ranges = noisy_ranges(hits, biases, laser, rng)
-    sweeps = [(fan_of(laser).angles, r) for r in np.where(np.isfinite(ranges), ranges, np.nan)]
+    sweeps = [(beam_fan(laser).angles, r) for r in np.where(np.isfinite(ranges), ranges, np.nan)]
     stated = poses + SIGMAS * rng.normal(size=poses.shape)
     covs = np.tile(np.diag(SIGMAS**2), (len(poses), 1, 1))
     return visit_from_scans(np.arange(len(poses)) * 100_000_000, stated, covs, sweeps)

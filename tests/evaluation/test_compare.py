@@ -25,7 +25,7 @@ from graphslam.evaluation.compare_rows import compare
 from graphslam.evaluation.compare_variants import variants
 from graphslam.evaluation.ground_truth import truth_of_logs
 from graphslam.evaluation.metrics import evaluate
-from graphslam.logs import KnownTruth, LogWriter, open_logs
+from graphslam.logs import GroundTruth, LogWriter, open_logs
 from graphslam.results.report_comparison import ahead, filled, notes, render_comparison
 from graphslam.simulation import load_scenario, simulate
 from graphslam.slam.smooth import smooth
@@ -283,7 +283,7 @@ def test_the_command_tells_of_a_failure_at_the_end(two, broken, tmp_path):
 
 
 def test_truth_of_another_robot_is_refused_before_the_work(two):
-    truth = KnownTruth({"elsewhere": two.truth.trajectories["vehicle"]}, ())
+    truth = GroundTruth({"elsewhere": two.truth.trajectories["vehicle"]}, ())
     with pytest.raises(OutputError, match=r"truth is of elsewhere, the log of pioneer, vehicle"):
         compare(two.log, two.config, (), truth=truth, run=pytest.fail)
 
@@ -294,7 +294,7 @@ def test_truth_of_another_time_is_told_and_the_rest_goes_on(two):
         for name, path in two.truth.trajectories.items()
     }
     rows = variants(["isam2", "batch"], None, START)
-    found = compare(two.log, two.config, rows, truth=KnownTruth(later, ()), run=play).found
+    found = compare(two.log, two.config, rows, truth=GroundTruth(later, ()), run=play).found
     assert [text for text in found["warnings"] if text.startswith("not evaluated: no pose of")]
     assert "robots" not in found["rows"][0]
     assert found["rows"][0]["difference"]["final"] is not None

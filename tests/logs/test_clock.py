@@ -8,7 +8,7 @@ from graphslam.core.config_io import load_config
 from graphslam.core.geometry import between, compose, exp
 from graphslam.core.records import OdometryIncrement, OdometryPose
 from graphslam.logs import LogWriter, open_logs
-from graphslam.logs.clock import Clock, on_one_clock
+from graphslam.logs.clock import Clock, to_common_clock
 from graphslam.slam.smooth import smooth
 
 S, T0 = 1_000_000_000, 10_000_000_000
@@ -23,8 +23,8 @@ SIGMAS = np.array([0.01, 0.03])
 @pytest.mark.parametrize("clock", [Clock(0.4, 3e-5, T0), Clock(-2.5, -1e-4, T0), Clock()])
 def test_own_and_common_time_are_each_others_inverse(clock):
     for time_ns in (T0, T0 + 100 * S, T0 + 10_000 * S):
-        own = int(clock.own(np.array([time_ns]))[0])
-        assert abs(clock.common(own) - time_ns) <= 1
+        own = int(clock.to_local(np.array([time_ns]))[0])
+        assert abs(clock.to_common(own) - time_ns) <= 1
         ahead = clock.offset_s + clock.drift * 1e-9 * (time_ns - clock.epoch_ns)
         assert own - time_ns == pytest.approx(1e9 * ahead, abs=2)
 
@@ -36,10 +36,10 @@ def test_messages_come_in_the_order_of_the_common_clock(offset_s):
     true = [(T0 + k * S // 10, "ab"[k % 2]) for k in range(200)]
     made = []
     for time_ns, robot in true:
-        own = int(clock.own(np.array([time_ns]))[0]) if robot == "b" else time_ns
+        own = int(clock.to_local(np.array([time_ns]))[0]) if robot == "b" else time_ns
         made.append(OdometryPose(robot, own, own, np.zeros(3)))
     made.sort(key=lambda message: message.time_ns)
-    found = list(on_one_clock(made, {"b": clock}))
+    found = list(to_common_clock(made, {"b": clock}))
     assert [m.robot for m in found] == [robot for _, robot in true]
     np.testing.assert_allclose([m.time_ns for m in found], [t for t, _ in true], atol=1)
     assert sorted(m.stamp_ns for m in found) == sorted(m.stamp_ns for m in made)
@@ -48,7 +48,7 @@ def test_messages_come_in_the_order_of_the_common_clock(offset_s):
 def test_both_ends_of_an_increment_move():
     clock = Clock(0.5, 0.0, T0)
     message = OdometryIncrement("b", T0 + S, T0 + S, T0, np.zeros(3), np.eye(3))
-    (found,) = on_one_clock([message], {"b": clock})
+    (found,) = to_common_clock([message], {"b": clock})
     assert (found.start_ns, found.time_ns) == (T0 - S // 2, T0 + S // 2)
 
 
@@ -71,7 +71,7 @@ def write(folder, offset_s, drift=0.0, seed=0, mutual=True):
         with LogWriter(path) as log:
             for k in range(1200):
                 time_ns = T0 + k * S // 10
-                own = int(clock.own(np.array([time_ns]))[0]) if robot == "b" else time_ns
+                own = int(clock.to_local(np.array([time_ns]))[0]) if robot == "b" else time_ns
                 x = pose(robot, k / 10)
                 log.odometry(robot, own, between(pose(robot, 0.0), x))
                 if k % 10 == 0:

@@ -18,7 +18,7 @@ from graphslam.core.errors import LogError, OutputError
 from graphslam.logs import LogSet, LogWriter, inspect_logs, open_logs, schemas
 from graphslam.logs.decoders import DECODERS, TopicContext
 from graphslam.logs.mcap_file import open_mcap, raw_messages
-from graphslam.logs.time_order import TOO_LATE, TimeLine
+from graphslam.logs.time_order import TOO_LATE, MessageSorter
 
 S = 1_000_000_000
 COV2, COV3 = np.diag([0.01, 0.04]), np.diag([0.01, 0.02, 0.03])
@@ -254,7 +254,7 @@ def test_log_times_and_not_file_positions_tell_the_order_of_recording(tmp_path):
 
 @given(st.lists(st.tuples(st.sampled_from(["a", "b"]), st.integers(0, 60)), max_size=60))
 def test_whatever_the_stamps_nothing_is_lost_uncounted_and_time_never_goes_back(recorded):
-    line = TimeLine(window_ns=10)
+    line = MessageSorter(window_ns=10)
     messages = [(t, records.OdometryPose("robot", s, s, np.zeros(3))) for t, s in recorded]
     placed = [out for topic, message in messages for out in line.push(topic, message)]
     placed += line.finish()

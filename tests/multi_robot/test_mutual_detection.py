@@ -21,14 +21,14 @@ from graphslam.simulation.robot_shapes import corners
 from graphslam.simulation.scenario import (
     Body,
     Box,
-    Clock,
     Cylinder,
     Encoders,
     Laser,
     Leg,
     Robot,
+    RobotClock,
     Scenario,
-    Things,
+    StaticObjects,
     Wall,
 )
 from graphslam.slam.smooth import initialise, smooth
@@ -46,7 +46,7 @@ ENCODERS = Encoders(
 )  # fmt: skip
 #: furniture of the robot's size among other, in a hall; beside it another room, not quite as large,
 #: or nothing could tell them apart
-HALL = Things(
+HALL = StaticObjects(
     walls=(
         Wall("hall", ((-8.0, -6.0), (8.0, -6.0), (8.0, 6.0), (-8.0, 6.0)), True),
         Wall("room", ((12.0, -7.0), (30.0, -7.0), (30.0, 6.0), (12.0, 6.0)), True),
@@ -129,7 +129,7 @@ def test_a_robot_is_found_as_well_as_stated(tmp_path):
     config, d2 = load_config().start, []
     sigmas = np.array([config.given_sigma_m, config.given_sigma_m, config.given_sigma_rad])
     for seed, (ahead_s, laser) in enumerate(cases):
-        robots = {"a": A, "b": replace(B, laser=laser, clock=Clock(offset_s=ahead_s))}
+        robots = {"a": A, "b": replace(B, laser=laser, clock=RobotClock(offset_s=ahead_s))}
         draw = sigmas * np.random.default_rng(seed).normal(size=3)
         found = joined(tmp_path, robots, seed=seed, draw=draw)
         assert found.frames == {"a": "a", "b": "a"}, seed
@@ -143,7 +143,10 @@ def test_a_robot_is_found_as_well_as_stated(tmp_path):
 def test_a_found_start_costs_nothing_against_a_known_one(tmp_path):
     """Clocks 0.4 s apart, as the map is aligned: within a tenth. Seeds differ by a hundredth."""
     few = replace(LASER, period_s=0.5, step_deg=1.0)
-    robots = {"a": replace(A, laser=few), "b": replace(B, laser=few, clock=Clock(offset_s=0.4))}
+    robots = {
+        "a": replace(A, laser=few),
+        "b": replace(B, laser=few, clock=RobotClock(offset_s=0.4)),
+    }
     log = recorded(tmp_path, robots)
     truth = read_truth([log], load_config()).trajectories
     errors = []

@@ -28,7 +28,7 @@ from graphslam.multi_robot.place_recognition import (
 from graphslam.multi_robot.relative_frames import RelativeFrame
 from graphslam.perception.scan_matching import Match, make_submap
 from graphslam.simulation import load_scenario, simulate
-from graphslam.simulation.scenario import Box, Leg, Things, Wall
+from graphslam.simulation.scenario import Box, Leg, StaticObjects, Wall
 from graphslam.slam.smooth import smooth
 
 SEEDS = (1, 2)
@@ -88,7 +88,7 @@ def halls(path, seed):
         }
         for x in (0.0, 24.0)
     }
-    world = Things(walls=tuple(walls), boxes=tuple(boxes))
+    world = StaticObjects(walls=tuple(walls), boxes=tuple(boxes))
     return two("office-loop", path, seed, drives[0.0], drives[24.0], world)
 
 

@@ -15,7 +15,7 @@ from graphslam.perception.dynamic_objects import moving
 from graphslam.perception.ordered_scan import make_sweep
 from graphslam.perception.robot_outlines import outline_of
 from graphslam.simulation import load_scenario, simulate
-from graphslam.simulation.laser import clean_scans, fan_of, mount_of, noisy_ranges
+from graphslam.simulation.laser import beam_fan, laser_mount, noise_free_scans, noisy_ranges
 from graphslam.simulation.robot_shapes import corners
 from graphslam.simulation.scenario import (
     Body,
@@ -25,7 +25,7 @@ from graphslam.simulation.scenario import (
     Leg,
     Robot,
     Scenario,
-    Things,
+    StaticObjects,
     Wall,
 )
 from graphslam.simulation.world import make_world, outlines_of
@@ -37,7 +37,7 @@ LASER = Laser(
     mixed_share=0.5,
 )  # fmt: skip
 BODIES = {"box": Body(length_m=0.7, width_m=0.5, rear_m=0.2), "round": Body(radius_m=0.25)}
-HALL = Things(
+HALL = StaticObjects(
     walls=(Wall("hall", ((-15.0, -15.0), (15.0, -15.0), (15.0, 15.0), (-15.0, 15.0)), True),)
 )
 
@@ -49,12 +49,12 @@ def outline(body):
 def scans(poses, things, others, rng, laser=LASER):
     """Scans from bases at ``poses`` (n, 3); ``others``: name -> (body, poses)."""
     world = make_world(tuple(outlines_of(things)))
-    hits = clean_scans(poses, laser, world, others)
+    hits = noise_free_scans(poses, laser, world, others)
     biases = laser.bias_sigma_m * rng.normal(size=len(world.names) + len(others))
-    fan = fan_of(laser)
+    fan = beam_fan(laser)
     return [
         Scan("a", k, k, np.where(np.isfinite(r), r, np.nan), fan.start_rad, fan.step_rad,
-             mount_of(laser))
+             laser_mount(laser))
         for k, r in enumerate(noisy_ranges(hits, biases, laser, rng))
     ]  # fmt: skip
 
@@ -64,7 +64,7 @@ def one_robot(body, distance_m, seed, laser=LASER):
     rng = np.random.default_rng(seed)
     bearing, heading = rng.uniform(-1.3, 1.3), rng.uniform(-np.pi, np.pi)
     truth = compose(
-        mount_of(LASER),
+        laser_mount(LASER),
         np.array([distance_m * np.cos(bearing), distance_m * np.sin(bearing), heading]),
     )
     sigmas = np.array([0.15, 0.15, 0.08])

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from graphslam.core.geometry import between, log
-from graphslam.simulation.drive import Trapezoid, plan
+from graphslam.simulation.drive import TrapezoidalProfile, plan_drive
 from graphslam.simulation.errors import ScenarioError
-from graphslam.simulation.path import rounded
-from graphslam.simulation.raycast import NOTHING, Fan, cast
-from graphslam.simulation.robot_shapes import encloses, outline_shapes, touches
+from graphslam.simulation.path import round_corners
+from graphslam.simulation.raycast import NO_SURFACE, BeamFan, cast_beams
+from graphslam.simulation.robot_shapes import contacts, encloses, outline_shapes
 from graphslam.simulation.scenario import Body, Leg, Move, Robot
 from graphslam.simulation.world import Shapes, displacement
 
-HALF_DEG = Fan(-pi / 2, pi / 360, 361)
-FULL = Fan(-pi, pi / 180, 361)
+HALF_DEG = BeamFan(-pi / 2, pi / 360, 361)
+FULL = BeamFan(-pi, pi / 180, 361)
 NO_CIRCLES, NO_SEGMENTS = np.zeros((0, 3)), np.zeros((0, 2, 2))
 WIDTH, DEPTH = 7.3, 4.1
 CORNERS = np.array([[0, 0], [WIDTH, 0], [WIDTH, DEPTH], [0, DEPTH]])
@@ -38,11 +38,11 @@ def random_poses(rng, n, low=(0.1, 0.1), high=(WIDTH - 0.1, DEPTH - 0.1)):
 # ------------------------------------------------------------ ray casting
 
 
-@pytest.mark.parametrize("fan", [HALF_DEG, FULL, Fan(-0.87, 0.0043, 401)])
+@pytest.mark.parametrize("fan", [HALF_DEG, FULL, BeamFan(-0.87, 0.0043, 401)])
 def test_ranges_in_a_room_are_those_of_the_closed_form(fan):
     """Breaks with a beam lost at a corner, at the seam of the circle or at a culled sector."""
     poses = random_poses(np.random.default_rng(3), 300)
-    hits = cast(poses, fan, ROOM, 20.0)
+    hits = cast_beams(poses, fan, ROOM, 20.0)
     expected = np.array([room_ranges(pose, fan.angles) for pose in poses])
     np.testing.assert_allclose(hits.ranges, expected, rtol=0, atol=1e-12)
     assert (hits.surfaces >= 0).all()
@@ -53,7 +53,7 @@ def test_beams_into_corners_do_not_leak():
     pose = np.array([2.0, 1.0, 0.0])
     for corner in CORNERS:
         angle = np.arctan2(*(corner - pose[:2])[::-1])
-        hits = cast(pose[None], Fan(angle, 1e-3, 1), ROOM, 20.0)
+        hits = cast_beams(pose[None], BeamFan(angle, 1e-3, 1), ROOM, 20.0)
         assert hits.ranges[0, 0] == pytest.approx(np.hypot(*(corner - pose[:2])), abs=1e-12)
 
 
@@ -88,18 +88,22 @@ def test_ranges_are_those_of_brute_force():
     poses = random_poses(rng, 40, (-6, -6), (6, 6))
     apart = np.linalg.norm(poses[:, None, :2] - circles[:, :2], axis=2)
     poses = poses[(apart > circles[:, 2]).all(axis=1)]
-    fan = Fan(-2.0, 0.05, 81)
-    hits = cast(poses, fan, shapes, 100.0)
+    fan = BeamFan(-2.0, 0.05, 81)
+    hits = cast_beams(poses, fan, shapes, 100.0)
     expected = brute_force(poses, fan, shapes)
     np.testing.assert_allclose(hits.ranges, expected, rtol=0, atol=1e-9)
-    assert ((hits.surfaces == NOTHING) == np.isinf(expected)).all()
+    assert ((hits.surfaces == NO_SURFACE) == np.isinf(expected)).all()
 
 
 def test_the_surface_is_the_one_that_was_met():
     wall = np.array([[[3.0, -1.0], [3.0, 1.0]]])
-    hits = cast(np.zeros((1, 3)), Fan(-0.5, 0.5, 3), Shapes(wall, np.array([[2, 0, 0.25]])), 9)
-    assert hits.surfaces.tolist() == [[NOTHING, 1, NOTHING]]
-    hits = cast(np.zeros((1, 3)), Fan(-0.2, 0.2, 3), Shapes(wall, np.array([[2, 0, 0.25]])), 9)
+    hits = cast_beams(
+        np.zeros((1, 3)), BeamFan(-0.5, 0.5, 3), Shapes(wall, np.array([[2, 0, 0.25]])), 9
+    )
+    assert hits.surfaces.tolist() == [[NO_SURFACE, 1, NO_SURFACE]]
+    hits = cast_beams(
+        np.zeros((1, 3)), BeamFan(-0.2, 0.2, 3), Shapes(wall, np.array([[2, 0, 0.25]])), 9
+    )
     assert hits.surfaces.tolist() == [[0, 1, 0]]
 
 
@@ -107,15 +111,15 @@ def test_shapes_that_move_are_met_where_they_are():
     """Another robot has a pose of its own at every scan."""
     others = np.array([[2.0, 0.0, 0.3], [4.0, 0.0, 0.0]])
     shapes = outline_shapes(Body(radius_m=0.5), others)
-    hits = cast(np.zeros((2, 3)), Fan(0.0, 1.0, 1), shapes, 10.0)
+    hits = cast_beams(np.zeros((2, 3)), BeamFan(0.0, 1.0, 1), shapes, 10.0)
     np.testing.assert_allclose(hits.ranges[:, 0], [1.5, 3.5], atol=1e-12)
     shapes = outline_shapes(Body(length_m=1.0, width_m=0.4, rear_m=0.25), others[1:])
-    hits = cast(np.zeros((1, 3)), Fan(0.0, 1.0, 1), shapes, 10.0)
+    hits = cast_beams(np.zeros((1, 3)), BeamFan(0.0, 1.0, 1), shapes, 10.0)
     assert hits.ranges[0, 0] == pytest.approx(3.75, abs=1e-12)
 
 
 def test_an_empty_world_gives_no_ranges():
-    hits = cast(np.zeros((3, 3)), HALF_DEG, Shapes(NO_SEGMENTS, NO_CIRCLES), 8.0)
+    hits = cast_beams(np.zeros((3, 3)), HALF_DEG, Shapes(NO_SEGMENTS, NO_CIRCLES), 8.0)
     assert np.isinf(hits.ranges).all()
 
 
@@ -123,7 +127,7 @@ def test_an_empty_world_gives_no_ranges():
 
 
 def test_a_curve_is_as_long_as_it_says_and_bends_without_a_jump():
-    curve = rounded([[0, 0], [5, 0], [5, 4], [1, 6]], 1.2)
+    curve = round_corners([[0, 0], [5, 0], [5, 4], [1, 6]], 1.2)
     s = np.linspace(0, curve.length_m, 40_001)
     position, heading = curve.at(s)
     step = np.hypot(*np.diff(position, axis=0).T)
@@ -135,7 +139,7 @@ def test_a_curve_is_as_long_as_it_says_and_bends_without_a_jump():
 
 
 def test_corners_are_cut_by_no_more_than_is_asked():
-    curve = rounded([[0, 0], [5, 0], [5, 5]], 1.0)
+    curve = round_corners([[0, 0], [5, 0], [5, 5]], 1.0)
     position, _ = curve.at(np.linspace(0, curve.length_m, 2001))
     on_lines = (np.abs(position[:, 1]) < 1e-9) | (np.abs(position[:, 0] - 5) < 1e-9)
     assert position[~on_lines].min(axis=0) == pytest.approx([4, 0], abs=0.01)
@@ -143,14 +147,14 @@ def test_corners_are_cut_by_no_more_than_is_asked():
 
 def test_a_corner_that_turns_back_is_refused():
     with pytest.raises(ScenarioError, match=r"turns back at \(5, 0\)"):
-        rounded([[0, 0], [5, 0], [0.1, 0.1]], 1.0)
+        round_corners([[0, 0], [5, 0], [0.1, 0.1]], 1.0)
     with pytest.raises(ScenarioError, match="coincide"):
-        rounded([[0, 0], [0, 0]], 1.0)
+        round_corners([[0, 0], [0, 0]], 1.0)
 
 
 @pytest.mark.parametrize("distance", [0.05, 10.0])  # a triangle, a trapezoid
 def test_the_speed_is_a_trapezoid(distance):
-    profile = Trapezoid(distance, 0.5, 0.25)
+    profile = TrapezoidalProfile(distance, 0.5, 0.25)
     t = np.linspace(0, profile.duration_s, 10_001)
     s = profile.at(t)
     assert s[0] == 0
@@ -169,7 +173,7 @@ def test_wheels_are_carried_by_what_the_poses_say():
         Leg(turn_deg=-200.0),
         Leg(through_m=((6.0, 1.0),), speed_m_s=0.8),
     )
-    drive = plan(np.zeros(3), legs, Robot((0.0, 0.0), Body(radius_m=0.2), drive=legs))
+    drive = plan_drive(np.zeros(3), legs, Robot((0.0, 0.0), Body(radius_m=0.2), drive=legs))
     states = drive.at(np.arange(0, drive.duration_s + 1, 0.01))
     twists = log(between(states.poses[:-1], states.poses[1:]))
     np.testing.assert_allclose(np.diff(states.travel), twists[:, 0], atol=1e-7)
@@ -195,15 +199,15 @@ def test_a_rectangle_touches_what_reaches_into_it():
         ]
     )
     circles = np.array([[1.8, 0.0, 0.31], [1.8, 0.0, 0.29], [0.2, 0.2, 0.1]])
-    met = touches(body, np.zeros((1, 3)), Shapes(segments, circles))
+    met = contacts(body, np.zeros((1, 3)), Shapes(segments, circles))
     assert met.tolist() == [[True, False, True, False, False, True, False, True]]
-    turned = touches(body, np.array([[0.0, 0.0, pi]]), Shapes(segments, circles))
+    turned = contacts(body, np.array([[0.0, 0.0, pi]]), Shapes(segments, circles))
     assert turned[0, :2].tolist() == [False, False]
 
 
 def test_a_disc_touches_what_is_nearer_than_its_radius():
     segments = np.array([[[0.3, -1], [0.3, 1]], [[0.5, -1], [0.5, 1]], [[0.2, 0.5], [2, 0.5]]])
-    met = touches(Body(radius_m=0.4), np.zeros((1, 3)), Shapes(segments, NO_CIRCLES))
+    met = contacts(Body(radius_m=0.4), np.zeros((1, 3)), Shapes(segments, NO_CIRCLES))
     assert met.tolist() == [[True, False, False]]
 
 

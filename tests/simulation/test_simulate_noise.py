@@ -14,15 +14,15 @@ from graphslam.simulation import simulate
 from graphslam.simulation.scenario import (
     Body,
     Box,
-    Clock,
     Cylinder,
     Encoders,
     Laser,
     Leg,
     Robot,
+    RobotClock,
     Scenario,
-    Seer,
-    Things,
+    SightingSensor,
+    StaticObjects,
     Wall,
 )
 from graphslam.simulation.sensor_clock import START_NS
@@ -46,7 +46,7 @@ class Log:
     """A scenario simulated and read back, by kind of message and robot."""
 
     def __init__(self, path, robots, things=None, seed=1, **more):
-        world = Things(walls=(ROOM,)) if things is None else things
+        world = StaticObjects(walls=(ROOM,)) if things is None else things
         scenario = Scenario(robots, world, name="test", truth_period_s=0.05, **more)
         self.simulation = simulate(scenario, path / "log.mcap", seed)
         config = load_config()
@@ -152,7 +152,10 @@ def test_biases_of_many_walls_have_their_sigma(tmp_path):
     laser = replace(QUIET, bias_sigma_m=0.05, field_deg=360.0, step_deg=3.0)
     stands = robot(laser=laser, start=(0.0, 0.0), drive=(), start_deg=1.5)
     log = Log(
-        tmp_path, {"robot": stands}, Things(walls=(Wall("ring", ring, closed=True),)), duration_s=1
+        tmp_path,
+        {"robot": stands},
+        StaticObjects(walls=(Wall("ring", ring, closed=True),)),
+        duration_s=1,
     )
     ranges = log.of(Scan)[0].ranges[:-1]
     biases = ranges - 10 * np.cos(np.pi / 120)
@@ -175,7 +178,7 @@ def test_drop_outs_and_spurious_returns_have_their_shares(tmp_path):
 
 def test_mixed_pixels_lie_between_the_two_sides_of_an_edge(tmp_path):
     laser = replace(QUIET, mixed_share=0.6, range_sigma_m=0.0)
-    things = Things(walls=(ROOM,), boxes=(Box("box", (4.5, 3.0), (0.6, 0.6)),))
+    things = StaticObjects(walls=(ROOM,), boxes=(Box("box", (4.5, 3.0), (0.6, 0.6)),))
     drive = (Leg(through_m=((7.5, 1.5),)),)
     clean = Log(tmp_path, {"robot": robot(laser=QUIET, drive=drive)}, things).of(Scan)
     mixed = Log(tmp_path, {"robot": robot(laser=laser, drive=drive)}, things).of(Scan)
@@ -295,13 +298,15 @@ def test_odometry_is_what_the_wrong_geometry_makes_of_true_wheels(tmp_path):
 
 
 def test_sightings_have_the_noise_that_they_state(tmp_path):
-    things = Things(
+    things = StaticObjects(
         walls=(ROOM, Wall("screen", ((4.5, 2.2), (4.5, 3.6)))),
         cylinders=(Cylinder("post", (8.0, 3.0), 0.1), Cylinder("pole", (4.0, 5.5), 0.05)),
     )
     seers = (
-        Seer("landmarks", period_s=0.05, range_sigma_m=0.03, bearing_sigma_deg=0.7, field_deg=200),
-        Seer("robots", period_s=0.05, direction_sigma_deg=2.0, identified=True),
+        SightingSensor(
+            "landmarks", period_s=0.05, range_sigma_m=0.03, bearing_sigma_deg=0.7, field_deg=200
+        ),
+        SightingSensor("robots", period_s=0.05, direction_sigma_deg=2.0, identified=True),
     )
     robots = {
         "robot": robot(sightings=seers),
@@ -347,7 +352,7 @@ def crosses(a, b, wall):
 
 
 def test_clocks_have_their_offset_and_drift_and_sensors_their_latency(tmp_path):
-    clock = Clock(offset_s=0.5, drift_ppm=1000.0)
+    clock = RobotClock(offset_s=0.5, drift_ppm=1000.0)
     laser = replace(QUIET, period_s=0.25, phase_s=0.1, latency_s=0.03)
     encoders = Encoders(period_s=0.2, latency_s=0.01)
     robots = {

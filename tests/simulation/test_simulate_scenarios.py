@@ -13,7 +13,7 @@ from graphslam.core.config_io import load_config
 from graphslam.core.records import OdometryPose, Scan, Sighting
 from graphslam.logs import LogWriter, open_logs, read_true_associations, read_truth
 from graphslam.simulation import SCENARIOS, ScenarioError, load_scenario, simulate
-from graphslam.simulation.scene import visits
+from graphslam.simulation.scene import prepare_visits
 
 CONFIG = load_config()
 
@@ -85,7 +85,7 @@ def test_every_scenario_runs_and_its_log_is_readable(name, tmp_path):
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_every_drive_is_free_of_collisions_to_its_end(name):
     """`visits` raises where a robot touches anything; and no drive goes nowhere."""
-    for visit in visits(load_scenario(name)):
+    for visit in prepare_visits(load_scenario(name)):
         assert max(actor.drive.path_m for actor in visit.actors.values()) > 5
 
 
@@ -271,7 +271,7 @@ def test_bad_files_get_one_clear_line(case, tmp_path):
     assert old in GOOD
     path = written(tmp_path, GOOD.replace(old, new, 1))
     with pytest.raises(ScenarioError, match=says) as told:
-        visits(load_scenario(path))
+        prepare_visits(load_scenario(path))
     line = str(told.value)
     assert "\n" not in line
     assert "mine.toml" in line
@@ -279,12 +279,12 @@ def test_bad_files_get_one_clear_line(case, tmp_path):
 
 
 def test_the_good_file_is_good(tmp_path):
-    assert len(visits(load_scenario(written(tmp_path, GOOD)))) == 1
+    assert len(prepare_visits(load_scenario(written(tmp_path, GOOD)))) == 1
 
 
 def test_what_may_cross_may(tmp_path):
     text = GOOD.replace("[4, 2]]", "[4, 7]], may_cross = true").replace("[[3, 3]]", "[[3, 1]]")
-    visits(load_scenario(written(tmp_path, text)))
+    prepare_visits(load_scenario(written(tmp_path, text)))
 
 
 @pytest.mark.parametrize(

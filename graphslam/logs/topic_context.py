@@ -12,7 +12,7 @@ from graphslam.core.geometry import Array
 from graphslam.logs import schemas
 from graphslam.logs.decoders import TopicContext, frame_of
 from graphslam.logs.mcap_file import McapFile, raw_messages, sample_messages
-from graphslam.logs.mounts import Tree, find_mount, is_level, transform_tree
+from graphslam.logs.mounts import TransformTree, find_mount, is_level, transform_tree
 from graphslam.logs.no_return import find_no_return
 from graphslam.logs.topics import ODOMETRY_KINDS, Topic, robot_of, static_transform_topics
 from graphslam.logs.writer import DEFAULT_ROBOT
@@ -33,7 +33,7 @@ class ScanShape:
 
 def scan_shape(files: Sequence[McapFile], topic: Topic) -> ScanShape | None:
     """Shape of the first scan of ``topic`` that decodes; None when none does."""
-    for message in samples(files, topic):
+    for message in sample_decoded(files, topic):
         beams = len(message.ranges)
         view = abs(float(message.angle_increment)) * max(beams - 1, 0)
         low, high = float(message.range_min), float(message.range_max)
@@ -43,7 +43,7 @@ def scan_shape(files: Sequence[McapFile], topic: Topic) -> ScanShape | None:
     return None
 
 
-def survey_topics(
+def topic_contexts(
     files: Sequence[McapFile], topics: Sequence[Topic], config: Config
 ) -> tuple[dict[str, TopicContext], list[str]]:
     """Context for the decoder of each topic, and warnings about what had to be assumed."""
@@ -57,7 +57,7 @@ def survey_topics(
         inverted: set[str] = set()
         no_return = None
         if topic.record in (records.Scan, records.Sighting):
-            messages = list(samples(files, topic))
+            messages = list(sample_decoded(files, topic))
             frames = sorted({frame_of(message) for message in messages})
             tree = _transforms(files, topic.robot)
             for frame in frames:
@@ -79,7 +79,7 @@ def survey_topics(
     return contexts, warnings
 
 
-def samples(files: Sequence[McapFile], topic: Topic) -> Iterator[Any]:
+def sample_decoded(files: Sequence[McapFile], topic: Topic) -> Iterator[Any]:
     """Some decoded messages of ``topic`` from all over the log; those that decode."""
     for file in files:
         for data in sample_messages(file, topic.name, _SAMPLE_BLOCKS, _SAMPLE_PER_BLOCK):
@@ -93,13 +93,13 @@ def _base_frame(files: Sequence[McapFile], topic: Topic) -> str:
     """Frame that an odometry topic tells the motion of."""
     if topic.record is records.WheelAngles:
         return "base_link"  # JointState names no frame that moves; this is ROS' convention
-    for message in samples(files, topic):
+    for message in sample_decoded(files, topic):
         name = message.child_frame_id if topic.record is records.OdometryPose else frame_of(message)
         return str(name).lstrip("/") or "base_link"
     return "base_link"
 
 
-def _transforms(files: Sequence[McapFile], robot: str) -> Tree:
+def _transforms(files: Sequence[McapFile], robot: str) -> TransformTree:
     """Static transforms for ``robot``: the global ones and those of its own namespace."""
     tree: dict[str, tuple[str, Array]] = {}
     for file in files:
@@ -117,7 +117,7 @@ def _decoded(transforms: Iterable[bytes]) -> Iterator[Any]:
 
 
 def _mount(
-    topic: Topic, tree: Tree, base: str, frame: str, configured: Sequence[float]
+    topic: Topic, tree: TransformTree, base: str, frame: str, configured: Sequence[float]
 ) -> tuple[Array, bool, list[str]]:
     """Pose (3,) of ``frame`` on the robot, whether it hangs upside down, and warnings."""
     where = f"{topic.name}: frame {frame or '(none)'}"

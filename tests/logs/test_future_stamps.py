@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from graphslam.core.config import Config
 from graphslam.core.records import OdometryIncrement, OdometryPose, Scan
 from graphslam.logs import LogWriter, open_logs
-from graphslam.logs.stamp_repair import LONGEST_RUN, TOLERANCE_NS, place_late
+from graphslam.logs.future_stamps import LONGEST_RUN, TOLERANCE_NS, repair_future_stamps
 from graphslam.logs.time_order import SAMPLED
 
 MS = 1_000_000
@@ -46,7 +46,7 @@ def sound(topic, n, end_ms):
 
 
 def placed_ms(recorded):
-    return [message.time_ns / MS for _, message, _ in place_late(recorded, SAMPLED)]
+    return [message.time_ns / MS for _, message, _ in repair_future_stamps(recorded, SAMPLED)]
 
 
 HISTORY = [*sound("/odom", 10, -20), *sound("/scan", 10, 0)]
@@ -63,7 +63,7 @@ def test_a_run_is_spread_evenly_and_in_order_across_topics():
 def test_stamps_are_kept_and_so_is_the_order_of_recording():
     """Time places a message; the stamp names it in every output, to the digit."""
     recorded = record(*HISTORY, ("/odom", 123.456789), ("/scan", 400), ("/odom", 60))
-    placed = list(place_late(recorded, SAMPLED))
+    placed = list(repair_future_stamps(recorded, SAMPLED))
     assert [(t, m.stamp_ns, log) for t, m, log in placed] == [
         (t, m.stamp_ns, log) for t, m, log in recorded
     ]
@@ -88,7 +88,7 @@ def test_two_runs_do_not_run_into_each_other():
 def test_clocks_are_read_twice(late_ns, moved):
     """The recorder reads its clock, then the driver; a millisecond of that is not lateness."""
     recorded = [*record(*HISTORY), ("/scan", scan(50 * MS + late_ns), 50 * MS)]
-    (*_, (_, message, _)) = place_late(recorded, SAMPLED)
+    (*_, (_, message, _)) = repair_future_stamps(recorded, SAMPLED)
     assert (message.time_ns != message.stamp_ns) == moved
 
 
@@ -100,7 +100,7 @@ def test_a_constant_offset_between_clocks_is_left_alone(offset_ms):
     for k in range(200):
         recorded.append(("/odom", odometry(10 * k * MS), 10 * k * MS))
         recorded.append(("/scan", scan((10 * k + 5 + offset_ms) * MS), (10 * k + 5) * MS))
-    placed = list(place_late(recorded, SAMPLED))
+    placed = list(repair_future_stamps(recorded, SAMPLED))
     assert all(a[1] is b[1] for a, b in zip(placed, recorded, strict=True))
 
 
@@ -148,7 +148,7 @@ def test_good_stamps_are_never_touched_and_time_never_runs_backwards(rows):
     # enough good stamps beforehand that no topic is ever half late
     history = [*sound("/odom", 70, -100), *sound("/scan", 70, 0)]
     recorded = record(*history, *spoken, ("/odom", now + 1000))
-    placed = list(place_late(recorded, SAMPLED))
+    placed = list(repair_future_stamps(recorded, SAMPLED))
     assert len(placed) == len(recorded)
     times = [m.time_ns for _, m, _ in placed]
     assert times == sorted(times)

@@ -20,7 +20,9 @@ LONGEST_RUN = 64
 Recorded = tuple[str, Message, int]
 
 
-def place_late(recorded: Iterable[Recorded], sampled: tuple[type, ...]) -> Iterator[Recorded]:
+def repair_future_stamps(
+    recorded: Iterable[Recorded], sampled: tuple[type, ...]
+) -> Iterator[Recorded]:
     """Give messages that are stamped after their recording a ``time_ns`` that fits the recording.
 
     A run of them is spread evenly between the last sound message and their time of recording. A
