@@ -1,9 +1,12 @@
-"""Which of many hypotheses agree: maximal consistent sets, leave-one-out tests, rigid fits.
+"""Which of many hypotheses agree: maximal consistent sets, leave-one-out tests, rivals, fits.
 
 Hypotheses are judged in pairs first; the largest set that agrees in pairs is looked for greedily
 (J. Mangelson et al., Pairwise consistent measurement set maximization, ICRA 2018, DOI
 10.1109/ICRA.2018.8460217), and members that all the others contradict leave it.
 """
+
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +18,16 @@ IntArray = NDArray[np.int64]
 
 #: probability up to which a point or a relative pose still fits what it is compared with
 FIT = 0.9999
+#: an alternative with more than this share of the best one's support leaves a decision open
+RIVAL_SHARE = 0.5
+#: the same for squared Mahalanobis distances: an alternative at most this much farther off is a
+#: rival. With Gaussian errors it has exp(-9/2), a hundredth, of the best one's likelihood
+RIVAL_D2 = 9.0
+
+
+def has_rival(support: float, others: Iterable[float], share: float = RIVAL_SHARE) -> bool:
+    """Whether an alternative has more than ``share`` of the support of the best hypothesis."""
+    return any(other > share * support for other in others)
 
 
 def largest_consistent_set(r: Array, S: Array, probability: float, starts: int) -> list[int]:
@@ -49,9 +62,7 @@ def largest_consistent_set(r: Array, S: Array, probability: float, starts: int) 
 def leave_one_out(chosen: IntArray, r: Array, S: Array, probability: float) -> list[int]:
     """Those of the chosen measurements that all the others bear out; the worst leaves first.
 
-    The inverse of the chosen measurements' covariance has in its blocks what the others leave of
-    each: its residual is own⁻¹ pull and that residual's covariance own⁻¹. Each removal inverts
-    again, O(n³).
+    Each removal inverts the covariance again, O(n³).
 
     Args:
         chosen: (m,) indices of measurements.
@@ -62,15 +73,66 @@ def leave_one_out(chosen: IntArray, r: Array, S: Array, probability: float) -> l
     members, gate = [int(k) for k in chosen], chi2_quantile(probability, 3)
     while len(members) > 1:
         rows = np.concatenate([np.arange(3 * k, 3 * k + 3) for k in members])
-        information = np.linalg.inv(S[np.ix_(rows, rows)])
-        pull = (information @ r[members].ravel()).reshape(-1, 3, 1)
-        diagonal = np.arange(len(members))
-        own = information.reshape(len(members), 3, -1, 3)[diagonal, :, diagonal]
-        d2 = (pull.mT @ np.linalg.solve(own, pull)).ravel()
+        d2 = leave_one_out_distances(np.linalg.inv(S[np.ix_(rows, rows)]), r[members])
         if d2.max() <= gate:
             break
         members = [k for k, bad in zip(members, d2 == d2.max(), strict=True) if not bad]
     return members
+
+
+def leave_one_out_distances(information: Array, r: Array) -> Array:
+    """Squared Mahalanobis distances (n,) of residuals r (n, d) from what the others predict.
+
+    Given all others, residual k is own⁻¹ (information r)_k with covariance own⁻¹, where own is the
+    diagonal block (d, d) of ``information`` (nd, nd), the inverse of the joint covariance.
+    """
+    n, d = r.shape
+    pull = (information @ r.ravel()).reshape(n, d, 1)
+    own = information.reshape(n, d, n, d)[np.arange(n), :, np.arange(n)]
+    return np.asarray((pull.mT @ np.linalg.solve(own, pull)).ravel())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LeastSquaresFit:
+    """Estimate ``x`` (d,) from m rows: covariance ``cov`` (d, d), ``gain`` (d, m) with x = gain b.
+
+    ``scale``: by what ``cov`` is larger than the rows' covariance says, as residuals are; at least
+    1. ``residuals`` (m,); ``information`` (m, m) is the inverse of the rows' covariance.
+    """
+
+    x: Array
+    cov: Array
+    gain: Array
+    scale: float
+    residuals: Array
+    information: Array
+
+
+def generalised_least_squares(
+    A: Array, b: Array, S: Array, prior: Array | float = 0.0, pull: Array | float = 0.0
+) -> LeastSquaresFit:
+    """Solve A x = b, whose rows have correlated errors.
+
+    Args:
+        A: (m, d).
+        b: (m,).
+        S: (m, m) covariance of the errors of b.
+        prior: information (d, d) of a prior on x.
+        pull: prior information times prior mean, (d,).
+    """
+    m, d = A.shape
+    information = np.linalg.inv(S)
+    N = np.linalg.inv(A.T @ information @ A + prior)
+    gain = N @ A.T @ information
+    x = gain @ b + N @ np.broadcast_to(pull, d)
+    e = np.asarray(b - A @ x)
+    scale = max(1.0, float(e @ information @ e) / max(m - d, 1))
+    return LeastSquaresFit(x, scale * N, gain, scale, e, information)
+
+
+def rival_set(agree: Array, worth: Array | NDArray[np.float32], rest: IntArray) -> IntArray:
+    """The set among ``rest`` (k,) of which all agree in pairs and that is worth most, indices."""
+    return rest[greedy_max_clique(agree[np.ix_(rest, rest)], worth[rest])]
 
 
 def greedy_max_clique(

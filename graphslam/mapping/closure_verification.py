@@ -22,21 +22,17 @@ from itertools import pairwise
 import numpy as np
 
 from graphslam.core.config import BackendConfig, Config, RobustConfig
-from graphslam.core.consistency import greedy_max_clique
+from graphslam.core.consistency import FIT, greedy_max_clique, has_rival, rival_set
+from graphslam.core.frame_forest import PRIOR_INFLATION, grow_frame_forest
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, adjoint, between, compose, inverse, log, rotate_cov
 from graphslam.core.records import Closure, Estimate, Motion, RelativePose, Start, Step, Trajectory
 from graphslam.estimation.isam2 import Isam2Backend, Reoptimiser
 from graphslam.odometry.preintegration import Track
 
-#: probability up to which two closures agree, and up to which one fits what all the others say:
-#: a true one is lost as rarely as that, and false ones miss by far more
-AGREE, FIT = 0.99, 0.9999
-#: a set places a robot if nothing beside it that agrees has more than this part of its size
-RIVAL = 0.5
-#: the prior of a robot that was placed is so many times as wide as the closures leave it: they
-#: enter the estimate themselves
-WIDER = 10.0
+#: probability up to which two closures agree; what all the others say is fitted up to `FIT`: a true
+#: one is lost as rarely as that, and false ones miss by far more
+AGREE = 0.99
 #: closures compared with each other at once, in the order of time: the work is their square
 CHUNK = 1000
 #: sigmas at which the kernel of the joint solution turns
@@ -110,10 +106,9 @@ def verify(
             frames_seen.update(zip(chunk, E, strict=True))
             worth = np.ones(len(chunk), dtype=np.float32)
             best = greedy_max_clique(agree, worth)
-            rest = np.setdiff1d(np.arange(len(chunk)), best)
-            rival = greedy_max_clique(agree[np.ix_(rest, rest)], worth[rest])
+            rival = rival_set(agree, worth, np.setdiff1d(np.arange(len(chunk)), best))
             sets[pair] = sets.get(pair, []) + [chunk[n] for n in best]
-            if len(rival) <= RIVAL * len(best):
+            if not has_rival(len(best), [len(rival)]):
                 clear.add(pair)
     placed, frames = _placed(sets, clear, frames_seen, odometry, starts)
     believed = {
@@ -130,7 +125,7 @@ def verify(
     found = {}
     for robot in unknown:
         first = estimate.states[robot]
-        wide = ORIGIN if frames[robot] == robot else WIDER**2 * first.covs[0]
+        wide = ORIGIN if frames[robot] == robot else PRIOR_INFLATION**2 * first.covs[0]
         found[robot] = Start(first.poses[0], wide)
     return Verified(refused, frozenset(believed), found, frames)
 
@@ -239,24 +234,22 @@ def _placed(
     The largest set that connects a robot without a place to one with a place is followed first;
     when there is none, the next robot begins a frame of its own.
     """
-    world = min(starts, default="")
-    frames = {robot: world for robot in odometry if robot in starts}
-    poses = {robot: starts[robot].pose for robot in frames}
     ways = sorted(
         ((a, b) for a, b in sets if a != b and (a, b) in clear), key=lambda p: -len(sets[p])
     )
-    while len(frames) < len(odometry):
-        way = next(((a, b) for a, b in ways if (a in frames) != (b in frames)), None)
-        if way is None:
-            robot = next(r for r in odometry if r not in frames)
-            frames[robot], poses[robot] = robot, np.zeros(3)
-            continue
-        a, b = way
-        E = seen[sets[way][0]]  # of b, in the frame of a
-        if a in frames:
-            poses[b], frames[b] = compose(poses[a], E), frames[a]
-        else:
-            poses[a], frames[a] = compose(poses[b], inverse(E)), frames[b]
+
+    def next_edge(poses: Mapping[str, Array]) -> tuple[str, str, Array] | None:
+        for a, b in ways:
+            E = seen[sets[a, b][0]]  # of b, in the frame of a
+            if a in poses and b not in poses:
+                return b, a, compose(poses[a], E)
+            if b in poses and a not in poses:
+                return a, b, compose(poses[b], inverse(E))
+        return None
+
+    given = {robot: starts[robot].pose for robot in odometry if robot in starts}
+    world = min(starts, default="")
+    poses, frames = grow_frame_forest(list(odometry), given, world, np.zeros(3), next_edge)
     wide = np.diag([1e3, 1e3, 3.0]) ** 2
     return {
         robot: Start(pose, ORIGIN if frames[robot] == robot else wide)

@@ -13,6 +13,7 @@ from itertools import combinations
 
 import numpy as np
 
+from graphslam.core.consistency import RIVAL_D2
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, between, rotate_cov, wrap
 from graphslam.core.records import Association, Step
@@ -30,8 +31,6 @@ OVERLAP_SHARE = 0.5
 #: walls farther apart (m across, rad) are not looked at, nor points
 REACH_M, REACH_RAD = 1.5, 0.3
 GATE_PROBABILITY = 0.95
-#: a tie waits while another that contradicts it is not worse by more than this (squared distance)
-RIVAL = 9.0
 
 
 @dataclass(slots=True, eq=False)
@@ -156,7 +155,7 @@ def _next_tie(marks: _Map, i: IntArray, j: IntArray, d2: Array, fits: BoolArray)
         if marks.contradict(a, b):
             continue
         tied = (marks.group == marks.group[a]) | (marks.group == marks.group[b])
-        rival = fits & (tied[i] != tied[j]) & (d2 <= d2[k] + RIVAL)
+        rival = fits & (tied[i] != tied[j]) & (d2 <= d2[k] + RIVAL_D2)
         outside = np.where(tied[i[rival]], j[rival], i[rival])
         if not any(marks.apart[marks.group == marks.group[o]][:, tied].any() for o in outside):
             return int(k)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graphslam.core.consistency import largest_consistent_set
+from graphslam.core.consistency import has_rival, largest_consistent_set
 from graphslam.core.geometry import (
     Array,
     adjoint,
@@ -61,8 +61,8 @@ SAME, ABSENT = 0.4, 0.15
 MIN_COARSE_OVERLAP = 0.2
 #: how sure the position must be in every direction, m
 SURE_M = 0.08
-#: the second best must be worse than this part of the best
-RIVAL = 0.8
+#: the second best may have at most this share of the best one's score
+RIVAL_SHARE = 0.8
 #: closures agree with each other up to this probability, by covariances that may be too small by
 #: this factor (the estimate does not know of what it missed)
 AGREE, TRUST = 0.99, 16.0
@@ -206,7 +206,7 @@ def verify_match(matches: Sequence[Match]) -> Match | None:
         best.same >= SAME
         and best.absent <= ABSENT * (best.same + best.absent)
         and sigma <= SURE_M
-        and all(m.same - m.absent <= RIVAL * score for m in matches[1:])
+        and not has_rival(score, (m.same - m.absent for m in matches[1:]), RIVAL_SHARE)
     )
     return best if good else None
 

@@ -15,19 +15,15 @@ from typing import Any
 import numpy as np
 
 from graphslam.core.config import AssociationConfig
-from graphslam.core.consistency import poses_differ
+from graphslam.core.consistency import has_rival, poses_differ
+from graphslam.core.frame_forest import PRIOR_INFLATION, grow_frame_forest
 from graphslam.core.geometry import compose, compose_cov
 from graphslam.core.records import Sighting, Start
 from graphslam.multi_robot.relative_frames import (
-    RIVAL,
     RelativeFrame,
     RobotEstimate,
     estimate_relative_frame,
 )
-
-#: sigmas of a start that was found are so many times as wide as the relation has them: what it
-#: was found from enters the estimate again
-PRIOR_INFLATION = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,24 +109,22 @@ def build_frame_tree(
             elif found:
                 undecided |= dict.fromkeys((a, b), found)
     world = min(starts, default="")
-    placed, frames = dict(starts), dict.fromkeys(starts, world)
     by: dict[str, RelativeFrame] = {}
-    while len(placed) < len(robots):
-        ways = [
-            way
-            for name in robots
-            if name not in placed
-            for way in [_strongest_relation(name, relations, placed, undecided)]
-            if way is not None
+
+    def next_edge(placed: Mapping[str, Start]) -> tuple[str, str, Start] | None:
+        free = [name for name in robots if name not in placed]
+        edges = [
+            edge
+            for name in free
+            if (edge := _strongest_relation(name, relations, placed, undecided)) is not None
         ]
-        if ways:
-            relation, start = max(ways, key=lambda way: way[0].weight)
-            name = relation.robot
-            frames[name], by[name] = frames[relation.other], relation
-        else:
-            name = next(name for name in robots if name not in placed)
-            frames[name], start = name, origin
-        placed[name] = start
+        if not edges:
+            return None
+        relation, start = max(edges, key=lambda edge: edge[0].weight)
+        by[relation.robot] = relation
+        return relation.robot, relation.other, start
+
+    placed, frames = grow_frame_forest(robots, starts, world, origin, next_edge)
     wide = {
         name: Start(start.pose, PRIOR_INFLATION**2 * start.cov) if name in by else start
         for name, start in placed.items()
@@ -164,7 +158,7 @@ def _strongest_relation(
     ]
     k = max(range(len(ways)), key=lambda n: (support[n], ways[n][0].weight))
     whole = sum(r.weight for r, _ in ways)
-    if whole - support[k] > RIVAL * support[k]:
+    if has_rival(support[k], [whole - support[k]]):
         others = ", ".join(r.other for r, _ in ways)
         undecided[name] = f"what {name} has in common with {others} contradicts itself"
         return None

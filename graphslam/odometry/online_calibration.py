@@ -118,7 +118,7 @@ def observed_information(
         landmarks: targets of ``seen``, world frame.
     """
     info = {robot: np.zeros((3, 3)) for robot in poses}
-    for name in {association.model for association in seen}:
+    for name in sorted({association.model for association in seen}):  # sums in one order
         model = MODELS[name]
         group = [k for k, association in enumerate(seen) if association.model == name]
         z, cov = (np.array([getattr(seen[k], what) for k in group]) for what in ("z", "cov"))

@@ -60,7 +60,7 @@ def judge_recorded_closures(
         # these may place a robot too: its start is asked for where it is needed
         found = {robot: start for robot, start in found.items() if frames[robot] != robot}
     elif RelativePose in kinds:
-        for robot in set(log.robots) - {*starts, *found}:
+        for robot in sorted(set(log.robots) - {*starts, *found}):
             found[robot], frames[robot] = own_frame(), robot
     world = min(starts, default="")
     kept = frozenset(closure_id(messages[k]) for k in verified.kept)

@@ -201,7 +201,8 @@ def _closed(
     counts["closures_refused"] += len(refused)
     if not lost:
         return steps, [], estimate
-    return rejoin_visits(taken_apart, now, landmarks), [believed[pair] for pair in lost], now
+    closures = [closure for pair, closure in believed.items() if pair in lost]
+    return rejoin_visits(taken_apart, now, landmarks), closures, now
 
 
 def _tightened(

@@ -7,11 +7,11 @@ import pytest
 
 from graphslam.core.config import OdometryConfig, RobotConfig
 from graphslam.core.config_io import load_config
+from graphslam.core.frame_forest import PRIOR_INFLATION
 from graphslam.core.geometry import compose, compose_jacobians, exp, wrap
 from graphslam.core.records import OdometryPose, Scan, Trajectory
 from graphslam.evaluation.metrics import evaluate
 from graphslam.logs import open_logs, read_truth
-from graphslam.multi_robot.frame_tree import PRIOR_INFLATION
 from graphslam.multi_robot.mutual_detection import ScanBuffer
 from graphslam.multi_robot.relative_frames import RobotEstimate
 from graphslam.multi_robot.track_registration import odometry_cross_covariance
