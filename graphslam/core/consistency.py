@@ -125,9 +125,9 @@ def generalised_least_squares(
     N = np.linalg.inv(A.T @ information @ A + prior)
     gain = N @ A.T @ information
     x = gain @ b + N @ np.broadcast_to(pull, d)
-    e = np.asarray(b - A @ x)
+    e = b - A @ x
     scale = max(1.0, float(e @ information @ e) / max(m - d, 1))
-    return LeastSquaresFit(x, scale * N, gain, scale, e, information)
+    return LeastSquaresFit(x, scale * N, gain, scale, e, np.asarray(information))
 
 
 def rival_set(agree: Array, worth: Array | NDArray[np.float32], rest: IntArray) -> IntArray:
