@@ -26,7 +26,7 @@ from graphslam.change_detection.surface_map import (
 )
 from graphslam.change_detection.visit import Bools, Ints, Visit
 from graphslam.core.config import ChangesConfig
-from graphslam.core.geometry import Array
+from graphslam.core.geometry import Array, unit_vectors
 
 #: a beam along a surface says nothing about whether it passed it
 _LEAST_COSINE = 0.2
@@ -177,7 +177,7 @@ def _crossings(
     beam, row = _candidates(surface, visit, used)
     scan = visit.scan[beam]
     heading = visit.poses[scan, 2] + visit.angle[beam]
-    d = np.column_stack([np.cos(heading), np.sin(heading)])
+    d = unit_vectors(heading)
     o, n = visit.poses[scan, :2], surface.normals[row]
     cosine = np.einsum("ni,ni->n", d, n)
     steep = (np.abs(cosine) > _LEAST_COSINE) & surface.good[row]

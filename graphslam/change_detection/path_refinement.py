@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from graphslam.change_detection.scan_network import Cloud, relax_scan_network
 from graphslam.change_detection.visit import Bools, Visit
-from graphslam.core.geometry import Array, between, compose, rotation, transform, wrap
+from graphslam.core.geometry import Array, between, compose, polar_points, rotation, transform, wrap
 
 #: scans before that make the surfaces, and every how many of them
 _WINDOW, _EVERY = 30, 3
@@ -35,7 +35,7 @@ _SIDE, _STRAIGHT, _FEWEST = 3, 0.1, 20
 
 def refine_path(visit: Visit) -> Visit:
     """The visit on a path that its scans agree with; its first scan stays where it is."""
-    local = visit.range_m[:, None] * np.column_stack([np.cos(visit.angle), np.sin(visit.angle)])
+    local = polar_points(visit.range_m, visit.angle)
     normals, flat = _normals(visit, local)
     metrics = np.where(flat[:, None, None], normals[:, :, None] * normals[:, None, :], np.eye(2))
     ends = np.searchsorted(visit.scan, np.arange(len(visit.poses) + 1))

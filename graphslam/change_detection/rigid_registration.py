@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 from graphslam.change_detection.visit import Bools, Ints
 from graphslam.core.errors import OutputError
-from graphslam.core.geometry import Array, rotation, transform, wrap
+from graphslam.core.geometry import Array, rotation, transform, unit_vectors, wrap
 from graphslam.core.records import Landmark
 
 #: lines are taken to cross if their directions differ by more than this
@@ -131,7 +131,7 @@ def _from_lines(a: _Lines, b: _Lines) -> Array:
         angle = wrap(m.normal[j] - m.normal[i])
         crossing = np.abs(np.sin(angle)) > np.sin(_CROSSING_RAD)
         i, j, angle = i[crossing], j[crossing], angle[crossing]
-        n = np.stack([np.cos(m.normal), np.sin(m.normal)], axis=-1)
+        n = unit_vectors(m.normal)
         N = np.stack([n[i], n[j]], axis=-2)
         at = np.linalg.solve(N, np.stack([m.offset[i], m.offset[j]], axis=-1)[..., None])[..., 0]
         parts.append((m.normal[i], angle, at))
@@ -218,12 +218,12 @@ def _match_lines(pose: Array, a: _Lines, b: _Lines, slack: float) -> tuple[Ints,
     """
     x, y = pose[:2]
     normal = b.normal + pose[2]
-    n = np.column_stack([np.cos(normal), np.sin(normal)])
+    n = unit_vectors(normal)
     t = np.column_stack([-n[:, 1], n[:, 0]])
     ends = transform(pose, b.ends.reshape(-1, 2)).reshape(-1, 2, 2)
     middle = ends.mean(axis=1)
     i, j = np.nonzero(np.abs(wrap(a.normal[:, None] - normal[None])) < 0.03 * slack + 0.03)
-    na = np.column_stack([np.cos(a.normal), np.sin(a.normal)])[i]
+    na = unit_vectors(a.normal)[i]
     ta = np.column_stack([-na[:, 1], na[:, 0]])
     angle = np.asarray(wrap(a.normal[i] - normal[j]))
     # distance from b's middle to line a, along a's normal

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from graphslam.change_detection.grid import Grid
 from graphslam.change_detection.visit import Bools, Ints
-from graphslam.core.geometry import Array
+from graphslam.core.geometry import Array, unit_vectors
 
 #: V_0 of 5.10, m³; it cancels out of every comparison
 VOLUME = 1.0
@@ -50,7 +50,7 @@ class DentMap:
 def scan_points(pose: Array, angles: Array, ranges: Array) -> Array:
     """World points (n, 2) m of a scan from ``pose`` (3,); NaN where there is no return."""
     heading = pose[2] + angles
-    along = np.column_stack([np.cos(heading), np.sin(heading)])
+    along = unit_vectors(heading)
     return np.asarray(pose[:2] + ranges[:, None] * along)
 
 
@@ -142,7 +142,7 @@ def expected_measurements(
     step = dents.grid.cell_m / _STEPS_PER_CELL
     r = np.arange(1, int(reach_m / step) + 1) * step
     heading = pose[2] + angles
-    d = np.column_stack([np.cos(heading), np.sin(heading)])
+    d = unit_vectors(heading)
     along = pose[:2] + r[None, :, None] * d[:, None, :]
     cell = dents.grid.cells(along.reshape(-1, 2)).reshape(len(angles), len(r))
     depth = np.where(cell >= 0, dents.depth[cell], 0.0)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphslam.core.errors import LogError, OutputError
-from graphslam.core.geometry import Array, between, compose, compose_cov
+from graphslam.core.geometry import Array, between, compose, compose_cov, polar_points, unit_vectors
 from graphslam.core.records import Landmark, Scan
 from graphslam.logs import open_logs
 from graphslam.odometry.interpolation import mounted
@@ -59,7 +59,7 @@ class Visit:
     def directions(self) -> Array:
         """Unit vectors (n, 2) of the beams in the world."""
         heading = self.poses[self.scan, 2] + self.angle
-        return np.column_stack([np.cos(heading), np.sin(heading)])
+        return unit_vectors(heading)
 
     @property
     def ends(self) -> Array:
@@ -127,7 +127,7 @@ def on_surface(angles: Array, ranges: Array) -> Bools:
         angles: (k,) rad.
         ranges: (k,) m, NaN without a return.
     """
-    points = ranges[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
+    points = polar_points(ranges, angles)
     gap = np.hypot(*np.diff(points, axis=0).T)
     nearer = np.fmin(ranges[1:], ranges[:-1])
     gap[nearer < LEAST_M] = np.inf

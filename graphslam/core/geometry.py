@@ -97,6 +97,22 @@ def transform(pose: Array, points: Array) -> Array:
     return np.asarray(points @ rotation(pose[2]).T + pose[:2])
 
 
+def unit_vectors(angle_rad: ArrayLike) -> Array:
+    """Vectors (..., 2) of length 1 in directions (...,)."""
+    return np.stack([np.cos(angle_rad), np.sin(angle_rad)], axis=-1)
+
+
+def polar_points(range_m: Array, bearing_rad: Array) -> Array:
+    """Points (..., 2), m, at ranges and bearings (...,) from the origin."""
+    return np.asarray(range_m[..., None] * unit_vectors(bearing_rad))
+
+
+def path_length(points: Array) -> Array:
+    """Length (n,), m, of the path through points or poses (n, 2 or 3) up to each of them."""
+    x, y = (points[1:] - points[:-1])[:, :2].T
+    return np.concatenate([[0.0], np.cumsum(np.hypot(x, y))])
+
+
 def _sinc(phi: float) -> float:
     """``sin(phi)/phi``, 1 at zero."""
     if not math.isfinite(phi):

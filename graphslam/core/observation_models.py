@@ -19,6 +19,7 @@ from graphslam.core.geometry import (
     compose_cov,
     log,
     log_jacobian,
+    polar_points,
     rotate_cov,
     wrap,
 )
@@ -214,11 +215,7 @@ class PointModel:
 
     def invert(self, z: Array, x: Array) -> Array:
         """See `ObservationModel`; a robot's heading is not observed and comes out as 0."""
-        direction = x[..., 2] + z[..., 0]
-        point = np.stack(
-            [x[..., 0] + z[..., 1] * np.cos(direction), x[..., 1] + z[..., 1] * np.sin(direction)],
-            axis=-1,
-        )
+        point = x[..., :2] + polar_points(z[..., 1], x[..., 2] + z[..., 0])
         if self.of_pose:
             point = np.concatenate([point, np.zeros((*point.shape[:-1], 1))], axis=-1)
         return point

@@ -9,13 +9,16 @@ output. ``time_ns`` is where it is placed on the time line: equal to the stamp e
 stamp contradicts the order of recording (see `graphslam.logs.time_order`).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from graphslam.core.geometry import Array
+
+#: a time or times (...,), ns
+Stamps = int | Sequence[int] | np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
 # ---------------------------------------------------------------- what a log says
 
@@ -269,6 +272,19 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
+
+    def index(self, stamps_ns: Stamps) -> Any:
+        """Index (...,) of poses by their stamps; the stamps are sorted and each is one of them."""
+        return np.searchsorted(self.stamps_ns, stamps_ns)
+
+    def at(self, stamps_ns: Stamps) -> Array:
+        """Poses (..., 3) by their stamps, see `index`."""
+        return np.asarray(self.poses[self.index(stamps_ns)])
+
+    def index_before(self, times_ns: Stamps) -> Any:
+        """Index (...,) of the last pose at or before any times, of the first for earlier ones."""
+        last = np.searchsorted(self.stamps_ns, times_ns, side="right") - 1
+        return np.maximum(last, 0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

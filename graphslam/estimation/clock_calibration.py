@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphslam.core.config import RobustConfig
-from graphslam.core.geometry import Array, compose, log
+from graphslam.core.geometry import Array, compose, log, polar_points
 from graphslam.core.observation_models import transport
 from graphslam.core.records import Association, Estimate, Sighting, Step
 from graphslam.estimation.clock_graph import DRIFT, OFFSET_S, clock_errors, robot_associations
@@ -229,7 +229,7 @@ def _place(sighting: Sighting) -> Array:
     if len(o.z) == 3:
         return compose(sighting.mount, o.z)[:2]
     z, _ = transport(o.z, o.cov, sighting.mount, np.zeros((3, 3)))
-    return np.asarray(z[1] * np.array([np.cos(z[0]), np.sin(z[0])]))
+    return polar_points(z[1], z[0])
 
 
 def _misfit(p: Array, q: Array) -> Array:

@@ -13,7 +13,7 @@ import numpy as np
 
 from graphslam.core.errors import OutputError
 from graphslam.core.geometry import Array, between, rotate_cov, rotation, wrap
-from graphslam.core.observation_models import LineModel
+from graphslam.core.observation_models import MODELS, LineModel
 from graphslam.core.records import Estimate, Step
 
 # of n edges: tag, measurements (n, k), covariances (n, m, m) of the last m entries; nothing is
@@ -183,10 +183,9 @@ def _line_edges(z: Array, cov: Array, x: Array, t: Array) -> _EdgeParts:
 
 def _cartesian(z: Array, cov: Array) -> tuple[Array, Array]:
     """Bearings and ranges (n, 2) as x and y (n, 2) in the base frame, covariances (n, 2, 2)."""
-    bearing, distance = z.T
-    c, s = np.cos(bearing), np.sin(bearing)
-    J = np.array([[-distance * s, c], [distance * c, s]]).transpose(2, 0, 1)
-    return distance[:, None] * np.column_stack([c, s]), J @ cov @ J.mT
+    model, origin = MODELS["point"], np.zeros((len(z), 3))
+    _, J = model.invert_jacobians(z, origin)
+    return model.invert(z, origin), J @ cov @ J.mT
 
 
 #: what a state of this size is called

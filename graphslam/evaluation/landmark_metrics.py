@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from graphslam.core.geometry import Array, between, wrap
+from graphslam.core.geometry import Array, between, unit_vectors, wrap
 from graphslam.core.records import Landmark, TrueLandmark
 from graphslam.evaluation.error_statistics import nees, rms
 
@@ -143,7 +143,7 @@ def _landmark_error(estimated: Landmark, true: TrueLandmark) -> tuple[float, Arr
     # a line has two normals: the true one nearer to the estimate's is taken
     true_normal = true.pose[2] + np.pi / 2
     true_normal += np.pi * np.round((normal - true_normal) / np.pi)
-    n = np.array([np.cos(true_normal), np.sin(true_normal)])
+    n = unit_vectors(true_normal)
     true_offset = float(n @ true.pose[:2])
     error = abs(float(n @ estimated.extent.mean(axis=0)) - true_offset)
     difference = np.array([normal - true_normal, offset - true_offset])

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from graphslam.core.consistency import fit_rigid_transform
-from graphslam.core.geometry import Array, between, interpolate, transform, wrap
+from graphslam.core.geometry import Array, between, interpolate, path_length, transform, wrap
 from graphslam.core.records import Trajectory
 from graphslam.evaluation.error_statistics import nees_statistics, rms
 
@@ -82,8 +82,7 @@ def relative_errors(
         axis, delta, slack = (pairs.stamps_ns - pairs.stamps_ns[0]) / 1e9, seconds, 0.5 * seconds
     else:
         assert metres is not None  # narrows the type; checked above
-        steps = np.hypot(*np.diff(pairs.truth[:, :2], axis=0).T)
-        axis, delta, slack = np.concatenate([[0.0], np.cumsum(steps)]), metres, 0.1 * metres
+        axis, delta, slack = path_length(pairs.truth), metres, 0.1 * metres
     wanted = axis + delta
     after = np.clip(np.searchsorted(axis, wanted), 1, len(axis) - 1)
     nearer = np.abs(axis[after - 1] - wanted) < np.abs(axis[after] - wanted)

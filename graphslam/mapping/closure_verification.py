@@ -26,7 +26,7 @@ from graphslam.core.consistency import FIT, greedy_max_clique, has_rival, rival_
 from graphslam.core.frame_forest import PRIOR_INFLATION, grow_frame_forest
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, adjoint, between, compose, inverse, log, rotate_cov
-from graphslam.core.records import Closure, Estimate, Motion, RelativePose, Start, Step, Trajectory
+from graphslam.core.records import Closure, Estimate, Motion, RelativePose, Start, Step
 from graphslam.estimation.isam2 import Isam2Backend, Reoptimiser
 from graphslam.odometry.preintegration import Track
 
@@ -327,7 +327,7 @@ class _Joint:
         """
         c = self._closures[k]
         ends = (c.other, c.other_time_ns), (c.robot, c.time_ns)
-        x, y = (_pose(estimate.states[robot], t) for robot, t in ends)
+        x, y = (estimate.states[robot].at(t) for robot, t in ends)
         h = between(x, y)
         L = np.linalg.cholesky(rotate_cov(c.cov, -float(c.delta[2])))
         r = np.linalg.solve(L, log(between(c.delta, h)))
@@ -340,7 +340,3 @@ class _Joint:
         told = rest > LEAST_TOLD
         r, m, rest = (Q.T @ r)[told], m[told], rest[told]
         return float(np.sum(r**2 / (rest * (rest + m))))
-
-
-def _pose(states: Trajectory, time_ns: int) -> Array:
-    return np.asarray(states.poses[np.searchsorted(states.stamps_ns, time_ns)])

@@ -176,7 +176,7 @@ def observed_from(seen: Sequence[Association], estimate: Estimate) -> Array:
     robots, times = np.array([a.robot for a in seen]), np.array([a.time_ns for a in seen])
     for robot, states in estimate.states.items():
         own = robots == robot
-        poses[own] = states.poses[np.searchsorted(states.stamps_ns, times[own])]
+        poses[own] = states.at(times[own])
     return poses
 
 

@@ -21,10 +21,12 @@ from graphslam.core.geometry import (
     compose,
     inverse,
     log,
+    path_length,
     rotate_cov,
     rotation,
     rotation3,
     transform,
+    wrap,
 )
 from graphslam.core.records import Closure, Picture, Trajectory
 from graphslam.core.worker import parallel_map
@@ -108,9 +110,8 @@ def build_submaps(
         poses, stamps = states_of.poses[seen], states_of.stamps_ns[seen]
         if len(poses) < 2:
             continue
-        moves = between(poses[:-1], poses[1:])
-        path = np.concatenate([[0.0], np.cumsum(np.hypot(moves[:, 0], moves[:, 1]))])
-        turned = np.concatenate([[0.0], np.cumsum(np.abs(moves[:, 2]))])
+        path = path_length(poses)
+        turned = np.concatenate([[0.0], np.cumsum(np.abs(wrap(np.diff(poses[:, 2]))))])
         spacing = max(SPACING_M, path[-1] / MAX_SUBMAPS)
         for middle in np.unique(np.searchsorted(path, np.arange(0.0, path[-1], spacing))):
             used: list[int] = []
@@ -138,9 +139,7 @@ def with_poses_from(
 ) -> list[SubmapPose]:
     """The same places where another estimate has them; what they show stays as it was."""
     return [
-        replace(p, pose=states[robot].poses[np.searchsorted(states[robot].stamps_ns, time_ns)])
-        for p in found
-        for robot, time_ns in [p.state]
+        replace(p, pose=states[robot].at(time_ns)) for p in found for robot, time_ns in [p.state]
     ]
 
 
@@ -348,7 +347,7 @@ def residuals(closures: Sequence[Closure], states: Mapping[str, Trajectory]) -> 
     found = np.zeros((len(closures), 3))
     for k, c in enumerate(closures):
         ends = (c.other, c.other_time_ns), (c.robot, c.time_ns)
-        poses = [states[r].poses[np.searchsorted(states[r].stamps_ns, t)] for r, t in ends]
+        poses = [states[r].at(t) for r, t in ends]
         found[k] = log(between(c.delta, between(*poses)))
     return found
 

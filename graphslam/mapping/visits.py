@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graphslam.core.geometry import Array, between
+from graphslam.core.geometry import Array, between, path_length
 from graphslam.core.records import Estimate, Step, Trajectory
 from graphslam.mapping.duplicate_landmarks import merged_steps
 from graphslam.mapping.landmark_map import LandmarkMap
@@ -55,9 +55,9 @@ def split_by_visit(
     if not seen:
         return SplitVisits(tuple(steps), {})
     robots = sorted(states)
-    driven = {robot: _driven(states[robot]) for robot in robots}
+    driven = {robot: path_length(states[robot].poses) for robot in robots}
     path = np.array([
-        driven[a.robot][np.searchsorted(states[a.robot].stamps_ns, a.time_ns)]
+        driven[a.robot][states[a.robot].index(a.time_ns)]
         for _, _, _, a in seen
     ])  # fmt: skip
     robot = np.array([robots.index(a.robot) for _, _, _, a in seen])
@@ -83,12 +83,6 @@ def split_by_visit(
             associations[k] = replace(associations[k], target=name)
         made[n] = replace(steps[n], associations=tuple(associations))
     return SplitVisits(tuple(made), origin)
-
-
-def _driven(states: Trajectory) -> Array:
-    """How far the robot had driven at each state, m."""
-    moves = between(states.poses[:-1], states.poses[1:])
-    return np.concatenate([[0.0], np.cumsum(np.hypot(moves[:, 0], moves[:, 1]))])
 
 
 def rejoin_visits(

@@ -17,7 +17,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphslam.core.consistency import fit_rigid_transform
-from graphslam.core.geometry import Array, between, compose, inverse, rotation, transform
+from graphslam.core.geometry import (
+    Array,
+    between,
+    compose,
+    inverse,
+    path_length,
+    rotation,
+    transform,
+)
 from graphslam.core.records import Scan
 from graphslam.multi_robot.relative_frames import RobotEstimate
 from graphslam.multi_robot.robot_detection import MARGIN_M
@@ -117,9 +125,7 @@ class Path:
         at = [view.at(times_ns + round(1e9 * shift)) for shift in shifts]
         poses = np.array([found for found, _ in at])
         middle = len(shifts) // 2
-        steps = np.hypot(*np.diff(poses[middle, :, :2], axis=0).T)
-        length = np.concatenate([[0.0], np.cumsum(steps)])
-        return cls(view, shifts, poses, at[middle][1], length)
+        return cls(view, shifts, poses, at[middle][1], path_length(poses[middle]))
 
     @property
     def now(self) -> Array:

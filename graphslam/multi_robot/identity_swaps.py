@@ -15,6 +15,7 @@ from itertools import combinations
 import numpy as np
 
 from graphslam.core.geometry import Array, compose
+from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Estimate, Sighting
 from graphslam.odometry.preintegration import Track
 from graphslam.odometry.readings import IntArray
@@ -101,12 +102,11 @@ def _sighted_points(
         when = np.array([s.time_ns for s in found], dtype=np.int64)
         states = estimate.states[robot]
         # the last state before, carried on by odometry
-        i = np.clip(np.searchsorted(states.stamps_ns, when, side="right") - 1, 0, None)
+        i = states.index_before(when)
         moved = tracks[robot].motions(states.stamps_ns[i], when)
         sensor = compose(compose(states.poses[i], moved.delta), np.array([s.mount for s in found]))
         z = np.array([s.z[:2] for s in found])
-        direction = sensor[:, 2] + z[:, 0]
-        seen = sensor[:, :2] + z[:, 1:] * np.column_stack([np.cos(direction), np.sin(direction)])
+        seen = MODELS["point"].invert(z, sensor)
         for sighting, point in zip(found, seen, strict=True):
             name = sighting.seen_robot or str(sighting.identity)
             points[name].append(point)

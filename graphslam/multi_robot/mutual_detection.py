@@ -25,7 +25,7 @@ import numpy as np
 
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.consistency import poses_differ
-from graphslam.core.geometry import Array, between, compose, wrap
+from graphslam.core.geometry import Array, between, compose, path_length, wrap
 from graphslam.core.records import Scan, Sighting
 from graphslam.multi_robot.detection_hypotheses import (
     SURE_M,
@@ -212,7 +212,7 @@ class _RobotSearch:
         self.observer, self.name, self.view = observer, name, view
         self.outline, self.doubt_s, self.config = outline, doubt_s, config
         there, _ = view.at(watch.times_ns)
-        way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(there[:, :2], axis=0).T))])
+        way = path_length(there)
         edge_ns = round(1e9 * doubt_s)
         known = (watch.times_ns > view.track.first_ns - edge_ns) & (
             watch.times_ns < view.track.last_ns + edge_ns

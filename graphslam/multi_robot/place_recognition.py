@@ -19,7 +19,16 @@ from scipy import fft
 
 from graphslam.core.consistency import greedy_max_clique
 from graphslam.core.gaussian import chi2_quantile
-from graphslam.core.geometry import Array, between, compose, inverse, rotation3, transform, wrap
+from graphslam.core.geometry import (
+    Array,
+    between,
+    compose,
+    inverse,
+    rotation3,
+    transform,
+    unit_vectors,
+    wrap,
+)
 from graphslam.mapping.loop_closure import NEAR_M, TRUST, SubmapPose, drift_covariance, verify_match
 from graphslam.multi_robot.relative_frames import RelativeFrame
 from graphslam.perception.scan_matching import ABSENT_M, IntArray, Match, match
@@ -169,7 +178,7 @@ def _free_points(place: SubmapPose) -> Array:
     scan, beam, step = np.nonzero(along < free[:, :, None] - ABSENT_M)
     sensors = compose(place.pose, submap.poses)
     direction = sensors[scan, 2] + angle[beam]
-    ray = np.column_stack([np.cos(direction), np.sin(direction)])
+    ray = unit_vectors(direction)
     return np.asarray(sensors[scan, :2] + along[step][:, None] * ray)
 
 

@@ -29,6 +29,7 @@ from graphslam.core.geometry import (
     inverse_cov,
     transform,
 )
+from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Sighting, Trajectory
 from graphslam.odometry.preintegration import Track
 from graphslam.odometry.readings import IntArray
@@ -63,7 +64,7 @@ class RobotEstimate:
     def at(self, times_ns: IntArray) -> tuple[Array, Array]:
         """Poses (n, 3) and covariances (n, 3, 3): the last state before, carried by odometry."""
         known = self.states
-        i = np.clip(np.searchsorted(known.stamps_ns, times_ns, side="right") - 1, 0, None)
+        i = known.index_before(times_ns)
         moved = self.track.motions(known.stamps_ns[i], times_ns)
         covs = compose_cov(known.poses[i], known.covs[i], moved.delta, moved.cov)
         return compose(known.poses[i], moved.delta), covs
@@ -206,8 +207,7 @@ def _correspondences(
         z = np.array([s.z[:2] for s in found])
         cov = np.array([s.cov[:2, :2] for s in found])
         sensor = compose(x, np.array([s.mount for s in found]))
-        direction = sensor[:, 2] + z[:, 0]
-        at = sensor[:, :2] + z[:, 1:] * np.column_stack([np.cos(direction), np.sin(direction)])
+        at = MODELS["point"].invert(z, sensor)
         use = _subsample(at, y[:, :2])
         reach = z[use, 1]
         bearing = cov[use, 0, 0] + config.floor_rad**2

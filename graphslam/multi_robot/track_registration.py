@@ -15,6 +15,7 @@ from scipy.linalg import cho_factor, cho_solve
 from graphslam.core.consistency import FIT
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, compose, rotation, rotation3, wrap
+from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Sighting
 from graphslam.multi_robot.relative_frames import RobotEstimate, encounter_covariance
 from graphslam.odometry.readings import IntArray
@@ -155,10 +156,7 @@ def _observed_path(sightings: Sequence[Sighting], observer: RobotEstimate) -> _O
     lasers = compose(poses, np.array([s.mount for s in sightings]))
     z = np.array([s.z[:2] for s in sightings])
     R = np.array([s.cov[:2, :2] for s in sightings])
-    c, s = np.cos(lasers[:, 2] + z[:, 0]), np.sin(lasers[:, 2] + z[:, 0])
-    r = z[:, 1]
-    at = lasers[:, :2] + r[:, None] * np.column_stack([c, s])
-    J = np.stack([np.column_stack([-r * s, c]), np.column_stack([r * c, s])], axis=1)
+    at, (_, J) = MODELS["point"].invert(z, lasers), MODELS["point"].invert_jacobians(z, lasers)
     lever = at - poses[:, :2]
     H = np.tile(np.eye(2, 3), (len(z), 1, 1))
     H[:, 0, 2], H[:, 1, 2] = -lever[:, 1], lever[:, 0]

@@ -47,7 +47,7 @@ def causal_at(
         times_ns: (n,) when.
         stamps_ns: (n,) what the result is stamped with.
     """
-    i = _state_before(states, times_ns)
+    i = states.index_before(times_ns)
     delta, noise = track.coarse_motions(states.stamps_ns[i], times_ns, calibrations, i)
     covs = compose_cov(states.poses[i], states.covs[i], delta, noise)
     return Trajectory(stamps_ns, compose(states.poses[i], delta), covs)
@@ -68,7 +68,7 @@ def final_at(
         stamps_ns: (n,) what the result is stamped with.
     """
     at, known = states.stamps_ns, [track.used_calibration]
-    i = _state_before(states, times_ns)
+    i = states.index_before(times_ns)
     following = np.minimum(i + 1, len(at) - 1)
     same = np.zeros(len(i), dtype=np.int64)
     delta, noise = track.coarse_motions(at[i], times_ns, known, same)
@@ -140,9 +140,3 @@ def origin_shift(start: Array, mounts: Array) -> Array:
     at ``mounts`` (..., 3) from the base: ``start ∘ mount ∘ start⁻¹`` makes up for it.
     """
     return compose(compose(np.broadcast_to(start, mounts.shape), mounts), inverse(start))
-
-
-def _state_before(states: Trajectory, times_ns: IntArray) -> IntArray:
-    """Index (n,) of the last state at or before each time (the first for earlier times)."""
-    found = np.searchsorted(states.stamps_ns, times_ns, side="right") - 1
-    return np.clip(found, 0, len(states) - 1)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from graphslam.core.geometry import Array, transform
+from graphslam.core.geometry import Array, polar_points, transform
 from graphslam.core.records import Scan
 
 
@@ -37,8 +37,7 @@ def make_sweep(scan: Scan, max_range_m: float) -> Sweep:
         ranges = np.where((ranges > 0) & np.isfinite(ranges), ranges, np.nan)
         beam = np.flatnonzero(ranges < max_range_m)  # at the maximum a laser saturates
     r, a = ranges[beam], angles[beam]
-    points = np.array((r * np.cos(a), r * np.sin(a))).T
-    return Sweep(ranges, angles, beam, np.ascontiguousarray(points), step)
+    return Sweep(ranges, angles, beam, polar_points(r, a), step)
 
 
 def _open_circle(ranges: Array, angles: Array) -> tuple[Array, Array]:
@@ -61,4 +60,4 @@ def scan_points(scan: Scan, max_range_m: float) -> Array:
     with np.errstate(invalid="ignore"):
         kept = (scan.ranges > 0) & (scan.ranges < max_range_m)
     r, a = scan.ranges[kept], scan.angles[kept]
-    return transform(scan.mount, np.column_stack((r * np.cos(a), r * np.sin(a))))
+    return transform(scan.mount, polar_points(r, a))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from graphslam.core.config import FrontEndConfig
-from graphslam.core.geometry import Array, rotation, wrap
+from graphslam.core.geometry import Array, polar_points, rotation, unit_vectors, wrap
 from graphslam.perception.ordered_scan import Sweep
 
 #: m, beams, m: returns farther apart are not of one thing that stands free; far away a side seen at
@@ -113,7 +113,7 @@ def outline_of(corners: Sequence[Sequence[float]]) -> Array:
         a = np.linspace(0.0, 2 * np.pi, ROUND_SIDES, endpoint=False)
         # the polygon has the circle's area: half of it lies outside
         radius = corners[0][0] * np.sqrt(2 * np.pi / ROUND_SIDES / np.sin(2 * np.pi / ROUND_SIDES))
-        return np.asarray(radius * np.column_stack([np.cos(a), np.sin(a)]))
+        return np.asarray(radius * unit_vectors(a))
     return np.array(corners, dtype=float)
 
 
@@ -293,7 +293,7 @@ def _edges_seen(sweep: Sweep, first: int, last: int) -> tuple[Array, Array]:
 def _placed(view: _View, expected: Array) -> Array:
     """The expected pose moved, not turned, so that the outline stands where the returns are."""
     a, r, pose = view.a, view.r, expected.copy()
-    seen = np.array([np.mean(r * np.cos(a)), np.mean(r * np.sin(a))])
+    seen = polar_points(r, a).mean(axis=0)
     pose[:2] = seen + reach(view.outline) / 2 * seen / max(float(np.hypot(*seen)), 1e-6)
     for _ in range(2):
         _, edges = expected_ranges(view.outline, pose[None], a)
@@ -301,7 +301,7 @@ def _placed(view: _View, expected: Array) -> Array:
         pose[:2] = rotation(turn) @ pose[:2]
         middle = a[len(a) // 2]
         miss = float(np.median(r - expected_ranges(view.outline, pose[None], a)[0][0]))
-        pose[:2] += miss * np.array([np.cos(middle), np.sin(middle)])
+        pose[:2] += miss * unit_vectors(middle)
     return pose
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Observation, Sighting
 
 
@@ -9,8 +10,8 @@ def sighting_observation(message: Sighting) -> Observation:
     """A sighting as an observation: a point, or with a direction a pose on the thing seen."""
     if len(message.z) == 2:
         return Observation("point", message.z, message.cov, None, message.identity)
-    bearing, range_m, direction = message.z
-    c, s = np.cos(bearing), np.sin(bearing)
-    J = np.array([[-range_m * s, c, 0.0], [range_m * c, s, 0.0], [0.0, 0.0, 1.0]])
-    z = np.array([range_m * c, range_m * s, direction])
+    sighted, origin = message.z[:2], np.zeros(3)
+    z = np.append(MODELS["point"].invert(sighted, origin), message.z[2])
+    J = np.eye(3)
+    _, J[:2, :2] = MODELS["point"].invert_jacobians(sighted, origin)
     return Observation("segment", z, J @ message.cov @ J.T, np.zeros(2), message.identity)

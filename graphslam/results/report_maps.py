@@ -8,7 +8,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from graphslam.core.gaussian import chi2_quantile
-from graphslam.core.geometry import Array, interpolate
+from graphslam.core.geometry import Array, interpolate, path_length, unit_vectors
 from graphslam.core.records import Landmark, Result, Trajectory
 from graphslam.results.report_figure import (
     ACCENT,
@@ -213,7 +213,7 @@ def _enlargement(sizes: Sequence[float], limits: Array) -> int:
 def _every(trajectory: Trajectory, count: int) -> tuple[Array, Array]:
     """Positions (k, 2) and covariances (k, 2, 2) at even intervals of path."""
     xy = trajectory.poses[:, :2]
-    path = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
+    path = path_length(xy)
     index = np.unique(np.searchsorted(path, np.linspace(0, path[-1], count)))
     index = index[np.isfinite(trajectory.covs[index]).all(axis=(1, 2))]
     return xy[index], trajectory.covs[index, :2, :2]
@@ -259,6 +259,6 @@ def _bounds(landmark: Landmark, factor: float) -> list[Array]:
     if landmark.line is None:
         return [_ellipse(landmark.position[:2], landmark.cov[:2, :2], factor)]
     normal = landmark.line[0]
-    n = np.array([np.cos(normal), np.sin(normal)])
+    n = unit_vectors(normal)
     half = factor * _across(landmark)[:, None] * n
     return [np.stack([e - h, e + h]) for e, h in zip(landmark.extent, half, strict=True)]

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from graphslam.core.geometry import path_length
 from graphslam.core.records import Landmark, Result
 
 _SPACE = "\u202f"  # narrow, no break: 13 631
@@ -59,7 +60,7 @@ def headline(result: Result) -> str:
     paths = [robot.final for robot in result.robots.values()]
     # of the states: they are in the order of time, which late stamps in a trajectory are not
     driven = result.estimate.states.values()
-    metres = sum(float(np.hypot(*np.diff(p.poses[:, :2], axis=0).T).sum()) for p in driven)
+    metres = sum(float(path_length(p.poses)[-1]) for p in driven)
     span = (max(p.stamps_ns[-1] for p in paths) - min(p.stamps_ns[0] for p in paths)) / 1e9
     source = f"{number(counts['scans'])} scans of {fleet}" if counts.get("scans") else fleet
     kinds = {landmark.kind for landmark in result.landmarks}

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphslam.core.geometry import Array
+from graphslam.core.geometry import Array, unit_vectors
 from graphslam.simulation.world import Shapes
 
 Ints = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
@@ -77,7 +77,7 @@ def _cast(
 ) -> None:
     ranges = np.full(len(poses) * fan.count, np.inf)
     surfaces = np.full(len(poses) * fan.count, NO_SURFACE, dtype=np.int64)
-    beams = np.column_stack([np.cos(fan.angles), np.sin(fan.angles)])
+    beams = unit_vectors(fan.angles)
     straight = shapes.segments.shape[-3]
     for place, surface, r in (
         *_segments(poses, fan, beams, shapes.segments, reach_m),

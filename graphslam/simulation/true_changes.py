@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.core.geometry import Array, between, inverse, transform
+from graphslam.core.geometry import Array, between, inverse, transform, unit_vectors
 from graphslam.simulation.raycast import NO_SURFACE
 from graphslam.simulation.recording import NoiseFreeScans, Recording
 from graphslam.simulation.scenario import LaterVisit, Scenario
@@ -86,7 +86,7 @@ def _polygon(visit: SimulatedVisit, name: str) -> list[list[float]] | None:
             if not outline.radius_m:
                 return [[float(x), float(y)] for x, y in outline.points]
             angles = 2 * np.pi * np.arange(_CORNERS) / _CORNERS
-            ring = outline.radius_m * np.column_stack([np.cos(angles), np.sin(angles)])
+            ring = outline.radius_m * unit_vectors(angles)
             return [[float(x), float(y)] for x, y in outline.points[0] + ring]
     return None
 
@@ -128,7 +128,7 @@ def _angles(sweep: NoiseFreeScans) -> Array:
 def _ends(sweep: NoiseFreeScans, scan: Any, beam: Any) -> Array:
     """World points (n, 2) where beams ended."""
     direction = sweep.poses[scan, 2] + _angles(sweep)[beam]
-    along = np.column_stack([np.cos(direction), np.sin(direction)])
+    along = unit_vectors(direction)
     return np.asarray(sweep.poses[scan, :2] + sweep.hits.ranges[scan, beam, None] * along)
 
 

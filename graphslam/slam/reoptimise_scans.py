@@ -254,8 +254,7 @@ def _noise_scales(steps: Sequence[Step], estimate: Estimate) -> dict[str, Array]
         if len(motions) < FEWEST_MOTIONS:
             continue
         first, last = (
-            states.poses[np.searchsorted(states.stamps_ns, [getattr(m, name) for m in motions])]
-            for name in ("start_ns", "end_ns")
+            states.at([getattr(m, name) for m in motions]) for name in ("start_ns", "end_ns")
         )
         off = between(first, last) - np.array([m.delta for m in motions])
         off[:, 2] = wrap(off[:, 2])

@@ -189,8 +189,7 @@ def _carried(
 
 def _poses(estimate: Estimate, robot: str, times_ns: IntArray) -> Array:
     """States (n, 3) of a robot at their times (n,)."""
-    states = estimate.states[robot]
-    return states.poses[np.searchsorted(states.stamps_ns, times_ns)]
+    return estimate.states[robot].at(times_ns)
 
 
 def variances(steps: Sequence[Step], seen: Sequence[Seen], estimate: Estimate) -> dict[str, Array]:
@@ -228,7 +227,7 @@ def motion_variances(steps: Sequence[Step], estimate: Estimate) -> dict[str, Arr
             if motion.length_m == 0 and motion.delta[2] == 0:
                 continue
             states = estimate.states[robot]
-            n = int(np.searchsorted(states.stamps_ns, motion.end_ns))
+            n = states.index(motion.end_ns)
             miss = between(states.poses[n - 1], states.poses[n]) - motion.delta
             miss[2] = wrap(miss[2])
             r = np.clip(miss / np.sqrt(np.diag(motion.cov)), -LARGEST, LARGEST)

@@ -104,7 +104,7 @@ class RobotState:
         known = Trajectory(np.array(self.times, dtype=np.int64), poses, np.array(self.causal_covs))
         causal = causal_at(known, self.calibrations, self.track, times, stamps)
         # the mount that was known then, for the base and for the world that hangs on it
-        last = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, None)
+        last = known.index_before(times)
         mount = np.array([self.track.mount_of(c) for c in self.calibrations])[last]
         causal = moved_world(causal, origin_shift(start, mount))
         scan = mounted(causal, laser) if self.scans else None

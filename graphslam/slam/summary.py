@@ -14,7 +14,7 @@ import numpy as np
 from graphslam import __version__
 from graphslam.core.config import Config
 from graphslam.core.config_io import dump_config
-from graphslam.core.geometry import Array, transform
+from graphslam.core.geometry import Array, transform, unit_vectors
 from graphslam.core.records import Estimate, Landmark
 from graphslam.estimation.clock_calibration import ClockEstimate
 from graphslam.logs import LogSet
@@ -41,7 +41,7 @@ def line_parameters(pose: Array, cov: Array) -> tuple[float, float, Array]:
     that of the line from the world's origin along the normal.
     """
     normal = float(pose[2] + np.pi / 2)
-    n = np.array([np.cos(normal), np.sin(normal)])
+    n = unit_vectors(normal)
     along = float(-n[1] * pose[0] + n[0] * pose[1])
     # offset = n·p: turning the normal by e moves it by (dn/de)·p = along * e
     J = np.array([[0.0, 0.0, 1.0], [n[0], n[1], along]])
