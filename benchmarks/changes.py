@@ -100,7 +100,7 @@ def case(name: str, seed: int, folder: Path) -> Case:
         visits = []
         for visit in ("reference", "later"):
             log = open_logs([here / "logs" / f"{visit}.mcap"], Config())
-            save(smooth(log, Config()), Config(), here / visit, force=True)
+            save(smooth(log, Config()), here / visit, force=True)
             visits.append(load_visit(load(here / visit), here / visit))
         truth = json.loads((here / "logs/truth.json").read_text(encoding="utf-8"))
         sweeps = [next(iter(r.sweeps.values())) for r in done.recordings]

@@ -173,7 +173,7 @@ def real(data: Path, folder: Path) -> Figure:
         log = folder / f"{name}.mcap"
         if not (folder / name).exists():
             IMPORTERS["tinyslam"](data / f"{name}.dat.xz", log)
-            save(smooth(open_logs([log], Config()), Config()), Config(), folder / name, force=True)
+            save(smooth(open_logs([log], Config()), Config()), folder / name, force=True)
         visits.append(load_visit(load(folder / name), folder / name))
     found = detect_changes(*visits, ChangesConfig())
     figure, axes = panels(2, (12, 6))

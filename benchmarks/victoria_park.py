@@ -46,7 +46,7 @@ def smooth_all_poses(source: str, directory: Path) -> Path:
     IMPORTERS["isam"](Path(source), log)
     config = load_config(overrides=["keyframe.mode=all", "robust.kernel=none"])
     result = smooth(open_logs([log], config), config)
-    save(result, config, directory / "all_poses", force=False)
+    save(result, directory / "all_poses", force=False)
     return directory / "all_poses"
 
 

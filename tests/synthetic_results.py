@@ -10,6 +10,7 @@ import itertools
 import numpy as np
 from walls import cast, rectangles
 
+from graphslam.core.config import Config
 from graphslam.core.geometry import between, compose, exp, wrap
 from graphslam.core.records import (
     Association,
@@ -227,6 +228,7 @@ def room(keyframes=300, beams=181, seed=3):
                 "robot.axle_m": {"value": 0.4, "sigma": 0.2, "observable": False},
             },
         ),
+        config=Config(),
     )
     return result, Trajectory(stamps, truth, np.zeros((keyframes, 3, 3)))
 
@@ -304,6 +306,7 @@ def orchard(keyframes=400, trees=60, seed=5):
         },
         step_ms=rng.gamma(2, 1.0, keyframes),
         summary=summary(10608, 0, 2 * keyframes, 3640, trees, []),
+        config=Config(),
     )
     return (
         result,

@@ -10,7 +10,8 @@ from graphslam.change_detection.visit import load_visit, select_time_span
 from graphslam.core.config import ChangesConfig
 from graphslam.core.errors import OutputError
 from graphslam.core.output_folder import atomic_folder
-from graphslam.results.folder import load, to_json
+from graphslam.results.file_formats import to_json
+from graphslam.results.folder import load
 
 Span = tuple[float, float]
 

@@ -41,7 +41,8 @@ from graphslam.core.errors import ConfigError, EstimationError, OutputError
 from graphslam.core.records import Result, TrueLandmark, Truth
 from graphslam.core.worker import Future
 from graphslam.logs import IMPORTERS, GroundTruth, inspect_logs, open_logs
-from graphslam.results.folder import check_target, load, save, to_json
+from graphslam.results.file_formats import to_json
+from graphslam.results.folder import check_target, load, save
 
 app = typer.Typer(
     help="Logs of wheeled robots in; trajectories, a landmark map and their covariances out.",
@@ -190,8 +191,8 @@ def _smooth(logs: Sequence[Path], tree: Config, output: Path, force: bool) -> Re
     with progress_bar(log.count((Truth, TrueLandmark))) as progress:
         result = smooth(log, tree, progress)
     quality = _quality(result, truth.result())
-    report = Future(lambda: render(result, quality, tree))
-    save(result, tree, output, force=force, report=lambda _: report.result())
+    report = Future(lambda: render(result, quality))
+    save(result, output, force=force, report=lambda _: report.result())
     return result
 
 

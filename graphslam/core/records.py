@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from graphslam.core.config import Config
 from graphslam.core.geometry import Array
 
 #: a time or times (...,), ns
@@ -353,7 +354,11 @@ class Picture:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Result:
-    """All that `smooth` found; `graphslam.results.folder` writes and reads it."""
+    """What `smooth` returns; `graphslam.results.folder` writes and reads it.
+
+    ``step_ms`` (n,) is the wall time of each step; ``innovations[model]`` (n, 2) time s and d² per
+    degree of freedom; ``summary`` is the content of summary.json.
+    """
 
     robots: Mapping[str, RobotResult]
     landmarks: tuple[Landmark, ...]
@@ -363,3 +368,4 @@ class Result:
     innovations: Mapping[str, Array]
     step_ms: Array
     summary: Mapping[str, Any]
+    config: Config

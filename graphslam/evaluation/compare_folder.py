@@ -5,7 +5,8 @@ from pathlib import Path
 
 from graphslam.core.config import Config
 from graphslam.core.config_io import dump_config
-from graphslam.results.folder import check_target, to_json, write_folder
+from graphslam.results.file_formats import to_json
+from graphslam.results.folder import check_target, write_folder
 from graphslam.results.report_comparison import Comparison, render_comparison
 
 

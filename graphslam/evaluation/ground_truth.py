@@ -7,7 +7,8 @@ from graphslam.core.config import Config
 from graphslam.core.errors import LogError, OutputError
 from graphslam.core.records import Trajectory, TrueLandmark, Truth
 from graphslam.logs import GroundTruth, LogSet, read_truth, truth_from_mcap
-from graphslam.results.folder import SavedResult, read_trajectory
+from graphslam.results.file_formats import read_trajectory
+from graphslam.results.folder import SavedResult
 
 _NO_TRUTH = "holds no true poses or landmarks; give --truth or --relations"
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from graphslam.core.errors import OutputError
-from graphslam.results.folder import to_json
+from graphslam.results.file_formats import to_json
 
 
 def save_summary(summary: Mapping[str, Any], directory: Path) -> None:

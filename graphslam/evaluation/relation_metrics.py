@@ -13,7 +13,7 @@ import numpy as np
 from graphslam.core.errors import OutputError
 from graphslam.core.geometry import Array, between
 from graphslam.core.records import Trajectory
-from graphslam.results.folder import read_text, stamp_ns
+from graphslam.results.file_formats import read_text, stamp_ns
 
 Stamps = np.ndarray[Any, np.dtype[np.int64]]
 

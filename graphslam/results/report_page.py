@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.core.config import Config
 from graphslam.core.config_io import dump_config
 from graphslam.core.records import Result
 from graphslam.results import report_maps as maps
@@ -17,7 +16,7 @@ from graphslam.results import report_tables as tables
 from graphslam.results.report_style import CSS
 
 
-def page(result: Result, evaluation: Mapping[str, Any] | None, config: Config | None) -> str:
+def page(result: Result, evaluation: Mapping[str, Any] | None) -> str:
     """See `graphslam.results.report.render`."""
     summary = result.summary
     title = " + ".join(PurePath(log["path"]).name for log in summary.get("logs", [])) or "Result"
@@ -30,7 +29,7 @@ def page(result: Result, evaluation: Mapping[str, Any] | None, config: Config | 
         _estimator_section(result),
         _accounting_section(summary),
         _landmark_section(result),
-        _reproduce_section(summary, config),
+        _reproduce_section(result),
     ]
     return document(title, sections)
 
@@ -204,7 +203,8 @@ def _landmark_section(result: Result) -> str:
     )
 
 
-def _reproduce_section(summary: Mapping[str, Any], config: Config | None) -> str:
+def _reproduce_section(result: Result) -> str:
+    summary = result.summary
     logs = [
         (log["path"], log["messages"], log["lost"], log["sha256"])
         for log in summary.get("logs", [])
@@ -218,10 +218,10 @@ def _reproduce_section(summary: Mapping[str, Any], config: Config | None) -> str
         f"<p class=note>Versions: {escape(versions)}. Configuration sha256 "
         f"<code>{escape(str(summary.get('config_sha256', '–')))}</code></p>",
         tables.table(["log", "messages", "lost", "sha256"], logs),
+        f"<pre>{escape(dump_config(result.config))}</pre>",
+        "</details></section>",
     ]
-    if config is not None:
-        parts.append(f"<pre>{escape(dump_config(config))}</pre>")
-    return "\n".join([*parts, "</details></section>"])
+    return "\n".join(parts)
 
 
 def section(title: str, figures: Sequence[str]) -> str:

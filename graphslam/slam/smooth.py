@@ -128,6 +128,7 @@ def smooth(
         innovations,
         np.array(pipeline.step_ms),
         summary,
+        config,
     )
 
 

@@ -27,7 +27,7 @@ def visits(tmp_path_factory):
     for name in ("exp1", "exp2"):
         IMPORTERS["tinyslam"](real_data(f"tinyslam/{name}.dat.xz"), folder / f"{name}.mcap")
         result = smooth(open_logs([folder / f"{name}.mcap"], Config()), Config())
-        save(result, Config(), folder / name, force=False)
+        save(result, folder / name, force=False)
         visit = load_visit(load(folder / name), folder / name)
         found.append(visit.select(np.arange(len(visit.poses)) % 2 == 0))
     return found

@@ -390,7 +390,7 @@ def test_the_example_of_the_docs_does_what_the_command_does(tmp_path, monkeypatc
     simulate(load_scenario("change"), tmp_path / "sim", 1)
     for log, name in (("reference", "before"), ("later", "after")):
         result = smooth(open_logs([tmp_path / f"sim/{log}.mcap"], Config()), Config())
-        save(result, Config(), tmp_path / name, force=False)
+        save(result, tmp_path / name, force=False)
     text = (ROOT / "docs/change-detection.md").read_text(encoding="utf-8")
     (code,) = [part.split("```")[0] for part in text.split("```python\n")[1:]]
     monkeypatch.chdir(tmp_path)
@@ -411,7 +411,7 @@ def test_two_spans_of_a_run_in_which_nothing_changes(tmp_path):
     """Forth and back through the same room: the second half against the first."""
     simulate(load_scenario("lab"), tmp_path / "lab.mcap", 0)
     log = open_logs([tmp_path / "lab.mcap"], Config())
-    save(smooth(log, Config()), Config(), tmp_path / "run", force=False)
+    save(smooth(log, Config()), tmp_path / "run", force=False)
     run = tmp_path / "run"
     found = changes_between(run, run, CONFIG, (0, 52), (52, 105))
     assert not found.changes

@@ -21,7 +21,8 @@ from graphslam.cli import main, terminal
 from graphslam.core.config_io import load_config
 from graphslam.core.geometry import between, compose
 from graphslam.logs import IMPORTERS, LogWriter
-from graphslam.results.folder import load, read_trajectory
+from graphslam.results.file_formats import read_trajectory
+from graphslam.results.folder import load
 from graphslam.slam import smooth as smooth_module
 
 

@@ -6,7 +6,6 @@ from paths import real_data
 from scipy.stats import chi2
 from synthetic_results import START_NS, orchard, room, room_walls
 
-from graphslam.core.config import Config
 from graphslam.core.errors import OutputError
 from graphslam.core.geometry import between, compose, exp, transform, wrap
 from graphslam.core.records import Landmark, Trajectory, TrueLandmark
@@ -402,7 +401,7 @@ def test_intel_raw_odometry_has_the_known_relation_error():
 
 def test_evaluate_has_the_keys_of_the_contract(tmp_path):
     result, truths, xy = orchard(keyframes=120, trees=20)
-    save(result, Config(), tmp_path / "out", force=False)
+    save(result, tmp_path / "out", force=False)
     true = [
         TrueLandmark("", 0, 0, str(i), "point", np.array([*p, np.nan]), None)
         for i, p in enumerate(xy)
@@ -439,7 +438,7 @@ def test_one_alignment_of_all_robots_leaves_what_is_between_them(tmp_path):
 
 def test_room_lines_are_consistent_and_relations_are_answered(tmp_path):
     result, truth = room(keyframes=80, beams=5)
-    save(result, Config(), tmp_path / "out", force=False)
+    save(result, tmp_path / "out", force=False)
     saved = load(tmp_path / "out")
     a, b = result.robots["robot"].scan_final.stamps_ns[[3, 40]]
     relations = Relations(np.array([a]), np.array([b]), np.zeros((1, 3)))
@@ -461,7 +460,7 @@ def wall_truth(name, wall):
 
 def test_truth_of_another_time_or_robot_is_one_line(tmp_path):
     result, truths, _ = orchard(keyframes=30, trees=5)
-    save(result, Config(), tmp_path / "out", force=False)
+    save(result, tmp_path / "out", force=False)
     saved = load(tmp_path / "out")
     for truth in ({"robot9": truths["robot1"]}, {"robot1": circle(5, start_ns=0)}):
         with pytest.raises(OutputError, match="within the span of the truth"):

@@ -129,7 +129,7 @@ def test_a_robot_that_never_meets_keeps_a_frame_of_its_own(tmp_path, marks):
 def test_frames_are_in_the_folder_and_judged_apart(tmp_path):
     """The files of a robot in its own frame are there; errors of it alone, none joint."""
     result = run(tmp_path, meets=lambda a, b: a != "c" and b != "c")
-    save(result, load_config(), tmp_path / "out", force=False)
+    save(result, tmp_path / "out", force=False)
     saved = load(tmp_path / "out")
     assert (tmp_path / "out/trajectories/c.tum").exists()
     assert json.loads((tmp_path / "out/summary.json").read_text())["frames"]["c"] == "c"

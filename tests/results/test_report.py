@@ -25,7 +25,7 @@ from graphslam.results.report_tables import headline, landmark_sigma, number
 def indoors():
     result, truth = room(keyframes=80, beams=61)
     saved = SavedResult(result.robots, result.landmarks, result.summary, Config())
-    return result, render(result, evaluate(saved, {"robot": truth}), Config())
+    return result, render(result, evaluate(saved, {"robot": truth}))
 
 
 @pytest.fixture(scope="module")

@@ -15,16 +15,14 @@ from graphslam.core.geometry import rotate_cov, wrap
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Estimate, Motion, Start, Step, Trajectory
 from graphslam.estimation.g2o import EDGES, NO_INFORMATION, graph_g2o, graph_ids, number_vertices
-from graphslam.results.folder import (
-    check_target,
+from graphslam.results.file_formats import (
     cov_text,
-    load,
     read_landmarks,
     read_trajectory,
-    save,
     stamp_ns,
     tum_text,
 )
+from graphslam.results.folder import check_target, load, save
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +45,7 @@ def trajectory(stamps, poses, covs=None):
 
 
 def test_folder_holds_the_contract(made, tmp_path):
-    save(made, Config(), tmp_path / "out", force=False, report=lambda _: "<html>")
+    save(made, tmp_path / "out", force=False, report=lambda _: "<html>")
     files = {str(p.relative_to(tmp_path / "out")) for p in (tmp_path / "out").rglob("*.*")}
     names = ("tum", "causal.tum", "scan.tum", "scan.causal.tum", "cov.csv", "causal.cov.csv")
     assert files == {
@@ -65,7 +63,7 @@ def test_folder_holds_the_contract(made, tmp_path):
 @pytest.mark.parametrize("fixture", ["made", "two_robots"])
 def test_load_gives_back_what_was_saved(fixture, request, tmp_path):
     result = request.getfixturevalue(fixture)
-    save(result, Config(), tmp_path / "out", force=False)
+    save(result, tmp_path / "out", force=False)
     saved = load(tmp_path / "out")
     assert list(saved.robots) == sorted(result.robots)
     assert saved.summary == json.loads(json.dumps(result.summary))
@@ -96,18 +94,18 @@ def test_load_gives_back_what_was_saved(fixture, request, tmp_path):
 def test_names_with_slashes_and_dots_stay_apart(made, tmp_path):
     robot = made.robots["robot"]
     names = {"fleet/a": robot, "fleet/a.scan": robot, "b.causal": robot}
-    save(dataclasses.replace(made, robots=names), Config(), tmp_path / "out", force=False)
+    save(dataclasses.replace(made, robots=names), tmp_path / "out", force=False)
     assert set(load(tmp_path / "out").robots) == set(names)
 
 
 def test_an_existing_result_needs_force_and_is_replaced(made, tmp_path):
     target = tmp_path / "out"
-    save(made, Config(), target, force=False)
+    save(made, target, force=False)
     (target / "stale.txt").write_text("old")
     with pytest.raises(OutputError, match="--force"):
-        save(made, Config(), target, force=False)
+        save(made, target, force=False)
     assert (target / "stale.txt").exists()
-    save(made, Config(), target, force=True)
+    save(made, target, force=True)
     assert not (target / "stale.txt").exists()
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
@@ -120,7 +118,7 @@ def test_what_is_not_a_result_folder_is_never_replaced(made, tmp_path):
     (tmp_path / "link").symlink_to(documents)
     for name in ("documents", "file", "link"):
         with pytest.raises(OutputError, match="not a result folder"):
-            save(made, Config(), tmp_path / name, force=True)
+            save(made, tmp_path / name, force=True)
         with pytest.raises(OutputError, match="not a result folder"):
             check_target(tmp_path / name, force=True)
     assert (documents / "thesis.tex").read_text() == "years of work"
@@ -131,16 +129,16 @@ def test_what_is_not_a_result_folder_is_never_replaced(made, tmp_path):
 def test_a_failure_leaves_nothing_and_keeps_the_old(made, tmp_path, existing):
     target = tmp_path / "out"
     if existing:
-        save(made, Config(), target, force=False)
+        save(made, target, force=False)
 
     def fails(_):
         raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        save(made, Config(), target, force=True, report=fails)
+        save(made, target, force=True, report=fails)
     bad = dataclasses.replace(made, summary={**made.summary, "scans_per_s": np.nan})
     with pytest.raises(OutputError, match=r"summary\.json"):
-        save(bad, Config(), target, force=True)
+        save(bad, target, force=True)
     assert [p.name for p in tmp_path.iterdir()] == (["out"] if existing else [])
     if existing:
         load(target)
@@ -148,7 +146,7 @@ def test_a_failure_leaves_nothing_and_keeps_the_old(made, tmp_path, existing):
 
 def test_numpy_numbers_in_the_summary_are_written(made, tmp_path):
     summary = {**made.summary, "scans_per_s": np.float64(1.5), "extra": np.arange(3)}
-    save(dataclasses.replace(made, summary=summary), Config(), tmp_path / "o", force=False)
+    save(dataclasses.replace(made, summary=summary), tmp_path / "o", force=False)
     back = load(tmp_path / "o").summary
     assert (back["scans_per_s"], back["extra"]) == (1.5, [0, 1, 2])
 
@@ -156,7 +154,7 @@ def test_numpy_numbers_in_the_summary_are_written(made, tmp_path):
 def test_a_directory_that_cannot_be_written_is_one_line(made, tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(OutputError, match="cannot be written"):
-        save(made, Config(), tmp_path / "file" / "out", force=False)
+        save(made, tmp_path / "file" / "out", force=False)
 
 
 # ---------------------------------------------------------------- trajectories
@@ -249,14 +247,14 @@ def test_malformed_landmarks_are_one_line(tmp_path, text):
 def test_no_folder_and_half_a_folder_are_one_line(made, tmp_path):
     with pytest.raises(OutputError, match="not a result folder"):
         load(tmp_path / "nothing")
-    save(made, Config(), tmp_path / "out", force=False)
+    save(made, tmp_path / "out", force=False)
     (tmp_path / "out" / "trajectories" / "robot.cov.csv").unlink()
     with pytest.raises(OutputError, match=r"robot\.cov\.csv: cannot be read"):
         load(tmp_path / "out")
 
 
 def test_permissions_are_those_of_the_user_not_of_a_temporary_directory(made, tmp_path):
-    save(made, Config(), tmp_path / "out", force=False)
+    save(made, tmp_path / "out", force=False)
     (tmp_path / "plain").mkdir()
     assert (tmp_path / "out").stat().st_mode == (tmp_path / "plain").stat().st_mode
 
