@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 from changes import case, detection, table_beams, true_frame
+from figure_style import BLUE, GREY, INK, MARK, RED, WALL, legend, panels, path, scatter
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
-from thesis_figures import BLUE, GREY, INK, MARK, RED, WALL, legend, panels, path, scatter
 
 from graphslam.change_detection import Visit, detect_changes, load_visit
 from graphslam.change_detection.detect import ChangeResult

@@ -6,30 +6,18 @@ are root mean squares over all robots, from the centralised estimate ("loss") an
 kB are what each robot sends on average, and what it measured; s is the time of the replay.
 
 Run: python benchmarks/decentralised.py [mrclam|two-robots ...] [SECONDS ...]
-The data are taken from GRAPHSLAM_DATA (default: ../shared/data beside the repository).
 """
 
-import json
-import os
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
-DATA = Path(os.environ.get("GRAPHSLAM_DATA", ROOT / "../shared/data"))
+from common import DATA, command, parser
+
 LOGS = {
     "mrclam": ["import", "mrclam", str(DATA / "mrclam/MRCLAM_Dataset6.tar.xz")],
     "two-robots": ["simulate", "two-robots", "--seed", "0"],
 }
 PERIODS_S = ("10", "30", "120")
-
-
-def command(*arguments: str) -> str:
-    """Standard output of a graphslam command."""
-    return subprocess.run(
-        [sys.executable, "-m", "graphslam", *arguments], check=True, capture_output=True, text=True
-    ).stdout
 
 
 def show(row: dict) -> None:
@@ -38,9 +26,9 @@ def show(row: dict) -> None:
         print(f"{row['label']:52} {row['error']}", flush=True)
         return
     final, causal = row["joint"]["final"], row["joint"]["causal"]
-    told = row.get("exchanged", {}).values()
+    messages = row.get("exchanged", {}).values()
     sent, measured = (
-        f"{sum(one[key] for one in told) / len(told) / 1e3:7.0f}" if told else "      -"
+        f"{sum(one[key] for one in messages) / len(messages) / 1e3:7.0f}" if messages else "      -"
         for key in ("sent_bytes", "measured_bytes")
     )
     loss = row["difference"]["final"]["rmse_m"]
@@ -52,8 +40,13 @@ def show(row: dict) -> None:
     )
 
 
-def main(names: list[str], periods_s: list[str]) -> None:
+def main() -> None:
     """Print the tables."""
+    options = parser(__doc__)
+    options.add_argument("given", nargs="*", metavar="NAME or SECONDS")
+    given = options.parse_args().given
+    names = [name for name in given if name in LOGS] or list(LOGS)
+    periods_s = [name for name in given if name not in LOGS] or list(PERIODS_S)
     specs = ["batch", *(f"decentralised+backend.exchange_s={t}" for t in periods_s)]
     with tempfile.TemporaryDirectory() as scratch:
         for name in names:
@@ -61,19 +54,15 @@ def main(names: list[str], periods_s: list[str]) -> None:
             command(*LOGS[name], "-o", str(log))
             found = command(
                 *("compare", str(log), "--start", "truth", "--backends", ",".join(specs)),
-                *("-o", str(Path(scratch) / name), "--json"),
+                *("-o", str(Path(scratch) / name)),
             )
             print(
                 f"{name:52}   final   NEES    loss  causal   NEES kB sent kB meas.      s",
                 flush=True,
             )
-            for row in json.loads(found)["rows"]:
+            for row in found["rows"]:
                 show(row)
 
 
 if __name__ == "__main__":
-    given = sys.argv[1:]
-    main(
-        [name for name in given if name in LOGS] or list(LOGS),
-        [name for name in given if name not in LOGS] or list(PERIODS_S),
-    )
+    main()

@@ -1,22 +1,20 @@
 """False loop closures among the verified ones: does the map stay what it is?
 
 After verification, closures are added to those that matching found (`smooth`'s hook ``tamper``),
-until they are 10, 30 or 50 % of all: half of them each for itself between places drawn at random,
-half in groups of three that agree with each other. Each is off by one to five metres and up to half
-a radian. The final error over all relations must stay within 10 % of the run without them.
+until they are 10, 30 or 50 % of all: half of them single ones between submaps drawn at random, half
+in groups of three that agree with each other. Each is off by one to five metres and up to half a
+radian. The final error over all relations must stay within 10 % of the run without them.
 
 Run: python benchmarks/false_closures.py [--seeds N] [aces] [intel]     exit code 1 if it does not
-The data are taken as in real_logs.py.
 """
 
-import argparse
 import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from real_logs import DATA, LOGS, command
+from common import FREIBURG, FREIBURG_LOGS, import_freiburg, parser
 
 from graphslam.core.config import Config
 from graphslam.core.geometry import between, compose
@@ -31,7 +29,7 @@ SHARES, WITHIN, GROUP = (0.1, 0.3, 0.5), 1.1, 3
 COV = np.diag([0.03, 0.03, 0.005]) ** 2
 
 
-class Liar:
+class FalseClosures:
     """Adds false closures, once, to those that were found first."""
 
     def __init__(self, share: float, seed: int) -> None:
@@ -81,26 +79,25 @@ def run(log: Path, relations: Path, tamper: Tamper | None) -> tuple[float, float
 
 def main() -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("logs", nargs="*", default=list(LOGS))
-    parser.add_argument("--seeds", type=int, default=2)
-    arguments = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("logs", nargs="*", default=list(FREIBURG_LOGS))
+    options.add_argument("--seeds", type=int, default=2)
+    arguments = options.parse_args()
     bad = 0
     print("log    share  seed  true  false  all, m  loops, m  of clean")
     for name in arguments.logs:
         with tempfile.TemporaryDirectory() as folder:
-            log = Path(folder) / f"{name}.mcap"
-            command("import", "carmen", str(DATA / f"{name}.clf.bz2"), "-o", str(log))
-            relations = DATA / f"{name}.relations"
+            log = import_freiburg(name, Path(folder))
+            relations = FREIBURG / f"{name}.relations"
             clean, loops = run(log, relations, None)
             print(f"{name:6} {0:5.0%}     -     -      -  {clean:.4f}    {loops:.4f}", flush=True)
             for share in SHARES:
                 for seed in range(arguments.seeds):
-                    liar = Liar(share, seed)
-                    error, loops = run(log, relations, liar)
+                    tamper = FalseClosures(share, seed)
+                    error, loops = run(log, relations, tamper)
                     bad += error > WITHIN * clean
                     print(
-                        f"{name:6} {share:5.0%} {seed:5d} {liar.true:5d} {liar.false:6d}  "
+                        f"{name:6} {share:5.0%} {seed:5d} {tamper.true:5d} {tamper.false:6d}  "
                         f"{error:.4f}    {loops:.4f}  {error / clean:8.2f}",
                         flush=True,
                     )

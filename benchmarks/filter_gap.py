@@ -7,7 +7,6 @@ robots, position; mean and standard deviation over seeds.
 Run: python benchmarks/filter_gap.py [SCENARIO [SEEDS [key=value ...]]]
 """
 
-import sys
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from tempfile import TemporaryDirectory
 from unittest.mock import patch
 
 import numpy as np
+from common import START_FROM_TRUTH, parser, simulated_log
 
 from graphslam.core.config_io import load_config
 from graphslam.core.records import Step
@@ -25,9 +25,7 @@ from graphslam.evaluation.compare_variants import variants
 from graphslam.evaluation.ground_truth import truth_of_logs
 from graphslam.evaluation.metrics import evaluate
 from graphslam.logs import GroundTruth, open_logs
-from graphslam.simulation import load_scenario, simulate
 
-START = ["start.from_truth=true"]
 #: label -> spec, whether late evidence is left out, and the gauge of filters' lines, m
 ROWS: dict[str, tuple[str, bool, float | None]] = {
     "EKF": ("ekf", False, None),
@@ -73,15 +71,18 @@ def judge(recording: Recording, truth: GroundTruth, label: str, settings: list[s
     return [*errors, found["landmarks"]["rmse_m"]]
 
 
-def main(scenario: str = "lab", seeds: str = "10", *overrides: str) -> None:
-    settings = [*START, *overrides]
+def main() -> None:
+    options = parser(__doc__)
+    options.add_argument("scenario", nargs="?", default="lab")
+    options.add_argument("seeds", nargs="?", type=int, default=10)
+    options.add_argument("overrides", nargs="*", metavar="key=value")
+    given = options.parse_args()
+    settings = [START_FROM_TRUTH, *given.overrides]
     config = load_config(None, settings)
     numbers: dict[str, list[list[float]]] = {label: [] for label in ROWS}
     with TemporaryDirectory() as folder:
-        for seed in range(int(seeds)):
-            path = Path(folder) / f"{seed}.mcap"
-            simulate(load_scenario(scenario), path, seed)
-            log = open_logs([path], config)
+        for seed in range(given.seeds):
+            log = open_logs([simulated_log(given.scenario, seed, Path(folder))], config)
             truth, recording = truth_of_logs(log, config), record(log, config)
             for label, rows in numbers.items():
                 rows.append(judge(recording, truth, label, settings))
@@ -95,4 +96,4 @@ def main(scenario: str = "lab", seeds: str = "10", *overrides: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()

@@ -1,7 +1,7 @@
 """Scans per second of the front ends on one core.
 
 Generated scans of a cluttered room (180 beams at 1°, 361 at 0.5°), and the Intel log if the data
-are there (GRAPHSLAM_DATA, else ../shared/data beside the repository). CPU time, best of five.
+are there. CPU time, best of five.
 Then what one Hough table costs, and the next line after it, with the accumulator that is used and
 with OpenCV's, which count anew for each line.
 
@@ -9,21 +9,17 @@ Run: python benchmarks/frontend_speed.py
 """
 
 import bz2
-import os
-import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import cv2
 import numpy as np
+from common import FREIBURG, best_cpu_s, parser
 
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.records import Scan
 from graphslam.perception.front_ends import FRONT_ENDS
 from graphslam.perception.hough import Votes
 from graphslam.perception.ordered_scan import Sweep, make_sweep
-
-DATA = Path(__file__).resolve().parents[1] / "../shared/data"
 
 
 def generated(beams: int, count: int = 500) -> list[Scan]:
@@ -48,7 +44,7 @@ def generated(beams: int, count: int = 500) -> list[Scan]:
 
 def intel(every: int = 10) -> list[Scan]:
     """Each tenth scan of the Intel log; none if it is not there."""
-    path = Path(os.environ.get("GRAPHSLAM_DATA", DATA)) / "freiburg/intel.clf.bz2"
+    path = FREIBURG / "intel.clf.bz2"
     if not path.exists():
         return []
     scans = []
@@ -62,11 +58,8 @@ def intel(every: int = 10) -> list[Scan]:
 
 def report(label: str, scans: Sequence[Scan], config: FrontEndConfig) -> None:
     for name, front_end in FRONT_ENDS.items():
-        seconds, found = np.inf, 0
-        for _ in range(5):
-            start = time.process_time()
-            found = sum(len(front_end(scan, config)) for scan in scans)
-            seconds = min(seconds, time.process_time() - start)
+        found = sum(len(front_end(scan, config)) for scan in scans)
+        seconds = best_cpu_s(lambda: [front_end(scan, config) for scan in scans])  # noqa: B023
         per_scan = seconds / len(scans)
         print(
             f"{label:22} {name:10} {1e3 * per_scan:7.3f} ms/scan {1 / per_scan:11.0f} scans/s"
@@ -76,13 +69,7 @@ def report(label: str, scans: Sequence[Scan], config: FrontEndConfig) -> None:
 
 def best_ms(what: Callable[[Sweep], object], sweeps: Sequence[Sweep]) -> float:
     """CPU time per sweep, ms, best of five."""
-    seconds = np.inf
-    for _ in range(5):
-        start = time.process_time()
-        for sweep in sweeps:
-            what(sweep)
-        seconds = min(seconds, time.process_time() - start)
-    return 1e3 * float(seconds) / len(sweeps)
+    return 1e3 * best_cpu_s(lambda: [what(sweep) for sweep in sweeps]) / len(sweeps)
 
 
 def accumulators(scans: Sequence[Scan], config: FrontEndConfig) -> None:
@@ -123,6 +110,7 @@ def accumulators(scans: Sequence[Scan], config: FrontEndConfig) -> None:
 
 
 def main() -> None:
+    parser(__doc__).parse_args()
     cv2.setNumThreads(1)
     config = FrontEndConfig()
     report("generated, 180 beams", generated(180), config)

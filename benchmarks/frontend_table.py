@@ -15,15 +15,14 @@ landmarks in the map, and CPU time of the front end per scan.
 Run: python benchmarks/frontend_table.py [--no-scans] [--no-runs] [LOG.mcap=RELATIONS ...]
 """
 
-import argparse
 import tempfile
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+from common import best_cpu_s, parser, simulated_log
 from numpy.typing import NDArray
 
 from graphslam.core.config import Config, FrontEndConfig, StartConfig
@@ -199,13 +198,8 @@ def score(name: str, config: FrontEndConfig, scans: Sequence[Seen]) -> tuple[Sco
 
 
 def ms_per_scan(config: FrontEndConfig, scans: Sequence[Scan]) -> float:
-    best = np.inf
-    for _ in range(3):
-        began = time.process_time()
-        for scan in scans:
-            FRONT_ENDS[config.name](scan, config)
-        best = min(best, time.process_time() - began)
-    return 1e3 * best / len(scans)
+    front_end = FRONT_ENDS[config.name]
+    return 1e3 * best_cpu_s(lambda: [front_end(scan, config) for scan in scans], 3) / len(scans)
 
 
 def spread(values: Sequence[float]) -> str:
@@ -239,10 +233,7 @@ def simulated_runs(folder: Path) -> None:
             config = replace(Config(), front_end=front, start=StartConfig(from_truth=True))
             final, causal = [], []
             for seed in RUN_SEEDS:
-                path = folder / f"{name}{seed}.mcap"
-                if not path.exists():
-                    simulate(load_scenario(name), path, seed)
-                log = open_logs([path], config)
+                log = open_logs([simulated_log(name, seed, folder)], config)
                 result = smooth(log, config)
                 found = evaluate(result, truth_of_logs(log, config).trajectories)["joint"]
                 final.append(found["final"]["ate_rmse_m"])
@@ -284,11 +275,11 @@ def scan_table(folder: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("logs", nargs="*", metavar="LOG.mcap=RELATIONS")
-    parser.add_argument("--no-scans", action="store_true", help="leave out the first table")
-    parser.add_argument("--no-runs", action="store_true", help="leave out simulated runs")
-    arguments = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("logs", nargs="*", metavar="LOG.mcap=RELATIONS")
+    options.add_argument("--no-scans", action="store_true", help="leave out the first table")
+    options.add_argument("--no-runs", action="store_true", help="leave out simulated runs")
+    arguments = options.parse_args()
     cv2.setNumThreads(1)
     with tempfile.TemporaryDirectory() as folder:
         if not arguments.no_scans:

@@ -10,29 +10,28 @@ Run: python benchmarks/horizon.py [lab] [forest]     BLAS on one thread: OPENBLA
 """
 
 import math
-import sys
 import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from common import parser, simulated_log, smooth_log
 
 from graphslam.core.config import Config
 from graphslam.core.records import Step, Trajectory
 from graphslam.estimation.backends import BACKENDS
 from graphslam.estimation.replay import Replay, replay
-from graphslam.logs import open_logs
-from graphslam.simulation import load_scenario, simulate
-from graphslam.slam.smooth import smooth
 
 SCENARIOS = ("lab", "forest")
 HORIZONS_S = (0.0, 1.0, 5.0, 20.0, 60.0, math.inf)
 
 
-def main(names: list[str]) -> None:
+def main() -> None:
     """Print one table per scenario."""
-    for name in names or SCENARIOS:
+    options = parser(__doc__)
+    options.add_argument("scenarios", nargs="*", default=SCENARIOS)
+    for name in options.parse_args().scenarios:
         config = Config()
         steps = recorded(name, config)
         batch = replay(steps, BACKENDS["batch"](config)).estimate
@@ -48,9 +47,7 @@ def main(names: list[str]) -> None:
 def recorded(name: str, config: Config) -> tuple[Step, ...]:
     """The steps of one run of full smoothing over a simulated log."""
     with tempfile.TemporaryDirectory() as folder:
-        log = Path(folder) / "log.mcap"
-        simulate(load_scenario(name), log, 0)
-        return smooth(open_logs([log], config), config).steps
+        return smooth_log(simulated_log(name, 0, Path(folder)), config).steps
 
 
 def row(horizon_s: float, done: Replay, batch: Mapping[str, Trajectory]) -> str:
@@ -72,4 +69,4 @@ def distance(found: Mapping[str, Trajectory], batch: Mapping[str, Trajectory]) -
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

@@ -23,8 +23,8 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+from common import FREIBURG, FREIBURG_LOGS, import_freiburg, measured_command, parser
 from perturbed_logs import write
-from real_logs import DATA, LOGS, command, smooth
 
 from graphslam.core.config import Config
 from graphslam.core.geometry import between
@@ -87,21 +87,20 @@ def errors(relations: Relations, scans: Trajectory, middle: int) -> str:
 
 def joined(name: str, folder: Path) -> bool:
     """Print what becomes of one log; whether it is one frame."""
-    whole, cut = folder / f"{name}.mcap", folder / f"{name}-cut.mcap"
-    command("import", "carmen", str(DATA / f"{name}.clf.bz2"), "-o", str(whole))
+    whole, cut = import_freiburg(name, folder), folder / f"{name}-cut.mcap"
     messages, middle = halves(list(open_logs([whole], Config()).messages()))
     write(messages, cut)
-    relations = read_relations(DATA / f"{name}.relations")
+    relations = read_relations(FREIBURG / f"{name}.relations")
     heads = "".join(f"{head:>{width}}" for head, width in HEADS)
     print(f"\n{name:24}{heads}")
     seen = {}
     for label, log in (("one robot", whole), ("two robots", cut)):
         target = folder / f"{log.stem}-result"
-        wall_s, _ = smooth(log, target)
+        _, used = measured_command("smooth", str(log), "-o", str(target))
         scans = scans_of(target)
         k = int(np.searchsorted(scans.stamps_ns, middle))
         seen[label] = between(scans.poses[0], scans.poses[k])
-        print(f"{label:24}{wall_s:8.1f}  {errors(relations, scans, middle)}")
+        print(f"{label:24}{used.wall_s:8.1f}  {errors(relations, scans, middle)}")
     summary = json.loads((folder / f"{cut.stem}-result" / "summary.json").read_text("utf-8"))
     for label, pose in seen.items():
         print(f"first scan of the second, {label:12}" + "".join(f"{v:10.4f}" for v in pose))
@@ -123,8 +122,7 @@ def seen_alone(log: Path) -> dict[str, AnonymousMap]:
 
 def parts(name: str, folder: Path) -> bool:
     """Print what becomes of pairs of parts; whether none was joined wrongly."""
-    whole, cut = folder / f"{name}.mcap", folder / f"{name}-cut.mcap"
-    command("import", "carmen", str(DATA / f"{name}.clf.bz2"), "-o", str(whole))
+    whole, cut = import_freiburg(name, folder), folder / f"{name}-cut.mcap"
     write(halves(list(open_logs([whole], Config()).messages()))[0], cut)
     counts: Counter[str] = Counter()
     for seen in seen_alone(cut).values():
@@ -146,9 +144,12 @@ def parts(name: str, folder: Path) -> bool:
     return not any("WRONGLY" in kind for kind in counts)
 
 
-def main(arguments: list[str]) -> int:
+def main() -> int:
     """Print all; 0 if every log was joined, or no part wrongly."""
-    names = [name for name in arguments if name in LOGS] or list(LOGS)
+    options = parser(__doc__)
+    options.add_argument("arguments", nargs="*", metavar="parts | LOG")
+    arguments = options.parse_args().arguments
+    names = [name for name in arguments if name in FREIBURG_LOGS] or list(FREIBURG_LOGS)
     judge = parts if "parts" in arguments else joined
     with tempfile.TemporaryDirectory() as folder:
         good = [judge(name, Path(folder)) for name in names]
@@ -156,4 +157,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

@@ -7,27 +7,19 @@ squares over all robots at 10 Hz over the whole span, blind stretches included; 
 those of `smooth`, the whole command with its report.
 
 Run: python benchmarks/mrclam.py [robots|alone|ekf|ekf-alone|unnamed|exchanged|start1..start5 ...]
-The data are taken from GRAPHSLAM_DATA (default: ../shared/data beside the repository).
 """
 
-import json
-import os
-import resource
-import subprocess
-import sys
 import tarfile
 import tempfile
-import time
 from pathlib import Path
+
+from common import DATA, command, measured_command, parser
 
 from graphslam.core.config import Config
 from graphslam.logs import open_logs
 from graphslam.slam.start_priors import first_truth
 
-ROOT = Path(__file__).parents[1]
-DATA = Path(os.environ.get("GRAPHSLAM_DATA", ROOT / "../shared/data"))
 SOURCE = DATA / "mrclam/MRCLAM_Dataset6.tar.xz"
-GRAPHSLAM = [sys.executable, "-m", "graphslam"]
 RUNS = {
     "robots": [],
     "alone": ["--set", "association.robot_sightings=ignore"],
@@ -43,19 +35,6 @@ BARS = (
     "bars of robots: final 0.105, aligned 0.065, worst 0.13, NEES 2.0, landmarks 0.09, "
     "causal 0.125, 12 s; of unnamed: final 0.20, extra 0; of start1..5: 1.1 x robots"
 )
-
-
-def command(*arguments: str) -> str:
-    """Standard output of a graphslam command."""
-    return subprocess.run(
-        [*GRAPHSLAM, *arguments], check=True, capture_output=True, text=True
-    ).stdout
-
-
-def cpu_seconds() -> float:
-    """What all commands so far have used."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
 
 
 def exchanged(folder: Path) -> Path:
@@ -79,10 +58,10 @@ def row(name: str, log: Path, folder: Path) -> str:
         log_set = open_logs([log], Config())
         x, y, phi = first_truth(log_set)[robot]
         start = f"{robot}={x},{y},{phi}"
-    began, cpu = time.perf_counter(), cpu_seconds()
-    command("smooth", str(log), "--start", start, "-o", str(folder / name), *RUNS[name])
-    seconds, cpu = time.perf_counter() - began, cpu_seconds() - cpu
-    found = json.loads(command("evaluate", str(folder / name), "--truth", str(log), "--json"))
+    _, used = measured_command(
+        "smooth", str(log), "--start", start, "-o", str(folder / name), *RUNS[name]
+    )
+    found = command("evaluate", str(folder / name), "--truth", str(log))
     final, causal = found["joint"]["final"], found["joint"]["causal"]
     worst = max(robot["final"]["ate_rmse_m"] for robot in found["robots"].values())
     landmarks = found["landmarks"]
@@ -90,16 +69,19 @@ def row(name: str, log: Path, folder: Path) -> str:
         f"{name:9} {final['ate_rmse_m']:7.3f} {final['ate_aligned_rmse_m']:8.3f} {worst:6.3f} "
         f"{final['max_m']:5.2f} {final['nees_per_dof']:6.2f} {causal['ate_rmse_m']:7.3f} "
         f"{landmarks['rmse_m']:10.3f} {landmarks['missed']:7} {landmarks['extra']:6} "
-        f"{seconds:6.1f} {cpu:6.1f}"
+        f"{used.wall_s:6.1f} {used.cpu_s:6.1f}"
     )
 
 
-def main(names: list[str]) -> None:
+def main() -> None:
     """Print the table."""
+    options = parser(__doc__)
+    options.add_argument("names", nargs="*", choices=[[], *RUNS], default=list(RUNS))
+    names = options.parse_args().names or list(RUNS)
     with tempfile.TemporaryDirectory() as scratch:
         log = Path(scratch) / "mrclam6.mcap"
-        command("import", "mrclam", str(SOURCE), "-o", str(log))
-        print(f"imported in {cpu_seconds():.1f} s")
+        _, used = measured_command("import", "mrclam", str(SOURCE), "-o", str(log))
+        print(f"imported in {used.cpu_s:.1f} s")
         print(
             "run         final  aligned  worst   max   NEES  causal  landmarks  missed  extra"
             "      s  CPU s"
@@ -114,4 +96,4 @@ def main(names: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:] or list(RUNS))
+    main()

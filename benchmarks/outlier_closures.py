@@ -9,11 +9,9 @@ them the optimum, what Levenberg-Marquardt and GTSAM's graduated non-convexity (
 odometry known to be right) make of the graph of one robot, and the same runs without false
 closures.
 
-Run: python benchmarks/outlier_closures.py [FOLDER]   (default: graphs/ of $GRAPHSLAM_DATA)
+Run: python benchmarks/outlier_closures.py [FOLDER]   (default: graphs/ of the data)
 """
 
-import os
-import sys
 import tempfile
 import time
 from dataclasses import dataclass
@@ -21,12 +19,11 @@ from pathlib import Path
 
 import gtsam
 import numpy as np
+from common import DATA, parser, pose_graph_values, smooth_log
 
-from graphslam.core.config import Config
 from graphslam.core.records import Result
-from graphslam.logs import IMPORTERS, open_logs, pose_stamp_ns
+from graphslam.logs import IMPORTERS, pose_stamp_ns
 from graphslam.logs.import_pose_graph import Edge, read_pose_graph, split_odometry
-from graphslam.slam.smooth import smooth
 
 PRIOR_SIGMA = 1e-3
 #: the graph without false closures; one robot with them; two robots with them, and without
@@ -43,18 +40,7 @@ def smoothed(sources: list[Path]) -> Result:
         whole, log = Path(folder) / "whole.g2o", Path(folder) / "log.mcap"
         whole.write_text("\n".join(source.read_text() for source in sources))
         IMPORTERS["g2o"](whole, log)
-        return smooth(open_logs([log], Config()), Config())
-
-
-def values_of(result: Result) -> gtsam.Values:
-    """Every pose under its number in the file."""
-    values = gtsam.Values()
-    for robot in result.robots.values():
-        for stamp, pose in zip(robot.final.stamps_ns, robot.final.poses, strict=True):
-            number = int(stamp) // pose_stamp_ns(0) - 1
-            if stamp == pose_stamp_ns(number):
-                values.insert(number, gtsam.Pose2(*pose))
-    return values
+        return smooth_log(log)
 
 
 def ends(edge: Edge) -> tuple[int, int]:
@@ -96,7 +82,7 @@ def run(folder: Path, names: tuple[str, ...]) -> Run:
     refused = [(c["other_time_ns"], c["time_ns"]) for c in result.summary["closures"]["refused"]]
     is_true = np.array([(*ends(e), *e.delta) in true for e in closures])
     is_kept = np.array([ends(e) not in refused for e in closures])
-    values, whole = values_of(result), clean_graph(folder)
+    values, whole = pose_graph_values(result), clean_graph(folder)
     linked = {ends(e) for e in edges}
     common = gtsam.NonlinearFactorGraph()
     for factor in (whole.at(n) for n in range(whole.size())):
@@ -143,7 +129,10 @@ def by_gtsam(folder: Path) -> tuple[gtsam.Values, gtsam.Values]:
     return least, gtsam.GncLMOptimizer(graph, start, parameters).optimize()
 
 
-def main(folder: Path) -> None:
+def main() -> None:
+    options = parser(__doc__)
+    options.add_argument("folder", nargs="?", type=Path, default=DATA / "graphs")
+    folder: Path = options.parse_args().folder
     columns = ("true", "false", "error", "optimum", "all factors", "s")
     print(f"{'':32}" + "".join(f"{column:>12}" for column in columns))
     runs = {
@@ -164,5 +153,4 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    data = os.environ.get("GRAPHSLAM_DATA", "../shared/data")
-    main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(data) / "graphs")
+    main()

@@ -13,7 +13,7 @@ The first is run once as recorded too. Errors are those of `graphslam evaluate -
 the relations whose scans are left; a run fails grossly if the mean over all of them exceeds 0.15 m.
 
 Run: python benchmarks/perturbed_logs.py [intel|aces[:PERTURBATION]] ...
-exit code 1 if a run fails grossly. GRAPHSLAM_DATA as in real_logs.py.
+exit code 1 if a run fails grossly.
 """
 
 import sys
@@ -23,7 +23,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from real_logs import DATA, LOGS, command, smooth
+from common import FREIBURG, FREIBURG_LOGS, command, import_freiburg, measured_command, parser
 
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array, between, compose
@@ -153,24 +153,24 @@ def runs(names: list[str]) -> Iterator[tuple[str, str, int]]:
                 yield from ((log, perturbation, seed) for seed in seeds)
 
 
-def main(names: list[str]) -> int:
+def main() -> int:
+    options = parser(__doc__)
+    options.add_argument("names", nargs="*", default=FREIBURG_LOGS, metavar="LOG[:PERTURBATION]")
     good = True
     print(f"{'':26}{'n':>6}{'all m':>9}{'local':>9}{'loops':>9}{'rot °':>8}{'causal':>9}{'s':>7}")
     with tempfile.TemporaryDirectory() as folder:
-        for log, perturbation, seed in runs(names):
-            whole = Path(folder, f"{log}.mcap")
-            if not whole.exists():
-                command("import", "carmen", str(DATA / f"{log}.clf.bz2"), "-o", str(whole))
+        for log, perturbation, seed in runs(options.parse_args().names):
+            whole = import_freiburg(log, Path(folder))
             messages = list(open_logs([whole], Config()).messages())
-            relations = read_relations(DATA / f"{log}.relations")
+            relations = read_relations(FREIBURG / f"{log}.relations")
             name = f"{log}-{perturbation}-{seed}"
             path, target = Path(folder, f"{name}.mcap"), Path(folder, name)
             write(PERTURBATIONS[perturbation][0](messages, relations, seed), path)
-            reference = DATA / f"{log}.relations"
+            reference = FREIBURG / f"{log}.relations"
             if perturbation == "mirrored":
                 reference = Path(folder, "mirrored.relations")
-                reference.write_text(mirrored_relations(DATA / f"{log}.relations"))
-            wall_s, _ = smooth(path, target)
+                reference.write_text(mirrored_relations(FREIBURG / f"{log}.relations"))
+            _, used = measured_command("smooth", str(path), "-o", str(target))
             path.unlink()
             found = command("evaluate", str(target), "--relations", str(reference))["relations"]
             causal = found["causal"]["all"]["trans_mean_m"]
@@ -179,7 +179,7 @@ def main(names: list[str]) -> int:
             print(
                 f"{log + ' ' + perturbation + ' ' + str(seed):26}{found['all']['n']:6}"
                 + "".join(f"{value:9.4f}" for value in mean)
-                + f"{found['all']['rot_mean_deg']:8.3f}{causal:9.3f}{wall_s:7.1f}"
+                + f"{found['all']['rot_mean_deg']:8.3f}{causal:9.3f}{used.wall_s:7.1f}"
                 + ("" if mean[0] <= GROSS_M else "  GROSS FAILURE"),
                 flush=True,
             )
@@ -187,4 +187,4 @@ def main(names: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:] or list(LOGS)))
+    sys.exit(main())

@@ -7,26 +7,17 @@ the log over the wall time of the whole `smooth` command, report and all; memory
 
 Run: python benchmarks/real_logs.py [intel] [aces] [--figures DIR]
 Exit code 1 if a bar is not held.
-The data are taken from GRAPHSLAM_DATA (default: ../shared/data beside the repository).
 """
 
-import argparse
 import json
-import os
-import subprocess
 import sys
 import tempfile
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import real_logs_figures
-
-ROOT = Path(__file__).parents[1]
-DATA = Path(os.environ.get("GRAPHSLAM_DATA", ROOT / "../shared/data")) / "freiburg"
-LOGS = ("intel", "aces")
-GRAPHSLAM = [sys.executable, "-m", "graphslam"]
+from common import FREIBURG, FREIBURG_LOGS, command, import_freiburg, measured_command, parser
 
 
 @dataclass(frozen=True)
@@ -91,34 +82,12 @@ class Run:
         }
 
 
-def command(*arguments: str) -> dict[str, Any]:
-    """What a command prints with --json."""
-    done = subprocess.run([*GRAPHSLAM, *arguments, "--json"], stdout=subprocess.PIPE, check=True)
-    found: dict[str, Any] = json.loads(done.stdout)
-    return found
-
-
-def smooth(log: Path, target: Path) -> tuple[float, float]:
-    """Wall time (s) and peak memory (MB) of `graphslam smooth`."""
-    began = time.perf_counter()
-    process = subprocess.Popen(
-        [*GRAPHSLAM, "smooth", str(log), "-o", str(target), "--json"], stdout=subprocess.DEVNULL
-    )
-    _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        raise subprocess.CalledProcessError(process.returncode, process.args)
-    unit = 1e6 if sys.platform == "darwin" else 1e3
-    return time.perf_counter() - began, usage.ru_maxrss / unit
-
-
 def run(name: str, folder: Path) -> Run:
-    log, target = folder / f"{name}.mcap", folder / name
-    command("import", "carmen", str(DATA / f"{name}.clf.bz2"), "-o", str(log))
-    wall_s, peak_mb = smooth(log, target)
-    found = command("evaluate", str(target), "--relations", str(DATA / f"{name}.relations"))
+    target = folder / name
+    _, used = measured_command("smooth", str(import_freiburg(name, folder)), "-o", str(target))
+    found = command("evaluate", str(target), "--relations", str(FREIBURG / f"{name}.relations"))
     summary = json.loads((target / "summary.json").read_text(encoding="utf-8"))
-    return Run(found["relations"], summary, wall_s, peak_mb)
+    return Run(found["relations"], summary, used.wall_s, used.peak_mb)
 
 
 def print_errors(name: str, done: Run) -> None:
@@ -160,13 +129,13 @@ def print_bars(name: str, done: Run) -> bool:
 
 def main() -> int:
     """Print errors and bars."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("logs", nargs="*", default=list(LOGS))
-    parser.add_argument("--figures", type=Path, help="folder for the figures of docs/real-logs.md")
-    arguments = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("logs", nargs="*", default=list(FREIBURG_LOGS))
+    options.add_argument("--figures", type=Path, help="folder for the figures of docs/real-logs.md")
+    arguments = options.parse_args()
     for name in arguments.logs:
-        if name not in LOGS or not (DATA / f"{name}.clf.bz2").exists():
-            print(f"real_logs: error: {DATA}/{name}.clf.bz2: no such log; set GRAPHSLAM_DATA")
+        if name not in FREIBURG_LOGS or not (FREIBURG / f"{name}.clf.bz2").exists():
+            print(f"real_logs: error: {FREIBURG}/{name}.clf.bz2: no such log; set GRAPHSLAM_DATA")
             return 2
     good = True
     with tempfile.TemporaryDirectory() as folder:
@@ -175,7 +144,7 @@ def main() -> int:
             print_errors(name, done)
             good &= print_bars(name, done)
             if arguments.figures:
-                relations = DATA / f"{name}.relations"
+                relations = FREIBURG / f"{name}.relations"
                 print(
                     real_logs_figures.draw(name, Path(folder) / name, relations, arguments.figures)
                 )

@@ -6,9 +6,9 @@ Drawn by benchmarks/real_logs.py --figures DIR, for docs/real-logs.md.
 from pathlib import Path
 
 import numpy as np
+from figure_style import BLUE, GREY, INK, RED, panels
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from thesis_figures import BLUE, GREY, INK, RED, panels
 
 from graphslam.change_detection import load_visit
 from graphslam.core.geometry import Array

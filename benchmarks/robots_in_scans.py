@@ -13,12 +13,12 @@ standard deviation.
 Run: python benchmarks/robots_in_scans.py [--seeds 20] [--unknown 10]
 """
 
-import argparse
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from common import START_FROM_TRUTH, parser, simulated_log, smooth_log
 
 from graphslam.core.config import Config
 from graphslam.core.config_io import load_config
@@ -26,9 +26,8 @@ from graphslam.core.geometry import Array, wrap
 from graphslam.evaluation.metrics import evaluate
 from graphslam.evaluation.trajectory_metrics import pair_poses
 from graphslam.logs import open_logs, read_truth
-from graphslam.simulation import load_scenario, simulate
+from graphslam.simulation import load_scenario
 from graphslam.simulation.robot_shapes import corners
-from graphslam.slam.smooth import smooth
 from graphslam.slam.start_priors import first_truth
 
 SCENARIO, OBSERVER, SEEN = "robots-in-scans", "vehicle", "pioneer"
@@ -53,13 +52,13 @@ def settings(*more: str) -> Config:
     """Defaults, the outline of the robot that is seen, and known starts."""
     body = load_scenario(SCENARIO).robots[SEEN].body
     outline = f"robots.{SEEN}.outline={corners(body).tolist()}"
-    return load_config(overrides=["start.from_truth=true", outline, *more])
+    return load_config(overrides=[START_FROM_TRUTH, outline, *more])
 
 
 def outcome(log: Path, *more: str) -> Outcome:
     """Smooth a log and hold it against the truth."""
     config = settings(*more)
-    result = smooth(open_logs([log], config), config)
+    result = smooth_log(log, config)
     found = result.robots[SEEN].final
     truth = read_truth([log], config).trajectories
     pairs = pair_poses(found, truth[SEEN])
@@ -83,15 +82,13 @@ def true_offset_s(log_s: float) -> float:
 
 def both(seed: int, folder: Path) -> tuple[Outcome, Outcome]:
     """Cooperating and alone."""
-    log = folder / f"{seed}.mcap"
-    simulate(load_scenario(SCENARIO), log, seed=seed)
+    log = simulated_log(SCENARIO, seed, folder)
     return outcome(log), outcome(log, "association.robot_sightings=ignore")
 
 
 def unknown(seed: int, other: str, folder: Path) -> tuple[Outcome, Outcome, Array, Array]:
     """All starts known, and but one: that of ``other``, whose error and sigmas (3,) are found."""
-    log = folder / f"{seed}.mcap"
-    simulate(load_scenario(SCENARIO), log, seed=seed)
+    log = simulated_log(SCENARIO, seed, folder)
     config = settings()
     true = first_truth(open_logs([log], config))
     (known,) = {OBSERVER, SEEN} - {other}
@@ -135,10 +132,10 @@ def print_unknown(count: int, other: str) -> None:
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--unknown", type=int, default=10)
-    arguments = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("--seeds", type=int, default=20)
+    options.add_argument("--unknown", type=int, default=10)
+    arguments = options.parse_args()
     if arguments.seeds:
         print_known(arguments.seeds)
     for other in (SEEN, OBSERVER) if arguments.unknown else ():

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from common import best_cpu_s, parser
 
 from graphslam.simulation import SCENARIOS, load_scenario, simulate
 from graphslam.simulation.raycast import BeamFan, cast_beams
@@ -31,11 +32,8 @@ def main() -> None:
     rng = np.random.default_rng(1)
     shapes = world(rng)
     poses = rng.uniform([0, 0, -np.pi], [SIDE_M, SIDE_M, np.pi], (SCANS, 3))
-    seconds = np.inf
-    for _ in range(5):
-        start = time.process_time()
-        cast_beams(poses, FAN, shapes, 32.0)
-        seconds = min(seconds, time.process_time() - start)
+    parser(__doc__).parse_args()
+    seconds = best_cpu_s(lambda: cast_beams(poses, FAN, shapes, 32.0))
     print(f"ray casting: {FAN.count} beams, {WALLS} walls: {SCANS / seconds:.0f} scans/s")
     with tempfile.TemporaryDirectory() as folder:
         for name in SCENARIOS:

@@ -5,7 +5,6 @@ Writes the tables of docs/experiments.md and its figures in docs/figures/. Exit 
 not held.
 """
 
-import argparse
 import sys
 import tempfile
 from collections.abc import Mapping
@@ -15,12 +14,11 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
+from common import FIGURES, ROOT, parser
 from thesis_figures import draw
 from thesis_runs import EXPERIMENTS, TRUE, WITH, WITHOUT, Array
 
-ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs/experiments.md"
-FIGURES = ROOT / "docs/figures"
 
 
 def one(job: tuple[str, int]) -> dict[str, float]:
@@ -122,15 +120,15 @@ def put(name: str, text: str) -> None:
 
 def main() -> int:
     """Run, print, write the page; 1 if a bar is not held."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(EXPERIMENTS))
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--no-page", action="store_true", help="print only")
-    arguments = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("names", nargs="*", metavar="NAME", help=", ".join(EXPERIMENTS))
+    options.add_argument("--seeds", type=int, default=20)
+    options.add_argument("--jobs", type=int, default=2)
+    options.add_argument("--no-page", action="store_true", help="print only")
+    arguments = options.parse_args()
     names = arguments.names or list(EXPERIMENTS)
     if unknown := set(names) - set(EXPERIMENTS):
-        parser.error(f"no experiment {', '.join(sorted(unknown))}")
+        options.error(f"no experiment {', '.join(sorted(unknown))}")
     failed = []
     with ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool:
         for name in names:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
+from figure_style import BLUE, GREY, MARK, RED, WALL, legend, panels, path, scatter, window
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from thesis_runs import (
@@ -25,32 +26,10 @@ from thesis_runs import (
     visits_of_the_start,
 )
 
-from graphslam.core.geometry import compose, transform
+from graphslam.core.geometry import transform
 from graphslam.simulation import load_scenario, simulate
 
 SEED = 0
-INK, WALL, MARK = "#1b1f24", "#c8601a", "#228833"
-BLUE, RED, GREY = "#4477aa", "#ee6677", "#9aa4af"
-
-
-def panels(columns: int, size: tuple[float, float]) -> tuple[Figure, list[Axes]]:
-    """A figure of one row; ``size`` in inches."""
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(1, columns, squeeze=False)[0]
-    for ax in axes:
-        ax.set_aspect("equal")
-        ax.tick_params(labelsize=7, color=GREY, labelcolor=INK)
-        for spine in ax.spines.values():
-            spine.set_color(GREY)
-    return figure, list(axes)
-
-
-def scatter(ax: Axes, points: Array, title: str, color: str = INK, size: float = 0.4) -> None:
-    """Superposed measurements (..., 2)."""
-    flat = points.reshape(-1, 2)
-    marker = "," if size <= 1 else "."
-    ax.plot(*flat.T, marker, color=color, markersize=size, alpha=0.5, rasterized=True)
-    ax.set_title(title, fontsize=9, color=INK)
 
 
 def walls(ax: Axes, done: Run, label: str = "true walls") -> None:
@@ -68,23 +47,6 @@ def landmarks(ax: Axes, done: Run, frame: Array) -> None:
         ends = transform(frame, mark.extent)
         ax.plot(*ends.T, ".-", color=MARK, lw=1.6, ms=3, label=label)
         label = "_"
-
-
-def path(ax: Axes, poses: Array, color: str, label: str, frame: Array | None = None) -> None:
-    """A trajectory (n, 3)."""
-    moved = poses if frame is None else compose(frame, poses)
-    ax.plot(*moved[:, :2].T, color=color, lw=1.1, label=label)
-
-
-def window(ax: Axes, center: Array, half_m: float) -> None:
-    """An enlargement."""
-    ax.set_xlim(center[0] - half_m, center[0] + half_m)
-    ax.set_ylim(center[1] - half_m, center[1] + half_m)
-
-
-def legend(ax: Axes) -> None:
-    """Small, where there is room."""
-    ax.legend(fontsize=7, frameon=False, loc="best")
 
 
 def lab(folder: Path) -> dict[str, Figure]:

@@ -6,7 +6,7 @@ trajectory at the poses' stamps and its landmarks by their identities; our own f
 Beside it: where Levenberg-Marquardt gets from odometry alone, and the optimum.
 
 Run: python benchmarks/victoria_park.py DIR...   (folders that `graphslam smooth` wrote)
-tests/test_real_logs.py holds the bar with the functions below.
+tests/slam/test_real_logs.py holds the bar with the functions below.
 """
 
 import sys
@@ -14,12 +14,12 @@ from pathlib import Path
 
 import gtsam
 import numpy as np
+from common import parser, smooth_log
 
 from graphslam.core.config_io import load_config
 from graphslam.core.errors import GraphSlamError, OutputError
-from graphslam.logs import IMPORTERS, open_logs, pose_stamp_ns
+from graphslam.logs import IMPORTERS, pose_stamp_ns
 from graphslam.results.folder import load, save
-from graphslam.slam.smooth import smooth
 
 SOURCE = gtsam.findExampleDataFile("victoria_park.txt")
 PRIOR_SIGMA = 1e-3
@@ -45,7 +45,7 @@ def smooth_all_poses(source: str, directory: Path) -> Path:
     log = directory / "log.mcap"
     IMPORTERS["isam"](Path(source), log)
     config = load_config(overrides=["keyframe.mode=all", "robust.kernel=none"])
-    result = smooth(open_logs([log], config), config)
+    result = smooth_log(log, config)
     save(result, directory / "all_poses", force=False)
     return directory / "all_poses"
 
@@ -77,7 +77,10 @@ def row(label: str, error: float, note: str = "") -> None:
     print(f"{label:42} {error:14,.2f}  {note}".rstrip())
 
 
-def main(directories: list[Path]) -> None:
+def main() -> None:
+    options = parser(__doc__)
+    options.add_argument("directories", nargs="*", type=Path, metavar="DIR")
+    directories: list[Path] = options.parse_args().directories
     graph, odometry = file_graph()
     print(f"{graph.size()} factors, {odometry.size()} variables: error")
     row("odometry alone", graph.error(odometry))
@@ -95,6 +98,6 @@ def main(directories: list[Path]) -> None:
 
 if __name__ == "__main__":
     try:
-        main([Path(argument) for argument in sys.argv[1:]])
+        main()
     except GraphSlamError as error:
         sys.exit(f"victoria_park: error: {error}")

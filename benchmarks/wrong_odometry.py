@@ -9,20 +9,18 @@ the scans contradicted, by `odometry.scan_matching`.
 Run: python benchmarks/wrong_odometry.py [--seeds 3]
 """
 
-import argparse
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from common import parser, simulated_log, smooth_log
 
 from graphslam.core.config_io import load_config
 from graphslam.core.geometry import Array, between, compose, exp, log
 from graphslam.core.records import Message, OdometryPose, Scan, Truth
 from graphslam.logs import LogWriter, open_logs
-from graphslam.simulation import load_scenario, simulate
-from graphslam.slam.smooth import smooth
 
 S = 1_000_000_000
 #: seconds since the start, length of the increment (s), its twist -> the twist that is reported,
@@ -64,9 +62,7 @@ CHANGES: dict[str, tuple[Change, float]] = {
 
 def recorded(seed: int, folder: Path) -> list[Message]:
     """What the lab's robot says, with good odometry."""
-    path = folder / f"{seed}.mcap"
-    simulate(load_scenario("lab"), path, seed)
-    messages = open_logs([path], load_config()).messages()
+    messages = open_logs([simulated_log("lab", seed, folder)], load_config()).messages()
     return [m for m in messages if isinstance(m, OdometryPose | Scan | Truth)]
 
 
@@ -98,7 +94,7 @@ def run(
                 if reported:
                     out.odometry(m.robot, m.stamp_ns + round(late_s * S), pose)
     config = load_config(overrides=settings)
-    result = smooth(open_logs([path], config), config)
+    result = smooth_log(path, config)
     (robot,) = result.robots.values()
     t, *true = np.array(truth).T
     true[2] = np.unwrap(true[2])
@@ -113,9 +109,9 @@ def run(
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--seeds", type=int, default=3)
-    seeds = range(parser.parse_args().seeds)
+    options = parser(__doc__)
+    options.add_argument("--seeds", type=int, default=3)
+    seeds = range(options.parse_args().seeds)
     print(f"{'':22}{'final mean':>11}{'max':>8}{'causal mean':>13}{'max':>8}{'contradicted':>14}")
     with tempfile.TemporaryDirectory() as folder:
         logs = [recorded(seed, Path(folder)) for seed in seeds]

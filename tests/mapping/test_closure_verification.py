@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 import pytest
+from common import pose_graph_values
 
 from graphslam.core.config import BackendConfig, Config, StartConfig
 from graphslam.core.geometry import between, compose
@@ -113,12 +114,7 @@ def errors(graph, result):
         noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
         for a, b, delta in edges:
             factors.add(gtsam.BetweenFactorPose2(a, b, gtsam.Pose2(*delta), noise))
-    values = gtsam.Values()
-    for robot in result.robots.values():
-        for stamp, pose in zip(robot.final.stamps_ns, robot.final.poses, strict=True):
-            number = int(stamp) // pose_stamp_ns(0) - 1
-            if stamp == pose_stamp_ns(number):
-                values.insert(number, gtsam.Pose2(*pose))
+    values = pose_graph_values(result)
     best = gtsam.LevenbergMarquardtOptimizer(factors, values).optimize()
     return factors.error(values), factors.error(best)
 

@@ -3,11 +3,11 @@
 The long logs (intel and aces whole) are run by benchmarks/real_logs.py.
 """
 
-import importlib.util
-
 import numpy as np
+import outlier_closures as outliers
 import pytest
-from paths import ROOT, real_data
+import victoria_park
+from paths import real_data
 
 from graphslam.core.config import Config
 from graphslam.core.records import Trajectory
@@ -17,16 +17,8 @@ from graphslam.logs import open_logs
 from graphslam.slam.smooth import smooth
 
 
-def benchmark(name):
-    spec = importlib.util.spec_from_file_location(name, ROOT / f"benchmarks/{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def error_of_all_poses(source, folder):
     """GTSAM's error of the file's own factors at our result."""
-    victoria_park = benchmark("victoria_park")
     graph, own = victoria_park.file_graph(source)
     directory = victoria_park.smooth_all_poses(source, folder)
     return graph.error(victoria_park.values_of(directory, own))
@@ -36,7 +28,6 @@ def test_victoria_park_reaches_its_optimum(tmp_path):
     """The optimum is 2339.22; Levenberg-Marquardt from odometry stops at 106 084. 0.1 % more is
     allowed: our sightings are transported to the base frame, and stamps and poses go through
     text."""
-    victoria_park = benchmark("victoria_park")
     assert error_of_all_poses(victoria_park.SOURCE, tmp_path) <= victoria_park.BAR
 
 
@@ -105,7 +96,6 @@ def test_csail_among_250_false_closures(robots):
     of two of which the second starts nobody knows where, and what comes out is the optimum (20.275
     with the odometry from 522 to 523, which the two robots' files lack; 20.159 without). 0.01 is
     more than the digits and the convergence of either."""
-    outliers = benchmark("outlier_closures")
     real_data(f"graphs/{outliers.CLEAN}")
     run = outliers.run(real_data("graphs"), outliers.ONE if robots == 1 else outliers.TWO)
     assert (run.true, run.kept, run.false, run.believed) == (128, 128, 250, 0)
