@@ -1,10 +1,10 @@
-"""A visit's path made straight by its own scans, where the smoothed one bends.
+"""A visit's path re-estimated from its own scans, where the smoothed path is bent.
 
-A map may bend where few landmarks hold it: a corner turned on odometry alone. Two visits then bend
-differently and no rigid motion brings one onto the other. Here each scan is matched to what the
-scans shortly before it saw (doi:10.1109/ROBOT.2008.4543181), predicted by the smoothed motion,
-which is doubted where it jumps. From there all poses are found at once (`relax`), so that the shape
-is that of the scans, however the smoothed path was bent.
+A map may bend where few landmarks constrain it, as at a corner that was turned on odometry alone.
+Two visits then bend differently, and no rigid motion registers them. Here each scan is matched to
+the scans shortly before it, starting from the smoothed motion, which is doubted where it jumps.
+From there `relax_scan_network` estimates all poses at once, so that the shape of the path is that
+of the scans, however the smoothed path was bent.
 """
 
 from dataclasses import replace
@@ -16,101 +16,101 @@ from scipy.spatial import cKDTree
 from graphslam.change_detection.scan_network import Cloud, relax_scan_network
 from graphslam.change_detection.visit import Bools, Visit
 from graphslam.core.geometry import Array, between, compose, polar_points, rotation, transform, wrap
+from graphslam.perception.point_to_line import (
+    gauss_newton_step,
+    line_metrics,
+    normal_equations,
+    point_terms,
+    redescending,
+    step_poses,
+)
 
-#: scans before that make the surfaces, and every how many of them
+#: how many scans before a scan it is matched to, and of how many of them one is taken
 _WINDOW, _EVERY = 30, 3
-#: sigmas of the smoothed motion from scan to scan, and the distance in sigmas from which on it is
-#: doubted: a path that was pulled by a wrong match jumps by degrees between two keyframes
+#: sigmas of the smoothed motion from scan to scan (m, m, rad), and their robust scale: a path that
+#: a wrong match pulled away jumps by degrees between two keyframes
 _STEP_SIGMAS, _DOUBTED = np.array([0.01, 0.01, 0.01]), 2.0
-#: turns that are tried where the smoothed motion may have jumped, rad, and how near a return must
-#: lie to a surface to speak for one, m
+#: rad: headings that are tried where the smoothed motion may have jumped; m: how near to another
+#: return one counts for a heading
 _TURNS = np.radians(np.arange(-12.0, 12.5, 1.0))
 _TURN_GATE_M = 0.1
+#: m, one per iteration
 _GATES_M = (0.2, 0.15, 0.1, 0.1)
-#: what a return lies off a surface by, m: neighbours share errors, so more than their noise
+#: m: sigma of a return's distance. Neighbouring returns share errors, so more than their noise
 _SIGMA_M = 0.04
-#: beams to each side that tell the direction of a surface, and how straight they must be
+#: beams to each side that give the direction of a surface, the largest ratio of their variances
+#: across and along it, and the fewest returns that are matched
 _SIDE, _STRAIGHT, _FEWEST = 3, 0.1, 20
 
 
 def refine_path(visit: Visit) -> Visit:
-    """The visit on a path that its scans agree with; its first scan stays where it is."""
+    """The visit with the poses at which its scans agree; its first pose is fixed."""
     local = polar_points(visit.range_m, visit.angle)
-    normals, flat = _normals(visit, local)
-    metrics = np.where(flat[:, None, None], normals[:, :, None] * normals[:, None, :], np.eye(2))
-    ends = np.searchsorted(visit.scan, np.arange(len(visit.poses) + 1))
-    points, facing = [], []
-    for low, high in pairwise(ends):
-        back = np.isfinite(visit.range_m[low:high])
-        points.append(local[low:high][back])
-        facing.append(metrics[low:high][back])
+    normals, straight = _normals(visit, local)
+    metrics = np.where(straight[:, None, None], line_metrics(normals), np.eye(2))
+    returned = np.isfinite(visit.range_m)
+    cloud = Cloud(visit.scan[returned], local[returned], metrics[returned])
+    bounds = np.searchsorted(cloud.scan, np.arange(len(visit.poses) + 1))
+    scans = [(cloud.points[low:high], cloud.metrics[low:high]) for low, high in pairwise(bounds)]
+    motion = between(visit.poses[:-1], visit.poses[1:])
     poses = visit.poses.copy()
     prior = np.diag(_STEP_SIGMAS**-2.0)
     for i in range(1, len(poses)):
-        poses[i] = compose(poses[i - 1], between(visit.poses[i - 1], visit.poses[i]))
+        poses[i] = compose(poses[i - 1], motion[i - 1])
         before = range(max(0, i - _WINDOW), i)[::-_EVERY]
-        at = np.concatenate([transform(poses[k], points[k]) for k in before])
+        map_points = np.concatenate([transform(poses[k], scans[k][0]) for k in before])
         turns = [rotation(poses[k, 2]) for k in before]
-        n = np.concatenate([R @ facing[k] @ R.T for k, R in zip(before, turns, strict=True)])
-        if len(at) >= _FEWEST and len(points[i]) >= _FEWEST:
-            poses[i] = _matched(poses[i], prior, points[i], at, n)
-    back = np.isfinite(visit.range_m)
-    cloud = Cloud(visit.scan[back], local[back], metrics[back])
-    motion = between(visit.poses[:-1], visit.poses[1:])
+        map_metrics = np.concatenate(
+            [R @ scans[k][1] @ R.T for k, R in zip(before, turns, strict=True)]
+        )
+        if len(map_points) >= _FEWEST and len(scans[i][0]) >= _FEWEST:
+            poses[i] = _match(poses[i], prior, scans[i][0], map_points, map_metrics)
     return replace(visit, poses=relax_scan_network(poses, cloud, motion, _STEP_SIGMAS, _DOUBTED))
 
 
 def _normals(visit: Visit, local: Array) -> tuple[Array, Bools]:
-    """Of the surface at each return (n, 2), in the laser's frame, and where it is straight (n,)."""
+    """Surface normals (n, 2) at all returns in the laser's frame, and where it is straight (n,)."""
     width = 2 * _SIDE + 1
-    normals, flat = np.zeros_like(local), np.zeros(len(local), dtype=bool)
+    normals, straight = np.zeros_like(local), np.zeros(len(local), dtype=bool)
     if len(local) < width:
-        return normals, flat
+        return normals, straight
     windows = np.lib.stride_tricks.sliding_window_view(np.nan_to_num(local), width, axis=0)
     away = windows - windows.mean(axis=2, keepdims=True)
     values, vectors = np.linalg.eigh(away @ away.mT)
     normals[_SIDE:-_SIDE] = vectors[:, :, 0]
     whole = np.lib.stride_tricks.sliding_window_view(visit.surface, width).all(axis=1)
     one_scan = visit.scan[width - 1 :] == visit.scan[: len(visit.scan) - width + 1]
-    flat[_SIDE:-_SIDE] = whole & one_scan & (values[:, 0] < _STRAIGHT * values[:, 1])
-    return normals, flat
+    straight[_SIDE:-_SIDE] = whole & one_scan & (values[:, 0] < _STRAIGHT * values[:, 1])
+    return normals, straight
 
 
-def _matched(pose: Array, prior: Array, points: Array, at: Array, metrics: Array) -> Array:
-    """The pose (3,) near ``pose`` that brings ``points`` (k, 2) onto those ``at`` (m, 2) m.
+def _match(pose: Array, prior: Array, points: Array, target: Array, metrics: Array) -> Array:
+    """The pose (3,) near ``pose`` at which ``points`` (k, 2) m lie on those of ``target`` (m, 2) m.
 
-    ``metrics`` (m, 2, 2) project onto the normal where they are on a line; ``prior`` (3, 3) is the
-    information of ``pose``.
+    ``metrics`` (m, 2, 2) belong to ``target``, see `Cloud`; ``prior`` (3, 3) is the information of
+    ``pose``.
     """
-    tree, start = cKDTree(at), pose
-    pose = _turned(tree, pose, points)
+    tree, expected = cKDTree(target), pose
+    pose = _best_heading(tree, pose, points)
     for gate in _GATES_M:
-        world = transform(pose, points)
-        away, near = tree.query(world, distance_upper_bound=gate)
+        placed = transform(pose, points)
+        away, near = tree.query(placed, distance_upper_bound=gate)
         used = np.isfinite(away)
-        M, d = metrics[near[used]], world[used] - at[near[used]]
-        e2 = np.einsum("ni,nij,nj->n", d, M, d)
-        arm = world[used] - pose[:2]
-        J = np.zeros((len(d), 2, 3))
-        J[:, 0, 0] = J[:, 1, 1] = 1.0
-        J[:, 0, 2], J[:, 1, 2] = -arm[:, 1], arm[:, 0]
-        weight = _SIGMA_M**-2.0 / (1 + e2 * (2 / gate) ** 2) ** 2
-        JM = weight[:, None, None] * (J.mT @ M)
-        back = start - pose
+        placed, near = placed[used], near[used]
+        terms, squared = point_terms(placed - target[near], metrics[near], placed - pose[:2])
+        A, g = normal_equations(terms @ (_SIGMA_M**-2.0 * redescending(squared, gate)))
+        back = expected - pose
         back[2] = wrap(back[2])
         held = prior / (1 + back @ prior @ back / _DOUBTED**2)
-        step = np.linalg.solve(
-            (JM @ J).sum(axis=0) + held, held @ back - np.einsum("nai,ni->a", JM, d)
-        )
-        pose = np.array([*(pose[:2] + step[:2]), wrap(pose[2] + step[2])])
+        pose = step_poses(pose, gauss_newton_step(A + held, g - held @ back))
     return pose
 
 
-def _turned(tree: cKDTree, pose: Array, points: Array) -> Array:
-    """The pose (3,) turned by what brings most of ``points`` (k, 2) onto the tree's."""
+def _best_heading(tree: cKDTree, pose: Array, points: Array) -> Array:
+    """The pose (3,) turned by what brings most of ``points`` (k, 2) m onto those of the tree."""
     tried = np.tile(pose, (len(_TURNS), 1))
     tried[:, 2] += _TURNS
-    world = np.concatenate([transform(turned, points) for turned in tried])
-    away = tree.query(world, distance_upper_bound=_TURN_GATE_M)[0].reshape(len(_TURNS), -1)
+    placed = np.concatenate([transform(turned, points) for turned in tried])
+    away = tree.query(placed, distance_upper_bound=_TURN_GATE_M)[0].reshape(len(_TURNS), -1)
     fits = np.maximum(1 - (away / _TURN_GATE_M) ** 2, 0.0).sum(axis=1)
     return np.asarray(tried[int(np.argmax(fits))])

@@ -1,9 +1,10 @@
-"""A path bent until all scans agree with those near them in time and in space.
+"""A path estimated from all pairs of neighbouring scans at once (scan network).
 
-Matched one after another, scans drift: by a degree over a room, and differently from every start.
-Here all poses are found at once (doi:10.1023/A:1008854305733): each scan's returns lie on those of
-its neighbours, on the line through them where they are straight, and the smoothed motion holds what
-the scans leave open. Scans of places that were come back to are neighbours too.
+Scan matching one scan after another drifts: by a degree over a room, and differently from every
+start. Here all poses are estimated together (doi:10.1023/A:1008854305733). The returns of each scan
+should lie on those of its neighbours: on the line through them where they are straight, else on the
+nearest point. The motion of the smoothed path constrains what the scans leave open. Neighbours are
+scans close in time, and scans close in space after the robot has come back.
 """
 
 from dataclasses import dataclass
@@ -15,26 +16,35 @@ from scipy.spatial import cKDTree
 
 from graphslam.change_detection.elastic_path import motion_terms
 from graphslam.change_detection.visit import Bools, Ints
-from graphslam.core.geometry import Array, wrap
+from graphslam.core.geometry import Array, between, rotation3
+from graphslam.perception.point_to_line import (
+    normal_equations,
+    point_terms,
+    redescending,
+    step_poses,
+)
 
-#: neighbours in time, scans before; in space: fewest scans between, farthest, m, and every how many
+#: neighbours in time: how many scans before
 _BEFORE = (1, 2, 4, 7, 11, 16, 22, 29)
-_AGAIN, _NEAR_M, _EVERY = 60, 1.5, 3
-#: returns of a scan that are enough, and pairs of scans at a time, which bounds the memory
+#: neighbours in space: fewest scans between two, their largest distance in m, and of how many scans
+#: one is taken
+_REVISIT_SCANS, _REVISIT_M, _EVERY = 60, 1.5, 3
+#: returns of a scan that are matched, and pairs of scans at a time, which bounds the memory
 _POINTS, _PAIRS = 60, 2000
-#: the widest lets the ends of a loop find each other, and takes some rounds to pull them together
+#: m, one per iteration: the wide ones let the ends of a loop find each other, and several rounds of
+#: them are needed to pull the ends together
 _GATES_M = (0.5, 0.5, 0.5, 0.4, 0.4, 0.3, 0.3, 0.2, 0.2, 0.15, 0.15, 0.1, 0.1, 0.1)
-#: what returns lie off each other by, m: neighbours share errors, so more than their noise
+#: m: sigma of a return's distance. Neighbouring returns share errors, so more than their noise
 _SIGMA_M = 0.04
-#: farther apart than any two scans reach: layers of the tree, one per scan, m
-_LAYER_M = 1000.0
+#: m: one tree holds all scans, each in a plane of its own. No gate reaches from one to the next.
+_PLANE_SPACING_M = 2 * max(_GATES_M)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cloud:
     """Returns of all scans: ``scan`` (n,) sorted, ``points`` (n, 2) m in the laser's frame.
 
-    ``metrics`` (n, 2, 2) are projections: onto the normal where the surface is straight, else 1.
+    ``metrics`` (n, 2, 2) are n nᵀ of the normal where the surface is straight, else the identity.
     """
 
     scan: Ints
@@ -45,39 +55,41 @@ class Cloud:
 def relax_scan_network(
     poses: Array, cloud: Cloud, motion: Array, sigmas: Array, doubted: float
 ) -> Array:
-    """The poses (s, 3) with which all scans agree best; the first stays.
+    """The poses (s, 3) at which all scans agree best; the first one is fixed.
 
     Args:
-        poses: (s, 3) to start from, right to a few decimetres among neighbours.
+        poses: (s, 3) initial values, among neighbours right to a few decimetres.
         cloud: returns.
-        motion: (s - 1, 3) from each pose to the next.
+        motion: (s - 1, 3) from each pose to the next, in its frame.
         sigmas: (3,) of the motion, m, m, rad.
-        doubted: distance of a motion, in sigmas, from which on it is doubted.
+        doubted: robust scale of the motion, see `motion_terms`.
     """
-    tree = cKDTree(np.column_stack([cloud.points, _LAYER_M * cloud.scan]))
-    chosen, weight = _thinned(cloud.scan, len(poses))
+    tree = cKDTree(np.column_stack([cloud.points, _PLANE_SPACING_M * cloud.scan]))
+    chosen, weight = _thin(cloud.scan, len(poses))
     anchor = np.zeros((len(poses), 3, 3))
     anchor[0] = 1e12 * np.eye(3)
+    scans = np.arange(len(poses))
     for gate in _GATES_M:
-        diagonal, beside, right = motion_terms(poses, motion, sigmas, doubted)
+        diagonal, above, right = motion_terms(poses, motion, sigmas, doubted)
+        blocks = [
+            (scans, scans, diagonal + anchor),
+            (scans[:-1], scans[1:], above),
+            (scans[1:], scans[:-1], above.mT),
+        ]
         late, early = _neighbours(poses, weight > 0)
-        blocks = [(np.arange(len(poses)),) * 2 + (diagonal + anchor,)]
-        blocks += [(np.arange(len(motion)), np.arange(1, len(poses)), beside)]
-        blocks += [(np.arange(1, len(poses)), np.arange(len(motion)), beside.mT)]
         for low in range(0, len(late), _PAIRS):
-            i, k = late[low : low + _PAIRS], early[low : low + _PAIRS]
-            H, g = _agreements(poses, cloud, tree, (i, k), chosen[i], weight[i], gate)
-            for a, rows in enumerate((i, k)):
-                np.add.at(right, rows, -g[:, 3 * a : 3 * a + 3])
-                for b, columns in enumerate((i, k)):
-                    blocks.append((rows, columns, H[:, 3 * a : 3 * a + 3, 3 * b : 3 * b + 3]))
-        poses = poses + _solved(blocks, right)
-        poses[:, 2] = wrap(poses[:, 2])
+            pair = late[low : low + _PAIRS], early[low : low + _PAIRS]
+            A, g, F = _match_pairs(poses, cloud, tree, pair, chosen, weight, gate)
+            for rows, F_row in zip(pair, F, strict=True):
+                np.add.at(right, rows, -(F_row.mT @ g[..., None])[..., 0])
+                for columns, F_column in zip(pair, F, strict=True):
+                    blocks.append((rows, columns, F_row.mT @ A @ F_column))
+        poses = step_poses(poses, _solve(blocks, right))
     return poses
 
 
-def _thinned(scan: Ints, scans: int) -> tuple[Ints, Array]:
-    """Returns (s, p) that speak for each scan, and each scan's weight (s,) for one of them."""
+def _thin(scan: Ints, scans: int) -> tuple[Ints, Array]:
+    """Rows (s, p) of the returns that stand for each scan, and the weight (s,) of one of them."""
     bounds = np.searchsorted(scan, np.arange(scans + 1))
     low, high = bounds[:-1], bounds[1:]
     share = np.arange(_POINTS) / _POINTS
@@ -85,68 +97,55 @@ def _thinned(scan: Ints, scans: int) -> tuple[Ints, Array]:
     return np.minimum(chosen, len(scan) - 1), np.minimum((high - low) / _POINTS, 1.0)
 
 
-def _neighbours(poses: Array, seeing: Bools) -> tuple[Ints, Ints]:
-    """Pairs (k,) of scans, the later and the earlier, that should agree."""
+def _neighbours(poses: Array, with_returns: Bools) -> tuple[Ints, Ints]:
+    """Pairs (k,) of scans that are matched, the later and the earlier ones."""
     scans = np.arange(len(poses))
     late = np.repeat(scans, len(_BEFORE))
     early = late - np.tile(_BEFORE, len(scans))
-    few = scans[::_EVERY]
-    again = cKDTree(poses[few, :2]).query_pairs(_NEAR_M, output_type="ndarray")
-    again = few[np.sort(again, axis=1)[:, ::-1]]
-    again = again[again[:, 0] - again[:, 1] >= _AGAIN]
-    late, early = np.concatenate([late, again[:, 0]]), np.concatenate([early, again[:, 1]])
-    both = (early >= 0) & seeing[late] & seeing[early]
-    return late[both], early[both]
+    some = scans[::_EVERY]
+    revisits = cKDTree(poses[some, :2]).query_pairs(_REVISIT_M, output_type="ndarray")
+    revisits = some[np.sort(revisits, axis=1)[:, ::-1]]
+    revisits = revisits[revisits[:, 0] - revisits[:, 1] >= _REVISIT_SCANS]
+    late, early = np.concatenate([late, revisits[:, 0]]), np.concatenate([early, revisits[:, 1]])
+    usable = (early >= 0) & with_returns[late] & with_returns[early]
+    return late[usable], early[usable]
 
 
-def _agreements(
+def _match_pairs(
     poses: Array,
     cloud: Cloud,
     tree: cKDTree,
-    pairs: tuple[Ints, Ints],
+    pair: tuple[Ints, Ints],
     chosen: Ints,
     weight: Array,
     gate_m: float,
-) -> tuple[Array, Array]:
-    """What pairs of scans (k,), (k,) want of their poses.
+) -> tuple[Array, Array, tuple[Array, Array]]:
+    """What the returns of one scan tell about its pose X in the frame of another, for k pairs.
 
     Returns:
-        Information (k, 6, 6) of both poses and gradient (k, 6).
+        Information (k, 3, 3) and gradient (k, 3) of additive errors of X, and its derivatives
+        (k, 3, 3) by the poses of both scans.
     """
-    i, k = pairs
-    R, S = _rotations(poses[i, 2]), _rotations(poses[k, 2])
-    arm = cloud.points[chosen] @ R.mT
-    there = (arm + (poses[i, :2] - poses[k, :2])[:, None]) @ S
-    layer = np.broadcast_to((_LAYER_M * k)[:, None, None], (*there.shape[:2], 1))
-    away, near = tree.query(np.concatenate([there, layer], axis=2), distance_upper_bound=gate_m)
+    late, early = pair
+    X = between(poses[early], poses[late])
+    arms = cloud.points[chosen[late]] @ rotation3(X[:, 2])[:, :2, :2].mT
+    there = arms + X[:, None, :2]
+    planes = np.broadcast_to((_PLANE_SPACING_M * early)[:, None, None], (*there.shape[:2], 1))
+    away, near = tree.query(np.concatenate([there, planes], axis=2), distance_upper_bound=gate_m)
     found = np.isfinite(away)
     near = np.where(found, near, 0)
-    # everything in the frame of the earlier scan turned into the world's directions
-    M = S[:, None] @ cloud.metrics[near] @ S.mT[:, None]
-    target = cloud.points[near] @ S.mT
-    d = np.where(found[..., None], there @ S.mT - target, 0.0)
-    e = np.einsum("...ij,...j->...i", M, d)
-    w = found * weight[:, None] * _SIGMA_M**-2.0
-    w = w / (1 + (e**2).sum(axis=-1) * (2 / gate_m) ** 2) ** 2
-    J = np.zeros((*d.shape, 6))
-    J[..., 0, 0] = J[..., 1, 1] = 1.0
-    J[..., 0, 3] = J[..., 1, 4] = -1.0
-    J[..., 0, 2], J[..., 1, 2] = -arm[..., 1], arm[..., 0]
-    J[..., 0, 5], J[..., 1, 5] = target[..., 1], -target[..., 0]
-    # M is a projection: M = M M
-    rows = (np.sqrt(w)[..., None, None] * (M @ J)).reshape(len(i), -1, 6)
-    left = (np.sqrt(w)[..., None] * e).reshape(len(i), -1)
-    return rows.mT @ rows, np.einsum("kri,kr->ki", rows, left)
+    d = np.where(found[..., None], there - cloud.points[near], 0.0)
+    terms, squared = point_terms(d, cloud.metrics[near], arms)
+    w = found * weight[late, None] * _SIGMA_M**-2.0 * redescending(squared, gate_m)
+    A, g = normal_equations((terms * w).sum(axis=-1))
+    by_late = rotation3(-poses[early, 2])
+    by_early = -by_late
+    by_early[:, 0, 2], by_early[:, 1, 2] = X[:, 1], -X[:, 0]
+    return A, g, (by_late, by_early)
 
 
-def _rotations(angle: Array) -> Array:
-    """Matrices (k, 2, 2) of angles (k,) rad."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
-
-
-def _solved(blocks: list[tuple[Ints, Ints, Array]], right: Array) -> Array:
-    """Solution (s, 3) of a system of 3 x 3 blocks, lists of them with rows and columns."""
+def _solve(blocks: list[tuple[Ints, Ints, Array]], right: Array) -> Array:
+    """Solution (s, 3) of a sparse system of 3 x 3 blocks, given with their rows and columns."""
     three = np.arange(3)
     parts = []
     for rows, columns, values in blocks:

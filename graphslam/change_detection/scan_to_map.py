@@ -12,6 +12,13 @@ import numpy as np
 from graphslam.change_detection.surface_map import Surface
 from graphslam.change_detection.visit import Bools, Ints, Visit
 from graphslam.core.geometry import Array, wrap
+from graphslam.perception.point_to_line import (
+    line_metrics,
+    normal_equations,
+    point_terms,
+    redescending,
+    step_poses,
+)
 
 #: noise of a beam against a surface beside its own, m: neighbouring beams share the surface's
 #: error, so they must not count as independent without end
@@ -42,15 +49,11 @@ def align_scans(
         away[:, 2] = wrap(away[:, 2])
         covs = np.asarray(np.linalg.inv(prior + information))
         right = right + np.einsum("nij,nj->ni", prior, away)
-        poses = now.poses + np.einsum("nij,nj->ni", covs, right)
-        poses[:, 2] = wrap(poses[:, 2])
-        now = replace(now, poses=poses)
+        step = np.einsum("nij,nj->ni", covs, right)
+        now = replace(now, poses=step_poses(now.poses, step))
     # the error is P prior⁻¹ (error of the prior) + (a part of this scan's noise): the first may be
     # common to all scans, and has the covariance P prior⁻¹ P
     return replace(now, covs=covs, shared=covs @ prior @ covs)
-
-
-_UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def scan_normal_equations(
@@ -71,16 +74,11 @@ def scan_normal_equations(
     row, e, found = surface_offsets(surface, ends, gate_m)
     scan = visit.scan[beams][found]
     n, arm = surface.normals[row], ends[found] - visit.poses[scan, :2]
-    J = np.column_stack([n, -n[:, 0] * arm[:, 1] + n[:, 1] * arm[:, 0]])
-    variance = _LEAST_SIGMA_M**2 + surface.noise[row]
-    weight = 1 / variance / (1 + (2 * e / gate_m) ** 2) ** 2
-    information, right = np.empty((size, 3, 3)), np.empty((size, 3))
-    for a, b in _UPPER:
-        total = np.bincount(scan, weight * J[:, a] * J[:, b], size)
-        information[:, a, b] = information[:, b, a] = total
-    for a in range(3):
-        right[:, a] = np.bincount(scan, weight * J[:, a] * -e, size)
-    return information, right
+    terms, squared = point_terms(e[:, None] * n, line_metrics(n), arm)
+    weight = redescending(squared, gate_m) / (_LEAST_SIGMA_M**2 + surface.noise[row])
+    sums = np.stack([np.bincount(scan, weight * term, size) for term in terms])
+    information, gradient = normal_equations(sums)
+    return information, -gradient
 
 
 def surface_offsets(surface: Surface, ends: Array, gate_m: float) -> tuple[Ints, Array, Ints]:

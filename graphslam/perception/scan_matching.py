@@ -14,7 +14,13 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
-from graphslam.core.geometry import Array, between, transform, wrap
+from graphslam.core.geometry import Array, between, transform
+from graphslam.perception.point_to_line import (
+    gauss_newton_step,
+    normal_equations,
+    point_terms,
+    step_poses,
+)
 
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 IntArray = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
@@ -224,8 +230,7 @@ def align(source: Submap, target: Submap, guess: Array) -> tuple[Array, Array]:
         if drawn is None:
             return x, np.diag([1e4, 1e4, 1e4])
         A = drawn.information
-        x -= drawn.step
-        x[2] = wrap(x[2])
+        x = step_poses(x, drawn.step)
         if k > ITERATIONS // 2 and np.abs(drawn.step).max() < 1e-4:
             break
     return x, _covariance(A)
@@ -243,7 +248,7 @@ def fit(source: Submap, target: Submap, pose: Array) -> tuple[float, Array, Arra
     drawn = _drawn(points, target, pose, REACH_LAST_M)
     if drawn is None:
         return 0.0, np.zeros(3), np.diag([1e4, 1e4, 1e4])
-    return drawn.weight / len(points), -drawn.step, _covariance(drawn.information)
+    return drawn.weight / len(points), drawn.step, _covariance(drawn.information)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -262,17 +267,12 @@ def _drawn(points: Array, target: Submap, x: Array, reach: float) -> _Drawn | No
     ok = np.isfinite(distance)
     if ok.sum() < 10:
         return None
-    near = near[ok]
-    p, r = placed[ok], placed[ok] - target.points[near]
-    # J = [I | j], written out: many small matrices cost more than their products
-    (rx, ry), jx, jy = r.T, x[1] - p[:, 1], p[:, 0] - x[0]
-    xx, xy, yy = target.information[near].reshape(-1, 4).T[[0, 1, 3]]
-    ux, uy = xx * rx + xy * ry, xy * rx + yy * ry
-    mx, my = xx * jx + xy * jy, xy * jx + yy * jy
-    w = 1.0 / (1.0 + (rx * ux + ry * uy) / 4.0)
-    sums = np.stack([xx, xy, yy, mx, my, jx * mx + jy * my, ux, uy, jx * ux + jy * uy]) @ w
-    A = sums[[[0, 1, 3], [1, 2, 4], [3, 4, 5]]] + np.diag([1e-4, 1e-4, 1e-4])
-    return _Drawn(np.linalg.solve(A, sums[6:]), A, float(w.sum()))
+    near, p = near[ok], placed[ok]
+    terms, squared = point_terms(p - target.points[near], target.information[near], p - x[:2])
+    w = 1.0 / (1.0 + squared / 4.0)
+    A, g = normal_equations(terms @ w)
+    A += np.diag([1e-4, 1e-4, 1e-4])
+    return _Drawn(gauss_newton_step(A, g), A, float(w.sum()))
 
 
 def _covariance(information: Array) -> Array:
