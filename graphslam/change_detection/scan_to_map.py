@@ -76,7 +76,7 @@ def scan_normal_equations(
     n, arm = surface.normals[row], ends[found] - visit.poses[scan, :2]
     terms, squared = point_terms(e[:, None] * n, line_metrics(n), arm)
     weight = redescending(squared, gate_m) / (_LEAST_SIGMA_M**2 + surface.noise[row])
-    sums = np.stack([np.bincount(scan, weight * term, size) for term in terms])
+    sums = np.array([np.bincount(scan, weight * t, size) for t in terms], dtype=float)
     information, gradient = normal_equations(sums)
     return information, -gradient
 
