@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from graphslam.core.geometry import Array, between, transform
+from graphslam.perception.correlation import occupancy_grid
 from graphslam.perception.point_to_line import (
     gauss_newton_step,
     normal_equations,
@@ -169,14 +170,12 @@ def search(
     points = _some(source.points, SEARCHED)
     sizes = STEP_M, STEP_M, STEP_RAD
     x, y, turns = (_steps(half, size) for half, size in zip(window, sizes, strict=True))
-    field, low = _field(target.points, (len(x), len(y)))
-    shifted = np.lib.stride_tricks.sliding_window_view(field, (len(x), len(y)))
-    last = np.array(shifted.shape[:2]) - 1
+    shape = len(x), len(y)
+    grid = occupancy_grid(target.points, STEP_M, np.array(shape) + 2)
     scores = np.empty((len(turns), len(x), len(y)))
     for row, turn in enumerate(turns):
         placed = transform(np.array([guess[0] + x[0], guess[1] + y[0], guess[2] + turn]), points)
-        at = np.clip(np.round((placed - low) / STEP_M).astype(np.intp), 0, last)
-        scores[row] = shifted[at[:, 0], at[:, 1]].mean(axis=0)
+        scores[row] = grid.correlate_window(placed, shape)
     found: list[Array] = []
     least = max(NEARLY * float(scores.max()), least)
     while len(found) < FOUND and scores.max() > least:
@@ -194,23 +193,6 @@ def _some(points: Array, count: int) -> Array:
 def _steps(half: float, step: float) -> Array:
     n = int(np.ceil(half / step))
     return np.asarray(np.arange(-n, n + 1) * step, dtype=float)
-
-
-def _field(points: Array, room: tuple[int, int]) -> tuple[Array, Array]:
-    """How near a point is to the points (n, 2), on a grid of `STEP_M`: 1 there, 0 far away.
-
-    With so much empty ``room`` round it, in cells, that windows of this size fit there; and the
-    position (2,) of the first cell.
-    """
-    margin = np.array(room) + 2
-    low = points.min(axis=0) - margin * STEP_M
-    cells = np.round((points - low) / STEP_M).astype(np.intp)
-    grid = np.zeros(cells.max(axis=0) + margin + 1, dtype=np.float32)
-    for weight, reach in ((0.5, 1), (1.0, 0)):
-        for i in range(-reach, reach + 1):
-            for j in range(-reach, reach + 1):
-                grid[cells[:, 0] + i, cells[:, 1] + j] = weight
-    return grid, low
 
 
 def align(source: Submap, target: Submap, guess: Array) -> tuple[Array, Array]:

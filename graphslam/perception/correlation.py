@@ -1,0 +1,98 @@
+"""Correlation of points with an occupancy grid at many shifts: the coarse step of scan matching.
+
+Within a window of shifts the grid is read directly; over a whole map its Fourier transform is
+cheaper. Source: E. Olson, ICRA 2009, DOI 10.1109/ROBOT.2009.5152375.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import fft
+
+from graphslam.core.geometry import Array
+
+#: value of cells next to an occupied one, which has 1: a point half a cell off still counts half
+BESIDE = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OccupancyGrid:
+    """Cells of ``cell_m``: ``values`` (nx, ny), 1 where occupied, 0 unknown; first at ``low`` (2,).
+
+    `BESIDE` next to occupied cells.
+    """
+
+    values: NDArray[np.float32]
+    low: Array
+    cell_m: float
+
+    def cells(self, points: Array) -> NDArray[np.intp]:
+        """Cells (n, 2) of points (n, 2) m, which may lie outside of the grid."""
+        return _cells(points - self.low, self.cell_m)
+
+    def correlate_window(self, points: Array, shape: tuple[int, int]) -> Array:
+        """Mean values (shape) under points (n, 2) m that are shifted by 0, 1, ... cells."""
+        windows = np.lib.stride_tricks.sliding_window_view(self.values, shape)
+        x, y = np.clip(self.cells(points), 0, np.array(windows.shape[:2]) - 1).T
+        return np.asarray(windows[x, y].mean(axis=0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GridSpectrum:
+    """Fourier transform of an `OccupancyGrid`, padded to ``shape``; its ``low`` and ``cell_m``."""
+
+    transformed: NDArray[np.complex64]
+    shape: tuple[int, int]
+    low: Array
+    cell_m: float
+
+    def correlate(self, points: Array) -> Array:
+        """Mean values (shape) under points (n, 2) m with their origin in each of the cells."""
+        x, y = _cells(points, self.cell_m).T
+        image = np.zeros(self.shape, dtype=np.float32)
+        np.add.at(image, (x, y), np.float32(1.0 / len(x)))
+        return np.asarray(fft.irfft2(self.transformed * fft.rfft2(image).conj(), self.shape))
+
+
+def occupancy_grid(
+    points: Array,
+    cell_m: float,
+    margin: ArrayLike,
+    free: Array | None = None,
+    free_value: float = 0.0,
+) -> OccupancyGrid:
+    """The grid of occupied points.
+
+    Args:
+        points: (n, 2) m, occupied.
+        cell_m: size of a cell.
+        margin: empty cells on each side, one number or (2,); at least 1.
+        free: (k, 2) m, points in free space; those outside of the grid are left out.
+        free_value: value of their cells unless they are occupied or next to it.
+    """
+    margin = np.asarray(margin)
+    low = points.min(axis=0) - margin * cell_m
+    cells = _cells(points - low, cell_m)
+    grid = OccupancyGrid(np.zeros(cells.max(axis=0) + margin + 1, dtype=np.float32), low, cell_m)
+    values = grid.values
+    if free is not None:
+        at = grid.cells(free)
+        x, y = at[((at >= 0) & (at < values.shape)).all(axis=1)].T
+        values[x, y] = free_value
+    x, y = cells.T
+    for value, reach in ((BESIDE, 1), (1.0, 0)):
+        for i in range(-reach, reach + 1):
+            for j in range(-reach, reach + 1):
+                values[x + i, y + j] = value
+    return grid
+
+
+def grid_spectrum(grid: OccupancyGrid) -> GridSpectrum:
+    """The Fourier transform of a grid, for correlation at all shifts."""
+    nx, ny = (fft.next_fast_len(size, real=True) for size in grid.values.shape)
+    return GridSpectrum(fft.rfft2(grid.values, (nx, ny)), (nx, ny), grid.low, grid.cell_m)
+
+
+def _cells(points: Array, cell_m: float) -> NDArray[np.intp]:
+    return np.asarray(np.round(points / cell_m).astype(np.intp))
