@@ -1,6 +1,6 @@
 """Logs in and out: MCAP files to time-ordered records, other formats to MCAP.
 
-`mcap` and `rosbags` are known to this package only. See docs/logs.md.
+No other package imports `mcap` or `rosbags`. See docs/logs.md.
 """
 
 from graphslam.logs.import_pose_graph import pose_stamp_ns

@@ -1,4 +1,4 @@
-"""Robots' clocks: what each reads at one time, and messages put on one time line."""
+"""Robots' clocks: local against common time, and messages of all robots on one time line."""
 
 import heapq
 from collections.abc import Iterable, Iterator, Mapping
@@ -13,56 +13,56 @@ IntArray = np.ndarray[tuple[int], np.dtype[np.int64]]
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """What a robot's clock reads more than the common one: ``offset_s`` at ``epoch_ns``, growing.
+    """Error of a robot's clock: local minus common time is ``offset_s`` at ``epoch_ns``.
 
-    ``drift`` is in seconds per second. The common clock is that of the first robot.
+    It grows by ``drift`` seconds per second. The common clock is that of the first robot.
     """
 
     offset_s: float = 0.0
     drift: float = 0.0
     epoch_ns: int = 0
 
-    def to_local(self, time_ns: IntArray) -> IntArray:
-        """What it reads (n,) at times (n,) of the common clock."""
-        since = time_ns - self.epoch_ns
-        ahead = np.rint(1e9 * self.offset_s + self.drift * since).astype(np.int64)
-        return np.asarray(time_ns + ahead)
+    def to_local(self, common_ns: IntArray) -> IntArray:
+        """Readings (n,) ns of this clock at times (n,) ns of the common clock."""
+        elapsed = common_ns - self.epoch_ns
+        error = np.rint(1e9 * self.offset_s + self.drift * elapsed).astype(np.int64)
+        return np.asarray(common_ns + error)
 
-    def to_common(self, own_ns: int) -> int:
-        """Time of the common clock when it reads ``own_ns``."""
-        since = own_ns - self.epoch_ns - 1e9 * self.offset_s
-        return self.epoch_ns + round(since / (1.0 + self.drift))
+    def to_common(self, local_ns: int) -> int:
+        """Time of the common clock when this clock reads ``local_ns``."""
+        elapsed = local_ns - self.epoch_ns - 1e9 * self.offset_s
+        return self.epoch_ns + round(elapsed / (1.0 + self.drift))
 
     def adjusted(self, offset_s: float, drift: float) -> "Clock":
-        """A clock that is ahead by so much more."""
+        """The clock with ``offset_s`` and ``drift`` added to its own."""
         return replace(self, offset_s=self.offset_s + offset_s, drift=self.drift + drift)
 
 
 def to_common_clock(messages: Iterable[Message], clocks: Mapping[str, Clock]) -> Iterator[Message]:
-    """Messages with their times by the common clock, in its order; stamps stay as they are.
+    """Messages with their ``time_ns`` in common time, sorted by it; stamps are not changed.
 
     Args:
-        messages: in the order of their own times.
-        clocks: of the robots whose clock differs.
+        messages: sorted by local time.
+        clocks: of the robots whose clocks differ from the common one.
     """
     if not clocks:
         yield from messages
         return
     heap: list[tuple[int, int, Message]] = []
     for number, message in enumerate(messages):
-        own_ns = message.time_ns
-        moved = _moved(message, clocks)
-        heapq.heappush(heap, (moved.time_ns, number, moved))
-        # whatever comes still has a later time of its own
-        safe_ns = min(own_ns, *(clock.to_common(own_ns) for clock in clocks.values()))
+        local_ns = message.time_ns
+        converted = _in_common_time(message, clocks)
+        heapq.heappush(heap, (converted.time_ns, number, converted))
+        # local times do not decrease, so no later message can come before this common time
+        safe_ns = min(local_ns, *(clock.to_common(local_ns) for clock in clocks.values()))
         while heap and heap[0][0] < safe_ns:
             yield heapq.heappop(heap)[2]
     while heap:
         yield heapq.heappop(heap)[2]
 
 
-def _moved(message: Message, clocks: Mapping[str, Clock]) -> Message:
-    """The message by the common clock."""
+def _in_common_time(message: Message, clocks: Mapping[str, Clock]) -> Message:
+    """The message with all its times by the common clock."""
     if isinstance(message, RelativePose) and message.other in clocks:
         message = replace(message, start_ns=clocks[message.other].to_common(message.start_ns))
     clock = clocks.get(message.robot)

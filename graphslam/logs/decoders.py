@@ -1,7 +1,7 @@
-"""From one decoded ROS message to one of our records: a row of `DECODERS` per schema.
+"""ROS messages to the records of `graphslam.core.records`: one row of `DECODERS` per schema.
 
-A decoder is a pure function of the message and of what is known about its topic. It raises
-`UnusableError` with a reason when the message must be dropped; the caller counts reasons.
+A decoder is a function of the message and of the topic's `TopicContext`. It raises
+`UnusableMessageError` with a reason when the message must be dropped; the caller counts reasons.
 """
 
 import math
@@ -26,11 +26,11 @@ class UnusableMessageError(Exception):
 
 @dataclass(frozen=True)
 class TopicContext:
-    """What a decoder knows about a topic beside the message.
+    """What a decoder needs to know about a topic in addition to the message.
 
-    ``mounts`` gives the pose (3,) of a sensor frame in the base frame; ``inverted`` names the
-    frames of sensors that hang upside down. Ranges of ``no_return_m`` and more mean no return.
-    ``beams`` counts single beams that were dropped from scans that stay, by reason.
+    ``mounts`` gives the pose (3,) of each sensor frame in the base frame; ``inverted`` names the
+    frames of sensors that are mounted upside down. Ranges of ``no_return_m`` or more mean no
+    return. ``beams`` counts dropped beams of scans that are kept, by reason.
     """
 
     robot: str
@@ -46,21 +46,21 @@ Decode = Callable[[Any, TopicContext], records.Message]
 
 
 class Decoder(NamedTuple):
-    """A row of `DECODERS`: what comes out, and how; ``read`` where bytes are not for `decode`."""
+    """A row of `DECODERS`: record type, decoder, and optionally a faster `schemas.decode`."""
 
     record: type[records.Message]
     decode: Decode
-    read: Callable[[bytes], Any] | None = None
+    deserialize: Callable[[bytes], Any] | None = None
 
 
 def scan(message: Any, topic: TopicContext) -> records.Scan:
-    """sensor_msgs/LaserScan: ranges (n,) m, NaN where a beam gave nothing; beams counter-clockwise.
+    """sensor_msgs/LaserScan: ranges (n,) m, NaN without a return; beams counter-clockwise.
 
-    inf and NaN are ROS' way to say no return, and 0 that of many drivers. Negative and absurd
-    ranges are errors of a driver: dropped beam by beam and counted.
+    ROS uses inf and NaN for no return, many drivers use 0. Negative ranges and ranges above
+    `MAX_RANGE_M` are driver errors: these beams are dropped and counted.
 
     Raises:
-        UnusableError: no beams, or an angle increment that is zero or not finite.
+        UnusableMessageError: no beams, or an angle increment that is zero or not finite.
     """
     ranges = np.asarray(message.ranges, dtype=float)
     start, step = float(message.angle_min), float(message.angle_increment)
@@ -81,7 +81,7 @@ def scan(message: Any, topic: TopicContext) -> records.Scan:
         topic.beams["range: absurd"] += int(absurd.sum())
     low, high = float(message.range_min), float(message.range_max)
     usable = finite & (ranges > 0) & (ranges <= MAX_RANGE_M) & (ranges < topic.no_return_m)
-    # a driver that leaves the limits at 0, or writes NaN or inf, does not limit anything
+    # limits of 0, NaN or inf were not set by the driver: no limit
     if low > 0:
         usable &= ranges >= low
     if high > 0:
@@ -89,7 +89,7 @@ def scan(message: Any, topic: TopicContext) -> records.Scan:
     ranges[~usable] = np.nan
     frame = frame_of(message)
     if frame in topic.inverted:
-        # seen from above, an upside-down laser turns clockwise
+        # seen from above, an upside-down laser scans clockwise
         start, step = -start, -step
     if step < 0:
         start, step = start + step * (len(ranges) - 1), -step
@@ -103,7 +103,7 @@ def odometry(message: schemas.PlanarOdometry, topic: TopicContext) -> records.Od
     """nav_msgs/Odometry: the pose (3,) of the base in the odometry frame.
 
     Raises:
-        UnusableError: the pose is not finite or its quaternion is no rotation.
+        UnusableMessageError: the pose is not finite or its quaternion is not a rotation.
     """
     stamp, x, y, (q_x, q_y, q_z, q_w) = message
     norm = q_x * q_x + q_y * q_y + q_z * q_z + q_w * q_w
@@ -119,7 +119,7 @@ def joint_state(message: Any, topic: TopicContext) -> records.WheelAngles:
     """sensor_msgs/JointState: the angles of the left and the right wheel, rad.
 
     Raises:
-        UnusableError: a wheel is missing or named twice, or its angle is not finite.
+        UnusableMessageError: a wheel is missing or named twice, or its angle is not finite.
     """
     positions = dict(zip(message.name, np.asarray(message.position).tolist(), strict=False))
     left = _joint(positions, topic.left_joint, "left")
@@ -133,7 +133,7 @@ def sighting(message: Any, topic: TopicContext) -> records.Sighting:
     """graphslam_msgs/Sighting.
 
     Raises:
-        UnusableError: something is not finite, the range is not positive, a variance is not.
+        UnusableMessageError: a number is not finite, or the range or covariance is not positive.
     """
     size = 2 if np.isnan(message.direction) else 3
     z = np.array([message.bearing, message.range, message.direction])[:size]
@@ -151,7 +151,8 @@ def odometry_increment(message: Any, topic: TopicContext) -> records.OdometryInc
     """graphslam_msgs/OdometryIncrement.
 
     Raises:
-        UnusableError: it ends before it starts, is not finite, or its covariance is not positive.
+        UnusableMessageError: its end is not after its start, a number is not finite, or the
+            covariance is not positive definite.
     """
     start, stamp = schemas.stamp_ns(message.start), stamp_of(message)
     if stamp <= start:
@@ -165,7 +166,7 @@ def relative_pose(message: Any, topic: TopicContext) -> records.RelativePose:
     """graphslam_msgs/RelativePose.
 
     Raises:
-        UnusableError: something is not finite or a variance is not positive.
+        UnusableMessageError: a number is not finite, or the covariance is not positive definite.
     """
     start, stamp = schemas.stamp_ns(message.start), stamp_of(message)
     delta = _pose("relative pose", message)
@@ -178,7 +179,7 @@ def true_pose(message: Any, topic: TopicContext) -> records.Truth:
     """graphslam_msgs/TruePose.
 
     Raises:
-        UnusableError: the pose is not finite.
+        UnusableMessageError: the pose is not finite.
     """
     stamp = stamp_of(message)
     return records.Truth(topic.robot, stamp, stamp, _pose("truth", message))
@@ -188,7 +189,7 @@ def true_landmark(message: Any, _topic: TopicContext) -> records.TrueLandmark:
     """graphslam_msgs/TrueLandmark.
 
     Raises:
-        UnusableError: an unknown kind, a position that is not finite, an extent of a wrong size.
+        UnusableMessageError: unknown kind, position not finite, or extent of a wrong size.
     """
     if message.kind not in ("point", "segment", "line"):
         raise UnusableMessageError("true landmark: kind is not point, segment or line")
@@ -206,7 +207,7 @@ def true_associations(message: Any, topic: TopicContext) -> records.TrueAssociat
     """graphslam_msgs/TrueAssociations.
 
     Raises:
-        UnusableError: a target is not among the names.
+        UnusableMessageError: a target is not among the names.
     """
     names, targets = tuple(message.names), np.asarray(message.targets, dtype=np.int64)
     if len(targets) and not -1 <= targets.min() <= targets.max() < len(names):
@@ -236,7 +237,7 @@ def stamp_of(message: Any) -> int:
 
 
 def frame_of(message: Any) -> str:
-    """Frame of a message's header; ROS 1 tools write a leading slash that means nothing."""
+    """Frame of a message's header, without the leading slash that ROS 1 tools write."""
     return str(message.header.frame_id).lstrip("/")
 
 
@@ -252,7 +253,7 @@ def _pose(what: str, message: Any) -> Array:
 
 
 def _covariance(what: str, values: Any, size: int) -> Array:
-    """The upper left (size, size) of nine numbers, symmetric to the last bit."""
+    """The upper left (size, size) block of nine numbers, made exactly symmetric."""
     cov = np.asarray(values, dtype=float).reshape(3, 3)[:size, :size]
     cov = np.asarray((cov + cov.T) / 2)
     _check_finite(what, cov)

@@ -1,69 +1,67 @@
 """CARMEN logs (the format of the Radish and Freiburg data sets) to MCAP.
 
 FLASER lines become LaserScan, ODOM lines Odometry, PARAM robot_frontlaser_offset the laser's
-mount. The ipc time (third field from the end) is the stamp, to the digit, since the published
+mount. The stamp is exactly the ipc time (third field from the end), because the published
 relations refer to it.
 """
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from decimal import Decimal, DecimalException
 from itertools import accumulate
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graphslam.core.errors import LogError
-from graphslam.logs.import_summary import ImportSummary, text_lines
+from graphslam.logs.decoders import MAX_RANGE_M
+from graphslam.logs.import_summary import ImportSummary
 from graphslam.logs.no_return import find_no_return
+from graphslam.logs.source_files import text_lines
 from graphslam.logs.writer import DEFAULT_ROBOT, LogWriter
 
 Ranges = NDArray[np.float32]
 
 _ROBOT = DEFAULT_ROBOT
-_TRAILER = 3  # ipc time, host, logger time
-_SCAN_TAIL = 6  # laser pose and odometry pose behind the ranges
-_SAMPLE_EVERY = 20  # scans that are looked at for the no-return value
-_BEYOND_M = 1000.0  # range limit of a laser that never reports "no return"
+_TRAILER = 3  # fields at the end: ipc time, host, logger time
+_SCAN_TAIL = 6  # fields after the ranges: laser pose and odometry pose
+_SAMPLE_EVERY = 20  # every 20th scan is searched for the no-return value
 
 
-@dataclass(frozen=True, slots=True)
-class _Odometry:
+class _Odometry(NamedTuple):
     stamp_ns: int
     pose: tuple[float, float, float]
 
 
-@dataclass(frozen=True, slots=True)
-class _Scan:
+class _Scan(NamedTuple):
     stamp_ns: int
     ranges: Ranges
 
 
-@dataclass(frozen=True, slots=True)
-class _Offset:
+class _LaserOffset(NamedTuple):
     forward_m: float
 
 
 def import_carmen(source: Path, target: Path) -> ImportSummary:
     """Convert the CARMEN log ``source`` (plain, .gz, .bz2, .xz) to the MCAP file ``target``.
 
-    The ranges stay as they are (float32); ``range_max`` is set just below the range with which
-    the log says "no return", so that ROS tools take it for what it is. The order of the file is
-    kept by the log times, its stamps jump back and forth.
+    Ranges are not changed (float32); ``range_max`` is set just below the log's no-return value, so
+    that ROS tools interpret it correctly. Stamps in these files are not monotonic; the log times
+    keep the order of the file.
 
     Raises:
         LogError: ``source`` cannot be read, or holds neither scans nor odometry.
         OutputError: ``target`` cannot be written.
     """
     malformed: Counter[str] = Counter()
-    # kept whole, about 4 bytes per beam: the log times need what comes last first
+    # all in memory, about 4 bytes per beam: the log times are computed from the end
     entries = list(_entries(source, malformed))
-    offsets = [entry.forward_m for entry in entries if isinstance(entry, _Offset)]
-    stamped = [entry for entry in entries if not isinstance(entry, _Offset)]
+    offsets = [entry.forward_m for entry in entries if isinstance(entry, _LaserOffset)]
+    stamped = [entry for entry in entries if not isinstance(entry, _LaserOffset)]
     if not stamped:
-        raise LogError(f"{source}: has no FLASER or ODOM line that can be read; is it CARMEN?")
+        raise LogError(f"{source}: has no readable FLASER or ODOM line; is it CARMEN? Name the log")
     log_times = _recording_times([entry.stamp_ns for entry in stamped])
     range_max = _range_max([entry.ranges for entry in stamped if isinstance(entry, _Scan)])
     notes = {"format": "carmen", "source": source.name, "stamps": "ipc time, exact"}
@@ -88,24 +86,24 @@ def import_carmen(source: Path, target: Path) -> ImportSummary:
 
 
 def _recording_times(stamps_ns: Sequence[int]) -> list[int]:
-    """Times of recording: they never decrease, so that readers keep the order of the file.
+    """Log times that never decrease, so that readers keep the order of the file.
 
-    The line was written before all lines behind it, so not after the earliest of their stamps.
+    A line was written before all lines after it, hence not later than the earliest of their stamps.
     """
     return list(accumulate(reversed(stamps_ns), min))[::-1]
 
 
 def _range_max(scans: Sequence[Ranges]) -> float:
-    """Just below the range that means no return, as float32 like the ranges."""
+    """Largest float32 below the no-return range; without one, the limit for any laser."""
     no_return = find_no_return(scans[::_SAMPLE_EVERY])
-    return _BEYOND_M if no_return is None else float(np.nextafter(np.float32(no_return), 0))
+    return MAX_RANGE_M if no_return is None else float(np.nextafter(np.float32(no_return), 0))
 
 
 def parse_stamp_ns(text: str) -> int:
-    """Nanoseconds of decimal seconds, exact to the ninth digit, never through a float.
+    """Nanoseconds of decimal seconds, exact to the ninth decimal, never through a float.
 
     Raises:
-        ValueError: it is not a decimal number, or more than the 32 bits of a ROS stamp hold.
+        ValueError: not a decimal number, or too large for the 32-bit seconds of a ROS stamp.
     """
     try:
         seconds = Decimal(text)
@@ -117,7 +115,7 @@ def parse_stamp_ns(text: str) -> int:
 
 
 def _beam_angles(beams: int) -> tuple[float, float]:
-    """First angle and step, rad, of a laser that looks 180 degrees ahead.
+    """First angle and step, rad, of a laser with a field of view of 180 degrees ahead.
 
     CARMEN's convention: the first beam points to -90 degrees. An odd number of beams includes
     +90 degrees (181 at 1, 361 at 0.5), an even number stops one step short of it (180 at 1).
@@ -125,8 +123,8 @@ def _beam_angles(beams: int) -> tuple[float, float]:
     return -np.pi / 2, np.pi / (beams - beams % 2) if beams > 1 else np.pi
 
 
-def _entries(source: Path, malformed: Counter[str]) -> Iterator[_Odometry | _Scan | _Offset]:
-    """What the lines of a log say, in the order of the file; counts those that say nonsense."""
+def _entries(source: Path, malformed: Counter[str]) -> Iterator[_Odometry | _Scan | _LaserOffset]:
+    """The parsed lines of a log in the order of the file; malformed lines are counted by tag."""
     for line in text_lines(source):
         fields = line.split()
         if not fields or fields[0] not in _PARSERS:
@@ -152,17 +150,17 @@ def _scan(fields: list[str]) -> _Scan:
     """FLASER n r1..rn x y theta odom_x odom_y odom_theta ipc_timestamp host logger_timestamp."""
     beams = int(fields[1])
     if len(fields) != 2 + beams + _SCAN_TAIL + _TRAILER:
-        raise ValueError("the number of ranges is not what the line says")
+        raise ValueError("the number of ranges differs from the count in the line")
     ranges = np.array([float(field) for field in fields[2 : 2 + beams]], dtype=np.float32)
     return _Scan(parse_stamp_ns(fields[-_TRAILER]), ranges)
 
 
-def _parameter(fields: list[str]) -> _Offset | None:
+def _parameter(fields: list[str]) -> _LaserOffset | None:
     """PARAM name value ipc_timestamp host logger_timestamp."""
-    return _Offset(float(fields[2])) if fields[1] == "robot_frontlaser_offset" else None
+    return _LaserOffset(float(fields[2])) if fields[1] == "robot_frontlaser_offset" else None
 
 
-_PARSERS: dict[str, Callable[[list[str]], _Odometry | _Scan | _Offset | None]] = {
+_PARSERS: dict[str, Callable[[list[str]], _Odometry | _Scan | _LaserOffset | None]] = {
     "ODOM": _odometry,
     "FLASER": _scan,
     "PARAM": _parameter,

@@ -1,7 +1,7 @@
 """MRCLAM data sets (UTIAS Multi-Robot Cooperative Localization and Mapping) to MCAP.
 
-A set is a folder, or an archive of it: per robot velocities, sightings of barcodes and, where
-there is any, truth; one table says which subject (a robot or a landmark) bears which barcode.
+A data set is a folder, or an archive of it: per robot commanded velocities, sightings of barcodes
+and optionally ground truth. One table maps barcodes to subjects (robots or landmarks).
 
 Format: K. Y. K. Leung, Y. Halpern, T. D. Barfoot, H. H. T. Liu, The UTIAS multi-robot cooperative
 localization and mapping dataset, IJRR 30(8), 2011, DOI 10.1177/0278364911398404.
@@ -22,18 +22,18 @@ from graphslam.core.errors import LogError
 from graphslam.core.geometry import Array, compose, exp
 from graphslam.logs.import_carmen import parse_stamp_ns
 from graphslam.logs.import_summary import ImportSummary
-from graphslam.logs.source_files import text_files
+from graphslam.logs.source_files import first_and_all, text_files
 from graphslam.logs.writer import LogWriter
 
-#: subjects up to this number are robots, the others landmarks
+#: subjects 1 .. 5 are robots, the others landmarks; part of the format
 ROBOTS = 5
-#: noise of one sighting; the files do not state it. The camera sees a barcode's direction to a few
-#: pixels and takes the range from its apparent height, so errors of range grow with it.
+#: Noise of one sighting, assumed: the files do not state it. The camera measures a barcode's
+#: bearing to a few pixels and its range by the apparent height, so range errors grow with range.
 BEARING_SIGMA_RAD = 0.015
 RANGE_SIGMA_M, RANGE_SIGMA_SHARE = 0.05, 0.03
-#: noise of driving what was commanded, variances per m or rad (see OdometryConfig). Motors follow
-#: after 0.1 to 0.3 s, not always the same, so a turn of some tenths of a rad misses by some
-#: hundredths; speeds are met to a few per cent.
+#: Motion noise of commanded velocities, variances per m or rad (see OdometryConfig). The motors
+#: follow with a varying delay of 0.1 to 0.3 s, so a turn of some tenths of a rad errs by some
+#: hundredths; speeds are reached to a few per cent.
 COMMANDED = {
     "odometry.commanded_velocities": "true",
     "odometry.k_x_m": "2e-3",
@@ -41,16 +41,16 @@ COMMANDED = {
     "odometry.k_phi_m": "2e-3",
     "odometry.k_phi_rad": "5e-3",
 }
-#: ns: poses are written this far apart at most, and not nearer than needed for that. Within so
-#: short a time it hardly matters when exactly the velocity changed
-LONGEST_ARC_NS = 100_000_000
+#: ns: longest time between two written poses; rows in between are left out. In 0.1 s it hardly
+#: matters when exactly the velocity changed.
+MAX_ARC_NS = 100_000_000
 
 _FILES = re.compile(
     r"(Barcodes|Landmark_Groundtruth|Robot(\d+)_(Odometry|Measurement|Groundtruth))\.dat"
 )
 
 Rows = list[tuple[int, list[float]]]
-#: what to write, and the stamp that it is written at
+#: stamp ns, and what writes the message
 Entry = tuple[int, Callable[[LogWriter], None]]
 
 
@@ -58,10 +58,11 @@ def import_mrclam(source: Path, target: Path) -> ImportSummary:
     """Convert an MRCLAM data set (folder, .zip, .tar or compressed .tar) to ``target``.
 
     Robots are ``robot1``, ``robot2``, ...; landmarks have their subject's number as identity. A
-    velocity holds until the robot's next row, so each row but the last is an arc; Odometry is the
-    poses that these arcs compound to, from the origin, every 0.1 s. How well commands are driven
-    goes into the log's notes as ``odometry.*``, where reading finds it. True poses and landmarks go
-    in where present. What cannot be used is counted by reason in the summary's warnings.
+    velocity holds until the robot's next row, so each row but the last is an arc; Odometry poses
+    compound these arcs from the origin, at most 0.1 s apart. The motion noise of commanded
+    velocities goes into the log's notes as ``odometry.*``, from which `smooth` takes it. True poses
+    and landmarks are written where present. Unusable lines are counted by reason in the summary's
+    warnings.
 
     Raises:
         LogError: ``source`` cannot be read, or has no odometry or no table of barcodes.
@@ -75,23 +76,23 @@ def import_mrclam(source: Path, target: Path) -> ImportSummary:
             "archive of one data set"
         )
     if "Barcodes.dat" not in texts:
-        raise LogError(f"{source}: has no Barcodes.dat, the table of who bears which barcode")
-    odd: Counter[str] = Counter()
-    subjects = _subjects(texts["Barcodes.dat"], odd)
+        raise LogError(f"{source}: has no Barcodes.dat, the table of barcodes; add it")
+    problems: Counter[str] = Counter()
+    subjects = _subjects(texts["Barcodes.dat"], problems)
     streams: list[Iterator[Entry]] = []
     for number in sorted(numbers):
         files = {kind: f"Robot{number}_{kind}.dat" for kind in ("Odometry", "Measurement")}
         truth = f"Robot{number}_Groundtruth.dat"
-        odometry = _rows(files["Odometry"], texts, 2, odd)
-        seen = _rows(files["Measurement"], texts, 3, odd)
+        odometry = _rows(files["Odometry"], texts, 2, problems)
+        seen = _rows(files["Measurement"], texts, 3, problems)
         streams.append(_odometry(number, odometry))
-        streams.append(_sightings(number, seen, subjects, odd))
-        streams.append(_truth(number, _rows(truth, texts, 3, odd)))
-        odd.update({f"{name} is missing": 1 for name in files.values() if name not in texts})
-    entries = heapq.merge(*streams, key=lambda entry: entry[0])
-    first = next(entries, None)
-    if first is None:
-        raise LogError(f"{source}: no line of its files can be read; is it MRCLAM?")
+        streams.append(_sightings(number, seen, subjects, problems))
+        streams.append(_truth(number, _rows(truth, texts, 3, problems)))
+        problems.update({f"{name} is missing": 1 for name in files.values() if name not in texts})
+    (first_ns, _), entries = first_and_all(
+        heapq.merge(*streams, key=lambda entry: entry[0]),
+        f"{source}: no line of its files can be read; is it MRCLAM?",
+    )
     notes = {
         "format": "mrclam",
         "source": source.name,
@@ -101,25 +102,25 @@ def import_mrclam(source: Path, target: Path) -> ImportSummary:
         **COMMANDED,
     }
     with LogWriter(target, notes) as log:
-        for subject, x, y in _landmarks(texts.get("Landmark_Groundtruth.dat", ""), odd):
-            log.true_landmark(first[0], str(subject), "point", (x, y, np.nan))
-        for _, write in (first, *entries):
+        for subject, x, y in _landmarks(texts.get("Landmark_Groundtruth.dat", ""), problems):
+            log.true_landmark(first_ns, str(subject), "point", (x, y, np.nan))
+        for _, write in entries:
             write(log)
-    warnings = [f"{source}: {n} x {reason}" for reason, n in sorted(odd.items())]
+    warnings = [f"{source}: {n} x {reason}" for reason, n in sorted(problems.items())]
     return ImportSummary(source, target, log.counts, tuple(warnings))
 
 
-# ---------------------------------------------------------------- what goes into the log
+# ---------------------------------------------------------------- messages of one robot
 
 
 def _odometry(number: int, rows: Rows) -> Iterator[Entry]:
-    """Poses that the velocities compound to: each holds until the next row."""
+    """Poses that result from the velocities, each of which holds until the next row."""
     times = np.array([stamp for stamp, _ in rows], dtype=np.int64)
     seconds = np.diff(times) * 1e-9
     speeds = np.array([row for _, row in rows]).reshape(-1, 2)[:-1]
     twists = np.column_stack([speeds[:, 0], np.zeros(len(speeds)), speeds[:, 1]])
-    poses = _compounded(twists * seconds[:, None])
-    for k in _kept(times.tolist()):
+    poses = _integrate(twists * seconds[:, None])
+    for k in _thinned(times.tolist()):
         stamp_ns, pose = int(times[k]), poses[k]
         yield (
             stamp_ns,
@@ -127,19 +128,18 @@ def _odometry(number: int, rows: Rows) -> Iterator[Entry]:
         )
 
 
-def _kept(times: list[int]) -> Iterator[int]:
-    """Places of the rows that are written: the ends, and what is needed between."""
+def _thinned(times: list[int]) -> Iterator[int]:
+    """Indices of the rows to write: both ends, and as few others as `MAX_ARC_NS` allows."""
     kept: int | None = None
     for k, time_ns in enumerate(times):
-        # dropped only if the arc would not become longer than allowed without it
         last = k == len(times) - 1
-        if kept is None or last or times[k + 1] - kept > LONGEST_ARC_NS:
+        if kept is None or last or times[k + 1] - kept > MAX_ARC_NS:
             kept = time_ns
             yield k
 
 
-def _compounded(twists: Array) -> Array:
-    """Poses (n + 1, 3) after 0 .. n arcs ``exp(twist)``, twists (n, 3), from the origin."""
+def _integrate(twists: Array) -> Array:
+    """Poses (n + 1, 3) after 0 .. n arcs ``exp(twist)`` from the origin, twists (n, 3)."""
     step = exp(twists)
     heading = np.concatenate([[0.0], np.cumsum(step[:, 2])])
     turned = np.column_stack([np.zeros((len(step), 2)), heading[:-1]])
@@ -148,17 +148,17 @@ def _compounded(twists: Array) -> Array:
 
 
 def _sightings(
-    number: int, rows: Rows, subjects: Mapping[int, int], odd: Counter[str]
+    number: int, rows: Rows, subjects: Mapping[int, int], problems: Counter[str]
 ) -> Iterator[Entry]:
-    """Sightings of subjects; barcodes that nobody bears, or the robot itself, are counted."""
+    """Sightings of subjects; unknown barcodes and the robot's own are counted."""
     for stamp_ns, (barcode, range_m, bearing) in rows:
         subject = subjects.get(int(barcode))
         if subject is None:
-            odd[f"sighting by {_name(number)} of unknown barcode {barcode:g}"] += 1
+            problems[f"sighting by {_name(number)} of unknown barcode {barcode:g}"] += 1
         elif subject == number:
-            odd[f"sighting by {_name(number)} of its own barcode {barcode:g}"] += 1
+            problems[f"sighting by {_name(number)} of its own barcode {barcode:g}"] += 1
         elif range_m <= 0:
-            odd[f"sighting by {_name(number)} with a range that is not positive"] += 1
+            problems[f"sighting by {_name(number)} with a range that is not positive"] += 1
         else:
             sigmas = [BEARING_SIGMA_RAD, RANGE_SIGMA_M + RANGE_SIGMA_SHARE * range_m]
             yield (
@@ -195,11 +195,11 @@ def _lines(text: str) -> Iterator[list[str]]:
             yield fields
 
 
-def _rows(name: str, texts: Mapping[str, str], columns: int, odd: Counter[str]) -> Rows:
-    """Stamp and numbers of each line of a file, sorted by stamp; others are counted.
+def _rows(name: str, texts: Mapping[str, str], columns: int, problems: Counter[str]) -> Rows:
+    """Stamp and numbers of each line of a file, sorted by stamp; malformed lines are counted.
 
-    Sorting is stable: what was seen in one image stays in its order. Of two rows of odometry with
-    one stamp the first holds for no time at all.
+    Sorting is stable: sightings of one image keep their order. Of two odometry rows with the same
+    stamp the first has no effect.
     """
     rows: Rows = []
     for fields in _lines(texts.get(name, "")):
@@ -209,32 +209,32 @@ def _rows(name: str, texts: Mapping[str, str], columns: int, odd: Counter[str]) 
                 raise ValueError
             rows.append((parse_stamp_ns(fields[0]), values))
         except ValueError:
-            odd[f"{name}: a line that cannot be read"] += 1
+            problems[f"{name}: a line that cannot be read"] += 1
     back = sum(after[0] < before[0] for before, after in pairwise(rows))
     if back:
-        odd[f"{name}: stamp earlier than the one before, sorted"] += back
+        problems[f"{name}: stamp earlier than the one before, sorted"] += back
         rows.sort(key=lambda row: row[0])
     return rows
 
 
-def _subjects(text: str, odd: Counter[str]) -> dict[int, int]:
-    """Barcode -> subject; of two subjects with one barcode the first."""
+def _subjects(text: str, problems: Counter[str]) -> dict[int, int]:
+    """Barcode -> subject; of two subjects with the same barcode the first."""
     subjects: dict[int, int] = {}
     for fields in _lines(text):
         try:
             subject, barcode = map(int, fields)
         except ValueError:
-            odd["Barcodes.dat: a line that cannot be read"] += 1
+            problems["Barcodes.dat: a line that cannot be read"] += 1
             continue
         if subjects.setdefault(barcode, subject) != subject:
-            odd[f"Barcodes.dat: barcode {barcode} is borne by two subjects; the first counts"] += 1
+            problems[f"Barcodes.dat: barcode {barcode} has two subjects; the first is used"] += 1
     return subjects
 
 
-def _landmarks(text: str, odd: Counter[str]) -> Iterator[tuple[int, float, float]]:
-    """Subject, x m, y m; the two standard deviations behind them are not used."""
+def _landmarks(text: str, problems: Counter[str]) -> Iterator[tuple[int, float, float]]:
+    """Subject, x m, y m of each true landmark; the standard deviations are not used."""
     for fields in _lines(text):
         try:
             yield int(fields[0]), float(fields[1]), float(fields[2])
         except (ValueError, IndexError):
-            odd["Landmark_Groundtruth.dat: a line that cannot be read"] += 1
+            problems["Landmark_Groundtruth.dat: a line that cannot be read"] += 1

@@ -1,8 +1,8 @@
 """Pose graphs (iSAM text, TORO .graph, g2o) to MCAP.
 
-Measured values and noise mean exactly what gtsam's `load2D` (`readG2o` for g2o files) makes of
-them, so that our results can be judged by the file's own factors. Such files have no times:
-stamps are invented, one second apart, and the log says so.
+Measurements and noise are interpreted exactly as by gtsam's `load2D` (`readG2o` for g2o files), so
+that results can be compared with the file's own factors. Such files have no times: stamps are
+invented, one second apart, and the log's notes say so.
 """
 
 import re
@@ -17,8 +17,9 @@ from typing import TypeVar
 import numpy as np
 
 from graphslam.core.errors import LogError
-from graphslam.core.geometry import Array, inverse, rotate_cov, rotation, wrap
-from graphslam.logs.import_summary import ImportSummary, text_lines
+from graphslam.core.geometry import Array, adjoint, inverse, rotate_cov, wrap
+from graphslam.logs.import_summary import ImportSummary
+from graphslam.logs.source_files import text_lines
 from graphslam.logs.writer import DEFAULT_ROBOT, LogWriter
 
 _T = TypeVar("_T")
@@ -31,7 +32,7 @@ _STAMPS = "invented: the source has none; pose number k (from 0) is stamped k+1 
 class Edge:
     """Pose (3,) of ``end`` in the frame of ``start``; ``cov`` (3, 3) along the axes of *end*.
 
-    That is gtsam's convention: the error is the logarithm of measured^-1 * predicted.
+    This is gtsam's convention: the error is the logarithm of measured^-1 * predicted.
     """
 
     start: int
@@ -52,30 +53,30 @@ class LandmarkEdge:
 
 @dataclass
 class PoseGraph:
-    """What a file holds, in its order; ``ignored`` counts lines by tag, ``odd`` by reason."""
+    """Contents of a file in its order; ``ignored`` counts lines by tag, ``assumed`` by reason."""
 
     edges: list[Edge] = field(default_factory=list)
     sightings: list[LandmarkEdge] = field(default_factory=list)
     ignored: Counter[str] = field(default_factory=Counter)
-    odd: Counter[str] = field(default_factory=Counter)
+    assumed: Counter[str] = field(default_factory=Counter)
 
 
 def pose_stamp_ns(number: int) -> int:
-    """Invented stamp of the ``number``-th pose of the odometry chain, from 0."""
+    """Invented stamp, ns, of pose ``number`` of the odometry chain, counted from 0."""
     return (number + 1) * _SECOND_NS
 
 
 def import_pose_graph(source: Path, target: Path) -> ImportSummary:
     """Convert a pose graph to the MCAP file ``target``.
 
-    Edges between consecutive poses become OdometryIncrement, others RelativePose, landmarks
+    Edges between consecutive poses become OdometryIncrement, other edges RelativePose, landmarks
     Sighting with the landmark's number as its identity. Initial values (VERTEX) are ignored.
-    Where two consecutive poses have no edge the odometry of a robot ends, and that of the next
-    begins: robots are told apart by nothing else, and are called ``robot1``, ``robot2``...
+    Where two consecutive poses have no edge, the odometry of one robot ends and that of the next
+    begins; nothing else separates robots. They are named ``robot1``, ``robot2``, ...
 
     Raises:
-        LogError: ``source`` cannot be read, its noise or a line makes no sense, it has no edges,
-            or a pose has no odometry.
+        LogError: ``source`` cannot be read, a line or its noise is invalid, it has no edges, or a
+            pose has no odometry.
         OutputError: ``target`` cannot be written.
     """
     graph = read_pose_graph(source)
@@ -89,7 +90,7 @@ def import_pose_graph(source: Path, target: Path) -> ImportSummary:
     sightings = _by_pose(graph.sightings, lambda seen: seen.pose)
     notes = {"format": "pose graph", "source": source.name, "stamps": _STAMPS}
     if others:
-        # what closures refer to was chosen by whoever made the graph
+        # closures refer to poses of the graph, so every one of them must be a keyframe
         notes["keyframe.mode"] = "all"
     with LogWriter(target, notes) as log:
         for pose in poses:
@@ -103,15 +104,15 @@ def import_pose_graph(source: Path, target: Path) -> ImportSummary:
                 stamp_ns = pose_stamp_ns(number[pose])
                 log.sighting(robot, stamp_ns, seen.z, seen.cov, identity=str(seen.landmark))
     warnings = [f"{source}: {n} {tag} lines are not used" for tag, n in graph.ignored.items()]
-    warnings += [f"{source}: {n} {reason}" for reason, n in graph.odd.items()]
+    warnings += [f"{source}: {n} {reason}" for reason, n in graph.assumed.items()]
     warnings += [
-        f"{source}: no edge from pose {a} to pose {b}: taken for the start of {robots[b]}"
+        f"{source}: no edge from pose {a} to pose {b}: assumed to be the start of {robots[b]}"
         for a, b in pairwise(poses)
         if robots[a] != robots[b]
     ]
-    strangers = sum(len(seen) for pose, seen in sightings.items() if pose not in number)
-    if strangers:
-        warnings.append(f"{source}: {strangers} sightings from poses without an edge are not used")
+    unlinked = sum(len(seen) for pose, seen in sightings.items() if pose not in number)
+    if unlinked:
+        warnings.append(f"{source}: {unlinked} sightings from poses without an edge are not used")
     return ImportSummary(source, target, log.counts, (*warnings, f"{source}: stamps are {_STAMPS}"))
 
 
@@ -123,7 +124,7 @@ def _by_pose(items: Iterable[_T], pose: Callable[[_T], int]) -> dict[int, list[_
 
 
 def _write(write: Callable[..., None], number: dict[int, int], edge: Edge) -> None:
-    """Write an edge; our covariance is along the axes of its start, gtsam's of its end."""
+    """Write an edge; covariances of a log are along the axes of its start, gtsam's of its end."""
     start_ns, end_ns = pose_stamp_ns(number[edge.start]), pose_stamp_ns(number[edge.end])
     cov = rotate_cov(edge.cov, float(edge.delta[2]))
     write(start_ns, end_ns, delta=edge.delta, cov=cov)
@@ -135,10 +136,10 @@ def _write(write: Callable[..., None], number: dict[int, int], edge: Edge) -> No
 def split_odometry(
     edges: Iterable[Edge], poses: Sequence[int]
 ) -> tuple[dict[int, Edge], list[Edge]]:
-    """The odometry, by the pose that each of its edges leads to, and all other edges.
+    """Odometry edges by the pose that they lead to, and all other edges.
 
-    The first edge between two neighbours of ``poses`` is the odometry. All edges are turned to lead
-    from the earlier pose to the later one, see `turned`.
+    The first edge between two neighbours in ``poses`` is odometry. Every edge is made to lead from
+    the earlier pose to the later one, see `reverse_edge`.
     """
     following = dict(pairwise(poses))
     odometry: dict[int, Edge] = {}
@@ -155,35 +156,32 @@ def split_odometry(
 def assign_robots(
     source: Path, odometry: Mapping[int, Edge], poses: Sequence[int]
 ) -> dict[int, str]:
-    """Pose -> its robot: a new one begins where no odometry leads to a pose.
+    """Pose -> its robot; a new robot begins at each pose that no odometry leads to.
 
     Raises:
-        LogError: a pose has neither odometry before it nor after it; named with its number.
+        LogError: a pose has odometry neither before nor after it; the message has its number.
     """
-    begins = [pose for pose in poses if pose not in odometry]
+    first_poses = [pose for pose in poses if pose not in odometry]
     for pose, following in pairwise([*poses, -1]):
         if pose not in odometry and following not in odometry:
             raise LogError(
-                f"{source}: the odometry has a break on either side of pose {pose}: no edge leads "
-                "to or from its neighbours; leave it out or give it one"
+                f"{source}: pose {pose} has no odometry: no edge to either of its neighbours; "
+                "remove the pose or add an edge"
             )
-    if len(begins) == 1:
+    if len(first_poses) == 1:
         return dict.fromkeys(poses, DEFAULT_ROBOT)
-    number = np.searchsorted(begins, poses, side="right")
-    digits = len(str(len(begins)))
+    number = np.searchsorted(first_poses, poses, side="right")
+    digits = len(str(len(first_poses)))
     return {p: f"robot{n:0{digits}}" for p, n in zip(poses, number, strict=True)}
 
 
 def reverse_edge(edge: Edge) -> Edge:
-    """The same measurement seen from its other end: pose of ``start`` in the frame of ``end``.
+    """The same measurement as the pose of ``start`` in the frame of ``end``.
 
     Exact for gtsam's error: with h = z exp(e) the inverse is h^-1 = z^-1 exp(-Ad_z e).
     """
-    x, y, phi = edge.delta
-    adjoint = np.eye(3)
-    adjoint[:2, :2] = rotation(phi)
-    adjoint[:2, 2] = y, -x
-    cov = np.asarray(adjoint @ edge.cov @ adjoint.T)
+    Ad = adjoint(edge.delta)
+    cov = np.asarray(Ad @ edge.cov @ Ad.T)
     return Edge(edge.end, edge.start, inverse(edge.delta), cov)
 
 
@@ -194,12 +192,12 @@ def read_pose_graph(source: Path) -> PoseGraph:
     """Read the lines of a pose graph.
 
     Raises:
-        LogError: the file cannot be read, or a line's numbers make no sense; the line is named.
+        LogError: the file cannot be read, or a line is invalid; the message has its number.
     """
     graph = PoseGraph()
     is_g2o = ".g2o" in source.suffixes
     lines = enumerate(text_lines(source), start=1)
-    for count, line in ((n, part) for n, whole in lines for part in _JOINED.split(whole)):
+    for count, line in ((n, part) for n, whole in lines for part in _MISSING_BREAK.split(whole)):
         fields = line.split()
         if not fields or fields[0].startswith("#"):
             continue
@@ -215,25 +213,25 @@ def read_pose_graph(source: Path) -> PoseGraph:
 
 
 def _edge(graph: PoseGraph, fields: Sequence[str], is_g2o: bool) -> None:
-    """Tag start end x y phi and six numbers of noise."""
+    """TAG start end x y phi and six numbers of noise."""
     start, end, delta, noise = int(fields[0]), int(fields[1]), _numbers(fields[2:5], 3), fields[5:]
     if start == end:
-        raise ValueError("leads from a pose to itself")
+        raise ValueError("start and end are the same pose")
     graph.edges.append(Edge(start, end, delta, _pose_covariance(_numbers(noise, 6), is_g2o)))
 
 
 def _landmark(graph: PoseGraph, fields: Sequence[str], is_g2o: bool) -> None:
-    """Tag pose landmark x y and three numbers of noise: the landmark's place in the pose's frame.
+    """TAG pose landmark x y and three numbers of noise; x, y in the frame of the pose.
 
     load2D: "in our experience, the x-y covariance on landmark sightings is not very good, so
     assume it describes the uncertainty at a range of 10 m". Sigmas are sqrt(v/10) and sqrt(v), or
-    1 where the two variances differ. It has no such rule for g2o, whose information matrix
-    (which `readG2o` drops with its line) is transported to bearing and range.
+    1 where the two variances differ. There is no such rule for g2o, whose lines `readG2o` drops:
+    their information matrix is propagated to bearing and range.
     """
     (x, y), noise = _numbers(fields[2:4], 2), _numbers(fields[4:7], 3)
     squared = x * x + y * y
     if not squared > 0:
-        raise ValueError("the landmark is at the pose itself")
+        raise ValueError("the landmark coincides with the pose")
     if is_g2o:
         cov_xy = np.linalg.inv(np.array([[noise[0], noise[1]], [noise[1], noise[2]]]))
         J = np.array([[-y / squared, x / squared], [x, y] / np.sqrt(squared)])
@@ -242,7 +240,9 @@ def _landmark(graph: PoseGraph, fields: Sequence[str], is_g2o: bool) -> None:
         cov = np.diag([noise[0] / 10.0, noise[0]])
     else:
         cov = np.eye(2)
-        graph.odd["landmark lines have unequal variances; sigmas of 1 rad and 1 m are used"] += 1
+        graph.assumed[
+            "landmark lines have unequal variances; sigmas of 1 rad and 1 m are used"
+        ] += 1
     z = np.array([np.arctan2(y, x), np.sqrt(squared)])
     graph.sightings.append(LandmarkEdge(int(fields[0]), int(fields[1]), z, _checked(cov)))
 
@@ -255,11 +255,11 @@ def _bearing_range(graph: PoseGraph, fields: Sequence[str], _is_g2o: bool) -> No
 
 
 def _pose_covariance(v: Array, is_g2o: bool) -> Array:
-    """Covariance (3, 3) from six numbers of noise, with load2D's guess at what they are.
+    """Covariance (3, 3) from six numbers of noise, whose layout is guessed as load2D does.
 
-    g2o has the upper triangle of the information matrix. Otherwise zeros tell: [a 0 b c 0 0] is
-    TORO's order xx xy yy phiphi xphi yphi, [a 0 0 b 0 c] the upper triangle, and load2D takes
-    either for a covariance.
+    g2o has the upper triangle of the information matrix. Otherwise the zeros decide: [a 0 b c 0 0]
+    is TORO's order xx xy yy phiphi xphi yphi, [a 0 0 b 0 c] the upper triangle; load2D reads both
+    as covariances.
     """
     upper = np.array([[v[0], v[1], v[2]], [v[1], v[3], v[4]], [v[2], v[4], v[5]]])
     if is_g2o:
@@ -287,9 +287,9 @@ def _numbers(fields: Sequence[str], count: int) -> Array:
     return values
 
 
-#: files put together, of which one did not end its last line: a tag follows a number at once
-_JOINED = re.compile(r"(?<=[0-9])(?=[A-Z]{2})")
-# the tags that load2D reads, and the names that g2o and its relatives give to the same
+#: concatenated files without a line break in between: a tag follows a number immediately
+_MISSING_BREAK = re.compile(r"(?<=[0-9])(?=[A-Z]{2})")
+# the tags that load2D reads, and their synonyms in g2o and similar formats
 _LINES: dict[str, Callable[[PoseGraph, Sequence[str], bool], None]] = {
     "ODOMETRY": _edge,
     "EDGE": _edge,

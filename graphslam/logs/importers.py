@@ -1,4 +1,4 @@
-"""Other formats to MCAP: a row of `IMPORTERS` per format."""
+"""Converters of other formats to MCAP: one row of `IMPORTERS` per format."""
 
 from graphslam.logs.import_carmen import import_carmen
 from graphslam.logs.import_mrclam import import_mrclam

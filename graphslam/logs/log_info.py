@@ -1,4 +1,4 @@
-"""What is in a log, what of it is usable and what is odd: the facts behind `graphslam info`."""
+"""Contents and defects of logs, as printed by `graphslam info`."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -28,14 +28,14 @@ from graphslam.logs.topics import (
     static_transform_topics,
 )
 
-_GAP_PERIODS, _GAP_S = 10, 1.0  # a gap is longer than both
-_REVERSING_M = 1e-3  # a step back by more than the noise of a robot at rest
-_ENOUGH_PATH_M = 50.0  # whoever drives this far without reversing once is remarkable
+_GAP_PERIODS, _GAP_S = 10, 1.0  # a gap is longer than both: 10 periods of the topic and 1 s
+_REVERSING_M = 1e-3  # smallest backward step; larger than the noise of a robot at rest
+_UNSIGNED_PATH_M = 50.0  # odometry that never reverses on a longer path is reported
 
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """A time without messages of a topic."""
+    """An interval without messages of a topic."""
 
     start_ns: int
     duration_s: float
@@ -43,13 +43,13 @@ class Gap:
 
 @dataclass(frozen=True, slots=True)
 class TopicInfo:
-    """A topic of the logs. All after ``count`` is None or empty where nothing can be decoded.
+    """A topic of the logs. Fields after ``count`` are None or empty if nothing can be decoded.
 
-    ``robot`` is None for a topic whose schema is unknown; ``used`` tells whether smoothing reads
-    it. ``rate_hz`` is the mean over the log; ``median_period_s`` is shorter than its inverse where
+    ``robot`` is None for a topic of unknown schema; ``used``: whether smoothing reads the topic.
+    ``rate_hz`` is the mean over the log; ``median_period_s`` is shorter than its inverse if
     messages come in bursts. ``jumps_back`` counts messages stamped earlier than the one recorded
-    before, ``glitches`` those whose stamp is not believed. ``no_return_m`` is the detected range
-    that means no return, ``dropouts`` the share of beams without a usable range.
+    before, ``glitches`` those whose stamp is replaced. ``no_return_m`` is the detected range that
+    means no return, ``dropouts`` the share of beams without a usable range.
     """
 
     name: str
@@ -73,11 +73,11 @@ class TopicInfo:
 
 @dataclass(frozen=True, slots=True)
 class RobotInfo:
-    """A robot of the logs; ``problem`` says why it is not usable, empty where it is.
+    """A robot of the logs; ``problem`` says why it is not usable, empty if it is.
 
-    ``speed_m_s`` is the mean over the log, ``top_speed_m_s`` the largest over a whole second, as
-    odometry that comes in bursts has no speed between two messages. ``reverses`` tells whether
-    odometry ever goes backwards.
+    ``speed_m_s`` is the mean over the log, ``top_speed_m_s`` the largest mean over one second,
+    because odometry in bursts has no speed between two messages. ``reverses``: whether odometry
+    ever goes backwards.
     """
 
     name: str
@@ -92,7 +92,7 @@ class RobotInfo:
 
 @dataclass(frozen=True, slots=True)
 class LogInfo:
-    """Everything that `inspect_logs` found; ``problem`` says why the logs cannot be smoothed."""
+    """Result of `inspect_logs`; ``problem`` says why the logs cannot be smoothed, if so."""
 
     files: tuple[LogFile, ...]
     topics: tuple[TopicInfo, ...]
@@ -111,9 +111,9 @@ class LogInfo:
 
 
 def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
-    """Read all that can be decoded in ``paths`` and report it.
+    """Read everything in ``paths`` that can be decoded and describe it.
 
-    What keeps the logs from being smoothed is reported in ``problem``, not raised.
+    A reason why the logs cannot be smoothed is reported in ``problem``, not raised.
 
     Raises:
         LogError: a file is missing, not MCAP or without a message.
@@ -155,7 +155,7 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
         robots=tuple(robots),
         notes=notes,
         dropped=dict(dropped),
-        warnings=tuple(warnings + assumed + _oddities(infos, robots)),
+        warnings=tuple(warnings + assumed + _defects(infos, robots)),
         problem=problem,
     )
 
@@ -165,7 +165,7 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
 
 @dataclass(slots=True)
 class _Reading:
-    """What one pass over a topic keeps: times, and poses where there are any."""
+    """Data kept from one pass over a topic."""
 
     stamps_ns: list[int]
     times_ns: list[int]
@@ -184,7 +184,7 @@ def _read_topic(
 ) -> _Reading:
     reading = _Reading([], [], [], 0, 0, Counter())
     for file in files:
-        line = time_order.MessageSorter(round(config.logs.reorder_s * 1e9))
+        sorter = time_order.MessageSorter(round(config.logs.reorder_s * 1e9))
         decoded = (
             (topic.name, message, raw.log_time_ns)
             for raw in raw_messages(file, {topic.name})
@@ -195,16 +195,16 @@ def _read_topic(
             if isinstance(message, records.Scan):
                 reading.beams += len(message.ranges)
                 reading.empty_beams += int(np.isnan(message.ranges).sum())
-            for placed in line.push(topic.name, message):
-                _take(reading, placed)
-        for placed in line.finish():
-            _take(reading, placed)
-        reading.counts += line.counts.get(topic.name, Counter())
+            for placed in sorter.push(topic.name, message):
+                _add_placed(reading, placed)
+        for placed in sorter.finish():
+            _add_placed(reading, placed)
+        reading.counts += sorter.counts.get(topic.name, Counter())
     dropped.update(context.beams)
     return reading
 
 
-def _take(reading: _Reading, message: records.Message) -> None:
+def _add_placed(reading: _Reading, message: records.Message) -> None:
     reading.times_ns.append(message.time_ns)
     if isinstance(message, records.OdometryPose):
         reading.motion.append(message.pose)
@@ -294,10 +294,10 @@ def _robot_info(
         return RobotInfo(name, "has no odometry")
     reading = readings[own[0].name]
     if len(reading.motion) < 2:
-        return RobotInfo(name, f"{own[0].name} has fewer than two messages that can be used")
+        return RobotInfo(name, f"{own[0].name} has fewer than two usable messages")
     forward, turning, path = _steps(own[0], np.array(reading.motion), settings)
     times_s = (np.array(reading.times_ns) - reading.times_ns[0]) * 1e-9
-    # increments tell the path up to their own stamp, poses that since the one before
+    # n increments have n steps, the first up to its own stamp; n poses have n - 1
     driven = np.cumsum(np.concatenate([np.zeros(len(times_s) - len(path)), path]))
     seconds = np.interp(np.arange(0.0, times_s[-1]), times_s, driven)
     return RobotInfo(
@@ -324,13 +324,14 @@ def _steps(topic: Topic, motion: Array, settings: RobotConfig) -> tuple[Array, A
     return motion[:, 0], motion[:, 2], np.hypot(motion[:, 0], motion[:, 1])
 
 
-def _oddities(topics: Sequence[TopicInfo], robots: Sequence[RobotInfo]) -> list[str]:
+def _defects(topics: Sequence[TopicInfo], robots: Sequence[RobotInfo]) -> list[str]:
+    """One line per defect of the topics and robots."""
     lines = []
     for topic in topics:
         if topic.jumps_back:
             lines.append(
                 f"{topic.name}: {topic.jumps_back} messages are stamped earlier than the one "
-                f"recorded before; {topic.glitches} stamps are not believed"
+                f"recorded before; {topic.glitches} stamps are replaced"
             )
         if topic.duplicates:
             lines.append(f"{topic.name}: {topic.duplicates} messages repeat a stamp")
@@ -338,7 +339,7 @@ def _oddities(topics: Sequence[TopicInfo], robots: Sequence[RobotInfo]) -> list[
             lines.append(
                 f"{topic.name}: {topic.too_late} messages come too late; see logs.reorder_s"
             )
-        if topic.gaps and topic.schema != SIGHTING:  # there is not always something to be seen
+        if topic.gaps and topic.schema != SIGHTING:  # there is not always a target in view
             longest = max(gap.duration_s for gap in topic.gaps)
             lines.append(f"{topic.name}: {len(topic.gaps)} gaps, the longest {longest:.1f} s")
         if topic.no_return_m is not None:
@@ -346,7 +347,7 @@ def _oddities(topics: Sequence[TopicInfo], robots: Sequence[RobotInfo]) -> list[
     for robot in robots:
         if robot.problem:
             lines.append(f"robot {robot.name}: {robot.problem}")
-        elif robot.reverses is False and (robot.path_m or 0) > _ENOUGH_PATH_M:
+        elif robot.reverses is False and (robot.path_m or 0) > _UNSIGNED_PATH_M:
             lines.append(
                 f"robot {robot.name}: odometry never reverses in {robot.path_m:.0f} m; "
                 "it may be unsigned"

@@ -1,4 +1,4 @@
-"""Logs opened together: what robots they hold, and their messages in the order of time."""
+"""Logs opened together: their robots, topics and messages sorted by time."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,13 +17,13 @@ from graphslam.logs.mcap_file import McapFile, RawMessage, open_mcap, raw_messag
 from graphslam.logs.topic_context import topic_contexts
 from graphslam.logs.topics import ODOMETRY_KINDS, Topic, choose_topics, find_topics
 
-#: messages that are worth a second process to read them
+#: fewer messages are read faster without a second process
 WORKER_MIN_MESSAGES = 10_000
 
 
 @dataclass(frozen=True, slots=True)
 class LogFile:
-    """One file of a `LogSet`: ``messages`` read of all topics, ``lost`` None when unknown."""
+    """One file of a `LogSet`: number of readable and of lost ``messages`` (None: unknown)."""
 
     path: Path
     sha256: str
@@ -37,14 +37,13 @@ class LogSet:
 
     Attributes:
         robots: names of the robots with odometry, sorted.
-        files: what each file held.
+        files: the files and their message counts.
         topics: the topics that are used.
         notes: the metadata record `graphslam` of the files, for example that stamps are invented.
-        warnings: what had to be assumed or is wrong, one line each; `messages` adds to it when it
-            has come to its end.
-        dropped: number of messages (or single beams, reasons that begin with ``range:``) that
-            were dropped, by reason; filled when `messages` has come to its end.
-        repaired: the same for messages that are used although something was odd.
+        warnings: assumptions and defects, one line each; `messages` adds to it when exhausted.
+        dropped: number of dropped messages (of dropped beams, where the reason begins with
+            ``range:``) by reason; filled when `messages` is exhausted.
+        repaired: the same for messages that are used in spite of a defect.
     """
 
     robots: tuple[str, ...]
@@ -63,7 +62,7 @@ class LogSet:
 
     @property
     def opened(self) -> Sequence[McapFile]:
-        """The files as they were opened, in the order of ``files``."""
+        """The opened MCAP files, in the order of ``files``."""
         return self._mcap
 
     def has_scans(self, robot: str) -> bool:
@@ -71,56 +70,56 @@ class LogSet:
         return any(t.robot == robot and t.record is records.Scan for t in self.topics)
 
     def no_return_m(self, topic: str) -> float:
-        """Range from which on a beam of ``topic`` means no return, m; inf when none was found."""
+        """Smallest range, m, that means no return in ``topic``; inf if none was detected."""
         return self._contexts[topic].no_return_m
 
-    def count(self, without: tuple[type[Message], ...] = ()) -> int:
-        """How many messages the files hold of all topics but those of the records ``without``."""
-        return sum(topic.count for topic in self.topics if topic.record not in without)
+    def count(self, exclude: tuple[type[Message], ...] = ()) -> int:
+        """Number of messages in all used topics except those of the records ``exclude``."""
+        return sum(topic.count for topic in self.topics if topic.record not in exclude)
 
     def messages(
-        self, without: tuple[type[Message], ...] = (), *, ahead: bool = False
+        self, exclude: tuple[type[Message], ...] = (), *, prefetch: bool = False
     ) -> Iterator[Message]:
-        """All messages in the order of ``time_ns``; at equal times odometry comes first.
+        """All messages sorted by ``time_ns``; at equal times odometry comes first.
 
-        Topics of the records ``without`` are passed over, which saves decoding them. Memory holds
-        what falls into ``logs.reorder_s``, not the log. Every call starts anew. ``ahead``: a second
-        process may read them, which pays where all are taken and something is done with them.
+        Topics of the records ``exclude`` are skipped without decoding. Memory holds the messages of
+        ``logs.reorder_s``, not the log. Every call starts at the beginning. ``prefetch``: allows a
+        second process to read ahead, which pays if the caller takes all and works on each.
         """
-        topics = {topic.name: topic for topic in self.topics if topic.record not in without}
-        self._tell(_Told(Counter(), Counter(), []))
-        ahead &= self.count(without) >= WORKER_MIN_MESSAGES
-        for item in Prefetch(lambda: self._read(topics)) if ahead else self._read(topics):
-            if isinstance(item, _Told):
-                self._tell(item)
+        topics = {topic.name: topic for topic in self.topics if topic.record not in exclude}
+        self._update(_ReadReport(Counter(), Counter(), []))
+        prefetch &= self.count(exclude) >= WORKER_MIN_MESSAGES
+        for item in Prefetch(lambda: self._read(topics)) if prefetch else self._read(topics):
+            if isinstance(item, _ReadReport):
+                self._update(item)
             else:
                 yield item
 
-    def _read(self, topics: Mapping[str, Topic]) -> Iterator["Message | _Told"]:
-        """Messages of ``topics`` and, last, what `messages` adds to the attributes."""
+    def _read(self, topics: Mapping[str, Topic]) -> Iterator["Message | _ReadReport"]:
+        """Messages of ``topics`` and, last, the report about all of them."""
         readers = [
             _FileReader(file, topics, self._contexts, self._window_ns) for file in self._mcap
         ]
         yield from time_order.merge([reader.messages() for reader in readers])
-        told = _Told(Counter(), Counter(), [])
+        report = _ReadReport(Counter(), Counter(), [])
         for file, reader in zip(self._mcap, readers, strict=True):
-            told.dropped.update(reader.dropped)
-            for topic, counts in sorted(reader.line.counts.items()):
-                told.warnings.extend(_warn_of_stamps(file, topic, counts))
-                told.dropped[time_order.TOO_LATE] += counts.pop(time_order.TOO_LATE, 0)
-                told.repaired.update(counts)
-        yield told
+            report.dropped.update(reader.dropped)
+            for topic, counts in sorted(reader.sorter.counts.items()):
+                report.warnings.extend(_stamp_warnings(file, topic, counts))
+                report.dropped[time_order.TOO_LATE] += counts.pop(time_order.TOO_LATE, 0)
+                report.repaired.update(counts)
+        yield report
 
-    def _tell(self, told: "_Told") -> None:
-        for counter, counts in ((self.dropped, told.dropped), (self.repaired, told.repaired)):
+    def _update(self, report: "_ReadReport") -> None:
+        for counter, counts in ((self.dropped, report.dropped), (self.repaired, report.repaired)):
             counter.clear()
             counter.update(+counts)  # without zeros
-        self.warnings[self._opening_warnings :] = told.warnings
+        self.warnings[self._opening_warnings :] = report.warnings
 
 
 @dataclass(frozen=True, slots=True)
-class _Told:
-    """What is known when all messages were read; see `LogSet`."""
+class _ReadReport:
+    """What is known after all messages were read; see `LogSet`."""
 
     dropped: Counter[str]
     repaired: Counter[str]
@@ -128,7 +127,7 @@ class _Told:
 
 
 def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
-    """Open ``paths`` (MCAP files) as one log and find out what is in it.
+    """Open ``paths`` (MCAP files) as one log and determine its robots and topics.
 
     Raises:
         LogError: a file is missing, not MCAP or empty; no topic is usable; all usable topics are
@@ -139,7 +138,7 @@ def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
     files = [open_mcap(Path(path)) for path in paths]
     for n, file in enumerate(files):
         if file.sha256 in {other.sha256 for other in files[:n]}:
-            raise LogError(f"{file.path}: is given twice; each log counts once")
+            raise LogError(f"{file.path}: is given twice; name each log once")
     topics, warnings = choose_topics(files, find_topics(files, config))
     contexts, assumed = topic_contexts(files, topics, config)
     notes: dict[str, str] = {}
@@ -167,10 +166,11 @@ def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
 def decode_message(
     raw: RawMessage, topic: Topic, context: TopicContext, dropped: Counter[str]
 ) -> Message | None:
-    """The record in one raw message; None, and the reason counted, when it must be dropped."""
+    """The record of a raw message; None if it must be dropped, which is counted by reason."""
     try:
-        _, decode, read = DECODERS[topic.schema]
-        return decode(read(raw.data) if read else schemas.decode(topic.schema, raw.data), context)
+        _, decode, deserialize = DECODERS[topic.schema]
+        data = deserialize(raw.data) if deserialize else schemas.decode(topic.schema, raw.data)
+        return decode(data, context)
     except UnusableMessageError as reason:
         dropped[str(reason)] += 1
     except schemas.CdrError:
@@ -189,16 +189,16 @@ class _FileReader:
         window_ns: int,
     ) -> None:
         self.dropped: Counter[str] = Counter()
-        self.line = time_order.MessageSorter(window_ns)
+        self.sorter = time_order.MessageSorter(window_ns)
         self._file, self._topics = file, topics
-        # beams are counted by the decoders, into this pass' own counter
+        # decoders count dropped beams in the counter of this pass
         self._contexts = {n: replace(c, beams=self.dropped) for n, c in contexts.items()}
 
     def messages(self) -> Iterator[Message]:
         """Sorted messages of this file."""
         for topic, message, _ in repair_future_stamps(self._recorded(), time_order.SAMPLED):
-            yield from self.line.push(topic, message)
-        yield from self.line.finish()
+            yield from self.sorter.push(topic, message)
+        yield from self.sorter.finish()
 
     def _recorded(self) -> Iterator[Recorded]:
         """Messages in the order of recording, with their topic and log time."""
@@ -209,8 +209,8 @@ class _FileReader:
                 yield raw.topic, message, raw.log_time_ns
 
 
-def _warn_of_stamps(file: McapFile, topic: str, counts: Counter[str]) -> list[str]:
-    """One line per kind of oddity among the stamps of a topic."""
+def _stamp_warnings(file: McapFile, topic: str, counts: Counter[str]) -> list[str]:
+    """One line per kind of defect among the stamps of a topic."""
     where = f"{file.path}: {topic}"
     lines = []
     if counts[time_order.GLITCH]:
@@ -229,7 +229,7 @@ def _warn_of_stamps(file: McapFile, topic: str, counts: Counter[str]) -> list[st
 
 
 def describe_damage(file: McapFile) -> str:
-    """One line that says what of a damaged file is lost."""
+    """One line about the losses in a damaged file."""
     lost = "an unknown number of" if file.lost is None else str(file.lost)
     return (
         f"{file.path}: damaged, {lost} messages are lost, {file.messages} are read: {file.damage}"

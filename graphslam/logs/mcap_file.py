@@ -1,9 +1,9 @@
-"""Raw messages of one MCAP file in the order of recording, whatever state the file is in.
+"""Raw messages of one MCAP file in the order of recording, also if the file is damaged.
 
 The file's own summary is not trusted: one pass over the data section lists the blocks of messages
-that can really be read, with their CRCs checked. A file that was cut off, has flipped bits or
-lacks a summary so gives everything that is left, and what is lost is counted. The only module
-that reads with `mcap`.
+that are readable, with their CRCs checked. From a file that was cut off, has flipped bits or lacks
+a summary everything readable is recovered, and lost messages are counted. The only module that
+reads with `mcap`.
 """
 
 import hashlib
@@ -41,8 +41,8 @@ _T = TypeVar("_T")
 MAGIC = b"\x89MCAP0\r\n"
 NOTES = "graphslam"  # name of the metadata record in which our own logs carry notes
 
-# What mcap, zstandard and lz4 raise on damaged bytes, found by flipping and cutting: their own
-# errors, and whatever the standard library says to a nonsensical length, id or string.
+# Errors that mcap, zstandard and lz4 raise on damaged bytes, found by flipping and cutting: their
+# own, and those of the standard library for an invalid length, id or string.
 _DAMAGE = (
     McapError,
     zstandard.ZstdError,
@@ -55,17 +55,17 @@ _DAMAGE = (
     OverflowError,
     EOFError,
 )
-# What every record begins with (opcode, length), and what a message begins with: that, channel,
-# sequence number, log time, publish time; its data follow.
+# Head of every record (opcode, length), and head of a message: the same, channel, sequence number,
+# log time, publish time; then its data.
 _RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<BQHIQQ")
-# an enum compares slowly
+# int: comparing with the enum is slow
 _IS_MESSAGE = int(Opcode.MESSAGE)
-# Messages outside chunks are read in runs of this many, so that a block is never large.
-_LOOSE_RUN = 1000
+# Messages outside chunks form blocks of at most this many, so that a block is never large.
+_MAX_LOOSE_BLOCK = 1000
 
 
 class RawMessage(NamedTuple):
-    """One message as recorded: its topic, the recorder's time and the encoded bytes."""
+    """One message as recorded: topic, time of recording and encoded bytes."""
 
     topic: str
     log_time_ns: int
@@ -84,7 +84,7 @@ class RawTopic:
 
 @dataclass(frozen=True, slots=True)
 class _Block:
-    """A chunk, or a run of messages outside chunks, that was read once without error."""
+    """A readable chunk, or a run of messages outside chunks."""
 
     offset: int
     start_ns: int
@@ -94,11 +94,11 @@ class _Block:
 
 @dataclass(frozen=True, slots=True)
 class McapFile:
-    """What one pass over an MCAP file found; `raw_messages` reads it again.
+    """Index of an MCAP file from one pass over it; `raw_messages` reads it again.
 
-    ``lost`` is the number of messages that the file once held and that cannot be read, None when
-    it is damaged but does not say how many there were. ``damage`` describes it in one line, empty
-    for a whole file. ``in_order`` tells that log times never decrease in file order.
+    ``lost`` is the number of messages that cannot be read, None if the file is damaged and does not
+    say how many there were. ``damage`` describes the damage in one line, empty if there is none.
+    ``in_order``: log times never decrease in file order.
     """
 
     path: Path
@@ -114,7 +114,7 @@ class McapFile:
 
 
 def open_mcap(path: Path) -> McapFile:
-    """Read through ``path`` once and list what it holds.
+    """Read through ``path`` once and index it.
 
     Raises:
         LogError: no such file, a directory, unreadable, not MCAP, or without any message.
@@ -141,9 +141,8 @@ def open_mcap(path: Path) -> McapFile:
 def raw_messages(file: McapFile, topics: Collection[str]) -> Iterator[RawMessage]:
     """Messages of ``topics`` in the order of recording.
 
-    That is the order of the file when its log times never decrease, else that of the log times.
-
-    Memory holds the blocks that overlap in log time, one where the file is in order.
+    This is the order of the file if its log times never decrease, else that of the log times.
+    Memory holds the blocks that overlap in log time, a single one if the file is in order.
     """
     wanted = {number for number, topic in file.channels.items() if topic in topics}
     blocks = [block for block in file.blocks if not wanted.isdisjoint(block.counts)]
@@ -195,7 +194,7 @@ def _by_log_time(
 
 
 def _records(stream: BinaryIO, offset: int, limit: int) -> Iterator[tuple[int, McapRecord]]:
-    """Offset and record, chunks unopened, from ``offset`` to the footer or to a damaged place."""
+    """Offset and record, chunks unopened, from ``offset`` to the footer or to the first damage."""
     stream.seek(offset)
     reader = StreamReader(stream, skip_magic=True, emit_chunks=True, record_size_limit=limit)
     for record in reader.records:
@@ -204,7 +203,7 @@ def _records(stream: BinaryIO, offset: int, limit: int) -> Iterator[tuple[int, M
 
 
 def _after_indexes(stream: BinaryIO) -> int:
-    """Passes over message indexes, which nobody asks for and which take longest to read."""
+    """Skip message indexes, which are not needed and take longest to read; the new offset."""
     while True:
         offset = stream.tell()
         head = stream.read(_RECORD.size)
@@ -214,9 +213,9 @@ def _after_indexes(stream: BinaryIO) -> int:
 
 
 class _Contents(NamedTuple):
-    """What is in a chunk: its bytes, messages, and the schemas and channels.
+    """Contents of a chunk: its bytes, messages, and schemas and channels (``others``).
 
-    A message is (channel, log time ns, where its data begin and end in the bytes).
+    A message is (channel, log time ns, begin and end of its data in the bytes).
     """
 
     data: bytes
@@ -225,7 +224,7 @@ class _Contents(NamedTuple):
 
 
 def _chunk_at(stream: BinaryIO, offset: int) -> _Contents:
-    """The records in the chunk at ``offset``; of a chunk that the file's end cuts, its beginning.
+    """The records in the chunk at ``offset``; if the file ends inside it, those before the end.
 
     Raises:
         One of `_DAMAGE` when the chunk is damaged in any other way, its CRC included.
@@ -244,13 +243,13 @@ def _chunk_at(stream: BinaryIO, offset: int) -> _Contents:
 def _records_in(chunk: Chunk) -> _Contents:
     """The schemas, channels and messages in a chunk.
 
-    As mcap's own ``breakup_chunk``, but messages, of which there are many, are not made objects.
+    Like mcap's ``breakup_chunk``, but without an object per message, which would be slow.
 
     Raises:
         One of `_DAMAGE` when the chunk is damaged, its CRC included.
     """
     stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-    # the head of a message is looked for in any record, the last of which may be shorter
+    # padded, because the head of a message is unpacked from every record, also from shorter ones
     data = stream.read(size) + bytes(_MESSAGE.size)
     found = _Contents(data, [], [])
     begin = 0
@@ -271,7 +270,7 @@ def _records_in(chunk: Chunk) -> _Contents:
 
 
 def _cut_chunk(chunk: Chunk) -> _Contents:
-    """Whole records at the beginning of a chunk whose end is missing."""
+    """Complete records at the beginning of a chunk whose end is missing."""
     data = chunk.data
     if chunk.compression == "zstd":
         data = zstandard.ZstdDecompressor().decompressobj().decompress(data)
@@ -305,7 +304,7 @@ def _block_messages(
 
 
 class _Indexer:
-    """The one pass over a file; `run` does it, everything else is a step of it."""
+    """One pass over a file: `run` does it, the other methods are its steps."""
 
     def __init__(self, path: Path, stream: BinaryIO) -> None:
         self.path, self.stream = path, stream
@@ -324,25 +323,25 @@ class _Indexer:
     def run(self) -> McapFile:
         try:
             for offset, record in _records(self.stream, self.position, self.size):
-                self.take(offset, record)
+                self.add(offset, record)
                 self.position = self.stream.tell()
         except _DAMAGE as error:
-            self.rescue(error)
-        self.close_run()
+            self.recover(error)
+        self.close_loose_block()
         return self.result()
 
-    def take(self, offset: int, record: McapRecord) -> None:
+    def add(self, offset: int, record: McapRecord) -> None:
         if isinstance(record, Message):
             self.loose.append((offset, record))
-            if len(self.loose) == _LOOSE_RUN:
-                self.close_run()
+            if len(self.loose) == _MAX_LOOSE_BLOCK:
+                self.close_loose_block()
         elif isinstance(record, Chunk):
-            self.close_run()
+            self.close_loose_block()
             self.tried.add(offset)
             try:
-                self.take_chunk(offset, _records_in(record))
+                self.add_chunk(offset, _records_in(record))
             except _DAMAGE as error:
-                self.damage.append(f"the chunk at byte {offset} is damaged ({_say(error)})")
+                self.damage.append(f"the chunk at byte {offset} is damaged ({_one_line(error)})")
         elif isinstance(record, Statistics):
             self.statistics = record
         elif isinstance(record, Metadata) and record.name == NOTES:
@@ -356,12 +355,12 @@ class _Indexer:
         elif isinstance(record, Channel):
             self.channels.setdefault(record.id, record)
 
-    def take_chunk(self, offset: int, found: _Contents) -> None:
+    def add_chunk(self, offset: int, found: _Contents) -> None:
         for record in found.others:
             self.describe(record)
-        self.take_block(offset, [m[0] for m in found.messages], [m[1] for m in found.messages])
+        self.add_block(offset, [m[0] for m in found.messages], [m[1] for m in found.messages])
 
-    def take_block(self, offset: int, channels: Sequence[int], times: Sequence[int]) -> None:
+    def add_block(self, offset: int, channels: Sequence[int], times: Sequence[int]) -> None:
         """A block of messages with these channels and log times."""
         if not times:
             return
@@ -369,21 +368,21 @@ class _Indexer:
         self.latest_ns = max(self.latest_ns, *times)
         self.blocks.append(_Block(offset, min(times), max(times), dict(Counter(channels))))
 
-    def close_run(self) -> None:
+    def close_loose_block(self) -> None:
         if self.loose:
             messages = [message for _, message in self.loose]
-            self.take_block(
+            self.add_block(
                 self.loose[0][0],
                 [message.channel_id for message in messages],
                 [message.log_time for message in messages],
             )
             self.loose = []
 
-    def rescue(self, error: Exception) -> None:
-        """What can be had beyond the place where reading in sequence failed."""
-        self.close_run()
+    def recover(self, error: Exception) -> None:
+        """Index the chunks after the offset at which sequential reading failed."""
+        self.close_loose_block()
         self.damage.append(
-            f"it cannot be read on at byte {self.position} of {self.size} ({_say(error)})"
+            f"it cannot be read from byte {self.position} of {self.size} ({_one_line(error)})"
         )
         offsets = [self.position]
         summary = self.summary()
@@ -394,9 +393,9 @@ class _Indexer:
             offsets += [index.chunk_start_offset for index in summary.chunk_indexes]
         for offset in sorted(set(offsets) - self.tried):
             try:
-                self.take_chunk(offset, _chunk_at(self.stream, offset))
+                self.add_chunk(offset, _chunk_at(self.stream, offset))
             except _DAMAGE:
-                continue  # lost; the statistics, where there are any, tell how much
+                continue  # lost; counted by the statistics record, if there is one
 
     def summary(self) -> Summary | None:
         try:
@@ -443,6 +442,6 @@ def _sha256(stream: BinaryIO) -> str:
     return digest.hexdigest()
 
 
-def _say(error: Exception) -> str:
-    """One line about an error of `_DAMAGE`; several of them come without words."""
+def _one_line(error: Exception) -> str:
+    """Text of an error of `_DAMAGE` in one line; its type if it has no text."""
     return " ".join(str(error).split()) or type(error).__name__

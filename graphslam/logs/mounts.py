@@ -1,4 +1,4 @@
-"""Where the sensors sit: static transforms to planar mounts."""
+"""Sensor mounts in the plane from static transforms."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -8,18 +8,18 @@ import numpy as np
 
 from graphslam.core.geometry import Array
 
-# Transforms are parent_from_child, keyed by the child: a frame has one parent.
+# Child -> (parent, parent_from_child (4, 4)): a frame has one parent.
 TransformTree = Mapping[str, tuple[str, Array]]
 
-# A laser tilted by less than this still sees a planar slice to about one per mille.
-_LEVEL = np.cos(np.deg2rad(3.0))
+# A tilt of 3 degrees changes ranges to vertical walls by 1 - cos(3 deg), about one per mille.
+_MAX_TILT_RAD = np.deg2rad(3.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """Pose (3,) of a sensor in the base frame; ``inverted`` when it hangs upside down.
+    """Pose (3,) of a sensor in the base frame; ``inverted`` if it is mounted upside down.
 
-    ``tilt_rad`` is the angle between its axis and the vertical, 0 for either way up.
+    ``tilt_rad`` is the angle between the sensor's z axis and the vertical, 0 also if inverted.
     """
 
     pose: Array
@@ -28,7 +28,7 @@ class Mount:
 
 
 def transform_tree(messages: Iterable[Any]) -> dict[str, tuple[str, Array]]:
-    """All transforms of TFMessages as matrices (4, 4), parent from child; the last one counts."""
+    """All transforms of TFMessages as matrices (4, 4), parent from child; the last one wins."""
     tree = {}
     for message in messages:
         for stamped in message.transforms:
@@ -40,21 +40,21 @@ def transform_tree(messages: Iterable[Any]) -> dict[str, tuple[str, Array]]:
 
 
 def find_mount(tree: TransformTree, base: str, sensor: str) -> Mount | None:
-    """Mount of frame ``sensor`` on frame ``base``; None when the tree does not connect them.
+    """Mount of frame ``sensor`` on frame ``base``; None if the tree does not connect them.
 
-    Either may be the other's ancestor, or both hang below a common one (base_footprint).
+    One may be the other's ancestor, or both may have a common one (base_footprint).
     """
     if base == sensor:
         return Mount(np.zeros(3), False, 0.0)
-    above_base, above_sensor = _ancestors(tree, base), _ancestors(tree, sensor)
-    common = next((frame for frame in above_sensor if frame in above_base), None)
+    of_base, of_sensor = _ancestors(tree, base), _ancestors(tree, sensor)
+    common = next((frame for frame in of_sensor if frame in of_base), None)
     if common is None:
         return None
-    return planar_mount(np.asarray(np.linalg.solve(above_base[common], above_sensor[common])))
+    return planar_mount(np.asarray(np.linalg.solve(of_base[common], of_sensor[common])))
 
 
 def planar_mount(base_from_sensor: Array) -> Mount:
-    """The planar part of a transform (4, 4): where the sensor's x axis points, seen from above."""
+    """The planar part of a transform (4, 4); the heading is that of the sensor's x axis."""
     R = base_from_sensor[:3, :3]
     x, y = base_from_sensor[:2, 3]
     pose = np.array([x, y, np.arctan2(R[1, 0], R[0, 0])])
@@ -63,16 +63,16 @@ def planar_mount(base_from_sensor: Array) -> Mount:
 
 
 def is_level(mount: Mount) -> bool:
-    """Whether the sensor's plane is the floor's to within what a planar map can ignore."""
-    return bool(np.cos(mount.tilt_rad) >= _LEVEL)
+    """Whether the tilt of the sensor is small enough for a planar map."""
+    return bool(mount.tilt_rad <= _MAX_TILT_RAD)
 
 
 def _ancestors(tree: TransformTree, frame: str) -> dict[str, Array]:
-    """``frame`` and everything above it, with the transform (4, 4) ancestor from ``frame``."""
+    """``frame`` and its ancestors, each with the transform (4, 4) ancestor from ``frame``."""
     found = {frame: np.eye(4)}
     while frame in tree:
         parent, parent_from_frame = tree[frame]
-        if parent in found:  # a loop, which tf forbids
+        if parent in found:  # a cycle, which tf forbids
             break
         found[parent] = parent_from_frame @ found[frame]
         frame = parent

@@ -1,8 +1,8 @@
-"""Message types of a log: ROS 2's own and ours, and their CDR encoding.
+"""Message types of a log, ROS 2's and our own, and their CDR encoding.
 
-The only module that knows rosbags. Messages are rosbags' plain dataclasses whose number arrays
-are numpy arrays. Our own types are defined here as ros2msg text, which is also what `LogWriter`
-puts into the file, so that any ROS 2 or MCAP tool can decode them. docs/logs.md explains them.
+The only module that imports rosbags. Messages are rosbags' dataclasses whose number arrays are
+numpy arrays. Our own types are defined here as ros2msg text, which `LogWriter` also puts into the
+file, so that any ROS 2 or MCAP tool can decode them. docs/logs.md explains them.
 """
 
 import struct
@@ -18,7 +18,7 @@ from rosbags.typesys.store import Typestore
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import Array
 
-#: pose, twist and their covariances
+#: numbers in a nav_msgs/Odometry: pose, twist and their covariances
 _ODOMETRY_NUMBERS = 7 + 36 + 6 + 36
 
 IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
@@ -33,6 +33,15 @@ RELATIVE_POSE = "graphslam_msgs/msg/RelativePose"
 TRUE_POSE = "graphslam_msgs/msg/TruePose"
 TRUE_LANDMARK = "graphslam_msgs/msg/TrueLandmark"
 TRUE_ASSOCIATIONS = "graphslam_msgs/msg/TrueAssociations"
+
+#: fields that OdometryIncrement and RelativePose begin with
+_START_AND_POSE = """\
+std_msgs/Header header
+builtin_interfaces/Time start
+float64 x
+float64 y
+float64 phi
+"""
 
 DEFINITIONS: dict[str, str] = {
     SIGHTING: """\
@@ -51,23 +60,15 @@ string identity
 # Name of the robot seen; empty = a landmark was seen.
 string robot
 """,
-    ODOMETRY_INCREMENT: """\
+    ODOMETRY_INCREMENT: f"""\
 # Pose of the base at header.stamp in the base frame at start: m, m, rad.
-std_msgs/Header header
-builtin_interfaces/Time start
-float64 x
-float64 y
-float64 phi
+{_START_AND_POSE}\
 # Covariance of additive errors (x, y, phi) along the axes of the base frame at start, row-major.
 float64[9] covariance
 """,
-    RELATIVE_POSE: """\
+    RELATIVE_POSE: f"""\
 # Pose of this robot's base at header.stamp in the base frame at start of the robot other.
-std_msgs/Header header
-builtin_interfaces/Time start
-float64 x
-float64 y
-float64 phi
+{_START_AND_POSE}\
 # Covariance of additive errors (x, y, phi) along the axes of the frame at start, row-major.
 float64[9] covariance
 # Name of the robot in whose frame the pose is given; empty = this robot itself.
@@ -117,10 +118,10 @@ def _typestore() -> Typestore:
 
 
 def decode(schema: str, data: bytes) -> Any:
-    """The message that ``data`` (CDR with its four header bytes) holds; ``schema`` is known.
+    """The message in ``data`` (CDR with its four header bytes) of a known ``schema``.
 
     Raises:
-        CdrError: the bytes are cut short or are no such message.
+        CdrError: the bytes are cut short or are not such a message.
     """
     try:
         return _typestore().deserialize_cdr(data, schema)
@@ -129,7 +130,7 @@ def decode(schema: str, data: bytes) -> Any:
 
 
 class PlanarOdometry(NamedTuple):
-    """What is used of a nav_msgs/Odometry: stamp, position in the plane, rotation as quaternion."""
+    """The used part of a nav_msgs/Odometry: stamp, position in the plane, quaternion x y z w."""
 
     stamp_ns: int
     x: float
@@ -138,18 +139,18 @@ class PlanarOdometry(NamedTuple):
 
 
 def decode_odometry(data: bytes) -> PlanarOdometry:
-    """The beginning of a nav_msgs/Odometry; `decode` makes ten objects of each of very many.
+    """The beginning of a nav_msgs/Odometry; faster than `decode`, which makes ten objects of each.
 
     Raises:
         CdrError: the bytes are cut short.
     """
     order = "<" if data[1:2] == b"\x01" else ">"
     try:
-        seconds, nanoseconds, named = struct.unpack_from(f"{order}iII", data, 4)
-        # numbers are aligned to their size, relative to what follows CDR's four bytes
-        at = 16 + named + -named % 4
-        (named,) = struct.unpack_from(f"{order}I", data, at)
-        at += 4 + named
+        seconds, nanoseconds, size = struct.unpack_from(f"{order}iII", data, 4)
+        # numbers are aligned to their size, counted from the end of CDR's four bytes
+        at = 16 + size + -size % 4
+        (size,) = struct.unpack_from(f"{order}I", data, at)
+        at += 4 + size
         at += -(at - 4) % 8
         x, y, _, *rotation = struct.unpack_from(f"{order}7d", data, at)
     except struct.error as error:
@@ -162,26 +163,26 @@ def decode_odometry(data: bytes) -> PlanarOdometry:
 def decode_true_poses(data: Sequence[bytes]) -> tuple[IntArray, Array]:
     """Stamps (n,) ns and poses (n, 3) of many `TRUE_POSE` messages at once.
 
-    Truth from motion capture is most of a log. Messages that differ in frame or byte order are
-    decoded one by one.
+    Ground truth of motion capture can be most of a log. Messages that differ in frame or byte order
+    are decoded one by one.
 
     Raises:
-        CdrError: the bytes of a message are cut short or are no such message.
+        CdrError: the bytes of a message are cut short or are not such a message.
     """
     first = data[0] if data else b""
-    # CDR: four bytes of header, the second of which tells the byte order; 8-byte numbers are
-    # aligned relative to what follows
-    named = struct.unpack_from("<I", first, 12)[0] if len(first) >= 16 else 0
-    gap = -(12 + named) % 8
-    if len(first) != 4 + 12 + named + gap + 24 or first[1] != 1:
+    # CDR: four header bytes, the second is the byte order; 8-byte numbers are aligned, counted
+    # from the end of the header
+    size = struct.unpack_from("<I", first, 12)[0] if len(first) >= 16 else 0
+    gap = -(12 + size) % 8
+    if len(first) != 4 + 12 + size + gap + 24 or first[1] != 1:
         return _true_poses_singly(data)
     layout = np.dtype(
         [
             ("order", "V4"),
             ("sec", "<i4"),
             ("nanosec", "<u4"),
-            ("named", "<u4"),
-            ("frame", f"V{named + gap}"),
+            ("frame_size", "<u4"),
+            ("frame", f"V{size + gap}"),
             ("pose", "<f8", 3),
         ]
     )
@@ -204,15 +205,15 @@ def encode(schema: str, message: Any) -> bytes:
 
 
 class Template:
-    """An encoded message of which only the header's stamp and some numbers change."""
+    """An encoded message in which the header's stamp and some float64 numbers are replaced."""
 
     def __init__(self, schema: str, message: Any, marks: Sequence[float]) -> None:
-        """Made from one ``message`` whose numbers that will change are ``marks``, each unique."""
+        """``message`` has the unique values ``marks`` where numbers will be replaced."""
         self._data = encode(schema, message)
         self._places = [self._data.index(struct.pack("<d", mark)) for mark in marks]
 
     def filled(self, stamp_ns: int, *numbers: float) -> bytes:
-        """The bytes with a stamp and numbers, in the order of the marks."""
+        """The bytes with this stamp and these numbers, in the order of the marks."""
         data = bytearray(self._data)
         # after CDR's own header of four bytes the message begins with its std_msgs/Header
         struct.pack_into("<iI", data, 4, *_seconds(stamp_ns))
@@ -222,14 +223,14 @@ class Template:
 
 
 def build(schema: str, **fields: Any) -> Any:
-    """A message of type ``schema``; every field must be given."""
+    """A message of type ``schema``; all fields are required."""
     return _typestore().types[schema](**fields)
 
 
 def definition(schema: str) -> bytes:
-    """The ros2msg text of ``schema`` with all types it is made of, as MCAP stores it."""
+    """The ros2msg text of ``schema`` with its nested types, as MCAP stores it."""
     if schema in DEFINITIONS:
-        # our own text keeps its comments; the nested types are appended as rosbags writes them
+        # our own text with its comments; rosbags generates the nested types
         nested = _typestore().generate_msgdef(schema, ros_version=2)[0].partition("=" * 80)
         return (DEFINITIONS[schema] + nested[1] + nested[2]).encode()
     return _typestore().generate_msgdef(schema, ros_version=2)[0].encode()

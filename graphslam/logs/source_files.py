@@ -1,30 +1,79 @@
-"""Sources that are several files: a folder, or an archive of it, read without unpacking."""
+"""Text files that importers read: plain, compressed, in a folder or in an archive."""
 
+import bz2
+import gzip
 import lzma
 import re
 import tarfile
 import zipfile
 import zlib
+from collections.abc import Callable, Iterator
+from itertools import chain
 from pathlib import Path, PurePosixPath
+from typing import TextIO, TypeVar
 
 from graphslam.core.errors import LogError
 
-#: endings that claim to be an archive or compressed
-_PACKED = {".zip", ".tar", ".tgz", ".tbz2", ".txz", ".gz", ".bz2", ".xz"}
+_OPENERS: dict[str, Callable[..., TextIO]] = {
+    ".bz2": bz2.open,
+    ".gz": gzip.open,
+    ".xz": lzma.open,
+}
+_ARCHIVE_SUFFIXES = {".zip", ".tar", ".tgz", ".tbz2", ".txz", *_OPENERS}
+_T = TypeVar("_T")
+
+_READ_ERRORS = (
+    OSError,
+    EOFError,
+    tarfile.TarError,
+    zipfile.BadZipFile,
+    lzma.LZMAError,
+    zlib.error,
+)
+
+
+def text_lines(path: Path) -> Iterator[str]:
+    """Lines of a text file, plain or compressed with gzip, bzip2 or xz.
+
+    Bytes that are not UTF-8 are replaced: old logs have comments in any encoding.
+
+    Raises:
+        LogError: no such file, a directory, or not readable to its end.
+    """
+    try:
+        opener = _OPENERS.get(path.suffix, open)
+        with opener(path, "rt", encoding="utf-8", errors="replace") as lines:
+            yield from lines
+    except IsADirectoryError as error:
+        raise LogError(f"{path}: is a directory; name the log in it") from error
+    except _READ_ERRORS as error:
+        raise _unreadable(path, error) from error
+
+
+def first_and_all(items: Iterator[_T], if_empty: str) -> tuple[_T, Iterator[_T]]:
+    """The first of ``items``, and all of them.
+
+    Raises:
+        LogError: there is none; ``if_empty`` is its message.
+    """
+    for first in items:
+        return first, chain((first,), items)
+    raise LogError(if_empty)
 
 
 def text_files(source: Path, names: re.Pattern[str]) -> dict[str, str]:
-    """Texts of the files of a folder or archive whose last name matches, at any depth.
+    """Texts of all files in a folder or archive whose base name matches, at any depth.
 
     Args:
-        source: a folder, a .zip or a .tar (plain or compressed in any way Python knows).
-        names: what a file's name must match as a whole.
+        source: a folder, a .zip or a .tar (plain or with any compression that Python knows);
+            archives are read without unpacking.
+        names: pattern that a base name must match in full.
 
     Returns:
-        Name without folders -> text; bytes that are not UTF-8 are replaced.
+        Base name -> text; bytes that are not UTF-8 are replaced.
 
     Raises:
-        LogError: no such file, not readable to its end, or two files of one name.
+        LogError: no such file, not readable to its end, or two files of the same name.
     """
     try:
         if source.is_dir():
@@ -32,39 +81,36 @@ def text_files(source: Path, names: re.Pattern[str]) -> dict[str, str]:
             return _texts(source, [(n, read()) for n, read in found if names.fullmatch(n)])
         if zipfile.is_zipfile(source):
             with zipfile.ZipFile(source) as packed:
-                inside = [(_last(name), name) for name in packed.namelist()]
+                inside = [(_base_name(name), name) for name in packed.namelist()]
                 return _texts(
                     source, [(n, packed.read(path)) for n, path in inside if names.fullmatch(n)]
                 )
         if source.is_file() and not source.stat().st_size:
             return {}
         return _texts(source, _tar_members(source, names))
-    except FileNotFoundError as error:
-        raise LogError(f"{source}: no such file; check the path") from error
-    except (OSError, EOFError, tarfile.TarError, zipfile.BadZipFile) as error:
-        raise _unreadable(source, error) from error
-    except (lzma.LZMAError, zlib.error) as error:
+    except _READ_ERRORS as error:
         raise _unreadable(source, error) from error
 
 
 def _tar_members(source: Path, names: re.Pattern[str]) -> list[tuple[str, bytes]]:
-    """Matching members of a tar file, in its order; a stream, as seeking in .xz is slow."""
+    """Base name and bytes of matching members of a tar file; streamed: seeking in .xz is slow."""
     members = []
     try:
         packed = tarfile.open(source, "r|*")  # noqa: SIM115 (closed below)
     except tarfile.ReadError:
-        if source.suffix.lower() in _PACKED:
+        if source.suffix.lower() in _ARCHIVE_SUFFIXES:
             raise
         return []  # a plain file of another kind: nothing in it matches
     with packed:
         for member in packed:
-            content = packed.extractfile(member) if names.fullmatch(_last(member.name)) else None
+            name = _base_name(member.name)
+            content = packed.extractfile(member) if names.fullmatch(name) else None
             if content is not None:
-                members.append((_last(member.name), content.read()))
+                members.append((name, content.read()))
     return members
 
 
-def _last(path: str) -> str:
+def _base_name(path: str) -> str:
     return PurePosixPath(path).name
 
 
@@ -78,5 +124,7 @@ def _texts(source: Path, found: list[tuple[str, bytes]]) -> dict[str, str]:
 
 
 def _unreadable(source: Path, error: Exception) -> LogError:
+    if isinstance(error, FileNotFoundError):
+        return LogError(f"{source}: no such file; check the path")
     why = " ".join(str(getattr(error, "strerror", None) or error).split())
     return LogError(f"{source}: cannot be read to its end: {why}; fetch it again")

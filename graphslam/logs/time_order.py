@@ -1,9 +1,9 @@
-"""Putting messages on the time line, in bounded memory.
+"""Sorting of messages by time, with repair of wrong stamps, in bounded memory.
 
 A recorder under load stamps some messages too late: in CARMEN logs about one per second by
-0.3-0.5 s. Recorded as a=.604, b=1.067, c=.802, d=.903, the message b belongs between a and c;
-believing its stamp makes dead reckoning jump forth and back (Intel: 675 m instead of 508 m). Such
-glitches are found topic by topic, in the order of recording; then all topics are sorted together.
+0.3-0.5 s. Recorded as a=.604, b=1.067, c=.802, d=.903, the message b belongs between a and c; with
+its own stamp dead reckoning jumps back and forth (Intel: path of 675 m instead of 508 m). Such
+glitches are detected per topic in the order of recording; then all topics are sorted together.
 """
 
 import heapq
@@ -19,19 +19,19 @@ TOO_LATE = "stamp: older than logs.reorder_s allows"
 GLITCH = "stamp: glitch"
 DUPLICATE = "stamp: duplicate"
 
-# A stamp is judged by those behind it that fall into the window, and by no more than this many:
-# an absurd one far in the future would otherwise never leave the window.
+# A stamp is compared with at most this many later ones of its topic within the window: an absurd
+# one far in the future would otherwise never leave the window.
 _LOOK_AHEAD = 128
-# Equal stamps are judged together (one image of sightings); a topic without stamps has them all
-# equal, so a group is bounded.
-_LARGEST_GROUP = 1000
-# What can be passed on is looked for so many times per window, not after every message.
-_LOOKS = 64
+# Equal stamps are treated as a group (one image of sightings). In a topic without stamps all are
+# equal, so the size of a group is bounded.
+_MAX_GROUP = 1000
+# Sorted messages are passed on this many times per window, not after every message.
+_EMISSIONS_PER_WINDOW = 64
 _LONG_AGO, _FAR_AHEAD = -(1 << 63), 1 << 63
 
 _Odometry = records.OdometryPose | records.WheelAngles | records.OdometryIncrement
-# What samples a continuous process, so that the order of recording is evidence of time.
-# Increments and relative poses name both of their times themselves.
+# Samples of a continuous process, for which the order of recording is evidence of time.
+# Increments and relative poses contain both of their times.
 SAMPLED = (
     records.OdometryPose,
     records.WheelAngles,
@@ -44,7 +44,7 @@ _RANKS = ((_Odometry, 0), (records.Truth | records.TrueLandmark, 1), (records.Re
 
 
 def sort_key(message: Message) -> tuple[int, int]:
-    """Time, then odometry before truth, relative poses, scans and sightings of the same time."""
+    """Time, then rank: odometry before truth, relative poses, scans and sightings."""
     rank = next((rank for kinds, rank in _RANKS if isinstance(message, kinds)), 3)
     return message.time_ns, rank
 
@@ -52,17 +52,18 @@ def sort_key(message: Message) -> tuple[int, int]:
 class MessageSorter:
     """Sorts the messages of one file, given in the order of recording.
 
-    A stamp that a later message of its topic contradicts by being earlier is a *glitch*: stamped
-    too late. Its message is placed between its neighbours in the order of recording (``time_ns``),
-    in proportion to what was recorded between them on *all* topics, so that a scan and the odometry
-    recorded around it stay in order when both are late; ``stamp_ns`` stays. Two messages that
-    contradict each other and nothing else are a mere swap and go by their stamps. A message may
-    come up to ``window_ns`` after younger ones and is still placed; one older than what was already
-    passed on is dropped.
+    A stamp is a *glitch* (stamped too late) if a later message of its topic has an earlier stamp.
+    The ``time_ns`` of such a message is set between its neighbours in the order of recording, in
+    proportion to the messages recorded between them on *all* topics, so that a scan and the
+    odometry recorded around it keep their order if both are late; ``stamp_ns`` is not changed. Two
+    messages that contradict only each other are swapped, and their stamps are used. A message may
+    come up to ``window_ns`` after younger ones; one older than what was already passed on is
+    dropped.
 
-    Believing recording over stamps is right because one topic has one publisher and one transport,
-    which keep its order, and because clocks are read late, not early. It took Intel's dead
-    reckoning from 675 m to 511 m (with `recording` to 510 m); as recorded it has 509 m.
+    The order of recording is more reliable than stamps because a topic has one publisher and one
+    transport, which keep its order, and because clocks are read late, not early. The repair changed
+    the path of Intel's dead reckoning from 675 m to 511 m (with `future_stamps` to 510 m); in the
+    order of recording it is 509 m.
 
     Attributes:
         counts: per topic, how many were `GLITCH`, `DUPLICATE` (kept) and `TOO_LATE` (dropped).
@@ -72,32 +73,32 @@ class MessageSorter:
         """Hold messages for about ``window_ns`` of log time."""
         self.counts: dict[str, Counter[str]] = {}
         self._window_ns = window_ns
-        self._repairs: dict[str, _Repair] = {}
+        self._repairs: dict[str, _GlitchRepair] = {}
         self._heap: list[tuple[tuple[int, int], int, Message]] = []
         self._number = 0
         self._recorded = 0
-        self._latest_ns = self._emitted_ns = self._looked_ns = _LONG_AGO
+        self._latest_ns = self._emitted_ns = self._checked_ns = _LONG_AGO
 
     def push(self, topic: str, message: Message) -> Iterator[Message]:
-        """Take the next message recorded; yield those whose place is now certain, sorted."""
+        """Add the next message recorded; yield, sorted, those whose order is now final."""
         if topic not in self._repairs:
             self.counts[topic] = Counter()
-            self._repairs[topic] = _Repair(self._window_ns, self.counts[topic])
+            self._repairs[topic] = _GlitchRepair(self._window_ns, self.counts[topic])
         self._recorded += 1
         self.counts[topic][GLITCH] += message.time_ns != message.stamp_ns
         self._place(topic, self._repairs[topic].push(message, self._recorded))
-        if self._latest_ns < self._looked_ns + self._window_ns // _LOOKS:
+        if self._latest_ns < self._checked_ns + self._window_ns // _EMISSIONS_PER_WINDOW:
             return
-        self._looked_ns = self._latest_ns
+        self._checked_ns = self._latest_ns
         for name, repair in self._repairs.items():
-            # a rare topic must not hold up the others until more of it has come
+            # a slow topic must not delay the others until its next message
             self._place(name, repair.settle_before(self._latest_ns - self._window_ns))
-        # nothing may be passed on that a message still under judgement can be placed before
-        judged = [repair.earliest_ns for repair in self._repairs.values()]
-        yield from self._emit(min(self._latest_ns - self._window_ns, *judged))
+        # a pending message may still be placed before messages that are already sorted
+        pending = [repair.earliest_ns for repair in self._repairs.values()]
+        yield from self._emit(min(self._latest_ns - self._window_ns, *pending))
 
     def finish(self) -> Iterator[Message]:
-        """The rest, sorted, after the last message was pushed."""
+        """The remaining messages, sorted, after the last `push`."""
         for name, repair in self._repairs.items():
             self._place(name, repair.finish())
         yield from self._emit(_FAR_AHEAD)
@@ -123,35 +124,35 @@ def merge(files: Sequence[Iterable[Message]]) -> Iterator[Message]:
     return heapq.merge(*files, key=sort_key)
 
 
-class _Repair:
-    """Finds the glitches of one topic; every method returns the messages that are settled."""
+class _GlitchRepair:
+    """Repairs the glitches of one topic; every method returns the messages whose time is final."""
 
     def __init__(self, window_ns: int, counts: Counter[str]) -> None:
         self._window_ns, self._counts = window_ns, counts
         self._pending: deque[list[Message]] = deque()  # groups of equal stamp
         self._stamps: deque[int] = deque()  # of the pending groups
-        self._numbers: deque[int] = deque()  # where in the file the pending groups were recorded
-        self._settled: deque[int] = deque(maxlen=_LOOK_AHEAD)  # stamps of the last settled ones
+        self._numbers: deque[int] = deque()  # their positions in the order of recording
+        self._settled: deque[int] = deque(maxlen=_LOOK_AHEAD)  # last settled stamps
         self._placed_ns = _LONG_AGO  # latest time of a settled message
-        self._placed_number = 0  # where in the file it was recorded
+        self._placed_number = 0  # its position in the order of recording
 
     @property
     def earliest_ns(self) -> int:
-        """No message that is still pending will be placed before this."""
+        """Lower bound of the times of pending messages."""
         return self._placed_ns if self._stamps else _FAR_AHEAD
 
     def push(self, message: Message, number: int) -> list[Message]:
         if not isinstance(message, SAMPLED):
             return [message]
-        # where it is placed so far, see `recording`; usually its stamp
+        # its time so far, see `future_stamps`; usually its stamp
         stamp_ns, stamps = message.time_ns, self._stamps
         if stamp_ns < self._placed_ns - self._window_ns:
-            # refused here already, lest it makes glitches of everything before it
+            # dropped here: as the earliest stamp it would turn all pending ones into glitches
             self._counts[TOO_LATE] += 1
             return []
         if stamps and stamps[-1] == stamp_ns:
             self._counts[DUPLICATE] += isinstance(message, _ONE_PER_STAMP)
-            if len(self._pending[-1]) < _LARGEST_GROUP:
+            if len(self._pending[-1]) < _MAX_GROUP:
                 self._pending[-1].append(message)
                 return []
         self._pending.append([message])
@@ -187,7 +188,7 @@ class _Repair:
         return group
 
     def _time_of(self, stamp_ns: int, number: int) -> int:
-        """Where a stamp that was just taken from the front of the queue belongs."""
+        """Time of a message whose stamp was just taken from the front of the queue."""
         later = self._stamps
         if not later or min(later) >= stamp_ns:
             return stamp_ns
@@ -199,7 +200,7 @@ class _Repair:
             return stamp_ns  # a swap
         if self._placed_ns == _LONG_AGO:
             return first_ns
-        # what lies between is later than first_ns as well: a run of glitches, all placed in here
+        # all stamps in between are later than first_ns too: a run of glitches, interpolated here
         before = self._placed_number
         part, whole = number - before, self._numbers[first] - before
         return self._placed_ns + (first_ns - self._placed_ns) * part // whole

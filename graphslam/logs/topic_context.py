@@ -1,4 +1,4 @@
-"""What must be known before the first message is decoded: mounts and no-return values."""
+"""Decoding context of each topic, from a sample of its messages: mounts and no-return values."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -17,13 +17,13 @@ from graphslam.logs.no_return import find_no_return
 from graphslam.logs.topics import ODOMETRY_KINDS, Topic, robot_of, static_transform_topics
 from graphslam.logs.writer import DEFAULT_ROBOT
 
-# 16 x 16 scans over the whole log: enough to find a frequent value, little to read
+# 16 x 16 messages over the whole log: enough to find a frequent value, quick to read
 _SAMPLE_BLOCKS, _SAMPLE_PER_BLOCK = 16, 16
 
 
 @dataclass(frozen=True, slots=True)
 class ScanShape:
-    """What a laser's messages say about it; a limit of range is None where it is not finite."""
+    """Properties of a laser by its messages; a range limit that is not finite is None."""
 
     beams: int
     field_of_view_rad: float
@@ -32,7 +32,7 @@ class ScanShape:
 
 
 def scan_shape(files: Sequence[McapFile], topic: Topic) -> ScanShape | None:
-    """Shape of the first scan of ``topic`` that decodes; None when none does."""
+    """Shape of the first scan of ``topic`` that can be decoded; None if there is none."""
     for message in sample_decoded(files, topic):
         beams = len(message.ranges)
         view = abs(float(message.angle_increment)) * max(beams - 1, 0)
@@ -46,7 +46,7 @@ def scan_shape(files: Sequence[McapFile], topic: Topic) -> ScanShape | None:
 def topic_contexts(
     files: Sequence[McapFile], topics: Sequence[Topic], config: Config
 ) -> tuple[dict[str, TopicContext], list[str]]:
-    """Context for the decoder of each topic, and warnings about what had to be assumed."""
+    """Decoding context of each topic, and warnings about assumptions that were made."""
     warnings: list[str] = []
     odometry = [t for kind in ODOMETRY_KINDS[::-1] for t in topics if t.record is kind]
     bases = {t.robot: _base_frame(files, t) for t in odometry}  # the preferred kind comes last
@@ -80,7 +80,7 @@ def topic_contexts(
 
 
 def sample_decoded(files: Sequence[McapFile], topic: Topic) -> Iterator[Any]:
-    """Some decoded messages of ``topic`` from all over the log; those that decode."""
+    """Decoded messages of ``topic``, sampled evenly over the log."""
     for file in files:
         for data in sample_messages(file, topic.name, _SAMPLE_BLOCKS, _SAMPLE_PER_BLOCK):
             try:
@@ -90,9 +90,9 @@ def sample_decoded(files: Sequence[McapFile], topic: Topic) -> Iterator[Any]:
 
 
 def _base_frame(files: Sequence[McapFile], topic: Topic) -> str:
-    """Frame that an odometry topic tells the motion of."""
+    """Frame whose motion an odometry topic describes."""
     if topic.record is records.WheelAngles:
-        return "base_link"  # JointState names no frame that moves; this is ROS' convention
+        return "base_link"  # JointState has no such frame; this is ROS' convention
     for message in sample_decoded(files, topic):
         name = message.child_frame_id if topic.record is records.OdometryPose else frame_of(message)
         return str(name).lstrip("/") or "base_link"
@@ -100,7 +100,7 @@ def _base_frame(files: Sequence[McapFile], topic: Topic) -> str:
 
 
 def _transforms(files: Sequence[McapFile], robot: str) -> TransformTree:
-    """Static transforms for ``robot``: the global ones and those of its own namespace."""
+    """Static transforms for ``robot``: global ones and those of its namespace."""
     tree: dict[str, tuple[str, Array]] = {}
     for file in files:
         own = [n for n in static_transform_topics(file) if robot_of(n) in (DEFAULT_ROBOT, robot)]
@@ -113,13 +113,13 @@ def _decoded(transforms: Iterable[bytes]) -> Iterator[Any]:
         try:
             yield schemas.decode(schemas.TF_MESSAGE, data)
         except schemas.CdrError:
-            continue  # a mount that is missing for it is warned about
+            continue  # a mount that is missing therefore causes a warning
 
 
 def _mount(
     topic: Topic, tree: TransformTree, base: str, frame: str, configured: Sequence[float]
 ) -> tuple[Array, bool, list[str]]:
-    """Pose (3,) of ``frame`` on the robot, whether it hangs upside down, and warnings."""
+    """Pose (3,) of ``frame`` on the robot, whether it is upside down, and warnings."""
     where = f"{topic.name}: frame {frame or '(none)'}"
     found = find_mount(tree, base, frame)
     inverted = found is not None and found.inverted
@@ -128,16 +128,10 @@ def _mount(
     if found is None:
         if topic.record is records.Sighting and not frame:
             return np.zeros(3), False, []  # no frame: measured from the base
-        return (
-            np.zeros(3),
-            False,
-            [
-                f"{where}: tf_static does not place it on {base}; taken as the base itself; "
-                f"set robots.{topic.robot}.laser"
-            ],
-        )
+        problem = f"tf_static has no transform from {base}; assumed to be the base itself"
+        return np.zeros(3), False, [f"{where}: {problem}; set robots.{topic.robot}.laser"]
     notes = []
     if not is_level(found):
         tilt = np.rad2deg(found.tilt_rad)
-        notes.append(f"{where}: is tilted by {tilt:.0f} deg; read as if it were level")
+        notes.append(f"{where}: is tilted by {tilt:.0f} deg; treated as level")
     return found.pose, inverted, notes

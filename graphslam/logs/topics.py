@@ -1,4 +1,4 @@
-"""Which topics of a log are used, and for which robot."""
+"""Selection of the topics of a log that are used, and their robots."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -12,8 +12,8 @@ from graphslam.logs.mcap_file import McapFile
 from graphslam.logs.schemas import TF_MESSAGE
 from graphslam.logs.writer import DEFAULT_ROBOT
 
-# What a robot's motion is taken from, the best first: an increment carries its covariance, wheel
-# angles need the wheels' geometry from the configuration.
+# Sources of odometry in order of preference: an increment has its covariance, wheel angles need
+# the wheel geometry from the configuration.
 ODOMETRY_KINDS: tuple[type[records.Message], ...] = (
     records.OdometryIncrement,
     records.OdometryPose,
@@ -23,7 +23,7 @@ ODOMETRY_KINDS: tuple[type[records.Message], ...] = (
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """A topic that can be decoded; ``count`` messages over all files, for ``robot``."""
+    """A topic of ``robot`` that can be decoded; ``count`` messages over all files."""
 
     name: str
     schema: str
@@ -70,13 +70,13 @@ def find_topics(files: Sequence[McapFile], config: Config) -> list[Topic]:
 
 
 def robot_of(topic: str) -> str:
-    """Robot that a topic's name tells: robot1 for ``/robot1/scan``, robot for ``/scan``."""
+    """Robot of a topic by its namespace: robot1 for ``/robot1/scan``, robot for ``/scan``."""
     first, separator, _ = topic.strip("/").partition("/")
     return first if separator else DEFAULT_ROBOT
 
 
 def static_transform_topics(file: McapFile) -> list[str]:
-    """Topics of ``file`` with transforms that never change."""
+    """Topics of ``file`` with static transforms."""
     return [
         topic.name
         for topic in file.topics
@@ -87,7 +87,7 @@ def static_transform_topics(file: McapFile) -> list[str]:
 def choose_topics(
     files: Sequence[McapFile], topics: Sequence[Topic]
 ) -> tuple[list[Topic], list[str]]:
-    """One source of odometry and one laser per robot, and everything else; with warnings.
+    """One odometry source and one laser per robot, all other topics, and warnings.
 
     Raises:
         LogError: all topics are empty, or a robot has scans or sightings but no odometry.
@@ -106,12 +106,12 @@ def choose_topics(
         lasers = sorted(
             (t for t in own if t.record is records.Scan), key=lambda t: (-t.count, t.name)
         )
-        _demand_odometry(names, robot, own, odometry)
-        # true associations are read by whom they concern only: `logs.truth`
+        _require_odometry(names, robot, own, odometry)
+        # true associations are read by `logs.truth` only
         others = (*ODOMETRY_KINDS, records.Scan, records.TrueAssociations)
         rest = [t for t in own if t.record not in others]
         chosen += odometry[:1] + lasers[:1] + rest
-        warnings += _one_of("odometry", robot, odometry) + _one_of("laser", robot, lasers)
+        warnings += _unused("odometry", robot, odometry) + _unused("laser", robot, lasers)
     if not any(topic.record in ODOMETRY_KINDS for topic in chosen):
         raise LogError(
             f"{names}: no odometry; the log has only {', '.join(t.name for t in filled)}; "
@@ -124,7 +124,7 @@ def _odometry_preference(topic: Topic) -> tuple[int, int, str]:
     return ODOMETRY_KINDS.index(topic.record), -topic.count, topic.name
 
 
-def _demand_odometry(
+def _require_odometry(
     names: str, robot: str, own: Sequence[Topic], odometry: Sequence[Topic]
 ) -> None:
     for topic in own:
@@ -136,7 +136,8 @@ def _demand_odometry(
             )
 
 
-def _one_of(what: str, robot: str, topics: Sequence[Topic]) -> list[str]:
+def _unused(what: str, robot: str, topics: Sequence[Topic]) -> list[str]:
+    """A warning that only the first of several ``topics`` is used."""
     if len(topics) < 2:
         return []
     others = ", ".join(topic.name for topic in topics[1:])

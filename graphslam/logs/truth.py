@@ -1,4 +1,4 @@
-"""What is true according to logs. Only evaluation reads this; it needs no odometry."""
+"""Ground truth in logs; read by evaluation only, needs no odometry."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ from graphslam.logs.topics import find_topics
 class GroundTruth:
     """True trajectories of robots' bases and true landmarks, world frame; either may be empty.
 
-    Covariances are NaN. ``sha256`` are those of the logs it was read from, in their order.
+    Covariances are NaN. ``sha256``: digests of the logs, in their order.
     """
 
     trajectories: Mapping[str, Trajectory]
@@ -29,14 +29,14 @@ class GroundTruth:
     sha256: tuple[str, ...] = ()
 
     def __bool__(self) -> bool:
-        """Whether there is anything to compare with."""
+        """Whether there is any ground truth."""
         return bool(self.trajectories or self.landmarks)
 
 
 def read_truth(paths: Sequence[Path], config: Config) -> GroundTruth:
     """All TruePose and TrueLandmark messages of ``paths``; both may be empty.
 
-    Poses are sorted by header stamp. A landmark told more than once (one per robot or file) is
+    Poses are sorted by header stamp. A landmark that appears repeatedly (per robot or file) is
     taken once, by its identity.
 
     Raises:
@@ -46,7 +46,7 @@ def read_truth(paths: Sequence[Path], config: Config) -> GroundTruth:
 
 
 def truth_from_mcap(files: Sequence[McapFile], config: Config) -> GroundTruth:
-    """`read_truth` of files that are open already."""
+    """`read_truth` of files that are already open."""
     topics = {t.name: t for t in find_topics(files, config) if t.record in (Truth, TrueLandmark)}
     poses: dict[str, list[bytes]] = {}
     landmarks: dict[str, TrueLandmark] = {}
@@ -71,7 +71,7 @@ def truth_from_mcap(files: Sequence[McapFile], config: Config) -> GroundTruth:
 def read_true_associations(
     paths: Sequence[Path], config: Config
 ) -> Mapping[str, tuple[TrueAssociations, ...]]:
-    """What scans and sightings truly met: topic -> messages in the order of recording.
+    """True associations of scans and sightings: topic -> messages in the order of recording.
 
     Raises:
         LogError: a file is missing, not MCAP, empty, or without any topic that can be decoded.
@@ -89,23 +89,23 @@ def read_true_associations(
     return {name: tuple(messages) for name, messages in found.items()}
 
 
-def _trajectory(found: Sequence[bytes]) -> Trajectory:
-    """Sorted by header stamp; what cannot be used is left out."""
+def _trajectory(messages: Sequence[bytes]) -> Trajectory:
+    """The poses sorted by header stamp; malformed messages are left out."""
     try:
-        stamps, poses = schemas.decode_true_poses(found)
+        stamps, poses = schemas.decode_true_poses(messages)
     except schemas.CdrError:
-        stamps, poses = _usable(found)
+        stamps, poses = _decodable(messages)
     finite = np.isfinite(poses).all(axis=1)
     stamps, poses = stamps[finite], poses[finite]
     order = np.argsort(stamps, kind="stable")
     return Trajectory(stamps[order], poses[order], np.full((len(order), 3, 3), np.nan))
 
 
-def _usable(found: Sequence[bytes]) -> tuple[schemas.IntArray, Array]:
-    """Stamps and poses of the messages that can be decoded."""
+def _decodable(messages: Sequence[bytes]) -> tuple[schemas.IntArray, Array]:
+    """Stamps (n,) ns and poses (n, 3) of the messages that can be decoded."""
     stamps: list[schemas.IntArray] = [np.zeros(0, dtype=np.int64)]
     poses = [np.zeros((0, 3))]
-    for data in found:
+    for data in messages:
         try:
             stamp, pose = schemas.decode_true_poses([data])
         except schemas.CdrError:

@@ -142,7 +142,9 @@ class Pipeline:
     def run(self, progress: Progress) -> None:
         """Take in every message of the log."""
         tracks = {name: run.track for name, run in self.runs.items()}
-        read = _counted(self.log.messages((Truth, TrueLandmark), ahead=True), self.counts, progress)
+        read = _counted(
+            self.log.messages((Truth, TrueLandmark), prefetch=True), self.counts, progress
+        )
         messages = synchronise(
             self.wanted(to_common_clock(read, self.known.clocks)),
             tracks,

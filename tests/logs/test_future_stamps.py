@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from graphslam.core.config import Config
 from graphslam.core.records import OdometryIncrement, OdometryPose, Scan
 from graphslam.logs import LogWriter, open_logs
-from graphslam.logs.future_stamps import LONGEST_RUN, TOLERANCE_NS, repair_future_stamps
+from graphslam.logs.future_stamps import MAX_RUN, TOLERANCE_NS, repair_future_stamps
 from graphslam.logs.time_order import SAMPLED
 
 MS = 1_000_000
@@ -117,9 +117,9 @@ def test_nothing_sound_before_it_nothing_to_place_it_by():
 
 
 def test_a_run_of_any_length_stays_in_order():
-    """Memory is bounded by LONGEST_RUN messages; what is behind them piles up at the time of the
+    """Memory is bounded by MAX_RUN messages; what is behind them piles up at the time of the
     recording, in order."""
-    late = [("/odom", 5000 + k) for k in range(LONGEST_RUN + 10)]
+    late = [("/odom", 5000 + k) for k in range(MAX_RUN + 10)]
     rows = [*sound("/odom", 2 * len(late), 0), *late, ("/odom", 65)]
     found = placed_ms(record(*rows))
     assert found[-(len(late) + 1) :] == sorted(found[-(len(late) + 1) :])

@@ -12,7 +12,7 @@ from graphslam.core.config import Config, OdometryConfig
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import compose, exp
 from graphslam.logs import IMPORTERS, open_logs, read_truth
-from graphslam.logs.import_mrclam import COMMANDED, LONGEST_ARC_NS
+from graphslam.logs.import_mrclam import COMMANDED, MAX_ARC_NS
 from graphslam.slam.robot_settings import odometry_settings
 
 START = 1248444187
@@ -99,7 +99,7 @@ def test_rows_are_thinned_without_changing_the_motion(tmp_path):
     odometry = of(messages, records.OdometryPose, "robot1")
     assert len(odometry) < len(rows) / 4
     assert odometry[-1].stamp_ns == rows[-1][0] * 1_000_000
-    assert max(np.diff([m.stamp_ns for m in odometry])) <= LONGEST_ARC_NS
+    assert max(np.diff([m.stamp_ns for m in odometry])) <= MAX_ARC_NS
     turned = compose(exp(np.array([0.124, 0, 0.372])), exp(np.array([0.124, 0, -0.248])))
     np.testing.assert_allclose(odometry[-1].pose, turned, atol=1e-12)
 

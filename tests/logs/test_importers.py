@@ -215,14 +215,14 @@ def test_where_odometry_breaks_another_robot_begins(tmp_path):
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("ODOMETRY 0 1 1 0 0 1 0 0 1 0 1\nEDGE2 0 3 1 0 0 1 0 0 1 0 1\n", "break .* pose 3"),
+        ("ODOMETRY 0 1 1 0 0 1 0 0 1 0 1\nEDGE2 0 3 1 0 0 1 0 0 1 0 1\n", "pose 3 has no odometry"),
         ("ODOMETRY 0 1 1 0 zero 1 0 0 1 0 1\n", "line 1 .ODOMETRY."),
         ("ODOMETRY 0 1 1 0 0 1 0 0\n", "line 1 .ODOMETRY.: needs 6 finite numbers"),
         ("ODOMETRY 0 1 1 0 nan 1 0 0 1 0 1\n", "finite"),
         ("ODOMETRY 0 1 1 0 0 1 2 3 4 5 6\n", "noise is neither"),
         ("ODOMETRY 0 1 1 0 0 1 0 0 -1 0 1\n", "positive definite"),
         ("EDGE_SE2 0 1 1 0 0 1 0 0 0 0 1\n", "positive definite"),
-        ("EDGE2 1 1 1 0 0 1 0 0 1 0 1\n", "to itself"),
+        ("EDGE2 1 1 1 0 0 1 0 0 1 0 1\n", "the same pose"),
         ("VERTEX2 1 1 1 0\n", "no edge"),
     ],
 )

@@ -84,7 +84,7 @@ def test_every_scenario_runs_and_its_log_is_readable(name, tmp_path):
 
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_every_drive_is_free_of_collisions_to_its_end(name):
-    """`visits` raises where a robot touches anything; and no drive goes nowhere."""
+    """`prepare_visits` raises where a robot touches anything; and no drive goes nowhere."""
     for visit in prepare_visits(load_scenario(name)):
         assert max(actor.drive.path_m for actor in visit.actors.values()) > 5
 
