@@ -1,5 +1,6 @@
-"""The interface of every estimator, and what they share: which state is which."""
+"""The interface of every estimator, the table of states, and a recorder of trajectories."""
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
@@ -8,16 +9,21 @@ import numpy as np
 
 from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import Array
-from graphslam.core.records import Estimate, Step
+from graphslam.core.records import Estimate, Step, Trajectory
+
+#: why a back end could not use something, the keys of `Backend.skipped`
+LATE_EVIDENCE = "late evidence"
+PAST_OBSERVATION = "observation from a past state"
+PAST_CLOSURE = "closure to a past state"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Joint:
-    """Joint marginal of a robot's latest pose, some landmarks and other robots, world frame.
+    """Joint marginal of a robot's latest pose, landmarks and other robots' latest poses, in world.
 
-    ``pose`` (3,), ``landmarks`` one array (2,) or (3,) each, ``others`` latest poses (3,) of other
-    robots; ``cov`` (D, D) of additive world-axis errors, the pose first, then the landmarks in
-    order, then the others; ``slices`` is where the block of each landmark, then of each other lies.
+    ``pose`` (3,); ``landmarks`` one array (2,) or (3,) each; ``others`` (3,) each. ``cov`` (D, D)
+    is of additive errors along world axes: the pose, then the landmarks, then the others.
+    ``slices`` are the blocks of the landmarks and the others in it.
     """
 
     pose: Array
@@ -28,16 +34,16 @@ class Joint:
 
 
 class Backend(Protocol):
-    """An estimator that takes steps in time order and can be asked at any time.
+    """An estimator that takes steps in time order and can be queried between any two.
 
-    ``error_frame`` says in which errors its covariances are Gaussian, which matters beyond first
-    order: ``world`` = additive along world axes (thesis), ``body`` = of the exponential map at each
-    pose (GTSAM). Whatever it says, covariances are handed out along world axes.
+    ``error_frame`` is the definition of pose errors that it takes as Gaussian, which matters beyond
+    first order: ``world`` = additive along world axes (thesis), ``body`` = exponential map at the
+    pose (GTSAM). Covariances are returned along world axes in either case.
     """
 
     @property
     def smooths(self) -> bool:
-        """Whether all data have a say in all of its final estimate."""
+        """Whether the final estimate of every state uses all data."""
         ...
 
     @property
@@ -47,11 +53,11 @@ class Backend(Protocol):
 
     @property
     def skipped(self) -> Mapping[str, int]:
-        """What of the steps could not be used, counted by reason: a filter has no past."""
+        """Number of observations and closures that could not be used, by reason."""
         ...
 
     def add(self, step: Step) -> None:
-        """Take in everything of one step.
+        """Add one step: starts, motions, associations, closures.
 
         Raises:
             EstimationError: the step makes the estimate indeterminate.
@@ -76,14 +82,14 @@ class Backend(Protocol):
 
 
 class StateTable:
-    """Which states each robot has: their times, in order."""
+    """The states of every robot: ``times`` in order, and their numbers by time."""
 
     def __init__(self) -> None:
         self.times: dict[str, list[int]] = {}
         self._number: dict[tuple[str, int], int] = {}
 
     def append(self, robot: str, time_ns: int) -> int:
-        """Number of a new state."""
+        """Add a state; returns its number."""
         times = self.times.setdefault(robot, [])
         self._number[robot, time_ns] = len(times)
         times.append(time_ns)
@@ -105,7 +111,7 @@ class StateTable:
             ) from None
 
     def latest(self, robot: str, at_ns: int | None = None) -> int:
-        """Number of the robot's latest state; ``at_ns`` is when it is needed, for the message.
+        """Number of the robot's latest state; ``at_ns``, for the message, is when it is needed.
 
         Raises:
             EstimationError: the robot has not started.
@@ -120,7 +126,33 @@ class StateTable:
         return np.array(self.times[robot], dtype=np.int64)
 
 
+class TrajectoryRecorder:
+    """Trajectories that grow state by state: ``poses`` and ``covs``, lists per robot."""
+
+    def __init__(self) -> None:
+        self.poses: dict[str, list[Array]] = defaultdict(list)
+        self.covs: dict[str, list[Array]] = defaultdict(list)
+        self._times: dict[str, list[int]] = defaultdict(list)
+
+    def append(self, robot: str, time_ns: int, pose: Array, cov: Array) -> None:
+        """Add a state: pose (3,), covariance (3, 3)."""
+        self._times[robot].append(time_ns)
+        self.poses[robot].append(pose)
+        self.covs[robot].append(cov)
+
+    def trajectories(self) -> dict[str, Trajectory]:
+        """Robot -> trajectory, robots in alphabetical order."""
+        return {
+            robot: Trajectory(
+                np.array(times, dtype=np.int64),
+                np.array(self.poses[robot]),
+                np.array(self.covs[robot]),
+            )
+            for robot, times in sorted(self._times.items())
+        }
+
+
 def block_slices(dims: Sequence[int]) -> tuple[slice, ...]:
-    """Where blocks of sizes ``dims`` lie behind a pose block of three."""
+    """Slices of blocks of sizes ``dims`` behind a pose, which has the first three rows."""
     ends = 3 + np.cumsum(dims, dtype=int)
     return tuple(slice(int(e - d), int(e)) for d, e in zip(dims, ends, strict=True))

@@ -1,8 +1,9 @@
-"""How much robots' clocks are off, as unknowns beside all states.
+"""Errors of the robots' clocks as variables of the linearised graph of all states.
 
-Two robots that see each other are where both say they are at one time. If the clock of the one seen
-is ahead by e, it is seen where it is e later by its own: its state moved by e times its speed. That
-is the column of e in the linear factor of each sighting, and minus that of the observer's clock.
+An observation of one robot by another relates their states at one time. If the target's clock is
+ahead by e, the target is seen where it is e later by its own clock: at its state moved by e times
+its velocity. That is the column of e in the linear factor of the observation; the column of the
+observer's clock is minus that.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,14 +17,14 @@ from graphslam.core.geometry import Array
 from graphslam.core.records import Association, Estimate, Step
 from graphslam.estimation.isam2 import WholeGraph
 
-#: what a unit of the unknowns is: s of offset, s/s of drift. Also their sigmas before any sighting:
-#: no clock is off by more than the drift, and the offset is free
+#: prior sigmas of the offset, s, and the drift, s/s, which are also the units of the variables: the
+#: offset is practically free, and 100 ppm is more than any crystal drifts
 OFFSET_S, DRIFT = 10.0, 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClockErrors:
-    """What is left of clocks' errors, (offset s, drift s/s) of each robot: (2n,) and (2n, 2n)."""
+    """Mean (2n,) and covariance (2n, 2n) of (offset s, drift s/s) of each robot's clock."""
 
     robots: tuple[str, ...]
     mean: Array
@@ -36,7 +37,7 @@ class ClockErrors:
 
 
 def robot_associations(steps: Sequence[Step]) -> list[tuple[int, Association]]:
-    """Sightings of robots in steps, with the time of the state that was seen."""
+    """Observations of robots in steps, with the time of the observed robot's state."""
     return [
         (step.time_ns, a) for step in steps for a in step.associations if isinstance(a.target, str)
     ]
@@ -45,48 +46,45 @@ def robot_associations(steps: Sequence[Step]) -> list[tuple[int, Association]]:
 def clock_errors(
     steps: Sequence[Step],
     estimate: Estimate,
-    speeds: Array,
+    velocities: Array,
     after_s: Array,
     prior: Mapping[str, Array],
     kernel: RobustConfig,
 ) -> ClockErrors:
-    """One Gauss-Newton step for the clocks, all states and landmarks free.
+    """One Gauss-Newton step for the clocks, with all states and landmarks as variables.
 
     Args:
         steps: as recorded.
         estimate: of all their states and landmarks.
-        speeds: (n, 3) twists per second of the robots that were seen, along their own axes, in the
+        velocities: (n, 3) twists per second of the observed robots, along their own axes, in the
             order of `robot_associations`.
         after_s: (n,) time since the clocks' epoch.
-        prior: robot -> what its clock has been corrected by so far (2,), of those whose clock is
-            unknown; the others' are right.
-        kernel: for observations.
+        prior: robot -> correction (2,) so far, of the clocks to estimate; others are correct.
+        kernel: of observations.
 
     Raises:
         EstimationError: the estimate is indeterminate.
     """
-    builder, values = WholeGraph(kernel, faced_later=True), gtsam.Values()
-    for step in steps:
-        builder.insert(step, estimate, values)
-    builder.face_lines(values)
+    builder, values = WholeGraph.at_estimate(steps, estimate, kernel)
+    builder.rebuild_lines(values)
     robots = tuple(sorted(prior))
     clock = int(gtsam.symbol("t", 0))
     size, units = 2 * len(robots), np.array([OFFSET_S, DRIFT])
     unit = gtsam.noiseModel.Unit.Create(size)
-    met = [builder.graph.at(place) for place, _ in builder.meetings]
-    for place, _ in builder.meetings:
-        builder.graph.remove(place)
+    nonlinear = [builder.graph.at(index) for index, _ in builder.robot_observations]
+    for index, _ in builder.robot_observations:
+        builder.graph.remove(index)
     linear = builder.graph.linearize(values)
     so_far = np.concatenate([prior[robot] / units for robot in robots])
     linear.add(gtsam.JacobianFactor(clock, np.eye(size), -so_far, unit))
     columns = np.column_stack([np.ones(len(after_s)), after_s]) * units
-    for n, (_, (key, target, seen)) in enumerate(builder.meetings):
-        factor = met[n].linearize(values)
+    for n, (_, (key, target, seen)) in enumerate(builder.robot_observations):
+        factor = nonlinear[n].linearize(values)
         A, b = factor.jacobian()
         first = factor.keys()[0] == key
         A_key, A_target = (A[:, :3], A[:, 3:]) if first else (A[:, 3:], A[:, :3])
         C = np.zeros((len(b), size))
-        along = np.outer(A_target @ speeds[n], columns[n])
+        along = np.outer(A_target @ velocities[n], columns[n])
         for robot, sign in ((str(seen.target), 1.0), (seen.robot, -1.0)):
             if robot in prior:
                 at = 2 * robots.index(robot)

@@ -1,19 +1,20 @@
 """Decentralised smoothing, simulated: a graph per robot, and condensed messages between them.
 
-Every robot smooths its own measurements. From time to time it tells the others what it measured
-since the last time. States that nobody else refers to are eliminated: what is left of a stretch of
-them is a Gaussian over its ends and the landmarks seen on it, sent as information with the place it
-was linearised at (DDF-SAM: A. Cunningham, M. Paluri, F. Dellaert, IROS 2010, DOI
-10.1109/IROS.2010.5652875, who send the whole condensed map anew each time; here each message is of
-its own span). Shared are landmarks, states at meetings, and the first and last state of the span.
-What nothing is eliminated from is sent as measured, and so is a stretch that is smaller that way.
+Every robot smooths its own measurements and periodically sends the others those since its last
+message. States that no other robot needs are eliminated. What remains of a section of them is a
+Gaussian over its two ends and the landmarks seen from it, sent as information with its
+linearisation point (DDF-SAM: A. Cunningham, M. Paluri, F. Dellaert, IROS 2010, DOI
+10.1109/IROS.2010.5652875, who send the whole condensed map each time; here each message covers its
+own interval). Shared variables are landmarks, states from which or at which robots observed each
+other, and the first and last state of the interval. Measurements are sent as they are where there
+is nothing to eliminate, or where that is smaller.
 
-No information counts twice: a message is made of the sender's own measurements of one span, never
-of messages, so all messages and the receiver's own measurements are different factors of one graph,
-and their sum is the centralised one, but for two losses: what was condensed keeps the place it was
-linearised at and its robust weights, and until the next message nothing is known of the others.
+No information is counted twice: a message consists of the sender's own measurements of one
+interval, never of messages. All messages and the receiver's own measurements are different factors
+of one graph, whose sum is the centralised one, with two losses: condensed factors keep their
+linearisation point and robust weights, and between messages the others are unknown.
 
-There is no network in it: every message reaches everybody, and identities of landmarks are agreed.
+There is no network model: every message reaches every robot, and landmark identities are shared.
 """
 
 from collections import defaultdict
@@ -24,22 +25,21 @@ import gtsam
 import numpy as np
 
 from graphslam.core.config import Config
-from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import Array
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Estimate, Step
 from graphslam.estimation import factors
-from graphslam.estimation.factor_graph import GraphBackend, GraphBuilder, Part, read, write
-from graphslam.estimation.isam2 import isam2_parameters, optimise
+from graphslam.estimation.factor_graph import FactorGroup, GraphBackend, GraphBuilder, read, write
+from graphslam.estimation.isam2 import isam2_parameters, isam2_tree, optimise
 
-#: bytes of a number, and of the name of a variable
-NUMBER, NAME = 8, 8
-KEPT = "evidence about a state before the last message: its robot keeps it"
+#: bytes of a number, and of a variable's key
+NUMBER_BYTES, KEY_BYTES = 8, 8
+NOT_SENT = "evidence about a state before the last message: its robot keeps it"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Measured:
-    """Factors of one measurement, and its bytes as it is."""
+class Measurement:
+    """Factors of one measurement, and its bytes if sent as it is."""
 
     factors: tuple[gtsam.NonlinearFactor, ...]
     size: int
@@ -51,7 +51,7 @@ class Measured:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Message:
-    """What a robot tells the others: factors, a value of every variable in them, and its bytes."""
+    """What a robot sends to the others: factors, values of their variables, and its bytes."""
 
     factors: tuple[gtsam.NonlinearFactor, ...]
     values: Mapping[int, Array]
@@ -59,49 +59,50 @@ class Message:
 
 
 @dataclass(slots=True, eq=False)
-class Member:
-    """One robot's own estimator: all it measured and all it was told.
+class LocalSmoother:
+    """One robot's own estimator, of its measurements and the messages it received.
 
-    ``dims`` are its variables; ``fresh`` factors and values of now, ``unsent`` its own factors
-    since the last message, ``frontier`` the number of its state then; ``sent`` and ``measured``
-    count the bytes of its messages and of its measurements as they are.
+    ``dims`` are its variables. ``new_factors`` and ``new_values`` wait for the next update.
+    ``unsent`` are its measurements since its last message, which ended at state number
+    ``last_sent``. ``sent`` and ``measured`` count the bytes of its messages and of its measurements
+    as they are.
     """
 
     name: str
     isam: gtsam.ISAM2
     graph: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     dims: dict[int, int] = field(default_factory=dict)
-    fresh: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
-    values: dict[int, Array] = field(default_factory=dict)
-    unsent: list[Measured] = field(default_factory=list)
-    frontier: int = 0
+    new_factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
+    new_values: dict[int, Array] = field(default_factory=dict)
+    unsent: list[Measurement] = field(default_factory=list)
+    last_sent: int = 0
     sent: int = 0
     measured: int = 0
 
-    def take(self, made: Iterable[gtsam.NonlinearFactor], new: Mapping[int, Array]) -> None:
-        """Factors for the next update; ``new`` are first values of what it may not know yet."""
+    def add(self, made: Iterable[gtsam.NonlinearFactor], values: Mapping[int, Array]) -> None:
+        """Add factors for the next update, with initial values for variables that are missing."""
         for factor in made:
-            self.fresh.add(factor)
-        for key, value in new.items():
+            self.new_factors.add(factor)
+        for key, value in values.items():
             if key not in self.dims:
                 self.dims[key] = len(value)
-                self.values[key] = value
+                self.new_values[key] = value
 
     def update(self) -> None:
-        """Bring the tree up to date."""
-        if not self.fresh.size():
+        """Update the tree."""
+        if not self.new_factors.size():
             return
         values = gtsam.Values()
-        for key, value in self.values.items():
+        for key, value in self.new_values.items():
             write(values, key, value)
-        self.graph.push_back(self.fresh)
-        self.isam.update(self.fresh, values)
-        self.fresh, self.values = gtsam.NonlinearFactorGraph(), {}
+        self.graph.push_back(self.new_factors)
+        self.isam.update(self.new_factors, values)
+        self.new_factors, self.new_values = gtsam.NonlinearFactorGraph(), {}
 
     def value(self, key: int) -> Array:
-        """Current estimate (2,) or (3,) of a variable that it knows."""
-        if key in self.values:
-            return self.values[key]
+        """Current estimate (2,) or (3,) of one of its variables."""
+        if key in self.new_values:
+            return self.new_values[key]
         if self.dims[key] == 3:
             return factors.array3(self.isam.calculateEstimatePose2(key))
         return np.asarray(self.isam.calculateEstimatePoint2(key))
@@ -109,35 +110,35 @@ class Member:
     def message(self, shared: set[int]) -> Message:
         """Its own measurements since the last message, states that are not ``shared`` eliminated.
 
-        A prior on what is eliminated is not needed: it hangs on the chain of states.
+        These need no prior: the chain of states ties them to shared ones.
         """
         unsent, self.unsent = self.unsent, []
         estimate = self.isam.calculateBestEstimate()
-        told: list[gtsam.NonlinearFactor] = []
+        content: list[gtsam.NonlinearFactor] = []
         size = 0
-        for stretch, inner in _stretches(unsent, shared):
-            as_measured = sum(measured.size for measured in stretch)
+        for section, inner in _sections(unsent, shared):
+            as_measured = sum(measurement.size for measurement in section)
             if inner:
-                made, smaller = _condensed(stretch, inner, estimate, self.dims)
+                made, smaller = _condensed(section, inner, estimate, self.dims)
                 if smaller < as_measured:
-                    told += made
+                    content += made
                     size += smaller
                     continue
-            told += [factor for measured in stretch for factor in measured.factors]
+            content += [factor for measurement in section for factor in measurement.factors]
             size += as_measured
-        keys = {key for factor in told for key in factor.keys()}  # noqa: SIM118
+        keys = {key for factor in content for key in factor.keys()}  # noqa: SIM118
         self.sent += size
         return Message(
-            tuple(told), {key: read(estimate, key, self.dims[key]) for key in keys}, size
+            tuple(content), {key: read(estimate, key, self.dims[key]) for key in keys}, size
         )
 
 
-def _stretches(
-    unsent: Sequence[Measured], shared: set[int]
-) -> Iterator[tuple[list[Measured], list[int]]]:
-    """Measurements that hang together by states nobody else needs, and those states.
+def _sections(
+    unsent: Sequence[Measurement], shared: set[int]
+) -> Iterator[tuple[list[Measurement], list[int]]]:
+    """Measurements connected by states that are not ``shared``, and those states.
 
-    Those without any such state come together.
+    Measurements without any such state form one section.
     """
     root: dict[int, int] = {}
 
@@ -151,45 +152,46 @@ def _stretches(
         for key in keys:
             root.setdefault(key, key)
             root[find(key)] = find(keys[0])
-    groups: dict[int | None, list[Measured]] = defaultdict(list)
+    sections: dict[int | None, list[Measurement]] = defaultdict(list)
     states: dict[int | None, set[int]] = defaultdict(set)
-    for measured, keys in zip(unsent, inner, strict=True):
-        group = find(keys[0]) if keys else None
-        groups[group].append(measured)
-        states[group] |= set(keys)
-    for group, found in groups.items():
-        yield found, sorted(states[group])
+    for measurement, keys in zip(unsent, inner, strict=True):
+        label = find(keys[0]) if keys else None
+        sections[label].append(measurement)
+        states[label] |= set(keys)
+    for label, section in sections.items():
+        yield section, sorted(states[label])
 
 
 def _condensed(
-    stretch: Sequence[Measured],
+    section: Sequence[Measurement],
     inner: Sequence[int],
     estimate: gtsam.Values,
     dims: Mapping[int, int],
 ) -> tuple[list[gtsam.NonlinearFactor], int]:
-    """What is left of measurements when states are eliminated, and its bytes.
+    """Factors that remain of measurements when states are eliminated, and their bytes.
 
-    Per factor the names of its variables, information (upper triangle) and vector; once per
-    variable the place that it was linearised at.
+    Per factor the keys of its variables, information (upper triangle) and vector; once per variable
+    its linearisation point.
     """
     graph = gtsam.NonlinearFactorGraph()
-    for measured in stretch:
-        for factor in measured.factors:
+    for measurement in section:
+        for factor in measurement.factors:
             graph.add(factor)
     order = gtsam.Ordering(list(inner))
-    left = graph.linearize(estimate).eliminatePartialSequential(order, gtsam.EliminateQR)[1]
-    made = gtsam.LinearContainerFactor.ConvertLinearGraph(left, estimate)
-    every = [made.at(n) for n in range(made.size())]
-    size = sum(NUMBER * dims[key] for key in {key for f in every for key in f.keys()})  # noqa: SIM118
-    for factor in every:
+    rest = graph.linearize(estimate).eliminatePartialSequential(order, gtsam.EliminateQR)[1]
+    made = gtsam.LinearContainerFactor.ConvertLinearGraph(rest, estimate)
+    condensed = [made.at(n) for n in range(made.size())]
+    unique = {key for factor in condensed for key in factor.keys()}  # noqa: SIM118
+    size = sum(NUMBER_BYTES * dims[key] for key in unique)
+    for factor in condensed:
         keys = factor.keys()
         dim = sum(dims[key] for key in keys)
-        size += NAME * len(keys) + NUMBER * (dim * (dim + 1) // 2 + dim)
-    return every, size
+        size += KEY_BYTES * len(keys) + NUMBER_BYTES * (dim * (dim + 1) // 2 + dim)
+    return condensed, size
 
 
 class DecentralisedBackend(GraphBackend):
-    """See the module's docstring; what a robot is asked for, its own estimator answers."""
+    """See the module's docstring; queries about a robot are answered by its own estimator."""
 
     smooths = True
 
@@ -198,22 +200,22 @@ class DecentralisedBackend(GraphBackend):
         self._config = config
         self._period_ns = round(1e9 * config.backend.exchange_s)
         self._next_ns: int | None = None
-        self._members: list[Member] = []
-        self._asked: Member | None = None  # whose state was asked for last
-        self._meetings: list[Part] = []  # since the last exchange
+        self._robots: list[LocalSmoother] = []
+        self._queried: LocalSmoother | None = None  # the robot whose state was queried last
+        self._between_robots: list[FactorGroup] = []  # since the last exchange
         self.messages = 0
 
     @property
     def sent(self) -> dict[str, int]:
-        """Robot -> bytes of its messages, each counted once, however many hear it."""
-        return {member.name: member.sent for member in self._members}
+        """Robot -> bytes of its messages, each counted once, whatever the number of receivers."""
+        return {robot.name: robot.sent for robot in self._robots}
 
     @property
     def measured(self) -> dict[str, int]:
         """Robot -> bytes of its measurements as they are: what a centralised estimate needs."""
-        return {member.name: member.measured for member in self._members}
+        return {robot.name: robot.measured for robot in self._robots}
 
-    # ------------------------------------------------------------ taking in
+    # ------------------------------------------------------------ adding steps
 
     def add(self, step: Step) -> None:
         """See `Backend`; an exchange comes before the first step after its time."""
@@ -225,183 +227,148 @@ class DecentralisedBackend(GraphBackend):
             self._next_ns += self._period_ns * (
                 1 + (step.time_ns - self._next_ns) // self._period_ns
             )
-        for part in self.builder.parts(step, self.value):
-            self._take(part)
+        for group in self.builder.factor_groups(step, self.value):
+            self._add(group)
         self._update()
 
-    def _take(self, part: Part) -> None:
-        """A part of a step, to the robot that measured it."""
-        keys = list(dict.fromkeys(key for f in part.factors for key in f.keys()))  # noqa: SIM118
+    def _add(self, group: FactorGroup) -> None:
+        """Give factors to the robot that measured them."""
+        keys = list(dict.fromkeys(key for f in group.factors for key in f.keys()))  # noqa: SIM118
         states = [key for key in keys if factors.is_state(key)]
-        key = part.observed[0] if part.observed else states[-1]
-        member = self._member(key)
-        size = _measured_bytes(part)
-        member.measured += size
-        late = [k for k in states if factors.number_of(k)[1] < self._member(k).frontier]
+        key = group.observed[0] if group.observed else states[-1]
+        robot = self._robot_of(key)
+        size = _measured_bytes(group)
+        robot.measured += size
+        late = any(factors.number_of(k)[1] < self._robot_of(k).last_sent for k in states)
         if len({factors.number_of(k)[0] for k in states}) > 1:
             if late:
-                self.builder.skipped[KEPT] += 1
+                self.builder.skipped[NOT_SENT] += 1
             else:
-                self._meetings.append(part)
+                self._between_robots.append(group)
             return
-        new = dict([part.new] if part.new else [])
-        made = list(part.factors)
-        if part.observed and part.observed[1] not in {*member.dims, *new}:
-            # known to others, but not to this one before their message
-            _, target, seen = part.observed
+        new = dict([group.new] if group.new else [])
+        if group.observed and group.observed[1] not in {*robot.dims, *new}:
+            # a landmark of other robots, of which this one has no message yet
+            _, target, seen = group.observed
             new[target] = MODELS[seen.model].invert(seen.z, self.value(key, 3))
-            if seen.model == "line":  # till then it needs to know where on the line, too
-                member.take([factors.line_gauge_factor(key, target, seen)], {})
-        member.take(made, new)
+            if seen.model == "line":  # until then it needs a gauge of its own
+                robot.add([factors.line_gauge_factor(key, target, seen)], {})
+        robot.add(group.factors, new)
         if late:
-            self.builder.skipped[KEPT] += 1
+            self.builder.skipped[NOT_SENT] += 1
         else:
-            member.unsent.append(Measured(part.factors, size))
+            robot.unsent.append(Measurement(group.factors, size))
 
     def exchange(self) -> None:
-        """Everybody tells everybody what was measured since the last time."""
+        """Every robot sends its measurements since its last message to all others."""
         self._joints.clear()
-        met = {key for part in self._meetings for f in part.factors for key in f.keys()}  # noqa: SIM118
+        between, self._between_robots = self._between_robots, []
+        shared = {key for group in between for f in group.factors for key in f.keys()}  # noqa: SIM118
         messages = []
-        for n, member in enumerate(self._members):
-            last = len(self.builder.states.times[member.name]) - 1
-            ends = {factors.state_key(n, number) for number in (member.frontier, last)}
-            messages.append(member.message(met | ends))
-            member.frontier = last
+        for n, robot in enumerate(self._robots):
+            last = len(self.builder.states.times[robot.name]) - 1
+            ends = {factors.state_key(n, number) for number in (robot.last_sent, last)}
+            messages.append(robot.message(shared | ends))
+            robot.last_sent = last
             self.messages += 1
-        for member in self._members:
-            for message, sender in zip(messages, self._members, strict=True):
-                if sender is not member:
-                    member.take(message.factors, message.values)
-            for part in self._meetings:
-                member.take(part.factors, {})
-        for part in self._meetings:
-            self._member(part.factors[0].keys()[0]).sent += _measured_bytes(part)
-        self._meetings = []
+        for robot in self._robots:
+            for message, sender in zip(messages, self._robots, strict=True):
+                if sender is not robot:
+                    robot.add(message.factors, message.values)
+            for group in between:
+                robot.add(group.factors, {})
+        for group in between:
+            self._robot_of(group.factors[0].keys()[0]).sent += _measured_bytes(group)
         self._update()
 
     def _update(self) -> None:
-        for member in self._members:
+        for robot in self._robots:
             try:
-                member.update()
+                robot.update()
             except RuntimeError as error:
                 raise self.builder.explain(error) from error
 
-    def _member(self, key: int) -> Member:
-        """The robot whose state it is."""
+    def _robot_of(self, key: int) -> LocalSmoother:
+        """The robot whose state ``key`` is."""
         index, _ = factors.number_of(key)
-        assert index is not None  # a landmark is nobody's
-        while len(self._members) <= index:
-            name = self.builder.robots[len(self._members)]
+        assert index is not None  # a landmark belongs to no robot
+        while len(self._robots) <= index:
+            name = self.builder.robots[len(self._robots)]
             tree = gtsam.ISAM2(isam2_parameters(self._config, "QR"))
-            self._members.append(Member(name, tree))
-        return self._members[index]
+            self._robots.append(LocalSmoother(name, tree))
+        return self._robots[index]
 
-    # ------------------------------------------------------------ answers
+    # ------------------------------------------------------------ queries
 
     def value(self, key: int, dim: int) -> Array:
-        """Of a state, what its robot thinks; of a landmark, whoever was asked last or knows it."""
+        """See `GraphBackend`: of a state by its robot, of a landmark by `_robot_with` it."""
         if factors.is_state(key):
-            self._asked = self._member(key)
-            return self._asked.value(key)
-        return self._knowing(key).value(key)
+            self._queried = self._robot_of(key)
+            return self._queried.value(key)
+        return self._robot_with(key).value(key)
 
-    def _knowing(self, key: int) -> Member:
-        first = [self._asked] if self._asked is not None else []
-        return next(m for m in (*first, *self._members) if key in m.dims)
+    def _robot_with(self, key: int) -> LocalSmoother:
+        """The robot queried last if it has the variable, else the first one that has."""
+        first = [self._queried] if self._queried is not None else []
+        return next(robot for robot in (*first, *self._robots) if key in robot.dims)
 
     def landmark_means(self, landmarks: Sequence[int]) -> list[Array]:
-        """See `Backend`: by the first robot that knows each."""
-        self._asked = None
+        """See `Backend`: each by the first robot that has it."""
+        self._queried = None
         return super().landmark_means(landmarks)
 
     def covariance(self, keys: list[int]) -> Array:
-        """See `GraphBackend`; what the first one's robot does not know comes as independent."""
-        member = self._member(keys[0])
-        known = [key for key in keys if key in member.dims]
-        others = {
-            key: self._member(key) if factors.is_state(key) else self._knowing(key)
-            for key in keys
-            if key not in known
-        }
-        owner = [others.get(key, member) for key in keys]
-        ends = np.cumsum([m.dims[key] for m, key in zip(owner, keys, strict=True)])
-        place = {
-            key: np.arange(end - m.dims[key], end)
-            for m, key, end in zip(owner, keys, ends, strict=True)
-        }
+        """See `GraphBackend`; variables that the first one's robot lacks count as independent."""
+        first = self._robot_of(keys[0])
+        blocks = [(first, [key for key in keys if key in first.dims])]
+        for key in keys:
+            if key not in first.dims:
+                is_state = factors.is_state(key)
+                blocks.append((self._robot_of(key) if is_state else self._robot_with(key), [key]))
+        dims = {key: robot.dims[key] for robot, block in blocks for key in block}
+        ends = np.cumsum([dims[key] for key in keys])
+        rows = {key: np.arange(e - dims[key], e) for key, e in zip(keys, ends, strict=True)}
         cov = np.zeros((ends[-1], ends[-1]))
-        groups = [(member, known)] + [
-            (m, [key]) for m, key in zip(owner, keys, strict=True) if key not in known
-        ]
-        for m, group in groups:
-            where = np.concatenate([place[key] for key in group])
-            cov[np.ix_(where, where)] = self._marginal(m, group)
+        for robot, block in blocks:
+            index = np.concatenate([rows[key] for key in block])
+            cov[np.ix_(index, index)] = self._marginal(robot, block)
         return cov
 
-    def _marginal(self, member: Member, keys: list[int]) -> Array:
-        try:
-            if len(keys) == 1:
-                cov = np.asarray(member.isam.marginalCovariance(keys[0]))
-            else:
-                cov = np.asarray(member.isam.jointMarginalCovariance(keys).fullMatrix())
-        except RuntimeError as error:
-            raise self.builder.explain(error) from error
-        if not np.isfinite(cov).all():
-            raise self._diagnosed(member)
-        return cov
-
-    def _diagnosed(self, member: Member) -> EstimationError:
-        """Which variable is indeterminate: QR answers NaN for all of them, Cholesky names one."""
-        try:
-            values = member.isam.calculateBestEstimate()
-            marginals = gtsam.Marginals(member.graph, values)
-            for key in member.dims:
-                marginals.marginalCovariance(key)
-        except RuntimeError as error:
-            return self.builder.explain(error)
-        return self.builder.explain(RuntimeError(""))
+    def _marginal(self, robot: LocalSmoother, keys: list[int]) -> Array:
+        return self.builder.covariance(robot.isam, robot.graph, keys)
 
     def finish(self) -> Estimate:
-        """See `Backend`: after a last exchange each robot optimises what it has, to convergence.
+        """See `Backend`: after a last exchange each robot optimises its graph to convergence.
 
-        States are those of their own robots, landmarks those of the first robot, whose graph the
-        error is of.
+        States are by their own robots, landmarks by the first robot, as is the error.
         """
         self.exchange()
-        means: dict[int, Array] = {}
-        covs: dict[int, Array] = {}
-        error = 0.0
-        for n, member in enumerate(self._members):
+        marginals: dict[int, tuple[Array, Array]] = {}
+        half_error = 0.0
+        for n, robot in enumerate(self._robots):
             try:
-                start = member.isam.calculateBestEstimate()
-                values = optimise(member.graph, start, self._config.robust)
-                isam = gtsam.ISAM2(isam2_parameters(self._config, "QR"))
-                isam.update(member.graph, values)
-            except RuntimeError as problem:
-                raise self.builder.explain(problem) from problem
-            member.isam = isam
-            for key, dim in member.dims.items():
-                robot, _ = factors.number_of(key)
-                if robot == n or (robot is None and key not in means):
-                    means[key] = read(values, key, dim)
-                    covs[key] = self._marginal(member, [key])
-            error = error if n else float(member.graph.error(values))
-        return self._estimate(means, covs, error)
+                start = robot.isam.calculateBestEstimate()
+                values = optimise(robot.graph, start, self._config.robust)
+                robot.isam = isam2_tree(self._config, "QR", robot.graph, values)
+            except RuntimeError as error:
+                raise self.builder.explain(error) from error
+            for key, dim in robot.dims.items():
+                index, _ = factors.number_of(key)
+                if index == n or (index is None and key not in marginals):
+                    marginals[key] = read(values, key, dim), self._marginal(robot, [key])
+            half_error = half_error if n else float(robot.graph.error(values))
+        return self.builder.estimate(marginals, half_error)
 
 
-def _measured_bytes(part: Part) -> int:
-    """A measurement as it is: names of its variables, values, covariance (upper triangle)."""
-    rows = len(part.observed[2].z) if part.observed else 3
-    names = len(part.factors[-1].keys())
-    return NAME * names + NUMBER * (rows + rows * (rows + 1) // 2)
+def _measured_bytes(group: FactorGroup) -> int:
+    """Bytes of a measurement: keys of its variables, values, covariance (upper triangle)."""
+    rows = len(group.observed[2].z) if group.observed else 3
+    keys = len(group.factors[-1].keys())
+    return KEY_BYTES * keys + NUMBER_BYTES * (rows + rows * (rows + 1) // 2)
 
 
 def exchanged_bytes(backend: object) -> tuple[dict[str, int], dict[str, int]] | None:
-    """Bytes sent and bytes measured, per robot; None for a back end that exchanges nothing."""
+    """Bytes sent and bytes measured, per robot; None for other back ends."""
     if isinstance(backend, DecentralisedBackend):
         return backend.sent, backend.measured
     return None
-
-
-__all__ = ["DecentralisedBackend", "Member", "Message", "exchanged_bytes"]

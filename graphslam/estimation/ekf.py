@@ -1,18 +1,16 @@
 """The thesis' centralised extended Kalman filter: robots and landmarks in one Gaussian.
 
-The same rows of `MODELS` and the same noise as the smoother, so a comparison is one of estimators.
-What a filter cannot do it leaves out and counts (`EkfBackend.skipped`): it has no past, but for the
-last few poses that stay in its state as copies (`EkfConfig.past_states`). Those are for sightings
-from before a landmark's promotion. The thesis adds a landmark where it is first seen; here it waits
-until it is known to be one, and a filter that had to forget the sightings it waited for would lose
-what ties the first landmarks to the start, and with it nine tenths of its accuracy
+It uses the same rows of `MODELS` and the same noise as the smoother, so a comparison is one of
+estimators. Its state holds copies of each robot's last few poses (`EkfConfig.past_states`), for
+observations from before a landmark's promotion. The thesis adds a landmark when it is first seen;
+here it must be confirmed first, and a filter that could not use the observations from before would
+lose what ties the first landmarks to the start, and nine tenths of its accuracy
 (docs/ekf-versus-smoothing.md).
 
-Two definitions of the error of a pose, rows of `ERRORS`. A textbook Jacobian is by additive errors
-along world axes; by the chain rule it becomes one by either error.
+The error of a pose has two definitions, rows of `ERRORS`. Jacobians of the models are by additive
+errors along world axes; the chain rule turns them into Jacobians by either error.
 """
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -20,7 +18,6 @@ from typing import Literal
 import numpy as np
 
 from graphslam.core.config import Config, RobustConfig
-from graphslam.core.errors import EstimationError
 from graphslam.core.gaussian import JointGaussian, whiten
 from graphslam.core.geometry import (
     Array,
@@ -28,23 +25,31 @@ from graphslam.core.geometry import (
     compose_jacobians,
     exp,
     exp_jacobian,
-    rotate_cov,
     rotation3,
     wrap,
 )
 from graphslam.core.observation_models import MODELS, ObservationModel
-from graphslam.core.records import Association, Closure, Estimate, Motion, Start, Step, Trajectory
+from graphslam.core.records import Association, Motion, Start, Step
 from graphslam.estimation import factors
-from graphslam.estimation.backend import Joint, StateTable, block_slices
-from graphslam.estimation.input_checks import check_finite, check_positive, indeterminate, sighting
-
-#: a robot's latest pose by its name, one of its past ones, or a landmark
-Member = str | tuple[str, int] | int
+from graphslam.estimation.backend import Joint, block_slices
+from graphslam.estimation.filter_base import (
+    FilterBackend,
+    Member,
+    unknown_landmark,
+    with_sigma_along_line,
+)
+from graphslam.estimation.input_checks import (
+    check_positive,
+    describe_closure,
+    describe_observation,
+    indeterminate,
+)
+from graphslam.estimation.m_estimators import robust_weight
 
 
 @dataclass(frozen=True)
 class PoseError:
-    """What the error of a pose is.
+    """A definition of the error of a pose.
 
     ``retract`` applies errors (..., 3) to poses (..., 3); ``jacobian`` is the derivative (3, 3) of
     the corrected pose, additive along world axes, by the error, at a pose (3,) and an error (3,).
@@ -60,7 +65,7 @@ def _add(pose: Array, error: Array) -> Array:
     return moved
 
 
-#: error -> how it works: `world` as the thesis adds them, `body` as GTSAM's Pose2
+#: name -> definition: `world` adds errors as the thesis does, `body` is that of GTSAM's Pose2
 ERRORS: dict[str, PoseError] = {
     "world": PoseError(_add, lambda _pose, _error: np.eye(3)),
     "body": PoseError(
@@ -69,84 +74,22 @@ ERRORS: dict[str, PoseError] = {
     ),
 }
 
-#: kernel -> weight of an observation whose whitened residual has length d, for a scale k
-WEIGHTS: dict[str, Callable[[float, float], float]] = {
-    "none": lambda _d, _k: 1.0,
-    "huber": lambda d, k: 1.0 if d <= k else k / d,
-    "cauchy": lambda d, k: k * k / (k * k + d * d),
-    "geman-mcclure": lambda d, k: (k * k / (k * k + d * d)) ** 2,
-}
-#: relative change of a weight at which it is settled; rounds at most (convergence is linear)
-SETTLED, MAX_ROUNDS = 1e-4, 100
 
-
-def robust_weight(innovation: Array, HPHt: Array, R: Array, robust: RobustConfig) -> float:
-    """The weight that the smoother's M-estimator would give one observation.
-
-    It weighs by the residual that is *left* after the update, not by the innovation: a far
-    innovation is right where the prediction is poor. Noise R/w leaves the whitened residual
-    ``u_j / (1 + w a_j)``, with a_j the eigenvalues of H P Hᵀ whitened by R and u the whitened
-    innovation in their axes; w is the largest weight that agrees with what it leaves, reached from
-    full weight downwards (each round of reweighting lowers it or leaves it).
-
-    Args:
-        innovation: (k,) measured minus expected.
-        HPHt: (k, k) covariance of the expected measurement.
-        R: (k, k) covariance of the measurement.
-        robust: kernel and scale; `none` gives 1.
-    """
-    if robust.kernel == "none":
-        return 1.0
-    L = np.linalg.cholesky(R)
-    a, U = np.linalg.eigh(np.linalg.solve(L, np.linalg.solve(L, HPHt).T))
-    u = U.T @ np.linalg.solve(L, innovation)
-    weight, w = WEIGHTS[robust.kernel], 1.0
-    for _ in range(MAX_ROUNDS):
-        before, w = w, weight(float(np.linalg.norm(u / (1 + w * np.maximum(a, 0.0)))), robust.scale)
-        if before - w <= SETTLED * before:
-            break
-    return w
-
-
-class EkfBackend:
+class EkfBackend(FilterBackend):
     """The filter; state and equations as in thesis chapters 3.2 and 4.
 
-    Each robot's latest pose, copies of its poses just before, as ``(robot, number modulo their
-    count)``, and each landmark are members of one Gaussian. Observations enter one at a time, each
-    linearised at what the ones before left (section 4.1). ``skipped`` counts what a filter cannot
-    use, by reason.
+    The members of `FilterBackend` are those of one Gaussian. Observations enter one at a time, each
+    linearised at the estimate that the ones before left (section 4.1).
     """
 
     def __init__(self, config: Config) -> None:
+        super().__init__(config.ekf.past_states)
         self._settings, self._robust = config.ekf, config.robust
         self._error = ERRORS[config.ekf.error]
-        self._states = StateTable()
         self._gaussian: JointGaussian[Member] = JointGaussian()
-        self._track: dict[str, list[tuple[Array, Array]]] = {}  # causal pose and cov, world axes
-        self._twice_error, self._dof = 0.0, 0
-        self.skipped: Counter[str] = Counter()
-        self.smooths = False
         self.error_frame: Literal["body", "world"] = config.ekf.error
 
-    # ------------------------------------------------------------ evidence in
-
-    def add(self, step: Step) -> None:
-        """See `Backend`.
-
-        Raises:
-            EstimationError: a state that was never made, or noise without a valid covariance.
-        """
-        for robot, start in step.starts.items():
-            self._start(robot, step.time_ns, start)
-        for robot, motion in step.motions.items():
-            self._move(robot, step.time_ns, motion)
-        for seen in step.associations:
-            self._observe(seen, step.time_ns)
-        for closure in step.closures:
-            self._close(closure)
-        for robot in {**step.starts, **step.motions}:
-            joint = self.joint(robot, ())
-            self._track.setdefault(robot, []).append((joint.pose, joint.cov))
+    # ------------------------------------------------------------ adding steps
 
     def remove(self, landmark: int) -> None:
         """Delete a landmark (thesis section 4.6); the joint marginal of the rest stays as it is.
@@ -154,21 +97,18 @@ class EkfBackend:
         Raises:
             EstimationError: there is no such landmark.
         """
-        self._known(landmark)
+        self._landmark_mean(landmark)
         self._gaussian.remove(landmark)
 
-    def _start(self, robot: str, time_ns: int, start: Start) -> None:
-        self._states.append(robot, time_ns)
-        check_finite(f"start of robot {robot} at {time_ns} ns", start.pose, start.cov)
+    def _start(self, robot: str, start: Start) -> None:
+        """See `FilterBackend`."""
         T = self._to_error(start.pose)
         self._gaussian.add(robot, start.pose, T @ start.cov @ T.T)
 
-    def _move(self, robot: str, time_ns: int, motion: Motion) -> None:
+    def _move(self, robot: str, motion: Motion) -> None:
         """System update 3.11-3.14, 4.4-4.17: only the robot's own rows and columns."""
-        last = self._states.latest(robot, time_ns)
-        self._states.append(robot, time_ns)
-        check_finite(f"motion of robot {robot} to {time_ns} ns", motion.delta, motion.cov)
-        self._keep(robot, last)
+        if self._past_states:
+            self._copy_pose(robot, self._states.latest(robot) - 1)
         x = self._mean(robot)
         moved = compose(x, motion.delta)
         F, W = compose_jacobians(x, motion.delta)
@@ -177,76 +117,55 @@ class EkfBackend:
         self._gaussian.move(robot, F, W @ motion.cov @ W.T)
         self._mean(robot)[:] = moved
 
-    def _keep(self, robot: str, number: int) -> None:
-        """A copy of the robot's latest pose, state ``number``, in the place of the oldest copy."""
-        if self._settings.past_states:
-            name = robot, number % self._settings.past_states
-            if name not in self._gaussian:
-                self._gaussian.add(name, self._mean(robot), np.zeros((3, 3)), {robot: np.eye(3)})
-            self._gaussian.copy(name, robot)
+    def _copy_pose(self, robot: str, number: int) -> None:
+        """Copy the robot's pose, state ``number``, over the oldest copy."""
+        name = robot, number % self._past_states
+        if name not in self._gaussian:
+            self._gaussian.add(name, self._mean(robot), np.zeros((3, 3)), {robot: np.eye(3)})
+        self._gaussian.copy(name, robot)
 
-    def _state(self, robot: str, time_ns: int) -> Member | None:
-        """The member that is the robot's state at ``time_ns``; None if it is forgotten."""
-        number, latest = self._states.number(robot, time_ns), self._states.latest(robot)
-        if number == latest:
-            return robot
-        kept = self._settings.past_states
-        return (robot, number % kept) if number >= latest - kept else None
+    def _observe_step(self, step: Step) -> None:
+        """See `FilterBackend`."""
+        for seen in step.associations:
+            ends = self._ends(seen, step.time_ns)
+            if ends is not None:
+                self._observe(seen, *ends)
+        for closure in step.closures:
+            ends = self._closure_ends(closure)
+            if ends is not None:  # as if the one robot had been seen from the other
+                kernel = RobustConfig("none") if closure.verified else self._robust
+                model, what = MODELS["robot-pose"], describe_closure(closure)
+                self._update(*ends, model, closure.delta, closure.cov, what, kernel)
 
-    def _observe(self, seen: Association, time_ns: int) -> None:
-        """One observation: update, or a new landmark."""
-        source, target = self._state(seen.robot, seen.time_ns), self._target(seen, time_ns)
-        if seen.late and not self._settings.past_states:
-            self.skipped["late evidence"] += 1
-        elif source is None or target is None:
-            self.skipped["observation from a past state"] += 1
+    def _observe(self, seen: Association, source: Member, target: Member) -> None:
+        """One observation of ``target`` from ``source``: an update, or a new landmark."""
+        if target in self._gaussian:
+            model, cov = self._model_and_cov(seen)
+            what = describe_observation(seen)
+            self._update(source, target, model, seen.z, cov, what, self._robust)
         else:
-            check_finite(sighting(seen), seen.z, seen.cov)
-            if target in self._gaussian:
-                model, cov = self._measured(seen)
-                self._update(source, target, model, seen.z, cov, sighting(seen), self._robust)
-            else:
-                self._augment(seen, source)
+            self._augment(seen, source)
 
-    def _target(self, seen: Association, time_ns: int) -> Member | None:
-        """What was observed: a landmark, or a robot's state."""
-        if isinstance(seen.target, str):
-            return self._state(seen.target, time_ns)
-        return seen.target
-
-    def _measured(self, seen: Association) -> tuple[ObservationModel, Array]:
-        """Model and covariance of an observation: of a line perhaps as the thesis has it."""
+    def _model_and_cov(self, seen: Association) -> tuple[ObservationModel, Array]:
+        """Model and covariance of an observation; see `EkfConfig.lines`."""
         if seen.model == "line" and self._settings.lines == "thesis":
-            # 4.33-4.34: its middle as a point, poorly known along the line
-            return MODELS["segment"], _along(seen, self._settings.along_sigma_m)
+            # 4.33-4.34: its middle as a pose, poorly known along the line
+            return MODELS["segment"], with_sigma_along_line(seen, self._settings.along_sigma_m)
         return MODELS[seen.model], seen.cov
 
     def _augment(self, seen: Association, source: Member) -> None:
-        """A new landmark where the observation from ``source`` puts it, 4.24-4.28."""
-        model, cov = self._measured(seen)
-        if model is MODELS["line"]:  # where on the line is a gauge
-            cov = _along(seen, factors.FILTER_GAUGE_SIGMA_M)
+        """Add the landmark that was observed from ``source``, 4.24-4.28."""
+        model, cov = self._model_and_cov(seen)
+        if model is MODELS["line"]:  # the origin's place along the line is a gauge
+            cov = with_sigma_along_line(seen, factors.FILTER_GAUGE_SIGMA_M)
         x = self._mean(source)
         mean = model.invert(seen.z, x)
         G_x, G_z = model.invert_jacobians(seen.z, x)
         T = self._to_error(mean)
         G_x, G_z = T @ G_x @ self._to_world(x), T @ G_z
-        fresh = G_z @ cov @ G_z.T
-        check_positive(fresh, sighting(seen))
-        self._gaussian.add(seen.target, mean, fresh, {source: G_x})
-
-    def _close(self, closure: Closure) -> None:
-        """A measured relative pose, if both its ends are known: as a robot seen from the other."""
-        robot = self._state(closure.robot, closure.time_ns)
-        other = self._state(closure.other, closure.other_time_ns)
-        if robot is None or other is None:
-            self.skipped["closure to a past state"] += 1
-            return
-        what = f"closure of robot {closure.robot} at {closure.time_ns} ns"
-        check_finite(what, closure.delta, closure.cov)
-        model = MODELS["robot-pose"]
-        kernel = RobustConfig("none") if closure.verified else self._robust
-        self._update(other, robot, model, closure.delta, closure.cov, what, kernel)
+        noise = G_z @ cov @ G_z.T
+        check_positive(noise, describe_observation(seen))
+        self._gaussian.add(seen.target, mean, noise, {source: G_x})
 
     def _update(
         self,
@@ -261,8 +180,8 @@ class EkfBackend:
         """Measurement update 3.15-3.20 of ``target`` seen from ``source`` as z, with covariance.
 
         More than one iteration is the iterated filter: Gauss-Newton on this one observation and the
-        prior (Bell and Cathey 1993, https://doi.org/10.1109/9.250476). The innovation is then the
-        one that the prior mean would have if the model were linear as it is at the iterate.
+        prior (Bell and Cathey 1993, https://doi.org/10.1109/9.250476). The innovation is then that
+        of the prior mean under the model linearised at the iterate.
         """
         gaussian, error = self._gaussian, self._error
         blocks = {name: gaussian.slot(name) for name in (source, target)}
@@ -287,7 +206,7 @@ class EkfBackend:
         if not np.isfinite(d2):
             raise indeterminate(what)
         gaussian.condition(B)
-        self._correct(d)
+        self._apply_correction(d)
         self._twice_error += d2
         self._dof += model.rows
 
@@ -296,11 +215,11 @@ class EkfBackend:
         return self._gaussian.x[self._gaussian.slot(name)]
 
     def _corrected(self, name: Member, error: Array) -> Array:
-        """The mean of one member with an error applied."""
+        """The mean of one member, corrected by an error."""
         mean = self._mean(name)
         return self._error.retract(mean, error) if len(mean) == 3 else mean + error
 
-    def _correct(self, d: Array) -> None:
+    def _apply_correction(self, d: Array) -> None:
         """Apply errors (n,) to all means."""
         x, points, poses = self._gaussian.x, self._gaussian.blocks(2), self._gaussian.blocks(3)
         x[points] += d[points]
@@ -314,22 +233,19 @@ class EkfBackend:
         """The inverse (d, d) of that; both are rotations, or the identity."""
         return self._to_world(mean).T
 
-    def _known(self, landmark: int) -> Array:
-        """Mean of a landmark."""
+    def _landmark_mean(self, landmark: int) -> Array:
+        """Mean of a landmark, a view of it."""
         if landmark not in self._gaussian:
-            raise EstimationError(
-                f"landmark {landmark} is not in the filter: it was deleted, or all that was seen "
-                "of it belonged to the past"
-            )
+            raise unknown_landmark(landmark)
         return self._mean(landmark)
 
-    # ------------------------------------------------------------ knowledge out
+    # ------------------------------------------------------------ queries
 
     def joint(self, robot: str, landmarks: Sequence[int], others: Sequence[str] = ()) -> Joint:
         """See `Backend`.
 
         Raises:
-            EstimationError: it is not known.
+            EstimationError: a robot or a landmark is not in the filter.
         """
         means = [self.state_mean(robot), *self.landmark_means(landmarks)]
         means += [self.state_mean(other) for other in others]
@@ -344,39 +260,19 @@ class EkfBackend:
 
     def state_mean(self, robot: str) -> Array:
         """See `Backend`."""
-        self._states.latest(robot)  # has it started?
+        self._states.latest(robot)  # raises if it has not started
         return self._mean(robot).copy()
 
     def landmark_means(self, landmarks: Sequence[int]) -> list[Array]:
         """See `Backend`."""
-        return [self._known(landmark).copy() for landmark in landmarks]
+        return [self._landmark_mean(landmark).copy() for landmark in landmarks]
 
-    def finish(self) -> Estimate:
-        """See `Backend`: a filter does not revise the past, so final states are the causal ones.
-
-        The error is half the sum of the squared normalised innovations, which in a linear problem
-        is the smoother's error; so are the degrees of freedom.
-        """
-        states = {
-            robot: Trajectory(
-                self._states.stamps(robot),
-                np.array([pose for pose, _ in track]),
-                np.array([cov for _, cov in track]),
-            )
-            for robot, track in sorted(self._track.items())
-        }
-        landmarks = {}
+    def _landmark_marginals(self) -> dict[int, tuple[Array, Array]]:
+        """See `FilterBackend`."""
+        marginals = {}
         for name in self._gaussian:
             if isinstance(name, int):
                 T = self._to_world(self._mean(name))
                 cov = T @ self._gaussian.marginal([name]) @ T.T
-                landmarks[name] = (self._mean(name).copy(), cov)
-        return Estimate(states, landmarks, 0.5 * self._twice_error, self._dof)
-
-
-def _along(seen: Association, sigma_m: float) -> Array:
-    """The covariance (3, 3) of a line's middle with ``sigma_m`` along the line: 4.33-4.34."""
-    own = rotate_cov(seen.cov, -seen.z[2])
-    own[0, :] = own[:, 0] = 0.0
-    own[0, 0] = sigma_m**2
-    return rotate_cov(own, seen.z[2])
+                marginals[name] = (self._mean(name).copy(), cov)
+        return marginals

@@ -1,15 +1,15 @@
-"""What every back end with GTSAM factors shares: from a step to factors, from variables to answers.
+"""What every back end with GTSAM factors shares: factors from steps, marginals from variables.
 
-`GraphBuilder` knows which key is which state or landmark and makes the factors of a step, one part
-after another, so that a filter can take in each before the next is built. `GraphBackend` answers
-the questions of `Backend` from any store of variables and covariances.
+`GraphBuilder` maps states and landmarks to keys and makes the factors of a step, one group after
+another, so that a filter can use each before the next is built. `GraphBackend` implements the
+queries of `Backend` for any store of values and covariances.
 """
 
 import math
 import re
 from abc import ABC, abstractmethod
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -23,21 +23,37 @@ from graphslam.core.geometry import Array, compose, rotate_cov
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Closure, Estimate, Step, Trajectory
 from graphslam.estimation import factors
-from graphslam.estimation.backend import Joint, StateTable, block_slices
+from graphslam.estimation.backend import (
+    LATE_EVIDENCE,
+    PAST_CLOSURE,
+    PAST_OBSERVATION,
+    Joint,
+    StateTable,
+    block_slices,
+)
+from graphslam.estimation.input_checks import (
+    describe_closure,
+    describe_motion,
+    describe_observation,
+    describe_start,
+    indeterminate,
+)
 
 #: current estimate of a variable, by its key and size
 Estimates = Callable[[int, int], Array]
 
+#: why a graph is indeterminate
+UNDERDETERMINED = "it has too few or too weak observations"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Part:
-    """What enters an estimate at once.
+class FactorGroup:
+    """Factors that must be added together: without one of them a new variable is indeterminate.
 
-    ``factors`` belong together: without one of them a new variable might be indeterminate.
-    ``what`` says it in terms of the log. ``new`` is the variable that they bring, with its first
-    value (2,) or (3,); ``replaces`` the robot's state before, where that variable is its next one.
-    ``observed`` is the association behind the last factor, with its two keys; ``robust`` whether a
-    kernel belongs on that factor.
+    ``what`` names them in terms of the log. ``new`` is the variable that they introduce, with its
+    initial value (2,) or (3,); ``replaces`` the robot's previous state, where that variable is its
+    next one. ``observed`` is the association of the last factor, with its two keys; ``robust``
+    whether a kernel applies to that factor.
     """
 
     factors: tuple[gtsam.NonlinearFactor, ...]
@@ -49,18 +65,24 @@ class Part:
 
 
 class GraphBuilder:
-    """Turns steps into factors and first values; remembers which key is what.
+    """Turns steps into factors and initial values, and keeps the keys of states and landmarks.
 
-    ``kernel`` is put on what is observed. ``rows`` counts the residual rows that carry information:
-    GTSAM counts a line's empty row too. ``oldest`` is the number of each robot's oldest state that
-    is still estimated; what refers to older ones is left out and counted in ``skipped``, by reason.
-    ``late``: whether late evidence is used. ``wide``: the gauge of lines, see `line_gauge_factor`:
-    wide where everything is linearised anew.
+    ``rows`` counts the residual rows that carry information: GTSAM counts a line's empty row too.
+    ``oldest`` is the number of each robot's oldest state that is still estimated; what refers to
+    older ones is left out and counted in ``skipped``, by reason.
     """
 
     def __init__(
         self, kernel: RobustConfig, *, late: bool = True, wide: bool = True, lines: bool = True
     ) -> None:
+        """Begin an empty graph.
+
+        Args:
+            kernel: of observations.
+            late: whether late evidence is used.
+            wide: gauge of lines, see `line_gauge_factor`; wide where factors are relinearised.
+            lines: whether to make the factors of lines, or leave them to the caller.
+        """
         self.kernel = kernel
         self.states = StateTable()
         self.robots: list[str] = []
@@ -68,8 +90,8 @@ class GraphBuilder:
         self.rows = 0
         self.oldest: dict[str, int] = defaultdict(int)
         self.skipped: Counter[str] = Counter()
-        self._late, self._wide, self._lines = late, wide, lines
-        self._first_seen: dict[int, tuple[str, int]] = {}
+        self._late, self._wide, self._make_lines = late, wide, lines
+        self._first_seen: dict[int, str] = {}  # landmark -> its first observation in words
 
     def state_key(self, robot: str, number: int) -> int:
         """Key of a robot's state."""
@@ -80,27 +102,27 @@ class GraphBuilder:
         return self.state_key(robot, self.states.latest(robot, at_ns))
 
     def dim(self, key: int) -> int:
-        """Size of a variable."""
+        """Dimension of a variable."""
         robot, number = factors.number_of(key)
         return self.landmark_dims[number] if robot is None else 3
 
     def dims(self) -> dict[int, int]:
-        """Every variable there is, with its size."""
-        found = {
-            self.state_key(robot, n): 3
-            for robot in self.robots
-            for n in range(len(self.states.times[robot]))
-        }
-        found.update((factors.landmark_key(i), d) for i, d in self.landmark_dims.items())
-        return found
+        """Every variable with its dimension."""
+        dims = {key: 3 for robot in self.robots for key in self.state_keys(robot)}
+        dims.update((factors.landmark_key(i), d) for i, d in self.landmark_dims.items())
+        return dims
 
-    def parts(self, step: Step, estimate: Estimates) -> Iterator[Part]:
-        """The parts of a step, in recorded order.
+    def state_keys(self, robot: str) -> list[int]:
+        """Keys of all states of a robot."""
+        return [self.state_key(robot, n) for n in range(len(self.states.times[robot]))]
+
+    def factor_groups(self, step: Step, estimate: Estimates) -> Iterator[FactorGroup]:
+        """The factors of a step, group by group in recorded order.
 
         Args:
-            step: what to take in.
-            estimate: asked for existing variables when a part is made, that is after whoever
-                iterates has done with the parts before.
+            step: the step.
+            estimate: called for existing variables when a group is made, which is after the caller
+                has used the groups before.
 
         Raises:
             EstimationError: a covariance is not positive definite and finite, or a state that the
@@ -109,49 +131,48 @@ class GraphBuilder:
         for robot, start in step.starts.items():
             self.robots.append(robot)
             key = self.state_key(robot, self.states.append(robot, step.time_ns))
-            what = f"start of robot {robot} at {step.time_ns} ns"
-            with _named(what, start.cov):
+            what = describe_start(robot, step.time_ns)
+            with _covariance_of(what, start.cov):
                 factor = factors.start_factor(key, start)
             self.rows += 3
-            yield Part((factor,), what, (key, start.pose))
+            yield FactorGroup((factor,), what, (key, start.pose))
         for robot, motion in step.motions.items():
             last = self.latest_key(robot, step.time_ns)
             key = self.state_key(robot, self.states.append(robot, step.time_ns))
-            what = f"motion of robot {robot} to {step.time_ns} ns"
-            with _named(what, motion.cov):
+            what = describe_motion(robot, step.time_ns)
+            with _covariance_of(what, motion.cov):
                 factor = factors.motion_factor(last, key, motion)
             self.rows += 3
-            yield Part((factor,), what, (key, compose(estimate(last, 3), motion.delta)), last)
+            new = key, compose(estimate(last, 3), motion.delta)
+            yield FactorGroup((factor,), what, new, last)
         for seen in step.associations:
-            part = self._observation(seen, step.time_ns, estimate)
-            if part is not None:
-                yield part
-        for closure in step.closures:
-            part = self._closure(closure)
-            if part is not None:
-                yield part
+            group = self._observation(seen, step.time_ns, estimate)
+            if group is not None:
+                yield group
+        yield from self.closure_groups(step.closures)
 
-    def _observation(self, seen: Association, time_ns: int, estimate: Estimates) -> Part | None:
+    def _observation(
+        self, seen: Association, time_ns: int, estimate: Estimates
+    ) -> FactorGroup | None:
         number = self.states.number(seen.robot, seen.time_ns)
         if seen.late and not self._late:
-            self.skipped["late evidence"] += 1
+            self.skipped[LATE_EVIDENCE] += 1
             return None
         if number < self.oldest[seen.robot]:
-            self.skipped["observation from a past state"] += 1
+            self.skipped[PAST_OBSERVATION] += 1
             return None
         key, model = self.state_key(seen.robot, number), MODELS[seen.model]
         known = not isinstance(seen.target, int) or seen.target in self.landmark_dims
         if isinstance(seen.target, int):
-            kind, target = "landmark", factors.landmark_key(seen.target)
+            target = factors.landmark_key(seen.target)
         else:
-            kind = "robot"
             target = self.state_key(seen.target, self.states.number(seen.target, time_ns))
         self.rows += model.rows
-        if known and seen.model == "line" and not self._lines:
-            return Part((), "", observed=(key, target, seen))  # its factor is made later
-        # only new ones, and lines, are built at an estimate, which is dear to ask for
+        if known and seen.model == "line" and not self._make_lines:
+            return FactorGroup((), "", observed=(key, target, seen))  # its factor is made later
+        # only new landmarks and lines need an estimate, which is expensive
         x = t = np.zeros(3)
-        what = f"{kind} {seen.target}, seen from robot {seen.robot} at {seen.time_ns} ns"
+        what = describe_observation(seen)
         made: list[gtsam.NonlinearFactor] = []
         new = None
         if not known:
@@ -160,38 +181,40 @@ class GraphBuilder:
             new = (target, t)
         elif seen.model == "line":
             x, t = estimate(key, 3), estimate(target, model.dim)
-        with _named(what, seen.cov):
+        with _covariance_of(what, seen.cov):
             if new is not None and seen.model == "line":
                 made.append(factors.line_gauge_factor(key, target, seen, wide=self._wide))
                 self.rows += 1
-            if self._lines or seen.model != "line":
+            if self._make_lines or seen.model != "line":
                 made.append(factors.observation_factor(key, target, seen, self.kernel, x, t))
         if new is not None and isinstance(seen.target, int):
             self.landmark_dims[seen.target] = model.dim
-            self._first_seen[seen.target] = (seen.robot, seen.time_ns)
-        return Part(tuple(made), what, new, observed=(key, target, seen), robust=True)
+            self._first_seen[seen.target] = what
+        return FactorGroup(tuple(made), what, new, observed=(key, target, seen), robust=True)
 
-    def _closure(self, closure: Closure) -> Part | None:
-        ends = (closure.robot, closure.time_ns), (closure.other, closure.other_time_ns)
-        numbers = [self.states.number(*end) for end in ends]
-        if any(n < self.oldest[robot] for n, (robot, _) in zip(numbers, ends, strict=True)):
-            self.skipped["closure to a past state"] += 1
-            return None
-        key, other = (self.state_key(r, n) for n, (r, _) in zip(numbers, ends, strict=True))
-        what = f"closure of robot {closure.robot} at {closure.time_ns} ns"
-        with _named(what, closure.cov):
-            factor = factors.closure_factor(key, other, closure, self.kernel)
-        self.rows += 3
-        return Part((factor,), what, robust=not closure.verified)
+    def closure_groups(self, closures: Iterable[Closure]) -> Iterator[FactorGroup]:
+        """Factors of closures between states that are still estimated."""
+        for closure in closures:
+            ends = (closure.robot, closure.time_ns), (closure.other, closure.other_time_ns)
+            numbers = [(robot, self.states.number(robot, time_ns)) for robot, time_ns in ends]
+            if any(number < self.oldest[robot] for robot, number in numbers):
+                self.skipped[PAST_CLOSURE] += 1
+                continue
+            key, other = (self.state_key(*number) for number in numbers)
+            what = describe_closure(closure)
+            with _covariance_of(what, closure.cov):
+                factor = factors.closure_factor(key, other, closure, self.kernel)
+            self.rows += 3
+            yield FactorGroup((factor,), what, robust=not closure.verified)
 
-    def faced(
+    def factor_at_estimate(
         self, observed: tuple[int, int, Association], estimate: Estimates
     ) -> gtsam.NonlinearFactor:
-        """An observation's factor, built at the estimate of now.
+        """The factor of an observation, built again at the current estimate.
 
-        A line's measurement was moved along the line to face the landmark's origin as estimated at
-        its time (see `LineModel`); where the estimate has moved since, so must the measurement, or
-        it claims some knowledge along the line.
+        A line's measurement is slid along the line to face the landmark's origin at the estimate
+        (see `LineModel`). It must follow when the estimate moves, or the factor would carry false
+        information along the line.
         """
         key, target, seen = observed
         x, t = estimate(key, 3), estimate(target, MODELS[seen.model].dim)
@@ -205,31 +228,75 @@ class GraphBuilder:
         return np.asarray(estimate.states[self.robots[robot]].poses[number])
 
     def explain(self, error: RuntimeError) -> EstimationError:
-        """GTSAM's complaint about a variable, said in terms of the log."""
-        # as a symbol only the first digits of a key are told
+        """GTSAM's error about an indeterminate variable, in terms of the log."""
+        # the symbol itself has only the first digits of the key
         found = re.search(r"(\d+) \(Symbol: [xl]", str(error))
-        if not found:
-            return indeterminate("some variable")
-        robot, number = factors.number_of(int(found[1]))
-        if robot is None:
-            return indeterminate(self.landmark_name(number))
-        name = self.robots[robot]
-        return indeterminate(f"robot {name} at {self.states.times[name][number]} ns")
+        what = "some variable"
+        if found:
+            robot, number = factors.number_of(int(found[1]))
+            if robot is None:
+                what = self._first_seen[number]
+            else:
+                name = self.robots[robot]
+                what = f"robot {name} at {self.states.times[name][number]} ns"
+        return indeterminate(what, UNDERDETERMINED)
 
-    def landmark_name(self, landmark: int) -> str:
-        """A landmark, and who saw it first and when."""
-        robot, time_ns = self._first_seen[landmark]
-        return f"landmark {landmark}, seen from robot {robot} at {time_ns} ns"
+    def diagnose(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> EstimationError:
+        """Which variable is indeterminate: QR returns NaN for all of them, Cholesky names one."""
+        try:
+            marginals = gtsam.Marginals(graph, values)
+            for key in values.keys():  # noqa: SIM118 (GTSAM's values are no mapping)
+                marginals.marginalCovariance(key)
+        except RuntimeError as error:
+            return self.explain(error)
+        return self.explain(RuntimeError(""))
+
+    def covariance(
+        self, tree: gtsam.ISAM2, graph: gtsam.NonlinearFactorGraph, keys: list[int]
+    ) -> Array:
+        """Joint marginal covariance (D, D) of variables by the ``tree`` of ``graph``.
+
+        Raises:
+            EstimationError: it is indeterminate.
+        """
+        try:
+            cov = joint_marginal(tree, keys)
+        except RuntimeError as error:
+            raise self.explain(error) from error
+        if not np.isfinite(cov).all():
+            raise self.diagnose(graph, tree.calculateBestEstimate())
+        return cov
+
+    def estimate(self, marginals: Mapping[int, tuple[Array, Array]], half_error: float) -> Estimate:
+        """An `Estimate` of every state and landmark.
+
+        Args:
+            marginals: key -> mean and covariance, errors in body frames.
+            half_error: half the weighted squared residual.
+        """
+        states, unknowns = {}, 0
+        for robot in sorted(self.robots):
+            means, covs = zip(*(marginals[key] for key in self.state_keys(robot)), strict=True)
+            poses = np.array(means)
+            turned = rotate_cov(np.array(covs), poses[:, 2])
+            states[robot] = Trajectory(self.states.stamps(robot), poses, turned)
+            unknowns += 3 * len(poses)
+        landmarks = {}
+        for landmark, dim in self.landmark_dims.items():
+            mean, cov = marginals[factors.landmark_key(landmark)]
+            landmarks[landmark] = (mean, rotate_cov(cov, mean[2]) if dim == 3 else cov)
+            unknowns += dim
+        return Estimate(states, landmarks, half_error, self.rows - unknowns)
 
 
-class _named:  # noqa: N801 (used as a function)
-    """Say what it is that has a bad covariance ``cov`` (k, k)."""
+class _covariance_of:  # noqa: N801 (used as a function)
+    """Checks a covariance (k, k); errors inside name ``what`` it is of."""
 
     def __init__(self, what: str, cov: Array) -> None:
         self._what, self._cov = what, cov
 
     def __enter__(self) -> None:
-        # the sum of finite numbers is finite; of so few Python finds it sooner than NumPy
+        # the sum of finite numbers is finite; for so few Python is faster than NumPy
         if not math.isfinite(sum(map(sum, self._cov.tolist()))):
             raise EstimationError(
                 f"{self._what}: its covariance is not finite, so it determines nothing: "
@@ -241,22 +308,15 @@ class _named:  # noqa: N801 (used as a function)
             raise EstimationError(f"{self._what}: {error}") from error
 
 
-def indeterminate(where: str) -> EstimationError:
-    """The error of a graph that does not determine the variable ``where``."""
-    return EstimationError(
-        f"the estimate is indeterminate at {where}: it has too few or too weak observations"
-    )
-
-
 class GraphBackend(ABC):
-    """The answers of `Backend`, from `value` and `covariance` of variables by their keys."""
+    """The queries of `Backend`, from `value` and `covariance` of variables by their keys."""
 
     smooths = False
     error_frame: Literal["body", "world"] = "body"
 
     def __init__(self, builder: GraphBuilder) -> None:
         self.builder = builder
-        self._joints: dict[str, Joint] = {}  # since the last step
+        self._joints: dict[str, Joint] = {}  # queried since the last step
 
     @property
     def skipped(self) -> Counter[str]:
@@ -276,13 +336,13 @@ class GraphBackend(ABC):
         """
 
     def joint(self, robot: str, landmarks: Sequence[int], others: Sequence[str] = ()) -> Joint:
-        """See `Backend`; asked for the pose alone after more, it answers from what it has."""
+        """See `Backend`; for a pose alone it uses the latest joint since the last step, if any."""
         builder = self.builder
         key = builder.latest_key(robot)
         if not landmarks and not others:
             if robot in self._joints:
-                known = self._joints[robot]
-                return Joint(known.pose, (), known.cov[:3, :3], ())
+                cached = self._joints[robot]
+                return Joint(cached.pose, (), cached.cov[:3, :3], ())
             alone = self.value(key, 3)
             cov = rotate_cov(self.covariance([key]), alone[2])
             self._joints[robot] = Joint(alone, (), cov, ())
@@ -312,73 +372,61 @@ class GraphBackend(ABC):
             self.value(factors.landmark_key(i), self.builder.landmark_dims[i]) for i in landmarks
         ]
 
-    def _estimate(
-        self, means: Mapping[int, Array], covs: Mapping[int, Array], error: float
-    ) -> Estimate:
-        """An `Estimate` of every state and landmark, by key; ``covs`` have errors in body frames.
-
-        ``error`` is half the weighted squared residual.
-        """
-        builder, unknowns = self.builder, 0
-        states = {}
-        for robot in sorted(builder.robots):
-            keys = [builder.state_key(robot, n) for n in range(len(builder.states.times[robot]))]
-            poses = np.array([means[k] for k in keys])
-            turned = rotate_cov(np.array([covs[k] for k in keys]), poses[:, 2])
-            states[robot] = Trajectory(builder.states.stamps(robot), poses, turned)
-            unknowns += 3 * len(keys)
-        landmarks = {}
-        for landmark, dim in builder.landmark_dims.items():
-            key = factors.landmark_key(landmark)
-            mean, cov = means[key], covs[key]
-            landmarks[landmark] = (mean, rotate_cov(cov, mean[2]) if dim == 3 else cov)
-            unknowns += dim
-        return Estimate(states, landmarks, error, builder.rows - unknowns)
-
 
 def square_root(
     net: gtsam.GaussianBayesNet, dims: Mapping[int, int]
 ) -> tuple[Array, dict[int, slice]]:
     """Upper triangular square root information R (D, D) of a Bayes net; each variable's columns.
 
-    ``dims`` are the variables' sizes. The net has its own order of them: elimination goes through
-    unconnected parts one by one.
+    ``dims`` are the variables' dimensions. The net has its own order: elimination goes through
+    unconnected components one by one.
     """
     keys = [net.at(n).firstFrontalKey() for n in range(net.size())]
     ends = np.cumsum([dims[key] for key in keys])
-    place = {k: slice(int(e - dims[k]), int(e)) for k, e in zip(keys, ends, strict=True)}
-    return net.matrix()[0], place
+    columns = {k: slice(int(e - dims[k]), int(e)) for k, e in zip(keys, ends, strict=True)}
+    return net.matrix()[0], columns
 
 
-def root_covariance(R: Array, place: Mapping[int, slice], keys: Sequence[int]) -> Array:
+def root_covariance(R: Array, slices: Mapping[int, slice], keys: Sequence[int]) -> Array:
     """Joint covariance (d, d) of ``keys``, in this order: their rows of R⁻¹ R⁻ᵀ."""
-    wanted = np.concatenate([np.arange(place[k].start, place[k].stop) for k in keys])
+    wanted = np.concatenate([np.arange(slices[k].start, slices[k].stop) for k in keys])
     columns = np.zeros((len(R), len(wanted)))
     columns[wanted, np.arange(len(wanted))] = 1.0
-    # not solve_triangular: LAPACK's wakes every core for a matrix of any size
+    # not solve_triangular: LAPACK's starts a thread per core for a matrix of any size
     columns = dtrsm(1.0, R, columns, trans_a=1)
     return np.asarray(columns.T @ columns)
 
 
+def joint_marginal(tree: gtsam.ISAM2 | gtsam.GaussianBayesTree, keys: list[int]) -> Array:
+    """Joint marginal covariance (D, D) of variables in this order.
+
+    Raises:
+        RuntimeError: it is indeterminate.
+    """
+    if len(keys) == 1:
+        return np.asarray(tree.marginalCovariance(keys[0]))
+    return np.asarray(tree.jointMarginalCovariance(keys).fullMatrix())
+
+
 def read(values: gtsam.Values, key: int, dim: int) -> Array:
-    """A variable (dim,) of GTSAM's values."""
+    """Value (dim,) of a variable."""
     if dim == 3:
         return factors.array3(values.atPose2(key))
     return np.asarray(values.atPoint2(key))
 
 
 def write(values: gtsam.Values, key: int, value: Array) -> None:
-    """A new variable (2,) or (3,) for GTSAM's values."""
+    """Insert a variable with its value (2,) or (3,)."""
     values.insert(key, factors.pose2(value) if len(value) == 3 else value)
 
 
 def update(values: gtsam.Values, key: int, value: Array) -> None:
-    """Another value (2,) or (3,) for a variable of GTSAM's values."""
+    """Set the value (2,) or (3,) of a variable that is there."""
     values.update(key, factors.pose2(value) if len(value) == 3 else value)
 
 
 def jacobian_factor(A: Array, b: Array, dims: Mapping[int, int]) -> gtsam.JacobianFactor:
-    """Whitened rows A (k, D) z = b (k,) over one or two variables of sizes ``dims``, in order."""
+    """Whitened rows A (k, D) z = b (k,) of one or two variables with their dimensions, in order."""
     unit = gtsam.noiseModel.Unit.Create(len(b))
     first, *second = dims
     dim = dims[first]

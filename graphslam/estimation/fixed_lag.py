@@ -1,24 +1,23 @@
-"""Finite horizons: smoothing of a window of states, at a cost that the map's size bounds.
+"""Fixed-lag smoothing: states older than the horizon are marginalised out, landmarks stay.
 
-Poses older than the horizon are marginalised out; landmarks stay for ever. The window is a
-nonlinear graph, optimised at every step. When a state leaves, the factors that touch it are
-linearised for the last time and it is eliminated from them; what they say about the variables next
-to it, most of all landmarks, stays as one linear factor, the prior.
+The window is a nonlinear graph, optimised at every step; the size of the map bounds its cost. When
+a state leaves, its factors are linearised for the last time and it is eliminated from them. What
+remains of them about its neighbours, mostly landmarks, is a linear factor, the prior.
 
-The prior knows nothing about where the whole map lies and how it is turned, as long as the
-directions in which that does not matter are the same for every factor. They depend on where one
-linearises; so a variable keeps the place at which the prior first touched it for its Jacobians
-(first-estimates Jacobians), while residuals are always those of the estimate of now. With Jacobians
-of now, prior and window would disagree about the turn that costs nothing and by that claim to know
-it: measured 20 times as far from batch. A landmark gets its place when the first state that saw it
-leaves: smoothed over the horizon, not as it was first seen.
+The prior has no information on the position and heading of the whole map, as long as the null space
+is the same for every factor. It depends on the linearisation point, so a variable that the prior
+involves keeps the point it had when it first became involved for all its Jacobians (first-estimates
+Jacobians), while residuals are at the current estimate. With current Jacobians the null spaces of
+prior and window would differ, which is false information on the heading: measured 20 times as far
+from batch. A landmark's point is its estimate when the first state that saw it leaves, which is
+smoothed over the horizon.
 
 Source: G. Huang, A. Mourikis, S. Roumeliotis, Observability-based rules for designing consistent
 EKF SLAM estimators, IJRR 2010, https://doi.org/10.1177/0278364909353640.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -32,6 +31,7 @@ from graphslam.estimation.factor_graph import (
     GraphBackend,
     GraphBuilder,
     jacobian_factor,
+    joint_marginal,
     read,
     root_covariance,
     square_root,
@@ -39,14 +39,18 @@ from graphslam.estimation.factor_graph import (
     write,
 )
 
-#: rounds of Gauss-Newton per step at most, and the norm of the movement (m, rad) that ends them.
-#: A step starts where the last one ended, so two are the rule.
-ROUNDS, STILL = 6, 1e-3
+#: largest number of Gauss-Newton iterations per step, and the norm of the update (m, rad) that ends
+#: them. A step starts where the last one ended, so two are the rule.
+MAX_ITERATIONS, CONVERGED = 6, 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Placed:
-    """A factor of the window: its keys, whether observed or odometry, or the linear prior."""
+class WindowFactor:
+    """A factor of the window and its keys.
+
+    ``observed``: its association with both keys, if any; ``robust``: whether the kernel applies;
+    ``prior``: whether it is what marginalised states left.
+    """
 
     factor: gtsam.NonlinearFactor
     keys: tuple[int, ...]
@@ -58,21 +62,21 @@ class Placed:
 class FixedLagBackend(GraphBackend):
     """The smoother; see the module's docstring.
 
-    At the end, states that left keep the estimate and covariance with which they left: smoothed
-    with what came within the horizon. What refers to a state that has left is skipped and counted.
+    At the end, states that left have the estimate and covariance with which they left: smoothed
+    with the data within the horizon. What refers to a state that has left is skipped and counted.
     """
 
     def __init__(self, config: Config) -> None:
-        # weights are those of residuals now, so the kernel is applied here
+        # weights are of residuals at the current estimate, so the kernel is applied here
         super().__init__(GraphBuilder(RobustConfig(kernel="none"), wide=False))
         self._kernel = config.robust
         self._horizon_ns = round(1e9 * config.backend.horizon_s)
         self._values = gtsam.Values()
         self._dims: dict[int, int] = {}
-        self._window: list[Placed] = []
-        self._first: dict[int, Array] = {}  # where Jacobians of what the prior touches are taken
+        self._window: list[WindowFactor] = []
+        self._first: dict[int, Array] = {}  # linearisation points of what the prior involves
         self._tree: gtsam.GaussianBayesTree | None = None
-        self._past: dict[int, tuple[Array, Array]] = {}
+        self._past: dict[int, tuple[Array, Array]] = {}  # states that left
         self._qr = False
 
     def value(self, key: int, dim: int) -> Array:
@@ -83,31 +87,31 @@ class FixedLagBackend(GraphBackend):
         """See `Backend`."""
         self._joints.clear()
         self._tree = None
-        for part in self.builder.parts(step, self.value):
-            if part.new is not None:
-                key, value = part.new
+        for group in self.builder.factor_groups(step, self.value):
+            if group.new is not None:
+                key, value = group.new
                 write(self._values, key, value)
                 self._dims[key] = len(value)
-            for factor in part.factors:
-                last = factor is part.factors[-1]
-                observed = part.observed if last else None
-                keys, robust = tuple(factor.keys()), last and part.robust
-                self._window.append(Placed(factor, keys, observed, robust))
+            for factor in group.factors:
+                last = factor is group.factors[-1]
+                observed = group.observed if last else None
+                keys, robust = tuple(factor.keys()), last and group.robust
+                self._window.append(WindowFactor(factor, keys, observed, robust))
         self._optimise()
-        self._let_go(step.time_ns - self._horizon_ns)
+        self._marginalise_before(step.time_ns - self._horizon_ns)
 
     def _optimise(self) -> None:
-        for _ in range(ROUNDS):
-            moved = self._eliminated().optimize()
-            size = moved.norm()
+        for _ in range(MAX_ITERATIONS):
+            delta = self._eliminated().optimize()
+            size = delta.norm()
             if not np.isfinite(size):
                 raise self._diagnose()
-            self._values, self._tree = self._values.retract(moved), None
-            if size < STILL:
+            self._values, self._tree = self._values.retract(delta), None
+            if size < CONVERGED:
                 break
 
     def _eliminated(self) -> gtsam.GaussianBayesTree:
-        """The window, linearised and eliminated: by Cholesky, or by QR where that gives up."""
+        """The window, linearised and eliminated: by Cholesky, or by QR where that fails."""
         if self._tree is None:
             linear = self._linear(self._window)
             try:
@@ -124,30 +128,30 @@ class FixedLagBackend(GraphBackend):
         return linear.eliminateMultifrontal(gtsam.Ordering.OrderingType.COLAMD, gtsam.EliminateQR)
 
     def _diagnose(self) -> EstimationError:
-        """Which variable is indeterminate: QR answers NaN for all of them, Cholesky names one."""
+        """Which variable is indeterminate: QR returns NaN for all of them, Cholesky names one."""
         try:
             self._linear(self._window).eliminateMultifrontal()
         except RuntimeError as error:
             return self.builder.explain(error)
         return self.builder.explain(RuntimeError(""))
 
-    def _linear(self, pieces: Iterable[Placed]) -> gtsam.GaussianFactorGraph:
-        """Factors with the residuals of now and, where `_first` says so, the Jacobians of then."""
-        then = gtsam.Values(self._values)
+    def _linear(self, window: Iterable[WindowFactor]) -> gtsam.GaussianFactorGraph:
+        """Factors with residuals at the estimate and first-estimates Jacobians (see `_first`)."""
+        first = gtsam.Values(self._values)
         for key, value in self._first.items():
-            update(then, key, value)
+            update(first, key, value)
         graph = gtsam.GaussianFactorGraph()
-        for placed in pieces:
-            linear = placed.factor.linearize(self._values)
-            if not placed.prior:
-                was = not self._first.keys().isdisjoint(placed.keys)
-                weighed = placed.robust and self._kernel.kernel != "none"
-                if was or weighed:
+        for each in window:
+            linear = each.factor.linearize(self._values)
+            if not each.prior:
+                involved = not self._first.keys().isdisjoint(each.keys)
+                weighted = each.robust and self._kernel.kernel != "none"
+                if involved or weighted:
                     A, b = linear.jacobian()
-                    if was:
-                        A = placed.factor.linearize(then).jacobian()[0]
-                    root = np.sqrt(self._noise(len(b)).weight(b)) if weighed else 1.0
-                    dims = {key: self._dims[key] for key in placed.keys}
+                    if involved:
+                        A = each.factor.linearize(first).jacobian()[0]
+                    root = np.sqrt(self._noise(len(b)).weight(b)) if weighted else 1.0
+                    dims = {key: self._dims[key] for key in each.keys}
                     linear = jacobian_factor(root * A, root * b, dims)
             graph.push_back(linear)
         return graph
@@ -162,26 +166,24 @@ class FixedLagBackend(GraphBackend):
         if self._qr:
             return self._qr_covariance(keys)
         try:
-            if len(keys) == 1:
-                return np.asarray(tree.marginalCovariance(keys[0]))
-            return np.asarray(tree.jointMarginalCovariance(keys).fullMatrix())
+            return joint_marginal(tree, keys)
         except RuntimeError:
             self._qr, self._tree = True, None
             return self.covariance(keys)
 
     def _qr_covariance(self, keys: list[int]) -> Array:
-        """By QR all along: the tree answers by Cholesky, however it was made."""
+        """By QR throughout: a tree computes marginals by Cholesky, however it was made."""
         linear = self._linear(self._window)
         others = gtsam.Ordering([key for key in self._dims if key not in keys])
         rest = linear.eliminatePartialSequential(others, gtsam.EliminateQR)[1]
         net = rest.eliminateSequential(gtsam.Ordering(keys), gtsam.EliminateQR)
-        R, place = square_root(net, self._dims)
+        R, columns = square_root(net, self._dims)
         if not (np.isfinite(R).all() and np.diag(R).all()):
             raise self._diagnose()
-        return root_covariance(R, place, keys)
+        return root_covariance(R, columns, keys)
 
-    def _let_go(self, before_ns: int) -> None:
-        """Marginalise the states before ``before_ns``, but no robot's latest."""
+    def _marginalise_before(self, before_ns: int) -> None:
+        """Marginalise the states before ``before_ns`` out, but no robot's latest."""
         leaving: list[int] = []
         for robot in self.builder.robots:
             times, oldest = self.builder.states.times[robot], self.builder.oldest[robot]
@@ -195,19 +197,19 @@ class FixedLagBackend(GraphBackend):
             self._marginalise(leaving)
 
     def _marginalise(self, leaving: Sequence[int]) -> None:
-        touched = [p for p in self._window if not set(leaving).isdisjoint(p.keys)]
-        # the last chance to build a line's factor at the best estimate there will be
-        linear, order = self._linear(map(self._faced, touched)), gtsam.Ordering(list(leaving))
+        involved = [f for f in self._window if not set(leaving).isdisjoint(f.keys)]
+        # lines are built a last time, at the best estimate that there will be
+        linear, order = self._linear(map(self._rebuilt, involved)), gtsam.Ordering(list(leaving))
         if self._qr:
             rest = linear.eliminatePartialSequential(order, gtsam.EliminateQR)[1]
         else:
             rest = linear.eliminatePartialSequential(order)[1]
-        self._window = [p for p in self._window if set(leaving).isdisjoint(p.keys)]
+        self._window = [f for f in self._window if set(leaving).isdisjoint(f.keys)]
         prior = gtsam.LinearContainerFactor.ConvertLinearGraph(rest, self._values)
-        for place in range(prior.size()):
-            factor = prior.at(place)
+        for n in range(prior.size()):
+            factor = prior.at(n)
             keys = tuple(factor.keys())
-            self._window.append(Placed(factor, keys, prior=True))
+            self._window.append(WindowFactor(factor, keys, prior=True))
             for key in keys:
                 self._first.setdefault(key, self.value(key, self._dims[key]))
         for key in leaving:
@@ -215,27 +217,26 @@ class FixedLagBackend(GraphBackend):
             self._first.pop(key, None)
             del self._dims[key]
 
-    def _faced(self, placed: Placed) -> Placed:
-        if placed.observed is None or placed.observed[2].model != "line":
-            return placed
-        factor = self.builder.faced(placed.observed, self.value)
-        return Placed(factor, placed.keys, placed.observed, placed.robust)
+    def _rebuilt(self, old: WindowFactor) -> WindowFactor:
+        """A line's factor at the current estimate; others as they are."""
+        if old.observed is None or old.observed[2].model != "line":
+            return old
+        return replace(old, factor=self.builder.factor_at_estimate(old.observed, self.value))
 
     def finish(self) -> Estimate:
         """See `Backend`."""
-        means = {key: mean for key, (mean, _) in self._past.items()}
-        covs = {key: cov for key, (_, cov) in self._past.items()}
+        marginals = dict(self._past)
         for key, dim in self._dims.items():
-            means[key], covs[key] = self.value(key, dim), self.covariance([key])
-        return self._estimate(means, covs, self._half_squares())
+            marginals[key] = self.value(key, dim), self.covariance([key])
+        return self.builder.estimate(marginals, self._half_error())
 
-    def _half_squares(self) -> float:
-        """Half the weighted squared residuals, of what has left too."""
+    def _half_error(self) -> float:
+        """Half the weighted squared residuals, including those in the prior."""
         total = 0.0
-        for placed in self._window:
-            if placed.robust:
-                b = placed.factor.linearize(self._values).jacobian()[1]
+        for each in self._window:
+            if each.robust:
+                b = each.factor.linearize(self._values).jacobian()[1]
                 total += self._noise(len(b)).loss(float(b @ b))
             else:
-                total += placed.factor.error(self._values)
+                total += each.factor.error(self._values)
         return total

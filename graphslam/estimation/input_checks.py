@@ -1,27 +1,42 @@
-"""Bad input, refused in one line that names robot, landmark and time."""
+"""Checks of a step's contents; errors are one line that names robot, landmark and time."""
 
 import numpy as np
 
 from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import Array
-from graphslam.core.records import Association
+from graphslam.core.records import Association, Closure
 
 
-def sighting(seen: Association) -> str:
-    """An observation in words."""
+def describe_start(robot: str, time_ns: int) -> str:
+    """A robot's start in words, for error messages; the others likewise."""
+    return f"start of robot {robot} at {time_ns} ns"
+
+
+def describe_motion(robot: str, time_ns: int) -> str:
+    """A motion that ends at ``time_ns``."""
+    return f"motion of robot {robot} to {time_ns} ns"
+
+
+def describe_observation(seen: Association) -> str:
+    """An observation of a landmark or a robot."""
     kind = "robot" if isinstance(seen.target, str) else "landmark"
     return f"{kind} {seen.target}, seen from robot {seen.robot} at {seen.time_ns} ns"
 
 
-def indeterminate(what: str) -> EstimationError:
-    """The error of something that determines nothing, said in words."""
-    return EstimationError(
-        f"the estimate is indeterminate at {what}: it says nothing, or its noise is no covariance"
-    )
+def describe_closure(closure: Closure) -> str:
+    """A relative pose of two states."""
+    return f"closure of robot {closure.robot} at {closure.time_ns} ns"
+
+
+def indeterminate(
+    what: str, why: str = "it carries no information, or its covariance is invalid"
+) -> EstimationError:
+    """The error of an estimate that ``what`` leaves indeterminate."""
+    return EstimationError(f"the estimate is indeterminate at {what}: {why}")
 
 
 def check_finite(what: str, *values: Array) -> None:
-    """Refuse infinities and what is not a number.
+    """Refuse values that are infinite or NaN.
 
     Raises:
         EstimationError: it names ``what``.
@@ -31,7 +46,7 @@ def check_finite(what: str, *values: Array) -> None:
 
 
 def check_positive(cov: Array, what: str) -> None:
-    """Refuse a matrix (k, k) that is no positive definite covariance.
+    """Refuse a matrix (k, k) that is not a positive definite covariance.
 
     Raises:
         EstimationError: it names ``what``.

@@ -1,17 +1,18 @@
-"""The extended Kalman filter with right-invariant errors: landmarks turn with the robot's heading.
+"""The extended Kalman filter with right-invariant errors: heading stays unobservable where it is.
 
-With additive errors, a turn of the whole world moves each landmark by an error that depends on
-where the estimate has it; the estimates change on the way, so the filter believes to have seen a
-turn that nothing showed. With the errors of A. Barrau and S. Bonnabel (IEEE TAC 62(4), 2017,
-https://doi.org/10.1109/TAC.2016.2594085; for SLAM https://arxiv.org/abs/1510.06263) it is the same
-error wherever the estimates are, and what cannot be observed stays unobserved.
+With additive errors, the direction of a turn of the whole world depends on the estimates of the
+landmarks. These change from update to update, so the filter gains information about a turn that was
+never observed. With the errors of A. Barrau and S. Bonnabel (IEEE TAC 62(4), 2017,
+https://doi.org/10.1109/TAC.2016.2594085; for SLAM https://arxiv.org/abs/1510.06263) that direction
+is the same at every estimate, and what is unobservable stays so.
 
 A pose (p, phi) has the error xi = (u, omega) with truth = exp(xi) estimate, a turn about the
-world's origin; a point borrows omega from a robot, the one that saw it first. (With one robot this
-is the group of a pose with many points; with several, a turn of the world is still omega in all.)
-To first order ``dp = u + omega J p`` with J the quarter turn, so u is ``dp - omega J p``, and a
-filter with additive errors becomes this one by two changes, both in `_correct`: the correction goes
-through exp, and as u is what keeps its covariance, dp becomes ``dp + omega J (new p - old p)``.
+world's origin. A point shares the omega of one robot, the one that saw it first. (With one robot
+this is the group of a pose with many points; with several, a turn of the world is still the same
+omega in all.) To first order ``dp = u + omega J p`` with J the quarter turn, so u is
+``dp - omega J p``. A filter with additive errors becomes this one by two changes, both in
+`_apply_correction`: the correction goes through exp, and since it is u whose covariance is kept,
+dp becomes ``dp + omega J (new p - old p)``.
 """
 
 from dataclasses import replace
@@ -23,18 +24,19 @@ from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array, compose, exp, wrap
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association
-from graphslam.estimation.ekf import EkfBackend, Member
+from graphslam.estimation.ekf import EkfBackend
+from graphslam.estimation.filter_base import Member
 
 
 class InvariantEkfBackend(EkfBackend):
-    """The filter; `ekf.error` has no say in it.
+    """The filter; `ekf.error` does not apply.
 
-    The covariance that it keeps and hands out is the additive one along world axes, which its own
-    errors become to first order.
+    The covariance that it keeps and returns is of additive errors along world axes, which equal its
+    own errors to first order.
     """
 
     def __init__(self, config: Config) -> None:
-        """Raise ConfigError if it is to iterate: `EkfBackend` iterates with additive errors."""
+        """Raise ConfigError for more than one iteration: `EkfBackend` iterates additive errors."""
         if config.ekf.iterations != 1:
             raise ConfigError("ekf.iterations: the invariant filter linearises once; leave it at 1")
         super().__init__(replace(config, ekf=replace(config.ekf, error="world")))
@@ -46,8 +48,8 @@ class InvariantEkfBackend(EkfBackend):
         if isinstance(seen.target, int) and MODELS[seen.model].dim == 2:
             self._anchor[seen.target] = seen.robot
 
-    def _correct(self, d: Array) -> None:
-        """Apply additive errors (n,) to all means by exp, and carry the covariance along."""
+    def _apply_correction(self, d: Array) -> None:
+        """Apply additive errors (n,) to all means by exp, and transform the covariance."""
         gaussian = self._gaussian
         x, P = gaussian.x, gaussian.P
         poses, points = gaussian.blocks(3), gaussian.blocks(2)
@@ -56,15 +58,15 @@ class InvariantEkfBackend(EkfBackend):
             for name in gaussian
             if isinstance(name, int) and name in self._anchor
         ]
-        places = np.concatenate([poses[:, :2], points])
-        turns = np.concatenate([poses[:, 2], np.array(anchors, dtype=np.int64)])
-        p, omega = x[places], d[turns, None]
-        u = d[places] - omega * _quarter_turn(p)
-        x[places] = compose(exp(np.hstack([u, omega])), np.pad(p, ((0, 0), (0, 1))))[:, :2]
+        positions = np.concatenate([poses[:, :2], points])
+        headings = np.concatenate([poses[:, 2], np.array(anchors, dtype=np.int64)])
+        p, omega = x[positions], d[headings, None]
+        u = d[positions] - omega * _quarter_turn(p)
+        x[positions] = compose(exp(np.hstack([u, omega])), np.pad(p, ((0, 0), (0, 1))))[:, :2]
         x[poses[:, 2]] = wrap(x[poses[:, 2]] + d[poses[:, 2]])
         # each error gains ``lever`` times the error ``turn``: P becomes (I + L) P (I + L)ᵀ
         lever, turn = np.zeros(len(x)), np.arange(len(x))
-        lever[places], turn[places] = _quarter_turn(x[places] - p), turns[:, None]
+        lever[positions], turn[positions] = _quarter_turn(x[positions] - p), headings[:, None]
         PL = lever * P[turn].T
         P += PL + PL.T + np.outer(lever, lever) * P[np.ix_(turn, turn)]
 

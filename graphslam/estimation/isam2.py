@@ -1,152 +1,159 @@
-"""Full smoothing with GTSAM: incrementally (iSAM2) and, at the end, to convergence.
+"""Full smoothing with GTSAM: incremental (iSAM2), and batch optimisation to convergence.
 
-`Isam2Backend` is incremental smoothing over the whole past (horizon = infinity), its tree updated
-at every step (`compressed` does so seldom). `Reoptimiser` solves what was recorded once more.
+`Isam2Backend` smooths all states incrementally (horizon = infinity) and updates its tree at every
+step (`compressed_filter` does so seldom). `Reoptimiser` solves recorded steps again.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import gtsam
 import numpy as np
 
 from graphslam.core.config import Config, RobustConfig
-from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import Array
 from graphslam.core.records import Association, Closure, Estimate, Step
 from graphslam.core.worker import parallel_map
 from graphslam.estimation import factors
 from graphslam.estimation.factor_graph import (
     Estimates,
+    FactorGroup,
     GraphBackend,
     GraphBuilder,
-    Part,
     read,
     write,
 )
 
 #: m or rad: the estimate has converged when all variables together move less than this
 CONVERGED = 1e-6
-#: the same for lines that are faced anew, and rounds of it: it converges in two without a kernel;
-#: with one it need not, as weights change too, and more rounds change nothing that shows
-FACED, MAX_FACINGS, MAX_FACINGS_ROBUST = 1e-6, 4, 2
-#: relative decrease of the error at which optimising ends: without a kernel; with one (reweighting
-#: converges linearly: beyond 1e-6 hundreds of iterations move nothing that shows); and where
-#: another round follows anyway
+#: the same for lines whose factors are built again, and the largest number of rounds: it converges
+#: in two without a kernel; with one it need not, as weights change too, and more rounds change
+#: nothing that shows
+LINES_CONVERGED, MAX_LINE_ROUNDS, MAX_LINE_ROUNDS_ROBUST = 1e-6, 4, 2
+#: relative decrease of the error at which optimisation ends: without a kernel; with one
+#: (reweighting converges linearly: beyond 1e-6 hundreds of iterations move nothing that shows); and
+#: where another round follows anyway
 CONVERGED_ERROR, CONVERGED_ERROR_ROBUST, CONVERGED_ERROR_ROUGH = 1e-10, 1e-6, 1e-3
-
-
-#: linearising anew costs what there is by then: so many steps make the time between two looks for
-#: what moved as long again
-AS_LONG_AGAIN = 1000
-#: marginals that are worth a second process
-MANY = 500
-#: updates between two looks, for GTSAM, that will not be
+#: steps after which the interval between relinearisations has doubled, since each costs as much as
+#: there are steps
+INTERVAL_DOUBLES = 1000
+#: marginals from which on a second process is worth while
+PARALLEL_MARGINALS = 500
+#: `relinearizeSkip` that leaves the decision to `Isam2Backend`
 NEVER = 1 << 30
 
 
 class WholeGraph(GraphBuilder):
-    """Keeps every factor there ever was, in ``graph``.
+    """Keeps every factor, in ``graph``.
 
-    With ``faced_later`` those of lines are only there once `face_lines` made them, all at once.
+    With ``defer_lines`` the factors of lines are missing until `rebuild_lines` makes them, all at
+    once. ``robot_observations`` are those of robots: index in the graph, and both keys.
     """
 
-    def __init__(self, kernel: RobustConfig, *, faced_later: bool = False) -> None:
-        super().__init__(kernel, lines=not faced_later)
+    def __init__(self, kernel: RobustConfig, *, defer_lines: bool = False) -> None:
+        super().__init__(kernel, lines=not defer_lines)
         self.graph = gtsam.NonlinearFactorGraph()
-        self._faced_later = faced_later
-        self._observed: list[tuple[int, int, Association]] = []  # lines, and their places in graph
-        self._places: list[int] = []
-        self.meetings: list[tuple[int, tuple[int, int, Association]]] = []  # the same of robots
+        self.robot_observations: list[tuple[int, tuple[int, int, Association]]] = []
+        self._defer_lines = defer_lines
+        self._lines: list[tuple[int, int, Association]] = []
+        self._line_indices: list[int] = []  # of the factors of `_lines` in the graph
 
-    def expand(self, step: Step, current: Estimates) -> list[Part]:
-        """The parts of a step, taken in; ``current`` is asked for existing estimates."""
-        fresh: dict[int, Array] = {}
+    @classmethod
+    def at_estimate(
+        cls, steps: Iterable[Step], start: Estimate, kernel: RobustConfig
+    ) -> tuple["WholeGraph", gtsam.Values]:
+        """The graph of recorded steps, lines deferred, and its variables' values in ``start``."""
+        builder, values = cls(kernel, defer_lines=True), gtsam.Values()
+        for step in steps:
+            builder.insert(step, start, values)
+        return builder, values
+
+    def expand(self, step: Step, current: Estimates) -> list[FactorGroup]:
+        """Add a step; ``current`` is called for estimates of variables that were there before."""
+        new: dict[int, Array] = {}
 
         def estimate(key: int, dim: int) -> Array:
-            return fresh[key] if key in fresh else current(key, dim)
+            return new[key] if key in new else current(key, dim)
 
-        parts = []
-        for part in self.parts(step, estimate):
-            if part.new is not None:
-                fresh.update([part.new])
-            self._take(part)
-            parts.append(part)
-        return parts
+        groups = []
+        for group in self.factor_groups(step, estimate):
+            if group.new is not None:
+                new.update([group.new])
+            self._add(group)
+            groups.append(group)
+        return groups
 
     def insert(self, step: Step, start: Estimate, values: gtsam.Values) -> None:
-        """Take in a recorded step, its variables at their values in ``start``."""
-        for part in self.parts(step, lambda key, _dim: self.value_in(start, key)):
-            if part.new is not None:
-                write(values, part.new[0], self.value_in(start, part.new[0]))
-            self._take(part)
+        """Add a recorded step, its variables with their values in ``start``."""
+        for group in self.factor_groups(step, lambda key, _dim: self.value_in(start, key)):
+            if group.new is not None:
+                write(values, group.new[0], self.value_in(start, group.new[0]))
+            self._add(group)
 
-    def _take(self, part: Part) -> None:
-        for factor in part.factors:
+    def _add(self, group: FactorGroup) -> None:
+        for factor in group.factors:
             self.graph.add(factor)
-        if self._note_line(part) and not self._faced_later:
-            self._places.append(self.graph.size() - 1)
-        elif part.observed is not None and isinstance(part.observed[2].target, str):
-            self.meetings.append((self.graph.size() - 1, part.observed))
-
-    def _note_line(self, part: Part) -> bool:
-        """Whether a part observes a line: noted for `face_lines`."""
-        if part.observed is None or part.observed[2].model != "line":
-            return False
-        self._observed.append(part.observed)
-        return True
-
-    def make_room(self) -> None:
-        """Places in the graph for the factors of lines that were left to `face_lines`."""
-        size, missing = self.graph.size(), len(self._observed) - len(self._places)
-        self.graph.resize(size + missing)
-        self._places += range(size, size + missing)
-
-    def face_lines(self, values: gtsam.Values) -> None:
-        """Make the factors of all lines anew at ``values``; see `GraphBuilder.faced`."""
-        if not self._observed:
+        if group.observed is None:
             return
-        self.make_room()
-        keys, targets, seen = zip(*self._observed, strict=True)
-        known = np.unique([keys, targets])
-        poses = np.array([read(values, int(key), 3) for key in known])
+        *_, seen = group.observed
+        if seen.model == "line":
+            self._lines.append(group.observed)
+            if not self._defer_lines:
+                self._line_indices.append(self.graph.size() - 1)
+        elif isinstance(seen.target, str):
+            self.robot_observations.append((self.graph.size() - 1, group.observed))
+
+    def reserve_lines(self) -> None:
+        """Reserve indices in the graph for the factors of deferred lines."""
+        size, missing = self.graph.size(), len(self._lines) - len(self._line_indices)
+        self.graph.resize(size + missing)
+        self._line_indices += range(size, size + missing)
+
+    def rebuild_lines(self, values: gtsam.Values) -> None:
+        """Make the factors of all lines again at ``values``; see `factor_at_estimate`."""
+        if not self._lines:
+            return
+        self.reserve_lines()
+        keys, targets, seen = zip(*self._lines, strict=True)
+        unique = np.unique([keys, targets])
+        poses = np.array([read(values, int(key), 3) for key in unique])
         made = factors.line_factors(
             keys,
             targets,
             np.array([a.z for a in seen]),
             np.array([a.cov for a in seen]),
-            poses[np.searchsorted(known, keys)],
-            poses[np.searchsorted(known, targets)],
+            poses[np.searchsorted(unique, keys)],
+            poses[np.searchsorted(unique, targets)],
             self.kernel,
         )
-        for place, factor in zip(self._places, made, strict=True):
-            self.graph.replace(place, factor)
+        for index, factor in zip(self._line_indices, made, strict=True):
+            self.graph.replace(index, factor)
 
-    def close(self, closures: Iterable[Closure]) -> None:
-        """Add closures between states that are there."""
-        for closure in closures:
-            part = self._closure(closure)
-            if part is not None:
-                for factor in part.factors:
-                    self.graph.add(factor)
-
-    def diagnose(self, values: gtsam.Values) -> EstimationError:
-        """Which variable is indeterminate: QR answers NaN for all of them, Cholesky names one."""
-        try:
-            marginals = gtsam.Marginals(self.graph, values)
-            for key in values.keys():  # noqa: SIM118 (GTSAM's values are no mapping)
-                marginals.marginalCovariance(key)
-        except RuntimeError as error:
-            return self.explain(error)
-        return self.explain(RuntimeError(""))
+    def add_closures(self, closures: Iterable[Closure]) -> None:
+        """Add closures between existing states."""
+        for group in self.closure_groups(closures):
+            self._add(group)
 
 
 def isam2_parameters(config: Config, factorization: str) -> gtsam.ISAM2Params:
     """Settings of iSAM2; ``factorization`` CHOLESKY or QR."""
     parameters = gtsam.ISAM2Params()
     parameters.setRelinearizeThreshold(config.backend.relinearize_threshold)
-    parameters.relinearizeSkip = NEVER  # `Isam2Backend` says when
+    parameters.relinearizeSkip = NEVER
     parameters.setFactorization(factorization)
     return parameters
+
+
+def isam2_tree(
+    config: Config, factorization: str, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
+) -> gtsam.ISAM2:
+    """A tree of the whole graph, linearised at ``values``.
+
+    Raises:
+        RuntimeError: it is indeterminate.
+    """
+    tree = gtsam.ISAM2(isam2_parameters(config, factorization))
+    tree.update(graph, values)
+    return tree
 
 
 class Isam2Backend(GraphBackend):
@@ -160,45 +167,45 @@ class Isam2Backend(GraphBackend):
         super().__init__(self._builder)
         self._factorization = "CHOLESKY"
         self._isam = gtsam.ISAM2(isam2_parameters(config, self._factorization))
-        self._finished: gtsam.Values | None = None  # `finish` ended here; not asked since
-        self._steps = self._looked = 0  # steps taken; the one at which it was linearised anew
+        self._finished: gtsam.Values | None = None  # result of `finish`, until the next query
+        self._steps = self._relinearised = 0  # number of steps; the one of the last relinearisation
 
     def value(self, key: int, dim: int) -> Array:
-        """Current estimate (dim,) of a variable."""
-        self._settle()
+        """See `GraphBackend`."""
+        self._rebuild_if_finished()
         if dim == 3:
             return factors.array3(self._isam.calculateEstimatePose2(key))
         return np.asarray(self._isam.calculateEstimatePoint2(key))
 
     def add(self, step: Step) -> None:
         """See `Backend`."""
-        self._settle()
+        self._rebuild_if_finished()
         self._joints.clear()
         self._steps += 1
         self._update(self._builder.expand(step, self.value), self._due())
 
     def _due(self) -> bool:
-        """Whether it is time to look for what is to be linearised anew."""
-        every = self._config.backend.relinearize_every * (1 + self._steps // AS_LONG_AGAIN)
-        return self._steps >= self._looked + every
+        """Whether variables that have moved are to be relinearised now."""
+        interval = self._config.backend.relinearize_every * (1 + self._steps // INTERVAL_DOUBLES)
+        return self._steps >= self._relinearised + interval
 
-    def _update(self, parts: Iterable[Part], anew: bool) -> None:
-        """Let the tree take in parts; ``anew``: after linearising anew what has moved before."""
+    def _update(self, groups: Iterable[FactorGroup], relinearise: bool) -> None:
+        """Add factors to the tree; with ``relinearise`` variables that have moved first."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        for part in parts:
-            if part.new is not None:
-                write(values, *part.new)
-            for factor in part.factors:
+        for group in groups:
+            if group.new is not None:
+                write(values, *group.new)
+            for factor in group.factors:
                 graph.add(factor)
-        if anew:
-            self._looked = self._steps
+        if relinearise:
+            self._relinearised = self._steps
         try:
-            self._isam.update(graph, values, [], None, None, None, anew)
+            self._isam.update(graph, values, [], None, None, None, relinearise)
         except RuntimeError as error:
             self._use_qr(error)
 
     def _use_qr(self, error: RuntimeError) -> None:
-        """Start the tree anew with QR, at what the failed one was linearised at.
+        """Build the tree again with QR, at the linearisation point of the one that failed.
 
         Cholesky is twice as fast but calls good graphs indeterminate where information spans many
         orders of magnitude (MIT at pose 165, M3500 at 695); QR does not.
@@ -207,23 +214,23 @@ class Isam2Backend(GraphBackend):
             raise self._builder.explain(error) from error
         self._factorization = "QR"
         graph, values = self._isam.getFactorsUnsafe(), self._isam.getLinearizationPoint()
-        self._isam = gtsam.ISAM2(isam2_parameters(self._config, "QR"))
         try:
-            self._isam.update(graph, values)
+            self._isam = isam2_tree(self._config, "QR", graph, values)
         except RuntimeError as again:
             raise self._builder.explain(again) from again
 
-    def _settle(self) -> None:
-        """After `finish`: a tree built anew at the converged estimate, which answers from now on.
+    def _rebuild_if_finished(self) -> None:
+        """After `finish`: build a tree at the converged estimate for queries from now on.
 
-        Only made when something is asked, since most are done after `finish`.
+        Not done by `finish` itself, since most runs end there.
         """
         if self._finished is None:
             return
         values, self._finished = self._finished, None
-        self._isam = gtsam.ISAM2(isam2_parameters(self._config, self._factorization))
+        graph, parameters = self._builder.graph, (self._config, self._factorization)
+        self._isam = gtsam.ISAM2(isam2_parameters(*parameters))
         try:
-            self._isam.update(self._builder.graph, values)
+            self._isam.update(graph, values)
         except RuntimeError as error:
             self._use_qr(error)
 
@@ -232,23 +239,14 @@ class Isam2Backend(GraphBackend):
         return self._tree_covariance(keys)
 
     def _tree_covariance(self, keys: list[int]) -> Array:
-        """The same according to the tree."""
-        self._settle()
-        try:
-            if len(keys) == 1:
-                cov = np.asarray(self._isam.marginalCovariance(keys[0]))
-            else:
-                cov = np.asarray(self._isam.jointMarginalCovariance(keys).fullMatrix())
-        except RuntimeError as error:
-            raise self._builder.explain(error) from error
-        if not np.isfinite(cov).all():
-            raise self._builder.diagnose(self._isam.calculateEstimate())
-        return cov
+        """The same by the tree, whatever a subclass has in front of it."""
+        self._rebuild_if_finished()
+        return self._builder.covariance(self._isam, self._builder.graph, keys)
 
     def finish(self) -> Estimate:
-        """See `Backend`: optimised to convergence, or iSAM2 until it moves no more.
+        """See `Backend`: optimised to convergence, or iSAM2 updated until it has converged.
 
-        What is asked afterwards, a joint marginal for example, is answered at that estimate.
+        Queries afterwards, of a joint marginal for example, are answered at that estimate.
         """
         if self._config.backend.optimise_at_end:
             return self._result(self._optimised(self._isam.calculateBestEstimate()))
@@ -261,13 +259,13 @@ class Isam2Backend(GraphBackend):
         return self._tree_covariance([builder.state_key(*state) for state in numbers])
 
     def current_estimate(self) -> Estimate:
-        """What the tree has now, where solving again begins: covariances are NaN."""
-        return self._rough(self._isam.calculateBestEstimate())
+        """The tree's estimate, from which to optimise again: covariances are NaN."""
+        return self._estimate(self._isam.calculateBestEstimate(), {})
 
-    def _rough(self, values: gtsam.Values) -> Estimate:
-        means = {key: read(values, key, dim) for key, dim in self._builder.dims().items()}
-        covs = {key: np.full((len(mean), len(mean)), np.nan) for key, mean in means.items()}
-        return self._estimate(means, covs, float(self._builder.graph.error(values)))
+    def _estimate(self, values: gtsam.Values, covs: Mapping[int, Array]) -> Estimate:
+        """The estimate with these marginal covariances; those that are missing are NaN."""
+        marginals = with_means(values, self._builder.dims(), covs)
+        return self._builder.estimate(marginals, float(self._builder.graph.error(values)))
 
     def _converged(self) -> gtsam.Values:
         nothing, no_values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -281,70 +279,65 @@ class Isam2Backend(GraphBackend):
         return self._isam.calculateBestEstimate()
 
     def _optimised(self, values: gtsam.Values) -> gtsam.Values:
-        """Optimised, the lines faced anew until that moves nothing any more."""
+        """Optimise, and build the lines' factors again, until nothing moves."""
         plain = self._config.robust.kernel == "none"
         try:
-            for _ in range(MAX_FACINGS if plain else MAX_FACINGS_ROBUST):
+            for _ in range(MAX_LINE_ROUNDS if plain else MAX_LINE_ROUNDS_ROBUST):
                 before = values
-                self._builder.face_lines(values)
+                self._builder.rebuild_lines(values)
                 values = optimise(self._builder.graph, values, self._config.robust)
-                if before.localCoordinates(values).norm() < FACED:
+                if before.localCoordinates(values).norm() < LINES_CONVERGED:
                     break
         except RuntimeError as error:
             raise self._builder.explain(error) from error
         return values
 
     def _marginals(self, values: gtsam.Values) -> dict[int, Array]:
-        """Marginal covariance of every key: by Cholesky, or by QR where that gives up."""
+        """Marginal covariance of every key: by Cholesky, or by QR where that fails."""
         keys = values.keys()
         try:
             return marginals_of(gtsam.Marginals(self._builder.graph, values), keys)
         except RuntimeError as error:
-            isam = gtsam.ISAM2(isam2_parameters(self._config, "QR"))
-            isam.update(self._builder.graph, values)
-            found = {key: isam.marginalCovariance(key) for key in keys}
-            # QR does not complain about an indeterminate graph, it answers NaN
-            if not all(np.isfinite(cov).all() for cov in found.values()):
+            tree = isam2_tree(self._config, "QR", self._builder.graph, values)
+            covs = {key: tree.marginalCovariance(key) for key in keys}
+            # QR does not fail on an indeterminate graph, it returns NaN
+            if not all(np.isfinite(cov).all() for cov in covs.values()):
                 raise self._builder.explain(error) from error
-            return found
+            return covs
 
     def _result(self, values: gtsam.Values) -> Estimate:
         self._finished = values
         self._joints.clear()
-        covs = self._marginals(values)
-        means = {key: read(values, key, len(cov)) for key, cov in covs.items()}
-        return self._estimate(means, covs, float(self._builder.graph.error(values)))
+        return self._estimate(values, self._marginals(values))
 
 
 class Reoptimiser(Isam2Backend):
-    """Solves recorded steps again and again, with more closures or fewer."""
+    """Solves recorded steps repeatedly, with varying closures."""
 
     def __init__(self, config: Config, steps: Iterable[Step], start: Estimate) -> None:
-        """Take steps in.
+        """Build the graph.
 
         Args:
             config: settings.
-            steps: all there are, as recorded.
-            start: an estimate of every variable in them, where solving begins.
+            steps: all, as recorded.
+            start: an estimate of all their variables, where optimisation starts.
 
         Raises:
             EstimationError: a covariance is not positive definite and finite.
         """
-        super().__init__(config, WholeGraph(config.robust, faced_later=True))
-        values = gtsam.Values()
-        for step in steps:
-            self._builder.insert(step, start, values)
-        self._builder.make_room()
+        builder, values = WholeGraph.at_estimate(steps, start, config.robust)
+        super().__init__(config, builder)
+        self._builder.reserve_lines()
         self._finished = values
         self._size, self._rows = self._builder.graph.size(), self._builder.rows
 
     def solve(self, closures: Iterable[Closure] = (), *, rough: bool = False) -> Estimate:
-        """Solved from where the last solution ended.
+        """Optimise from the last solution.
 
         Args:
-            closures: beside those in the steps; those of the last solution are gone.
-            rough: to what a next round can go on from, in a fraction of the time: covariances are
-                NaN (`joint` and `state_covariance` have them).
+            closures: in addition to those in the steps; those of the last call are removed.
+            rough: stop early, in a fraction of the time, as a start for another round; covariances
+                are NaN (`joint` and `state_covariance` have them).
 
         Raises:
             EstimationError: the steps make the estimate indeterminate.
@@ -352,31 +345,41 @@ class Reoptimiser(Isam2Backend):
         builder, values = self._builder, self._values()
         builder.graph.resize(self._size)
         builder.rows = self._rows
-        builder.close(closures)
+        builder.add_closures(closures)
         if not rough:
             return self._result(self._optimised(values))
         try:
-            builder.face_lines(values)
+            builder.rebuild_lines(values)
             values = optimise(builder.graph, values, self._config.robust, CONVERGED_ERROR_ROUGH)
         except RuntimeError as error:
             raise builder.explain(error) from error
         self._finished = values
         self._joints.clear()
-        return self._rough(values)
+        return self._estimate(values, {})
 
     def _values(self) -> gtsam.Values:
         return self._isam.calculateBestEstimate() if self._finished is None else self._finished
 
 
 def marginals_of(marginals: gtsam.Marginals, keys: Sequence[int]) -> dict[int, Array]:
-    """Marginal covariance (d, d) of each key, m and rad.
+    """Marginal covariance (d, d) of each key, errors in body frames.
 
     Raises:
         RuntimeError: one is indeterminate.
     """
     keys = list(keys)
-    found = parallel_map(marginals.marginalCovariance, keys, fewest=MANY)
-    return dict(zip(keys, found, strict=True))
+    covs = parallel_map(marginals.marginalCovariance, keys, fewest=PARALLEL_MARGINALS)
+    return dict(zip(keys, covs, strict=True))
+
+
+def with_means(
+    values: gtsam.Values, dims: Mapping[int, int], covs: Mapping[int, Array]
+) -> dict[int, tuple[Array, Array]]:
+    """Mean and covariance of every variable, of NaN where there is none."""
+    return {
+        key: (read(values, key, dim), covs.get(key, np.full((dim, dim), np.nan)))
+        for key, dim in dims.items()
+    }
 
 
 def optimise(
@@ -385,10 +388,10 @@ def optimise(
     kernel: RobustConfig,
     converged: float | None = None,
 ) -> gtsam.Values:
-    """Levenberg-Marquardt from ``values`` until the error decreases by less than ``converged``.
+    """Levenberg-Marquardt from ``values`` until the relative decrease of the error is small.
 
-    Relative to the error; by default, without a kernel, to 1e-10, which comes for free where
-    convergence is quadratic.
+    ``converged`` is that limit: by default `CONVERGED_ERROR`, whose 1e-10 costs nothing where
+    convergence is quadratic, or `CONVERGED_ERROR_ROBUST` with a kernel.
     """
     if converged is None:
         converged = CONVERGED_ERROR if kernel.kernel == "none" else CONVERGED_ERROR_ROBUST

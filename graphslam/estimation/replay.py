@@ -1,7 +1,6 @@
-"""Recorded steps through a back end: the same evidence for every estimator.
+"""Recorded steps replayed through a back end, so that all estimators get the same evidence.
 
-What an estimator makes of given steps is estimation and nothing else: which observation belongs to
-which landmark was decided before.
+Data association was decided when the steps were recorded; a replay compares estimation alone.
 """
 
 import time
@@ -12,16 +11,17 @@ import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam.core.records import Estimate, Step, Trajectory
-from graphslam.estimation.backend import Backend
+from graphslam.estimation.backend import Backend, TrajectoryRecorder
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Replay:
-    """What a back end made of the steps.
+    """The result of a replay.
 
-    ``causal[robot]`` is each state from the data up to its own time; ``step_ms`` (n,) the time that
-    each step took, reading the new poses (not their covariances) included, ``finish_ms``
-    that of the end; ``late`` counts associations from before their landmark's promotion.
+    ``causal[robot]`` has each state as estimated from the data up to its own time. ``step_ms`` (n,)
+    is the time of each step, including the query of the new poses (not of their covariances);
+    ``finish_ms`` that of `Backend.finish`. ``late`` counts associations from before their
+    landmark's promotion.
     """
 
     causal: Mapping[str, Trajectory]
@@ -41,14 +41,12 @@ def replay(
     Args:
         steps: as recorded.
         backend: a fresh one.
-        watch: called after each step, outside the time that is taken.
+        watch: called after each step, outside the measured time.
 
     Raises:
         EstimationError: the steps make the estimate indeterminate.
     """
-    times: dict[str, list[int]] = {}
-    poses: dict[str, list[Array]] = {}
-    covs: dict[str, list[Array]] = {}
+    causal = TrajectoryRecorder()
     step_ms: list[float] = []
     late = 0
     for step in steps:
@@ -59,17 +57,9 @@ def replay(
         step_ms.append(1e3 * (time.perf_counter() - began))
         late += sum(seen.late for seen in step.associations)
         for robot, mean in zip(moved, means, strict=True):
-            times.setdefault(robot, []).append(step.time_ns)
-            poses.setdefault(robot, []).append(mean)
-            covs.setdefault(robot, []).append(backend.joint(robot, []).cov)
+            causal.append(robot, step.time_ns, mean, backend.joint(robot, []).cov)
         watch(step, backend)
     began = time.perf_counter()
     estimate = backend.finish()
     finish_ms = 1e3 * (time.perf_counter() - began)
-    causal = {
-        robot: Trajectory(
-            np.array(times[robot], dtype=np.int64), np.array(poses[robot]), np.array(covs[robot])
-        )
-        for robot in sorted(times)
-    }
-    return Replay(causal, estimate, np.array(step_ms), finish_ms, late)
+    return Replay(causal.trajectories(), estimate, np.array(step_ms), finish_ms, late)

@@ -497,8 +497,8 @@ def test_what_the_filter_cannot_take_goes_into_the_tree_at_once(why, monkeypatch
         def breaks(*_):
             raise np.linalg.LinAlgError
 
-        monkeypatch.setattr(compressed.LocalFilter, "take", breaks)
-        monkeypatch.setattr(compressed.LocalFilter, "takes", lambda *_: True)
+        monkeypatch.setattr(compressed.LocalFilter, "add", breaks)
+        monkeypatch.setattr(compressed.LocalFilter, "has_variables_of", lambda *_: True)
     once = replace(PLAIN.backend, relinearize_every=1000)
     config = Config(robust=PLAIN.robust, backend=once)
     both = isam2.Isam2Backend(config), compressed.CompressedBackend(config)

@@ -36,9 +36,10 @@ from graphslam.core.geometry import (
 )
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Closure, Start, Step
-from graphslam.estimation.ekf import ERRORS, WEIGHTS, EkfBackend, robust_weight
+from graphslam.estimation.ekf import ERRORS, EkfBackend
 from graphslam.estimation.factor_ekf import FactorEkfBackend
 from graphslam.estimation.factors import FILTER_GAUGE_SIGMA_M
+from graphslam.estimation.m_estimators import WEIGHTS, robust_weight
 
 FRAMES = ["world", "body"]
 

@@ -15,7 +15,7 @@ from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Closure, Start, Step
 from graphslam.estimation import rbpf
 from graphslam.estimation.backends import BACKENDS
-from graphslam.estimation.rbpf import RbpfBackend, low_variance
+from graphslam.estimation.rbpf import RbpfBackend, low_variance_sample
 
 
 def settings(particles, seed=0, proposal="observation"):
@@ -154,7 +154,7 @@ def test_a_draw_changes_what_is_sampled_and_not_what_is_known():
     backend = run("rbpf", [Step(0, starts), Step(0, associations=(seen,))], settings(20_000))
     before = backend.joint("a", [], ["b"]).cov
     alone = backend._P[0, 3:, 3:].copy()
-    backend._draw("a")
+    backend._sample_pose("a")
     sigmas = np.sqrt(np.diag(before))
     after = backend.joint("a", [], ["b"]).cov
     np.testing.assert_allclose((after - before) / np.outer(sigmas, sigmas), 0.0, atol=0.05)
@@ -168,7 +168,7 @@ def test_resampling_is_unbiased_and_of_low_variance():
     weights = rng.gamma(0.3, size=40)
     weights /= weights.sum()
     shares = (np.arange(20_000) + 0.5) / 20_000
-    counts = np.array([np.bincount(low_variance(weights, u), minlength=40) for u in shares])
+    counts = np.array([np.bincount(low_variance_sample(weights, u), minlength=40) for u in shares])
     np.testing.assert_allclose(counts.mean(axis=0), 40 * weights, atol=40 / 20_000)
     assert np.all(counts.sum(axis=1) == 40)
     assert np.all(np.abs(counts - 40 * weights) < 1)
@@ -177,7 +177,9 @@ def test_resampling_is_unbiased_and_of_low_variance():
 def test_equal_weights_keep_every_particle():
     """Resampling where there is nothing to choose throws nothing away."""
     for share in (1e-9, 0.5, 1 - 1e-9):
-        np.testing.assert_array_equal(low_variance(np.full(1000, 1e-3), share), np.arange(1000))
+        np.testing.assert_array_equal(
+            low_variance_sample(np.full(1000, 1e-3), share), np.arange(1000)
+        )
 
 
 def test_particles_are_drawn_again_when_too_few_carry_the_weight(monkeypatch):
@@ -187,9 +189,9 @@ def test_particles_are_drawn_again_when_too_few_carry_the_weight(monkeypatch):
 
     def spy(weights, share):
         replaced.append(1 / np.sum(weights**2))
-        return low_variance(weights, share)
+        return low_variance_sample(weights, share)
 
-    monkeypatch.setattr(rbpf, "low_variance", spy)
+    monkeypatch.setattr(rbpf, "low_variance_sample", spy)
     kept = []
     for factor in (1, 30, 1e3, 1e5):  # of all variances: sightings say less and less
         steps = [
@@ -211,7 +213,7 @@ def test_particles_are_drawn_again_when_too_few_carry_the_weight(monkeypatch):
 def test_weights_are_how_probable_the_sighting_was(monkeypatch):
     """By SciPy's normal density, particle by particle: mean and covariance of what a drawn pose
     expects, which near a landmark differ from pose to pose. Rounding only."""
-    monkeypatch.setattr(rbpf, "LEAST_EFFECTIVE", 0.0)
+    monkeypatch.setattr(rbpf, "RESAMPLE_BELOW", 0.0)
     x = np.array([0.5, 0.0, 0.0])
     place, model, R = np.array([1.0, 1.0]), MODELS["point"], np.diag([4e-2, 9e-2])
     first, second = (

@@ -1,0 +1,47 @@
+"""Robust kernels for filters: the weight that an M-estimator gives to one observation."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from graphslam.core.config import RobustConfig
+from graphslam.core.geometry import Array
+
+#: kernel -> weight of an observation whose whitened residual has length d, for a scale k
+WEIGHTS: dict[str, Callable[[float, float], float]] = {
+    "none": lambda _d, _k: 1.0,
+    "huber": lambda d, k: 1.0 if d <= k else k / d,
+    "cauchy": lambda d, k: k * k / (k * k + d * d),
+    "geman-mcclure": lambda d, k: (k * k / (k * k + d * d)) ** 2,
+}
+#: relative change of a weight at which reweighting ends, and its largest number of rounds
+#: (convergence is linear)
+CONVERGED, MAX_ROUNDS = 1e-4, 100
+
+
+def robust_weight(innovation: Array, HPHt: Array, R: Array, robust: RobustConfig) -> float:
+    """The weight that the smoother's M-estimator would give one observation.
+
+    It weighs by the residual that is *left* after the update, not by the innovation: a large
+    innovation is no outlier where the prediction is poor. Noise R/w leaves the whitened residual
+    ``u_j / (1 + w a_j)``, with a_j the eigenvalues of H P Hᵀ whitened by R and u the whitened
+    innovation in their axes. Each round of reweighting lowers w or leaves it, so starting at 1 it
+    converges to the largest weight that agrees with the residual it leaves.
+
+    Args:
+        innovation: (k,) measured minus expected.
+        HPHt: (k, k) covariance of the expected measurement.
+        R: (k, k) covariance of the measurement.
+        robust: kernel and scale; `none` gives 1.
+    """
+    if robust.kernel == "none":
+        return 1.0
+    L = np.linalg.cholesky(R)
+    a, U = np.linalg.eigh(np.linalg.solve(L, np.linalg.solve(L, HPHt).T))
+    u = U.T @ np.linalg.solve(L, innovation)
+    weight, w = WEIGHTS[robust.kernel], 1.0
+    for _ in range(MAX_ROUNDS):
+        before, w = w, weight(float(np.linalg.norm(u / (1 + w * np.maximum(a, 0.0)))), robust.scale)
+        if before - w <= CONVERGED * before:
+            break
+    return w
