@@ -32,11 +32,13 @@ class LogsConfig:
     """How logs are read.
 
     reorder_s: how much out of order, by their stamps, messages may arrive and still be sorted.
+    max_clock_offset_s: largest offset between the clocks of two robots that is searched for.
     topics: topics to use, name -> robot; empty = every topic whose schema is known, with the
         topic's namespace as robot.
     """
 
     reorder_s: float = 2.0
+    max_clock_offset_s: float = 5.0
     topics: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -237,7 +239,9 @@ class BackendConfig:
 
     name: which one. relinearize_threshold: change of a variable (m, rad) above which it is
     relinearised; relinearize_every: steps between two checks for that in the first 1000 steps,
-    twice as many in the next 1000, and so on. optimise_at_end: optimise to convergence at the end;
+    twice as many in the next 1000, and so on. local_landmarks: how many landmarks the filter in
+    front of isam2's tree holds; querying another one updates the tree, which takes longer than a
+    larger filter. optimise_at_end: optimise to convergence at the end;
     reoptimise: then apply the final calibration to the whole log, merge duplicate landmarks and
     optimise again (smoothers only); close_loops: before that, add loop closures verified by scans.
     verify_closures: use relative poses recorded in a log only if they are mutually consistent.
@@ -253,6 +257,7 @@ class BackendConfig:
     exchange_s: float = 30.0
     relinearize_threshold: float = 0.05
     relinearize_every: int = 20
+    local_landmarks: int = 32
     optimise_at_end: bool = True
     reoptimise: bool = True
     close_loops: bool = True

@@ -1,9 +1,9 @@
-"""By how much robots' clocks differ, from how they move and where they see each other.
+"""Offsets and drifts of the robots' clocks, from odometry and observations of each other.
 
 A robot that drives at v is seen v times the offset away from where its own clock puts it. First
-roughly: over short spans the path of a robot as others saw it must fit the path of its odometry,
-moved and turned as is best, at the right offset (`offsets_from_paths`). Then exactly: offsets and
-drifts are unknowns of the linearised problem of all states (`clock_graph`). The thesis synchronised
+coarsely: over short spans, the path of a robot as another observed it must fit the path of its
+odometry, rigidly moved, at the right offset (`offsets_from_paths`). Then precisely: offsets and
+drifts are variables of the linearised graph of all states (`clock_graph`). The thesis synchronised
 its clocks over a wireless network and could not tell how well (6.1.3).
 """
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphslam.core.config import RobustConfig
+from graphslam.core.config import Config
 from graphslam.core.geometry import Array, compose, log, polar_points
 from graphslam.core.observation_models import transport
 from graphslam.core.records import Association, Estimate, Sighting, Step
@@ -23,34 +23,31 @@ from graphslam.odometry.preintegration import Track
 from graphslam.perception.sightings import sighting_observation
 
 #: an offset is applied if it is so many sigmas and at least so long, s
-SURE, SHOWS_S = 3.0, 0.01
-#: s: an offset known no better is not known
+SIGNIFICANT_SIGMAS, SIGNIFICANT_S = 3.0, 0.01
+#: s: with a larger sigma an offset is unobservable
 OBSERVABLE_S = 1.0
-#: s: offsets that are tried, and their steps
-SEARCH_S, STEP_S = 5.0, 0.1
-#: s: spans over which odometry is good enough to compare paths; sightings in one at least; how many
-#: spans of two robots are compared, those with the most sightings
-SPAN_S, FEWEST, SPANS = 20.0, 6, 8
-#: s: grid on which paths are tabulated
-GRID_S = 0.1
-#: paths that fit so many times better at another offset decide for it
-DECIDED = 1.5
-#: scale by which odometry may be off
-SCALE = 0.1
-#: m: paths fit no better than this
-FLOOR_M = 0.02
-#: ns: over which a speed is taken
-RATE_NS = 200_000_000
-#: residuals of sightings are alike over so many of them: their number divided by it counts
-ALIKE = 4.0
+#: s: steps of the offsets tried, and of the tabulated paths
+STEP_S = 0.1
+#: s: spans over which odometry is accurate enough to compare paths
+SPAN_S = 20.0
+#: fewest observations in a span, and most spans compared for two robots, those with most first
+MIN_OBSERVATIONS, MAX_SPANS = 6, 8
+#: ratio of the costs at offset zero and at the best one from which the best one is taken
+MIN_COST_RATIO = 1.5
+#: relative error of odometry's scale at most, and accuracy, m, of paths however well they fit
+MAX_SCALE_ERROR, FLOOR_M = 0.1, 0.02
+#: ns: a velocity is the motion over this time
+VELOCITY_NS = 200_000_000
+#: so many consecutive residuals count as one independent residual
+CORRELATED = 4.0
 
 
 @dataclass(frozen=True, slots=True)
 class ClockEstimate:
-    """What is known of a robot's clock, against the first robot's.
+    """A robot's clock relative to the first robot's.
 
-    ``clock`` with standard deviations of offset, s, and drift, s/s. ``observable``: whether
-    sightings say anything of the offset. ``applied``: the part of it by which the log was read.
+    ``clock`` with standard deviations of offset, s, and drift, s/s. ``observable``: whether the
+    observations determine the offset. ``applied``: the clock that the log was read with.
     """
 
     clock: Clock
@@ -61,13 +58,13 @@ class ClockEstimate:
 
     @property
     def needs_correction(self) -> bool:
-        """Whether the clock is not what the log was read by, so that it shows.
+        """Whether the log should be read again with this clock.
 
-        A clock that is right so far must be wrong beyond doubt.
+        A first correction must be significant; a later one only large enough to matter.
         """
         error_s = abs(self.clock.offset_s - self.applied.offset_s)
-        doubt_s = 0.0 if self.applied.offset_s else SURE * self.offset_sigma_s
-        return self.observable and error_s > max(doubt_s, SHOWS_S)
+        limit_s = 0.0 if self.applied.offset_s else SIGNIFICANT_SIGMAS * self.offset_sigma_s
+        return self.observable and error_s > max(limit_s, SIGNIFICANT_S)
 
 
 def estimate_clocks(
@@ -76,58 +73,59 @@ def estimate_clocks(
     sightings: Iterable[Sighting],
     tracks: Mapping[str, Track],
     applied: Mapping[str, Clock],
-    kernel: RobustConfig,
+    config: Config,
 ) -> dict[str, ClockEstimate]:
     """The clocks of all robots but the first, whose clock is the common one.
 
     Args:
-        steps: as recorded, by clocks ``applied``.
+        steps: as recorded, with clocks ``applied``.
         estimate: of all their states and landmarks.
-        sightings: of robots, behind the steps.
+        sightings: the observations of robots in the steps, as read from the log.
         tracks: odometry of every robot.
-        applied: clocks by which the log was read.
-        kernel: for observations.
+        applied: clocks that the log was read with.
+        config: settings.
     """
     if len(tracks) < 2:
         return {}
     first, *others = sorted(tracks)
     epoch_ns = min(track.first_ns for track in tracks.values())
     known = {robot: applied.get(robot, Clock(0.0, 0.0, epoch_ns)) for robot in others}
-    met = robot_associations(steps)
-    seen = {name for _, a in met for name in (a.robot, str(a.target))}
-    unseen = {r: ClockEstimate(known[r], OFFSET_S, DRIFT, False, known[r]) for r in others}
-    if first not in seen:
-        return unseen
-    rough = offsets_from_paths(sightings, tracks) if not applied else {}
+    observations = robot_associations(steps)
+    if not any(first in (a.robot, a.target) for _, a in observations):
+        return {r: ClockEstimate(known[r], OFFSET_S, DRIFT, False, known[r]) for r in others}
+    max_offset_s = config.logs.max_clock_offset_s
+    coarse = {} if applied else offsets_from_paths(sightings, tracks, max_offset_s)
     errors = clock_errors(
         steps,
         estimate,
-        _speeds(met, tracks),
-        np.array([1e-9 * (time_ns - epoch_ns) for time_ns, _ in met]),
+        _velocities(observations, tracks),
+        np.array([1e-9 * (time_ns - epoch_ns) for time_ns, _ in observations]),
         {robot: np.array([clock.offset_s, clock.drift]) for robot, clock in known.items()},
-        kernel,
+        config.robust,
     )
     out = {}
     for robot, clock in known.items():
         mean, cov = errors.of(robot)
         offset_sigma, drift_sigma = np.sqrt(np.diag(cov)).tolist()
-        if robot in rough:
-            mean, offset_sigma = np.array([rough[robot].value_s, 0.0]), rough[robot].sigma_s
+        if robot in coarse:
+            mean, offset_sigma = np.array([coarse[robot].value_s, 0.0]), coarse[robot].sigma_s
         observable = offset_sigma < OBSERVABLE_S
         better = clock.adjusted(*mean.tolist()) if observable else clock
         out[robot] = ClockEstimate(better, offset_sigma, drift_sigma, observable, clock)
     return out
 
 
-def _speeds(met: Sequence[tuple[int, Association]], tracks: Mapping[str, Track]) -> Array:
-    """Twists (n, 3) per second of the robots that were seen, along their own axes."""
-    out = np.zeros((len(met), 3))
+def _velocities(
+    observations: Sequence[tuple[int, Association]], tracks: Mapping[str, Track]
+) -> Array:
+    """Twists (n, 3) per second of the observed robots, along their own axes."""
+    out = np.zeros((len(observations), 3))
     for robot, track in tracks.items():
-        which = [k for k, (_, a) in enumerate(met) if a.target == robot]
+        which = [k for k, (_, a) in enumerate(observations) if a.target == robot]
         if which:
-            times = np.array([met[k][0] for k in which], dtype=np.int64)
-            begin, end = times - RATE_NS // 2, times + RATE_NS // 2
-            out[which] = log(track.motions(begin, end).delta) / (1e-9 * RATE_NS)
+            times = np.array([observations[k][0] for k in which], dtype=np.int64)
+            begin, end = times - VELOCITY_NS // 2, times + VELOCITY_NS // 2
+            out[which] = log(track.motions(begin, end).delta) / (1e-9 * VELOCITY_NS)
     return out
 
 
@@ -135,8 +133,8 @@ def _speeds(met: Sequence[tuple[int, Association]], tracks: Mapping[str, Track])
 
 
 @dataclass(frozen=True, slots=True)
-class Offset:
-    """How far a clock is ahead, s, and the standard deviation."""
+class ClockOffset:
+    """How far a clock is ahead, s, and its standard deviation."""
 
     value_s: float
     sigma_s: float
@@ -155,76 +153,86 @@ class _Path:
 
 
 def offsets_from_paths(
-    sightings: Iterable[Sighting], tracks: Mapping[str, Track]
-) -> dict[str, Offset]:
-    """How far each robot's clock is ahead of the first robot's, as far as sightings tell.
+    sightings: Iterable[Sighting], tracks: Mapping[str, Track], max_offset_s: float
+) -> dict[str, ClockOffset]:
+    """How far each robot's clock is ahead of the first robot's.
 
     Args:
         sightings: of robots.
         tracks: odometry of every robot.
+        max_offset_s: largest offset tried.
 
     Returns:
-        Robot -> offset, of the robots for which it is clear that there is one.
+        Robot -> offset, of the robots whose offset is clearly not zero.
     """
     pairs: dict[tuple[str, str], list[Sighting]] = defaultdict(list)
     for sighting in sightings:
         if sighting.seen_robot in tracks and sighting.robot in tracks:
             pairs[sighting.robot, str(sighting.seen_robot)].append(sighting)
-    if not pairs:
+    if not pairs or max_offset_s < STEP_S:
         return {}
     start_ns = min(track.first_ns for track in tracks.values())
     involved = sorted({robot for pair in pairs for robot in pair})
     paths = {robot: _path(tracks[robot], start_ns) for robot in involved}
-    found = {
-        pair: offset
-        for pair, seen in pairs.items()
-        if (offset := _between_two(seen, paths[pair[0]], paths[pair[1]], start_ns)) is not None
-    }
-    return _combined(found, min(tracks))
+    steps = round(max_offset_s / STEP_S)
+    tried = np.asarray(STEP_S * np.arange(-steps, steps + 1))
+    offsets = {}
+    for pair, seen in pairs.items():
+        offset = _relative_offset(seen, paths[pair[0]], paths[pair[1]], start_ns, tried)
+        if offset is not None:
+            offsets[pair] = offset
+    return _combined(offsets, min(tracks))
 
 
 def _path(track: Track, start_ns: int) -> _Path:
-    """The path in steps of `GRID_S`, by the track's calibration, from its first reading on."""
-    times = np.arange(track.first_ns, track.last_ns + 1, round(1e9 * GRID_S), dtype=np.int64)
+    """The path in steps of `STEP_S`, by the track's calibration, from its first reading on."""
+    times = np.arange(track.first_ns, track.last_ns + 1, round(1e9 * STEP_S), dtype=np.int64)
     poses = track.motions(np.full(len(times), track.first_ns), times).delta.astype(float)
     poses[:, 2] = np.unwrap(poses[:, 2])
     return _Path(np.asarray(1e-9 * (times - start_ns)), poses)
 
 
-def _between_two(
-    seen: Sequence[Sighting], observer: _Path, other: _Path, start_ns: int
-) -> Offset | None:
-    """How far the seen robot's clock is ahead of the observer's; None if that is not clear."""
+def _relative_offset(
+    seen: Sequence[Sighting], observer: _Path, target: _Path, start_ns: int, offsets: Array
+) -> ClockOffset | None:
+    """How far the target's clock is ahead of the observer's; None if that is not clear.
+
+    Args:
+        seen: sightings of the target.
+        observer: path of the one.
+        target: path of the other.
+        start_ns: time zero of the paths.
+        offsets: (g,) offsets to try, s, evenly spaced around zero.
+    """
     times = np.array([1e-9 * (s.time_ns - start_ns) for s in seen])
     span = np.floor(times / SPAN_S).astype(int)
     numbers, counts = np.unique(span, return_counts=True)
-    offsets = STEP_S * np.arange(-round(SEARCH_S / STEP_S), round(SEARCH_S / STEP_S) + 1)
     cost, count = np.zeros(len(offsets)), 0
-    for number in numbers[np.argsort(-counts, kind="stable")][:SPANS]:
+    for number in numbers[np.argsort(-counts, kind="stable")][:MAX_SPANS]:
         which = np.flatnonzero(span == number)
-        if len(which) < FEWEST:
+        if len(which) < MIN_OBSERVATIONS:
             break
-        points = np.array([[*_place(seen[k]), 0.0] for k in which.tolist()])
+        points = np.array([[*_position(seen[k]), 0.0] for k in which.tolist()])
         p = compose(observer.at(times[which]), points)[:, :2] @ np.array([1.0, 1j])
-        q = other.at(times[which] + offsets[:, None])[..., :2] @ np.array([1.0, 1j])
-        cost += _misfit(p, q)
+        q = target.at(times[which] + offsets[:, None])[..., :2] @ np.array([1.0, 1j])
+        cost += _residual(p, q)
         count += len(which) - 2
     if not count:
         return None
     best = int(np.clip(np.argmin(cost), 1, len(offsets) - 2))
-    if cost[len(offsets) // 2] < DECIDED * cost[best]:
+    if cost[len(offsets) // 2] < MIN_COST_RATIO * cost[best]:
         return None
-    bend = (cost[best - 1] - 2 * cost[best] + cost[best + 1]) / STEP_S**2
-    if bend <= 0:
+    curvature = (cost[best - 1] - 2 * cost[best] + cost[best + 1]) / STEP_S**2
+    if curvature <= 0:
         return None
-    shift = (cost[best - 1] - cost[best + 1]) / (2 * STEP_S) / bend
+    shift = (cost[best - 1] - cost[best + 1]) / (2 * STEP_S) / curvature
     noise = max(cost[best] / count, FLOOR_M**2)
-    sigma = float(np.sqrt(2 * noise * ALIKE / bend))
-    return Offset(float(offsets[best] + np.clip(shift, -STEP_S, STEP_S)), sigma)
+    sigma = float(np.sqrt(2 * noise * CORRELATED / curvature))
+    return ClockOffset(float(offsets[best] + np.clip(shift, -STEP_S, STEP_S)), sigma)
 
 
-def _place(sighting: Sighting) -> Array:
-    """Where the thing seen is (2,), m, in the observer's base frame."""
+def _position(sighting: Sighting) -> Array:
+    """Position (2,) of what was seen, m, in the observer's base frame."""
     o = sighting_observation(sighting)
     if len(o.z) == 3:
         return compose(sighting.mount, o.z)[:2]
@@ -232,37 +240,34 @@ def _place(sighting: Sighting) -> Array:
     return polar_points(z[1], z[0])
 
 
-def _misfit(p: Array, q: Array) -> Array:
-    """Sum of squares (g,) of what is left of points p (n,) by paths q (g, n), complex numbers.
+def _residual(p: Array, q: Array) -> Array:
+    """Sums of squares (g,) of points p (n,) minus the best fits of paths q (g, n), complex numbers.
 
-    Each path is moved, turned, and scaled by no more than `SCALE`, as fits best.
+    A fit moves, turns and scales, the scale limited by `MAX_SCALE_ERROR`. All paths at once, and
+    without the fits themselves: `core.consistency.fit_rigid_transform` has neither.
     """
     p, q = p - p.mean(), q - q.mean(axis=1, keepdims=True)
     pp, qq = np.sum(np.abs(p) ** 2), np.sum(np.abs(q) ** 2, axis=1)
     pq = np.abs(np.conj(q) @ p)
-    s = np.clip(pq / np.maximum(qq, 1e-9), 1 - SCALE, 1 + SCALE)
+    s = np.clip(pq / np.maximum(qq, 1e-9), 1 - MAX_SCALE_ERROR, 1 + MAX_SCALE_ERROR)
     return np.asarray(pp - 2 * s * pq + s**2 * qq)
 
 
-def _combined(found: Mapping[tuple[str, str], Offset], first: str) -> dict[str, Offset]:
-    """Offsets of all robots from those between two: weighted least squares."""
-    linked = {first}
-    while True:
-        more = {r for pair in found if linked & set(pair) for r in pair} - linked
-        if not more:
-            break
-        linked |= more
-    robots = sorted(linked - {first})
-    if not robots:
+def _combined(offsets: Mapping[tuple[str, str], ClockOffset], first: str) -> dict[str, ClockOffset]:
+    """Offsets relative to ``first`` from those between pairs, by weighted least squares."""
+    connected = {first}
+    while more := {r for pair in offsets if connected & set(pair) for r in pair} - connected:
+        connected |= more
+    index = {robot: k for k, robot in enumerate(sorted(connected - {first}))}
+    if not index:
         return {}
-    place = {robot: k for k, robot in enumerate(robots)}
-    N, v = np.zeros((len(robots),) * 2), np.zeros(len(robots))
-    for (a, b), offset in found.items():
-        row = np.zeros(len(robots))
+    N, v = np.zeros((len(index),) * 2), np.zeros(len(index))
+    for (a, b), offset in offsets.items():
+        row = np.zeros(len(index))
         for robot, sign in ((a, -1.0), (b, 1.0)):
-            if robot in place:
-                row[place[robot]] = sign
+            if robot in index:
+                row[index[robot]] = sign
         N += np.outer(row, row) / offset.sigma_s**2
         v += row * offset.value_s / offset.sigma_s**2
     P = np.linalg.inv(N)
-    return {r: Offset(float((P @ v)[k]), float(np.sqrt(P[k, k]))) for r, k in place.items()}
+    return {r: ClockOffset(float((P @ v)[k]), float(np.sqrt(P[k, k]))) for r, k in index.items()}

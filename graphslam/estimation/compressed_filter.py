@@ -26,8 +26,6 @@ from graphslam.estimation import factors
 from graphslam.estimation.factor_graph import FactorGroup, read, write
 from graphslam.estimation.isam2 import Isam2Backend
 
-LOCAL_LANDMARKS = 32
-
 
 class LocalFilter:
     """Joint Gaussian of a few variables, from GTSAM's factors, with errors in body frames.
@@ -229,7 +227,7 @@ class CompressedBackend(Isam2Backend):
         self._mark_recent(keys)
         if self._local is None or not all(key in self._local for key in keys):
             self._flush()
-            most = max(LOCAL_LANDMARKS, len(keys))
+            most = max(self._config.backend.local_landmarks, len(keys))
             self._recent = dict.fromkeys(list(self._recent)[-most:])
             self._local = self._make_local([*self._latest_states(), *self._recent])
         return self._local.covariance(keys)

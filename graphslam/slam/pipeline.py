@@ -600,7 +600,7 @@ class Pipeline:
         tracks = {name: run.track for name, run in self.runs.items() if run.started}
         sightings = [*(s for s in self.sources if s.seen_robot), *self.sightings]
         return estimate_clocks(
-            self.steps, estimate, sightings, tracks, self.known.clocks, self.config.robust
+            self.steps, estimate, sightings, tracks, self.known.clocks, self.config
         )
 
     def worlds(self) -> FrameTransforms:
