@@ -36,10 +36,11 @@ from graphslam.multi_robot.frame_tree import FrameAssignment
 from graphslam.multi_robot.place_recognition import relate_places
 from graphslam.multi_robot.relative_frames import RelativeFrame
 from graphslam.results.folder import load
-from graphslam.slam.initialisation import anonymous_maps, views_after
-from graphslam.slam.pipeline import Pipeline, PriorKnowledge
+from graphslam.slam.initialisation import anonymous_maps, separate_estimates
+from graphslam.slam.pipeline import Pipeline
 from graphslam.slam.recorded_closures import judge_recorded_closures
 from graphslam.slam.start_priors import origin, start_poses
+from graphslam.slam.step_recorder import PriorKnowledge
 
 NAMES = ("first", "second")
 #: stretches of each half; two overlap if so many places are so near, m; m, rad: a start is right
@@ -117,7 +118,7 @@ def seen_alone(log: Path) -> dict[str, AnonymousMap]:
     known = PriorKnowledge(FrameAssignment.separate_frames(opened.robots, origin(config)), recorded)
     pipeline = Pipeline(opened, config, known)
     pipeline.run(lambda _count: None)
-    return anonymous_maps(pipeline, views_after(pipeline))
+    return anonymous_maps(pipeline, separate_estimates(pipeline))
 
 
 def parts(name: str, folder: Path) -> bool:

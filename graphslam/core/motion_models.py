@@ -82,6 +82,13 @@ class Calibration:
     mean: Array
     cov: Array
 
+    def held(self) -> "Calibration":
+        """The same means as if they were known: motions computed with it leave its errors out.
+
+        The variance is 1e-18, not 0, so that covariances stay invertible.
+        """
+        return Calibration(self.names, self.mean, 1e-18 * np.eye(len(self.mean)))
+
 
 def odometry_increments(
     rows: Array, calibration: Array, _robot: RobotConfig, config: OdometryConfig

@@ -1,69 +1,59 @@
-"""The last solution of logs of scans, with the calibration of odometry and mount as unknowns.
+"""Batch solution with the calibration of odometry and mount as unknowns beside all states.
 
 A wrong wheel radius is one constant of the whole run, so along a corridor that shows nothing but
-its walls the uncertainty grows with the path, not with its root. What `calibration` learns on the
-way is where this begins; here it becomes a variable of the graph, and its uncertainty a part of
-every covariance.
+its walls the uncertainty grows with the path, not with its root. What `online_calibration` learns
+while the log is read is the initial value; here it becomes a variable of the graph, and its
+uncertainty a part of every covariance.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from graphslam.core.config import Config
-from graphslam.core.motion_models import Calibration
+from graphslam.core.config import RobustConfig
 from graphslam.core.records import Estimate, Motion, Step
 from graphslam.estimation.calibration_graph import solve_calibrated
 from graphslam.odometry.preintegration import Track
 
-#: times that motions are made anew; after the first the calibration moves by a tenth of its sigma
+#: times that everything is solved: after the first the calibration moves by a tenth of its sigma
 ROUNDS = 2
 
-#: steps with motions as noisy as an estimate shows them
-Loosen = Callable[[Sequence[Step], Estimate], tuple[Step, ...]]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Calibrated:
-    """The estimate and the steps behind it; the tracks have the calibration found with it."""
-
-    estimate: Estimate
-    steps: tuple[Step, ...]
+#: (latest estimate, whether it is the last round) -> steps computed with the tracks' calibration,
+#: whose own errors their covariances leave out
+Rebuild = Callable[[Estimate, bool], tuple[Step, ...]]
 
 
 def calibrate(
-    steps: Sequence[Step],
-    estimate: Estimate,
-    tracks: Mapping[str, Track],
-    loosen: Loosen,
-    config: Config,
-) -> Calibrated:
-    """Solve for states, landmarks and calibrations together.
+    rebuild: Rebuild, estimate: Estimate, tracks: Mapping[str, Track], robust: RobustConfig
+) -> tuple[Estimate, tuple[Step, ...]]:
+    """Solve for states, landmarks and calibrations together, `ROUNDS` times.
 
     Args:
-        steps: all steps.
+        rebuild: computes the steps anew in every round.
         estimate: of all their states and landmarks.
-        tracks: odometry of every robot; their calibration is set to what is found.
-        loosen: for motions whose covariance leaves out the calibration.
-        config: settings.
+        tracks: odometry of every robot; their calibration is set to the one found.
+        robust: kernel of the observations.
+
+    Returns:
+        The estimate and the steps behind it.
 
     Raises:
         EstimationError: the estimate is indeterminate.
     """
     priors = {name: track.nominal for name, track in tracks.items()}
-    made = tuple(steps)
+    steps: tuple[Step, ...] = ()
     for k in range(ROUNDS):
-        now = {name: track.calibration for name, track in tracks.items()}
-        for name, track in tracks.items():
-            still = np.diag(np.full(len(now[name].mean), 1e-18))
-            track.calibration = Calibration(now[name].names, now[name].mean, still)
-        made = loosen(recompute_motions(steps, tracks), estimate)
-        solved = solve_calibrated(made, estimate, priors, now, config.robust, rough=k < ROUNDS - 1)
+        last = k == ROUNDS - 1
+        initial = {name: track.calibration for name, track in tracks.items()}
+        for track in tracks.values():
+            track.calibration = track.calibration.held()
+        steps = rebuild(estimate, last)
+        solved = solve_calibrated(steps, estimate, priors, initial, robust, rough=not last)
         estimate = solved.estimate
         for name, track in tracks.items():
             track.calibration = solved.calibrations[name]
-    return Calibrated(estimate, made)
+    return estimate, steps
 
 
 def recompute_motions(steps: Sequence[Step], tracks: Mapping[str, Track]) -> tuple[Step, ...]:

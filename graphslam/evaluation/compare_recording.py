@@ -13,13 +13,13 @@ from graphslam.core.records import Step
 from graphslam.estimation.replay import Replay
 from graphslam.logs import LogSet
 from graphslam.mapping.landmark_map import LandmarkMap
+from graphslam.mapping.landmark_records import make_landmarks
 from graphslam.odometry.interpolation import FrameTransforms
 from graphslam.results.folder import SavedResult, SavedRobot
 from graphslam.slam.initialisation import initialise
 from graphslam.slam.pipeline import Pipeline, Progress
 from graphslam.slam.robot_settings import check_robots
 from graphslam.slam.robot_state import RobotState
-from graphslam.slam.summary import make_landmarks
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,7 +105,7 @@ def record(log: LogSet, config: Config, progress: Progress = lambda _count: None
         tuple(pipeline.steps),
         runs,
         pipeline.starts[pipeline.frames.world].pose,
-        pipeline.worlds(),
+        pipeline.transforms(),
         pipeline.associator.map,
         time.perf_counter() - began,
     )

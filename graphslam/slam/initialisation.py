@@ -1,9 +1,9 @@
-"""Where robots begin: what is known of a log before its pass proper.
+"""Start poses of the robots: what is known of a log before its first pass.
 
-Robots whose start is not given are put where what they have in common with others has them. That
-takes a pass over the log in which every robot is estimated by itself: afterwards they are joined by
-what bears a name, by how they show in each other's scans, and else by places and points without
-names.
+Robots whose start is not given are placed relative to others by what they have observed in common.
+That takes a pass over the log in which every robot is estimated in a frame of its own. Afterwards
+frames are related by landmarks with an identity, by robots detected in each other's scans, and else
+by scans and points without identities.
 """
 
 from collections import defaultdict
@@ -27,17 +27,18 @@ from graphslam.multi_robot.mutual_detection import (
     find_robots_in_scans,
 )
 from graphslam.multi_robot.relative_frames import RelativeFrame, RobotEstimate
-from graphslam.slam.pipeline import CLOCK_DOUBT_S, Pipeline, PriorKnowledge
+from graphslam.slam.pipeline import CLOCK_DOUBT_S, Pipeline
 from graphslam.slam.recorded_closures import RecordedClosures, judge_recorded_closures
 from graphslam.slam.robot_settings import outlines
 from graphslam.slam.start_priors import origin, start_poses
+from graphslam.slam.step_recorder import PriorKnowledge
 
-#: relations between robots found without names, and robot -> why there is none
+#: relative frames found without identities, and robot -> why it has none
 Found = tuple[Sequence[RelativeFrame], Mapping[str, str]]
 
 
 def initialise(log: LogSet, config: Config) -> PriorKnowledge:
-    """What is known of a log before its first pass proper: starts, frames, recorded closures.
+    """What is known of a log before its first pass: starts, frames, recorded closures.
 
     Raises:
         EstimationError: truth was asked for and a robot has none, or a given pose is malformed.
@@ -47,33 +48,33 @@ def initialise(log: LogSet, config: Config) -> PriorKnowledge:
     return PriorKnowledge(estimate_start_poses(log, config, {}, starts, recorded), recorded)
 
 
-def with_names(
-    known: PriorKnowledge, log: LogSet, config: Config, names: Mapping[str, str]
+def with_identities(
+    known: PriorKnowledge, log: LogSet, config: Config, identities: Mapping[str, str]
 ) -> PriorKnowledge:
-    """What is known by the right names: robots may have been placed by what bore false ones."""
+    """What is known with the right identities, as robots may have been placed by false ones."""
     starts = start_poses(log, config)
-    joined = estimate_start_poses(log, config, names, starts, known.recorded)
-    return replace(known, names=names, joined=joined)
+    joined = estimate_start_poses(log, config, identities, starts, known.recorded)
+    return replace(known, identities=identities, joined=joined)
 
 
 def estimate_start_poses(
     log: LogSet,
     config: Config,
-    names: Mapping[str, str],
+    identities: Mapping[str, str],
     starts: Mapping[str, Start],
     recorded: RecordedClosures,
 ) -> FrameAssignment:
-    """Where all robots start, of which the ``starts`` of some are known.
+    """Start poses and frames of all robots, of which the ``starts`` of some are known.
 
-    The others are put where what they see in common has them. That takes a pass over the log in
-    which every robot is estimated by itself.
+    The others are placed by what they observed in common. That takes a pass over the log in which
+    every robot is estimated by itself.
 
     Args:
         log: opened logs.
         config: settings.
-        names: see `Known`.
-        starts: those that are known.
-        recorded: what follows from the log's relative poses.
+        identities: see `PriorKnowledge`.
+        starts: known start poses.
+        recorded: relative poses of the log, and starts that follow from them.
 
     Raises:
         EstimationError: the estimate of a robot by itself is indeterminate.
@@ -93,16 +94,18 @@ def estimate_start_poses(
 
     if not any(topic.record in (Sighting, Scan) for topic in log.topics):
         return joined({}, (), ((), {}))
-    apart = PriorKnowledge(FrameAssignment.separate_frames(log.robots, own), recorded, names)
+    apart = PriorKnowledge(FrameAssignment.separate_frames(log.robots, own), recorded, identities)
     pipeline = Pipeline(log, replace(config, backend=BackendConfig()), apart)
     shapes = outlines(log, config) if config.association.robot_sightings != "ignore" else {}
-    pipeline.kept = ScanBuffer({name: run.track for name, run in pipeline.runs.items()}, shapes)
+    tracks = {name: run.track for name, run in pipeline.runs.items()}
+    pipeline.scan_buffer = ScanBuffer(tracks, shapes)
     pipeline.run(lambda _count: None)
     if not pipeline.steps:
         return joined({}, (), ((), {}))
-    views, meetings, looked = views_after(pipeline), pipeline.meetings, MutualDetections((), {})
+    views, meetings = separate_estimates(pipeline), pipeline.unrelated_sightings
+    looked = MutualDetections((), {})
     if watchable(log, shapes, starts):
-        scans = pipeline.kept.scans
+        scans = pipeline.scan_buffer.scans
         looked = find_robots_in_scans(
             views, scans, shapes, tuple(starts), CLOCK_DOUBT_S, config.front_end
         )
@@ -116,10 +119,10 @@ def estimate_start_poses(
     return joined(views, meetings, found)
 
 
-def views_after(run: Pipeline) -> dict[str, RobotEstimate]:
-    """What each robot knows by itself, after a pass in which each had a frame of its own."""
+def separate_estimates(run: Pipeline) -> dict[str, RobotEstimate]:
+    """Every robot's own estimate, after a pass in which each had a frame of its own."""
     estimate, entries = run.backend.finish(), run.associator.map.entries
-    moved = run.worlds().estimate(estimate)
+    moved = run.transforms().estimate(estimate)
     frames = run.frames.landmark_frames(entries.values())
     marks: dict[str, dict[str, tuple[Array, Array]]] = defaultdict(dict)
     unnamed: dict[str, list[tuple[Array, Array]]] = defaultdict(list)
@@ -145,7 +148,7 @@ def views_after(run: Pipeline) -> dict[str, RobotEstimate]:
 
 
 def anonymous_maps(run: Pipeline, views: Mapping[str, RobotEstimate]) -> dict[str, AnonymousMap]:
-    """What each robot saw that bears no name, in its own frame, after the pass of ``views``."""
+    """Submaps and points without identity of each robot, after the pass that gave ``views``."""
     assert isinstance(run.backend, Isam2Backend)
     found = build_submaps({robot: view.states for robot, view in views.items()}, run.pictures)
     seen = {}
@@ -158,7 +161,7 @@ def anonymous_maps(run: Pipeline, views: Mapping[str, RobotEstimate]) -> dict[st
 
 
 def watchable(log: LogSet, outlines: Collection[str], placed: Collection[str]) -> bool:
-    """Whether a robot has scans in which another may show that is not placed relative to it."""
+    """Whether some robot has scans that may show another one, not yet placed relative to it."""
     return any(
         log.has_scans(observer) and name != observer and not {name, observer} <= set(placed)
         for observer in log.robots

@@ -4,11 +4,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from graphslam.core.config import Config
-from graphslam.core.records import RelativePose, Scan, Sighting, Start, TrueLandmark, Truth
+from graphslam.core.geometry import compose, compose_cov, inverse, inverse_cov
+from graphslam.core.records import Closure, RelativePose, Scan, Sighting, Start, TrueLandmark, Truth
 from graphslam.logs import LogSet
 from graphslam.mapping.closure_verification import NOTHING_RECORDED, own_frame, verify
 from graphslam.slam.robot_settings import make_tracks
+from graphslam.slam.robot_state import RobotState
 from graphslam.slam.synchronisation import ODOMETRY
 
 #: robot, time, other robot, its time, relative pose (as bytes): what a recorded closure is known by
@@ -73,3 +77,41 @@ def closure_id(message: RelativePose) -> ClosureId:
     """What a recorded closure is known by in every pass over the log."""
     ends = message.robot, message.time_ns, message.other, message.start_ns
     return (*ends, message.delta.tobytes())
+
+
+def between_states(
+    message: RelativePose,
+    state_ns: int,
+    runs: Mapping[str, RobotState],
+    recorded: RecordedClosures,
+) -> Closure | str:
+    """A recorded relative pose as a closure between states, or why it is dropped.
+
+    Odometry carries it to the states nearest before its ends.
+
+    Args:
+        message: as recorded.
+        state_ns: time of the state nearest before its later end.
+        runs: of every robot.
+        recorded: which relative poses are believed.
+    """
+    other = runs.get(message.other)
+    if closure_id(message) in recorded.refused:
+        return "not believed, see closures"
+    if message.other == message.robot and message.start_ns >= message.time_ns:
+        return "it does not begin before it ends"
+    if other is None or not other.started or message.start_ns < other.times[0]:
+        return "its first end has no state"
+    other_ns = other.times[int(np.searchsorted(other.times, message.start_ns, "right")) - 1]
+    delta, cov = message.delta, message.cov
+    if other_ns < message.start_ns:
+        lead = other.track.motion(other_ns, message.start_ns)
+        cov = compose_cov(lead.delta, lead.cov, delta, cov)
+        delta = compose(lead.delta, delta)
+    if state_ns < message.time_ns:
+        tail = runs[message.robot].track.motion(state_ns, message.time_ns)
+        back = inverse(tail.delta)
+        cov = compose_cov(delta, cov, back, inverse_cov(tail.delta, tail.cov))
+        delta = compose(delta, back)
+    is_verified = closure_id(message) in recorded.kept
+    return Closure(message.robot, state_ns, message.other, other_ns, delta, cov, is_verified)

@@ -1,19 +1,19 @@
-"""The last word on logs of scans: final calibration, loops closed, duplicate walls merged.
+"""A whole log of scans solved again: noise, loop closure, duplicate landmarks, calibration.
 
-What calibration learned on the way is applied to the motions before it was known; loops that were
-missed are closed by what was seen (`closing`); and landmarks that turn out to be one and the same
-become one, round after round until nothing changes. Where merged landmarks say what a closure
-says, the closure has done its work and goes: both are of the same scans.
+The calibration that was learned while the log was read is applied to the motions before it was
+known. Loops are closed by matching submaps (`loop_closure`). Landmarks that turn out to be one are
+merged, round after round. Where merged landmarks say what a closure says, the closure is removed,
+since both come from the same scans.
 """
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from graphslam.core.config import Config
-from graphslam.core.geometry import Array, between, wrap
+from graphslam.core.geometry import Array
 from graphslam.core.records import Closure, Estimate, Picture, Step
 from graphslam.estimation.batch_calibration import calibrate, recompute_motions
 from graphslam.estimation.isam2 import Reoptimiser
@@ -42,30 +42,20 @@ from graphslam.mapping.loop_closure import (
 from graphslam.mapping.reassociation import reassociate
 from graphslam.mapping.visits import rejoin_visits, split_by_visit
 from graphslam.odometry.preintegration import Track
+from graphslam.slam.motion_noise import noise_scales, scale_motion_noise
 
 #: m across, rad: how far an observation may lie from a wall, from round to round
 GATES = ((0.3, 0.15), (0.15, 0.1), (0.15, 0.1))
-#: motions from which their noise is told at least; median of the absolute value of a unit normal
-FEWEST_MOTIONS, MEDIAN_OF_NORMAL = 50, 0.6745
-ONE = np.ones(3)
-#: solutions that tell how noisy motions are, at most; more noise by less than this is none
-MAX_LOOSENINGS, LOOSE = 4, 1.1
-#: rounds of closing loops
-MAX_CLOSINGS = 8
-#: solutions from slack to tight closures; less progress than to this part is none
-TIGHTENINGS, STUCK = 4, 0.9
+#: times that the noise of motions is estimated, at most; it is settled when it grows by less than
+MAX_NOISE_ROUNDS, NOISE_GROWTH = 4, 1.1
+#: rounds of loop closing, at most
+MAX_CLOSING_ROUNDS = 8
+#: solutions from inflated to stated covariances of closures, at most; residuals that stay above
+#: this share of those of the solution before make no progress
+MAX_TIGHTENING_ROUNDS, NO_PROGRESS = 4, 0.9
 
 #: stands between verifying closures and believing them: for tests, which add false ones
 Tamper = Callable[[list[Closure], Sequence[SubmapPose]], list[Closure]]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ReoptimisedScanLog:
-    """The estimate and the steps behind it; ``counts`` of what was changed, by name."""
-
-    estimate: Estimate
-    steps: tuple[Step, ...]
-    counts: Counter[str]
 
 
 def reoptimise_scan_log(
@@ -76,27 +66,30 @@ def reoptimise_scan_log(
     pictures: Iterable[Picture],
     config: Config,
     tamper: Tamper | None = None,
-) -> ReoptimisedScanLog:
-    """Solve a log of scans again.
+) -> tuple[Estimate, tuple[Step, ...], Counter[str]]:
+    """Solve a log of scans again: motion noise, loop closure, duplicates, calibration.
 
     Args:
         steps: as recorded.
         estimate: of all their states and landmarks.
         tracks: odometry of every robot, with its final calibration.
-        landmarks: what is known of landmarks beside; merged ones leave it.
-        pictures: what was seen from the states.
+        landmarks: the map beside the estimate; merged landmarks leave it.
+        pictures: scan points seen from the states.
         config: settings.
         tamper: for tests, see `Tamper`.
+
+    Returns:
+        The estimate, the steps behind it, and counts of what was changed, by name.
 
     Raises:
         EstimationError: the estimate is indeterminate.
     """
     solve = _Solver(config)
-    steps, estimate = _as_noisy_as_shown(recompute_motions(steps, tracks), estimate, solve)
+    steps, estimate = _with_observed_motion_noise(recompute_motions(steps, tracks), estimate, solve)
     counts: Counter[str] = Counter()
     closures: list[Closure] = []
     if config.backend.close_loops:
-        steps, closures, estimate = _closed(
+        steps, closures, estimate = _close_loops(
             steps, estimate, pictures, landmarks, solve, tamper, counts
         )
     for gates in GATES:
@@ -107,27 +100,32 @@ def reoptimise_scan_log(
             steps = merged_steps(steps, into, kinds)
             merge_entries(landmarks, into)
             counts["landmarks_merged"] += len(into)
-        # merged first: what went to either of two walls that are one would move to and fro
+        # duplicates are merged first: else observations would move to and fro between the two
         again = reassociate(steps, estimate, landmarks.entries, *gates)
         if into or again.moved or again.dropped:
             steps = again.steps
         counts["observations_reassociated"] += again.moved
         counts["observations_dropped"] += again.dropped
     if closures:
-        # what the landmarks do not hold together without them
+        # those stay that the landmarks do not satisfy without them
         estimate = solve(steps, estimate)
         missed = violated(closures, estimate.states, CLOSED)
         closures = [c for c, off in zip(closures, missed, strict=True) if off]
         counts["closures_kept"] = len(closures)
     if config.odometry.calibrate:
         estimate = solve(steps, estimate, closures)
-        done = calibrate(with_closures(steps, closures), estimate, tracks, _loosened, config)
-        estimate, steps = done.estimate, done.steps
+        closed = with_closures(steps, closures)
+
+        def rebuild(estimate: Estimate, _last: bool) -> tuple[Step, ...]:
+            made = recompute_motions(closed, tracks)
+            return scale_motion_noise(made, noise_scales(made, estimate))
+
+        estimate, steps = calibrate(rebuild, estimate, tracks, config.robust)
     else:
         estimate = solve(steps, estimate, closures, rough=False)
         steps = with_closures(steps, closures)
     landmarks.follow(steps, estimate)
-    return ReoptimisedScanLog(estimate, steps, counts)
+    return estimate, steps, counts
 
 
 class _Solver:
@@ -153,7 +151,7 @@ class _Solver:
         return estimate
 
 
-def _closed(
+def _close_loops(
     steps: tuple[Step, ...],
     estimate: Estimate,
     pictures: Iterable[Picture],
@@ -175,7 +173,7 @@ def _closed(
     lost: set[Pair] = set()  # those of them that said something new
     refused: dict[Pair, Closure] = {}
     looked: dict[Pair, Array] = {}
-    for _ in range(MAX_CLOSINGS if seen else 0):
+    for _ in range(MAX_CLOSING_ROUNDS if seen else 0):
         P = solve.backend.state_covariance([place.state for place in seen])
         new, same = loop_closures(with_poses_from(seen, now.states), P, looked)
         if tamper is not None:
@@ -210,12 +208,12 @@ def _tightened(
 ) -> Estimate:
     """Solved with closures that are slack first, and the tighter the nearer the estimate comes."""
     before = np.inf
-    for _ in range(TIGHTENINGS):
+    for _ in range(MAX_TIGHTENING_ROUNDS):
         if not any(violated(closures, estimate.states, BORNE_OUT)):
             return solve(steps, estimate, closures)
         estimate = solve(steps, estimate, inflate_covariances(closures, estimate.states))
         left = float(np.abs(residuals(closures, estimate.states)).sum())
-        if left > STUCK * before:
+        if left > NO_PROGRESS * before:
             break
         before = left
     # what holds the estimate back may be wrong and sure of itself: from where all closures hold,
@@ -224,64 +222,22 @@ def _tightened(
     return solve(steps, held, closures)
 
 
-def _as_noisy_as_shown(
+def _with_observed_motion_noise(
     steps: tuple[Step, ...], estimate: Estimate, solve: _Solver
 ) -> tuple[tuple[Step, ...], Estimate]:
     """Steps with motions as noisy as the log shows them, and the estimate from them.
 
-    Motions that are believed too much hold an estimate back from showing how noisy they are, so it
-    is asked again until it shows no more.
+    Motions that are believed too much keep an estimate from showing how noisy they are, so their
+    noise is estimated again until it grows no more.
     """
-    loosened, scales = steps, dict.fromkeys(estimate.states, ONE)
-    for _ in range(MAX_LOOSENINGS):
-        before, scales = scales, scales | _noise_scales(steps, estimate)
-        loosened = _scaled(steps, scales)
-        estimate = solve(loosened, estimate)
-        if all(np.all(scale <= LOOSE * before[robot]) for robot, scale in scales.items()):
+    scaled, scales = steps, {robot: np.ones(3) for robot in estimate.states}
+    for _ in range(MAX_NOISE_ROUNDS):
+        before, scales = scales, scales | noise_scales(steps, estimate)
+        scaled = scale_motion_noise(steps, scales)
+        estimate = solve(scaled, estimate)
+        if all(np.all(scale <= NOISE_GROWTH * before[robot]) for robot, scale in scales.items()):
             break
-    return loosened, estimate
-
-
-def _noise_scales(steps: Sequence[Step], estimate: Estimate) -> dict[str, Array]:
-    """Robot -> by how much (3,) its motions are noisier than believed, 1 if they are not.
-
-    By the median of what the estimate makes of them, over all motions of a robot and axis by axis:
-    what few motions got wrong is left to them.
-    """
-    scales = {}
-    for robot, states in estimate.states.items():
-        motions = [step.motions[robot] for step in steps if robot in step.motions]
-        if len(motions) < FEWEST_MOTIONS:
-            continue
-        first, last = (
-            states.at([getattr(m, name) for m in motions]) for name in ("start_ns", "end_ns")
-        )
-        off = between(first, last) - np.array([m.delta for m in motions])
-        off[:, 2] = wrap(off[:, 2])
-        sigmas = np.sqrt([np.diag(m.cov) for m in motions])
-        scales[robot] = np.maximum(ONE, np.median(np.abs(off) / sigmas, axis=0) / MEDIAN_OF_NORMAL)
-    return scales
-
-
-def _scaled(steps: Sequence[Step], scales: Mapping[str, Array]) -> tuple[Step, ...]:
-    """Steps with the sigmas of each robot's motions times its scales (3,)."""
-    return tuple(
-        replace(
-            step,
-            motions={
-                robot: replace(m, cov=scales[robot][:, None] * m.cov * scales[robot])
-                if robot in scales
-                else m
-                for robot, m in step.motions.items()
-            },
-        )
-        for step in steps
-    )
-
-
-def _loosened(steps: Sequence[Step], estimate: Estimate) -> tuple[Step, ...]:
-    """Steps with motions as noisy as the estimate shows them, if that is noisier than believed."""
-    return _scaled(steps, _noise_scales(steps, estimate))
+    return scaled, estimate
 
 
 def _duplicates(

@@ -1,4 +1,4 @@
-"""What a run keeps for one robot while the log goes by, and the trajectories it becomes."""
+"""What a pass accumulates for one robot, and the trajectories made of it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -30,12 +30,12 @@ BASE_RATE_HZ = 10
 class RobotState:
     """One robot's odometry, its states so far and its scans.
 
-    ``times`` of the states, ns; per state the causal pose, its covariance and the calibration that
-    was known; ``scans`` (stamp, time, mount), ``scanned_ns`` the last one that was used. The
-    states are rigid to the sensor: the base is where the calibration puts it. ``refined``: the
-    track's calibration is one that was estimated together with all states. ``scan``: the time of
-    the latest state that has a scan, and what that shows; ``contradicted`` motions of ``motions``.
-    Times are the common clock's, stamps those of the robot's own ``clock``.
+    ``times``: of the states, ns; for each state there is the causal pose, its covariance and the
+    calibration known then. ``scans``: (stamp, time, mount) of each; ``scanned_ns``: time of the
+    last one used. States are poses of the sensor; the base is where the calibrated mount puts it.
+    ``is_calibrated``: the track's calibration was estimated together with all states. ``scan``:
+    time and submap of the latest state that has a scan; ``contradicted``: how many of ``motions``
+    the scans contradicted. Times are of the common clock, stamps of the robot's own ``clock``.
     """
 
     track: Track
@@ -47,7 +47,7 @@ class RobotState:
     causal_covs: list[Array] = field(default_factory=list)
     calibrations: list[Calibration] = field(default_factory=list)
     scans: list[tuple[int, int, Array]] = field(default_factory=list)
-    refined: bool = False
+    is_calibrated: bool = False
     scan: tuple[int, Submap] | None = None
     motions: int = 0
     contradicted: int = 0
@@ -64,7 +64,7 @@ class RobotState:
         return self.times[-1] if self.times else -1
 
     def append(self, time_ns: int, pose: Array) -> None:
-        """Book a new state; its covariance follows."""
+        """Record a new state; its covariance follows."""
         self.times.append(time_ns)
         self.causal_poses.append(pose)
         self.calibrations.append(self.track.used_calibration)
@@ -83,12 +83,12 @@ class RobotState:
         )
 
     def is_causal(self, states: Trajectory) -> bool:
-        """Whether final ``states`` are what each was at its own time: a filter's."""
+        """Whether final ``states`` equal the causal ones, as those of a filter do."""
         return np.array_equal(states.poses, self.causal_poses)
 
     def calibration_found(self) -> dict[str, tuple[float, float, bool]]:
-        """Parameter -> (value, sigma, observable): what the log says of the odometry."""
-        if self.refined:
+        """Parameter -> (value, sigma, observable) of the estimated calibration."""
+        if self.is_calibrated:
             return to_summary(self.track.calibration, self.track.nominal.cov)
         return self.calibrator.found()
 
@@ -96,14 +96,14 @@ class RobotState:
         """The causal trajectories.
 
         Args:
-            start: (3,) where the prior put the robot that defines the world frame.
-            away_m: how far along x its frame lay while it was estimated.
+            start: (3,) prior pose of the robot that defines the frame.
+            away_m: offset along x of that frame while it was estimated.
         """
         stamps, times, laser = self._report_times()
         poses = np.array(self.causal_poses) - np.array([away_m, 0.0, 0.0])
         known = Trajectory(np.array(self.times, dtype=np.int64), poses, np.array(self.causal_covs))
         causal = causal_at(known, self.calibrations, self.track, times, stamps)
-        # the mount that was known then, for the base and for the world that hangs on it
+        # the mount known then, for the base pose and for the frame that starts at it
         last = known.index_before(times)
         mount = np.array([self.track.mount_of(c) for c in self.calibrations])[last]
         causal = moved_world(causal, origin_shift(start, mount))
@@ -118,8 +118,8 @@ class RobotState:
         Args:
             states: the final states, world frame.
             causal: the causal trajectories.
-            causal_only: final poses are the causal ones, also between the states: what revises no
-                state knows nothing better about the way there either.
+            causal_only: final poses are the causal ones, also between the states, as a back end
+                that revises no state does not revise the motion between states either.
         """
         stamps, times, laser = self._report_times()
         final = final_at(states, self.track, times, stamps)

@@ -1,30 +1,28 @@
-"""What a run adds up to: the map's landmarks as records, and the keys of summary.json."""
+"""The keys of summary.json, and the warnings about a run that went through."""
 
 import hashlib
 import platform
 import resource
 import sys
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
 
-import numpy as np
-
 from graphslam import __version__
-from graphslam.core.config import Config
+from graphslam.core.config import RobotConfig
 from graphslam.core.config_io import dump_config
-from graphslam.core.geometry import Array, transform, unit_vectors
-from graphslam.core.records import Estimate, Landmark
+from graphslam.core.records import Estimate
 from graphslam.estimation.clock_calibration import ClockEstimate
-from graphslam.logs import LogSet
-from graphslam.mapping.landmark_map import Entry, LandmarkMap
-from graphslam.multi_robot.frame_tree import FrameAssignment
+from graphslam.slam.pipeline import Pipeline
+from graphslam.slam.robot_settings import robot_settings
+from graphslam.slam.robot_state import span_warnings
 
 FORMAT = "graphslam-result-1"
 
-#: what solving the whole log again may change, see `graphslam.slam.reoptimise_scans`
-CONSOLIDATED = (
+#: counts of what `reoptimise_scans` may change
+REOPTIMISED = (
     "closures_verified",
     "closures_refused",
     "closures_kept",
@@ -34,79 +32,26 @@ CONSOLIDATED = (
 )
 
 
-def line_parameters(pose: Array, cov: Array) -> tuple[float, float, Array]:
-    """Normal direction (rad), offset (m) and their covariance (2, 2) of the line through a pose.
-
-    The line's direction is the pose's x axis; its normal points to the left of it. The offset is
-    that of the line from the world's origin along the normal.
-    """
-    normal = float(pose[2] + np.pi / 2)
-    n = unit_vectors(normal)
-    along = float(-n[1] * pose[0] + n[0] * pose[1])
-    # offset = n·p: turning the normal by e moves it by (dn/de)·p = along * e
-    J = np.array([[0.0, 0.0, 1.0], [n[0], n[1], along]])
-    return normal, float(n @ pose[:2]), J @ cov @ J.T
-
-
-def make_landmark(entry: Entry, mean: Array, cov: Array) -> Landmark:
-    """Bookkeeping and estimate (``mean`` (2,) or (3,), ``cov``; world axes) as one record."""
-    if entry.kind == "point":
-        position = np.array([mean[0], mean[1], np.nan])
-        extent = np.array([mean, mean])
-        line = None
-    else:
-        position = mean
-        low, high = entry.extent_at(mean)
-        ends = np.array([[low, 0.0], [high, 0.0]])
-        extent = transform(mean, ends)
-        line = line_parameters(mean, cov)
-    return Landmark(
-        entry.id,
-        entry.kind,
-        position,
-        cov,
-        extent,
-        line,
-        entry.sightings,
-        entry.first_ns,
-        entry.last_ns,
-        entry.identity,
-    )
-
-
-def make_landmarks(landmarks: LandmarkMap, estimate: Estimate) -> tuple[Landmark, ...]:
-    """The final map: every landmark that the back end estimated; both in the same world frame."""
-    return tuple(
-        make_landmark(landmarks.entries[number], mean, cov)
-        for number, (mean, cov) in sorted(estimate.landmarks.items())
-    )
-
-
 def summarise(
-    *,
-    log: LogSet,
-    config: Config,
-    estimate: Estimate,
-    counts: Counter[str],
-    rejected: Counter[str],
-    dropped: Counter[str],
-    tentative_deleted: int,
-    line_closures: int,
-    landmarks: int,
-    seconds: Mapping[str, float],
-    calibration: Mapping[str, Mapping[str, tuple[float, float, bool]]],
-    odometry: Mapping[str, Mapping[str, int]],
-    closures: Mapping[str, Any],
-    joined: FrameAssignment,
-    clocks: Mapping[str, ClockEstimate],
-    warnings: Sequence[str],
-    log_s: float,
+    pipeline: Pipeline, estimate: Estimate, landmarks: int, clocks: Mapping[str, ClockEstimate]
 ) -> dict[str, Any]:
-    """The keys of summary.json (see docs/formats.md)."""
-    scans, total = counts["scans"], max(seconds["all"], 1e-9)
-    all_dropped = Counter(log.dropped) + dropped
-    if tentative_deleted:
-        all_dropped["tentative landmark: not seen often enough"] += tentative_deleted
+    """The keys of summary.json (see docs/formats.md).
+
+    Args:
+        pipeline: the last pass, its ``seconds`` complete.
+        estimate: the final one.
+        landmarks: how many there are.
+        clocks: of the robots, as found.
+    """
+    log, counts, associator, known = (
+        pipeline.log, pipeline.counts, pipeline.associator, pipeline.known
+    )  # fmt: skip
+    runs = {name: run for name, run in sorted(pipeline.runs.items()) if run.started}
+    log_s = 1e-9 * (pipeline.last_ns - pipeline.first_ns)
+    scans, total = counts["scans"], max(pipeline.seconds["all"], 1e-9)
+    all_dropped = Counter(log.dropped) + pipeline.dropped + pipeline.robot_detector.counts
+    if associator.map.deleted:
+        all_dropped["tentative landmark: not seen often enough"] += associator.map.deleted
     return {
         "format": FORMAT,
         "versions": {
@@ -126,9 +71,9 @@ def summarise(
             for file in log.files
         ],
         "notes": dict(log.notes),
-        "config_sha256": hashlib.sha256(dump_config(config).encode()).hexdigest(),
-        "backend": config.backend.name,
-        "stages": {name: round(value, 4) for name, value in sorted(seconds.items())},
+        "config_sha256": hashlib.sha256(dump_config(pipeline.given_config).encode()).hexdigest(),
+        "backend": pipeline.config.backend.name,
+        "stages": {name: round(value, 4) for name, value in sorted(pipeline.seconds.items())},
         "scans_per_s": round(scans / total, 2),
         # invented stamps have no real time to compare with
         "real_time_factor": None if has_invented_stamps(log.notes) else round(log_s / total, 2),
@@ -139,35 +84,44 @@ def summarise(
             "keyframes": counts["keyframes"],
             "observations": counts["observations"],
             "landmarks": landmarks,
-            "loop_closures": counts["loop_closures"] + line_closures + counts["closures_verified"],
+            "loop_closures": counts["loop_closures"]
+            + associator.closures
+            + counts["closures_verified"],
         },
-        "consolidated": {name: counts[name] for name in CONSOLIDATED if name in counts},
-        "closures": dict(closures),
-        "world": joined.world,
-        "frames": dict(sorted(joined.frames.items())),
-        "starts_found": joined.to_summary(),
-        "rejected": dict(sorted(rejected.items())),
+        "consolidated": {name: counts[name] for name in REOPTIMISED if name in counts},
+        "closures": known.recorded.to_summary(),
+        "world": known.joined.world,
+        "frames": dict(sorted(known.joined.frames.items())),
+        "starts_found": known.joined.to_summary(),
+        "rejected": dict(sorted(associator.rejected.items())),
         "dropped": dict(sorted(all_dropped.items())),
         "repaired": dict(sorted(log.repaired.items())),
         "graph": {"error": estimate.error, "dof": estimate.dof},
         "calibration": {
             f"{robot}.{name}": {"value": value, "sigma": sigma, "observable": observable}
-            for robot, found in sorted(calibration.items())
-            for name, (value, sigma, observable) in found.items()
+            for robot, run in runs.items()
+            for name, (value, sigma, observable) in run.calibration_found().items()
         },
-        "odometry": {robot: dict(counts) for robot, counts in sorted(odometry.items())},
+        "odometry": {
+            robot: {
+                "motions": run.motions,
+                "contradicted": run.contradicted,
+                "resets": run.track.resets,
+            }
+            for robot, run in runs.items()
+        },
         "clocks": {
             robot: {
-                "offset_s": found.clock.offset_s,
-                "offset_sigma_s": found.offset_sigma_s,
-                "drift_ppm": 1e6 * found.clock.drift,
-                "drift_sigma_ppm": 1e6 * found.drift_sigma,
-                "observable": found.observable,
-                "applied": found.applied.offset_s != 0.0,
+                "offset_s": clock.clock.offset_s,
+                "offset_sigma_s": clock.offset_sigma_s,
+                "drift_ppm": 1e6 * clock.clock.drift,
+                "drift_sigma_ppm": 1e6 * clock.drift_sigma,
+                "observable": clock.observable,
+                "applied": clock.applied.offset_s != 0.0,
             }
-            for robot, found in sorted(clocks.items())
+            for robot, clock in sorted(clocks.items())
         },
-        "warnings": [*log.warnings, *warnings],
+        "warnings": [*log.warnings, *run_warnings(pipeline)],
     }
 
 
@@ -180,3 +134,53 @@ def _peak_memory_mb() -> float:
     """Largest resident size of this process; macOS counts bytes, Linux kilobytes."""
     peak = float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
     return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
+
+
+def run_warnings(pipeline: Pipeline) -> list[str]:
+    """What a user should know about a run although it went through."""
+    known = pipeline.known
+    warnings = [
+        f"{name}: its odometry jumped {run.track.resets} times; taken to have gone on as before"
+        for name, run in pipeline.runs.items()
+        if run.track.resets
+    ]
+    warnings += [
+        f"{name}: scans contradict its odometry in {run.contradicted} of {run.motions} motions; "
+        "these were taken from the scans"
+        for name, run in pipeline.runs.items()
+        if run.contradicted
+    ]
+    warnings += [
+        f"{name}: its wheel radii and axle are not set; the defaults of robots.{name}.* were used"
+        for name, run in pipeline.runs.items()
+        if run.track.source == "wheels"
+        and replace(robot_settings(name, pipeline.config, pipeline.log.notes), outline=())
+        == RobotConfig()
+    ]
+    warnings += [
+        f"{a} and {b}: bore each other's code in all sightings; their names were exchanged back"
+        for a, b in known.identities.items()
+        if a < b
+    ]
+    warnings += span_warnings(
+        {name: run.track for name, run in pipeline.runs.items()},
+        unplaced=pipeline.dropped["sighting: no odometry near it"] > 0,
+    )
+    warnings += [
+        f"the back end could not use {count} x {reason}"
+        for reason, count in sorted(pipeline.backend.skipped.items())
+    ]
+    warnings += [
+        f"{robot}: {known.joined.undecided.get(robot, 'nothing says where it was')}; its poses "
+        f"are in a frame of its own, which begins where it began; --start {robot}=x,y,phi places it"
+        for robot, run in pipeline.runs.items()
+        if run.started and robot == pipeline.frames.of[robot] != known.joined.world
+    ]
+    if known.recorded.refused:
+        warnings.append(
+            f"{len(known.recorded.refused)} recorded closures are not believed; closures.refused"
+            " in summary.json lists them"
+        )
+    if not any(step.associations or step.closures for step in pipeline.steps):
+        warnings.append("no observation entered the estimate: this is dead reckoning")
+    return warnings

@@ -10,7 +10,7 @@ from graphslam.core.geometry import between, compose
 from graphslam.core.records import Association, Closure, Motion, Start, Step
 from graphslam.estimation.isam2 import Isam2Backend
 from graphslam.mapping.loop_closure import residuals, violated
-from graphslam.slam.reoptimise_scans import _as_noisy_as_shown, _Solver, _tightened
+from graphslam.slam.reoptimise_scans import _Solver, _tightened, _with_observed_motion_noise
 
 SECOND = 10**9
 MOTION_COV = np.diag([0.01, 0.01, 0.02]) ** 2
@@ -99,7 +99,7 @@ def test_motions_become_as_noisy_as_they_are():
         for step in steps
     )
     solve, estimate = solved(noisy)
-    made, _ = _as_noisy_as_shown(noisy, estimate, solve)
+    made, _ = _with_observed_motion_noise(noisy, estimate, solve)
     scale = np.sqrt(np.diag(made[1].motions["r"].cov) / np.diag(MOTION_COV))
     # the median of 200 is good to 0.2; asking ends where a tenth more would come
     assert scale[2] == pytest.approx(3.0, abs=0.5)

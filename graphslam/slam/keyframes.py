@@ -1,0 +1,57 @@
+"""Keyframe selection: which events are used, and which of them get a state of their own."""
+
+from collections.abc import Sequence
+
+from graphslam.core.config import KeyframeConfig
+from graphslam.core.records import Message, Scan, Sighting
+from graphslam.slam.robot_state import RobotState
+
+
+class KeyframeSelector:
+    """Decides by motion since the last keyframe; mode ``all`` makes a state of everything."""
+
+    def __init__(self, config: KeyframeConfig) -> None:
+        self._config = config
+
+    def is_used(self, event: Sequence[Message], run: RobotState) -> bool:
+        """Whether an event becomes observations; else only its pose is reported.
+
+        Scans overlap, so one is enough per stretch of motion since the last scan that was used,
+        whatever states other observations have made in between. Sightings are all used. A scan that
+        is used is noted in ``run``.
+        """
+        first = event[0]
+        if self._config.mode == "all" or not isinstance(first, Scan):
+            return True
+        used = self.has_moved(run, run.scanned_ns, first.time_ns, self._config.scan_angle_rad)
+        if used:
+            run.scanned_ns = first.time_ns
+        return used
+
+    def gets_state(self, event: Sequence[Message], run: RobotState) -> bool:
+        """Whether a used event gets a state at its own time; else it is moved to the last one."""
+        first = event[0]
+        return (
+            self._config.mode == "all"
+            or isinstance(first, Scan)
+            or any(isinstance(m, Sighting) and m.seen_robot for m in event)
+            or self.has_moved(run, run.state_ns, first.time_ns)
+        )
+
+    def has_moved(
+        self, run: RobotState, since_ns: int | None, time_ns: int, angle_rad: float | None = None
+    ) -> bool:
+        """Whether a robot drove a keyframe's distance or turned by an angle since a time.
+
+        Args:
+            run: the robot.
+            since_ns: from when; None = never before, so it has.
+            time_ns: until when.
+            angle_rad: the angle; None = that of a keyframe.
+        """
+        if since_ns is None:
+            return True
+        path_m, turned_rad = run.track.moved(since_ns, time_ns)
+        if angle_rad is None:
+            angle_rad = self._config.angle_rad
+        return path_m >= self._config.distance_m or turned_rad >= angle_rad

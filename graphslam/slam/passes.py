@@ -1,0 +1,188 @@
+"""Passes over a log, repeated until start poses, identities and clocks no longer change.
+
+Mostly one pass is enough. What it finds may show that the log should be read again: landmarks'
+identities that were swapped, or robots' clocks that differ.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+
+from graphslam.core.config import Config
+from graphslam.core.errors import LogError
+from graphslam.core.records import Estimate
+from graphslam.core.worker import Future
+from graphslam.estimation.clock_calibration import ClockEstimate, estimate_clocks
+from graphslam.estimation.isam2 import Isam2Backend
+from graphslam.logs import LogSet
+from graphslam.multi_robot.identity_swaps import find_swapped_identities
+from graphslam.slam.initialisation import with_identities
+from graphslam.slam.pipeline import Pipeline, Progress
+from graphslam.slam.reoptimise_scans import Tamper, reoptimise_scan_log
+from graphslam.slam.reoptimise_sightings import reoptimise_sighting_log
+from graphslam.slam.robot_state import Causal
+from graphslam.slam.step_recorder import PriorKnowledge, timed
+
+#: passes at most that differ in the robots' clocks
+MAX_CLOCK_PASSES = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Findings:
+    """What a pass tells besides its estimate.
+
+    ``swapped``: false identity -> right one, of identities that were swapped; ``clocks``: the
+    robots' clocks as their sightings of each other show them; ``causal``: causal trajectories.
+    """
+
+    swapped: Mapping[str, str]
+    clocks: Mapping[str, ClockEstimate]
+    causal: Mapping[str, Causal]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FinishedPass:
+    """The last pass over a log, its final estimate and what it found."""
+
+    pipeline: Pipeline
+    estimate: Estimate
+    findings: Findings
+
+
+def run_passes(
+    log: LogSet,
+    config: Config,
+    known: PriorKnowledge,
+    progress: Progress,
+    tamper: Tamper | None,
+) -> FinishedPass:
+    """Read the log until nothing more is found that would change how it is read.
+
+    Args:
+        log: opened logs.
+        config: settings.
+        known: what is known before the first pass.
+        progress: see `graphslam.slam.smooth.smooth`.
+        tamper: see `graphslam.slam.reoptimise_scans.Tamper`.
+
+    Raises:
+        LogError: no message of the log could be used.
+        EstimationError: the estimate is indeterminate, or a robot's start is unknown.
+    """
+    clock_passes = 0
+    while True:
+        pipeline = run_pass(Pipeline(log, config, known, tamper), progress)
+        with timed(pipeline.seconds, "final optimisation"):
+            estimate, is_rough = current_estimate(pipeline)
+            finding = Future(partial(find, pipeline, estimate))
+            # a log is seldom read again, so where reoptimisation is quick it does not wait to know
+            at_once = is_rough and is_quick(pipeline) and not finding.done
+            final = reoptimise(pipeline, estimate) if at_once else estimate
+            findings = finding.result()
+            following = decide_next_pass(known, findings, log, config, clock_passes)
+            if following is None:
+                if is_rough and not at_once:
+                    final = reoptimise(pipeline, estimate)
+                return FinishedPass(pipeline, final, findings)
+        clock_passes += following.clocks is not known.clocks
+        known = following
+
+
+def decide_next_pass(
+    known: PriorKnowledge, findings: Findings, log: LogSet, config: Config, clock_passes: int
+) -> PriorKnowledge | None:
+    """What another pass is to begin with; None if no further pass is needed.
+
+    Args:
+        known: what the last pass began with.
+        findings: of the last pass.
+        log: opened logs.
+        config: settings.
+        clock_passes: passes so far whose clocks differed from those of the one before.
+    """
+    if findings.swapped and not known.identities:
+        return with_identities(known, log, config, findings.swapped)
+    if clock_passes < MAX_CLOCK_PASSES and any(
+        c.needs_correction for c in findings.clocks.values()
+    ):
+        return replace(known, clocks={robot: c.clock for robot, c in findings.clocks.items()})
+    return None
+
+
+def run_pass(pipeline: Pipeline, progress: Progress) -> Pipeline:
+    """The pipeline after its log went by.
+
+    Raises:
+        LogError: no message of the log could be used.
+    """
+    pipeline.run(progress)
+    if not pipeline.steps:
+        path = pipeline.log.files[0].path
+        raise LogError(f"{path}: nothing in it could be used; see `graphslam info`")
+    pipeline.note_covariances()
+    return pipeline
+
+
+def current_estimate(pipeline: Pipeline) -> tuple[Estimate, bool]:
+    """What the back end has after a pass, and whether that is only where `reoptimise` begins."""
+    backend, settings = pipeline.backend, pipeline.config.backend
+    if isinstance(backend, Isam2Backend) and settings.optimise_at_end and settings.reoptimise:
+        return backend.current_estimate(), True
+    return backend.finish(), False
+
+
+def is_quick(pipeline: Pipeline) -> bool:
+    """Whether `reoptimise` solves a log of sightings: without loop closure, in a second or two."""
+    return bool(pipeline.sources)
+
+
+def reoptimise(pipeline: Pipeline, estimate: Estimate) -> Estimate:
+    """The whole log solved again from a rough estimate; the pipeline's steps follow the result."""
+    tracks = {name: run.track for name, run in pipeline.runs.items() if run.started}
+    config = pipeline.config
+    if is_quick(pipeline):
+        estimate, steps = reoptimise_sighting_log(
+            pipeline.steps, estimate, tracks, pipeline.sources, config
+        )
+    else:
+        estimate, steps, counts = reoptimise_scan_log(
+            pipeline.steps,
+            estimate,
+            tracks,
+            pipeline.associator.map,
+            pipeline.pictures,
+            config,
+            pipeline.tamper,
+        )
+        pipeline.counts.update(counts)
+    pipeline.steps = list(steps)
+    for name in tracks:
+        pipeline.runs[name].is_calibrated = config.odometry.calibrate
+    return estimate
+
+
+def find(pipeline: Pipeline, estimate: Estimate) -> Findings:
+    """What a pass tells besides its estimate; a rough estimate is good enough for it."""
+    frames = pipeline.frames
+    started = {name: run for name, run in sorted(pipeline.runs.items()) if run.started}
+    causal = {
+        name: run.causal(
+            pipeline.starts[frames.of[name]].pose, frames.away.get(frames.of[name], 0.0)
+        )
+        for name, run in started.items()
+    }
+    tracks = {name: run.track for name, run in started.items()}
+    of_robots = [s for s in pipeline.sources if s.seen_robot]
+    clocks = estimate_clocks(
+        pipeline.steps,
+        estimate,
+        [*of_robots, *pipeline.robot_sightings],
+        tracks,
+        pipeline.known.clocks,
+        pipeline.config,
+    )
+    swapped: dict[str, str] = {}
+    if pipeline.sources and pipeline.config.association.identities != "ignore":
+        pairs = find_swapped_identities(pipeline.sources, estimate, tracks)
+        swapped = {a: b for pair in pairs for a, b in (pair, pair[::-1])}
+    return Findings(swapped, clocks, causal)
