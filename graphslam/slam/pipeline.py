@@ -101,7 +101,9 @@ class Pipeline(StepRecorder):
     def run(self, progress: Progress) -> None:
         """Take in every message of the log; ``progress`` gets the number of messages read."""
         tracks = {name: run.track for name, run in self.runs.items()}
-        read = _counted(self.log.messages((Truth, TrueLandmark), prefetch=True), self.counts, progress)
+        read = _counted(
+            self.log.messages((Truth, TrueLandmark), prefetch=True), self.counts, progress
+        )
         messages = synchronise(
             self.accepted(to_common_clock(read, self.known.clocks)),
             tracks,
