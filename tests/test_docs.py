@@ -9,7 +9,7 @@ import pytest
 from paths import ROOT
 
 from graphslam.cli.commands import app
-from graphslam.core.config import Config
+from graphslam.core.config import Config, RobotConfig
 
 #: the thesis' equations by chapter: the first and the last number
 EQUATIONS = {3: (1, 25), 4: (1, 38), 5: (1, 14)}
@@ -72,19 +72,65 @@ def exists(name):
     return True
 
 
+def functions_of_test(module):
+    """Names of the functions of a file of tests, in classes too."""
+    (path,) = (ROOT / "tests").rglob(f"{module}.py")
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    return {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+
+
+def is_there(name):
+    """Whether what a page calls by a name in code quotes exists; None if that is no name of ours.
+
+    Names are files (``core/config.py``, ``benchmarks/horizon.py``), tests (``test_ekf.py``,
+    ``test_ekf.test_motion_jacobians``), objects of the package (``logs.open_logs``) and settings
+    (``ekf.error``, ``robots.NAME.axle_m``, ``start.from_truth=true``).
+    """
+    if test := re.fullmatch(r"(test_\w+)\.(\w+)", name):
+        module, function = test.groups()
+        paths = list((ROOT / "tests").rglob(f"{module}.py"))
+        return len(paths) == 1 and (function == "py" or function in functions_of_test(module))
+    if re.fullmatch(r"[\w*]+(/[\w*]+)+\.(py|md|toml)", name):
+        return any(any(folder.glob(name)) for folder in (ROOT, ROOT / "graphslam"))
+    if robot := re.fullmatch(r"robots\.NAME\.(\w+)", name):
+        return hasattr(RobotConfig(), robot[1])
+    dotted = re.fullmatch(r"(?:graphslam\.)?(([a-z]\w*)(?:\.\w+)+)(?:\(.*\)| ?=.*)?", name)
+    if (
+        dotted
+        and not name.endswith(FILES)
+        and (dotted[2] in PACKAGES or hasattr(Config(), dotted[2]))
+    ):
+        return exists(dotted[1])
+    return None
+
+
+PACKAGES = {path.parent.name for path in (ROOT / "graphslam").glob("*/__init__.py")}
+#: names that end so are of files that a user has
+FILES = ("py", "csv", "html", "json", "jsonl", "mcap", "md", "pgm", "tum", "yaml")
+PAGES = [
+    *sorted(set((ROOT / "docs").glob("*.md")) - {ROOT / "docs/configuration.md"}),
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "benchmarks/README.md")),
+]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_what_a_page_names_is_there(page):
+    """Files, tests, functions and settings by their current names; links to pages that exist."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+    wrong = [name for name in re.findall(r"`([^`\n]+)`", text) if is_there(name) is False]
+    assert not wrong, f"{page.name}: {', '.join(wrong)}"
+    links = [link for link in re.findall(r"\]\(([^)#\s]+)", text) if not link.startswith("http")]
+    wrong = [link for link in links if not (page.parent / link).exists()]
+    assert not wrong, f"{page.name}: {', '.join(wrong)}"
+
+
+@pytest.mark.parametrize("script", sorted((ROOT / "benchmarks").glob("*.py")))
+def test_the_table_of_benchmarks_has_every_script(script):
+    assert f"`{script.name}`" in (ROOT / "benchmarks/README.md").read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize("cells", thesis_rows(), ids=lambda cells: cells[0][:30])
-def test_what_the_thesis_page_names_is_there(cells):
-    """Functions, settings and tests; a file of tests where many hold a row."""
+def test_a_row_of_the_thesis_page_names_what_implements_it_and_a_test(cells):
     names = re.findall(r"`([a-z_0-9]+(?:\.\w+)+)(?:\(.*?\))?`", cells[1])
     assert names or "scenario" in cells[1] or "`MODELS`" in cells[1] or "front_end" in cells[1]
-    assert [name for name in names if not exists(name)] == []
-    tests = re.findall(r"`(test_\w+)\.(\w+)`", cells[2])
-    assert tests or cells[2].startswith("as before")
-    for module, name in tests:
-        (path,) = (ROOT / "tests").rglob(f"{module}.py")
-        functions = {
-            node.name
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-            if isinstance(node, ast.FunctionDef)
-        }
-        assert name == "py" or name in functions, f"{module}.{name}"
+    assert re.findall(r"`(test_\w+)\.(\w+)`", cells[2]) or cells[2].startswith("as before")
