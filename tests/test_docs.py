@@ -109,7 +109,10 @@ PACKAGES = {path.parent.name for path in (ROOT / "graphslam").glob("*/__init__.p
 FILES = ("py", "csv", "html", "json", "jsonl", "mcap", "md", "pgm", "tum", "yaml")
 PAGES = [
     *sorted(set((ROOT / "docs").glob("*.md")) - {ROOT / "docs/configuration.md"}),
-    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "benchmarks/README.md")),
+    *(
+        ROOT / name
+        for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "benchmarks/README.md")
+    ),
 ]
 
 
