@@ -173,7 +173,8 @@ def test_a_log_read_ahead_tells_the_same(tmp_path):
         forks = []
         fork, os.fork = os.fork, lambda: forks.append(1) or fork()
         for ahead in (False, True):
-            read = [(m.stamp_ns, m.time_ns, *m.pose.tolist()) for m in logs.messages(prefetch=ahead)]
+            messages = logs.messages(prefetch=ahead)
+            read = [(m.stamp_ns, m.time_ns, *m.pose.tolist()) for m in messages]
             print(hash(tuple(read)), len(read), logs.warnings, logs.dropped, logs.repaired)
         print(len(forks))
         """,
