@@ -1,4 +1,4 @@
-"""The estimators: factors, back ends behind one protocol, batch calibration, replay, g2o output.
+"""Estimators: factors, back ends behind one protocol, batch calibration, replay, g2o output.
 
-`gtsam` is known to this package only.
+Only this package imports `gtsam`.
 """

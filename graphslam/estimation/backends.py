@@ -1,4 +1,4 @@
-"""The estimators, all behind one interface; `BACKENDS` is the table to extend."""
+"""The table of estimators by name, `BACKENDS`: the place to register another one."""
 
 import math
 from collections.abc import Callable
@@ -15,11 +15,11 @@ from graphslam.estimation.invariant_ekf import InvariantEkfBackend
 from graphslam.estimation.rbpf import RbpfBackend
 
 
-def with_horizon(config: Config) -> Backend:
-    """The estimator of `isam2` with the configured horizon.
+def isam2_with_horizon(config: Config) -> Backend:
+    """The estimator for the configured horizon: full smoothing, fixed lag, or a filter.
 
-    All of the past, a window of it, or none: see the modules. Horizon 0 is no limit of the window,
-    which takes a step's factors together and keeps one place for the Jacobians of each variable.
+    Horizon 0 is not the limit of the fixed-lag smoother, which adds a step's factors together and
+    keeps one linearisation point for the Jacobians of each variable.
     """
     if config.backend.horizon_s == 0:
         return FactorEkfBackend(config)
@@ -35,7 +35,7 @@ BACKENDS: dict[str, Callable[[Config], Backend]] = {
     "decentralised": DecentralisedBackend,
     "ekf": EkfBackend,
     "invariant-ekf": InvariantEkfBackend,
-    "isam2": with_horizon,
+    "isam2": isam2_with_horizon,
     "rbpf": RbpfBackend,
 }
 

@@ -409,7 +409,7 @@ def joint_marginal(tree: gtsam.ISAM2 | gtsam.GaussianBayesTree, keys: list[int])
 
 
 def read(values: gtsam.Values, key: int, dim: int) -> Array:
-    """Value (dim,) of a variable."""
+    """Value (dim,) of a variable, m and rad."""
     if dim == 3:
         return factors.array3(values.atPose2(key))
     return np.asarray(values.atPoint2(key))

@@ -1,8 +1,8 @@
-"""The only place that makes GTSAM factors, keys and noise models.
+"""GTSAM factors, keys and noise models, made only here.
 
-GTSAM's errors of a `Pose2` live in its body frame (`retract` is the exponential map) and a factor's
+GTSAM's errors of a `Pose2` are in its body frame (`retract` is the exponential map), and a factor's
 error is *expected minus measured*. Our covariances are of additive errors along the axes of the
-frame a quantity is given in; the conversions are here.
+frame in which a quantity is given; the conversions are here.
 """
 
 import math
@@ -18,14 +18,13 @@ from graphslam.core.geometry import Array, is_positive, rotate_cov, rotation3
 from graphslam.core.observation_models import LineModel
 from graphslam.core.records import Association, Closure, Motion, Start
 
-#: m: where on a wall a line landmark's origin sits, relative to the state that first saw it. A
-#: gauge: the only factor with information along the line. To first order its size changes no other
-#: estimate. To second order the direction's error couples what lies along the line with the normal:
-#: a smoother leaves that to the gauge, so it is wide; a filter never linearises anew, and a wide
-#: one makes it overconfident at any noise (docs/ekf-versus-smoothing.md).
+#: m: sigma of a line landmark's origin along the line, relative to the state that first saw it. A
+#: gauge: no other factor has information along the line, and to first order its size changes no
+#: other estimate. To second order the direction's error couples the position along the line with
+#: the normal. A smoother relinearises, so its gauge is wide; in a filter, which does not, a wide
+#: one makes the estimate overconfident at any noise (docs/ekf-versus-smoothing.md).
 LINE_GAUGE_SIGMA_M = 1.0
 FILTER_GAUGE_SIGMA_M = 1e-3
-
 
 #: a symbol's letter is in its highest byte, its number in the others
 FIRST_STATE, FIRST_LANDMARK = (int(gtsam.symbol(letter, 0)) for letter in "xl")
@@ -42,29 +41,29 @@ def landmark_key(landmark: int) -> int:
 
 
 def is_state(key: int) -> bool:
-    """Whether a key is that of a state; that of a landmark else."""
+    """Whether a key is that of a state, else that of a landmark."""
     return key >= FIRST_STATE
 
 
 def number_of(key: int) -> tuple[int | None, int]:
-    """Whose state a key is (index of the robot) and which, or None and the landmark's number."""
+    """Index of the robot and number of its state, or None and the landmark's number."""
     if not is_state(key):
         return None, key - FIRST_LANDMARK
     return divmod(key - FIRST_STATE, 1 << 40)
 
 
 def pose2(pose: Array) -> gtsam.Pose2:
-    """Array (3,) to GTSAM."""
+    """GTSAM pose of an array (3,)."""
     return gtsam.Pose2(float(pose[0]), float(pose[1]), float(pose[2]))
 
 
 def array3(pose: gtsam.Pose2) -> Array:
-    """GTSAM pose to array (3,)."""
+    """Array (3,) of a GTSAM pose."""
     return np.array([pose.x(), pose.y(), pose.theta()])
 
 
 def world_from_body(heading_rad: float) -> Array:
-    """Matrix (3, 3) that turns body-frame errors of a pose into additive world-axis errors."""
+    """Matrix (3, 3) from body-frame errors of a pose to additive world-axis errors."""
     return rotation3(heading_rad)
 
 
@@ -107,10 +106,10 @@ def motion_factor(key: int, next_key: int, motion: Motion) -> gtsam.NonlinearFac
 def closure_factor(
     key: int, other_key: int, closure: Closure, kernel: RobustConfig
 ) -> gtsam.NonlinearFactor:
-    """A measured relative pose: ``key`` seen from ``other_key``; under ``kernel`` if unverified.
+    """A measured relative pose: ``key`` seen from ``other_key``; with ``kernel`` if unverified.
 
-    The kernel of n images' closure is wider by the root of n: far off, where a kernel's cost grows
-    with its scale squared, it then costs what n observations of one image each would.
+    The kernel's scale grows with the root of the number n of images behind the closure: in its
+    tails, where the cost is proportional to the scale squared, it then costs as much as n closures.
     """
     wide = replace(kernel, scale=kernel.scale * math.sqrt(closure.images))
 
@@ -127,7 +126,7 @@ def relative_pose_factor(
     noise: Callable[[Array], gtsam.noiseModel.Base],
     cov: Array,
 ) -> gtsam.NonlinearFactor:
-    """Between factor; ``cov`` along the first frame's axes, GTSAM wants the measured frame's."""
+    """Between factor; ``cov`` is along the first frame's axes, GTSAM's along the second's."""
     turned = rotate_cov(cov, -float(delta[2]))
     return gtsam.BetweenFactorPose2(key, next_key, pose2(delta), noise(turned))
 
@@ -135,19 +134,20 @@ def relative_pose_factor(
 def _pose_observation(
     key: int, target: int, seen: Association, kernel: RobustConfig, _x: Array, _t: Array
 ) -> gtsam.NonlinearFactor:
-    noise = robust(gaussian(rotate_cov(seen.cov, -float(seen.z[2]))), kernel)
-    return gtsam.BetweenFactorPose2(key, target, pose2(seen.z), noise)
+    def noise(cov: Array) -> gtsam.noiseModel.Base:
+        return robust(gaussian(cov), kernel)
+
+    return relative_pose_factor(key, target, seen.z, noise, seen.cov)
 
 
 def _line_observation(
     key: int, target: int, seen: Association, kernel: RobustConfig, x: Array, t: Array
 ) -> gtsam.NonlinearFactor:
-    """The measurement, moved along its line to face the landmark's origin at the estimate.
+    """The measurement, slid along its line to face the landmark's origin at the estimate.
 
-    The square root information has a zero first row: nothing is known along the line.
+    The square root information has a zero first row: no information along the line.
     """
-    faced, R = _facing(seen.z, seen.cov, x, t)
-    return _line_factor(key, target, faced, R, kernel)
+    return _line_factor(key, target, *_facing(seen.z, seen.cov, x, t), kernel)
 
 
 def line_factors(
@@ -159,11 +159,11 @@ def line_factors(
     t: Array,
     kernel: RobustConfig,
 ) -> list[gtsam.NonlinearFactor]:
-    """What `observation_factor` makes of n lines, at once.
+    """The factors of n lines, as `observation_factor` makes them, computed at once.
 
     Args:
-        keys: the observing states.
-        targets: the lines' keys.
+        keys: of the observing states.
+        targets: of the lines.
         z: (n, 3) measurements.
         cov: (n, 3, 3) their covariances.
         x: (n, 3) estimates of the states.
@@ -177,7 +177,7 @@ def line_factors(
 
 
 def _facing(z: Array, cov: Array, x: Array, t: Array) -> tuple[Array, Array]:
-    """Lines (..., 3) that face their landmarks, square root information (..., 3, 3)."""
+    """Lines (..., 3) facing their landmarks, and square root information (..., 3, 3)."""
     model = LineModel()
     R = np.zeros(cov.shape)
     # upper triangular U with UᵀU = V⁻¹: from the Cholesky factor of the inverse
@@ -186,53 +186,48 @@ def _facing(z: Array, cov: Array, x: Array, t: Array) -> tuple[Array, Array]:
 
 
 def _line_factor(
-    key: int, target: int, faced: Array, R: Array, kernel: RobustConfig
+    key: int, target: int, z: Array, R: Array, kernel: RobustConfig
 ) -> gtsam.NonlinearFactor:
     noise = robust(gtsam.noiseModel.Gaussian.SqrtInformation(R, False), kernel)
-    return gtsam.BetweenFactorPose2(key, target, pose2(faced), noise)
-
-
-def _point_observation(
-    key: int, target: int, seen: Association, kernel: RobustConfig, _x: Array, _t: Array
-) -> gtsam.NonlinearFactor:
-    bearing, range_m = gtsam.Rot2(float(seen.z[0])), float(seen.z[1])
-    return gtsam.BearingRangeFactor2D(
-        key, target, bearing, range_m, robust(gaussian(seen.cov), kernel)
-    )
-
-
-def _robot_point_observation(
-    key: int, target: int, seen: Association, kernel: RobustConfig, _x: Array, _t: Array
-) -> gtsam.NonlinearFactor:
-    bearing, range_m = gtsam.Rot2(float(seen.z[0])), float(seen.z[1])
-    return gtsam.BearingRangeFactorPose2(
-        key, target, bearing, range_m, robust(gaussian(seen.cov), kernel)
-    )
+    return gtsam.BetweenFactorPose2(key, target, pose2(z), noise)
 
 
 _FactorMaker = Callable[[int, int, Association, RobustConfig, Array, Array], gtsam.NonlinearFactor]
 
+
+def _bearing_range(factor: Callable[..., gtsam.NonlinearFactor]) -> _FactorMaker:
+    """Maker of a bearing-range ``factor`` to a point or to a pose."""
+
+    def make(
+        key: int, target: int, seen: Association, kernel: RobustConfig, _x: Array, _t: Array
+    ) -> gtsam.NonlinearFactor:
+        bearing, range_m = gtsam.Rot2(float(seen.z[0])), float(seen.z[1])
+        return factor(key, target, bearing, range_m, robust(gaussian(seen.cov), kernel))
+
+    return make
+
+
 #: row of `MODELS` -> its factor
 FACTORS: dict[str, _FactorMaker] = {
-    "point": _point_observation,
+    "point": _bearing_range(gtsam.BearingRangeFactor2D),
     "line": _line_observation,
     "segment": _pose_observation,
     "robot-pose": _pose_observation,
-    "robot-point": _robot_point_observation,
+    "robot-point": _bearing_range(gtsam.BearingRangeFactorPose2),
 }
 
 
 def observation_factor(
     key: int, target: int, seen: Association, kernel: RobustConfig, x: Array, t: Array
 ) -> gtsam.NonlinearFactor:
-    """Factor between a state and what was observed from it.
+    """Factor of an observation.
 
     Args:
-        key: the observing state.
+        key: of the observing state.
         target: key of the landmark, or of the observed robot's state.
         seen: the association.
         kernel: robust kernel.
-        x: estimate (3,) of the observing state, where the factor is built.
+        x: estimate (3,) of the observing state at which the factor is built.
         t: estimate of the target.
     """
     return FACTORS[seen.model](key, target, seen, kernel, x, t)
@@ -241,9 +236,9 @@ def observation_factor(
 def line_gauge_factor(
     key: int, target: int, seen: Association, *, wide: bool = True
 ) -> gtsam.NonlinearFactor:
-    """Ties a new line landmark's origin along its line; see `LINE_GAUGE_SIGMA_M`.
+    """Fixes a new line landmark's origin along its line; ``wide`` for smoothers, not for filters.
 
-    ``wide`` for smoothers, not for filters.
+    See `LINE_GAUGE_SIGMA_M`.
     """
     R = np.zeros((3, 3))
     R[0, 0] = 1.0 / (LINE_GAUGE_SIGMA_M if wide else FILTER_GAUGE_SIGMA_M)

@@ -1,8 +1,8 @@
-"""The factor graph as text that other tools open: g2o, and the table that names its vertices.
+"""The factor graph in g2o's text format, and the table that identifies its vertices.
 
-g2o knows no robots and no stamps, and readers differ in what they make of comments, so vertices
-are numbered here and `graph_ids` says which is which. Robust kernels have no place in the format:
-the file holds the plain Gaussian weights.
+g2o has neither robots nor stamps, and readers differ in their treatment of comments, so vertices
+are numbered and `graph_ids` is the table of numbers. The format has no robust kernels: the file
+contains the plain Gaussian weights.
 """
 
 from collections import defaultdict
@@ -12,17 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphslam.core.errors import OutputError
-from graphslam.core.geometry import Array, between, rotate_cov, rotation, wrap
+from graphslam.core.geometry import Array, between, is_positive, rotate_cov, rotation, wrap
 from graphslam.core.observation_models import MODELS, LineModel
 from graphslam.core.records import Estimate, Step
 
-# of n edges: tag, measurements (n, k), covariances (n, m, m) of the last m entries; nothing is
-# known of the entries before them
+# of n edges: tag, measurements (n, k), covariances (n, m, m) of the last m entries; the entries
+# before them have no information
 _EdgeParts = tuple[str, Array, Array]
 
-# "No information" in a direction is written as this, not as zero: GTSAM refuses a zero on the
-# diagonal of an information matrix ("looks like this is not G2O matrix order"), and it as well as
-# Ceres take a Cholesky factor, which needs a positive matrix. One sigma is then 1000 km.
+# Information of a direction without any, instead of zero: GTSAM refuses a zero on the diagonal of
+# an information matrix ("looks like this is not G2O matrix order"), and it and Ceres compute a
+# Cholesky factor, which needs a positive definite matrix. One sigma is then 1000 km.
 NO_INFORMATION = 1e-12
 
 
@@ -38,7 +38,7 @@ class GraphIds:
 
 
 def number_vertices(estimate: Estimate) -> GraphIds:
-    """Running numbers for every state and landmark of the estimate, the same for equal input."""
+    """Consecutive numbers of every state and landmark of the estimate, the same for equal input."""
     states = [
         (robot, stamp)
         for robot in sorted(estimate.states)
@@ -90,7 +90,7 @@ def graph_g2o(steps: Sequence[Step], estimate: Estimate) -> str:
     for model, places in alike.items():
         group = [edges[place] for place in places]
         z, cov = (np.array([getattr(edge, name) for edge in group]) for name in ("z", "cov"))
-        # the prior of a start has one end only, and its line needs neither
+        # the prior of a start has one end, and needs neither
         x, t = (_padded([states[edge.ends[end]] for edge in group]) for end in (0, -1))
         tag, z, cov = EDGES[model](z, cov, x, t)
         infos = _informations(cov, z.shape[1], group)
@@ -111,12 +111,12 @@ class _Edge:
 
 
 def _edges(step: Step, ids: GraphIds) -> Iterator[_Edge]:
-    """Edges of one step; none of what has an end that is not in the estimate."""
+    """Edges of one step whose ends are all in the estimate."""
     states = ids.states
     for robot, start in sorted(step.starts.items()):
         if (robot, step.time_ns) in states:
             ends = (states[robot, step.time_ns],)
-            # world axes, those of the frame that the prior is given in
+            # along world axes, as the prior is given
             yield _Edge("start", ends, start.pose, start.cov, f"start of {robot}")
     for robot, motion in sorted(step.motions.items()):
         a, b = states.get((robot, motion.start_ns)), states.get((robot, motion.end_ns))
@@ -141,7 +141,7 @@ def _edges(step: Step, ids: GraphIds) -> Iterator[_Edge]:
 
 
 def _padded(states: Sequence[Array]) -> Array:
-    """States (n, 3): points get a heading that nobody asks for."""
+    """States (n, 3): points get a heading, which is not used."""
     return np.array([state if len(state) == 3 else (*state, 0.0) for state in states])
 
 
@@ -151,10 +151,10 @@ def _point_edges(z: Array, cov: Array, x: Array, t: Array) -> _EdgeParts:
 
 
 def _robot_point_edges(z: Array, cov: Array, x: Array, t: Array) -> _EdgeParts:
-    """Robots' positions as pose edges: no information on their headings.
+    """Robots' positions as pose edges without information on the heading.
 
-    The residual of EDGE_SE2 is turned by the measured heading; there is none, so the estimate
-    stands in for it, which is exact at the estimate and first order beside it.
+    The residual of EDGE_SE2 is rotated by the measured heading. There is none, so that of the
+    estimate is used, which is exact at the estimate and first order elsewhere.
     """
     xy, cov = _cartesian(z, cov)
     phi = between(x, t)[:, 2]
@@ -176,7 +176,7 @@ def _start_edges(z: Array, cov: Array, x: Array, t: Array) -> _EdgeParts:
 
 
 def _line_edges(z: Array, cov: Array, x: Array, t: Array) -> _EdgeParts:
-    """Lines, moved along themselves to face the landmarks' origins; no information along them."""
+    """Lines, slid along themselves to face the landmarks' origins; no information along them."""
     model = LineModel()
     return "EDGE_SE2", model.facing(z, x, t), model.noise(z, cov, x, t)
 
@@ -188,10 +188,10 @@ def _cartesian(z: Array, cov: Array) -> tuple[Array, Array]:
     return model.invert(z, origin), J @ cov @ J.mT
 
 
-#: what a state of this size is called
+#: dimension of a state -> its tag
 VERTICES: Mapping[int, str] = {2: "VERTEX_XY", 3: "VERTEX_SE2"}
-#: what says where a vertex is -> its edges, from measurements (n, k), their covariances, and the
-#: estimates (n, 3) of both ends; the rows are those of `graphslam.models` and what steps hold
+#: kind of measurement -> its edges, from measurements (n, k), their covariances, and the estimates
+#: (n, 3) of both ends; the rows are those of `MODELS` and the other contents of steps
 EDGES: Mapping[str, Callable[[Array, Array, Array, Array], _EdgeParts]] = {
     "start": _start_edges,
     "motion": _pose_edges,
@@ -209,7 +209,7 @@ def _informations(cov: Array, size: int, edges: Sequence[_Edge]) -> list[list[fl
     try:
         half = np.linalg.inv(np.linalg.cholesky(cov))
     except np.linalg.LinAlgError as error:
-        what = next(edge.what for edge, P in zip(edges, cov, strict=True) if not _positive(P))
+        what = next(edge.what for edge, P in zip(edges, cov, strict=True) if not is_positive(P))
         raise OutputError(f"graph.g2o: the covariance of {what} is not positive") from error
     m = cov.shape[1]
     info = np.zeros((len(cov), size, size))
@@ -218,14 +218,6 @@ def _informations(cov: Array, size: int, edges: Sequence[_Edge]) -> list[list[fl
     i, j = np.triu_indices(size)
     upper: list[list[float]] = info[:, i, j].tolist()
     return upper
-
-
-def _positive(cov: Array) -> bool:
-    try:
-        np.linalg.cholesky(cov)
-    except np.linalg.LinAlgError:
-        return False
-    return True
 
 
 def _record(tag: str, ids: Sequence[int], values: list[float], upper: Sequence[float] = ()) -> str:

@@ -375,7 +375,7 @@ def marginals_of(marginals: gtsam.Marginals, keys: Sequence[int]) -> dict[int, A
 def with_means(
     values: gtsam.Values, dims: Mapping[int, int], covs: Mapping[int, Array]
 ) -> dict[int, tuple[Array, Array]]:
-    """Mean and covariance of every variable, of NaN where there is none."""
+    """Mean (d,) and covariance (d, d), NaN if missing in ``covs``, of every variable."""
     return {
         key: (read(values, key, dim), covs.get(key, np.full((dim, dim), np.nan)))
         for key, dim in dims.items()
