@@ -1,7 +1,7 @@
 """Batch solution with the calibration of odometry and mount as unknowns beside all states.
 
-A wrong wheel radius is one constant of the whole run, so along a corridor that shows nothing but
-its walls the uncertainty grows with the path, not with its root. What `online_calibration` learns
+A wrong wheel radius is one constant of the whole run, so along a corridor with nothing but
+walls the uncertainty grows with the path, not with its root. What `online_calibration` learns
 while the log is read is the initial value; here it becomes a variable of the graph, and its
 uncertainty a part of every covariance.
 """
@@ -57,10 +57,10 @@ def calibrate(
 
 
 def recompute_motions(steps: Sequence[Step], tracks: Mapping[str, Track]) -> tuple[Step, ...]:
-    """Steps with motions by the calibration that the tracks have, but those from scans.
+    """Steps with motions by the tracks' calibration, except those from scan matching.
 
-    With the latency held a motion at the edge of the odometry would be sure of what it does not
-    cover.
+    Where odometry does not cover a motion to its end, its covariance is that of the missing part,
+    which would be zero with the latency held.
     """
     motions: list[dict[str, Motion]] = [dict(step.motions) for step in steps]
     for robot, track in tracks.items():
