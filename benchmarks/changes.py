@@ -215,7 +215,7 @@ def _promised(found: ChangeResult, moved: Array, beams: Array) -> Array:
     surface, evidence = found.surfaces[1], found.evidence[1]
     cell = surface.cells[np.maximum(surface.beams[beams], 0)]
     row = surface.nearest.member[cell]
-    sigma = found.spread * np.sqrt(evidence.variance[row])
+    sigma = found.null_sigma * np.sqrt(evidence.variance[row])
     # beams that end farther behind are counted as if they ended at the gate
     return norm.sf(norm.isf(found.rate / 2) - np.minimum(moved, ChangesConfig().gate_m) / sigma)
 
@@ -289,7 +289,7 @@ def _surface_in(found: ChangeResult, polygon: Array) -> Array:
     """Pieces (k, 2) of flagged surface inside a polygon."""
     parts = []
     for surface, evidence in zip(found.surfaces, found.evidence, strict=True):
-        high = evidence.scores(found.spread) > norm.isf(found.rate / 2)
+        high = evidence.scores(found.null_sigma) > norm.isf(found.rate / 2)
         parts.append(surface.points[high])
     points = np.concatenate(parts)
     contour = polygon.astype(np.float32)[:, None]

@@ -1,7 +1,7 @@
-"""What is different since the last visit, and how sure (thesis chapter 5, and beyond it).
+"""Change detection between two visits of a place, with probabilities (thesis chapter 5, extended).
 
-`compare` takes two visits; `changes_between` reads them from result folders. `thesis` has the
-method as printed, to compare with. See docs/change-detection.md.
+`changes_between` compares two result folders, `detect_changes` two visits in memory.
+`thesis_method` is the method as printed, for comparison. See docs/change-detection.md.
 """
 
 from graphslam.change_detection.detect import ChangeResult, detect_changes

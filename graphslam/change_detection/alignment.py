@@ -1,9 +1,9 @@
-"""Two visits in one frame, each on the surfaces of the other.
+"""Two visits in one frame, each with its surfaces and the evidence of the other's beams on them.
 
-By landmarks of both maps (`registration`), or, where the maps bend and no one motion brings them
-together, along the path by the surfaces that its scans see (`localisation`). Then every scan is
-brought onto the reference's surfaces within its covariance (`alignment`), once more without what
-seems to have changed.
+The frames are registered by landmarks (`rigid_registration`), or, where the maps are bent against
+each other and no rigid motion fits, by the scans along the paths (`nonrigid_registration`). Then
+every scan is aligned with the reference's surfaces within its covariance (`scan_to_map`), and once
+more without the beams that seem to have hit something that changed.
 """
 
 from dataclasses import dataclass, replace
@@ -25,143 +25,156 @@ from graphslam.change_detection.surface_map import Surface, fit_surfaces
 from graphslam.change_detection.visit import Bools, Ints, Visit
 from graphslam.core.config import ChangesConfig
 from graphslam.core.errors import OutputError
+from graphslam.core.geometry import Array
 
-#: farthest returns that pull a scan, m, round by round: wide first
-_REFERENCE_GATES = (0.15, 0.1, 0.1)
-_LATER_GATES = (0.5, 0.5, 0.4, 0.3, 0.2, 0.15, 0.1, 0.07, 0.06)
-#: from this share of suspected beams on, scans are placed again without them; scores, in sigmas,
-#: that make a beam suspect
-_MANY_SUSPECTS, _SUSPECT = 0.03, 3.0
+#: gates over `max_pose_error_m`, one per iteration, from coarse to fine: of the later visit, and of
+#: the reference, whose scans the surfaces are made of
+_LATER_GATES = np.array([1.0, 1.0, 0.8, 0.6, 0.4, 0.3, 0.2, 0.14, 0.12])
+_REFERENCE_GATES = np.array([0.3, 0.2, 0.2])
 _REFERENCE_ROUNDS = 2
-_OVERLAP = 0.05  # share of the later returns that must lie where the reference looked
-_FIRST_SIGMA_M = 0.02  # of ranges, until they tell themselves
-#: where maps bend: how far off a return is still compared, m, and what to say
-_BENT_GATE_M = 0.3
-#: factor on the stated sigmas from which on two maps are not of one place: where a path was
-#: bent to fit, anything that is left was free to fit; and from which on it is warned of
-_MOST_SPREAD, _WIDE_SPREAD = {False: 5.0, True: 1.8}, 1.5
+#: beams with a score above _SUSPECT_SIGMAS are suspected to have hit something that changed; above
+#: this share of them the scans are aligned again without them
+_SUSPECT_SIGMAS, _MAX_SUSPECTS = 3.0, 0.03
+_OVERLAP = 0.05  # least share of the later returns on surfaces of the reference
+#: null sigma above which two maps are not of one place, by whether the registration is nonrigid: a
+#: path that was bent to fit should leave less; and from which on there is a warning
+_MAX_SIGMA, _WARN_SIGMA = {False: 5.0, True: 1.8}, 1.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AlignedVisits:
-    """Two visits in one frame, and what each says of the other's surfaces; ``config`` for that."""
+    """Two visits in the reference's frame, with what is compared of them.
+
+    ``surfaces``, ``range_sigmas_m``: of the reference and of the later visit; ``evidence``: later
+    beams on reference surfaces, reference beams on later surfaces; ``config``: the settings for the
+    comparison; ``nonrigid``: whether the maps were bent against each other.
+    """
 
     reference: Visit
     later: Visit
     registration: Registration
     surfaces: tuple[Surface, Surface]
-    sigmas: tuple[float, float]
+    range_sigmas_m: tuple[float, float]
     evidence: tuple[Evidence, Evidence]
     config: ChangesConfig
-    bent: bool
+    nonrigid: bool
 
     @property
-    def broken(self) -> bool:
-        """Whether the visits disagree by more than can be."""
-        return null_sigma(self.evidence) > _MOST_SPREAD[self.bent]
+    def is_inconsistent(self) -> bool:
+        """Whether the visits disagree too much to be of one place."""
+        return null_sigma(self.evidence) > _MAX_SIGMA[self.nonrigid]
 
 
 def align_visits(
     reference: Visit, later: Visit, registration: Registration | None, config: ChangesConfig
 ) -> AlignedVisits:
-    """Both visits in the reference's frame, by landmarks, or else as the maps bend.
+    """Both visits in the reference's frame, registered by landmarks, or else nonrigidly.
 
     Raises:
-        OutputError: neither way works.
+        OutputError: neither is possible.
     """
     if registration is None:
         try:
             registration = register(reference.landmarks, later.landmarks)
         except OutputError:
-            if max(reference.robots, later.robots) > 1:  # no path to follow from scan to scan
+            if max(reference.robots, later.robots) > 1:  # consecutive scans are of several paths
                 raise
             return align_visits_nonrigid(reference, later, config)
-    placed = later.transformed(registration.pose, registration.cov)
-    reference, later, surfaces, sigmas = _aligned(reference, placed, config)
-    evidence = _evidence(reference, later, surfaces, sigmas, config)
-    suspects = _suspects(later, surfaces, evidence)
-    if suspects.mean() > _MANY_SUSPECTS:
-        # what changed pulled at the scans that saw it: place them again without it
-        a = surfaces[0]
-        later = align_scans(placed, a, _LATER_GATES, suspects)
-        surfaces = (a, fit_surfaces(later, a.nearest.grid, sigmas[1], config))
-        evidence = _evidence(reference, later, surfaces, sigmas, config)
-    return AlignedVisits(reference, later, registration, surfaces, sigmas, evidence, config, False)
+    prior = later.transformed(registration.pose, registration.cov)
+    aligned = _align(reference, prior, registration, config, nonrigid=False)
+    suspects = _suspects(aligned)
+    if suspects.mean() <= _MAX_SUSPECTS:
+        return aligned
+    # what changed affected the alignment of the scans that observed it
+    surface, sigmas = aligned.surfaces[0], aligned.range_sigmas_m
+    later = align_scans(prior, surface, _gates(_LATER_GATES, config), suspects)
+    surfaces = (surface, fit_surfaces(later, surface.nearest.grid, sigmas[1], config))
+    evidence = _evidence((aligned.reference, later), surfaces, sigmas, config)
+    return replace(aligned, later=later, surfaces=surfaces, evidence=evidence)
 
 
 def align_visits_nonrigid(reference: Visit, later: Visit, config: ChangesConfig) -> AlignedVisits:
-    """Both visits in one frame although their maps bend differently.
+    """Both visits in one frame although their maps are bent against each other.
 
     Raises:
         OutputError: they are hardly of one place.
     """
-    reference, placed, registration = register_nonrigid(reference, later, config)
-    config = replace(config, gate_m=max(config.gate_m, _BENT_GATE_M))
-    reference, later, surfaces, sigmas = _aligned(reference, placed, config, bent=True)
-    evidence = _evidence(reference, later, surfaces, sigmas, config)
-    return AlignedVisits(reference, later, registration, surfaces, sigmas, evidence, config, True)
+    reference, later, registration = register_nonrigid(reference, later, config)
+    config = replace(config, gate_m=max(config.gate_m, config.nonrigid_gate_m))
+    return _align(reference, later, registration, config, nonrigid=True)
 
 
-def _aligned(
-    reference: Visit, later: Visit, config: ChangesConfig, bent: bool = False
-) -> tuple[Visit, Visit, tuple[Surface, Surface], tuple[float, float]]:
-    """Two visits in one frame, each on the reference's surfaces; surfaces; range sigmas, m.
+def _align(
+    reference: Visit,
+    later: Visit,
+    registration: Registration,
+    config: ChangesConfig,
+    nonrigid: bool,
+) -> AlignedVisits:
+    """Both visits, registered, with every scan aligned with the reference's surfaces.
 
-    Where the maps are ``bent``, scans are where their neighbours are: one alone sees too little.
+    After a ``nonrigid`` registration scans are not aligned: alone they are constrained too little.
 
     Raises:
-        OutputError: the later visit saw hardly anything of what the reference saw.
+        OutputError: the later visit observed hardly any surface of the reference.
     """
     ends = np.concatenate([v.ends[v.surface] for v in (reference, later)])
     grid = grid_over(ends, config.resolution_m, config.max_side_cells**2)
-    sigma = _FIRST_SIGMA_M
-    first = reference
-    a = fit_surfaces(reference, grid, sigma, config)
+    sigma = config.range_sigma_m
+    prior = reference
+    surface = fit_surfaces(reference, grid, sigma, config)
     for _ in range(_REFERENCE_ROUNDS):
-        reference = first if bent else align_scans(first, a, _REFERENCE_GATES)
-        a = fit_surfaces(reference, grid, sigma, config)
-        sigma = range_noise(a, reference, config.gate_m)
-    at = grid.cells(later.ends[later.surface])
-    near = (at >= 0) & (a.nearest.distance_m[at] < _LATER_GATES[0])
-    if not a.good.any() or near.mean() < _OVERLAP:
+        if not nonrigid:
+            reference = align_scans(prior, surface, _gates(_REFERENCE_GATES, config))
+        surface = fit_surfaces(reference, grid, sigma, config)
+        sigma = range_noise(surface, reference, config)
+    cells = grid.cells(later.ends[later.surface])
+    near = (cells >= 0) & (surface.nearest.distance_m[cells] < config.max_pose_error_m)
+    if not surface.good.any() or near.mean() < _OVERLAP:
         raise OutputError(
             f"nothing to compare: {100 * near.mean():.0f} % of the later returns lie on surfaces "
             "of the reference; did both runs see the same place?"
         )
-    later = later if bent else align_scans(later, a, _LATER_GATES)
-    sigmas = (sigma, range_noise(a, later, config.gate_m))
-    return reference, later, (a, fit_surfaces(later, grid, sigmas[1], config)), sigmas
+    if not nonrigid:
+        later = align_scans(later, surface, _gates(_LATER_GATES, config))
+    sigmas = (sigma, range_noise(surface, later, config))
+    surfaces = (surface, fit_surfaces(later, grid, sigmas[1], config))
+    evidence = _evidence((reference, later), surfaces, sigmas, config)
+    return AlignedVisits(
+        reference, later, registration, surfaces, sigmas, evidence, config, nonrigid
+    )
+
+
+def _gates(shares: Array, config: ChangesConfig) -> tuple[float, ...]:
+    return tuple((config.max_pose_error_m * shares).tolist())
 
 
 def _evidence(
-    reference: Visit,
-    later: Visit,
+    visits: tuple[Visit, Visit],
     surfaces: tuple[Surface, Surface],
     sigmas: tuple[float, float],
     config: ChangesConfig,
 ) -> tuple[Evidence, Evidence]:
-    """Later beams past reference surfaces, reference beams past later surfaces."""
-    a, b = surfaces
+    """Evidence of later beams on reference surfaces, of reference beams on later surfaces."""
     return (
-        beams_past_surfaces(a, later, a.incidence, sigmas[1], config),
-        beams_past_surfaces(b, reference, b.incidence, sigmas[0], config),
+        beams_past_surfaces(surfaces[0], visits[1], sigmas[1], config),
+        beams_past_surfaces(surfaces[1], visits[0], sigmas[0], config),
     )
 
 
-def _suspects(
-    later: Visit, surfaces: tuple[Surface, Surface], evidence: tuple[Evidence, Evidence]
-) -> Bools:
-    """Later beams (n,) on anything that seems to lie elsewhere than before, to either side."""
-    suspect = np.zeros(len(later.range_m), dtype=bool)
-    odd = [np.abs(e.scores(1.0)) > _SUSPECT for e in evidence]
-    suspect[evidence[0].beams[odd[0][evidence[0].rows]]] = True
-    beams, rows = beams_on_surface(surfaces[1], later)
-    suspect[beams[odd[1][rows]]] = True
+def _suspects(aligned: AlignedVisits) -> Bools:
+    """Later beams (n,) on surfaces that seem to have moved, in either direction."""
+    suspect = np.zeros(len(aligned.later.range_m), dtype=bool)
+    moved = [np.abs(e.scores(1.0)) > _SUSPECT_SIGMAS for e in aligned.evidence]
+    on_old = aligned.evidence[0]
+    suspect[on_old.beams[moved[0][on_old.rows]]] = True
+    beams, rows = beams_on_surface(aligned.surfaces[1], aligned.later)
+    suspect[beams[moved[1][rows]]] = True
     return suspect
 
 
 def beams_on_surface(surface: Surface, visit: Visit) -> tuple[Ints, Ints]:
-    """Beams (k,) of a visit and the good piece (k,) of its own surfaces next to their ends."""
+    """Beams (k,) that end near good pieces of the visit's own surfaces, and those pieces (k,)."""
     beams = np.nonzero(surface.beams >= 0)[0]
     cell = surface.cells[surface.beams[beams]]
     near = surface.nearest.distance_m[cell] < 2.5 * surface.nearest.grid.cell_m
@@ -180,21 +193,21 @@ def laser_warnings(reference: Visit, later: Visit) -> tuple[str, ...]:
     )
 
 
-def consistency_warnings(factor: float, bent: bool) -> tuple[str, ...]:
-    """A warning if the visits disagree all over by more than is stated.
+def consistency_warnings(aligned: AlignedVisits) -> tuple[str, ...]:
+    """A warning if the visits disagree all over by more than their covariances allow.
 
     Raises:
         OutputError: by so much more that they are hardly of one place.
     """
-    allowed = _MOST_SPREAD[bent]
-    if factor > allowed:
+    sigma = null_sigma(aligned.evidence)
+    if aligned.is_inconsistent:
         raise OutputError(
-            f"nothing to compare: the surfaces of the two runs disagree by {factor:.1f} times what "
+            f"nothing to compare: the surfaces of the two runs disagree by {sigma:.1f} times what "
             "their covariances allow; they are of different places, or one of the maps is broken"
         )
-    if factor < _WIDE_SPREAD:
+    if sigma < _WARN_SIGMA:
         return ()
     return (
-        f"the surfaces of the two runs disagree by {factor:.1f} times what their covariances "
-        "allow, all over: a path is worse than it says, and changes may be false",
+        f"the surfaces of the two runs disagree by {sigma:.1f} times what their covariances "
+        "allow, all over: a path is worse than its covariances say, and changes may be false",
     )

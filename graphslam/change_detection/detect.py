@@ -1,9 +1,9 @@
-"""Change detection, top to bottom: one frame, surfaces, evidence, changes.
+"""Change detection between two visits, top to bottom.
 
-1. both visits come to lie in the reference's frame, scan by scan (`laying`);
-2. the beams of each visit are held against the surfaces of the other (`evidence`);
-3. flagged pieces of surface that hang together (`regions`) are changes, of which some are one
-   thing that moved (`things`).
+1. Both visits are aligned in the reference's frame, scan by scan (`alignment`).
+2. The beams of each visit are tested against the surfaces of the other (`beam_evidence`).
+3. Connected regions of flagged surface (`regions`) are changes; pairs of them may be one object
+   that moved (`objects`).
 """
 
 from dataclasses import dataclass, replace
@@ -34,9 +34,9 @@ from graphslam.change_detection.transparency import without_transparent
 from graphslam.change_detection.visit import Bools, Visit, pose_to_dict
 from graphslam.change_detection.wall_motion import segment_motions
 from graphslam.core.config import ChangesConfig
-from graphslam.core.geometry import transform
+from graphslam.core.geometry import Array, transform
 
-_BENT = (
+_NONRIGID = (
     "the maps bend differently, so no one motion brings their landmarks together: both paths were "
     "straightened by their scans and the later one bent onto the reference; only large changes "
     "are found, and where they are is known to decimetres"
@@ -45,19 +45,20 @@ _BENT = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChangeResult:
-    """All that a comparison found.
+    """The result of a comparison of two visits.
 
     Attributes:
         changes: largest first.
         registration: of the later world frame in the reference's.
         reference, later: the visits, aligned, in the reference's frame.
         surfaces: of the reference and of the later visit.
-        evidence: later beams past reference surfaces; reference beams past later surfaces.
+        evidence: of later beams on reference surfaces, of reference beams on later surfaces.
         compared, flagged: (n,) which later beams were compared, and flagged.
-        spread: factor on the stated sigmas that keeps the rate asked for where nothing changed.
-        range_sigma_m: range noise of both visits as found.
-        rate: the false-alarm rate that was asked for.
-        warnings: what makes the result weaker than its numbers say, one line each.
+        null_sigma: sigma of the scores without a change, see
+            `graphslam.change_detection.beam_evidence.null_sigma`; "spread" in changes.json.
+        range_sigmas_m: estimated range noise of both visits.
+        rate: the requested false-alarm rate.
+        warnings: reasons to doubt the result, one line each.
     """
 
     changes: tuple[Change, ...]
@@ -68,8 +69,8 @@ class ChangeResult:
     evidence: tuple[Evidence, Evidence]
     compared: Bools
     flagged: Bools
-    spread: float
-    range_sigma_m: tuple[float, float]
+    null_sigma: float
+    range_sigmas_m: tuple[float, float]
     rate: float
     warnings: tuple[str, ...] = ()
 
@@ -82,14 +83,14 @@ class ChangeResult:
             "false_alarm_rate_requested": self.rate,
             "registration": pose_to_dict(self.registration.pose, self.registration.cov)
             | {"landmarks": len(self.registration.matched)},
-            "spread": self.spread,
-            "range_sigma_m": list(self.range_sigma_m),
+            "spread": self.null_sigma,
+            "range_sigma_m": list(self.range_sigmas_m),
             "warnings": list(self.warnings),
         }
 
 
 def identity_registration(visit: Visit) -> Registration:
-    """The registration of two spans of one run: they share its world frame."""
+    """The registration of two time spans of one run, which share its world frame."""
     every = np.arange(len(visit.landmarks))
     return Registration(
         np.zeros(3), np.zeros((3, 3)), np.column_stack([every, every]), np.zeros(0, dtype=np.int64)
@@ -102,99 +103,89 @@ def detect_changes(
     config: ChangesConfig,
     registration: Registration | None = None,
 ) -> ChangeResult:
-    """Find what is different in the later visit.
+    """Find what changed between two visits.
 
     Args:
         reference: in its world frame.
         later: in its own.
         config: settings.
-        registration: where the later frame lies; found by landmarks if not given.
+        registration: of the later frame in the reference's; by default found from both maps.
 
     Raises:
-        OutputError: the two cannot be registered, or saw nothing in common.
+        OutputError: the two cannot be registered, or have nothing in common.
     """
     warnings = laser_warnings(reference, later)
-    laid = align_visits(reference, later, registration, config)
-    if laid.broken and registration is None and max(reference.robots, later.robots) == 1:
-        # a motion that some landmarks agree on, while the rest of the maps lies elsewhere
-        laid = align_visits_nonrigid(reference, later, config)
-    reference, later, registration = laid.reference, laid.later, laid.registration
-    surfaces, evidence, sigmas, config = laid.surfaces, laid.evidence, laid.sigmas, laid.config
-    if laid.bent:
-        warnings += (_BENT,)
-    # judged with all there is: of paths that are broken little seems solid
-    warnings += consistency_warnings(null_sigma(evidence), laid.bent)
-    surfaces, evidence = _of_solid(surfaces, evidence, (reference, later), config)
-    a, b = surfaces
-    factor = null_sigma(evidence)
-    flags = tuple(flag_pieces(e, factor, config.false_alarm_rate / 2) for e in evidence)
-    compared, marked = _beams(later, surfaces, evidence, (flags[0], flags[1]))
-    seen = np.nonzero(b.beams >= 0)[0]
-    vanished = find_regions(
-        a, evidence[0], evidence[0].beams, evidence[0].rows, evidence[0].first_ns, factor, config
+    aligned = align_visits(reference, later, registration, config)
+    if (
+        aligned.is_inconsistent
+        and registration is None
+        and max(reference.robots, later.robots) == 1
+    ):
+        # a motion that some landmarks agree on, while the rest of the maps disagrees
+        aligned = align_visits_nonrigid(reference, later, config)
+    reference, later, registration = aligned.reference, aligned.later, aligned.registration
+    config = aligned.config
+    if aligned.nonrigid:
+        warnings += (_NONRIGID,)
+    # before transparent surfaces are left out: in maps that disagree most surfaces seem so
+    warnings += consistency_warnings(aligned)
+    a, b = surfaces = without_transparent(aligned.surfaces, (reference, later), config)
+    on_a, on_b = evidence = tuple(
+        replace(e, tested=e.tested & s.good)
+        for e, s in zip(aligned.evidence, surfaces, strict=True)
     )
-    appeared = find_regions(b, evidence[1], seen, b.beams[seen], b.first_ns, factor, config)
+    sigma = null_sigma(evidence)
+    compared, flagged = _classify_beams(later, b, (on_a, on_b), sigma, config)
+    ended = np.nonzero(b.beams >= 0)[0]
+    vanished = find_regions(a, on_a, on_a.beams, on_a.rows, on_a.first_ns, sigma, config)
+    appeared = find_regions(b, on_b, ended, b.beams[ended], b.first_ns, sigma, config)
     shapes = (
-        [extract_shape(a, reference, evidence[0], factor, r.points) for r in vanished],
-        [extract_shape(b, later, evidence[1], factor, r.points) for r in appeared],
+        [extract_shape(a, reference, on_a, sigma, r.points) for r in vanished],
+        [extract_shape(b, later, on_b, sigma, r.points) for r in appeared],
     )
-    known = MotionSettings(
+    settings = MotionSettings(
         config.bias_sigma_m,
         repeatability(evidence),
         a.nearest.grid.cell_m,
         config.max_displacement_m,
     )
-    fits = match_shapes(*shapes, known)
-    marks = (reference.landmarks, later.landmarks)
+    landmarks = (reference.landmarks, later.landmarks)
     moves = segment_motions(
-        marks, registration, surfaces, (reference, later), evidence, known, factor
+        landmarks, registration, surfaces, (reference, later), (on_a, on_b), settings, sigma
     )
-    stretches = match_segments(vanished, appeared, moves)
-    lines = (
-        _placed_lines(reference, identity_registration(reference)),
-        _placed_lines(later, registration),
+    changes = assemble_changes(
+        vanished,
+        appeared,
+        match_shapes(*shapes, settings),
+        match_segments(vanished, appeared, moves),
+        (_lines(reference, np.zeros(3)), _lines(later, registration.pose)),
     )
-    changes = assemble_changes(vanished, appeared, fits, stretches, lines)
     return ChangeResult(
-        changes, registration, reference, later, surfaces, evidence, compared, marked,
-        factor, sigmas, config.false_alarm_rate, warnings,
+        changes, registration, reference, later, surfaces, (on_a, on_b), compared, flagged,
+        sigma, aligned.range_sigmas_m, config.false_alarm_rate, warnings,
     )  # fmt: skip
 
 
-def _of_solid(
-    surfaces: tuple[Surface, Surface],
-    evidence: tuple[Evidence, Evidence],
-    visits: tuple[Visit, Visit],
-    config: ChangesConfig,
-) -> tuple[tuple[Surface, Surface], tuple[Evidence, Evidence]]:
-    """Surfaces and evidence without what a visit itself looked through."""
-    a, b = without_transparent(surfaces, visits, config)
-    left = [replace(e, tested=e.tested & s.good) for e, s in zip(evidence, (a, b), strict=True)]
-    return (a, b), (left[0], left[1])
-
-
-def _beams(
+def _classify_beams(
     later: Visit,
-    surfaces: tuple[Surface, Surface],
+    surface: Surface,
     evidence: tuple[Evidence, Evidence],
-    flags: tuple[Bools, Bools],
+    sigma: float,
+    config: ChangesConfig,
 ) -> tuple[Bools, Bools]:
-    """Which later beams (n,) met something that could be tested, and which are flagged."""
+    """Which later beams (n,) are on or behind tested pieces, and which on flagged ones.
+
+    ``surface``: of the later visit; ``evidence`` and ``sigma``: see `ChangeResult`.
+    """
     compared = np.zeros(len(later.range_m), dtype=bool)
     marked = compared.copy()
-    for beams, rows, e, flag in (
-        (evidence[0].beams, evidence[0].rows, evidence[0], flags[0]),
-        (*beams_on_surface(surfaces[1], later), evidence[1], flags[1]),
-    ):
+    behind_old, own = (evidence[0].beams, evidence[0].rows), beams_on_surface(surface, later)
+    for (beams, rows), e in zip((behind_old, own), evidence, strict=True):
         compared[beams[e.tested[rows]]] = True
-        marked[beams[flag[rows]]] = True
+        marked[beams[flag_pieces(e, sigma, config.false_alarm_rate / 2)[rows]]] = True
     return compared, marked
 
 
-def _placed_lines(visit: Visit, registration: Registration) -> Lines:
-    """Ids and ends (2, 2) m of a visit's line landmarks in the reference's frame."""
-    return [
-        (mark.id, transform(registration.pose, mark.extent))
-        for mark in visit.landmarks
-        if mark.line is not None
-    ]
+def _lines(visit: Visit, frame: Array) -> Lines:
+    """Ids and ends (2, 2) m of a visit's line landmarks, their map being at ``frame`` (3,)."""
+    return [(m.id, transform(frame, m.extent)) for m in visit.landmarks if m.line is not None]

@@ -1,4 +1,4 @@
-"""Changes for other tools: a map to lay over the reference's, and messages for a viewer."""
+"""Changes for other tools: a map to overlay on the reference's, and an MCAP file for viewers."""
 
 from pathlib import Path
 from typing import Any
@@ -17,23 +17,23 @@ from graphslam.logs.writer import LogWriter
 #: grey values of nav2's map_server in mode trinary
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
 _FRAME = "map"
-#: red, green, blue of the kinds, and of the points of reference and later visit
+#: red, green, blue of the kinds
 _RGB = {"appeared": (0.16, 0.63, 0.17), "vanished": (0.89, 0.34, 0.1), "moved": (0.58, 0.2, 0.75)}
-_MOST_POINTS = 200_000
+_MAX_POINTS = 200_000
 _LINE_STRIP, _TEXT, _POINT_FLOAT32 = 4, 9, 7
 
 
 def overlay_map(found: ChangeResult) -> tuple[NDArray[np.uint8], str]:
-    """The changes as a picture (rows, columns), north up, and the YAML that belongs to it.
+    """The changes as an image (rows, columns), north up, and its YAML for nav2's map_server.
 
-    Occupied where something is now, free where something was before, unknown elsewhere: laid over
-    the map of the reference it gives the map of today.
+    Occupied where something is now, free where something was before, unknown elsewhere: overlaid on
+    the reference's map it gives the current map.
     """
     grid = found.surfaces[0].nearest.grid
     image = np.full(grid.shape[::-1], _UNKNOWN, dtype=np.uint8)
     for gone in (True, False):  # what is there now is drawn over what was there before
         for change in found.changes:
-            polygon = _old_place(change) if gone else _new_place(change)
+            polygon = _old_outline(change) if gone else _new_outline(change)
             if polygon is not None:
                 cells = (polygon - np.array(grid.origin_m)) / grid.cell_m - 0.5
                 value = _FREE if gone else _OCCUPIED
@@ -41,11 +41,11 @@ def overlay_map(found: ChangeResult) -> tuple[NDArray[np.uint8], str]:
     return np.ascontiguousarray(image[::-1]), _yaml(grid)
 
 
-def _old_place(change: Change) -> Array | None:
+def _old_outline(change: Change) -> Array | None:
     return change.polygon if change.kind == "vanished" else change.before
 
 
-def _new_place(change: Change) -> Array | None:
+def _new_outline(change: Change) -> Array | None:
     return None if change.kind == "vanished" else change.polygon
 
 
@@ -60,14 +60,14 @@ def _yaml(grid: Grid) -> str:
 
 
 def pgm(image: NDArray[np.uint8]) -> bytes:
-    """A grey picture (rows, columns) as binary PGM."""
+    """A grey image (rows, columns) as binary PGM."""
     return f"P5\n{image.shape[1]} {image.shape[0]}\n255\n".encode() + image.tobytes()
 
 
 def write_mcap(found: ChangeResult, path: Path) -> None:
-    """MCAP for a viewer: `/changes` as markers, `/reference` and `/later` as point clouds.
+    """MCAP for viewers: `/changes` as markers, `/reference` and `/later` as point clouds.
 
-    Each change is stamped with when it was first seen.
+    Each change has the stamp at which it was first observed.
 
     Raises:
         OutputError: the file cannot be written.
@@ -91,7 +91,7 @@ def write_mcap(found: ChangeResult, path: Path) -> None:
 
 
 def _cloud(points: Array, stamp_ns: int) -> dict[str, Any]:
-    points = points[:: max(1, len(points) // _MOST_POINTS)]
+    points = points[:: max(1, len(points) // _MAX_POINTS)]
     data = np.zeros((len(points), 3), dtype="<f4")
     data[:, :2] = points
     fields = [
@@ -108,12 +108,12 @@ def _cloud(points: Array, stamp_ns: int) -> dict[str, Any]:
 
 
 def _markers(number: int, change: Change) -> list[Any]:
-    """The outline, the old one where it is known, and a word."""
+    """Markers of the outline, of the old one if it is known, and of a label."""
     lines = [_marker(3 * number, change, _LINE_STRIP, change.polygon, 0.03, "")]
     if change.before is not None:
         lines.append(_marker(3 * number + 1, change, _LINE_STRIP, change.before, 0.015, ""))
-    words = f"{number + 1} {change.kind}"
-    return [*lines, _marker(3 * number + 2, change, _TEXT, change.polygon, 0.25, words)]
+    label = f"{number + 1} {change.kind}"
+    return [*lines, _marker(3 * number + 2, change, _TEXT, change.polygon, 0.25, label)]
 
 
 def _marker(

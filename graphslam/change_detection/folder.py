@@ -1,6 +1,5 @@
-"""Result folders in; changes.json, a map, messages and a report out."""
+"""Reads two result folders and writes a folder of changes: JSON, a map, MCAP, a report."""
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from graphslam.core.config import ChangesConfig
 from graphslam.core.errors import OutputError
 from graphslam.core.output_folder import atomic_folder
 from graphslam.results.file_formats import to_json
-from graphslam.results.folder import load
+from graphslam.results.folder import check_target, load
 
 Span = tuple[float, float]
 
@@ -26,24 +25,24 @@ def changes_between(
     """Compare two result folders of `smooth`, or two time spans of one.
 
     Args:
-        reference: result folder of the visit that the other is compared with.
-        later: result folder of the later visit; it may be the same one with other spans.
+        reference: result folder of the visit to compare with.
+        later: result folder of the later visit; may be the same one with other spans.
         config: settings.
         reference_span_s: scans to use, s since the first one.
-        later_span_s: the same of the later visit.
+        later_span_s: the same for the later visit.
 
     Raises:
         OutputError: a folder is not a result, has no scans or covariances, or the two have nothing
             in common.
-        LogError: a log is not where it was, or is another one now.
+        LogError: a log is missing or has changed.
     """
     same = reference.resolve() == later.resolve()
     if same and (reference_span_s is None or later_span_s is None):
         raise OutputError(
             f"{later}: is the reference itself; give --reference-span and --later-span"
         )
-    a = load_visit(load(reference), reference)
-    b = a if same else load_visit(load(later), later)
+    a = load_visit(load(reference), reference, config)
+    b = a if same else load_visit(load(later), later, config)
     registration = identity_registration(a) if same else None
     if reference_span_s is not None:
         a = select_time_span(a, reference_span_s, "--reference-span")
@@ -53,20 +52,12 @@ def changes_between(
 
 
 def check_changes_target(directory: Path, *, force: bool) -> None:
-    """Say before a long computation whether `save_changes` may write to ``directory``.
+    """Check before a long computation that `save_changes` may write to ``directory``.
 
     Raises:
-        OutputError: it is there and may not be replaced.
+        OutputError: it exists and may not be replaced, or it cannot be written.
     """
-    if os.path.lexists(directory):
-        ours = (directory / "changes.json").is_file()
-        empty = directory.is_dir() and not any(directory.iterdir())
-        if not force:
-            raise OutputError(f"{directory}: already exists; give --force to replace it")
-        if directory.is_symlink() or not (ours or empty):
-            raise OutputError(
-                f"{directory}: holds no changes.json, so it is not replaced; choose another name"
-            )
+    check_target(directory, force=force, replaceable=lambda d: (d / "changes.json").is_file())
 
 
 def save_changes(

@@ -1,4 +1,4 @@
-"""A grid over what was seen: cells, and the nearest cell of a set for any point."""
+"""A grid over the observed area, its distance map, and sums over cells and windows of cells."""
 
 from dataclasses import dataclass
 
@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from graphslam.change_detection.visit import Bools, Ints
 from graphslam.core.geometry import Array
 
-#: the nearest occupied cell is known for points up to this many cells outside of what was seen
-_MARGIN = 8
+#: cells by which a grid is larger than the observed area on each side
+_MARGIN_CELLS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +22,7 @@ class Grid:
     shape: tuple[int, int]
 
     def cells(self, points: Array) -> Ints:
-        """Flat numbers (n,) of the cells of ``points`` (n, 2) m; -1 outside."""
+        """Flat indices (n,) of the cells that hold ``points`` (n, 2) m; -1 outside of the grid."""
         with np.errstate(invalid="ignore"):
             ij = np.floor((points - np.array(self.origin_m)) / self.cell_m)
             inside = ((ij >= 0) & (ij < np.array(self.shape))).all(axis=1)
@@ -30,43 +30,43 @@ class Grid:
         return np.where(inside, ij[:, 0] * self.shape[1] + ij[:, 1], -1)
 
     def centers(self, cells: Ints) -> Array:
-        """Middles (n, 2) m of cells (n,)."""
+        """Centres (n, 2) m of cells (n,)."""
         ij = np.column_stack(np.divmod(cells, self.shape[1]))
         return np.asarray(np.array(self.origin_m) + (ij + 0.5) * self.cell_m)
 
     def occupied(self, cells: Ints) -> tuple[Ints, Ints]:
-        """The different ones (m,) of ``cells`` (n,), sorted, and for each cell its place there."""
+        """The distinct ``cells`` (m,) of (n,), sorted, and the index of each cell among them."""
         number = np.zeros(self.shape[0] * self.shape[1], dtype=np.int64)
         number[cells] = 1
-        different = np.flatnonzero(number)
-        number[different] = np.arange(len(different))
-        return different, number[cells]
+        unique = np.flatnonzero(number)
+        number[unique] = np.arange(len(unique))
+        return unique, number[cells]
 
     def neighbours(self, cells: Ints, radius: int) -> list[Ints]:
-        """Per offset within ``radius`` cells the number of that neighbour of each cell (n,)."""
+        """Per offset within ``radius`` cells the flat index of that neighbour of each cell (n,)."""
         offsets = range(-radius, radius + 1)
         return [cells + i * self.shape[1] + j for i in offsets for j in offsets]
 
 
 def sorted_unique(numbers: Ints) -> Ints:
-    """The different ones of ``numbers`` (n,), sorted; np.unique's hash table is slower."""
+    """The distinct ``numbers`` (n,), sorted; np.unique's hash table is slower."""
     numbers = np.sort(numbers)
     first = np.ones(len(numbers), dtype=bool)
     first[1:] = numbers[1:] != numbers[:-1]
     return np.asarray(numbers[first])
 
 
-def grid_over(points: Array, cell_m: float, most_cells: int) -> Grid:
-    """A grid that holds ``points`` (n, 2) m; coarser than ``cell_m`` where it would be too large.
+def grid_over(points: Array, cell_m: float, max_cells: int) -> Grid:
+    """A grid that holds ``points`` (n, 2) m; coarser than ``cell_m`` if it would be too large.
 
-    A few stray returns far outside are left out: they would blow up the grid.
+    The outermost 0.05 % on each side are left out: a few stray returns would blow up the grid.
     """
     low, high = np.quantile(points, [0.0005, 0.9995], axis=0)
     low, high = low - 0.5, high + 0.5
     size = high - low
-    cell = max(cell_m, float(np.sqrt(size.prod() / most_cells)))
-    count = np.ceil(size / cell).astype(int) + 2 * _MARGIN
-    origin = low - _MARGIN * cell
+    cell = max(cell_m, float(np.sqrt(size.prod() / max_cells)))
+    count = np.ceil(size / cell).astype(int) + 2 * _MARGIN_CELLS
+    origin = low - _MARGIN_CELLS * cell
     return Grid((float(origin[0]), float(origin[1])), cell, (int(count[0]), int(count[1])))
 
 
@@ -74,7 +74,7 @@ def grid_over(points: Array, cell_m: float, most_cells: int) -> Grid:
 class DistanceMap:
     """For every cell of a grid the nearest member of a set of cells.
 
-    ``distance_m`` (cells,) float32 between middles, ``member`` (cells,) int32 its place in the set.
+    ``distance_m`` (cells,) float32 between centres, ``member`` (cells,) int32 its index in the set.
     """
 
     grid: Grid
@@ -83,7 +83,7 @@ class DistanceMap:
 
 
 def distance_map(grid: Grid, cells: Ints, chosen: Bools) -> DistanceMap:
-    """Which of ``cells`` (n,), flat numbers, ``chosen`` among them, is nearest, everywhere."""
+    """The distance map of the ``chosen`` (n,) ones of ``cells`` (n,), flat indices."""
     rows = np.nonzero(chosen)[0]
     cells = cells[rows]
     free = np.ones(grid.shape, dtype=np.uint8)
@@ -99,21 +99,21 @@ def distance_map(grid: Grid, cells: Ints, chosen: Bools) -> DistanceMap:
 
 
 def row_sums(rows: Ints, weights: Array, size: int) -> Array:
-    """Sum (size,) of ``weights`` (k,) per row; ``rows`` (k,)."""
+    """Sums (size,) of ``weights`` (k,) over equal ``rows`` (k,)."""
     return np.asarray(np.bincount(rows, weights, size), dtype=float)
 
 
-def window_sums(values: Array, places: list[Ints]) -> Array:
-    """Sum of ``values`` (n, ...) over each row's neighbours; places (n,) of -1 add nothing."""
+def window_sums(values: Array, windows: list[Ints]) -> Array:
+    """Sums of ``values`` (n, ...) over each row's neighbours; a neighbour (n,) of -1 adds 0."""
     padded = np.concatenate([values, np.zeros((1, *values.shape[1:]))])
     total = np.zeros_like(values)
-    for place in places:
-        total += padded[place]
+    for rows in windows:
+        total += padded[rows]
     return np.asarray(total)
 
 
 def neighbour_rows(grid: Grid, cells: Ints, radius: int) -> list[Ints]:
-    """Per offset the row of each cell's neighbour in ``cells`` (n,) itself; -1 for none."""
+    """Per offset within ``radius`` the row in ``cells`` (n,) of each cell's neighbour; -1: none."""
     row = np.full(grid.shape[0] * grid.shape[1] + 1, -1, dtype=np.int32)
     row[cells] = np.arange(len(cells), dtype=np.int32)
     size = grid.shape[0] * grid.shape[1]

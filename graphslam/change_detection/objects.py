@@ -1,4 +1,4 @@
-"""Changes out of regions: what vanished, what appeared, and what is one thing that moved."""
+"""Changes from regions: what vanished, what appeared, and which pairs are one moved object."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -14,30 +14,28 @@ from graphslam.change_detection.shapes import (
     MotionSettings,
     Shape,
     is_straight,
-    moved_points,
     near_segment,
 )
 from graphslam.change_detection.visit import pose_to_dict
-from graphslam.core.geometry import Array, inverse
+from graphslam.core.geometry import Array, inverse, transform
 
 Kind = Literal["appeared", "vanished", "moved"]
 #: ids and ends (2, 2), m, of line landmarks in the reference's frame
 Lines = list[tuple[int, Array]]
 
-#: a region is a part of what is this near to most of it, m
-_AT_SEGMENT_M = 0.08
-_LINE_SAMPLES = 40  # points of a line that are asked for whether they lie on what changed
+#: points within this distance, m, of a segment or region lie on it
+_NEAR_M = 0.08
+_LINE_SAMPLES = 40  # points of a line that are tested for lying on changed regions
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Change:
     """One change, in the reference's world frame.
 
-    ``polygon`` (c, 2) m counter-clockwise: of the new place, of the old one if it vanished;
-    ``before`` the old place of what moved, where it was seen. ``displacement`` is the rigid motion
-    of the world that takes it from the old to the new place. ``lines_before`` and ``lines_now`` are
-    ids of line landmarks of either map most of which is what changed: walls that were removed,
-    added or moved.
+    ``polygon`` (c, 2) m, counter-clockwise: the new outline, or the old one if it vanished;
+    ``before``: the old outline of what moved, if observed. ``displacement``: the rigid motion of
+    the world from the old to the new pose. ``lines_before``, ``lines_now``: ids of line landmarks
+    of either map that lie mostly on the change: walls that were removed, added or moved.
     """
 
     kind: Kind
@@ -67,8 +65,8 @@ class Change:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pair:
-    """Vanished ``old`` and appeared ``new``, numbers of regions, that are one thing; its way."""
+class MoveHypothesis:
+    """Vanished ``old`` and appeared ``new`` regions (indices) may be one object that moved."""
 
     old: list[int]
     new: list[int]
@@ -76,18 +74,18 @@ class Pair:
 
 
 def match_shapes(
-    before: list[Shape | None], after: list[Shape | None], known: MotionSettings
-) -> tuple[list[Pair], list[Pair]]:
-    """Pairs of like shape, the most alike first; those with corners, and straight ones."""
+    before: list[Shape | None], after: list[Shape | None], settings: MotionSettings
+) -> tuple[list[MoveHypothesis], list[MoveHypothesis]]:
+    """Pairs of similar shapes, the most similar first: those with corners, and straight ones."""
     found = []
     for i, a in enumerate(before):
         for j, b in enumerate(after):
-            fit = None if a is None or b is None else motion_between(a, b, known)
+            fit = None if a is None or b is None else motion_between(a, b, settings)
             if fit is not None and a is not None:
                 found.append((-fit[0], i, j, is_straight(a), fit[1]))
     found.sort(key=lambda fit: fit[:3])
     cornered, straight = (
-        [Pair([i], [j], motion) for _, i, j, flat, motion in found if flat == kind]
+        [MoveHypothesis([i], [j], motion) for _, i, j, flat, motion in found if flat == kind]
         for kind in (False, True)
     )
     return cornered, straight
@@ -95,12 +93,12 @@ def match_shapes(
 
 def match_segments(
     vanished: list[Region], appeared: list[Region], moves: list[tuple[Array, Array, Displacement]]
-) -> list[Pair]:
-    """Regions along lines of the maps that moved; of each its ends before and now, (2, 2) m."""
+) -> list[MoveHypothesis]:
+    """Regions along line landmarks that moved; ``moves``: see `wall_motion.segment_motions`."""
     return [
-        Pair(
-            [i for i, r in enumerate(vanished) if _mostly_at(r, before)],
-            [j for j, r in enumerate(appeared) if _mostly_at(r, now)],
+        MoveHypothesis(
+            [i for i, r in enumerate(vanished) if _mostly_on_segment(r, before)],
+            [j for j, r in enumerate(appeared) if _mostly_on_segment(r, now)],
             motion,
         )
         for before, now, motion in moves
@@ -110,35 +108,42 @@ def match_segments(
 def assemble_changes(
     vanished: list[Region],
     appeared: list[Region],
-    fits: tuple[list[Pair], list[Pair]],
-    stretches: list[Pair],
+    fits: tuple[list[MoveHypothesis], list[MoveHypothesis]],
+    segments: list[MoveHypothesis],
     lines: tuple[Lines, Lines],
 ) -> tuple[Change, ...]:
-    """Regions as changes; what moved once instead of twice.
+    """Changes from regions; an object that moved is one change instead of two.
 
-    Shapes with corners say most about what is which, then lines of both maps (of a box they
-    may be opposite sides), then other straight shapes.
+    Shapes with corners are the least ambiguous, then lines of both maps (of a box they may be
+    opposite sides), then other straight shapes.
+
+    Args:
+        vanished: regions of the reference.
+        appeared: regions of the later visit.
+        fits: pairs of shapes, see `match_shapes`.
+        segments: see `match_segments`.
+        lines: line landmarks of both maps.
     """
     found: list[Change] = []
     old_left, new_left = set(range(len(vanished))), set(range(len(appeared)))
-    for pairs, needs_both in ((fits[0], True), (stretches, False), (fits[1], True)):
+    for pairs, needs_both in ((fits[0], True), (segments, False), (fits[1], True)):
         for pair in pairs:
             old = [i for i in pair.old if i in old_left]
             new = [j for j in pair.new if j in new_left]
             if not (old and new if needs_both else old or new):
                 continue
-            # other parts of the same thing: the motion brings them onto it
-            there = [vanished[i].points for i in old]
-            here = [appeared[j].points for j in new]
-            back = Displacement(inverse(pair.motion.motion), pair.motion.cov)
+            # other parts of the same object: the motion brings them onto it
+            before = [vanished[i].points for i in old]
+            after = [appeared[j].points for j in new]
+            motion = pair.motion.motion
             if old and new:
                 old += [
                     i for i in sorted(old_left - set(old))
-                    if _lands(moved_points(vanished[i].points, pair.motion), here)
+                    if _mostly_near(transform(motion, vanished[i].points), after)
                 ]  # fmt: skip
                 new += [
                     j for j in sorted(new_left - set(new))
-                    if _lands(moved_points(appeared[j].points, back), there)
+                    if _mostly_near(transform(inverse(motion), appeared[j].points), before)
                 ]  # fmt: skip
             parts = [appeared[j] for j in new] or [vanished[i] for i in old]
             change = _moved(parts, [vanished[i] for i in old] if new else [], pair.motion)
@@ -163,24 +168,26 @@ def assemble_changes(
 
 
 def _lines_on(lines: Lines, regions: list[Region]) -> tuple[int, ...]:
-    """Ids of lines most of whose length lies on regions."""
+    """Ids of the lines that lie on regions for most of their length."""
     if not regions:
         return ()
     points = [region.points for region in regions]
     steps = np.linspace(0, 1, _LINE_SAMPLES)[:, None]
     return tuple(
-        number for number, ends in lines if _lands(ends[0] + steps * (ends[1] - ends[0]), points)
+        number
+        for number, ends in lines
+        if _mostly_near(ends[0] + steps * (ends[1] - ends[0]), points)
     )
 
 
-def _lands(points: Array, parts: list[Array]) -> bool:
-    """Whether most points (k, 2) m lie at some of the parts (n, 2) m."""
+def _mostly_near(points: Array, parts: list[Array]) -> bool:
+    """Whether most points (k, 2) m lie near points (n, 2) m of the parts."""
     away = cKDTree(np.concatenate(parts)).query(points)[0]
-    return bool((away < _AT_SEGMENT_M).mean() > 0.5)
+    return bool((away < _NEAR_M).mean() > 0.5)
 
 
-def _mostly_at(region: Region, ends: Array) -> bool:
-    return len(near_segment(region.points, ends, _AT_SEGMENT_M)) > 0.5 * len(region.points)
+def _mostly_on_segment(region: Region, ends: Array) -> bool:
+    return len(near_segment(region.points, ends, _NEAR_M)) > 0.5 * len(region.points)
 
 
 def _moved(new: list[Region], old: list[Region], motion: Displacement) -> Change:

@@ -1,4 +1,4 @@
-"""From flagged pieces of surface to changes: connected, long enough, certain enough, outlined."""
+"""Connected regions of flagged pieces that are large and significant enough, with outlines."""
 
 from dataclasses import dataclass
 
@@ -13,84 +13,83 @@ from graphslam.change_detection.visit import Bools, Ints
 from graphslam.core.config import ChangesConfig
 from graphslam.core.geometry import Array
 
-#: pieces closer than this many cells belong to one change
+#: pieces closer than this many cells belong to one region
 _JOIN_CELLS = 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Region:
-    """A connected stretch of changed surface.
+    """A connected region of changed surface.
 
-    ``rows`` (k,) of the pieces, ``points`` (k, 2) m and ``normals`` (k, 2) of them, ``offset_m``
-    by how much the other visit's beams went past it (cut off at the gate), ``outline`` (c, 2) m
-    counter-clockwise.
+    ``rows`` (k,) of the pieces and their ``points`` (k, 2) m; ``outline`` (c, 2) m, a
+    counter-clockwise polygon; ``probability`` that it is a change; ``beams``: number of later beams
+    that observed it, ``first_ns`` the first one's stamp.
     """
 
     rows: Ints
     points: Array
-    normals: Array
-    offset_m: float
     outline: Array
     probability: float
     beams: int
     first_ns: int
 
 
-def flag_pieces(evidence: Evidence, spread: float, rate: float) -> Bools:
-    """Pieces (n,) that beams go past: one-sided, ``rate`` of those that did not change."""
-    return np.asarray(evidence.scores(spread) > norm.isf(rate))
+def flag_pieces(evidence: Evidence, sigma: float, rate: float) -> Bools:
+    """Which pieces (n,) a one-sided test of false-alarm ``rate`` rejects as unchanged.
+
+    ``sigma``: see `graphslam.change_detection.beam_evidence.null_sigma`.
+    """
+    return np.asarray(evidence.scores(sigma) > norm.isf(rate))
 
 
 def find_regions(
     surface: Surface,
     evidence: Evidence,
-    told_by: Ints,
-    told_rows: Ints,
+    beams: Ints,
+    beam_rows: Ints,
     first_ns: Ints,
-    spread: float,
+    sigma: float,
     config: ChangesConfig,
 ) -> list[Region]:
-    """The changes among the pieces of one visit's surfaces.
+    """The regions of one visit's surfaces that changed.
 
-    A region needs `min_length_m` of pieces that no run without a change would show more often
-    than `run_false_alarm_rate`: there are many places in a run to be wrong about.
+    A region needs `min_length_m` of pieces whose scores a run without changes shows anywhere with a
+    probability of at most `run_false_alarm_rate`: the tests of a run are many (Bonferroni).
 
     Args:
         surface: pieces.
-        evidence: what the other visit's beams say about them.
-        told_by: (p,) later beams that tell, with ``told_rows`` (p,) their pieces.
-        told_rows: see above.
-        first_ns: (n,) when a piece was first told of by the later visit.
-        spread: see `graphslam.change_detection.beam_evidence.null_sigma`.
+        evidence: of the other visit's beams on them.
+        beams: (p,) later beams that observed pieces, with ``beam_rows`` (p,) the pieces.
+        beam_rows: see above.
+        first_ns: (n,) stamp at which the later visit first observed a piece.
+        sigma: see `graphslam.change_detection.beam_evidence.null_sigma`.
         config: settings.
     """
-    # stated sigmas are a bound here: what is reported must be sure
-    grid, scores = surface.nearest.grid, evidence.scores(max(spread, 1.0))
-    # windows overlap, so neighbours repeat each other
-    places = max(int(evidence.tested.sum()) / (2 * WINDOW + 1), 1.0)
-    sure = norm.isf(0.5 * config.run_false_alarm_rate / places)
+    # not less than the stated sigmas: what is reported must be certain
+    grid, scores = surface.nearest.grid, evidence.scores(max(sigma, 1.0))
+    # windows overlap, so neighbours are not independent tests
+    tests = max(int(evidence.tested.sum()) / (2 * WINDOW + 1), 1.0)
+    significant = norm.isf(0.5 * config.run_false_alarm_rate / tests)
     enough = max(int(np.ceil(config.min_length_m / grid.cell_m)), 1)
-    rows = np.nonzero(flag_pieces(evidence, spread, config.false_alarm_rate / 2))[0]
+    rows = np.nonzero(flag_pieces(evidence, sigma, config.false_alarm_rate / 2))[0]
     label = connected_components(grid, surface.cells[rows])
     found = []
     for number in range(1, int(label.max(initial=0)) + 1):
         members = rows[label == number]
         strongest = np.sort(scores[members])[::-1]
-        if len(members) < enough or strongest[enough - 1] < sure:
+        if len(members) < enough or strongest[enough - 1] < significant:
             continue
-        beams = len(np.unique(told_by[np.isin(told_rows, members)]))
-        if beams < config.min_beams:
+        count = len(np.unique(beams[np.isin(beam_rows, members)]))
+        if count < config.min_beams:
             continue
-        expected = places * norm.sf(min(float(strongest[enough - 1]), 30.0))
+        expected = tests * norm.sf(min(float(strongest[enough - 1]), 30.0))
         found.append(
             Region(
                 members,
                 surface.points[members],
-                surface.normals[members],
-                float(np.average(evidence.offset[members])),
                 outline(grid, surface.cells[members]),
                 float(1 / (1 + expected)),
-                beams,
+                count,
                 int(first_ns[members].min()),
             )
         )
@@ -98,7 +97,7 @@ def find_regions(
 
 
 def connected_components(grid: Grid, cells: Ints, join_cells: int = _JOIN_CELLS) -> Ints:
-    """Label (k,) from 1 of the cluster of each cell (k,); gaps up to ``join_cells`` are closed."""
+    """Labels (k,) from 1 of the clusters of cells (k,); gaps up to ``join_cells`` are bridged."""
     if not len(cells):
         return np.zeros(0, dtype=np.int64)
     mask = np.zeros(grid.shape, dtype=np.uint8)
@@ -109,11 +108,11 @@ def connected_components(grid: Grid, cells: Ints, join_cells: int = _JOIN_CELLS)
 
 
 def outline(grid: Grid, cells: Ints) -> Array:
-    """Counter-clockwise polygon (c, 2) m around cells (k,), closed over gaps between them."""
+    """Counter-clockwise polygon (c, 2) m around cells (k,), with the gaps between them closed."""
     ij = np.column_stack(np.divmod(cells, grid.shape[1]))
     pad = _JOIN_CELLS + 2
     low = ij.min(axis=0) - pad
-    scale = 2  # half cells: the outline may run along edges of cells
+    scale = 2  # half cells: the outline may follow the edges of cells
     size = (ij.max(axis=0) - low + pad + 1) * scale
     mask = np.zeros(size, dtype=np.uint8)
     at = (ij - low) * scale
@@ -122,7 +121,7 @@ def outline(grid: Grid, cells: Ints) -> Array:
             mask[at[:, 0] + di, at[:, 1] + dj] = 1
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (4 * _JOIN_CELLS - 1,) * 2)
     mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, disk)
-    # half a cell wider: the returns of a piece lie on both sides of it
+    # half a cell larger: the returns of a piece lie on both sides of it
     mask = cv2.dilate(mask, np.ones((3, 3), dtype=np.uint8))
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     largest = max(contours, key=cv2.contourArea)
@@ -132,7 +131,7 @@ def outline(grid: Grid, cells: Ints) -> Array:
 
 
 def counter_clockwise(polygon: Array) -> Array:
-    """A polygon (c, 2) m with its area on the left."""
+    """The polygon (c, 2) m, reversed if it is clockwise."""
     x, y = polygon.T
     doubled = float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
     return np.asarray(polygon if doubled > 0 else polygon[::-1])

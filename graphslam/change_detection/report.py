@@ -1,18 +1,19 @@
 # ruff: noqa: RUF001 -- σ is meant: people read it
-"""From a comparison to its page: what is drawn, and the numbers beside it."""
+"""The report of a comparison: the contents of its pictures, tiles and tables."""
 
 from dataclasses import asdict
 
 import numpy as np
 
 from graphslam.change_detection.detect import ChangeResult
-from graphslam.change_detection.shapes import Displacement, moved_points
+from graphslam.change_detection.shapes import Displacement
 from graphslam.change_detection.visit import Bools, Visit
 from graphslam.core.config import ChangesConfig
-from graphslam.core.geometry import Array, rotation
+from graphslam.core.geometry import Array, inverse, transform
 
-#: squares of the picture of what was not seen, and scans that it is made of at most
-_SQUARE_M, _SQUARES, _SCANS = 0.1, 400, 300
+#: the picture of the observed area: least size of its squares, m; most squares of a side; most
+#: scans that are used
+_SQUARE_M, _MAX_SQUARES, _MAX_SCANS = 0.1, 400, 300
 
 
 def render_changes(
@@ -27,15 +28,14 @@ def render_changes(
     low, high = np.quantile(every, [0.002, 0.998], axis=0)
     margin = 0.04 * float((high - low).max())
     limits = np.column_stack([low - margin, high + margin])
-    square = max(_SQUARE_M, float((limits[:, 1] - limits[:, 0]).max()) / _SQUARES)
-    unseen = ~(_seen(found.reference, limits, square) & _seen(found.later, limits, square))
+    square = max(_SQUARE_M, float((limits[:, 1] - limits[:, 0]).max()) / _MAX_SQUARES)
+    unseen = ~(_observed(found.reference, limits, square) & _observed(found.later, limits, square))
     start = found.later.stamps_ns.min()
     marks = []
     for change in found.changes:
-        moved = (
-            None if change.displacement is None else _at_middle(change.polygon, change.displacement)
-        )
-        motion, sigmas = (None, None) if moved is None else moved
+        motion, sigmas = None, None
+        if change.displacement is not None:
+            motion, sigmas = _motion_of_middle(change.polygon, change.displacement)
         marks.append(
             Mark(
                 change.kind, change.polygon, change.before, motion, sigmas, change.probability,
@@ -51,40 +51,39 @@ def render_changes(
         "false alarms asked for": f"{100 * found.rate:g} %",
         "landmarks in common": str(len(found.registration.matched)),
         "registration σ": f"{1000 * max(sigma[:2]):.1f} mm, {np.degrees(sigma[2]):.2f}°",
-        "range noise σ": f"{1000 * found.range_sigma_m[1]:.1f} mm",
+        "range noise σ": f"{1000 * found.range_sigmas_m[1]:.1f} mm",
     }
     scores = [e.scores(1.0)[e.tested] for e in found.evidence]
     settings = "\n".join(f"changes.{key} = {value}" for key, value in asdict(config).items())
     return changes_page(
         ChangesPicture(
             names, reference, later, unseen, limits, tuple(marks), np.concatenate(scores),
-            found.spread, facts, settings, found.warnings,
+            found.null_sigma, facts, settings, found.warnings,
         )
     )  # fmt: skip
 
 
-def _at_middle(polygon: Array, by: Displacement) -> tuple[Array, Array]:
-    """How far the middle of a polygon moved, and sigmas: that of the world's origin says little.
+def _motion_of_middle(polygon: Array, by: Displacement) -> tuple[Array, Array]:
+    """Shift and rotation (3,) m, rad, of the middle of a polygon, and their sigmas (3,).
+
+    Those of the world's origin would depend on its distance.
 
     Args:
-        polygon: (c, 2) m, the new place.
+        polygon: (c, 2) m, the new outline.
         by: the motion of the world.
-
-    Returns:
-        Shift and turn (3,) m, rad, and their sigmas (3,).
     """
-    arm = polygon.mean(axis=0) - by.motion[:2]
-    was = arm @ rotation(by.motion[2])
-    shift = moved_points(was[None], by)[0] - was
+    middle = polygon.mean(axis=0)
+    arm = middle - by.motion[:2]
+    shift = middle - transform(inverse(by.motion), middle[None])[0]
     J = np.array([[1, 0, -arm[1]], [0, 1, arm[0]], [0, 0, 1.0]])
     return np.array([*shift, by.motion[2]]), np.sqrt(np.diag(J @ by.cov @ J.T))
 
 
-def _seen(visit: Visit, limits: Array, square_m: float) -> Bools:
-    """Squares (columns, rows) of ``limits`` that some beam of a visit reached or crossed."""
+def _observed(visit: Visit, limits: Array, square_m: float) -> Bools:
+    """Which squares (columns, rows) of ``limits`` beams of a visit crossed or ended in."""
     shape = np.ceil((limits[:, 1] - limits[:, 0]) / square_m).astype(int)
-    seen = np.zeros(shape, dtype=bool)
-    every = max(1, len(visit.poses) // _SCANS)
+    observed = np.zeros(shape, dtype=bool)
+    every = max(1, len(visit.poses) // _MAX_SCANS)
     used = np.isfinite(visit.range_m) & (visit.scan % every == 0)
     origin, d = visit.poses[visit.scan[used], :2], visit.directions[used]
     end = visit.range_m[used]
@@ -93,5 +92,5 @@ def _seen(visit: Visit, limits: Array, square_m: float) -> Bools:
         on = r <= end
         ij = np.floor((origin[on] + r * d[on] - limits[:, 0]) / square_m).astype(int)
         ij = ij[((ij >= 0) & (ij < shape)).all(axis=1)]
-        seen[ij[:, 0], ij[:, 1]] = True
-    return seen
+        observed[ij[:, 0], ij[:, 1]] = True
+    return observed

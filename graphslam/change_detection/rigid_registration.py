@@ -1,40 +1,49 @@
-"""Where the later run's world frame lies in that of the reference: from landmarks of both.
+"""Rigid registration of the later run's world frame in the reference's, by landmarks of both.
 
-Hypotheses come from pairs: two crossing lines, or two points, that look the same in both maps fix a
-rigid motion. Motions vote; the best are refined by weighted least squares with a redescending
-weight, so that landmarks that moved have no say, and the one that explains most wins.
+Two crossing lines, or two points, that are congruent in both maps determine a rigid motion. These
+motions vote; the best candidates are refined by least squares with a redescending weight, which
+suppresses landmarks that moved, and the one that explains most landmarks wins.
+
+The fit is not `core.consistency.fit_rigid_transform`: lines are among the landmarks, and every
+landmark has a full covariance of its own.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
 from graphslam.change_detection.visit import Bools, Ints
+from graphslam.core.config import FrontEndConfig
 from graphslam.core.errors import OutputError
-from graphslam.core.geometry import Array, rotation, transform, unit_vectors, wrap
+from graphslam.core.gaussian import chi2_quantile
+from graphslam.core.geometry import Array, compose, rotation, transform, unit_vectors, wrap
 from graphslam.core.records import Landmark
 
-#: lines are taken to cross if their directions differ by more than this
+#: least angle between two lines whose intersection is used, rad
 _CROSSING_RAD = 0.35
-#: how far the two visits may differ in what pairs they compare
+#: tolerances of congruent pairs: angle between two lines, rad; distance of two points, m
 _ANGLE_RAD, _LENGTH_M = 0.06, 0.15
-#: bins of the vote
-_BIN = np.array([0.3, 0.3, 0.06])
+#: bins of the vote, m, m, rad: twice the distance tolerance, the angle tolerance
+_BIN = np.array([2 * _LENGTH_M, 2 * _LENGTH_M, _ANGLE_RAD])
 _CANDIDATES = 12
-#: what landmark maps leave out: flatness, association, sharpness
-_FLOOR_RAD, _FLOOR_M = 0.005, 0.01
-_GATE = float(chi2.ppf(0.999, 2))
+#: errors of landmarks beside their covariances (flatness, association): the front end's floors
+_FLOOR_RAD, _FLOOR_M = FrontEndConfig.floor_angle_rad, FrontEndConfig.floor_normal_m
+_GATE = float(chi2_quantile(0.999, 2))
+#: pairs of landmarks of one map, at most: those of the longest lines where there are more
 _MAX_PAIRS = 2500
+#: factors on the gates of the matching, one per iteration of the refinement
+_SLACKS = (8.0, 4.0, 2.0, 1.0, 1.0, 1.0)
+#: least information of a registration: no direction may be known worse than to 0.1 m or 0.1 rad
+_MIN_INFORMATION = 1e2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration:
     """Pose (3,) of the later world frame in the reference's, with covariance (3, 3).
 
-    ``matched`` (k, 2) are indices of landmarks (reference, later) that agree; ``moved`` indices of
-    later landmarks that lie where the reference has none.
+    ``matched`` (k, 2): indices of landmarks (reference, later) that agree; ``moved``: indices of
+    later landmarks without a match.
     """
 
     pose: Array
@@ -75,8 +84,8 @@ def register(reference: Sequence[Landmark], later: Sequence[Landmark]) -> Regist
     """
     a, b = (_lines(reference), _points(reference)), (_lines(later), _points(later))
     best: tuple[float, Registration] | None = None
-    for guess in guesses(reference, later):
-        refined = _refine(guess, a, b)
+    for candidate in candidate_motions(reference, later):
+        refined = _refine(candidate, a, b)
         if refined is not None and (best is None or refined[0] > best[0]):
             best = refined
     if best is None:
@@ -87,10 +96,12 @@ def register(reference: Sequence[Landmark], later: Sequence[Landmark]) -> Regist
     return best[1]
 
 
-def guesses(reference: Sequence[Landmark], later: Sequence[Landmark]) -> list[Array]:
-    """Poses (3,) of the later frame that most pairs of landmarks vote for."""
+def candidate_motions(reference: Sequence[Landmark], later: Sequence[Landmark]) -> list[Array]:
+    """Poses (3,) of the later frame with the most votes of pairs of landmarks."""
     a, b = (_lines(reference), _points(reference)), (_lines(later), _points(later))
-    return _peaks(np.concatenate([_from_lines(a[0], b[0]), _from_points(a[1], b[1])]))
+    return _vote_peaks(
+        np.concatenate([_motions_of_lines(a[0], b[0]), _motions_of_points(a[1], b[1])])
+    )
 
 
 def _lines(landmarks: Sequence[Landmark]) -> _Lines:
@@ -114,7 +125,7 @@ def _points(landmarks: Sequence[Landmark]) -> _Points:
 
 
 def _pairs(n: int, weight: Array) -> tuple[Ints, Ints]:
-    """Ordered pairs of different things, those of the strongest first where they are many."""
+    """Ordered pairs of different indices below n; of many only those of the largest weights."""
     limit = int(np.sqrt(_MAX_PAIRS))
     chosen = np.argsort(-weight, kind="stable")[: limit if n > limit else n]
     i, j = np.meshgrid(chosen, chosen, indexing="ij")
@@ -122,8 +133,8 @@ def _pairs(n: int, weight: Array) -> tuple[Ints, Ints]:
     return i[different], j[different]
 
 
-def _from_lines(a: _Lines, b: _Lines) -> Array:
-    """Motions (k, 3) that bring two crossing lines of b onto two of a."""
+def _motions_of_lines(a: _Lines, b: _Lines) -> Array:
+    """Motions (k, 3) that bring two crossing lines of b onto two of a, for all congruent pairs."""
     parts = []
     for m in (a, b):
         length = np.hypot(*(m.ends[:, 1] - m.ends[:, 0]).T) if len(m.index) else np.zeros(0)
@@ -137,32 +148,31 @@ def _from_lines(a: _Lines, b: _Lines) -> Array:
         parts.append((m.normal[i], angle, at))
     (normal_a, angle_a, at_a), (normal_b, angle_b, at_b) = parts
     p, q = np.nonzero(np.abs(wrap(angle_a[:, None] - angle_b[None, :])) < _ANGLE_RAD)
-    # the mean over both lines: half of the difference of the angles goes to each
+    # the mean over both lines: each gets half of the difference of the angles
     phi = wrap(normal_a[p] - normal_b[q] + wrap(angle_a[p] - angle_b[q]) / 2)
     return _motions(phi, at_a[p], at_b[q])
 
 
-def _from_points(a: _Points, b: _Points) -> Array:
-    """Motions (k, 3) that bring two points of b onto two of a."""
+def _motions_of_points(a: _Points, b: _Points) -> Array:
+    """Motions (k, 3) that bring two points of b onto two of a, for all congruent pairs."""
     parts = []
     for m in (a, b):
         i, j = _pairs(len(m.index), np.ones(len(m.index)))
         d = m.xy[j] - m.xy[i]
         parts.append(((m.xy[i] + m.xy[j]) / 2, np.hypot(*d.T), np.arctan2(d[:, 1], d[:, 0])))
-    (mid_a, long_a, way_a), (mid_b, long_b, way_b) = parts
-    p, q = np.nonzero(np.abs(long_a[:, None] - long_b[None, :]) < _LENGTH_M)
-    return _motions(wrap(way_a[p] - way_b[q]), mid_a[p], mid_b[q])
+    (middle_a, length_a, angle_a), (middle_b, length_b, angle_b) = parts
+    p, q = np.nonzero(np.abs(length_a[:, None] - length_b[None, :]) < _LENGTH_M)
+    return _motions(wrap(angle_a[p] - angle_b[q]), middle_a[p], middle_b[q])
 
 
 def _motions(phi: Array, to: Array, start: Array) -> Array:
-    """Motions (k, 3) that turn by ``phi`` and bring ``start`` (k, 2) to ``to`` (k, 2)."""
-    c, s = np.cos(phi), np.sin(phi)
-    turned = np.column_stack([c * start[:, 0] - s * start[:, 1], s * start[:, 0] + c * start[:, 1]])
-    return np.column_stack([to - turned, phi])
+    """Motions (k, 3) that turn by ``phi`` (k,) and bring ``start`` (k, 2) to ``to`` (k, 2)."""
+    zero = np.zeros(len(phi))
+    return compose(np.column_stack([to, phi]), np.column_stack([-start, zero]))
 
 
-def _peaks(votes: Array) -> list[Array]:
-    """Centres of the fullest bins; bins are laid twice, shifted by half, so none cuts a peak."""
+def _vote_peaks(votes: Array) -> list[Array]:
+    """Medians (3,) of the fullest bins, of two grids shifted by half a bin so none cuts a peak."""
     found = []
     for shift in (0.0, 0.5):
         if not len(votes):
@@ -178,10 +188,10 @@ def _peaks(votes: Array) -> list[Array]:
 def _refine(
     pose: Array, a: tuple[_Lines, _Points], b: tuple[_Lines, _Points]
 ) -> tuple[float, Registration] | None:
-    """Least squares over matched landmarks, matched anew each round; its score is what agrees."""
+    """Iterated matching and least squares; the score is the matched length, None if ambiguous."""
     cov: Array = np.eye(3)
     pairs, score = np.zeros((0, 2), dtype=np.int64), 0.0
-    for slack in (8.0, 4.0, 2.0, 1.0, 1.0, 1.0):
+    for slack in _SLACKS:
         line_pairs, line_rows = _match_lines(pose, a[0], b[0], slack)
         point_pairs, point_rows = _match_points(pose, a[1], b[1], slack)
         pairs = np.concatenate([line_pairs, point_pairs])
@@ -190,12 +200,12 @@ def _refine(
         for r, H, S, size in (line_rows, point_rows):
             W = np.linalg.inv(S)
             d2 = np.einsum("ni,nij,nj->n", r, W, r)
-            weight = 1 / (1 + d2 / 4) ** 2  # Geman-McClure: what is far off has no say
+            weight = 1 / (1 + d2 / 4) ** 2  # Geman-McClure: suppresses outliers
             information += np.einsum("n,nia,nij,njb->ab", weight, H, W, H)
             gradient += np.einsum("n,nia,nij,nj->a", weight, H, W, r)
-            # what agrees counts, not how well: a lucky few must not outweigh many
+            # what agrees counts, hardly how well: a few exact ones must not outweigh many
             score += float((size * np.maximum(1 - d2 / (2 * _GATE), 0.0)).sum())
-        if np.linalg.eigvalsh(information)[0] < 1e2:  # a direction known worse than to 0.1 m, rad
+        if np.linalg.eigvalsh(information)[0] < _MIN_INFORMATION:
             return None
         cov = np.asarray(np.linalg.inv(information), dtype=float)
         step = cov @ gradient
@@ -213,8 +223,8 @@ _Rows = tuple[Array, Array, Array, Array]
 def _match_lines(pose: Array, a: _Lines, b: _Lines, slack: float) -> tuple[Ints, _Rows]:
     """Pairs (k, 2) of landmark indices that agree, and (residual, Jacobian, covariance, length).
 
-    The residual is a's direction and offset minus b's after the motion, the offset taken where
-    b's middle lands: at the origin it would hang on the direction by a long lever.
+    The residual is a's direction and offset minus b's after the motion, the offset at b's middle:
+    at the origin a long lever would correlate it with the direction.
     """
     x, y = pose[:2]
     normal = b.normal + pose[2]
@@ -231,7 +241,7 @@ def _match_lines(pose: Array, a: _Lines, b: _Lines, slack: float) -> tuple[Ints,
     r = np.column_stack([angle, across])
     lever_a = np.einsum("ni,ni->n", ta, middle[j])
     lever_b = np.einsum("ni,ni->n", t[j], middle[j] - np.array([x, y]))
-    S = _carried(a.cov[i], lever_a) + _carried(b.cov[j], lever_b)
+    S = _cov_at(a.cov[i], lever_a) + _cov_at(b.cov[j], lever_b)
     S += np.diag([_FLOOR_RAD**2, _FLOOR_M**2])
     # d(predicted)/d(pose): direction by phi; the middle moves with the frame
     H = np.zeros((len(i), 2, 3))
@@ -248,7 +258,7 @@ def _match_lines(pose: Array, a: _Lines, b: _Lines, slack: float) -> tuple[Ints,
     return pairs, (r[keep], H[keep], S[keep], size)
 
 
-def _carried(cov: Array, lever: Array) -> Array:
+def _cov_at(cov: Array, lever: Array) -> Array:
     """Covariance (n, 2, 2) of (direction, distance to a point at ``lever`` (n,) m along the line).
 
     The point's distance is offset - lever * direction.
@@ -260,14 +270,14 @@ def _carried(cov: Array, lever: Array) -> Array:
 
 
 def _overlap(a: Array, b: Array, along: Array) -> Array:
-    """Length (n,) m that extents a, b (n, 2, 2) share along directions (n, 2)."""
+    """Length (n,) m of the overlap of extents a, b (n, 2, 2) along directions (n, 2)."""
     sa = np.sort(np.einsum("nki,ni->nk", a, along), axis=1)
     sb = np.sort(np.einsum("nki,ni->nk", b, along), axis=1)
     return np.asarray(np.minimum(sa[:, 1], sb[:, 1]) - np.maximum(sa[:, 0], sb[:, 0]))
 
 
 def _match_points(pose: Array, a: _Points, b: _Points, slack: float) -> tuple[Ints, _Rows]:
-    """The same for points: the residual is the difference of positions."""
+    """As `_match_lines` for points: the residual is the difference of positions."""
     xy = transform(pose, b.xy)
     R = rotation(pose[2])
     r_all = a.xy[:, None] - xy[None]
@@ -285,7 +295,7 @@ def _match_points(pose: Array, a: _Points, b: _Points, slack: float) -> tuple[In
 
 
 def _best_of_each(j: Ints, i: Ints, d2: Array, allowed: Bools) -> Ints:
-    """Rows of the best partner of every j."""
+    """Rows of the pairs (i, j) with the least d2 for every j, among the ``allowed`` ones."""
     rows = np.nonzero(allowed)[0]
     rows = rows[np.lexsort((i[rows], d2[rows], j[rows]))]
     first = np.ones(len(rows), dtype=bool)

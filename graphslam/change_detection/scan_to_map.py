@@ -1,8 +1,8 @@
-"""Each scan's pose by the surfaces it sees, within what its covariance allows.
+"""Scan-to-map alignment: each scan's pose from the surfaces that it observes, with a prior.
 
-The pose error is shared by all beams of a scan. Its posterior given the scan's own beams is what
-is left of it, which marginalises the shared error: a beam is then judged by what the others leave
-open. The prior keeps a scan where nothing holds it, and a redescending weight keeps changes out.
+The pose error is common to all beams of a scan. Its posterior given the scan's own beams
+marginalises it: a beam is then judged by the uncertainty that the other beams leave. The prior
+holds a scan where no surface constrains it; a redescending weight suppresses changes.
 """
 
 from dataclasses import replace
@@ -20,23 +20,23 @@ from graphslam.perception.point_to_line import (
     step_poses,
 )
 
-#: noise of a beam against a surface beside its own, m: neighbouring beams share the surface's
-#: error, so they must not count as independent without end
-_LEAST_SIGMA_M = 0.008
-#: beams per scan that are enough to place it
+#: sigma of a beam against a surface beside the surface's own noise, m: neighbouring beams share the
+#: surface's error, so their information must not grow without bound
+_MIN_SIGMA_M = 0.008
+#: number of beams per scan that suffices to estimate its pose
 _BEAMS = 150
 
 
 def align_scans(
     visit: Visit, surface: Surface, gates_m: tuple[float, ...], changed: Bools | None = None
 ) -> Visit:
-    """The visit with poses and covariances that agree with a surface map.
+    """The visit with poses and covariances updated by alignment with a surface map.
 
     Args:
-        visit: scans in the frame of the surfaces, covariances as known so far.
-        surface: what to agree with.
-        gates_m: farthest a return may lie from its surface to count, one per iteration.
-        changed: (n,) beams that have no say, as they are known to have met what changed.
+        visit: scans in the frame of the surfaces, with their prior covariances.
+        surface: the surface map.
+        gates_m: largest distance of a return from its surface, one per iteration.
+        changed: (n,) beams to leave out, as they hit something that changed.
     """
     usable = visit.surface if changed is None else visit.surface & ~changed
     beams = np.nonzero(usable)[0]
@@ -51,47 +51,47 @@ def align_scans(
         right = right + np.einsum("nij,nj->ni", prior, away)
         step = np.einsum("nij,nj->ni", covs, right)
         now = replace(now, poses=step_poses(now.poses, step))
-    # the error is P prior⁻¹ (error of the prior) + (a part of this scan's noise): the first may be
-    # common to all scans, and has the covariance P prior⁻¹ P
+    # the error is P prior⁻¹ (error of the prior) + (a part due to this scan's noise): the first may
+    # be common to all scans; its covariance is P prior⁻¹ P
     return replace(now, covs=covs, shared=covs @ prior @ covs)
 
 
 def scan_normal_equations(
     visit: Visit, surface: Surface, beams: Ints, gate_m: float
 ) -> tuple[Array, Array]:
-    """How beams pull their scans' poses onto a surface map: normal equations per scan.
+    """Normal equations of point-to-line alignment with a surface map, per scan.
 
     Args:
         visit: scans in the frame of the surfaces.
-        surface: what to agree with.
-        beams: (k,) which have a say.
-        gate_m: farthest a return may lie from its surface to count.
+        surface: the surface map.
+        beams: (k,) beams to use.
+        gate_m: largest distance of a return from its surface.
 
     Returns:
-        Information (s, 3, 3) and right-hand side (s, 3); the step is the solution of both.
+        Information (s, 3, 3) and right-hand side (s, 3).
     """
     ends, size = visit.ends[beams], len(visit.poses)
     row, e, found = surface_offsets(surface, ends, gate_m)
     scan = visit.scan[beams][found]
     n, arm = surface.normals[row], ends[found] - visit.poses[scan, :2]
     terms, squared = point_terms(e[:, None] * n, line_metrics(n), arm)
-    weight = redescending(squared, gate_m) / (_LEAST_SIGMA_M**2 + surface.noise[row])
+    weight = redescending(squared, gate_m) / (_MIN_SIGMA_M**2 + surface.noise[row])
     sums = np.array([np.bincount(scan, weight * t, size) for t in terms], dtype=float)
     information, gradient = normal_equations(sums)
     return information, -gradient
 
 
 def surface_offsets(surface: Surface, ends: Array, gate_m: float) -> tuple[Ints, Array, Ints]:
-    """Where points lie against the surface next to them.
+    """Distances of points from the surface next to them.
 
     Args:
         surface: pieces.
         ends: (k, 2) m.
-        gate_m: farthest from the piece.
+        gate_m: largest distance.
 
     Returns:
-        Rows (f,) of pieces and signed distances (f,) m along their normals, for those points
-        (f,) whose nearest piece is good, near enough, and not ending before them.
+        For those points whose nearest piece is good, within the gate, and beside them: rows (f,) of
+        the pieces, signed distances (f,) m along their normals, indices (f,) of the points.
     """
     grid = surface.nearest.grid
     cell = grid.cells(ends)

@@ -1,4 +1,4 @@
-"""The surfaces that a visit saw: in every cell a small straight piece with its uncertainty."""
+"""The surfaces that a visit observed: in every occupied cell a line fit with its uncertainty."""
 
 from dataclasses import dataclass
 
@@ -19,30 +19,31 @@ from graphslam.core.geometry import Array
 
 #: half width, in cells, of the window over which a piece is fitted and evidence is summed
 WINDOW = 2
-#: a piece is straight if its length exceeds its thickness by this factor (of variances)
+#: a piece is straight if its variance along the line exceeds that across it by this factor, ...
 _STRAIGHT = 4.0
-#: and if its variance is what the noise explains times this, and the spread of the estimate
+#: ... and if that across it is below this factor times what the noise explains (plus 3 sigmas of
+#: the estimated variance)
 _SLACK = 1.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """Straight pieces, one per cell in which enough returns ended.
+    """Pieces of surface: line fits, one per cell with returns.
 
     Attributes:
-        cells: (n,) flat numbers on the grid, sorted.
+        cells: (n,) flat indices on the grid, sorted.
         windows: per offset the rows of the neighbours, see `neighbour_rows`.
-        points: (n, 2) m, on the fitted line, in the cell's middle.
-        normals: (n, 2) unit vectors; their sign means nothing.
-        noise: (n,) m², variance of the returns of the window about the line.
-        offset_cov: (n,) m², of the piece's place along its normal, by white noise and by how much
-            the surface bends within the window.
-        pose_var: (n,) m², of the piece's place along its normal, by its scans' poses.
-        incidence: (n,) mean of the cosine between beam and normal.
-        returns: (n,) in the window.
-        first_ns: (n,) when it was first seen.
-        good: (n,) whether it is straight and seen often enough to be compared.
-        nearest: the nearest piece for any place.
+        points: (n, 2) m, on the fitted line, next to the cell's centre.
+        normals: (n, 2) unit vectors; the sign is arbitrary.
+        noise: (n,) m², variance of the window's returns about the line.
+        offset_cov: (n,) m², variance of the piece's position along its normal, due to white noise
+            and to the curvature of the surface within the window.
+        pose_var: (n,) m², the same due to the poses of its scans.
+        incidence: (n,) mean cosine between beam and normal.
+        returns: (n,) number in the window.
+        first_ns: (n,) stamp of the first return in the cell.
+        good: (n,) whether it is straight and observed often enough to be compared.
+        nearest: distance map of the good pieces.
         beams: (b,) for every beam of the visit the row of its piece, -1 for none.
     """
 
@@ -65,16 +66,16 @@ def fit_surfaces(visit: Visit, grid: Grid, sigma_m: float, config: ChangesConfig
     """The surfaces of a visit on a grid.
 
     Args:
-        visit: what was seen.
+        visit: in the grid's frame.
         grid: cells; only those with returns take memory.
-        sigma_m: range noise; a piece that scatters more than it explains is not straight.
+        sigma_m: range noise; a piece with more scatter than it explains is not straight.
         config: settings.
     """
     used = np.nonzero(visit.surface & (visit.range_m <= config.max_range_m))[0]
     ends = visit.ends[used]
-    place = grid.cells(ends)
-    used, ends, place = used[place >= 0], ends[place >= 0], place[place >= 0]
-    cells, row = grid.occupied(place)
+    cell = grid.cells(ends)
+    used, ends, cell = used[cell >= 0], ends[cell >= 0], cell[cell >= 0]
+    cells, row = grid.occupied(cell)
     n = len(cells)
     windows = neighbour_rows(grid, cells, WINDOW)
     local = ends - grid.centers(cells)[row]  # small numbers: no cancellation in the moments
@@ -84,12 +85,12 @@ def fit_surfaces(visit: Visit, grid: Grid, sigma_m: float, config: ChangesConfig
     m, mean, cov = _window_moments(moments, windows, grid.cell_m)
     values, vectors = np.linalg.eigh(cov)
     normals = vectors[:, :, 0]
-    # the cell's own middle, brought onto the line through the window's mean
+    # the cell's centre, projected onto the line through the window's mean
     t = np.einsum("ni,ni->n", -mean, vectors[:, :, 1])
     points = grid.centers(cells) + mean + t[:, None] * vectors[:, :, 1]
     noise = np.maximum(values[:, 0], 0.0) * m / np.maximum(m - 2, 1)
     leverage = 1 / m + t**2 / np.maximum(m * values[:, 1], 1e-12)
-    bend = 0.25 * ((WINDOW + 0.5) * grid.cell_m) ** 2 * _bending(normals, m, windows)
+    bend = 0.25 * ((WINDOW + 0.5) * grid.cell_m) ** 2 * _direction_variance(normals, m, windows)
     scans = scans_per_cell(row, visit.scan[used], len(visit.poses), n)
     scans_in_window = window_sums(scans.astype(float), windows)
     directions = visit.directions[used]
@@ -102,8 +103,8 @@ def fit_surfaces(visit: Visit, grid: Grid, sigma_m: float, config: ChangesConfig
     np.minimum.at(first, row, visit.stamps_ns[visit.scan[used]])
     expected = (sigma_m * cosine_sum / m) ** 2 + config.flatness_m**2
     expected += (own_sum + common_sum) / m
-    # The line passes through the cell. Returns that noise threw into other cells belong to the
-    # piece next to them: a piece of their own would collect what lies off the line, no more.
+    # The line must pass through the cell. Returns that noise moved into other cells belong to the
+    # piece next to them: a piece of their own would be made of outliers only.
     aside = np.einsum("ni,ni->n", mean, normals)
     crossed = np.abs(aside) <= 0.5 * grid.cell_m * np.abs(normals).sum(axis=1)
     good = (
@@ -123,12 +124,12 @@ def fit_surfaces(visit: Visit, grid: Grid, sigma_m: float, config: ChangesConfig
 
 
 def window_max(values: Ints, windows: list[Ints]) -> Array:
-    """Largest of ``values`` (n,) in each window."""
+    """Maxima (n,) of ``values`` (n,) in each window."""
     padded = np.concatenate([values, [0]])
-    return np.asarray(np.max([padded[place] for place in windows], axis=0), dtype=float)
+    return np.asarray(np.max([padded[rows] for rows in windows], axis=0), dtype=float)
 
 
-def _bending(normals: Array, weight: Array, windows: list[Ints]) -> Array:
+def _direction_variance(normals: Array, weight: Array, windows: list[Ints]) -> Array:
     """Variance (n,) rad² of the directions of the pieces in each window."""
     double = np.array([2.0]) * np.arctan2(normals[:, 1], normals[:, 0])[:, None]
     parts = weight[:, None] * np.hstack([np.cos(double), np.sin(double), np.ones_like(double)])
@@ -138,28 +139,30 @@ def _bending(normals: Array, weight: Array, windows: list[Ints]) -> Array:
 
 
 def pose_variance(visit: Visit, beams: Ints, ends: Array, normals: Array) -> tuple[Array, Array]:
-    """Variances (k,) m² of ``ends`` (k, 2) along ``normals`` (k, 2) by their scans' poses.
-
-    The first is each scan's own, the second may be common to all scans.
+    """Variances (k,) m² of ``ends`` (k, 2) along ``normals`` (k, 2) due to their scans' poses.
 
     The end of a beam moves with the laser and turns about it: J = [n, n · perp(end - laser)].
+
+    Returns:
+        The part that is independent between scans, and the part that may be common to all.
     """
     scan = visit.scan[beams]
     arm = ends - visit.poses[scan, :2]
     J = np.column_stack([normals, -normals[:, 0] * arm[:, 1] + normals[:, 1] * arm[:, 0]])
-    every = np.einsum("ni,nij,nj->n", J, visit.covs[scan], J)
-    common = np.einsum("ni,nij,nj->n", J, visit.shared[scan], J)
-    return np.maximum(every - common, 0.0), common
+    total, common = (
+        np.einsum("ni,nij,nj->n", J, covs[scan], J) for covs in (visit.covs, visit.shared)
+    )
+    return np.maximum(total - common, 0.0), common
 
 
 def _window_moments(moments: Array, windows: list[Ints], cell_m: float) -> tuple[Array, ...]:
-    """Count (n,), mean (n, 2) and covariance (n, 2, 2) over windows, about the cell's middle."""
+    """Count (n,), mean (n, 2) and covariance (n, 2, 2) over windows, about the cell's centre."""
     padded = np.concatenate([moments, np.zeros((1, 6))])
     total = np.zeros_like(moments)
     offsets = range(-WINDOW, WINDOW + 1)
     shifts = [(i * cell_m, j * cell_m) for i in offsets for j in offsets]
-    for (dx, dy), place in zip(shifts, windows, strict=True):
-        c, x, y, xx, xy, yy = padded[place].T
+    for (dx, dy), rows in zip(shifts, windows, strict=True):
+        c, x, y, xx, xy, yy = padded[rows].T
         total[:, 0] += c
         total[:, 1] += x + dx * c
         total[:, 2] += y + dy * c
@@ -175,6 +178,6 @@ def _window_moments(moments: Array, windows: list[Ints], cell_m: float) -> tuple
 
 
 def scans_per_cell(row: Ints, scan: Ints, scans: int, rows: int) -> Ints:
-    """How many different scans (rows,) ended in each cell."""
+    """Number (rows,) of distinct scans with a return in each cell."""
     pairs = sorted_unique(row * scans + scan)
     return np.asarray(np.bincount(pairs // scans, minlength=rows))

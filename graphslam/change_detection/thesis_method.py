@@ -1,7 +1,7 @@
-"""Change detection as the thesis has it (chapter 5): one scan against a map of dents.
+"""The thesis' change detection (chapter 5): one scan against a map of dents, for comparison.
 
-Corrections to what is printed are named where they are made; docs/change-detection.md says what
-the method reaches. `compare` is what to use.
+Corrections of the printed equations are stated where they are made; docs/change-detection.md has
+the method's detection and false-alarm rates. Applications use `detect_changes`.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ _STEPS_PER_CELL = 2
 
 @dataclass(frozen=True, slots=True)
 class LaserNoise:
-    """Standard deviations of a beam: range m, and across it ``phi1`` m and ``phi2`` rad (5.3)."""
+    """Standard deviations of a beam: of its range, m; across it ``phi1`` m + ``phi2`` rad (5.3)."""
 
     range_m: float = 0.015
     phi1_m: float = 0.001
@@ -35,8 +35,8 @@ class DentMap:
     Attributes:
         grid: cells.
         depth: (cells,) of the winning dent in that cell, 0 where there is none.
-        winner: (cells,) number of the point whose dent it is, -1 for none.
-        bottom: (n,) depth of every point's dent at its own bottom.
+        winner: (cells,) index of the point whose dent it is, -1 for none.
+        bottom: (n,) depth of every point's dent at its centre.
         threshold: d²_thres of 5.7.
     """
 
@@ -61,7 +61,7 @@ def point_covariances(
 
     Args:
         pose: (3,) of the laser in the world.
-        cov: (3, 3) of it.
+        cov: (3, 3) of the pose.
         angles: (n,) rad in the laser's frame.
         ranges: (n,) m.
         noise: of a beam.
@@ -75,14 +75,14 @@ def point_covariances(
 
 
 def make_dents(grid: Grid, points: Array, covs: Array, threshold: float = 9.0) -> DentMap:
-    """The reference map of dents (5.7-5.12): equal volume, the deeper one wins.
+    """The reference map of dents (5.7-5.12): of equal volume; where they overlap the deeper wins.
 
     A dent is the paraboloid c (1 - d²/d²_thres) with d² = (z - m)' cov⁻¹ (z - m); its depth at
     the bottom is c = 2 V_0 / (π a b), a and b being the semi-axes *at the rim*, √(λ d²_thres).
 
     Args:
         grid: cells of the map.
-        points: (n, 2) m; rows with NaN leave no dent.
+        points: (n, 2) m; rows with NaN make no dent.
         covs: (n, 2, 2) m².
         threshold: d²_thres.
     """
@@ -94,7 +94,7 @@ def make_dents(grid: Grid, points: Array, covs: Array, threshold: float = 9.0) -
     size = grid.shape[0] * grid.shape[1]
     depth, winner = np.zeros(size), np.full(size, -1, dtype=np.int64)
     home = grid.cells(points[usable])
-    # over the offsets of the largest dent, not over points or cells
+    # a loop over the cells of the largest dent, vectorised over the points
     widest = np.sqrt(threshold * max(float(np.linalg.eigvalsh(covs[usable]).max()), 0.0))
     radius = int(np.ceil(widest / grid.cell_m)) + 1
     for offset in grid.neighbours(np.zeros(1, dtype=np.int64), radius):
@@ -102,7 +102,7 @@ def make_dents(grid: Grid, points: Array, covs: Array, threshold: float = 9.0) -
         inside = (home >= 0) & (cell >= 0) & (cell < size)
         away = grid.centers(np.where(inside, cell, 0)) - points[usable]
         d2 = np.einsum("ni,nij,nj->n", away, information, away)
-        # the cell that holds the point belongs to its dent however narrow that is
+        # the cell that holds the point belongs to its dent however narrow it is
         share = 1 - d2 / threshold
         share = np.maximum(share, 1e-3) if offset[0] == 0 else share
         value = bottom[usable] * share
@@ -114,10 +114,10 @@ def make_dents(grid: Grid, points: Array, covs: Array, threshold: float = 9.0) -
 
 
 def dent_covariance(depth: Array, threshold: float) -> Array:
-    """Covariance (n, 2, 2) m² that a dent of ``depth`` (n,) at its bottom stands for (5.13).
+    """Covariance (n, 2, 2) m² of a dent with ``depth`` (n,) at its centre (5.13).
 
     The printed a² = 2 V_0/(π c) is the semi-axis at the rim; the covariance is that over d²_thres.
-    A round covariance comes back as it went in.
+    An isotropic covariance is recovered exactly.
     """
     variance = 2 * VOLUME / (np.pi * depth * threshold)
     return np.asarray(variance[:, None, None] * np.eye(2))
@@ -126,18 +126,18 @@ def dent_covariance(depth: Array, threshold: float) -> Array:
 def expected_measurements(
     dents: DentMap, pose: Array, angles: Array, reach_m: float
 ) -> tuple[Array, Array]:
-    """Along each beam the first dent's deepest cell on it, and that dent's covariance (5.2).
+    """Range along each beam to the deepest cell of the first dent, and its covariance (5.2).
 
-    The covariance is of the winning dent at its own bottom, not of where the beam crosses it.
+    The covariance is that of the winning dent at its centre, not at the cell that the beam crosses.
 
     Args:
         dents: the reference map.
         pose: (3,) of the laser.
         angles: (n,) rad in its frame.
-        reach_m: how far to look.
+        reach_m: largest range.
 
     Returns:
-        Ranges (n,) m, NaN where no dent is met, and covariances (n, 2, 2) m².
+        Ranges (n,) m, NaN where there is no dent, and covariances (n, 2, 2) m².
     """
     step = dents.grid.cell_m / _STEPS_PER_CELL
     r = np.arange(1, int(reach_m / step) + 1) * step
@@ -163,7 +163,7 @@ def expected_measurements(
 
 
 def squared_mahalanobis(points: Array, covs: Array, expected: Array, expected_covs: Array) -> Array:
-    """Mahalanobis distances squared (n,) of measured and expected points (5.14); NaN if none."""
+    """Squared Mahalanobis distances (n,) of measured from expected points (5.14); NaN if none."""
     r = points - expected
     S = covs + expected_covs
     usable = np.isfinite(r).all(axis=1) & np.isfinite(S).all(axis=(1, 2))
@@ -173,14 +173,14 @@ def squared_mahalanobis(points: Array, covs: Array, expected: Array, expected_co
 
 
 def occlusion_map(grid: Grid, pose: Array, angles: Array, ranges: Array, margin_m: float) -> Bools:
-    """Cells (cells,) that the reference scan saw, free or hit; the rest is occluded (5.4).
+    """Which cells (cells,) the reference scan observed, free or hit; others are occluded (5.4).
 
     Args:
         grid: cells.
         pose: (3,) of the laser.
         angles: (n,) rad, evenly spaced and ascending.
-        ranges: (n,) m, NaN where nothing came back (then nothing is known to have been seen).
-        margin_m: how far behind its return a surface still extends.
+        ranges: (n,) m, NaN without a return (then nothing is known to have been observed).
+        margin_m: depth of the surface behind a return.
     """
     centers = grid.centers(np.arange(grid.shape[0] * grid.shape[1]))
     away = centers - pose[:2]
@@ -214,7 +214,7 @@ def changed_beams(
         ranges: (n,) m, NaN without a return.
         noise: of a beam.
         gate: on the squared distance of 5.14.
-        consecutive: flagged neighbours that it takes; 1 = the rule is off.
+        consecutive: least number of flagged neighbours in a row; 1 = the rule is off.
 
     Returns:
         Which beams (n,) could be compared, and which of them show a change.
@@ -227,14 +227,14 @@ def changed_beams(
     compared = np.isfinite(d2)
     cell = dents.grid.cells(points)
     hidden = (cell < 0) | ~visible[cell]
-    # what was hidden from the reference and stands in front may have been there all along
+    # what stands where the reference was occluded may have been there all along
     dismissed = hidden & (ranges < np.nan_to_num(expected))
     marked = compared & (np.nan_to_num(d2) > gate) & ~dismissed
     return compared, marked & consecutive_runs(marked, consecutive)
 
 
 def consecutive_runs(marked: Bools, least: int) -> Bools:
-    """Which of ``marked`` (n,) are in a run of at least ``least`` (5.3)."""
+    """Which of ``marked`` (n,) are in a run of at least ``least`` marked ones (5.3)."""
     edges = np.diff(np.concatenate([[0], marked.astype(int), [0]]))
     begin, end = np.nonzero(edges == 1)[0], np.nonzero(edges == -1)[0]
     out = np.zeros(len(marked) + 1, dtype=int)
@@ -247,7 +247,7 @@ def consecutive_runs(marked: Bools, least: int) -> Bools:
 def stable_points(points: Array, others: list[Array], within_m: float, least: int) -> Bools:
     """Which points (n, 2) m lie near some point of at least ``least`` of the ``others`` (k, 2).
 
-    The rule of 5.3 that points be stable over time before they enter map or comparison.
+    Rule of 5.3: points must be stable over time before they enter the map or the comparison.
     """
     usable = np.isfinite(points).all(axis=1)
     count = np.zeros(len(points), dtype=int)

@@ -1,4 +1,4 @@
-"""What one visit measured and from where: the scans of a result folder with their laser poses."""
+"""One visit: the scans that a result folder was made from, with the laser poses it estimated."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from graphslam.core.config import ChangesConfig
 from graphslam.core.errors import LogError, OutputError
 from graphslam.core.geometry import Array, between, compose, compose_cov, polar_points, unit_vectors
 from graphslam.core.records import Landmark, Scan
@@ -18,12 +19,7 @@ from graphslam.results.folder import SavedResult
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-#: a return farther from the next beam's than this share of its range + this length, m, stands at
-#: an edge: where a beam meets two surfaces its range is that of neither. What recedes faster than
-#: this is seen at a grazing angle and tells little.
-EDGE_SHARE, EDGE_M = 0.025, 0.06
-#: nearer than this, m, a laser sees its own vehicle, dust, or means an error code
-LEAST_M = 0.1
+_DEFAULTS = ChangesConfig()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,14 +30,14 @@ class Visit:
         stamps_ns: (s,) of the scans.
         poses: (s, 3) of the laser.
         covs: (s, 3, 3) of additive world-axis errors.
-        shared: (s, 3, 3) the part of them that may be the same in all scans; the rest is each
-            scan's own.
-        scan: (n,) which scan a beam belongs to; beams of a scan are neighbours in bearing.
+        shared: (s, 3, 3) the part of ``covs`` that may be common to all scans; the rest is
+            independent between scans.
+        scan: (n,) index of the beam's scan, ascending; within a scan bearings ascend.
         angle: (n,) rad in the laser's frame.
-        range_m: (n,) NaN where nothing usable came back.
-        surface: (n,) whether the return is on a surface: not an edge, not alone.
+        range_m: (n,) NaN without a usable return.
+        surface: (n,) whether the return is on a surface, see `on_surface`.
         landmarks: the map of the run.
-        robots: how many robots' scans these are; neighbours in time are of one robot only if 1.
+        robots: number of robots that the scans come from.
     """
 
     stamps_ns: Ints
@@ -58,22 +54,25 @@ class Visit:
     @property
     def directions(self) -> Array:
         """Unit vectors (n, 2) of the beams in the world."""
-        heading = self.poses[self.scan, 2] + self.angle
-        return unit_vectors(heading)
+        return unit_vectors(self.headings())
+
+    def headings(self, beams: Ints | slice = slice(None)) -> Array:
+        """Directions (k,) rad of some beams (k,) in the world; default: of all."""
+        return np.asarray(self.poses[self.scan[beams], 2] + self.angle[beams])
 
     @property
     def ends(self) -> Array:
-        """World points (n, 2) m that the beams reached."""
+        """End points (n, 2) m of the beams in the world."""
         return np.asarray(self.poses[self.scan, :2] + self.range_m[:, None] * self.directions)
 
     def transformed(self, pose: Array, cov: Array) -> "Visit":
-        """The same visit after its world frame was put at ``pose`` (3,) with ``cov`` (3, 3)."""
+        """The visit in a frame where its world is at ``pose`` (3,) with ``cov`` (3, 3)."""
         at = np.broadcast_to(pose, self.poses.shape)
         covs = compose_cov(at, np.broadcast_to(cov, self.covs.shape), self.poses, self.covs)
         return replace(self, poses=compose(at, self.poses), covs=covs, shared=covs)
 
     def select(self, scans: Bools) -> "Visit":
-        """Only some scans; ``scans`` (s,) says which."""
+        """The visit with only the scans (s,) that are True in ``scans``."""
         number = np.cumsum(scans) - 1
         beams = scans[self.scan]
         return Visit(
@@ -96,6 +95,7 @@ def visit_from_scans(
     covs: Array,
     sweeps: Sequence[tuple[Array, Array]],
     landmarks: tuple[Landmark, ...] = (),
+    config: ChangesConfig = _DEFAULTS,
 ) -> Visit:
     """A visit from scans.
 
@@ -105,6 +105,7 @@ def visit_from_scans(
         covs: (s, 3, 3).
         sweeps: per scan its bearings (k,) rad, ascending, and ranges (k,) m, NaN without a return.
         landmarks: of the run's map.
+        config: settings.
     """
     counts = [len(angles) for angles, _ in sweeps]
     return Visit(
@@ -115,32 +116,41 @@ def visit_from_scans(
         np.repeat(np.arange(len(sweeps)), counts),
         np.concatenate([angles for angles, _ in sweeps]),
         np.concatenate([ranges for _, ranges in sweeps]),
-        np.concatenate([on_surface(angles, ranges) for angles, ranges in sweeps]),
+        np.concatenate([on_surface(angles, ranges, config) for angles, ranges in sweeps]),
         landmarks,
     )
 
 
-def on_surface(angles: Array, ranges: Array) -> Bools:
-    """Which returns (k,) have neighbours close by on both sides.
+def on_surface(angles: Array, ranges: Array, config: ChangesConfig = _DEFAULTS) -> Bools:
+    """Which returns (k,) have close neighbours on both sides.
+
+    The others are at an edge, where a beam that meets two surfaces measures the range of neither,
+    or on a surface seen at a grazing angle, which contributes little.
 
     Args:
         angles: (k,) rad.
         ranges: (k,) m, NaN without a return.
+        config: `min_range_m`, `edge_gap_m`, `edge_gap_share`.
     """
     points = polar_points(ranges, angles)
     gap = np.hypot(*np.diff(points, axis=0).T)
     nearer = np.fmin(ranges[1:], ranges[:-1])
-    gap[nearer < LEAST_M] = np.inf
-    joined = gap < EDGE_M + EDGE_SHARE * nearer  # false with NaN
+    gap[nearer < config.min_range_m] = np.inf
+    joined = gap < config.edge_gap_m + config.edge_gap_share * nearer  # false with NaN
     joined = np.concatenate([[False], joined, [False]])
     return np.asarray(joined[1:] & joined[:-1])
 
 
-def load_visit(saved: SavedResult, directory: Path) -> Visit:
-    """The scans of a result folder: ranges from the logs it names, poses from the folder.
+def load_visit(saved: SavedResult, directory: Path, config: ChangesConfig = _DEFAULTS) -> Visit:
+    """The visit of a result folder: ranges from the logs that it names, poses from the folder.
+
+    Args:
+        saved: the loaded result folder.
+        directory: where it is, for messages.
+        config: settings.
 
     Raises:
-        LogError: a log is gone or is another one now.
+        LogError: a log is missing or has changed.
         OutputError: the result has no scans or no covariances.
     """
     logs = saved.summary["logs"]
@@ -149,7 +159,7 @@ def load_visit(saved: SavedResult, directory: Path) -> Visit:
         if entry["sha256"] != file.sha256:
             raise LogError(f"{file.path}: is not the log that {directory} was smoothed from")
     stamps, poses, covs, sweeps = [], [], [], []
-    known: dict[tuple[str, int], tuple[Array, Array]] = {}
+    laser_poses: dict[tuple[str, int], tuple[Array, Array]] = {}
     for name, robot in saved.robots.items():
         if robot.scan_final is None:
             continue
@@ -158,13 +168,13 @@ def load_visit(saved: SavedResult, directory: Path) -> Visit:
                 f"{directory}: {name} has no covariances; smooth its log with another back end"
             )
         laser = mounted(robot.final, between(robot.final.poses, robot.scan_final.poses))
-        known |= {
+        laser_poses |= {
             (name, int(stamp)): (pose, cov)
             for stamp, pose, cov in zip(laser.stamps_ns, laser.poses, laser.covs, strict=True)
         }
     for message in log.messages():
-        if isinstance(message, Scan) and (message.robot, message.stamp_ns) in known:
-            pose, cov = known[message.robot, message.stamp_ns]
+        if isinstance(message, Scan) and (message.robot, message.stamp_ns) in laser_poses:
+            pose, cov = laser_poses[message.robot, message.stamp_ns]
             stamps.append(message.stamp_ns)
             poses.append(pose)
             covs.append(cov)
@@ -173,16 +183,17 @@ def load_visit(saved: SavedResult, directory: Path) -> Visit:
     if not stamps:
         raise OutputError(f"{directory}: has no laser scans to compare")
     visit = visit_from_scans(
-        np.array(stamps, dtype=np.int64), np.array(poses), np.array(covs), sweeps, saved.landmarks
-    )
-    return replace(visit, robots=len({name for name, _ in known}))
+        np.array(stamps, dtype=np.int64), np.array(poses), np.array(covs), sweeps,
+        saved.landmarks, config,
+    )  # fmt: skip
+    return replace(visit, robots=len({name for name, _ in laser_poses}))
 
 
 def select_time_span(visit: Visit, span_s: tuple[float, float], what: str) -> Visit:
     """The scans of a time span, s since the visit's first scan.
 
     Raises:
-        OutputError: there is none; ``what`` names the span.
+        OutputError: there is none; ``what`` names the span in the message.
     """
     seconds = (visit.stamps_ns - visit.stamps_ns.min()) * 1e-9
     chosen = (seconds >= span_s[0]) & (seconds <= span_s[1])
@@ -194,6 +205,6 @@ def select_time_span(visit: Visit, span_s: tuple[float, float], what: str) -> Vi
 
 
 def pose_to_dict(pose: Array, cov: Array) -> dict[str, Any]:
-    """A pose (3,) m, rad with covariance (3, 3) as in changes.json."""
+    """A pose (3,) m, rad with its covariance (3, 3), as in changes.json."""
     x, y, phi = pose.tolist()
     return {"x": x, "y": y, "phi": phi, "covariance": cov.tolist()}

@@ -1,7 +1,7 @@
-"""How a straight thing moved: a wall, a door, a board.
+"""Displacement of straight objects: walls, doors, boards.
 
-Its pieces tell how far it went across itself and how it turned; how far along itself, only its
-ends tell, and only if beams were seen to pass beyond them.
+The pieces of a segment determine its motion across itself and its rotation. Its motion along itself
+is determined by its ends only, and only if beams passed beyond them.
 """
 
 from collections.abc import Sequence
@@ -9,10 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphslam.change_detection.beam_evidence import Evidence
+from graphslam.change_detection.beam_evidence import MIN_COSINE, Evidence
 from graphslam.change_detection.rigid_registration import Registration
 from graphslam.change_detection.shapes import (
     PIECES_PER_WINDOW,
+    UNCHANGED_SIGMAS,
     Displacement,
     MotionSettings,
     Shape,
@@ -27,28 +28,30 @@ from graphslam.core.geometry import (
     compose,
     compose_jacobians,
     inverse,
-    rotation,
+    rotate_cov,
     transform,
     wrap,
 )
 from graphslam.core.records import Landmark
 
-#: stretches whose lengths differ by less are alike, m; shorter ones than _LEAST_M are too many
-_LENGTH_M, _LEAST_M = 0.12, 0.48
-#: pieces this near to a landmark, m, and facing as it does, are of it; they may be longer than it
-_AT_M, _FACING, _LONGER_M = 0.08, 0.95, 0.15
-#: an end is seen if so many beams pass this far beyond it at most
-_BEYOND_M, _FEWEST_BEAMS, _LEAST_COSINE = 0.25, 3, 0.2
-#: a piece is as it was below this many sigmas; of what moved no more than this share is
-_AS_BEFORE, _MOST_AS_BEFORE = 2.0, 0.5
+#: segments may be the same one if their lengths differ by less than this, m; segments shorter than
+#: _MIN_LENGTH_M are too ambiguous
+_LENGTH_TOLERANCE_M, _MIN_LENGTH_M = 0.12, 0.48
+#: pieces within this distance of a landmark, m, with normals within this cosine of its own, belong
+#: to it; they may extend beyond its ends by _EXTENSION_M
+_NEAR_M, _PARALLEL_COSINE, _EXTENSION_M = 0.08, 0.95, 0.15
+#: an end is observed if at least so many beams pass it within this distance, m
+_BEYOND_M, _MIN_BEAMS = 0.25, 3
+#: largest share of unchanged pieces of a segment that moved
+_MAX_UNCHANGED = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WallSegment:
-    """A straight shape: pose (3,) of its middle, x along it, y at who saw it; its length, m.
+    """A straight shape: pose (3,) of its middle, x along it, y towards the laser; length, m.
 
-    ``cov`` (3, 3) of the pose in its own axes, without what the material's bias does: ``bias`` (3,)
-    is the pose's change per metre of it.
+    ``cov`` (3, 3) of the pose in its own axes, without the effect of the material's range bias:
+    ``bias`` (3,) is the derivative of the pose by that.
     """
 
     pose: Array
@@ -64,10 +67,10 @@ class WallSegment:
 
 
 def fit_wall_segment(shape: Shape, cell_m: float) -> WallSegment:
-    """The straight line through a shape's pieces, from end to end.
+    """The segment through a straight shape's pieces, fitted by least squares.
 
-    Returns at an end are not used, as they may be mixed pixels: how far it lies beyond the last
-    piece differs by a beam's spacing and a cell, over which it is taken to be uniform.
+    Returns at an end are not used, as they may be mixed pixels. The true end lies beyond the last
+    piece by up to a beam's spacing and a cell, uniformly distributed.
 
     Args:
         shape: straight.
@@ -88,43 +91,47 @@ def fit_wall_segment(shape: Shape, cell_m: float) -> WallSegment:
     P = np.linalg.inv(H.T @ (W[:, None] * H))
     gain = P @ (H * W[:, None]).T
     offset, turn = gain @ e
-    pulled = gain @ np.sqrt(shape.common)
+    common = gain @ np.sqrt(shape.common)
     cov = np.zeros((3, 3))
-    cov[1:, 1:] = P + np.outer(pulled, pulled)
-    open_ = shape.spacing_m[[first, last]] + cell_m
-    cov[0, 0] = float(open_ @ open_) / 12 / 4
+    cov[1:, 1:] = P + np.outer(common, common)
+    unknown = shape.spacing_m[[first, last]] + cell_m
+    cov[0, 0] = float(unknown @ unknown) / 12 / 4
     at = middle + half * along + offset * across
     heading = float(np.arctan2(along[1], along[0]) + turn)
-    # what is measured too far lies behind, by as much as the beams met it squarely
+    # a bias of the ranges moves the segment back, times the cosine of incidence
     return WallSegment(
         np.array([*at, wrap(heading)]), float(t[last] - t[first]), cov,
         np.array([0.0, *-(gain @ shape.incidence)]),
     )  # fmt: skip
 
 
-def motion_between_segments(a: WallSegment, b: WallSegment, known: MotionSettings) -> Displacement:
-    """The motion that takes a to b; the bias counts as far as it differs between the visits."""
-    differs = known.bias_m * (b.bias - a.bias)
-    cov = a.cov + b.cov + np.outer(differs, differs)
-    cov[1, 1] += known.repeatability_m**2
-    R = np.eye(3)
-    R[:2, :2] = rotation(b.pose[2])
+def motion_between_segments(
+    a: WallSegment, b: WallSegment, settings: MotionSettings
+) -> Displacement:
+    """The motion that takes a to b; of the bias only the difference between the visits counts."""
+    bias = settings.bias_m * (b.bias - a.bias)
+    cov = a.cov + b.cov + np.outer(bias, bias)
+    cov[1, 1] += settings.repeatability_m**2
     back = inverse(a.pose)
     F, _ = compose_jacobians(b.pose, back)
-    return Displacement(compose(b.pose, back), F @ R @ cov @ R.T @ F.T)
+    return Displacement(compose(b.pose, back), F @ rotate_cov(cov, b.pose[2]) @ F.T)
 
 
-def straight_motion(a: Shape, b: Shape, known: MotionSettings) -> tuple[float, Displacement] | None:
-    """Of two straight shapes of the same length: how alike they are, and the motion."""
-    one, other = fit_wall_segment(a, known.cell_m), fit_wall_segment(b, known.cell_m)
-    if not _alike(one, other):
+def straight_motion(
+    a: Shape, b: Shape, settings: MotionSettings
+) -> tuple[float, Displacement] | None:
+    """Similarity 0..1 of two straight shapes and the motion; None if their lengths differ."""
+    one, other = fit_wall_segment(a, settings.cell_m), fit_wall_segment(b, settings.cell_m)
+    if not _same_length(one, other):
         return None
     share = min(one.length, other.length) / max(one.length, other.length)
-    return share, motion_between_segments(one, other, known)
+    return share, motion_between_segments(one, other, settings)
 
 
-def _alike(a: WallSegment, b: WallSegment) -> bool:
-    return abs(a.length - b.length) < _LENGTH_M and min(a.length, b.length) > _LEAST_M
+def _same_length(a: WallSegment, b: WallSegment) -> bool:
+    return (
+        abs(a.length - b.length) < _LENGTH_TOLERANCE_M and min(a.length, b.length) > _MIN_LENGTH_M
+    )
 
 
 def segment_motions(
@@ -133,81 +140,80 @@ def segment_motions(
     surfaces: tuple[Surface, Surface],
     visits: tuple[Visit, Visit],
     evidence: tuple[Evidence, Evidence],
-    known: MotionSettings,
-    spread: float,
+    settings: MotionSettings,
+    sigma: float,
 ) -> list[tuple[Array, Array, Displacement]]:
-    """Lines of the maps that are in both runs with the same length, but not in the same place.
+    """Line landmarks that both maps have with the same length, but at different poses.
 
-    What moved by less than its size hides its old place, which then is nowhere seen to be gone:
-    this way it is found to have moved nevertheless.
+    An object that moved by less than its size occludes its old place, so no beam shows that it has
+    left: this way its motion is found nevertheless.
 
     Args:
         landmarks: of the reference and of the later map, each in its own frame.
         registration: of the two.
         surfaces: of both visits in the reference's frame.
         visits: both, in the reference's frame.
-        evidence: the other visit's beams on those surfaces.
-        known: how well a piece is known.
-        spread: see `graphslam.change_detection.beam_evidence.null_sigma`.
+        evidence: of the other visit's beams on those surfaces.
+        settings: noise and limits of displacements.
+        sigma: see `graphslam.change_detection.beam_evidence.null_sigma`.
 
     Returns:
-        Per moved stretch its ends (2, 2) m before and after, and its displacement.
+        Per moved segment its ends (2, 2) m before and after, and its displacement.
     """
-    frames = (np.zeros(3), registration.pose)
     sides: list[list[WallSegment]] = []
-    for k in (0, 1):
+    for k, frame in enumerate((np.zeros(3), registration.pose)):
         matched = set(registration.matched[:, k].tolist())
         lines = [m for i, m in enumerate(landmarks[k]) if m.line is not None and i not in matched]
         found = [
-            _at(transform(frames[k], m.extent), surfaces[k], visits[k], evidence[k], spread)
+            _segment_at(transform(frame, m.extent), surfaces[k], visits[k], evidence[k], sigma)
             for m in lines
         ]
         sides.append([s for s in found if s is not None])
     pairs = []
     for i, a in enumerate(sides[0]):
         for j, b in enumerate(sides[1]):
-            way = float(np.hypot(*(b.pose[:2] - a.pose[:2])))
-            if _alike(a, b) and way < known.max_displacement_m:
-                pairs.append((abs(a.length - b.length) + 0.1 * way, i, j))
+            distance = float(np.hypot(*(b.pose[:2] - a.pose[:2])))
+            if _same_length(a, b) and distance < settings.max_displacement_m:
+                pairs.append((abs(a.length - b.length) + 0.1 * distance, i, j))
     moved, taken = [], (set[int](), set[int]())
     for _, i, j in sorted(pairs):
         if i not in taken[0] and j not in taken[1]:
             taken[0].add(i)
             taken[1].add(j)
             a, b = sides[0][i], sides[1][j]
-            moved.append((a.ends, b.ends, motion_between_segments(a, b, known)))
+            moved.append((a.ends, b.ends, motion_between_segments(a, b, settings)))
     return moved
 
 
-def _at(
-    ends: Array, surface: Surface, visit: Visit, evidence: Evidence, spread: float
+def _segment_at(
+    ends: Array, surface: Surface, visit: Visit, evidence: Evidence, sigma: float
 ) -> WallSegment | None:
-    """The stretch of a visit's surface at a line of its map; None if its ends were not seen."""
+    """The segment of a visit's surface at a line of its map, if it moved and its ends were seen."""
     along = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
-    longer = ends + _LONGER_M * np.array([-along, along])
-    facing = np.abs(surface.normals @ np.array([-along[1], along[0]])) > _FACING
-    near = near_segment(surface.points, longer, _AT_M)
-    rows = near[(surface.good & facing)[near]]
-    if len(rows) * surface.nearest.grid.cell_m < _LEAST_M:
+    extended = ends + _EXTENSION_M * np.array([-along, along])
+    parallel = np.abs(surface.normals @ np.array([-along[1], along[0]])) > _PARALLEL_COSINE
+    near = near_segment(surface.points, extended, _NEAR_M)
+    rows = near[(surface.good & parallel)[near]]
+    if len(rows) * surface.nearest.grid.cell_m < _MIN_LENGTH_M:
         return None
     shape = shape_of_rows(surface, visit, rows)
-    as_before = evidence.tested[rows] & (evidence.scores(spread)[rows] < _AS_BEFORE)
-    if as_before.mean() > _MOST_AS_BEFORE or not is_straight(shape):
+    unchanged = evidence.tested[rows] & (evidence.scores(sigma)[rows] < UNCHANGED_SIGMAS)
+    if unchanged.mean() > _MAX_UNCHANGED or not is_straight(shape):
         return None
-    found = fit_wall_segment(shape, surface.nearest.grid.cell_m)
-    return found if ends_seen(found, visit) else None
+    segment = fit_wall_segment(shape, surface.nearest.grid.cell_m)
+    return segment if ends_observed(segment, visit) else None
 
 
-def ends_seen(stretch: WallSegment, visit: Visit) -> bool:
-    """Whether beams of a visit pass a little beyond both ends of a stretch."""
+def ends_observed(segment: WallSegment, visit: Visit) -> bool:
+    """Whether beams of a visit pass closely beyond both ends of a segment."""
     beams = np.nonzero(visit.surface)[0]
-    heading = visit.poses[visit.scan[beams], 2] + visit.angle[beams] - stretch.pose[2]
-    away = transform(inverse(stretch.pose), visit.poses[visit.scan[beams], :2])
+    heading = visit.headings(beams) - segment.pose[2]
+    away = transform(inverse(segment.pose), visit.poses[visit.scan[beams], :2])
     sine = np.sin(heading)
-    steep = np.abs(sine) > _LEAST_COSINE
+    steep = np.abs(sine) > MIN_COSINE
     reach = -away[:, 1] / np.where(steep, sine, 1.0)
     at = away[:, 0] + reach * np.cos(heading)
     through = steep & (reach > 0) & (visit.range_m[beams] > reach + _BEYOND_M)
-    beyond = np.abs(at) - stretch.length / 2
+    beyond = np.abs(at) - segment.length / 2
     through &= (beyond > 0) & (beyond < _BEYOND_M)
-    return min(int((through & (at < 0)).sum()), int((through & (at > 0)).sum())) >= _FEWEST_BEAMS
+    return min(int((through & (at < 0)).sum()), int((through & (at > 0)).sum())) >= _MIN_BEAMS

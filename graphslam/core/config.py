@@ -325,12 +325,17 @@ class ChangesConfig:
 
     false_alarm_rate: share of the later beams that are flagged where nothing changed.
     run_false_alarm_rate: probability that a run without any change reports one. resolution_m: of
-    the map; coarser where the map would have more than max_side_cells squared cells. max_range_m:
-    farther returns are not compared. min_returns, min_scans: a surface is compared if it has so
-    many returns from so many scans. flatness_m: deviation of a straight surface from a line.
-    bias_sigma_m: range bias that depends on the material. gate_m: returns within this distance
-    of a surface are compared with it; beams that end farther behind it passed through it.
-    min_length_m: smallest change that is reported. min_beams: fewest beams that support one.
+    the map; coarser where the map would have more than max_side_cells squared cells. min_range_m,
+    max_range_m: nearer returns (the vehicle itself, dust, error codes) and farther ones are not
+    used. edge_gap_m, edge_gap_share: a return is at an edge, and not used, if the next beam's is
+    farther from it than edge_gap_m + edge_gap_share * range. range_sigma_m: range noise until it is
+    estimated from the scans. max_pose_error_m: largest error of a later scan's position that
+    alignment with the reference's surfaces corrects. min_returns, min_scans: a surface is compared
+    if it has so many returns from so many scans. flatness_m: deviation of a straight surface from
+    a line. bias_sigma_m: range bias that depends on the material. gate_m: returns within this
+    distance of a surface are compared with it; beams that end farther behind it passed through it.
+    nonrigid_gate_m: gate_m, at least, where the maps are bent against each other. min_length_m:
+    smallest change that is reported. min_beams: fewest beams that support one.
     max_displacement_m: what moved farther is reported as vanished and appeared.
     """
 
@@ -338,12 +343,18 @@ class ChangesConfig:
     run_false_alarm_rate: float = 0.01
     resolution_m: float = 0.025
     max_side_cells: int = 2000
+    min_range_m: float = 0.1
     max_range_m: float = 30.0
+    edge_gap_m: float = 0.06
+    edge_gap_share: float = 0.025
+    range_sigma_m: float = 0.02
+    max_pose_error_m: float = 0.5
     min_returns: int = 6
     min_scans: int = 3
     flatness_m: float = 0.004
     bias_sigma_m: float = 0.01
     gate_m: float = 0.15
+    nonrigid_gate_m: float = 0.3
     min_length_m: float = 0.1
     min_beams: int = 5
     max_displacement_m: float = 5.0

@@ -276,8 +276,8 @@ def test_evidence_is_one_sided():
     a, b = visit([], poses, rng), visit([box(5, 4)], poses, rng)
     grid = grid_over(a.ends, 0.025, 10**6)
     old, new = (fit_surfaces(v, grid, SIGMA, CONFIG) for v in (a, b))
-    assert beams_past_surfaces(old, b, old.incidence, SIGMA, CONFIG).passed.sum() == 0
-    assert beams_past_surfaces(new, a, new.incidence, SIGMA, CONFIG).passed.sum() > 100
+    assert beams_past_surfaces(old, b, SIGMA, CONFIG).passed.sum() == 0
+    assert beams_past_surfaces(new, a, SIGMA, CONFIG).passed.sum() > 100
 
 
 def test_what_is_tested_has_a_time_of_being_seen():
@@ -291,7 +291,7 @@ def test_what_is_tested_has_a_time_of_being_seen():
     grid = grid_over(a.ends, 0.025, 10**6)
     old = fit_surfaces(a, grid, SIGMA, CONFIG)
     wide = replace(CONFIG, gate_m=0.3)
-    found = beams_past_surfaces(old, b, old.incidence, SIGMA, wide)
+    found = beams_past_surfaces(old, b, SIGMA, wide)
     back = found.tested & (found.offset > 0.06)
     assert back.any()
     assert (found.first_ns[found.tested] <= b.stamps_ns.max()).all()
@@ -552,7 +552,7 @@ def test_maps_are_laid_over_each_other_from_any_pose():
     rng = np.random.default_rng(12)
     ends = visit([box(5, 4), box(1, 1, 0.8, 0.4)], drive(40), rng).ends
     pose = np.array([4.0, -3.0, 2.2])
-    found = correlate_maps(transform(pose, ends), ends)
+    found = correlate_maps(transform(pose, ends), ends, 0.1)
     error = np.array([between(pose, one) for one in found])
     # turns are tried every 2 degrees, shifts every 10 cm
     assert (np.hypot(*error[:, :2].T)[np.abs(wrap(error[:, 2])) < np.radians(2)] < 0.2).any()
