@@ -188,6 +188,25 @@ class FrontEndConfig:
 
 
 @dataclass(frozen=True)
+class ScanMatchingConfig:
+    """Scans matched with scans: consecutive ones, loop closures, maps of other robots.
+
+    point_sigma_m: error of a point across its surface, by range noise and roughness. cell_m: points
+    that are matched are thinned to one per cell of this size. reach_m: largest distance of a point
+    from its counterpart where the alignment begins. free_margin_m: a beam shows that space is free
+    up to so far before its return. floor_m, floor_rad: errors of a match that do not shrink with
+    the number of points.
+    """
+
+    point_sigma_m: float = 0.03
+    cell_m: float = 0.05
+    reach_m: float = 0.6
+    free_margin_m: float = 0.4
+    floor_m: float = 0.02
+    floor_rad: float = 0.004
+
+
+@dataclass(frozen=True)
 class AssociationConfig:
     """Which observation belongs to which landmark (thesis 3.21-3.25 and section 4.6).
 
@@ -372,6 +391,7 @@ class Config:
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
     keyframe: KeyframeConfig = field(default_factory=KeyframeConfig)
     front_end: FrontEndConfig = field(default_factory=FrontEndConfig)
+    scan_matching: ScanMatchingConfig = field(default_factory=ScanMatchingConfig)
     association: AssociationConfig = field(default_factory=AssociationConfig)
     robust: RobustConfig = field(default_factory=RobustConfig)
     backend: BackendConfig = field(default_factory=BackendConfig)

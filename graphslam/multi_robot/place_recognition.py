@@ -31,7 +31,7 @@ from graphslam.core.geometry import (
 )
 from graphslam.mapping.loop_closure import NEAR_M, TRUST, SubmapPose, drift_covariance, verify_match
 from graphslam.multi_robot.relative_frames import RelativeFrame
-from graphslam.perception.scan_matching import ABSENT_M, IntArray, Match, match
+from graphslam.perception.scan_matching import IntArray, Match, match
 
 #: m, rad: steps of the search; of what was looked through, only so near a laser, m
 STEP_M, STEP_RAD, CLEAR_M = 0.3, np.radians(2.5), 12.0
@@ -175,7 +175,7 @@ def _free_points(place: SubmapPose) -> Array:
     free = submap.free[:, ::2]
     along = np.arange(0.0, CLEAR_M, STEP_M)
     angle = 2 * np.pi * np.arange(free.shape[1]) / free.shape[1]
-    scan, beam, step = np.nonzero(along < free[:, :, None] - ABSENT_M)
+    scan, beam, step = np.nonzero(along < free[:, :, None])
     sensors = compose(place.pose, submap.poses)
     direction = sensors[scan, 2] + angle[beam]
     ray = unit_vectors(direction)

@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from graphslam.core.config import ScanMatchingConfig
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, rotation, wrap
 from graphslam.core.records import Closure, Motion, Observation
@@ -35,11 +36,11 @@ MARGIN = np.array([0.5, 0.5, 0.2])
 BESIDE_M = 0.1
 
 
-def scan_submap(points: Array) -> Submap | None:
+def scan_submap(points: Array, config: ScanMatchingConfig | None = None) -> Submap | None:
     """The points (n, 2) of one scan, in the frame of its state; None where there are few."""
     if len(points) < FEWEST:
         return None
-    return make_submap(np.zeros((1, 3)), [np.asarray(points, dtype=float)])
+    return make_submap(np.zeros((1, 3)), [np.asarray(points, dtype=float)], config)
 
 
 def checked_against_scans(motion: Motion, before: Submap, now: Submap) -> Motion:
@@ -111,7 +112,7 @@ def measured(motion: Motion, before: Submap, robot: str, points: Array) -> Closu
         robot: whose.
         points: (n, 2) of the scan where it ends, in that state's frame, see `beside_lines`.
     """
-    source = scan_submap(points)
+    source = scan_submap(points, before.config)
     if source is None:
         return None
     pose, cov = align(source, before, motion.delta)

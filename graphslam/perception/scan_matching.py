@@ -1,10 +1,10 @@
-"""Scan matching: where a place was seen from, among points that were seen before.
+"""Scan matching: the pose of one submap in the frame of another.
 
 A `Submap` holds what some neighbouring scans saw: points, the direction of the surface at each of
-them, and every scan as a range image, which also knows what is *not* there. Two submaps are matched
-in three steps: `search` tries a whole window of poses against a coarse field, `align` refines one
-by point-to-line steps, and `agreement` counts which points of one the scans of the other confirm
-and which they look through.
+them, and every scan as a range image, which also tells what space was free. Two submaps are matched
+in three steps: `search` correlates the points with an occupancy grid over a window of poses,
+`align` refines a pose by point-to-line steps, and `agreement` counts which points of one submap
+the scans of the other confirm, and which lie in what those saw as free space.
 """
 
 from collections.abc import Sequence
@@ -12,53 +12,53 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from graphslam.core.config import ScanMatchingConfig
 from graphslam.core.geometry import Array, between, transform
 from graphslam.perception.correlation import occupancy_grid
 from graphslam.perception.point_to_line import (
     gauss_newton_step,
+    line_metrics,
     normal_equations,
     point_terms,
     step_poses,
 )
 
-BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
-IntArray = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.intp]
 
-#: m: points of a submap are thinned to one per cell of this size
-CELL_M = 0.05
-#: neighbours that tell the direction of a surface, and how far away they may be, m
-NEIGHBOURS, FEWEST_NEIGHBOURS, NEIGHBOURHOOD_M = 8, 4, 0.3
-#: beams of a range image over the full circle
+#: neighbours that give the direction of a surface: most, fewest, and their distance at most, cells
+NEIGHBOURS, FEWEST_NEIGHBOURS, NEIGHBOURHOOD_CELLS = 8, 4, 6
+#: beams of a range image over the full circle: a degree each, for coarser lasers leave few empty
 BEAMS = 360
-#: m: how far a point may lie from what a beam met to be the same, and before it to be absent
-SAME_M, ABSENT_M = 0.15, 0.4
-#: m: noise of one point across its surface, and of a point that lies on no surface
-SURFACE_SIGMA_M, CLUTTER_SIGMA_M = 0.03, 0.06
+#: sigmas of a point: noise of one that lies on no surface; within so many of a range, and of a
+#: neighbour in the last iterations, a point is the same
+CLUTTER_SIGMAS, SAME_SIGMAS = 2.0, 5.0
 #: points whose errors count as one: materials, curvature and the submap's own shape are shared
-SHARED_POINTS = 10
-#: m, rad: errors of the matching as a whole that no number of points averages out
-FLOOR_M, FLOOR_RAD = 0.02, 0.004
-#: m: a point and its nearest neighbour farther apart than this do not belong together: first, last
-REACH_FIRST_M, REACH_LAST_M = 0.6, 0.15
+CORRELATED_POINTS = 10
 ITERATIONS = 12
-#: m, rad: steps of the search
-STEP_M, STEP_RAD = 0.15, np.radians(1.5)
-#: points of a submap that the search looks at, and that the alignment uses
-SEARCHED, ALIGNED = 250, 300
-#: places that a search finds at most, and how much of the best one's score they have at least
-FOUND, NEARLY = 4, 0.6
+#: steps of the search: cells are this share of the reach of the alignment, which does the rest, and
+#: a step in heading (rad) moves points at 6 m by one cell
+SEARCH_CELL, STEP_RAD = 0.25, np.radians(1.5)
+#: points of a submap that the search uses, and that the alignment uses
+SEARCH_POINTS, ALIGN_POINTS = 250, 300
+#: poses that a search returns at most, their score at least as a share of the best one's, and rad:
+#: nearer ones (in position: than the reach of the alignment) are one
+MAX_POSES, MIN_SCORE_SHARE, DISTINCT_RAD = 4, 0.6, np.radians(8.0)
+#: aligned poses are one if they are nearer than this share of the reach, and than this in heading
+DUPLICATE_SHARE, DUPLICATE_RAD = 2 / 3, np.radians(6.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Submap:
     """What neighbouring scans saw, in one frame.
 
-    ``points`` (n, 2) m; ``information`` (n, 2, 2), 1/m^2, of what each tells about where another
-    one near it lies: across a surface, both ways where there is none, and nothing where there are
-    too few neighbours to tell (where a wall leaves the laser's reach); ``poses`` (k, 3) of the
-    sensor and ``clouds``, k arrays (n, 2) of what it saw from there.
+    ``points`` (n, 2) m; ``information`` (n, 2, 2), 1/m^2, of each point about another one near it:
+    across a surface, in both directions where there is none, and zero where there are too few
+    neighbours to tell (where a wall leaves the laser's range); ``poses`` (k, 3) of the sensor and
+    ``clouds``, k arrays (n, 2) of the points in its frame.
     """
 
     points: Array
@@ -66,29 +66,33 @@ class Submap:
     poses: Array
     clouds: Sequence[Array]
     tree: cKDTree
+    config: ScanMatchingConfig
 
-    # worked out when asked for: few single scans are ever compared with another one beam by beam
+    # computed on demand: few single scans are ever compared with another one beam by beam
     @cached_property
     def images(self) -> Array:
         """(6, k, `BEAMS`), m: nearest and farthest return of each degree and both its neighbours.
 
-        NaN without one.
+        NaN without a return.
         """
         returns = _range_images(self.clouds)
         return np.concatenate([np.roll(returns, turn, axis=2) for turn in (-1, 0, 1)])
 
     @cached_property
     def free(self) -> Array:
-        """(k, `BEAMS`) m: the nearest of the six ``images``, 0 where one of them is not known."""
-        return np.asarray(np.nan_to_num(self.images.min(axis=0)))
+        """(k, `BEAMS`) m: range up to which space was free, 0 where a return is missing.
+
+        It ends ``free_margin_m`` before the nearest of the six ``images``.
+        """
+        return np.asarray(np.nan_to_num(self.images.min(axis=0))) - self.config.free_margin_m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Match:
     """Pose (3,) of one submap in the frame of another, cov (3, 3) along that frame's axes.
 
-    ``same`` and ``absent`` are shares of all points of both: confirmed by the other's scans, and
-    looked through by them; the rest was out of sight.
+    ``same`` and ``absent`` are shares of all points of both: confirmed by the other's scans, and in
+    what those saw as free space; the rest was out of sight.
     """
 
     pose: Array
@@ -97,19 +101,24 @@ class Match:
     absent: float
 
 
-def make_submap(poses: Array, clouds: Sequence[Array]) -> Submap:
+def make_submap(
+    poses: Array, clouds: Sequence[Array], config: ScanMatchingConfig | None = None
+) -> Submap:
     """A submap of some scans.
 
     Args:
         poses: (k, 3) of the sensor in the submap's frame.
         clouds: k arrays (n, 2) of points in the sensor's frame, m.
+        config: settings; by default the default ones.
     """
+    config = config or ScanMatchingConfig()
     points = np.concatenate([transform(p, c) for p, c in zip(poses, clouds, strict=True)])
-    cell = np.round(points / CELL_M).astype(np.int64)
+    cell = np.round(points / config.cell_m).astype(np.int64)
     _, kept = np.unique((cell[:, 0] << 32) + cell[:, 1], return_index=True)
     points = points[np.sort(kept)]
     tree = cKDTree(points)
-    return Submap(points, _information(points, tree), np.asarray(poses), clouds, tree)
+    information = _information(points, tree, config)
+    return Submap(points, information, np.asarray(poses), clouds, tree, config)
 
 
 def _range_images(clouds: Sequence[Array]) -> Array:
@@ -130,63 +139,63 @@ def _beam(x: Array, y: Array) -> IntArray:
     return np.asarray(np.round(degrees).astype(np.intp) % BEAMS)
 
 
-def _information(points: Array, tree: cKDTree) -> Array:
-    """What points (n, 2) tell, (n, 2, 2), see `Submap`: by the scatter of their neighbours."""
+def _information(points: Array, tree: cKDTree, config: ScanMatchingConfig) -> Array:
+    """Information (n, 2, 2) of points (n, 2), see `Submap`, by the scatter of their neighbours."""
     k = min(NEIGHBOURS, len(points))
     distance, near = tree.query(points, k=k)
-    known = distance.reshape(len(points), k) <= NEIGHBOURHOOD_M
+    used = distance.reshape(len(points), k) <= NEIGHBOURHOOD_CELLS * config.cell_m
     around = points[near.reshape(len(points), k)]
-    count = known.sum(axis=1)
-    mean = (around * known[..., None]).sum(axis=1) / count[:, None]
-    d = (around - mean[:, None]) * known[..., None]
+    count = used.sum(axis=1)
+    mean = (around * used[..., None]).sum(axis=1) / count[:, None]
+    d = (around - mean[:, None]) * used[..., None]
     xx, yy = (d[..., 0] ** 2).sum(axis=1), (d[..., 1] ** 2).sum(axis=1)
     xy = (d[..., 0] * d[..., 1]).sum(axis=1)
     along = 0.5 * np.arctan2(2 * xy, xx - yy)
     spread = np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
     small, large = 0.5 * (xx + yy) - spread, 0.5 * (xx + yy) + spread
-    alone = count < FEWEST_NEIGHBOURS
-    normals = np.column_stack([-np.sin(along), np.cos(along)])
-    found = normals[:, :, None] * normals[:, None, :] / SURFACE_SIGMA_M**2
-    found[small >= 0.1 * large] = np.eye(2) / CLUTTER_SIGMA_M**2
-    found[alone] = 0.0
+    variance = config.point_sigma_m**2
+    found = line_metrics(np.column_stack([-np.sin(along), np.cos(along)])) / variance
+    found[small >= 0.1 * large] = np.eye(2) / (CLUTTER_SIGMAS**2 * variance)
+    found[count < FEWEST_NEIGHBOURS] = 0.0
     return np.asarray(found)
 
 
 def search(
-    source: Submap, target: Submap, guess: Array, window: Array, least: float = 0.0
+    source: Submap, target: Submap, guess: Array, window: Array, min_score: float = 0.0
 ) -> list[Array]:
-    """Poses (3,) of ``source`` in ``target`` at which many of its points lie on the other's.
+    """Poses (3,) of ``source`` in ``target`` at which many points of one lie on the other's.
 
     Args:
-        source: what to place.
-        target: where.
+        source: the submap to be placed.
+        target: the submap that it is placed in.
         guess: (3,) middle of the window.
         window: (3,) m, m, rad: half its size.
-        least: share of its points that are to do so; those in the next cell count half.
+        min_score: least share of points on points; those in a neighbouring cell count half.
 
     Returns:
         The best ones, best first, no two of them close together.
     """
-    points = _some(source.points, SEARCHED)
-    sizes = STEP_M, STEP_M, STEP_RAD
+    points = _subsample(source.points, SEARCH_POINTS)
+    cell_m, apart_m = SEARCH_CELL * target.config.reach_m, target.config.reach_m
+    sizes = cell_m, cell_m, STEP_RAD
     x, y, turns = (_steps(half, size) for half, size in zip(window, sizes, strict=True))
     shape = len(x), len(y)
-    grid = occupancy_grid(target.points, STEP_M, np.array(shape) + 2)
-    scores = np.empty((len(turns), len(x), len(y)))
+    grid = occupancy_grid(target.points, cell_m, np.array(shape) + 2)
+    scores = np.empty((len(turns), *shape))
     for row, turn in enumerate(turns):
         placed = transform(np.array([guess[0] + x[0], guess[1] + y[0], guess[2] + turn]), points)
         scores[row] = grid.correlate_window(placed, shape)
     found: list[Array] = []
-    least = max(NEARLY * float(scores.max()), least)
-    while len(found) < FOUND and scores.max() > least:
+    min_score = max(MIN_SCORE_SHARE * float(scores.max()), min_score)
+    while len(found) < MAX_POSES and scores.max() > min_score:
         k, i, j = map(int, np.unravel_index(int(scores.argmax()), scores.shape))
         found.append(guess + np.array([x[i], y[j], turns[k]]))
-        near = np.hypot(x - x[i], (y - y[j])[:, None]).T < 0.6
-        scores[(np.abs(turns - turns[k]) < np.radians(8.0))[:, None, None] & near] = 0.0
+        near = apart_m > np.hypot(x - x[i], (y - y[j])[:, None]).T
+        scores[(np.abs(turns - turns[k]) < DISTINCT_RAD)[:, None, None] & near] = 0.0
     return found
 
 
-def _some(points: Array, count: int) -> Array:
+def _subsample(points: Array, count: int) -> Array:
     return points[:: max(1, len(points) // count)]
 
 
@@ -198,52 +207,59 @@ def _steps(half: float, step: float) -> Array:
 def align(source: Submap, target: Submap, guess: Array) -> tuple[Array, Array]:
     """The pose (3,) of ``source`` in ``target`` near ``guess`` (3,), and its covariance (3, 3).
 
-    Each point is drawn to its nearest neighbour: across a surface, or both ways where there is
-    none; what lies too far away has no say, and what that means shrinks on the way. Along what the
-    points do not tell (a corridor) the covariance is large. Source: A. Censi, ICRA 2008, DOI
-    10.1109/ROBOT.2008.4543181, for the metric.
+    Iterated least squares: each point is matched to its nearest neighbour, across a surface or in
+    both directions where there is none. Points farther away than a reach that shrinks from
+    iteration to iteration do not count. In directions that the points do not determine (along a
+    corridor) the covariance is large.
     """
     x = np.array(guess, dtype=float)
-    points = _some(source.points, ALIGNED)
+    points = _subsample(source.points, ALIGN_POINTS)
+    first, last = target.config.reach_m, SAME_SIGMAS * target.config.point_sigma_m
     A = np.eye(3)
     for k in range(ITERATIONS):
-        reach = REACH_FIRST_M * (REACH_LAST_M / REACH_FIRST_M) ** min(1.0, 2 * k / ITERATIONS)
-        drawn = _drawn(points, target, x, reach)
-        if drawn is None:
+        reach = first * (last / first) ** min(1.0, 2 * k / ITERATIONS)
+        equations = _linearise(points, target, x, reach)
+        if equations is None:
             return x, np.diag([1e4, 1e4, 1e4])
-        A = drawn.information
-        x = step_poses(x, drawn.step)
-        if k > ITERATIONS // 2 and np.abs(drawn.step).max() < 1e-4:
+        A = equations.information
+        step = gauss_newton_step(A, equations.gradient)
+        x = step_poses(x, step)
+        if k > ITERATIONS // 2 and np.abs(step).max() < 1e-4:
             break
-    return x, _covariance(A)
+    return x, _covariance(A, target.config)
 
 
 def fit(source: Submap, target: Submap, pose: Array) -> tuple[float, Array, Array]:
     """How well ``source`` lies on ``target`` at ``pose`` (3,), without moving it.
 
     Returns:
-        Share of its points that lie on something (a point that is 2 sigmas off counts half); by how
-        much the pose would move (3,) to first order; and the covariance (3, 3) of that, see
+        Share of its points that lie on others (a point that is 2 sigmas off counts half); the first
+        Gauss-Newton step (3,) of the pose; and the covariance (3, 3) of the pose after it, see
         `align`.
     """
-    points = _some(source.points, ALIGNED)
-    drawn = _drawn(points, target, pose, REACH_LAST_M)
-    if drawn is None:
+    points = _subsample(source.points, ALIGN_POINTS)
+    equations = _linearise(points, target, pose, SAME_SIGMAS * target.config.point_sigma_m)
+    if equations is None:
         return 0.0, np.zeros(3), np.diag([1e4, 1e4, 1e4])
-    return drawn.weight / len(points), drawn.step, _covariance(drawn.information)
+    A = equations.information
+    step = gauss_newton_step(A, equations.gradient)
+    return equations.weight / len(points), step, _covariance(A, target.config)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Drawn:
-    """One step of Gauss and Newton; ``weight`` is the sum over points of their robust weights."""
+class _NormalEquations:
+    """``information`` (3, 3), ``gradient`` (3,), and the sum of the points' robust weights."""
 
-    step: Array
     information: Array
+    gradient: Array
     weight: float
 
 
-def _drawn(points: Array, target: Submap, x: Array, reach: float) -> _Drawn | None:
-    """Points (n, 2), seen from x (3,), drawn to what is within ``reach``; None where hardly any."""
+def _linearise(points: Array, target: Submap, x: Array, reach: float) -> _NormalEquations | None:
+    """Equations of points (n, 2) seen from x (3,) and their neighbours within ``reach``, m.
+
+    None where there are hardly any.
+    """
     placed = transform(x, points)
     distance, near = target.tree.query(placed, distance_upper_bound=reach)
     ok = np.isfinite(distance)
@@ -253,35 +269,34 @@ def _drawn(points: Array, target: Submap, x: Array, reach: float) -> _Drawn | No
     terms, squared = point_terms(p - target.points[near], target.information[near], p - x[:2])
     w = 1.0 / (1.0 + squared / 4.0)
     A, g = normal_equations(terms @ w)
-    A += np.diag([1e-4, 1e-4, 1e-4])
-    return _Drawn(gauss_newton_step(A, g), A, float(w.sum()))
+    return _NormalEquations(A + np.diag([1e-4, 1e-4, 1e-4]), g, float(w.sum()))
 
 
-def _covariance(information: Array) -> Array:
-    shared = SHARED_POINTS * np.linalg.inv(information)
-    return np.asarray(shared + np.diag([FLOOR_M**2, FLOOR_M**2, FLOOR_RAD**2]))
+def _covariance(information: Array, config: ScanMatchingConfig) -> Array:
+    floor = np.diag([config.floor_m**2, config.floor_m**2, config.floor_rad**2])
+    return np.asarray(CORRELATED_POINTS * np.linalg.inv(information) + floor)
 
 
 def agreement(source: Submap, target: Submap, pose: Array) -> tuple[float, float]:
-    """Shares of all points of both submaps that the other's scans confirm, and look through.
+    """Shares of all points of both submaps that the other confirms, and that it saw as free space.
 
-    ``pose`` (3,) is that of ``source`` in ``target``. A confirmed point counts as such whatever
-    other scans saw: a door that was open once is no contradiction.
+    ``pose`` (3,) is that of ``source`` in ``target``. A point that one scan confirms counts as such
+    whatever other scans saw: a door that was open once is no contradiction.
     """
     same = absent = 0
     for a, b, x in (
         (source, target, pose),
         (target, source, between(pose, np.zeros(3))),
     ):
-        confirmed, missed = _seen_from(transform(x, a.points), b)
+        confirmed, free = _compare_with_scans(transform(x, a.points), b)
         same += int(confirmed.sum())
-        absent += int((missed & ~confirmed).sum())
+        absent += int((free & ~confirmed).sum())
     total = len(source.points) + len(target.points)
     return same / total, absent / total
 
 
-def _seen_from(points: Array, submap: Submap) -> tuple[BoolArray, BoolArray]:
-    """Which points (n, 2) any scan of the submap confirms, and which any looks through."""
+def _compare_with_scans(points: Array, submap: Submap) -> tuple[BoolArray, BoolArray]:
+    """Which points (n, 2) any scan of the submap confirms, and which lie in its free space."""
     poses = submap.poses
     c, s = np.cos(poses[:, 2])[:, None], np.sin(poses[:, 2])[:, None]
     dx, dy = points[:, 0] - poses[:, :1], points[:, 1] - poses[:, 1:2]
@@ -289,30 +304,32 @@ def _seen_from(points: Array, submap: Submap) -> tuple[BoolArray, BoolArray]:
     r = np.sqrt(dx * dx + dy * dy)
     at = _beam(c * dx + s * dy, c * dy - s * dx) + BEAMS * np.arange(len(poses))[:, None]
     near = np.zeros(r.shape, dtype=np.bool_)
+    same_m = SAME_SIGMAS * submap.config.point_sigma_m
     with np.errstate(invalid="ignore"):
         for image in submap.images:  # one by one they stay in the cache
-            near |= np.abs(image.ravel()[at] - r) < SAME_M
-        through = r < submap.free.ravel()[at] - ABSENT_M
-    return np.asarray(near.any(axis=0)), np.asarray(through.any(axis=0))
+            near |= np.abs(image.ravel()[at] - r) < same_m
+    free = r < submap.free.ravel()[at]
+    return np.asarray(near.any(axis=0)), np.asarray(free.any(axis=0))
 
 
 def match(
-    source: Submap, target: Submap, guess: Array, window: Array, least: float = 0.0
+    source: Submap, target: Submap, guess: Array, window: Array, min_score: float = 0.0
 ) -> list[Match]:
-    """All places of ``source`` in ``target`` within a window, the most agreeing first.
+    """All poses of ``source`` in ``target`` within a window that fit, the most agreeing first.
 
     ``guess`` (3,) is the middle of the window, ``window`` (3,) half its size, m, m, rad; for
-    ``least`` see `search`.
+    ``min_score`` see `search`.
     """
     found: list[Match] = []
-    for start in search(source, target, guess, window, least):
+    for start in search(source, target, guess, window, min_score):
         pose, cov = align(source, target, start)
-        if any(_close(pose, m.pose) for m in found):
+        if any(_duplicates(pose, m.pose, target.config) for m in found):
             continue
         found.append(Match(pose, cov, *agreement(source, target, pose)))
     return sorted(found, key=lambda m: m.absent - m.same)
 
 
-def _close(a: Array, b: Array) -> bool:
+def _duplicates(a: Array, b: Array, config: ScanMatchingConfig) -> bool:
     d = between(a, b)
-    return bool(np.hypot(d[0], d[1]) < 0.4 and abs(d[2]) < np.radians(6.0))
+    near = np.hypot(d[0], d[1]) < DUPLICATE_SHARE * config.reach_m
+    return bool(near and abs(d[2]) < DUPLICATE_RAD)

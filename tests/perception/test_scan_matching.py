@@ -31,7 +31,7 @@ def test_a_room_is_found_again_from_elsewhere():
 
 
 def test_a_place_where_hardly_a_point_lies_on_another_is_none():
-    """Breaks with a search that forgets ``least``, or takes it of the best place instead of all
+    """Breaks with a search that forgets ``min_score``, or takes it of the best place instead of all
     points. On the room itself 0.7 of them lie (a neighbouring cell counts half), on a corridor less
     than a tenth: 0.5 is between the two."""
     here, there = np.array([-2.0, 1.0, 0.3]), np.array([1.0, -1.5, -0.6])
