@@ -284,6 +284,23 @@ class BackendConfig:
 
 
 @dataclass(frozen=True)
+class LoopClosureConfig:
+    """Loop closure by matching submaps.
+
+    submap_spacing_m: path between two submaps. submap_reach_m: path that a submap takes in before
+    and after its middle. revisit_path_m: path without observing a place after which observing it
+    again is another visit. search_max_m, search_max_rad: half the window in which a submap is
+    searched for, at most.
+    """
+
+    submap_spacing_m: float = 3.0
+    submap_reach_m: float = 3.0
+    revisit_path_m: float = 15.0
+    search_max_m: float = 5.0
+    search_max_rad: float = 0.5
+
+
+@dataclass(frozen=True)
 class EkfConfig:
     """The extended Kalman filter of the thesis, and the invariant one (which has its own error).
 
@@ -395,6 +412,7 @@ class Config:
     association: AssociationConfig = field(default_factory=AssociationConfig)
     robust: RobustConfig = field(default_factory=RobustConfig)
     backend: BackendConfig = field(default_factory=BackendConfig)
+    loop_closure: LoopClosureConfig = field(default_factory=LoopClosureConfig)
     ekf: EkfConfig = field(default_factory=EkfConfig)
     rbpf: RbpfConfig = field(default_factory=RbpfConfig)
     start: StartConfig = field(default_factory=StartConfig)

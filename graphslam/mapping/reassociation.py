@@ -1,7 +1,8 @@
-"""All observations of walls anew: each to the wall that it fits best, now that everything is known.
+"""Data association of all observations of walls again, by the solved estimate.
 
-On the way an observation went to what the map was then; of a wall that was drawn elsewhere, or
-drawn twice, it may have gone to the wrong one. What fits no wall any more belongs to none.
+While the log was read, an observation was associated with the map of that time: of a wall that was
+estimated elsewhere, or twice, it may have been associated with the wrong one. Each observation now
+goes to the wall that it fits best; one that fits none is dropped.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,19 +14,17 @@ from graphslam.core.geometry import Array, compose, wrap
 from graphslam.core.records import Association, Estimate, Step
 from graphslam.mapping.landmark_map import Entry, observed_from
 
-#: m across, rad: how well an observation fits its own wall as a rule: the unit of competition
+#: m across, rad: typical residuals of an observation at its own wall, the unit of the distance
 SIGMA_M, SIGMA_RAD = 0.03, 0.02
-#: squared distance by which another wall must be better than the present one
+#: squared distance by which another wall must fit better than the present one
 BETTER = 4.0
-#: m beyond the ends of a wall at which the middle of an observation may lie
-BEYOND_M = 0.3
 #: observations compared with all walls at once
 CHUNK = 2000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reassociated:
-    """Steps, and how many observations went to another wall, or to none."""
+    """Steps, and how many observations were moved to another wall or dropped."""
 
     steps: tuple[Step, ...]
     moved: int
@@ -38,8 +37,9 @@ def reassociate(
     entries: Mapping[int, Entry],
     gate_m: float,
     gate_rad: float,
+    beyond_m: float,
 ) -> Reassociated:
-    """Observations of lines and segments with the walls that they fit best.
+    """Associate observations of lines and segments with the walls that they fit best.
 
     Args:
         steps: as recorded.
@@ -47,6 +47,7 @@ def reassociate(
         entries: kinds, means and extents of the landmarks, as estimated.
         gate_m: how far off a wall the middle of an observation may lie.
         gate_rad: how far its direction may differ.
+        beyond_m: how far beyond the ends of a wall the middle of an observation may lie.
     """
     walls = [e for i, e in entries.items() if i in estimate.landmarks and e.kind != "point"]
     place = {e.id: k for k, e in enumerate(walls)}
@@ -56,7 +57,7 @@ def reassociate(
     world = compose(observed_from(seen, estimate), np.array([a.z for a in seen]))
     own = np.array([place[a.target] for a in seen if isinstance(a.target, int)])
     best = np.concatenate([
-        _best(world[k : k + CHUNK], own[k : k + CHUNK], walls, gate_m, gate_rad)
+        _best(world[k : k + CHUNK], own[k : k + CHUNK], walls, gate_m, gate_rad, beyond_m)
         for k in range(0, len(seen), CHUNK)
     ])  # fmt: skip
     best = _exclusive(seen, own, best)
@@ -78,9 +79,9 @@ def reassociate(
 
 
 def _best(
-    seen: Array, own: Array, walls: Sequence[Entry], gate_m: float, gate_rad: float
+    seen: Array, own: Array, walls: Sequence[Entry], gate_m: float, gate_rad: float, beyond_m: float
 ) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-    """For observed middles and directions (n, 3) in the world the fitting wall, -1 for none."""
+    """Index of the wall that fits each observed pose (n, 3; world frame) best; -1 for none."""
     means, extents = np.array([e.mean for e in walls]), np.array([e.extent for e in walls])
     c, s = np.cos(means[:, 2]), np.sin(means[:, 2])
     dx, dy = seen[:, None, 0] - means[:, 0], seen[:, None, 1] - means[:, 1]
@@ -89,8 +90,8 @@ def _best(
     fits = (
         (np.abs(across) <= gate_m)
         & (np.abs(turn) <= gate_rad)
-        & (along >= extents[:, 0] - BEYOND_M)
-        & (along <= extents[:, 1] + BEYOND_M)
+        & (along >= extents[:, 0] - beyond_m)
+        & (along <= extents[:, 1] + beyond_m)
     )
     d2 = np.where(fits, (across / SIGMA_M) ** 2 + (turn / SIGMA_RAD) ** 2, np.inf)
     rows = np.arange(len(seen))
@@ -101,11 +102,11 @@ def _best(
 
 
 def _exclusive(seen: Sequence[Association], own: Array, best: Array) -> Array:
-    """No wall twice in one image: who comes anew to a wall that another one has stays where it was.
+    """No wall twice in one image: an observation does not move to a wall that another one has.
 
     Args:
         seen: the observations.
-        own: (n,) walls that they had.
+        own: (n,) walls they were associated with.
         best: (n,) walls that they fit best, -1 for none.
     """
     taken: dict[tuple[str, int, int], int] = {}

@@ -1,8 +1,8 @@
-"""Landmarks taken apart where a robot came back to them, and put together again.
+"""Landmarks split by visit before loop closure, and joined again after it.
 
-What was tied on the way, when little was known, may be tied wrongly: one of two parallel walls is
-taken for the other, and the whole map follows. So loops are judged and closed with every visit's
-landmarks for themselves; afterwards those of one landmark that lie where they should are one again.
+Associations made while little was known may be wrong: one of two parallel walls is taken for the
+other, and the whole map follows. So loops are closed with separate landmarks for every visit.
+Afterwards the landmarks that were one become one again where the solved estimate has them together.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,35 +15,37 @@ from graphslam.core.records import Estimate, Step, Trajectory
 from graphslam.mapping.duplicate_landmarks import merged_steps
 from graphslam.mapping.landmark_map import LandmarkMap
 
-#: m of path without a sighting, after which the next one is another visit's
-APART_M = 15.0
-#: m, rad: visits' landmarks that lie farther apart are not one
+#: m, rad: landmarks of different visits that lie farther apart stay separate
 SAME_M, SAME_RAD = 0.3, 0.15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SplitVisits:
-    """Steps in which every visit has its own landmarks; ``origin``: new landmark -> what it was."""
+    """Steps with separate landmarks per visit; ``origin``: new landmark -> the one it was."""
 
     steps: tuple[Step, ...]
     origin: Mapping[int, int]
 
     def start(self, estimate: Estimate) -> Estimate:
-        """An estimate of the steps as they were, with the new landmarks where the old ones are."""
+        """The estimate with every new landmark at the mean of the one it was."""
         landmarks = dict(estimate.landmarks)
         landmarks.update((new, landmarks[old]) for new, old in self.origin.items())
         return replace(estimate, landmarks=landmarks)
 
 
 def split_by_visit(
-    steps: Sequence[Step], states: Mapping[str, Trajectory], landmarks: LandmarkMap
+    steps: Sequence[Step],
+    states: Mapping[str, Trajectory],
+    landmarks: LandmarkMap,
+    revisit_path_m: float,
 ) -> SplitVisits:
-    """Steps with the landmarks of every robot's every visit for themselves.
+    """Steps in which every visit of every robot has its own landmarks.
 
     Args:
         steps: as recorded.
         states: estimates of all states.
         landmarks: those with an identity stay as they are.
+        revisit_path_m: path without observing a landmark, after which another visit begins.
     """
     named = set(landmarks.by_identity.values())
     seen = [
@@ -64,7 +66,7 @@ def split_by_visit(
     target = np.array([t for _, _, t, _ in seen])
     order = np.lexsort((path, robot, target))
     known = np.diff(target[order]) == 0
-    again = known & ((np.diff(robot[order]) != 0) | (np.diff(path[order]) > APART_M))
+    again = known & ((np.diff(robot[order]) != 0) | (np.diff(path[order]) > revisit_path_m))
     fresh = max(target.max(), max(landmarks.entries, default=0)) + 1
     number = np.concatenate([[0], np.cumsum(again)])  # of separations so far
     before = np.maximum.accumulate(np.where(np.append(True, ~known), number, 0))
@@ -86,22 +88,22 @@ def split_by_visit(
 
 
 def rejoin_visits(
-    taken_apart: SplitVisits, estimate: Estimate, landmarks: LandmarkMap
+    split: SplitVisits, estimate: Estimate, landmarks: LandmarkMap
 ) -> tuple[Step, ...]:
-    """Steps in which visits' landmarks that lie where they should are one again.
+    """Steps in which landmarks of different visits that lie together are one again.
 
     Args:
-        taken_apart: what `opened` made.
-        estimate: of its steps.
-        landmarks: those that are not one with what they were enter the map.
+        split: the steps with separate landmarks.
+        estimate: of their states and landmarks.
+        landmarks: the map; landmarks that stay separate enter it.
     """
     groups: dict[int, list[int]] = {}
     into: dict[int, int] = {}
-    for new, old in sorted(taken_apart.origin.items()):
+    for new, old in sorted(split.origin.items()):
         entry = landmarks.entries[old]
         mean = estimate.landmarks[new][0]
         for leader in groups.setdefault(old, [old]):
-            if _one(estimate.landmarks[leader][0], mean, entry.kind):
+            if _is_same(estimate.landmarks[leader][0], mean, entry.kind):
                 into[new] = leader
                 break
         else:
@@ -109,11 +111,11 @@ def rejoin_visits(
             landmarks.split(old, new)
             landmarks.entries[new].move(mean)
     kinds = {leader: landmarks.entries[leader].kind for leader in into.values()}
-    return merged_steps(taken_apart.steps, into, kinds)
+    return merged_steps(split.steps, into, kinds)
 
 
-def _one(a: Array, b: Array, kind: str) -> bool:
-    """Whether two landmarks (2,) or (3,) are one and the same, a line whatever lies along it."""
+def _is_same(a: Array, b: Array, kind: str) -> bool:
+    """Whether two means (2,) or (3,) are of one landmark; of lines, only the part across counts."""
     if kind == "point":
         return bool(np.hypot(*(b - a)) <= SAME_M)
     off = between(a, b)

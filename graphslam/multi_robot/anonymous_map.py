@@ -9,7 +9,7 @@ from itertools import combinations
 
 from graphslam.core.config import AssociationConfig
 from graphslam.core.geometry import Array
-from graphslam.mapping.loop_closure import SubmapPose
+from graphslam.mapping.submaps import SubmapPose
 from graphslam.multi_robot.landmark_constellations import relate_points
 from graphslam.multi_robot.place_recognition import relate_places
 from graphslam.multi_robot.relative_frames import RelativeFrame

@@ -29,7 +29,8 @@ from graphslam.core.geometry import (
     unit_vectors,
     wrap,
 )
-from graphslam.mapping.loop_closure import NEAR_M, TRUST, SubmapPose, drift_covariance, verify_match
+from graphslam.mapping.loop_closure import NEAR_M, TRUST, verify_match
+from graphslam.mapping.submaps import SubmapPose, drift_covariance
 from graphslam.multi_robot.relative_frames import RelativeFrame
 from graphslam.perception.scan_matching import IntArray, Match, match
 

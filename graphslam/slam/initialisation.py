@@ -17,7 +17,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.records import Scan, Sighting, Start, Trajectory
 from graphslam.estimation.isam2 import Isam2Backend
 from graphslam.logs import LogSet
-from graphslam.mapping.loop_closure import build_submaps
+from graphslam.mapping.submaps import build_submaps
 from graphslam.multi_robot.anonymous_map import AnonymousMap, relate_anonymous_maps
 from graphslam.multi_robot.frame_tree import FrameAssignment, build_frame_tree
 from graphslam.multi_robot.frames import logged_identity
@@ -150,7 +150,11 @@ def separate_estimates(run: Pipeline) -> dict[str, RobotEstimate]:
 def anonymous_maps(run: Pipeline, views: Mapping[str, RobotEstimate]) -> dict[str, AnonymousMap]:
     """Submaps and points without identity of each robot, after the pass that gave ``views``."""
     assert isinstance(run.backend, Isam2Backend)
-    found = build_submaps({robot: view.states for robot, view in views.items()}, run.pictures)
+    found = build_submaps(
+        {robot: view.states for robot, view in views.items()},
+        run.pictures,
+        run.config.loop_closure,
+    )
     seen = {}
     for robot, view in views.items():
         own = [place for place in found if place.state[0] == robot]

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphslam.core.config import Config
+from graphslam.core.config import Config, LoopClosureConfig
 from graphslam.core.geometry import Array
 from graphslam.core.records import Closure, Estimate, Picture, Step
 from graphslam.estimation.batch_calibration import calibrate, recompute_motions
@@ -27,19 +27,17 @@ from graphslam.mapping.duplicate_landmarks import (
 )
 from graphslam.mapping.landmark_map import LandmarkMap
 from graphslam.mapping.loop_closure import (
-    BORNE_OUT,
     CLOSED,
+    MAX_RESIDUAL,
     Pair,
-    SubmapPose,
-    build_submaps,
     consistent_closures,
     inflate_covariances,
     loop_closures,
     residuals,
     violated,
-    with_poses_from,
 )
 from graphslam.mapping.reassociation import reassociate
+from graphslam.mapping.submaps import SubmapPose, build_submaps, with_poses_from
 from graphslam.mapping.visits import rejoin_visits, split_by_visit
 from graphslam.odometry.preintegration import Track
 from graphslam.slam.motion_noise import noise_scales, scale_motion_noise
@@ -90,7 +88,7 @@ def reoptimise_scan_log(
     closures: list[Closure] = []
     if config.backend.close_loops:
         steps, closures, estimate = _close_loops(
-            steps, estimate, pictures, landmarks, solve, tamper, counts
+            steps, estimate, pictures, landmarks, solve, tamper, counts, config.loop_closure
         )
     for gates in GATES:
         estimate = solve(steps, estimate, closures)
@@ -101,7 +99,9 @@ def reoptimise_scan_log(
             merge_entries(landmarks, into)
             counts["landmarks_merged"] += len(into)
         # duplicates are merged first: else observations would move to and fro between the two
-        again = reassociate(steps, estimate, landmarks.entries, *gates)
+        again = reassociate(
+            steps, estimate, landmarks.entries, *gates, config.association.overlap_gap_m
+        )
         if into or again.moved or again.dropped:
             steps = again.steps
         counts["observations_reassociated"] += again.moved
@@ -159,65 +159,72 @@ def _close_loops(
     solve: _Solver,
     tamper: Tamper | None,
     counts: Counter[str],
+    config: LoopClosureConfig,
 ) -> tuple[tuple[Step, ...], list[Closure], Estimate]:
-    """Loops closed by matching: steps, the closures that are believed, and the estimate with them.
+    """Loops closed by matching submaps.
 
-    Where visits' landmarks are tied wrongly the estimate is wrong and sure of itself. So closures
-    are judged by what is known without those ties, and landmarks are tied again afterwards.
+    Where landmarks of different visits are associated wrongly, the estimate is wrong and
+    overconfident. So closures are judged by what is known without those associations, and
+    landmarks of different visits are associated again afterwards.
+
+    Returns:
+        Steps, the closures that are used, and the estimate with them.
     """
-    taken_apart = split_by_visit(steps, estimate.states, landmarks)
-    now = taken_apart.start(estimate)
-    loose = solve(taken_apart.steps, now)
-    seen = build_submaps(loose.states, pictures)  # bent by no tie
-    believed: dict[Pair, Closure] = {}
-    lost: set[Pair] = set()  # those of them that said something new
+    split = split_by_visit(steps, estimate.states, landmarks, config.revisit_path_m)
+    closed = split.start(estimate)
+    prior = solve(split.steps, closed)
+    submaps = build_submaps(prior.states, pictures, config)  # bent by no wrong association
+    accepted: dict[Pair, Closure] = {}
+    correcting: set[Pair] = set()  # those of them that correct the estimate
     refused: dict[Pair, Closure] = {}
-    looked: dict[Pair, Array] = {}
-    for _ in range(MAX_CLOSING_ROUNDS if seen else 0):
-        P = solve.backend.state_covariance([place.state for place in seen])
-        new, same = loop_closures(with_poses_from(seen, now.states), P, looked)
-        if tamper is not None:
-            new = [c for c in tamper([*new, *same], seen) if c not in same]
-        # what did not agree before may do so now
-        open_ones = refused | {c.pair: c for c in new}
-        agreed = consistent_closures(
-            [*open_ones.values(), *same], with_poses_from(seen, loose.states), P
+    examined: dict[Pair, Array] = {}
+    for _ in range(MAX_CLOSING_ROUNDS if submaps else 0):
+        P = solve.backend.state_covariance([submap.state for submap in submaps])
+        new, confirming = loop_closures(
+            with_poses_from(submaps, closed.states), P, examined, config
         )
-        refused = {pair: c for pair, c in open_ones.items() if c not in agreed}
-        told = {c.pair for c in agreed if c not in same}
-        if not told:
+        if tamper is not None:
+            new = [c for c in tamper([*new, *confirming], submaps) if c not in confirming]
+        # what was inconsistent before may be consistent now
+        proposed = refused | {c.pair: c for c in new}
+        consistent = consistent_closures(
+            [*proposed.values(), *confirming], with_poses_from(submaps, prior.states), P
+        )
+        refused = {pair: c for pair, c in proposed.items() if c not in consistent}
+        added = {c.pair for c in consistent if c not in confirming}
+        if not added:
             break
-        lost |= told
-        believed |= {c.pair: c for c in agreed}
-        now = loose = _tightened(taken_apart.steps, [*believed.values()], now, solve)
-        gone = violated([*believed.values()], now.states, BORNE_OUT)
-        taken_back = {pair for pair, off in zip(believed, gone, strict=True) if off}
-        counts["closures_refused"] += len(taken_back & lost)
-        believed = {pair: c for pair, c in believed.items() if pair not in taken_back}
-        lost -= taken_back
-    counts["closures_verified"] = len(lost)
+        correcting |= added
+        accepted |= {c.pair: c for c in consistent}
+        closed = prior = _tightened(split.steps, [*accepted.values()], closed, solve)
+        off = violated([*accepted.values()], closed.states, MAX_RESIDUAL)
+        taken_back = {pair for pair, is_off in zip(accepted, off, strict=True) if is_off}
+        counts["closures_refused"] += len(taken_back & correcting)
+        accepted = {pair: c for pair, c in accepted.items() if pair not in taken_back}
+        correcting -= taken_back
+    counts["closures_verified"] = len(correcting)
     counts["closures_refused"] += len(refused)
-    if not lost:
+    if not correcting:
         return steps, [], estimate
-    closures = [closure for pair, closure in believed.items() if pair in lost]
-    return rejoin_visits(taken_apart, now, landmarks), closures, now
+    closures = [closure for pair, closure in accepted.items() if pair in correcting]
+    return rejoin_visits(split, closed, landmarks), closures, closed
 
 
 def _tightened(
     steps: Sequence[Step], closures: Sequence[Closure], estimate: Estimate, solve: _Solver
 ) -> Estimate:
-    """Solved with closures that are slack first, and the tighter the nearer the estimate comes."""
+    """Solved with closures whose covariances are inflated first, and tightened step by step."""
     before = np.inf
     for _ in range(MAX_TIGHTENING_ROUNDS):
-        if not any(violated(closures, estimate.states, BORNE_OUT)):
+        if not any(violated(closures, estimate.states, MAX_RESIDUAL)):
             return solve(steps, estimate, closures)
         estimate = solve(steps, estimate, inflate_covariances(closures, estimate.states))
         left = float(np.abs(residuals(closures, estimate.states)).sum())
         if left > NO_PROGRESS * before:
             break
         before = left
-    # what holds the estimate back may be wrong and sure of itself: from where all closures hold,
-    # kernels tell which of the two is
+    # what holds the estimate back may be wrong associations: starting where all closures are
+    # satisfied, the robust kernels tell which of the two is wrong
     held = solve(steps, estimate, [replace(closure, verified=True) for closure in closures])
     return solve(steps, held, closures)
 

@@ -302,7 +302,7 @@ def test_a_line_ends_where_its_observations_end(map_moved, slid):
     wall = landmarks.entries[0]
     ends = [compose(wall.mean, np.array([end, 0.0, 0.0]))[0] for end in wall.extent]
     np.testing.assert_allclose(ends, [4.5 + map_moved, -0.5 + map_moved], atol=1e-12)
-    assert not reassociate(steps, estimate, landmarks.entries, 0.1, 0.1).dropped
+    assert not reassociate(steps, estimate, landmarks.entries, 0.1, 0.1, 0.3).dropped
 
 
 def test_a_segment_brings_its_ends_along():

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from walls import L_ROOM, cloud
 
+from graphslam.core.config import LoopClosureConfig
 from graphslam.core.geometry import between, compose
 from graphslam.core.records import Closure, Picture, Trajectory
 from graphslam.mapping.loop_closure import (
-    build_submaps,
     candidates,
     consistent_closures,
     inflate_covariances,
@@ -17,9 +17,11 @@ from graphslam.mapping.loop_closure import (
     verify_match,
     violated,
 )
+from graphslam.mapping.submaps import build_submaps
 from graphslam.perception.scan_matching import Match
 
 COV = np.diag([0.02, 0.02, 0.005]) ** 2
+CONFIG = LoopClosureConfig()
 
 
 def drive(poses, seen_from):
@@ -56,9 +58,9 @@ def test_a_drifted_run_meets_itself():
     found says where the later place truly lies in the earlier."""
     true = round_trip()
     states, pictures = drive(drifting(true), true)
-    found = build_submaps(states, pictures)
+    found = build_submaps(states, pictures, CONFIG)
     P = np.kron(np.eye(len(found)), np.diag([0.05, 0.05, 0.03]) ** 2)
-    closures, _ = loop_closures(found, P, {})
+    closures, _ = loop_closures(found, P, {}, CONFIG)
     assert len(closures) >= 3
     at = {int(t): k for k, t in enumerate(states["robot"].stamps_ns)}
     for c in closures:
@@ -73,10 +75,10 @@ def test_a_run_that_is_right_needs_no_closure():
     """Breaks with closures where nothing is to be closed: what is there is only confirmed."""
     true = round_trip()
     states, pictures = drive(true, true)
-    found = build_submaps(states, pictures)
+    found = build_submaps(states, pictures, CONFIG)
     P = np.kron(np.eye(len(found)), np.diag([0.05, 0.05, 0.03]) ** 2)
-    assert candidates(found, P)
-    lost, confirmed = loop_closures(found, P, {})
+    assert candidates(found, P, CONFIG)
+    lost, confirmed = loop_closures(found, P, {}, CONFIG)
     assert lost == []
     for c in confirmed:
         at = {place.state: place.pose for place in found}
@@ -88,11 +90,11 @@ def test_a_pair_is_looked_at_once():
     """Breaks if rounds cost as much as the first one where nothing has moved."""
     true = round_trip()
     states, pictures = drive(drifting(true), true)
-    found = build_submaps(states, pictures)
+    found = build_submaps(states, pictures, CONFIG)
     P = np.kron(np.eye(len(found)), np.diag([0.05, 0.05, 0.03]) ** 2)
     looked = {}
-    assert loop_closures(found, P, looked)[0]
-    assert loop_closures(found, P, looked) == ([], [])
+    assert loop_closures(found, P, looked, CONFIG)[0]
+    assert loop_closures(found, P, looked, CONFIG) == ([], [])
 
 
 GOOD = Match(np.zeros(3), COV, same=0.7, absent=0.03)
@@ -118,7 +120,7 @@ def test_what_makes_a_match_unbelievable(bad):
 def closed_loops(poses, true):
     """Places along ``poses`` where ``true`` ones were driven, true poses of them, true closures."""
     states, pictures = drive(poses, true)
-    found = build_submaps(states, pictures)
+    found = build_submaps(states, pictures, CONFIG)
     at = {int(t): k for k, t in enumerate(states["robot"].stamps_ns)}
     where = np.array([true[at[p.state[1]]] for p in found])
     good = [

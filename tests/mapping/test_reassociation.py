@@ -46,7 +46,7 @@ def targets_of(steps):
 def test_each_goes_to_the_wall_that_it_fits():
     """Breaks with a comparison in the wrong frame, or one that keeps what was."""
     steps, estimate = world([0, 0, 1, 1], at=[0, 1, 1, 0])
-    done = reassociate(steps, estimate, {0: entry(0), 1: entry(1)}, 0.3, 0.15)
+    done = reassociate(steps, estimate, {0: entry(0), 1: entry(1)}, 0.3, 0.15, 0.3)
     assert targets_of(done.steps) == [0, 1, 1, 0]
     assert (done.moved, done.dropped) == (2, 0)
 
@@ -54,7 +54,7 @@ def test_each_goes_to_the_wall_that_it_fits():
 def test_what_fits_no_wall_goes():
     """Breaks if an observation a metre off every wall goes on bending the map."""
     steps, estimate = world([0, 0, 1], at=[0, None, 1])
-    done = reassociate(steps, estimate, {0: entry(0), 1: entry(1)}, 0.3, 0.15)
+    done = reassociate(steps, estimate, {0: entry(0), 1: entry(1)}, 0.3, 0.15, 0.3)
     assert targets_of(done.steps) == [0, 1]
     assert (done.moved, done.dropped) == (0, 1)
 
@@ -65,7 +65,7 @@ def test_one_image_shows_a_wall_once():
     (a,) = steps[0].associations
     near = replace(a, target=1, z=a.z + np.array([0.5, 0.0, 0.0]))  # booked for 1, fits 0
     steps = (replace(steps[0], associations=(a, near)),)
-    done = reassociate(steps, estimate, {0: entry(0), 1: entry(1)}, 0.3, 0.15)
+    done = reassociate(steps, estimate, {0: entry(0), 1: entry(1)}, 0.3, 0.15, 0.3)
     assert targets_of(done.steps) == [0, 1]
 
 
@@ -73,6 +73,6 @@ def test_beyond_the_end_of_a_wall_it_is_another():
     """Breaks without the test of extents: all walls in line would be one."""
     steps, estimate = world([0, 0], at=[0, 0])
     short = replace(entry(0), extent=np.array([1.5, 5.0]))  # world x from -5 to -1.5
-    done = reassociate(steps, estimate, {0: short, 1: entry(1)}, 0.1, 0.15)
+    done = reassociate(steps, estimate, {0: short, 1: entry(1)}, 0.1, 0.15, 0.3)
     assert targets_of(done.steps) == [0]
     assert done.dropped == 1

@@ -16,7 +16,7 @@ from graphslam.core.geometry import between, compose, inverse, transform, wrap
 from graphslam.core.records import Start
 from graphslam.evaluation.metrics import evaluate
 from graphslam.logs import open_logs, read_truth
-from graphslam.mapping.loop_closure import SubmapPose
+from graphslam.mapping.submaps import SubmapPose
 from graphslam.multi_robot.frame_tree import build_frame_tree
 from graphslam.multi_robot.landmark_constellations import relate_points
 from graphslam.multi_robot.place_recognition import (

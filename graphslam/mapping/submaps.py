@@ -1,0 +1,118 @@
+"""Submaps along the paths: the scans of a few metres of path, as one set of points."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphslam.core.config import LoopClosureConfig
+from graphslam.core.geometry import (
+    Array,
+    adjoint,
+    between,
+    compose,
+    inverse,
+    path_length,
+    transform,
+    wrap,
+)
+from graphslam.core.records import Picture, Trajectory
+from graphslam.perception.scan_matching import Submap, make_submap
+
+#: m of path and rad turned between the scans of a submap: nearer ones show the same
+SCAN_M, SCAN_RAD = 0.5, 0.4
+#: points of a scan, at least
+MIN_POINTS = 20
+#: submaps of a robot's path, at most; a longer path has them farther apart
+MAX_SUBMAPS = 400
+#: m, m, rad per root of a metre: drift of an estimate that its covariance does not know of
+DRIFT = np.array([0.02, 0.02, 0.01])
+
+#: state of a robot: its name and time
+State = tuple[str, int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SubmapPose:
+    """A submap with the state in whose frame it is.
+
+    ``pose`` (3,) is the estimate of that state, ``path_m`` how far its robot had driven there,
+    ``span_ns`` the times of the submap's first and last scan.
+    """
+
+    state: State
+    pose: Array
+    path_m: float
+    span_ns: tuple[int, int]
+    submap: Submap
+
+
+def build_submaps(
+    states: Mapping[str, Trajectory], pictures: Iterable[Picture], config: LoopClosureConfig
+) -> list[SubmapPose]:
+    """Submaps along every robot's path.
+
+    Args:
+        states: estimates of all states.
+        pictures: scan points seen from them.
+        config: spacing and reach of the submaps.
+    """
+    clouds = {(p.robot, p.time_ns): p for p in pictures if len(p.points) >= MIN_POINTS}
+    found = []
+    for robot, states_of in states.items():
+        seen = np.array([(robot, int(t)) in clouds for t in states_of.stamps_ns], dtype=bool)
+        poses, stamps = states_of.poses[seen], states_of.stamps_ns[seen]
+        if len(poses) < 2:
+            continue
+        path = path_length(poses)
+        turned = np.concatenate([[0.0], np.cumsum(np.abs(wrap(np.diff(poses[:, 2]))))])
+        spacing = max(config.submap_spacing_m, path[-1] / MAX_SUBMAPS)
+        for middle in np.unique(np.searchsorted(path, np.arange(0.0, path[-1], spacing))):
+            used: list[int] = []
+            for k in np.flatnonzero(np.abs(path - path[middle]) <= config.submap_reach_m):
+                if (
+                    not used
+                    or path[k] - path[used[-1]] >= SCAN_M
+                    or turned[k] - turned[used[-1]] >= SCAN_RAD
+                ):
+                    used.append(int(k))
+            seen_there = [clouds[robot, int(stamps[k])] for k in used]
+            sensors = np.array([p.sensor for p in seen_there])
+            submap = make_submap(
+                compose(between(poses[middle], poses[used]), sensors),
+                [transform(inverse(p.sensor), p.points.astype(float)) for p in seen_there],
+            )
+            state = robot, int(stamps[middle])
+            span = int(stamps[used[0]]), int(stamps[used[-1]])
+            found.append(SubmapPose(state, poses[middle], float(path[middle]), span, submap))
+    return found
+
+
+def with_poses_from(
+    found: Sequence[SubmapPose], states: Mapping[str, Trajectory]
+) -> list[SubmapPose]:
+    """The same submaps with their poses from another estimate; their points stay as they are."""
+    return [
+        replace(p, pose=states[robot].at(time_ns)) for p in found for robot, time_ns in [p.state]
+    ]
+
+
+def drift_covariance(found: Sequence[SubmapPose]) -> Array:
+    """Joint covariance (3n, 3n) of submap poses by drift that the estimate does not know of.
+
+    A wall taken for its parallel neighbour bends the path there, and everything after it follows:
+    modelled as a random walk along each robot's path. Errors are along each pose's own axes.
+    """
+    n = len(found)
+    poses, path = np.array([p.pose for p in found]), np.array([p.path_m for p in found])
+    robots = np.array([p.state[0] for p in found])
+    D = np.zeros((n, n, 3, 3))
+    for robot in np.unique(robots):
+        own = np.flatnonzero(robots == robot)
+        own = own[np.argsort(path[own], kind="stable")]
+        k, steps = len(own), np.diff(path[own], prepend=path[own[0]])
+        # how an error that arises at one place (second axis) moves a later one (first axis)
+        G = adjoint(between(poses[own][:, None], poses[own])) * np.tri(k)[:, :, None, None]
+        G = (G * np.sqrt(steps)[:, None, None] * DRIFT).transpose(0, 2, 1, 3).reshape(3 * k, -1)
+        D[np.ix_(own, own)] = (G @ G.T).reshape(k, 3, k, 3).transpose(0, 2, 1, 3)
+    return D.transpose(0, 2, 1, 3).reshape(3 * n, 3 * n)
