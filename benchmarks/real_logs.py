@@ -58,14 +58,13 @@ class Run:
 
     relations: dict[str, Any]
     summary: dict[str, Any]
-    wall_s: float
-    peak_mb: float
+    used: Used
 
     @property
     def times_real_time(self) -> float:
         """Length of the log over the wall time of the command."""
         stages = self.summary["stages"]
-        return float(self.summary["real_time_factor"] * stages["all"] / self.wall_s)
+        return float(self.summary["real_time_factor"] * stages["all"] / self.used.wall_s)
 
     def values(self) -> dict[str, float]:
         """What the bars are about, by their names."""
@@ -74,10 +73,10 @@ class Run:
             "all, mean m": groups["all"]["trans_mean_m"],
             "all, mean deg": groups["all"]["rot_mean_deg"],
             "loops, mean m": groups["loops"]["trans_mean_m"],
-            "wall s": self.wall_s,
+            "wall s": self.used.wall_s,
             "local, mean m": groups["local"]["trans_mean_m"],
             "x real time": self.times_real_time,
-            "peak memory MB": self.peak_mb,
+            "peak memory MB": self.used.peak_mb,
             "unmatched": groups["all"]["unmatched"],
         }
 
@@ -87,7 +86,7 @@ def run(name: str, folder: Path) -> Run:
     _, used = measured_command("smooth", str(import_freiburg(name, folder)), "-o", str(target))
     found = command("evaluate", str(target), "--relations", str(FREIBURG / f"{name}.relations"))
     summary = json.loads((target / "summary.json").read_text(encoding="utf-8"))
-    return Run(found["relations"], summary, used.wall_s, used.peak_mb)
+    return Run(found["relations"], summary, used)
 
 
 def print_errors(name: str, done: Run) -> None:
@@ -108,8 +107,8 @@ def print_errors(name: str, done: Run) -> None:
             row = "".join(f"{value:10.4f}" for value in numbers)
             print(f"{label:10}{group:8}{g['n']:6}{row}")
     print(
-        f"{done.times_real_time:.1f} x real time ({done.wall_s:.1f} s wall),"
-        f" peak {done.peak_mb:.0f} MB"
+        f"{done.times_real_time:.1f} x real time ({done.used.wall_s:.1f} s wall),"
+        f" peak {done.used.peak_mb:.0f} MB"
     )
 
 

@@ -2,21 +2,10 @@
 
 from collections import Counter
 
+import backend_cases as cases
 import gtsam
 import numpy as np
 import pytest
-from backend_cases import (
-    MODEL_OF,
-    MOTION_COV,
-    PLAIN,
-    WORLD,
-    drive,
-    motion,
-    run,
-    see,
-    two_robots,
-    without_lines,
-)
 from finite_differences import jacobian
 from scipy.optimize import least_squares
 from scipy.stats import chi2
@@ -256,12 +245,15 @@ def in_the_middle(error):
     rng = np.random.default_rng(3)
     b, a = np.array([2.0, -1.0, 2.0]), np.array([0.1, 0.2, 0.4])
     cov = np.diag([1e-2, 2e-2, 5e-3])
-    seen = [see("b", 0, 2, "segment", b, WORLD[2], rng), see("b", 0, 0, "point", b, WORLD[0], rng)]
+    seen = [
+        cases.see("b", 0, 2, "segment", b, cases.WORLD[2], rng),
+        cases.see("b", 0, 0, "point", b, cases.WORLD[0], rng),
+    ]
     steps = [
         Step(0, {"b": Start(b, cov)}),
         Step(0, {}, {}, tuple(seen)),
         Step(0, {"a": Start(a, cov)}),
-        Step(0, {}, {}, (see("a", 0, 1, "line", a, WORLD[1], rng),)),
+        Step(0, {}, {}, (cases.see("a", 0, 1, "line", a, cases.WORLD[1], rng),)),
     ]
     return filtered(steps, settings(error))
 
@@ -290,7 +282,7 @@ def test_measurement_jacobian_in_the_whole_state(error, robot, target, point_of,
     backend = in_the_middle(error)
     gaussian = backend._gaussian
     assert list(gaussian) == ["b", 2, 0, "a", 1]
-    name = MODEL_OF.get(target) or ("robot-point" if point_of else "robot-pose")
+    name = cases.MODEL_OF.get(target) or ("robot-point" if point_of else "robot-pose")
     x, t = (gaussian.x[gaussian.slot(member)].copy() for member in (robot, target))
     z = MODELS[name].predict(x, t)
     z = z if name == "line" else z + np.array([0.1, -0.2, 0.15])[: len(z)]
@@ -330,7 +322,7 @@ def test_motion_jacobians(error, monkeypatch):
     F = jacobian(lambda e: difference(compose(ERRORS[error].retract(x, e), delta)), np.zeros(3))
     W = jacobian(lambda w: difference(compose(x, delta + w)), np.zeros(3))
     calls = spied(monkeypatch, "move")
-    backend.add(Step(1, motions={"b": motion(0, 1, delta, Q)}))
+    backend.add(Step(1, motions={"b": cases.motion(0, 1, delta, Q)}))
     ((name, found, noise),) = calls
     assert name == "b"
     np.testing.assert_allclose(found, F, atol=1e-9)
@@ -459,7 +451,7 @@ def test_the_filter_is_the_textbooks(error, past_states):
     """Everything at once, all kinds of landmarks and both kinds of meetings: 1e-9 of each sigma.
     With two past states, late evidence counts; with eight, the closure to the first state as well.
     Copies whose place is used again are what a filter that forgets nothing has."""
-    steps, _ = two_robots(np.random.default_rng(21))
+    steps, _ = cases.two_robots(np.random.default_rng(21))
     backend = EkfBackend(settings(error, past_states=past_states))
     twin = Twin(error, past_states)
     for step in steps:
@@ -484,13 +476,13 @@ def test_body_errors_are_the_filter_of_gtsam_factors(seed):
     """Mean and covariance after every step, in units of sigma. The seeds leave no heading residual
     below 1e-3 rad, where GTSAM's derivative of the logarithm cancels: it is off by 1.6e-5 at 1e-4
     rad and by 8e-4 at 3e-5, against 1e-8 here."""
-    steps, _ = two_robots(np.random.default_rng(seed))
+    steps, _ = cases.two_robots(np.random.default_rng(seed))
     config = settings("body")
     ours, theirs, known = EkfBackend(config), FactorEkfBackend(config), set()
     for step in steps:
         ours.add(step)
         theirs.add(step)
-        known |= {a.target for a in step.associations if a.target in MODEL_OF}
+        known |= {a.target for a in step.associations if a.target in cases.MODEL_OF}
         a, b = (backend.joint("b", sorted(known), ["a"]) for backend in (ours, theirs))
         sigmas = np.sqrt(np.diag(a.cov))
         for mine, other in zip((a.pose, *a.landmarks, *a.others),
@@ -504,7 +496,7 @@ def test_body_errors_are_the_filter_of_gtsam_factors(seed):
 @pytest.mark.parametrize("error", FRAMES)
 def test_robots_that_never_met_know_nothing_of_each_other(error):
     """To the digit: what b does leaves a where it was."""
-    steps, _ = two_robots(np.random.default_rng(2))
+    steps, _ = cases.two_robots(np.random.default_rng(2))
     apart = [
         Step(
             s.time_ns,
@@ -527,7 +519,7 @@ def test_robots_that_never_met_know_nothing_of_each_other(error):
 @pytest.mark.parametrize("error", FRAMES)
 def test_deleting_a_landmark_leaves_the_rest(error):
     """4.6: the marginal of the others stays, and the landmark may be seen anew."""
-    steps, where = two_robots(np.random.default_rng(21))
+    steps, where = cases.two_robots(np.random.default_rng(21))
     backend = filtered(steps, settings(error))
     before = backend.joint("b", [2, 0], ["a"])
     backend.remove(1)
@@ -538,19 +530,19 @@ def test_deleting_a_landmark_leaves_the_rest(error):
     for ask in (lambda: backend.joint("b", [1]), lambda: backend.remove(1)):
         with pytest.raises(EstimationError, match="landmark 1 is not in the filter"):
             ask()
-    backend.add(Step(6, associations=(see("a", 6, 1, "line", where["a"], WORLD[1]),)))
+    backend.add(Step(6, associations=(cases.see("a", 6, 1, "line", where["a"], cases.WORLD[1]),)))
     assert set(backend.finish().landmarks) == {0, 1, 2}
 
 
 def test_final_is_causal():
     """A filter does not revise: what a state was after its own step it is in the end, whatever came
     later, also at the same state."""
-    steps, where = two_robots(np.random.default_rng(21))
-    backend, causal = EkfBackend(PLAIN), []
+    steps, where = cases.two_robots(np.random.default_rng(21))
+    backend, causal = EkfBackend(cases.PLAIN), []
     for step in steps:
         backend.add(step)
         causal.append(backend.joint("b", []))
-    backend.add(Step(6, associations=(see("b", 6, 0, "point", where["b"], WORLD[0]),)))
+    backend.add(Step(6, associations=(cases.see("b", 6, 0, "point", where["b"], cases.WORLD[0]),)))
     states = backend.finish().states["b"]
     np.testing.assert_array_equal(states.poses, [joint.pose for joint in causal])
     np.testing.assert_array_equal(states.covs, [joint.cov for joint in causal])
@@ -560,11 +552,14 @@ def test_error_and_degrees_of_freedom_are_the_smoothers():
     """In a problem that small noise leaves linear, half the squared normalised innovations add up
     to the smoother's error; measured 2e-4 apart. Without lines: the smoother's wide gauge times a
     direction's residual is no smaller than the noise, however small that is."""
-    steps = without_lines(drive(np.random.default_rng(5), 1e-2)[0])
-    ours, batch = filtered(steps, PLAIN).finish(), run("batch", steps).finish()
+    steps = cases.without_lines(cases.drive(np.random.default_rng(5), 1e-2)[0])
+    ours, batch = filtered(steps, cases.PLAIN).finish(), cases.run("batch", steps).finish()
     assert ours.error == pytest.approx(batch.error, rel=2e-3)
-    with_lines = drive(np.random.default_rng(5), 1e-2)[0]
-    assert filtered(with_lines, PLAIN).finish().dof == run("batch", with_lines).finish().dof
+    with_lines = cases.drive(np.random.default_rng(5), 1e-2)[0]
+    assert (
+        filtered(with_lines, cases.PLAIN).finish().dof
+        == cases.run("batch", with_lines).finish().dof
+    )
 
 
 # ------------------------------------------------------------ consistency
@@ -577,15 +572,15 @@ def test_final_joint_state_is_as_uncertain_as_it_says(error):
     0.84 and 1.18 per degree. Too small means noise counted twice, too large information."""
     values = []
     for seed in range(60):
-        steps, true = drive(np.random.default_rng(seed), 2e-2)
+        steps, true = cases.drive(np.random.default_rng(seed), 2e-2)
         joint = filtered(steps, settings(error)).joint("a", [0, 2, 1], ["b"])
-        miss = [joint.pose - true["a"], joint.landmarks[0] - WORLD[0]]
-        miss += [joint.landmarks[1] - WORLD[2], rotation3(WORLD[1][2]).T @ (
-            joint.landmarks[2] - WORLD[1]), joint.others[0] - true["b"]]  # fmt: skip
+        miss = [joint.pose - true["a"], joint.landmarks[0] - cases.WORLD[0]]
+        miss += [joint.landmarks[1] - cases.WORLD[2], rotation3(cases.WORLD[1][2]).T @ (
+            joint.landmarks[2] - cases.WORLD[1]), joint.others[0] - true["b"]]  # fmt: skip
         e = np.concatenate([wrap(m) if abs(m[-1]) > 3 else m for m in miss])
         line = joint.slices[2]
         T = np.eye(len(e))
-        T[line, line] = rotation3(WORLD[1][2]).T
+        T[line, line] = rotation3(cases.WORLD[1][2]).T
         keep = np.delete(np.arange(len(e)), line.start)
         P = (T @ joint.cov @ T.T)[np.ix_(keep, keep)]
         values.append(e[keep] @ np.linalg.solve(P, e[keep]))
@@ -601,7 +596,7 @@ def corridor(**ekf):
     steps = [Step(0, {"r": Start(np.zeros(3), np.diag([1e-4, 1e-4, 1e-6]))})]
     for k in range(1, 61):
         seen = Association("r", k, 0, "line", np.array([0.0, 1.5, 0.0]), R)
-        moved = motion(k - 1, k, [0.5, 0, 0], np.diag([1e-2, 1e-4, 1e-5]))
+        moved = cases.motion(k - 1, k, [0.5, 0, 0], np.diag([1e-2, 1e-4, 1e-5]))
         steps.append(Step(k, {}, {"r": moved}, (seen,)))
     joint = filtered(steps, settings(**ekf)).joint("r", [])
     return joint.pose, np.sqrt(joint.cov[0, 0])
@@ -661,7 +656,7 @@ def test_a_far_innovation_is_believed_where_the_prediction_is_poor():
 
 @pytest.mark.parametrize("error", FRAMES)
 def test_an_outlier_is_ignored_with_a_kernel_only(error):
-    steps, _ = two_robots(np.random.default_rng(21))
+    steps, _ = cases.two_robots(np.random.default_rng(21))
     seen = steps[-1].associations[0]
     wrong = Association("a", 6, 0, "point", seen.z + np.array([0.0, 3.0]), seen.cov)
 
@@ -722,7 +717,7 @@ def test_the_iterated_filter_is_the_most_probable_state(error):
 )
 def test_what_belongs_to_a_forgotten_past_is_skipped_and_counted(past_states, skipped):
     """Late evidence is two states old, the closure's other end six."""
-    steps, _ = two_robots(np.random.default_rng(21))
+    steps, _ = cases.two_robots(np.random.default_rng(21))
     assert filtered(steps, settings(past_states=past_states)).skipped == Counter(skipped)
 
 
@@ -732,22 +727,24 @@ def test_the_state_stays_bounded(past_states):
     more, in either filter; else every step would cost more than the one before."""
     config = settings("body", past_states=past_states)
     for backend in (EkfBackend(config), FactorEkfBackend(config)):
-        backend.add(Step(0, {"r": Start(np.zeros(3), MOTION_COV)}))
-        seen = see("r", 0, 0, "point", np.zeros(3), WORLD[0])
+        backend.add(Step(0, {"r": Start(np.zeros(3), cases.MOTION_COV)}))
+        seen = cases.see("r", 0, 0, "point", np.zeros(3), cases.WORLD[0])
         backend.add(Step(0, associations=(seen,)))
         for k in range(1, 12):
-            backend.add(Step(k, motions={"r": motion(k - 1, k, [0.1, 0, 0], MOTION_COV)}))
+            backend.add(
+                Step(k, motions={"r": cases.motion(k - 1, k, [0.1, 0, 0], cases.MOTION_COV)})
+            )
         ekf = isinstance(backend, EkfBackend)
         size = len(backend._gaussian) if ekf else len(backend._matrix()[0])
         assert size == 3 * (1 + past_states) + 2
 
 
 def test_what_is_skipped_changes_nothing():
-    steps, where = two_robots(np.random.default_rng(21))
+    steps, where = cases.two_robots(np.random.default_rng(21))
     backend = filtered(steps, settings(past_states=1))
     skipped = backend.skipped["observation from a past state"]
     before = backend.joint("a", [0, 1, 2], ["b"])
-    past = see("a", 4, 0, "point", where["a"], WORLD[0])
+    past = cases.see("a", 4, 0, "point", where["a"], cases.WORLD[0])
     backend.add(Step(6, associations=(past,)))
     assert backend.skipped["observation from a past state"] == skipped + 1
     after = backend.joint("a", [0, 1, 2], ["b"])
@@ -757,8 +754,8 @@ def test_what_is_skipped_changes_nothing():
 
 @pytest.mark.parametrize("error", FRAMES)
 def test_a_closure_between_states_of_now_is_a_robot_seen(error):
-    steps, where = two_robots(np.random.default_rng(21))
-    seen = see("a", 6, "b", "robot-pose", where["a"], where["b"])
+    steps, where = cases.two_robots(np.random.default_rng(21))
+    seen = cases.see("a", 6, "b", "robot-pose", where["a"], where["b"])
     closure = Closure("b", 6, "a", 6, seen.z, seen.cov)
     results = []
     for last in (Step(6, associations=(seen,)), Step(6, closures=(closure,))):
@@ -779,7 +776,7 @@ BAD = {
 @pytest.mark.parametrize("what", BAD)
 def test_an_indeterminate_landmark_is_named_with_its_robot_and_time(what, known):
     """At its first sighting and at a later one, in one line."""
-    backend = filtered([Step(0, {"r": Start(np.zeros(3), 1e-4 * np.eye(3))})], PLAIN)
+    backend = filtered([Step(0, {"r": Start(np.zeros(3), 1e-4 * np.eye(3))})], cases.PLAIN)
     if known:
         good = Association("r", 0, 7, "point", np.array([0.3, 2.0]), 1e-2 * np.eye(2))
         backend.add(Step(0, associations=(good,)))
@@ -791,7 +788,7 @@ def test_an_indeterminate_landmark_is_named_with_its_robot_and_time(what, known)
 
 def test_a_point_at_range_zero_is_indeterminate():
     """It has no bearing: one direction would be known as well as the robot, with no noise."""
-    backend = filtered([Step(0, {"r": Start(np.zeros(3), 1e-4 * np.eye(3))})], PLAIN)
+    backend = filtered([Step(0, {"r": Start(np.zeros(3), 1e-4 * np.eye(3))})], cases.PLAIN)
     point = Association("r", 0, 7, "point", np.zeros(2), 1e-4 * np.eye(2))
     with pytest.raises(EstimationError, match="indeterminate at landmark 7, seen from robot r"):
         backend.add(Step(0, associations=(point,)))
@@ -799,7 +796,7 @@ def test_a_point_at_range_zero_is_indeterminate():
 
 def test_a_start_or_a_motion_of_infinite_variance_is_named():
     with pytest.raises(EstimationError, match="start of robot r at 0 ns"):
-        filtered([Step(0, {"r": Start(np.zeros(3), np.diag([np.inf, 1, 1]))})], PLAIN)
-    backend = filtered([Step(0, {"r": Start(np.zeros(3), MOTION_COV)})], PLAIN)
+        filtered([Step(0, {"r": Start(np.zeros(3), np.diag([np.inf, 1, 1]))})], cases.PLAIN)
+    backend = filtered([Step(0, {"r": Start(np.zeros(3), cases.MOTION_COV)})], cases.PLAIN)
     with pytest.raises(EstimationError, match="motion of robot r to 4 ns"):
-        backend.add(Step(4, motions={"r": motion(0, 4, [1, 0, 0], np.diag([np.inf, 1, 1]))}))
+        backend.add(Step(4, motions={"r": cases.motion(0, 4, [1, 0, 0], np.diag([np.inf, 1, 1]))}))

@@ -12,17 +12,7 @@ from graphslam.core.config import AssociationConfig
 from graphslam.core.geometry import between, compose, rotate_cov, wrap
 from graphslam.core.observation_models import MODELS, PointModel
 from graphslam.core.records import Observation
-from graphslam.mapping.gating import (
-    MAX_ANGLE_RAD,
-    Pairs,
-    assign,
-    candidate_pairs,
-    compare,
-    fixes_pose,
-    flip,
-    gate_distance,
-    jointly_compatible,
-)
+from graphslam.mapping import gating
 
 UNDIRECTED = AssociationConfig(directed=False)
 DIRECTED = AssociationConfig(directed=True)
@@ -47,7 +37,7 @@ def candidates(seen, means, extents=None, *, points=None, whole=None, config=UND
     """`candidate_pairs` as {(observation, landmark): (model, flipped)}."""
     m = len(means)
     means = np.array([(*mean, 0.0)[:3] for mean in means])
-    pairs = candidate_pairs(
+    pairs = gating.candidate_pairs(
         seen,
         pose,
         means,
@@ -65,11 +55,13 @@ def compared(seen, models, states, P_xx=None, pose=POSE, flipped=False, floor=NO
     """`compare` of observation k with landmark k, landmarks known exactly."""
     k = len(seen)
     index = np.arange(k)
-    pairs = Pairs(index, index, tuple(models), np.full(k, flipped), np.zeros(k))
+    pairs = gating.Pairs(index, index, tuple(models), np.full(k, flipped), np.zeros(k))
     padded = np.array([(*s, 0.0)[:3] for s in states])
     P = np.zeros((3, 3)) if P_xx is None else P_xx
     zero = np.zeros((k, 3, 3))
-    return compare(seen, pairs, pose, padded, np.broadcast_to(P, (k, 3, 3)), zero, zero, floor)
+    return gating.compare(
+        seen, pairs, pose, padded, np.broadcast_to(P, (k, 3, 3)), zero, zero, floor
+    )
 
 
 # ------------------------------------------------------------ gates without covariance
@@ -131,7 +123,7 @@ def test_directed_lines_tell_the_two_sides_of_a_wall():
 @pytest.mark.parametrize("config", [DIRECTED, UNDIRECTED])
 @pytest.mark.parametrize("beyond", [False, True])
 def test_lines_of_quite_different_direction_never_pair(config, beyond):
-    error = MAX_ANGLE_RAD + (0.01 if beyond else -0.01)
+    error = gating.MAX_ANGLE_RAD + (0.01 if beyond else -0.01)
     seen = [see_line([6.0, 3.0, 0.2 + error], [-1, 1])]
     assert bool(candidates(seen, [[6.0, 3.0, 0.2]], [[-2, 2]], config=config)) != beyond
 
@@ -169,7 +161,7 @@ def test_ends_count_only_where_both_sides_know_them(kind, whole, length, model):
 @pytest.mark.parametrize("n", [0, 3])
 def test_nothing_seen_or_nothing_known_gives_no_pairs(n):
     seen = [see_point([5, 4])] * n
-    pairs = candidate_pairs(
+    pairs = gating.candidate_pairs(
         seen,
         POSE,
         np.zeros((0, 3)),
@@ -180,20 +172,20 @@ def test_nothing_seen_or_nothing_known_gives_no_pairs(n):
     )
     assert len(pairs.observation) == len(pairs.model) == 0
     empty = (np.zeros((0, *s)) for s in [(3,), *[(3, 3)] * 3])
-    result = compare(seen, pairs, POSE, *empty, NO_FLOOR)
+    result = gating.compare(seen, pairs, POSE, *empty, NO_FLOOR)
     assert len(result.d2) == 0
 
 
 def test_flip_describes_the_same_ends_the_other_way_round():
     seen = see_line([6, 3, 0.2], [-1, 3])
-    turned = flip(seen)
+    turned = gating.flip(seen)
     for a, b in ((0, 1), (1, 0)):
         np.testing.assert_allclose(
             compose(turned.z, np.array([turned.extent[a], 0, 0]))[:2],
             compose(seen.z, np.array([seen.extent[b], 0, 0]))[:2],
             atol=1e-15,
         )
-    again = flip(turned)
+    again = gating.flip(turned)
     np.testing.assert_allclose(wrap(again.z[2] - seen.z[2]), 0, atol=1e-15)
     np.testing.assert_array_equal(again.extent, seen.extent)
 
@@ -227,22 +219,22 @@ def test_gate_accepts_its_probability_of_true_pairs(name, probability):
     z = exact + rng.multivariate_normal(np.zeros(width), cov, n)
     seen = [Observation("line", v, cov, np.zeros(2)) for v in z]
     index = np.arange(n)
-    pairs = Pairs(index, index, (name,) * n, np.zeros(n, bool), np.zeros(n))
+    pairs = gating.Pairs(index, index, (name,) * n, np.zeros(n, bool), np.zeros(n))
     padded = np.broadcast_to((*t, 0.0)[:3], (n, 3))
     full = np.zeros((6, 6))
     full[: 3 + model.dim, : 3 + model.dim] = P
     blocks = [full[:3, :3], full[:3, 3:], full[3:, 3:]]
     stacked = (np.broadcast_to(b, (n, 3, 3)) for b in blocks)
-    result = compare(seen, pairs, x, padded, *stacked, NO_FLOOR)
+    result = gating.compare(seen, pairs, x, padded, *stacked, NO_FLOOR)
     assert set(result.dof) == {model.rows}
-    share = np.mean(result.d2 < gate_distance(probability, result.dof))
+    share = np.mean(result.d2 < gating.gate_distance(probability, result.dof))
     assert abs(share - probability) < 4 * np.sqrt(probability * (1 - probability) / n)
 
 
 def test_gate_is_the_chi_square_quantile():
-    assert gate_distance(0.99, 2) == pytest.approx(9.2103, abs=1e-4)
+    assert gating.gate_distance(0.99, 2) == pytest.approx(9.2103, abs=1e-4)
     np.testing.assert_allclose(
-        gate_distance(0.99, np.array([[1, 2], [3, 9]])), chi2.ppf(0.99, [[1, 2], [3, 9]])
+        gating.gate_distance(0.99, np.array([[1, 2], [3, 9]])), chi2.ppf(0.99, [[1, 2], [3, 9]])
     )
 
 
@@ -279,7 +271,7 @@ def figure_3_1():
     seen = [see_point(o + shift, pose, cov) for o in objects]
     P = np.diag([0.6**2, 0.6**2, 1e-6])
     config = AssociationConfig(max_distance_m=10.0)
-    found = candidate_pairs(
+    found = gating.candidate_pairs(
         seen, pose, np.column_stack([objects, [0, 0]]), np.zeros((2, 2)), np.ones(2, bool),
         np.zeros(2, bool), config,
     )  # fmt: skip
@@ -287,23 +279,23 @@ def figure_3_1():
     states = np.column_stack([objects, [0, 0]])[found.landmark]
     zero = np.zeros((k, 3, 3))
     P_xx = np.broadcast_to(P, (k, 3, 3))
-    result = compare(seen, found, pose, states, P_xx, zero, zero, NO_FLOOR)
+    result = gating.compare(seen, found, pose, states, P_xx, zero, zero, NO_FLOOR)
     cost = np.full((2, 2), np.inf)
     cost[found.observation, found.landmark] = result.d2
-    return cost, np.full((2, 2), float(gate_distance(0.99, 2)))
+    return cost, np.full((2, 2), float(gating.gate_distance(0.99, 2)))
 
 
 def test_figure_3_1_greedy_pairs_wrongly():
     """The thesis' own example of what its fast variant does: z1 takes object 2. What is left for z2
     is object 1, too far away, or accepted where the gate is wide."""
     cost, gate = figure_3_1()
-    assert assign(cost, gate, "greedy") == [(0, 1)]
-    assert assign(cost, np.full((2, 2), 1e6), "greedy") == [(0, 1), (1, 0)]
+    assert gating.assign(cost, gate, "greedy") == [(0, 1)]
+    assert gating.assign(cost, np.full((2, 2), 1e6), "greedy") == [(0, 1), (1, 0)]
 
 
 def test_figure_3_1_optimal_pairs_rightly():
     cost, gate = figure_3_1()
-    assert assign(cost, gate, "optimal") == [(0, 0), (1, 1)]
+    assert gating.assign(cost, gate, "optimal") == [(0, 0), (1, 1)]
 
 
 @st.composite
@@ -336,7 +328,7 @@ def test_optimal_assignment_equals_brute_force(table):
         free = len({j for _, j in taken}) == len(taken)
         if free and all(cost[i, j] < gate[i, j] for i, j in taken):
             best = min(best, total(taken, cost, gate))
-    pairs = assign(cost, gate, "optimal")
+    pairs = gating.assign(cost, gate, "optimal")
     assert all(cost[i, j] < gate[i, j] for i, j in pairs)
     assert len({i for i, _ in pairs}) == len({j for _, j in pairs}) == len(pairs)
     assert pairs == sorted(pairs)
@@ -355,7 +347,7 @@ def test_greedy_assignment_takes_the_smallest_left(table):
             expected.append((i, j))
             rows.add(i)
             columns.add(j)
-    assert assign(cost, gate, "greedy") == sorted(expected)
+    assert gating.assign(cost, gate, "greedy") == sorted(expected)
 
 
 # ------------------------------------------------------------ several pairs together
@@ -378,15 +370,15 @@ def shifted_triple(shifts):
 def test_individually_compatible_contradicting_triple_is_rejected_jointly():
     """Each could be explained by the pose's uncertainty, but not by one pose: a false closure."""
     result, joint, slices = shifted_triple([[0.8, 0], [-0.8, 0], [0, 0.8]])
-    assert np.all(result.d2 < gate_distance(0.99, result.dof))
-    assert not jointly_compatible(result, [0, 1, 2], slices, joint, 0.99)
+    assert np.all(result.d2 < gating.gate_distance(0.99, result.dof))
+    assert not gating.jointly_compatible(result, [0, 1, 2], slices, joint, 0.99)
     for one in range(3):
-        assert jointly_compatible(result, [one], slices[one : one + 1], joint, 0.99)
+        assert gating.jointly_compatible(result, [one], slices[one : one + 1], joint, 0.99)
 
 
 def test_triple_that_agrees_on_one_pose_is_accepted_jointly():
     result, joint, slices = shifted_triple([[0.8, 0.3]] * 3)
-    assert jointly_compatible(result, [0, 1, 2], slices, joint, 0.99)
+    assert gating.jointly_compatible(result, [0, 1, 2], slices, joint, 0.99)
 
 
 def test_joint_gate_accepts_its_probability_of_true_triples():
@@ -402,7 +394,7 @@ def test_joint_gate_accepts_its_probability_of_true_triples():
         z = z + rng.normal(0, 0.01, size=(3, 2))
         seen = [Observation("point", v, POINT_COV) for v in z]
         result = compared(seen, ["point"] * 3, PLACES, pose=pose)
-        accepted += jointly_compatible(result, [0, 1, 2], slices, P, 0.9)
+        accepted += gating.jointly_compatible(result, [0, 1, 2], slices, P, 0.9)
     assert abs(accepted / n - 0.9) < 4 * np.sqrt(0.9 * 0.1 / n)
 
 
@@ -425,10 +417,10 @@ def test_only_pairs_that_leave_no_direction_free_fix_the_pose(targets, fixed):
     models = ["point" if len(t) == 2 else "line" for t in targets]
     if not targets:
         result = compared([see_point([5, 4])], ["point"], [[5, 4]])
-        assert not fixes_pose(result, [])
+        assert not gating.fixes_pose(result, [])
         return
     result = compared(seen, models, targets)
-    assert fixes_pose(result, range(len(targets))) == fixed
+    assert gating.fixes_pose(result, range(len(targets))) == fixed
 
 
 def test_where_the_walls_are_seen_does_not_matter_for_fixing_the_pose():
@@ -436,4 +428,4 @@ def test_where_the_walls_are_seen_does_not_matter_for_fixing_the_pose():
     for along in (-3.0, 4.0):
         a, b = (compose(np.array(w), np.array([along, 0, 0])) for w in ([6, 3, 0.2], [9, 0, 1.77]))
         seen = [see_line(a, [-1, 1]), see_line(b, [-1, 1])]
-        assert fixes_pose(compared(seen, ["line"] * 2, [[6, 3, 0.2], [9, 0, 1.77]]), [0, 1])
+        assert gating.fixes_pose(compared(seen, ["line"] * 2, [[6, 3, 0.2], [9, 0, 1.77]]), [0, 1])

@@ -16,63 +16,51 @@ from graphslam.multi_robot.mutual_detection import ScanBuffer
 from graphslam.multi_robot.relative_frames import RobotEstimate
 from graphslam.multi_robot.track_registration import odometry_cross_covariance
 from graphslam.odometry.preintegration import Track
+from graphslam.simulation import scenario as sim
 from graphslam.simulation import simulate
 from graphslam.simulation.robot_shapes import corners
-from graphslam.simulation.scenario import (
-    Body,
-    Box,
-    Cylinder,
-    Encoders,
-    Laser,
-    Leg,
-    Robot,
-    RobotClock,
-    Scenario,
-    StaticObjects,
-    Wall,
-)
 from graphslam.slam.smooth import initialise, smooth
 
 S = 1_000_000_000
-SHAPE = Body(length_m=0.45, width_m=0.38, rear_m=0.22)
+SHAPE = sim.Body(length_m=0.45, width_m=0.38, rear_m=0.22)
 OUTLINE = corners(SHAPE).tolist()
-LASER = Laser(
+LASER = sim.Laser(
     period_s=0.25, step_deg=0.5, range_max_m=32.0, mount_m=(0.15, 0.0), dropout_share=0.005,
     mixed_share=0.5,
 )  # fmt: skip
-ENCODERS = Encoders(
+ENCODERS = sim.Encoders(
     wheel_radius_m=0.08, axle_m=0.33, radius_error_left=0.004, radius_error_right=-0.004,
     slip_m=0.006,
 )  # fmt: skip
 #: furniture of the robot's size among other, in a hall; beside it another room, not quite as large,
 #: or nothing could tell them apart
-HALL = StaticObjects(
+HALL = sim.StaticObjects(
     walls=(
-        Wall("hall", ((-8.0, -6.0), (8.0, -6.0), (8.0, 6.0), (-8.0, 6.0)), True),
-        Wall("room", ((12.0, -7.0), (30.0, -7.0), (30.0, 6.0), (12.0, 6.0)), True),
+        sim.Wall("hall", ((-8.0, -6.0), (8.0, -6.0), (8.0, 6.0), (-8.0, 6.0)), True),
+        sim.Wall("room", ((12.0, -7.0), (30.0, -7.0), (30.0, 6.0), (12.0, 6.0)), True),
     ),
     boxes=(
-        Box("desk", (-5.5, 4.5), (1.6, 0.8)),
-        Box("crate", (6.0, -3.0), (0.5, 0.4), 20.0),
-        Box("stool", (-2.5, -4.5), (0.4, 0.4), 10.0),
+        sim.Box("desk", (-5.5, 4.5), (1.6, 0.8)),
+        sim.Box("crate", (6.0, -3.0), (0.5, 0.4), 20.0),
+        sim.Box("stool", (-2.5, -4.5), (0.4, 0.4), 10.0),
     ),
-    cylinders=(Cylinder("post 1", (3.0, 3.5), 0.2), Cylinder("post 2", (-3.0, -3.0), 0.2)),
+    cylinders=(sim.Cylinder("post 1", (3.0, 3.5), 0.2), sim.Cylinder("post 2", (-3.0, -3.0), 0.2)),
 )
 WAY = ((2.0, -2.0), (4.5, -1.0), (5.5, 2.0), (3.5, 2.3), (1.5, 3.5), (-1.5, 3.0), (-4.0, 1.5))
 AROUND = ((5.0, 4.5), (3.0, 5.0), (-4.0, 3.8), (-6.5, 2.0), (-6.5, -3.5))
 
 
 def robot(start, *way, deg=0.0, body=SHAPE, **more):
-    drive = (Leg(tuple(way)),) if way else ()
-    return Robot(start, body, deg, drive, **{"encoders": ENCODERS, "laser": LASER, **more})
+    drive = (sim.Leg(tuple(way)),) if way else ()
+    return sim.Robot(start, body, deg, drive, **{"encoders": ENCODERS, "laser": LASER, **more})
 
 
 A = robot((-6.0, -1.0), (-4.0, -1.0), (-1.0, 0.5), (1.5, 0.0), (1.5, -2.0), speed_m_s=0.2)
 B = robot((0.5, -3.0), *WAY, deg=45.0)
 #: the same drive where nobody sees it
-AWAY = replace(B, start_m=(20.5, -3.0), drive=(Leg(tuple((x + 20.0, y) for x, y in WAY)),))
+AWAY = replace(B, start_m=(20.5, -3.0), drive=(sim.Leg(tuple((x + 20.0, y) for x, y in WAY)),))
 WALKER = robot(
-    (6.5, 4.5), *AROUND, deg=180.0, body=Body(radius_m=0.25), laser=None, speed_m_s=0.4
+    (6.5, 4.5), *AROUND, deg=180.0, body=sim.Body(radius_m=0.25), laser=None, speed_m_s=0.4
 )  # fmt: skip
 
 
@@ -91,7 +79,7 @@ def settings(robots, known, outlined, draw=None):
 
 def recorded(folder, robots, seed=0):
     log = folder / "log.mcap"
-    simulate(Scenario(robots=robots, world=HALL, name="hall"), log, seed=seed)
+    simulate(sim.Scenario(robots=robots, world=HALL, name="hall"), log, seed=seed)
     return log
 
 
@@ -129,7 +117,7 @@ def test_a_robot_is_found_as_well_as_stated(tmp_path):
     config, d2 = load_config().start, []
     sigmas = np.array([config.given_sigma_m, config.given_sigma_m, config.given_sigma_rad])
     for seed, (ahead_s, laser) in enumerate(cases):
-        robots = {"a": A, "b": replace(B, laser=laser, clock=RobotClock(offset_s=ahead_s))}
+        robots = {"a": A, "b": replace(B, laser=laser, clock=sim.RobotClock(offset_s=ahead_s))}
         draw = sigmas * np.random.default_rng(seed).normal(size=3)
         found = joined(tmp_path, robots, seed=seed, draw=draw)
         assert found.frames == {"a": "a", "b": "a"}, seed
@@ -145,7 +133,7 @@ def test_a_found_start_costs_nothing_against_a_known_one(tmp_path):
     few = replace(LASER, period_s=0.5, step_deg=1.0)
     robots = {
         "a": replace(A, laser=few),
-        "b": replace(B, laser=few, clock=RobotClock(offset_s=0.4)),
+        "b": replace(B, laser=few, clock=sim.RobotClock(offset_s=0.4)),
     }
     log = recorded(tmp_path, robots)
     truth = read_truth([log], load_config()).trajectories
