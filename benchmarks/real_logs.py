@@ -17,7 +17,15 @@ from pathlib import Path
 from typing import Any
 
 import real_logs_figures
-from common import FREIBURG, FREIBURG_LOGS, command, import_freiburg, measured_command, parser
+from common import (
+    FREIBURG,
+    FREIBURG_LOGS,
+    Used,
+    command,
+    import_freiburg,
+    measured_command,
+    parser,
+)
 
 
 @dataclass(frozen=True)
