@@ -1,17 +1,17 @@
-"""Relative poses that a log brings along: which of them are believed, and where robots start.
+"""Verification of recorded closures: which relative poses of a log are used, and robots' starts.
 
-Whoever recorded them may have been mistaken, so nothing is believed for what it says alone.
+Recorded closures may be outliers, so none is accepted by itself.
 
 1. Two closures between the same robots and the odometry between their ends make a loop; they agree
    if it closes within its uncertainty. Of all closures between two robots (or of one with itself)
-   the largest set found that agrees in pairs goes on: J. Mangelson et al., ICRA 2018, DOI
-   10.1109/ICRA.2018.8460217. No start is needed for it: each closure says where one robot's
-   odometry began in the frame of the other's.
-2. Robots whose start is unknown are put where such a set has them, if it is clearly larger than
-   what else agrees; otherwise they stay in a frame of their own.
-3. Everything is solved together under a kernel that redescends, and each closure is held against
-   what all the others leave of it: those that contradict are taken back, the worst first; those
-   left out that fit come in; until nothing changes.
+   the largest set found that agrees in pairs is kept: J. Mangelson et al., ICRA 2018, DOI
+   10.1109/ICRA.2018.8460217. It needs no start pose: each closure gives the start of one robot's
+   odometry in the frame of the other's.
+2. Robots whose start is unknown are placed by such a set, if it is clearly larger than any other
+   consistent set; otherwise they stay in a frame of their own.
+3. Everything is solved together under a redescending kernel, and each closure is compared with what
+   all others predict (leave one out). Closures that contradict are removed, the worst first; left
+   out ones that fit are added; until nothing changes.
 """
 
 from collections import defaultdict
@@ -30,30 +30,30 @@ from graphslam.core.records import Closure, Estimate, Motion, RelativePose, Star
 from graphslam.estimation.isam2 import Isam2Backend, Reoptimiser
 from graphslam.odometry.preintegration import Track
 
-#: probability up to which two closures agree; what all the others say is fitted up to `FIT`: a true
-#: one is lost as rarely as that, and false ones miss by far more
+#: probability up to which two closures agree; against all others together `FIT` is the limit, so
+#: that true closures are rarely lost (false ones miss by far more)
 AGREE = 0.99
-#: closures compared with each other at once, in the order of time: the work is their square
+#: closures compared with each other at once, in order of time; the work grows with its square
 CHUNK = 1000
-#: sigmas at which the kernel of the joint solution turns
+#: scale of the redescending kernel of the joint solution, in sigmas
 KERNEL_SIGMAS = 3.0
-#: part of what is known in a direction that the others must say for a closure to be held against it
-LEAST_TOLD = 1e-3
-#: rounds of taking back and letting in
+#: share of the information in a direction that the other closures must have for a comparison
+MIN_SHARE = 1e-3
+#: rounds of removing and adding closures
 MAX_ROUNDS = 30
-#: m, rad: where a frame of its own begins
+#: prior covariance (m, rad) of the origin of a robot's own frame
 ORIGIN = np.diag([1e-3, 1e-3, 1e-3]) ** 2
 
-UNLIKE = "it contradicts the others"
-ALONE = "nothing bears it out"
+CONTRADICTED = "it contradicts the others"
+UNSUPPORTED = "no other closure supports it"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Verified:
-    """What was decided: ``refused`` (place in the sequence given -> why), the places ``kept``.
+    """The decision: ``refused`` (index of the message -> why) and the indices ``kept``.
 
-    ``starts`` are those of the robots that had none; ``frames`` says in whose frame each robot is,
-    the one whose start it hangs on; both only of robots that have a relative pose.
+    ``starts``: start poses found for robots that had none; ``frames``: robot -> the robot whose
+    start defines its frame. Both only of robots that have a relative pose.
     """
 
     refused: Mapping[int, str]
@@ -76,11 +76,11 @@ def verify(
     starts: Mapping[str, Start],
     config: Config,
 ) -> Verified:
-    """Decide which relative poses to believe.
+    """Decide which relative poses to use.
 
     Args:
-        messages: all of a log. Those of which an end lies outside of the odometry are not judged.
-        tracks: the odometry of every robot, whole.
+        messages: all of a log. Those with an end outside the odometry are not judged.
+        tracks: the complete odometry of every robot.
         starts: of the robots whose start is known.
         config: settings.
 
@@ -110,7 +110,7 @@ def verify(
             sets[pair] = sets.get(pair, []) + [chunk[n] for n in best]
             if not has_rival(len(best), [len(rival)]):
                 clear.add(pair)
-    placed, frames = _placed(sets, clear, frames_seen, odometry, starts)
+    placed, frames = _initial_starts(sets, clear, frames_seen, odometry, starts)
     believed = {
         k
         for (a, b), numbers in sets.items()
@@ -121,7 +121,9 @@ def verify(
     solver = _Joint(messages, odometry, {**placed, **starts}, config)
     candidates = [k for k in judged if frames[messages[k].robot] == frames[messages[k].other]]
     believed, estimate = solver.settle(believed, candidates)
-    refused = {k: UNLIKE if k in candidates else ALONE for k in judged if k not in believed}
+    refused = {
+        k: CONTRADICTED if k in candidates else UNSUPPORTED for k in judged if k not in believed
+    }
     found = {}
     for robot in unknown:
         first = estimate.states[robot]
@@ -146,9 +148,8 @@ def _has_ends(m: RelativePose, tracks: Mapping[str, Track]) -> bool:
 class _Chain:
     """A robot's odometry at the ends of closures: times (n,), poses (n, 3) from its first reading.
 
-    ``spread`` (n, 3, 3) is the covariance of what odometry has gathered up to there, of errors
-    that move the rest of the world about the first pose (the left tangent space of SE(2)): that of
-    a stretch is the difference of its ends'.
+    ``spread`` (n, 3, 3) is the covariance of the odometry up to there, in the left tangent space of
+    SE(2) at the first pose, so that the covariance of a stretch is the difference of its ends'.
     """
 
     times_ns: np.ndarray[tuple[int], np.dtype[np.int64]]
@@ -157,7 +158,7 @@ class _Chain:
     motions: tuple[Motion, ...]
 
     def at(self, times_ns: Iterable[int]) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-        """Places (k,) of times in the chain."""
+        """Indices (k,) of times in the chain."""
         return np.searchsorted(self.times_ns, np.array(list(times_ns), dtype=np.int64))
 
 
@@ -186,7 +187,7 @@ def _odometry(messages: Iterable[RelativePose], tracks: Mapping[str, Track]) -> 
 
 
 def _loops(messages: Sequence[RelativePose], odometry: Mapping[str, _Chain]) -> tuple[Array, Array]:
-    """Closures between the same two robots, held against each other.
+    """Closures between the same two robots, compared in pairs.
 
     Closure a sees the first pose of its robot's odometry at E_a in the frame of the other's. The
     loop of two is E_a E_b⁻¹; its errors are those of both closures and of the odometry between
@@ -222,24 +223,24 @@ def _loops(messages: Sequence[RelativePose], odometry: Mapping[str, _Chain]) -> 
 # ---------------------------------------------------------------- frames
 
 
-def _placed(
+def _initial_starts(
     sets: Mapping[tuple[str, str], Sequence[int]],
     clear: set[tuple[str, str]],
     seen: Mapping[int, Array],
     odometry: Mapping[str, _Chain],
     starts: Mapping[str, Start],
 ) -> tuple[dict[str, Start], dict[str, str]]:
-    """First guesses of unknown starts, and in whose frame each robot is.
+    """Initial start poses of robots that have none, and the frame of each robot.
 
-    The largest set that connects a robot without a place to one with a place is followed first;
-    when there is none, the next robot begins a frame of its own.
+    The largest set that connects a robot without a start to one with a start is followed first; if
+    there is none, the next robot begins a frame of its own.
     """
-    ways = sorted(
+    edges = sorted(
         ((a, b) for a, b in sets if a != b and (a, b) in clear), key=lambda p: -len(sets[p])
     )
 
     def next_edge(poses: Mapping[str, Array]) -> tuple[str, str, Array] | None:
-        for a, b in ways:
+        for a, b in edges:
             E = seen[sets[a, b][0]]  # of b, in the frame of a
             if a in poses and b not in poses:
                 return b, a, compose(poses[a], E)
@@ -262,7 +263,7 @@ def _placed(
 
 
 class _Joint:
-    """Odometry between the ends of closures, and any of the closures, solved together."""
+    """Solves odometry between the ends of closures together with any set of closures."""
 
     def __init__(
         self,
@@ -285,7 +286,7 @@ class _Joint:
                 self._motions[motion.end_ns][robot] = motion
 
     def settle(self, believed: set[int], candidates: Sequence[int]) -> tuple[set[int], Estimate]:
-        """Those of the candidates that bear each other out, beginning with some; the estimate."""
+        """The candidates that support each other, beginning with ``believed``; and the estimate."""
         gate = chi2_quantile(FIT, 3)
         backend: Isam2Backend = Isam2Backend(self._plain)
         for step in self._steps(believed):
@@ -300,7 +301,7 @@ class _Joint:
             new = {k for k in candidates if k not in believed | barred and d2[k] <= gate}
             if not wrong and not new:
                 break
-            # one that is wrong makes others look it
+            # one outlier makes others look like outliers, so the worst are removed first
             gone = set(wrong[: max(1, len(wrong) // 4)])
             barred |= gone
             believed = believed - gone if gone else believed | new
@@ -318,12 +319,12 @@ class _Joint:
         ]
 
     def _misfit(self, k: int, used: bool, backend: Reoptimiser, estimate: Estimate) -> float:
-        """Squared Mahalanobis distance of a closure from what all others say.
+        """Squared Mahalanobis distance of a closure from what all others predict (leave one out).
 
         In units of the closure's own sigmas, along directions in which the estimate is independent:
         with m the variance of the relative pose by the estimate, r the residual and w the weight
-        that the closure has in it (0 unless used), all others together say r / (1 - w m) with
-        variance m / (1 - w m). Directions of which they know next to nothing are left out.
+        that the closure has in it (0 unless used), all others together predict r / (1 - w m) with
+        variance m / (1 - w m). Directions in which they have hardly any information are left out.
         """
         c = self._closures[k]
         ends = (c.other, c.other_time_ns), (c.robot, c.time_ns)
@@ -337,6 +338,6 @@ class _Joint:
         m, Q = np.linalg.eigh(J @ backend.state_covariance(ends) @ J.T)
         w = (KERNEL_SIGMAS**2 / (KERNEL_SIGMAS**2 + r @ r)) ** 2 if used else 0.0
         rest = 1.0 - w * m
-        told = rest > LEAST_TOLD
-        r, m, rest = (Q.T @ r)[told], m[told], rest[told]
+        known = rest > MIN_SHARE
+        r, m, rest = (Q.T @ r)[known], m[known], rest[known]
         return float(np.sum(r**2 / (rest * (rest + m))))

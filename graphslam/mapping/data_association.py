@@ -1,8 +1,8 @@
-"""Data association of one image (scan or set of sightings) at a time, and the life of a landmark.
+"""Data association of one image (scan or set of sightings) at a time, and landmark life cycle.
 
-Order of decisions for an observation: known identity; a landmark of the graph that was seen
-recently; landmarks not seen for long, only when enough of them agree *together* (a loop closure);
-a tentative landmark; a new one; else rejected, with the reason.
+An observation is associated with, in this order: the landmark of its identity; a landmark of the
+graph that was seen recently; landmarks not seen for long, only if enough of them are jointly
+compatible (a loop closure); a tentative landmark; a new one. Else it is rejected, with the reason.
 """
 
 from collections import Counter
@@ -30,10 +30,10 @@ from graphslam.mapping.gating import (
 from graphslam.mapping.landmark_map import Entry, LandmarkMap
 from graphslam.odometry.preintegration import Track
 
-#: images between two refreshes of all landmark estimates; those compared are always fresh
+#: images between two refreshes of all landmark estimates; those compared are always current
 REFRESH_EVERY = 50
-#: landmarks per observation whose joint marginal is asked for, the crudely nearest: recently seen
-#: ones, and old ones (whose distance says less, as the pose has drifted)
+#: landmarks per observation whose joint marginal is read, the nearest by crude distance: recently
+#: seen ones, and old ones (more, as the pose may have drifted)
 NEAREST_RECENT, NEAREST_OLD = 3, 4
 
 
@@ -110,8 +110,8 @@ class Associator:
             track: the robot's odometry.
             path_m: how far the robot has driven.
             gathering: more images follow before the back end takes the step (`settle` then).
-                Innovations of sightings with an identity, which need the dear joint marginal, are
-                not booked.
+                Innovations of sightings with an identity, which need the expensive joint marginal,
+                are not recorded.
 
         Returns:
             What is to enter the graph, including earlier sightings of landmarks that this image
@@ -126,17 +126,17 @@ class Associator:
         if motion is not None:
             pose = compose(pose, motion.delta)
         if gathering and all(map(self._has_identity, seen)):
-            return self._named_only(robot, time_ns, seen, pose, path_m)
+            return self._associate_identified(robot, time_ns, seen, pose, path_m)
         image = self._image(robot, time_ns, seen, pose, motion, track, path_m, gathering)
-        associations = self._book(image, self._choose(image))
+        associations = self._apply(image, self._choose(image))
         if not gathering:
             self.settle()
         return associations
 
-    def _named_only(
+    def _associate_identified(
         self, robot: str, time_ns: int, seen: Sequence[Observation], pose: Array, path_m: float
     ) -> tuple[Association, ...]:
-        """An image in which everything says what it is: nothing to compare."""
+        """Associations of an image in which every observation has an identity."""
         out: list[Association] = []
         for o in seen:
             entry = self._named(o)
@@ -150,7 +150,7 @@ class Associator:
         return tuple(out)
 
     def settle(self) -> None:
-        """Note that the back end has taken the step of all associations so far."""
+        """Record that the back end has taken the step of all associations so far."""
         self._unsettled.clear()
 
     def _image(
@@ -164,7 +164,7 @@ class Associator:
         path_m: float,
         gathering: bool,
     ) -> Image:
-        """Candidate pairs, compared."""
+        """The image with its candidate pairs and their distances."""
         ids, means, extents, is_point, whole = self.map.arrays()
         free = [n for n, o in enumerate(seen) if not self._has_identity(o)]
         pairs = candidate_pairs(
@@ -203,7 +203,7 @@ class Associator:
         return o.identity is not None and self._config.identities == "use"
 
     def _named(self, o: Observation) -> Entry | None:
-        """The landmark that bears the observation's identity."""
+        """The landmark with the observation's identity."""
         if not self._has_identity(o) or o.identity not in self.map.by_identity:
             return None
         return self.map.entries[self.map.by_identity[str(o.identity)]]
@@ -224,8 +224,8 @@ class Associator:
     ) -> Compared:
         """Distances of all candidate pairs.
 
-        A tentative landmark is known relative to the robot that saw it, so what separates it from
-        now is its own measurement noise and the motion since, not the robot's place in the world.
+        A tentative landmark is known relative to the robot that saw it, so its distance has the
+        covariance of its own measurement and of the motion since, not that of the robot's pose.
         """
         k = len(entries)
         P_xx, P_xt, P_tt = (np.zeros((k, 3, 3)) for _ in range(3))
@@ -259,10 +259,10 @@ class Associator:
         def best(which: BoolArray) -> dict[int, int]:
             return _assign_pairs(pairs, compared, gate, which, len(image.seen), config.method)
 
-        # sightings of one image exclude each other: what a named one sees is taken
+        # observations of one image exclude each other: landmarks with an identity are taken
         free = ~known & ~np.isin(pairs.landmark, pairs.landmark[known])
         chosen = best(free & in_graph & image.recent)
-        # one that the back end does not have yet closes no loop
+        # a landmark that the back end does not have yet closes no loop
         settled = np.array([e.id in image.where for e in image.entries], dtype=bool)
         old = best(free & in_graph & ~image.recent & settled)
         if self._closes_loop(image, list(old.values())):
@@ -273,7 +273,7 @@ class Associator:
         return chosen | {int(pairs.observation[k]): int(k) for k in np.flatnonzero(known)}
 
     def _closes_loop(self, image: Image, picks: list[int]) -> bool:
-        """Whether pairs with landmarks not seen for long are believed: only many, and together."""
+        """Whether pairs with landmarks not seen for long are accepted: enough, and together."""
         if len(picks) < self._config.reacquire_min:
             return False
         slices = [image.joint.slices[image.where[image.entries[k].id]] for k in picks]
@@ -281,8 +281,8 @@ class Associator:
             image.compared, picks, slices, image.joint.cov, self._config.gate_probability
         )
 
-    def _book(self, image: Image, chosen: dict[int, int]) -> tuple[Association, ...]:
-        """Turn the choices into associations; make, promote and reject."""
+    def _apply(self, image: Image, chosen: dict[int, int]) -> tuple[Association, ...]:
+        """Associations of the chosen pairs; other observations make landmarks or are rejected."""
         pairs, compared, pose = image.pairs, image.compared, image.joint.pose
         new_gate = gate_distance(self._config.new_landmark_probability, np.maximum(compared.dof, 1))
         close = image.recent & (compared.d2 < new_gate)
@@ -337,10 +337,10 @@ def _association(robot: str, time_ns: int, entry: Entry, model: str, o: Observat
 def _worth_comparing(
     pairs: Pairs, entries: Sequence[Entry], recent: BoolArray, reacquire_min: int
 ) -> BoolArray:
-    """Pairs (k,) whose joint marginal is worth its price.
+    """Pairs (k,) that are compared by the joint marginal, which is expensive to read.
 
-    Tentative landmarks need none. Of the graph's, the crudely nearest few per observation; old ones
-    only where enough observations have some, else no loop could be closed by them.
+    All pairs with tentative landmarks, which need none; of the graph's landmarks the few nearest
+    per observation; old ones only if enough observations have some to close a loop.
     """
     in_graph = np.array([e.in_graph for e in entries], dtype=bool)
     keep = ~in_graph
@@ -362,8 +362,8 @@ def _assign_pairs(
 ) -> dict[int, int]:
     """Observation -> pair among the pairs ``which``.
 
-    One-to-one first. Then a line may be seen in several parts (a pillar hides its middle): a
-    line observation left alone joins its nearest landmark even if that has one already.
+    One-to-one first. A line may be seen in several parts (a pillar hides its middle), so a line
+    observation left over joins its nearest landmark even if that has an observation already.
     """
     use = np.flatnonzero(which & (compared.d2 < gate))
     if not len(use):
@@ -381,6 +381,3 @@ def _assign_pairs(
         if i not in chosen and pairs.model[k] == "line":
             chosen[i] = int(k)
     return chosen
-
-
-__all__ = ["Associator", "predicted_joint"]

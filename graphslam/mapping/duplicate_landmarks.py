@@ -1,9 +1,9 @@
-"""Duplicates in a map: which landmarks are one and the same, and what that makes of the steps.
+"""Duplicate landmarks: which landmarks of a map are one, and how they are merged.
 
-A wall or a tree that was not recognised when it was seen again is in the map twice. With all data
-in, the joint covariance of the whole map says how far two landmarks may lie apart if they are one.
-Pairs are tied one after another, the most certain first, and every tie conditions the joint: what
-agrees with one tie must agree with the next. What one image showed as two things is never tied.
+A wall or a tree that was not recognised when it was seen again is in the map twice. After all data
+is in, the joint covariance of the map says how far apart two landmarks may be if they are one.
+Pairs are merged one after another, the most certain first. Each merge conditions the joint, so
+later merges must agree with earlier ones. What one image showed as two things is never merged.
 """
 
 from collections import Counter
@@ -23,12 +23,12 @@ from graphslam.mapping.landmark_map import Entry, LandmarkMap
 IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 
-#: m, rad: by how much two images of one wall may differ beyond what the covariance says: across it,
-#: in direction, and in where its ends are; of one point the first, both ways
+#: m, rad, m: how much two estimates of one wall may differ beyond their covariance: across it, in
+#: direction, and in the position of its ends; of one point the first, along both axes
 FLOOR_M, FLOOR_RAD, FLOOR_END_M = 0.02, 0.015, 0.08
-#: share of the shorter wall that must lie beside the longer one
+#: share of the shorter wall that must overlap the longer one
 OVERLAP_SHARE = 0.5
-#: walls farther apart (m across, rad) are not looked at, nor points
+#: m, rad: walls farther apart (across, direction), and points, are not compared
 REACH_M, REACH_RAD = 1.5, 0.3
 GATE_PROBABILITY = 0.95
 
@@ -37,9 +37,9 @@ GATE_PROBABILITY = 0.95
 class _Map:
     """All landmarks: means (n, 3), joint covariance (3n, 3n), extents (n, 2).
 
-    ``whole`` (n,) segments whose ends are known; ``point`` (n,) points, with a heading of 0 that is
-    certain; ``group`` (n,) numbers what is tied already; ``apart`` (n, n) is true for different
-    things.
+    ``whole`` (n,): segments whose ends are known; ``point`` (n,): points, whose heading is 0 and
+    certain; ``group`` (n,): equal for landmarks that are merged; ``apart`` (n, n): true for pairs
+    known to be different things.
     """
 
     x: Array
@@ -51,18 +51,20 @@ class _Map:
     apart: BoolArray
 
     def contradict(self, a: int, b: int) -> bool:
-        """Whether the groups of two landmarks hold things that are known to differ."""
+        """Whether the groups of two landmarks contain things known to be different."""
         return bool(
             self.apart[np.ix_(self.group == self.group[a], self.group == self.group[b])].any()
         )
 
 
 def partners(entries: Sequence[Entry], together: Iterable[frozenset[int]]) -> list[Entry]:
-    """Those landmarks that may have a duplicate, where they are: the others need no covariance.
+    """Landmarks that have another one near enough to be a duplicate.
+
+    Only these need a joint covariance.
 
     Args:
-        entries: all of them.
-        together: pairs that one image showed side by side.
+        entries: all landmarks.
+        together: pairs that one image showed as two things.
     """
     if len(entries) < 2:
         return []
@@ -75,12 +77,12 @@ def partners(entries: Sequence[Entry], together: Iterable[frozenset[int]]) -> li
 def duplicates(
     entries: Sequence[Entry], joint: Joint, together: Iterable[frozenset[int]]
 ) -> list[tuple[int, int]]:
-    """Pairs of landmarks that are one and the same, the older first, the most certain first.
+    """Pairs of landmarks that are one, the most certain pair first; the older landmark first.
 
     Args:
         entries: landmarks, in the order of ``joint``.
         joint: their means and joint covariance, world axes (the pose in front is not used).
-        together: pairs that one image showed side by side.
+        together: pairs that one image showed as two things.
     """
     if len(entries) < 2:
         return []
@@ -90,14 +92,14 @@ def duplicates(
     while len(i):
         r, H_i, H_j, rows = _compare(marks, i, j)
         d2 = _distances(marks, i, j, r, H_i, H_j)
-        # what is out of its gate may come back in when a tie has moved the map
+        # pairs outside the gate stay: a merge moves the map and may bring them inside
         fits = d2 <= chi2_quantile(GATE_PROBABILITY, rows)
-        k = _next_tie(marks, i, j, d2, fits)
+        k = _next_merge(marks, i, j, d2, fits)
         if k is None:
             break
         a, b = int(i[k]), int(j[k])
         found.append((entries[a].id, entries[b].id))
-        _tie(marks, a, b, r[k, : rows[k]], H_i[k, : rows[k]], H_j[k, : rows[k]])
+        _condition(marks, a, b, r[k, : rows[k]], H_i[k, : rows[k]], H_j[k, : rows[k]])
         marks.group[marks.group == marks.group[b]] = marks.group[a]
         open_still = marks.group[i] != marks.group[j]
         i, j = i[open_still], j[open_still]
@@ -117,7 +119,7 @@ def _padded(joint: Joint) -> tuple[Array, Array]:
 
 
 def _map(entries: Sequence[Entry], x: Array, P: Array, together: Iterable[frozenset[int]]) -> _Map:
-    """Landmarks, none tied yet; different names are of different things."""
+    """The landmarks, none merged yet; those with different identities are apart."""
     place = {entry.id: k for k, entry in enumerate(entries)}
     names = np.array([entry.identity or "" for entry in entries])
     named = names != ""
@@ -138,7 +140,7 @@ def _map(entries: Sequence[Entry], x: Array, P: Array, together: Iterable[frozen
 
 
 def _near(marks: _Map) -> tuple[IntArray, IntArray]:
-    """Pairs (m,) and (m,) that may be one landmark, as far as means and extents can tell."""
+    """Pairs (m,), (m,) that may be one landmark by their means and extents; O(n²)."""
     i, j = np.triu_indices(len(marks.x), 1)
     points = marks.point[i]
     near = (points == marks.point[j]) & ~marks.apart[i, j]
@@ -147,23 +149,23 @@ def _near(marks: _Map) -> tuple[IntArray, IntArray]:
     return i[near], j[near]
 
 
-def _next_tie(marks: _Map, i: IntArray, j: IntArray, d2: Array, fits: BoolArray) -> int | None:
-    """The most certain pair that nothing contradicts, None when there is none."""
+def _next_merge(marks: _Map, i: IntArray, j: IntArray, d2: Array, fits: BoolArray) -> int | None:
+    """Index of the most certain pair that nothing contradicts; None if there is none."""
     order = np.flatnonzero(fits)
     for k in order[np.argsort(d2[order])]:
         a, b = int(i[k]), int(j[k])
         if marks.contradict(a, b):
             continue
-        tied = (marks.group == marks.group[a]) | (marks.group == marks.group[b])
-        rival = fits & (tied[i] != tied[j]) & (d2 <= d2[k] + RIVAL_D2)
-        outside = np.where(tied[i[rival]], j[rival], i[rival])
-        if not any(marks.apart[marks.group == marks.group[o]][:, tied].any() for o in outside):
+        merged = (marks.group == marks.group[a]) | (marks.group == marks.group[b])
+        rival = fits & (merged[i] != merged[j]) & (d2 <= d2[k] + RIVAL_D2)
+        outside = np.where(merged[i[rival]], j[rival], i[rival])
+        if not any(marks.apart[marks.group == marks.group[o]][:, merged].any() for o in outside):
             return int(k)
     return None
 
 
 def _relative(marks: _Map, i: IntArray, j: IntArray) -> tuple[Array, Array, Array, Array]:
-    """Wall j in the frame of wall i, (m,) each: along, across, turn; middle of the overlap."""
+    """Wall j in the frame of wall i, (m,) each: along, across, turn; and middle of the overlap."""
     x, y = marks.x[i], marks.x[j]
     c, s, d = np.cos(x[:, 2]), np.sin(x[:, 2]), y[:, :2] - x[:, :2]
     along, across = c * d[:, 0] + s * d[:, 1], -s * d[:, 0] + c * d[:, 1]
@@ -173,7 +175,7 @@ def _relative(marks: _Map, i: IntArray, j: IntArray) -> tuple[Array, Array, Arra
 
 
 def _beside(marks: _Map, i: IntArray, j: IntArray) -> BoolArray:
-    """Which pairs (m,) are near, about parallel, and share much of their length."""
+    """Which pairs (m,) are near, nearly parallel, and overlap along much of their length."""
     along, across, turn, middle = _relative(marks, i, j)
     a, b = marks.extents[i], marks.extents[j] + along[:, None]
     shared = np.minimum(a[:, 1], b[:, 1]) - np.maximum(a[:, 0], b[:, 0])
@@ -184,10 +186,10 @@ def _beside(marks: _Map, i: IntArray, j: IntArray) -> BoolArray:
 
 
 def _compare(marks: _Map, i: IntArray, j: IntArray) -> tuple[Array, Array, Array, IntArray]:
-    """How pairs (m,) differ, with Jacobians (m, 3, 3) by either one, and how many rows count.
+    """Residuals (m, 3) of pairs being one, Jacobians (m, 3, 3) by either, and rows (m,) that count.
 
-    Rows: distance across where both are, direction, and for whole walls where their middles are;
-    of points along x and y.
+    Rows: distance across at the overlap, direction, and for whole segments the distance of their
+    middles along the wall; for points the differences in x and y.
     """
     along, across, turn, middle = _relative(marks, i, j)
     c, s = np.cos(marks.x[i, 2]), np.sin(marks.x[i, 2])
@@ -213,7 +215,7 @@ def _compare(marks: _Map, i: IntArray, j: IntArray) -> tuple[Array, Array, Array
     return r, H_i, H_j, np.where(unknown, 2, 3)
 
 
-#: what two images differ by at least, of walls and of points
+#: covariances added to the residuals of walls and of points
 _FLOORS = np.array([
     np.diag([FLOOR_M**2, FLOOR_RAD**2, FLOOR_END_M**2]),
     np.diag([FLOOR_M**2, FLOOR_M**2, FLOOR_END_M**2]),
@@ -229,8 +231,8 @@ def _distances(marks: _Map, i: IntArray, j: IntArray, r: Array, H_i: Array, H_j:
     return np.asarray(np.sum(r * np.linalg.solve(S, r[..., None])[..., 0], axis=1))
 
 
-def _tie(marks: _Map, a: int, b: int, r: Array, H_a: Array, H_b: Array) -> None:
-    """Condition the joint on two landmarks being one: a Kalman update, ``r`` (k,) measured 0."""
+def _condition(marks: _Map, a: int, b: int, r: Array, H_a: Array, H_b: Array) -> None:
+    """Condition the joint on two landmarks being one: a Kalman update with residual ``r`` (k,)."""
     P, floor = marks.P, _FLOORS[int(marks.point[a])]
     PHt = P[:, 3 * a : 3 * a + 3] @ H_a.T + P[:, 3 * b : 3 * b + 3] @ H_b.T
     S = H_a @ PHt[3 * a : 3 * a + 3] + H_b @ PHt[3 * b : 3 * b + 3] + floor[: len(r), : len(r)]
@@ -240,15 +242,14 @@ def _tie(marks: _Map, a: int, b: int, r: Array, H_a: Array, H_b: Array) -> None:
     P -= B.T @ B
 
 
-# ---------------------------------------------------------------- what it makes of steps and map
+# ---------------------------------------------------------------- merging in steps and map
 
 
 def seen_together(steps: Iterable[Step]) -> set[frozenset[int]]:
-    """Pairs of landmarks that one robot saw from one state, as two things.
+    """Pairs of landmarks that one robot observed from one state as two things.
 
-    Two lines that an image has in line with each other may be parts of one wall, with a door
-    between them. Of many images of one wall some have its parts out of line, by their noise; what
-    most have is believed.
+    Two collinear lines of one image may be parts of one wall, with a door between them. By noise
+    some of many images show such parts out of line, so the majority of images decides.
     """
     images: dict[tuple[str, int], list[Association]] = {}
     for step in steps:
@@ -258,7 +259,7 @@ def seen_together(steps: Iterable[Step]) -> set[frozenset[int]]:
     pairs = [(a, b) for seen in images.values() for a, b in combinations(seen, 2)]
     pairs = [(a, b) for a, b in pairs if a.target != b.target]
     lines = np.array([a.model == b.model == "line" for a, b in pairs], dtype=bool)
-    weight = np.where(lines, 1, len(pairs))  # segments end where they were seen to end
+    weight = np.where(lines, 1, len(pairs))  # segments have known ends, so they are two things
     of_lines = [pair for pair, both in zip(pairs, lines, strict=True) if both]
     weight[lines] = np.where(_in_line(of_lines), -1, 1)
     votes: Counter[frozenset[int]] = Counter()
@@ -269,15 +270,15 @@ def seen_together(steps: Iterable[Step]) -> set[frozenset[int]]:
 
 
 def _in_line(pairs: Sequence[tuple[Association, Association]]) -> BoolArray:
-    """Which pairs (m,) of lines of one image each may lie on one straight line, by their noise."""
+    """Which pairs (m,) of lines, each of one image, may be collinear given their noise."""
     if not pairs:
         return np.zeros(0, dtype=bool)
     z = np.array([[a.z, b.z] for a, b in pairs])
     cov = np.array([[a.cov, b.cov] for a, b in pairs])
-    # as each is seen along itself; the first column is the offset across it
+    # covariances along each line's own axes
     own = rotate_cov(cov, -z[..., 2])
     off = between(z[:, 0], z[:, 1])
-    turn = np.arctan(np.tan(off[:, 2]))  # a wall has no direction
+    turn = np.arctan(np.tan(off[:, 2]))  # modulo pi
     variance = own[:, :, 2, 2].sum(axis=1) + FLOOR_RAD**2
     across = own[:, :, 1, 1].sum(axis=1) + (off[:, 0] ** 2) * own[:, 0, 2, 2] + FLOOR_M**2
     gate = chi2_quantile(GATE_PROBABILITY, 1)
@@ -285,7 +286,7 @@ def _in_line(pairs: Sequence[tuple[Association, Association]]) -> BoolArray:
 
 
 def merge_targets(pairs: Iterable[tuple[int, int]]) -> dict[int, int]:
-    """Landmark that goes -> landmark that it becomes: the oldest of all that are one."""
+    """Duplicate landmark -> the landmark it is merged into, the oldest of its group."""
     into: dict[int, int] = {}
 
     def last(i: int) -> int:
@@ -301,7 +302,7 @@ def merge_targets(pairs: Iterable[tuple[int, int]]) -> dict[int, int]:
 def merged_steps(
     steps: Iterable[Step], into: Mapping[int, int], kinds: Mapping[int, str]
 ) -> tuple[Step, ...]:
-    """Steps with landmarks renamed; what was seen of a segment that becomes a line is a line's."""
+    """Steps with duplicates replaced; observations of a segment merged into a line are lines."""
 
     def renamed(a: Association) -> Association:
         target = into.get(a.target) if isinstance(a.target, int) else None
@@ -316,7 +317,7 @@ def merged_steps(
 
 
 def merge_entries(landmarks: LandmarkMap, into: Mapping[int, int]) -> None:
-    """Book in the map what merging makes of extents, counts and times."""
+    """Merge entries of the map: extents, counts and times."""
     for gone, kept in into.items():
         old, new = landmarks.entries.pop(gone), landmarks.entries[kept]
         relative = between(new.mean, old.mean)

@@ -1,8 +1,8 @@
-"""Which observation belongs to which landmark: gate, assign, reject with a reason.
+"""Gating and assignment of observations to landmarks.
 
 Thesis 3.21-3.25 (a variant of the nearest neighbour standard filter) and section 4.6 (new objects
-between two thresholds). Pure functions on arrays; what is known about the landmarks comes in as
-`Candidates`, made by `graphslam.mapping.landmark_map`.
+between two thresholds). Pure functions on arrays: `candidate_pairs` applies the gates that need no
+covariance, `compare` computes Mahalanobis distances, `assign` chooses pairs.
 """
 
 import functools
@@ -23,19 +23,21 @@ BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 
 #: rad: lines that differ more in direction are never compared, however uncertain the heading
 MAX_ANGLE_RAD = 0.6
-#: m, rad: scale of how far a right pair is apart before any covariance is known
+#: m, rad: typical distance of a correct pair, to rank pairs before covariances are read
 TYPICAL_M, TYPICAL_RAD = 0.1, 0.05
-#: m: lengths of a segment seen whole twice agree within this; else only its line is used
+#: m: two observations of a whole segment agree in length within this; else only the line is used
 LENGTH_TOLERANCE_M = 0.15
+#: m: sigma of a position that counts as determined; walls that differ by 5° just miss it
+MAX_POSITION_SIGMA_M = 0.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
     """Candidate pairs (k,) of observation and landmark that passed the cheap gates.
 
-    ``model`` names the row of `MODELS` per pair; ``flipped``: the measured direction is to be
-    turned by pi before it is compared (eq. 3.24). ``miss`` is a crude distance, without covariance:
-    how many times `TYPICAL_M` and `TYPICAL_RAD` the two are apart.
+    ``model`` names the row of `MODELS` per pair; ``flipped``: the measured direction is
+    turned by pi before it is compared (eq. 3.24). ``miss`` is a crude distance without covariance,
+    in units of `TYPICAL_M` and `TYPICAL_RAD`.
     """
 
     observation: IntArray
@@ -68,7 +70,7 @@ class Compared:
 
 
 def gate_distance(probability: float, dof: IntArray | int) -> Array:
-    """Chi-square quantiles, shaped like ``dof``: what a true pair's d² (0-d or (k,)) stays below.
+    """Chi-square gates on d², shaped like ``dof`` (0-d or (k,)).
 
     Thesis eq. 3.25; 1 to 9 degrees of freedom.
     """
@@ -182,9 +184,9 @@ def compare(
             landmark, P_tt: (k, 3, 3) of the landmark; world axes, points padded with zeros.
         P_xt: see P_xx.
         P_tt: see P_xx.
-        floor: model name -> covariance (rows, rows) added to every innovation: what the models
-            leave out (walls that are not flat, stamps that are not exact). It widens the gates and
-            never enters the estimate.
+        floor: model name -> covariance (rows, rows) added to every innovation for what the models
+            leave out (walls that are not flat, inexact stamps). It widens the gates and never
+            enters the estimate.
     """
     k = len(pairs.observation)
     d2, dof = np.full(k, np.inf), np.zeros(k, dtype=np.int64)
@@ -242,7 +244,7 @@ def assign(cost: Array, gate: Array, method: str) -> list[tuple[int, int]]:
             found.append((i, j))
             left[i, :], left[:, j] = np.inf, np.inf
         return sorted(found)
-    # one private column per row stands for "belongs to none": so the problem is always feasible
+    # a column per row stands for "no landmark", so the problem is always feasible
     alone = np.full((n, n), np.inf)
     finite_gate = np.where(np.isfinite(allowed), gate, 0.0).max(axis=1)
     np.fill_diagonal(alone, finite_gate)
@@ -263,10 +265,10 @@ def jointly_compatible(
     P: Array,
     probability: float,
 ) -> bool:
-    """Whether several pairs agree *together*: their stacked innovation under its own covariance.
+    """Whether several pairs are jointly compatible, by the covariance of their stacked innovation.
 
-    Individually compatible pairs may contradict each other: a false closure usually consists of
-    such. (Neira, Tardós: joint compatibility, DOI 10.1109/70.976019.)
+    Individually compatible pairs may contradict each other; false closures usually do. (J. Neira,
+    J. Tardós, joint compatibility, DOI 10.1109/70.976019.)
 
     Args:
         compared: the pairs.
@@ -291,13 +293,12 @@ def jointly_compatible(
 def fixes_pose(compared: Compared, chosen: Sequence[int]) -> bool:
     """Whether the chosen pairs determine the robot's whole pose.
 
-    Parallel walls, or a single point, leave a direction free. The information that the pairs
-    alone give about the pose must be regular: its weakest direction of position is known to
-    better than 0.2 m (two walls that differ by 5° in direction just miss it).
+    Parallel walls, or a single point, leave a direction open. By the information of the pairs alone
+    the position must be known to better than `MAX_POSITION_SIGMA_M` in its weakest direction.
     """
     info = np.zeros((3, 3))
     for k in chosen:
         H = compared.H_x[k]
         info += H.T @ np.linalg.solve(compared.noise[k], H)
     position = info[:2, :2] - np.outer(info[:2, 2], info[2, :2]) / max(info[2, 2], 1e-12)
-    return bool(np.linalg.eigvalsh(position)[0] > 1 / 0.2**2)
+    return bool(np.linalg.eigvalsh(position)[0] > MAX_POSITION_SIGMA_M**-2)

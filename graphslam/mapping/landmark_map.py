@@ -1,8 +1,8 @@
-"""What the pipeline knows about landmarks beside their estimate: kind, extent, sightings, age.
+"""The landmark map: kind, extent, sightings and age of every landmark, beside its estimate.
 
-A landmark is *tentative* until it has been seen often enough; only then does it enter the graph,
-together with its earlier sightings. Estimates are copies, refreshed from the back end when they
-may have changed: reading them is much of an incremental smoother's cost.
+A landmark is *tentative* until it has been seen often enough. Only then does it enter the graph,
+together with its earlier sightings. Estimates are copies, refreshed from the back end when they may
+have changed, since reading them is a large part of an incremental smoother's cost.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ class Entry:
 
     ``mean`` (3,) world frame (heading 0 for points); ``extent`` (2,) along its x axis, m;
     ``cov`` (3, 3) of a tentative one relative to the robot that saw it; ``path_m[robot]`` is how
-    far the robot had driven when it last saw it; ``evidence`` the associations that wait.
+    far the robot had driven when it last saw it; ``evidence`` the associations of a tentative one.
     """
 
     id: int
@@ -42,8 +42,8 @@ class Entry:
     def extent_at(self, mean: Array) -> Array:
         """The extent (2,) at another estimate (2,) or (3,).
 
-        That of a line stays where it is in the world, as its origin may slide along it by metres;
-        a segment brings its own along. Where the wall itself has moved, see `LandmarkMap.follow`.
+        The extent of a line stays where it is in the world, as the line's origin may slide along it
+        by metres; that of a segment moves with it. For walls that moved see `LandmarkMap.follow`.
         """
         return self.extent - between(self.mean, mean)[0] if self.kind == "line" else self.extent
 
@@ -102,7 +102,7 @@ class LandmarkMap:
     def saw(
         self, entry: Entry, seen: Observation, pose: Array, time_ns: int, robot: str, path_m: float
     ) -> None:
-        """Book a sighting: count it and let the extent grow to what was seen.
+        """Record a sighting: count it and extend the landmark to what was seen.
 
         ``seen`` is in the base frame of the robot's ``pose`` (3,), which is in the world frame;
         ``path_m`` is how far ``robot`` has driven.
@@ -113,7 +113,7 @@ class LandmarkMap:
         if seen.extent is not None and entry.kind != "point":
             relative = between(entry.mean, compose(pose, seen.z))
             ends = relative[0] + np.cos(relative[2]) * seen.extent
-            # a segment seen whole keeps its own ends; a line grows
+            # a segment keeps its known ends; a line grows
             if entry.kind == "line" or entry.sightings == 1:
                 entry.extent = np.array(
                     [min(entry.extent[0], ends.min()), max(entry.extent[1], ends.max())]
@@ -125,10 +125,10 @@ class LandmarkMap:
             self.entries[i].move(mean)
 
     def follow(self, steps: Sequence[Step], estimate: Estimate) -> None:
-        """Move to an estimate of steps; what nothing was seen of any more leaves the map.
+        """Move to an estimate of the steps; landmarks without observations leave the map.
 
-        Lines extend over what was seen of them, as it now lies: a map that is drawn straight takes
-        them along, by metres where a loop is closed.
+        Extents of lines are computed anew from what was observed of them, by the latest estimate:
+        closing a loop may move a wall by metres.
         """
         for number, entry in list(self.entries.items()):
             if number in estimate.landmarks:
@@ -137,11 +137,11 @@ class LandmarkMap:
                 del self.entries[number]
         for number, extent in seen_extents(steps, estimate).items():
             entry = self.entries[number]
-            if entry.kind == "line":  # a segment was seen whole, and brings its ends along
+            if entry.kind == "line":  # the ends of a segment move with it
                 entry.extent = extent
 
     def split(self, number: int, new: int) -> None:
-        """What was taken for one landmark is two: ``new`` looks like ``number`` for now."""
+        """Add landmark ``new`` as a copy of ``number``, without its identity."""
         old = self.entries[number]
         self.entries[new] = replace(
             old, id=new, mean=old.mean.copy(), extent=old.extent.copy(), identity=None
@@ -181,7 +181,7 @@ def observed_from(seen: Sequence[Association], estimate: Estimate) -> Array:
 
 
 def seen_extents(steps: Sequence[Step], estimate: Estimate) -> dict[int, Array]:
-    """From where to where walls were seen in all, (2,) m along the x axis of each, by number."""
+    """Number of each wall -> extent (2,) of all observations of it, m along its x axis."""
     seen = [
         a
         for step in steps
@@ -195,7 +195,7 @@ def seen_extents(steps: Sequence[Step], estimate: Estimate) -> dict[int, Array]:
     world = compose(observed_from(seen, estimate), np.array([a.z for a in seen]))
     relative = between(means[wall], world)
     ends = relative[:, :1] + np.cos(relative[:, 2:]) * np.array([a.extent for a in seen])
-    ends.sort(axis=1)  # a wall may be described the other way round
+    ends.sort(axis=1)  # an observation may have the opposite direction
     low, high = np.full(len(walls), np.inf), np.full(len(walls), -np.inf)
     np.minimum.at(low, wall, ends[:, 0])
     np.maximum.at(high, wall, ends[:, 1])

@@ -1,4 +1,4 @@
-"""What becomes of the relative poses that a log brings along, in every pass over it."""
+"""Relative poses recorded in a log: which are used, and their conversion to closures."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,13 +15,13 @@ from graphslam.slam.robot_settings import make_tracks
 from graphslam.slam.robot_state import RobotState
 from graphslam.slam.synchronisation import ODOMETRY
 
-#: robot, time, other robot, its time, relative pose (as bytes): what a recorded closure is known by
+#: robot, time, other robot, its time, relative pose as bytes: identifies a recorded closure
 ClosureId = tuple[str, int, str, int, bytes]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedClosures:
-    """What became of a log's relative poses, see `graphslam.mapping.closure_verification.Verified`.
+    """Which relative poses of a log are used, see `mapping.closure_verification.Verified`.
 
     ``refused`` and ``kept`` by `closure_id`; ``frames`` of all robots that have a start.
     """
@@ -43,10 +43,10 @@ class RecordedClosures:
 def judge_recorded_closures(
     log: LogSet, config: Config, starts: Mapping[str, Start]
 ) -> RecordedClosures:
-    """Which relative poses of a log to believe, by all of it; starts that follow from them.
+    """Decide which relative poses of a log to use, and the start poses that follow from them.
 
-    In a log of nothing but relative poses, robots that these do not place keep a frame of their
-    own. That takes a pass over the odometry, which is made only where there are relative poses.
+    In a log of relative poses only, robots that these do not place keep a frame of their own. The
+    decision takes a pass over the odometry, made only where there are relative poses.
     """
     kinds = {topic.record for topic in log.topics}
     messages: list[RelativePose] = []
@@ -61,7 +61,7 @@ def judge_recorded_closures(
         verified = verify(messages, tracks, starts, config)
     found, frames = dict(verified.starts), dict(verified.frames)
     if kinds & {Scan, Sighting}:
-        # these may place a robot too: its start is asked for where it is needed
+        # these may place a robot too, so only starts relative to another robot are used
         found = {robot: start for robot, start in found.items() if frames[robot] != robot}
     elif RelativePose in kinds:
         for robot in sorted(set(log.robots) - {*starts, *found}):
@@ -74,7 +74,7 @@ def judge_recorded_closures(
 
 
 def closure_id(message: RelativePose) -> ClosureId:
-    """What a recorded closure is known by in every pass over the log."""
+    """Identifies a recorded closure in every pass over the log."""
     ends = message.robot, message.time_ns, message.other, message.start_ns
     return (*ends, message.delta.tobytes())
 

@@ -1,4 +1,4 @@
-"""Settings of a log's robots: the configuration's where set, else what the log's notes say."""
+"""Settings of a log's robots: from the configuration where set there, else from the log's notes."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ Settings = TypeVar("Settings", KeyframeConfig, OdometryConfig, RobotConfig)
 
 
 def check_robots(log: LogSet, config: Config) -> None:
-    """Refuse settings about robots that are not there.
+    """Refuse settings of robots that the log does not have.
 
     Raises:
         ConfigError: naming the key.
@@ -41,7 +41,7 @@ def make_tracks(log: LogSet, config: Config) -> dict[str, Track]:
 
 
 def sensing(config: OdometryConfig, scans: bool) -> OdometryConfig:
-    """Settings of a robot's calibration: without a laser only the latency of its sightings."""
+    """Odometry settings for a robot with or without scans: without, only latency is calibrated."""
     if scans:
         return config
     return replace(
@@ -59,22 +59,22 @@ def outlines(log: LogSet, config: Config) -> dict[str, Array]:
 
 
 def robot_settings(name: str, config: Config, notes: Mapping[str, str]) -> RobotConfig:
-    """Settings of a robot: the configuration's where set, else what the log's notes say of it."""
+    """Settings of a robot: from the configuration where set there, else from the log's notes."""
     noted = [f"{key}={value}" for key, value in notes.items() if key.startswith(f"robots.{name}.")]
     return _noted(config.robot(name), load_config(overrides=noted).robot(name), RobotConfig())
 
 
 def odometry_settings(config: OdometryConfig, notes: Mapping[str, str]) -> OdometryConfig:
-    """Settings of odometry: the configuration's where set, else what the log's notes say of it.
+    """Odometry settings: from the configuration where set there, else from the log's notes.
 
-    How well velocities are driven that were only commanded is a property of the log's robots, which
-    whoever wrote the log knows, as with the noise of sightings.
+    How accurately commanded velocities are driven is a property of the robots, which the writer of
+    the log knows, like the noise of sightings.
     """
     return noted(config, "odometry", notes)
 
 
 def noted(config: Settings, table: str, notes: Mapping[str, str]) -> Settings:
-    """A table of settings: those that are not the defaults, the others as a log's notes say."""
+    """A table of settings, in which a log's notes replace what is at its default."""
     lines = [f"{key}={value}" for key, value in notes.items() if key.startswith(f"{table}.")]
     known: Settings = getattr(load_config(overrides=lines), table)
     default: Settings = getattr(Config(), table)
@@ -82,7 +82,7 @@ def noted(config: Settings, table: str, notes: Mapping[str, str]) -> Settings:
 
 
 def _noted(config: Settings, noted: Settings, default: Settings) -> Settings:
-    """Settings as in ``config``, as in ``noted`` where they are the default."""
+    """``config`` with the values of ``noted`` where it has the default."""
     changes = {
         field.name: getattr(noted, field.name)
         for field in dataclasses.fields(config)

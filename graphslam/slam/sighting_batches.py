@@ -1,8 +1,8 @@
-"""Sightings gathered over a short span, so that many images share one step of the estimator.
+"""Sighting batches: images of a short span that share one step of the estimator.
 
-A camera with four images per second of five robots would make twenty states per second, most of
-them a few millimetres apart. Instead all that the robots of a log see within a span becomes one
-step: one state per robot at its end, and every sighting carried there by odometry.
+Five robots whose cameras take four images per second would get twenty states per second, most of
+them a few millimetres apart. Instead all images within a span make one step, with one state per
+robot at its end, and odometry moves every sighting there.
 """
 
 import itertools
@@ -20,7 +20,7 @@ from graphslam.odometry.readings import IntArray
 from graphslam.perception.sightings import sighting_observation
 from graphslam.slam.synchronisation import ODOMETRY
 
-#: rad: how well the relative heading of two robots is known that turns a short motion
+#: rad: sigma of the relative heading of two robots, used to rotate a short motion
 HEADING_SIGMA_RAD = 0.1
 
 
@@ -50,15 +50,15 @@ class SightingBatch:
 def batch_sightings(
     events: Iterable[Sequence[Message]], tracks: Mapping[str, Track], span_ns: int, max_gap_ns: int
 ) -> Iterator[Sequence[Message] | SightingBatch]:
-    """Events in the order of time, images of one span as one `Gathered`.
+    """Events in order of time, images of one span as one `SightingBatch`.
 
-    It is handed out once the odometry of all its robots has reached its end (waiting for no longer
-    than ``max_gap_ns``), or before a scan or a relative pose, which make steps of their own.
+    A batch is complete once the odometry of all its robots has reached its end (waiting at most
+    ``max_gap_ns``), or before a scan or a relative pose, which make steps of their own.
 
     Args:
         events: what one robot perceived at one time, each released by its own robots' odometry.
         tracks: odometry of every robot; it grows while events are taken.
-        span_ns: from a gathering's first image to its last; 0 gathers nothing.
+        span_ns: from the first image of a batch to its last; 0 makes no batches.
         max_gap_ns: longest wait for a robot's odometry.
     """
     complete: deque[SightingBatch] = deque()
@@ -89,37 +89,39 @@ def batch_sightings(
 
 
 def batch_motions(
-    gathered: SightingBatch,
+    batch: SightingBatch,
     state_ns: Mapping[str, int],
     last_ns: Mapping[str, int],
     tracks: Mapping[str, Track],
 ) -> tuple[dict[tuple[str, int], Motion], dict[str, Motion]]:
-    """The motions of a step, worked out together.
+    """The motions of a step, computed together.
 
     Args:
-        gathered: the images.
+        batch: the images.
         state_ns: time of each robot's state, before or after an image.
         last_ns: time of its state before that, of robots that get a new one.
         tracks: odometry of every robot.
 
     Returns:
-        (robot, time) of every image that it made or was seen in -> its motion there from its state;
+        (robot, time of an image that it took or was seen in) -> its motion from its state to then;
         robot -> its motion to its new state.
     """
     times: dict[str, set[int]] = defaultdict(set)
-    for image in gathered.images:
+    for image in batch.images:
         for robot in sorted({image[0].robot, *(s.seen_robot for s in image if s.seen_robot)}):
             times[robot].add(image[0].time_ns)
-    asked: list[tuple[Track, IntArray, IntArray]] = []
+    queries: list[tuple[Track, IntArray, IntArray]] = []
     for robot, needed in times.items():
         starts, ends = [state_ns[robot]] * len(needed), sorted(needed)
         if robot in last_ns:
             starts, ends = [*starts, last_ns[robot]], [*ends, state_ns[robot]]
         begin, end = np.array([starts, ends], dtype=np.int64)
-        asked.append((tracks[robot], begin, end))
+        queries.append((tracks[robot], begin, end))
     there: dict[tuple[str, int], Motion] = {}
     new: dict[str, Motion] = {}
-    for robot, (_, start_ns, end_ns), moved in zip(times, asked, motions_of(asked), strict=True):
+    for robot, (_, start_ns, end_ns), moved in zip(
+        times, queries, motions_of(queries), strict=True
+    ):
         made = map(moved.one, itertools.count(), start_ns.tolist(), end_ns.tolist())
         images = itertools.islice(made, len(times[robot]))
         there.update(((robot, motion.end_ns), motion) for motion in images)
@@ -130,9 +132,10 @@ def batch_motions(
 def to_state_frame(
     sightings: Sequence[Sighting], moved: Sequence[Motion], first_source: int = 0
 ) -> list[Observation]:
-    """Sightings in the base frames at the starts of ``moved``, each of which ends when it was made.
+    """Sightings in the base frames of the states at which the motions ``moved`` begin.
 
-    What is seen from the state itself keeps its own covariance. Observations are numbered from
+    Each motion ends when its sighting was made; without motion the covariance is the sighting's
+    own. Observations are numbered from
     ``first_source`` on.
     """
     base = []
@@ -184,7 +187,7 @@ def robot_observations(
     moved: Mapping[tuple[str, int], Motion],
     heading: Mapping[str, float],
 ) -> list[Association]:
-    """Sightings of robots, moved from where those robots were to where they are at their states.
+    """Sightings of robots as associations between states: the seen robot is moved to its state.
 
     Args:
         sightings: of a step, of landmarks as well.
@@ -223,10 +226,10 @@ def robot_observations(
 def transport_target(
     z: Array, cov: Array, delta: Array, delta_cov: Array, turn_rad: Array
 ) -> tuple[Array, Array]:
-    """Measurements of robots, moved from where these were seen to where their states are.
+    """Measurements of robots, moved from where the robots were seen to their states.
 
-    What a robot drove in between is known along its own axes. The relative heading that turns it
-    into the observer's comes from the estimate and needs not be known well: the way is short.
+    The motion in between is known along the seen robot's axes. The relative heading that rotates it
+    into the observer's frame comes from the estimate and need not be accurate: the motion is short.
 
     Args:
         z: (..., 2) bearings and ranges, or (..., 3) poses, in the observer's base frame.
@@ -257,10 +260,10 @@ def _seen_at(point: Array, cov: Array) -> tuple[Array, Array]:
 
 
 def inflate_repeated(associations: Sequence[Association]) -> tuple[Association, ...]:
-    """Associations of one step: n of one target by one robot count as one.
+    """Associations of one step, in which n sightings of one target by one robot count as one.
 
-    Errors of a target's sightings within a short span are nearly the same (MRCLAM: the ranges of
-    consecutive images correlate by 0.8), so they get n times the covariance.
+    Errors of a target's sightings within a short span are nearly equal (MRCLAM: the ranges of
+    consecutive images correlate by 0.8), so each gets n times its covariance.
     """
     count = Counter((a.robot, a.target) for a in associations)
     return tuple(
@@ -270,7 +273,7 @@ def inflate_repeated(associations: Sequence[Association]) -> tuple[Association, 
 
 
 def events(messages: Iterable[Message]) -> Iterator[list[Message]]:
-    """Messages grouped: the sightings of one robot at one time are one image."""
+    """Messages grouped to events: the sightings of one robot at one time are one image."""
 
     def key(message: Message) -> tuple[object, ...]:
         if isinstance(message, Sighting):

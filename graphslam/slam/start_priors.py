@@ -1,4 +1,4 @@
-"""Where the robots start: the prior of each robot's first state."""
+"""Start priors: the prior of each robot's first state."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ MAX_TRUTH_LAG_NS = 500_000_000
 
 
 def start_poses(log: LogSet, config: Config) -> dict[str, Start]:
-    """Where robots start: as given, from one truth sample; the first at the origin if nothing is.
+    """Start poses as given or from one truth sample; without any the first robot is at the origin.
 
     Raises:
         EstimationError: truth was asked for and a robot has none, or a given pose is malformed.
@@ -37,7 +37,7 @@ def start_poses(log: LogSet, config: Config) -> dict[str, Start]:
 
 
 def origin(config: Config) -> Start:
-    """Start of a robot at whose first pose a frame has its origin."""
+    """Start prior of a robot whose first pose is the origin of a frame."""
     sigmas = config.start.origin_sigma_m, config.start.origin_sigma_rad
     return Start(np.zeros(3), _cov(*sigmas))
 

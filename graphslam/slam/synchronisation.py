@@ -34,19 +34,18 @@ def synchronise(
 ) -> Iterator[Message]:
     """Feed odometry into the tracks and hold everything else until the track covers its time.
 
-    A scan stamped between two odometry readings needs the later one to be placed. The order of
-    time is kept over all robots, so one robot's silence may delay the others, by ``max_gap_s`` at
-    most: what is farther than that from any odometry of its robot is dropped and counted, and so
-    is, at once, a sighting of a robot that has no track. At the end of the log the robot is taken
-    to stand still after its last reading. Scans may show the robots ``watched``, so they wait for
-    the odometry of these too.
+    A scan stamped between two odometry readings needs the later one. The order of time is kept over
+    all robots, so one robot without odometry may delay the others, by ``max_gap_s`` at most.
+    Messages farther than that from any odometry of their robot are dropped and counted, and so are
+    sightings of robots without a track. At the end of the log robots are taken to stand still after
+    their last reading. Scans may show the robots ``watched``, so they wait for their odometry too.
     """
     waiting: deque[Message] = deque()
     max_gap_ns = round(max_gap_s * 1e9)
     now_ns = 0
 
     def next_of_waiting(final: bool) -> Message | None:
-        """The first that waits, taken out, unless it has to wait on."""
+        """Takes out and returns the first waiting message, unless it has to wait longer."""
         while waiting:
             head = waiting[0]
             if not isinstance(head, ODOMETRY):

@@ -10,7 +10,7 @@ from common import pose_graph_values
 from graphslam.core.config import BackendConfig, Config, StartConfig
 from graphslam.core.geometry import between, compose
 from graphslam.logs import IMPORTERS, open_logs, pose_stamp_ns
-from graphslam.mapping.closure_verification import UNLIKE
+from graphslam.mapping.closure_verification import CONTRADICTED
 from graphslam.slam.smooth import smooth
 
 DEFAULTS = Config()
@@ -132,7 +132,7 @@ def test_false_closures_are_refused_and_the_other_robot_is_found(outliers, seed,
     found = refused(result)
     assert ends(graph.false) <= found
     assert len(ends(graph.true) & found) <= len(graph.true) // 20
-    assert {c["reason"] for c in result.summary["closures"]["refused"]} <= {UNLIKE}
+    assert {c["reason"] for c in result.summary["closures"]["refused"]} <= {CONTRADICTED}
     assert result.summary["frames"] == {"robot1": "robot1", "robot2": "robot1"}
     error, best = errors(graph, result)
     # a lost one that is true misses the rest by less than FIT, chi-square 21 of 3
