@@ -1,4 +1,4 @@
-"""What the benchmarks share: where the data are, the commands that a user types, times, poses.
+"""What the benchmarks share: data paths, commands with their times and memory, logs, poses.
 
 Logs that the repository does not hold are taken from GRAPHSLAM_DATA (default: ../shared/data
 beside the repository).

@@ -1,6 +1,7 @@
-"""What a graph per robot and condensed messages cost against one graph of all robots.
+"""What a graph per robot with condensed messages costs, compared with one graph of all robots.
 
-The same recorded steps go into both, by `graphslam compare`, for several times between messages:
+The same recorded steps are replayed into both by `graphslam compare`, for several intervals between
+messages:
 MRCLAM set 6, from the true start poses, and the thesis' two robots with lasers (simulated). Errors
 are root mean squares over all robots, from the centralised estimate ("loss") and from the truth, m;
 kB are what each robot sends on average, and what it measured; s is the time of the replay.

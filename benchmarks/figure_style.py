@@ -1,4 +1,4 @@
-"""The look of the figures in docs/figures: colours, panels, and what is drawn in most of them."""
+"""The style of the figures in docs/figures: colours, panels, and common plot elements."""
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure

@@ -1,7 +1,7 @@
-"""What separates a filter from the smoother on a simulated log, by switching it off bit by bit.
+"""What separates a filter from the smoother on a simulated log, one difference at a time.
 
-Each seed's log is associated once, by the default smoother; its steps go into every row: the same
-evidence, or the same without what is late (from before a landmark's promotion). Base poses over all
+Each seed's log is associated once, by the default smoother; its steps are replayed in every row,
+with or without late evidence (from before a landmark's promotion). Base poses over all
 robots, position; mean and standard deviation over seeds.
 
 Run: python benchmarks/filter_gap.py [SCENARIO [SEEDS [key=value ...]]]

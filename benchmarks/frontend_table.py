@@ -59,7 +59,7 @@ WHOLE = {label: front for label, front in FRONT.items() if not front.cylinders}
 
 
 @dataclass(frozen=True)
-class Seen:
+class TrueScan:
     """A noisy scan, and its truth in the laser frame.
 
     ``faces`` (k, 2, 2) and ``circles`` (m, 3) of the world; ``part[face]``: where on the face, m
@@ -87,7 +87,7 @@ class Score:
     nis: list[float] = field(default_factory=list)
 
 
-def seen(name: str, seed: int, folder: Path, scans: int = SCANS) -> Iterator[Seen]:
+def true_scans(name: str, seed: int, folder: Path, scans: int = SCANS) -> Iterator[TrueScan]:
     """Scans of all robots of a scenario, with their truth."""
     scenario = load_scenario(name)
     world = prepare_visits(scenario)[0].world
@@ -119,7 +119,7 @@ def seen(name: str, seed: int, folder: Path, scans: int = SCANS) -> Iterator[See
                     part[surface] = (along.min(), along.max(), np.count_nonzero(here))
                 elif surface < len(mine) + len(round_):
                     hit[surface - len(mine)] = np.count_nonzero(here)
-            yield Seen(noisy[i], mine, round_, part, hit, hits, surfaces)
+            yield TrueScan(noisy[i], mine, round_, part, hit, hits, surfaces)
 
 
 def unit(face: Array) -> Array:
@@ -127,7 +127,7 @@ def unit(face: Array) -> Array:
     return np.asarray(along / np.hypot(*along))
 
 
-def faces_of(o: Observation, truth: Seen) -> tuple[Array | None, list[int]]:
+def faces_of(o: Observation, truth: TrueScan) -> tuple[Array | None, list[int]]:
     """Error (offset m, direction rad) of a line against the face it is mostly made of.
 
     None where it lies on no face; and all faces of which beams met it. What it is made of are the
@@ -157,7 +157,7 @@ def faces_of(o: Observation, truth: Seen) -> tuple[Array | None, list[int]]:
     ]
 
 
-def score(name: str, config: FrontEndConfig, scans: Sequence[Seen]) -> tuple[Score, Score]:
+def score(name: str, config: FrontEndConfig, scans: Sequence[TrueScan]) -> tuple[Score, Score]:
     """Lines and cylinders of one front end."""
     lines, points = Score(), Score()
     for truth in scans:
@@ -263,7 +263,7 @@ def scan_table(folder: Path) -> None:
         f" {'per scan':>9} {'ms/scan':>8}"
     )
     for name in SCENARIOS:
-        truths = [list(seen(name, seed, folder)) for seed in SEEDS]
+        truths = [list(true_scans(name, seed, folder)) for seed in SEEDS]
         scans = [t.scan for t in truths[0]]
         count = sum(map(len, truths))
         for label, config in FRONT.items():

@@ -1,17 +1,18 @@
-"""A real log cut into two robots' logs, nothing said of where the second starts: joined again?
+"""A real log cut into two robots whose relative start is unknown: are they joined correctly?
 
 The first half of the log is one robot, the second half another, whose odometry begins at an origin
-of its own. They share a building, never meet, and nothing in it has a name. Printed are where the
-second robot's first scan is as seen from the first robot's first, by the run of two robots and by
-that over the whole log, the start that was found with its sigmas, and the errors of Kümmerle et al.
-2009 over the hand-made relations, those across the halves apart.
+of its own. They drive in the same building but never see each other, and no landmark has an
+identity. Printed are the pose of the second robot's first scan in the frame of the first robot's
+first scan, by the run of two robots and by that of the whole log; the estimated start with its
+sigmas; and the errors of Kümmerle et al. 2009 over the hand-made relations, separately within the
+halves and across them.
 
-`parts` cuts each half's places into five stretches and compares any two of one half as if they were
-of two robots. Their frame is one, so that the start to be found is the origin. A pair overlaps if
-four places of one or more are within 2 m of one of the other's.
+`parts` cuts the submaps of each half into five stretches and relates any two of the same half as if
+they were of two robots. Both are in one frame, so the correct start is the origin. Two stretches
+overlap if at least four submaps of one are within 2 m of a submap of the other.
 
 Run: python benchmarks/joined_by_maps.py [parts] [intel] [aces]
-Exit code 1 if a log is not joined, or a part wrongly. GRAPHSLAM_DATA as in real_logs.py.
+Exit code 1 if a log is not joined, or a part wrongly.
 """
 
 import json
@@ -43,7 +44,7 @@ from graphslam.slam.start_priors import origin, start_poses
 from graphslam.slam.step_recorder import PriorKnowledge
 
 NAMES = ("first", "second")
-#: stretches of each half; two overlap if so many places are so near, m; m, rad: a start is right
+#: stretches of each half; two overlap if so many submaps are so near (m); limits of a correct start
 PARTS, OVERLAPPING, OVERLAP_M = 5, 4, 2.0
 RIGHT_M, RIGHT_RAD = 0.5, 0.05
 #: of the table: headings and their widths

@@ -3,8 +3,8 @@
 Imported, smoothed from the true start poses and evaluated by the commands that a user types; then
 without sightings of robots, both also by the filter, without identities, with two codes exchanged
 in the table of who bears which, and with the start of one robot alone given. Errors are root mean
-squares over all robots at 10 Hz over the whole span, blind stretches included; s and CPU s are
-those of `smooth`, the whole command with its report.
+squares over all robots at 10 Hz over the whole log, stretches without sightings included; s and
+CPU s are those of the whole `smooth` command with its report.
 
 Run: python benchmarks/mrclam.py [robots|alone|ekf|ekf-alone|unnamed|exchanged|start1..start5 ...]
 """

@@ -1,13 +1,12 @@
-"""Closures that are wrong among closures that are right: which are believed, and what that costs.
+"""False loop closures in a pose graph: which are believed, and what they cost.
 
-The CSAIL pose graph with 250 closures added that nobody measured, once as one robot and once cut
-into two robots of which the second starts nobody knows where. Our result, by default settings, is
-judged by the factors of the graph without them: GTSAM's error, with a prior of 1e-3 on pose 0. The
-files of two robots lack one of these factors, the odometry from the last pose of one to the first
-of the other: errors are of the factors that the files have, and in another column of all. Beside
-them the optimum, what Levenberg-Marquardt and GTSAM's graduated non-convexity (`GncLMOptimizer`,
-odometry known to be right) make of the graph of one robot, and the same runs without false
-closures.
+The CSAIL pose graph with 250 false closures added, once as one robot and once cut into two robots
+of which the second one's start is unknown. Our result with default settings is evaluated with the
+factors of the graph without them: GTSAM's error, with a prior of 1e-3 on pose 0. The files of two
+robots lack one of these factors, the odometry from the last pose of one to the first of the other:
+errors are of the factors in the files, and in another column of all. For comparison: the optimum,
+the results of Levenberg-Marquardt and of GTSAM's graduated non-convexity (`GncLMOptimizer`, with
+odometry as known inliers) for one robot, and the same runs without false closures.
 
 Run: python benchmarks/outlier_closures.py [FOLDER]   (default: graphs/ of the data)
 """

@@ -1,16 +1,16 @@
-"""Intel and ACES made worse in four ways, with default settings: does any run fail grossly?
+"""Intel and ACES degraded in four ways, with default settings: does any run fail grossly?
 
 late      the first 20 s are missing
 half      every second scan is missing
-noisy     noise on every odometry increment, until odometry's own error, the mean over relations at
-          most 60 s apart, is 1.5-fold (two seeds); over longer ones it says little of increments,
-          since nothing is farther off than the building is wide
-wild      the same until the mean over all relations is 1.5-fold; only if named: for Intel that
-          takes increments nine to thirteen times as bad
-mirrored  left is right
+noisy     noise on every odometry increment, until odometry's own error (mean over relations at most
+          60 s apart) is 1.5 times as large (two seeds); over longer relations the error depends
+          little on the increments, since it is bounded by the size of the building
+wild      the same until the mean over all relations is 1.5 times as large; only if named: for Intel
+          that takes increments with nine to thirteen times the noise
+mirrored  left and right exchanged
 
-The first is run once as recorded too. Errors are those of `graphslam evaluate --relations`, over
-the relations whose scans are left; a run fails grossly if the mean over all of them exceeds 0.15 m.
+Each log is also run as recorded. Errors are those of `graphslam evaluate --relations`, over the
+relations whose scans remain; a run fails grossly if the mean over all of them exceeds 0.15 m.
 
 Run: python benchmarks/perturbed_logs.py [intel|aces[:PERTURBATION]] ...
 exit code 1 if a run fails grossly.

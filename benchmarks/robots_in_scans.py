@@ -1,4 +1,4 @@
-"""Two robots, one found in the other's scans, their clocks 0.4 s apart: what cooperation is worth.
+"""Two robots, one detected in the other's scans, clocks 0.4 s apart: the value of cooperation.
 
 The scenario `robots-in-scans` is the thesis' experiment 6.1.3 without a sensor for robots: the
 vehicle knows the Pioneer's outline and finds it in its laser's scans. Smoothed as it is, and
@@ -6,9 +6,9 @@ without the sightings (`association.robot_sightings=ignore`). Printed per seed: 
 position error, root mean square over the drive (world frame, unaligned, starts known), its standard
 deviation, and the error of the clock offset with its standard deviation; then all seeds together.
 
-Then without the start of one of them, which the other must find in its scans, or find itself by
-what it sees, wherever it began: the same error, how far the start that was found is off, and its
-standard deviation.
+Then with the start of one of them unknown: it must be detected in the scans of the other, or
+localise itself by what it sees. Printed are the same error, the error of the estimated start, and
+its standard deviation.
 
 Run: python benchmarks/robots_in_scans.py [--seeds 20] [--unknown 10]
 """
@@ -37,8 +37,8 @@ SCENARIO, OBSERVER, SEEN = "robots-in-scans", "vehicle", "pioneer"
 class Outcome:
     """One run: error and standard deviation of the robot that is seen, m, and the clock found.
 
-    ``aligned_m`` is the error of both robots once the world is where it fits best: what their
-    places among each other are worth.
+    ``aligned_m`` is the error of both robots after one common alignment: that of their relative
+    poses.
     """
 
     error_m: float

@@ -126,8 +126,8 @@ def main() -> None:
                     for kind in ("final", "causal")
                     for f in (np.mean, np.max)
                 ]
-                told = [next(iter(summary["odometry"].values())) for _, summary in runs]
-                count = f"{sum(t['contradicted'] for t in told)}/{sum(t['motions'] for t in told)}"
+                odometry = [next(iter(summary["odometry"].values())) for _, summary in runs]
+                count = f"{sum(t['contradicted'] for t in odometry)}/{sum(t['motions'] for t in odometry)}"
                 print(
                     f"{name + ', ' + setting:22}{values[0]:11.3f}{values[1]:8.3f}{values[2]:13.3f}"
                     f"{values[3]:8.3f}{count:>14}",
