@@ -156,10 +156,11 @@ def runs(names: list[str]) -> Iterator[tuple[str, str, int]]:
 def main() -> int:
     options = parser(__doc__)
     options.add_argument("names", nargs="*", default=FREIBURG_LOGS, metavar="LOG[:PERTURBATION]")
+    names = options.parse_args().names
     good = True
     print(f"{'':26}{'n':>6}{'all m':>9}{'local':>9}{'loops':>9}{'rot °':>8}{'causal':>9}{'s':>7}")
     with tempfile.TemporaryDirectory() as folder:
-        for log, perturbation, seed in runs(options.parse_args().names):
+        for log, perturbation, seed in runs(names):
             whole = import_freiburg(log, Path(folder))
             messages = list(open_logs([whole], Config()).messages())
             relations = read_relations(FREIBURG / f"{log}.relations")

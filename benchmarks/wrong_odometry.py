@@ -127,10 +127,12 @@ def main() -> None:
                     for f in (np.mean, np.max)
                 ]
                 odometry = [next(iter(summary["odometry"].values())) for _, summary in runs]
-                count = f"{sum(t['contradicted'] for t in odometry)}/{sum(t['motions'] for t in odometry)}"
+                contradicted, motions = (
+                    sum(one[key] for one in odometry) for key in ("contradicted", "motions")
+                )
                 print(
                     f"{name + ', ' + setting:22}{values[0]:11.3f}{values[1]:8.3f}{values[2]:13.3f}"
-                    f"{values[3]:8.3f}{count:>14}",
+                    f"{values[3]:8.3f}{f'{contradicted}/{motions}':>14}",
                     flush=True,
                 )
 
