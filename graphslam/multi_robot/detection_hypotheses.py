@@ -30,10 +30,15 @@ from graphslam.core.records import Scan
 from graphslam.multi_robot.relative_frames import RobotEstimate
 from graphslam.multi_robot.robot_detection import MARGIN_M
 from graphslam.odometry.readings import IntArray
-from graphslam.perception.dynamic_objects import SHARE as STANDING_SHARE
-from graphslam.perception.dynamic_objects import stood_there
+from graphslam.perception.dynamic_objects import MIN_SHARE as STANDING_SHARE
+from graphslam.perception.dynamic_objects import returns_present_before
 from graphslam.perception.ordered_scan import Sweep, make_sweep
-from graphslam.perception.robot_outlines import FEWEST, centres, clusters, reach
+from graphslam.perception.robot_outlines import (
+    MIN_RETURNS,
+    cluster_centres,
+    free_standing_clusters,
+    outline_radius,
+)
 
 #: of an outline's least width, at least seen
 SHARE = 0.5
@@ -184,25 +189,25 @@ def scans_with_robot_away(poses: Array, k: int, apart_m: float) -> list[int]:
 
 def candidate_detections(watch: ScanSequence, path: Path, outline: Array) -> CandidateDetections:
     """Everything in the scans that has about the size of ``outline`` (k, 2) and moves about."""
-    size, (_, thin, wide) = reach(outline), outline_extent(outline)
+    size, (_, thin, wide) = outline_radius(outline), outline_extent(outline)
     depth, shaped = DEPTH * (thin + wide) / 2, (wide - thin) / 2
     number, points, variance = [], [], []
     for k, sweep in enumerate(watch.sweeps):
-        found = clusters(sweep, 2 * size + MARGIN_M)
+        found = free_standing_clusters(sweep, 2 * size + MARGIN_M)
         if not len(found):
             continue
         standing = np.zeros(len(found), dtype=np.bool_)
         count = found.last - found.first + 1
         for j in scans_with_robot_away(path.now, k, 2 * size):
             then = between(watch.lasers[j], watch.lasers[k])
-            same = stood_there(sweep.points, watch.sweeps[j], then)
+            same = returns_present_before(sweep.points, watch.sweeps[j], then)
             sums = np.concatenate([[0], np.cumsum(same)])
             standing |= sums[found.last + 1] - sums[found.first] >= STANDING_SHARE * count
-        at = centres(sweep, found)
+        at = cluster_centres(sweep, found)
         r = np.hypot(*at.T)
         width = np.hypot(*(sweep.points[found.last] - sweep.points[found.first]).T)
         width += sweep.step_rad * r
-        use = ~standing & (count >= FEWEST) & (width >= SHARE * 2 * thin)
+        use = ~standing & (count >= MIN_RETURNS) & (width >= SHARE * 2 * thin)
         behind = at[use] * (1 + depth / np.maximum(r[use], depth))[:, None]
         points.append(transform(watch.lasers[k], behind))
         variance.append(MIDDLE_M**2 + shaped**2 + (sweep.step_rad * r[use]) ** 2)

@@ -48,7 +48,7 @@ from graphslam.multi_robot.track_registration import fit_start
 from graphslam.odometry.preintegration import Track
 from graphslam.odometry.readings import IntArray
 from graphslam.perception.ordered_scan import Sweep
-from graphslam.perception.robot_outlines import FEWEST, expected_ranges, reach
+from graphslam.perception.robot_outlines import MIN_RETURNS, expected_ranges, outline_radius
 
 #: m: a scan is kept once a robot drove so far since the last one
 APART_M = 0.1
@@ -176,7 +176,7 @@ def find_robots_in_scans(
             rivals = [
                 n
                 for n in found
-                if n != name and _is_same_object(one, found[n], reach(outlines[name]))
+                if n != name and _is_same_object(one, found[n], outline_radius(outlines[name]))
             ]
             if rivals:
                 undecided[name] = f"what {observer} saw may be {' or '.join([name, *rivals])}"
@@ -295,7 +295,7 @@ class _RobotSearch:
             cov = np.diag([place.spread[k] + SURE_M**2 / 9] * 2 + [turned])
             before = [
                 (watch.sweeps[j], between(watch.lasers[j], watch.lasers[k]))
-                for j in scans_with_robot_away(there, k, 2 * reach(self.outline))
+                for j in scans_with_robot_away(there, k, 2 * outline_radius(self.outline))
             ]
             found = detect_robots(
                 watch.scans[k],
@@ -338,7 +338,7 @@ def is_visible(sweep: Sweep, outline: Array, pose: Array) -> bool:
     right, left = edges[0]
     off = np.abs(wrap(sweep.angles - (right + left) / 2))
     beams = np.flatnonzero(off < WITHIN * (left - right) / 2)
-    if len(beams) < FEWEST:
+    if len(beams) < MIN_RETURNS:
         return False
     with np.errstate(invalid="ignore"):
         free = sweep.ranges[beams] > h[0, beams] - HIDDEN_M

@@ -29,9 +29,16 @@ from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Motion, Scan, Sighting
 from graphslam.estimation.backend import Backend, Joint
 from graphslam.odometry.preintegration import Track
-from graphslam.perception.dynamic_objects import moving, was_there
+from graphslam.perception.dynamic_objects import dynamic_returns, was_present
 from graphslam.perception.ordered_scan import Sweep, make_sweep
-from graphslam.perception.robot_outlines import FEWEST, Fit, centres, clusters, fit_outline, reach
+from graphslam.perception.robot_outlines import (
+    MIN_RETURNS,
+    OutlineFit,
+    cluster_centres,
+    fit_outline,
+    free_standing_clusters,
+    outline_radius,
+)
 
 #: a robot is where it is expected with this probability
 GATE_PROBABILITY = 0.999
@@ -142,7 +149,7 @@ def detect_robots(
         if not fits and np.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]) < KNOWN_M:
             places = [pose]
         for place in places:
-            gone |= _near(sweep, place, reach(outlines[name]) + MARGIN_M)
+            gone |= _near(sweep, place, outline_radius(outlines[name]) + MARGIN_M)
     if not gone.any():
         return DetectedRobots(scan, tuple(sightings))
     return DetectedRobots(_without_returns(scan, sweep, gone), tuple(sightings))
@@ -155,40 +162,40 @@ def _fit_clusters(
     cov: Array,
     config: FrontEndConfig,
     elsewhere: Sequence[View],
-) -> list[tuple[float, Fit]]:
+) -> list[tuple[float, OutlineFit]]:
     """Clusters that can be the robot, as squared distance from what is expected and fit; by it."""
-    size = 2 * reach(outline)
-    found = clusters(sweep, size + MARGIN_M)
-    near = np.hypot(*(centres(sweep, found) - pose[:2]).T) if len(found) else np.zeros(0)
+    size = 2 * outline_radius(outline)
+    found = free_standing_clusters(sweep, size + MARGIN_M)
+    near = np.hypot(*(cluster_centres(sweep, found) - pose[:2]).T) if len(found) else np.zeros(0)
     spread = float(np.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]))
-    enough = found.last - found.first + 1 >= FEWEST
+    enough = found.last - found.first + 1 >= MIN_RETURNS
     use = np.flatnonzero(enough & (near < 4 * (spread + SLACK_M) + size))
     fits = []
     for k in use[np.argsort(near[use], kind="stable")][:CANDIDATES]:
         sigma = min(float(np.sqrt(cov[2, 2])), 0.5)
         span = int(found.first[k]), int(found.last[k])
-        fit = fit_outline(sweep, *span, found.bare[k], outline, pose, sigma, config)
-        if not fit.good:
+        fit = fit_outline(sweep, *span, found.unoccluded[k], outline, pose, sigma, config)
+        if not fit.is_plausible:
             continue
-        n = 3 if fit.direction else 2
+        n = 3 if fit.heading_found else 2
         off = fit.pose - pose
         off[2] = wrap(off[2])
         S = cov[:n, :n] + fit.cov[:n, :n] + SLACK_M**2 * np.eye(n)
         d2 = float(off[:n] @ np.linalg.solve(S, off[:n]))
         points = sweep.points[span[0] : span[1] + 1]
-        old = any(was_there(points, before, here) for before, here in elsewhere)
+        old = any(was_present(points, before, here) for before, here in elsewhere)
         if d2 < chi2_quantile(GATE_PROBABILITY, n) and not old:
             fits.append((d2, fit))
     return sorted(fits, key=lambda one: one[0])
 
 
-def _sighting(scan: Scan, name: str, fit: Fit) -> Sighting:
+def _sighting(scan: Scan, name: str, fit: OutlineFit) -> Sighting:
     """A fit as bearing and range, with direction where it was found."""
     x, y, phi = fit.pose
     r2 = x * x + y * y
     r = np.sqrt(r2)
     J = np.array([[-y / r2, x / r2, 0.0], [x / r, y / r, 0.0], [0.0, 0.0, 1.0]])
-    n = 3 if fit.direction else 2
+    n = 3 if fit.heading_found else 2
     z = np.array([np.arctan2(y, x), r, wrap(phi)])[:n]
     cov = (J @ fit.cov @ J.T)[:n, :n]
     return Sighting(scan.robot, scan.stamp_ns, scan.time_ns, z, cov, None, name, scan.mount)
@@ -210,7 +217,7 @@ def _without_returns(scan: Scan, sweep: Sweep, gone: Flags) -> Scan:
 
 def _without_moving(scan: Scan, sweep: Sweep, views: Sequence[tuple[int, View]]) -> Scan:
     """The scan, of which ``sweep`` is made, without things that move."""
-    gone = moving(sweep, [view for _, view in views[-EARLIER:]])
+    gone = dynamic_returns(sweep, [view for _, view in views[-EARLIER:]])
     return _without_returns(scan, sweep, gone) if gone.any() else scan
 
 
@@ -308,7 +315,7 @@ class RobotDetector:
 
     def _elsewhere(self, scan: Scan, name: str, views: Sequence[tuple[int, View]]) -> list[View]:
         """Earlier scans at times when a robot was where it cannot be taken for itself of now."""
-        track, size = self._runs[name].track, 2 * reach(self.outlines[name])
+        track, size = self._runs[name].track, 2 * outline_radius(self.outlines[name])
         times = np.array([scan.time_ns, *(time_ns for time_ns, _ in views)], dtype=np.int64)
         away = np.hypot(*(between(track.pose(times[:1]), track.pose(times[1:]))[:, :2]).T) > size
         return [view for (_, view), far in zip(views, away, strict=True) if far]

@@ -11,14 +11,13 @@ delta = phi - beta.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array, wrap
 from graphslam.core.records import Observation
 from graphslam.perception.line_moments import fitted_lines, mean_square, point_moments
-from graphslam.perception.ordered_scan import Sweep
+from graphslam.perception.ordered_scan import Indices, Mask, Sweep
 from graphslam.perception.segments import MISSING_BEAMS
 
 ITERATIONS = 3
@@ -35,9 +34,6 @@ FIT_PROBABILITY = 0.01
 
 OUTLIER_SIGMAS = 4.0
 """The first and the last return may be mixed pixels: left out if so far off."""
-
-Indices = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,7 +62,7 @@ def cylinders(sweep: Sweep, config: FrontEndConfig) -> tuple[tuple[Observation, 
         Observations of kind ``point``: bearing and range of the centre, laser frame; and the sweep
         whose ``points`` lack what they are made of (what it says about single beams stays).
     """
-    first, last = free_standing(sweep, config)
+    first, last = free_standing_runs(sweep, config)
     if not len(first):
         return (), sweep
     circles = fit_circles(sweep, first, last, config)
@@ -88,7 +84,7 @@ def cylinders(sweep: Sweep, config: FrontEndConfig) -> tuple[tuple[Observation, 
     return seen, replace(sweep, beam=sweep.beam[rows], points=sweep.points[rows])
 
 
-def free_standing(sweep: Sweep, config: FrontEndConfig) -> tuple[Indices, Indices]:
+def free_standing_runs(sweep: Sweep, config: FrontEndConfig) -> tuple[Indices, Indices]:
     """First and last row of the runs of returns that could be a cylinder.
 
     On both sides the next return is farther away by more than ``gap_m``, or there is none for

@@ -14,14 +14,13 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array
 from graphslam.core.records import Observation
 from graphslam.perception.line_fit import fit_lines, observations
 from graphslam.perception.line_moments import fitted_line, fitted_lines, mean_square, point_moments
-from graphslam.perception.ordered_scan import Sweep
+from graphslam.perception.ordered_scan import Indices, Mask, Sweep
 from graphslam.perception.segments import MISSING_BEAMS, allowed_rms, fewest_points, valid_lines
 
 SEED_POINTS = 3
@@ -44,9 +43,6 @@ may deviate (mean squares), beside noise: walls of several materials, doors in t
 
 ROUNDS = 8
 """Largest number of times that a line is fitted anew while it grows; three are usual."""
-
-Indices = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 
 def hough_lines(sweep: Sweep, config: FrontEndConfig) -> tuple[Observation, ...]:

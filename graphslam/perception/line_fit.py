@@ -7,12 +7,12 @@ from the line's position, w a point's weight, V the covariance of (normal offset
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import Array, wrap
 from graphslam.core.records import Observation
+from graphslam.perception.ordered_scan import Indices, Mask
 
 SMALLEST_SIGMA_M = 1e-4
 """Floor of one point's normal noise where the settings have none: weights stay finite."""
@@ -34,7 +34,7 @@ class LineFits:
     end_var: Array
     rms: Array
 
-    def __getitem__(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> "LineFits":
+    def __getitem__(self, rows: Indices | Mask) -> "LineFits":
         return LineFits(
             self.z[rows], self.length[rows], self.V[rows], self.end_var[rows], self.rms[rows]
         )
@@ -52,7 +52,7 @@ def fit_line(points: Array, config: FrontEndConfig, fully_visible: bool) -> Obse
     return observations(fits, np.array([fully_visible]), config)[0]
 
 
-def fit_lines(points: Array, starts: NDArray[np.intp], config: FrontEndConfig) -> LineFits:
+def fit_lines(points: Array, starts: Indices, config: FrontEndConfig) -> LineFits:
     """Weighted total least squares of m lines, thesis 4.7.6 and eq. 4.32, 4.36-4.38.
 
     With ``config.covariance == "incidence"`` a point weighs 1/sigma_n², its own noise along the
@@ -105,7 +105,7 @@ def fit_lines(points: Array, starts: NDArray[np.intp], config: FrontEndConfig) -
 
 
 def _total_least_squares(
-    x: Array, y: Array, weight: Array, starts: NDArray[np.intp], line: NDArray[np.intp]
+    x: Array, y: Array, weight: Array, starts: Indices, line: Indices
 ) -> tuple[Array, Array, Array]:
     """Weighted centroids x, y (m,) and directions (m,) of the principal axes, modulo pi."""
     w, wx, wy = np.add.reduceat(np.array((weight, weight * x, weight * y)), starts, axis=1)
@@ -118,7 +118,7 @@ def _total_least_squares(
     return cx, cy, np.asarray(0.5 * np.arctan2(2 * xy, xx - yy))
 
 
-def _normal_block(eta: Array, weight: Array, starts: NDArray[np.intp]) -> Array:
+def _normal_block(eta: Array, weight: Array, starts: Indices) -> Array:
     """V (m, 2, 2) of (normal offset, direction): eq. 4.32 with a weight for each point."""
     powers = weight * np.array((np.ones(len(eta)), eta, eta * eta))
     w0, w1, w2 = np.add.reduceat(powers, starts, axis=1)
@@ -130,7 +130,7 @@ def _normal_block(eta: Array, weight: Array, starts: NDArray[np.intp]) -> Array:
 
 
 def observations(
-    fits: LineFits, fully_visible: NDArray[np.bool_], config: FrontEndConfig
+    fits: LineFits, fully_visible: Mask, config: FrontEndConfig
 ) -> tuple[Observation, ...]:
     """Lines as observations with covariance, eq. 4.34.
 

@@ -1,4 +1,4 @@
-"""One scan put in order: beams counter-clockwise, usable returns as points."""
+"""A scan in a standard order: beams counter-clockwise, usable returns as points."""
 
 from dataclasses import dataclass
 
@@ -8,19 +8,22 @@ from numpy.typing import NDArray
 from graphslam.core.geometry import Array, polar_points, transform
 from graphslam.core.records import Scan
 
+Indices = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sweep:
-    """A scan whose beams turn counter-clockwise, so that every wall has the sensor on its left.
+    """A scan with its beams counter-clockwise, so that every wall has the sensor on its left.
 
-    ``ranges`` (n,) m, NaN for a missing return, and ``angles`` (n,) rad hold all beams, for what
-    lies beside a segment. ``beam`` (k,) and ``points`` (k, 2) m, laser frame, hold the returns
-    that lines may be made of. ``step_rad`` > 0 is the angle between beams.
+    ``ranges`` (n,) m, NaN for a missing return, and ``angles`` (n,) rad are of all beams.
+    ``points`` (k, 2) m, laser frame, are the returns that lines may be fitted to, and ``beam``
+    (k,) their beams. ``step_rad`` > 0 is the angle between beams.
     """
 
     ranges: Array
     angles: Array
-    beam: NDArray[np.intp]
+    beam: Indices
     points: Array
     step_rad: float
 
@@ -41,14 +44,14 @@ def make_sweep(scan: Scan, max_range_m: float) -> Sweep:
 
 
 def _open_circle(ranges: Array, angles: Array) -> tuple[Array, Array]:
-    """A full circle cut at its largest jump in range: at its seam it may cut a wall in two."""
+    """A full circle cut at its largest jump in range: its own seam may cut a wall in two."""
     known = np.nan_to_num(ranges, nan=0.0, posinf=0.0, neginf=0.0)
     start = int(np.argmax(np.abs(known - np.roll(known, 1))))
     return np.roll(ranges, -start), np.roll(angles, -start)
 
 
 def scan_points(scan: Scan, max_range_m: float) -> Array:
-    """Returns of a scan for pictures.
+    """Returns of a scan as points.
 
     Args:
         scan: the scan, with its mount.

@@ -13,20 +13,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array, polar_points, rotation, unit_vectors, wrap
-from graphslam.perception.ordered_scan import Sweep
+from graphslam.perception.ordered_scan import Indices, Mask, Sweep
 
 #: m, beams, m: returns farther apart are not of one thing that stands free; far away a side seen at
 #: grazing incidence has them farther apart, up to a limit
 APART_M, APART_BEAMS, APART_MOST_M = 0.25, 6.0, 0.5
 #: returns at least, of which a pose is to be found
-FEWEST = 3
+MIN_RETURNS = 3
 #: returns at least, of which a direction is to be found
-FEWEST_TO_TURN = 6
+MIN_RETURNS_FOR_HEADING = 6
 #: steps of the search
 ITERATIONS = 8
 #: beams: sigma of an edge between two of them, for the last one may be a mixed pixel
@@ -38,18 +37,15 @@ MIXED_M = 0.15
 #: things that fit an outline worse than this share of robots would are none
 FIT_PROBABILITY = 0.001
 #: of an outline's width, at least seen
-SHARE = 0.5
+MIN_VISIBLE_SHARE = 0.5
 #: rad: a direction known less well is not linear enough to be told
-SURE_RAD = 0.1
+MAX_HEADING_SIGMA_RAD = 0.1
 #: m, rad: step of difference quotients, and farthest step of the search
-STEP, FARTHEST = 1e-4, 0.3
+DIFFERENCE_STEP, MAX_STEP = 1e-4, 0.3
 #: in squared sigmas: the search ends when it gains less
 CONVERGED = 1e-3
 #: sides of the polygon that stands for a circle
 ROUND_SIDES = 24
-
-Indices = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,14 +58,14 @@ class Clusters:
 
     first: Indices
     last: Indices
-    bare: Mask
+    unoccluded: Mask
 
     def __len__(self) -> int:
         return len(self.first)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fit:
+class OutlineFit:
     """An outline fitted to a cluster.
 
     ``pose`` (3,) in the laser's frame, ``cov`` (3, 3) of it; ``direction`` whether the heading was
@@ -79,19 +75,21 @@ class Fit:
 
     pose: Array
     cov: Array
-    direction: bool
+    heading_found: bool
     chi2: float
     dof: int
     share: float
 
     @property
-    def good(self) -> bool:
+    def is_plausible(self) -> bool:
         """Whether what was seen can be the outline; a small part of one may be of anything."""
-        return self.share > SHARE and self.chi2 <= float(chdtri(max(self.dof, 1), FIT_PROBABILITY))
+        return self.share > MIN_VISIBLE_SHARE and self.chi2 <= float(
+            chdtri(max(self.dof, 1), FIT_PROBABILITY)
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _View:
+class _ClusterView:
     """A cluster: ranges ``r`` (n,) in directions ``a`` (n,), directions of its ``edges`` (2,).
 
     ``w`` (n + 2,): weights of ranges and edges, 0 for an edge that is not its own.
@@ -117,7 +115,7 @@ def outline_of(corners: Sequence[Sequence[float]]) -> Array:
     return np.array(corners, dtype=float)
 
 
-def reach(outline: Array) -> float:
+def outline_radius(outline: Array) -> float:
     """How far the outline (k, 2) goes from the base's origin, m."""
     return float(np.hypot(*outline.T).max())
 
@@ -128,7 +126,7 @@ def is_round(outline: Array) -> bool:
     return bool(len(outline) >= ROUND_SIDES and r.max() - r.min() < 1e-6)
 
 
-def clusters(sweep: Sweep, widest_m: float) -> Clusters:
+def free_standing_clusters(sweep: Sweep, widest_m: float) -> Clusters:
     """Things no wider than ``widest_m`` that stand free.
 
     On both sides what is next is farther away, or nearer (then it may hide a part), or there is
@@ -159,7 +157,7 @@ def clusters(sweep: Sweep, widest_m: float) -> Clusters:
     return Clusters(first[keep], last[keep], bare[keep])
 
 
-def centres(sweep: Sweep, found: Clusters) -> Array:
+def cluster_centres(sweep: Sweep, found: Clusters) -> Array:
     """Mean points (m, 2) of clusters, m, laser frame."""
     sums = np.concatenate([np.zeros((1, 2)), np.cumsum(sweep.points, axis=0)])
     count = (found.last - found.first + 1)[:, None]
@@ -207,7 +205,7 @@ def fit_outline(
     expected: Array,
     heading_sigma: float,
     config: FrontEndConfig,
-) -> Fit:
+) -> OutlineFit:
     """The pose of an outline that explains a cluster best.
 
     Only where the search begins comes from what is expected, and the heading where it is not seen.
@@ -223,27 +221,29 @@ def fit_outline(
         config: ``range_sigma_m``, ``floor_normal_m``.
     """
     view = _view(sweep, first, last, bare, outline, config)
-    fixed = _solved(_placed(view, expected), 2, view)
+    fixed = _levenberg_marquardt(_initial_pose(view, expected), 2, view)
     floor = _floor(fixed, outline, sweep.step_rad, config)
     dof = int(np.count_nonzero(view.w)) - 2
-    if len(view.r) >= FEWEST_TO_TURN and not is_round(outline):
-        turned = _solved(fixed, 3, view)
-        e, J = _linearised(turned, view)
+    if len(view.r) >= MIN_RETURNS_FOR_HEADING and not is_round(outline):
+        turned = _levenberg_marquardt(fixed, 3, view)
+        e, J = _linearise(turned, view)
         P = np.asarray(np.linalg.inv(J.T @ (view.w[:, None] * J) + np.eye(3)))
         # one that is not where it is expected may be that of another face
         off2 = float(wrap(turned[2] - expected[2])) ** 2
-        if P[2, 2] < SURE_RAD**2 and off2 < 9 * (heading_sigma**2 + P[2, 2]):
-            return Fit(turned, P + floor, True, float(view.w @ e**2), dof - 1, _share(turned, view))
-    e, J = _linearised(fixed, view)
+        if P[2, 2] < MAX_HEADING_SIGMA_RAD**2 and off2 < 9 * (heading_sigma**2 + P[2, 2]):
+            return OutlineFit(
+                turned, P + floor, True, float(view.w @ e**2), dof - 1, _share(turned, view)
+            )
+    e, J = _linearise(fixed, view)
     P = np.linalg.inv(J[:, :2].T @ (view.w[:, None] * J[:, :2]) + np.eye(2))
     # what the heading does to the position: it is the expected one
     lever = -P @ J[:, :2].T @ (view.w * J[:, 2])
     cov = np.diag([0.0, 0.0, heading_sigma**2])
     cov[:2, :2] = P + floor[:2, :2] + heading_sigma**2 * np.outer(lever, lever)
-    return Fit(fixed, cov, False, float(view.w @ e**2), dof, _share(fixed, view))
+    return OutlineFit(fixed, cov, False, float(view.w @ e**2), dof, _share(fixed, view))
 
 
-def _share(pose: Array, view: _View) -> float:
+def _share(pose: Array, view: _ClusterView) -> float:
     """Share of the outline's width at a pose that the cluster has."""
     _, sides = expected_ranges(view.outline, pose[None], view.a)
     return float(wrap(view.edges[1] - view.edges[0]) / (sides[0, 1] - sides[0, 0]))
@@ -257,19 +257,19 @@ def _floor(pose: Array, outline: Array, step_rad: float, config: FrontEndConfig)
     """
     flat = config.floor_normal_m
     across = np.array([-pose[1], pose[0]]) * EDGES_ALIKE * step_rad
-    P = np.diag([flat, flat, 2 * flat / reach(outline)]) ** 2
+    P = np.diag([flat, flat, 2 * flat / outline_radius(outline)]) ** 2
     P[:2, :2] += np.outer(across, across)
     return P
 
 
 def _view(
     sweep: Sweep, first: int, last: int, bare: Mask, outline: Array, config: FrontEndConfig
-) -> _View:
+) -> _ClusterView:
     beam = sweep.beam[first : last + 1]
     edges, sigma = _edges_seen(sweep, first, last)
     w = np.concatenate([np.full(len(beam), config.range_sigma_m**-2), bare * sigma**-2])
     w[[0, len(beam) - 1]] = MIXED_M**-2
-    return _View(outline, sweep.angles[beam], sweep.ranges[beam], edges, w)
+    return _ClusterView(outline, sweep.angles[beam], sweep.ranges[beam], edges, w)
 
 
 def _edges_seen(sweep: Sweep, first: int, last: int) -> tuple[Array, Array]:
@@ -290,11 +290,11 @@ def _edges_seen(sweep: Sweep, first: int, last: int) -> tuple[Array, Array]:
     return out, sigma
 
 
-def _placed(view: _View, expected: Array) -> Array:
+def _initial_pose(view: _ClusterView, expected: Array) -> Array:
     """The expected pose moved, not turned, so that the outline stands where the returns are."""
     a, r, pose = view.a, view.r, expected.copy()
     seen = polar_points(r, a).mean(axis=0)
-    pose[:2] = seen + reach(view.outline) / 2 * seen / max(float(np.hypot(*seen)), 1e-6)
+    pose[:2] = seen + outline_radius(view.outline) / 2 * seen / max(float(np.hypot(*seen)), 1e-6)
     for _ in range(2):
         _, edges = expected_ranges(view.outline, pose[None], a)
         turn = float(wrap((a[0] + a[-1]) / 2 - edges[0].mean()))
@@ -305,27 +305,27 @@ def _placed(view: _View, expected: Array) -> Array:
     return pose
 
 
-def _linearised(pose: Array, view: _View) -> tuple[Array, Array]:
+def _linearise(pose: Array, view: _ClusterView) -> tuple[Array, Array]:
     """Measured minus expected (n + 2,), derivatives (n + 2, 3) of what is expected."""
-    shifts = STEP * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    shifts = DIFFERENCE_STEP * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     h = np.concatenate(expected_ranges(view.outline, pose + shifts, view.a), axis=1)
     e = np.concatenate([view.r, view.edges]) - h[0]
     e[-2:] = wrap(e[-2:])
-    return e, ((h[1:4] - h[4:7]) / (2 * STEP)).T
+    return e, ((h[1:4] - h[4:7]) / (2 * DIFFERENCE_STEP)).T
 
 
-def _solved(pose: Array, free: int, view: _View) -> Array:
+def _levenberg_marquardt(pose: Array, free: int, view: _ClusterView) -> Array:
     """Levenberg-Marquardt steps over the first ``free`` parts of the pose."""
     damping = 1e-3
-    e, J = _linearised(pose, view)
+    e, J = _linearise(pose, view)
     cost = float(view.w @ e**2)
     for _ in range(ITERATIONS):
         J = J[:, :free]
         N = J.T @ (view.w[:, None] * J)
         N += damping * np.diag(np.diag(N)) + 1e-6 * np.eye(free)
         trial = pose.copy()
-        trial[:free] += np.clip(np.linalg.solve(N, J.T @ (view.w * e)), -FARTHEST, FARTHEST)
-        new_e, new_J = _linearised(trial, view)
+        trial[:free] += np.clip(np.linalg.solve(N, J.T @ (view.w * e)), -MAX_STEP, MAX_STEP)
+        new_e, new_J = _linearise(trial, view)
         less = cost - float(view.w @ new_e**2)
         if less < 0:
             damping = max(10 * damping, 1e-2)

@@ -11,14 +11,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array
 from graphslam.core.records import Observation
 from graphslam.perception.line_fit import LineFits, fit_lines, observations
 from graphslam.perception.line_moments import fitted_lines, mean_square, point_moments
-from graphslam.perception.ordered_scan import Sweep
+from graphslam.perception.ordered_scan import Indices, Mask, Sweep
 from graphslam.perception.segment_ends import fully_visible
 
 MISSING_BEAMS = 3
@@ -29,8 +28,6 @@ STEP_GROWTH = 4.0
 
 MERGE_GATE = 13.82
 """Chi-square, two degrees of freedom, 99.9 %: pieces of one wall differ by no more."""
-
-Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,7 +41,7 @@ class Pieces:
     last: Indices
     moments: Array
 
-    def __getitem__(self, rows: slice | Indices | NDArray[np.bool_]) -> "Pieces":
+    def __getitem__(self, rows: slice | Indices | Mask) -> "Pieces":
         return Pieces(self.first[rows], self.last[rows], self.moments[:, rows])
 
 
@@ -59,8 +56,8 @@ class Segments:
     rows: Indices
     starts: Indices
     fits: LineFits
-    whole: NDArray[np.bool_]
-    valid: NDArray[np.bool_]
+    whole: Mask
+    valid: Mask
 
 
 def segments(sweep: Sweep, config: FrontEndConfig) -> tuple[Observation, ...]:
@@ -100,7 +97,7 @@ def find_segments(sweep: Sweep, config: FrontEndConfig) -> Segments | None:
     return Segments(rows, starts, fits, whole, valid_lines(fits, config))
 
 
-def valid_lines(fits: LineFits, config: FrontEndConfig) -> NDArray[np.bool_]:
+def valid_lines(fits: LineFits, config: FrontEndConfig) -> Mask:
     """(m,) True where a line is long enough and its points scatter no more than allowed."""
     return (fits.length >= config.min_length_m) & (fits.rms <= allowed_rms(config))
 

@@ -11,9 +11,8 @@ from graphslam.core.config import FrontEndConfig
 from graphslam.core.records import Observation
 from graphslam.perception.hough import find_lines
 from graphslam.perception.line_fit import fit_lines, observations
-from graphslam.perception.ordered_scan import Sweep
+from graphslam.perception.ordered_scan import Indices, Mask, Sweep
 from graphslam.perception.segments import (
-    Indices,
     Segments,
     fewest_points,
     find_segments,
@@ -68,9 +67,7 @@ def _cut_lines(
     return seen, rows[valid[_owner(rows, starts)]]
 
 
-def _left_over(
-    found: Segments, free: np.ndarray[tuple[int], np.dtype[np.bool_]], config: FrontEndConfig
-) -> tuple[Indices, Indices]:
+def _left_over(found: Segments, free: Mask, config: FrontEndConfig) -> tuple[Indices, Indices]:
     """Rows and starts of the cut segments that mostly consist of ``free`` returns, of those."""
     owner = _owner(found.rows, found.starts)
     is_free = free[found.rows]

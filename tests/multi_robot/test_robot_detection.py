@@ -11,7 +11,7 @@ from graphslam.core.geometry import between, compose, wrap
 from graphslam.core.records import Scan
 from graphslam.logs import open_logs
 from graphslam.multi_robot.robot_detection import ExpectedPose, detect_robots
-from graphslam.perception.dynamic_objects import moving
+from graphslam.perception.dynamic_objects import dynamic_returns
 from graphslam.perception.ordered_scan import make_sweep
 from graphslam.perception.robot_outlines import outline_of
 from graphslam.simulation import load_scenario, simulate
@@ -189,7 +189,7 @@ def test_what_stands_where_an_earlier_scan_looked_through_is_moving():
     before, now = scans(robot, things, {"someone": walker}, rng)
     laser = [compose(pose, before.mount) for pose in robot]
     sweeps = [make_sweep(scan, 30.0) for scan in (before, now)]
-    gone = moving(sweeps[1], [(sweeps[0], between(laser[0], laser[1]))])
+    gone = dynamic_returns(sweeps[1], [(sweeps[0], between(laser[0], laser[1]))])
     place = between(laser[1], np.array([6.0, -1.0, 0.0]))[:2]
     near = np.hypot(*(sweeps[1].points - place).T) < 0.4
     assert gone[near].mean() > 0.9
@@ -210,7 +210,7 @@ def test_nothing_of_a_building_is_moving():
     returns = flagged = 0
     for k in range(4, 40):
         for j in range(k - 4, k):
-            gone = moving(sweeps[k], [(sweeps[j], between(lasers[j], lasers[k]))])
+            gone = dynamic_returns(sweeps[k], [(sweeps[j], between(lasers[j], lasers[k]))])
             flagged, returns = flagged + int(gone.sum()), returns + len(gone)
     assert flagged < 0.002 * returns
 

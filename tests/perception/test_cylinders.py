@@ -6,7 +6,7 @@ from walls import cast, make_scan
 
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import wrap
-from graphslam.perception.cylinders import fit_circles, free_standing
+from graphslam.perception.cylinders import fit_circles, free_standing_runs
 from graphslam.perception.front_ends import FRONT_ENDS
 from graphslam.perception.ordered_scan import make_sweep
 
@@ -54,7 +54,7 @@ def test_the_radius_is_estimated_with_its_covariance():
         rho, beta, radius = rng.uniform(2, 6), rng.uniform(-1, 1), rng.uniform(0.1, 0.4)
         scan = see([(rho * np.cos(beta), rho * np.sin(beta), radius)], sigma=0.015, seed=seed)
         sweep = make_sweep(scan, 30.0)
-        first, last = free_standing(sweep, CONFIG)
+        first, last = free_standing_runs(sweep, CONFIG)
         fit = fit_circles(sweep, first, last, CONFIG)
         (i,) = np.flatnonzero(np.abs(fit.state[:, 1] - rho) < 0.5)
         e = fit.state[i] - [beta, rho, radius]
