@@ -130,9 +130,10 @@ def main() -> None:
                 contradicted, motions = (
                     sum(one[key] for one in odometry) for key in ("contradicted", "motions")
                 )
+                count = f"{contradicted}/{motions}"
                 print(
                     f"{name + ', ' + setting:22}{values[0]:11.3f}{values[1]:8.3f}{values[2]:13.3f}"
-                    f"{values[3]:8.3f}{f'{contradicted}/{motions}':>14}",
+                    f"{values[3]:8.3f}{count:>14}",
                     flush=True,
                 )
 
