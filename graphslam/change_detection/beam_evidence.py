@@ -90,8 +90,7 @@ def beams_past_surfaces(
     cosine = np.einsum("ni,ni->n", surface.normals[row], directions[found])
     near = (row, used[found], np.sign(cosine) * e, np.abs(cosine))
     far = crossings(surface, visit, used, config.gate_m)
-    row, beam = np.concatenate([near[0], far[0]]), np.concatenate([near[1], far[1]])
-    e, cosine = np.concatenate([near[2], far[2]]), np.concatenate([near[3], far[3]])
+    row, beam, e, cosine = map(np.concatenate, zip(near, far, strict=True))
     passed = np.concatenate([np.zeros(len(near[0])), np.ones(len(far[0]))])
     n = len(surface.cells)
     weight = 1 / ((sigma_m * cosine) ** 2 + config.flatness_m**2)
@@ -104,9 +103,8 @@ def beams_past_surfaces(
     )  # fmt: skip
     sums = np.column_stack([row_sums(row, t, n) for t in terms])
     inner = inner_windows(surface)
-    total, sum_e, sum_own, sum_common, sum_cos, count, through, *squares = window_sums(
-        sums, inner
-    ).T
+    sums = window_sums(sums, inner).T
+    total, sum_e, sum_own, sum_common, sum_cos, count, through, *squares = sums
     safe = np.where(total > 0, total, 1.0)
     mean = sum_e / safe
     # Beams that contradict each other (most end on the surface, a few graze past its edge) carry

@@ -116,11 +116,8 @@ def detect_changes(
     """
     warnings = laser_warnings(reference, later)
     aligned = align_visits(reference, later, registration, config)
-    if (
-        aligned.is_inconsistent
-        and registration is None
-        and max(reference.robots, later.robots) == 1
-    ):
+    one_robot = max(reference.robots, later.robots) == 1
+    if aligned.is_inconsistent and registration is None and one_robot:
         # a motion that some landmarks agree on, while the rest of the maps disagrees
         aligned = align_visits_nonrigid(reference, later, config)
     reference, later, registration = aligned.reference, aligned.later, aligned.registration
@@ -144,22 +141,16 @@ def detect_changes(
         [extract_shape(b, later, on_b, sigma, r.points) for r in appeared],
     )
     settings = MotionSettings(
-        config.bias_sigma_m,
-        repeatability(evidence),
-        a.nearest.grid.cell_m,
+        config.bias_sigma_m, repeatability(evidence), a.nearest.grid.cell_m,
         config.max_displacement_m,
-    )
+    )  # fmt: skip
     landmarks = (reference.landmarks, later.landmarks)
     moves = segment_motions(
         landmarks, registration, surfaces, (reference, later), (on_a, on_b), settings, sigma
     )
-    changes = assemble_changes(
-        vanished,
-        appeared,
-        match_shapes(*shapes, settings),
-        match_segments(vanished, appeared, moves),
-        (_lines(reference, np.zeros(3)), _lines(later, registration.pose)),
-    )
+    lines = (_lines(reference, np.zeros(3)), _lines(later, registration.pose))
+    fits, segments = match_shapes(*shapes, settings), match_segments(vanished, appeared, moves)
+    changes = assemble_changes(vanished, appeared, fits, segments, lines)
     return ChangeResult(
         changes, registration, reference, later, surfaces, (on_a, on_b), compared, flagged,
         sigma, aligned.range_sigmas_m, config.false_alarm_rate, warnings,

@@ -9,7 +9,6 @@ an elastic whole (`elastic_path`), and the fit with the highest agreement is kep
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 
 from graphslam.change_detection.elastic_path import fit_elastic_path
@@ -21,6 +20,7 @@ from graphslam.change_detection.visit import Bools, Visit
 from graphslam.core.config import ChangesConfig
 from graphslam.core.errors import OutputError
 from graphslam.core.geometry import Array, compose, inverse, rotation, wrap
+from graphslam.perception.correlation import grid_spectrum, occupancy_grid
 
 #: stated covariance of a registered scan, (2 cm, 2 cm, 0.5 deg)²: a bound, as the map is bent
 _SCAN_COV = np.diag([0.02, 0.02, np.radians(0.5)]) ** 2
@@ -34,8 +34,10 @@ _COARSE = 4
 #: least share of a scan's returns that agree (legs and clutter are no surfaces); of a run's scans
 _SCAN_SHARE, _RUN_SHARE = 0.3, 0.5
 _MIN_RETURNS = 20  # of a scan: fewer may agree by chance
-#: correlation: most cells of a side, step of the rotation, rad, and number of candidates
+#: correlation: most cells of a side, step of the rotation, rad, and number of candidates; points
+#: outside of these quantiles are left out
 _MAX_CELLS, _TURN_RAD, _CANDIDATES = 600, np.radians(2.0), 6
+_QUANTILES = (0.005, 0.995)
 
 
 def register_nonrigid(
@@ -126,33 +128,23 @@ def agreement(surface: Surface, visit: Visit, near_m: float) -> Array:
 def correlate_maps(reference: Array, later: Array, cell_m: float) -> list[Array]:
     """Motions (3,), best first, with which the maps' points (n, 2), (m, 2) m overlap most.
 
-    Exhaustive over rotations and shifts in cells of ``cell_m``: the cross-correlation of two images
-    is the product of their spectra.
+    Exhaustive over rotations and shifts, in cells of ``cell_m`` or larger ones.
     """
-    low, high = np.quantile(reference, [0.005, 0.995], axis=0)
+    low, high = np.quantile(reference, _QUANTILES, axis=0)
     middle = np.median(later, axis=0)
-    later = later - middle
-    radius = float(np.quantile(np.hypot(*later.T), 0.995))
-    side = float((high - low).max()) + 2 * radius
-    cell = max(cell_m, side / _MAX_CELLS)
-    size = int(np.ceil(side / cell)) + 2
-    spectrum = np.fft.rfft2(_image(reference - (low + high) / 2, cell, size))
+    distance = np.hypot(*(later - middle).T)
+    radius = float(np.quantile(distance, _QUANTILES[1]))
+    cell = max(cell_m, (float((high - low).max()) + 2 * radius) / _MAX_CELLS)
+    inside = ((reference >= low) & (reference <= high)).all(axis=1)
+    grid = occupancy_grid(reference[inside], cell, int(np.ceil(radius / cell)) + 1)
+    spectrum = grid_spectrum(grid)
+    # every cell counts once, however many returns ended in it
+    later = np.unique(np.round((later - middle)[distance <= radius] / cell), axis=0) * cell
     found = []
     for turn in np.arange(0, 2 * np.pi, _TURN_RAD):
-        other = np.fft.rfft2(_image(later @ rotation(turn).T, cell, size))
-        match = np.fft.irfft2(spectrum * np.conj(other), (size, size))
-        steps = np.array(np.unravel_index(int(match.argmax()), match.shape))
-        steps = np.where(steps > size // 2, steps - size, steps)
-        to = (low + high) / 2 + steps * cell
-        found.append((float(match.max()), np.array([*(to - rotation(turn) @ middle), wrap(turn)])))
+        scores = spectrum.correlate(later @ rotation(turn).T)
+        best = np.array(np.unravel_index(int(scores.argmax()), scores.shape))
+        shift = grid.low + best * cell - rotation(turn) @ middle
+        found.append((float(scores.max()), np.array([*shift, wrap(turn)])))
     found.sort(key=lambda one: -one[0])
     return [motion for _, motion in found[:_CANDIDATES]]
-
-
-def _image(points: Array, cell_m: float, size: int) -> Array:
-    """Image (size, size), 0 to 1, of points (n, 2) m about the origin, blurred by a pixel."""
-    ij = np.floor(points / cell_m).astype(np.int64) + size // 2
-    ij = ij[((ij >= 0) & (ij < size)).all(axis=1)]
-    image = np.zeros((size, size), dtype=np.float32)
-    image[ij[:, 0], ij[:, 1]] = 1.0
-    return np.asarray(cv2.GaussianBlur(image, (3, 3), 0), dtype=float)

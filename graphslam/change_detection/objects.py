@@ -195,11 +195,6 @@ def _moved(new: list[Region], old: list[Region], motion: Displacement) -> Change
     before = max(old, key=lambda r: len(r.rows)).outline if old else None
     every = [*new, *old]
     return Change(
-        "moved",
-        largest.outline,
-        max(r.probability for r in every),
-        motion,
-        sum(r.beams for r in every),
-        min(r.first_ns for r in every),
-        before,
-    )
+        "moved", largest.outline, max(r.probability for r in every), motion,
+        sum(r.beams for r in every), min(r.first_ns for r in every), before,
+    )  # fmt: skip

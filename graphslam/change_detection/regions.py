@@ -85,14 +85,10 @@ def find_regions(
         expected = tests * norm.sf(min(float(strongest[enough - 1]), 30.0))
         found.append(
             Region(
-                members,
-                surface.points[members],
-                outline(grid, surface.cells[members]),
-                float(1 / (1 + expected)),
-                count,
-                int(first_ns[members].min()),
+                members, surface.points[members], outline(grid, surface.cells[members]),
+                float(1 / (1 + expected)), count, int(first_ns[members].min()),
             )
-        )
+        )  # fmt: skip
     return found
 
 

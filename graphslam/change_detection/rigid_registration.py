@@ -19,6 +19,7 @@ from graphslam.core.errors import OutputError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, compose, rotation, transform, unit_vectors, wrap
 from graphslam.core.records import Landmark
+from graphslam.perception.point_to_line import offset_jacobian
 
 #: least angle between two lines whose intersection is used, rad
 _CROSSING_RAD = 0.35
@@ -83,25 +84,15 @@ def register(reference: Sequence[Landmark], later: Sequence[Landmark]) -> Regist
         OutputError: there are not enough landmarks in common to fix a pose.
     """
     a, b = (_lines(reference), _points(reference)), (_lines(later), _points(later))
-    best: tuple[float, Registration] | None = None
-    for candidate in candidate_motions(reference, later):
-        refined = _refine(candidate, a, b)
-        if refined is not None and (best is None or refined[0] > best[0]):
-            best = refined
+    votes = np.concatenate([_motions_of_lines(a[0], b[0]), _motions_of_points(a[1], b[1])])
+    refined = (_refine(motion, a, b) for motion in _vote_peaks(votes))
+    best = max((r for r in refined if r is not None), key=lambda r: r[0], default=None)
     if best is None:
         raise OutputError(
             "the two runs cannot be registered: their maps have no landmarks in common that fix a "
             "pose (two crossing lines or two points); did both drive through the same place?"
         )
     return best[1]
-
-
-def candidate_motions(reference: Sequence[Landmark], later: Sequence[Landmark]) -> list[Array]:
-    """Poses (3,) of the later frame with the most votes of pairs of landmarks."""
-    a, b = (_lines(reference), _points(reference)), (_lines(later), _points(later))
-    return _vote_peaks(
-        np.concatenate([_motions_of_lines(a[0], b[0]), _motions_of_points(a[1], b[1])])
-    )
 
 
 def _lines(landmarks: Sequence[Landmark]) -> _Lines:
@@ -226,7 +217,6 @@ def _match_lines(pose: Array, a: _Lines, b: _Lines, slack: float) -> tuple[Ints,
     The residual is a's direction and offset minus b's after the motion, the offset at b's middle:
     at the origin a long lever would correlate it with the direction.
     """
-    x, y = pose[:2]
     normal = b.normal + pose[2]
     n = unit_vectors(normal)
     t = np.column_stack([-n[:, 1], n[:, 0]])
@@ -240,15 +230,13 @@ def _match_lines(pose: Array, a: _Lines, b: _Lines, slack: float) -> tuple[Ints,
     across = a.offset[i] - np.einsum("ni,ni->n", na, middle[j])
     r = np.column_stack([angle, across])
     lever_a = np.einsum("ni,ni->n", ta, middle[j])
-    lever_b = np.einsum("ni,ni->n", t[j], middle[j] - np.array([x, y]))
+    arm = middle[j] - pose[:2]
+    lever_b = np.einsum("ni,ni->n", t[j], arm)
     S = _cov_at(a.cov[i], lever_a) + _cov_at(b.cov[j], lever_b)
     S += np.diag([_FLOOR_RAD**2, _FLOOR_M**2])
     # d(predicted)/d(pose): direction by phi; the middle moves with the frame
     H = np.zeros((len(i), 2, 3))
-    H[:, 0, 2] = 1.0
-    H[:, 1, 0], H[:, 1, 1] = na[:, 0], na[:, 1]
-    arm = middle[j] - np.array([x, y])
-    H[:, 1, 2] = -na[:, 0] * arm[:, 1] + na[:, 1] * arm[:, 0]
+    H[:, 0, 2], H[:, 1] = 1.0, offset_jacobian(na, arm)
     overlap = _overlap(a.ends[i], ends[j], ta)
     d2 = np.einsum("ni,nij,nj->n", r, np.linalg.inv(S), r) if len(i) else np.zeros(0)
     near = (np.abs(across) < 0.1 * slack) & (d2 < _GATE * slack**2) & (overlap > 0.1)

@@ -16,6 +16,7 @@ from graphslam.change_detection.grid import (
 from graphslam.change_detection.visit import Bools, Ints, Visit
 from graphslam.core.config import ChangesConfig
 from graphslam.core.geometry import Array
+from graphslam.perception.point_to_line import offset_jacobian
 
 #: half width, in cells, of the window over which a piece is fitted and evidence is summed
 WINDOW = 2
@@ -147,8 +148,7 @@ def pose_variance(visit: Visit, beams: Ints, ends: Array, normals: Array) -> tup
         The part that is independent between scans, and the part that may be common to all.
     """
     scan = visit.scan[beams]
-    arm = ends - visit.poses[scan, :2]
-    J = np.column_stack([normals, -normals[:, 0] * arm[:, 1] + normals[:, 1] * arm[:, 0]])
+    J = offset_jacobian(normals, ends - visit.poses[scan, :2])
     total, common = (
         np.einsum("ni,nij,nj->n", J, covs[scan], J) for covs in (visit.covs, visit.shared)
     )

@@ -51,14 +51,14 @@ class Visit:
     landmarks: tuple[Landmark, ...]
     robots: int = 1
 
+    def headings(self, beams: Ints | slice = slice(None)) -> Array:
+        """Directions (k,) rad of some beams (k,) in the world; default: of all."""
+        return np.asarray(self.poses[self.scan[beams], 2] + self.angle[beams])
+
     @property
     def directions(self) -> Array:
         """Unit vectors (n, 2) of the beams in the world."""
         return unit_vectors(self.headings())
-
-    def headings(self, beams: Ints | slice = slice(None)) -> Array:
-        """Directions (k,) rad of some beams (k,) in the world; default: of all."""
-        return np.asarray(self.poses[self.scan[beams], 2] + self.angle[beams])
 
     @property
     def ends(self) -> Array:
@@ -76,17 +76,10 @@ class Visit:
         number = np.cumsum(scans) - 1
         beams = scans[self.scan]
         return Visit(
-            self.stamps_ns[scans],
-            self.poses[scans],
-            self.covs[scans],
-            self.shared[scans],
-            number[self.scan[beams]],
-            self.angle[beams],
-            self.range_m[beams],
-            self.surface[beams],
-            self.landmarks,
-            self.robots,
-        )
+            self.stamps_ns[scans], self.poses[scans], self.covs[scans], self.shared[scans],
+            number[self.scan[beams]], self.angle[beams], self.range_m[beams], self.surface[beams],
+            self.landmarks, self.robots,
+        )  # fmt: skip
 
 
 def visit_from_scans(
@@ -109,16 +102,13 @@ def visit_from_scans(
     """
     counts = [len(angles) for angles, _ in sweeps]
     return Visit(
-        stamps_ns,
-        poses,
-        covs,
-        covs,
+        stamps_ns, poses, covs, covs,
         np.repeat(np.arange(len(sweeps)), counts),
         np.concatenate([angles for angles, _ in sweeps]),
         np.concatenate([ranges for _, ranges in sweeps]),
         np.concatenate([on_surface(angles, ranges, config) for angles, ranges in sweeps]),
         landmarks,
-    )
+    )  # fmt: skip
 
 
 def on_surface(angles: Array, ranges: Array, config: ChangesConfig = _DEFAULTS) -> Bools:
