@@ -103,7 +103,7 @@ def case(name: str, seed: int, folder: Path) -> Case:
             save(smooth(log, Config()), here / visit, force=True)
             visits.append(load_visit(load(here / visit), here / visit))
         truth = json.loads((here / "logs/truth.json").read_text(encoding="utf-8"))
-        sweeps = [next(iter(r.sweeps.values())) for r in done.recordings]
+        sweeps = [next(iter(r.scans.values())) for r in done.recordings]
     found = (visits[0], visits[1], truth, sweeps)
     kept.write_bytes(pickle.dumps(found))
     return found

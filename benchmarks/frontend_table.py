@@ -98,7 +98,7 @@ def true_scans(name: str, seed: int, folder: Path, scans: int = SCANS) -> Iterat
         if isinstance(message, Scan):
             by_robot.setdefault(message.robot, []).append(message)
     faces, circles = world.shapes.segments, world.shapes.circles
-    for robot, sweep in recording.sweeps.items():
+    for robot, sweep in recording.scans.items():
         noisy = by_robot[robot]
         assert len(noisy) == len(sweep.poses)
         for i in np.unique(np.linspace(0, len(noisy) - 1, scans // len(by_robot)).astype(int)):

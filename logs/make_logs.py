@@ -1,8 +1,8 @@
-"""Writes the sample logs and the table of README.md anew.
+"""Writes the sample logs and the table of README.md.
 
 Run: python logs/make_logs.py
 
-The same version gives the same bytes; a change of the simulator shows here as other digests.
+The same version gives the same bytes; a change of the simulator shows as different digests.
 """
 
 import hashlib
@@ -16,8 +16,8 @@ SEED = 0
 BEGIN, END = "<!-- table -->\n", "<!-- end -->"
 
 
-def made(name: str) -> list[Path]:
-    """Simulate a scenario into this folder; its recordings."""
+def simulate_to_folder(name: str) -> list[Path]:
+    """Simulate a scenario into this folder; the paths of its files."""
     scenario = load_scenario(name)
     target = HERE / (name if scenario.later else f"{name}.mcap")
     if target.is_dir():
@@ -35,9 +35,9 @@ def row(path: Path) -> str:
 
 
 def main() -> None:
-    """All recordings, then the table."""
+    """Write all recordings, then the table."""
     table = "| file | kB | SHA-256 |\n|---|---|---|\n"
-    table += "".join(row(path) for name in sorted(SCENARIOS) for path in made(name))
+    table += "".join(row(path) for name in sorted(SCENARIOS) for path in simulate_to_folder(name))
     page = HERE / "README.md"
     before, _, rest = page.read_text(encoding="utf-8").partition(BEGIN)
     page.write_text(before + BEGIN + table + END + rest.partition(END)[2], encoding="utf-8")

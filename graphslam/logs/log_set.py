@@ -98,9 +98,10 @@ class LogSet:
     def _read(self, topics: Mapping[str, Topic]) -> Iterator["Message | _ReadReport"]:
         """Messages of ``topics`` and, last, the report about all of them."""
         readers = [
-            _FileReader(file, topics, self._contexts, self._window_ns) for file in self._mcap
+            _FileReader(file, time_order.MessageSorter(self._window_ns)) for file in self._mcap
         ]
-        yield from time_order.merge([reader.messages() for reader in readers])
+        streams = [reader.messages(topics, self._contexts) for reader in readers]
+        yield from time_order.merge(streams)
         report = _ReadReport(Counter(), Counter(), [])
         for file, reader in zip(self._mcap, readers, strict=True):
             report.dropped.update(reader.dropped)
@@ -178,33 +179,31 @@ def decode_message(
     return None
 
 
+@dataclass
 class _FileReader:
     """One pass over the messages of one file."""
 
-    def __init__(
-        self,
-        file: McapFile,
-        topics: Mapping[str, Topic],
-        contexts: Mapping[str, TopicContext],
-        window_ns: int,
-    ) -> None:
-        self.dropped: Counter[str] = Counter()
-        self.sorter = time_order.MessageSorter(window_ns)
-        self._file, self._topics = file, topics
-        # decoders count dropped beams in the counter of this pass
-        self._contexts = {n: replace(c, beams=self.dropped) for n, c in contexts.items()}
+    file: McapFile
+    sorter: time_order.MessageSorter
+    dropped: Counter[str] = field(default_factory=Counter)
 
-    def messages(self) -> Iterator[Message]:
-        """Sorted messages of this file."""
-        for topic, message, _ in repair_future_stamps(self._recorded(), time_order.SAMPLED):
+    def messages(
+        self, topics: Mapping[str, Topic], contexts: Mapping[str, TopicContext]
+    ) -> Iterator[Message]:
+        """Sorted messages of ``topics``."""
+        recorded = self._recorded(topics, contexts)
+        for topic, message, _ in repair_future_stamps(recorded, time_order.SAMPLED):
             yield from self.sorter.push(topic, message)
         yield from self.sorter.finish()
 
-    def _recorded(self) -> Iterator[Recorded]:
+    def _recorded(
+        self, topics: Mapping[str, Topic], contexts: Mapping[str, TopicContext]
+    ) -> Iterator[Recorded]:
         """Messages in the order of recording, with their topic and log time."""
-        for raw in raw_messages(self._file, self._topics.keys()):
-            topic, context = self._topics[raw.topic], self._contexts[raw.topic]
-            message = decode_message(raw, topic, context, self.dropped)
+        # decoders count dropped beams in the counter of this pass
+        own = {name: replace(context, beams=self.dropped) for name, context in contexts.items()}
+        for raw in raw_messages(self.file, topics.keys()):
+            message = decode_message(raw, topics[raw.topic], own[raw.topic], self.dropped)
             if message is not None:
                 yield raw.topic, message, raw.log_time_ns
 

@@ -1,4 +1,4 @@
-"""Write logs: ROS 2 MCAP files that our reader and every ROS 2 or MCAP tool opens.
+"""Writing of logs: ROS 2 MCAP files that any ROS 2 or MCAP tool opens.
 
 The only module that writes with `mcap`.
 """
@@ -21,20 +21,20 @@ from graphslam.logs import schemas
 from graphslam.logs.mcap_file import NOTES
 
 DEFAULT_ROBOT = "robot"  # its topics have no namespace
-# Small chunks cost a few per cent of compression; a damaged chunk loses less.
+# Small chunks: a damaged one loses less; costs a few per cent of compression.
 _CHUNK_BYTES = 64 * 1024
 
 
 class LogWriter:
-    """A log being written; a context manager.
+    """Context manager that writes a log.
 
-    The file appears under its name only when the block ends without an error; until then it is
-    written beside it. Equal calls give equal bytes. Robot ``robot``'s topics are ``/odom``,
-    ``/scan``, ...; those of any other robot ``/NAME/odom``, ... Frames follow the same rule:
-    ``odom``, ``base_link``, ``laser``.
+    The file appears under its name only if the block ends without an error; until then it has a
+    temporary name in the same folder. Equal calls give equal bytes. Topics of robot ``robot`` are
+    ``/odom``, ``/scan``, ...; those of any other robot ``/NAME/odom``, ... Frames follow the same
+    rule: ``odom``, ``base_link``, ``laser``.
 
-    Every method takes ``stamp_ns``, the header stamp, and ``log_time_ns``, when the message was
-    recorded (default: at its stamp); readers take the order of recording from it.
+    Every method takes ``stamp_ns``, the header stamp, and ``log_time_ns``, the time of recording
+    (default: the stamp), which gives the order of recording.
     """
 
     def __init__(self, path: Path, notes: Mapping[str, str] | None = None) -> None:
@@ -71,7 +71,7 @@ class LogWriter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Finish and rename the file, or remove it when the block raised."""
+        """Finish and rename the file, or remove it if the block raised."""
         assert self._stream is not None  # __enter__ opened it
         try:
             if kind is None:
@@ -87,7 +87,7 @@ class LogWriter:
             self._stream.close()
             self._partial.unlink(missing_ok=True)
 
-    # ------------------------------------------------------------ what a robot measures
+    # ------------------------------------------------------------ measurements
 
     def odometry(
         self, robot: str, stamp_ns: int, pose: ArrayLike, *, log_time_ns: int | None = None
@@ -108,16 +108,14 @@ class LogWriter:
         log_time_ns: int | None = None,
     ) -> None:
         """sensor_msgs/JointState on ``joint_states``: accumulated wheel angles, never wrapped."""
-        message = schemas.build(
+        self._build(
             schemas.JOINT_STATE,
-            header=schemas.header(stamp_ns, ""),
+            (_topic(robot, "joint_states"), ""),
+            (stamp_ns, log_time_ns),
             name=["left_wheel_joint", "right_wheel_joint"],
             position=np.array([left_rad, right_rad]),
             velocity=np.zeros(0),
             effort=np.zeros(0),
-        )
-        self._add(
-            _topic(robot, "joint_states"), schemas.JOINT_STATE, message, stamp_ns, log_time_ns
         )
 
     def increment(
@@ -135,15 +133,14 @@ class LogWriter:
         ``delta`` (3,) is the base's pose at ``stamp_ns`` in the base frame at ``start_ns``, ``cov``
         (3, 3) of additive errors along the axes of the frame at ``start_ns``.
         """
-        message = schemas.build(
+        self._build(
             schemas.ODOMETRY_INCREMENT,
-            header=schemas.header(stamp_ns, frame(robot, "base_link")),
+            (_topic(robot, "odom_increment"), frame(robot, "base_link")),
+            (stamp_ns, log_time_ns),
             start=schemas.time(start_ns),
-            **_named(delta),
+            **xy_phi(delta),
             covariance=_flat(cov),
         )
-        schema = schemas.ODOMETRY_INCREMENT
-        self._add(_topic(robot, "odom_increment"), schema, message, stamp_ns, log_time_ns)
 
     def scan(
         self,
@@ -162,9 +159,10 @@ class LogWriter:
         A beam without a return is written as inf or as a value above ``range_max_m``.
         """
         values = np.asarray(ranges, dtype=np.float32)
-        message = schemas.build(
+        self._build(
             schemas.LASER_SCAN,
-            header=schemas.header(stamp_ns, frame(robot, "laser")),
+            (_topic(robot, "scan"), frame(robot, "laser")),
+            (stamp_ns, log_time_ns),
             angle_min=angle_min_rad,
             angle_max=angle_min_rad + angle_step_rad * (len(values) - 1),
             angle_increment=angle_step_rad,
@@ -175,7 +173,6 @@ class LogWriter:
             ranges=values,
             intensities=np.zeros(0, dtype=np.float32),
         )
-        self._add(_topic(robot, "scan"), schemas.LASER_SCAN, message, stamp_ns, log_time_ns)
 
     def mount(self, robot: str, stamp_ns: int, pose: ArrayLike, sensor: str = "laser") -> None:
         """tf2_msgs/TFMessage on ``/tf_static``: pose (3,) of the sensor in the base frame."""
@@ -211,9 +208,10 @@ class LogWriter:
         full = np.zeros((3, 3))
         size = 2 + len(direction)
         full[:size, :size] = cov
-        message = schemas.build(
+        self._build(
             schemas.SIGHTING,
-            header=schemas.header(stamp_ns, frame(robot, sensor)),
+            (_topic(robot, "sightings"), frame(robot, sensor)),
+            (stamp_ns, log_time_ns),
             bearing=bearing,
             range=distance,
             direction=direction[0] if direction else np.nan,
@@ -221,7 +219,6 @@ class LogWriter:
             identity=identity or "",
             robot=seen_robot or "",
         )
-        self._add(_topic(robot, "sightings"), schemas.SIGHTING, message, stamp_ns, log_time_ns)
 
     def relative_pose(
         self,
@@ -230,27 +227,26 @@ class LogWriter:
         stamp_ns: int,
         *,
         delta: ArrayLike,
-        cov: ArrayLike,
         other: str | None = None,
+        cov: ArrayLike,
         log_time_ns: int | None = None,
     ) -> None:
-        """RelativePose on ``relative_poses``: the robot at ``stamp_ns`` seen from ``start_ns``.
+        """RelativePose on ``relative_poses``: the robot at ``stamp_ns`` relative to ``start_ns``.
 
         ``delta`` (3,) is in the base frame at ``start_ns`` of ``other`` (None: the robot itself),
         ``cov`` (3, 3) of additive errors along that frame's axes.
         """
-        message = schemas.build(
+        self._build(
             schemas.RELATIVE_POSE,
-            header=schemas.header(stamp_ns, frame(robot, "base_link")),
+            (_topic(robot, "relative_poses"), frame(robot, "base_link")),
+            (stamp_ns, log_time_ns),
             start=schemas.time(start_ns),
-            **_named(delta),
+            **xy_phi(delta),
             covariance=_flat(cov),
             other=other or "",
         )
-        schema = schemas.RELATIVE_POSE
-        self._add(_topic(robot, "relative_poses"), schema, message, stamp_ns, log_time_ns)
 
-    # ------------------------------------------------------------ what is true
+    # ------------------------------------------------------------ ground truth
 
     def truth(
         self, robot: str, stamp_ns: int, pose: ArrayLike, *, log_time_ns: int | None = None
@@ -271,16 +267,15 @@ class LogWriter:
         log_time_ns: int | None = None,
     ) -> None:
         """TrueLandmark on ``/true_landmarks``: pose (3,), extent (2, 2) or None, world frame."""
-        message = schemas.build(
+        self._build(
             schemas.TRUE_LANDMARK,
-            header=schemas.header(stamp_ns, "world"),
+            (_topic(DEFAULT_ROBOT, "true_landmarks"), "world"),
+            (stamp_ns, log_time_ns),
             identity=identity,
             kind=kind,
-            **_named(pose),
+            **xy_phi(pose),
             extent=np.zeros(0) if extent is None else _flat(extent),
         )
-        schema = schemas.TRUE_LANDMARK
-        self._add(_topic(DEFAULT_ROBOT, "true_landmarks"), schema, message, stamp_ns, log_time_ns)
 
     def true_associations(
         self,
@@ -292,32 +287,39 @@ class LogWriter:
         *,
         log_time_ns: int | None = None,
     ) -> None:
-        """TrueAssociations on ``true_associations/OF``: what a scan or an image truly met.
+        """TrueAssociations on ``true_associations/OF`` for the beams of a scan, or for sightings.
 
-        ``of`` names the topic that they belong to (scan, sightings); ``targets`` (n,) places in
+        ``of``: the topic that they belong to (scan, sightings); ``targets`` (n,): indices into
         ``names``, -1 for nothing.
         """
-        message = schemas.build(
+        self._build(
             schemas.TRUE_ASSOCIATIONS,
-            header=schemas.header(stamp_ns, "world"),
+            (_topic(robot, f"true_associations/{of}"), "world"),
+            (stamp_ns, log_time_ns),
             names=list(names),
             targets=np.asarray(targets, dtype=np.int16),
         )
-        schema, name = schemas.TRUE_ASSOCIATIONS, f"true_associations/{of}"
-        self._add(_topic(robot, name), schema, message, stamp_ns, log_time_ns)
 
     # ------------------------------------------------------------ anything else
 
     def message(self, topic: str, schema: str, message: Any, stamp_ns: int) -> None:
-        """Any ROS 2 message, made by `schemas.build`, on ``topic`` with its leading slash."""
+        """Any ROS 2 message, made by `schemas.build`, on ``topic`` (with its leading slash)."""
         self._add(topic, schema, message, stamp_ns, None)
 
-    # ------------------------------------------------------------ inside
+    # ------------------------------------------------------------ internals
+
+    def _build(
+        self, schema: str, where: tuple[str, str], times: tuple[int, int | None], **fields: Any
+    ) -> None:
+        """Build a message and write it; topic and frame, stamp and log time, fields but header."""
+        topic, frame_id = where
+        message = schemas.build(schema, header=schemas.header(times[0], frame_id), **fields)
+        self._add(topic, schema, message, *times)
 
     def _add(
         self, topic: str, schema: str, message: Any, stamp_ns: int, log_time_ns: int | None
     ) -> None:
-        """A message made by `schemas.build`, or its bytes."""
+        """Write a message made by `schemas.build`, or its bytes."""
         channel = self._channel(topic, schema)
         sequence = self.counts[topic] = self.counts.get(topic, 0) + 1
         self._writer.add_message(
@@ -342,7 +344,7 @@ class LogWriter:
 
 @cache
 def _odometry_template(robot: str) -> schemas.Template:
-    """nav_msgs/Odometry; its numbers are x, y and the quaternion's z, w."""
+    """nav_msgs/Odometry with the numbers x, y and the quaternion's z, w."""
     x, y, z, w = marks = (1.25, 2.25, 3.25, 4.25)
     rotation = schemas.build("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=z, w=w)
     point = schemas.build("geometry_msgs/msg/Point", x=x, y=y, z=0.0)
@@ -359,9 +361,9 @@ def _odometry_template(robot: str) -> schemas.Template:
 
 @cache
 def _truth_template() -> schemas.Template:
-    """TruePose; its numbers are x, y, phi."""
+    """TruePose with the numbers x, y, phi."""
     marks = (1.25, 2.25, 3.25)
-    message = schemas.build(schemas.TRUE_POSE, header=schemas.header(0, "world"), **_named(marks))
+    message = schemas.build(schemas.TRUE_POSE, header=schemas.header(0, "world"), **xy_phi(marks))
     return schemas.Template(schemas.TRUE_POSE, message, marks)
 
 
@@ -374,7 +376,8 @@ def frame(robot: str, name: str) -> str:
     return name if robot == DEFAULT_ROBOT else f"{robot}/{name}"
 
 
-def _named(pose: ArrayLike) -> dict[str, float]:
+def xy_phi(pose: ArrayLike) -> dict[str, float]:
+    """A pose (3,) as the fields x, y, phi of a message or a JSON object."""
     return dict(zip(("x", "y", "phi"), np.asarray(pose, dtype=float).tolist(), strict=True))
 
 

@@ -1,6 +1,6 @@
-"""A drive in time: where a robot is, and how far its wheels have carried it, at any time.
+"""A drive as a function of time: pose of the robot and accumulated travel of its base.
 
-Legs begin and end at rest; along a leg the speed is a trapezoid.
+Legs begin and end at rest with a trapezoidal speed profile.
 """
 
 from collections.abc import Sequence
@@ -13,15 +13,15 @@ from graphslam.core.geometry import Array, wrap
 from graphslam.simulation.path import Curve, round_corners
 from graphslam.simulation.scenario import Leg, Robot
 
-_ALIGNED_RAD = 1e-9  # a smaller turn on the spot is none
+_ALIGNED_RAD = 1e-9  # smaller turns on the spot are left out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BaseStates:
-    """What is true of a robot's base at n times.
+    """True states of a robot's base at n times.
 
     ``poses`` (n, 3) world frame; ``travel`` (n,) m, signed along the robot's x axis, and
-    ``turned`` (n,) rad, both since the start and never wrapped: they move the wheels.
+    ``turned`` (n,) rad, both accumulated since the start and never wrapped.
     """
 
     poses: Array
@@ -31,7 +31,7 @@ class BaseStates:
 
 @dataclass(frozen=True, slots=True)
 class TrapezoidalProfile:
-    """A distance covered from rest to rest with one acceleration and one top speed (any unit)."""
+    """Trapezoidal speed profile from rest to rest: distance, top speed, acceleration (any unit)."""
 
     distance: float
     speed: float
@@ -48,7 +48,7 @@ class TrapezoidalProfile:
         return 2 * ramp + max(0.0, self.distance / (self.acceleration * ramp) - ramp)
 
     def at(self, time_s: Array) -> Array:
-        """Distance covered (n,) at times (n,) s; 0 before the start, all of it after the end."""
+        """Distance covered (n,) at times (n,) s; 0 before the start, ``distance`` after the end."""
         ramp, whole = self._ramp_s, self.duration_s
         t = np.clip(time_s, 0.0, whole)
         up = np.minimum(t, ramp)
@@ -60,7 +60,7 @@ class TrapezoidalProfile:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CurveMotion:
-    """Along a curve, forwards or backwards."""
+    """Motion along a curve, forwards or backwards."""
 
     curve: Curve
     profile: TrapezoidalProfile
@@ -82,7 +82,7 @@ class CurveMotion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TurnOnSpot:
-    """On the spot, from ``start`` (3,) by ``angle_rad``; a turn of nothing is a wait."""
+    """Turn on the spot from ``start`` (3,) by ``angle_rad``; without a profile it is a wait."""
 
     start: Array
     angle_rad: float
@@ -106,7 +106,7 @@ class TurnOnSpot:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
-    """Motions one after the other; ``begins_s``, ``travel`` and ``turned`` are at their starts."""
+    """A sequence of motions; ``begins_s``, ``travel`` and ``turned`` are at their starts."""
 
     motions: tuple[CurveMotion | TurnOnSpot, ...]
     begins_s: tuple[float, ...]
@@ -115,7 +115,7 @@ class Drive:
 
     @property
     def duration_s(self) -> float:
-        """Time at which the robot has arrived for good."""
+        """Time at which the last motion ends."""
         return self.begins_s[-1] + self.motions[-1].duration_s
 
     @property
@@ -124,17 +124,17 @@ class Drive:
         return sum(m.curve.length_m for m in self.motions if isinstance(m, CurveMotion))
 
     def at(self, time_s: Array) -> BaseStates:
-        """States at times (n,) s; the robot stands before the first motion and after the last."""
+        """States at times (n,) s; at rest before the first motion and after the last."""
         times = np.asarray(time_s, dtype=float)
         which = np.clip(np.searchsorted(self.begins_s, times, side="right") - 1, 0, None)
         poses = np.zeros((len(times), 3))
         travel, turned = np.zeros(len(times)), np.zeros(len(times))
         for number in np.unique(which):
             rows = which == number
-            found = self.motions[number].at(times[rows] - self.begins_s[number])
-            poses[rows] = found.poses
-            travel[rows] = self.travel[number] + found.travel
-            turned[rows] = self.turned[number] + found.turned
+            states = self.motions[number].at(times[rows] - self.begins_s[number])
+            poses[rows] = states.poses
+            travel[rows] = self.travel[number] + states.travel
+            turned[rows] = self.turned[number] + states.turned
         return BaseStates(poses, travel, turned)
 
 
@@ -150,7 +150,7 @@ def plan_drive(start: Array, legs: Sequence[Leg], robot: Robot) -> Drive:
         for motion in _motions(pose, leg, robot):
             motions.append(motion)
             pose = motion.at(np.array([motion.duration_s])).poses[0]
-    motions.append(TurnOnSpot(pose, 0.0, None))  # stands for good
+    motions.append(TurnOnSpot(pose, 0.0, None))  # at rest from now on
     ends = [m.at(np.array([m.duration_s])) for m in motions[:-1]]
     return Drive(
         tuple(motions),
@@ -161,7 +161,7 @@ def plan_drive(start: Array, legs: Sequence[Leg], robot: Robot) -> Drive:
 
 
 def _motions(pose: Array, leg: Leg, robot: Robot) -> list[CurveMotion | TurnOnSpot]:
-    """The motions of one leg; a path that begins in another direction brings its turn along."""
+    """The motions of one leg; a path in another direction begins with a turn on the spot."""
     if leg.wait_s:
         return [TurnOnSpot(pose, 0.0, None, leg.wait_s)]
     rate = np.radians(robot.turn_rate_deg_s)

@@ -1,4 +1,4 @@
-"""From true motion to counted wheel pulses, and to the odometry that a robot makes of them."""
+"""True motion to encoder counts, and encoder counts to the robot's odometry."""
 
 import numpy as np
 
@@ -12,8 +12,8 @@ from graphslam.simulation.scenario import Encoders
 def wheel_angles(states: BaseStates, encoders: Encoders, rng: np.random.Generator) -> Array:
     """Accumulated wheel angles (n, 2) rad, left and right, as read at n successive states.
 
-    The true wheels have the true radii and the true axle; what they turn more or less than they
-    roll is slip. A reading is the number of whole counts, from an unknown angle of the wheel.
+    Wheels have the true radii and the true axle length; slip is rolled path without motion of the
+    base. Readings are whole counts from an unknown initial angle of the wheel.
     """
     half = encoders.axle_m * (1 + encoders.axle_error) / 2
     rolled = states.travel[:, None] + half * states.turned[:, None] * np.array([-1.0, 1.0])
@@ -27,15 +27,15 @@ def wheel_angles(states: BaseStates, encoders: Encoders, rng: np.random.Generato
 
 
 def odometry(angles: Array, encoders: Encoders) -> Array:
-    """Poses (n, 3) from wheel angles (n, 2) by what the robot believes its geometry to be.
+    """Poses (n, 3) from wheel angles (n, 2) with the robot's nominal geometry.
 
-    In the frame of the first reading; thesis eq. 2.6-2.12.
+    In the frame of the first pose; thesis eq. 2.6-2.12.
     """
     radius = encoders.wheel_radius_m
-    believed = RobotConfig(
+    nominal = RobotConfig(
         wheel_radius_left_m=radius, wheel_radius_right_m=radius, axle_m=encoders.axle_m
     )
     poses = np.zeros((len(angles), 3))
-    for i, step in enumerate(exp(wheel_twist(np.diff(angles, axis=0), believed)), start=1):
+    for i, step in enumerate(exp(wheel_twist(np.diff(angles, axis=0), nominal)), start=1):
         poses[i] = compose(poses[i - 1], step)
     return poses

@@ -1,7 +1,7 @@
-"""What is wrong with a scenario."""
+"""Errors of scenarios."""
 
 from graphslam.core.errors import GraphSlamError
 
 
 class ScenarioError(GraphSlamError):
-    """A scenario cannot be read or cannot take place; the message names file and key or place."""
+    """A scenario is unreadable or infeasible; the message names file and key or position."""

@@ -1,4 +1,4 @@
-"""A laser's scans: exact ranges first, then everything that a real one does to them."""
+"""Laser scans: exact ranges, then noise and errors of a real laser."""
 
 from collections.abc import Mapping
 
@@ -10,9 +10,9 @@ from graphslam.simulation.robot_shapes import outline_shapes
 from graphslam.simulation.scenario import Body, Laser
 from graphslam.simulation.world import World
 
-# Beyond the range limit a wall is not reported but still hides what is behind it, and a mixed
-# pixel may pull it inside; this much farther is looked.
-_BEYOND_M = 5.0
+# Surfaces are searched this far beyond the range limit: a mixed pixel at a range discontinuity may
+# return a range inside the limit although the far surface is outside.
+_MARGIN_M = 5.0
 
 
 def beam_fan(laser: Laser) -> BeamFan:
@@ -29,13 +29,13 @@ def laser_mount(laser: Laser) -> Array:
 def noise_free_scans(
     poses: Array, laser: Laser, world: World, others: Mapping[str, tuple[Body, Array]]
 ) -> Hits:
-    """What noise-free beams meet, from bases at ``poses`` (n, 3).
+    """Ranges and surfaces of noise-free beams for bases at ``poses`` (n, 3).
 
-    ``others`` are the other robots with their poses (n, 3) at the same times. Surfaces are those
-    of ``world``; robot number i has the number ``len(world.names) + i`` for its whole outline.
+    ``others``: the other robots with their poses (n, 3) at the same times. Surfaces are numbered as
+    in ``world``; the whole outline of robot i is surface ``len(world.names) + i``.
     """
     at, fan = compose(poses, laser_mount(laser)), beam_fan(laser)
-    reach = laser.range_max_m + _BEYOND_M
+    reach = laser.range_max_m + _MARGIN_M
     hits = cast_beams(at, fan, world.shapes, reach)
     for number, (body, where) in enumerate(others.values()):
         seen = cast_beams(at, fan, outline_shapes(body, where), reach)
@@ -45,15 +45,15 @@ def noise_free_scans(
 
 
 def noisy_ranges(hits: Hits, biases: Array, laser: Laser, rng: np.random.Generator) -> Array:
-    """Ranges (n, beams) m as the laser reports them; inf where it reports nothing.
+    """Ranges (n, beams) m as the laser reports them; inf without a return.
 
-    ``biases`` (surfaces,) m are added to what is measured on a surface. All random numbers are
-    drawn in one order whatever the shares are: one kind of error does not change the others.
+    ``biases`` (surfaces,) m are added to ranges on the surface. Random numbers are drawn in the
+    same order for all settings, so that one kind of error does not change the others.
     """
     clean, shape = hits.ranges, hits.ranges.shape
     bias = np.where(hits.surfaces == NO_SURFACE, 0.0, np.append(biases, 0.0)[hits.surfaces])
     ranges = clean + bias + laser.range_sigma_m * rng.normal(size=shape)
-    ranges = _mixed(ranges, hits, laser, rng)
+    ranges = _mixed_pixels(ranges, hits, laser, rng)
     spurious = rng.random(shape) < laser.spurious_share
     farthest = np.minimum(np.where(np.isfinite(clean), clean, np.inf), laser.range_max_m)
     somewhere = laser.range_min_m + (farthest - laser.range_min_m) * rng.random(shape)
@@ -65,15 +65,15 @@ def noisy_ranges(hits: Hits, biases: Array, laser: Laser, rng: np.random.Generat
     return np.where(reported, ranges, np.inf)
 
 
-def _mixed(ranges: Array, hits: Hits, laser: Laser, rng: np.random.Generator) -> Array:
-    """Some beams at range edges return a mixture of what is on both sides of the edge.
+def _mixed_pixels(ranges: Array, hits: Hits, laser: Laser, rng: np.random.Generator) -> Array:
+    """Ranges with mixed pixels: some beams at a range discontinuity return a range in between.
 
-    A beam has a width: at an edge it meets the near and the far surface, and a time-of-flight
-    laser reports something between them.
+    A beam has a width: at an edge it hits the near and the far surface, and a time-of-flight laser
+    reports a range between them.
     """
     share, chosen = rng.random(hits.ranges.shape), rng.random(hits.ranges.shape)
     following = np.roll(hits.ranges, -1, axis=1)
-    with np.errstate(invalid="ignore"):  # two beams that meet nothing
+    with np.errstate(invalid="ignore"):  # two beams without a hit
         jump = following - hits.ranges
     edge = (np.abs(jump) > laser.mixed_gap_m) & np.isfinite(jump)
     edge[:, -1] = False  # the last beam has no neighbour

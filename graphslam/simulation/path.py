@@ -1,4 +1,4 @@
-"""Smooth curves through points: straight stretches joined by pairs of clothoids.
+"""Smooth curves through points: straight segments joined by pairs of clothoids.
 
 The curvature is continuous and piecewise linear in the arc length, so a wheeled robot can follow
 the curve without a jump in its turn rate, and its heading is known in closed form.
@@ -15,8 +15,8 @@ from graphslam.simulation.errors import ScenarioError
 
 Ints = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
-_STEP_M = 0.02  # positions are tabulated this densely; exact to rounding in between
-_STRAIGHT_RAD = 1e-6  # smaller corners are none
+_STEP_M = 0.02  # spacing of tabulated positions; evaluation in between is exact to rounding
+_STRAIGHT_RAD = 1e-6  # smaller corners are not rounded
 _SHARPEST_RAD = np.radians(150.0)  # a sharper corner would need a loop
 # Three-point Gauss-Legendre: the error over one step is below 1e-13 m at curvatures up to 10 / m.
 _NODES = (np.array([-np.sqrt(0.6), 0.0, np.sqrt(0.6)]) + 1) / 2
@@ -25,7 +25,7 @@ _WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Curve:
-    """A curve by its curvature: linear between tabulated arc lengths.
+    """A curve with curvature linear between tabulated arc lengths.
 
     ``s`` (k,) m, ``curvature`` (k,) rad/m (left positive), ``heading`` (k,) rad, not wrapped,
     ``position`` (k, 2) m at ``s``.
@@ -76,8 +76,8 @@ def curve_from_curvature(
 def round_corners(points: Sequence[Sequence[float]], corner_m: float) -> Curve:
     """The polyline through ``points`` (k, 2) m with its inner corners rounded.
 
-    Each corner is cut by at most ``corner_m`` on both sides, and by no more than half of a
-    stretch, by two equal clothoids.
+    Each corner is replaced by two equal clothoids that begin at most ``corner_m``, and at most half
+    of the shorter adjacent segment, before the corner.
 
     Raises:
         ScenarioError: two points coincide, or a corner turns back by more than 150 degrees.
@@ -97,7 +97,7 @@ def round_corners(points: Sequence[Sequence[float]], corner_m: float) -> Curve:
     cuts = np.minimum(corner_m, np.minimum(lengths[:-1], lengths[1:]) / 2)
     cuts[np.abs(turns) < _STRAIGHT_RAD] = 0.0
     knots, curvature, s = [0.0], [0.0], 0.0
-    before = 0.0  # how much of the present stretch the last corner took
+    before = 0.0  # part of the current segment that the last corner replaced
     for length, turn, cut in zip(lengths[:-1], turns, cuts, strict=True):
         s += length - before - cut
         before = cut
@@ -109,14 +109,16 @@ def round_corners(points: Sequence[Sequence[float]], corner_m: float) -> Curve:
             s += arc
     knots.append(s + lengths[-1] - before)
     curvature.append(0.0)
-    first = np.append(True, np.diff(knots) > 1e-12)  # corners that meet leave no straight between
+    first = np.append(
+        True, np.diff(knots) > 1e-12
+    )  # adjacent corners have no straight part in between
     return curve_from_curvature(
         path[0], float(headings[0]), np.array(knots)[first], np.array(curvature)[first]
     )
 
 
 def _tangent_share(turn_rad: float) -> float:
-    """How far before the corner a pair of clothoids of length 1 begins."""
+    """Distance from the corner to the start of a pair of clothoids of total length 1."""
     unit = curve_from_curvature(
         np.zeros(2), 0.0, np.array([0.0, 0.5, 1.0]), np.array([0.0, 2 * turn_rad, 0.0])
     )

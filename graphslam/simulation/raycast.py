@@ -1,8 +1,8 @@
-"""Exact ranges from beams to straight faces and circles, for many scans at once.
+"""Ray casting: exact ranges from beams to straight faces and circles, for many scans at once.
 
-Only the beams inside the angle under which a surface is seen are intersected with it: in a world
-of 200 walls that is a few per cent of all pairs, and the work no longer grows with beams x walls.
-Every pair is still intersected in closed form, so nothing is approximated.
+A surface is intersected only with the beams inside the angle that it subtends: in a world of 200
+walls these are a few per cent of all pairs, and the cost does not grow with beams x walls. Each
+pair is intersected in closed form, without approximation.
 """
 
 from collections.abc import Iterator
@@ -16,9 +16,9 @@ from graphslam.simulation.world import Shapes
 Ints = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
 NO_SURFACE = -1  # surface number of a beam that met nothing
-# scans x surfaces at a time: the arrays of a chunk stay in the processor's cache
+# scans x surfaces per chunk, so that its arrays fit into the processor's cache
 _CHUNK = 20_000
-# Share of a face's length by which beams may miss its ends: neighbouring faces must not leak.
+# Faces are extended by this share of their length, so that no beam passes between adjacent ones.
 _SEAM = 1e-9
 
 
@@ -38,7 +38,7 @@ class BeamFan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hits:
-    """``ranges`` (scans, beams) m, inf where nothing was met; ``surfaces`` their numbers or -1."""
+    """``ranges`` (scans, beams) m, inf without a hit; ``surfaces`` (scans, beams) numbers or -1."""
 
     ranges: Array
     surfaces: Ints
@@ -48,7 +48,7 @@ def cast_beams(poses: Array, fan: BeamFan, shapes: Shapes, reach_m: float) -> Hi
     """The first surface on each beam, for lasers at ``poses`` (n, 3) in the frame of ``shapes``.
 
     Surfaces beyond ``reach_m`` may be left out. Shapes with a leading axis of n move: those of
-    scan i are ``segments[i]``, ``circles[i]``. A laser inside a circle does not see it.
+    scan i are ``segments[i]``, ``circles[i]``. A circle around the laser is not seen.
     """
     n = len(poses)
     hits = Hits(
@@ -100,7 +100,7 @@ def points_in_frames(poses: Array, points: Array) -> Array:
 def _segments(
     poses: Array, fan: BeamFan, beams: Array, segments: Array, reach_m: float
 ) -> Iterator[tuple[Ints, Ints, Array]]:
-    """(place, surface, range) of every beam that meets a face, in flat arrays."""
+    """(beam index, surface, range) of each hit on a face; the index is into all scans, flat."""
     if not segments.shape[-3]:
         return
     a = points_in_frames(poses, segments[..., 0, :])
@@ -111,7 +111,7 @@ def _segments(
     scan, surface = np.nonzero(near)
     a, b, e = a[near], b[near], e[near]
     turn = np.arctan2(b[:, 1], b[:, 0]) - np.arctan2(a[:, 1], a[:, 0])
-    turn -= 2 * np.pi * np.round(turn / (2 * np.pi))  # a face is seen under less than half a turn
+    turn -= 2 * np.pi * np.round(turn / (2 * np.pi))  # a face subtends less than half a turn
     begin = np.arctan2(a[:, 1], a[:, 0]) + np.minimum(turn, 0.0)
     pair, beam = _beams_between(fan, begin, np.abs(turn))
     d, a, e = beams[beam], a[pair], e[pair]
@@ -148,9 +148,9 @@ def _circles(
 
 
 def _beams_between(fan: BeamFan, begin_rad: Array, width_rad: Array) -> tuple[Ints, Ints]:
-    """Pairs (sector, beam) of the beams in sectors (n,), each up to one beam wider than it is.
+    """Pairs (sector, beam) of the beams in sectors (n,), each widened by up to one beam.
 
-    The wider margin leaves rounding to the exact intersection that follows.
+    The margin covers rounding; the exact intersection follows.
     """
     begin = np.mod(begin_rad - fan.start_rad, 2 * np.pi)
     sector = np.tile(np.arange(len(begin)), 2)

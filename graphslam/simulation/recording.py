@@ -1,4 +1,4 @@
-"""One visit as a log: every sensor of every robot sampled, spoiled, stamped and written."""
+"""The log of one visit: all sensors of all robots sampled, with noise, stamped and written."""
 
 import zlib
 from collections.abc import Callable, Iterator, Mapping
@@ -21,7 +21,7 @@ from graphslam.simulation.sightings import LANDMARKS, sighting_targets, simulate
 
 
 class Event(NamedTuple):
-    """A message to be written: its stamp, and what writes it."""
+    """A message to be written: its stamp, and the call that writes it."""
 
     stamp_ns: int
     write: Callable[[LogWriter], None]
@@ -29,16 +29,16 @@ class Event(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseFreeScans:
-    """Noise-free scans of a robot: laser ``poses`` (n, 3) and what their beams met."""
+    """Noise-free scans of a robot from laser ``poses`` (n, 3), world frame."""
 
     laser: Laser
     poses: Array
     hits: Hits
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True)
 class RobotSummary:
-    """What a robot did; ``dead_reckoning_end_m`` is how far off its odometry ends."""
+    """Statistics of a robot; ``dead_reckoning_end_m``: final position error of its odometry."""
 
     path_m: float
     duration_s: float
@@ -49,32 +49,33 @@ class RobotSummary:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """A log that was written, and what only the simulator knows."""
+    """A log that was written, with data that only the simulator knows."""
 
+    visit: SimulatedVisit
     path: Path
     counts: Mapping[str, int]
     robots: Mapping[str, RobotSummary]
-    sweeps: Mapping[str, NoiseFreeScans]
+    scans: Mapping[str, NoiseFreeScans]
 
 
 def sensor_rng(seed: int, *names: str) -> np.random.Generator:
-    """Random numbers of one sensor: they do not change when another sensor is added."""
+    """Random numbers of one sensor, independent of which other sensors there are."""
     return np.random.default_rng([seed, *(zlib.crc32(name.encode()) for name in names)])
 
 
 def record_visit(scenario: Scenario, visit: SimulatedVisit, path: Path, seed: int) -> Recording:
-    """Simulate a visit and write it to ``path``.
+    """Simulate a visit and write its log to ``path``.
 
     Raises:
         OutputError: the log cannot be written.
     """
     events: list[Event] = []
     robots: dict[str, RobotSummary] = {}
-    sweeps: dict[str, NoiseFreeScans] = {}
+    ideal_scans: dict[str, NoiseFreeScans] = {}
     sighted: set[str] = set()
     for name, actor in visit.actors.items():
         wheels, end_m = _wheels(name, actor, visit, seed)
-        scans, sweep = _scans(name, actor, visit, seed)
+        scans, ideal = _scans(name, actor, visit, seed)
         seen = list(_sightings(name, actor, visit, seed))
         true = sample_times(visit.duration_s, scenario.truth_period_s)
         truth = [
@@ -84,12 +85,11 @@ def record_visit(scenario: Scenario, visit: SimulatedVisit, path: Path, seed: in
             )
         ]
         events += [*wheels, *truth, *scans, *(event for event, _ in seen)]
-        if sweep is not None:
-            events += _met(name, visit, sweep, scans)
-        events += _identities(name, seen)
+        if ideal is not None:
+            events += _beam_associations(name, visit, ideal, scans)
+            ideal_scans[name] = ideal
+        events += _sighting_associations(name, seen)
         sighted |= {landmark for _, landmark in seen}
-        if sweep is not None:
-            sweeps[name] = sweep
         robots[name] = RobotSummary(
             actor.drive.path_m, visit.duration_s, len(scans), len(seen), end_m
         )
@@ -99,15 +99,15 @@ def record_visit(scenario: Scenario, visit: SimulatedVisit, path: Path, seed: in
         for name, actor in visit.actors.items():
             if actor.robot.laser is not None:
                 log.mount(name, first_ns, laser_mount(actor.robot.laser))
-        for event in _landmarks(visit, sweeps, sighted, first_ns):
+        for event in _landmarks(visit, ideal_scans, sighted, first_ns):
             event.write(log)
         for event in events:
             event.write(log)
-    return Recording(path, log.counts, robots, sweeps)
+    return Recording(visit, path, log.counts, robots, ideal_scans)
 
 
 def _notes(scenario: Scenario, visit: SimulatedVisit, seed: int) -> dict[str, str]:
-    """What the file says about itself: everything that is needed to write it again."""
+    """The metadata of the log, from which it can be reproduced."""
     notes = {"format": "simulation", "scenario": scenario.name, "seed": str(seed)}
     if visit.name:
         notes["visit"] = visit.name
@@ -133,7 +133,7 @@ def _others(visit: SimulatedVisit, name: str, times: Array) -> dict[str, tuple[B
 def _wheels(
     name: str, actor: SimulatedRobot, visit: SimulatedVisit, seed: int
 ) -> tuple[list[Event], float]:
-    """The encoders' messages, and how far off dead reckoning ends, m."""
+    """The encoders' messages, and the final position error of dead reckoning, m."""
     encoders = actor.robot.encoders
     times = sample_times(visit.duration_s, encoders.period_s, encoders.phase_s)
     states = actor.drive.at(times)
@@ -161,7 +161,7 @@ def _wheels(
 def _scans(
     name: str, actor: SimulatedRobot, visit: SimulatedVisit, seed: int
 ) -> tuple[list[Event], NoiseFreeScans | None]:
-    """The laser's messages and the noise-free scans behind them."""
+    """The laser's messages, and the noise-free scans."""
     laser = actor.robot.laser
     if laser is None:
         return [], None
@@ -193,10 +193,10 @@ def _scans(
 
 
 def _biases(visit: SimulatedVisit, name: str, laser: Laser, seed: int) -> Array:
-    """By how much each surface (n,) is measured too far, m; the other robots' come last.
+    """Range bias, m, of each surface (n,); the other robots' come last.
 
-    A material has its bias at every visit and for every laser: what differs is the laser's scale.
-    Each stretch of a wall is a material of its own, all faces of a box are one.
+    A material has the same normalised bias at every visit and for every laser, times the laser's
+    sigma. Each face of a wall is a material, all faces of a box are one.
     """
     world = visit.world
     materials = [
@@ -211,24 +211,24 @@ def _biases(visit: SimulatedVisit, name: str, laser: Laser, seed: int) -> Array:
 def _sightings(
     name: str, actor: SimulatedRobot, visit: SimulatedVisit, seed: int
 ) -> Iterator[tuple[Event, str]]:
-    """The sightings' messages, each with the name of what was seen."""
-    for number, seer in enumerate(actor.robot.sightings):
-        times = sample_times(visit.duration_s, seer.period_s, seer.phase_s)
+    """The sightings' messages, each with the name of the target."""
+    for number, sensor in enumerate(actor.robot.sightings):
+        times = sample_times(visit.duration_s, sensor.period_s, sensor.phase_s)
         poses = actor.drive.at(times).poses
         candidates = list(
-            sighting_targets(seer, visit.world, _others(visit, name, times), len(times))
+            sighting_targets(sensor, visit.world, _others(visit, name, times), len(times))
         )
         rng = sensor_rng(seed, visit.name, name, f"sightings {number}")
-        at = stamps(times, actor.robot.clock, seer.latency_s).tolist()
-        for seen in simulate_sightings(poses, seer, candidates, rng):
-            t, landmark = at[seen.sample], seer.of == LANDMARKS
+        at = stamps(times, actor.robot.clock, sensor.latency_s).tolist()
+        for seen in simulate_sightings(poses, sensor, candidates, rng):
+            t, landmark = at[seen.sample], sensor.of == LANDMARKS
             write = partial(
                 LogWriter.sighting,
                 robot=name,
                 stamp_ns=t,
                 z=seen.z,
                 cov=seen.cov,
-                identity=seen.name if landmark and seer.identified else None,
+                identity=seen.name if landmark and sensor.identified else None,
                 seen_robot=None if landmark else seen.name,
             )
             yield Event(t, write), seen.name
@@ -237,27 +237,27 @@ def _sightings(
 # ---------------------------------------------------------------- truth
 
 
-def _met(
-    name: str, visit: SimulatedVisit, sweep: NoiseFreeScans, scans: list[Event]
+def _beam_associations(
+    name: str, visit: SimulatedVisit, ideal: NoiseFreeScans, scans: list[Event]
 ) -> Iterator[Event]:
-    """What each beam met; a spurious return still belongs to what it should have met."""
+    """True surface of each beam; for a spurious return that of the noise-free beam."""
     everything = np.array([*visit.world.names, *(other for other in visit.actors if other != name)])
-    for scan, surfaces in zip(scans, sweep.hits.surfaces, strict=True):
-        met, places = np.unique(surfaces, return_inverse=True)
-        nothing = int(NO_SURFACE in met)  # sorted first, as it is negative
+    for scan, surfaces in zip(scans, ideal.hits.surfaces, strict=True):
+        hit, indices = np.unique(surfaces, return_inverse=True)
+        nothing = int(NO_SURFACE in hit)  # sorted first, as it is negative
         write = partial(
             LogWriter.true_associations,
             robot=name,
             stamp_ns=scan.stamp_ns,
             of="scan",
-            names=everything[met[nothing:]].tolist(),
-            targets=places - nothing,
+            names=everything[hit[nothing:]].tolist(),
+            targets=indices - nothing,
         )
         yield Event(scan.stamp_ns, write)
 
 
-def _identities(name: str, seen: list[tuple[Event, str]]) -> Iterator[Event]:
-    """Who was sighted: one message per image, in the order in which the sightings are written."""
+def _sighting_associations(name: str, seen: list[tuple[Event, str]]) -> Iterator[Event]:
+    """True targets of sightings: one message per image, in the order of its sightings."""
     images: dict[int, list[str]] = {}
     for event, target in seen:
         images.setdefault(event.stamp_ns, []).append(target)
@@ -274,13 +274,16 @@ def _identities(name: str, seen: list[tuple[Event, str]]) -> Iterator[Event]:
 
 
 def _landmarks(
-    visit: SimulatedVisit, sweeps: Mapping[str, NoiseFreeScans], sighted: set[str], first_ns: int
+    visit: SimulatedVisit,
+    scans: Mapping[str, NoiseFreeScans],
+    sighted: set[str],
+    first_ns: int,
 ) -> Iterator[Event]:
-    """True landmarks: the surfaces that some noise-free beam or some sighting reached."""
+    """True landmarks: the surfaces that a noise-free beam or a sighting reached."""
     world = visit.world
     reached = set(sighted)
-    for sweep in sweeps.values():
-        numbers = np.unique(sweep.hits.surfaces)
+    for ideal in scans.values():
+        numbers = np.unique(ideal.hits.surfaces)
         inside = (numbers != NO_SURFACE) & (numbers < len(world.names))  # the rest are robots
         reached |= {world.names[number] for number in numbers[inside]}
     for number, name in enumerate(world.names):
@@ -300,7 +303,7 @@ def _landmarks(
 
 
 def _middle(ends: Array) -> Array:
-    """Pose (3,) in the middle of a face (2, 2), x along it."""
+    """Pose (3,) at the middle of a face (2, 2), x axis along it."""
     along = ends[1] - ends[0]
     return np.array([*ends.mean(axis=0), np.arctan2(along[1], along[0])])
 

@@ -1,4 +1,4 @@
-"""Robots as shapes: what others see of them, and what they bump into."""
+"""Robots as shapes, for ray casting and collision checks."""
 
 import numpy as np
 
@@ -28,9 +28,9 @@ def outline_shapes(body: Body, poses: Array) -> Shapes:
 
 
 def contacts(body: Body, poses: Array, shapes: Shapes) -> Flags:
-    """Which surfaces (n, surfaces) the body, with all that is inside it, meets at poses (n, 3).
+    """Whether the body at poses (n, 3) overlaps each surface: (n, surfaces).
 
-    Standing in the middle of a circle counts; standing inside a polygon does not, see `encloses`.
+    A body inside a circle overlaps it; for a body inside a polygon see `encloses`.
     """
     a = points_in_frames(poses, shapes.segments[..., 0, :])
     b = points_in_frames(poses, shapes.segments[..., 1, :])
@@ -67,7 +67,7 @@ def _distance(a: Array, b: Array) -> Array:
 
 
 def _crosses_rectangle(a: Array, b: Array, low: Array, high: Array) -> Flags:
-    """Which segments a-b (n, k, 2) have a part in the rectangle ``low``-``high`` (2,), clipping."""
+    """Which segments a-b (n, k, 2) intersect the rectangle ``low``-``high`` (2,), by clipping."""
     e = b - a
     flat = np.abs(e) < 1e-15
     safe = np.where(flat, 1.0, e)

@@ -1,8 +1,8 @@
-"""What a scenario file may say: one record per table, units in the keys.
+"""Contents of a scenario file: one record per table, units in the keys.
 
-Angles in files are degrees, since people write them; everything behind this module is in
-radians. Bounds of the numbers are in the fields' metadata and checked by
-`graphslam.simulation.scenario_parser`. docs/simulator.md explains the keys.
+Angles in files are in degrees, as people write them; all other modules use radians. Bounds of the
+numbers are in the fields' metadata and checked by `graphslam.simulation.scenario_parser`.
+docs/simulator.md explains the keys.
 """
 
 from collections.abc import Mapping
@@ -19,67 +19,69 @@ RELATIVE = {"above": -1.0, "most": 1.0}
 
 
 @dataclass(frozen=True)
-class Wall:
-    """Straight stretches from point to point; ``closed`` joins the last to the first.
-
-    may_cross: whether it may cut through other things, which otherwise is taken for a mistake.
-    """
+class StaticObject:
+    """Anything that stands still, by its name."""
 
     name: str
-    points_m: tuple[Point, ...]
-    closed: bool = False
-    may_cross: bool = False
 
 
 @dataclass(frozen=True)
-class Box:
-    """A rectangle that stands on the floor: table, cupboard, pillar; ``angle_deg`` of its length.
+class FacetedObject(StaticObject):
+    """An object with straight faces.
 
-    size_m: length and width.
+    may_cross: whether it may intersect other objects, which otherwise is an error.
     """
 
-    name: str
+    may_cross: bool = field(default=False, kw_only=True)
+
+
+@dataclass(frozen=True)
+class Wall(FacetedObject):
+    """A polyline; ``closed`` joins the last point to the first."""
+
+    points_m: tuple[Point, ...]
+    closed: bool = False
+
+
+@dataclass(frozen=True)
+class Box(FacetedObject):
+    """A rectangle: table, cupboard, pillar. size_m: length and width. angle_deg: of its length."""
+
     center_m: Point
     size_m: Point = field(metadata=POSITIVE)
     angle_deg: float = 0.0
-    may_cross: bool = False
 
 
 @dataclass(frozen=True)
-class Board:
-    """A thin plate, seen from both sides: a board that leans on a wall, a table on its side."""
+class Board(FacetedObject):
+    """A thin plate with two visible sides: a board that leans on a wall, a table on its side."""
 
-    name: str
     center_m: Point
     length_m: float = field(metadata=POSITIVE)
     angle_deg: float
-    may_cross: bool = False
 
 
 @dataclass(frozen=True)
-class Cylinder:
+class Door(FacetedObject):
+    """A leaf on a hinge with direction closed_deg when shut, opening_deg more when open."""
+
+    hinge_m: Point
+    width_m: float = field(metadata=POSITIVE)
+    closed_deg: float
+    opening_deg: float = 0.0
+
+
+@dataclass(frozen=True)
+class Cylinder(StaticObject):
     """A vertical cylinder: tree, pole, round pillar."""
 
-    name: str
     center_m: Point
     radius_m: float = field(metadata=POSITIVE)
 
 
 @dataclass(frozen=True)
-class Door:
-    """A leaf on a hinge; it points along closed_deg when shut, opening_deg more when open."""
-
-    name: str
-    hinge_m: Point
-    width_m: float = field(metadata=POSITIVE)
-    closed_deg: float
-    opening_deg: float = 0.0
-    may_cross: bool = False
-
-
-@dataclass(frozen=True)
 class StaticObjects:
-    """Everything that stands still."""
+    """All static objects of a world."""
 
     walls: tuple[Wall, ...] = ()
     boxes: tuple[Box, ...] = ()
@@ -87,13 +89,19 @@ class StaticObjects:
     cylinders: tuple[Cylinder, ...] = ()
     doors: tuple[Door, ...] = ()
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all objects, kind by kind."""
+        kinds = (self.walls, self.boxes, self.boards, self.cylinders, self.doors)
+        return tuple(thing.name for kind in kinds for thing in kind)
+
 
 # ---------------------------------------------------------------- robots
 
 
 @dataclass(frozen=True)
 class Body:
-    """Outline that others see: a circle, or a rectangle of which rear_m lies behind the axle."""
+    """Outline in other robots' scans: a circle, or a rectangle with rear_m behind the axle."""
 
     radius_m: float = field(default=0.0, metadata=NOT_NEGATIVE)
     length_m: float = field(default=0.0, metadata=NOT_NEGATIVE)
@@ -103,11 +111,11 @@ class Body:
 
 @dataclass(frozen=True)
 class Leg:
-    """One part of a drive: through points, or a turn on the spot, or a wait; from rest to rest.
+    """One part of a drive from rest to rest: a path, a turn on the spot, or a wait.
 
-    through_m: the polyline from where the robot stands, its corners rounded. A robot that does not
-    look along the first stretch turns on the spot first. reverse: backwards. speed_m_s: over the
-    robot's own; 0 = the robot's own.
+    through_m: a polyline from the current position, its corners rounded. A robot with another
+    heading turns on the spot first. reverse: drive backwards. speed_m_s: instead of the robot's;
+    0 = the robot's.
     """
 
     through_m: tuple[Point, ...] = ()
@@ -119,25 +127,34 @@ class Leg:
 
 @dataclass(frozen=True)
 class RobotClock:
-    """What the robot's clock reads: true time plus offset plus drift per second."""
+    """Error of a robot's clock: it reads true time plus offset plus drift times true time."""
 
     offset_s: float = 0.0
     drift_ppm: float = 0.0
 
 
 @dataclass(frozen=True)
-class Encoders:
+class Sensor:
+    """Timing of a sensor: one sample per period_s, the first at phase_s.
+
+    latency_s: stamp minus true time of a sample. The default of period_s depends on the sensor.
+    """
+
+    phase_s: float = field(default=0.0, metadata=NOT_NEGATIVE, kw_only=True)
+    latency_s: float = field(default=0.0, metadata=NOT_NEGATIVE, kw_only=True)
+
+
+@dataclass(frozen=True)
+class Encoders(Sensor):
     """Wheel encoders, and the odometry that the robot computes from them (thesis 2.1-2.12).
 
-    wheel_radius_m and axle_m: nominal, what the robot believes. The true radii and the true axle
+    wheel_radius_m and axle_m: nominal values that the robot uses. The true radii and the true axle
     length are larger by the shares radius_error_left, radius_error_right, axle_error.
-    slip_m: wheel travel gets white noise of this sigma per square root of metre travelled.
-    odometry, joint_states: which messages to write.
+    slip_m: sigma of white noise of wheel travel per square root of metre. odometry, joint_states:
+    which messages to write.
     """
 
     period_s: float = field(default=0.1, metadata=POSITIVE)
-    phase_s: float = field(default=0.0, metadata=NOT_NEGATIVE)
-    latency_s: float = field(default=0.0, metadata=NOT_NEGATIVE)
     counts_per_turn: int = field(default=2000, metadata=POSITIVE)
     wheel_radius_m: float = field(default=0.1, metadata=POSITIVE)
     axle_m: float = field(default=0.5, metadata=POSITIVE)
@@ -150,19 +167,17 @@ class Encoders:
 
 
 @dataclass(frozen=True)
-class Laser:
+class Laser(Sensor):
     """A planar laser like the SICK LMS 200; beams from -field/2 to +field/2.
 
     mount_m, mount_deg: its pose in the base frame. range_sigma_m: white noise. bias_sigma_m: sigma
-    of the constant by which a material is measured too far. dropout_share: beams without a
-    return; spurious_share: beams with a return from somewhere in front. mixed_share: how many of
-    the beams at a range edge larger than mixed_gap_m fall between its two sides.
+    of the constant range bias of a material. dropout_share: share of beams without a return;
+    spurious_share: with a return from a random range in front of the surface. mixed_share: share of
+    the beams at a range discontinuity above mixed_gap_m that return a range between its two sides.
     resolution_m: ranges are rounded to multiples of it; 0 = not rounded.
     """
 
     period_s: float = field(default=0.3, metadata=POSITIVE)
-    phase_s: float = field(default=0.0, metadata=NOT_NEGATIVE)
-    latency_s: float = field(default=0.0, metadata=NOT_NEGATIVE)
     field_deg: float = field(default=180.0, metadata={"above": 0.0, "most": 360.0})
     step_deg: float = field(default=0.5, metadata=POSITIVE)
     range_min_m: float = field(default=0.05, metadata=NOT_NEGATIVE)
@@ -184,17 +199,16 @@ class Laser:
 
 
 @dataclass(frozen=True)
-class SightingSensor:
-    """A sensor that sees cylinders or other robots as such, from the robot's base.
+class SightingSensor(Sensor):
+    """A sensor that measures bearing and range of cylinders or other robots, at the base frame.
 
-    names: what it sees; empty = all that the scenario has. direction_sigma_deg: 0 = the direction
-    is not measured (cylinders have none). identified: whether the identity is in the message.
+    of: `landmarks` or `robots`. names: its targets; empty = all of the scenario.
+    direction_sigma_deg: 0 = the direction is not measured (cylinders have none). identified:
+    whether the identity is in the message.
     """
 
     of: str
     period_s: float = field(default=0.5, metadata=POSITIVE)
-    phase_s: float = field(default=0.0, metadata=NOT_NEGATIVE)
-    latency_s: float = field(default=0.0, metadata=NOT_NEGATIVE)
     names: tuple[str, ...] = ()
     field_deg: float = field(default=360.0, metadata={"above": 0.0, "most": 360.0})
     range_max_m: float = field(default=8.0, metadata=POSITIVE)
@@ -205,16 +219,22 @@ class SightingSensor:
 
 
 @dataclass(frozen=True)
-class Robot:
-    """A robot: where it starts, what it looks like, how it drives, what it carries.
-
-    corner_m: how far before a corner of the drive the robot leaves the straight line.
-    """
+class DrivePlan:
+    """Start pose and legs of a robot's drive."""
 
     start_m: Point
+    start_deg: float = field(default=0.0, kw_only=True)
+    drive: tuple[Leg, ...] = field(default=(), kw_only=True)
+
+
+@dataclass(frozen=True)
+class Robot(DrivePlan):
+    """A robot: its drive, outline, limits of motion, clock and sensors.
+
+    corner_m: distance before a corner of the drive at which the robot leaves the straight line.
+    """
+
     body: Body
-    start_deg: float = 0.0
-    drive: tuple[Leg, ...] = ()
     speed_m_s: float = field(default=0.4, metadata=POSITIVE)
     acceleration_m_s2: float = field(default=0.3, metadata=POSITIVE)
     turn_rate_deg_s: float = field(default=45.0, metadata=POSITIVE)
@@ -230,7 +250,7 @@ class Robot:
 
 @dataclass(frozen=True)
 class Move:
-    """A thing that stands elsewhere at the second visit: turned about a point, then shifted."""
+    """An object with another pose at the second visit: turned about a point, then shifted."""
 
     name: str
     turn_deg: float = 0.0
@@ -239,30 +259,21 @@ class Move:
 
 
 @dataclass(frozen=True)
-class LaterDrive:
-    """Another start and drive of a robot."""
-
-    start_m: Point
-    start_deg: float = 0.0
-    drive: tuple[Leg, ...] = ()
-
-
-@dataclass(frozen=True)
 class LaterVisit:
-    """The second visit: what moved, vanished or appeared, and who drives differently."""
+    """The second visit: objects that moved, vanished or appeared, and robots' other drives."""
 
     moved: tuple[Move, ...] = ()
     vanished: tuple[str, ...] = ()
     appeared: StaticObjects = field(default_factory=StaticObjects)
-    robots: Mapping[str, LaterDrive] = field(default_factory=dict)
+    robots: Mapping[str, DrivePlan] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """A whole scenario. duration_s: 0 = until the last drive is over.
+    """A whole scenario. duration_s: 0 = until the end of the last drive.
 
-    world_of: name or file of another scenario whose world this one has. name: the file's; it is
-    not a key.
+    world_of: name or file of another scenario whose world is used. name: that of the file; not a
+    key.
     """
 
     robots: Mapping[str, Robot]

@@ -1,4 +1,4 @@
-"""Scenario files: the ones that come with the package, and everyone's own."""
+"""Scenario files: those of the package and the user's own."""
 
 import re
 import tomllib
@@ -40,7 +40,7 @@ SCENARIOS: dict[str, Path] = {
 
 
 def load_scenario(scenario: str | Path) -> Scenario:
-    """A scenario by its name in `SCENARIOS`, or from a TOML file of one's own.
+    """Load a scenario by its name in `SCENARIOS`, or from a TOML file.
 
     Raises:
         ScenarioError: no such name or file, not TOML, or a key or value is wrong; the message
@@ -58,18 +58,18 @@ def load_scenario(scenario: str | Path) -> Scenario:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ScenarioError(f"{path}: not valid TOML: {error}") from error
     try:
-        found: Scenario = build(Scenario, tree)
+        parsed: Scenario = build(Scenario, tree)
     except ScenarioError as error:
         raise ScenarioError(f"{path.name}: {error}") from error
-    if found.world_of:
-        found = _with_world_of(found, path)
-    for problem in _contradictions(found):
+    if parsed.world_of:
+        parsed = _with_world_of(parsed, path)
+    for problem in _inconsistencies(parsed):
         raise ScenarioError(f"{path.name}: {problem}")
-    return replace(found, name=path.name)
+    return replace(parsed, name=path.name)
 
 
 def _with_world_of(scenario: Scenario, path: Path) -> Scenario:
-    """The scenario in another one's world, whose file may lie beside its own."""
+    """The scenario with the world of another one, whose file may be in the same folder."""
     if scenario.world != StaticObjects():
         raise ScenarioError(f"{path.name}: give either world or world_of")
     beside = path.parent / scenario.world_of
@@ -79,11 +79,11 @@ def _with_world_of(scenario: Scenario, path: Path) -> Scenario:
     return replace(scenario, world=other.world)
 
 
-def _contradictions(scenario: Scenario) -> Iterator[str]:
-    """What the single keys allow and their combination does not."""
+def _inconsistencies(scenario: Scenario) -> Iterator[str]:
+    """Problems with combinations of keys that are valid one by one."""
     if not scenario.robots:
         yield "robots: is empty; give at least one [robots.NAME]"
-    names = Counter(_names(scenario.world))
+    names = Counter(scenario.world.names)
     for name, count in names.items():
         if count > 1:
             yield f"world: {count} things are named {name!r}; names must differ"
@@ -95,17 +95,17 @@ def _contradictions(scenario: Scenario) -> Iterator[str]:
 
 
 def _later(later: LaterVisit, scenario: Scenario) -> Iterator[str]:
-    names = list(_names(scenario.world))
+    names = scenario.world.names
     for name in (*(move.name for move in later.moved), *later.vanished):
         if name not in names:
             yield f"later: nothing is named {name!r}; known: {', '.join(names)}"
-    for name in _names(later.appeared):
+    for name in later.appeared.names:
         if name in names:
             yield f"later.appeared: {name!r} is there already; names must differ"
-    for name, again in later.robots.items():
+    for name, plan in later.robots.items():
         if name not in scenario.robots:
             yield f"later.robots.{name}: no such robot; known: {', '.join(scenario.robots)}"
-        for problem in _drive(again.drive):
+        for problem in _drive(plan.drive):
             yield f"later.robots.{name}{problem}"
 
 
@@ -122,8 +122,8 @@ def _robot(name: str, robot: Robot, scenario: Scenario) -> Iterator[str]:
     yield from _drive(robot.drive)
     if robot.laser is not None:
         yield from _laser(robot.laser)
-    for number, seer in enumerate(robot.sightings):
-        for problem in _seer(seer, scenario):
+    for number, sensor in enumerate(robot.sightings):
+        for problem in _sighting_sensor(sensor, scenario):
             yield f".sightings[{number}]{problem}"
 
 
@@ -140,18 +140,13 @@ def _laser(laser: Laser) -> Iterator[str]:
         yield ".laser.range_min_m: is not below range_max_m"
 
 
-def _seer(seer: SightingSensor, scenario: Scenario) -> Iterator[str]:
+def _sighting_sensor(sensor: SightingSensor, scenario: Scenario) -> Iterator[str]:
     known = {
         LANDMARKS: [cylinder.name for cylinder in scenario.world.cylinders],
         ROBOTS: list(scenario.robots),
     }
-    if seer.of not in known:
-        yield f".of: {seer.of!r} is not one of {', '.join(known)}"
-    for name in seer.names:
-        if name not in known.get(seer.of, []):
-            yield f".names: {name!r} is not one of the {seer.of}"
-
-
-def _names(things: StaticObjects) -> Iterator[str]:
-    for kind in (things.walls, things.boxes, things.boards, things.cylinders, things.doors):
-        yield from (thing.name for thing in kind)
+    if sensor.of not in known:
+        yield f".of: {sensor.of!r} is not one of {', '.join(known)}"
+    for name in sensor.names:
+        if name not in known.get(sensor.of, []):
+            yield f".names: {name!r} is not one of the {sensor.of}"

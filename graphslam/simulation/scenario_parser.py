@@ -1,4 +1,4 @@
-"""Parsed TOML to the records of `graphslam.simulation.scenario`; whatever is wrong is one line."""
+"""Parsed TOML to the records of `graphslam.simulation.scenario`; errors are one line."""
 
 import dataclasses
 import difflib
@@ -16,7 +16,7 @@ _NONE: Mapping[str, Any] = {}
 def build(kind: Any, value: Any, key: str = "", bounds: Mapping[str, Any] = _NONE) -> Any:
     """The value of type ``kind`` (record, mapping, tuple, optional or scalar) at ``key``.
 
-    Numbers, also those inside tuples, are held against ``bounds``: above, least, most.
+    Numbers, also those in tuples, are checked against ``bounds``: above, least, most.
 
     Raises:
         ScenarioError: unknown or missing key, wrong type, number out of bounds; names the key.
@@ -24,7 +24,7 @@ def build(kind: Any, value: Any, key: str = "", bounds: Mapping[str, Any] = _NON
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if dataclasses.is_dataclass(kind):
         return _record(kind, value, key)
-    if origin is types.UnionType:  # X | None: TOML has no null, a key is there or it is not
+    if origin is types.UnionType:  # X | None: TOML has no null, the key is present or not
         return build(arguments[0], value, key, bounds)
     if origin is Mapping:
         items = _table(value, key)

@@ -1,7 +1,8 @@
-"""A scenario made ready: worlds with surfaces, robots with drives, and no collisions."""
+"""Visits of a scenario, ready to be recorded: world, robots with drives, no collisions."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,12 +24,11 @@ from graphslam.simulation.world import (
 
 REFERENCE, LATER = "reference", "later"
 
-_CHECK_S = 0.05  # collisions are looked for this often; robots drive well below 1 m/s
-_CHUNK = 500
+_CHECK_S = 0.05  # interval of collision checks; robots drive well below 1 m/s: every few cm
+_CHUNK = 500  # poses per collision check, to limit memory
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SimulatedRobot:
+class SimulatedRobot(NamedTuple):
     """A robot of one visit with its drive."""
 
     robot: Robot
@@ -37,7 +37,7 @@ class SimulatedRobot:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedVisit:
-    """One recording to be: ``name`` is empty unless there are two."""
+    """A visit to be recorded; ``name`` is empty unless there are two."""
 
     name: str
     world: World
@@ -46,11 +46,11 @@ class SimulatedVisit:
 
 
 def prepare_visits(scenario: Scenario) -> tuple[SimulatedVisit, ...]:
-    """The recordings of a scenario, one or two, checked for collisions.
+    """The visits of a scenario, one or two, checked for collisions.
 
     Raises:
-        ScenarioError: things cross each other, a drive is impossible, a robot starts in something
-            or drives through it.
+        ScenarioError: objects intersect, a drive is impossible, or a robot starts in an object or
+            drives into one.
     """
     outlines = tuple(outlines_of(scenario.world))
     first = _visit(scenario, REFERENCE if scenario.later else "", outlines, scenario.robots)
@@ -58,8 +58,8 @@ def prepare_visits(scenario: Scenario) -> tuple[SimulatedVisit, ...]:
         return (first,)
     later = scenario.later
     robots = {
-        name: replace(robot, start_m=again.start_m, start_deg=again.start_deg, drive=again.drive)
-        if (again := later.robots.get(name))
+        name: replace(robot, start_m=plan.start_m, start_deg=plan.start_deg, drive=plan.drive)
+        if (plan := later.robots.get(name))
         else robot
         for name, robot in scenario.robots.items()
     }
@@ -108,30 +108,30 @@ def _rearranged(outlines: Sequence[Outline], later: LaterVisit) -> Iterator[Outl
 
 
 def _collisions(world: World, actors: Mapping[str, SimulatedRobot], end_s: float) -> Iterator[str]:
-    """What robots bump into, one line each, in the order of robots."""
+    """Collisions of robots, one line each, in the order of robots."""
     times = np.append(np.arange(0.0, end_s, _CHECK_S), end_s)
     poses = {name: actor.drive.at(times).poses for name, actor in actors.items()}
     for name, actor in actors.items():
-        hit = _bump(actor.robot.body, poses[name], world)
+        hit = _first_collision(actor.robot.body, poses[name], world)
         if hit is not None:
             sample, surface = hit
-            yield _told(name, poses[name][sample], times[sample], world.names[surface])
+            yield _describe(name, poses[name][sample], times[sample], world.names[surface])
         for other, theirs in poses.items():
             if other > name:
                 body = actors[other].robot.body
-                met = _touched(actor.robot.body, poses[name], outline_shapes(body, theirs))
-                if met is not None:
-                    yield _told(name, poses[name][met[0]], times[met[0]], f"robot {other}")
+                hit = _first_contact(actor.robot.body, poses[name], outline_shapes(body, theirs))
+                if hit is not None:
+                    yield _describe(name, poses[name][hit[0]], times[hit[0]], f"robot {other}")
 
 
-def _told(name: str, pose: Array, time_s: float, what: str) -> str:
+def _describe(name: str, pose: Array, time_s: float, what: str) -> str:
     when = "starts in" if time_s == 0 else f"after {time_s:.1f} s drives into"
     return f"robots.{name}: {when} {what} at ({pose[0]:.2f}, {pose[1]:.2f}); move one of them"
 
 
-def _bump(body: Body, poses: Array, world: World) -> tuple[int, int] | None:
-    """First (sample, surface) at which a body meets a thing or is inside a solid one."""
-    first = _touched(body, poses, world.shapes)
+def _first_collision(body: Body, poses: Array, world: World) -> tuple[int, int] | None:
+    """First (sample, surface) at which a body overlaps a surface or is inside a solid object."""
+    first = _first_contact(body, poses, world.shapes)
     for number, outline in enumerate(world.outlines):
         if outline.solid and not outline.radius_m:
             inside = np.flatnonzero(encloses(outline.points, poses[:, :2]))
@@ -140,13 +140,13 @@ def _bump(body: Body, poses: Array, world: World) -> tuple[int, int] | None:
     return first
 
 
-def _touched(body: Body, poses: Array, shapes: Shapes) -> tuple[int, int] | None:
-    """First (sample, surface) at which a body meets one of the shapes; in parts, to save memory."""
+def _first_contact(body: Body, poses: Array, shapes: Shapes) -> tuple[int, int] | None:
+    """First (sample, surface) at which a body overlaps one of the shapes."""
     for begin in range(0, len(poses), _CHUNK):
         part = slice(begin, begin + _CHUNK)
         moving = shapes.segments.ndim == 4
         here = Shapes(shapes.segments[part], shapes.circles[part]) if moving else shapes
-        met = np.argwhere(contacts(body, poses[part], here))
-        if len(met):
-            return begin + int(met[0, 0]), int(met[0, 1])
+        hits = np.argwhere(contacts(body, poses[part], here))
+        if len(hits):
+            return begin + int(hits[0, 0]), int(hits[0, 1])
     return None

@@ -1,7 +1,7 @@
-"""When sensors sample, and what the robot's clock says then.
+"""Sample times of sensors, and their stamps by the robot's clock.
 
-Inside the simulator time is seconds of true time since the start of the scenario. What is written
-is integer nanoseconds of the robot's own clock.
+The simulator uses true time in seconds since the start of the scenario. Logs have integer
+nanoseconds of the robot's own clock.
 """
 
 import numpy as np
@@ -21,7 +21,7 @@ def sample_times(duration_s: float, period_s: float, phase_s: float = 0.0) -> Ar
 
 
 def stamps(time_s: Array, clock: RobotClock, latency_s: float = 0.0) -> Stamps:
-    """Stamps (n,) ns of what was measured at true times (n,) s and came in ``latency_s`` later."""
+    """Stamps (n,) ns of samples at true times (n,) s that arrive ``latency_s`` later."""
     true_ns = np.round((time_s + latency_s) * 1e9).astype(np.int64)
     drift_ns = np.round(true_ns * (clock.drift_ppm * 1e-6)).astype(np.int64)
     return np.asarray(START_NS + true_ns + drift_ns + round(clock.offset_s * 1e9))

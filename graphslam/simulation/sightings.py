@@ -1,4 +1,4 @@
-"""Sightings: cylinders and other robots seen as such, by bearing, range and perhaps direction."""
+"""Simulated sightings of cylinders and other robots: bearing, range, optionally direction."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,22 +17,22 @@ _ONE_BEAM = BeamFan(0.0, 1.0, 1)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Target:
-    """Something that can be seen: its ``poses`` (n, 3) at the sampling times.
+    """A possible target with its ``poses`` (n, 3) at the sampling times.
 
-    ``blockers`` are the shapes that may stand before it: everything but itself.
+    ``occluders``: shapes that may hide it, all but its own.
     """
 
     name: str
     poses: Array
     radius_m: float
-    blockers: tuple[Shapes, ...]
+    occluders: tuple[Shapes, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedSighting:
-    """One sighting: sample number, whom, ``z`` (2,) or (3,) and its covariance.
+    """One sighting: sample index, name of the target, ``z`` (2,) or (3,) and its covariance.
 
-    ``z`` is bearing rad, range m and perhaps direction rad, in the base frame of the seer.
+    ``z`` is bearing rad, range m and optionally direction rad, in the observer's base frame.
     """
 
     sample: int
@@ -42,11 +42,11 @@ class SimulatedSighting:
 
 
 def sighting_targets(
-    seer: SightingSensor, world: World, others: Mapping[str, tuple[Body, Array]], samples: int
+    sensor: SightingSensor, world: World, others: Mapping[str, tuple[Body, Array]], samples: int
 ) -> Iterator[Target]:
-    """What a sensor may see at its ``samples`` times: cylinders, or robots (their poses (n, 3))."""
+    """Possible targets at the ``samples`` times: cylinders, or robots with poses (n, 3)."""
     outlines = {name: outline_shapes(*other) for name, other in others.items()}
-    if seer.of == ROBOTS:
+    if sensor.of == ROBOTS:
         for name, (body, poses) in others.items():
             rest = tuple(shapes for other, shapes in outlines.items() if other != name)
             yield Target(name, poses, _inner_radius(body), (world.shapes, *rest))
@@ -60,20 +60,20 @@ def sighting_targets(
 
 
 def simulate_sightings(
-    poses: Array, seer: SightingSensor, candidates: Sequence[Target], rng: np.random.Generator
+    poses: Array, sensor: SightingSensor, candidates: Sequence[Target], rng: np.random.Generator
 ) -> list[SimulatedSighting]:
-    """All sightings from bases at ``poses`` (n, 3), in the order of time.
+    """All sightings from bases at ``poses`` (n, 3), sorted by time.
 
-    A target is seen when its centre is in the field of view and within range, and nothing stands
-    on the straight line to it.
+    A target is seen if its centre is in the field of view and within range, and the straight line
+    to it is free.
     """
-    sigmas = [np.radians(seer.bearing_sigma_deg), seer.range_sigma_m]
-    if seer.of == ROBOTS and seer.direction_sigma_deg:
-        sigmas.append(np.radians(seer.direction_sigma_deg))
+    sigmas = [np.radians(sensor.bearing_sigma_deg), sensor.range_sigma_m]
+    if sensor.of == ROBOTS and sensor.direction_sigma_deg:
+        sigmas.append(np.radians(sensor.direction_sigma_deg))
     sigma = np.array(sigmas)
     found: list[SimulatedSighting] = []
     for target in candidates:
-        if seer.names and target.name not in seer.names:
+        if sensor.names and target.name not in sensor.names:
             continue
         relative = between(poses, target.poses)
         bearing = np.arctan2(relative[:, 1], relative[:, 0])
@@ -82,8 +82,8 @@ def simulate_sightings(
         z = z + sigma * rng.normal(size=z.shape)
         z[:, 0] = wrap(z[:, 0])
         z[:, 2:] = wrap(z[:, 2:])
-        visible = np.abs(bearing) <= np.radians(seer.field_deg) / 2
-        visible &= (distance <= seer.range_max_m) & (z[:, 1] > 0)
+        visible = np.abs(bearing) <= np.radians(sensor.field_deg) / 2
+        visible &= (distance <= sensor.range_max_m) & (z[:, 1] > 0)
         visible &= _line_of_sight(poses, bearing, distance, target)
         cov = np.diag(sigma**2)
         found += [
@@ -93,17 +93,17 @@ def simulate_sightings(
 
 
 def _line_of_sight(poses: Array, bearing: Array, distance: Array, target: Target) -> Flags:
-    """At which samples (n,) nothing stands before the target's surface."""
+    """Whether the line of sight to the target's surface is free, per sample (n,)."""
     towards = poses + np.column_stack([np.zeros((len(poses), 2)), bearing])
     free = np.full(len(poses), np.inf)
-    for shapes in target.blockers:
+    for shapes in target.occluders:
         reach = float(distance.max(initial=0.0))
         free = np.minimum(free, cast_beams(towards, _ONE_BEAM, shapes, reach).ranges[:, 0])
     return np.asarray(free > distance - target.radius_m)
 
 
 def _inner_radius(body: Body) -> float:
-    """Radius, m, of the circle about the base that fits into the body."""
+    """Radius, m, of the largest circle about the base inside the body."""
     if body.radius_m:
         return body.radius_m
     return min(body.rear_m, body.length_m - body.rear_m, body.width_m / 2)

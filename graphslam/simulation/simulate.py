@@ -1,6 +1,7 @@
-"""A scenario and a seed in; a log with its truth out."""
+"""Simulation of a scenario with a seed: logs with ground truth."""
 
 import json
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from graphslam.simulation.true_changes import true_changes
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Simulation:
-    """What was written where: a log, or a folder with the logs of two visits."""
+    """What was written: a log, or a folder with the logs of two visits, at ``target``."""
 
     scenario: str
     seed: int
@@ -26,43 +27,38 @@ class Simulation:
     @property
     def counts(self) -> Mapping[str, int]:
         """Messages per topic over all logs."""
-        total: dict[str, int] = {}
-        for recording in self.recordings:
-            for topic, count in recording.counts.items():
-                total[topic] = total.get(topic, 0) + count
-        return total
+        return sum((Counter(recording.counts) for recording in self.recordings), Counter())
 
 
 def simulate(scenario: Scenario, target: Path, seed: int = 0) -> Simulation:
-    """Write the log ``target``; of a scenario with two visits, the folder ``target``.
+    """Write the log ``target``, or the folder ``target`` if the scenario has two visits.
 
-    The folder holds reference.mcap, later.mcap and truth.json; it appears when it is whole. What
-    is there already is replaced. Equal scenarios and seeds give equal bytes.
+    The folder has reference.mcap, later.mcap and truth.json; it appears whole or not at all. An
+    existing target is replaced. Equal scenarios and seeds give equal bytes.
 
     Raises:
-        ScenarioError: the scenario cannot take place, see `graphslam.simulation.scene.visits`.
+        ScenarioError: the scenario is infeasible, see `graphslam.simulation.scene.prepare_visits`.
         OutputError: nothing can be written there.
     """
-    ready = prepare_visits(scenario)
-    if len(ready) == 1:
+    visits = prepare_visits(scenario)
+    if len(visits) == 1:
         if target.is_dir():
             raise OutputError(f"{target}: is a folder; this scenario makes one log: -o LOG.mcap")
-        recording = record_visit(scenario, ready[0], target, seed)
+        recording = record_visit(scenario, visits[0], target, seed)
         return Simulation(scenario.name, seed, target, (recording,))
-    return _two_visits(scenario, (ready[0], ready[1]), target, seed)
+    return _two_visits(scenario, (visits[0], visits[1]), target, seed)
 
 
 def _two_visits(
-    scenario: Scenario, ready: tuple[SimulatedVisit, SimulatedVisit], target: Path, seed: int
+    scenario: Scenario, visits: tuple[SimulatedVisit, SimulatedVisit], target: Path, seed: int
 ) -> Simulation:
     if target.is_file() or target.suffix == ".mcap":
         raise OutputError(f"{target}: this scenario makes two logs; name a folder: -o DIR")
     with atomic_folder(target) as part:
         first, second = (
-            record_visit(scenario, visit, part / f"{visit.name}.mcap", seed) for visit in ready
+            record_visit(scenario, visit, part / f"{visit.name}.mcap", seed) for visit in visits
         )
-        assert scenario.later is not None  # that is what makes two visits
-        truth = true_changes(scenario, scenario.later, ready, (first, second), seed)
+        truth = true_changes(scenario, (first, second), seed)
         text = json.dumps(truth, indent=1, allow_nan=False) + "\n"
         (part / "truth.json").write_text(text, encoding="utf-8")
     written = tuple(replace(r, path=target / r.path.name) for r in (first, second))

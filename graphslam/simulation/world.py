@@ -1,4 +1,4 @@
-"""Things as surfaces: the straight faces and circles that a beam can meet."""
+"""Static objects as surfaces: straight faces and circles for ray casting."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -11,9 +11,9 @@ from graphslam.simulation.scenario import Box, Move, StaticObjects
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outline:
-    """One thing: a polyline ``points`` (k, 2) m, or a circle of ``radius_m`` about its one point.
+    """An object: a polyline ``points`` (k, 2) m, or a circle of ``radius_m`` about its one point.
 
-    ``closed`` joins the last point to the first; nothing fits inside a ``solid`` one.
+    ``closed`` joins the last point to the first; no robot fits inside a ``solid`` one.
     """
 
     name: str
@@ -25,23 +25,23 @@ class Outline:
 
     @property
     def faces(self) -> Array:
-        """Its straight faces (k, 2, 2): from point to point."""
+        """Straight faces (k, 2, 2) from point to point."""
         if self.radius_m:
             return np.zeros((0, 2, 2))
         ends = np.roll(self.points, -1, axis=0)
         return np.stack([self.points, ends], axis=1)[: None if self.closed else -1]
 
     def moved(self, pose: Array) -> "Outline":
-        """The same thing after the rigid motion ``pose`` (3,) of the world frame."""
+        """The object after the rigid motion ``pose`` (3,) of the world frame."""
         return replace(self, points=transform(pose, self.points))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shapes:
-    """What a beam can meet: ``segments`` (..., k, 2, 2) m, then ``circles`` (..., m, 3) x y r.
+    """Surfaces: ``segments`` (..., k, 2, 2) m, then ``circles`` (..., m, 3) x y radius.
 
-    Leading axes, where there are any, are those of the scans: shapes that move. Surfaces are
-    numbered in this order, segments first.
+    A leading axis, if any, is that of the scans, for moving shapes. Surfaces are numbered in this
+    order, segments first.
     """
 
     segments: Array
@@ -55,10 +55,7 @@ class Shapes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class World:
-    """Outlines and their surfaces.
-
-    ``names`` and ``things`` (the outline's number) are per surface, segments first.
-    """
+    """Outlines and their surfaces; ``names`` and ``things`` (outline index) are per surface."""
 
     outlines: tuple[Outline, ...]
     shapes: Shapes
@@ -72,7 +69,7 @@ class World:
 
 
 def outlines_of(things: StaticObjects) -> Iterator[Outline]:
-    """The outline of everything in a scenario's list of things."""
+    """The outlines of a scenario's static objects."""
     for wall in things.walls:
         yield Outline(wall.name, np.array(wall.points_m), 0.0, wall.closed, False, wall.may_cross)
     for box in things.boxes:
@@ -102,12 +99,12 @@ def _direction(angle_deg: float) -> Array:
 
 
 def make_world(outlines: Iterable[Outline]) -> World:
-    """Number the surfaces: faces first, then circles; a face is named after its thing.
+    """Number the surfaces: faces first, then circles; a face has the name of its object.
 
-    A thing with several faces names them NAME/1, NAME/2, ...
+    The faces of an object with several are NAME/1, NAME/2, ...
     """
     outlines = tuple(outlines)
-    faces, circles, names, round_names, things, round_things = [], [], [], [], [], []
+    faces, circles, names, names_of_circles, things, circle_outlines = [], [], [], [], [], []
     for number, outline in enumerate(outlines):
         count = len(outline.faces)
         faces.append(outline.faces)
@@ -115,17 +112,17 @@ def make_world(outlines: Iterable[Outline]) -> World:
         names += [f"{outline.name}/{i + 1}" if count > 1 else outline.name for i in range(count)]
         if outline.radius_m:
             circles.append([*outline.points[0], outline.radius_m])
-            round_names.append(outline.name)
-            round_things.append(number)
+            names_of_circles.append(outline.name)
+            circle_outlines.append(number)
     shapes = Shapes(
         np.concatenate([np.zeros((0, 2, 2)), *faces]), np.array(circles, dtype=float).reshape(-1, 3)
     )
-    everything = np.array([*things, *round_things], dtype=np.int64)
-    return World(outlines, shapes, (*names, *round_names), everything)
+    everything = np.array([*things, *circle_outlines], dtype=np.int64)
+    return World(outlines, shapes, (*names, *names_of_circles), everything)
 
 
 def displacement(move: Move) -> Array:
-    """The rigid motion (3,) of the world frame that a move makes: a turn about a point, a shift."""
+    """Rigid motion (3,) of the world frame by a move: a turn about a point, then a shift."""
     about = np.array([*move.about_m, 0.0])
     back = np.array([-move.about_m[0], -move.about_m[1], 0.0])
     turn = np.array([0.0, 0.0, np.radians(move.turn_deg)])
@@ -133,10 +130,10 @@ def displacement(move: Move) -> Array:
 
 
 def find_crossing(world: World) -> tuple[str, str] | None:
-    """Names of two faces that cut through each other; None where none do.
+    """Names of two faces that intersect; None if there are none.
 
-    Touching is allowed (a wall that ends on another one, a cupboard against a wall), and so is
-    what one of the two things was told that it may.
+    Touching is allowed (a wall that ends on another one, a cupboard against a wall), and so are
+    intersections of objects with ``may_cross``.
     """
     faces, n = world.shapes.segments, len(world.shapes.segments)
     start, along = faces[:, 0], faces[:, 1] - faces[:, 0]
@@ -147,7 +144,7 @@ def find_crossing(world: World) -> tuple[str, str] | None:
     safe = np.where(parallel, 1.0, denominator)
     on_first = _cross(offset, along[None, :]) / safe
     on_second = _cross(offset, along[:, None]) / safe
-    # a millimetre of overlap is how people write things that touch
+    # objects that touch are often given with a millimetre of overlap
     margin = 1e-3 / length
     inside = (on_first > margin[:, None]) & (on_first < 1 - margin[:, None])
     inside &= (on_second > margin[None, :]) & (on_second < 1 - margin[None, :])
@@ -161,7 +158,7 @@ def _cross(a: Array, b: Array) -> Array:
 
 
 def find_degenerate(outlines: Sequence[Outline]) -> str | None:
-    """Name of a thing with a face of no length, or a wall of less than two points."""
+    """Name of an object with a face of zero length or a wall of less than two points."""
     for outline in outlines:
         along = outline.faces[:, 1] - outline.faces[:, 0]
         if not outline.radius_m and not (len(along) and np.hypot(*along.T).min() > 1e-6):

@@ -52,7 +52,8 @@ AROUND = ((5.0, 4.5), (3.0, 5.0), (-4.0, 3.8), (-6.5, 2.0), (-6.5, -3.5))
 
 def robot(start, *way, deg=0.0, body=SHAPE, **more):
     drive = (sim.Leg(tuple(way)),) if way else ()
-    return sim.Robot(start, body, deg, drive, **{"encoders": ENCODERS, "laser": LASER, **more})
+    sensors = {"encoders": ENCODERS, "laser": LASER}
+    return sim.Robot(start, body, start_deg=deg, drive=drive, **sensors | more)
 
 
 A = robot((-6.0, -1.0), (-4.0, -1.0), (-1.0, 0.5), (1.5, 0.0), (1.5, -2.0), speed_m_s=0.2)

@@ -119,7 +119,7 @@ def test_the_pioneer_has_one_landmark_in_view_and_is_seen_at_every_sample(tmp_pa
     segments = [m for m in read_truth([path], CONFIG).landmarks if m.kind == "segment"]
     assert [m.identity for m in segments] == ["wall"]
     # the wall, surface 0, is in every scan; poles are 1 to 6, the vehicle would be 7
-    surfaces = done.sweeps["pioneer"].hits.surfaces
+    surfaces = done.scans["pioneer"].hits.surfaces
     assert np.count_nonzero(surfaces == 0, axis=1).min() >= 10
     assert surfaces.max() <= 6
 
@@ -331,7 +331,7 @@ def test_true_associations_name_what_beams_and_sightings_met(tmp_path):
     met_robots = 0
     for name in scenario.robots:
         scans = topics[f"/{name}/true_associations/scan"]
-        surfaces = done.sweeps[name].hits.surfaces
+        surfaces = done.scans[name].hits.surfaces
         assert len(scans) == len(surfaces)
         for scan, numbers in zip(scans, surfaces, strict=True):
             np.testing.assert_array_equal(scan.targets >= 0, numbers >= 0)
