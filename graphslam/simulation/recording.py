@@ -47,7 +47,7 @@ class RobotSummary:
     dead_reckoning_end_m: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Recording:
     """A log that was written, with data that only the simulator knows."""
 

@@ -158,12 +158,12 @@ class Encoders(Sensor):
     counts_per_turn: int = field(default=2000, metadata=POSITIVE)
     wheel_radius_m: float = field(default=0.1, metadata=POSITIVE)
     axle_m: float = field(default=0.5, metadata=POSITIVE)
+    odometry: bool = True
+    joint_states: bool = False
     radius_error_left: float = field(default=0.0, metadata=RELATIVE)
     radius_error_right: float = field(default=0.0, metadata=RELATIVE)
     axle_error: float = field(default=0.0, metadata=RELATIVE)
     slip_m: float = field(default=0.0, metadata=NOT_NEGATIVE)
-    odometry: bool = True
-    joint_states: bool = False
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Visits of a scenario, ready to be recorded: world, robots with drives, no collisions."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -35,8 +35,7 @@ class SimulatedRobot(NamedTuple):
     drive: Drive
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SimulatedVisit:
+class SimulatedVisit(NamedTuple):
     """A visit to be recorded; ``name`` is empty unless there are two."""
 
     name: str

@@ -22,7 +22,7 @@ class Simulation:
     seed: int
     target: Path
     recordings: tuple[Recording, ...]
-    changed_cells: int = 0
+    changed_cells: int
 
     @property
     def counts(self) -> Mapping[str, int]:
@@ -45,7 +45,7 @@ def simulate(scenario: Scenario, target: Path, seed: int = 0) -> Simulation:
         if target.is_dir():
             raise OutputError(f"{target}: is a folder; this scenario makes one log: -o LOG.mcap")
         recording = record_visit(scenario, visits[0], target, seed)
-        return Simulation(scenario.name, seed, target, (recording,))
+        return Simulation(scenario.name, seed, target, (recording,), 0)
     return _two_visits(scenario, (visits[0], visits[1]), target, seed)
 
 
