@@ -27,7 +27,7 @@ import numpy as np
 from common import FREIBURG, FREIBURG_LOGS, import_freiburg, measured_command, parser
 from perturbed_logs import write
 
-from graphslam.core.config import Config
+from graphslam.core.config import Config, MultiRobotConfig
 from graphslam.core.geometry import between
 from graphslam.core.records import Message, OdometryPose, Trajectory
 from graphslam.evaluation.relation_metrics import Relations, read_relations, relation_errors
@@ -133,7 +133,7 @@ def parts(name: str, folder: Path) -> bool:
             rows = [(3 * part[:, None] + np.arange(3)).ravel() for part in pair]
             here, there = ([seen.places[k] for k in part] for part in pair)
             P_a, P_b = (seen.cov[np.ix_(k, k)] for k in rows)
-            found = relate_places("a", "b", here, there, P_a, P_b)
+            found = relate_places("a", "b", here, there, P_a, P_b, MultiRobotConfig())
             positions = (np.array([p.pose[:2] for p in places]) for places in (here, there))
             p, q = positions
             near = np.linalg.norm(p[:, None] - q, axis=-1).min(axis=0) < OVERLAP_M

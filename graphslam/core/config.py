@@ -356,6 +356,27 @@ class StartConfig:
 
 
 @dataclass(frozen=True)
+class MultiRobotConfig:
+    """How robots whose start pose is not given are related to the others (docs/several-robots.md).
+
+    sampling_m: a robot is looked for in scans, and a sighting of it is used, once it or its
+    observer moved this far since the last time. min_detections: a robot found by its motion in
+    scans needs so many detections. min_path_residual_m: root mean square distance of its path
+    there from a straight one at constant speed, which anybody might drive. place_cell_m: cells of
+    the grid on which a submap is searched for in the map of another robot; of free space, only what
+    is nearer to the laser than place_range_m counts. min_place_extent_m: submaps that two robots
+    have in common must extend over more than this in both maps, since rooms are alike.
+    """
+
+    sampling_m: float = 0.1
+    min_detections: int = 12
+    min_path_residual_m: float = 0.25
+    place_cell_m: float = 0.3
+    place_range_m: float = 12.0
+    min_place_extent_m: float = 6.0
+
+
+@dataclass(frozen=True)
 class ChangesConfig:
     """Change detection (thesis chapter 5).
 
@@ -416,6 +437,7 @@ class Config:
     ekf: EkfConfig = field(default_factory=EkfConfig)
     rbpf: RbpfConfig = field(default_factory=RbpfConfig)
     start: StartConfig = field(default_factory=StartConfig)
+    multi_robot: MultiRobotConfig = field(default_factory=MultiRobotConfig)
     changes: ChangesConfig = field(default_factory=ChangesConfig)
     warnings: tuple[str, ...] = field(default=(), compare=False, metadata={"setting": False})
 

@@ -239,6 +239,9 @@ _NOT_ZERO = {
     "along_sigma_m",
     "iterations",
     "particles",
+    "sampling_m",
+    "place_cell_m",
+    "place_range_m",
 }
 
 

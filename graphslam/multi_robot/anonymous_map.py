@@ -1,13 +1,13 @@
-"""What robots have in common that bears no name: places and points, and what that relates.
+"""Relative poses of robots from what has no identity: places and points in the maps of both.
 
-Looked at only where nothing with a name says how robots' frames lie.
+Used only between robots that nothing with an identity relates.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
-from graphslam.core.config import AssociationConfig
+from graphslam.core.config import Config
 from graphslam.core.geometry import Array
 from graphslam.mapping.submaps import SubmapPose
 from graphslam.multi_robot.landmark_constellations import relate_points
@@ -17,10 +17,10 @@ from graphslam.multi_robot.relative_frames import RelativeFrame
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AnonymousMap:
-    """What one robot saw by itself that bears no name, in the frame in which it began.
+    """What one robot saw that has no identity, in the frame in which it began.
 
-    ``places`` by its scans, ``cov`` (3n, 3n) the joint covariance of their poses, errors along each
-    one's own axes; ``points`` means (m, 2), covariances (m, 2, 2).
+    ``places``: its submaps, with the joint covariance ``cov`` (3n, 3n) of their poses, errors along
+    each one's own axes. ``points``: means (m, 2), covariances (m, 2, 2).
     """
 
     places: Sequence[SubmapPose]
@@ -29,27 +29,27 @@ class AnonymousMap:
 
 
 def relate_anonymous_maps(
-    seen: Mapping[str, AnonymousMap], frames: Mapping[str, str], config: AssociationConfig
+    maps: Mapping[str, AnonymousMap], frames: Mapping[str, str], config: Config
 ) -> tuple[list[RelativeFrame], dict[str, str]]:
     """Relations between robots in different frames, and why there is none: robot -> reason.
 
     Args:
-        seen: what each robot saw by itself.
-        frames: whose frame each robot is in, by all that bears a name.
-        config: floors of what is seen.
+        maps: of each robot by itself.
+        frames: robot -> its frame, by all that has an identity.
+        config: settings.
     """
     relations: list[RelativeFrame] = []
     doubts: dict[str, str] = {}
-    for a, b in combinations(sorted(seen), 2):
+    for a, b in combinations(sorted(maps), 2):
         if frames[a] == frames[b]:
             continue
-        here, there = seen[a], seen[b]
-        for found in (
-            relate_places(a, b, here.places, there.places, here.cov, there.cov),
-            relate_points(a, b, here.points, there.points, config),
+        m, n = maps[a], maps[b]
+        for relation in (
+            relate_places(a, b, m.places, n.places, m.cov, n.cov, config.multi_robot),
+            relate_points(a, b, m.points, n.points, config.association.floor_m),
         ):
-            if isinstance(found, RelativeFrame):
-                relations.append(found)
-            elif found:
-                doubts |= dict.fromkeys((a, b), found)
+            if isinstance(relation, RelativeFrame):
+                relations.append(relation)
+            elif relation:
+                doubts |= dict.fromkeys((a, b), relation)
     return relations, doubts

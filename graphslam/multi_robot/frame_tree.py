@@ -1,20 +1,19 @@
-"""Robots that do not know where the others are: which of them are joined, and to whom.
+"""Start poses and frames of robots whose start is unknown, from relative poses of two at a time.
 
-`relating` says of any two where one began in the frame of the other.
-
-1. Robots are joined to what has a place, by all relations to it that agree.
-2. Whatever is not joined keeps a frame of its own.
+1. A robot is placed relative to placed robots, by all relations to them that agree.
+2. What nothing relates to a placed robot gets a frame of its own.
 """
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import combinations
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from graphslam.core.config import AssociationConfig
+from graphslam.core.config import Config
 from graphslam.core.consistency import has_rival, poses_differ
 from graphslam.core.frame_forest import PRIOR_INFLATION, grow_frame_forest
 from graphslam.core.geometry import compose, compose_cov
@@ -28,11 +27,11 @@ from graphslam.multi_robot.relative_frames import (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameAssignment:
-    """Where robots start, and in whose frame each is: the robot at whose start the frame hangs.
+    """Start pose of every robot, and its frame, named after the robot that begins at its origin.
 
-    ``world`` is the one whose frame is the world's. ``found``: robot -> the relation that it was
-    placed by. ``undecided``: robot -> why it has a frame of its own although something connects it
-    with others.
+    ``world`` is the frame of the world. ``found``: robot -> the relation by which it was placed.
+    ``undecided``: robot -> why it has a frame of its own although it shares observations with
+    others.
     """
 
     starts: Mapping[str, Start]
@@ -49,17 +48,17 @@ class FrameAssignment:
 
     @classmethod
     def separate_frames(cls, robots: Iterable[str], origin: Start) -> "FrameAssignment":
-        """Every robot in a frame of its own, at whose ``origin`` it starts."""
+        """Every robot at the ``origin`` of a frame of its own."""
         frames = {robot: robot for robot in robots}
         return cls(dict.fromkeys(frames, origin), frames, min(frames, default=""))
 
     def to_summary(self) -> dict[str, dict[str, Any]]:
         """For summary.json: robot -> the start that was found, and from what."""
-        told = {}
+        summary = {}
         for robot, relation in sorted(self.found.items()):
             x, y, phi = self.starts[robot].pose.tolist()
             sigmas = np.sqrt(np.diag(self.starts[robot].cov)) / PRIOR_INFLATION
-            told[robot] = {
+            summary[robot] = {
                 "x": x,
                 "y": y,
                 "phi": phi,
@@ -68,69 +67,67 @@ class FrameAssignment:
                 "seen_with": relation.other,
                 "evidence": relation.weight,
             }
-        return told
+        return summary
 
 
 def build_frame_tree(
     robots: Sequence[str],
-    views: Mapping[str, RobotEstimate],
-    meetings: Sequence[Sighting],
+    estimates: Mapping[str, RobotEstimate],
+    sightings: Sequence[Sighting],
     starts: Mapping[str, Start],
-    config: AssociationConfig,
+    config: Config,
     origin: Start,
     more: Sequence[RelativeFrame] = (),
     doubts: Mapping[str, str] = MappingProxyType({}),
 ) -> FrameAssignment:
-    """Put robots whose start is unknown where what they saw in common has them.
+    """Place robots whose start is unknown relative to the others, by what they saw in common.
 
     Args:
         robots: all of them.
-        views: what each knows by itself, of those that know anything.
-        meetings: all sightings of robots by robots.
+        estimates: of each robot by itself, of those that have any.
+        sightings: all sightings of robots by robots.
         starts: of the robots whose start is known, at least one.
-        config: floors of what is seen.
-        origin: start of what has a frame of its own.
+        config: settings.
+        origin: start of a robot in a frame of its own.
         more: relations that were found in other ways.
-        doubts: robot -> why those ways do not say where it was.
+        doubts: robot -> why those ways do not determine its start.
     """
-    names = sorted(views)
     by_pair: dict[tuple[str, str], list[Sighting]] = defaultdict(list)
-    for s in meetings:
+    for s in sightings:
         by_pair[min(s.robot, str(s.seen_robot)), max(s.robot, str(s.seen_robot))].append(s)
-    relations = [way for found in more for way in (found, found.reversed())]
+    relations = [either for relation in more for either in (relation, relation.reversed())]
     undecided = dict(doubts)
-    for n, a in enumerate(names):
-        for b in names[n + 1 :]:
-            if a in starts and b in starts:
-                continue
-            found = estimate_relative_frame(a, b, views, by_pair[a, b], config)
-            if isinstance(found, RelativeFrame):
-                relations += [found, found.reversed()]
-            elif found:
-                undecided |= dict.fromkeys((a, b), found)
+    for a, b in combinations(sorted(estimates), 2):
+        if a in starts and b in starts:
+            continue
+        relation = estimate_relative_frame(a, b, estimates, by_pair[a, b], config)
+        if isinstance(relation, RelativeFrame):
+            relations += [relation, relation.reversed()]
+        elif relation:
+            undecided |= dict.fromkeys((a, b), relation)
     world = min(starts, default="")
-    by: dict[str, RelativeFrame] = {}
+    found: dict[str, RelativeFrame] = {}
 
     def next_edge(placed: Mapping[str, Start]) -> tuple[str, str, Start] | None:
-        free = [name for name in robots if name not in placed]
         edges = [
             edge
-            for name in free
-            if (edge := _strongest_relation(name, relations, placed, undecided)) is not None
+            for name in robots
+            if name not in placed
+            and (edge := _strongest_relation(name, relations, placed, undecided)) is not None
         ]
         if not edges:
             return None
         relation, start = max(edges, key=lambda edge: edge[0].weight)
-        by[relation.robot] = relation
+        found[relation.robot] = relation
         return relation.robot, relation.other, start
 
     placed, frames = grow_frame_forest(robots, starts, world, origin, next_edge)
-    wide = {
-        name: Start(start.pose, PRIOR_INFLATION**2 * start.cov) if name in by else start
+    priors = {
+        name: Start(start.pose, PRIOR_INFLATION**2 * start.cov) if name in found else start
         for name, start in placed.items()
     }
     alone = {name: why for name, why in undecided.items() if frames[name] == name != world}
-    return FrameAssignment(wide, frames, world, by, alone)
+    return FrameAssignment(priors, frames, world, found, alone)
 
 
 def _strongest_relation(
@@ -139,28 +136,27 @@ def _strongest_relation(
     placed: Mapping[str, Start],
     undecided: dict[str, str],
 ) -> tuple[RelativeFrame, Start] | None:
-    """The relation that places a robot best, if those to robots with a place do not contradict.
+    """The best supported relation of a robot to placed ones, unless too much contradicts it.
 
     Returns:
         The relation, its weight that of all that agree with it, and the start that it gives.
     """
-    ways = []
+    edges = []
     for r in relations:
         if r.robot == name and r.other in placed:
             at = placed[r.other]
             cov = compose_cov(at.pose, at.cov, r.pose, r.cov)
-            ways.append((r, Start(compose(at.pose, r.pose), cov)))
-    if not ways:
+            edges.append((r, Start(compose(at.pose, r.pose), cov)))
+    if not edges:
         return None
     support = [
-        sum(r.weight for r, s in ways if not poses_differ(s.pose, s.cov, start.pose, start.cov))
-        for _, start in ways
+        sum(r.weight for r, s in edges if not poses_differ(s.pose, s.cov, start.pose, start.cov))
+        for _, start in edges
     ]
-    k = max(range(len(ways)), key=lambda n: (support[n], ways[n][0].weight))
-    whole = sum(r.weight for r, _ in ways)
-    if has_rival(support[k], [whole - support[k]]):
-        others = ", ".join(r.other for r, _ in ways)
+    k = max(range(len(edges)), key=lambda n: (support[n], edges[n][0].weight))
+    if has_rival(support[k], [sum(r.weight for r, _ in edges) - support[k]]):
+        others = ", ".join(r.other for r, _ in edges)
         undecided[name] = f"what {name} has in common with {others} contradicts itself"
         return None
-    r, start = ways[k]
+    r, start = edges[k]
     return RelativeFrame(name, r.other, r.pose, r.cov, support[k]), start

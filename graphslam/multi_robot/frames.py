@@ -1,8 +1,8 @@
-"""Robots in frames that nothing relates, in one estimate.
+"""Several frames in one estimate, for robots whose relative poses are unknown.
 
 A frame is a set of robots whose starts are related. While they are estimated, frames lie so far
-apart that no association can reach from one to another, and each has a map of its own: what bears
-the same name in two of them is not taken for the same. At the end all go back to their origins.
+apart that no gate reaches from one to another, and each has a map of its own: landmarks of the same
+identity in two frames are different landmarks. At the end all frames go back to their origins.
 """
 
 from collections.abc import Iterable, Mapping
@@ -17,26 +17,27 @@ from graphslam.multi_robot.frame_tree import FrameAssignment
 from graphslam.odometry.interpolation import FrameTransforms, origin_shift
 from graphslam.odometry.preintegration import Track
 
-#: m: how far apart frames lie while they are estimated
+#: m: distance of neighbouring frames while they are estimated, farther than any building is long
 FRAME_SPACING_M = 1e5
-#: between frame and identity of landmarks in other frames than the world's; in no name
+#: between frame and identity of landmarks outside the world frame; no identity contains it
 IDENTITY_SEPARATOR = "\0"
 
 
 class RobotFrames:
-    """Which robot is in which frame (``of``), and where frames other than the world's lie.
+    """The frame of each robot (``of``), and where frames other than the world's lie.
 
-    A frame bears the name of the robot at whose start it hangs; ``away`` (m, along x) is where it
+    A frame is named after the robot that begins at its origin; ``away`` (m, along x) is where it
     lies while it is estimated.
     """
 
-    def __init__(self, joined: FrameAssignment) -> None:
-        self.of, self.world, self._starts = joined.frames, joined.world, joined.starts
+    def __init__(self, assignment: FrameAssignment) -> None:
+        self.of, self.world = assignment.frames, assignment.world
+        self._starts = assignment.starts
         others = sorted(set(self.of.values()) - {self.world})
         self.away = {frame: (k + 1) * FRAME_SPACING_M for k, frame in enumerate(others)}
 
     def crosses_frames(self, message: Message) -> bool:
-        """Whether a message relates robots whose frames are not related."""
+        """Whether a message is about two robots in different frames."""
         other = None
         if isinstance(message, Sighting):
             other = message.seen_robot
@@ -47,30 +48,27 @@ class RobotFrames:
         return self.of[message.robot] != self.of[other]
 
     def with_frame_identity(self, message: Message) -> Message:
-        """A message in which a landmark bears the name that it has in the frame of the robot."""
+        """The message; in a frame other than the world's, a landmark's identity has its prefix."""
         if not self.away or not isinstance(message, Sighting) or message.identity is None:
             return message
         frame = self.of[message.robot]
-        own = (
-            message.identity
-            if frame == self.world
-            else f"{frame}{IDENTITY_SEPARATOR}{message.identity}"
-        )
-        return replace(message, identity=own)
+        if frame == self.world:
+            return message
+        return replace(message, identity=f"{frame}{IDENTITY_SEPARATOR}{message.identity}")
 
     def offset_start(self, robot: str, start: Start) -> Start:
-        """A robot's start where its frame lies while it is estimated."""
+        """The start of a robot where its frame lies while it is estimated."""
         away = np.array([self.away.get(self.of[robot], 0.0), 0.0, 0.0])
         return replace(start, pose=start.pose + away)
 
     def landmark_frames(self, entries: Iterable[Entry]) -> dict[int, str]:
-        """Landmark -> in whose frame it is: whoever saw it has the same one."""
+        """Landmark -> its frame, that of any robot that saw it."""
         return {entry.id: self.of[min(entry.path_m)] for entry in entries}
 
     def transforms(self, tracks: Mapping[str, Track], entries: Iterable[Entry]) -> FrameTransforms:
-        """What takes every robot and landmark from where it was estimated into its frame.
+        """Transforms of every robot and landmark from where it was estimated into its frame.
 
-        A prior is on the base of the robot at which a frame hangs, states are on its sensor.
+        A prior is on the base of the robot that begins at a frame's origin, states are its sensor.
         """
         by_frame: dict[str, Array] = {}
         for frame in sorted(set(self.of.values())):
@@ -85,7 +83,7 @@ class RobotFrames:
     def label_landmarks(
         self, landmarks: tuple[Landmark, ...], entries: Iterable[Entry]
     ) -> tuple[Landmark, ...]:
-        """The final map, in which landmarks of other frames than the world's say whose it is."""
+        """The final map: identities as in the log, the frame of landmarks outside the world's."""
         if not self.away:
             return landmarks
         frames = self.landmark_frames(entries)
@@ -98,5 +96,5 @@ class RobotFrames:
 
 
 def logged_identity(identity: str | None) -> str | None:
-    """The name that a landmark bears in the log."""
+    """The identity that a landmark has in the log."""
     return identity and identity.rpartition(IDENTITY_SEPARATOR)[2]

@@ -1,20 +1,21 @@
-"""Robots whose start is unknown, found in another's scans by the way they move.
+"""Robots of unknown start, found in another one's scans by the way they move.
 
 After every robot has been estimated by itself, for each observer and each robot of known outline:
 
-1. `supposing` has places where the robot may have begun. Each says where the robot is in every
-   scan; there its outline is fitted, as `watching` does. Where it should show and does not, because
-   beams went through or something else stands there, the place is contradicted.
-2. Where the robot began, and how far its clock is ahead, follow from all its sightings
-   (`registering`).
-3. It is believed if its sightings are many, hardly contradicted, of a motion that is its own (not
-   straight at one speed, as anybody's), if no other place explains half as much, and if they are
-   not as well those of another robot.
+1. `detection_hypotheses` proposes where the robot began. Each hypothesis predicts where the robot
+   is in every scan; there its outline is fitted, as `robot_detection` does. Scans in which it
+   should be visible and is not, because beams passed through or something else stands there,
+   contradict the hypothesis.
+2. The start and the offset of the robot's clock follow from all its detections
+   (`track_registration`).
+3. It is accepted with many detections, hardly contradicted, of a motion that is its own (not
+   straight at constant speed, as anybody's), if no other hypothesis has half as much support, and
+   if the detections are not as well those of another robot.
 
-Odds of chance: in ten minutes of a real building with people in it, searched for robots of three
-outlines that were never there, the best place had 7 sightings; `FEWEST_SEEN` are asked for. What is
-left to be afraid of moves like the robot: for that are the outline, contradictions, rivals and the
-shape of the motion itself.
+False detections: in ten minutes of a real building with people in it, searched for robots of three
+outlines that were never there, the best hypothesis had 7 detections; `multi_robot.min_detections`
+is 12. What may still deceive moves like the robot: against that are the outline, contradictions,
+rivals and the shape of the motion itself.
 """
 
 from collections import defaultdict
@@ -23,13 +24,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graphslam.core.config import FrontEndConfig
-from graphslam.core.consistency import poses_differ
+from graphslam.core.config import Config
+from graphslam.core.consistency import RIVAL_SHARE, has_rival, poses_differ
 from graphslam.core.geometry import Array, between, compose, path_length, wrap
 from graphslam.core.records import Scan, Sighting
 from graphslam.multi_robot.detection_hypotheses import (
-    SURE_M,
-    Path,
+    MAX_POSITION_SIGMA_M,
+    PredictedPath,
     ScanSequence,
     StartHypothesis,
     candidate_detections,
@@ -38,55 +39,56 @@ from graphslam.multi_robot.detection_hypotheses import (
     start_hypotheses,
 )
 from graphslam.multi_robot.relative_frames import (
-    MAX_TURN_SIGMA_RAD,
-    RIVAL,
+    MAX_HEADING_SIGMA_RAD,
     RelativeFrame,
     RobotEstimate,
+    evenly_spaced,
 )
 from graphslam.multi_robot.robot_detection import ExpectedPose, detect_robots
-from graphslam.multi_robot.track_registration import fit_start
+from graphslam.multi_robot.track_registration import FittedStart, fit_start
 from graphslam.odometry.preintegration import Track
 from graphslam.odometry.readings import IntArray
 from graphslam.perception.ordered_scan import Sweep
 from graphslam.perception.robot_outlines import MIN_RETURNS, expected_ranges, outline_radius
 
-#: m: a scan is kept once a robot drove so far since the last one
-APART_M = 0.1
-#: sightings at least, and share of the scans where the robot should show that have one
-FEWEST_SEEN, SHARE_SEEN = 12, 0.6
-#: m: what drives straight at one speed is nowhere as far from the robot's path, root mean square
-OWN_M = 0.25
-#: places that are looked at closely; scans searched for those where a robot should show; scans in
-#: which its outline is fitted
-LOOKED, SEARCHED, FITTED = 8, 1000, 100
-#: scans after which a place is given up that has the robot in less than half of `SHARE_SEEN`
-SOME = 12
-#: of the angle that an outline takes, where its beams must meet it; m: what is so much nearer hides
-#: it; of these beams, hidden at most
-WITHIN, HIDDEN_M, HIDDEN = 0.8, 0.3, 0.2
-#: rad: sigma of a heading by a place, beyond what its turn has
-HEADING_RAD = 0.1
+#: share of the scans in which the robot should be visible that must have a detection
+MIN_DETECTION_RATE = 0.6
+#: hypotheses that are evaluated; scans searched for those in which a robot should be visible; scans
+#: in which its outline is fitted: bound the run time
+MAX_EVALUATED, MAX_SEARCHED, MAX_FITTED = 8, 1000, 100
+#: scans after which a hypothesis is given up that has the robot in less than half as many as it
+#: should
+FIRST_SCANS = 12
+#: share of the angle that an outline takes in which its beams must meet it
+VISIBLE_SHARE = 0.8
+#: m: what is so much nearer hides it; share of these beams that may be hidden
+HIDDEN_M, MAX_HIDDEN_SHARE = 0.3, 0.2
+#: rad: sigma of a predicted heading, beyond that of the hypothesis
+HEADING_SIGMA_RAD = 0.1
 
 
 class ScanBuffer:
-    """Scans in which robots are to be looked for when a pass is over.
+    """Scans in which robots are to be looked for when a pass over the log is over.
 
-    One for every `APART_M` that another robot of known outline drove: a robot that stands tells
-    nothing new.
+    One for every ``sampling_m`` that another robot of known outline drove: a robot that stands adds
+    nothing.
     """
 
-    def __init__(self, tracks: Mapping[str, Track], outlines: Mapping[str, Array]) -> None:
-        """Nothing kept yet; ``outlines``: robot -> corners (k, 2), m."""
+    def __init__(
+        self, tracks: Mapping[str, Track], outlines: Mapping[str, Array], sampling_m: float
+    ) -> None:
+        """An empty buffer; ``outlines``: robot -> corners (k, 2), m."""
         self.scans: list[Scan] = []
-        self._tracks, self._outlines = tracks, outlines
+        self._tracks, self._outlines, self._sampling_m = tracks, outlines, sampling_m
         self._last: dict[str, dict[str, int]] = defaultdict(dict)
 
     def add(self, scan: Scan) -> None:
-        """Take in the next scan of a log."""
+        """Keep the next scan of a log if it is needed."""
         last = self._last[scan.robot]
         others = [name for name in self._outlines if name != scan.robot and self._tracks[name]]
         if any(
-            name not in last or self._tracks[name].moved(last[name], scan.time_ns)[0] >= APART_M
+            name not in last
+            or self._tracks[name].moved(last[name], scan.time_ns)[0] >= self._sampling_m
             for name in others
         ):
             last.update(dict.fromkeys(others, scan.time_ns))
@@ -95,89 +97,87 @@ class ScanBuffer:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectionCandidate:
-    """A place after a close look.
+    """A start hypothesis after its outline was fitted in the scans.
 
-    ``relation`` of the robot to its observer, weighed by the number of sightings; ``seen`` share of
-    scans with a sighting among those where the robot should show; ``support`` those with one less
-    those without, if all of these scans had been looked at; ``own_m`` how far its path is from one
-    that goes straight at one speed. ``at``: scan's time -> where it was seen (2,), in the
-    observer's frame; ``sightings`` in order of time; ``late_s``, ``turn_sigma``: see
-    `registering.Began`.
+    ``relation`` of the robot to its observer, its weight the number of detections; ``rate``: share
+    of the scans in which the robot should be visible that have one; ``support``: scans with a
+    detection less those without, scaled to all scans in which it should be visible;
+    ``path_residual_m``: root mean square distance of its path from a straight one at constant
+    speed. ``positions``: scan's time -> (2,) in the observer's frame; ``sightings`` in order of
+    time; ``clock_offset_s``, ``heading_sigma``: see `FittedStart`.
     """
 
     relation: RelativeFrame
     support: float
-    seen: float
-    own_m: float
-    at: Mapping[int, Array]
+    rate: float
+    path_residual_m: float
+    positions: Mapping[int, Array]
     sightings: Sequence[Sighting]
-    late_s: float
-    turn_sigma: float
+    clock_offset_s: float
+    heading_sigma: float
 
-    @property
-    def is_accepted(self) -> bool:
-        """Whether it is the robot as far as its own sightings tell."""
+    def is_accepted(self, config: Config) -> bool:
+        """Whether it is the robot as far as its own detections show."""
         return (
-            self.relation.weight >= FEWEST_SEEN
-            and self.seen >= SHARE_SEEN
-            and self.own_m >= OWN_M
-            and self.turn_sigma <= MAX_TURN_SIGMA_RAD
+            self.relation.weight >= config.multi_robot.min_detections
+            and self.rate >= MIN_DETECTION_RATE
+            and self.path_residual_m >= config.multi_robot.min_path_residual_m
+            and self.heading_sigma <= MAX_HEADING_SIGMA_RAD
         )
 
     def differs(self, other: "DetectionCandidate") -> bool:
-        """Whether two places are not one."""
+        """Whether the starts of two hypotheses are not the same."""
         one, two = self.relation, other.relation
         return poses_differ(one.pose, one.cov, two.pose, two.cov)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MutualDetections:
-    """What looking for robots in scans told: relations, and robot -> why it is not related."""
+    """Relations found by robots in scans, and robot -> why it is not related."""
 
     relations: tuple[RelativeFrame, ...]
     undecided: Mapping[str, str]
 
 
 def find_robots_in_scans(
-    views: Mapping[str, RobotEstimate],
+    estimates: Mapping[str, RobotEstimate],
     scans: Sequence[Scan],
     outlines: Mapping[str, Array],
     placed: Sequence[str],
-    doubt_s: float,
-    config: FrontEndConfig,
+    clock_sigma_s: float,
+    config: Config,
 ) -> MutualDetections:
     """Find robots in scans of others, wherever they began.
 
     Args:
-        views: what each robot knows by itself.
-        scans: of any robots, in which others may show.
+        estimates: of each robot by itself.
+        scans: of any robots, in which others may be visible.
         outlines: robot -> corners (k, 2), m, base frame.
-        placed: robots whose start is known. They are looked for as well, for they may be taken for
-            another one.
-        doubt_s: sigma of the difference of two robots' clocks.
-        config: of the front end.
+        placed: robots whose start is known. They are looked for as well, for they may be mistaken
+            for another one.
+        clock_sigma_s: sigma of the offset of two robots' clocks.
+        config: settings.
     """
     relations: list[RelativeFrame] = []
     undecided: dict[str, str] = {}
     for observer, own in scans_by_robot(scans).items():
-        others = [name for name in outlines if name in views and name != observer]
-        if observer not in views or {observer, *others} <= set(placed):
+        others = [name for name in outlines if name in estimates and name != observer]
+        if observer not in estimates or {observer, *others} <= set(placed):
             continue
-        watch = ScanSequence.of(views[observer], own, config.max_range_m)
+        watch = ScanSequence.of(estimates[observer], own, config.front_end.max_range_m)
         found: dict[str, DetectionCandidate] = {}
         for name in others:
-            look = _RobotSearch(observer, name, watch, views[name], outlines[name], doubt_s, config)
-            one = look.found()
-            if isinstance(one, DetectionCandidate):
-                found[name] = one
-            elif one:
-                undecided[name] = one
+            search = _RobotSearch(
+                observer, name, watch, estimates[name], outlines[name], clock_sigma_s, config
+            )
+            result = search.find()
+            if isinstance(result, DetectionCandidate):
+                found[name] = result
+            elif result:
+                undecided[name] = result
         for name, one in found.items():
-            rivals = [
-                n
-                for n in found
-                if n != name and _is_same_object(one, found[n], outline_radius(outlines[name]))
-            ]
+            near_m = outline_radius(outlines[name])
+            rivals = [n for n in found if n != name and _is_same_object(one, found[n], near_m)]
             if rivals:
                 undecided[name] = f"what {observer} saw may be {' or '.join([name, *rivals])}"
             elif not {name, observer} <= set(placed):
@@ -186,182 +186,192 @@ def find_robots_in_scans(
 
 
 def _is_same_object(one: DetectionCandidate, other: DetectionCandidate, near_m: float) -> bool:
-    """Whether sightings of a robot are as well those of another, seen as often or nearly so."""
+    """Whether detections of a robot are as well those of another, which has about as many."""
     shared = sum(
-        bool(np.hypot(*(at - other.at[time_ns])) < near_m)
-        for time_ns, at in one.at.items()
-        if time_ns in other.at
+        bool(np.hypot(*(position - other.positions[time_ns])) < near_m)
+        for time_ns, position in one.positions.items()
+        if time_ns in other.positions
     )
-    alike = shared > RIVAL * min(len(one.at), len(other.at))
-    return alike and other.support > RIVAL * one.support
+    alike = has_rival(min(len(one.positions), len(other.positions)), [shared])
+    return alike and has_rival(one.support, [other.support])
 
 
 class _RobotSearch:
-    """One observer looks for one robot."""
+    """The search of one observer for one robot."""
 
     def __init__(
         self,
         observer: str,
         name: str,
         watch: ScanSequence,
-        view: RobotEstimate,
+        estimate: RobotEstimate,
         outline: Array,
-        doubt_s: float,
-        config: FrontEndConfig,
+        clock_sigma_s: float,
+        config: Config,
     ) -> None:
-        self.observer, self.name, self.view = observer, name, view
-        self.outline, self.doubt_s, self.config = outline, doubt_s, config
-        there, _ = view.at(watch.times_ns)
-        way = path_length(there)
-        edge_ns = round(1e9 * doubt_s)
-        known = (watch.times_ns > view.track.first_ns - edge_ns) & (
-            watch.times_ns < view.track.last_ns + edge_ns
+        self.observer, self.name, self.estimate = observer, name, estimate
+        self.outline, self.clock_sigma_s, self.config = outline, clock_sigma_s, config
+        poses, _ = estimate.at(watch.times_ns)
+        edge_ns = round(1e9 * clock_sigma_s)
+        covered = (watch.times_ns > estimate.track.first_ns - edge_ns) & (
+            watch.times_ns < estimate.track.last_ns + edge_ns
         )
         # the robot has moved since the scan before
-        _, first = np.unique(np.floor(way / APART_M), return_index=True)
-        self.watch = watch.some(np.intersect1d(first, np.flatnonzero(known)))
+        samples = np.floor(path_length(poses) / config.multi_robot.sampling_m)
+        _, first = np.unique(samples, return_index=True)
+        self.watch = watch.subset(np.intersect1d(first, np.flatnonzero(covered)))
 
-    def found(self) -> DetectionCandidate | str:
-        """Where it began, or why that is not known ("" if nothing like it was seen)."""
-        if len(self.watch.scans) < FEWEST_SEEN:
+    def find(self) -> DetectionCandidate | str:
+        """Where it began, or why that is unknown ("" if nothing like it was seen)."""
+        fewest = self.config.multi_robot.min_detections
+        if len(self.watch.scans) < fewest:
             return ""
-        path = Path.of(self.view, self.watch.times_ns, self.doubt_s)
+        path = PredictedPath.of(self.estimate, self.watch.times_ns, self.clock_sigma_s)
         seen = candidate_detections(self.watch, path, self.outline)
-        looked: list[DetectionCandidate] = []
-        most = 0.0
-        for place in start_hypotheses(self.watch, path, self.outline, seen)[:LOOKED]:
-            # what has not half as much to confirm it is no rival
-            if place.score >= RIVAL * most:
-                looked += [found for found in [self._close(place)] if found]
-                if looked and looked[-1].is_accepted:
-                    most = max(most, place.score)
-        seen_well = [f for f in looked if f.seen >= SHARE_SEEN and len(f.sightings) >= FEWEST_SEEN]
-        if not seen_well:
+        evaluated: list[DetectionCandidate] = []
+        best_score = 0.0
+        for hypothesis in start_hypotheses(self.watch, path, self.outline, seen)[:MAX_EVALUATED]:
+            if hypothesis.score < RIVAL_SHARE * best_score:
+                continue  # too little support for a rival
+            candidate = self._evaluate(hypothesis)
+            if candidate is not None:
+                evaluated.append(candidate)
+            if evaluated and evaluated[-1].is_accepted(self.config):
+                best_score = max(best_score, hypothesis.score)
+        frequent = [
+            c for c in evaluated if c.rate >= MIN_DETECTION_RATE and len(c.sightings) >= fewest
+        ]
+        if not frequent:
             return ""
-        what = f"what {self.observer} saw in its scans"
-        accepted = [f for f in seen_well if f.is_accepted]
+        accepted = [c for c in frequent if c.is_accepted(self.config)]
         if not accepted:
-            return f"{what} moved too simply to be known as {self.name}"
-        enough = RIVAL * max(f.support for f in accepted)
-        # of equals the one to which both drifted least says best where the robot began
+            return (
+                f"what {self.observer} saw in its scans moved too simply to be recognised as "
+                f"{self.name}"
+            )
+        enough = RIVAL_SHARE * max(c.support for c in accepted)
+        # of about equals, the one with least drift of both robots determines the start best
         best = min(
-            (f for f in accepted if f.support >= enough), key=lambda f: float(f.relation.cov[2, 2])
+            (c for c in accepted if c.support >= enough), key=lambda c: float(c.relation.cov[2, 2])
         )
-        best = self._united(best, [f for f in accepted if f is not best and not best.differs(f)])
-        if any(f.support > RIVAL * best.support and best.differs(f) for f in looked):
-            return f"{what} may be {self.name} in two ways"
+        best = self._merge(best, [c for c in accepted if c is not best and not best.differs(c)])
+        if has_rival(best.support, [c.support for c in evaluated if best.differs(c)]):
+            return f"what {self.observer} saw in its scans may be {self.name} in two ways"
         return best
 
-    def _united(
+    def _fit_start(
+        self, pose: Array, clock_offset_s: float, sightings: Sequence[Sighting]
+    ) -> FittedStart | None:
+        observer = self.watch.estimate
+        return fit_start(
+            pose, clock_offset_s, sightings, observer, self.estimate, self.clock_sigma_s
+        )
+
+    def _merge(
         self, best: DetectionCandidate, same: Sequence[DetectionCandidate]
     ) -> DetectionCandidate:
-        """One place that was followed from several stretches: from all their sightings."""
+        """One hypothesis from the detections of all that agree, extended from other stretches."""
         if not same:
             return best
-        every = {s.time_ns: s for found in (*same, best) for s in found.sightings}
-        sightings = [every[time_ns] for time_ns in sorted(every)]
-        pose, late_s = best.relation.pose, best.late_s
-        began = fit_start(pose, late_s, sightings, self.watch.view, self.view, self.doubt_s)
-        if began is None or len(began.used) < best.relation.weight:
+        by_time = {s.time_ns: s for candidate in (*same, best) for s in candidate.sightings}
+        sightings = [by_time[time_ns] for time_ns in sorted(by_time)]
+        start = self._fit_start(best.relation.pose, best.clock_offset_s, sightings)
+        if start is None or len(start.used) < best.relation.weight:
             return best
-        weight = float(len(began.used))
-        relation = RelativeFrame(self.name, self.observer, began.pose, began.cov, weight)
-        at = {time_ns: at for found in (*same, best) for time_ns, at in found.at.items()}
-        return replace(best, relation=relation, support=max(best.support, weight), at=at)
+        weight = float(len(start.used))
+        relation = RelativeFrame(self.name, self.observer, start.pose, start.cov, weight)
+        positions = {t: at for candidate in (*same, best) for t, at in candidate.positions.items()}
+        support = max(best.support, weight)
+        return replace(best, relation=relation, support=support, positions=positions)
 
-    def _close(self, place: StartHypothesis) -> DetectionCandidate | None:
-        """The outline fitted in every scan where a place has it, and what follows from that."""
+    def _evaluate(self, hypothesis: StartHypothesis) -> DetectionCandidate | None:
+        """The outline fitted in every scan where a hypothesis predicts it, and the start by that.
+
+        None if too few scans have it.
+        """
         watch = self.watch
-        there, _ = self.view.at(watch.times_ns + round(1e9 * place.shift_s))
-        poses = between(watch.poses, compose(place.pose, there))
-        known = np.flatnonzero(place.spread < SURE_M**2)
-        shown = np.array(
+        own, _ = self.estimate.at(watch.times_ns + round(1e9 * hypothesis.clock_offset_s))
+        poses = between(watch.poses, compose(hypothesis.pose, own))
+        known = np.flatnonzero(hypothesis.spread < MAX_POSITION_SIGMA_M**2)
+        visible = np.array(
             [
                 k
-                for k in _evenly(known, SEARCHED)
+                for k in evenly_spaced(known, MAX_SEARCHED)
                 if is_visible(
                     watch.sweeps[k], self.outline, between(watch.scans[k].mount, poses[k])
                 )
             ],
             dtype=np.int64,
         )
-        fitted = _evenly(shown, FITTED)
+        fitted = evenly_spaced(visible, MAX_FITTED)
         sightings: list[Sighting] = []
         numbers: list[int] = []
-        turned = place.turn_sigma**2 + HEADING_RAD**2
-        for n, k in enumerate(_first_some(fitted)):
-            if n == SOME and len(sightings) < SHARE_SEEN / 2 * SOME:
+        heading_var = hypothesis.heading_sigma**2 + HEADING_SIGMA_RAD**2
+        for n, k in enumerate(_some_first(fitted)):
+            if n == FIRST_SCANS and len(sightings) < MIN_DETECTION_RATE / 2 * FIRST_SCANS:
                 return None
-            cov = np.diag([place.spread[k] + SURE_M**2 / 9] * 2 + [turned])
-            before = [
+            variance = hypothesis.spread[k] + MAX_POSITION_SIGMA_M**2 / 9
+            earlier = [
                 (watch.sweeps[j], between(watch.lasers[j], watch.lasers[k]))
-                for j in scans_with_robot_away(there, k, 2 * outline_radius(self.outline))
+                for j in scans_with_robot_away(own, k, 2 * outline_radius(self.outline))
             ]
             found = detect_robots(
                 watch.scans[k],
-                {self.name: ExpectedPose(poses[k], cov)},
+                {self.name: ExpectedPose(poses[k], np.diag([variance, variance, heading_var]))},
                 {self.name: self.outline},
-                self.config,
-                {self.name: before},
+                self.config.front_end,
+                {self.name: earlier},
             )
             sightings += found.sightings
             numbers += [k] * len(found.sightings)
         order = np.argsort(numbers, kind="stable")
         numbers, sightings = [numbers[k] for k in order], [sightings[k] for k in order]
-        began = fit_start(place.pose, place.shift_s, sightings, watch.view, self.view, self.doubt_s)
-        if began is None:
+        start = self._fit_start(hypothesis.pose, hypothesis.clock_offset_s, sightings)
+        if start is None:
             return None
-        used = np.array(numbers)[began.used]
-        share = len(sightings) / len(fitted)
-        q, t = there[used], watch.times_ns[used]
-        at = compose(began.pose, q)[:, :2]
+        used = np.array(numbers)[start.used]
+        q, times = own[used], watch.times_ns[used]
+        positions = compose(start.pose, q)[:, :2]
         return DetectionCandidate(
-            RelativeFrame(self.name, self.observer, began.pose, began.cov, float(len(used))),
-            (len(used) + len(sightings) - len(fitted)) * len(shown) / len(fitted),
-            share,
-            _straight_line_residual(q[:, :2], t),
-            dict(zip(t.tolist(), at, strict=True)),
-            [sightings[k] for k in began.used],
-            began.late_s,
-            began.turn_sigma,
+            RelativeFrame(self.name, self.observer, start.pose, start.cov, float(len(used))),
+            (len(used) + len(sightings) - len(fitted)) * len(visible) / len(fitted),
+            len(sightings) / len(fitted),
+            _straight_line_residual(q[:, :2], times),
+            dict(zip(times.tolist(), positions, strict=True)),
+            [sightings[k] for k in start.used],
+            start.clock_offset_s,
+            start.heading_sigma,
         )
 
 
 def is_visible(sweep: Sweep, outline: Array, pose: Array) -> bool:
     """Whether a robot at ``pose`` (3,), laser frame, would be seen: nothing nearer hides it.
 
-    Beams without a return do not tell.
+    Beams of unknown range count as hidden.
     """
     if not len(sweep.angles):
         return False
     h, edges = expected_ranges(outline, pose[None], sweep.angles)
     right, left = edges[0]
     off = np.abs(wrap(sweep.angles - (right + left) / 2))
-    beams = np.flatnonzero(off < WITHIN * (left - right) / 2)
+    beams = np.flatnonzero(off < VISIBLE_SHARE * (left - right) / 2)
     if len(beams) < MIN_RETURNS:
         return False
     with np.errstate(invalid="ignore"):
         free = sweep.ranges[beams] > h[0, beams] - HIDDEN_M
-    return bool(np.mean(free) >= 1 - HIDDEN)
+    return bool(np.mean(free) >= 1 - MAX_HIDDEN_SHARE)
 
 
-def _first_some(numbers: IntArray) -> IntArray:
-    """``numbers``, first `SOME` of them that are spread over all."""
-    if len(numbers) <= SOME:
+def _some_first(numbers: IntArray) -> IntArray:
+    """``numbers``, those of `FIRST_SCANS` first that are evenly spread over all."""
+    if len(numbers) <= FIRST_SCANS:
         return numbers
-    first = np.linspace(0, len(numbers) - 1, SOME).round().astype(np.int64)
+    first = np.linspace(0, len(numbers) - 1, FIRST_SCANS).round().astype(np.int64)
     return np.concatenate([numbers[first], np.delete(numbers, first)])
 
 
-def _evenly(numbers: IntArray, most: int) -> IntArray:
-    """So many of ``numbers`` at most, evenly."""
-    if len(numbers) <= most:
-        return numbers
-    return numbers[np.linspace(0, len(numbers) - 1, most).round().astype(np.int64)]
-
-
 def _straight_line_residual(q: Array, times_ns: IntArray) -> float:
-    """How far points (n, 2) are from going straight at one speed, root mean square, m."""
+    """Root mean square distance of points (n, 2) from a straight path at constant speed, m."""
     t = 1e-9 * (times_ns - times_ns[0])
     A = np.column_stack([np.ones_like(t), t])
     off = q - A @ np.linalg.lstsq(A, q, rcond=None)[0]

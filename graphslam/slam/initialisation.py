@@ -88,9 +88,7 @@ def estimate_start_poses(
     def joined(
         views: Mapping[str, RobotEstimate], meetings: Sequence[Sighting], found: Found
     ) -> FrameAssignment:
-        return build_frame_tree(
-            log.robots, views, meetings, starts, config.association, own, *found
-        )
+        return build_frame_tree(log.robots, views, meetings, starts, config, own, *found)
 
     if not any(topic.record in (Sighting, Scan) for topic in log.topics):
         return joined({}, (), ((), {}))
@@ -98,7 +96,7 @@ def estimate_start_poses(
     pipeline = Pipeline(log, replace(config, backend=BackendConfig()), apart)
     shapes = outlines(log, config) if config.association.robot_sightings != "ignore" else {}
     tracks = {name: run.track for name, run in pipeline.runs.items()}
-    pipeline.scan_buffer = ScanBuffer(tracks, shapes)
+    pipeline.scan_buffer = ScanBuffer(tracks, shapes, config.multi_robot.sampling_m)
     pipeline.run(lambda _count: None)
     if not pipeline.steps:
         return joined({}, (), ((), {}))
@@ -106,15 +104,11 @@ def estimate_start_poses(
     looked = MutualDetections((), {})
     if watchable(log, shapes, starts):
         scans = pipeline.scan_buffer.scans
-        looked = find_robots_in_scans(
-            views, scans, shapes, tuple(starts), CLOCK_DOUBT_S, config.front_end
-        )
+        looked = find_robots_in_scans(views, scans, shapes, tuple(starts), CLOCK_DOUBT_S, config)
     by_name = joined(views, meetings, (looked.relations, looked.undecided))
     if len(set(by_name.frames.values())) == 1:
         return by_name
-    more, doubts = relate_anonymous_maps(
-        anonymous_maps(pipeline, views), by_name.frames, config.association
-    )
+    more, doubts = relate_anonymous_maps(anonymous_maps(pipeline, views), by_name.frames, config)
     found = (*looked.relations, *more), {**doubts, **looked.undecided}
     return joined(views, meetings, found)
 
@@ -160,7 +154,7 @@ def anonymous_maps(run: Pipeline, views: Mapping[str, RobotEstimate]) -> dict[st
         own = [place for place in found if place.state[0] == robot]
         states = [place.state for place in own]
         cov = run.backend.state_covariance(states) if own else np.zeros((0, 0))
-        seen[robot] = AnonymousMap(own, cov, view.unnamed)
+        seen[robot] = AnonymousMap(own, cov, view.anonymous_points)
     return seen
 
 

@@ -88,9 +88,9 @@ class Pipeline(StepRecorder):
         )
         self.keyframes = KeyframeSelector(self.config.keyframe)
         self.robot_detector = RobotDetector(
-            self.backend, self.runs, outlines(log, config), config.front_end, CLOCK_DOUBT_S
+            self.backend, self.runs, outlines(log, config), config, CLOCK_DOUBT_S
         )
-        self.scan_buffer = ScanBuffer({}, {})
+        self.scan_buffer = ScanBuffer({}, {}, 0.0)
         self.sources: list[Sighting] = []
         self.robot_sightings: list[Sighting] = []
         self.unrelated_sightings: list[Sighting] = []

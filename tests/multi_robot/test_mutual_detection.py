@@ -282,7 +282,7 @@ def driven(seconds, config=NO_FLOOR):
 
 def test_only_scans_between_which_a_robot_drove_are_kept():
     """One for every 0.1 m of 3 m, none of where it stands."""
-    kept = ScanBuffer({"a": driven(0), "b": driven(10)}, {"b": np.array(OUTLINE)})
+    kept = ScanBuffer({"a": driven(0), "b": driven(10)}, {"b": np.array(OUTLINE)}, 0.1)
     for k in range(300):
         kept.add(Scan("a", k * S // 10, k * S // 10, np.ones(3), 0.0, 0.1, np.zeros(3)))
     assert 24 <= len(kept.scans) <= 31
