@@ -243,7 +243,7 @@ def _subsample(p: Array, q: Array, spacing_m: float) -> IntArray:
 
 
 def evenly_spaced(numbers: IntArray, most: int) -> IntArray:
-    """At most ``most`` of ``numbers``, evenly spread, the first and the last among them."""
+    """At most ``most`` of ``numbers`` (n,), evenly spread, with the first and the last."""
     if len(numbers) <= most:
         return numbers
     return numbers[np.linspace(0, len(numbers) - 1, most).round().astype(np.int64)]
