@@ -57,7 +57,7 @@ def in_time(steps: tuple[Step, ...]) -> tuple[Step, ...]:
 def judge(recording: Recording, truth: GroundTruth, label: str, settings: list[str]) -> list[float]:
     """Causal and final position error, m; causal NEES per degree of freedom; landmarks, m."""
     spec, strip, gauge_m = ROWS[label]
-    (variant,) = variants([spec], None, settings)
+    (variant,) = variants([spec], load_config(overrides=settings))
     gauge: AbstractContextManager[object] = nullcontext()
     if gauge_m is not None:
         gauge = patch("graphslam.estimation.factors.FILTER_GAUGE_SIGMA_M", gauge_m)

@@ -1,3 +1,454 @@
-"""Cooperative 2-D graph SLAM: robot logs in; trajectories, landmarks and covariances out."""
+"""Cooperative 2-D graph SLAM: robot logs in; trajectories, landmarks and covariances out.
+
+This module is the public Python interface; what its names do is what the commands do::
+
+    import graphslam
+
+    result = graphslam.smooth("drive.mcap", keyframe={"distance_m": 0.5}, output="result")
+    errors = graphslam.evaluate(result)  # against the truth in the log
+
+Everything else in the package is internal and may change with every version.
+
+Settings are keywords with the names, checks and defaults of docs/configuration.md: a table as a
+mapping (``keyframe={"mode": "all"}``), a dotted key (``**{"keyframe.mode": "all"}``), or for the
+tables that have a ``name`` just that (``backend="ekf"``). They go over ``config``, which is a
+`Config` or the path of a TOML file. Paths are strings or path objects. With ``output`` a function
+also writes the folder that its command writes, replacing an existing one only with ``force``.
+
+What a name needs is imported when it is used, so ``import graphslam`` costs nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+if TYPE_CHECKING:
+    from graphslam.change_detection import Change, ChangeResult
+    from graphslam.core.config import Config
+    from graphslam.core.errors import (
+        ConfigError,
+        EstimationError,
+        GraphSlamError,
+        LogError,
+        OutputError,
+    )
+    from graphslam.core.records import Estimate, Landmark, Result, RobotResult, Trajectory
+    from graphslam.evaluation.relation_metrics import Relations
+    from graphslam.logs import GroundTruth, LogSet, LogWriter
+    from graphslam.results.folder import SavedResult
+    from graphslam.results.report_comparison import Comparison
+    from graphslam.simulation import Scenario, ScenarioError, Simulation
+
+    PathLike: TypeAlias = str | os.PathLike[str]
+    Recording: TypeAlias = PathLike | Sequence[PathLike] | LogSet
+    Truth: TypeAlias = PathLike | Sequence[PathLike] | GroundTruth
 
 __version__ = "0.1.0"
+
+#: module -> the public classes that it defines
+_CLASSES = {
+    "change_detection": ("Change", "ChangeResult"),
+    "core.config": ("Config",),
+    "core.errors": (
+        "ConfigError",
+        "EstimationError",
+        "GraphSlamError",
+        "LogError",
+        "OutputError",
+    ),
+    "core.records": ("Estimate", "Landmark", "Result", "RobotResult", "Trajectory"),
+    "logs": ("GroundTruth", "LogSet", "LogWriter"),
+    "results.folder": ("SavedResult",),
+    "results.report_comparison": ("Comparison",),
+    "simulation": ("ScenarioError", "Simulation"),
+}
+
+__all__ = [
+    "Change",
+    "ChangeResult",
+    "Comparison",
+    "Config",
+    "ConfigError",
+    "Estimate",
+    "EstimationError",
+    "GraphSlamError",
+    "GroundTruth",
+    "Landmark",
+    "LogError",
+    "LogSet",
+    "LogWriter",
+    "OutputError",
+    "Result",
+    "RobotResult",
+    "SavedResult",
+    "ScenarioError",
+    "Simulation",
+    "Trajectory",
+    "__version__",
+    "changes_between",
+    "compare",
+    "evaluate",
+    "load_config",
+    "load_result",
+    "open_logs",
+    "simulate",
+    "smooth",
+]
+
+if not TYPE_CHECKING:  # a type checker would take every name for defined
+
+    def __getattr__(name: str) -> Any:
+        """A public class, imported when it is first used."""
+        for module, names in _CLASSES.items():
+            if name in names:
+                return getattr(importlib.import_module(f"{__name__}.{module}"), name)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+# ---------------------------------------------------------------- functions
+
+
+def load_config(config: Config | PathLike | None = None, **settings: Any) -> Config:
+    """The defaults, over them a TOML file or another configuration, over that ``settings``.
+
+    Raises:
+        ConfigError: the file cannot be read, a key is unknown, a value has the wrong type or is
+            out of range; the message names the key.
+    """
+    from graphslam.core import config_io
+    from graphslam.core.config import Config
+
+    if not isinstance(config, Config):
+        config = config_io.load_config(None if config is None else Path(config))
+    return config_io.with_settings(config, settings) if settings else config
+
+
+def open_logs(
+    paths: PathLike | Sequence[PathLike],
+    /,
+    *,
+    config: Config | PathLike | None = None,
+    **settings: Any,
+) -> LogSet:
+    """Open MCAP files as one recording and find out what is in it.
+
+    Raises:
+        LogError: a file is missing, not MCAP or empty, or holds nothing usable.
+        ConfigError: see `load_config`.
+    """
+    from graphslam.logs import open_logs
+
+    return open_logs(_paths(paths), load_config(config, **settings))
+
+
+def smooth(
+    recording: Recording,
+    /,
+    *,
+    config: Config | PathLike | None = None,
+    output: PathLike | None = None,
+    force: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+    **settings: Any,
+) -> Result:
+    """Estimate the trajectories of all robots and a landmark map: the main job.
+
+    Args:
+        recording: MCAP files, or what `open_logs` returned.
+        config: settings, or the path of a TOML file with them; default: those of opened logs.
+        output: result folder to write, with report.html (the report has a section on the errors
+            where the logs hold the truth).
+        force: replace a result folder at ``output``.
+        progress: called with the number of messages read so far, and of all.
+        **settings: settings over ``config``, see the module.
+
+    Raises:
+        LogError: a log cannot be read, or no message of it could be used.
+        ConfigError: see `load_config`; or a setting is about a robot that is not in the log, or
+            about the reading of logs that are open already.
+        EstimationError: the estimate is indeterminate, or a robot's start is unknown.
+        OutputError: ``output`` cannot be written or is something that may not be replaced.
+    """
+    from graphslam.core.worker import Future
+    from graphslam.results.folder import check_target, save
+
+    settled = _settle(recording, config, settings)
+    if output is not None:
+        check_target(Path(output), force=force)
+    opened = _open(recording, settled)
+    from graphslam.evaluation.ground_truth import truth_of_logs
+    from graphslam.results.report import render
+    from graphslam.slam.smooth import smooth
+
+    log = opened()
+    if output is None:
+        return smooth(log, settled, _count(log, progress))
+    truth = Future(lambda: truth_of_logs(log, settled))
+    result = smooth(log, settled, _count(log, progress))
+    errors = _errors(result, truth.result())
+    report = Future(lambda: render(result, errors))
+    save(result, Path(output), force=force, report=lambda _: report.result())
+    return result
+
+
+def load_result(directory: PathLike) -> SavedResult:
+    """Read a result folder back.
+
+    Raises:
+        OutputError: it is not a result folder, or a file of it is malformed.
+        ConfigError: its config.toml is not valid.
+    """
+    from graphslam.results.folder import load
+
+    return load(Path(directory))
+
+
+def evaluate(
+    result: Result | SavedResult | PathLike,
+    *,
+    truth: Truth | None = None,
+    relations: Relations | PathLike | None = None,
+) -> dict[str, Any]:
+    """Errors and consistency of a result, in the shape of ``evaluate --json`` (docs/formats.md).
+
+    Args:
+        result: what `smooth` returned, or a result folder.
+        truth: logs (``LOG.mcap``) or TUM files (``FILE.tum``, ``ROBOT=FILE.tum``) with true poses
+            of the base; default, without ``relations``: the logs of the run.
+        relations: file with reference relations between scans.
+
+    Raises:
+        OutputError: ``result`` is no result folder, a file cannot be read, or nothing in it can be
+            compared.
+        LogError: a log cannot be read or holds no truth.
+    """
+    from graphslam.evaluation.ground_truth import truth_of_run
+    from graphslam.evaluation.metrics import evaluate
+    from graphslam.logs import GroundTruth
+
+    if isinstance(result, str | os.PathLike):
+        result = load_result(result)
+    reference = _relations(relations)
+    if truth is not None:
+        known = _truth(truth, tuple(result.robots))
+    else:
+        known = truth_of_run(result) if reference is None else GroundTruth({}, ())
+    return evaluate(result, known.trajectories, known.landmarks, reference)
+
+
+def compare(
+    recording: Recording,
+    /,
+    backends: str | Sequence[str] = ("ekf", "isam2:0", "isam2", "batch"),
+    *,
+    mode: str = "replay",
+    truth: Truth | None = None,
+    relations: Relations | PathLike | None = None,
+    config: Config | PathLike | None = None,
+    output: PathLike | None = None,
+    force: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+    announce: Callable[[str], None] = lambda _text: None,
+    **settings: Any,
+) -> Comparison:
+    """Compare back ends on one recording: errors, consistency, time, memory.
+
+    Each back end runs in a process of its own, which is spawned: a script that calls this needs
+    ``if __name__ == "__main__":``. A back end that fails has its error in its row.
+
+    Args:
+        recording: as for `smooth`.
+        backends: ``NAME[:HORIZON][+key=value...]`` each: ekf, isam2:20, ekf+ekf.error=body.
+        mode: ``replay`` (the same recorded steps for all) or ``associate`` (each for itself).
+        truth: as for `evaluate`; default: that in the logs, if any.
+        relations: as for `evaluate`.
+        config: as for `smooth`.
+        output: folder to write, with compare.json and report.html.
+        force: replace a comparison at ``output``.
+        progress: as for `smooth`.
+        announce: called with a line on what is done next.
+        **settings: as for `smooth`.
+
+    Raises:
+        LogError: a log cannot be read, or no message of it could be used.
+        ConfigError: as for `smooth`; or a back end is unknown, or there is no such mode.
+        EstimationError: the log cannot be associated, or every back end failed.
+        OutputError: the truth is of other robots, a file cannot be read, or ``output`` written.
+    """
+    from graphslam.evaluation.compare_folder import is_comparison, save_comparison
+    from graphslam.evaluation.compare_rows import compare
+    from graphslam.evaluation.compare_variants import variants
+    from graphslam.evaluation.ground_truth import truth_of_logs
+    from graphslam.results.folder import check_target
+
+    settled = _settle(recording, config, settings)
+    rows = variants(backends.split(",") if isinstance(backends, str) else backends, settled)
+    if output is not None:
+        check_target(Path(output), force=force, replaceable=is_comparison)
+    log = _open(recording, settled)()
+    comparison = compare(
+        log,
+        settled,
+        rows,
+        mode,
+        truth=truth_of_logs(log, settled) if truth is None else _truth(truth, log.robots),
+        relations=_relations(relations),
+        progress=_count(log, progress),
+        say=announce,
+    )
+    if output is not None:
+        save_comparison(comparison, settled, Path(output), force=force)
+    return comparison
+
+
+def changes_between(
+    reference: PathLike,
+    later: PathLike,
+    *,
+    reference_span_s: tuple[float, float] | None = None,
+    later_span_s: tuple[float, float] | None = None,
+    config: Config | PathLike | None = None,
+    output: PathLike | None = None,
+    force: bool = False,
+    **settings: Any,
+) -> ChangeResult:
+    """Find what changed between two visits, and how certain that is.
+
+    Args:
+        reference: result folder of the earlier visit.
+        later: result folder of the later visit; it may be the same one, with two spans.
+        reference_span_s: scans to use, s since the first one.
+        later_span_s: the same of the later visit.
+        config: settings, or the path of a TOML file with them.
+        output: folder to write, with changes.json, report.html, a map and an MCAP file.
+        force: replace a folder of changes at ``output``.
+        **settings: as for `smooth`; those of the table ``changes`` are used.
+
+    Raises:
+        OutputError: a folder is not a result, has no scans or covariances, the two have nothing in
+            common, or ``output`` cannot be written.
+        LogError: a log is not where it was, or is another one now.
+        ConfigError: see `load_config`.
+    """
+    from graphslam.change_detection import changes_between, render_changes, save_changes
+    from graphslam.change_detection.folder import check_changes_target
+
+    chosen = load_config(config, **settings).changes
+    if output is not None:
+        check_changes_target(Path(output), force=force)
+    names = (Path(reference).name, Path(later).name)
+    found = changes_between(Path(reference), Path(later), chosen, reference_span_s, later_span_s)
+    if output is not None:
+        page = partial(render_changes, config=chosen, names=names)
+        save_changes(found, Path(output), force=force, report=page)
+    return found
+
+
+def simulate(
+    scenario: Scenario | PathLike, output: PathLike, *, seed: int = 0, force: bool = False
+) -> Simulation:
+    """Write a simulated recording with its truth; equal scenarios and seeds give equal bytes.
+
+    Args:
+        scenario: the name of a scenario of the package, or a scenario file.
+        output: the log; of a scenario with two visits, the folder for both.
+        seed: of the noise.
+        force: replace what is at ``output``.
+
+    Raises:
+        ScenarioError: the scenario cannot be read or cannot take place.
+        OutputError: something is at ``output``, or nothing can be written there.
+    """
+    from graphslam.core.errors import OutputError
+    from graphslam.simulation import Scenario, load_scenario, simulate
+
+    known = scenario if isinstance(scenario, Scenario) else load_scenario(os.fspath(scenario))
+    if os.path.lexists(output) and not force:
+        raise OutputError(f"{os.fspath(output)}: already exists; give --force to replace it")
+    return simulate(known, Path(output), seed)
+
+
+# ---------------------------------------------------------------- arguments
+
+
+def _paths(paths: PathLike | Sequence[PathLike]) -> list[Path]:
+    if isinstance(paths, str | os.PathLike):
+        return [Path(paths)]
+    return [Path(path) for path in paths]
+
+
+def _settle(
+    recording: Recording, config: Config | PathLike | None, settings: dict[str, Any]
+) -> Config:
+    """The configuration; logs that are open already bring theirs."""
+    from graphslam.core.errors import ConfigError
+    from graphslam.logs import LogSet
+
+    if not isinstance(recording, LogSet):
+        return load_config(config, **settings)
+    settled = load_config(recording.config if config is None else config, **settings)
+    if (settled.logs, settled.robots) != (recording.config.logs, recording.config.robots):
+        raise ConfigError("logs.*, robots.*: are settings of open_logs, which is done already")
+    return settled
+
+
+def _open(recording: Recording, config: Config) -> Callable[[], LogSet]:
+    """What returns the logs; they are opened while the caller goes on."""
+    from graphslam.core.worker import Future
+    from graphslam.logs import LogSet, open_logs
+
+    if isinstance(recording, LogSet):
+        return lambda: recording
+    return Future(lambda: open_logs(_paths(recording), config)).result
+
+
+def _count(log: LogSet, progress: Callable[[int, int], None] | None) -> Callable[[int], None]:
+    """``progress`` with the number of messages that are read altogether."""
+    from graphslam.core.records import TrueLandmark, Truth
+
+    if progress is None:
+        return lambda _done: None
+    total = log.count((Truth, TrueLandmark))
+    return lambda done: progress(done, total)
+
+
+def _errors(result: Result, truth: GroundTruth) -> dict[str, Any] | None:
+    """Errors against the truth in the logs, None without; a warning where it does not fit."""
+    from graphslam.core.errors import OutputError
+    from graphslam.evaluation.metrics import evaluate
+
+    if not truth:
+        return None
+    try:
+        return evaluate(result, truth.trajectories, truth.landmarks)
+    except OutputError as error:
+        # the truth is of another time: no reason to lose the run
+        result.summary["warnings"].append(f"not evaluated: {error}")
+        return None
+
+
+def _truth(truth: Truth, robots: Sequence[str]) -> GroundTruth:
+    from graphslam.evaluation.ground_truth import truth_of_files
+    from graphslam.logs import GroundTruth
+
+    if isinstance(truth, GroundTruth):
+        return truth
+    sources = [truth] if isinstance(truth, str | os.PathLike) else truth
+    return truth_of_files([os.fspath(source) for source in sources], robots)
+
+
+def _relations(relations: Relations | PathLike | None) -> Relations | None:
+    from graphslam.evaluation.relation_metrics import read_relations
+
+    if isinstance(relations, str | os.PathLike):
+        return read_relations(Path(relations))
+    return relations

@@ -87,8 +87,9 @@ def package_imports():
         here = package_of(path)
         for line, name in imports(path):
             parts = name.split(".")
-            if parts[0] == "graphslam" and parts[1:] != ["__version__"] and parts[1] != here:
-                yield path, line, here, parts[1]
+            there = parts[1] if parts[0] == "graphslam" and len(parts) > 1 else here
+            if there not in (here, "__version__"):
+                yield path, line, here, there
 
 
 def test_everything_is_in_a_package():
@@ -104,6 +105,20 @@ def test_imports_go_only_downwards():
         f"{place(path, line)} {here} imports {there}"
         for path, line, here, there in package_imports()
         if here in PACKAGES and PACKAGES.index(there) >= PACKAGES.index(here)
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_only_the_command_line_uses_the_public_interface():
+    """`graphslam/__init__.py` is above all packages: what it defines is for callers, and an import
+    of it from below would be an import upwards."""
+    wrong = [
+        place(path, line)
+        for path in FILES
+        for line, name in imports(path)
+        if package_of(path) not in ("cli", "__init__", "__main__")
+        and name.split(".")[0] == "graphslam"
+        and [*name.split("."), ""][1] not in (*PACKAGES, "__version__")
     ]
     assert not wrong, "\n".join(wrong)
 

@@ -1,4 +1,4 @@
-"""The arguments and options that commands share, and what makes them wrong (exit code 2)."""
+"""The arguments and options of the commands, each defined once, and their checks (exit code 2)."""
 
 import typing
 from math import isfinite
@@ -17,14 +17,14 @@ def _choices(section: Any) -> list[str]:
     return list(typing.get_args(typing.get_type_hints(section)["name"]))
 
 
-def _one_of(value: str | None, known: list[str]) -> str | None:
-    if value is not None and value not in known:
-        raise typer.BadParameter(f"{value!r} is not one of {', '.join(known)}")
+def _one_of(value: str | None, values: list[str]) -> str | None:
+    if value is not None and value not in values:
+        raise typer.BadParameter(f"{value!r} is not one of {', '.join(values)}")
     return value
 
 
 def check_start(values: list[str] | None) -> list[str]:
-    """Starts as settings: ``truth`` -> start.from_truth, ``ROBOT=x,y,phi`` -> start.poses.ROBOT.
+    """Settings for starts: ``truth`` -> start.from_truth, ``ROBOT=x,y,phi`` -> start.poses.ROBOT.
 
     Raises:
         typer.BadParameter: a value is neither.
@@ -46,7 +46,7 @@ def check_start(values: list[str] | None) -> list[str]:
 
 
 def span_of(value: str | None) -> tuple[float, float] | None:
-    """``A:B`` as seconds; None as it is.
+    """``A:B`` in seconds; None stays None.
 
     Raises:
         typer.BadParameter: it is not two numbers in order.
@@ -83,16 +83,75 @@ BACKENDS = _choices(BackendConfig)
 FRONT_ENDS = _choices(FrontEndConfig)
 MODES = ["replay", "associate"]
 
+
+def _choice(values: list[str], text: str, *flags: str) -> Any:
+    """An option that takes one of ``values``."""
+    return typer.Option(
+        *flags,
+        metavar="|".join(values),
+        callback=lambda value: _one_of(value, values),
+        help=text,
+    )
+
+
+def _output(metavar: str, text: str) -> Any:
+    """The option that says where the output goes."""
+    return typer.Option("-o", "--output", metavar=metavar, help=text)
+
+
+# ---------------------------------------------------------------- what goes in
+
 Logs = Annotated[
     list[Path], typer.Argument(metavar="LOG", help="MCAP files; several are one recording.")
 ]
-Backend = Annotated[
-    str | None,
-    typer.Option(
-        metavar="|".join(BACKENDS),
-        callback=lambda value: _one_of(value, BACKENDS),
-        help="The estimator; backend.name in the configuration.",
+Format = Annotated[
+    str,
+    typer.Argument(
+        metavar="FORMAT",
+        callback=lambda value: _one_of(value, sorted(IMPORTERS)),
+        help=f"Format of SOURCE: {', '.join(sorted(IMPORTERS))}.",
     ),
+]
+Source = Annotated[Path, typer.Argument(metavar="SOURCE", help="Plain, .gz, .bz2 or .xz.")]
+Scenario = Annotated[
+    str,
+    typer.Argument(
+        metavar="SCENARIO", help=f"A scenario file (TOML), or one of {', '.join(SCENARIOS)}."
+    ),
+]
+Experiment = Annotated[
+    str,
+    typer.Argument(
+        metavar="NAME|FILE.toml",
+        help="An experiment file, or ekf-versus-smoothing, filters or thesis.",
+    ),
+]
+ReferenceFolder = Annotated[
+    Path, typer.Argument(metavar="REFERENCE", help="Result folder of the earlier visit.")
+]
+LaterFolder = Annotated[
+    Path, typer.Argument(metavar="LATER", help="Result folder of the later visit.")
+]
+Span = Annotated[
+    str | None,
+    typer.Option(metavar="A:B", callback=_check_span, help="Only scans of these seconds of it."),
+]
+TruthFiles = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="LOG.mcap|[ROBOT=]FILE.tum",
+        help="True poses of the base; repeatable. Default: those in the logs.",
+    ),
+]
+Relations = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Reference relations between scans: t1 t2 x y z r p y."),
+]
+
+# ---------------------------------------------------------------- settings
+
+Backend = Annotated[
+    str | None, _choice(BACKENDS, "The estimator; backend.name in the configuration.")
 ]
 Horizon = Annotated[
     float | None,
@@ -106,11 +165,7 @@ Horizon = Annotated[
 ]
 FrontEnd = Annotated[
     str | None,
-    typer.Option(
-        metavar="|".join(FRONT_ENDS),
-        callback=lambda value: _one_of(value, FRONT_ENDS),
-        help="What finds landmarks in scans; front_end.name in the configuration.",
-    ),
+    _choice(FRONT_ENDS, "What finds landmarks in scans; front_end.name in the configuration."),
 ]
 Starts = Annotated[
     list[str] | None,
@@ -120,25 +175,6 @@ Starts = Annotated[
         callback=check_start,
         help="Where a robot starts (m, m, rad), or one true pose per robot from the log; "
         "repeatable. Default: the first robot is the origin, others as their sightings have it.",
-    ),
-]
-ConfigFile = Annotated[Path | None, typer.Option("--config", metavar="FILE.toml", help="Settings.")]
-Settings = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="One setting, over the file's; repeatable."),
-]
-Format = Annotated[
-    str,
-    typer.Argument(
-        metavar="FORMAT",
-        callback=lambda value: _one_of(value, sorted(IMPORTERS)),
-        help=f"Format of SOURCE: {', '.join(sorted(IMPORTERS))}.",
-    ),
-]
-Scenario = Annotated[
-    str,
-    typer.Argument(
-        metavar="SCENARIO", help=f"A scenario file (TOML), or one of {', '.join(SCENARIOS)}."
     ),
 ]
 Backends = Annotated[
@@ -152,22 +188,33 @@ Backends = Annotated[
 ]
 ComparisonMode = Annotated[
     str,
-    typer.Option(
-        "--mode",
-        metavar="|".join(MODES),
-        callback=lambda value: _one_of(value, MODES),
-        help="The same recorded steps for all, or each associates for itself.",
-    ),
+    _choice(MODES, "The same recorded steps for all, or each associates for itself.", "--mode"),
+]
+ConfigFile = Annotated[Path | None, typer.Option("--config", metavar="FILE.toml", help="Settings.")]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="One setting, over the file's; repeatable."),
 ]
 Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Other noise.")]
+Runs = Annotated[int | None, typer.Option(metavar="N", min=1, help="Seeds, instead of the file's.")]
+Jobs = Annotated[int | None, typer.Option(metavar="N", min=1, help="Processes; one per core.")]
+
+# ---------------------------------------------------------------- what comes out
+
+ResultFolder = Annotated[Path, _output("DIR", "The result folder to make.")]
+OutputFolder = Annotated[Path, _output("DIR", "The folder to make.")]
+OutputLog = Annotated[Path, _output("LOG.mcap", "The log.")]
+OutputLogOrFolder = Annotated[
+    Path,
+    _output("LOG.mcap|DIR", "The log; of a scenario with two visits, the folder for both."),
+]
+ExperimentFolder = Annotated[Path, _output("DIR", "The experiment's folder.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace what is there.")]
+ForceOrResume = Annotated[
+    bool,
+    typer.Option(
+        "--force/--resume", help="Throw away what is in DIR, or run only what is missing."
+    ),
+]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
-ReferenceSpan = Annotated[
-    str | None,
-    typer.Option(metavar="A:B", callback=_check_span, help="Only scans of these seconds of it."),
-]
-LaterSpan = Annotated[
-    str | None,
-    typer.Option(metavar="A:B", callback=_check_span, help="Only scans of these seconds of it."),
-]

@@ -1,18 +1,18 @@
-"""The commands. Each checks, calls the package, and shows what it got.
+"""The commands. Each checks its arguments, calls the package, and shows what it got.
 
-What takes long to import is imported by the command that needs it, so that help and complaints
-about arguments come at once.
+What takes long to import is imported by the command that needs it, so that help and errors in
+arguments appear at once.
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from graphslam import __version__
+import graphslam
 from graphslam.cli import show
 from graphslam.cli.arguments import (
     Backend,
@@ -20,29 +20,38 @@ from graphslam.cli.arguments import (
     ComparisonMode,
     ConfigFile,
     Debug,
+    Experiment,
+    ExperimentFolder,
     Force,
+    ForceOrResume,
     Format,
     FrontEnd,
     Horizon,
+    Jobs,
     Json,
-    LaterSpan,
+    LaterFolder,
     Logs,
-    ReferenceSpan,
+    OutputFolder,
+    OutputLog,
+    OutputLogOrFolder,
+    ReferenceFolder,
+    Relations,
+    ResultFolder,
+    Runs,
     Scenario,
     Seed,
     Settings,
+    Source,
+    Span,
     Starts,
+    TruthFiles,
     span_of,
 )
 from graphslam.cli.terminal import errors_in_one_line, progress_bar
-from graphslam.core.config import Config
 from graphslam.core.config_io import load_config
 from graphslam.core.errors import ConfigError, EstimationError, OutputError
-from graphslam.core.records import Result, TrueLandmark, Truth
-from graphslam.core.worker import Future
-from graphslam.logs import IMPORTERS, GroundTruth, inspect_logs, open_logs
+from graphslam.logs import IMPORTERS, inspect_logs
 from graphslam.results.file_formats import to_json
-from graphslam.results.folder import check_target, load, save
 
 app = typer.Typer(
     help="Logs of wheeled robots in; trajectories, a landmark map and their covariances out.",
@@ -56,17 +65,25 @@ app = typer.Typer(
 
 def _version(wanted: bool) -> None:
     if wanted:
-        typer.echo(__version__)
+        typer.echo(graphslam.__version__)
         raise typer.Exit
 
 
 @app.callback()
-def graphslam(
+def options(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     """Logs of wheeled robots in; trajectories, a landmark map and their covariances out."""
+
+
+def _print(name: str, content: Any, json: bool, for_people: Callable[[], None]) -> None:
+    """Print ``content`` as one JSON object, or what ``for_people`` prints of it."""
+    if json:
+        typer.echo(to_json(content, name), nl=False)
+    else:
+        for_people()
 
 
 @app.command("info")
@@ -79,18 +96,15 @@ def info_command(
 ) -> None:
     """Say what is in a log, what is usable, what is odd."""
     with errors_in_one_line(debug):
-        found = inspect_logs(logs, load_config(config, settings or ()))
-        if json:
-            typer.echo(to_json(found.to_dict(), "info"), nl=False)
-        else:
-            show.log_info(found)
+        info = inspect_logs(logs, load_config(config, settings or ()))
+        _print("info", info.to_dict(), json, lambda: show.log_info(info))
 
 
 @app.command("import")
 def import_command(
     format_name: Format,
-    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="Plain, .gz, .bz2 or .xz.")],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="LOG.mcap", help="The log.")],
+    source: Source,
+    output: OutputLog,
     json: Json = False,
     force: Force = False,
     debug: Debug = False,
@@ -103,25 +117,14 @@ def import_command(
         if os.path.lexists(output) and not force:
             raise OutputError(f"{output}: already exists; give --force to replace it")
         done = IMPORTERS[format_name](source, output)
-        if json:
-            found = {"log": str(output), "counts": done.counts, "warnings": done.warnings}
-            typer.echo(to_json(found, "import"), nl=False)
-        else:
-            show.imported(done)
+        content = {"log": str(output), "counts": done.counts, "warnings": done.warnings}
+        _print("import", content, json, lambda: show.imported(done))
 
 
 @app.command("simulate")
 def simulate_command(
     scenario: Scenario,
-    output: Annotated[
-        Path,
-        typer.Option(
-            "-o",
-            "--output",
-            metavar="LOG.mcap|DIR",
-            help="The log; of a scenario with two visits, the folder for both.",
-        ),
-    ],
+    output: OutputLogOrFolder,
     seed: Seed = 0,
     json: Json = False,
     force: Force = False,
@@ -132,24 +135,14 @@ def simulate_command(
     Equal scenarios and seeds give equal bytes.
     """
     with errors_in_one_line(debug):
-        from graphslam.simulation import load_scenario, simulate
-
-        wanted = load_scenario(scenario)
-        if os.path.lexists(output) and not force:
-            raise OutputError(f"{output}: already exists; give --force to replace it")
-        done = simulate(wanted, output, seed)
-        if json:
-            typer.echo(to_json(show.simulation(done), "simulation"), nl=False)
-        else:
-            show.simulated(done)
+        done = graphslam.simulate(scenario, output, seed=seed, force=force)
+        _print("simulation", show.simulation(done), json, lambda: show.simulated(done))
 
 
 @app.command("smooth")
 def smooth_command(
     logs: Logs,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="DIR", help="The result folder to make.")
-    ],
+    output: ResultFolder,
     backend: Backend = None,
     horizon: Horizon = None,
     front_end: FrontEnd = None,
@@ -171,59 +164,18 @@ def smooth_command(
         tree = load_config(config, [*options, *(start or ()), *(settings or ())])
         if horizon is not None and tree.backend.name != "isam2":
             raise ConfigError(f"--horizon: only isam2 has one, not {tree.backend.name}; leave it")
-        check_target(output, force=force)
-        result = _smooth(logs, tree, output, force)
-        if json:
-            typer.echo(to_json(result.summary, "summary"), nl=False)
-        else:
-            show.smoothed(result, output)
-
-
-def _smooth(logs: Sequence[Path], tree: Config, output: Path, force: bool) -> Result:
-    """Run the pipeline and write the folder."""
-    opening = Future(lambda: open_logs(logs, tree))
-    from graphslam.evaluation.ground_truth import truth_of_logs
-    from graphslam.results.report import render
-    from graphslam.slam.smooth import smooth
-
-    log = opening.result()
-    truth = Future(lambda: truth_of_logs(log, tree))
-    with progress_bar(log.count((Truth, TrueLandmark))) as progress:
-        result = smooth(log, tree, progress)
-    quality = _quality(result, truth.result())
-    report = Future(lambda: render(result, quality))
-    save(result, output, force=force, report=lambda _: report.result())
-    return result
-
-
-def _quality(result: Result, known: GroundTruth) -> dict[str, Any] | None:
-    """What the truth in the logs says about the result; None without truth."""
-    if not known:
-        return None
-    from graphslam.evaluation.metrics import evaluate
-
-    try:
-        return evaluate(result, known.trajectories, known.landmarks)
-    except OutputError as error:
-        # the truth is of another time: no reason to lose the run, but one to say so
-        result.summary["warnings"].append(f"not evaluated: {error}")
-        return None
+        with progress_bar("smoothing") as progress:
+            result = graphslam.smooth(
+                logs, config=tree, output=output, force=force, progress=progress
+            )
+        _print("summary", result.summary, json, lambda: show.smoothed(result, output))
 
 
 @app.command("evaluate")
 def evaluate_command(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="Result folder of smooth.")],
-    truth: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="LOG.mcap|[ROBOT=]FILE.tum",
-            help="True poses of the base; repeatable. Default: those in the logs of the run.",
-        ),
-    ] = None,
-    relations: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Reference relations between scans: t1 t2 x y z r p y."),
-    ] = None,
+    truth: TruthFiles = None,
+    relations: Relations = None,
     json: Json = False,
     debug: Debug = False,
 ) -> None:
@@ -232,44 +184,18 @@ def evaluate_command(
     That is true poses and landmarks, or reference relations between the scans.
     """
     with errors_in_one_line(debug):
-        from graphslam.evaluation.ground_truth import truth_of_files, truth_of_run
-        from graphslam.evaluation.metrics import evaluate
-        from graphslam.evaluation.relation_metrics import read_relations
-
-        saved = load(directory)
-        for warning in saved.config.warnings:
-            typer.echo(f"warning: {directory / 'config.toml'}: {warning}", err=True)
-        reference = read_relations(relations) if relations else None
-        if truth:
-            known = truth_of_files(truth, list(saved.robots))
-        else:
-            known = GroundTruth({}, ()) if reference else truth_of_run(saved)
-        found = evaluate(saved, known.trajectories, known.landmarks, reference)
-        if json:
-            typer.echo(to_json(found, "evaluation"), nl=False)
-        else:
-            show.evaluation(found)
+        errors = graphslam.evaluate(directory, truth=truth or None, relations=relations)
+        _print("evaluation", errors, json, lambda: show.evaluation(errors))
 
 
 @app.command("compare")
 def compare_command(
     logs: Logs,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="DIR", help="The folder to make.")
-    ],
+    output: OutputFolder,
     backends: Backends = "ekf,isam2:0,isam2,batch",
     mode: ComparisonMode = "replay",
-    truth: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="LOG.mcap|[ROBOT=]FILE.tum",
-            help="True poses of the base; repeatable. Default: those in the logs.",
-        ),
-    ] = None,
-    relations: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Reference relations between scans: t1 t2 x y z r p y."),
-    ] = None,
+    truth: TruthFiles = None,
+    relations: Relations = None,
     front_end: FrontEnd = None,
     start: Starts = None,
     config: ConfigFile = None,
@@ -283,48 +209,29 @@ def compare_command(
     Writes a folder with compare.json and report.html.
     """
     with errors_in_one_line(debug):
-        from graphslam.evaluation.compare_folder import is_comparison, save_comparison
-        from graphslam.evaluation.compare_rows import compare
-        from graphslam.evaluation.compare_variants import variants
-        from graphslam.evaluation.ground_truth import truth_of_files, truth_of_logs
-        from graphslam.evaluation.relation_metrics import read_relations
-
         options = [f"front_end.name={front_end}"] if front_end else []
-        options += [*(start or ()), *(settings or ())]
-        tree = load_config(config, options)
-        rows = variants([spec for spec in backends.split(",") if spec], config, options)
-        check_target(output, force=force, replaceable=is_comparison)
-        log = open_logs(logs, tree)
-        known = truth_of_files(truth, log.robots) if truth else truth_of_logs(log, tree)
-        reference = read_relations(relations) if relations else None
-        with progress_bar(log.count((Truth, TrueLandmark)), "associating") as progress:
-            found = compare(
-                log, tree, rows, mode, truth=known, relations=reference, progress=progress,
-                say=show.stage,
+        tree = load_config(config, [*options, *(start or ()), *(settings or ())])
+        with progress_bar("associating") as progress:
+            comparison = graphslam.compare(
+                logs, [spec for spec in backends.split(",") if spec], mode=mode,
+                truth=truth or None, relations=relations, config=tree, output=output, force=force,
+                progress=progress, announce=show.stage,
             )  # fmt: skip
-        save_comparison(found, tree, output, force=force)
-        if json:
-            typer.echo(to_json(found.found, "comparison"), nl=False)
-        else:
-            show.comparison(found.found, output)
-        failed = [f"{row['spec']}: {row['error']}" for row in found.found["rows"] if row["error"]]
+        found = comparison.found
+        _print("comparison", found, json, lambda: show.comparison(found, output))
+        failed = [f"{row['spec']}: {row['error']}" for row in found["rows"] if row["error"]]
         if failed:
-            raise EstimationError(f"{len(failed)} of {len(rows)} back ends failed; {failed[0]}")
+            rows = len(found["rows"])
+            raise EstimationError(f"{len(failed)} of {rows} back ends failed; {failed[0]}")
 
 
 @app.command("changes")
 def changes_command(
-    reference: Annotated[
-        Path, typer.Argument(metavar="REFERENCE", help="Result folder of the earlier visit.")
-    ],
-    later: Annotated[
-        Path, typer.Argument(metavar="LATER", help="Result folder of the later visit.")
-    ],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="DIR", help="The folder to make.")
-    ],
-    reference_span: ReferenceSpan = None,
-    later_span: LaterSpan = None,
+    reference: ReferenceFolder,
+    later: LaterFolder,
+    output: OutputFolder,
+    reference_span: Span = None,
+    later_span: Span = None,
     config: ConfigFile = None,
     settings: Settings = None,
     json: Json = False,
@@ -337,52 +244,23 @@ def changes_command(
     one folder with two spans.
     """
     with errors_in_one_line(debug):
-        from graphslam.change_detection import changes_between, render_changes, save_changes
-        from graphslam.change_detection.folder import check_changes_target
-
-        tree = load_config(config, settings or ())
-        check_changes_target(output, force=force)
-        spans = (span_of(reference_span), span_of(later_span))
-        found = changes_between(reference, later, tree.changes, *spans)
-        found = replace(found, warnings=(*tree.warnings, *found.warnings))
-        names = (reference.name, later.name)
-        save_changes(
-            found,
-            output,
-            force=force,
-            report=lambda done: render_changes(done, tree.changes, names),
-        )
-        if json:
-            typer.echo(to_json(found.to_dict(), "changes"), nl=False)
-        else:
-            show.changes(found.to_dict(), output)
+        done = graphslam.changes_between(
+            reference, later, reference_span_s=span_of(reference_span),
+            later_span_s=span_of(later_span), config=load_config(config, settings or ()),
+            output=output, force=force,
+        )  # fmt: skip
+        found = done.to_dict()
+        _print("changes", found, json, lambda: show.changes(found, output))
 
 
 @app.command("experiment")
 def experiment_command(
-    experiment: Annotated[
-        str,
-        typer.Argument(
-            metavar="NAME|FILE.toml",
-            help="An experiment file, or ekf-versus-smoothing, filters or thesis.",
-        ),
-    ],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="DIR", help="The experiment's folder.")
-    ],
-    runs: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="Seeds, instead of the file's.")
-    ] = None,
-    jobs: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="Processes; one per core.")
-    ] = None,
+    experiment: Experiment,
+    output: ExperimentFolder,
+    runs: Runs = None,
+    jobs: Jobs = None,
     json: Json = False,
-    force: Annotated[
-        bool,
-        typer.Option(
-            "--force/--resume", help="Throw away what is in DIR, or run only what is missing."
-        ),
-    ] = False,
+    force: ForceOrResume = False,
     debug: Debug = False,
 ) -> None:
     """Run a Monte Carlo experiment: many seeds, estimators and noise scales.
@@ -396,13 +274,13 @@ def experiment_command(
         from graphslam.evaluation.monte_carlo_folder import save_summary
         from graphslam.evaluation.monte_carlo_summary import summarise
 
-        wanted = load_definition(experiment)
-        wanted = replace(wanted, runs=runs or wanted.runs)
-        with progress_bar(len(jobs_of(wanted)), "running") as progress:
-            rows = run_campaign(wanted, output, jobs=jobs, force=force, progress=progress)
-        found = summarise(wanted, rows)
-        save_summary(found, output)
-        if json:
-            typer.echo(to_json(found, "experiment"), nl=False)
-        else:
-            show.experiment(found, output)
+        definition = load_definition(experiment)
+        definition = replace(definition, runs=runs or definition.runs)
+        total = len(jobs_of(definition))
+        with progress_bar("running") as progress:
+            rows = run_campaign(
+                definition, output, jobs=jobs, force=force, progress=lambda n: progress(n, total)
+            )
+        summary = summarise(definition, rows)
+        save_summary(summary, output)
+        _print("experiment", summary, json, lambda: show.experiment(summary, output))

@@ -1,4 +1,4 @@
-"""How a command talks while it works: one line for an error, a bar where someone is watching."""
+"""Output of a running command: one line for an error, a progress bar on a terminal."""
 
 import math
 import sys
@@ -12,22 +12,22 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from graphslam.core.errors import GraphSlamError
 
-DRAWN_EVERY_S = 0.1  # smoother than the eye needs, and drawing takes no time to speak of
-INTERRUPTED = 130  # what shells give a program that Ctrl-C ended
+DRAW_INTERVAL_S = 0.1  # smooth to the eye, and drawing takes no noticeable time
+INTERRUPTED = 130  # the exit code of a program that Ctrl-C ended, by convention of shells
 
 
 @contextmanager
 def errors_in_one_line(debug: bool) -> Iterator[None]:
-    """Turn whatever goes wrong into one line on stderr and exit code 1; with ``debug`` let it pass.
+    """Turn any error into one line on stderr and exit code 1; with ``debug`` let it pass.
 
     Raises:
-        typer.Exit: in place of the error; code 130, without a word, for Ctrl-C.
+        typer.Exit: in place of the error; code 130 and no output for Ctrl-C.
     """
     try:
         yield
     except KeyboardInterrupt:
         raise typer.Exit(INTERRUPTED) from None
-    except (typer.Exit, BrokenPipeError):  # the reader of our output left: nobody to tell
+    except (typer.Exit, BrokenPipeError):  # nobody reads the output any more
         raise
     except Exception as error:
         if debug:
@@ -52,22 +52,22 @@ def _describe(error: Exception) -> str:
 
 
 @contextmanager
-def progress_bar(total: int, doing: str = "smoothing") -> Iterator[Callable[[int], None]]:
-    """A function that takes the number of messages done; it draws only on a terminal."""
+def progress_bar(doing: str) -> Iterator[Callable[[int, int], None]]:
+    """A function of how much is done, of how much in all; it draws only on a terminal."""
     if not sys.stderr.isatty():
-        yield lambda _done: None
+        yield lambda _done, _total: None
         return
     columns = TextColumn(doing), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    # a thread that draws would keep work from being done `beside`
+    # without a drawing thread: a process with threads does not fork, see `core.worker`
     bar = Progress(*columns, console=Console(stderr=True), transient=True, auto_refresh=False)
     drawn_s = -math.inf
     with bar as progress:
-        task = progress.add_task("", total=total)
+        task = progress.add_task("", total=None)
 
-        def show(done: int) -> None:
+        def show(done: int, total: int) -> None:
             nonlocal drawn_s
-            if time.monotonic() - drawn_s > DRAWN_EVERY_S:
+            if time.monotonic() - drawn_s > DRAW_INTERVAL_S:
                 drawn_s = time.monotonic()
-                progress.update(task, completed=done, refresh=True)
+                progress.update(task, completed=done, total=total, refresh=True)
 
         yield show

@@ -3,6 +3,7 @@
 An unknown key, a wrong type or a value out of range is a `ConfigError` that names the key.
 """
 
+import copy
 import copyreg
 import dataclasses
 import difflib
@@ -49,19 +50,43 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Conf
             raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise ConfigError(f"{path}: not valid TOML: {error}") from error
-    renamed = _rename(tree)
-    given: dict[str, Any] = {}  # the overrides alone: they win over the file, also by the new name
-    for text in overrides:
-        key, separator, value = text.partition("=")
-        if not separator or not key.strip():
-            raise ConfigError(f"--set {text}: write it as key=value, for example keyframe.mode=all")
-        keys = _split_key(key.strip())
-        _set(given, keys, _parse_value(value.strip()))
-        one: dict[str, Any] = {}
-        _set(one, keys, _parse_value(value.strip()))
-        _rename(one)
-        _set(tree, *_follow(one, len(keys)))
-    return _config(tree, [*renamed, *_rename(given)])
+    settings = map(parse_setting, overrides)
+    return _override(tree, [(_split_key(key), value) for key, value in settings])
+
+
+def parse_setting(text: str) -> tuple[str, Any]:
+    """Dotted key and value of ``key=value``.
+
+    Raises:
+        ConfigError: the text has another form.
+    """
+    key, separator, value = text.partition("=")
+    if not separator or not key.strip():
+        raise ConfigError(f"--set {text}: write it as key=value, for example keyframe.mode=all")
+    return key.strip(), _parse_value(value.strip())
+
+
+def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
+    """The configuration with other settings; what is not given stays as it is.
+
+    Args:
+        config: the settings to begin with.
+        settings: dotted key -> value (``{"keyframe.mode": "all"}``) or table -> mapping
+            (``{"keyframe": {"mode": "all"}}``); a text for a table that has a ``name`` is that name
+            (``{"backend": "ekf"}``). An empty mapping empties its table. Arrays may stand for
+            lists.
+
+    Raises:
+        ConfigError: as `load_config`.
+    """
+    tables, leaves = settings_of(Config), []
+    for text, value in settings.items():
+        keys = _split_key(text)
+        if len(keys) == 1 and isinstance(value, str) and "name" in _hints(tables.get(keys[0])):
+            keys = [*keys, "name"]
+        leaves += _leaves(keys, value)
+    changed = _override(tomllib.loads(dump_config(config)), leaves)
+    return dataclasses.replace(changed, warnings=(*config.warnings, *changed.warnings))
 
 
 def parse_config(text: str) -> Config:
@@ -86,6 +111,30 @@ def settings_of(kind: Any) -> dict[str, Any]:
     hints = typing.get_type_hints(kind)
     fields = dataclasses.fields(kind)
     return {f.name: hints[f.name] for f in fields if f.metadata.get("setting", True)}
+
+
+def _override(tree: dict[str, Any], settings: Sequence[tuple[list[str], Any]]) -> Config:
+    """The configuration of a tree with ``settings`` (keys, value) over it, one after the other."""
+    renamed = _rename(tree)
+    given: dict[str, Any] = {}  # the settings alone: they win over the tree, also by the new name
+    for keys, value in settings:
+        _set(given, keys, value)
+        one: dict[str, Any] = {}
+        _set(one, keys, copy.deepcopy(value))
+        _rename(one)
+        _set(tree, *_follow(one, len(keys)))
+    return _config(tree, [*renamed, *_rename(given)])
+
+
+def _leaves(keys: list[str], value: Any) -> list[tuple[list[str], Any]]:
+    """(keys, value) of every setting in nested mappings."""
+    if isinstance(value, Mapping) and value:
+        return [leaf for key, item in value.items() for leaf in _leaves([*keys, str(key)], item)]
+    return [(keys, value.tolist() if hasattr(value, "tolist") else value)]
+
+
+def _hints(kind: Any) -> dict[str, Any]:
+    return settings_of(kind) if dataclasses.is_dataclass(kind) else {}
 
 
 def _config(tree: dict[str, Any], renamed: Sequence[str]) -> Config:

@@ -3,10 +3,9 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from graphslam.core.config import Config
-from graphslam.core.config_io import load_config
+from graphslam.core.config_io import parse_setting, with_settings
 from graphslam.core.errors import ConfigError
 from graphslam.estimation.backends import BACKENDS
 
@@ -34,15 +33,13 @@ class Variant:
         return self.config.backend.horizon_s if self.config.backend.name == "isam2" else None
 
 
-def variants(
-    specs: Sequence[str], path: Path | None = None, overrides: Sequence[str] = ()
-) -> tuple[Variant, ...]:
-    """The rows that ``specs`` ask for, over the settings of ``path`` and ``overrides``.
+def variants(specs: Sequence[str], config: Config | None = None) -> tuple[Variant, ...]:
+    """The rows that ``specs`` ask for, over the settings of ``config``.
 
     Raises:
         ConfigError: a spec is unknown, malformed or there twice; it names the spec.
     """
-    found = tuple(_variant(spec, path, overrides) for spec in specs)
+    found = tuple(_variant(spec, config or Config()) for spec in specs)
     if not found:
         raise ConfigError("--backends: names no back end")
     for number, variant in enumerate(found):
@@ -51,7 +48,7 @@ def variants(
     return found
 
 
-def _variant(spec: str, path: Path | None, overrides: Sequence[str]) -> Variant:
+def _variant(spec: str, config: Config) -> Variant:
     head, *settings = spec.split("+")
     name, colon, horizon = head.partition(":")
     if name not in BACKENDS:
@@ -61,7 +58,7 @@ def _variant(spec: str, path: Path | None, overrides: Sequence[str]) -> Variant:
     if colon:
         settings.insert(0, f"backend.horizon_s={horizon}")
     try:
-        config = load_config(path, [*overrides, f"backend.name={name}", *settings])
+        config = with_settings(config, {"backend": name} | dict(map(parse_setting, settings)))
     except ConfigError as error:
         raise ConfigError(f"--backends {spec}: {error}") from error
     label = NAMES.get(name, name)

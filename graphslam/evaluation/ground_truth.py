@@ -5,7 +5,7 @@ from pathlib import Path
 
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError, OutputError
-from graphslam.core.records import Trajectory, TrueLandmark, Truth
+from graphslam.core.records import Result, Trajectory, TrueLandmark, Truth
 from graphslam.logs import GroundTruth, LogSet, read_truth, truth_from_mcap
 from graphslam.results.file_formats import read_trajectory
 from graphslam.results.folder import SavedResult
@@ -20,14 +20,14 @@ def truth_of_logs(log: LogSet, config: Config) -> GroundTruth:
     return truth_from_mcap(log.opened, config)
 
 
-def truth_of_run(saved: SavedResult) -> GroundTruth:
+def truth_of_run(result: Result | SavedResult) -> GroundTruth:
     """What the logs that a result came from say about the truth.
 
     Raises:
         LogError: a log is not where it was or is another one now, or none holds any truth.
     """
-    logs = saved.summary["logs"]
-    found = read_truth([Path(log["path"]) for log in logs], saved.config)
+    logs = result.summary["logs"]
+    found = read_truth([Path(log["path"]) for log in logs], result.config)
     for log, sha256 in zip(logs, found.sha256, strict=True):
         if log["sha256"] != sha256:
             raise LogError(f"{log['path']}: is not the log that was smoothed; give --truth")

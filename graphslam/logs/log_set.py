@@ -44,6 +44,7 @@ class LogSet:
         dropped: number of dropped messages (of dropped beams, where the reason begins with
             ``range:``) by reason; filled when `messages` is exhausted.
         repaired: the same for messages that are used in spite of a defect.
+        config: the settings that the logs were opened with.
     """
 
     robots: tuple[str, ...]
@@ -55,7 +56,7 @@ class LogSet:
     repaired: Counter[str]
     _mcap: Sequence[McapFile] = field(repr=False)
     _contexts: Mapping[str, TopicContext] = field(repr=False)
-    _window_ns: int
+    config: Config = field(repr=False)
 
     def __post_init__(self) -> None:
         self._opening_warnings = len(self.warnings)
@@ -97,9 +98,8 @@ class LogSet:
 
     def _read(self, topics: Mapping[str, Topic]) -> Iterator["Message | _ReadReport"]:
         """Messages of ``topics`` and, last, the report about all of them."""
-        readers = [
-            _FileReader(file, time_order.MessageSorter(self._window_ns)) for file in self._mcap
-        ]
+        window_ns = round(self.config.logs.reorder_s * 1e9)
+        readers = [_FileReader(file, time_order.MessageSorter(window_ns)) for file in self._mcap]
         streams = [reader.messages(topics, self._contexts) for reader in readers]
         yield from time_order.merge(streams)
         report = _ReadReport(Counter(), Counter(), [])
@@ -160,7 +160,7 @@ def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
         repaired=Counter(),
         _mcap=files,
         _contexts=contexts,
-        _window_ns=round(config.logs.reorder_s * 1e9),
+        config=config,
     )
 
 

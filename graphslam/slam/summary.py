@@ -121,7 +121,10 @@ def summarise(
             }
             for robot, clock in sorted(clocks.items())
         },
-        "warnings": [*log.warnings, *run_warnings(pipeline)],
+        "warnings": [
+            *dict.fromkeys([*pipeline.given_config.warnings, *log.warnings]),
+            *run_warnings(pipeline),
+        ],
     }
 
 

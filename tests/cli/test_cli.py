@@ -116,14 +116,6 @@ def test_output_for_people_says_what_was_found_and_where_the_report_is(room, tmp
     assert f"usable: graphslam smooth {room.log} -o DIR" in info
 
 
-def test_the_example_of_the_readme_runs(room, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "drive.mcap").symlink_to(room.log)
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    exec(readme.split("```python\n")[1].split("```")[0], {})
-    assert load(tmp_path / "result").config.keyframe.distance_m == 0.5
-
-
 def test_the_page_on_formats_has_every_file_and_every_key(room):
     page = (ROOT / "docs/formats.md").read_text(encoding="utf-8")
     for path in room.out.rglob("*.*"):
@@ -494,13 +486,13 @@ def test_debug_shows_the_traceback(tmp_path):
 
 
 def test_the_bar_is_drawn_on_a_terminal_only_and_never_on_stdout(capsys, monkeypatch):
-    with terminal.progress_bar(10) as progress:
-        progress(5)
+    with terminal.progress_bar("smoothing") as progress:
+        progress(5, 10)
     assert capsys.readouterr() == ("", "")
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     monkeypatch.setenv("TTY_COMPATIBLE", "1")
-    with terminal.progress_bar(10) as progress:
-        progress(10)
+    with terminal.progress_bar("smoothing") as progress:
+        progress(10, 10)
     out, err = capsys.readouterr()
     assert out == ""
     assert "10/10" in err

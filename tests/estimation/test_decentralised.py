@@ -218,9 +218,7 @@ def test_it_is_a_row_of_a_comparison(tmp_path):
                 where[robot] = compose(x, np.array([0.05, 0.0, 0.02]))
     settings = load_config(overrides=["start.from_truth=true"])
     opened = open_logs([tmp_path / "log.mcap"], settings)
-    rows = variants(
-        ["batch", "decentralised+backend.exchange_s=5"], None, ["start.from_truth=true"]
-    )
+    rows = variants(["batch", "decentralised+backend.exchange_s=5"], settings)
     found = compare(opened, settings, rows, run=play).found["rows"]
     assert [row["error"] for row in found] == [None, None]
     assert "exchanged" not in found[0]

@@ -43,7 +43,7 @@ def two(tmp_path_factory):
     config = load_config(None, START)
     log = open_logs([path], config)
     truth = truth_of_logs(log, config)
-    done = compare(log, config, variants(SPECS, None, START), truth=truth, run=play)
+    done = compare(log, config, variants(SPECS, load_config(None, START)), truth=truth, run=play)
     return SimpleNamespace(path=path, config=config, log=log, truth=truth, done=done)
 
 
@@ -91,7 +91,7 @@ def test_a_row_is_what_smooth_and_evaluate_say(two, mode, backend):
     alone = evaluate(
         smooth(open_logs([two.path], config), config), two.truth.trajectories, two.truth.landmarks
     )
-    rows = variants([backend], None, START)
+    rows = variants([backend], load_config(None, START))
     found = compare(two.log, two.config, rows, mode, truth=two.truth, run=play)
     assert_equal_numbers({key: found.found["rows"][0][key] for key in ACCURACY}, alone)
 
@@ -130,7 +130,7 @@ def test_final_is_causal_for_what_never_revises_and_only_there(two):
 def test_filters_name_their_errors_and_do_not_revise(two):
     """With horizon 0 a state still moves until the next one comes, which is not smoothing."""
     specs = ["ekf", "ekf+ekf.error=body", "isam2:0", "isam2"]
-    rows = variants(specs, None, START)
+    rows = variants(specs, load_config(None, START))
     found = rows_of(compare(two.log, two.config, rows, truth=two.truth, run=play))
     for spec in specs[:3]:
         assert found[spec]["final_is_causal"]
@@ -155,7 +155,9 @@ def test_late_evidence_is_counted(two):
 
 def test_what_a_filter_could_not_use_is_said(two):
     specs = ["ekf", "ekf+ekf.past_states=0", "isam2"]
-    done = compare(two.log, two.config, variants(specs, None, START), truth=two.truth, run=play)
+    done = compare(
+        two.log, two.config, variants(specs, load_config(None, START)), truth=two.truth, run=play
+    )
     found = rows_of(done)
     assert found["ekf"]["skipped"] == found["isam2"]["skipped"] == {}
     assert found[specs[1]]["skipped"] == {"late evidence": found["ekf"]["late"]}
@@ -231,7 +233,7 @@ def test_wrong_specs_are_named(specs, what):
 
 def test_what_the_recording_follows_from_is_the_same_for_all_in_replay(two):
     """A row with its own keyframes would silently be given the recorded ones."""
-    rows = variants(["isam2+keyframe.distance_m=0.5"], None, START)
+    rows = variants(["isam2+keyframe.distance_m=0.5"], load_config(None, START))
     with pytest.raises(ConfigError, match=r"keyframe\.\* belongs to the recording"):
         compare(two.log, two.config, rows, run=play)
     found = compare(two.log, two.config, rows, "associate", run=play).found["rows"][0]
@@ -255,7 +257,7 @@ def broken(monkeypatch):
 
 
 def test_a_back_end_that_fails_has_its_error_in_its_row(two, broken):
-    rows = variants(["isam2", "batch", "dead-reckoning"], None, START)
+    rows = variants(["isam2", "batch", "dead-reckoning"], load_config(None, START))
     done = compare(two.log, two.config, rows, truth=two.truth, run=play)
     found = rows_of(done)
     assert found["batch"]["error"] == "indeterminate at <landmark 7>"
@@ -269,7 +271,7 @@ def test_a_back_end_that_fails_has_its_error_in_its_row(two, broken):
 
 def test_nothing_is_left_where_every_back_end_fails(two, broken):
     with pytest.raises(EstimationError, match="no back end came to an end; batch: indeterminate"):
-        compare(two.log, two.config, variants(["batch"], None, START), run=play)
+        compare(two.log, two.config, variants(["batch"], load_config(None, START)), run=play)
 
 
 def test_the_command_tells_of_a_failure_at_the_end(two, broken, tmp_path):
@@ -293,7 +295,7 @@ def test_truth_of_another_time_is_told_and_the_rest_goes_on(two):
         name: replace(path, stamps_ns=path.stamps_ns + 10**15)
         for name, path in two.truth.trajectories.items()
     }
-    rows = variants(["isam2", "batch"], None, START)
+    rows = variants(["isam2", "batch"], load_config(None, START))
     found = compare(two.log, two.config, rows, truth=GroundTruth(later, ()), run=play).found
     assert [text for text in found["warnings"] if text.startswith("not evaluated: no pose of")]
     assert "robots" not in found["rows"][0]
@@ -428,7 +430,7 @@ def test_the_page_is_one_file_with_every_table_and_figure(two):
 
 
 def test_without_truth_rows_are_compared_with_each_other(two):
-    rows = variants(["dead-reckoning", "isam2"], None, START)
+    rows = variants(["dead-reckoning", "isam2"], load_config(None, START))
     done = compare(two.log, two.config, rows, run=play)
     found = rows_of(done)
     assert not set(ACCURACY) & found["isam2"].keys()
