@@ -10,7 +10,7 @@ from graphslam.core.config import Config
 from graphslam.core.geometry import compose, compose_cov, inverse, inverse_cov
 from graphslam.core.records import Closure, RelativePose, Scan, Sighting, Start, TrueLandmark, Truth
 from graphslam.logs import LogSet
-from graphslam.mapping.closure_verification import NOTHING_RECORDED, own_frame, verify
+from graphslam.mapping.recorded_closure_verification import NOTHING_RECORDED, own_frame, verify
 from graphslam.slam.robot_settings import make_tracks
 from graphslam.slam.robot_state import RobotState
 from graphslam.slam.synchronisation import ODOMETRY
@@ -21,7 +21,7 @@ ClosureId = tuple[str, int, str, int, bytes]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedClosures:
-    """Which relative poses of a log are used, see `mapping.closure_verification.Verified`.
+    """Which relative poses of a log are used, see `mapping.recorded_closure_verification.Verified`.
 
     ``refused`` and ``kept`` by `closure_id`; ``frames`` of all robots that have a start.
     """

@@ -10,7 +10,7 @@ from common import pose_graph_values
 from graphslam.core.config import BackendConfig, Config, StartConfig
 from graphslam.core.geometry import between, compose
 from graphslam.logs import IMPORTERS, open_logs, pose_stamp_ns
-from graphslam.mapping.closure_verification import CONTRADICTED
+from graphslam.mapping.recorded_closure_verification import CONTRADICTED
 from graphslam.slam.smooth import smooth
 
 DEFAULTS = Config()
