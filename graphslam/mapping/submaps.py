@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graphslam.core.config import LoopClosureConfig
+from graphslam.core.config import Config
 from graphslam.core.geometry import (
     Array,
     adjoint,
@@ -48,14 +48,14 @@ class SubmapPose:
 
 
 def build_submaps(
-    states: Mapping[str, Trajectory], pictures: Iterable[Picture], config: LoopClosureConfig
+    states: Mapping[str, Trajectory], pictures: Iterable[Picture], config: Config
 ) -> list[SubmapPose]:
     """Submaps along every robot's path.
 
     Args:
         states: estimates of all states.
         pictures: scan points seen from them.
-        config: spacing and reach of the submaps.
+        config: ``loop_closure``, the spacing and reach of the submaps, and ``scan_matching``.
     """
     clouds = {(p.robot, p.time_ns): p for p in pictures if len(p.points) >= MIN_POINTS}
     found = []
@@ -66,10 +66,12 @@ def build_submaps(
             continue
         path = path_length(poses)
         turned = np.concatenate([[0.0], np.cumsum(np.abs(wrap(np.diff(poses[:, 2]))))])
-        spacing = max(config.submap_spacing_m, path[-1] / MAX_SUBMAPS)
+        spacing = max(config.loop_closure.submap_spacing_m, path[-1] / MAX_SUBMAPS)
         for middle in np.unique(np.searchsorted(path, np.arange(0.0, path[-1], spacing))):
             used: list[int] = []
-            for k in np.flatnonzero(np.abs(path - path[middle]) <= config.submap_reach_m):
+            for k in np.flatnonzero(
+                np.abs(path - path[middle]) <= config.loop_closure.submap_reach_m
+            ):
                 if (
                     not used
                     or path[k] - path[used[-1]] >= SCAN_M
@@ -81,6 +83,7 @@ def build_submaps(
             submap = make_submap(
                 compose(between(poses[middle], poses[used]), sensors),
                 [transform(inverse(p.sensor), p.points.astype(float)) for p in seen_there],
+                config.scan_matching,
             )
             state = robot, int(stamps[middle])
             span = int(stamps[used[0]]), int(stamps[used[-1]])

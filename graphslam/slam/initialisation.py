@@ -144,11 +144,8 @@ def separate_estimates(run: Pipeline) -> dict[str, RobotEstimate]:
 def anonymous_maps(run: Pipeline, views: Mapping[str, RobotEstimate]) -> dict[str, AnonymousMap]:
     """Submaps and points without identity of each robot, after the pass that gave ``views``."""
     assert isinstance(run.backend, Isam2Backend)
-    found = build_submaps(
-        {robot: view.states for robot, view in views.items()},
-        run.pictures,
-        run.config.loop_closure,
-    )
+    estimates = {robot: view.states for robot, view in views.items()}
+    found = build_submaps(estimates, run.pictures, run.config)
     seen = {}
     for robot, view in views.items():
         own = [place for place in found if place.state[0] == robot]

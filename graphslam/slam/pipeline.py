@@ -273,7 +273,7 @@ class Pipeline(StepRecorder):
         """
         run = self.runs[scan.robot]
         points = scan_points(scan, self.config.front_end.max_range_m)
-        now, last = scan_submap(points), run.scan
+        now, last = scan_submap(points, self.config.scan_matching), run.scan
         run.scan = None if now is None else (scan.time_ns, now)
         if motion is None or now is None or last is None or last[0] != motion.start_ns:
             return motion, None

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphslam.core.config import Config, LoopClosureConfig
+from graphslam.core.config import Config
 from graphslam.core.geometry import Array
 from graphslam.core.records import Closure, Estimate, Picture, Step
 from graphslam.estimation.batch_calibration import calibrate, recompute_motions
@@ -88,7 +88,7 @@ def reoptimise_scan_log(
     closures: list[Closure] = []
     if config.backend.close_loops:
         steps, closures, estimate = _close_loops(
-            steps, estimate, pictures, landmarks, solve, tamper, counts, config.loop_closure
+            steps, estimate, pictures, landmarks, solve, tamper, counts, config
         )
     for gates in GATES:
         estimate = solve(steps, estimate, closures)
@@ -159,7 +159,7 @@ def _close_loops(
     solve: _Solver,
     tamper: Tamper | None,
     counts: Counter[str],
-    config: LoopClosureConfig,
+    config: Config,
 ) -> tuple[tuple[Step, ...], list[Closure], Estimate]:
     """Loops closed by matching submaps.
 
@@ -170,7 +170,7 @@ def _close_loops(
     Returns:
         Steps, the closures that are used, and the estimate with them.
     """
-    split = split_by_visit(steps, estimate.states, landmarks, config.revisit_path_m)
+    split = split_by_visit(steps, estimate.states, landmarks, config.loop_closure.revisit_path_m)
     closed = split.start(estimate)
     prior = solve(split.steps, closed)
     submaps = build_submaps(prior.states, pictures, config)  # bent by no wrong association
@@ -181,7 +181,7 @@ def _close_loops(
     for _ in range(MAX_CLOSING_ROUNDS if submaps else 0):
         P = solve.backend.state_covariance([submap.state for submap in submaps])
         new, confirming = loop_closures(
-            with_poses_from(submaps, closed.states), P, examined, config
+            with_poses_from(submaps, closed.states), P, examined, config.loop_closure
         )
         if tamper is not None:
             new = [c for c in tamper([*new, *confirming], submaps) if c not in confirming]

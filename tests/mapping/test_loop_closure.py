@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from walls import L_ROOM, cloud
 
-from graphslam.core.config import LoopClosureConfig
+from graphslam.core.config import Config, LoopClosureConfig
 from graphslam.core.geometry import between, compose
 from graphslam.core.records import Closure, Picture, Trajectory
 from graphslam.mapping.loop_closure import (
@@ -58,7 +58,7 @@ def test_a_drifted_run_meets_itself():
     found says where the later place truly lies in the earlier."""
     true = round_trip()
     states, pictures = drive(drifting(true), true)
-    found = build_submaps(states, pictures, CONFIG)
+    found = build_submaps(states, pictures, Config())
     P = np.kron(np.eye(len(found)), np.diag([0.05, 0.05, 0.03]) ** 2)
     closures, _ = loop_closures(found, P, {}, CONFIG)
     assert len(closures) >= 3
@@ -75,7 +75,7 @@ def test_a_run_that_is_right_needs_no_closure():
     """Breaks with closures where nothing is to be closed: what is there is only confirmed."""
     true = round_trip()
     states, pictures = drive(true, true)
-    found = build_submaps(states, pictures, CONFIG)
+    found = build_submaps(states, pictures, Config())
     P = np.kron(np.eye(len(found)), np.diag([0.05, 0.05, 0.03]) ** 2)
     assert candidates(found, P, CONFIG)
     lost, confirmed = loop_closures(found, P, {}, CONFIG)
@@ -90,7 +90,7 @@ def test_a_pair_is_looked_at_once():
     """Breaks if rounds cost as much as the first one where nothing has moved."""
     true = round_trip()
     states, pictures = drive(drifting(true), true)
-    found = build_submaps(states, pictures, CONFIG)
+    found = build_submaps(states, pictures, Config())
     P = np.kron(np.eye(len(found)), np.diag([0.05, 0.05, 0.03]) ** 2)
     looked = {}
     assert loop_closures(found, P, looked, CONFIG)[0]
@@ -120,7 +120,7 @@ def test_what_makes_a_match_unbelievable(bad):
 def closed_loops(poses, true):
     """Places along ``poses`` where ``true`` ones were driven, true poses of them, true closures."""
     states, pictures = drive(poses, true)
-    found = build_submaps(states, pictures, CONFIG)
+    found = build_submaps(states, pictures, Config())
     at = {int(t): k for k, t in enumerate(states["robot"].stamps_ns)}
     where = np.array([true[at[p.state[1]]] for p in found])
     good = [
