@@ -1,4 +1,7 @@
-"""Robots' clocks: local against common time, and messages of all robots on one time line."""
+"""Robots' clocks: local against common time, and messages of all robots on one time line.
+
+Offsets and drifts are estimated by `graphslam.estimation.clock_calibration`.
+"""
 
 import heapq
 from collections.abc import Iterable, Iterator, Mapping

@@ -3,7 +3,7 @@
 A detection becomes a `Sighting`, as if a camera had made it. Its returns are removed from the scan,
 so that no landmark is made of them. A cluster is the robot if it has the outline's shape, lies
 within the gate of the expected pose, and no other does. Returns of unknown dynamic objects are
-removed too.
+removed too. Robots of unknown start are detected by `mutual_detection`.
 """
 
 from collections import Counter, defaultdict, deque
