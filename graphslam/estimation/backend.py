@@ -32,6 +32,12 @@ class Joint:
     slices: tuple[slice, ...]
     others: tuple[Array, ...] = ()
 
+    @classmethod
+    def of(cls, means: Sequence[Array], landmarks: int, cov: Array) -> "Joint":
+        """From the means of the pose, so many landmarks and others, and their covariance."""
+        n, slices = 1 + landmarks, block_slices([len(mean) for mean in means[1:]])
+        return cls(means[0], tuple(means[1:n]), cov, slices, tuple(means[n:]))
+
 
 class Backend(Protocol):
     """An estimator that takes steps in time order and can be queried between any two.

@@ -248,21 +248,6 @@ class CompressedBackend(Isam2Backend):
         z = self._isam.getDelta().vector(keys)
         return LocalFilter(points, z, self._tree_covariance(keys))
 
-    def state_covariance(self, states: Sequence[tuple[str, int]]) -> Array:
-        """See `Isam2Backend`."""
-        self._flush()
-        return super().state_covariance(states)
-
-    def finish(self) -> Estimate:
-        """See `Backend`."""
-        self._flush()
-        return super().finish()
-
-    def current_estimate(self) -> Estimate:
-        """See `Isam2Backend`."""
-        self._flush()
-        return super().current_estimate()
-
 
 class BatchBackend(CompressedBackend):
     """Optimises to convergence at the end, whatever `backend.optimise_at_end`; else as `isam2`."""

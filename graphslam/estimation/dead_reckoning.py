@@ -4,13 +4,13 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Literal
 
-import numpy as np
+from scipy.linalg import block_diag
 
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array, compose, compose_cov
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Estimate, Step
-from graphslam.estimation.backend import Joint, StateTable, TrajectoryRecorder, block_slices
+from graphslam.estimation.backend import Joint, StateTable, TrajectoryRecorder
 from graphslam.estimation.input_checks import (
     check_finite,
     check_positive,
@@ -64,16 +64,11 @@ class DeadReckoningBackend:
 
     def joint(self, robot: str, landmarks: Sequence[int], others: Sequence[str] = ()) -> Joint:
         """See `Backend`; poses and landmarks are taken as independent."""
-        pose, own_cov = self._state(robot, self._states.latest(robot))
-        marginals = [self._landmarks[i] for i in landmarks]
+        marginals = [self._state(robot, self._states.latest(robot))]
+        marginals += [self._landmarks[i] for i in landmarks]
         marginals += [self._state(other, self._states.latest(other)) for other in others]
-        slices = block_slices([len(mean) for mean, _ in marginals])
-        cov = np.zeros((slices[-1].stop if slices else 3,) * 2)
-        cov[:3, :3] = own_cov
-        for block, (_, block_cov) in zip(slices, marginals, strict=True):
-            cov[block, block] = block_cov
-        means, n = tuple(mean for mean, _ in marginals), len(landmarks)
-        return Joint(pose, means[:n], cov, slices, means[n:])
+        means, covs = zip(*marginals, strict=True)
+        return Joint.of(means, len(landmarks), block_diag(*covs))
 
     def state_mean(self, robot: str) -> Array:
         """See `Backend`."""

@@ -215,8 +215,6 @@ class DecentralisedBackend(GraphBackend):
         """Robot -> bytes of its measurements as they are: what a centralised estimate needs."""
         return {robot.name: robot.measured for robot in self._robots}
 
-    # ------------------------------------------------------------ adding steps
-
     def add(self, step: Step) -> None:
         """See `Backend`; an exchange comes before the first step after its time."""
         self._joints.clear()
@@ -297,8 +295,6 @@ class DecentralisedBackend(GraphBackend):
             tree = gtsam.ISAM2(isam2_parameters(self._config, "QR"))
             self._robots.append(LocalSmoother(name, tree))
         return self._robots[index]
-
-    # ------------------------------------------------------------ queries
 
     def value(self, key: int, dim: int) -> Array:
         """See `GraphBackend`: of a state by its robot, of a landmark by `_robot_with` it."""

@@ -31,7 +31,7 @@ from graphslam.core.geometry import (
 from graphslam.core.observation_models import MODELS, ObservationModel
 from graphslam.core.records import Association, Motion, Start, Step
 from graphslam.estimation import factors
-from graphslam.estimation.backend import Joint, block_slices
+from graphslam.estimation.backend import Joint
 from graphslam.estimation.filter_base import (
     FilterBackend,
     Member,
@@ -89,8 +89,6 @@ class EkfBackend(FilterBackend):
         self._gaussian: JointGaussian[Member] = JointGaussian()
         self.error_frame: Literal["body", "world"] = config.ekf.error
 
-    # ------------------------------------------------------------ adding steps
-
     def remove(self, landmark: int) -> None:
         """Delete a landmark (thesis section 4.6); the joint marginal of the rest stays as it is.
 
@@ -101,7 +99,6 @@ class EkfBackend(FilterBackend):
         self._gaussian.remove(landmark)
 
     def _start(self, robot: str, start: Start) -> None:
-        """See `FilterBackend`."""
         T = self._to_error(start.pose)
         self._gaussian.add(robot, start.pose, T @ start.cov @ T.T)
 
@@ -125,7 +122,6 @@ class EkfBackend(FilterBackend):
         self._gaussian.copy(name, robot)
 
     def _observe_step(self, step: Step) -> None:
-        """See `FilterBackend`."""
         for seen in step.associations:
             ends = self._ends(seen, step.time_ns)
             if ends is not None:
@@ -239,8 +235,6 @@ class EkfBackend(FilterBackend):
             raise unknown_landmark(landmark)
         return self._mean(landmark)
 
-    # ------------------------------------------------------------ queries
-
     def joint(self, robot: str, landmarks: Sequence[int], others: Sequence[str] = ()) -> Joint:
         """See `Backend`.
 
@@ -249,14 +243,13 @@ class EkfBackend(FilterBackend):
         """
         means = [self.state_mean(robot), *self.landmark_means(landmarks)]
         means += [self.state_mean(other) for other in others]
-        slices = block_slices([len(mean) for mean in means[1:]])
         cov = self._gaussian.marginal([robot, *landmarks, *others])
-        for block, mean in zip((slice(0, 3), *slices), means, strict=True):
+        joint = Joint.of(means, len(landmarks), cov)
+        for block, mean in zip((slice(0, 3), *joint.slices), means, strict=True):
             T = self._to_world(mean)
             cov[block] = T @ cov[block]
             cov[:, block] = cov[:, block] @ T.T
-        n = 1 + len(landmarks)
-        return Joint(means[0], tuple(means[1:n]), cov, slices, tuple(means[n:]))
+        return joint
 
     def state_mean(self, robot: str) -> Array:
         """See `Backend`."""
@@ -268,7 +261,6 @@ class EkfBackend(FilterBackend):
         return [self._landmark_mean(landmark).copy() for landmark in landmarks]
 
     def _landmark_marginals(self) -> dict[int, tuple[Array, Array]]:
-        """See `FilterBackend`."""
         marginals = {}
         for name in self._gaussian:
             if isinstance(name, int):

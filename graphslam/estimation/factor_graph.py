@@ -350,16 +350,13 @@ class GraphBackend(ABC):
         dims = [builder.landmark_dims[i] for i in landmarks] + [3] * len(others)
         keys = [factors.landmark_key(i) for i in landmarks]
         keys += [builder.latest_key(other) for other in others]
-        pose = self.value(key, 3)
-        means = tuple(self.value(k, d) for k, d in zip(keys, dims, strict=True))
+        means = [self.value(k, d) for k, d in zip([key, *keys], [3, *dims], strict=True)]
         cov = self.covariance([key, *keys])
-        slices = block_slices(dims)
         turn = np.eye(len(cov))
-        for block, mean in zip((slice(0, 3), *slices), (pose, *means), strict=True):
+        for block, mean in zip((slice(0, 3), *block_slices(dims)), means, strict=True):
             if len(mean) == 3:
                 turn[block, block] = factors.world_from_body(float(mean[2]))
-        n = len(landmarks)
-        self._joints[robot] = Joint(pose, means[:n], turn @ cov @ turn.T, slices, means[n:])
+        self._joints[robot] = Joint.of(means, len(landmarks), turn @ cov @ turn.T)
         return self._joints[robot]
 
     def state_mean(self, robot: str) -> Array:

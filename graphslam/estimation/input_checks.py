@@ -1,5 +1,8 @@
 """Checks of a step's contents; errors are one line that names robot, landmark and time."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 
 from graphslam.core.errors import EstimationError
@@ -35,6 +38,15 @@ def indeterminate(
     return EstimationError(f"the estimate is indeterminate at {what}: {why}")
 
 
+@contextmanager
+def errors_at(what: str) -> Iterator[None]:
+    """Turn a failed factorisation inside into an error that names ``what``."""
+    try:
+        yield
+    except np.linalg.LinAlgError:
+        raise indeterminate(what) from None
+
+
 def check_finite(what: str, *values: Array) -> None:
     """Refuse values that are infinite or NaN.
 
@@ -51,7 +63,5 @@ def check_positive(cov: Array, what: str) -> None:
     Raises:
         EstimationError: it names ``what``.
     """
-    try:
+    with errors_at(what):
         np.linalg.cholesky(cov)
-    except np.linalg.LinAlgError:
-        raise indeterminate(what) from None

@@ -43,7 +43,6 @@ class InvariantEkfBackend(EkfBackend):
         self._anchor: dict[int, str] = {}  # point -> the robot whose heading error it shares
 
     def _augment(self, seen: Association, source: Member) -> None:
-        """See `EkfBackend`."""
         super()._augment(seen, source)
         if isinstance(seen.target, int) and MODELS[seen.model].dim == 2:
             self._anchor[seen.target] = seen.robot

@@ -84,10 +84,9 @@ class WholeGraph(GraphBuilder):
 
     def insert(self, step: Step, start: Estimate, values: gtsam.Values) -> None:
         """Add a recorded step, its variables with their values in ``start``."""
-        for group in self.factor_groups(step, lambda key, _dim: self.value_in(start, key)):
+        for group in self.expand(step, lambda key, _dim: self.value_in(start, key)):
             if group.new is not None:
                 write(values, group.new[0], self.value_in(start, group.new[0]))
-            self._add(group)
 
     def _add(self, group: FactorGroup) -> None:
         for factor in group.factors:
@@ -227,12 +226,14 @@ class Isam2Backend(GraphBackend):
         if self._finished is None:
             return
         values, self._finished = self._finished, None
-        graph, parameters = self._builder.graph, (self._config, self._factorization)
-        self._isam = gtsam.ISAM2(isam2_parameters(*parameters))
+        self._isam = gtsam.ISAM2(isam2_parameters(self._config, self._factorization))
         try:
-            self._isam.update(graph, values)
+            self._isam.update(self._builder.graph, values)
         except RuntimeError as error:
             self._use_qr(error)
+
+    def _flush(self) -> None:
+        """Bring the tree up to date; a subclass may have steps pending."""
 
     def covariance(self, keys: list[int]) -> Array:
         """See `GraphBackend`."""
@@ -248,18 +249,21 @@ class Isam2Backend(GraphBackend):
 
         Queries afterwards, of a joint marginal for example, are answered at that estimate.
         """
+        self._flush()
         if self._config.backend.optimise_at_end:
             return self._result(self._optimised(self._isam.calculateBestEstimate()))
         return self._result(self._converged())
 
     def state_covariance(self, states: Sequence[tuple[str, int]]) -> Array:
         """Joint covariance (3n, 3n) of states, by robot and time, errors along each one's axes."""
+        self._flush()
         builder = self._builder
         numbers = [(robot, builder.states.number(robot, t)) for robot, t in states]
         return self._tree_covariance([builder.state_key(*state) for state in numbers])
 
     def current_estimate(self) -> Estimate:
         """The tree's estimate, from which to optimise again: covariances are NaN."""
+        self._flush()
         return self._estimate(self._isam.calculateBestEstimate(), {})
 
     def _estimate(self, values: gtsam.Values, covs: Mapping[int, Array]) -> Estimate:

@@ -11,8 +11,7 @@ All arrays have the N particles as their first axis; nothing loops over particle
 robust kernel.
 """
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -25,7 +24,7 @@ from graphslam.core.records import Association, Motion, Start, Step
 from graphslam.estimation.backend import Joint, block_slices
 from graphslam.estimation.factors import FILTER_GAUGE_SIGMA_M
 from graphslam.estimation.filter_base import FilterBackend, unknown_landmark, with_sigma_along_line
-from graphslam.estimation.input_checks import describe_closure, describe_observation, indeterminate
+from graphslam.estimation.input_checks import describe_closure, describe_observation, errors_at
 
 #: resample when the effective number of particles is below this share of them
 RESAMPLE_BELOW = 0.5
@@ -75,10 +74,7 @@ class RbpfBackend(FilterBackend):
         self._log_weights = np.zeros(self._count)
         self._weights = np.full(self._count, 1 / self._count)
 
-    # ------------------------------------------------------------ adding steps
-
     def _start(self, robot: str, start: Start) -> None:
-        """See `FilterBackend`."""
         n = self._x.shape[1]
         block = self._blocks[robot] = slice(n, n + 3)
         self._x = np.pad(self._x, ((0, 0), (0, 3)))
@@ -102,10 +98,10 @@ class RbpfBackend(FilterBackend):
             return
         for seen in associations:
             if isinstance(seen.target, str):
-                with _errors_at(describe_observation(seen)):
+                with errors_at(describe_observation(seen)):
                     self._update_poses(seen.robot, seen.target, seen.model, seen.z, seen.cov)
         for c in closures:
-            with _errors_at(describe_closure(c)):
+            with errors_at(describe_closure(c)):
                 self._update_poses(c.other, c.robot, "robot-pose", c.delta, c.cov)
         for robot in sorted({seen.robot for seen in associations}):
             own = [(s, s.target) for s in associations if s.robot == robot]
@@ -121,12 +117,12 @@ class RbpfBackend(FilterBackend):
         # a second observation of a landmark is independent only after the first corrected it
         first = {target: s for s, target in reversed(seen) if target in self._landmarks}
         for target, s in first.items():
-            with _errors_at(describe_observation(s)):
+            with errors_at(describe_observation(s)):
                 self._update_poses(robot, target, s.model, s.z, s.cov)
         if self._proposal == "observation":
             self._sample_pose(robot)
         for s, target in seen:
-            with _errors_at(describe_observation(s)):
+            with errors_at(describe_observation(s)):
                 if target in self._landmarks:
                     self._update_landmark(s, target, weigh=s is not first.get(target))
                 else:
@@ -220,8 +216,6 @@ class RbpfBackend(FilterBackend):
         """The same value for every particle, (N, ...)."""
         return np.broadcast_to(value, (self._count, *value.shape))
 
-    # ------------------------------------------------------------ queries
-
     def joint(self, robot: str, landmarks: Sequence[int], others: Sequence[str] = ()) -> Joint:
         """See `Backend`.
 
@@ -243,9 +237,7 @@ class RbpfBackend(FilterBackend):
         index = np.concatenate([np.r_[self._blocks[name]] for name in robots])
         rows = np.concatenate([np.r_[block] for block in (slice(0, 3), *slices[n:])])
         cov[np.ix_(rows, rows)] += self._within(self._P[:, index[:, None], index])
-        return Joint(
-            means[0], tuple(means[1 : n + 1]), 0.5 * (cov + cov.T), slices, tuple(means[n + 1 :])
-        )
+        return Joint.of(means, n, 0.5 * (cov + cov.T))
 
     def _poses(self, robot: str) -> Array:
         """The robot's latest poses (N, 3)."""
@@ -280,7 +272,6 @@ class RbpfBackend(FilterBackend):
         return [self._moments(self._landmark(i).mean)[0] for i in landmarks]
 
     def _landmark_marginals(self) -> dict[int, tuple[Array, Array]]:
-        """See `FilterBackend`."""
         marginals = {}
         for i, landmark in self._landmarks.items():
             mean, off = self._moments(landmark.mean)
@@ -312,12 +303,3 @@ def _update(x: Array, P: Array, H: Array, R: Array, innovation: Array) -> tuple[
     P -= B.mT @ B
     log_det = 2 * np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1)
     return np.square(w[..., 0]).sum(axis=1), log_det
-
-
-@contextmanager
-def _errors_at(what: str) -> Iterator[None]:
-    """Turn a failed factorisation into an error that names ``what``."""
-    try:
-        yield
-    except np.linalg.LinAlgError:
-        raise indeterminate(what) from None
