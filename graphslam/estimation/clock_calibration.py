@@ -26,20 +26,8 @@ from graphslam.perception.sightings import sighting_observation
 SIGNIFICANT_SIGMAS, SIGNIFICANT_S = 3.0, 0.01
 #: s: with a larger sigma an offset is unobservable
 OBSERVABLE_S = 1.0
-#: s: steps of the offsets tried, and of the tabulated paths
-STEP_S = 0.1
-#: s: spans over which odometry is accurate enough to compare paths
-SPAN_S = 20.0
-#: fewest observations in a span, and most spans compared for two robots, those with most first
-MIN_OBSERVATIONS, MAX_SPANS = 6, 8
-#: ratio of the costs at offset zero and at the best one from which the best one is taken
-MIN_COST_RATIO = 1.5
-#: relative error of odometry's scale at most, and accuracy, m, of paths however well they fit
-MAX_SCALE_ERROR, FLOOR_M = 0.1, 0.02
 #: ns: a velocity is the motion over this time
 VELOCITY_NS = 200_000_000
-#: so many consecutive residuals count as one independent residual
-CORRELATED = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +118,19 @@ def _velocities(
 
 
 # ---------------------------------------------------------------- from paths alone
+
+#: s: steps of the offsets tried, and of the tabulated paths
+STEP_S = 0.1
+#: s: spans over which odometry is accurate enough to compare paths
+SPAN_S = 20.0
+#: fewest observations in a span, and most spans compared for two robots, those with most first
+MIN_OBSERVATIONS, MAX_SPANS = 6, 8
+#: ratio of the costs at offset zero and at the best one from which the best one is taken
+MIN_COST_RATIO = 1.5
+#: relative error of odometry's scale at most, and accuracy, m, of paths however well they fit
+MAX_SCALE_ERROR, FLOOR_M = 0.1, 0.02
+#: so many consecutive residuals count as one independent residual
+CORRELATED = 4.0
 
 
 @dataclass(frozen=True, slots=True)
