@@ -24,7 +24,8 @@ from graphslam.simulation.world import (
 
 REFERENCE, LATER = "reference", "later"
 
-_CHECK_S = 0.05  # interval of collision checks; robots drive well below 1 m/s: every few cm
+# Collisions are checked at least this often in time and path; turns on the spot need the first.
+_CHECK_S, _CHECK_M = 0.05, 0.05
 _CHUNK = 500  # poses per collision check, to limit memory
 
 
@@ -108,7 +109,12 @@ def _rearranged(outlines: Sequence[Outline], later: LaterVisit) -> Iterator[Outl
 
 def _collisions(world: World, actors: Mapping[str, SimulatedRobot], end_s: float) -> Iterator[str]:
     """Collisions of robots, one line each, in the order of robots."""
-    times = np.append(np.arange(0.0, end_s, _CHECK_S), end_s)
+    speeds = [
+        max(actor.robot.speed_m_s, *(leg.speed_m_s for leg in actor.robot.drive), 0.0)
+        for actor in actors.values()
+    ]
+    step_s = min(_CHECK_S, _CHECK_M / max(speeds))
+    times = np.append(np.arange(0.0, end_s, step_s), end_s)
     poses = {name: actor.drive.at(times).poses for name, actor in actors.items()}
     for name, actor in actors.items():
         hit = _first_collision(actor.robot.body, poses[name], world)

@@ -31,7 +31,7 @@ def test_own_and_common_time_are_each_others_inverse(clock):
 
 @pytest.mark.parametrize("offset_s", [0.4, -0.4, 7.0])
 def test_messages_come_in_the_order_of_the_common_clock(offset_s):
-    """Whichever clock is ahead, and by more than any window of reordering. Stamps stay."""
+    """For both signs of the offset, also beyond the window of reordering. Stamps do not change."""
     clock = Clock(offset_s, 1e-4, T0)
     true = [(T0 + k * S // 10, "ab"[k % 2]) for k in range(200)]
     made = []
@@ -56,7 +56,7 @@ def test_both_ends_of_an_increment_move():
 
 
 def pose(robot, seconds):
-    """Both drive on circles, now faster, now slower, so that a delay is no displacement."""
+    """Both drive on circles with varying speed, so that a delay is not equal to a displacement."""
     phase = {"a": 0.0, "b": 1.0}[robot]
     way = 0.3 * seconds + 0.8 * (np.cos(phase) - np.cos(0.5 * seconds + phase))
     return compose(np.array(STARTS[robot]), exp(way * np.array([1.0, 0.0, 0.5])))
@@ -96,7 +96,7 @@ def run(paths, *settings):
 
 
 def ate(result, offset_s):
-    """RMS position error of b, m, at the times that its own stamps mean."""
+    """RMS position error of b, m, at the true times of its stamps."""
     found = result.robots["b"].final
     true = [pose("b", 1e-9 * (t - T0) - offset_s) for t in found.stamps_ns]
     return float(np.sqrt(np.mean(np.sum((found.poses - true)[:, :2] ** 2, axis=1))))
@@ -127,7 +127,7 @@ def test_clocks_that_agree_are_left_alone(tmp_path):
 
 
 def test_a_drift_is_found_where_the_log_is_long_enough(tmp_path):
-    """One in a thousand is beyond any quartz, so the prior holds it; the sign is right."""
+    """A drift of 1e-3 is beyond any quartz, so the prior shrinks it; the sign is correct."""
     drifts = [
         run(write(tmp_path, 0.1, drift)).summary["clocks"]["b"]["drift_ppm"]
         for drift in (-5e-4, 5e-4)

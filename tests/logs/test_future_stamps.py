@@ -41,7 +41,7 @@ def record(*rows):
 
 
 def sound(topic, n, end_ms):
-    """n messages, one per ms, the last at end_ms: a topic's history of good stamps."""
+    """n messages, one per ms, the last at end_ms: a topic's history of valid stamps."""
     return [(topic, end_ms - n + 1 + k) for k in range(n)]
 
 
@@ -61,7 +61,7 @@ def test_a_run_is_spread_evenly_and_in_order_across_topics():
 
 
 def test_stamps_are_kept_and_so_is_the_order_of_recording():
-    """Time places a message; the stamp names it in every output, to the digit."""
+    """The time gives the order; outputs name a message by its unchanged stamp."""
     recorded = record(*HISTORY, ("/odom", 123.456789), ("/scan", 400), ("/odom", 60))
     placed = list(repair_future_stamps(recorded, SAMPLED))
     assert [(t, m.stamp_ns, log) for t, m, log in placed] == [
@@ -86,7 +86,7 @@ def test_two_runs_do_not_run_into_each_other():
 
 @pytest.mark.parametrize(("late_ns", "moved"), [(TOLERANCE_NS, False), (TOLERANCE_NS + 1, True)])
 def test_clocks_are_read_twice(late_ns, moved):
-    """The recorder reads its clock, then the driver; a millisecond of that is not lateness."""
+    """Recorder and driver read the clock in turn; a millisecond between them is tolerated."""
     recorded = [*record(*HISTORY), ("/scan", scan(50 * MS + late_ns), 50 * MS)]
     (*_, (_, message, _)) = repair_future_stamps(recorded, SAMPLED)
     assert (message.time_ns != message.stamp_ns) == moved
@@ -105,7 +105,7 @@ def test_a_constant_offset_between_clocks_is_left_alone(offset_ms):
 
 
 def test_increments_name_their_times_themselves():
-    """Only what samples a process goes by the order of recording."""
+    """Only samples of a process are placed by the order of recording."""
     recorded = record(*HISTORY, ("/odom_increment", 500), ("/odom", 60))
     assert placed_ms(recorded)[-2:] == [500, 60]
 

@@ -293,7 +293,7 @@ def test_beams_are_spread_over_half_a_turn_from_the_right(beams, step_deg, tmp_p
 
 
 def test_intel_is_read_whole_with_its_stamps_and_in_the_order_of_the_recording(tmp_path):
-    """Its late stamps, believed, make dead reckoning 675 m long; as recorded it is 509 m."""
+    """With its late stamps the path of dead reckoning is 675 m; in the order of recording 509 m."""
     source, relations = real_data("freiburg/intel.clf.bz2"), real_data("freiburg/intel.relations")
     target = tmp_path / "intel.mcap"
     IMPORTERS["carmen"](source, target)

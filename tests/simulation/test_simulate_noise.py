@@ -284,7 +284,7 @@ def test_slip_is_white_and_grows_with_the_root_of_the_travel(tmp_path):
 
 
 def test_odometry_is_what_the_wrong_geometry_makes_of_true_wheels(tmp_path):
-    """A right wheel 2 % larger than believed: the odometry turns right by what it did not count."""
+    """A right wheel 2 % larger than nominal: the odometry turns right by the uncounted path."""
     encoders = Encoders(radius_error_right=0.02, counts_per_turn=10**8)
     drive = (Leg(through_m=((7.5, 3.0),)),)
     log = Log(tmp_path, {"robot": robot(encoders=encoders, drive=drive, start=(1.5, 3.0))})

@@ -84,7 +84,7 @@ def test_every_scenario_runs_and_its_log_is_readable(name, tmp_path):
 
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_every_drive_is_free_of_collisions_to_its_end(name):
-    """`prepare_visits` raises where a robot touches anything; and no drive goes nowhere."""
+    """`prepare_visits` raises if a robot touches anything; and every drive moves its robot."""
     for visit in prepare_visits(load_scenario(name)):
         assert max(actor.drive.path_m for actor in visit.actors.values()) > 5
 
@@ -175,7 +175,7 @@ def test_equal_seeds_give_equal_bytes_and_others_do_not(name, tmp_path):
 
 
 def test_another_sensor_does_not_change_the_noise_of_the_first(tmp_path):
-    """So that an experiment with and without cooperation compares like with like."""
+    """So that experiments with and without cooperation differ in nothing else."""
     scenario = load_scenario(written(tmp_path, GOOD))
     simulate(scenario, tmp_path / "with.mcap")
     robots = dict(scenario.robots)
