@@ -10,6 +10,7 @@ from paths import ROOT
 
 from graphslam.cli.commands import app
 from graphslam.core.config import Config, RobotConfig
+from graphslam.core.config_io import RENAMED_KEYS
 
 #: the thesis' equations by chapter: the first and the last number
 EQUATIONS = {3: (1, 25), 4: (1, 38), 5: (1, 14)}
@@ -125,6 +126,11 @@ def test_what_a_page_names_is_there(page):
     links = [link for link in re.findall(r"\]\(([^)#\s]+)", text) if not link.startswith("http")]
     wrong = [link for link in links if not (page.parent / link).exists()]
     assert not wrong, f"{page.name}: {', '.join(wrong)}"
+
+
+@pytest.mark.parametrize(("old", "new"), RENAMED_KEYS.items())
+def test_the_changelog_has_every_renamed_setting(old, new):
+    assert f"| {old} | `{new}` |" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("script", sorted((ROOT / "benchmarks").glob("*.py")))
