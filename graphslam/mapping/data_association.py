@@ -51,17 +51,30 @@ def predicted_joint(joint: Joint, motion: Motion | None) -> Joint:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Image:
-    """One image under association: what was seen, and its candidate pairs with landmarks.
+    """One image to associate; the fields are the arguments of `Associator.associate`.
+
+    ``pose`` (3,) is the predicted one, after ``motion``.
+    """
+
+    robot: str
+    time_ns: int
+    seen: Sequence[Observation]
+    pose: Array
+    motion: Motion | None
+    track: Track
+    path_m: float
+    gathering: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidates:
+    """Candidate pairs of an image's observations with landmarks.
 
     ``entries`` (k) is the landmark of each pair, ``recent`` (k,) whether this robot saw it lately;
     ``joint`` is over the predicted pose and the graph's landmarks among them, ``where[id]`` their
     place in it.
     """
 
-    robot: str
-    time_ns: int
-    path_m: float
-    seen: Sequence[Observation]
     pairs: Pairs
     entries: tuple[Entry, ...]
     recent: BoolArray
@@ -125,53 +138,42 @@ class Associator:
         self.map.expire(time_ns, robot, path_m, round(config.tentative_s * 1e9), config.tentative_m)
         if motion is not None:
             pose = compose(pose, motion.delta)
+        image = Image(robot, time_ns, seen, pose, motion, track, path_m, gathering)
         if gathering and all(map(self._has_identity, seen)):
-            return self._associate_identified(robot, time_ns, seen, pose, path_m)
-        image = self._image(robot, time_ns, seen, pose, motion, track, path_m, gathering)
-        associations = self._apply(image, self._choose(image))
+            return self._associate_identified(image)
+        candidates = self._candidates(image)
+        associations = self._apply(image, candidates, self._choose(image, candidates))
         if not gathering:
             self.settle()
         return associations
 
-    def _associate_identified(
-        self, robot: str, time_ns: int, seen: Sequence[Observation], pose: Array, path_m: float
-    ) -> tuple[Association, ...]:
+    def _associate_identified(self, image: Image) -> tuple[Association, ...]:
         """Associations of an image in which every observation has an identity."""
         out: list[Association] = []
-        for o in seen:
+        for o in image.seen:
             entry = self._named(o)
             if entry is None:
-                entry = self.map.add(o, pose, time_ns)
+                entry = self.map.add(o, image.pose, image.time_ns)
             elif (entry.kind == "point") != (o.kind == "point"):
                 self.rejected["identity: known as a landmark of another kind"] += 1
                 continue
-            self.map.saw(entry, o, pose, time_ns, robot, path_m)
-            out += self._admit(entry, _association(robot, time_ns, entry, o.kind, o), True)
+            out += self._record(image, entry, o.kind, o, True)
         return tuple(out)
 
     def settle(self) -> None:
         """Record that the back end has taken the step of all associations so far."""
         self._unsettled.clear()
 
-    def _image(
-        self,
-        robot: str,
-        time_ns: int,
-        seen: Sequence[Observation],
-        pose: Array,
-        motion: Motion | None,
-        track: Track,
-        path_m: float,
-        gathering: bool,
-    ) -> Image:
-        """The image with its candidate pairs and their distances."""
+    def _candidates(self, image: Image) -> Candidates:
+        """Candidate pairs of an image and their distances."""
+        seen = image.seen
         ids, means, extents, is_point, whole = self.map.arrays()
         free = [n for n, o in enumerate(seen) if not self._has_identity(o)]
         pairs = candidate_pairs(
-            [seen[n] for n in free], pose, means, extents, is_point, whole, self._config
+            [seen[n] for n in free], image.pose, means, extents, is_point, whole, self._config
         )
         entries = [self.map.entries[int(ids[j])] for j in pairs.landmark]
-        recent = np.array([self._is_recent(e, robot, path_m) for e in entries], dtype=bool)
+        recent = np.array([self._is_recent(e, image) for e in entries], dtype=bool)
         keep = _worth_comparing(pairs, entries, recent, self._config.reacquire_min)
         pairs, recent = pairs.only(keep), recent[keep]
         entries = [e for e, k in zip(entries, keep, strict=True) if k]
@@ -190,14 +192,12 @@ class Associator:
         )
         entries += [e for _, e in known]
         recent = np.append(recent, np.ones(len(known), dtype=bool))
-        wanted = entries[: len(entries) - len(known)] if gathering else entries
+        wanted = entries[: len(entries) - len(known)] if image.gathering else entries
         graph_ids = sorted({e.id for e in wanted if e.in_graph and e.id not in self._unsettled})
         where = {landmark: n for n, landmark in enumerate(graph_ids)}
-        joint = predicted_joint(self._backend.joint(robot, graph_ids), motion)
-        compared = self._compare(seen, pairs, entries, joint, where, motion, track, time_ns)
-        return Image(
-            robot, time_ns, path_m, seen, pairs, tuple(entries), recent, joint, where, compared
-        )
+        joint = predicted_joint(self._backend.joint(image.robot, graph_ids), image.motion)
+        compared = self._compare(image, pairs, entries, joint, where)
+        return Candidates(pairs, tuple(entries), recent, joint, where, compared)
 
     def _has_identity(self, o: Observation) -> bool:
         return o.identity is not None and self._config.identities == "use"
@@ -208,26 +208,24 @@ class Associator:
             return None
         return self.map.entries[self.map.by_identity[str(o.identity)]]
 
-    def _is_recent(self, entry: Entry, robot: str, path_m: float) -> bool:
-        return path_m - entry.path_m.get(robot, -np.inf) <= self._config.reacquire_m
+    def _is_recent(self, entry: Entry, image: Image) -> bool:
+        path_m = entry.path_m.get(image.robot, -np.inf)
+        return image.path_m - path_m <= self._config.reacquire_m
 
     def _compare(
         self,
-        seen: Sequence[Observation],
+        image: Image,
         pairs: Pairs,
         entries: Sequence[Entry],
         joint: Joint,
         where: dict[int, int],
-        motion: Motion | None,
-        track: Track,
-        time_ns: int,
     ) -> Compared:
         """Distances of all candidate pairs.
 
         A tentative landmark is known relative to the robot that saw it, so its distance has the
         covariance of its own measurement and of the motion since, not that of the robot's pose.
         """
-        k = len(entries)
+        k, motion = len(entries), image.motion
         P_xx, P_xt, P_tt = (np.zeros((k, 3, 3)) for _ in range(3))
         states = np.zeros((k, 3))
         since: dict[int, Array] = {}
@@ -243,17 +241,18 @@ class Associator:
                 P_tt[n, :size, :size] = joint.cov[block, block]
             else:
                 if entry.last_ns not in since:
-                    moved = track.motion(entry.last_ns, time_ns)
+                    moved = image.track.motion(entry.last_ns, image.time_ns)
                     start_heading = joint.pose[2] - moved.delta[2]
                     since[entry.last_ns] = rotate_cov(moved.cov, start_heading)
                 states[n], P_xx[n], P_tt[n] = entry.mean, since[entry.last_ns], entry.cov
-        return compare(seen, pairs, joint.pose, states, P_xx, P_xt, P_tt, self._floor)
+        return compare(image.seen, pairs, joint.pose, states, P_xx, P_xt, P_tt, self._floor)
 
-    def _choose(self, image: Image) -> dict[int, int]:
+    def _choose(self, image: Image, candidates: Candidates) -> dict[int, int]:
         """Observation -> pair."""
-        config, pairs, compared = self._config, image.pairs, image.compared
+        config, pairs, compared = self._config, candidates.pairs, candidates.compared
+        entries = candidates.entries
         known = np.array([self._has_identity(image.seen[i]) for i in pairs.observation], dtype=bool)
-        in_graph = np.array([e.in_graph for e in image.entries], dtype=bool)
+        in_graph = np.array([e.in_graph for e in entries], dtype=bool)
         gate = gate_distance(config.gate_probability, np.maximum(compared.dof, 1))
 
         def best(which: BoolArray) -> dict[int, int]:
@@ -261,39 +260,42 @@ class Associator:
 
         # observations of one image exclude each other: landmarks with an identity are taken
         free = ~known & ~np.isin(pairs.landmark, pairs.landmark[known])
-        chosen = best(free & in_graph & image.recent)
+        chosen = best(free & in_graph & candidates.recent)
         # a landmark that the back end does not have yet closes no loop
-        settled = np.array([e.id in image.where for e in image.entries], dtype=bool)
-        old = best(free & in_graph & ~image.recent & settled)
-        if self._closes_loop(image, list(old.values())):
+        settled = np.array([e.id in candidates.where for e in entries], dtype=bool)
+        old = best(free & in_graph & ~candidates.recent & settled)
+        if self._closes_loop(candidates, list(old.values())):
             chosen |= old
             self.closures += 1
         taken = np.array([int(i) in chosen for i in pairs.observation], dtype=bool)
         chosen |= best(free & ~in_graph & ~taken)
         return chosen | {int(pairs.observation[k]): int(k) for k in np.flatnonzero(known)}
 
-    def _closes_loop(self, image: Image, picks: list[int]) -> bool:
+    def _closes_loop(self, candidates: Candidates, picks: list[int]) -> bool:
         """Whether pairs with landmarks not seen for long are accepted: enough, and together."""
         if len(picks) < self._config.reacquire_min:
             return False
-        slices = [image.joint.slices[image.where[image.entries[k].id]] for k in picks]
-        return fixes_pose(image.compared, picks) and jointly_compatible(
-            image.compared, picks, slices, image.joint.cov, self._config.gate_probability
+        compared, joint = candidates.compared, candidates.joint
+        slices = [joint.slices[candidates.where[candidates.entries[k].id]] for k in picks]
+        return fixes_pose(compared, picks) and jointly_compatible(
+            compared, picks, slices, joint.cov, self._config.gate_probability
         )
 
-    def _apply(self, image: Image, chosen: dict[int, int]) -> tuple[Association, ...]:
+    def _apply(
+        self, image: Image, candidates: Candidates, chosen: dict[int, int]
+    ) -> tuple[Association, ...]:
         """Associations of the chosen pairs; other observations make landmarks or are rejected."""
-        pairs, compared, pose = image.pairs, image.compared, image.joint.pose
+        pairs, compared = candidates.pairs, candidates.compared
         new_gate = gate_distance(self._config.new_landmark_probability, np.maximum(compared.dof, 1))
-        close = image.recent & (compared.d2 < new_gate)
+        close = candidates.recent & (compared.d2 < new_gate)
         out: list[Association] = []
         for n, seen in enumerate(image.seen):
             o = seen
             if n in chosen:
                 k = chosen[n]
-                entry, model = image.entries[k], pairs.model[k]
+                entry, model = candidates.entries[k], pairs.model[k]
                 o = flip(o) if pairs.flipped[k] else o
-                if entry.id in image.where or not entry.in_graph:
+                if entry.id in candidates.where or not entry.in_graph:
                     self.innovations.setdefault(model, []).append(
                         (image.time_ns, float(compared.d2[k] / compared.dof[k]))
                     )
@@ -306,14 +308,25 @@ class Associator:
             else:
                 identity = o.identity if self._has_identity(o) else None
                 o = replace(o, identity=identity)
-                entry, model = self.map.add(o, pose, image.time_ns), o.kind
-            self.map.saw(entry, o, pose, image.time_ns, image.robot, image.path_m)
-            association = _association(image.robot, image.time_ns, entry, model, o)
-            out += self._admit(entry, association, self._has_identity(o))
+                entry, model = self.map.add(o, image.pose, image.time_ns), o.kind
+            out += self._record(image, entry, model, o, self._has_identity(o))
         return tuple(out)
 
-    def _admit(self, entry: Entry, seen: Association, certain: bool) -> list[Association]:
-        """What enters the graph with this sighting: nothing, it alone, or all so far."""
+    def _record(
+        self, image: Image, entry: Entry, model: str, o: Observation, certain: bool
+    ) -> list[Association]:
+        """Record an observation, and what enters the graph with it: none, it alone, all so far."""
+        self.map.saw(entry, o, image.pose, image.time_ns, image.robot, image.path_m)
+        seen = Association(
+            image.robot,
+            image.time_ns,
+            entry.id,
+            model,
+            o.z,
+            o.cov,
+            extent=o.extent,
+            source=o.source,
+        )
         if entry.in_graph:
             return [seen]
         entry.evidence.append(seen)
@@ -325,13 +338,6 @@ class Associator:
             entry.kind = "line"
         waiting, entry.evidence = entry.evidence, []
         return [replace(e, model=entry.kind, late=e.time_ns != seen.time_ns) for e in waiting]
-
-
-def _association(robot: str, time_ns: int, entry: Entry, model: str, o: Observation) -> Association:
-    """The observation ``o`` from a robot's state at ``time_ns`` as one of a landmark."""
-    return Association(
-        robot, time_ns, entry.id, model, o.z, o.cov, extent=o.extent, source=o.source
-    )
 
 
 def _worth_comparing(
