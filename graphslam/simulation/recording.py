@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,11 @@ class Event(NamedTuple):
 
     stamp_ns: int
     write: Callable[[LogWriter], None]
+
+    @classmethod
+    def of(cls, method: Callable[..., None], robot: str, stamp_ns: int, **fields: Any) -> "Event":
+        """A call of a `LogWriter` method."""
+        return cls(stamp_ns, partial(method, robot=robot, stamp_ns=stamp_ns, **fields))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,9 +84,9 @@ def record_visit(scenario: Scenario, visit: SimulatedVisit, path: Path, seed: in
         seen = list(_sightings(name, actor, visit, seed))
         true = sample_times(visit.duration_s, scenario.truth_period_s)
         truth = [
-            Event(int(t), partial(LogWriter.truth, robot=name, stamp_ns=int(t), pose=pose))
+            Event.of(LogWriter.truth, name, t, pose=pose)
             for t, pose in zip(
-                stamps(true, actor.robot.clock), actor.drive.at(true).poses, strict=True
+                stamps(true, actor.robot.clock).tolist(), actor.drive.at(true).poses, strict=True
             )
         ]
         events += [*wheels, *truth, *scans, *(event for event, _ in seen)]
@@ -144,16 +149,10 @@ def _wheels(
         stamps(times, actor.robot.clock, encoders.latency_s).tolist(), poses, angles, strict=True
     ):
         if encoders.odometry:
-            events.append(Event(t, partial(LogWriter.odometry, robot=name, stamp_ns=t, pose=pose)))
+            events.append(Event.of(LogWriter.odometry, name, t, pose=pose))
         if encoders.joint_states:
-            write = partial(
-                LogWriter.wheel_angles,
-                robot=name,
-                stamp_ns=t,
-                left_rad=float(left),
-                right_rad=float(right),
-            )
-            events.append(Event(t, write))
+            angle = {"left_rad": float(left), "right_rad": float(right)}
+            events.append(Event.of(LogWriter.wheel_angles, name, t, **angle))
     ends = compose(states.poses[0], poses[-1])
     return events, float(np.hypot(*(ends - states.poses[-1])[:2]))
 
@@ -172,18 +171,15 @@ def _scans(
     ranges = noisy_ranges(hits, _biases(visit, name, laser, seed), laser, rng)
     fan = beam_fan(laser)
     events = [
-        Event(
+        Event.of(
+            LogWriter.scan,
+            name,
             t,
-            partial(
-                LogWriter.scan,
-                robot=name,
-                stamp_ns=t,
-                ranges=row,
-                angle_min_rad=fan.start_rad,
-                angle_step_rad=fan.step_rad,
-                range_min_m=laser.range_min_m,
-                range_max_m=laser.range_max_m,
-            ),
+            ranges=row,
+            angle_min_rad=fan.start_rad,
+            angle_step_rad=fan.step_rad,
+            range_min_m=laser.range_min_m,
+            range_max_m=laser.range_max_m,
         )
         for t, row in zip(
             stamps(times, actor.robot.clock, laser.latency_s).tolist(), ranges, strict=True
@@ -222,16 +218,16 @@ def _sightings(
         at = stamps(times, actor.robot.clock, sensor.latency_s).tolist()
         for seen in simulate_sightings(poses, sensor, candidates, rng):
             t, landmark = at[seen.sample], sensor.of == LANDMARKS
-            write = partial(
+            event = Event.of(
                 LogWriter.sighting,
-                robot=name,
-                stamp_ns=t,
+                name,
+                t,
                 z=seen.z,
                 cov=seen.cov,
                 identity=seen.name if landmark and sensor.identified else None,
                 seen_robot=None if landmark else seen.name,
             )
-            yield Event(t, write), seen.name
+            yield event, seen.name
 
 
 # ---------------------------------------------------------------- truth
@@ -245,15 +241,8 @@ def _beam_associations(
     for scan, surfaces in zip(scans, ideal.hits.surfaces, strict=True):
         hit, indices = np.unique(surfaces, return_inverse=True)
         nothing = int(NO_SURFACE in hit)  # sorted first, as it is negative
-        write = partial(
-            LogWriter.true_associations,
-            robot=name,
-            stamp_ns=scan.stamp_ns,
-            of="scan",
-            names=everything[hit[nothing:]].tolist(),
-            targets=indices - nothing,
-        )
-        yield Event(scan.stamp_ns, write)
+        truth = {"names": everything[hit[nothing:]].tolist(), "targets": indices - nothing}
+        yield Event.of(LogWriter.true_associations, name, scan.stamp_ns, of="scan", **truth)
 
 
 def _sighting_associations(name: str, seen: list[tuple[Event, str]]) -> Iterator[Event]:
@@ -262,15 +251,8 @@ def _sighting_associations(name: str, seen: list[tuple[Event, str]]) -> Iterator
     for event, target in seen:
         images.setdefault(event.stamp_ns, []).append(target)
     for stamp_ns, names in images.items():
-        write = partial(
-            LogWriter.true_associations,
-            robot=name,
-            stamp_ns=stamp_ns,
-            of="sightings",
-            names=names,
-            targets=np.arange(len(names)),
-        )
-        yield Event(stamp_ns, write)
+        truth = {"names": names, "targets": np.arange(len(names))}
+        yield Event.of(LogWriter.true_associations, name, stamp_ns, of="sightings", **truth)
 
 
 def _landmarks(
