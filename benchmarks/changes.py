@@ -77,7 +77,7 @@ Case = tuple[Visit, Visit, dict[str, Any], list[Any]]
 
 
 def case(name: str, seed: int, folder: Path) -> Case:
-    """Two smoothed visits with truth.json and what only the simulator knows.
+    """Two smoothed visits, truth.json, and the simulated sweeps.
 
     "door opens" are the visits of "door closes" the other way round.
     """
@@ -90,10 +90,10 @@ def case(name: str, seed: int, folder: Path) -> Case:
         motion = dict(zip(("x", "y", "phi"), back.tolist(), strict=True))
         move = move | {"displacement": motion, "before": move["after"], "after": move["before"]}
         return second, first, truth | {"starts": starts, "changes": [move]}, sweeps[::-1]
-    kept = folder / f"{name} {seed}.pickle"
-    if kept.exists():
-        known: Case = pickle.loads(kept.read_bytes())  # our own file
-        return known
+    cache = folder / f"{name} {seed}.pickle"
+    if cache.exists():
+        cached: Case = pickle.loads(cache.read_bytes())  # our own file
+        return cached
     with tempfile.TemporaryDirectory(dir=folder) as temporary:
         here = Path(temporary)
         done = simulate(variants()[name], here / "logs", seed)
@@ -105,12 +105,12 @@ def case(name: str, seed: int, folder: Path) -> Case:
         truth = json.loads((here / "logs/truth.json").read_text(encoding="utf-8"))
         sweeps = [next(iter(r.scans.values())) for r in done.recordings]
     found = (visits[0], visits[1], truth, sweeps)
-    kept.write_bytes(pickle.dumps(found))
+    cache.write_bytes(pickle.dumps(found))
     return found
 
 
 def disturbed(visit: Visit, seed: int) -> Visit:
-    """Every scan with a localisation error of its own, and a covariance that says so."""
+    """The visit with an independent error added to every pose, and to its covariance."""
     noise = np.random.default_rng(seed).normal(size=visit.poses.shape) * POSE_SIGMAS
     covs = visit.covs + np.diag(POSE_SIGMAS**2)
     return replace(visit, poses=visit.poses + noise, covs=covs, shared=covs)

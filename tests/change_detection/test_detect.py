@@ -1,4 +1,4 @@
-"""Change detection: one frame first, what changed is found, what did not is not."""
+"""Change detection: registration, false-alarm rate, detected changes, displacements, files."""
 
 import json
 from dataclasses import replace
@@ -56,7 +56,7 @@ def drive(n, turn=0.0):
 
 
 def visit(things, poses, rng, pose_sigmas=(0.005, 0.005, 0.002), landmarks=()):
-    """Scans of a world from poses that are known up to their covariance, as it says."""
+    """Scans of a world; the stated poses have errors of the stated covariance."""
     clean = cast_beams(poses, FAN, make_world([ROOM, *things]).shapes, 30.0).ranges
     ranges = clean + SIGMA * rng.normal(size=clean.shape)
     sigmas = np.array(pose_sigmas)
@@ -96,7 +96,7 @@ def walls(pose=(0, 0, 0), moved=None, rng=None):
 
 
 def same(a, b, **changes):
-    """Compare two visits that share a frame: registered by the room's walls, known well."""
+    """Changes between two visits in one frame, registered by the room's walls."""
     marks = tuple(walls())
     return detect_changes(
         replace(a, landmarks=marks), replace(b, landmarks=marks), replace(CONFIG, **changes)
@@ -115,7 +115,7 @@ def test_registration_finds_any_pose_of_the_later_frame(pose):
     assert len(found.matched) == 6
 
 
-def test_a_wall_that_moved_is_left_out_and_does_not_drag():
+def test_a_wall_that_moved_does_not_bias_the_registration():
     found = register(walls(), walls(moved=(1, np.array([0.4, 0.0]))))
     np.testing.assert_allclose(found.pose, 0, atol=1e-4)
     assert list(found.moved) == [1]
@@ -142,7 +142,7 @@ def test_no_common_landmarks_is_one_clear_line(later):
         register(walls(), later)
 
 
-def test_alignment_takes_out_the_error_that_a_scan_shares():
+def test_alignment_removes_the_error_common_to_a_scan():
     """5 cm and 1 degree of localisation error, with an honest covariance."""
     rng = np.random.default_rng(1)
     a = visit([box(5, 4)], drive(60), rng)
@@ -163,7 +163,7 @@ def test_alignment_takes_out_the_error_that_a_scan_shares():
 
 
 @pytest.mark.parametrize("pose_sigmas", [(0.005, 0.005, 0.002), (0.05, 0.05, np.radians(1))])
-def test_nothing_changed_alarms_at_the_rate_that_was_asked_for(pose_sigmas):
+def test_without_changes_the_false_alarm_rate_is_as_requested(pose_sigmas):
     """1 % of the later beams, pooled over seeds; no change is reported. The laser has no bias and
     walls are flat, and the settings say so: then all that is stated is what there is."""
     flagged = compared = 0
@@ -180,8 +180,8 @@ def test_nothing_changed_alarms_at_the_rate_that_was_asked_for(pose_sigmas):
     assert 0.002 < flagged / compared < 0.02
 
 
-def test_unseen_is_never_vanished():
-    """A new cupboard hides an old box: the box may still be there."""
+def test_occluded_objects_never_count_as_vanished():
+    """A new cupboard occludes an old box, which may still be there."""
     rng = np.random.default_rng(3)
     hidden = box(7.2, 2.8, 0.4, 0.4, "hidden")
     a = visit([hidden], drive(50), rng)
@@ -270,7 +270,7 @@ def test_walls_that_were_removed_and_added_are_named():
 
 
 def test_evidence_is_one_sided():
-    """A surface that came nearer hides the old one: later beams do not go past it."""
+    """A surface that came nearer occludes the old one: later beams do not pass that."""
     rng = np.random.default_rng(8)
     poses = drive(40)
     a, b = visit([], poses, rng), visit([box(5, 4)], poses, rng)
@@ -280,8 +280,8 @@ def test_evidence_is_one_sided():
     assert beams_past_surfaces(new, a, SIGMA, CONFIG).passed.sum() > 100
 
 
-def test_what_is_tested_has_a_time_of_being_seen():
-    """A wall that went back by less than one beam can tell: every tested piece was met sometime.
+def test_tested_pieces_have_a_stamp_of_first_observation():
+    """A wall that moved back by less than a single beam resolves: its pieces have stamps as well.
 
     Breaks if a piece that no single beam went clearly past keeps the largest integer as its time.
     """
@@ -535,7 +535,7 @@ def test_the_shape_is_that_of_the_scans_wherever_the_path_jumped(turn_deg):
 
 
 def test_a_path_follows_a_map_that_bends_within_a_few_metres():
-    """One motion for all scans leaves decimetres; bending the path by as little leaves few cm."""
+    """A rigid motion leaves an error of decimetres; an elastic path of a few cm."""
     rng = np.random.default_rng(23)
     things = [box(5, 4), box(1, 1, 0.8, 0.4)]
     a = visit(things, drive(120), rng, (1e-4, 1e-4, 1e-5))
@@ -548,7 +548,7 @@ def test_a_path_follows_a_map_that_bends_within_a_few_metres():
     assert left < 0.3 * off
 
 
-def test_maps_are_laid_over_each_other_from_any_pose():
+def test_map_correlation_finds_any_relative_pose():
     rng = np.random.default_rng(12)
     ends = visit([box(5, 4), box(1, 1, 0.8, 0.4)], drive(40), rng).ends
     pose = np.array([4.0, -3.0, 2.2])
@@ -584,7 +584,7 @@ def test_other_rooms_are_not_registered():
 
 
 def test_maps_that_disagree_all_over_are_refused():
-    """Registered by chance: every wall is a decimetre off. Not a list of changes."""
+    """Registered by chance, every wall off by a decimetre: an error, not a list of changes."""
     rng = np.random.default_rng(18)
     a = visit([], drive(40), rng)
     poses = drive(40, 0.1)
@@ -609,14 +609,14 @@ def test_a_result_without_covariances_is_one_clear_line(tmp_path):
         load_visit(load(tmp_path / "result"), tmp_path / "result")
 
 
-def test_several_robots_are_not_followed_from_scan_to_scan():
+def test_several_robots_have_no_nonrigid_registration():
     rng = np.random.default_rng(19)
     a = replace(visit([], drive(20), rng), robots=2)
     with pytest.raises(OutputError, match="no landmarks in common"):
         detect_changes(a, a, CONFIG)
 
 
-def test_other_lasers_are_warned_of():
+def test_different_lasers_cause_a_warning():
     rng = np.random.default_rng(15)
     a, b = visit([], drive(30), rng), visit([], drive(30, 0.1), rng)
     assert laser_warnings(a, b) == ()

@@ -1,4 +1,4 @@
-"""What lasers see badly is not taken for a change: glass, thin things, grazing views, edges."""
+"""No false alarms where lasers measure badly: glass, thin objects, grazing views, edges."""
 
 from dataclasses import replace
 
