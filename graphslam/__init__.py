@@ -12,8 +12,13 @@ Everything else in the package is internal and may change with every version.
 Settings are keywords with the names, checks and defaults of docs/configuration.md: a table as a
 mapping (``keyframe={"mode": "all"}``), a dotted key (``**{"keyframe.mode": "all"}``), or for the
 tables that have a ``name`` just that (``backend="ekf"``). They go over ``config``, which is a
-`Config` or the path of a TOML file. Paths are strings or path objects. With ``output`` a function
-also writes the folder that its command writes, replacing an existing one only with ``force``.
+`Config` or the path of a TOML file. A wrong setting is a `ConfigError` that names its key.
+
+Paths are strings or path objects. A ``recording`` is an MCAP file, several that belong together,
+or what `open_logs` returned, whose settings are then the default. With ``output`` a function also
+writes the folder that its command writes, and replaces an existing one only with ``force``; what
+cannot be written is an `OutputError`. ``progress`` is called with the number of messages read so
+far and of all.
 
 What a name needs is imported when it is used, so ``import graphslam`` costs nothing.
 """
@@ -69,36 +74,12 @@ _CLASSES = {
 }
 
 __all__ = [
-    "Change",
-    "ChangeResult",
-    "Comparison",
-    "Config",
-    "ConfigError",
-    "Estimate",
-    "EstimationError",
-    "GraphSlamError",
-    "GroundTruth",
-    "Landmark",
-    "LogError",
-    "LogSet",
-    "LogWriter",
-    "OutputError",
-    "Result",
-    "RobotResult",
-    "SavedResult",
-    "ScenarioError",
-    "Simulation",
-    "Trajectory",
-    "__version__",
-    "changes_between",
-    "compare",
-    "evaluate",
-    "load_config",
-    "load_result",
-    "open_logs",
-    "simulate",
-    "smooth",
-]
+    "Change", "ChangeResult", "Comparison", "Config", "ConfigError", "Estimate",
+    "EstimationError", "GraphSlamError", "GroundTruth", "Landmark", "LogError", "LogSet",
+    "LogWriter", "OutputError", "Result", "RobotResult", "SavedResult", "ScenarioError",
+    "Simulation", "Trajectory", "__version__", "changes_between", "compare", "evaluate",
+    "load_config", "load_result", "open_logs", "simulate", "smooth",
+]  # fmt: skip
 
 if not TYPE_CHECKING:  # a type checker would take every name for defined
 
@@ -121,8 +102,7 @@ def load_config(config: Config | PathLike | None = None, **settings: Any) -> Con
     """The defaults, over them a TOML file or another configuration, over that ``settings``.
 
     Raises:
-        ConfigError: the file cannot be read, a key is unknown, a value has the wrong type or is
-            out of range; the message names the key.
+        ConfigError: the file cannot be read, or a setting is wrong.
     """
     from graphslam.core import config_io
     from graphslam.core.config import Config
@@ -143,7 +123,6 @@ def open_logs(
 
     Raises:
         LogError: a file is missing, not MCAP or empty, or holds nothing usable.
-        ConfigError: see `load_config`.
     """
     from graphslam.logs import open_logs
 
@@ -162,21 +141,14 @@ def smooth(
 ) -> Result:
     """Estimate the trajectories of all robots and a landmark map: the main job.
 
-    Args:
-        recording: MCAP files, or what `open_logs` returned.
-        config: settings, or the path of a TOML file with them; default: those of opened logs.
-        output: result folder to write, with report.html (the report has a section on the errors
-            where the logs hold the truth).
-        force: replace a result folder at ``output``.
-        progress: called with the number of messages read so far, and of all.
-        **settings: settings over ``config``, see the module.
+    Arguments as in the module's docstring. The folder has a report, with a section on the errors
+    where the logs hold the truth.
 
     Raises:
         LogError: a log cannot be read, or no message of it could be used.
-        ConfigError: see `load_config`; or a setting is about a robot that is not in the log, or
-            about the reading of logs that are open already.
+        ConfigError: also where a setting is about a robot that is not in the log, or about the
+            reading of logs that are open already.
         EstimationError: the estimate is indeterminate, or a robot's start is unknown.
-        OutputError: ``output`` cannot be written or is something that may not be replaced.
     """
     from graphslam.core.worker import Future
     from graphslam.results.folder import check_target, save
@@ -266,23 +238,18 @@ def compare(
     ``if __name__ == "__main__":``. A back end that fails has its error in its row.
 
     Args:
-        recording: as for `smooth`.
+        recording: see the module, as ``config``, ``output``, ``force`` and ``progress``.
         backends: ``NAME[:HORIZON][+key=value...]`` each: ekf, isam2:20, ekf+ekf.error=body.
         mode: ``replay`` (the same recorded steps for all) or ``associate`` (each for itself).
         truth: as for `evaluate`; default: that in the logs, if any.
         relations: as for `evaluate`.
-        config: as for `smooth`.
-        output: folder to write, with compare.json and report.html.
-        force: replace a comparison at ``output``.
-        progress: as for `smooth`.
         announce: called with a line on what is done next.
-        **settings: as for `smooth`.
 
     Raises:
         LogError: a log cannot be read, or no message of it could be used.
-        ConfigError: as for `smooth`; or a back end is unknown, or there is no such mode.
+        ConfigError: also where a back end or the mode is unknown.
         EstimationError: the log cannot be associated, or every back end failed.
-        OutputError: the truth is of other robots, a file cannot be read, or ``output`` written.
+        OutputError: also where the truth is of other robots.
     """
     from graphslam.evaluation.compare_folder import is_comparison, save_comparison
     from graphslam.evaluation.compare_rows import compare
@@ -328,16 +295,14 @@ def changes_between(
         later: result folder of the later visit; it may be the same one, with two spans.
         reference_span_s: scans to use, s since the first one.
         later_span_s: the same of the later visit.
-        config: settings, or the path of a TOML file with them.
-        output: folder to write, with changes.json, report.html, a map and an MCAP file.
-        force: replace a folder of changes at ``output``.
-        **settings: as for `smooth`; those of the table ``changes`` are used.
+
+    The other arguments are described in the module's docstring; of the settings those of the table
+    ``changes`` are used.
 
     Raises:
-        OutputError: a folder is not a result, has no scans or covariances, the two have nothing in
-            common, or ``output`` cannot be written.
+        OutputError: a folder is not a result, has no scans or covariances, or the two have nothing
+            in common.
         LogError: a log is not where it was, or is another one now.
-        ConfigError: see `load_config`.
     """
     from graphslam.change_detection import changes_between, render_changes, save_changes
     from graphslam.change_detection.folder import check_changes_target
