@@ -48,7 +48,7 @@ def render_changes(
         "changes": str(len(found.changes)),
         "beams compared": tile(compared, ""),
         "beams flagged": f"{100 * flagged / max(compared, 1):.2f} %",
-        "false alarms asked for": f"{100 * found.rate:g} %",
+        "false alarms requested": f"{100 * found.rate:g} %",
         "landmarks in common": str(len(found.registration.matched)),
         "registration σ": f"{1000 * max(sigma[:2]):.1f} mm, {np.degrees(sigma[2]):.2f}°",
         "range noise σ": f"{1000 * found.range_sigmas_m[1]:.1f} mm",

@@ -20,11 +20,9 @@ from graphslam.perception.point_to_line import offset_jacobian
 
 #: half width, in cells, of the window over which a piece is fitted and evidence is summed
 WINDOW = 2
-#: a piece is straight if its variance along the line exceeds that across it by this factor, ...
-_STRAIGHT = 4.0
-#: ... and if that across it is below this factor times what the noise explains (plus 3 sigmas of
-#: the estimated variance)
-_SLACK = 1.3
+#: a piece is straight if its variance along the line exceeds that across it by the first factor, and
+#: if that across it is below the second factor times what the noise explains (plus 3 sigmas)
+_STRAIGHT, _SLACK = 4.0, 1.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)

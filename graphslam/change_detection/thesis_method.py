@@ -151,14 +151,14 @@ def expected_measurements(
     minimum = (depth > 0) & (ahead < depth)
     first = minimum.argmax(axis=1)
     beam = np.arange(len(angles))
-    met = minimum[beam, first]
+    found = minimum[beam, first]
     # a plateau of one cell: its middle
     level = depth[beam, first]
     begin = (depth == level[:, None]) & (np.arange(len(r)) <= first[:, None])
     width = np.minimum(begin.sum(axis=1), 2 * _STEPS_PER_CELL)
-    ranges = np.where(met, r[first] - step * (width - 1) / 2, np.nan)
+    ranges = np.where(found, r[first] - step * (width - 1) / 2, np.nan)
     point = dents.winner[cell[beam, first]]
-    bottom = np.where(met, dents.bottom[point], np.nan)
+    bottom = np.where(found, dents.bottom[point], np.nan)
     return ranges, dent_covariance(bottom, dents.threshold)
 
 
