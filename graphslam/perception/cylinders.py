@@ -1,8 +1,8 @@
 """Vertical cylinders (trees, poles, table legs) as points: thesis 7.2, "additional landmarks".
 
-A cylinder is what stands free: a few consecutive returns with everything beside them farther away.
-Its two edges are then its own, and where they are says as much about it as the ranges do: the
-ranges of a thin one hardly show that it is round. The circle is fitted to both.
+A cylinder stands free: a few consecutive returns with everything beside them farther away. Both of
+its edges are then visible, and their directions tell as much as the ranges: the ranges of a thin
+cylinder hardly show that it is round. The circle is fitted to both.
 
 Symbols: beta, rho bearing (rad) and range (m) of the centre, R radius (m), phi direction of a beam,
 delta = phi - beta.
@@ -21,19 +21,19 @@ from graphslam.perception.ordered_scan import Indices, Mask, Sweep
 from graphslam.perception.segments import MISSING_BEAMS
 
 ITERATIONS = 3
-"""Of Gauss and Newton, before outliers are left out and after; the edges give a good start."""
+"""Of Gauss-Newton, before and after outliers are removed; the edges give a good initial value."""
 
 DAMPING = 1.0
-"""1/m², 1/rad²: where all beams graze, the normal matrix is regular and the covariance huge."""
+"""1/m², 1/rad²: keeps the normal matrix regular at grazing incidence; the covariance is large."""
 
 GRAZING = 0.2
-"""Beams whose incidence has a smaller cosine say little, and their linearisation nothing."""
+"""Beams with a smaller cosine of incidence are not used: the linearisation fails there."""
 
 FIT_PROBABILITY = 0.01
-"""Things that fit a circle worse than this share of circles would are none."""
+"""Significance of the chi-square test: clusters that fit worse than this share of circles."""
 
 OUTLIER_SIGMAS = 4.0
-"""The first and the last return may be mixed pixels: left out if so far off."""
+"""The first and the last return may be mixed pixels: removed if their residual is larger."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +60,7 @@ def cylinders(sweep: Sweep, config: FrontEndConfig) -> tuple[tuple[Observation, 
 
     Returns:
         Observations of kind ``point``: bearing and range of the centre, laser frame; and the sweep
-        whose ``points`` lack what they are made of (what it says about single beams stays).
+        without their ``points``; its ranges stay.
     """
     first, last = free_standing_runs(sweep, config)
     if not len(first):
@@ -77,7 +77,9 @@ def cylinders(sweep: Sweep, config: FrontEndConfig) -> tuple[tuple[Observation, 
         Observation("point", z[:2], P[:2, :2] + floor * np.diag([z[1] ** -2, 1.0]))
         for z, P in zip(circles.state[good], circles.cov[good], strict=True)
     )
-    taken = np.zeros(len(sweep.beam) + 1, dtype=np.int64)  # runs are apart: +1 into, -1 out of one
+    taken = np.zeros(
+        len(sweep.beam) + 1, dtype=np.int64
+    )  # runs do not touch: +1 into, -1 out of one
     taken[first[good]] += 1
     taken[last[good] + 1] -= 1
     rows = np.flatnonzero(np.cumsum(taken)[:-1] == 0)
@@ -85,10 +87,10 @@ def cylinders(sweep: Sweep, config: FrontEndConfig) -> tuple[tuple[Observation, 
 
 
 def free_standing_runs(sweep: Sweep, config: FrontEndConfig) -> tuple[Indices, Indices]:
-    """First and last row of the runs of returns that could be a cylinder.
+    """First and last row of the runs of returns that may be a cylinder.
 
-    On both sides the next return is farther away by more than ``gap_m``, or there is none for
-    more beams than drop-outs explain.
+    On both sides the next return is more than ``gap_m`` farther away, or missing for more beams
+    than drop-outs explain.
     """
     k = len(sweep.beam)
     if k < config.cylinder_points:
@@ -104,7 +106,7 @@ def free_standing_runs(sweep: Sweep, config: FrontEndConfig) -> tuple[Indices, I
     cut[0] = cut[-1] = True
     border = np.flatnonzero(cut)
     first, last = border[:-1], border[1:] - 1
-    # a cut without missing beams is a step in range; it must go up on leaving the thing
+    # a cut without missing beams is a step in range: up on leaving the object
     free = (missing[first] | (rise[first] < -config.gap_m / 2)) & (
         missing[last + 1] | (rise[last + 1] > config.gap_m / 2)
     )
@@ -114,11 +116,11 @@ def free_standing_runs(sweep: Sweep, config: FrontEndConfig) -> tuple[Indices, I
 
 
 def fit_circles(sweep: Sweep, first: Indices, last: Indices, config: FrontEndConfig) -> Circles:
-    """Weighted least squares of circles from ranges and edges, by Gauss and Newton.
+    """Weighted least squares of circles from ranges and edges, by Gauss-Newton.
 
-    The range of a beam that meets the circle is rho cos(delta) - sqrt(R² - rho² sin²(delta)), with
+    The range of a beam that hits the circle is rho cos(delta) - sqrt(R² - rho² sin²(delta)), with
     noise ``range_sigma_m`` along the beam. The circle's edges, beta ± asin(R / rho), lie between
-    the last beam that met it and the next: half a beam beyond, give or take a beam.
+    the last beam that hit it and the next: half a beam beyond, with a sigma of one beam.
 
     Args:
         sweep: the scan.
@@ -175,7 +177,7 @@ def _residuals(
     sigma: float,
     edge_sigma: float,
 ) -> tuple[Array, Array, Array]:
-    """Measured minus expected (m, n + 2), its model's derivatives (m, n + 2, 3), weights."""
+    """Residuals (m, n + 2), measured minus predicted, derivatives (m, n + 2, 3), weights."""
     beta, rho, R = state.T[:, :, None]
     delta = wrap(phi - beta)
     c, s = np.cos(delta), np.sin(delta)

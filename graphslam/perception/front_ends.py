@@ -1,7 +1,7 @@
-"""Front ends: what one scan says about landmarks. A new one is a function and a row here.
+"""Front ends: landmark observations from one scan. A new one is a function and a row here.
 
 A front end is a pure function of the scan and the settings. It returns its observations in the
-frame of the LASER; moving them to the base frame through ``scan.mount`` is the caller's business.
+frame of the LASER; the caller transforms them to the base frame with ``scan.mount``.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ FrontEnd = Callable[[Scan, FrontEndConfig], tuple[Observation, ...]]
 def _front_end(
     lines: Callable[[Sweep, FrontEndConfig], tuple[Observation, ...]],
 ) -> FrontEnd:
-    """A front end from a way to find lines: cylinders come first, and their returns make no line.
+    """A front end from an extractor of lines: cylinders come first, without their returns.
 
     Otherwise a thick tree would be a point and a short segment at once.
     """

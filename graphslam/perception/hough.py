@@ -1,13 +1,12 @@
 """Lines by the range-weighted Hough transform, thesis 4.7.1-4.7.4.
 
-Every return votes for the lines that it may lie on; the line with most votes is taken, its returns
-stop voting, and so on. A wall seen in pieces, between things that stand before it or on both
-sides of a door, is ONE line: its pieces vote together.
+Every return votes for the lines that it may lie on; the line with most votes is extracted, its
+returns stop voting, and so on. A wall seen in pieces, behind objects or on both sides of a door, is
+ONE line: its pieces vote together.
 
-The grid is coarse. A peak is therefore only where the search for a line's returns begins: returns
-close to the line fitted to those so far are taken in until nothing changes, so the line grows along
-the wall. What is taken in comes in runs, and each run must fit the line: the front of a cupboard
-does not become a part of the wall beside it.
+The grid is coarse, so a peak is only the seed of a line: returns close to the line fitted so far
+are added until nothing changes, so the line grows along the wall. Returns are added in runs, and
+each run must fit the line: the front of a cupboard does not become a part of the wall beside it.
 """
 
 import math
@@ -16,6 +15,7 @@ from functools import lru_cache
 import numpy as np
 
 from graphslam.core.config import FrontEndConfig
+from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.records import Observation
 from graphslam.perception.line_fit import fit_lines, observations
@@ -24,25 +24,25 @@ from graphslam.perception.ordered_scan import Indices, Mask, Sweep
 from graphslam.perception.segments import MISSING_BEAMS, allowed_rms, fewest_points, valid_lines
 
 SEED_POINTS = 3
-"""A peak has at least so many returns: any two are on a line, and far ones have much weight."""
+"""Fewest returns of a peak: any two lie on a line, and far ones have large weights."""
 
 RUN_POINTS = 3
-"""A run has at least so many returns: one or two are where another wall crosses the line."""
+"""Fewest returns of a run: one or two are where another wall crosses the line."""
 
 BLOCK_POINTS = 16
-"""Runs are tested in blocks of at most so many returns: a run that bends fits its own line badly,
-but each of its blocks shows by how much it is off."""
+"""Runs are tested in blocks of at most so many returns: a bent run fits even its own line badly,
+but each of its blocks shows how far it is off the common line."""
 
-RUN_GATE = 18.42
-"""Chi-square, two degrees of freedom, 99.99 %: a line has many blocks, and one that is left out
-wrongly may come back as a second line of the same wall."""
+RUN_GATE = chi2_quantile(0.9999, 2)
+"""Two degrees of freedom. A line has many blocks, and one that is rejected wrongly may come back as
+a second line of the same wall."""
 
 FLATNESS = 1 / 8
-"""The part of its deviation that a run's own line does not have may be this share of what a segment
-may deviate (mean squares), beside noise: walls of several materials, doors in their frames."""
+"""Largest excess of a run's mean square deviation from the line over that from its own line, as a
+share of what a segment may have, besides noise: walls of several materials, doors in frames."""
 
 ROUNDS = 8
-"""Largest number of times that a line is fitted anew while it grows; three are usual."""
+"""Largest number of fits while a line grows; three are usual."""
 
 
 def hough_lines(sweep: Sweep, config: FrontEndConfig) -> tuple[Observation, ...]:
@@ -83,7 +83,7 @@ def find_lines(sweep: Sweep, free: Mask, config: FrontEndConfig) -> tuple[Indice
         votes = Votes(sweep.points, sweep.ranges[sweep.beam] * sweep.step_rad, free, config)
         while len(seed := votes.peak()):
             rows = _grow(seed, sweep, moments, free, config)
-            # a peak that is no line stops voting too, but its returns may belong to another line
+            # the returns of a rejected peak stop voting too, but may be added to another line
             votes.remove(np.union1d(seed, rows))
             if len(rows) >= fewest_points(config):
                 lines.append(rows)
@@ -96,7 +96,7 @@ def find_lines(sweep: Sweep, free: Mask, config: FrontEndConfig) -> tuple[Indice
 
 
 class Votes:
-    """C(d, γ) of eq. 4.29-4.31 for the returns that still vote.
+    """Accumulator C(d, γ) of eq. 4.29-4.31 for the returns that still vote.
 
     A line at (d, γ + π) is the one at (-d, γ): angles cover half a turn, distances both signs.
     Stripes touch (Δd = 2a), so at each angle a return is in one stripe.
@@ -119,7 +119,7 @@ class Votes:
         stripe = np.rint(points @ normals / config.hough_delta_d_m).astype(np.intp)
         outside = np.abs(stripe) > half
         stripe += half + self._width * np.arange(normals.shape[1])
-        stripe[outside] = size  # one cell more, which is not looked at
+        stripe[outside] = size  # one extra cell, which is ignored
         self._stripe, self._weights, self._voting = stripe, weights, voting.copy()
         self._threshold = config.hough_threshold_m
         cells = stripe[voting]
@@ -129,7 +129,7 @@ class Votes:
         self.C[few] = 0.0
 
     def peak(self) -> Indices:
-        """Rows of the returns in the fullest stripe; none if it is not above the threshold."""
+        """Rows of the returns in the stripe with most votes; none if it is below the threshold."""
         while True:
             cell = int(np.argmax(self.C))
             if self.C[cell] <= self._threshold:
@@ -161,7 +161,7 @@ def _normals(gamma_steps: int) -> Array:
 def _grow(
     seed: Indices, sweep: Sweep, moments: Array, free: Mask, config: FrontEndConfig
 ) -> Indices:
-    """Rows of the returns of the line that those of a stripe begin, in the order of the beams."""
+    """Rows of the returns of the line that grows from a seed, in the order of the beams."""
     line, direction = fitted_line(moments[:, seed].sum(axis=1))
     before = seed
     for _ in range(ROUNDS):
@@ -184,9 +184,9 @@ def _fitting_runs(
 ) -> Indices:
     """Of the returns near a line, those in runs that fit it.
 
-    A run ends where the line goes on farther away than a chain would, with other returns between.
-    First its blocks are tested, so that a run of two things loses the one that is not on the line;
-    then what is left of it as a whole, which shows smaller differences.
+    A run ends where the next return on the line is farther away than in a chain, with other returns
+    between. First its blocks are tested, so that of a run of two objects the one off the line is
+    removed; then the rest of each run as a whole, which shows smaller deviations.
     """
     if len(rows) < SEED_POINTS:
         return rows
@@ -212,7 +212,7 @@ def _fit(
     moments: Array,
     config: FrontEndConfig,
 ) -> Mask:
-    """Which parts of ``rows`` lie on the line; ``starts`` may begin anew, for another division."""
+    """Which parts of ``rows`` lie on the line; ``starts`` may hold several divisions."""
     r = sweep.ranges[sweep.beam[rows]]
     # along the normal; line[0] is the squared offset, so the factor is cos² of the incidence
     var = config.range_sigma_m**2 * line[0] / (r * r)
@@ -228,7 +228,7 @@ def _fit(
 
 
 def _borders(rows: Indices, direction: float, sweep: Sweep, config: FrontEndConfig) -> Indices:
-    """Where runs of ``rows`` begin, and the end of the last."""
+    """Where runs of ``rows`` begin, and the end of the last one."""
     along = sweep.points[rows] @ np.array((math.cos(direction), math.sin(direction)))
     beam = sweep.beam[rows]
     r = sweep.ranges[beam]

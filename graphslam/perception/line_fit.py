@@ -46,7 +46,7 @@ def fit_line(points: Array, config: FrontEndConfig, fully_visible: bool) -> Obse
     Args:
         points: (k, 2), m, laser frame, in the order of the beams; at least two distinct points.
         config: noise and floors.
-        fully_visible: whether both ends of the points are ends of the thing seen.
+        fully_visible: whether both ends of the points are ends of the wall.
     """
     fits = fit_lines(points, np.zeros(1, dtype=np.intp), config)
     return observations(fits, np.array([fully_visible]), config)[0]
@@ -58,8 +58,8 @@ def fit_lines(points: Array, starts: Indices, config: FrontEndConfig) -> LineFit
     With ``config.covariance == "incidence"`` a point weighs 1/sigma_n², its own noise along the
     normal: range noise acts along the beam, so sigma_n = range_sigma_m |cos(incidence)|, and not
     less than floor_normal_m, as the material's bias does not vanish at grazing incidence. The
-    cosine is taken from the beam's direction, which has no noise: a cosine from the measured
-    range would correlate weight and error. With ``"thesis"`` every point weighs
+    cosine is computed from the beam's direction, which has no noise: one from the measured range
+    would correlate weight and error. With ``"thesis"`` every point weighs
     1/range_sigma_m², as in eq. 4.32.
 
     Args:

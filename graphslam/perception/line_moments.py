@@ -1,8 +1,8 @@
-"""Sums over returns that say how well a line fits them, without touching the returns again.
+"""Moments of sets of returns, from which the deviation from any line follows.
 
 The moments of returns are the sums of 1, x, y, x², xy, y²: M (6,). A line is a vector q (6,) such
-that q·M / M[0] is the mean square deviation of those returns from it. So one product tests any
-set of returns against any line, and the moments of a union are a sum.
+that q·M / M[0] is the mean square deviation of those returns from it. So one product tests any set
+of returns against any line, and the moments of a union are a sum.
 """
 
 import math
@@ -28,7 +28,7 @@ def fitted_lines(moments: Array) -> Array:
 
 
 def fitted_line(moments: Array) -> tuple[Array, float]:
-    """One of `fitted_lines`, q (6,), and its direction in rad: a tenth of the time for one."""
+    """One of `fitted_lines`, q (6,), and its direction in rad: for one line ten times as fast."""
     n, sx, sy, sxx, sxy, syy = moments.tolist()
     x, y = sx / n, sy / n
     direction = 0.5 * math.atan2(2 * (sxy / n - x * y), sxx / n - x * x - syy / n + y * y)

@@ -1,10 +1,10 @@
-"""Robots of known outline in a scan: which returns are theirs, where they are, how sure that is.
+"""Robots of known outline in a scan: their returns, their poses and covariances.
 
-A robot stands free: a few consecutive returns, nearer than what is beside them. Its outline, put at
-a pose, predicts the range of every beam that meets it and the directions between which beams do.
-The pose is fitted to both by weighted least squares, as `frontend.cylinders` does with circles, so
-the covariance follows from what is seen: one face tells how far the robot is, its two edges in what
-direction, two faces which way it looks. Thesis 4.5 and 6.1.3 take robots for objects like others.
+A robot stands free: a few consecutive returns, nearer than what is beside them. Its outline at a
+pose predicts the range of every beam that hits it, and the directions of its two edges. The pose is
+fitted to both by weighted least squares, as `cylinders` does with circles, so the covariance
+depends on what is seen: one face gives the range, the two edges the bearing, two faces the heading.
+Thesis 4.5 and 6.1.3 treat robots as objects like others.
 
 Symbols: p = (x, y, phi) pose of the robot in the laser's frame, r range, a direction of a beam.
 """
@@ -19,41 +19,41 @@ from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array, polar_points, rotation, unit_vectors, wrap
 from graphslam.perception.ordered_scan import Indices, Mask, Sweep
 
-#: m, beams, m: returns farther apart are not of one thing that stands free; far away a side seen at
-#: grazing incidence has them farther apart, up to a limit
+#: m, beams, m: returns farther apart are not of one free-standing object: a distance, as many times
+#: the distance between beams if that is more (a side at grazing incidence), and an upper limit
 APART_M, APART_BEAMS, APART_MOST_M = 0.25, 6.0, 0.5
-#: returns at least, of which a pose is to be found
+#: fewest returns that a pose is fitted to
 MIN_RETURNS = 3
-#: returns at least, of which a direction is to be found
+#: fewest returns that a heading is fitted to
 MIN_RETURNS_FOR_HEADING = 6
-#: steps of the search
+#: Levenberg-Marquardt iterations
 ITERATIONS = 8
-#: beams: sigma of an edge between two of them, for the last one may be a mixed pixel
+#: beams: sigma of an edge between two beams, as the last one may be a mixed pixel
 EDGE_SHARE = 1.0
-#: beams: by which both edges may be off the same way
+#: beams: sigma of the error that both edges share
 EDGES_ALIKE = 0.25
 #: m: sigma of the first and the last range, which may be mixed pixels
 MIXED_M = 0.15
-#: things that fit an outline worse than this share of robots would are none
+#: significance of the chi-square test: clusters that fit worse than this share of robots are none
 FIT_PROBABILITY = 0.001
-#: of an outline's width, at least seen
+#: least visible share of an outline's width
 MIN_VISIBLE_SHARE = 0.5
-#: rad: a direction known less well is not linear enough to be told
+#: rad: with a larger sigma the fit of a heading is not linear enough
 MAX_HEADING_SIGMA_RAD = 0.1
-#: m, rad: step of difference quotients, and farthest step of the search
+#: m, rad: step of difference quotients, and largest step of an iteration
 DIFFERENCE_STEP, MAX_STEP = 1e-4, 0.3
-#: in squared sigmas: the search ends when it gains less
+#: the iteration ends when chi-square decreases by less
 CONVERGED = 1e-3
-#: sides of the polygon that stands for a circle
+#: sides of the polygon that approximates a circle
 ROUND_SIDES = 24
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Clusters:
-    """What stands free in a scan: (m,) each, in the order of the beams.
+    """Free-standing objects in a scan: (m,) each, in the order of the beams.
 
-    ``first`` and ``last`` row of `Sweep.points`, both included. ``bare`` (m, 2): on the right, on
-    the left nothing nearer hides where it ends.
+    ``first`` and ``last`` row of `Sweep.points`, both included. ``unoccluded`` (m, 2): whether
+    nothing nearer hides the right and the left end.
     """
 
     first: Indices
@@ -68,9 +68,9 @@ class Clusters:
 class OutlineFit:
     """An outline fitted to a cluster.
 
-    ``pose`` (3,) in the laser's frame, ``cov`` (3, 3) of it; ``direction`` whether the heading was
-    found, else it is the expected one and ``cov`` has the expectation's share in it. ``chi2`` of
-    ranges and edges with ``dof``; ``share`` of the outline's width that is seen.
+    ``pose`` (3,) in the laser's frame, ``cov`` (3, 3) of it; ``heading_found``: whether the heading
+    was fitted, else it is the expected one and ``cov`` includes its uncertainty. ``chi2`` of
+    ranges and edges with ``dof``; ``share`` of the outline's width that is visible.
     """
 
     pose: Array
@@ -82,7 +82,7 @@ class OutlineFit:
 
     @property
     def is_plausible(self) -> bool:
-        """Whether what was seen can be the outline; a small part of one may be of anything."""
+        """Whether the cluster can be the outline; a small part of one may be of anything."""
         return self.share > MIN_VISIBLE_SHARE and self.chi2 <= float(
             chdtri(max(self.dof, 1), FIT_PROBABILITY)
         )
@@ -92,7 +92,7 @@ class OutlineFit:
 class _ClusterView:
     """A cluster: ranges ``r`` (n,) in directions ``a`` (n,), directions of its ``edges`` (2,).
 
-    ``w`` (n + 2,): weights of ranges and edges, 0 for an edge that is not its own.
+    ``w`` (n + 2,): weights of ranges and edges, 0 for an occluded edge.
     """
 
     outline: Array
@@ -116,7 +116,7 @@ def outline_of(corners: Sequence[Sequence[float]]) -> Array:
 
 
 def outline_radius(outline: Array) -> float:
-    """How far the outline (k, 2) goes from the base's origin, m."""
+    """Largest distance of the outline (k, 2) from the base's origin, m."""
     return float(np.hypot(*outline.T).max())
 
 
@@ -127,10 +127,10 @@ def is_round(outline: Array) -> bool:
 
 
 def free_standing_clusters(sweep: Sweep, widest_m: float) -> Clusters:
-    """Things no wider than ``widest_m`` that stand free.
+    """Free-standing objects no wider than ``widest_m``.
 
-    On both sides what is next is farther away, or nearer (then it may hide a part), or there is
-    nothing. Something is free if at least one of its sides is bare.
+    On either side the next return is farther away, or nearer (it may then occlude a part), or there
+    is none. At least one end is not occluded.
     """
     k = len(sweep.beam)
     if not k:
@@ -145,16 +145,16 @@ def free_standing_clusters(sweep: Sweep, widest_m: float) -> Clusters:
     first, last = border[:-1], border[1:] - 1
     rise = np.concatenate(([np.inf], r[1:] - r[:-1], [-np.inf]))
     before, after = -rise[first], rise[last + 1]
-    # the scan's own ends hide what is beyond them
+    # what lies beyond the ends of the scan is unknown
     before[0] = after[-1] = -np.inf
     if sweep.beam[0] > 0:
         before[0] = np.inf
     if sweep.beam[-1] < len(sweep.ranges) - 1:
         after[-1] = np.inf
-    bare = np.array((before > 0, after > 0)).T
+    visible = np.array((before > 0, after > 0)).T
     width = np.hypot(x[last] - x[first], y[last] - y[first])
-    keep = (width <= widest_m) & bare.any(axis=1)
-    return Clusters(first[keep], last[keep], bare[keep])
+    keep = (width <= widest_m) & visible.any(axis=1)
+    return Clusters(first[keep], last[keep], visible[keep])
 
 
 def cluster_centres(sweep: Sweep, found: Clusters) -> Array:
@@ -165,7 +165,7 @@ def cluster_centres(sweep: Sweep, found: Clusters) -> Array:
 
 
 def expected_ranges(outline: Array, poses: Array, angles: Array) -> tuple[Array, Array]:
-    """What a laser at the origin sees of an outline.
+    """What a laser at the origin measures of an outline.
 
     Args:
         outline: (k, 2) corners in the base frame.
@@ -173,8 +173,8 @@ def expected_ranges(outline: Array, poses: Array, angles: Array) -> tuple[Array,
         angles: (n,) directions of beams.
 
     Returns:
-        Ranges (m, n) of the beams, those that miss taken to graze the nearer edge, and the
-        directions (m, 2) of both edges, right then left.
+        Ranges (m, n) of the beams, for those that miss at the nearer edge, and the directions
+        (m, 2) of both edges, right then left.
     """
     c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     X = poses[:, :1] + c * outline[:, 0] - s * outline[:, 1]
@@ -186,7 +186,7 @@ def expected_ranges(outline: Array, poses: Array, angles: Array) -> tuple[Array,
     a = edges[:, :1] + wrap(angles - edges[:, :1])
     a = np.clip(a, (edges[:, 0] + inset)[:, None], (edges[:, 1] - inset)[:, None])
     ca, sa = np.cos(a)[:, :, None], np.sin(a)[:, :, None]
-    # across a beam and along it, of each corner; a side is met where `across` changes sign
+    # coordinates of each corner across and along a beam; a side is hit where `across` changes sign
     across = ca * Y[:, None] - sa * X[:, None]
     along = ca * X[:, None] + sa * Y[:, None]
     across2, along2 = np.roll(across, -1, axis=2), np.roll(along, -1, axis=2)
@@ -200,27 +200,27 @@ def fit_outline(
     sweep: Sweep,
     first: int,
     last: int,
-    bare: Mask,
+    unoccluded: Mask,
     outline: Array,
     expected: Array,
     heading_sigma: float,
     config: FrontEndConfig,
 ) -> OutlineFit:
-    """The pose of an outline that explains a cluster best.
+    """The pose of an outline that fits a cluster best.
 
-    Only where the search begins comes from what is expected, and the heading where it is not seen.
+    The expected pose is only the initial value, except for a heading that the returns do not show.
 
     Args:
         sweep: one scan, in order.
         first: row of the cluster's first return in `Sweep.points`.
         last: row of its last return, inclusive.
-        bare: (2,) whether its edges are its own.
+        unoccluded: (2,) whether its right and left edge are visible.
         outline: (k, 2) corners in the robot's base frame.
         expected: (3,) pose in the laser's frame.
         heading_sigma: of its heading, rad.
         config: ``range_sigma_m``, ``floor_normal_m``.
     """
-    view = _view(sweep, first, last, bare, outline, config)
+    view = _view(sweep, first, last, unoccluded, outline, config)
     fixed = _levenberg_marquardt(_initial_pose(view, expected), 2, view)
     floor = _floor(fixed, outline, sweep.step_rad, config)
     dof = int(np.count_nonzero(view.w)) - 2
@@ -228,7 +228,7 @@ def fit_outline(
         turned = _levenberg_marquardt(fixed, 3, view)
         e, J = _linearise(turned, view)
         P = np.asarray(np.linalg.inv(J.T @ (view.w[:, None] * J) + np.eye(3)))
-        # one that is not where it is expected may be that of another face
+        # a heading far from the expected one may be that of another face
         off2 = float(wrap(turned[2] - expected[2])) ** 2
         if P[2, 2] < MAX_HEADING_SIGMA_RAD**2 and off2 < 9 * (heading_sigma**2 + P[2, 2]):
             return OutlineFit(
@@ -236,7 +236,7 @@ def fit_outline(
             )
     e, J = _linearise(fixed, view)
     P = np.linalg.inv(J[:, :2].T @ (view.w[:, None] * J[:, :2]) + np.eye(2))
-    # what the heading does to the position: it is the expected one
+    # derivative of the position by the heading, which is the expected one
     lever = -P @ J[:, :2].T @ (view.w * J[:, 2])
     cov = np.diag([0.0, 0.0, heading_sigma**2])
     cov[:2, :2] = P + floor[:2, :2] + heading_sigma**2 * np.outer(lever, lever)
@@ -244,16 +244,16 @@ def fit_outline(
 
 
 def _share(pose: Array, view: _ClusterView) -> float:
-    """Share of the outline's width at a pose that the cluster has."""
+    """Share of the outline's width at a pose that the cluster covers."""
     _, sides = expected_ranges(view.outline, pose[None], view.a)
     return float(wrap(view.edges[1] - view.edges[0]) / (sides[0, 1] - sides[0, 0]))
 
 
 def _floor(pose: Array, outline: Array, step_rad: float, config: FrontEndConfig) -> Array:
-    """Covariance (3, 3) of what no number of returns makes better.
+    """Covariance (3, 3) of errors that do not shrink with the number of returns.
 
-    The outline is known, and its surface measured, to ``floor_normal_m``; so is its direction, over
-    its size. Mixed pixels shift both edges the same way, by a share of the angle between beams.
+    The outline is known, and its surface measured, to ``floor_normal_m``; its heading to that over
+    its size. Mixed pixels shift both edges the same way, by a fraction of the beam spacing.
     """
     flat = config.floor_normal_m
     across = np.array([-pose[1], pose[0]]) * EDGES_ALIKE * step_rad
@@ -263,11 +263,11 @@ def _floor(pose: Array, outline: Array, step_rad: float, config: FrontEndConfig)
 
 
 def _view(
-    sweep: Sweep, first: int, last: int, bare: Mask, outline: Array, config: FrontEndConfig
+    sweep: Sweep, first: int, last: int, unoccluded: Mask, outline: Array, config: FrontEndConfig
 ) -> _ClusterView:
     beam = sweep.beam[first : last + 1]
     edges, sigma = _edges_seen(sweep, first, last)
-    w = np.concatenate([np.full(len(beam), config.range_sigma_m**-2), bare * sigma**-2])
+    w = np.concatenate([np.full(len(beam), config.range_sigma_m**-2), unoccluded * sigma**-2])
     w[[0, len(beam) - 1]] = MIXED_M**-2
     return _ClusterView(outline, sweep.angles[beam], sweep.ranges[beam], edges, w)
 
@@ -275,7 +275,7 @@ def _view(
 def _edges_seen(sweep: Sweep, first: int, last: int) -> tuple[Array, Array]:
     """Directions (2,) of a cluster's edges and their sigmas: between its last beam and the next.
 
-    Where the next beam has no return it is unknown which side of it the edge lies.
+    Where the next beam has no return, the edge may lie on either side of it.
     """
     out, sigma = np.zeros(2), np.zeros(2)
     known = np.isfinite(sweep.ranges)
@@ -291,7 +291,7 @@ def _edges_seen(sweep: Sweep, first: int, last: int) -> tuple[Array, Array]:
 
 
 def _initial_pose(view: _ClusterView, expected: Array) -> Array:
-    """The expected pose moved, not turned, so that the outline stands where the returns are."""
+    """The expected pose, translated so that the outline lies at the returns."""
     a, r, pose = view.a, view.r, expected.copy()
     seen = polar_points(r, a).mean(axis=0)
     pose[:2] = seen + outline_radius(view.outline) / 2 * seen / max(float(np.hypot(*seen)), 1e-6)
@@ -306,7 +306,7 @@ def _initial_pose(view: _ClusterView, expected: Array) -> Array:
 
 
 def _linearise(pose: Array, view: _ClusterView) -> tuple[Array, Array]:
-    """Measured minus expected (n + 2,), derivatives (n + 2, 3) of what is expected."""
+    """Residuals (n + 2,), measured minus predicted; derivatives (n + 2, 3) of the prediction."""
     shifts = DIFFERENCE_STEP * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     h = np.concatenate(expected_ranges(view.outline, pose + shifts, view.a), axis=1)
     e = np.concatenate([view.r, view.edges]) - h[0]
@@ -315,7 +315,7 @@ def _linearise(pose: Array, view: _ClusterView) -> tuple[Array, Array]:
 
 
 def _levenberg_marquardt(pose: Array, free: int, view: _ClusterView) -> Array:
-    """Levenberg-Marquardt steps over the first ``free`` parts of the pose."""
+    """Levenberg-Marquardt over the first ``free`` parameters of the pose."""
     damping = 1e-3
     e, J = _linearise(pose, view)
     cost = float(view.w @ e**2)

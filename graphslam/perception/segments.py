@@ -1,9 +1,9 @@
 """Line segments by split and merge, thesis 4.7.5-4.7.8.
 
-A scan is cut into chains where the range jumps, chains into pieces where they bend (split), and
-pieces are joined again where one line explains both (merge): the split cuts noisy walls too
-often, and drop-outs or a pole in front of a wall interrupt the chain. What is left is fitted by
-least squares and checked for validity.
+A scan is cut into chains at range discontinuities, chains into pieces where they bend (split), and
+pieces are joined again where one line fits both (merge): the split cuts noisy walls too often, and
+drop-outs or a pole in front of a wall interrupt the chain. The remaining pieces are fitted by least
+squares and checked for validity.
 """
 
 import math
@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from graphslam.core.config import FrontEndConfig
+from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.records import Observation
 from graphslam.perception.line_fit import LineFits, fit_lines, observations
@@ -21,13 +22,13 @@ from graphslam.perception.ordered_scan import Indices, Mask, Sweep
 from graphslam.perception.segment_ends import fully_visible
 
 MISSING_BEAMS = 3
-"""A chain bridges so many missing returns; how far apart the returns are is another test."""
+"""Missing returns that a chain may bridge; the distance of the returns is another test."""
 
 STEP_GROWTH = 4.0
-"""A wall at grazing incidence: from one return to the next the distance grows by less than this."""
+"""Largest growth of the distance from one return to the next on a wall at grazing incidence."""
 
-MERGE_GATE = 13.82
-"""Chi-square, two degrees of freedom, 99.9 %: pieces of one wall differ by no more."""
+MERGE_GATE = chi2_quantile(0.999, 2)
+"""Two degrees of freedom: pieces of one wall differ by no more."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +51,8 @@ class Segments:
     """Segments (m) of one scan in the order of the beams, counter-clockwise.
 
     ``rows``: the rows of `Sweep.points` of all of them, one after the other; ``starts`` (m,) where
-    each begins in it. ``whole`` (m,): both ends are real. ``valid`` (m,): long and straight enough.
+    each begins in it. ``whole`` (m,): both ends of the wall are visible. ``valid`` (m,): long and
+    straight enough.
     """
 
     rows: Indices
@@ -78,11 +80,11 @@ def segments(sweep: Sweep, config: FrontEndConfig) -> tuple[Observation, ...]:
 
 
 def find_segments(sweep: Sweep, config: FrontEndConfig) -> Segments | None:
-    """What `segments` observes, with the returns it is made of; None where there is nothing."""
+    """The segments of one scan with their returns; None where there are none."""
     moments = point_moments(sweep.points)
     pieces = _split(sweep, moments, config)
-    # Twice: what does not belong to a wall but stands before it keeps the wall's parts from being
-    # neighbours, and can be told from small pieces of a wall only when those have been joined.
+    # Twice: an object in front of a wall keeps the parts of the wall from being neighbours, and can
+    # be distinguished from small pieces of the wall only after those have been merged.
     pieces = _merge(pieces, sweep, moments, config)
     pieces = pieces[pieces.moments[0] >= fewest_points(config)]
     pieces = _merge(pieces, sweep, moments, config)
@@ -103,26 +105,26 @@ def valid_lines(fits: LineFits, config: FrontEndConfig) -> Mask:
 
 
 def fewest_points(config: FrontEndConfig) -> int:
-    """At least two, for a direction, beside the two end points that `_members` doubts."""
+    """Fewest returns of a line: two for a direction and two end points, which may be dropped."""
     return max(config.min_points, 4)
 
 
 def allowed_rms(config: FrontEndConfig) -> float:
-    """Root mean square deviation from one line, m, that goes with a largest one of split_m."""
-    return max(config.split_m, 1e-4) / 2  # it is divided by, and rounding must pass
+    """Largest root mean square deviation from a line, m: half of the largest deviation, split_m."""
+    return max(config.split_m, 1e-4) / 2  # a divisor; and rounding errors must pass
 
 
 def _misfit(pieces: Array, unions: Array, config: FrontEndConfig) -> Array:
-    """How badly one line explains two neighbouring pieces (p - 1,); 1 is the limit.
+    """Misfit of one line to two neighbouring pieces (p - 1,); 1 is the limit.
 
-    The union may scatter as a segment may, with leave for the scatter of a small sample. That
-    alone would let a step of 2 split_m pass as one tilted line; so for each piece the part of its
-    deviation that its own line does not have is limited too: n times it is chi-square with two
-    degrees of freedom where the walls are one, plus what a wall that is not flat brings.
+    The union may deviate as much as a segment, with an allowance for small samples. That alone
+    would let a step of 2 split_m pass as one tilted line. So the excess of each piece's mean square
+    deviation over that from its own line is limited too: n times it is chi-square with two degrees
+    of freedom if there is one wall, plus an allowance for walls that are not flat.
 
     Args:
         pieces: (6, p), moments.
-        unions: (6, p - 1), moments of each two neighbours together.
+        unions: (6, p - 1), moments of neighbours together.
         config: ``split_m`` and ``range_sigma_m``.
     """
     p = pieces.shape[1]
@@ -142,16 +144,15 @@ def _misfit(pieces: Array, unions: Array, config: FrontEndConfig) -> Array:
 def _chain_starts(sweep: Sweep, config: FrontEndConfig) -> Indices:
     """Rows of the returns that begin a chain: thesis 4.7.5, range discontinuities.
 
-    At grazing incidence the returns of one wall are as far apart as different things are. A step
-    that goes straight on from the one before it, or into the one after it, is therefore no
-    discontinuity.
+    At grazing incidence the returns of one wall are as far apart as different objects are. A step
+    that is collinear with the one before or after it is therefore no discontinuity.
     """
     x, y = sweep.points.T
     dx, dy = x[1:] - x[:-1], y[1:] - y[:-1]
     length = np.sqrt(dx * dx + dy * dy)
     r = sweep.ranges[sweep.beam]
     cut = length > config.gap_m + config.gap_ratio * np.minimum(r[1:], r[:-1])
-    aside = np.abs(dx[:-1] * dy[1:] - dy[:-1] * dx[1:])  # how far off straight, times the base
+    aside = np.abs(dx[:-1] * dy[1:] - dy[:-1] * dx[1:])  # deviation from collinear, times the base
     ahead = dx[:-1] * dx[1:] + dy[:-1] * dy[1:] > 0
     into, out_of = length[:-1], length[1:]
     cut[1:] &= ~(ahead & (aside < config.split_m * into) & (out_of < STEP_GROWTH * into))
@@ -163,7 +164,8 @@ def _chain_starts(sweep: Sweep, config: FrontEndConfig) -> Indices:
 def _split(sweep: Sweep, moments: Array, config: FrontEndConfig) -> Pieces:
     """Pieces within split_m of the chord between their ends: thesis 4.7.6, steps 0 to 3.
 
-    Douglas and Peucker's recursion is the thesis' split; OpenCV has it.
+    The thesis splits by the recursion of Douglas and Peucker. So does OpenCV, which then drops
+    vertices that their neighbours make redundant; the merge step would join those pieces anyway.
     """
     starts = _chain_starts(sweep, config)
     stops = np.append(starts[1:], len(sweep.beam))
@@ -177,7 +179,7 @@ def _split(sweep: Sweep, moments: Array, config: FrontEndConfig) -> Pieces:
     if not chains:
         none = np.zeros(0, dtype=np.intp)
         return Pieces(none, none, np.zeros((6, 0)))
-    # Vertices are copies of points, to the bit: x and y read as one integer tell which.
+    # Vertices are bitwise copies of points: x and y read as one integer identify the point.
     key, vertex_key = points.view(np.int64)[:, 0], np.concatenate(chains).view(np.int64)[:, 0]
     order = np.argsort(key)
     vertex = order[np.searchsorted(key, vertex_key, sorter=order)]
@@ -189,9 +191,9 @@ def _split(sweep: Sweep, moments: Array, config: FrontEndConfig) -> Pieces:
 
 
 def _merge(pieces: Pieces, sweep: Sweep, moments: Array, config: FrontEndConfig) -> Pieces:
-    """Neighbours joined while their union's line fits each of the two: thesis 4.7.6.
+    """Neighbours joined while the line through both fits each of them: thesis 4.7.6.
 
-    Of two unions that share a piece the better one comes first, so the result does not depend on
+    Of two unions that share a piece the better one is made first, so the result does not depend on
     the direction of the scan.
     """
     while len(pieces.first) > 1:
@@ -216,16 +218,16 @@ def _merge(pieces: Pieces, sweep: Sweep, moments: Array, config: FrontEndConfig)
 
 
 def _bridged(pieces: Pieces, i: int, sweep: Sweep, config: FrontEndConfig) -> bool:
-    """Whether pieces i and i + 1, on one line, are one wall though a stretch between is not seen.
+    """Whether pieces i and i + 1, on one line, are one wall despite a gap between them.
 
-    Not if the stretch is longer than the shorter part, or if a beam went through it (a door).
+    Not if the gap is longer than the shorter piece, or if a beam went through it (a door).
     """
     rows = pieces.first[i], pieces.last[i], pieces.first[i + 1], pieces.last[i + 1]
     a0, a1, b0, b1 = sweep.points[rows, :].tolist()
     if math.dist(a1, b0) > max(config.gap_m, min(math.dist(a0, a1), math.dist(b0, b1))):
         return False
     between = slice(sweep.beam[rows[1]] + 1, sweep.beam[rows[2]])
-    # seen counter-clockwise a wall has the sensor on its left, and what lies behind on its right
+    # counter-clockwise, the sensor is on the left of a wall, and what lies behind on its right
     r, angle = sweep.ranges[between], sweep.angles[between]
     wall = math.atan2(b1[1] - a0[1], b1[0] - a0[0])
     left = r * np.sin(angle - wall) - (a0[1] * math.cos(wall) - a0[0] * math.sin(wall))
@@ -237,9 +239,9 @@ def _members(
 ) -> tuple[Indices, Indices]:
     """Rows of the returns of each segment, one after the other, and where each begins.
 
-    Returns farther than split_m from the segment's line are left out: a pole before the wall, and
-    mixed pixels. The line is taken without the end points, which are the doubtful ones; one that
-    two pieces share goes to the line that it is closer to. Segments with too few are dropped.
+    Returns farther than split_m from the segment's line are left out: a pole in front of the wall,
+    mixed pixels. The line is fitted without the end points, which are the doubtful ones; a return
+    that two pieces share goes to the closer line. Segments with too few returns are dropped.
     """
     inner = pieces.moments - moments[:, pieces.first] - moments[:, pieces.last]
     line = fitted_lines(inner)

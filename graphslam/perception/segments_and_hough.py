@@ -1,8 +1,8 @@
 """Segments and Hough lines together: one wall gives one observation, no return counts twice.
 
-Segments know where a wall ends; Hough lines hold together what hides behind furniture or goes on
-beyond a door. So segments with two real ends come first and keep their returns; Hough lines are
-made of the others; a segment that was cut stays where no Hough line took its returns.
+Segments know where a wall ends; Hough lines connect the parts of a wall that furniture or a door
+separates. So segments with both ends visible come first and keep their returns; Hough lines are
+extracted from the others; an occluded segment stays where no Hough line took its returns.
 """
 
 import numpy as np
@@ -20,7 +20,7 @@ from graphslam.perception.segments import (
 )
 
 SHARED = 0.5
-"""A cut segment that lost a larger share of its returns to Hough lines is a part of them."""
+"""An occluded segment that lost a larger share of its returns to Hough lines is dropped."""
 
 
 def both(sweep: Sweep, config: FrontEndConfig) -> tuple[Observation, ...]:
@@ -32,7 +32,7 @@ def both(sweep: Sweep, config: FrontEndConfig) -> tuple[Observation, ...]:
 
     Returns:
         Observations, laser frame: whole segments in the order of the beams, then Hough lines, then
-        what is left of cut segments, of kind ``line``.
+        the rest of the occluded segments, of kind ``line``.
     """
     found = find_segments(sweep, config)
     free = np.ones(len(sweep.beam), dtype=np.bool_)
@@ -42,11 +42,11 @@ def both(sweep: Sweep, config: FrontEndConfig) -> tuple[Observation, ...]:
         free[found.rows[take[_owner(found.rows, found.starts)]]] = False
         whole = observations(found.fits[take], found.whole[take], config)
     rows, starts = find_lines(sweep, free, config)
-    hough, used = _cut_lines(sweep, rows, starts, config)
+    hough, used = _line_observations(sweep, rows, starts, config)
     free[used] = False
     if found is None:
         return hough
-    left, _ = _cut_lines(sweep, *_left_over(found, free, config), config)
+    left, _ = _line_observations(sweep, *_remaining_segments(found, free, config), config)
     return (*whole, *hough, *left)
 
 
@@ -55,10 +55,10 @@ def _owner(rows: Indices, starts: Indices) -> Indices:
     return np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(rows))))
 
 
-def _cut_lines(
+def _line_observations(
     sweep: Sweep, rows: Indices, starts: Indices, config: FrontEndConfig
 ) -> tuple[tuple[Observation, ...], Indices]:
-    """Observations of kind ``line`` of those that are valid, and the rows that they are made of."""
+    """Observations of kind ``line`` of the valid lines, and the rows of their returns."""
     if not len(starts):
         return (), rows
     fits = fit_lines(sweep.points[rows], starts, config)
@@ -67,8 +67,10 @@ def _cut_lines(
     return seen, rows[valid[_owner(rows, starts)]]
 
 
-def _left_over(found: Segments, free: Mask, config: FrontEndConfig) -> tuple[Indices, Indices]:
-    """Rows and starts of the cut segments that mostly consist of ``free`` returns, of those."""
+def _remaining_segments(
+    found: Segments, free: Mask, config: FrontEndConfig
+) -> tuple[Indices, Indices]:
+    """Rows and starts of the ``free`` returns of occluded segments that mostly consist of such."""
     owner = _owner(found.rows, found.starts)
     is_free = free[found.rows]
     count = np.bincount(owner, minlength=len(found.starts))

@@ -1,4 +1,4 @@
-"""Sightings as observations: what a camera or another detector has already made of its image."""
+"""Sightings (of landmarks, by a camera or another detector) as observations."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from graphslam.core.records import Observation, Sighting
 
 
 def sighting_observation(message: Sighting) -> Observation:
-    """A sighting as an observation: a point, or with a direction a pose on the thing seen."""
+    """A sighting as an observation: a point, or with a direction the pose of the landmark."""
     if len(message.z) == 2:
         return Observation("point", message.z, message.cov, None, message.identity)
     sighted, origin = message.z[:2], np.zeros(3)
