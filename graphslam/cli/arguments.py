@@ -126,6 +126,7 @@ Experiment = Annotated[
         help="An experiment file, or ekf-versus-smoothing, filters or thesis.",
     ),
 ]
+EvaluatedFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Result folder of smooth.")]
 ReferenceFolder = Annotated[
     Path, typer.Argument(metavar="REFERENCE", help="Result folder of the earlier visit.")
 ]

@@ -4,10 +4,10 @@ What takes long to import is imported by the command that needs it, so that help
 arguments appear at once.
 """
 
+import inspect
 import os
 from collections.abc import Callable
-from dataclasses import replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import typer
@@ -20,6 +20,7 @@ from graphslam.cli.arguments import (
     ComparisonMode,
     ConfigFile,
     Debug,
+    EvaluatedFolder,
     Experiment,
     ExperimentFolder,
     Force,
@@ -78,69 +79,80 @@ def options(
     """Logs of wheeled robots in; trajectories, a landmark map and their covariances out."""
 
 
-def _print(name: str, content: Any, json: bool, for_people: Callable[[], None]) -> None:
-    """Print ``content`` as one JSON object, or what ``for_people`` prints of it."""
-    if json:
-        typer.echo(to_json(content, name), nl=False)
-    else:
-        for_people()
+@dataclass(frozen=True)
+class Output:
+    """What a command prints: ``content`` with --json, else what ``show`` prints for people.
+
+    ``failure``: an error to report after that, for work that was done in part.
+    """
+
+    content: Any
+    show: Callable[[], None]
+    failure: str = ""
 
 
-@app.command("info")
-def info_command(
-    logs: Logs,
-    config: ConfigFile = None,
-    settings: Settings = None,
-    json: Json = False,
-    debug: Debug = False,
-) -> None:
+def command(name: str) -> Callable[[Callable[..., Output]], None]:
+    """Register a function as a command, with the options --json and --debug that all have."""
+
+    def register(function: Callable[..., Output]) -> None:
+        def run(*, json: Json = False, debug: Debug = False, **arguments: Any) -> None:
+            with errors_in_one_line(debug):
+                output = function(**arguments)
+                if json:
+                    typer.echo(to_json(output.content, name), nl=False)
+                else:
+                    output.show()
+                if output.failure:
+                    raise EstimationError(output.failure)
+
+        # typer reads the options from the signature
+        common = list(inspect.signature(run).parameters.values())[:2]
+        own = inspect.signature(function)
+        signature = own.replace(parameters=[*own.parameters.values(), *common])
+        run.__dict__["__signature__"] = signature
+        run.__annotations__ = function.__annotations__ | {"json": Json, "debug": Debug}
+        run.__doc__ = function.__doc__
+        app.command(name)(run)
+
+    return register
+
+
+@command("info")
+def info(logs: Logs, config: ConfigFile = None, settings: Settings = None) -> Output:
     """Say what is in a log, what is usable, what is odd."""
-    with errors_in_one_line(debug):
-        info = inspect_logs(logs, load_config(config, settings or ()))
-        _print("info", info.to_dict(), json, lambda: show.log_info(info))
+    found = inspect_logs(logs, load_config(config, settings or ()))
+    return Output(found.to_dict(), lambda: show.log_info(found))
 
 
-@app.command("import")
-def import_command(
-    format_name: Format,
-    source: Source,
-    output: OutputLog,
-    json: Json = False,
-    force: Force = False,
-    debug: Debug = False,
-) -> None:
+@command("import")
+def import_log(
+    format_name: Format, source: Source, output: OutputLog, force: Force = False
+) -> Output:
     """Convert SOURCE to an MCAP log.
 
     True poses and landmarks, where SOURCE has any, go in too.
     """
-    with errors_in_one_line(debug):
-        if os.path.lexists(output) and not force:
-            raise OutputError(f"{output}: already exists; give --force to replace it")
-        done = IMPORTERS[format_name](source, output)
-        content = {"log": str(output), "counts": done.counts, "warnings": done.warnings}
-        _print("import", content, json, lambda: show.imported(done))
+    if os.path.lexists(output) and not force:
+        raise OutputError(f"{output}: already exists; give --force to replace it")
+    done = IMPORTERS[format_name](source, output)
+    content = {"log": str(output), "counts": done.counts, "warnings": done.warnings}
+    return Output(content, lambda: show.imported(done))
 
 
-@app.command("simulate")
-def simulate_command(
-    scenario: Scenario,
-    output: OutputLogOrFolder,
-    seed: Seed = 0,
-    json: Json = False,
-    force: Force = False,
-    debug: Debug = False,
-) -> None:
+@command("simulate")
+def simulate(
+    scenario: Scenario, output: OutputLogOrFolder, seed: Seed = 0, force: Force = False
+) -> Output:
     """Simulate a recording, with its truth.
 
     Equal scenarios and seeds give equal bytes.
     """
-    with errors_in_one_line(debug):
-        done = graphslam.simulate(scenario, output, seed=seed, force=force)
-        _print("simulation", show.simulation(done), json, lambda: show.simulated(done))
+    done = graphslam.simulate(scenario, output, seed=seed, force=force)
+    return Output(show.simulation(done), lambda: show.simulated(done))
 
 
-@app.command("smooth")
-def smooth_command(
+@command("smooth")
+def smooth(
     logs: Logs,
     output: ResultFolder,
     backend: Backend = None,
@@ -149,47 +161,37 @@ def smooth_command(
     start: Starts = None,
     config: ConfigFile = None,
     settings: Settings = None,
-    json: Json = False,
     force: Force = False,
-    debug: Debug = False,
-) -> None:
+) -> Output:
     """Find the best trajectories and a landmark map.
 
     Writes a folder with trajectories, landmarks, covariances, the factor graph and report.html.
     """
-    with errors_in_one_line(debug):
-        options = [f"backend.name={backend}"] if backend else []
-        options += [] if horizon is None else [f"backend.horizon_s={horizon}"]
-        options += [f"front_end.name={front_end}"] if front_end else []
-        tree = load_config(config, [*options, *(start or ()), *(settings or ())])
-        if horizon is not None and tree.backend.name != "isam2":
-            raise ConfigError(f"--horizon: only isam2 has one, not {tree.backend.name}; leave it")
-        with progress_bar("smoothing") as progress:
-            result = graphslam.smooth(
-                logs, config=tree, output=output, force=force, progress=progress
-            )
-        _print("summary", result.summary, json, lambda: show.smoothed(result, output))
+    options = [f"backend.name={backend}"] if backend else []
+    options += [] if horizon is None else [f"backend.horizon_s={horizon}"]
+    options += [f"front_end.name={front_end}"] if front_end else []
+    tree = load_config(config, [*options, *(start or ()), *(settings or ())])
+    if horizon is not None and tree.backend.name != "isam2":
+        raise ConfigError(f"--horizon: only isam2 has one, not {tree.backend.name}; leave it")
+    with progress_bar("smoothing") as progress:
+        result = graphslam.smooth(logs, config=tree, output=output, force=force, progress=progress)
+    return Output(result.summary, lambda: show.smoothed(result, output))
 
 
-@app.command("evaluate")
-def evaluate_command(
-    directory: Annotated[Path, typer.Argument(metavar="DIR", help="Result folder of smooth.")],
-    truth: TruthFiles = None,
-    relations: Relations = None,
-    json: Json = False,
-    debug: Debug = False,
-) -> None:
+@command("evaluate")
+def evaluate(
+    directory: EvaluatedFolder, truth: TruthFiles = None, relations: Relations = None
+) -> Output:
     """Compare a result with the truth.
 
     That is true poses and landmarks, or reference relations between the scans.
     """
-    with errors_in_one_line(debug):
-        errors = graphslam.evaluate(directory, truth=truth or None, relations=relations)
-        _print("evaluation", errors, json, lambda: show.evaluation(errors))
+    errors = graphslam.evaluate(directory, truth=truth or None, relations=relations)
+    return Output(errors, lambda: show.evaluation(errors))
 
 
-@app.command("compare")
-def compare_command(
+@command("compare")
+def compare(
     logs: Logs,
     output: OutputFolder,
     backends: Backends = "ekf,isam2:0,isam2,batch",
@@ -200,33 +202,28 @@ def compare_command(
     start: Starts = None,
     config: ConfigFile = None,
     settings: Settings = None,
-    json: Json = False,
     force: Force = False,
-    debug: Debug = False,
-) -> None:
+) -> Output:
     """Compare back ends on one log: errors, consistency, time, memory.
 
     Writes a folder with compare.json and report.html.
     """
-    with errors_in_one_line(debug):
-        options = [f"front_end.name={front_end}"] if front_end else []
-        tree = load_config(config, [*options, *(start or ()), *(settings or ())])
-        with progress_bar("associating") as progress:
-            comparison = graphslam.compare(
-                logs, [spec for spec in backends.split(",") if spec], mode=mode,
-                truth=truth or None, relations=relations, config=tree, output=output, force=force,
-                progress=progress, announce=show.stage,
-            )  # fmt: skip
-        found = comparison.found
-        _print("comparison", found, json, lambda: show.comparison(found, output))
-        failed = [f"{row['spec']}: {row['error']}" for row in found["rows"] if row["error"]]
-        if failed:
-            rows = len(found["rows"])
-            raise EstimationError(f"{len(failed)} of {rows} back ends failed; {failed[0]}")
+    options = [f"front_end.name={front_end}"] if front_end else []
+    tree = load_config(config, [*options, *(start or ()), *(settings or ())])
+    with progress_bar("associating") as progress:
+        comparison = graphslam.compare(
+            logs, [spec for spec in backends.split(",") if spec], mode=mode, truth=truth or None,
+            relations=relations, config=tree, output=output, force=force, progress=progress,
+            announce=show.stage,
+        )  # fmt: skip
+    found = comparison.found
+    failed = [f"{row['spec']}: {row['error']}" for row in found["rows"] if row["error"]]
+    failure = f"{len(failed)} of {len(found['rows'])} back ends failed; " if failed else ""
+    return Output(found, lambda: show.comparison(found, output), failure + "".join(failed[:1]))
 
 
-@app.command("changes")
-def changes_command(
+@command("changes")
+def changes(
     reference: ReferenceFolder,
     later: LaterFolder,
     output: OutputFolder,
@@ -234,53 +231,46 @@ def changes_command(
     later_span: Span = None,
     config: ConfigFile = None,
     settings: Settings = None,
-    json: Json = False,
     force: Force = False,
-    debug: Debug = False,
-) -> None:
+) -> Output:
     """Find what is different since the last visit, and how sure.
 
     Writes changes.json, report.html, a map and an MCAP file of them. REFERENCE and LATER may be
     one folder with two spans.
     """
-    with errors_in_one_line(debug):
-        done = graphslam.changes_between(
-            reference, later, reference_span_s=span_of(reference_span),
-            later_span_s=span_of(later_span), config=load_config(config, settings or ()),
-            output=output, force=force,
-        )  # fmt: skip
-        found = done.to_dict()
-        _print("changes", found, json, lambda: show.changes(found, output))
+    found = graphslam.changes_between(
+        reference, later, reference_span_s=span_of(reference_span),
+        later_span_s=span_of(later_span), config=load_config(config, settings or ()),
+        output=output, force=force,
+    ).to_dict()  # fmt: skip
+    return Output(found, lambda: show.changes(found, output))
 
 
-@app.command("experiment")
-def experiment_command(
-    experiment: Experiment,
+@command("experiment")
+def experiment(
+    name: Experiment,
     output: ExperimentFolder,
     runs: Runs = None,
     jobs: Jobs = None,
-    json: Json = False,
     force: ForceOrResume = False,
-    debug: Debug = False,
-) -> None:
+) -> Output:
     """Run a Monte Carlo experiment: many seeds, estimators and noise scales.
 
     Writes results.jsonl, a row per run as it ends, then summary.json, report.html and figures.
     Stopped, it goes on where it was when it is called again.
     """
-    with errors_in_one_line(debug):
-        from graphslam.evaluation.monte_carlo_campaign import jobs_of, run_campaign
-        from graphslam.evaluation.monte_carlo_definition import load_definition
-        from graphslam.evaluation.monte_carlo_folder import save_summary
-        from graphslam.evaluation.monte_carlo_summary import summarise
+    from graphslam.evaluation.monte_carlo_campaign import jobs_of, run_campaign
+    from graphslam.evaluation.monte_carlo_definition import load_definition
+    from graphslam.evaluation.monte_carlo_folder import save_summary
+    from graphslam.evaluation.monte_carlo_summary import summarise
 
-        definition = load_definition(experiment)
-        definition = replace(definition, runs=runs or definition.runs)
-        total = len(jobs_of(definition))
-        with progress_bar("running") as progress:
-            rows = run_campaign(
-                definition, output, jobs=jobs, force=force, progress=lambda n: progress(n, total)
-            )
-        summary = summarise(definition, rows)
-        save_summary(summary, output)
-        _print("experiment", summary, json, lambda: show.experiment(summary, output))
+    definition = load_definition(name)
+    definition = replace(definition, runs=runs or definition.runs)
+    total = len(jobs_of(definition))
+    with progress_bar("running") as progress:
+        rows = run_campaign(
+            definition, output, jobs=jobs, force=force, progress=lambda n: progress(n, total)
+        )
+    summary = summarise(definition, rows)
+    save_summary(summary, output)
+    return Output(summary, lambda: show.experiment(summary, output))
