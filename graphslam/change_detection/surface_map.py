@@ -20,8 +20,8 @@ from graphslam.perception.point_to_line import offset_jacobian
 
 #: half width, in cells, of the window over which a piece is fitted and evidence is summed
 WINDOW = 2
-#: a piece is straight if its variance along the line exceeds that across it by the first factor, and
-#: if that across it is below the second factor times what the noise explains (plus 3 sigmas)
+#: a piece is straight if its variance along the line exceeds that across it by the first factor,
+#: and that across it is below the second factor times what the noise explains (plus 3 sigmas)
 _STRAIGHT, _SLACK = 4.0, 1.3
 
 
