@@ -22,28 +22,20 @@ from graphslam.perception.ordered_scan import Indices, Mask, Sweep
 #: m, beams, m: returns farther apart are not of one free-standing object: a distance, as many times
 #: the distance between beams if that is more (a side at grazing incidence), and an upper limit
 APART_M, APART_BEAMS, APART_MOST_M = 0.25, 6.0, 0.5
-#: fewest returns that a pose is fitted to
-MIN_RETURNS = 3
-#: fewest returns that a heading is fitted to
-MIN_RETURNS_FOR_HEADING = 6
-#: Levenberg-Marquardt iterations
-ITERATIONS = 8
-#: beams: sigma of an edge between two beams, as the last one may be a mixed pixel
-EDGE_SHARE = 1.0
-#: beams: sigma of the error that both edges share
-EDGES_ALIKE = 0.25
-#: m: sigma of the first and the last range, which may be mixed pixels
-MIXED_M = 0.15
+#: fewest returns that a pose, and also a heading, is fitted to
+MIN_RETURNS, MIN_RETURNS_FOR_HEADING = 3, 6
+#: beams: sigma of an edge between two beams, as the last one may be a mixed pixel, and of the error
+#: that both edges share; m: sigma of the first and the last range, which may be mixed pixels too
+EDGE_BEAMS, COMMON_EDGE_BEAMS, MIXED_M = 1.0, 0.25, 0.15
 #: significance of the chi-square test: clusters that fit worse than this share of robots are none
 FIT_PROBABILITY = 0.001
 #: least visible share of an outline's width
 MIN_VISIBLE_SHARE = 0.5
 #: rad: with a larger sigma the fit of a heading is not linear enough
 MAX_HEADING_SIGMA_RAD = 0.1
-#: m, rad: step of difference quotients, and largest step of an iteration
-DIFFERENCE_STEP, MAX_STEP = 1e-4, 0.3
-#: the iteration ends when chi-square decreases by less
-CONVERGED = 1e-3
+#: Levenberg-Marquardt: iterations at most, decrease of chi-square below which it ends, step of the
+#: difference quotients and largest step of an iteration (m, rad)
+ITERATIONS, CONVERGED, DIFFERENCE_STEP, MAX_STEP = 8, 1e-3, 1e-4, 0.3
 #: sides of the polygon that approximates a circle
 ROUND_SIDES = 24
 
@@ -256,7 +248,7 @@ def _floor(pose: Array, outline: Array, step_rad: float, config: FrontEndConfig)
     its size. Mixed pixels shift both edges the same way, by a fraction of the beam spacing.
     """
     flat = config.floor_normal_m
-    across = np.array([-pose[1], pose[0]]) * EDGES_ALIKE * step_rad
+    across = np.array([-pose[1], pose[0]]) * COMMON_EDGE_BEAMS * step_rad
     P = np.diag([flat, flat, 2 * flat / outline_radius(outline)]) ** 2
     P[:2, :2] += np.outer(across, across)
     return P
@@ -286,7 +278,7 @@ def _edges_seen(sweep: Sweep, first: int, last: int) -> tuple[Array, Array]:
             beyond += way
         apart = sweep.step_rad * max(abs(beyond - beam), 1)
         out[k] = sweep.angles[beam] + way * apart / 2
-        sigma[k] = EDGE_SHARE * apart
+        sigma[k] = EDGE_BEAMS * apart
     return out, sigma
 
 

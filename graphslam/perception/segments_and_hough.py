@@ -19,8 +19,8 @@ from graphslam.perception.segments import (
     valid_lines,
 )
 
+#: an occluded segment that lost a larger share of its returns to Hough lines is dropped
 SHARED = 0.5
-"""An occluded segment that lost a larger share of its returns to Hough lines is dropped."""
 
 
 def both(sweep: Sweep, config: FrontEndConfig) -> tuple[Observation, ...]:
@@ -28,7 +28,7 @@ def both(sweep: Sweep, config: FrontEndConfig) -> tuple[Observation, ...]:
 
     Args:
         sweep: one scan, in order.
-        config: thresholds and noise.
+        config: settings of both.
 
     Returns:
         Observations, laser frame: whole segments in the order of the beams, then Hough lines, then
