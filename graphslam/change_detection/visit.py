@@ -120,13 +120,13 @@ def on_surface(angles: Array, ranges: Array, config: ChangesConfig = _DEFAULTS) 
     Args:
         angles: (k,) rad.
         ranges: (k,) m, NaN without a return.
-        config: `min_range_m`, `edge_gap_m`, `edge_gap_share`.
+        config: `min_range_m`, `edge_gap_m`, `edge_gap_ratio`.
     """
     points = polar_points(ranges, angles)
     gap = np.hypot(*np.diff(points, axis=0).T)
     nearer = np.fmin(ranges[1:], ranges[:-1])
     gap[nearer < config.min_range_m] = np.inf
-    joined = gap < config.edge_gap_m + config.edge_gap_share * nearer  # false with NaN
+    joined = gap < config.edge_gap_m + config.edge_gap_ratio * nearer  # false with NaN
     joined = np.concatenate([[False], joined, [False]])
     return np.asarray(joined[1:] & joined[:-1])
 

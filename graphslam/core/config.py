@@ -221,7 +221,8 @@ class AssociationConfig:
     tentative landmark enters the graph at this many sightings. tentative_s, tentative_m: one not
     observed again within this time and path is deleted. reacquire_m: a landmark not observed for
     this much path counts as old; old lines are matched again only if reacquire_min of them, not all
-    parallel, agree.
+    parallel, agree. reassociation_gate_m (across), reassociation_gate_rad: largest residual of an
+    observation when the solved log is associated again, and distance of one landmark's visits.
     """
 
     method: Literal["optimal", "greedy"] = "optimal"
@@ -239,6 +240,8 @@ class AssociationConfig:
     tentative_m: float = 5.0
     reacquire_m: float = 10.0
     reacquire_min: int = 3
+    reassociation_gate_m: float = 0.3
+    reassociation_gate_rad: float = 0.15
 
 
 @dataclass(frozen=True)
@@ -384,8 +387,8 @@ class ChangesConfig:
     run_false_alarm_rate: probability that a run without any change reports one. resolution_m: of
     the map; coarser where the map would have more than max_side_cells squared cells. min_range_m,
     max_range_m: nearer returns (the vehicle itself, dust, error codes) and farther ones are not
-    used. edge_gap_m, edge_gap_share: a return is at an edge, and not used, if the next beam's is
-    farther from it than edge_gap_m + edge_gap_share * range. range_sigma_m: range noise until it is
+    used. edge_gap_m, edge_gap_ratio: a return is at an edge, and not used, if the next beam's is
+    farther from it than edge_gap_m + edge_gap_ratio * range. range_sigma_m: range noise until it is
     estimated from the scans. max_pose_error_m: largest error of a later scan's position that
     alignment with the reference's surfaces corrects. min_returns, min_scans: a surface is compared
     if it has so many returns from so many scans. flatness_m: deviation of a straight surface from
@@ -403,7 +406,7 @@ class ChangesConfig:
     min_range_m: float = 0.1
     max_range_m: float = 30.0
     edge_gap_m: float = 0.06
-    edge_gap_share: float = 0.025
+    edge_gap_ratio: float = 0.025
     range_sigma_m: float = 0.02
     max_pose_error_m: float = 0.5
     min_returns: int = 6

@@ -10,13 +10,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graphslam.core.config import AssociationConfig
 from graphslam.core.geometry import Array, between, path_length
 from graphslam.core.records import Estimate, Step, Trajectory
 from graphslam.mapping.duplicate_landmarks import merged_steps
 from graphslam.mapping.landmark_map import LandmarkMap
-
-#: m, rad: landmarks of different visits that lie farther apart stay separate
-SAME_M, SAME_RAD = 0.3, 0.15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,7 +86,7 @@ def split_by_visit(
 
 
 def rejoin_visits(
-    split: SplitVisits, estimate: Estimate, landmarks: LandmarkMap
+    split: SplitVisits, estimate: Estimate, landmarks: LandmarkMap, config: AssociationConfig
 ) -> tuple[Step, ...]:
     """Steps in which landmarks of different visits that lie together are one again.
 
@@ -96,6 +94,7 @@ def rejoin_visits(
         split: the steps with separate landmarks.
         estimate: of their states and landmarks.
         landmarks: the map; landmarks that stay separate enter it.
+        config: how far apart the landmarks of two visits may be.
     """
     groups: dict[int, list[int]] = {}
     into: dict[int, int] = {}
@@ -103,7 +102,7 @@ def rejoin_visits(
         entry = landmarks.entries[old]
         mean = estimate.landmarks[new][0]
         for leader in groups.setdefault(old, [old]):
-            if _is_same(estimate.landmarks[leader][0], mean, entry.kind):
+            if _is_same(estimate.landmarks[leader][0], mean, entry.kind, config):
                 into[new] = leader
                 break
         else:
@@ -114,10 +113,11 @@ def rejoin_visits(
     return merged_steps(split.steps, into, kinds)
 
 
-def _is_same(a: Array, b: Array, kind: str) -> bool:
+def _is_same(a: Array, b: Array, kind: str, config: AssociationConfig) -> bool:
     """Whether two means (2,) or (3,) are of one landmark; of lines, only the part across counts."""
     if kind == "point":
-        return bool(np.hypot(*(b - a)) <= SAME_M)
+        return bool(np.hypot(*(b - a)) <= config.reassociation_gate_m)
     off = between(a, b)
     across = abs(off[1]) if kind == "line" else np.hypot(off[0], off[1])
-    return bool(across <= SAME_M and abs(off[2]) <= SAME_RAD)
+    is_near = across <= config.reassociation_gate_m
+    return bool(is_near and abs(off[2]) <= config.reassociation_gate_rad)

@@ -42,8 +42,8 @@ from graphslam.mapping.visits import rejoin_visits, split_by_visit
 from graphslam.odometry.preintegration import Track
 from graphslam.slam.motion_noise import noise_scales, scale_motion_noise
 
-#: m across, rad: how far an observation may lie from a wall, from round to round
-GATES = ((0.3, 0.15), (0.15, 0.1), (0.15, 0.1))
+#: factors on the gates of re-association (across, direction), round by round
+GATE_FACTORS = ((1.0, 1.0), (1 / 2, 2 / 3), (1 / 2, 2 / 3))
 #: times that the noise of motions is estimated, at most; it is settled when it grows by less than
 MAX_NOISE_ROUNDS, NOISE_GROWTH = 4, 1.1
 #: rounds of loop closing, at most
@@ -90,7 +90,8 @@ def reoptimise_scan_log(
         steps, closures, estimate = _close_loops(
             steps, estimate, pictures, landmarks, solve, tamper, counts, config
         )
-    for gates in GATES:
+    association = config.association
+    for factor_m, factor_rad in GATE_FACTORS:
         estimate = solve(steps, estimate, closures)
         into = _duplicates(estimate, solve.backend, landmarks, steps)
         if into:
@@ -100,7 +101,12 @@ def reoptimise_scan_log(
             counts["landmarks_merged"] += len(into)
         # duplicates are merged first: else observations would move to and fro between the two
         again = reassociate(
-            steps, estimate, landmarks.entries, *gates, config.association.overlap_gap_m
+            steps,
+            estimate,
+            landmarks.entries,
+            factor_m * association.reassociation_gate_m,
+            factor_rad * association.reassociation_gate_rad,
+            association.overlap_gap_m,
         )
         if into or again.moved or again.dropped:
             steps = again.steps
@@ -207,7 +213,7 @@ def _close_loops(
     if not correcting:
         return steps, [], estimate
     closures = [closure for pair, closure in accepted.items() if pair in correcting]
-    return rejoin_visits(split, closed, landmarks), closures, closed
+    return rejoin_visits(split, closed, landmarks, config.association), closures, closed
 
 
 def _tightened(
