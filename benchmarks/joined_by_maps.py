@@ -34,7 +34,7 @@ from graphslam.evaluation.relation_metrics import Relations, read_relations, rel
 from graphslam.logs import open_logs
 from graphslam.multi_robot.anonymous_map import AnonymousMap
 from graphslam.multi_robot.frame_tree import FrameAssignment
-from graphslam.multi_robot.place_recognition import relate_places
+from graphslam.multi_robot.place_recognition import PlaceMap, relate_places
 from graphslam.multi_robot.relative_frames import RelativeFrame
 from graphslam.results.folder import load
 from graphslam.slam.initialisation import anonymous_maps, separate_estimates
@@ -127,15 +127,16 @@ def parts(name: str, folder: Path) -> bool:
     whole, cut = import_freiburg(name, folder), folder / f"{name}-cut.mcap"
     write(halves(list(open_logs([whole], Config()).messages()))[0], cut)
     counts: Counter[str] = Counter()
-    for seen in seen_alone(cut).values():
+    for seen in (alone.places for alone in seen_alone(cut).values()):
         stretches = np.array_split(np.arange(len(seen.places)), PARTS)
         for pair in combinations(stretches, 2):
             rows = [(3 * part[:, None] + np.arange(3)).ravel() for part in pair]
-            here, there = ([seen.places[k] for k in part] for part in pair)
-            P_a, P_b = (seen.cov[np.ix_(k, k)] for k in rows)
-            found = relate_places("a", "b", here, there, P_a, P_b, MultiRobotConfig())
-            positions = (np.array([p.pose[:2] for p in places]) for places in (here, there))
-            p, q = positions
+            maps = [
+                PlaceMap([seen.places[n] for n in part], seen.cov[np.ix_(k, k)])
+                for part, k in zip(pair, rows, strict=True)
+            ]
+            found = relate_places("a", "b", *maps, MultiRobotConfig())
+            p, q = (np.array([place.pose[:2] for place in one.places]) for one in maps)
             near = np.linalg.norm(p[:, None] - q, axis=-1).min(axis=0) < OVERLAP_M
             kind = "overlapping" if near.sum() >= OVERLAPPING else "others"
             counts[kind] += 1

@@ -3,15 +3,14 @@
 Used only between robots that nothing with an identity relates.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import combinations
 
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array
-from graphslam.mapping.submaps import SubmapPose
 from graphslam.multi_robot.landmark_constellations import relate_points
-from graphslam.multi_robot.place_recognition import relate_places
+from graphslam.multi_robot.place_recognition import PlaceMap, relate_places
 from graphslam.multi_robot.relative_frames import RelativeFrame
 
 
@@ -19,12 +18,10 @@ from graphslam.multi_robot.relative_frames import RelativeFrame
 class AnonymousMap:
     """What one robot saw that has no identity, in the frame in which it began.
 
-    ``places``: its submaps, with the joint covariance ``cov`` (3n, 3n) of their poses, errors along
-    each one's own axes. ``points``: means (m, 2), covariances (m, 2, 2).
+    ``places``: its submaps; ``points``: means (m, 2), covariances (m, 2, 2).
     """
 
-    places: Sequence[SubmapPose]
-    cov: Array
+    places: PlaceMap
     points: tuple[Array, Array]
 
 
@@ -43,10 +40,9 @@ def relate_anonymous_maps(
     for a, b in combinations(sorted(maps), 2):
         if frames[a] == frames[b]:
             continue
-        m, n = maps[a], maps[b]
         for relation in (
-            relate_places(a, b, m.places, n.places, m.cov, n.cov, config.multi_robot),
-            relate_points(a, b, m.points, n.points, config.association.floor_m),
+            relate_places(a, b, maps[a].places, maps[b].places, config.multi_robot),
+            relate_points(a, b, maps[a].points, maps[b].points, config.association.floor_m),
         ):
             if isinstance(relation, RelativeFrame):
                 relations.append(relation)

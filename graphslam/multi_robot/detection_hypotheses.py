@@ -28,7 +28,7 @@ from graphslam.core.geometry import (
 )
 from graphslam.core.records import Scan
 from graphslam.multi_robot.relative_frames import RobotEstimate
-from graphslam.multi_robot.robot_detection import MARGIN_M
+from graphslam.multi_robot.robot_detection import MARGIN_M, MAX_POSITION_SIGMA_M
 from graphslam.odometry.readings import IntArray
 from graphslam.perception.dynamic_objects import MIN_SHARE as STANDING_SHARE
 from graphslam.perception.dynamic_objects import returns_present_before
@@ -52,18 +52,13 @@ MIDDLE_SIGMA_M = 0.04
 STRETCH_M, STRETCH_STEP_M, MIN_BASE_M = 4.0, 2.0, 1.0
 #: pairs of candidates per stretch, placements per stretch, and in all, at most: bound the run time
 MAX_PAIRS, MAX_PER_STRETCH, MAX_EXTENDED = 2000, 3, 30
-#: candidates that must support a placement
-MIN_SUPPORT = 5
-#: m: placements of a stretch nearer to each other are one, about the size of a robot
-SAME_M = 0.4
+#: candidates that must support a placement; m: placements of a stretch nearer together are one,
+#: about the size of a robot
+MIN_SUPPORT, SAME_M = 5, 0.4
 #: sigmas: gate of a candidate around the predicted position
 GATE_SIGMAS = 3.0
-#: rad: sigma of the heading of a stretch before it is fitted
-HEADING_SIGMA_RAD = 0.06
-#: m: a path is extended as far as its position is known this well, about the radius of a robot
-MAX_POSITION_SIGMA_M = 0.3
-#: rounds of gating and fitting
-ROUNDS = 4
+#: rad: sigma of the heading of a stretch before it is fitted; rounds of gating and fitting
+HEADING_SIGMA_RAD, ROUNDS = 0.06, 4
 #: hypotheses that share more than this part of their inliers are one
 SAME_SHARE = 0.8
 #: clock offsets that are tried, in sigmas of the prior
@@ -333,7 +328,7 @@ def _place_stretch(
 
 
 class _PathFitter:
-    """Extends the placement of a stretch, from its middle scan k, to all scans."""
+    """Extends the placement of a stretch, from its middle scan k, as far as the path is known."""
 
     def __init__(
         self,

@@ -21,6 +21,9 @@ from graphslam.core.geometry import Array, between, transform, wrap
 from graphslam.multi_robot.relative_frames import MAX_HEADING_SIGMA_RAD, RelativeFrame
 from graphslam.perception.scan_matching import IntArray
 
+#: means (n, 2) m and covariances (n, 2, 2) of points
+Points = tuple[Array, Array]
+
 #: each point is paired with this many nearest ones
 NEIGHBOURS = 8
 #: transforms that are tried at most, and that are fitted: bounds the run time
@@ -57,19 +60,15 @@ class _Fit:
 
 
 def relate_points(
-    a: str,
-    b: str,
-    points_a: tuple[Array, Array],
-    points_b: tuple[Array, Array],
-    floor_m: float,
+    a: str, b: str, points_a: Points, points_b: Points, floor_m: float
 ) -> RelativeFrame | str:
     """Start of ``b`` in the frame of ``a``, or why it is unknown ("" without evidence).
 
     Args:
         a: name of a robot.
         b: name of another one.
-        points_a: means (n, 2) and covariances (n, 2, 2) of points in the frame of ``a``.
-        points_b: the same in the frame of ``b``.
+        points_a: in the frame of ``a``.
+        points_b: in the frame of ``b``.
         floor_m: sigma that is added to the distance of two matched points.
     """
     (p, P), (q, Q) = points_a, points_b

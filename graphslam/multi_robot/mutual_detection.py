@@ -29,7 +29,6 @@ from graphslam.core.consistency import RIVAL_SHARE, has_rival, poses_differ
 from graphslam.core.geometry import Array, between, compose, path_length, wrap
 from graphslam.core.records import Scan, Sighting
 from graphslam.multi_robot.detection_hypotheses import (
-    MAX_POSITION_SIGMA_M,
     PredictedPath,
     ScanSequence,
     StartHypothesis,
@@ -44,7 +43,11 @@ from graphslam.multi_robot.relative_frames import (
     RobotEstimate,
     evenly_spaced,
 )
-from graphslam.multi_robot.robot_detection import ExpectedPose, detect_robots
+from graphslam.multi_robot.robot_detection import (
+    MAX_POSITION_SIGMA_M,
+    ExpectedPose,
+    detect_robots,
+)
 from graphslam.multi_robot.track_registration import FittedStart, fit_start
 from graphslam.odometry.preintegration import Track
 from graphslam.odometry.readings import IntArray

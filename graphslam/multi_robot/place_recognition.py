@@ -82,30 +82,34 @@ class PlaceMatch:
         return self.match.same - ABSENT_WEIGHT * self.match.absent
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaceMap:
+    """The n places of a robot in its frame.
+
+    ``cov`` (3n, 3n): joint covariance of their poses, errors along each one's own axes.
+    """
+
+    places: Sequence[SubmapPose]
+    cov: Array
+
+
 def relate_places(
-    a: str,
-    b: str,
-    places_a: Sequence[SubmapPose],
-    places_b: Sequence[SubmapPose],
-    P_a: Array,
-    P_b: Array,
-    config: MultiRobotConfig,
+    a: str, b: str, map_a: PlaceMap, map_b: PlaceMap, config: MultiRobotConfig
 ) -> RelativeFrame | str:
     """Start of ``b`` in the frame of ``a``, or why it is unknown ("" without evidence).
 
     Args:
         a: name of a robot.
         b: name of another one.
-        places_a: places of ``a``, in its frame.
-        places_b: places of ``b``, in its frame.
-        P_a: (3n, 3n) joint covariance of the poses of ``places_a``, errors along each one's axes.
-        P_b: the same of ``places_b``.
+        map_a: places of ``a``.
+        map_b: places of ``b``.
         config: settings.
     """
+    places_a, places_b = map_a.places, map_b.places
     found = match_places(places_a, places_b, config) if places_a and places_b else []
     if not found:
         return ""
-    relation = choose_alignment(a, b, found, places_a, places_b, P_a, P_b, config)
+    relation = choose_alignment(a, b, found, map_a, map_b, config)
     if isinstance(relation, RelativeFrame) and any(
         _is_supported(start, places_a, places_b)
         for start in alternative_alignments(relation.pose, places_a, places_b, config)
@@ -152,10 +156,8 @@ def choose_alignment(
     a: str,
     b: str,
     found: Sequence[PlaceMatch],
-    places_a: Sequence[SubmapPose],
-    places_b: Sequence[SubmapPose],
-    P_a: Array,
-    P_b: Array,
+    map_a: PlaceMap,
+    map_b: PlaceMap,
     config: MultiRobotConfig,
 ) -> RelativeFrame | str:
     """Start of ``b`` in the frame of ``a`` from matches, at least one; see `relate_places`.
@@ -163,15 +165,18 @@ def choose_alignment(
     Which matches agree is decided with covariances that allow for undetected drift; the start is
     then estimated with those of the estimates, times `COVARIANCE_INFLATION`.
     """
-    drift = TRUST * P_a + drift_covariance(places_a), TRUST * P_b + drift_covariance(places_b)
-    starts, covs = _start_estimates(found, places_a, places_b, *drift)
+    places_a, places_b = map_a.places, map_b.places
+    wide_a, wide_b = (
+        PlaceMap(m.places, TRUST * m.cov + drift_covariance(m.places)) for m in (map_a, map_b)
+    )
+    starts, covs = _start_estimates(found, wide_a, wide_b)
     best = greedy_max_clique(_pairwise_agreement(found, starts, covs), _scores(found))
     if len(best) < MIN_FOUND:
         return ""
     # the search may have overlooked places that coincide, or that should
     more, differing = verify_places(_consensus(starts, covs, best).pose, places_a, places_b)
     found = [*found, *more]
-    starts, covs = _start_estimates(found, places_a, places_b, *drift)
+    starts, covs = _start_estimates(found, wide_a, wide_b)
     agree, scores = _pairwise_agreement(found, starts, covs), _scores(found)
     best = greedy_max_clique(agree, scores)
     if len(best) < MIN_MATCHES:
@@ -196,8 +201,8 @@ def choose_alignment(
         )
     if differing > MAX_DIFFERING_SHARE * len(best):
         return f"{a} and {b} saw places that look alike, but their surroundings differ"
-    own = COVARIANCE_INFLATION * P_a, COVARIANCE_INFLATION * P_b
-    start = _consensus(*_start_estimates(found, places_a, places_b, *own), best)
+    own = (PlaceMap(m.places, COVARIANCE_INFLATION * m.cov) for m in (map_a, map_b))
+    start = _consensus(*_start_estimates(found, *own), best)
     return RelativeFrame(b, a, start.pose, start.cov, float(len(best)))
 
 
@@ -240,11 +245,7 @@ def _scores(found: Sequence[PlaceMatch]) -> Array:
 
 
 def _start_estimates(
-    found: Sequence[PlaceMatch],
-    places_a: Sequence[SubmapPose],
-    places_b: Sequence[SubmapPose],
-    P_a: Array,
-    P_b: Array,
+    found: Sequence[PlaceMatch], map_a: PlaceMap, map_b: PlaceMap
 ) -> tuple[Array, Array]:
     """Start of b in the frame of a by each of n matches.
 
@@ -252,19 +253,12 @@ def _start_estimates(
     of t and x are along the axes of a's frame, those of x_a and x_b along their own; that of h has
     covariance R along the axes of x_a. Matches share the errors of x_a and x_b.
 
-    Args:
-        found: the matches.
-        places_a: places of a, in its frame.
-        places_b: places of b, in its frame.
-        P_a: joint covariance of ``places_a``.
-        P_b: joint covariance of ``places_b``.
-
     Returns:
         Starts t (n, 3) and their joint covariance (n, n, 3, 3).
     """
     n = np.arange(len(found))
     j, i = np.array([m.index_a for m in found]), np.array([m.index_b for m in found])
-    x_a, x_b = np.array([p.pose for p in places_a])[j], np.array([p.pose for p in places_b])[i]
+    x_a, x_b = (np.array([p.pose for p in m.places])[k] for m, k in ((map_a, j), (map_b, i)))
     x = compose(x_a, np.array([m.match.pose for m in found]))
     t = compose(x, inverse(x_b))
     t_by_x = np.tile(np.eye(3), (len(n), 1, 1))
@@ -274,7 +268,7 @@ def _start_estimates(
     x_by_a[:, :2, 2] += _perpendicular(x - x_a)
     t_by_a, t_by_b, t_by_h = t_by_x @ x_by_a, -t_by_x @ rotation3(x[:, 2]), t_by_x @ x_by_h
     covs = np.zeros((len(n), len(n), 3, 3))
-    for J, P, k in ((t_by_a, P_a, j), (t_by_b, P_b, i)):
+    for J, P, k in ((t_by_a, map_a.cov, j), (t_by_b, map_b.cov, i)):
         blocks = P.reshape(len(P) // 3, 3, len(P) // 3, 3).transpose(0, 2, 1, 3)
         covs += J[:, None] @ blocks[np.ix_(k, k)] @ J.mT
     R = np.array([m.match.cov for m in found])

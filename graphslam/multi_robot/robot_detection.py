@@ -50,8 +50,8 @@ MODEL_SIGMA_M = 0.05
 MAX_CLUSTERS = 3
 #: m: returns this near to a robot's outline may be of its edges, its wheels, its cables
 MARGIN_M = 0.1
-#: m: where a robot is not found, the returns around its expected pose are removed if its position
-#: is known this well, about its radius
+#: m: a position known less well, about the radius of a robot, does not tell which returns are the
+#: robot's
 MAX_POSITION_SIGMA_M = 0.3
 #: rad: a robot is looked for again once it or the observer turned so much, or moved by
 #: `multi_robot.sampling_m`
@@ -74,14 +74,6 @@ class ExpectedPose:
 
     pose: Array
     cov: Array
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DetectedRobots:
-    """A scan without the returns of robots, and the sightings made from them."""
-
-    scan: Scan
-    sightings: tuple[Sighting, ...]
 
 
 def expected_pose(
@@ -115,6 +107,14 @@ def expected_pose(
     v = rotation(float(h[2])) @ clock_shift
     cov[:2, :2] += np.outer(v, v)
     return ExpectedPose(h, cov)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DetectedRobots:
+    """A scan without the returns of robots, and the sightings made from them."""
+
+    scan: Scan
+    sightings: tuple[Sighting, ...]
 
 
 def detect_robots(

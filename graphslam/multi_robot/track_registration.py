@@ -24,10 +24,8 @@ from graphslam.core.records import Sighting
 from graphslam.multi_robot.relative_frames import RobotEstimate, encounter_covariance
 from graphslam.odometry.readings import IntArray
 
-#: Gauss-Newton steps
-STEPS = 6
-#: s: over which a robot's velocity is taken
-VELOCITY_SPAN_S = 0.3
+#: Gauss-Newton steps; s: span over which a robot's velocity is taken
+STEPS, VELOCITY_SPAN_S = 6, 0.3
 #: least number of sightings: with two rows each, more rows than the four unknowns
 MIN_SIGHTINGS = 3
 

@@ -26,6 +26,7 @@ from graphslam.multi_robot.mutual_detection import (
     ScanBuffer,
     find_robots_in_scans,
 )
+from graphslam.multi_robot.place_recognition import PlaceMap
 from graphslam.multi_robot.relative_frames import RelativeFrame, RobotEstimate
 from graphslam.slam.pipeline import CLOCK_DOUBT_S, Pipeline
 from graphslam.slam.recorded_closures import RecordedClosures, judge_recorded_closures
@@ -151,7 +152,7 @@ def anonymous_maps(run: Pipeline, views: Mapping[str, RobotEstimate]) -> dict[st
         own = [place for place in found if place.state[0] == robot]
         states = [place.state for place in own]
         cov = run.backend.state_covariance(states) if own else np.zeros((0, 0))
-        seen[robot] = AnonymousMap(own, cov, view.anonymous_points)
+        seen[robot] = AnonymousMap(PlaceMap(own, cov), view.anonymous_points)
     return seen
 
 

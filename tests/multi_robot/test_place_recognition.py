@@ -19,7 +19,12 @@ from graphslam.logs import open_logs, read_truth
 from graphslam.mapping.submaps import SubmapPose
 from graphslam.multi_robot.frame_tree import build_frame_tree
 from graphslam.multi_robot.landmark_constellations import relate_points
-from graphslam.multi_robot.place_recognition import PlaceMatch, choose_alignment, relate_places
+from graphslam.multi_robot.place_recognition import (
+    PlaceMap,
+    PlaceMatch,
+    choose_alignment,
+    relate_places,
+)
 from graphslam.multi_robot.place_search import alternative_alignments
 from graphslam.multi_robot.relative_frames import RelativeFrame
 from graphslam.perception.scan_matching import Match, make_submap
@@ -194,7 +199,9 @@ def met(here, there, start, pairs, same=0.8):
 def believed(monkeypatch, found, here, there):
     monkeypatch.setattr("graphslam.multi_robot.place_recognition.verify_places", lambda *_: ([], 0))
     P = np.kron(np.eye(len(here)), np.diag([0.02, 0.02, 0.005]) ** 2)
-    return choose_alignment("a", "b", found, here, there, P, P, MultiRobotConfig())
+    return choose_alignment(
+        "a", "b", found, PlaceMap(here, P), PlaceMap(there, P), MultiRobotConfig()
+    )
 
 
 def test_meetings_that_agree_say_where_the_other_began(monkeypatch):
@@ -232,7 +239,7 @@ def test_places_that_differ_contradict(monkeypatch):
     monkeypatch.setattr("graphslam.multi_robot.place_recognition.verify_places", lambda *_: ([], 2))
     P = np.zeros((24, 24))
     assert "surroundings differ" in str(
-        choose_alignment("a", "b", found, here, there, P, P, MultiRobotConfig())
+        choose_alignment("a", "b", found, PlaceMap(here, P), PlaceMap(there, P), MultiRobotConfig())
     )
 
 
@@ -353,7 +360,7 @@ def test_robots_that_saw_a_plain_hall_are_not_joined(niche_m, joined):
     at = (0.0, 2.5, 5.0, 7.5, 10.0)
     here, there = in_hall(niche_m, 28.0, at), in_hall(niche_m, 28.0, at, START)
     P = np.kron(np.eye(len(at)), np.diag([0.02, 0.02, 0.005]) ** 2)
-    relation = relate_places("a", "b", here, there, P, P, MultiRobotConfig())
+    relation = relate_places("a", "b", PlaceMap(here, P), PlaceMap(there, P), MultiRobotConfig())
     assert isinstance(relation, RelativeFrame) == joined
     if joined:
         np.testing.assert_allclose(between(START, relation.pose), 0.0, atol=0.05)
