@@ -26,13 +26,8 @@ SHARED = 0.5
 def both(sweep: Sweep, config: FrontEndConfig) -> tuple[Observation, ...]:
     """Whole segments, Hough lines of the other returns, and segments that no Hough line covers.
 
-    Args:
-        sweep: one scan, in order.
-        config: settings of both.
-
-    Returns:
-        Observations, laser frame: whole segments in the order of the beams, then Hough lines, then
-        the rest of the occluded segments, of kind ``line``.
+    Observations are in the laser frame: whole segments in the order of the beams, then Hough lines,
+    then the rest of the occluded segments, of kind ``line``. Arguments are those of `segments`.
     """
     found = find_segments(sweep, config)
     free = np.ones(len(sweep.beam), dtype=np.bool_)
