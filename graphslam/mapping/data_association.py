@@ -75,12 +75,12 @@ class Candidates:
     place in it.
     """
 
-    pairs: Pairs
-    entries: tuple[Entry, ...]
-    recent: BoolArray
     joint: Joint
     where: dict[int, int]
+    pairs: Pairs
     compared: Compared
+    recent: BoolArray
+    entries: tuple[Entry, ...]
 
 
 class Associator:
@@ -197,7 +197,7 @@ class Associator:
         where = {landmark: n for n, landmark in enumerate(graph_ids)}
         joint = predicted_joint(self._backend.joint(image.robot, graph_ids), image.motion)
         compared = self._compare(image, pairs, entries, joint, where)
-        return Candidates(pairs, tuple(entries), recent, joint, where, compared)
+        return Candidates(joint, where, pairs, compared, recent, tuple(entries))
 
     def _has_identity(self, o: Observation) -> bool:
         return o.identity is not None and self._config.identities == "use"

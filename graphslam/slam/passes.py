@@ -5,8 +5,9 @@ identities that were swapped, or robots' clocks that differ.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError
@@ -27,8 +28,7 @@ from graphslam.slam.step_recorder import PriorKnowledge, timed
 MAX_CLOCK_PASSES = 4
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Findings:
+class Findings(NamedTuple):
     """What a pass tells besides its estimate.
 
     ``swapped``: false identity -> right one, of identities that were swapped; ``clocks``: the
@@ -40,8 +40,7 @@ class Findings:
     causal: Mapping[str, Causal]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FinishedPass:
+class FinishedPass(NamedTuple):
     """The last pass over a log, its final estimate and what it found."""
 
     pipeline: Pipeline
