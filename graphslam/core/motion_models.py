@@ -73,6 +73,10 @@ class Increments:
     cov: Array
     d_cal: Array
 
+    def part(self, i: int, j: int) -> "Increments":
+        """The increments from the i-th up to the j-th, which is left out."""
+        return Increments(self.delta[i:j], self.cov[i:j], self.d_cal[i:j])
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:

@@ -1,13 +1,14 @@
-"""One robot's odometry readings, and the way that they describe by themselves.
+"""One robot's odometry readings, and the path that they describe by themselves.
 
-Readings come one by one and are worked out when first asked for, many at once where that is rare.
-Between two readings the robot is taken to move on a circle segment. Nothing here knows of
-calibration: that is `dead_reckoning`.
+Readings are added one by one and integrated when a motion is first needed, many at once where that
+is rare. Between two readings the robot is taken to move on a circle segment. Calibration is the
+matter of `graphslam.odometry.preintegration`.
 """
 
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,7 +25,7 @@ Odometry = OdometryPose | OdometryIncrement | WheelAngles
 #: in a burst (a logger that fell behind): its stamps do not tell when the motion took place, so a
 #: time inside it belongs to the reading before, as the order of recording has it
 MAX_SPEED_M_S, MAX_TURN_RAD_S = 20.0, 20.0
-#: m/s over at least this many ns (and half a metre): the odometry jumped, see `Track.resets`
+#: m/s over at least this many ns (and half a metre): the odometry jumped, see `_rows`
 RESET_SPEED_M_S, SHORTEST_RESET_NS = 10.0, 10_000_000
 #: share of readings in bursts above which the stamps are not good enough to learn a latency
 MAX_BURST_SHARE = 0.01
@@ -34,6 +35,22 @@ EDGE_NS = 500_000_000
 TURNING_EFFORT_M = 0.3
 
 _ROW_SIZE = {"odometry": 3, "commands": 3, "given": 12, "wheels": 2}
+#: columns of `Readings._totals`: path m, heading rad (not wrapped), effort m; then those of a row
+_PATH, _HEADING, _EFFORT, _ROW = 0, 1, 2, 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RowSpan:
+    """Rows of the readings around some times.
+
+    ``whole`` (w, k): rows from the first interval that a time lies in up to the last one, which is
+    left out. ``index`` (...,): how many of them lie before each time; ``part`` (..., k): what each
+    time has reached of the row of its own interval.
+    """
+
+    whole: Array
+    index: IntArray
+    part: Array
 
 
 class Readings:
@@ -44,20 +61,18 @@ class Readings:
     """
 
     def __init__(self, config: OdometryConfig, robot: RobotConfig) -> None:
-        """None yet."""
+        """No readings yet."""
         self.source = ""
         self._config, self._robot = config, robot
         self._count, self._bursts, self._resets = 0, 0, 0
-        self._settled = 0  # readings that are worked out; the others' values wait in `_fresh`
+        self._settled = 0  # readings that are integrated; the others' values wait in `_fresh`
         self._fresh: list[Array] = []
         self._times = np.empty(1024, dtype=np.int64)  # time of the end of each row's interval
         self._rows = np.empty((1024, 0))
-        self._sums = np.empty((1024, 0))  # of the rows
+        self._totals = np.empty((1024, 0))  # accumulated, see `_PATH` and its like
         self._poses = np.empty((1024, 3))  # by odometry alone, first reading = origin
-        self._effort = np.empty(1024)  # accumulated, see `effort`
-        self._path = np.empty(1024)  # accumulated, m
         self._burst = np.empty(1024, dtype=bool)  # interval too short for its motion
-        self._last = np.zeros(0)  # the last reading that is worked out
+        self._last = np.zeros(0)  # the last reading that is integrated
 
     def __len__(self) -> int:
         return self._count
@@ -112,8 +127,7 @@ class Readings:
         else:
             # a second reading of one time: its motion belongs to the interval that ends here
             self._settle()
-            n = self._count - 1
-            row = self._row(value, 0)
+            row, n = self._row(value, 0), self._count - 1
             if n:
                 self._bursts -= int(self._burst[n])
                 self._enter(n, self._rows[n] + row)
@@ -122,22 +136,22 @@ class Readings:
         """The first reading, from which all motion counts."""
         self.source, self._count, self._settled = source, 1, 1
         self._rows = np.zeros((len(self._times), _ROW_SIZE[source]))
-        self._sums = np.zeros_like(self._rows)
+        self._totals = np.zeros((len(self._times), _ROW + _ROW_SIZE[source]))
         self._times[0] = time_ns
-        self._poses[0], self._effort[0], self._path[0], self._burst[0] = 0.0, 0.0, 0.0, False
+        self._poses[0], self._burst[0] = 0.0, False
 
     def _grow(self) -> None:
-        for name in ("_times", "_rows", "_sums", "_poses", "_effort", "_path", "_burst"):
+        for name in ("_times", "_rows", "_totals", "_poses", "_burst"):
             full = getattr(self, name)
             setattr(self, name, np.concatenate([full, np.empty_like(full)]))
 
     def _settle(self) -> None:
-        """Work out the readings that came since it was last asked for any motion, all at once."""
+        """Integrate the readings that came since a motion was last needed, all at once."""
         if self._settled < self._count:
             settle((self,))
 
     def _row(self, value: Array, apart_ns: int) -> Array:
-        """Row (k,) of a reading (k,) that follows the last one after ``apart_ns``; see `_rows`."""
+        """`_rows` of one reading, which follows the last one after ``apart_ns``."""
         if self.source == "given":
             return value
         before, self._last = self._last, value
@@ -150,14 +164,18 @@ class Readings:
         return row
 
     def _enter(self, n: int, row: Array) -> None:
-        """The row of the n-th reading, n > 0, and what accumulates from it."""
+        """`_integrate` of one row, that of the n-th reading, n > 0.
+
+        Arrays of one number take six times as long, and where every scan asks for its pose this
+        would add up to 15 % to the time of a run.
+        """
         twist = wheel_twist(row[None], self._robot)[0] if self.source == "wheels" else row[:3]
         (x, y, turned), (east, north, heading) = exp(twist).tolist(), self._poses[n - 1].tolist()
         c, s, path, turn = math.cos(heading), math.sin(heading), math.hypot(x, y), abs(turned)
-        self._rows[n], self._sums[n] = row, self._sums[n - 1] + row
+        self._rows[n] = row
         self._poses[n] = east + c * x - s * y, north + s * x + c * y, float(wrap(heading + turned))
-        self._effort[n] = self._effort[n - 1] + path + TURNING_EFFORT_M * turn
-        self._path[n] = self._path[n - 1] + path
+        step = path, turned, path + TURNING_EFFORT_M * turn, *row.tolist()
+        self._totals[n] = self._totals[n - 1] + step
         seconds = 1e-9 * int(self._times[n] - self._times[n - 1])
         burst = path > MAX_SPEED_M_S * seconds or turn > MAX_TURN_RAD_S * seconds
         self._burst[n] = burst
@@ -182,76 +200,80 @@ class Readings:
 
         Before the first reading and after the last one the robot is taken to stand still.
         """
-        self._settle()
-        times = np.asarray(times_ns, dtype=np.int64)
-        i = np.clip(self.times.searchsorted(times), 1, max(self._count - 1, 1))
+        i, share = self._interval(np.asarray(times_ns, dtype=np.int64))
         if self._count < 2:
-            return np.zeros((*times.shape, 3))
-        share = self._share(i, self._times[i - 1], times)
+            return np.zeros((*share.shape, 3))
         twist = log(between(self._poses[i - 1], self._poses[i]))
         return compose(self._poses[i - 1], exp(share[..., None] * twist))
 
-    def _share(self, i: IntArray, from_ns: IntArray | int, to_ns: IntArray | int) -> Array:
-        """Share (..., ) of the interval that ends at reading i that lies in from_ns..to_ns."""
-        around = self._times[i - 1], self._times[i], self._burst[i]
-        return reached(*around, to_ns) - reached(*around, from_ns)
-
     def effort(self, times_ns: IntArray | int) -> Array:
         """Accumulated motion (...,), m: path plus turning. Odometry errors grow with it."""
-        self._settle()
-        return self._at(np.asarray(times_ns, dtype=np.int64), self._effort)
+        return self._total(np.asarray(times_ns, dtype=np.int64))[..., _EFFORT]
 
-    def _at(self, times_ns: IntArray, accumulated: Array) -> Array:
-        """An accumulated quantity at any times, by the same rule as `pose`; settle first."""
-        if self._count < 2:
-            return np.zeros((*times_ns.shape, *accumulated.shape[1:]))
-        i = np.clip(self.times.searchsorted(times_ns), 1, self._count - 1)
-        share = self._share(i, self._times[i - 1], times_ns)
-        if accumulated.ndim > 1:
-            share = share[..., None]
-        return accumulated[i - 1] + share * (accumulated[i] - accumulated[i - 1])
+    def times_of_effort(self, effort_m: Array) -> IntArray:
+        """Times (n,), ns, at which accumulated `effort` reaches values (n,), m."""
+        self._settle()
+        known = self._totals[: self._count, _EFFORT]
+        return np.interp(effort_m, known, self.times).astype(np.int64)
 
     def moved(self, start_ns: int, end_ns: int) -> tuple[float, float]:
         """Path (m) and net turning (rad, absolute) from ``start_ns`` to ``end_ns``; cheap."""
+        start, end = self._total(np.array([start_ns, end_ns]))
+        return float(end[_PATH] - start[_PATH]), abs(float(wrap(end[_HEADING] - start[_HEADING])))
+
+    def added_rows(self, start_ns: IntArray, end_ns: IntArray) -> Array:
+        """Sums (n, k) of the rows between times (n,) and (n,), a share of those cut by a time."""
+        return (self._total(end_ns) - self._total(start_ns))[:, _ROW:]
+
+    def rows_between(self, start_ns: int, end_ns: int) -> Array:
+        """Rows (m, k) of the readings between two times, a share of those cut by a time."""
+        self._settle()
+        first = max(int(np.searchsorted(self.times, start_ns, side="right")), 1)
+        last = min(int(np.searchsorted(self.times, end_ns, side="left")), self._count - 1)
+        if end_ns <= start_ns or last < first:
+            return self._rows[:0]
+        i = np.arange(first, last + 1)
+        return self._rows[i] * (self._share(i, end_ns) - self._share(i, start_ns))[:, None]
+
+    def span(self, times_ns: IntArray) -> RowSpan:
+        """The rows around times (...,); there are two readings at least."""
+        i, share = self._interval(times_ns)
+        first = int(i.min(initial=self._count - 1))
+        last = int(i.max(initial=first))
+        return RowSpan(self._rows[first:last], i - first, self._rows[i] * share[..., None])
+
+    def _total(self, times_ns: IntArray) -> Array:
+        """What accumulated (..., 3 + k) up to any times, by the same rule as `pose`."""
+        i, share = self._interval(times_ns)
+        if self._count < 2:
+            return np.zeros((*times_ns.shape, self._totals.shape[1]))
+        before = self._totals[i - 1]
+        return np.asarray(before + share[..., None] * (self._totals[i] - before))
+
+    def _interval(self, times_ns: IntArray) -> tuple[IntArray, Array]:
+        """The reading (...,) that ends the interval of a time, and the share of it reached."""
         self._settle()
         if self._count < 2:
-            return 0.0, 0.0
-        (path, heading), (last_path, last_heading) = map(self._way, (start_ns, end_ns))
-        return last_path - path, abs(float(wrap(last_heading - heading)))
+            return np.ones_like(times_ns), np.zeros(times_ns.shape)
+        i = np.minimum(np.maximum(self.times.searchsorted(times_ns), 1), self._count - 1)
+        return i, self._share(i, times_ns)
 
-    def _way(self, time_ns: int) -> tuple[float, float]:
-        """Path and heading at a time, by the same rule as `pose`; settle first."""
-        i = min(max(int(self.times.searchsorted(time_ns)), 1), self._count - 1)
-        begin, end = int(self._times[i - 1]), int(self._times[i])
-        share = min(max((time_ns - begin) / max(end - begin, 1), 0.0), 1.0)
-        if self._burst[i]:
-            share = float(share >= 1.0)
-        path, last_path = self._path[i - 1], self._path[i]
-        heading, last_heading = self._poses[i - 1, 2], self._poses[i, 2]
-        turned = float(wrap(last_heading - heading))
-        return float(path + share * (last_path - path)), float(heading + share * turned)
+    def _share(self, i: IntArray, time_ns: IntArray | int) -> Array:
+        """Share (...,) of the intervals that end at readings i that times have reached.
 
-
-def reached(
-    begin_ns: IntArray, end_ns: IntArray, burst: BoolArray, time_ns: IntArray | int
-) -> Array:
-    """Share (...,) of intervals that times have reached; of one in a burst nothing but at its end.
-
-    Args:
-        begin_ns: (...,) times of the readings before.
-        end_ns: (...,) times of the readings after.
-        burst: (...,) whether these were stamped in bursts, see `MAX_SPEED_M_S`.
-        time_ns: (...,) any times.
-    """
-    share = (time_ns - begin_ns) / np.maximum(end_ns - begin_ns, 1)
-    share = np.minimum(np.maximum(share, 0.0), 1.0)
-    return np.asarray(np.where(burst, share >= 1.0, share))
+        Of an interval in a burst, see `MAX_SPEED_M_S`, nothing is reached before its end.
+        """
+        begin, end = self._times[i - 1], self._times[i]
+        share = (time_ns - begin) / np.maximum(end - begin, 1)
+        share = np.minimum(np.maximum(share, 0.0), 1.0)
+        return np.asarray(np.where(self._burst[i], share >= 1.0, share))
 
 
 def settle(many: Iterable[Readings]) -> None:
-    """Work out what readings of several robots say of motion, at once, as far as it is not known.
+    """Integrate the readings of several robots that are not integrated yet, at once.
 
-    Arrays of few numbers are dear, so this takes not much longer for five robots than for one.
+    NumPy's cost per call outweighs that of few numbers, so five robots take little more time than
+    one.
     """
     alike: dict[str, list[Readings]] = defaultdict(list)
     for one in many:
@@ -265,11 +287,11 @@ def settle(many: Iterable[Readings]) -> None:
             one._settled = one._count
             one._enter(n, row)
         else:
-            _settle_alike(group)
+            _integrate(group)
 
 
-def _settle_alike(group: Sequence[Readings]) -> None:
-    """`settle` of readings from one kind of source, those of one robot after those of the other."""
+def _integrate(group: Sequence[Readings]) -> None:
+    """`settle` of readings from one kind of source: arrays (n, ...) robot after robot."""
     counts = [len(one._fresh) for one in group]
     firsts = np.cumsum([0, *counts[:-1]])
     times = [one._times[one._settled - 1 : one._count] for one in group]
@@ -293,23 +315,19 @@ def _settle_alike(group: Sequence[Readings]) -> None:
 
     last = [one._settled - 1 for one in group]
     poses = np.array([one._poses[n] for one, n in zip(group, last, strict=True)])
+    totals = np.array([one._totals[n] for one, n in zip(group, last, strict=True)])
     heading = summed(turned, poses[:, 2])
     c, s = np.cos(heading - turned), np.sin(heading - turned)
     effort = path + TURNING_EFFORT_M * turn
-    step = np.column_stack([c * x - s * y, s * x + c * y, effort, path, rows])
-    known = [
-        [*one._poses[n, :2], one._effort[n], one._path[n], *one._sums[n]]
-        for one, n in zip(group, last, strict=True)
-    ]
-    sums = summed(step, np.array(known))
-    heading = wrap(heading)
+    step = np.column_stack([c * x - s * y, s * x + c * y, path, turned, effort, rows])
+    sums = summed(step, np.column_stack([poses[:, :2], totals]))
+    poses = np.column_stack([sums[:, :2], wrap(heading)])
     seconds = 1e-9 * apart_ns
     burst = (path > MAX_SPEED_M_S * seconds) | (turn > MAX_TURN_RAD_S * seconds)
     for one, first, count in zip(group, firsts.tolist(), counts, strict=True):
         new, own = slice(one._settled, one._count), slice(first, first + count)
-        one._rows[new], one._sums[new], one._burst[new] = rows[own], sums[own, 4:], burst[own]
-        one._poses[new, :2], one._poses[new, 2] = sums[own, :2], heading[own]
-        one._effort[new], one._path[new] = sums[own, 2], sums[own, 3]
+        one._rows[new], one._totals[new], one._poses[new] = rows[own], sums[own, 2:], poses[own]
+        one._burst[new] = burst[own]
         one._bursts += int(np.count_nonzero(burst[own]))
         one._settled = one._count
         one._fresh.clear()

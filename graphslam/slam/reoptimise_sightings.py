@@ -17,7 +17,8 @@ from graphslam.core.geometry import Array
 from graphslam.core.observation_models import MODELS, transport
 from graphslam.core.records import Estimate, Motion, Sighting, Step
 from graphslam.estimation.batch_calibration import calibrate
-from graphslam.odometry.preintegration import Motions, Track, motions_of
+from graphslam.odometry.increment_sums import Motions
+from graphslam.odometry.preintegration import Track, motions_of
 from graphslam.odometry.readings import IntArray
 from graphslam.perception.sightings import sighting_observation
 from graphslam.slam.motion_noise import noise_scales, scale_motion_noise
