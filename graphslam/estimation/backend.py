@@ -48,11 +48,6 @@ class Backend(Protocol):
     """
 
     @property
-    def smooths(self) -> bool:
-        """Whether the final estimate of every state uses all data."""
-        ...
-
-    @property
     def error_frame(self) -> Literal["body", "world"]:
         """See the class."""
         ...

@@ -29,14 +29,8 @@ def calibrate(
 ) -> tuple[Estimate, tuple[Step, ...]]:
     """Solve for states, landmarks and calibrations together, `ROUNDS` times.
 
-    Args:
-        rebuild: computes the steps anew in every round.
-        estimate: of all their states and landmarks.
-        tracks: odometry of every robot; their calibration is set to the one found.
-        robust: kernel of the observations.
-
-    Returns:
-        The estimate and the steps behind it.
+    ``rebuild`` computes the steps anew in every round, the first by ``estimate``. The calibration
+    of ``tracks`` is set to the one found. Returns the estimate and the steps behind it.
 
     Raises:
         EstimationError: the estimate is indeterminate.
@@ -64,14 +58,10 @@ def recompute_motions(steps: Sequence[Step], tracks: Mapping[str, Track]) -> tup
     """
     motions: list[dict[str, Motion]] = [dict(step.motions) for step in steps]
     for robot, track in tracks.items():
-        which = [
-            n
-            for n, step in enumerate(steps)
-            if robot in step.motions and not step.motions[robot].matched
-        ]
-        recomputed = _recomputed([steps[n].motions[robot] for n in which], track)
-        for n, motion in zip(which, recomputed, strict=True):
-            motions[n][robot] = motion
+        own = [made for made in motions if robot in made and not made[robot].matched]
+        recomputed = _recomputed([made[robot] for made in own], track)
+        for made, motion in zip(own, recomputed, strict=True):
+            made[robot] = motion
     return tuple(replace(step, motions=made) for step, made in zip(steps, motions, strict=True))
 
 

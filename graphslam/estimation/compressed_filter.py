@@ -12,8 +12,8 @@ algorithm for real-time implementation, IEEE T-RA 17(3), 2001, https://doi.org/1
 (the compressed filter; theirs has a filter behind it, not a smoother).
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import groupby
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain, groupby
 
 import gtsam
 import numpy as np
@@ -23,7 +23,7 @@ from graphslam.core.gaussian import JointGaussian, whiten
 from graphslam.core.geometry import Array
 from graphslam.core.records import Estimate, Step
 from graphslam.estimation import factors
-from graphslam.estimation.factor_graph import FactorGroup, read, write
+from graphslam.estimation.factor_graph import FactorGroup
 from graphslam.estimation.isam2 import Isam2Backend
 
 
@@ -36,16 +36,10 @@ class LocalFilter:
     """
 
     def __init__(self, points: Mapping[int, Array], z: Array, cov: Array) -> None:
-        """Begin.
-
-        Args:
-            points: key -> linearisation point (2,) or (3,).
-            z: (D,) their corrections, in that order.
-            cov: (D, D) covariance of z.
-        """
+        """Begin with linearisation points (2,) or (3,), corrections z (D,), covariance (D, D)."""
         self._points = gtsam.Values()
         for key, point in points.items():
-            write(self._points, key, point)
+            factors.write(self._points, key, point)
         self._dims = {key: len(point) for key, point in points.items()}
         self._gaussian: JointGaussian[int] = JointGaussian.of(self._dims, z, cov)
 
@@ -101,7 +95,7 @@ class LocalFilter:
         """
         news = [group.new for group in groups if group.new is not None]
         for key, point in news:
-            write(self._points, key, point)
+            factors.write(self._points, key, point)
             self._dims[key] = len(point)
         befores = [group.replaces for group in groups if group.replaces is not None]
         linear = [group.factors[0].linearize(self._points).jacobian() for group in groups]
@@ -114,7 +108,7 @@ class LocalFilter:
 
     def _augment(self, key: int, point: Array, group: Iterable[gtsam.NonlinearFactor]) -> None:
         """A new variable from the factors that introduce it: thesis 4.24-4.28."""
-        write(self._points, key, point)
+        factors.write(self._points, key, point)
         self._dims[key] = len(point)
         H, b = self._linear(group)
         J = H.pop(key)  # square, but for a line's empty row
@@ -229,22 +223,16 @@ class CompressedBackend(Isam2Backend):
             self._flush()
             most = max(self._config.backend.local_landmarks, len(keys))
             self._recent = dict.fromkeys(list(self._recent)[-most:])
-            self._local = self._make_local([*self._latest_states(), *self._recent])
+            robots = self._builder.robots
+            states = [self._builder.state_keys(r, -self._past_states) for r in robots]
+            self._local = self._make_local([*chain.from_iterable(states), *self._recent])
         return self._local.covariance(keys)
-
-    def _latest_states(self) -> Iterator[int]:
-        """Keys of each robot's latest states."""
-        builder = self._builder
-        for robot in builder.robots:
-            latest = builder.states.latest(robot)
-            for number in range(max(0, latest + 1 - self._past_states), latest + 1):
-                yield builder.state_key(robot, number)
 
     def _make_local(self, keys: list[int]) -> LocalFilter:
         """The filter of variables, from the tree."""
         self._rebuild_if_finished()
         linearised_at = self._isam.getLinearizationPoint()
-        points = {key: read(linearised_at, key, self._builder.dim(key)) for key in keys}
+        points = {key: factors.read(linearised_at, key, self._builder.dim(key)) for key in keys}
         z = self._isam.getDelta().vector(keys)
         return LocalFilter(points, z, self._tree_covariance(keys))
 

@@ -23,7 +23,6 @@ from graphslam.estimation.input_checks import (
 class DeadReckoningBackend:
     """The baseline that uses no observation for the trajectory."""
 
-    smooths = False
     error_frame: Literal["body", "world"] = "world"
     skipped: Mapping[str, int] = MappingProxyType({})  # it ignores observations on purpose
 

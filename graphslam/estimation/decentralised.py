@@ -29,7 +29,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Estimate, Step
 from graphslam.estimation import factors
-from graphslam.estimation.factor_graph import FactorGroup, GraphBackend, GraphBuilder, read, write
+from graphslam.estimation.factor_graph import FactorGroup, GraphBackend, GraphBuilder
 from graphslam.estimation.isam2 import isam2_parameters, isam2_tree, optimise
 
 #: bytes of a number, and of a variable's key
@@ -94,7 +94,7 @@ class LocalSmoother:
             return
         values = gtsam.Values()
         for key, value in self.new_values.items():
-            write(values, key, value)
+            factors.write(values, key, value)
         self.graph.push_back(self.new_factors)
         self.isam.update(self.new_factors, values)
         self.new_factors, self.new_values = gtsam.NonlinearFactorGraph(), {}
@@ -129,7 +129,7 @@ class LocalSmoother:
         keys = {key for factor in content for key in factor.keys()}  # noqa: SIM118
         self.sent += size
         return Message(
-            tuple(content), {key: read(estimate, key, self.dims[key]) for key in keys}, size
+            tuple(content), {key: factors.read(estimate, key, self.dims[key]) for key in keys}, size
         )
 
 
@@ -192,8 +192,6 @@ def _condensed(
 
 class DecentralisedBackend(GraphBackend):
     """See the module's docstring; queries about a robot are answered by its own estimator."""
-
-    smooths = True
 
     def __init__(self, config: Config) -> None:
         super().__init__(GraphBuilder(config.robust))
@@ -351,7 +349,7 @@ class DecentralisedBackend(GraphBackend):
             for key, dim in robot.dims.items():
                 index, _ = factors.number_of(key)
                 if index == n or (index is None and key not in marginals):
-                    marginals[key] = read(values, key, dim), self._marginal(robot, [key])
+                    marginals[key] = factors.read(values, key, dim), self._marginal(robot, [key])
             half_error = half_error if n else float(robot.graph.error(values))
         return self.builder.estimate(marginals, half_error)
 

@@ -23,11 +23,8 @@ from graphslam.estimation.factor_graph import (
     FactorGroup,
     GraphBackend,
     GraphBuilder,
-    jacobian_factor,
-    read,
     root_covariance,
     square_root,
-    write,
 )
 from graphslam.estimation.input_checks import indeterminate
 from graphslam.estimation.m_estimators import robust_weight
@@ -56,7 +53,7 @@ class FactorEkfBackend(GraphBackend):
 
     def value(self, key: int, dim: int) -> Array:
         """See `GraphBackend`."""
-        return read(self._values, key, dim)
+        return factors.read(self._values, key, dim)
 
     def covariance(self, keys: list[int]) -> Array:
         """See `GraphBackend`."""
@@ -95,7 +92,7 @@ class FactorEkfBackend(GraphBackend):
 
     def _insert(self, key: int, value: Array, replaces: int | None) -> None:
         """Insert a variable into the order: a robot's next state behind the one before."""
-        write(self._values, key, value)
+        factors.write(self._values, key, value)
         poses = sum(map(factors.is_state, self._order))
         if replaces is not None:
             self._order.insert(self._order.index(replaces) + 1, key)
@@ -152,7 +149,7 @@ class FactorEkfBackend(GraphBackend):
         A, b = linear.jacobian()
         keys = linear.keys()
         b = b + A @ self._z.vector(keys)
-        return jacobian_factor(A, b, {key: self._z.at(key).size for key in keys})
+        return factors.jacobian_factor(A, b, {key: self._z.at(key).size for key in keys})
 
     def _weighted(self, linear: gtsam.JacobianFactor) -> gtsam.JacobianFactor:
         """``linear``, A z = b with unit noise, scaled by the root of its `robust_weight`."""
@@ -161,7 +158,9 @@ class FactorEkfBackend(GraphBackend):
         innovation = b - A @ self._z.vector(keys)
         HPHt = A @ self.covariance(list(keys)) @ A.T
         root = np.sqrt(robust_weight(innovation, HPHt, np.eye(len(b)), self._kernel))
-        return jacobian_factor(root * A, root * b, {key: self._z.at(key).size for key in keys})
+        return factors.jacobian_factor(
+            root * A, root * b, {key: self._z.at(key).size for key in keys}
+        )
 
     def finish(self) -> Estimate:
         """See `Backend`: every state as its own step left it."""

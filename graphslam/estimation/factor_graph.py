@@ -10,6 +10,7 @@ import re
 from abc import ABC, abstractmethod
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,7 +20,7 @@ from scipy.linalg.blas import dtrsm
 
 from graphslam.core.config import RobustConfig
 from graphslam.core.errors import EstimationError
-from graphslam.core.geometry import Array, compose, rotate_cov
+from graphslam.core.geometry import Array, compose, rotate_cov, rotation3
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Closure, Estimate, Step, Trajectory
 from graphslam.estimation import factors
@@ -112,17 +113,16 @@ class GraphBuilder:
         dims.update((factors.landmark_key(i), d) for i, d in self.landmark_dims.items())
         return dims
 
-    def state_keys(self, robot: str) -> list[int]:
-        """Keys of all states of a robot."""
-        return [self.state_key(robot, n) for n in range(len(self.states.times[robot]))]
+    def state_keys(self, robot: str, first: int = 0) -> list[int]:
+        """Keys of a robot's states from number ``first`` on, which counts from the end if < 0."""
+        numbers = range(len(self.states.times[robot]))
+        return [self.state_key(robot, n) for n in numbers[first:]]
 
     def factor_groups(self, step: Step, estimate: Estimates) -> Iterator[FactorGroup]:
         """The factors of a step, group by group in recorded order.
 
-        Args:
-            step: the step.
-            estimate: called for existing variables when a group is made, which is after the caller
-                has used the groups before.
+        ``estimate`` is called for existing variables when a group is made, which is after the
+        caller has used the groups before.
 
         Raises:
             EstimationError: a covariance is not positive definite and finite, or a state that the
@@ -241,7 +241,9 @@ class GraphBuilder:
                 what = f"robot {name} at {self.states.times[name][number]} ns"
         return indeterminate(what, UNDERDETERMINED)
 
-    def diagnose(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> EstimationError:
+    def diagnose(
+        self, graph: gtsam.NonlinearFactorGraph | gtsam.GaussianFactorGraph, values: gtsam.Values
+    ) -> EstimationError:
         """Which variable is indeterminate: QR returns NaN for all of them, Cholesky names one."""
         try:
             marginals = gtsam.Marginals(graph, values)
@@ -270,9 +272,8 @@ class GraphBuilder:
     def estimate(self, marginals: Mapping[int, tuple[Array, Array]], half_error: float) -> Estimate:
         """An `Estimate` of every state and landmark.
 
-        Args:
-            marginals: key -> mean and covariance, errors in body frames.
-            half_error: half the weighted squared residual.
+        ``marginals``: key -> mean and covariance, errors in body frames; ``half_error``: half the
+        weighted squared residual.
         """
         states, unknowns = {}, 0
         for robot in sorted(self.robots):
@@ -289,29 +290,23 @@ class GraphBuilder:
         return Estimate(states, landmarks, half_error, self.rows - unknowns)
 
 
-class _covariance_of:  # noqa: N801 (used as a function)
+@contextmanager
+def _covariance_of(what: str, cov: Array) -> Iterator[None]:
     """Checks a covariance (k, k); errors inside name ``what`` it is of."""
-
-    def __init__(self, what: str, cov: Array) -> None:
-        self._what, self._cov = what, cov
-
-    def __enter__(self) -> None:
-        # the sum of finite numbers is finite; for so few Python is faster than NumPy
-        if not math.isfinite(sum(map(sum, self._cov.tolist()))):
-            raise EstimationError(
-                f"{self._what}: its covariance is not finite, so it determines nothing: "
-                f"{self._cov.tolist()}"
-            )
-
-    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
-        if isinstance(error, (EstimationError, np.linalg.LinAlgError)):
-            raise EstimationError(f"{self._what}: {error}") from error
+    # the sum of finite numbers is finite; for so few Python is faster than NumPy
+    if not math.isfinite(sum(map(sum, cov.tolist()))):
+        raise EstimationError(
+            f"{what}: its covariance is not finite, so it determines nothing: {cov.tolist()}"
+        )
+    try:
+        yield
+    except (EstimationError, np.linalg.LinAlgError) as error:
+        raise EstimationError(f"{what}: {error}") from error
 
 
 class GraphBackend(ABC):
     """The queries of `Backend`, from `value` and `covariance` of variables by their keys."""
 
-    smooths = False
     error_frame: Literal["body", "world"] = "body"
 
     def __init__(self, builder: GraphBuilder) -> None:
@@ -339,14 +334,9 @@ class GraphBackend(ABC):
         """See `Backend`; for a pose alone it uses the latest joint since the last step, if any."""
         builder = self.builder
         key = builder.latest_key(robot)
-        if not landmarks and not others:
-            if robot in self._joints:
-                cached = self._joints[robot]
-                return Joint(cached.pose, (), cached.cov[:3, :3], ())
-            alone = self.value(key, 3)
-            cov = rotate_cov(self.covariance([key]), alone[2])
-            self._joints[robot] = Joint(alone, (), cov, ())
-            return self._joints[robot]
+        if robot in self._joints and not landmarks and not others:
+            cached = self._joints[robot]
+            return Joint(cached.pose, (), cached.cov[:3, :3], ())
         dims = [builder.landmark_dims[i] for i in landmarks] + [3] * len(others)
         keys = [factors.landmark_key(i) for i in landmarks]
         keys += [builder.latest_key(other) for other in others]
@@ -355,7 +345,7 @@ class GraphBackend(ABC):
         turn = np.eye(len(cov))
         for block, mean in zip((slice(0, 3), *block_slices(dims)), means, strict=True):
             if len(mean) == 3:
-                turn[block, block] = factors.world_from_body(float(mean[2]))
+                turn[block, block] = rotation3(mean[2])
         self._joints[robot] = Joint.of(means, len(landmarks), turn @ cov @ turn.T)
         return self._joints[robot]
 
@@ -403,30 +393,3 @@ def joint_marginal(tree: gtsam.ISAM2 | gtsam.GaussianBayesTree, keys: list[int])
     if len(keys) == 1:
         return np.asarray(tree.marginalCovariance(keys[0]))
     return np.asarray(tree.jointMarginalCovariance(keys).fullMatrix())
-
-
-def read(values: gtsam.Values, key: int, dim: int) -> Array:
-    """Value (dim,) of a variable, m and rad."""
-    if dim == 3:
-        return factors.array3(values.atPose2(key))
-    return np.asarray(values.atPoint2(key))
-
-
-def write(values: gtsam.Values, key: int, value: Array) -> None:
-    """Insert a variable with its value (2,) or (3,)."""
-    values.insert(key, factors.pose2(value) if len(value) == 3 else value)
-
-
-def update(values: gtsam.Values, key: int, value: Array) -> None:
-    """Set the value (2,) or (3,) of a variable that is there."""
-    values.update(key, factors.pose2(value) if len(value) == 3 else value)
-
-
-def jacobian_factor(A: Array, b: Array, dims: Mapping[int, int]) -> gtsam.JacobianFactor:
-    """Whitened rows A (k, D) z = b (k,) of one or two variables with their dimensions, in order."""
-    unit = gtsam.noiseModel.Unit.Create(len(b))
-    first, *second = dims
-    dim = dims[first]
-    if not second:
-        return gtsam.JacobianFactor(first, A, b, unit)
-    return gtsam.JacobianFactor(first, A[:, :dim], second[0], A[:, dim:], b, unit)

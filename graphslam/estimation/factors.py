@@ -6,7 +6,7 @@ frame in which a quantity is given; the conversions are here.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import gtsam
@@ -14,7 +14,7 @@ import numpy as np
 
 from graphslam.core.config import RobustConfig
 from graphslam.core.errors import EstimationError
-from graphslam.core.geometry import Array, is_positive, rotate_cov, rotation3
+from graphslam.core.geometry import Array, is_positive, rotate_cov
 from graphslam.core.observation_models import LineModel
 from graphslam.core.records import Association, Closure, Motion, Start
 
@@ -25,6 +25,7 @@ from graphslam.core.records import Association, Closure, Motion, Start
 #: one makes the estimate overconfident at any noise (docs/ekf-versus-smoothing.md).
 LINE_GAUGE_SIGMA_M = 1.0
 FILTER_GAUGE_SIGMA_M = 1e-3
+NO_KERNEL = RobustConfig("none")
 
 #: a symbol's letter is in its highest byte, its number in the others
 FIRST_STATE, FIRST_LANDMARK = (int(gtsam.symbol(letter, 0)) for letter in "xl")
@@ -62,9 +63,14 @@ def array3(pose: gtsam.Pose2) -> Array:
     return np.array([pose.x(), pose.y(), pose.theta()])
 
 
-def world_from_body(heading_rad: float) -> Array:
-    """Matrix (3, 3) from body-frame errors of a pose to additive world-axis errors."""
-    return rotation3(heading_rad)
+def read(values: gtsam.Values, key: int, dim: int) -> Array:
+    """Value (dim,) of a variable, m and rad."""
+    return array3(values.atPose2(key)) if dim == 3 else np.asarray(values.atPoint2(key))
+
+
+def write(values: gtsam.Values, key: int, value: Array) -> None:
+    """Insert a variable with its value (2,) or (3,)."""
+    values.insert(key, pose2(value) if len(value) == 3 else value)
 
 
 def gaussian(cov: Array) -> gtsam.noiseModel.Base:
@@ -100,7 +106,7 @@ def start_factor(key: int, start: Start) -> gtsam.NonlinearFactor:
 
 def motion_factor(key: int, next_key: int, motion: Motion) -> gtsam.NonlinearFactor:
     """Odometry between two states of one robot."""
-    return relative_pose_factor(key, next_key, motion.delta, gaussian, motion.cov)
+    return relative_pose_factor(key, next_key, motion.delta, motion.cov, NO_KERNEL)
 
 
 def closure_factor(
@@ -112,32 +118,22 @@ def closure_factor(
     tails, where the cost is proportional to the scale squared, it then costs as much as n closures.
     """
     wide = replace(kernel, scale=kernel.scale * math.sqrt(closure.images))
-
-    def noise(cov: Array) -> gtsam.noiseModel.Base:
-        return gaussian(cov) if closure.verified else robust(gaussian(cov), wide)
-
-    return relative_pose_factor(other_key, key, closure.delta, noise, closure.cov)
+    kernel = NO_KERNEL if closure.verified else wide
+    return relative_pose_factor(other_key, key, closure.delta, closure.cov, kernel)
 
 
 def relative_pose_factor(
-    key: int,
-    next_key: int,
-    delta: Array,
-    noise: Callable[[Array], gtsam.noiseModel.Base],
-    cov: Array,
+    key: int, next_key: int, delta: Array, cov: Array, kernel: RobustConfig
 ) -> gtsam.NonlinearFactor:
     """Between factor; ``cov`` is along the first frame's axes, GTSAM's along the second's."""
-    turned = rotate_cov(cov, -float(delta[2]))
-    return gtsam.BetweenFactorPose2(key, next_key, pose2(delta), noise(turned))
+    noise = robust(gaussian(rotate_cov(cov, -float(delta[2]))), kernel)
+    return gtsam.BetweenFactorPose2(key, next_key, pose2(delta), noise)
 
 
 def _pose_observation(
     key: int, target: int, seen: Association, kernel: RobustConfig, _x: Array, _t: Array
 ) -> gtsam.NonlinearFactor:
-    def noise(cov: Array) -> gtsam.noiseModel.Base:
-        return robust(gaussian(cov), kernel)
-
-    return relative_pose_factor(key, target, seen.z, noise, seen.cov)
+    return relative_pose_factor(key, target, seen.z, seen.cov, kernel)
 
 
 def _line_observation(
@@ -161,14 +157,8 @@ def line_factors(
 ) -> list[gtsam.NonlinearFactor]:
     """The factors of n lines, as `observation_factor` makes them, computed at once.
 
-    Args:
-        keys: of the observing states.
-        targets: of the lines.
-        z: (n, 3) measurements.
-        cov: (n, 3, 3) their covariances.
-        x: (n, 3) estimates of the states.
-        t: (n, 3) estimates of the lines.
-        kernel: robust kernel.
+    ``z`` (n, 3) are the measurements, ``cov`` (n, 3, 3) their covariances, ``x`` (n, 3) and ``t``
+    (n, 3) the estimates of the observing states and of the lines.
     """
     return [
         _line_factor(*made, kernel)
@@ -197,14 +187,13 @@ _FactorMaker = Callable[[int, int, Association, RobustConfig, Array, Array], gts
 
 def _bearing_range(factor: Callable[..., gtsam.NonlinearFactor]) -> _FactorMaker:
     """Maker of a bearing-range ``factor`` to a point or to a pose."""
-
-    def make(
-        key: int, target: int, seen: Association, kernel: RobustConfig, _x: Array, _t: Array
-    ) -> gtsam.NonlinearFactor:
-        bearing, range_m = gtsam.Rot2(float(seen.z[0])), float(seen.z[1])
-        return factor(key, target, bearing, range_m, robust(gaussian(seen.cov), kernel))
-
-    return make
+    return lambda key, target, seen, kernel, _x, _t: factor(
+        key,
+        target,
+        gtsam.Rot2(float(seen.z[0])),
+        float(seen.z[1]),
+        robust(gaussian(seen.cov), kernel),
+    )
 
 
 #: row of `MODELS` -> its factor
@@ -220,15 +209,10 @@ FACTORS: dict[str, _FactorMaker] = {
 def observation_factor(
     key: int, target: int, seen: Association, kernel: RobustConfig, x: Array, t: Array
 ) -> gtsam.NonlinearFactor:
-    """Factor of an observation.
+    """Factor of an observation from state ``key`` of a landmark or another robot's state.
 
-    Args:
-        key: of the observing state.
-        target: key of the landmark, or of the observed robot's state.
-        seen: the association.
-        kernel: robust kernel.
-        x: estimate (3,) of the observing state at which the factor is built.
-        t: estimate of the target.
+    It is built at the estimates ``x`` (3,) of the observing state and ``t`` (2,) or (3,) of the
+    target.
     """
     return FACTORS[seen.model](key, target, seen, kernel, x, t)
 
@@ -240,7 +224,15 @@ def line_gauge_factor(
 
     See `LINE_GAUGE_SIGMA_M`.
     """
-    R = np.zeros((3, 3))
-    R[0, 0] = 1.0 / (LINE_GAUGE_SIGMA_M if wide else FILTER_GAUGE_SIGMA_M)
-    noise = gtsam.noiseModel.Gaussian.SqrtInformation(R, False)
-    return gtsam.BetweenFactorPose2(key, target, pose2(seen.z), noise)
+    R = np.diag([1.0 / (LINE_GAUGE_SIGMA_M if wide else FILTER_GAUGE_SIGMA_M), 0.0, 0.0])
+    return _line_factor(key, target, seen.z, R, NO_KERNEL)
+
+
+def jacobian_factor(A: Array, b: Array, dims: Mapping[int, int]) -> gtsam.JacobianFactor:
+    """Whitened rows A (k, D) z = b (k,) of one or two variables with their dimensions, in order."""
+    unit = gtsam.noiseModel.Unit.Create(len(b))
+    first, *second = dims
+    dim = dims[first]
+    if not second:
+        return gtsam.JacobianFactor(first, A, b, unit)
+    return gtsam.JacobianFactor(first, A[:, :dim], second[0], A[:, dim:], b, unit)

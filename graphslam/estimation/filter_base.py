@@ -35,8 +35,6 @@ class FilterBackend(ABC):
     is counted in ``skipped``, by reason.
     """
 
-    smooths = False
-
     def __init__(self, past_states: int = 0) -> None:
         self._past_states = past_states
         self._states = StateTable()

@@ -23,20 +23,15 @@ import gtsam
 import numpy as np
 
 from graphslam.core.config import Config, RobustConfig
-from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import Array
 from graphslam.core.records import Association, Estimate, Step
 from graphslam.estimation import factors
 from graphslam.estimation.factor_graph import (
     GraphBackend,
     GraphBuilder,
-    jacobian_factor,
     joint_marginal,
-    read,
     root_covariance,
     square_root,
-    update,
-    write,
 )
 
 #: largest number of Gauss-Newton iterations per step, and the norm of the update (m, rad) that ends
@@ -81,7 +76,7 @@ class FixedLagBackend(GraphBackend):
 
     def value(self, key: int, dim: int) -> Array:
         """See `GraphBackend`."""
-        return read(self._values, key, dim)
+        return factors.read(self._values, key, dim)
 
     def add(self, step: Step) -> None:
         """See `Backend`."""
@@ -90,7 +85,7 @@ class FixedLagBackend(GraphBackend):
         for group in self.builder.factor_groups(step, self.value):
             if group.new is not None:
                 key, value = group.new
-                write(self._values, key, value)
+                factors.write(self._values, key, value)
                 self._dims[key] = len(value)
             for factor in group.factors:
                 last = factor is group.factors[-1]
@@ -105,7 +100,7 @@ class FixedLagBackend(GraphBackend):
             delta = self._eliminated().optimize()
             size = delta.norm()
             if not np.isfinite(size):
-                raise self._diagnose()
+                raise self.builder.diagnose(self._linear(self._window), self._values)
             self._values, self._tree = self._values.retract(delta), None
             if size < CONVERGED:
                 break
@@ -113,9 +108,10 @@ class FixedLagBackend(GraphBackend):
     def _eliminated(self) -> gtsam.GaussianBayesTree:
         """The window, linearised and eliminated: by Cholesky, or by QR where that fails."""
         if self._tree is None:
-            linear = self._linear(self._window)
+            linear, order = self._linear(self._window), gtsam.Ordering.OrderingType.COLAMD
+            by_qr = (order, gtsam.EliminateQR) if self._qr else ()
             try:
-                self._tree = self._qr_tree(linear) if self._qr else linear.eliminateMultifrontal()
+                self._tree = linear.eliminateMultifrontal(*by_qr)
             except RuntimeError as error:
                 if self._qr:
                     raise self.builder.explain(error) from error
@@ -123,23 +119,11 @@ class FixedLagBackend(GraphBackend):
                 return self._eliminated()
         return self._tree
 
-    @staticmethod
-    def _qr_tree(linear: gtsam.GaussianFactorGraph) -> gtsam.GaussianBayesTree:
-        return linear.eliminateMultifrontal(gtsam.Ordering.OrderingType.COLAMD, gtsam.EliminateQR)
-
-    def _diagnose(self) -> EstimationError:
-        """Which variable is indeterminate: QR returns NaN for all of them, Cholesky names one."""
-        try:
-            self._linear(self._window).eliminateMultifrontal()
-        except RuntimeError as error:
-            return self.builder.explain(error)
-        return self.builder.explain(RuntimeError(""))
-
     def _linear(self, window: Iterable[WindowFactor]) -> gtsam.GaussianFactorGraph:
         """Factors with residuals at the estimate and first-estimates Jacobians (see `_first`)."""
         first = gtsam.Values(self._values)
         for key, value in self._first.items():
-            update(first, key, value)
+            first.update(key, factors.pose2(value) if len(value) == 3 else value)
         graph = gtsam.GaussianFactorGraph()
         for each in window:
             linear = each.factor.linearize(self._values)
@@ -152,7 +136,7 @@ class FixedLagBackend(GraphBackend):
                         A = each.factor.linearize(first).jacobian()[0]
                     root = np.sqrt(self._noise(len(b)).weight(b)) if weighted else 1.0
                     dims = {key: self._dims[key] for key in each.keys}
-                    linear = jacobian_factor(root * A, root * b, dims)
+                    linear = factors.jacobian_factor(root * A, root * b, dims)
             graph.push_back(linear)
         return graph
 
@@ -179,7 +163,7 @@ class FixedLagBackend(GraphBackend):
         net = rest.eliminateSequential(gtsam.Ordering(keys), gtsam.EliminateQR)
         R, columns = square_root(net, self._dims)
         if not (np.isfinite(R).all() and np.diag(R).all()):
-            raise self._diagnose()
+            raise self.builder.diagnose(linear, self._values)
         return root_covariance(R, columns, keys)
 
     def _marginalise_before(self, before_ns: int) -> None:
@@ -200,10 +184,8 @@ class FixedLagBackend(GraphBackend):
         involved = [f for f in self._window if not set(leaving).isdisjoint(f.keys)]
         # lines are built a last time, at the best estimate that there will be
         linear, order = self._linear(map(self._rebuilt, involved)), gtsam.Ordering(list(leaving))
-        if self._qr:
-            rest = linear.eliminatePartialSequential(order, gtsam.EliminateQR)[1]
-        else:
-            rest = linear.eliminatePartialSequential(order)[1]
+        by_qr = (gtsam.EliminateQR,) if self._qr else ()
+        _, rest = linear.eliminatePartialSequential(order, *by_qr)
         self._window = [f for f in self._window if set(leaving).isdisjoint(f.keys)]
         prior = gtsam.LinearContainerFactor.ConvertLinearGraph(rest, self._values)
         for n in range(prior.size()):

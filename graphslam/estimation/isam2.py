@@ -14,14 +14,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.records import Association, Closure, Estimate, Step
 from graphslam.core.worker import parallel_map
 from graphslam.estimation import factors
-from graphslam.estimation.factor_graph import (
-    Estimates,
-    FactorGroup,
-    GraphBackend,
-    GraphBuilder,
-    read,
-    write,
-)
+from graphslam.estimation.factor_graph import Estimates, FactorGroup, GraphBackend, GraphBuilder
 
 #: m or rad: the estimate has converged when all variables together move less than this
 CONVERGED = 1e-6
@@ -86,7 +79,7 @@ class WholeGraph(GraphBuilder):
         """Add a recorded step, its variables with their values in ``start``."""
         for group in self.expand(step, lambda key, _dim: self.value_in(start, key)):
             if group.new is not None:
-                write(values, group.new[0], self.value_in(start, group.new[0]))
+                factors.write(values, group.new[0], self.value_in(start, group.new[0]))
 
     def _add(self, group: FactorGroup) -> None:
         for factor in group.factors:
@@ -114,7 +107,7 @@ class WholeGraph(GraphBuilder):
         self.reserve_lines()
         keys, targets, seen = zip(*self._lines, strict=True)
         unique = np.unique([keys, targets])
-        poses = np.array([read(values, int(key), 3) for key in unique])
+        poses = np.array([factors.read(values, int(key), 3) for key in unique])
         made = factors.line_factors(
             keys,
             targets,
@@ -158,8 +151,6 @@ def isam2_tree(
 class Isam2Backend(GraphBackend):
     """Incremental smoothing of all states; see the module's docstring."""
 
-    smooths = True
-
     def __init__(self, config: Config, builder: WholeGraph | None = None) -> None:
         self._config = config
         self._builder = builder or WholeGraph(config.robust)
@@ -193,7 +184,7 @@ class Isam2Backend(GraphBackend):
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for group in groups:
             if group.new is not None:
-                write(values, *group.new)
+                factors.write(values, *group.new)
             for factor in group.factors:
                 graph.add(factor)
         if relinearise:
@@ -381,7 +372,7 @@ def with_means(
 ) -> dict[int, tuple[Array, Array]]:
     """Mean (d,) and covariance (d, d), NaN if missing in ``covs``, of every variable."""
     return {
-        key: (read(values, key, dim), covs.get(key, np.full((dim, dim), np.nan)))
+        key: (factors.read(values, key, dim), covs.get(key, np.full((dim, dim), np.nan)))
         for key, dim in dims.items()
     }
 

@@ -88,8 +88,8 @@ def test_factor_linearises_like_the_model(name, seed):
     A, b = graph.jacobian(order)
 
     H_x, H_t = model.jacobians(seen.z, x, t)
-    turned = H_t @ factors.world_from_body(t[2]) if len(t) == 3 else H_t
-    H = np.hstack([H_x @ factors.world_from_body(x[2]), turned])
+    turned = H_t @ rotation3(t[2]) if len(t) == 3 else H_t
+    H = np.hstack([H_x @ rotation3(x[2]), turned])
     r = model.residual(seen.z, x, t)
     weight = np.linalg.inv(model.noise(seen.z, seen.cov, x, t))
     scale = np.abs(H.T @ weight @ H).max()
@@ -185,11 +185,11 @@ def test_start_factor_takes_its_covariance_along_world_axes():
 
 
 @pytest.mark.parametrize("heading", [0.0, 1.0, -2.5])
-def test_world_from_body_turns_retracted_errors_into_world_axes(heading):
+def test_rotation3_turns_retracted_errors_into_world_axes(heading):
     """Pose2.retract moves in the body frame: its first-order effect on (x, y, phi)."""
     pose, small = np.array([1.0, 2.0, heading]), np.array([2e-6, -1e-6, 3e-6])
     moved = factors.array3(factors.pose2(pose).retract(small))
-    expected = factors.world_from_body(heading) @ small
+    expected = rotation3(heading) @ small
     np.testing.assert_allclose(moved - pose, expected, atol=1e-11)  # second order: (1e-6)²
 
 
@@ -291,10 +291,6 @@ def test_corridor_line_sigma_is_unmoved_by_what_is_claimed_along_the_wall():
     the optimiser's own tolerance (1e-10 of the error is some 1e-7 of the distance)."""
     results = [drive_corridor("batch", "line", along_sigma_m=s) for s in (0.01, 100.0)]
     np.testing.assert_allclose(results[0], results[1], rtol=1e-6)
-
-
-def test_world_from_body_is_the_thesis_rotation():
-    np.testing.assert_array_equal(factors.world_from_body(0.3), rotation3(0.3))
 
 
 def test_point_rows_measure_bearing_and_range():
