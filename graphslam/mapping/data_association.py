@@ -51,9 +51,13 @@ def predicted_joint(joint: Joint, motion: Motion | None) -> Joint:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Image:
-    """One image to associate; the fields are the arguments of `Associator.associate`.
+    """One image to associate: the observations ``seen`` in the robot's base frame at one state.
 
-    ``pose`` (3,) is the predicted one, after ``motion``.
+    ``time_ns`` is the time of that state. ``pose`` (3,) estimates the robot's latest state in the
+    back end, and ``motion`` leads from there to this one; None if it is it. ``path_m`` is how far
+    the robot has driven. ``gathering``: more images follow before the back end takes the step (and
+    `Associator.settle` is called). Innovations of sightings with an identity, which need the
+    expensive joint marginal, are not recorded then.
     """
 
     robot: str
@@ -63,7 +67,12 @@ class Image:
     motion: Motion | None
     track: Track
     path_m: float
-    gathering: bool
+    gathering: bool = False
+
+    @property
+    def predicted(self) -> Array:
+        """Predicted pose (3,) at the image."""
+        return self.pose if self.motion is None else compose(self.pose, self.motion.delta)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,49 +110,23 @@ class Associator:
             "segment": np.diag([m2, m2, rad2]),
         }
 
-    def associate(
-        self,
-        robot: str,
-        time_ns: int,
-        seen: Sequence[Observation],
-        pose: Array,
-        motion: Motion | None,
-        track: Track,
-        path_m: float,
-        gathering: bool = False,
-    ) -> tuple[Association, ...]:
-        """Associations of one image.
+    def associate(self, image: Image) -> tuple[Association, ...]:
+        """What is to enter the graph of an image.
 
-        Args:
-            robot: who saw it.
-            time_ns: time of the robot's state that the observations belong to.
-            seen: observations in the robot's base frame at that state.
-            pose: (3,) estimate of the robot's latest state in the back end.
-            motion: from the robot's latest state in the back end to this one; None if it is it.
-            track: the robot's odometry.
-            path_m: how far the robot has driven.
-            gathering: more images follow before the back end takes the step (`settle` then).
-                Innovations of sightings with an identity, which need the expensive joint marginal,
-                are not recorded.
-
-        Returns:
-            What is to enter the graph, including earlier sightings of landmarks that this image
-            promotes (marked late).
+        It includes earlier sightings of landmarks that this image promotes (marked late).
         """
         config = self._config
         if self._images % REFRESH_EVERY == 0:
             ids = [i for i in self.map.graph_ids() if i not in self._unsettled]
             self.map.refresh(self._backend, ids)
         self._images += 1
-        self.map.expire(time_ns, robot, path_m, round(config.tentative_s * 1e9), config.tentative_m)
-        if motion is not None:
-            pose = compose(pose, motion.delta)
-        image = Image(robot, time_ns, seen, pose, motion, track, path_m, gathering)
-        if gathering and all(map(self._has_identity, seen)):
+        age_ns = round(config.tentative_s * 1e9)
+        self.map.expire(image.time_ns, image.robot, image.path_m, age_ns, config.tentative_m)
+        if image.gathering and all(map(self._has_identity, image.seen)):
             return self._associate_identified(image)
         candidates = self._candidates(image)
         associations = self._apply(image, candidates, self._choose(image, candidates))
-        if not gathering:
+        if not image.gathering:
             self.settle()
         return associations
 
@@ -153,7 +136,7 @@ class Associator:
         for o in image.seen:
             entry = self._named(o)
             if entry is None:
-                entry = self.map.add(o, image.pose, image.time_ns)
+                entry = self.map.add(o, image.predicted, image.time_ns)
             elif (entry.kind == "point") != (o.kind == "point"):
                 self.rejected["identity: known as a landmark of another kind"] += 1
                 continue
@@ -170,7 +153,7 @@ class Associator:
         ids, means, extents, is_point, whole = self.map.arrays()
         free = [n for n, o in enumerate(seen) if not self._has_identity(o)]
         pairs = candidate_pairs(
-            [seen[n] for n in free], image.pose, means, extents, is_point, whole, self._config
+            [seen[n] for n in free], image.predicted, means, extents, is_point, whole, self._config
         )
         entries = [self.map.entries[int(ids[j])] for j in pairs.landmark]
         recent = np.array([self._is_recent(e, image) for e in entries], dtype=bool)
@@ -308,7 +291,7 @@ class Associator:
             else:
                 identity = o.identity if self._has_identity(o) else None
                 o = replace(o, identity=identity)
-                entry, model = self.map.add(o, image.pose, image.time_ns), o.kind
+                entry, model = self.map.add(o, image.predicted, image.time_ns), o.kind
             out += self._record(image, entry, model, o, self._has_identity(o))
         return tuple(out)
 
@@ -316,16 +299,10 @@ class Associator:
         self, image: Image, entry: Entry, model: str, o: Observation, certain: bool
     ) -> list[Association]:
         """Record an observation, and what enters the graph with it: none, it alone, all so far."""
-        self.map.saw(entry, o, image.pose, image.time_ns, image.robot, image.path_m)
+        robot, time_ns = image.robot, image.time_ns
+        self.map.saw(entry, o, image.predicted, time_ns, robot, image.path_m)
         seen = Association(
-            image.robot,
-            image.time_ns,
-            entry.id,
-            model,
-            o.z,
-            o.cov,
-            extent=o.extent,
-            source=o.source,
+            robot, time_ns, entry.id, model, o.z, o.cov, extent=o.extent, source=o.source
         )
         if entry.in_graph:
             return [seen]

@@ -18,10 +18,8 @@ from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, between, rotate_cov, wrap
 from graphslam.core.records import Association, Step
 from graphslam.estimation.backend import Joint
-from graphslam.mapping.landmark_map import Entry, LandmarkMap
-
-IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
-BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
+from graphslam.mapping.gating import BoolArray, IntArray
+from graphslam.mapping.landmark_map import Entry, LandmarkMap, retarget
 
 #: m, rad, m: how much two estimates of one wall may differ beyond their covariance: across it, in
 #: direction, and in the position of its ends; of one point the first, along both axes
@@ -52,19 +50,14 @@ class _Map:
 
     def contradict(self, a: int, b: int) -> bool:
         """Whether the groups of two landmarks contain things known to be different."""
-        return bool(
-            self.apart[np.ix_(self.group == self.group[a], self.group == self.group[b])].any()
-        )
+        in_a, in_b = self.group == self.group[a], self.group == self.group[b]
+        return bool(self.apart[np.ix_(in_a, in_b)].any())
 
 
 def partners(entries: Sequence[Entry], together: Iterable[frozenset[int]]) -> list[Entry]:
     """Landmarks that have another one near enough to be a duplicate.
 
-    Only these need a joint covariance.
-
-    Args:
-        entries: all landmarks.
-        together: pairs that one image showed as two things.
+    Only these need a joint covariance. ``together``: pairs that one image showed as two things.
     """
     if len(entries) < 2:
         return []
@@ -79,10 +72,8 @@ def duplicates(
 ) -> list[tuple[int, int]]:
     """Pairs of landmarks that are one, the most certain pair first; the older landmark first.
 
-    Args:
-        entries: landmarks, in the order of ``joint``.
-        joint: their means and joint covariance, world axes (the pose in front is not used).
-        together: pairs that one image showed as two things.
+    ``joint`` has the means and covariance of ``entries`` in their order (the pose in front is not
+    used). ``together``: pairs that one image showed as two things.
     """
     if len(entries) < 2:
         return []
@@ -306,13 +297,10 @@ def merged_steps(
 
     def renamed(a: Association) -> Association:
         target = into.get(a.target) if isinstance(a.target, int) else None
-        if target is None:
-            return a
-        line = a.model == "segment" and kinds[target] == "line"
-        return replace(a, target=target, model="line" if line else a.model)
+        return a if target is None else retarget(a, target, kinds[target])
 
     return tuple(
-        replace(step, associations=tuple(renamed(a) for a in step.associations)) for step in steps
+        replace(step, associations=tuple(map(renamed, step.associations))) for step in steps
     )
 
 
@@ -320,10 +308,8 @@ def merge_entries(landmarks: LandmarkMap, into: Mapping[int, int]) -> None:
     """Merge entries of the map: extents, counts and times."""
     for gone, kept in into.items():
         old, new = landmarks.entries.pop(gone), landmarks.entries[kept]
-        relative = between(new.mean, old.mean)
-        ends = relative[0] + np.cos(relative[2]) * old.extent
         if new.kind == "line":
-            new.extent = np.array([min(new.extent[0], ends.min()), max(new.extent[1], ends.max())])
+            new.extend(old.mean, old.extent)
         if old.identity is not None and new.identity is None:
             new.identity = old.identity
             landmarks.by_identity[old.identity] = kept

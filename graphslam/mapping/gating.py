@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.optimize import linear_sum_assignment
 
 from graphslam.core.config import AssociationConfig
@@ -180,10 +181,9 @@ def compare(
         pairs: k candidate pairs.
         pose: predicted pose (3,).
         states: landmark estimate (k, 3) of each pair; the third entry of a point is not used.
-        P_xx: covariance (k, 3, 3) of the pose, P_xt: (k, 3, 3) cross covariance with the
-            landmark, P_tt: (k, 3, 3) of the landmark; world axes, points padded with zeros.
-        P_xt: see P_xx.
-        P_tt: see P_xx.
+        P_xx: covariance (k, 3, 3) of the pose; all three along world axes.
+        P_xt: (k, 3, 3) cross covariance with the landmark, points padded with zeros.
+        P_tt: (k, 3, 3) of the landmark, likewise.
         floor: model name -> covariance (rows, rows) added to every innovation for what the models
             leave out (walls that are not flat, inexact stamps). It widens the gates and never
             enters the estimate.
@@ -194,10 +194,8 @@ def compare(
     H_xs: list[Array] = [np.zeros((0, 3))] * k
     H_ts: list[Array] = [np.zeros((0, 3))] * k
     noises: list[Array] = [np.zeros((0, 0))] * k
-    oriented = [
-        flip(seen[i]) if f else seen[i]
-        for i, f in zip(pairs.observation, pairs.flipped, strict=True)
-    ]
+    both = zip(pairs.observation, pairs.flipped, strict=True)
+    oriented = [flip(seen[i]) if flipped else seen[i] for i, flipped in both]
     for name in sorted(set(pairs.model)):
         model = MODELS[name]
         which = np.array([n for n, m in enumerate(pairs.model) if m == name])
@@ -238,19 +236,16 @@ def assign(cost: Array, gate: Array, method: str) -> list[tuple[int, int]]:
         return []
     if method == "greedy":
         found = []
-        left = allowed.copy()
-        while np.isfinite(left).any():
-            i, j = divmod(int(np.argmin(left)), m)
+        while np.isfinite(allowed).any():
+            i, j = divmod(int(np.argmin(allowed)), m)
             found.append((i, j))
-            left[i, :], left[:, j] = np.inf, np.inf
+            allowed[i, :] = allowed[:, j] = np.inf
         return sorted(found)
     # a column per row stands for "no landmark", so the problem is always feasible
     alone = np.full((n, n), np.inf)
-    finite_gate = np.where(np.isfinite(allowed), gate, 0.0).max(axis=1)
-    np.fill_diagonal(alone, finite_gate)
-    big = 1e9
-    table = np.concatenate([np.where(np.isfinite(allowed), allowed, big), alone], axis=1)
-    rows, columns = linear_sum_assignment(np.where(np.isfinite(table), table, big))
+    np.fill_diagonal(alone, np.where(np.isfinite(allowed), gate, 0.0).max(axis=1))
+    table = np.concatenate([allowed, alone], axis=1)
+    rows, columns = linear_sum_assignment(np.where(np.isfinite(table), table, 1e9))
     return [
         (int(i), int(j))
         for i, j in zip(rows, columns, strict=True)
@@ -270,21 +265,16 @@ def jointly_compatible(
     Individually compatible pairs may contradict each other; false closures usually do. (J. Neira,
     J. Tardós, joint compatibility, DOI 10.1109/70.976019.)
 
-    Args:
-        compared: the pairs.
-        chosen: which of them.
-        slices: for each chosen pair, where its landmark lies in ``P``.
-        P: joint covariance (D, D), pose first.
-        probability: of the chi-square gate.
+    ``slices`` are, for each chosen pair, where its landmark lies in the joint covariance ``P``
+    (D, D), pose first; ``probability`` is that of the chi-square gate.
     """
     r = np.concatenate([compared.residuals[k] for k in chosen])
+    R = block_diag(*(compared.noise[k] for k in chosen))
     H = np.zeros((len(r), len(P)))
-    R = np.zeros((len(r), len(r)))
     row = 0
     for k, where in zip(chosen, slices, strict=True):
         rows = slice(row, row + len(compared.residuals[k]))
         H[rows, :3], H[rows, where] = compared.H_x[k], compared.H_t[k]
-        R[rows, rows] = compared.noise[k]
         row = rows.stop
     d2 = float(r @ np.linalg.solve(H @ P @ H.T + R, r))
     return d2 < float(chi2_quantile(probability, len(r)))

@@ -47,6 +47,12 @@ class Entry:
         """
         return self.extent - between(self.mean, mean)[0] if self.kind == "line" else self.extent
 
+    def extend(self, pose: Array, extent: Array) -> None:
+        """Extend to ``extent`` (2,) along the x axis of ``pose`` (3,), in the world frame."""
+        relative = between(self.mean, pose)
+        ends = relative[0] + np.cos(relative[2]) * extent
+        self.extent = np.array([min(self.extent[0], ends.min()), max(self.extent[1], ends.max())])
+
     def move(self, mean: Array) -> None:
         """A new estimate (2,) or (3,)."""
         self.extent = self.extent_at(mean)
@@ -110,14 +116,10 @@ class LandmarkMap:
         entry.sightings += 1
         entry.last_ns = max(entry.last_ns, time_ns)
         entry.path_m[robot] = path_m
-        if seen.extent is not None and entry.kind != "point":
-            relative = between(entry.mean, compose(pose, seen.z))
-            ends = relative[0] + np.cos(relative[2]) * seen.extent
-            # a segment keeps its known ends; a line grows
-            if entry.kind == "line" or entry.sightings == 1:
-                entry.extent = np.array(
-                    [min(entry.extent[0], ends.min()), max(entry.extent[1], ends.max())]
-                )
+        # a segment keeps its known ends; a line grows
+        grows = entry.kind == "line" or (entry.kind == "segment" and entry.sightings == 1)
+        if grows and seen.extent is not None:
+            entry.extend(compose(pose, seen.z), seen.extent)
 
     def refresh(self, backend: Backend, ids: list[int]) -> None:
         """Copy the back end's current estimates of these landmarks."""
@@ -168,6 +170,12 @@ class LandmarkMap:
         for i in gone:
             del self.entries[i]
         self.deleted += len(gone)
+
+
+def retarget(a: Association, target: int, kind: str) -> Association:
+    """An association with another landmark, of ``kind``; a segment may be part of a line."""
+    line = a.model == "segment" and kind == "line"
+    return replace(a, target=target, model="line" if line else a.model)
 
 
 def observed_from(seen: Sequence[Association], estimate: Estimate) -> Array:

@@ -15,7 +15,7 @@ import numpy as np
 
 from graphslam.core.config import LoopClosureConfig
 from graphslam.core.consistency import has_rival, largest_consistent_set
-from graphslam.core.geometry import Array, between, log, rotate_cov, rotation, rotation3
+from graphslam.core.geometry import Array, between, log, rotate_cov, rotation3
 from graphslam.core.records import Closure, Trajectory
 from graphslam.core.worker import parallel_map
 from graphslam.mapping.submaps import State, SubmapPose, drift_covariance
@@ -56,11 +56,7 @@ def candidates(
     """Pairs of submaps that may show one place: later, earlier, and half the window (3,) to search.
 
     Of consecutive earlier submaps only the nearest is returned. All pairs are looked at, O(n²).
-
-    Args:
-        found: the submaps.
-        P: (3n, 3n) joint covariance of their poses, errors along each pose's own axes.
-        config: what counts as another visit, and how far is searched.
+    ``P`` (3n, 3n) is the joint covariance of the submaps' poses, errors along each one's own axes.
     """
     limit = np.array([config.search_max_m, config.search_max_m, config.search_max_rad])
     n = len(found)
@@ -113,8 +109,7 @@ def verify_match(matches: Sequence[Match]) -> Match | None:
     score = best.same - best.absent
     sigma = np.sqrt(np.linalg.eigvalsh(best.cov[:2, :2])[-1])
     good = (
-        best.same >= MIN_CONFIRMED
-        and best.absent <= MAX_SEEN_THROUGH * (best.same + best.absent)
+        _is_confirmed(best.same, best.absent)
         and sigma <= MAX_SIGMA_M
         and not has_rival(score, (m.same - m.absent for m in matches[1:]), RIVAL_SHARE)
     )
@@ -128,7 +123,7 @@ def loop_closures(
 
     Args:
         found: the submaps.
-        P: (3n, 3n) joint covariance of their poses, errors along each pose's own axes.
+        P: (3n, 3n) see `candidates`.
         examined: relative poses (3,) of pairs at which they were examined before; those need not be
             examined again. New ones are added.
         config: what counts as another visit, and how far is searched.
@@ -186,12 +181,11 @@ def verify_in_place(source: Submap, target: Submap, guess: Array) -> tuple[Array
     pose, cov = align(source, target, guess)
     if not _near(guess, pose, CLOSED):
         return None
-    same, absent = agreement(source, target, pose)
-    return (
-        (pose, cov)
-        if same >= MIN_CONFIRMED and absent <= MAX_SEEN_THROUGH * (same + absent)
-        else None
-    )
+    return (pose, cov) if _is_confirmed(*agreement(source, target, pose)) else None
+
+
+def _is_confirmed(same: float, absent: float) -> bool:
+    return same >= MIN_CONFIRMED and absent <= MAX_SEEN_THROUGH * (same + absent)
 
 
 def _near(a: Array, b: Array, limits: tuple[float, float]) -> bool:
@@ -204,13 +198,8 @@ def consistent_closures(
 ) -> list[Closure]:
     """The largest set found of closures that agree with the estimate and with each other.
 
-    The covariance of the estimate is inflated by `TRUST` and by drift that it does not know of; see
-    `largest_consistent_set` for the rule.
-
-    Args:
-        closures: between submaps.
-        found: the submaps.
-        P: (3n, 3n) joint covariance of their poses, errors along each pose's own axes.
+    The covariance ``P`` (3n, 3n) of the estimate, see `candidates`, is inflated by `TRUST` and by
+    drift that it does not know of; see `largest_consistent_set` for the rule.
     """
     if not closures:
         return []
@@ -230,8 +219,7 @@ def _innovations(
         j = at[closure.other, closure.other_time_ns]
         h = between(found[j].pose, found[i].pose)
         r[k] = log(between(closure.delta, h))
-        turn = np.eye(3)
-        turn[:2, :2] = rotation(-float(closure.delta[2]))
+        turn = rotation3(-closure.delta[2])
         H, rows = turn @ _jacobian(h), slice(3 * k, 3 * k + 3)
         J[rows, 3 * j : 3 * j + 3], J[rows, 3 * i : 3 * i + 3] = H[:, :3], H[:, 3:]
         R[rows, rows] = turn @ closure.cov @ turn.T

@@ -12,7 +12,7 @@ import numpy as np
 
 from graphslam.core.geometry import Array, compose, wrap
 from graphslam.core.records import Association, Estimate, Step
-from graphslam.mapping.landmark_map import Entry, observed_from
+from graphslam.mapping.landmark_map import Entry, observed_from, retarget
 
 #: m across, rad: typical residuals of an observation at its own wall, the unit of the distance
 SIGMA_M, SIGMA_RAD = 0.03, 0.02
@@ -41,13 +41,8 @@ def reassociate(
 ) -> Reassociated:
     """Associate observations of lines and segments with the walls that they fit best.
 
-    Args:
-        steps: as recorded.
-        estimate: of their states and landmarks.
-        entries: kinds, means and extents of the landmarks, as estimated.
-        gate_m: how far off a wall the middle of an observation may lie.
-        gate_rad: how far its direction may differ.
-        beyond_m: how far beyond the ends of a wall the middle of an observation may lie.
+    ``entries`` are the landmarks as estimated. The middle of an observation may lie ``gate_m`` off
+    a wall and ``beyond_m`` beyond its ends, and its direction may differ by ``gate_rad``.
     """
     walls = [e for i, e in entries.items() if i in estimate.landmarks and e.kind != "point"]
     place = {e.id: k for k, e in enumerate(walls)}
@@ -71,11 +66,10 @@ def reassociate(
             if wall is None:
                 kept.append(a)
             elif wall >= 0:
-                kept.append(_retarget(a, walls[wall]))
+                kept.append(_moved(a, walls[wall]))
         made.append(replace(step, associations=tuple(kept)))
-    return Reassociated(
-        tuple(made), int(((best != own) & (best >= 0)).sum()), int((best < 0).sum())
-    )
+    moved, dropped = (best != own) & (best >= 0), best < 0
+    return Reassociated(tuple(made), int(moved.sum()), int(dropped.sum()))
 
 
 def _best(
@@ -104,27 +98,19 @@ def _best(
 def _exclusive(seen: Sequence[Association], own: Array, best: Array) -> Array:
     """No wall twice in one image: an observation does not move to a wall that another one has.
 
-    Args:
-        seen: the observations.
-        own: (n,) walls they were associated with.
-        best: (n,) walls that they fit best, -1 for none.
+    ``own`` (n,) are the walls that the observations were associated with, ``best`` (n,) those that
+    they fit best, -1 for none.
     """
-    taken: dict[tuple[str, int, int], int] = {}
-    order = np.argsort(best != own, kind="stable")  # those that stay choose first
+    taken: set[tuple[str, int, int]] = set()
     out = best.copy()
-    for k in order:
-        wall = int(best[k])
-        if wall < 0:
-            continue
-        key = seen[k].robot, seen[k].time_ns, wall
+    for k in np.argsort(best != own, kind="stable"):  # those that stay choose first
+        key = seen[k].robot, seen[k].time_ns, int(best[k])
         if key in taken and best[k] != own[k]:
             out[k] = own[k]
-        taken[key] = int(k)
+        if best[k] >= 0:
+            taken.add(key)
     return out
 
 
-def _retarget(a: Association, wall: Entry) -> Association:
-    if a.target == wall.id:
-        return a
-    line = a.model == "segment" and wall.kind == "line"
-    return replace(a, target=wall.id, model="line" if line else a.model, late=False)
+def _moved(a: Association, wall: Entry) -> Association:
+    return a if a.target == wall.id else replace(retarget(a, wall.id, wall.kind), late=False)

@@ -99,7 +99,6 @@ def verify(
     frames_seen: dict[int, Array] = {}
     for pair, numbers in groups.items():
         numbers.sort(key=lambda k: messages[k].time_ns)
-        E = np.zeros((0, 3))
         for part in range(0, len(numbers), CHUNK):
             chunk = numbers[part : part + CHUNK]
             E, agree = _loops([messages[k] for k in chunk], odometry)
@@ -117,18 +116,19 @@ def verify(
         for k in numbers
         if frames[a] == frames[b] and (a == b or (a, b) in clear or {a, b} <= set(starts))
     }
-    unknown = [robot for robot in odometry if robot not in starts]
     solver = _Joint(messages, odometry, {**placed, **starts}, config)
     candidates = [k for k in judged if frames[messages[k].robot] == frames[messages[k].other]]
     believed, estimate = solver.settle(believed, candidates)
     refused = {
         k: CONTRADICTED if k in candidates else UNSUPPORTED for k in judged if k not in believed
     }
-    found = {}
-    for robot in unknown:
-        first = estimate.states[robot]
-        wide = ORIGIN if frames[robot] == robot else PRIOR_INFLATION**2 * first.covs[0]
-        found[robot] = Start(first.poses[0], wide)
+    found = {
+        robot: Start(
+            s.poses[0], ORIGIN if frames[robot] == robot else PRIOR_INFLATION**2 * s.covs[0]
+        )
+        for robot, s in estimate.states.items()
+        if robot not in starts
+    }
     return Verified(refused, frozenset(believed), found, frames)
 
 

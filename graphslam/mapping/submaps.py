@@ -50,12 +50,9 @@ class SubmapPose:
 def build_submaps(
     states: Mapping[str, Trajectory], pictures: Iterable[Picture], config: Config
 ) -> list[SubmapPose]:
-    """Submaps along every robot's path.
+    """Submaps along every robot's path, of the scan points in ``pictures``.
 
-    Args:
-        states: estimates of all states.
-        pictures: scan points seen from them.
-        config: ``loop_closure``, the spacing and reach of the submaps, and ``scan_matching``.
+    Of ``config`` it uses ``loop_closure``, the spacing and reach of submaps, and ``scan_matching``.
     """
     clouds = {(p.robot, p.time_ns): p for p in pictures if len(p.points) >= MIN_POINTS}
     found = []
@@ -69,9 +66,8 @@ def build_submaps(
         spacing = max(config.loop_closure.submap_spacing_m, path[-1] / MAX_SUBMAPS)
         for middle in np.unique(np.searchsorted(path, np.arange(0.0, path[-1], spacing))):
             used: list[int] = []
-            for k in np.flatnonzero(
-                np.abs(path - path[middle]) <= config.loop_closure.submap_reach_m
-            ):
+            within = np.abs(path - path[middle]) <= config.loop_closure.submap_reach_m
+            for k in np.flatnonzero(within):
                 if (
                     not used
                     or path[k] - path[used[-1]] >= SCAN_M

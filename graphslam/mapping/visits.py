@@ -39,11 +39,8 @@ def split_by_visit(
 ) -> SplitVisits:
     """Steps in which every visit of every robot has its own landmarks.
 
-    Args:
-        steps: as recorded.
-        states: estimates of all states.
-        landmarks: those with an identity stay as they are.
-        revisit_path_m: path without observing a landmark, after which another visit begins.
+    Another visit begins after a path of ``revisit_path_m`` without observing the landmark.
+    Landmarks with an identity stay as they are.
     """
     named = set(landmarks.by_identity.values())
     seen = [
@@ -56,10 +53,7 @@ def split_by_visit(
         return SplitVisits(tuple(steps), {})
     robots = sorted(states)
     driven = {robot: path_length(states[robot].poses) for robot in robots}
-    path = np.array([
-        driven[a.robot][states[a.robot].index(a.time_ns)]
-        for _, _, _, a in seen
-    ])  # fmt: skip
+    path = np.array([driven[a.robot][states[a.robot].index(a.time_ns)] for *_, a in seen])
     robot = np.array([robots.index(a.robot) for _, _, _, a in seen])
     target = np.array([t for _, _, t, _ in seen])
     order = np.lexsort((path, robot, target))
@@ -90,11 +84,8 @@ def rejoin_visits(
 ) -> tuple[Step, ...]:
     """Steps in which landmarks of different visits that lie together are one again.
 
-    Args:
-        split: the steps with separate landmarks.
-        estimate: of their states and landmarks.
-        landmarks: the map; landmarks that stay separate enter it.
-        config: how far apart the landmarks of two visits may be.
+    ``estimate`` is that of the split steps, ``config`` says how far apart the landmarks of two
+    visits may be. Landmarks that stay separate enter the map.
     """
     groups: dict[int, list[int]] = {}
     into: dict[int, int] = {}

@@ -30,6 +30,7 @@ from graphslam.core.records import (
 )
 from graphslam.logs import LogSet
 from graphslam.logs.clock import to_common_clock
+from graphslam.mapping.data_association import Image
 from graphslam.multi_robot.identity_swaps import rename_identities
 from graphslam.multi_robot.mutual_detection import ScanBuffer
 from graphslam.multi_robot.robot_detection import RobotDetector
@@ -221,15 +222,9 @@ class Pipeline(StepRecorder):
         self.counts["observations"] += len(seen)
         if not landmarks:
             return ()
+        pose, motion = run.causal_poses[-1], motions.get(robot)
         return self.associator.associate(
-            robot,
-            state_ns,
-            landmarks,
-            run.causal_poses[-1],
-            motions.get(robot),
-            run.track,
-            run.path_m,
-            gathering=True,
+            Image(robot, state_ns, landmarks, pose, motion, run.track, run.path_m, gathering=True)
         )
 
     def add_event(self, event: Sequence[Message]) -> None:
@@ -321,8 +316,9 @@ class Pipeline(StepRecorder):
             known = set(self.associator.map.graph_ids())
             associations: tuple[Association, ...] = ()
             if seen:
+                pose = run.causal_poses[-1]
                 associations = self.associator.associate(
-                    robot, state_ns, seen, run.causal_poses[-1], motion, run.track, run.path_m
+                    Image(robot, state_ns, seen, pose, motion, run.track, run.path_m)
                 )
             for message in event:
                 if isinstance(message, Sighting) and message.seen_robot is not None:

@@ -15,6 +15,7 @@ from graphslam.mapping.data_association import (
     NEAREST_OLD,
     NEAREST_RECENT,
     Associator,
+    Image,
     _worth_comparing,
     predicted_joint,
 )
@@ -71,9 +72,8 @@ class Run:
         track.add(OdometryPose(robot, self.now_ns, self.now_ns, pose))
         self.paths[robot] = self.paths.get(robot, 0.0) + path_m
         self.poses[self.now_ns] = self.backend.pose = pose
-        found = self.associator.associate(
-            robot, self.now_ns, seen, pose, None, track, self.paths[robot]
-        )
+        image = Image(robot, self.now_ns, seen, pose, None, track, self.paths[robot])
+        found = self.associator.associate(image)
         for a in found:
             if a.target not in self.backend.landmarks:
                 place = MODELS[a.model].invert(a.z, self.poses[a.time_ns])
