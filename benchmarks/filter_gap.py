@@ -20,10 +20,10 @@ from graphslam.core.config_io import load_config
 from graphslam.core.records import Step
 from graphslam.estimation.backends import BACKENDS
 from graphslam.estimation.replay import replay
-from graphslam.evaluation.compare_recording import Recording, record
-from graphslam.evaluation.compare_variants import variants
+from graphslam.evaluation.compare_variants import parse_variants
 from graphslam.evaluation.ground_truth import truth_of_logs
 from graphslam.evaluation.metrics import evaluate
+from graphslam.evaluation.recorded_steps import RecordedSteps, record_steps
 from graphslam.logs import GroundTruth, open_logs
 
 #: label -> spec, whether late evidence is left out, and the gauge of filters' lines, m
@@ -54,10 +54,12 @@ def in_time(steps: tuple[Step, ...]) -> tuple[Step, ...]:
     )
 
 
-def judge(recording: Recording, truth: GroundTruth, label: str, settings: list[str]) -> list[float]:
+def judge(
+    recording: RecordedSteps, truth: GroundTruth, label: str, settings: list[str]
+) -> list[float]:
     """Causal and final position error, m; causal NEES per degree of freedom; landmarks, m."""
     spec, strip, gauge_m = ROWS[label]
-    (variant,) = variants([spec], load_config(overrides=settings))
+    (variant,) = parse_variants([spec], load_config(overrides=settings))
     gauge: AbstractContextManager[object] = nullcontext()
     if gauge_m is not None:
         gauge = patch("graphslam.estimation.factors.FILTER_GAUGE_SIGMA_M", gauge_m)
@@ -83,7 +85,7 @@ def main() -> None:
     with TemporaryDirectory() as folder:
         for seed in range(given.seeds):
             log = open_logs([simulated_log(given.scenario, seed, Path(folder))], config)
-            truth, recording = truth_of_logs(log, config), record(log, config)
+            truth, recording = truth_of_logs(log, config), record_steps(log, config)
             for label, rows in numbers.items():
                 rows.append(judge(recording, truth, label, settings))
     print("                                     causal, mm     final, mm   NEES/dof  landmarks, mm")

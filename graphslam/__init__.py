@@ -251,14 +251,14 @@ def compare(
         EstimationError: the log cannot be associated, or every back end failed.
         OutputError: also where the truth is of other robots.
     """
+    from graphslam.evaluation.compare_backends import compare
     from graphslam.evaluation.compare_folder import is_comparison, save_comparison
-    from graphslam.evaluation.compare_rows import compare
-    from graphslam.evaluation.compare_variants import variants
+    from graphslam.evaluation.compare_variants import parse_variants
     from graphslam.evaluation.ground_truth import truth_of_logs
     from graphslam.results.folder import check_target
 
     settled = _settle(recording, config, settings)
-    rows = variants(backends.split(",") if isinstance(backends, str) else backends, settled)
+    rows = parse_variants(backends.split(",") if isinstance(backends, str) else backends, settled)
     if output is not None:
         check_target(Path(output), force=force, replaceable=is_comparison)
     log = _open(recording, settled)()

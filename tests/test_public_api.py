@@ -247,7 +247,7 @@ def test_compare_returns_a_row_for_each_back_end(room, tmp_path):
         **TRUTH_START,
     )
     assert isinstance(found, graphslam.Comparison)
-    assert [row["spec"] for row in found.found["rows"]] == ["dead-reckoning", "isam2"]
+    assert [row["spec"] for row in found.summary["rows"]] == ["dead-reckoning", "isam2"]
     assert len(lines) == 3
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         *("compare.json", "config.toml", "report.html")

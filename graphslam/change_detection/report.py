@@ -21,7 +21,7 @@ def render_changes(
 ) -> str:
     """The report as one self-contained HTML document; ``names`` of the two visits."""
     # matplotlib takes half a second to import, and --json may do without
-    from graphslam.results.report_changes import ChangesPicture, Mark, changes_page, tile  # noqa: PLC0415
+    from graphslam.results.report_changes import ChangeMark, ChangesPicture, changes_page, tile  # noqa: PLC0415
 
     reference, later = (v.ends[v.surface] for v in (found.reference, found.later))
     every = np.concatenate([reference, later])
@@ -37,7 +37,7 @@ def render_changes(
         if change.displacement is not None:
             motion, sigmas = _motion_of_middle(change.polygon, change.displacement)
         marks.append(
-            Mark(
+            ChangeMark(
                 change.kind, change.polygon, change.before, motion, sigmas, change.probability,
                 change.beams, float((change.first_seen_ns - start) * 1e-9),
             )

@@ -216,7 +216,7 @@ def compare(
             relations=relations, config=tree, output=output, force=force, progress=progress,
             announce=show.stage,
         )  # fmt: skip
-    found = comparison.found
+    found = comparison.summary
     failed = [f"{row['spec']}: {row['error']}" for row in found["rows"] if row["error"]]
     failure = f"{len(failed)} of {len(found['rows'])} back ends failed; " if failed else ""
     return Output(found, lambda: show.comparison(found, output), failure + "".join(failed[:1]))
@@ -259,14 +259,14 @@ def experiment(
     Writes results.jsonl, a row per run as it ends, then summary.json, report.html and figures.
     Stopped, it goes on where it was when it is called again.
     """
-    from graphslam.evaluation.monte_carlo_campaign import jobs_of, run_campaign
+    from graphslam.evaluation.monte_carlo_campaign import list_jobs, run_campaign
     from graphslam.evaluation.monte_carlo_definition import load_definition
     from graphslam.evaluation.monte_carlo_folder import save_summary
     from graphslam.evaluation.monte_carlo_summary import summarise
 
     definition = load_definition(name)
     definition = replace(definition, runs=runs or definition.runs)
-    total = len(jobs_of(definition))
+    total = len(list_jobs(definition))
     with progress_bar("running") as progress:
         rows = run_campaign(
             definition, output, jobs=jobs, force=force, progress=lambda n: progress(n, total)

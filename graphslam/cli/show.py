@@ -13,7 +13,14 @@ from rich.table import Table
 
 from graphslam.core.records import Result
 from graphslam.logs import ImportSummary, LogInfo, RobotInfo, TopicInfo
-from graphslam.results.report_comparison import AHEAD, ahead, filled, notes, sentence
+from graphslam.results.metric_tables import evaluation_tables
+from graphslam.results.report_comparison import (
+    FILTER_WIN_HEADS,
+    comparison_tables,
+    filter_wins,
+    headline,
+    reading_notes,
+)
 from graphslam.simulation import Simulation
 
 _PIPE_WIDTH = 200  # a pipe has no width; tables take what they need of this
@@ -139,44 +146,21 @@ def _clock(found: Mapping[str, Any]) -> str:
     return f"{told}; {'made up for' if found['applied'] else 'no different from zero, not applied'}"
 
 
-def evaluation(found: Mapping[str, Any]) -> None:
-    """Tables of errors: trajectories, landmarks, relations, as far as they were compared."""
+def evaluation(errors: Mapping[str, Any]) -> None:
+    """Tables of errors: trajectories, relations, landmarks, as far as they were compared."""
     console = _console()
-    robots = found.get("robots", {})
-    runs = [*robots.items()] + (
-        [("all together", found["joint"])] if len(robots) > 1 and "joint" in found else []
-    )
-    rows = [(name, kind, *_trajectory_row(both[kind])) for name, both in runs for kind in both]
-    head = ["robot", "", "ATE, m", "aligned, m", "max, m", "heading, deg"]
-    head += ["RPE 1 s, m", "RPE 10 m, m", "NEES/dof", "coverage"]
-    if rows:
-        console.print(_table(head, rows, texts=2))
-    if marks := found.get("landmarks"):
-        head = ["landmarks", "RMSE, m", "NEES/dof", "matched", "missed", "extra"]
-        keys = ["rmse_m", "nees_per_dof", "matched", "missed", "extra"]
-        console.print(_table(head, [("map", *(marks[key] for key in keys))]))
-        if worst := marks["worst"]:
-            console.print(
-                f"largest NEES/dof: {worst['nees_per_dof']:.3g}, landmark {worst['id']}, "
-                f"{worst['error_m']:.3g} m off"
-            )
-        for a, b in marks.get("exchanged", ()):
-            console.print(f"landmarks {a} and {b} bear each other's names; compared by place")
-    if relations := found.get("relations"):
-        head = ["relations", "", "matched", "unmatched", "mean, m", "std, m", "median, m"]
-        head += ["mean, deg", "std, deg"]
-        keys = ["n", "unmatched", "trans_mean_m", "trans_std_m", "trans_median_m"]
-        keys += ["rot_mean_deg", "rot_std_deg"]
-        kinds = {"final": relations, "causal": relations.get("causal", {})}
-        rows = [
-            (group, kind, *(values[group][key] for key in keys))
-            for kind, values in kinds.items()
-            for group in ("all", "local", "loops")
-            if group in values
-        ]
-        console.print(_table(head, rows, texts=2))
-        if not relations["all"]["n"]:
-            console.print("warning: no scan has the stamps of a relation, to the nanosecond")
+    for _, heads, rows in evaluation_tables(errors):
+        console.print(_table(heads, rows, texts=2))
+    landmarks = errors.get("landmarks", {})
+    if worst := landmarks.get("worst"):
+        console.print(
+            f"largest NEES/dof: {worst['nees_per_dof']:.3g}, landmark {worst['id']}, "
+            f"{worst['error_m']:.3g} m off"
+        )
+    for a, b in landmarks.get("exchanged", ()):
+        console.print(f"landmarks {a} and {b} have each other's names; matched by position")
+    if "relations" in errors and not errors["relations"]["all"]["n"]:
+        console.print("warning: no scan has the stamps of a relation, to the nanosecond")
 
 
 def stage(text: str) -> None:
@@ -188,8 +172,8 @@ def stage(text: str) -> None:
 def comparison(found: Mapping[str, Any], directory: Path) -> None:
     """A table per kind of number, the best of a column with a star; then what failed."""
     console = _console()
-    console.print(sentence(found))
-    for title, (heads, rows) in filled(found).items():
+    console.print(headline(found))
+    for title, (heads, rows) in comparison_tables(found).items():
         lines = [
             (row["label"], *(f"{_number(value)}{' *'[best]}" for value, best in cells))
             for row, cells in zip(found["rows"], rows, strict=True)
@@ -198,11 +182,13 @@ def comparison(found: Mapping[str, Any], directory: Path) -> None:
         console.print()
         console.print(title)
         console.print(_table(["", *heads], lines))
-    if won := ahead(found):
+    if won := filter_wins(found):
         console.print("\nWhere a filter is ahead of every smoother")
-        console.print(_table(["", *AHEAD[1:]], [tuple(map(_number, row)) for row in won]))
+        console.print(
+            _table(["", *FILTER_WIN_HEADS[1:]], [tuple(map(_number, row)) for row in won])
+        )
     console.print()
-    for text in ("* best of its column.", *notes(found)):
+    for text in ("* best of its column.", *reading_notes(found)):
         console.print(text)
     for warning in found["warnings"]:
         console.print(f"warning: {warning}")
@@ -354,17 +340,3 @@ def _span(topics: Sequence[TopicInfo]) -> str:
 def _reasons(console: Console, what: str, reasons: Mapping[str, int]) -> None:
     for reason, count in sorted(reasons.items(), key=lambda item: (-item[1], item[0])):
         console.print(f"{what}: {_number(count)} {reason}")
-
-
-def _trajectory_row(values: Mapping[str, Any]) -> tuple[object, ...]:
-    coverage, heading = values["coverage"], values["heading_rmse_rad"]
-    return (
-        values["ate_rmse_m"],
-        values["ate_aligned_rmse_m"],
-        values["max_m"],
-        None if heading is None else degrees(heading),
-        values["rpe"]["1_s"]["trans_rmse_m"],
-        values["rpe"]["10_m"]["trans_rmse_m"],
-        values["nees_per_dof"],
-        None if coverage is None else f"{100 * coverage:.1f} %",
-    )

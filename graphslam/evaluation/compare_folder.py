@@ -30,7 +30,7 @@ def save_comparison(
     check_target(directory, force=force, replaceable=is_comparison)
     settings = dump_config(config)
     files = [
-        ("compare.json", to_json(comparison.found, "compare.json")),
+        ("compare.json", to_json(comparison.summary, "compare.json")),
         ("config.toml", settings),
         ("report.html", render_comparison(comparison, settings)),
     ]

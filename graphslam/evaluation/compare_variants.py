@@ -33,7 +33,7 @@ class Variant:
         return self.config.backend.horizon_s if self.config.backend.name == "isam2" else None
 
 
-def variants(specs: Sequence[str], config: Config | None = None) -> tuple[Variant, ...]:
+def parse_variants(specs: Sequence[str], config: Config | None = None) -> tuple[Variant, ...]:
     """The rows that ``specs`` ask for, over the settings of ``config``.
 
     Raises:

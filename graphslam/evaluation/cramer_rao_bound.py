@@ -18,7 +18,7 @@ import numpy as np
 from graphslam.core.geometry import Array
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association
-from graphslam.evaluation.monte_carlo_bench import BenchRun, Noise, draw
+from graphslam.evaluation.monte_carlo_bench import BenchRun, Noise, draw_run
 from graphslam.evaluation.monte_carlo_definition import Bench
 
 #: starts over which the information is averaged; it hardly depends on them
@@ -26,7 +26,7 @@ _DRAWS = 200
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Curves:
+class PoseBounds:
     """Bounds on the mean squared error over time (K+1,): position m² and heading rad².
 
     Mean over the robots.
@@ -44,8 +44,8 @@ class Bound:
     data. ``landmarks``: named as by `monte_carlo_consistency.landmark_squares`.
     """
 
-    causal: Curves
-    final: Curves
+    causal: PoseBounds
+    final: PoseBounds
     landmarks: dict[str, float]
 
 
@@ -71,9 +71,9 @@ class _Layout:
         return slice(place, place + 2)
 
 
-def cramer_rao(bench: Bench, scale: float, rng: np.random.Generator) -> Bound:
+def cramer_rao_bound(bench: Bench, scale: float, rng: np.random.Generator) -> Bound:
     """The bounds at a noise scale; ``rng`` draws the starts."""
-    run, noise = draw(bench, scale, None), Noise.of(bench, scale)
+    run, noise = draw_run(bench, scale, None), Noise.of(bench, scale)
     names = tuple(run.truth)
     steps = len(run.steps) - 1
     layout = _Layout(names, steps, len(bench.points_m), len(bench.walls_m))
@@ -94,8 +94,8 @@ def cramer_rao(bench: Bench, scale: float, rng: np.random.Generator) -> Bound:
         causal[:, k] = latest[:, :2].sum(axis=1).mean(), latest[:, 2].mean()
     variance = _variances(J, seen)
     poses = variance[: 3 * len(names) * (steps + 1)].reshape(steps + 1, len(names), 3)
-    final = Curves(poses[..., :2].sum(axis=2).mean(axis=1), poses[..., 2].mean(axis=1))
-    return Bound(Curves(*causal), final, _landmarks(variance, layout, run))
+    final = PoseBounds(poses[..., :2].sum(axis=2).mean(axis=1), poses[..., 2].mean(axis=1))
+    return Bound(PoseBounds(*causal), final, _landmarks(variance, layout, run))
 
 
 def _variances(J: Array, seen: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Array:

@@ -70,7 +70,7 @@ def planned_path(robot: BenchRobot) -> Array:
     return np.array(poses)
 
 
-def seed_of(seed: int, scale: float, run: int) -> np.random.SeedSequence:
+def run_seed(seed: int, scale: float, run: int) -> np.random.SeedSequence:
     """The randomness of a run: of the experiment, the scale and the run alone.
 
     Not of the variant, nor of which process runs it when: all variants get the same draws.
@@ -78,7 +78,7 @@ def seed_of(seed: int, scale: float, run: int) -> np.random.SeedSequence:
     return np.random.SeedSequence(seed, spawn_key=(round(1e6 * scale), run))
 
 
-def draw(bench: Bench, scale: float, rng: np.random.Generator | None) -> BenchRun:
+def draw_run(bench: Bench, scale: float, rng: np.random.Generator | None) -> BenchRun:
     """A run; without ``rng`` the one in which every error happens to be zero.
 
     Start and motions get additive errors, sightings of points too; the pose of a line or a robot

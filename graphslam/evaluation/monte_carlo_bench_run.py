@@ -12,8 +12,8 @@ from graphslam.estimation.backends import BACKENDS
 from graphslam.evaluation.monte_carlo_bench import BenchRun
 from graphslam.evaluation.monte_carlo_consistency import (
     joint_errors,
+    joint_nees,
     landmark_squares,
-    squared_error,
 )
 
 
@@ -65,7 +65,7 @@ def _latest(backend: Backend, run: BenchRun, k: int) -> tuple[Array, float]:
     joint = backend.joint(first, [], others)
     truth = [run.truth[name][k] for name in run.truth]
     errors, cov = joint_errors(joint, truth[0], [], truth[1:], backend.error_frame)
-    return np.array([joint.pose, *joint.others]) - np.array(truth), squared_error(errors, cov)
+    return np.array([joint.pose, *joint.others]) - np.array(truth), joint_nees(errors, cov)
 
 
 def _joint(backend: Backend, run: BenchRun, estimate: Estimate) -> tuple[float, int]:
@@ -79,4 +79,4 @@ def _joint(backend: Backend, run: BenchRun, estimate: Estimate) -> tuple[float, 
         [run.truth[name][-1] for name in others],
         backend.error_frame,
     )
-    return squared_error(errors, cov), len(errors)
+    return joint_nees(errors, cov), len(errors)

@@ -24,7 +24,7 @@ import numpy as np
 
 from graphslam import __version__
 from graphslam.core.errors import OutputError
-from graphslam.evaluation.monte_carlo_bench import draw, seed_of
+from graphslam.evaluation.monte_carlo_bench import draw_run, run_seed
 from graphslam.evaluation.monte_carlo_bench_run import run_bench
 from graphslam.evaluation.monte_carlo_definition import Definition
 from graphslam.evaluation.monte_carlo_log_run import run_log
@@ -45,7 +45,7 @@ class Job:
     run: int
 
 
-def jobs_of(definition: Definition) -> list[Job]:
+def list_jobs(definition: Definition) -> list[Job]:
     """Every run of an experiment; all variants of a run follow each other."""
     if definition.logs is None:
         sources = [("", "")]
@@ -66,10 +66,10 @@ def run_job(definition: Definition, job: Job) -> Row:
     Raises:
         GraphSlamError: the run failed.
     """
-    sequence = seed_of(definition.seed, job.scale, job.run)
+    sequence = run_seed(definition.seed, job.scale, job.run)
     if definition.bench is not None:
         rng = np.random.default_rng(sequence)
-        run = draw(definition.bench, job.scale, rng)
+        run = draw_run(definition.bench, job.scale, rng)
         return run_bench(run, definition.config(job.variant))
     config = definition.config(job.variant, f"front_end.name={job.front_end}")
     return run_log(job.scenario, job.scale, int(sequence.generate_state(1)[0]), config)
@@ -99,7 +99,7 @@ def run_campaign(
         OutputError: the folder holds another experiment or something else, cannot be written, or a
             process died.
     """
-    wanted = jobs_of(definition)
+    wanted = list_jobs(definition)
     try:
         _prepare(definition, directory, force)
         found = {key: row for key, row in _read(directory / ROWS) if key in set(wanted)}
@@ -150,7 +150,7 @@ def _row(definition: Definition, job: Job, future: "Future[Row]") -> Row:
         ) from error
     row: Row = {
         **asdict(job),
-        "seed": [definition.seed, *seed_of(definition.seed, job.scale, job.run).spawn_key],
+        "seed": [definition.seed, *run_seed(definition.seed, job.scale, job.run).spawn_key],
         "settings": [*definition.settings, *definition.variants[job.variant]],
         "version": __version__,
         "code": code_version(),

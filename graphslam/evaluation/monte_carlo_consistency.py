@@ -51,7 +51,7 @@ def joint_errors(
     return np.concatenate(errors), T @ joint.cov @ T.T
 
 
-def squared_error(error: Array, cov: Array) -> float:
+def joint_nees(error: Array, cov: Array) -> float:
     """Normalised estimation error squared of errors (D,) with covariance (D, D).
 
     NaN where the covariance is not positive definite: such an estimate says nothing.

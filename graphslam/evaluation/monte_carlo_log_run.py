@@ -28,7 +28,7 @@ NOISE = {
 }
 
 
-def scaled(scenario: Scenario, scale: float) -> Scenario:
+def scale_noise(scenario: Scenario, scale: float) -> Scenario:
     """The scenario with all errors of its sensors multiplied by ``scale``."""
     found: Scenario = _scaled(scenario, scale)
     return found
@@ -60,7 +60,7 @@ def run_log(scenario: str, scale: float, seed: int, config: Config) -> dict[str,
     """
     with TemporaryDirectory(prefix="graphslam-") as folder:
         path = Path(folder) / "log.mcap"
-        simulate(scaled(load_scenario(scenario), scale), path, seed)
+        simulate(scale_noise(load_scenario(scenario), scale), path, seed)
         config = replace(config, start=replace(config.start, from_truth=True))
         log = open_logs([path], config)
         result = smooth(log, config)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import chi2, norm
 
 from graphslam.core.geometry import Array
-from graphslam.evaluation.cramer_rao_bound import Bound, cramer_rao
+from graphslam.evaluation.cramer_rao_bound import Bound, cramer_rao_bound
 from graphslam.evaluation.monte_carlo_definition import Definition
 
 Row = Mapping[str, Any]
@@ -82,7 +82,7 @@ def _bench(definition: Definition, groups: Mapping[tuple[Any, ...], list[Row]]) 
     for scale in definition.noise_scales:
         assert definition.bench is not None  # narrows the type
         rng = np.random.default_rng(np.random.SeedSequence(definition.seed))
-        bound = cramer_rao(definition.bench, scale, rng)
+        bound = cramer_rao_bound(definition.bench, scale, rng)
         over_time: dict[str, Any] = {"bound": _bound_curves(bound), "variants": {}}
         ends = {row["run"]: row for row in groups["", "", scale, reference] if not row["error"]}
         for variant in definition.variants:

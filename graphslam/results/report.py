@@ -22,7 +22,7 @@ def render(
         evaluation: its errors against the truth, from `graphslam.evaluation.metrics.evaluate`;
             adds a section.
     """
-    # matplotlib takes half a second to import, and most commands draw nothing
+    # importing matplotlib takes half a second
     from graphslam.results.report_page import page  # noqa: PLC0415
 
     return page(result, evaluation)

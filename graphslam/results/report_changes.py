@@ -14,8 +14,16 @@ from scipy.stats import norm
 
 from graphslam.core.geometry import Array
 from graphslam.results.report_figure import INK, PALETTE, WIDTH_IN, density, map_axes, svg
-from graphslam.results.report_style import CSS
-from graphslam.results.report_tables import number, table
+from graphslam.results.report_html import (
+    details,
+    document,
+    figure,
+    figure_grid,
+    header,
+    number,
+    section,
+    table,
+)
 
 COLORS = {"appeared": PALETTE[2], "vanished": PALETTE[1], "moved": PALETTE[3]}
 _REFERENCE, _LATER, _UNSEEN = "#7d8590", PALETTE[0], "#a8adb3"
@@ -32,7 +40,7 @@ _CSS += "tbody th { white-space: nowrap; }\n"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mark:
+class ChangeMark:
     """One change: outlines (c, 2) m now and ``before`` (if it moved), and what the table says.
 
     ``motion`` (3,) and ``sigmas`` (3,) m, m, rad: of the place of its middle, None if unknown.
@@ -62,7 +70,7 @@ class ChangesPicture:
     later: Array
     unseen: NDArray[np.bool_]
     limits: Array
-    marks: tuple[Mark, ...]
+    marks: tuple[ChangeMark, ...]
     scores: Array
     spread: float
     facts: Mapping[str, str]
@@ -73,18 +81,13 @@ class ChangesPicture:
 def changes_page(picture: ChangesPicture) -> str:
     """One self-contained HTML document."""
     title = f"{picture.names[1]} against {picture.names[0]}"
-    tiles = "".join(
-        f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>"
-        for name, value in picture.facts.items()
-    )
-    notes = "".join(f"<p class=note>Note: {escape(line)}.</p>\n" for line in picture.warnings)
     legend = (
         "Grey: surfaces of the reference. Blue: later returns. Hatched: not seen by both, so "
         "nothing is said about it."
     )
     figures = [
-        _figure(_map(picture), "Changes.", legend),
-        _figure(
+        figure(_map(picture), "Changes.", legend),
+        figure(
             _scores(picture),
             "Scores.",
             "How far the beams of one visit end behind each piece of the other's surfaces, in "
@@ -93,22 +96,17 @@ def changes_page(picture: ChangesPicture) -> str:
         ),
     ]
     figures += [
-        _figure(_close_up(picture, i), f"{i + 1}: {mark.kind}.", _words(mark))
+        figure(_close_up(picture, i), f"{i + 1}: {mark.kind}.", _words(mark))
         for i, mark in enumerate(picture.marks[:_MAX_CLOSE_UPS])
     ]
-    return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        '<meta name="color-scheme" content="light dark">\n'
-        f"<title>{escape(title)} – graphslam changes</title>\n<style>{CSS}{_CSS}</style>\n</head>\n"
-        f"<body>\n<main>\n<header><p class=brand>graphslam changes</p><h1>{escape(title)}</h1>\n"
-        f"<p class=lead>{escape(_headline(picture))}</p>\n{notes}"
-        f"<dl class=tiles>{tiles}</dl></header>\n"
-        f"{_table(picture)}\n"
-        f'<section><h2>Map</h2><div class="grid">{"".join(figures)}</div></section>\n'
-        f"<section><details><summary>Settings</summary><pre>{escape(picture.settings)}</pre>"
-        "</details></section>\n</main>\n</body>\n</html>\n"
-    )
+    notes = [f"Note: {line}." for line in picture.warnings]
+    sections = [
+        header("graphslam changes", title, _headline(picture), picture.facts.items(), notes),
+        _table(picture),
+        section("Map", figure_grid(figures)),
+        details("Settings", f"<pre>{escape(picture.settings)}</pre>"),
+    ]
+    return document(title, sections, _CSS)
 
 
 def _headline(picture: ChangesPicture) -> str:
@@ -120,7 +118,7 @@ def _headline(picture: ChangesPicture) -> str:
     return f"{len(kinds)} {changes}: {', '.join(parts)}."
 
 
-def _words(mark: Mark) -> str:
+def _words(mark: ChangeMark) -> str:
     x, y = mark.polygon.mean(axis=0)
     text = f"At x {x:.2f} m, y {y:.2f} m."
     if mark.motion is None or mark.sigmas is None:
@@ -162,14 +160,7 @@ def _table(picture: ChangesPicture) -> str:
     for kind in COLORS:
         html = html.replace(f" {kind}</th>", f' <span class="{kind}">{kind}</span></th>')
     note = "First seen: seconds since the later visit's first scan. ±: 1σ."
-    return f"<section><h2>Changes</h2>{html}<p class=note>{note}</p></section>"
-
-
-def _figure(drawing: str, title: str, caption: str) -> str:
-    return (
-        f"<figure><figcaption><b>{escape(title)}</b> {escape(caption)}</figcaption>\n"
-        f"{drawing}</figure>"
-    )
+    return section("Changes", f"{html}<p class=note>{note}</p>")
 
 
 def _map(picture: ChangesPicture) -> str:
@@ -240,7 +231,7 @@ def _hatched(unseen: NDArray[np.bool_], pixels: int) -> NDArray[np.uint8]:
     return image
 
 
-def _outlines(axes: Axes, mark: Mark) -> None:
+def _outlines(axes: Axes, mark: ChangeMark) -> None:
     color = COLORS[mark.kind]
     axes.add_patch(Polygon(mark.polygon, facecolor=color, alpha=0.25, edgecolor="none"))
     axes.add_patch(Polygon(mark.polygon, fill=False, edgecolor=color, linewidth=1.2))

@@ -1,4 +1,4 @@
-"""What a comparison of back ends looks like: paths, errors and consistency over time, cost."""
+"""Figures of a comparison of back ends: paths, errors and consistency over time, cost."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
-from graphslam.results.report_comparison import Comparison, Curve, Lane
+from graphslam.results.report_comparison import BackendCurves, Comparison, ErrorCurve
 from graphslam.results.report_figure import (
     ACCENT,
     INK,
@@ -17,28 +17,29 @@ from graphslam.results.report_figure import (
     WIDTH_IN,
     log_scale,
     map_axes,
+    positive,
     robot_color,
     svg,
+    time_axis,
     time_rows,
 )
-from graphslam.results.report_page import figure
+from graphslam.results.report_html import figure
 
-_SMALLEST = 1e-6  # m or degrees: nothing below it is worth a decade of a logarithmic axis
-_MAX_POINTS = 120  # of one curve: more hide each other where errors change from pose to pose
+_MAX_POINTS = 120  # of one curve; more would hide other curves where errors vary quickly
 
 
 def figures(comparison: Comparison) -> dict[str, list[str]]:
     """Heading -> figures."""
     found: dict[str, list[str]] = {"Trajectories": [], "Errors over time": [], "Time per step": []}
-    against = "the truth" if comparison.truth else "{reference}".format(**comparison.found)
-    moved = comparison.truth and not comparison.found["start_given"]
-    aligned = " Every back end is aligned with the truth by itself." if moved else ""
+    against = "the truth" if comparison.truth else "{reference}".format(**comparison.summary)
+    moved = comparison.truth and not comparison.summary["start_given"]
+    aligned = " Every back end is aligned with the truth separately." if moved else ""
     dashed = " Dashed: the truth." if comparison.truth else ""
     for kind in ("final", "causal"):
         found["Trajectories"].append(
             figure(_paths(comparison, kind), f"{kind.title()}.", f"In the plane.{dashed}{aligned}")
         )
-        if any(lane.curves[kind] for lane in comparison.lanes):
+        if any(backend.curves[kind] for backend in comparison.backends):
             caption = (
                 f"Distance to {against} and difference of heading, RMS of neighbouring poses."
                 f"{aligned}"
@@ -58,16 +59,16 @@ def figures(comparison: Comparison) -> dict[str, list[str]]:
         ("landmarks in the map", "landmarks", "Against map size: medians."),
         ("path driven, m", "path_m", "Against path length: medians."),
     ):
-        drawing = _cost(comparison.lanes, label, axis)
+        drawing = _cost(comparison.backends, label, axis)
         found["Time per step"].append(figure(drawing, f"By {label}.", caption))
     return found
 
 
 def _paths(comparison: Comparison, kind: str) -> str:
-    paths = [path for lane in comparison.lanes for path in lane.paths[kind].values()]
-    seen = [*paths, *comparison.truth.values()]
-    low = np.min([path.min(axis=0) for path in seen], axis=0)
-    high = np.max([path.max(axis=0) for path in seen], axis=0)
+    paths = [path for backend in comparison.backends for path in backend.paths[kind].values()]
+    shown = [*paths, *comparison.truth.values()]
+    low = np.min([path.min(axis=0) for path in shown], axis=0)
+    high = np.max([path.max(axis=0) for path in shown], axis=0)
     margin = 0.03 * max(float((high - low).max()), 1.0)
     limits = np.column_stack([low - margin, high + margin])
     size = limits[:, 1] - limits[:, 0]
@@ -75,8 +76,8 @@ def _paths(comparison: Comparison, kind: str) -> str:
 
     def draw(drawing: Figure) -> None:
         axes = map_axes(drawing, limits)
-        for lane, style in _styled(comparison.lanes):
-            for path in lane.paths[kind].values():
+        for backend, style in _styled(comparison.backends):
+            for path in backend.paths[kind].values():
                 axes.plot(*path.T, **style)
         for path in comparison.truth.values():
             axes.plot(*path.T, color=INK, linewidth=0.7, linestyle=(0, (4, 2.5)), zorder=9)
@@ -92,8 +93,8 @@ def _errors(comparison: Comparison, kind: str) -> str:
         for _, style, curve in _curves(comparison, kind):
             t = (curve.stamps_ns - start) / unit
             for axes, values in ((top, curve.position_m), (bottom, np.degrees(curve.heading_rad))):
-                middle, squares = _gathered(t, values**2)
-                axes.plot(middle, _positive(np.sqrt(squares)), **style)
+                middle, squares = _averaged(t, values**2)
+                axes.plot(middle, positive(np.sqrt(squares)), **style)
         _log(top, "position, m")
         _log(bottom, "heading, °")
 
@@ -107,7 +108,7 @@ def _nees(comparison: Comparison, kind: str) -> str:
         (axes,) = time_rows(drawing, 1, label)
         for _, style, curve in _curves(comparison, kind):
             t = (curve.stamps_ns - start) / unit
-            axes.plot(*_gathered(t, curve.nees), **style)
+            axes.plot(*_averaged(t, curve.nees), **style)
         for bound in chi2_quantile([0.025, 0.975], 3) / 3:
             axes.axhline(bound, color=ACCENT, linewidth=1, linestyle=(0, (4, 2.5)), zorder=9)
         axes.axhline(1.0, color=ACCENT, linewidth=0.9, zorder=9)
@@ -116,19 +117,19 @@ def _nees(comparison: Comparison, kind: str) -> str:
     return svg(f"Consistency over time, {kind}", 2.6, draw)
 
 
-def _cost(lanes: tuple[Lane, ...], label: str, axis: str | None) -> str:
+def _cost(backends: tuple[BackendCurves, ...], label: str, axis: str | None) -> str:
     def draw(drawing: Figure) -> None:
         (axes,) = time_rows(drawing, 1, label)
-        for lane, style in _styled(lanes):
-            size = np.arange(len(lane.step_ms)) if axis is None else getattr(lane, axis)
+        for backend, style in _styled(backends):
+            size = np.arange(len(backend.step_ms)) if axis is None else getattr(backend, axis)
             order = np.argsort(size, kind="stable")
             parts = np.array_split(order, max(1, min(60, len(order) // 8)))
             x = np.array([np.median(size[part]) for part in parts])
-            middle = np.array([np.median(lane.step_ms[part]) for part in parts])
-            known = np.unique(x)  # a map may stay at one size for long
-            axes.plot(known, [float(np.median(middle[x == value])) for value in known], **style)
+            middle = np.array([np.median(backend.step_ms[part]) for part in parts])
+            sizes = np.unique(x)  # a map may keep its size for many steps
+            axes.plot(sizes, [float(np.median(middle[x == value])) for value in sizes], **style)
             if axis is None:
-                high = [float(np.quantile(lane.step_ms[part], 0.99)) for part in parts]
+                high = [float(np.quantile(backend.step_ms[part], 0.99)) for part in parts]
                 axes.plot(x, high, **(style | {"linewidth": 0.7, "alpha": 0.45}))
         _log(axes, "ms")
 
@@ -136,7 +137,7 @@ def _cost(lanes: tuple[Lane, ...], label: str, axis: str | None) -> str:
 
 
 def _log(axes: Axes, label: str) -> None:
-    """A logarithmic axis over three decades at most: a zero crossing below them says nothing."""
+    """A logarithmic axis over at most three decades: zero crossings go below any limit."""
     values = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in axes.lines])
     values = values[np.isfinite(values) & (values > 0)]
     if len(values):
@@ -145,34 +146,31 @@ def _log(axes: Axes, label: str) -> None:
         log_scale(axes, label)
 
 
-def _styled(lanes: tuple[Lane, ...]) -> Iterator[tuple[Lane, dict[str, Any]]]:
-    """Lanes with how they are drawn: later ones thinner, so that equal ones are all seen."""
-    widths = np.linspace(2.6, 1.0, len(lanes)) if len(lanes) > 1 else [1.2]
-    for i, (lane, width) in enumerate(zip(lanes, widths, strict=True)):
-        stroke = "-" if i < len(PALETTE) else (0, (3, 1.2))  # the colours begin anew
-        yield lane, {"color": robot_color(i), "linewidth": float(width), "linestyle": stroke}
+def _styled(backends: tuple[BackendCurves, ...]) -> Iterator[tuple[BackendCurves, dict[str, Any]]]:
+    """Back ends with their line styles: later ones thinner, so that equal curves are all seen."""
+    widths = np.linspace(2.6, 1.0, len(backends)) if len(backends) > 1 else [1.2]
+    for i, (backend, width) in enumerate(zip(backends, widths, strict=True)):
+        stroke = "-" if i < len(PALETTE) else (0, (3, 1.2))  # the colours repeat
+        yield backend, {"color": robot_color(i), "linewidth": float(width), "linestyle": stroke}
 
 
-def _curves(comparison: Comparison, kind: str) -> Iterator[tuple[Lane, dict[str, Any], Curve]]:
-    for lane, style in _styled(comparison.lanes):
-        for curve in lane.curves[kind].values():
-            yield lane, style, curve
+def _curves(
+    comparison: Comparison, kind: str
+) -> Iterator[tuple[BackendCurves, dict[str, Any], ErrorCurve]]:
+    for backend, style in _styled(comparison.backends):
+        for curve in backend.curves[kind].values():
+            yield backend, style, curve
 
 
 def _clock(comparison: Comparison) -> tuple[int, float, str]:
     """First stamp, ns per unit, and the name of the time axis."""
     stamps = [c.stamps_ns for k in ("final", "causal") for _, _, c in _curves(comparison, k)]
     first, last = min(int(s[0]) for s in stamps), max(int(s[-1]) for s in stamps)
-    return (first, 60e9, "time, min") if last - first > 900e9 else (first, 1e9, "time, s")
+    return first, *time_axis(first, last)
 
 
-def _gathered(t: Array, values: Array) -> tuple[Array, Array]:
-    """Means of neighbouring values, `_MAX_POINTS` of them at most: every pose is in one."""
+def _averaged(t: Array, values: Array) -> tuple[Array, Array]:
+    """Means of neighbouring values, at most `_MAX_POINTS`; every value is in one of them."""
     parts = max(1, min(len(t), _MAX_POINTS))
     means = [[part.mean() for part in np.array_split(x, parts)] for x in (t, values)]
     return np.array(means[0]), np.array(means[1])
-
-
-def _positive(values: Array) -> Array:
-    """Values for a logarithmic axis: what is below the smallest leaves a gap."""
-    return np.where(values > _SMALLEST, values, np.nan)

@@ -1,8 +1,8 @@
 # ruff: noqa: RUF001 -- σ and – are meant: people read them
 """The page of an experiment, and its figures as files of their own.
 
-Everything comes from the summary that `graphslam.experiments.summarise` makes; `FIGURES` is the
-list of what is drawn of an experiment on the bench.
+Everything is drawn from the summary of `graphslam.evaluation.monte_carlo_summary.summarise`;
+`FIGURES` lists the figures of an experiment on the bench.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,10 +13,18 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from graphslam.core.geometry import Array
-from graphslam.results.report_figure import ACCENT, FAINT, INK, legend, robot_color, svg
-from graphslam.results.report_page import document, figure, section
-from graphslam.results.report_tables import number, table
+from graphslam.results.report_figure import ACCENT, FAINT, INK, legend, positive, robot_color, svg
+from graphslam.results.report_html import (
+    details,
+    document,
+    figure,
+    figure_grid,
+    header,
+    number,
+    section,
+    table,
+    warning_box,
+)
 
 Summary = Mapping[str, Any]
 
@@ -26,12 +34,15 @@ def experiment_page(summary: Summary) -> str:
     sections = [_header(summary), _warnings(summary)]
     if summary["kind"] == "bench":
         sections += [
-            _section("Consistency", _consistency(summary)),
-            _section("Errors against the Cramér-Rao bound", _errors(summary)),
-            section("Figures", [figure(draw(summary), *text) for draw, *text in FIGURES.values()]),
+            section("Consistency", _consistency(summary)),
+            section("Errors against the Cramér-Rao bound", _errors(summary)),
+            section(
+                "Figures",
+                figure_grid([figure(draw(summary), *text) for draw, *text in FIGURES.values()]),
+            ),
         ]
     else:
-        sections.append(_section("Errors over logs", _logs(summary)))
+        sections.append(section("Errors over logs", _logs(summary)))
     sections.append(_reproduce(summary))
     return document(str(summary["name"]), sections)
 
@@ -44,7 +55,7 @@ def experiment_figures(summary: Summary) -> dict[str, str]:
 
 
 def _standalone(drawing: str) -> str:
-    """SVG of a page as a file: with its name space, light colours and a ground of its own."""
+    """SVG of a page as a file: with its name space, the light colours and a background."""
     colors = {"var(--grid)": FAINT, "var(--accent)": ACCENT, "currentColor": INK}
     colors |= {f"var(--robot{i})": robot_color(i) for i in range(6)}
     for variable, color in colors.items():
@@ -55,11 +66,7 @@ def _standalone(drawing: str) -> str:
     return drawing.replace("<svg ", f"<svg{style}", 1) + "\n"
 
 
-# ---------------------------------------------------------------- words and tables
-
-
-def _section(title: str, content: str) -> str:
-    return f"<section><h2>{escape(title)}</h2>{content}</section>"
+# ---------------------------------------------------------------- text and tables
 
 
 def _header(summary: Summary) -> str:
@@ -71,20 +78,19 @@ def _header(summary: Summary) -> str:
         ("diverged", sum(row.get("diverged", 0) for row in summary["table"])),
         ("run time, s", summary["seconds"]),
     )
-    tiles = "".join(f"<div><dt>{name}</dt><dd>{number(value)}</dd></div>" for name, value in counts)
-    return (
-        f"<header><p class=brand>graphslam experiment</p><h1>{escape(str(summary['name']))}</h1>\n"
-        f"<p class=lead>{escape(str(summary['description']))}.</p>\n"
-        f"<dl class=tiles>{tiles}</dl>"
-        f"<p class=note>A run has diverged if: {escape(str(summary['diverged_if']))}. Failed runs "
-        "are in no mean, diverged ones in all.</p></header>"
+    note = (
+        f"A run has diverged if: {summary['diverged_if']}. Failed runs are in no mean, diverged "
+        "ones in all."
     )
+    tiles = [(name, number(value)) for name, value in counts]
+    lead = f"{summary['description']}."
+    return header("graphslam experiment", str(summary["name"]), lead, tiles, [note])
 
 
 def _warnings(summary: Summary) -> str:
-    lines = [*summary["warnings"], *(f"{n} × {text}" for text, n in summary["errors"].items())]
-    items = "".join(f"<li>{escape(str(text))}</li>" for text in lines)
-    return f'<section class="warn"><h2>Warnings</h2><ul>{items}</ul></section>' if items else ""
+    return warning_box(
+        [*summary["warnings"], *(f"{n} × {text}" for text, n in summary["errors"].items())]
+    )
 
 
 def _consistency(summary: Summary) -> str:
@@ -173,12 +179,12 @@ def _mean(row: Mapping[str, Any], kind: str, name: str) -> float | None:
 def _reproduce(summary: Summary) -> str:
     settings = [(name, " ".join(values)) for name, values in summary["variants"].items()]
     command = f"graphslam experiment {summary['name']} --runs {summary['runs']} -o DIR"
-    return (
-        "<section><details><summary>How to reproduce this</summary>"
+    return details(
+        "How to reproduce this",
         f"<p><code>{escape(command)}</code></p>"
         f"<p class=note>Seed {summary['seed']}; code {escape(', '.join(summary['code']))}; "
         f"settings of all: {escape(' '.join(summary['settings']) or 'none')}</p>"
-        f"{table(['variant', 'settings'], settings)}</details></section>"
+        f"{table(['variant', 'settings'], settings)}",
     )
 
 
@@ -209,7 +215,7 @@ def _panels(summary: Summary, draw: Callable[[Axes, str], None], label: str) -> 
 
 
 def _styles(summary: Summary) -> dict[str, dict[str, Any]]:
-    """Colour and stroke of each variant; strokes differ, since some curves lie on each other."""
+    """Colour and stroke of each variant; strokes differ, since some curves coincide."""
     strokes = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)))
     return {
         name: {"color": robot_color(i), "linestyle": strokes[i % 3], "linewidth": 1.1}
@@ -275,7 +281,7 @@ def error_against_noise(summary: Summary) -> str:
             gap = np.array([row["from_reference_m"] or np.nan for row in rows], dtype=float)
             left.plot(scales, rmse, marker=".", label=name, **styles[name])
             if np.nanmax(gap, initial=0.0) > 0:
-                right.plot(scales, _positive(gap), marker=".", label=name, **styles[name])
+                right.plot(scales, positive(gap, 0.0), marker=".", label=name, **styles[name])
         rows = next((rows for rows in lines.values() if rows), [])
         bound = [row["final"]["position_m2"]["bound"] for row in rows]
         scales = [row["scale"] for row in rows]
@@ -296,10 +302,6 @@ def error_against_noise(summary: Summary) -> str:
 
 def _of_variant(summary: Summary, name: str) -> list[Mapping[str, Any]]:
     return [row for row in summary["table"] if row["variant"] == name and "final" in row]
-
-
-def _positive(values: Array) -> Array:
-    return np.where(values > 0, values, np.nan)
 
 
 def consistency_against_noise(summary: Summary) -> str:

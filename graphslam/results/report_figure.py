@@ -27,6 +27,8 @@ PALETTE = ("#4477aa", "#ee6677", "#228833", "#aa3377", "#ccbb44", "#66ccee")
 ACCENT = "#c8601a"
 
 WIDTH_IN = 4.9
+#: m or degrees: smaller values are not worth a decade of a logarithmic axis
+SMALLEST = 1e-6
 _THEMED = {INK: "currentColor", FAINT: "var(--grid)", ACCENT: "var(--accent)"} | {
     color: f"var(--robot{i})" for i, color in enumerate(PALETTE)
 }
@@ -172,6 +174,16 @@ def legend(axes: Axes) -> None:
         [first[name] for name in names], names, loc="lower right", bbox_to_anchor=(1, 0.98),
         ncols=min(len(names), 6), handlelength=1.4, columnspacing=1.0, borderaxespad=0,
     )  # fmt: skip
+
+
+def time_axis(first_ns: int, last_ns: int) -> tuple[float, str]:
+    """Unit, ns, and label of a time axis over a span: minutes from a quarter of an hour on."""
+    return (60e9, "time, min") if last_ns - first_ns > 900e9 else (1e9, "time, s")
+
+
+def positive(values: Array, smallest: float = SMALLEST) -> Array:
+    """Values (n,) for a logarithmic axis: what is not above ``smallest`` leaves a gap."""
+    return np.where(values > smallest, values, np.nan)
 
 
 def log_scale(axes: Axes, label: str) -> None:

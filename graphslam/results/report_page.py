@@ -1,7 +1,7 @@
 # ruff: noqa: RUF001 -- σ, × and – are meant: people read them
-"""The order of the report, its words and its style."""
+"""The sections of the report of a result, in their order."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from html import escape
 from pathlib import PurePath
 from typing import Any
@@ -13,7 +13,17 @@ from graphslam.core.records import Result
 from graphslam.results import report_maps as maps
 from graphslam.results import report_plots as plots
 from graphslam.results import report_tables as tables
-from graphslam.results.report_style import CSS
+from graphslam.results.report_html import (
+    details,
+    document,
+    figure,
+    figure_grid,
+    header,
+    number,
+    section,
+    table,
+    warning_box,
+)
 
 
 def page(result: Result, evaluation: Mapping[str, Any] | None) -> str:
@@ -34,18 +44,6 @@ def page(result: Result, evaluation: Mapping[str, Any] | None) -> str:
     return document(title, sections)
 
 
-def document(title: str, sections: Sequence[str]) -> str:
-    """A whole HTML document of the sections that are not empty."""
-    body = "\n".join(part for part in sections if part)
-    return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        '<meta name="color-scheme" content="light dark">\n'
-        f"<title>{escape(title)} – graphslam</title>\n<style>{CSS}</style>\n</head>\n"
-        f"<body>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
-    )
-
-
 def _header(result: Result, title: str) -> str:
     counts, summary = result.summary.get("counts", {}), result.summary
     sigma = tables.median_sigma(result)
@@ -59,32 +57,14 @@ def _header(result: Result, title: str) -> str:
         ("peak memory", summary.get("peak_memory_mb"), " MB"),
     ]
     # what is zero or unknown (no scans, no closures) has no tile
-    shown = "".join(
-        f"<div><dt>{name}</dt><dd>{tables.number(value)}{unit}</dd></div>"
-        for name, value, unit in tiles
-        if value
-    )
-    return (
-        f"<header><p class=brand>graphslam</p><h1>{escape(title)}</h1>\n"
-        f"<p class=lead>{escape(tables.headline(result))}</p>\n"
-        f"<dl class=tiles>{shown}</dl></header>"
-    )
+    shown = [(name, f"{number(value)}{unit}") for name, value, unit in tiles if value]
+    return header("graphslam", title, tables.headline(result), shown)
 
 
 def _warnings(summary: Mapping[str, Any]) -> str:
     stamps = summary.get("notes", {}).get("stamps", "")
     texts = [f"stamps: {stamps}"] if stamps.startswith("invented") else []
-    texts += [str(text) for text in summary.get("warnings", [])]
-    items = "".join(f"<li>{escape(text)}</li>" for text in texts)
-    return f'<section class="warn"><h2>Warnings</h2><ul>{items}</ul></section>' if items else ""
-
-
-def figure(drawing: str, title: str, caption: str) -> str:
-    """A drawing (SVG) with a caption that begins with its title."""
-    return (
-        f"<figure><figcaption><b>{escape(title)}</b> {escape(caption)}</figcaption>\n"
-        f"{drawing}</figure>"
-    )
+    return warning_box([*texts, *map(str, summary.get("warnings", []))])
 
 
 def _map_section(result: Result) -> str:
@@ -126,7 +106,7 @@ def _map_section(result: Result) -> str:
             "the faint line is the causal estimate.",
         )
     )
-    return section("Map", figures)
+    return section("Map", figure_grid(figures))
 
 
 def _times(factor: int) -> str:
@@ -134,27 +114,24 @@ def _times(factor: int) -> str:
 
 
 def _quality_section(evaluation: Mapping[str, Any]) -> str:
-    content = tables.quality(evaluation)
-    return f"<section><h2>Against the truth</h2>{content}</section>" if content else ""
+    return section("Against the truth", tables.quality(evaluation))
 
 
 def _uncertainty_section(result: Result) -> str:
-    return section(
-        "Over time",
-        [
-            figure(
-                plots.uncertainty(result),
-                "Standard deviations.",
-                "Final (strong) and causal (pale); position along its worst direction.",
-            ),
-            figure(
-                plots.revision(result),
-                "Final against causal.",
-                "Distance of the causal estimate (solid) and of odometry alone (dashed) from the "
-                "final trajectory: what later data changed.",
-            ),
-        ],
-    )
+    figures = [
+        figure(
+            plots.uncertainty(result),
+            "Standard deviations.",
+            "Final (strong) and causal (pale); position along its worst direction.",
+        ),
+        figure(
+            plots.revision(result),
+            "Final against causal.",
+            "Distance of the causal estimate (solid) and of odometry alone (dashed) from the "
+            "final trajectory: what later data changed.",
+        ),
+    ]
+    return section("Over time", figure_grid(figures))
 
 
 def _estimator_section(result: Result) -> str:
@@ -175,12 +152,12 @@ def _estimator_section(result: Result) -> str:
             figure(
                 plots.timing(result.step_ms),
                 "Wall time per keyframe.",
-                f"With its running median; p50 {tables.number(float(p50))} ms, "
-                f"p99 {tables.number(float(p99))} ms, max "
-                f"{tables.number(float(result.step_ms.max()))} ms.",
+                f"With its running median; p50 {number(float(p50))} ms, "
+                f"p99 {number(float(p99))} ms, max "
+                f"{number(float(result.step_ms.max()))} ms.",
             )
         )
-    return section("Estimator", figures) if figures else ""
+    return section("Estimator", figure_grid(figures)) if figures else ""
 
 
 def _accounting_section(summary: Mapping[str, Any]) -> str:
@@ -191,16 +168,14 @@ def _accounting_section(summary: Mapping[str, Any]) -> str:
         tables.calibration(summary),
     ]
     content = "\n".join(part for part in parts if part)
-    return f'<section><h2>Accounts</h2><div class="accounts">{content}</div></section>'
+    return section("Accounts", f'<div class="accounts">{content}</div>')
 
 
 def _landmark_section(result: Result) -> str:
     if not result.landmarks:
         return ""
-    return (
-        f"<section><details><summary>All {tables.number(len(result.landmarks))} landmarks</summary>"
-        f"{tables.landmarks(result.landmarks)}</details></section>"
-    )
+    count = number(len(result.landmarks))
+    return details(f"All {count} landmarks", tables.landmarks(result.landmarks))
 
 
 def _reproduce_section(result: Result) -> str:
@@ -213,17 +188,10 @@ def _reproduce_section(result: Result) -> str:
     paths = " ".join(str(log[0]) for log in logs)
     command = f"graphslam smooth {paths} -o DIR --config config.toml"
     parts = [
-        "<section><details><summary>How to reproduce this</summary>",
         f"<p>With the config.toml beside this file: <code>{escape(command)}</code></p>",
         f"<p class=note>Versions: {escape(versions)}. Configuration sha256 "
         f"<code>{escape(str(summary.get('config_sha256', '–')))}</code></p>",
-        tables.table(["log", "messages", "lost", "sha256"], logs),
+        table(["log", "messages", "lost", "sha256"], logs),
         f"<pre>{escape(dump_config(result.config))}</pre>",
-        "</details></section>",
     ]
-    return "\n".join(parts)
-
-
-def section(title: str, figures: Sequence[str]) -> str:
-    """Figures side by side where there is room, under a heading."""
-    return f'<section><h2>{title}</h2><div class="grid">{"".join(figures)}</div></section>'
+    return details("How to reproduce this", "\n".join(parts))

@@ -1,5 +1,5 @@
 # ruff: noqa: RUF001 -- σ and – are meant: people read them
-"""Curves over time: uncertainty, revision of the past, innovations, time per keyframe."""
+"""Curves over time: uncertainty, revision of past poses, innovations, time per keyframe."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -16,26 +16,27 @@ from graphslam.results.report_figure import (
     INK,
     legend,
     log_scale,
+    positive,
     robot_color,
     svg,
+    time_axis,
     time_rows,
 )
 
-_SMALLEST = 1e-6  # m or degrees: nothing below it is worth a decade of a logarithmic axis
 _MAX_DOTS = 4000
 
 
 def uncertainty(result: Result) -> str:
     """Standard deviations of position (worst direction) and heading over time."""
-    clock = _Clock.of(result)
+    axis = _TimeAxis(result)
 
     def draw(figure: Figure) -> None:
-        top, bottom = time_rows(figure, 2, clock.label)
+        top, bottom = time_rows(figure, 2, axis.label)
         for i, (name, robot) in enumerate(sorted(result.robots.items())):
             both = ((robot.final, 1.0, 3, "final"), (robot.causal, 0.5, 2, "causal"))
             for path, alpha, layer, kind in both:
-                label = _label(name, kind, len(result.robots))
-                t = clock.time(path)
+                label = _legend_text(name, kind, len(result.robots))
+                t = axis.time(path)
                 style: dict[str, Any] = {"color": robot_color(i), "alpha": alpha, "zorder": layer}
                 top.plot(t, _worst_sigma(path), label=label, **style)
                 bottom.plot(t, np.degrees(_root(path.covs[:, 2, 2])), **style)
@@ -48,10 +49,10 @@ def uncertainty(result: Result) -> str:
 
 def revision(result: Result) -> str:
     """How far causal estimates and dead reckoning are from the final trajectory, over time."""
-    clock = _Clock.of(result)
+    axis = _TimeAxis(result)
 
     def draw(figure: Figure) -> None:
-        top, bottom = time_rows(figure, 2, clock.label)
+        top, bottom = time_rows(figure, 2, axis.label)
         for i, (name, robot) in enumerate(sorted(result.robots.items())):
             others: tuple[tuple[Trajectory, dict[str, Any], str], ...] = (
                 (robot.causal, {"zorder": 3}, "causal"),
@@ -59,14 +60,14 @@ def revision(result: Result) -> str:
             )
             for path, style, kind in others:
                 if len(path) != len(robot.final):
-                    continue  # not at the same stamps: nothing to compare
+                    continue  # at other stamps: cannot be compared
                 off = path.poses - robot.final.poses
-                t, color = clock.time(path), robot_color(i)
-                label = _label(name, kind, len(result.robots))
+                t, color = axis.time(path), robot_color(i)
+                label = _legend_text(name, kind, len(result.robots))
                 distance = np.hypot(off[:, 0], off[:, 1])
-                top.plot(t, _positive(distance), color=color, label=label, linewidth=1, **style)
+                top.plot(t, positive(distance), color=color, label=label, linewidth=1, **style)
                 turn = np.degrees(np.abs(wrap(off[:, 2])))
-                bottom.plot(t, _positive(turn), color=color, linewidth=1, **style)
+                bottom.plot(t, positive(turn), color=color, linewidth=1, **style)
         log_scale(top, "position, m")
         log_scale(bottom, "heading, °")
         legend(top)
@@ -87,7 +88,7 @@ def innovations(found: Mapping[str, Array]) -> str:
         for axes, (model, values) in zip(rows, found.items(), strict=True):
             dots = values[:: max(1, len(values) // _MAX_DOTS)]
             axes.plot(
-                dots[:, 0], _positive(dots[:, 1], 1e-3), ".", color=robot_color(0), markersize=2.5,
+                dots[:, 0], positive(dots[:, 1], 1e-3), ".", color=robot_color(0), markersize=2.5,
                 alpha=0.55, markeredgewidth=0, rasterized=True,
             )  # fmt: skip
             axes.plot(*_running(values, np.mean), color=INK, linewidth=1.2)
@@ -112,7 +113,7 @@ def timing(step_ms: Array) -> str:
     def draw(figure: Figure) -> None:
         (axes,) = time_rows(figure, 1, "keyframe")
         axes.plot(
-            number[dots], _positive(step_ms[dots], 1e-3), ".", color=robot_color(0), markersize=3,
+            number[dots], positive(step_ms[dots], 1e-3), ".", color=robot_color(0), markersize=3,
             alpha=0.6, markeredgewidth=0, rasterized=True,
         )  # fmt: skip
         axes.plot(
@@ -123,37 +124,26 @@ def timing(step_ms: Array) -> str:
     return svg("Wall time per keyframe", 2.6, draw)
 
 
-class _Clock:
-    """Time since the first pose of any robot, in a unit that suits the span."""
+class _TimeAxis:
+    """Time since the first pose of any robot, in a unit that fits the span."""
 
-    def __init__(self, start_ns: int, span_s: float) -> None:
-        minutes = span_s > 900
-        self._start_ns, self._unit_ns = start_ns, 60e9 if minutes else 1e9
-        self.label = "time, min" if minutes else "time, s"
-
-    @classmethod
-    def of(cls, result: Result) -> "_Clock":
+    def __init__(self, result: Result) -> None:
         stamps = [robot.final.stamps_ns for robot in result.robots.values()]
-        first, last = min(s[0] for s in stamps), max(s[-1] for s in stamps)
-        return cls(int(first), float(last - first) / 1e9)
+        self._start_ns, last_ns = int(min(s[0] for s in stamps)), int(max(s[-1] for s in stamps))
+        self._unit_ns, self.label = time_axis(self._start_ns, last_ns)
 
     def time(self, path: Trajectory) -> Array:
         return np.asarray((path.stamps_ns - self._start_ns) / self._unit_ns)
 
 
 def _worst_sigma(path: Trajectory) -> Array:
-    """Square root of the larger eigenvalue of the position's covariance, closed form for 2x2."""
+    """Square root (n,) of the larger eigenvalue of the position covariances, in closed form."""
     a, b, c = path.covs[:, 0, 0], path.covs[:, 0, 1], path.covs[:, 1, 1]
     return _root((a + c) / 2 + np.hypot((a - c) / 2, b))
 
 
 def _root(variance: Array) -> Array:
-    return _positive(np.sqrt(np.maximum(variance, 0.0)))
-
-
-def _positive(values: Array, smallest: float = _SMALLEST) -> Array:
-    """Values for a logarithmic axis: what is below the smallest leaves a gap."""
-    return np.where(values > smallest, values, np.nan)
+    return positive(np.sqrt(np.maximum(variance, 0.0)))
 
 
 def _running(
@@ -165,6 +155,6 @@ def _running(
     return x, np.array([statistic(part[:, 1]) for part in parts])
 
 
-def _label(name: str, kind: str, robots: int) -> str:
+def _legend_text(name: str, kind: str, robots: int) -> str:
     """Legend text: colours tell several robots apart, strokes the kinds of one robot."""
     return kind if robots == 1 else name

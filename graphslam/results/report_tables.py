@@ -1,7 +1,7 @@
 # ruff: noqa: RUF001 -- σ and – are meant: people read them
 """Numbers as HTML: the headline, tables of counts and reasons, quality, landmarks."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
@@ -9,47 +9,8 @@ import numpy as np
 
 from graphslam.core.geometry import path_length
 from graphslam.core.records import Landmark, Result
-
-_SPACE = "\u202f"  # narrow, no break: 13 631
-
-
-def number(value: object, digits: int = 3) -> str:
-    """A number for reading: integers in groups of three, others to ``digits`` significant ones."""
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, int | np.integer):
-        return f"{int(value):,}".replace(",", _SPACE)
-    if isinstance(value, float | np.floating):
-        return _decimal(float(value), digits)
-    return "–" if value is None else escape(str(value))
-
-
-def _decimal(value: float, digits: int) -> str:
-    if not np.isfinite(value):
-        return "–"
-    if 0 < abs(value) < 1e-4:
-        return f"{value:.{digits - 1}e}"
-    places = digits - 1 - int(np.floor(np.log10(abs(value)))) if value else 0
-    return f"{value:,.{max(places, 0)}f}".replace(",", _SPACE)
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[object]], caption: str = "") -> str:
-    """An HTML table; the first column is a heading, the rest is right-aligned.
-
-    Cells that are numbers are formatted with `number`, texts are escaped.
-    """
-    top = "".join(f'<th scope="col">{escape(name)}</th>' for name in head)
-    body = "".join(
-        f'<tr><th scope="row">{number(first)}</th>'
-        + "".join(f"<td>{number(cell)}</td>" for cell in rest)
-        + "</tr>\n"
-        for first, *rest in rows
-    )
-    title = f"<caption>{escape(caption)}</caption>" if caption else ""
-    return (
-        f'<div class="scroll"><table>{title}<thead><tr>{top}</tr></thead>\n'
-        f"<tbody>{body}</tbody></table></div>"
-    )
+from graphslam.results.metric_tables import evaluation_tables
+from graphslam.results.report_html import number, table
 
 
 def headline(result: Result) -> str:
@@ -182,53 +143,12 @@ def landmark_sigma(landmark: Landmark) -> float:
 
 
 def quality(evaluation: Mapping[str, Any]) -> str:
-    """The evaluation against truth and relations, as far as there is one."""
-    parts = []
-    robots = evaluation.get("robots", {})
-    if robots:
-        runs = [*robots.items()] + (
-            [("all", evaluation["joint"])] if len(robots) > 1 and "joint" in evaluation else []
+    """Errors against truth and relations, as far as there are any."""
+    return "\n".join(
+        table(
+            [heads[0], *heads[2:]],
+            [(", ".join(filter(None, row[:2])), *row[2:]) for row in rows],
+            title,
         )
-        rows = [
-            (f"{name}, {kind}", *_trajectory_row(both[kind]))
-            for name, both in runs
-            for kind in ("final", "causal")
-        ]
-        head = ["trajectory", "ATE, m", "aligned, m", "max, m", "heading, °"]
-        head += ["RPE 1 s, m", "RPE 10 m, m", "NEES/dof", "95 % bounds", "coverage"]
-        parts.append(table(head, rows, "Against true poses"))
-    relations = evaluation.get("relations", {})
-    if relations:
-        keys = ["n", "unmatched", "trans_mean_m", "trans_std_m", "trans_median_m"]
-        keys += ["rot_mean_deg", "rot_std_deg"]
-        rows = [
-            (f"{group}, {kind}", *(found[group][key] for key in keys))
-            for kind, found in (("final", relations), ("causal", relations.get("causal", {})))
-            for group in ("all", "local", "loops")
-            if group in found
-        ]
-        head = ["pairs", "n", "unmatched", "mean, m", "std, m", "median, m", "mean, °", "std, °"]
-        parts.append(table(head, rows, "Against reference relations"))
-    marks = evaluation.get("landmarks", {})
-    if marks:
-        keys = ["rmse_m", "nees_per_dof", "matched", "missed", "extra"]
-        head = ["", "RMSE, m", "NEES/dof", "matched", "missed", "extra"]
-        parts.append(
-            table(head, [("map", *(marks[key] for key in keys))], "Against true landmarks")
-        )
-    return "\n".join(parts)
-
-
-def _trajectory_row(found: Mapping[str, Any]) -> tuple[object, ...]:
-    bounds, heading = found["nees_bounds"], found["heading_rmse_rad"]
-    return (
-        found["ate_rmse_m"],
-        found["ate_aligned_rmse_m"],
-        found["max_m"],
-        None if heading is None else float(np.degrees(heading)),
-        found["rpe"]["1_s"]["trans_rmse_m"],
-        found["rpe"]["10_m"]["trans_rmse_m"],
-        found["nees_per_dof"],
-        None if bounds is None else f"{bounds[0]:.3f}…{bounds[1]:.3f}",
-        None if found["coverage"] is None else f"{100 * found['coverage']:.1f} %",
+        for title, heads, rows in evaluation_tables(evaluation)
     )

@@ -11,10 +11,10 @@ from graphslam.core.geometry import compose
 from graphslam.core.records import Association, Start, Step
 from graphslam.estimation.backends import BACKENDS
 from graphslam.estimation.replay import replay
-from graphslam.evaluation.compare_recording import record
-from graphslam.evaluation.compare_replay import play
-from graphslam.evaluation.compare_rows import compare
-from graphslam.evaluation.compare_variants import variants
+from graphslam.evaluation.compare_backends import compare
+from graphslam.evaluation.compare_variants import parse_variants
+from graphslam.evaluation.recorded_steps import record_steps
+from graphslam.evaluation.timed_replay import timed_replay
 from graphslam.logs import LogWriter, open_logs
 
 S = 1_000_000_000
@@ -218,14 +218,14 @@ def test_it_is_a_row_of_a_comparison(tmp_path):
                 where[robot] = compose(x, np.array([0.05, 0.0, 0.02]))
     settings = load_config(overrides=["start.from_truth=true"])
     opened = open_logs([tmp_path / "log.mcap"], settings)
-    rows = variants(["batch", "decentralised+backend.exchange_s=5"], settings)
-    found = compare(opened, settings, rows, run=play).found["rows"]
+    rows = parse_variants(["batch", "decentralised+backend.exchange_s=5"], settings)
+    found = compare(opened, settings, rows, run=timed_replay).summary["rows"]
     assert [row["error"] for row in found] == [None, None]
     assert "exchanged" not in found[0]
     for told in found[1]["exchanged"].values():
         # three landmarks seen again and again: condensed is much less
         assert 0 < told["sent_bytes"] < 0.8 * told["measured_bytes"]
     assert found[1]["difference"]["final"]["rmse_m"] < 0.005
-    steps = record(opened, settings).steps
+    steps = record_steps(opened, settings).steps
     done = replay(steps, BACKENDS["decentralised"](settings))
     assert set(done.estimate.states) == {"a", "b"}

@@ -13,20 +13,25 @@ import pytest
 from command_line import call, check_one_line
 from room_log import drive
 
-import graphslam.evaluation.compare_rows
+import graphslam.evaluation.compare_backends
 from graphslam.core.config import Config
 from graphslam.core.config_io import load_config
 from graphslam.core.errors import ConfigError, EstimationError, LogError, OutputError
 from graphslam.estimation.backends import BACKENDS
+from graphslam.evaluation.compare_backends import compare
 from graphslam.evaluation.compare_folder import is_comparison, save_comparison
-from graphslam.evaluation.compare_recording import record
-from graphslam.evaluation.compare_replay import growth_exponent, play, play_apart
-from graphslam.evaluation.compare_rows import compare
-from graphslam.evaluation.compare_variants import variants
+from graphslam.evaluation.compare_variants import parse_variants
 from graphslam.evaluation.ground_truth import truth_of_logs
 from graphslam.evaluation.metrics import evaluate
+from graphslam.evaluation.recorded_steps import record_steps
+from graphslam.evaluation.timed_replay import growth_exponent, timed_replay, timed_replay_in_process
 from graphslam.logs import GroundTruth, LogWriter, open_logs
-from graphslam.results.report_comparison import ahead, filled, notes, render_comparison
+from graphslam.results.report_comparison import (
+    comparison_tables,
+    filter_wins,
+    reading_notes,
+    render_comparison,
+)
 from graphslam.simulation import load_scenario, simulate
 from graphslam.slam.smooth import smooth
 
@@ -43,12 +48,14 @@ def two(tmp_path_factory):
     config = load_config(None, START)
     log = open_logs([path], config)
     truth = truth_of_logs(log, config)
-    done = compare(log, config, variants(SPECS, load_config(None, START)), truth=truth, run=play)
+    done = compare(
+        log, config, parse_variants(SPECS, load_config(None, START)), truth=truth, run=timed_replay
+    )
     return SimpleNamespace(path=path, config=config, log=log, truth=truth, done=done)
 
 
 def rows_of(comparison):
-    return {row["spec"]: row for row in comparison.found["rows"]}
+    return {row["spec"]: row for row in comparison.summary["rows"]}
 
 
 class Broken:
@@ -91,26 +98,26 @@ def test_a_row_is_what_smooth_and_evaluate_say(two, mode, backend):
     alone = evaluate(
         smooth(open_logs([two.path], config), config), two.truth.trajectories, two.truth.landmarks
     )
-    rows = variants([backend], load_config(None, START))
-    found = compare(two.log, two.config, rows, mode, truth=two.truth, run=play)
-    assert_equal_numbers({key: found.found["rows"][0][key] for key in ACCURACY}, alone)
+    rows = parse_variants([backend], load_config(None, START))
+    found = compare(two.log, two.config, rows, mode, truth=two.truth, run=timed_replay)
+    assert_equal_numbers({key: found.summary["rows"][0][key] for key in ACCURACY}, alone)
 
 
 def test_rows_come_in_the_order_asked_with_every_key_of_the_contract(two):
-    rows = two.done.found["rows"]
+    rows = two.done.summary["rows"]
     assert [row["spec"] for row in rows] == SPECS
     for row in rows:
         assert row["error"] is None
         assert set(ACCURACY) <= row.keys()
         ms = row["ms_per_step"]
         assert 0 < ms["p50"] <= ms["p99"] <= ms["max"] <= 1e3 * row["total_s"]
-    assert two.done.found["mode"] == "replay"
-    assert two.done.found["recorded_by"] == "isam2"
+    assert two.done.summary["mode"] == "replay"
+    assert two.done.summary["recorded_by"] == "isam2"
 
 
 def test_the_reference_is_at_no_distance_from_itself_and_odometry_is_far(two):
     rows = rows_of(two.done)
-    assert two.done.found["reference"] == "batch"
+    assert two.done.summary["reference"] == "batch"
     assert rows["batch"]["difference"]["final"]["max_m"] == 0.0
     # odometry ends 1.07 m off in this scenario, the smoother some mm
     assert rows["dead-reckoning"]["difference"]["final"]["max_m"] > 0.5
@@ -124,14 +131,16 @@ def test_final_is_causal_for_what_never_revises_and_only_there(two):
     for robot in rows["dead-reckoning"]["robots"].values():
         assert robot["final"] == robot["causal"]
     assert rows["isam2"]["joint"]["final"] != rows["isam2"]["joint"]["causal"]
-    assert any("Final equals causal for dead-reckoning" in text for text in notes(two.done.found))
+    assert any(
+        "Final equals causal for dead-reckoning" in text for text in reading_notes(two.done.summary)
+    )
 
 
 def test_filters_name_their_errors_and_do_not_revise(two):
     """With horizon 0 a state still moves until the next one comes, which is not smoothing."""
     specs = ["ekf", "ekf+ekf.error=body", "isam2:0", "isam2"]
-    rows = variants(specs, load_config(None, START))
-    found = rows_of(compare(two.log, two.config, rows, truth=two.truth, run=play))
+    rows = parse_variants(specs, load_config(None, START))
+    found = rows_of(compare(two.log, two.config, rows, truth=two.truth, run=timed_replay))
     for spec in specs[:3]:
         assert found[spec]["final_is_causal"]
         assert found[spec]["joint"]["final"] == found[spec]["joint"]["causal"]
@@ -145,10 +154,10 @@ def test_filters_name_their_errors_and_do_not_revise(two):
 
 
 def test_late_evidence_is_counted(two):
-    recording = record(two.log, two.config)
+    recording = record_steps(two.log, two.config)
     late = sum(seen.late for step in recording.steps for seen in step.associations)
     assert late > 0
-    for row in two.done.found["rows"]:
+    for row in two.done.summary["rows"]:
         assert (row["late"], row["associations"]) == (late, recording.associations)
         assert row["skipped"] == {}
 
@@ -156,24 +165,28 @@ def test_late_evidence_is_counted(two):
 def test_what_a_filter_could_not_use_is_said(two):
     specs = ["ekf", "ekf+ekf.past_states=0", "isam2"]
     done = compare(
-        two.log, two.config, variants(specs, load_config(None, START)), truth=two.truth, run=play
+        two.log,
+        two.config,
+        parse_variants(specs, load_config(None, START)),
+        truth=two.truth,
+        run=timed_replay,
     )
     found = rows_of(done)
     assert found["ekf"]["skipped"] == found["isam2"]["skipped"] == {}
     assert found[specs[1]]["skipped"] == {"late evidence": found["ekf"]["late"]}
-    assert any(f"{specs[1]} could not use" in text for text in notes(done.found))
+    assert any(f"{specs[1]} could not use" in text for text in reading_notes(done.summary))
     page = render_comparison(done)
     # one of both is there: what a filter is better in, or that it is not
-    assert ("Where a filter is ahead" in page) is bool(ahead(done.found))
-    assert ("No filter is ahead" in page) is not bool(ahead(done.found))
+    assert ("Where a filter is ahead" in page) is bool(filter_wins(done.summary))
+    assert ("No filter is ahead" in page) is not bool(filter_wins(done.summary))
 
 
 # ---------------------------------------------------------------- a process of its own
 
 
 def test_a_process_of_its_own_comes_to_the_same(two):
-    steps = record(two.log, two.config).steps
-    here, there = play(steps, two.config), play_apart(steps, two.config)
+    steps = record_steps(two.log, two.config).steps
+    here, there = timed_replay(steps, two.config), timed_replay_in_process(steps, two.config)
     for name, path in here.replay.estimate.states.items():
         assert np.array_equal(path.poses, there.replay.estimate.states[name].poses)
         assert np.array_equal(here.replay.causal[name].covs, there.replay.causal[name].covs)
@@ -182,8 +195,8 @@ def test_a_process_of_its_own_comes_to_the_same(two):
 def test_its_memory_is_not_that_of_its_parent(two):
     """ru_maxrss of a child starts at its parent's size; a back end needs a fraction of this."""
     ballast = np.ones(75_000_000)  # 600 MB
-    steps = record(two.log, two.config).steps[:5]
-    played = play_apart(steps, two.config)
+    steps = record_steps(two.log, two.config).steps[:5]
+    played = timed_replay_in_process(steps, two.config)
     assert 0 <= played.before_mb <= played.peak_mb < ballast.nbytes / 1e6
 
 
@@ -196,14 +209,14 @@ class Deadly:
 
 def test_a_process_that_dies_is_an_error_of_its_row(monkeypatch, two):
     with pytest.raises(EstimationError, match="its process died"):
-        play_apart([Deadly()], Config())
+        timed_replay_in_process([Deadly()], Config())
 
 
 # ---------------------------------------------------------------- specs
 
 
 def test_specs_say_back_end_horizon_and_settings():
-    found = variants(["isam2", "isam2:0", "isam2:2.5+robust.kernel=none", "batch"])
+    found = parse_variants(["isam2", "isam2:0", "isam2:2.5+robust.kernel=none", "batch"])
     assert [v.config.backend.name for v in found] == ["isam2", "isam2", "isam2", "batch"]
     assert [v.config.backend.horizon_s for v in found] == [np.inf, 0.0, 2.5, np.inf]
     assert found[2].config.robust.kernel == "none"
@@ -228,15 +241,15 @@ def test_specs_say_back_end_horizon_and_settings():
 )
 def test_wrong_specs_are_named(specs, what):
     with pytest.raises(ConfigError, match=re.escape(what)):
-        variants(specs)
+        parse_variants(specs)
 
 
 def test_what_the_recording_follows_from_is_the_same_for_all_in_replay(two):
     """A row with its own keyframes would silently be given the recorded ones."""
-    rows = variants(["isam2+keyframe.distance_m=0.5"], load_config(None, START))
+    rows = parse_variants(["isam2+keyframe.distance_m=0.5"], load_config(None, START))
     with pytest.raises(ConfigError, match=r"keyframe\.\* belongs to the recording"):
-        compare(two.log, two.config, rows, run=play)
-    found = compare(two.log, two.config, rows, "associate", run=play).found["rows"][0]
+        compare(two.log, two.config, rows, run=timed_replay)
+    found = compare(two.log, two.config, rows, "associate", run=timed_replay).summary["rows"][0]
     assert found["states"] < rows_of(two.done)["isam2"]["states"]
 
 
@@ -253,25 +266,32 @@ def test_the_settings_survive_the_way_to_another_process():
 def broken(monkeypatch):
     monkeypatch.setitem(BACKENDS, "batch", Broken)
     # in this process: another one would not know the broken back end
-    monkeypatch.setattr(graphslam.evaluation.compare_rows, "compare", partial(compare, run=play))
+    monkeypatch.setattr(
+        graphslam.evaluation.compare_backends, "compare", partial(compare, run=timed_replay)
+    )
 
 
 def test_a_back_end_that_fails_has_its_error_in_its_row(two, broken):
-    rows = variants(["isam2", "batch", "dead-reckoning"], load_config(None, START))
-    done = compare(two.log, two.config, rows, truth=two.truth, run=play)
+    rows = parse_variants(["isam2", "batch", "dead-reckoning"], load_config(None, START))
+    done = compare(two.log, two.config, rows, truth=two.truth, run=timed_replay)
     found = rows_of(done)
     assert found["batch"]["error"] == "indeterminate at <landmark 7>"
     assert found["isam2"]["error"] is None and found["dead-reckoning"]["error"] is None
-    assert done.found["reference"] == "isam2"
+    assert done.summary["reference"] == "isam2"
     page = render_comparison(done)
     assert "failed: indeterminate at &lt;landmark 7&gt;" in page
-    for _, cells in filled(done.found).values():
+    for _, cells in comparison_tables(done.summary).values():
         assert [bool(row) for row in cells] == [True, False, True]
 
 
 def test_nothing_is_left_where_every_back_end_fails(two, broken):
     with pytest.raises(EstimationError, match="no back end came to an end; batch: indeterminate"):
-        compare(two.log, two.config, variants(["batch"], load_config(None, START)), run=play)
+        compare(
+            two.log,
+            two.config,
+            parse_variants(["batch"], load_config(None, START)),
+            run=timed_replay,
+        )
 
 
 def test_the_command_tells_of_a_failure_at_the_end(two, broken, tmp_path):
@@ -295,8 +315,10 @@ def test_truth_of_another_time_is_told_and_the_rest_goes_on(two):
         name: replace(path, stamps_ns=path.stamps_ns + 10**15)
         for name, path in two.truth.trajectories.items()
     }
-    rows = variants(["isam2", "batch"], load_config(None, START))
-    found = compare(two.log, two.config, rows, truth=GroundTruth(later, ()), run=play).found
+    rows = parse_variants(["isam2", "batch"], load_config(None, START))
+    found = compare(
+        two.log, two.config, rows, truth=GroundTruth(later, ()), run=timed_replay
+    ).summary
     assert [text for text in found["warnings"] if text.startswith("not evaluated: no pose of")]
     assert "robots" not in found["rows"][0]
     assert found["rows"][0]["difference"]["final"] is not None
@@ -312,14 +334,14 @@ def still_log(path, value):
 def test_a_log_without_a_step(tmp_path):
     log = still_log(tmp_path / "nan.mcap", np.nan)
     with pytest.raises(LogError, match="nothing in it could be used"):
-        compare(log, Config(), variants(["isam2"]), run=play)
+        compare(log, Config(), parse_variants(["isam2"]), run=timed_replay)
 
 
 def test_a_robot_that_never_moves_is_compared_all_the_same(tmp_path):
     """One state, no landmark, no path: nothing to divide by."""
     log = still_log(tmp_path / "still.mcap", 0.0)
-    done = compare(log, Config(), variants(["isam2", "dead-reckoning"]), run=play)
-    for row in done.found["rows"]:
+    done = compare(log, Config(), parse_variants(["isam2", "dead-reckoning"]), run=timed_replay)
+    for row in done.summary["rows"]:
         assert row["states"] == 1
         assert row["growth_exponent"] == {"landmarks": None, "path": None}
     assert "<svg" in render_comparison(done)
@@ -327,7 +349,7 @@ def test_a_robot_that_never_moves_is_compared_all_the_same(tmp_path):
 
 def test_an_unknown_mode(two):
     with pytest.raises(ConfigError, match="--mode guess"):
-        compare(two.log, two.config, variants(["isam2"]), "guess", run=play)
+        compare(two.log, two.config, parse_variants(["isam2"]), "guess", run=timed_replay)
 
 
 # ---------------------------------------------------------------- growth and the best
@@ -361,7 +383,7 @@ def marked(**columns):
         }
         for i in range(count)
     ]
-    heads, cells = filled({"rows": rows, "mode": "replay", "reference": "batch"})[
+    heads, cells = comparison_tables({"rows": rows, "mode": "replay", "reference": "batch"})[
         "Final trajectory, from all data"
     ]
     return {head: [row[i][1] for row in cells] for i, head in enumerate(heads)}
@@ -405,11 +427,11 @@ def test_where_a_filter_is_ahead_is_said_and_where_it_is_not():
         judged("dead-reckoning", nees=1.0, rmse_m=0.001, p50=0.1, causal=True),
         {"spec": "ekf+x=1", "label": "EKF, x=1", "error": "indeterminate"},
     ]
-    assert ahead({"rows": rows}) == [
+    assert filter_wins({"rows": rows}) == [
         ("causal: NEES/dof", "EKF", 1.5, "ISAM2", 0.5),
         ("cost: ms/step p50", "ISAM2:0", 2.0, "BATCH", 3.0),
     ]
-    assert ahead({"rows": rows[:2]}) == ahead({"rows": rows[2:]}) == []
+    assert filter_wins({"rows": rows[:2]}) == filter_wins({"rows": rows[2:]}) == []
 
 
 # ---------------------------------------------------------------- the page and the folder
@@ -419,24 +441,24 @@ def test_the_page_is_one_file_with_every_table_and_figure(two):
     page = render_comparison(two.done, "[backend]\n")
     assert page == render_comparison(two.done, "[backend]\n")
     assert not re.search(r'(?:src|href)="(?!#|data:)', page)
-    for row in two.done.found["rows"]:
+    for row in two.done.summary["rows"]:
         assert row["label"] in page
-    for title in filled(two.done.found):
+    for title in comparison_tables(two.done.summary):
         assert title in page
     assert "ahead of every smoother" not in page  # odometry is no filter
-    assert "estimation and nothing else" in page
+    assert "a comparison of estimation alone" in page
     labels = re.findall(r'aria-label="([^"]+)"', page)
     assert len(labels) == len(set(labels)) == 9  # paths, errors, NEES twice each; three of cost
 
 
 def test_without_truth_rows_are_compared_with_each_other(two):
-    rows = variants(["dead-reckoning", "isam2"], load_config(None, START))
-    done = compare(two.log, two.config, rows, run=play)
+    rows = parse_variants(["dead-reckoning", "isam2"], load_config(None, START))
+    done = compare(two.log, two.config, rows, run=timed_replay)
     found = rows_of(done)
     assert not set(ACCURACY) & found["isam2"].keys()
-    assert done.found["reference"] == "isam2"  # a smoother is nearer to the truth than odometry
+    assert done.summary["reference"] == "isam2"  # a smoother is nearer to the truth than odometry
     assert found["dead-reckoning"]["difference"]["final"]["rmse_m"] > 0.1
-    assert [title.split()[0] for title in filled(done.found)] == ["Distance", "Cost"]
+    assert [title.split()[0] for title in comparison_tables(done.summary)] == ["Distance", "Cost"]
     page = render_comparison(done)
     assert "Distance to isam2" in page and "NEES" not in page
 
@@ -445,17 +467,17 @@ def test_without_a_start_what_is_drawn_is_aligned(tmp_path):
     """The world then has its origin at the first pose, metres from where the truth has it."""
     log = open_logs([drive(tmp_path / "room.mcap", seconds=8)], Config())
     truth = truth_of_logs(log, Config())
-    done = compare(log, Config(), variants(["isam2"]), truth=truth, run=play)
-    assert done.found["rows"][0]["joint"]["final"]["ate_rmse_m"] > 1
-    assert any("start was not given" in text for text in done.found["warnings"])
-    (curve,) = done.lanes[0].curves["final"].values()
+    done = compare(log, Config(), parse_variants(["isam2"]), truth=truth, run=timed_replay)
+    assert done.summary["rows"][0]["joint"]["final"]["ate_rmse_m"] > 1
+    assert any("start was not given" in text for text in done.summary["warnings"])
+    (curve,) = done.backends[0].curves["final"].values()
     assert np.sqrt(np.mean(curve.position_m**2)) == pytest.approx(
-        done.found["rows"][0]["joint"]["final"]["ate_aligned_rmse_m"]
+        done.summary["rows"][0]["joint"]["final"]["ate_aligned_rmse_m"]
     )
     # an offset of the frame is no error of the estimate: turned back, heading is within 2 degrees
     assert curve.heading_rad.max() < np.radians(2)
     assert np.isnan(curve.nees).all()
-    (path,) = done.lanes[0].paths["final"].values()
+    (path,) = done.backends[0].paths["final"].values()
     assert np.hypot(*(path[0] - done.truth["robot"][0])) < 0.1
     page = render_comparison(done)
     assert "aligned with the truth" in page and "Consistency" not in page
@@ -465,7 +487,7 @@ def test_the_folder_is_whole_and_only_another_comparison_is_replaced(two, tmp_pa
     out = tmp_path / "out"
     save_comparison(two.done, two.config, out, force=False)
     assert {p.name for p in out.iterdir()} == {"compare.json", "config.toml", "report.html"}
-    assert json.loads((out / "compare.json").read_text()) == two.done.found
+    assert json.loads((out / "compare.json").read_text()) == two.done.summary
     assert load_config(out / "config.toml") == two.config
     with pytest.raises(OutputError, match="already exists; give --force"):
         save_comparison(two.done, two.config, out, force=False)
@@ -482,7 +504,9 @@ def test_the_folder_is_whole_and_only_another_comparison_is_replaced(two, tmp_pa
 
 @pytest.fixture
 def here(monkeypatch):
-    monkeypatch.setattr(graphslam.evaluation.compare_rows, "compare", partial(compare, run=play))
+    monkeypatch.setattr(
+        graphslam.evaluation.compare_backends, "compare", partial(compare, run=timed_replay)
+    )
 
 
 def test_the_command_prints_what_it_wrote(two, here, tmp_path):
@@ -494,7 +518,7 @@ def test_the_command_prints_what_it_wrote(two, here, tmp_path):
     assert json.loads(done.out) == json.loads((out / "compare.json").read_text())
     plain = call(*command, "--mode", "associate", "--force")
     assert plain.code == 0, plain.err
-    for text in ("each associating for itself", "Final trajectory", "ms/step", "Associations of"):
+    for text in ("each with its own data association", "Final trajectory", "ms/step", "Associations of"):
         assert text in plain.out
 
 

@@ -21,16 +21,16 @@ from graphslam.core.observation_models import MODELS
 from graphslam.estimation.backend import Joint
 from graphslam.evaluation import cramer_rao_bound as bound
 from graphslam.evaluation import monte_carlo_campaign as campaign
-from graphslam.evaluation.monte_carlo_bench import Noise, draw, planned_path, seed_of
+from graphslam.evaluation.monte_carlo_bench import Noise, draw_run, planned_path, run_seed
 from graphslam.evaluation.monte_carlo_campaign import Job, run_campaign, run_job
-from graphslam.evaluation.monte_carlo_consistency import joint_errors, squared_error
+from graphslam.evaluation.monte_carlo_consistency import joint_errors, joint_nees
 from graphslam.evaluation.monte_carlo_definition import (
     EXPERIMENTS,
     Definition,
     Logs,
     load_definition,
 )
-from graphslam.evaluation.monte_carlo_log_run import NOISE, scaled
+from graphslam.evaluation.monte_carlo_log_run import NOISE, scale_noise
 from graphslam.evaluation.monte_carlo_summary import summarise
 from graphslam.results.report_experiment import experiment_figures, experiment_page
 from graphslam.simulation import load_scenario
@@ -107,7 +107,7 @@ def test_an_unknown_name_says_which_there_are():
 
 def test_a_run_without_noise_says_the_truth():
     """Motions compose to the truth, every sighting predicts itself."""
-    run = draw(WHOLE.bench, 1.0, None)
+    run = draw_run(WHOLE.bench, 1.0, None)
     for name, robot in WHOLE.bench.robots.items():
         np.testing.assert_array_equal(run.truth[name], planned_path(robot))
     for k, step in enumerate(run.steps):
@@ -126,7 +126,7 @@ def test_what_is_drawn_has_the_covariance_that_is_stated():
     linear: their means are the degrees of freedom, within the 1e-4 quantiles for so many."""
     scale, squares = 1e-3, {"start": [], "motion": [], "point": [], "line": [], "robot-pose": []}
     for r in range(60):
-        run = draw(WHOLE.bench, scale, np.random.default_rng(seed_of(1, scale, r)))
+        run = draw_run(WHOLE.bench, scale, np.random.default_rng(run_seed(1, scale, r)))
         for k, step in enumerate(run.steps):
             for name, start in step.starts.items():
                 e = run.truth[name][0] - start.pose
@@ -151,11 +151,13 @@ def test_what_is_drawn_has_the_covariance_that_is_stated():
 def test_a_seed_is_of_run_and_scale_alone():
     """And differs between them: else runs would repeat each other."""
     states = {
-        tuple(seed_of(seed, scale, run).generate_state(4))
+        tuple(run_seed(seed, scale, run).generate_state(4))
         for seed in (0, 1) for scale in (1.0, 0.3) for run in (0, 1)
     }  # fmt: skip
     assert len(states) == 8
-    a, b = (draw(WHOLE.bench, 1.0, np.random.default_rng(seed_of(5, 1.0, 3))) for _ in range(2))
+    a, b = (
+        draw_run(WHOLE.bench, 1.0, np.random.default_rng(run_seed(5, 1.0, 3))) for _ in range(2)
+    )
     np.testing.assert_array_equal(a.truth["a"][0], b.truth["a"][0])
 
 
@@ -196,14 +198,14 @@ def test_nees_of_errors_drawn_from_the_covariance(frame):
         ):
             errors, own_cov = joint_errors(joint, *truth, frame_asked)
             assert errors.shape == (10,)
-            values.append(squared_error(errors, own_cov))
+            values.append(joint_nees(errors, own_cov))
     low, high = chi2.ppf([5e-5, 1 - 5e-5], 4000) / 400
     assert low < np.mean(found) < high
     assert not low < np.mean(wrong) < high
 
 
 def test_a_covariance_that_is_none_has_no_nees():
-    assert np.isnan(squared_error(np.ones(2), np.diag([1.0, -1.0])))
+    assert np.isnan(joint_nees(np.ones(2), np.diag([1.0, -1.0])))
 
 
 # ------------------------------------------------------------ the bound
@@ -213,7 +215,7 @@ def test_bound_is_the_inverse_information_of_residuals_by_differences(small, mon
     """The whole problem stacked into one residual of all errors, differentiated numerically."""
     monkeypatch.setattr(bound, "_DRAWS", 1)
     tiny = 1e-6  # the start's draw is 1e-7 off the plan
-    run, noise = draw(small.bench, tiny, None), Noise.of(small.bench, tiny)
+    run, noise = draw_run(small.bench, tiny, None), Noise.of(small.bench, tiny)
     names, K = list(run.truth), len(run.steps) - 1
     lines = [i for i, t in run.landmarks.items() if len(t) == 3]
 
@@ -253,7 +255,7 @@ def test_bound_is_the_inverse_information_of_residuals_by_differences(small, mon
     H = jacobian(residuals, np.zeros(size))
     P = np.linalg.inv(H.T @ H)
     poses = np.diag(P)[: 3 * len(names) * (K + 1)].reshape(len(names), K + 1, 3)
-    found = bound.cramer_rao(small.bench, tiny, np.random.default_rng(0))
+    found = bound.cramer_rao_bound(small.bench, tiny, np.random.default_rng(0))
     # 1e-4: the residual of lines is differentiated with its along part, which is second order
     np.testing.assert_allclose(
         found.final.position_m2, poses[..., :2].sum(axis=2).mean(axis=0), rtol=1e-4
@@ -267,7 +269,7 @@ def test_bound_is_the_inverse_information_of_residuals_by_differences(small, mon
 
 def test_bounds_fall_with_data_and_scale_with_noise():
     rng = np.random.default_rng
-    at = {s: bound.cramer_rao(WHOLE.bench, s, rng(0)) for s in (0.02, 0.01)}
+    at = {s: bound.cramer_rao_bound(WHOLE.bench, s, rng(0)) for s in (0.02, 0.01)}
     b = at[0.01]
     assert np.all(b.final.position_m2 <= b.causal.position_m2 * (1 + 1e-9))
     # at the last step both have seen everything
@@ -477,7 +479,7 @@ def test_page_and_figures_of_a_real_campaign(done):
 
 
 def test_a_noise_scale_multiplies_every_error_of_the_sensors_and_nothing_else():
-    before, after = load_scenario("two-robots"), scaled(load_scenario("two-robots"), 0.5)
+    before, after = load_scenario("two-robots"), scale_noise(load_scenario("two-robots"), 0.5)
     for name, robot in before.robots.items():
         for part in ("encoders", "laser"):
             a, b = getattr(robot, part), getattr(after.robots[name], part)
@@ -486,7 +488,7 @@ def test_a_noise_scale_multiplies_every_error_of_the_sensors_and_nothing_else():
                 value = getattr(a, key)
                 assert getattr(b, key) == (value if factor == 1.0 else factor * value), key
     assert after.world == before.world
-    assert scaled(before, 1.0) == before
+    assert scale_noise(before, 1.0) == before
 
 
 def test_a_run_over_a_log_is_evaluated(tmp_path):

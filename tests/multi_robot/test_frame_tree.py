@@ -239,9 +239,9 @@ def test_real_robots_are_found_whoever_is_known(real, known):
 
 
 def test_a_comparison_wants_one_frame(tmp_path):
-    from graphslam.evaluation.compare_recording import record
+    from graphslam.evaluation.recorded_steps import record_steps
 
     write(tmp_path / "log.mcap", meets=lambda a, b: a != "c" and b != "c")
     config = load_config()
     with pytest.raises(EstimationError, match=r"robot c: .*--start c=x,y,phi"):
-        record(open_logs([tmp_path / "log.mcap"], config), config)
+        record_steps(open_logs([tmp_path / "log.mcap"], config), config)

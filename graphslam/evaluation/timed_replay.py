@@ -25,7 +25,7 @@ WARM_UP = 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Played:
+class TimedReplay:
     """A replay, and the largest size of the process, MB, before and after it.
 
     ``skipped``: what of the steps the back end could not use, counted by reason. ``exchanged``:
@@ -40,7 +40,7 @@ class Played:
     exchanged: tuple[Mapping[str, int], Mapping[str, int]] | None = None
 
 
-def play(steps: Sequence[Step], config: Config) -> Played:
+def timed_replay(steps: Sequence[Step], config: Config) -> TimedReplay:
     """Replay ``steps`` into the back end of ``config``, in this process.
 
     Raises:
@@ -53,10 +53,10 @@ def play(steps: Sequence[Step], config: Config) -> Played:
     backend = BACKENDS[config.backend.name](config)
     done = replay(steps, backend)
     told, skipped = exchanged_bytes(backend), dict(backend.skipped)
-    return Played(done, backend.error_frame, skipped, before, _peak_mb(), told)
+    return TimedReplay(done, backend.error_frame, skipped, before, _peak_mb(), told)
 
 
-def play_apart(steps: Sequence[Step], config: Config) -> Played:
+def timed_replay_in_process(steps: Sequence[Step], config: Config) -> TimedReplay:
     """`play` in a fresh process, so that memory and time are of this back end alone.
 
     The process is spawned: a script that calls this needs ``if __name__ == "__main__":``.
@@ -72,7 +72,7 @@ def play_apart(steps: Sequence[Step], config: Config) -> Played:
         initargs=(signal.SIGINT, signal.SIG_DFL),
     ) as pool:
         try:
-            return pool.submit(play, steps, config).result()
+            return pool.submit(timed_replay, steps, config).result()
         except BrokenProcessPool as error:
             raise EstimationError("its process died; perhaps memory ran out") from error
 

@@ -9,16 +9,16 @@ from graphslam.core.config import Config
 from graphslam.core.errors import ConfigError, EstimationError, GraphSlamError, OutputError
 from graphslam.core.geometry import Array, transform, wrap
 from graphslam.core.records import Step, Trajectory
-from graphslam.evaluation.compare_recording import Recording, record
-from graphslam.evaluation.compare_replay import Played, growth_exponent, play_apart
 from graphslam.evaluation.compare_variants import NAMES, Variant
 from graphslam.evaluation.error_statistics import nees
 from graphslam.evaluation.metrics import evaluate
+from graphslam.evaluation.recorded_steps import RecordedSteps, record_steps
 from graphslam.evaluation.relation_metrics import Relations
+from graphslam.evaluation.timed_replay import TimedReplay, growth_exponent, timed_replay_in_process
 from graphslam.evaluation.trajectory_metrics import PosePairs, align, pair_poses
 from graphslam.logs import GroundTruth, LogSet
 from graphslam.results.folder import SavedResult
-from graphslam.results.report_comparison import Comparison, Curve, Lane
+from graphslam.results.report_comparison import BackendCurves, Comparison, ErrorCurve
 from graphslam.slam.pipeline import Progress
 
 FORMAT = "graphslam-comparison-1"
@@ -38,7 +38,7 @@ def compare(
     relations: Relations | None = None,
     progress: Progress = lambda _count: None,
     say: Callable[[str], None] = lambda _text: None,
-    run: Callable[[Sequence[Step], Config], Played] = play_apart,
+    run: Callable[[Sequence[Step], Config], TimedReplay] = timed_replay_in_process,
 ) -> Comparison:
     """Every back end of ``rows`` on one log, one after another, in the order given.
 
@@ -73,12 +73,12 @@ def compare(
     if mode == "replay":
         _check_perception(config, rows)
         say(f"associating with {NAMES.get(config.backend.name, config.backend.name)}")
-        shared = record(log, config, progress)
+        shared = record_steps(log, config, progress)
     runs: list[_Run] = []
     for variant in rows:
         say(variant.label)
         try:
-            recording = shared or record(log, variant.config, progress)
+            recording = shared or record_steps(log, variant.config, progress)
             runs.append(_Run.of(variant, recording, run(recording.steps, variant.config)))
         except GraphSlamError as error:
             runs.append(_Run(variant, error=str(error)))
@@ -148,7 +148,7 @@ class _Run:
         return found
 
     @classmethod
-    def of(cls, variant: Variant, recording: Recording, played: Played) -> "_Run":
+    def of(cls, variant: Variant, recording: RecordedSteps, played: TimedReplay) -> "_Run":
         """A run that came to an end."""
         self, done = cls(variant), played.replay
         result = recording.result(done, variant.config)
@@ -218,7 +218,9 @@ class _Run:
             if name in other and len(found := pair_poses(getattr(robot, kind), other[name])):
                 yield name, found
 
-    def lane(self, truth: Mapping[str, Trajectory], reference: "_Run", *, in_place: bool) -> Lane:
+    def lane(
+        self, truth: Mapping[str, Trajectory], reference: "_Run", *, in_place: bool
+    ) -> BackendCurves:
         """What the report draws; aligned with the truth unless the estimate is in its place."""
         assert self.result is not None  # see `judge`
         paths, curves = {}, {}
@@ -238,7 +240,7 @@ class _Run:
                 name: transform(moved, getattr(robot, kind).poses[:, :2])
                 for name, robot in self.result.robots.items()
             }
-        return Lane(
+        return BackendCurves(
             self.row["spec"], self.row["label"], self.row["final_is_causal"], paths, curves,
             self.step_ms, self.landmarks, self.path_m,
         )  # fmt: skip
@@ -257,10 +259,10 @@ def _difference(pairs: Sequence[PosePairs]) -> dict[str, float] | None:
     }
 
 
-def _curve(pairs: PosePairs, moved: Array, *, consistency: bool) -> Curve:
+def _curve(pairs: PosePairs, moved: Array, *, consistency: bool) -> ErrorCurve:
     """Errors over time after the estimate was put at ``moved`` (3,)."""
     off = pairs.estimate - pairs.truth
     off[:, 2] = wrap(off[:, 2] + moved[2])
     off[:, :2] = transform(moved, pairs.estimate[:, :2]) - pairs.truth[:, :2]
     values = nees(off, pairs.covs) / 3 if consistency else np.full(len(off), np.nan)
-    return Curve(pairs.stamps_ns, np.hypot(off[:, 0], off[:, 1]), np.abs(off[:, 2]), values)
+    return ErrorCurve(pairs.stamps_ns, np.hypot(off[:, 0], off[:, 1]), np.abs(off[:, 2]), values)

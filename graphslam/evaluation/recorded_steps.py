@@ -23,7 +23,7 @@ from graphslam.slam.robot_state import RobotState
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Recording:
+class RecordedSteps:
     """The steps of one run over a log, and what turns states into trajectories and a map.
 
     ``start`` (3,) is where the prior put the robot that defines the world frame, ``worlds`` what
@@ -80,7 +80,9 @@ class Recording:
         return SavedResult(robots, landmarks, {}, config)
 
 
-def record(log: LogSet, config: Config, progress: Progress = lambda _count: None) -> Recording:
+def record_steps(
+    log: LogSet, config: Config, progress: Progress = lambda _count: None
+) -> RecordedSteps:
     """Run over the log with the back end of ``config`` and keep the steps; optimise nothing.
 
     Raises:
@@ -101,7 +103,7 @@ def record(log: LogSet, config: Config, progress: Progress = lambda _count: None
             f"back ends are compared in one frame: give --start {min(apart)}=x,y,phi"
         )
     runs = {name: run for name, run in sorted(pipeline.runs.items()) if run.started}
-    return Recording(
+    return RecordedSteps(
         tuple(pipeline.steps),
         runs,
         pipeline.starts[pipeline.frames.world].pose,

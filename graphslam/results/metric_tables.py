@@ -1,0 +1,124 @@
+"""Errors as tables: the columns that reports and the terminal share."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from math import degrees
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A number of a row.
+
+    ``value`` finds it (None: there is none). The best value of the column is the smallest if
+    ``target`` is 0, else the one nearest to ``target`` in ratio; without ``target`` there is none.
+    """
+
+    head: str
+    value: Callable[[Mapping[str, Any]], Any]
+    target: float | None = 0.0
+
+
+def value_at(*keys: str) -> Callable[[Mapping[str, Any]], Any]:
+    """A function that finds a value by its nested keys; None where one is missing."""
+
+    def find(row: Mapping[str, Any]) -> Any:
+        value: Any = row
+        for key in keys:
+            value = None if value is None else value.get(key)
+        return value
+
+    return find
+
+
+def converted(convert: Callable[[Any], object], *keys: str) -> Callable[[Mapping[str, Any]], Any]:
+    """As `value_at`, with the value converted; None stays None."""
+    find = value_at(*keys)
+
+    def found(row: Mapping[str, Any]) -> object:
+        value = find(row)
+        return None if value is None else convert(value)
+
+    return found
+
+
+def _interval(bounds: Sequence[float]) -> str:
+    return f"{bounds[0]:.3f}…{bounds[1]:.3f}"
+
+
+def trajectory_columns(*at: str) -> tuple[Column, ...]:
+    """Columns of the metrics of a trajectory, which are at the nested keys ``at`` of a row."""
+    return (
+        Column("ATE, m", value_at(*at, "ate_rmse_m")),
+        Column("aligned, m", value_at(*at, "ate_aligned_rmse_m")),
+        Column("max, m", value_at(*at, "max_m")),
+        Column("heading, °", converted(degrees, *at, "heading_rmse_rad")),
+        Column("RPE 1 s, m", value_at(*at, "rpe", "1_s", "trans_rmse_m")),
+        Column("RPE 10 m, m", value_at(*at, "rpe", "10_m", "trans_rmse_m")),
+        Column("NEES/dof", value_at(*at, "nees_per_dof"), 1.0),
+        Column("95 % bounds", converted(_interval, *at, "nees_bounds"), None),
+        Column("coverage, %", converted(lambda share: 100.0 * share, *at, "coverage"), 95.0),
+    )
+
+
+def landmark_columns(*at: str) -> tuple[Column, ...]:
+    """Columns of the metrics of a landmark map, which are at the nested keys ``at`` of a row."""
+    return (
+        Column("RMSE, m", value_at(*at, "rmse_m")),
+        Column("NEES/dof", value_at(*at, "nees_per_dof"), 1.0),
+        Column("matched", value_at(*at, "matched"), None),
+        Column("missed", value_at(*at, "missed"), None),
+        Column("extra", value_at(*at, "extra"), None),
+    )
+
+
+_RELATION_COLUMNS = tuple(
+    Column(head, value_at(key))
+    for head, key in (
+        ("matched", "n"),
+        ("unmatched", "unmatched"),
+        ("mean, m", "trans_mean_m"),
+        ("std, m", "trans_std_m"),
+        ("median, m", "trans_median_m"),
+        ("mean, °", "rot_mean_deg"),
+        ("std, °", "rot_std_deg"),
+    )
+)
+
+#: title, heads, rows; the first two cells of each are labels, the others numbers
+Table = tuple[str, list[str], list[list[Any]]]
+
+
+def evaluation_tables(evaluation: Mapping[str, Any]) -> Iterator[Table]:
+    """Tables of what `graphslam.evaluation.metrics.evaluate` returns, as far as it has them."""
+    robots = dict(evaluation.get("robots", {}))
+    if len(robots) > 1 and "joint" in evaluation:
+        robots["all together"] = evaluation["joint"]
+    if robots:
+        paths = [
+            (name, kind, values) for name, both in robots.items() for kind, values in both.items()
+        ]
+        yield _table("Against true poses", "robot", trajectory_columns(), paths)
+    if relations := evaluation.get("relations"):
+        groups = [
+            (group, kind, found[group])
+            for kind, found in (("final", relations), ("causal", relations.get("causal", {})))
+            for group in ("all", "local", "loops")
+            if group in found
+        ]
+        yield _table("Against reference relations", "relations", _RELATION_COLUMNS, groups)
+    if landmarks := evaluation.get("landmarks"):
+        yield _table(
+            "Against true landmarks", "landmarks", landmark_columns(), [("map", "", landmarks)]
+        )
+
+
+def _table(
+    title: str,
+    label: str,
+    columns: Sequence[Column],
+    rows: Sequence[tuple[str, str, Mapping[str, Any]]],
+) -> Table:
+    heads = [label, "", *(column.head for column in columns)]
+    cells = [[a, b, *(column.value(values) for column in columns)] for a, b, values in rows]
+    return title, heads, cells

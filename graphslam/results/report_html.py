@@ -1,0 +1,110 @@
+# ruff: noqa: RUF001 -- – is meant: people read it
+"""The HTML that all report pages share: document, header, warnings, figures, tables, numbers."""
+
+from collections.abc import Iterable, Sequence
+from html import escape
+
+import numpy as np
+
+from graphslam.results.report_style import CSS
+
+_SPACE = "\u202f"  # narrow, no break: 13 631
+
+
+def document(title: str, sections: Sequence[str], css: str = "") -> str:
+    """A whole HTML document of the sections that are not empty; ``css`` over the style sheet."""
+    body = "\n".join(part for part in sections if part)
+    return (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        '<meta name="color-scheme" content="light dark">\n'
+        f"<title>{escape(title)} – graphslam</title>\n<style>{CSS}{css}</style>\n</head>\n"
+        f"<body>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
+    )
+
+
+def header(
+    brand: str,
+    title: str,
+    lead: str,
+    tiles: Iterable[tuple[str, str]] = (),
+    notes: Iterable[str] = (),
+) -> str:
+    """The head of a page: title, a leading sentence, notes, and tiles (name, value)."""
+    small = "".join(f"<p class=note>{escape(note)}</p>\n" for note in notes)
+    shown = "".join(
+        f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in tiles
+    )
+    return (
+        f"<header><p class=brand>{escape(brand)}</p><h1>{escape(title)}</h1>\n"
+        f"<p class=lead>{escape(lead)}</p>\n{small}"
+        f"{f'<dl class=tiles>{shown}</dl>' if shown else ''}</header>"
+    )
+
+
+def warning_box(texts: Iterable[str]) -> str:
+    """A box with warnings; empty without any."""
+    items = "".join(f"<li>{escape(text)}</li>" for text in texts)
+    return f'<section class="warn"><h2>Warnings</h2><ul>{items}</ul></section>' if items else ""
+
+
+def section(title: str, content: str) -> str:
+    """HTML content under a heading; empty without content."""
+    return f"<section><h2>{escape(title)}</h2>{content}</section>" if content else ""
+
+
+def figure_grid(drawings: Sequence[str]) -> str:
+    """Figures side by side where there is room."""
+    return f'<div class="grid">{"".join(drawings)}</div>'
+
+
+def figure(drawing: str, title: str, caption: str) -> str:
+    """A drawing (SVG) with a caption that begins with its title."""
+    return (
+        f"<figure><figcaption><b>{escape(title)}</b> {escape(caption)}</figcaption>\n"
+        f"{drawing}</figure>"
+    )
+
+
+def details(summary: str, content: str) -> str:
+    """HTML content that is folded under a line of text."""
+    return f"<section><details><summary>{escape(summary)}</summary>{content}</details></section>"
+
+
+def number(value: object, digits: int = 3) -> str:
+    """A number for reading: integers in groups of three, others to ``digits`` significant ones."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int | np.integer):
+        return f"{int(value):,}".replace(",", _SPACE)
+    if isinstance(value, float | np.floating):
+        return _decimal(float(value), digits)
+    return "–" if value is None else escape(str(value))
+
+
+def _decimal(value: float, digits: int) -> str:
+    if not np.isfinite(value):
+        return "–"
+    if 0 < abs(value) < 1e-4:
+        return f"{value:.{digits - 1}e}"
+    places = digits - 1 - int(np.floor(np.log10(abs(value)))) if value else 0
+    return f"{value:,.{max(places, 0)}f}".replace(",", _SPACE)
+
+
+def table(heads: Sequence[str], rows: Iterable[Sequence[object]], caption: str = "") -> str:
+    """An HTML table; the first column is a heading, the rest is right-aligned.
+
+    Cells that are numbers are formatted with `number`, texts are escaped.
+    """
+    top = "".join(f'<th scope="col">{escape(name)}</th>' for name in heads)
+    body = "".join(
+        f'<tr><th scope="row">{number(first)}</th>'
+        + "".join(f"<td>{number(cell)}</td>" for cell in rest)
+        + "</tr>\n"
+        for first, *rest in rows
+    )
+    title = f"<caption>{escape(caption)}</caption>" if caption else ""
+    return (
+        f'<div class="scroll"><table>{title}<thead><tr>{top}</tr></thead>\n'
+        f"<tbody>{body}</tbody></table></div>"
+    )
