@@ -518,7 +518,7 @@ def test_the_command_prints_what_it_wrote(two, here, tmp_path):
     assert json.loads(done.out) == json.loads((out / "compare.json").read_text())
     plain = call(*command, "--mode", "associate", "--force")
     assert plain.code == 0, plain.err
-    for text in ("each with its own data association", "Final trajectory", "ms/step", "Associations of"):
+    for text in ("its own data association", "Final trajectory", "ms/step", "Associations of"):
         assert text in plain.out
 
 
