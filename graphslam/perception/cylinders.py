@@ -16,7 +16,7 @@ from scipy.special import chdtri
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array, wrap
 from graphslam.core.records import Observation
-from graphslam.perception.line_moments import fitted_lines, mean_square, point_moments
+from graphslam.perception.line_moments import fitted_lines, mean_square
 from graphslam.perception.ordered_scan import Indices, Mask, Sweep
 from graphslam.perception.segments import MISSING_BEAMS
 
@@ -52,15 +52,9 @@ class Circles:
 
 
 def cylinders(sweep: Sweep, config: FrontEndConfig) -> tuple[tuple[Observation, ...], Sweep]:
-    """Cylinders of one scan, and the scan without their returns.
+    """Cylinders of one scan, and the scan without their ``points``; its ranges stay.
 
-    Args:
-        sweep: one scan, in order.
-        config: ``cylinder_`` settings, ``range_sigma_m``, ``gap_m``, ``floor_normal_m``.
-
-    Returns:
-        Observations of kind ``point``: bearing and range of the centre, laser frame; and the sweep
-        without their ``points``; its ranges stay.
+    Observations are of kind ``point``: bearing and range of the centre, laser frame.
     """
     first, last = free_standing_runs(sweep, config)
     if not len(first):
@@ -70,20 +64,15 @@ def cylinders(sweep: Sweep, config: FrontEndConfig) -> tuple[tuple[Observation, 
     good = (radius >= config.cylinder_min_radius_m) & (radius <= config.cylinder_max_radius_m)
     good &= circles.chi2 <= chdtri(circles.dof, FIT_PROBABILITY)
     good &= circles.range_chi2 <= _line_chi2(sweep, first, last, config)
-    if not good.any():
-        return (), sweep
     floor = config.floor_normal_m**2
     seen = tuple(
         Observation("point", z[:2], P[:2, :2] + floor * np.diag([z[1] ** -2, 1.0]))
         for z, P in zip(circles.state[good], circles.cov[good], strict=True)
     )
-    taken = np.zeros(
-        len(sweep.beam) + 1, dtype=np.int64
-    )  # runs do not touch: +1 into, -1 out of one
-    taken[first[good]] += 1
-    taken[last[good] + 1] -= 1
-    rows = np.flatnonzero(np.cumsum(taken)[:-1] == 0)
-    return seen, replace(sweep, beam=sweep.beam[rows], points=sweep.points[rows])
+    left = np.ones(len(sweep.beam), dtype=np.bool_)
+    for i, j in zip(first[good], last[good], strict=True):
+        left[i : j + 1] = False
+    return seen, replace(sweep, beam=sweep.beam[left], points=sweep.points[left])
 
 
 def free_standing_runs(sweep: Sweep, config: FrontEndConfig) -> tuple[Indices, Indices]:
@@ -120,13 +109,8 @@ def fit_circles(sweep: Sweep, first: Indices, last: Indices, config: FrontEndCon
 
     The range of a beam that hits the circle is rho cos(delta) - sqrt(R² - rho² sin²(delta)), with
     noise ``range_sigma_m`` along the beam. The circle's edges, beta ± asin(R / rho), lie between
-    the last beam that hit it and the next: half a beam beyond, with a sigma of one beam.
-
-    Args:
-        sweep: the scan.
-        first: (m,) row of the first return of each.
-        last: (m,) row of the last return, inclusive.
-        config: ``range_sigma_m``.
+    the last beam that hit it and the next: half a beam beyond, with a sigma of one beam. The
+    returns of each circle are those from row ``first`` (m,) to ``last`` (m,), inclusive.
     """
     counts = last - first + 1
     column = np.arange(counts.max())
@@ -169,13 +153,7 @@ def fit_circles(sweep: Sweep, first: Indices, last: Indices, config: FrontEndCon
 
 
 def _residuals(
-    state: Array,
-    r: Array,
-    phi: Array,
-    used: Mask,
-    edges: Array,
-    sigma: float,
-    edge_sigma: float,
+    state: Array, r: Array, phi: Array, used: Mask, edges: Array, sigma: float, edge_sigma: float
 ) -> tuple[Array, Array, Array]:
     """Residuals (m, n + 2), measured minus predicted, derivatives (m, n + 2, 3), weights."""
     beta, rho, R = state.T[:, :, None]
@@ -202,6 +180,6 @@ def _residuals(
 
 def _line_chi2(sweep: Sweep, first: Indices, last: Indices, config: FrontEndConfig) -> Array:
     """(m,) chi-square of straight lines through the same returns."""
-    sums = np.cumsum(point_moments(sweep.points), axis=1)
+    sums = np.cumsum(sweep.moments, axis=1)
     M = sums[:, last] - np.where(first > 0, sums[:, first - 1], 0.0)
     return np.asarray(M[0] * mean_square(fitted_lines(M), M) / config.range_sigma_m**2)

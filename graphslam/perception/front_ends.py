@@ -10,18 +10,14 @@ from graphslam.core.config import FrontEndConfig
 from graphslam.core.records import Observation, Scan
 from graphslam.perception.cylinders import cylinders
 from graphslam.perception.hough import hough_lines
-from graphslam.perception.ordered_scan import Sweep, make_sweep, scan_points
+from graphslam.perception.ordered_scan import Sweep, make_sweep
 from graphslam.perception.segments import segments
 from graphslam.perception.segments_and_hough import both
-
-__all__ = ["FRONT_ENDS", "scan_points"]
 
 FrontEnd = Callable[[Scan, FrontEndConfig], tuple[Observation, ...]]
 
 
-def _front_end(
-    lines: Callable[[Sweep, FrontEndConfig], tuple[Observation, ...]],
-) -> FrontEnd:
+def _front_end(lines: Callable[[Sweep, FrontEndConfig], tuple[Observation, ...]]) -> FrontEnd:
     """A front end from an extractor of lines: cylinders come first, without their returns.
 
     Otherwise a thick tree would be a point and a short segment at once.

@@ -19,7 +19,7 @@ from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.records import Observation
 from graphslam.perception.line_fit import fit_lines, observations
-from graphslam.perception.line_moments import fitted_line, fitted_lines, mean_square, point_moments
+from graphslam.perception.line_moments import fitted_line, fitted_lines, mean_square
 from graphslam.perception.ordered_scan import Indices, Mask, Sweep
 from graphslam.perception.segments import MISSING_BEAMS, allowed_rms, fewest_points, valid_lines
 
@@ -46,31 +46,29 @@ ROUNDS = 8
 
 
 def hough_lines(sweep: Sweep, config: FrontEndConfig) -> tuple[Observation, ...]:
-    """Hough lines of one scan, all of kind ``line``.
+    """Hough lines of one scan, laser frame, all of kind ``line``, the one with most votes first.
 
-    Args:
-        sweep: one scan, in order.
-        config: thresholds and noise.
-
-    Returns:
-        Observations, laser frame, the line with most votes first; ``extent`` reaches from the
-        first to the last return.
+    ``extent`` reaches from the first to the last return.
     """
-    rows, starts = find_lines(sweep, np.ones(len(sweep.beam), dtype=np.bool_), config)
-    if not len(starts):
-        return ()
+    free = np.ones(len(sweep.beam), dtype=np.bool_)
+    return line_observations(sweep, *find_lines(sweep, free, config), config)[0]
+
+
+def line_observations(
+    sweep: Sweep, rows: Indices, starts: Indices, config: FrontEndConfig
+) -> tuple[tuple[Observation, ...], Indices]:
+    """Observations of kind ``line`` of the valid lines, and the rows of their returns.
+
+    The returns of the lines are given as by `find_lines`.
+    """
     fits = fit_lines(sweep.points[rows], starts, config)
-    fits = fits[valid_lines(fits, config)]
-    return observations(fits, np.zeros(len(fits.z), dtype=np.bool_), config)
+    valid = valid_lines(fits, config)
+    seen = observations(fits[valid], np.zeros(np.count_nonzero(valid), dtype=np.bool_), config)
+    return seen, rows[np.repeat(valid, np.diff(starts, append=len(rows)))]
 
 
 def find_lines(sweep: Sweep, free: Mask, config: FrontEndConfig) -> tuple[Indices, Indices]:
-    """The returns of each line: no return belongs to two.
-
-    Args:
-        sweep: one scan, in order.
-        free: (k,) which returns may be used.
-        config: thresholds and noise.
+    """The returns of each line, of those that are ``free`` (k,): no return belongs to two.
 
     Returns:
         Rows of `Sweep.points`, one line after the other, those of a line in the order of the
@@ -79,38 +77,27 @@ def find_lines(sweep: Sweep, free: Mask, config: FrontEndConfig) -> tuple[Indice
     free = free.copy()
     lines: list[Indices] = []
     if np.count_nonzero(free) >= fewest_points(config):
-        moments = point_moments(sweep.points)
         votes = Votes(sweep.points, sweep.ranges[sweep.beam] * sweep.step_rad, free, config)
         while len(seed := votes.peak()):
-            rows = _grow(seed, sweep, moments, free, config)
+            rows = _grow(seed, sweep, free, config)
             # the returns of a rejected peak stop voting too, but may be added to another line
             votes.remove(np.union1d(seed, rows))
             if len(rows) >= fewest_points(config):
                 lines.append(rows)
                 free[rows] = False
-    if not lines:
-        none = np.zeros(0, dtype=np.intp)
-        return none, none
-    sizes = [len(rows) for rows in lines]
-    return np.concatenate(lines), np.cumsum([0, *sizes[:-1]])
+    sizes = np.array([len(rows) for rows in lines], dtype=np.intp)
+    return np.concatenate((np.zeros(0, dtype=np.intp), *lines)), np.cumsum(sizes) - sizes
 
 
 class Votes:
     """Accumulator C(d, γ) of eq. 4.29-4.31 for the returns that still vote.
 
+    ``points`` (k, 2) m, laser frame, with ``weights`` (k,) g; ``voting`` (k,): which of them vote.
     A line at (d, γ + π) is the one at (-d, γ): angles cover half a turn, distances both signs.
     Stripes touch (Δd = 2a), so at each angle a return is in one stripe.
     """
 
     def __init__(self, points: Array, weights: Array, voting: Mask, config: FrontEndConfig) -> None:
-        """Count the votes.
-
-        Args:
-            points: (k, 2), m, laser frame.
-            weights: (k,) g of each return.
-            voting: (k,) which returns vote.
-            config: the ``hough_`` settings.
-        """
         normals = _normals(config.hough_gamma_steps)
         reach = min(config.hough_d_max_m, float(np.abs(points).sum(axis=1).max()))
         half = round(reach / config.hough_delta_d_m)
@@ -125,8 +112,7 @@ class Votes:
         cells = stripe[voting]
         each = np.repeat(weights[voting], stripe.shape[1])
         self.C = np.bincount(cells.ravel(), each, minlength=size + 1)[:-1]
-        few = np.bincount(cells.ravel(), minlength=size + 1)[:-1] < SEED_POINTS
-        self.C[few] = 0.0
+        self.C[np.bincount(cells.ravel(), minlength=size + 1)[:-1] < SEED_POINTS] = 0.0
 
     def peak(self) -> Indices:
         """Rows of the returns in the stripe with most votes; none if it is below the threshold."""
@@ -158,29 +144,21 @@ def _normals(gamma_steps: int) -> Array:
     return np.array((np.cos(gamma), np.sin(gamma)))
 
 
-def _grow(
-    seed: Indices, sweep: Sweep, moments: Array, free: Mask, config: FrontEndConfig
-) -> Indices:
+def _grow(seed: Indices, sweep: Sweep, free: Mask, config: FrontEndConfig) -> Indices:
     """Rows of the returns of the line that grows from a seed, in the order of the beams."""
-    line, direction = fitted_line(moments[:, seed].sum(axis=1))
-    before = seed
+    rows = seed
     for _ in range(ROUNDS):
-        rows = np.flatnonzero((line @ moments <= config.split_m**2) & free)
-        rows = _fitting_runs(rows, line, direction, sweep, moments, config)
-        if len(rows) < SEED_POINTS or np.array_equal(rows, before):
-            return rows
-        line, direction = fitted_line(moments[:, rows].sum(axis=1))
         before = rows
+        line, direction = fitted_line(sweep.moments[:, before].sum(axis=1))
+        rows = np.flatnonzero((line @ sweep.moments <= config.split_m**2) & free)
+        rows = _fitting_runs(rows, line, direction, sweep, config)
+        if len(rows) < SEED_POINTS or np.array_equal(rows, before):
+            break
     return rows
 
 
 def _fitting_runs(
-    rows: Indices,
-    line: Array,
-    direction: float,
-    sweep: Sweep,
-    moments: Array,
-    config: FrontEndConfig,
+    rows: Indices, line: Array, direction: float, sweep: Sweep, config: FrontEndConfig
 ) -> Indices:
     """Of the returns near a line, those in runs that fit it.
 
@@ -192,31 +170,23 @@ def _fitting_runs(
         return rows
     borders = _borders(rows, direction, sweep, config)
     blocks = _blocks(borders)
-    fits = _fit(rows, np.concatenate((blocks, borders[:-1])), line, sweep, moments, config)
+    fits = _fit(rows, np.concatenate((blocks, borders[:-1])), line, sweep, config)
     if fits.all():
         return rows
-    sizes = np.diff(np.append(blocks, len(rows)))
-    rows = rows[np.repeat(fits[: len(blocks)], sizes)]
+    rows = rows[np.repeat(fits[: len(blocks)], np.diff(blocks, append=len(rows)))]
     if len(rows) < SEED_POINTS:
         return rows
     borders = _borders(rows, direction, sweep, config)
-    fits = _fit(rows, borders[:-1], line, sweep, moments, config)
+    fits = _fit(rows, borders[:-1], line, sweep, config)
     return rows[np.repeat(fits, np.diff(borders))]
 
 
-def _fit(
-    rows: Indices,
-    starts: Indices,
-    line: Array,
-    sweep: Sweep,
-    moments: Array,
-    config: FrontEndConfig,
-) -> Mask:
+def _fit(rows: Indices, starts: Indices, line: Array, sweep: Sweep, config: FrontEndConfig) -> Mask:
     """Which parts of ``rows`` lie on the line; ``starts`` may hold several divisions."""
     r = sweep.ranges[sweep.beam[rows]]
     # along the normal; line[0] is the squared offset, so the factor is cos² of the incidence
     var = config.range_sigma_m**2 * line[0] / (r * r)
-    sums = np.cumsum(np.concatenate((moments[:, rows], var[None])), axis=1)
+    sums = np.cumsum(np.concatenate((sweep.moments[:, rows], var[None])), axis=1)
     stops = np.append(starts[1:], 0)
     stops[stops == 0] = len(rows)  # the last part of each division
     M = sums[:, stops - 1]

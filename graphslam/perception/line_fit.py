@@ -10,7 +10,7 @@ import numpy as np
 
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.errors import EstimationError
-from graphslam.core.geometry import Array, wrap
+from graphslam.core.geometry import Array, rotation3, wrap
 from graphslam.core.records import Observation
 from graphslam.perception.ordered_scan import Indices, Mask
 
@@ -40,18 +40,6 @@ class LineFits:
         )
 
 
-def fit_line(points: Array, config: FrontEndConfig, fully_visible: bool) -> Observation:
-    """One line through points: `fit_lines` and `observations` for a single line.
-
-    Args:
-        points: (k, 2), m, laser frame, in the order of the beams; at least two distinct points.
-        config: noise and floors.
-        fully_visible: whether both ends of the points are ends of the wall.
-    """
-    fits = fit_lines(points, np.zeros(1, dtype=np.intp), config)
-    return observations(fits, np.array([fully_visible]), config)[0]
-
-
 def fit_lines(points: Array, starts: Indices, config: FrontEndConfig) -> LineFits:
     """Weighted total least squares of m lines, thesis 4.7.6 and eq. 4.32, 4.36-4.38.
 
@@ -71,8 +59,7 @@ def fit_lines(points: Array, starts: Indices, config: FrontEndConfig) -> LineFit
     Raises:
         EstimationError: the points of a line do not define a direction.
     """
-    stops = np.append(starts[1:], len(points))
-    counts = stops - starts
+    counts = np.diff(starts, append=len(points))
     line = np.repeat(np.arange(len(starts)), counts)
     x, y = points.T
     weight = np.full(len(points), max(config.range_sigma_m, SMALLEST_SIGMA_M) ** -2)
@@ -92,7 +79,7 @@ def fit_lines(points: Array, starts: Indices, config: FrontEndConfig) -> LineFit
     c_each, s_each = c[line], s[line]
     eta = c_each * dx + s_each * dy
     deviation = c_each * dy - s_each * dx
-    last = stops - 1
+    last = starts + counts - 1
     middle = (eta[starts] + eta[last]) / 2
     spacing_sq = (eta[starts] - eta[starts + 1]) ** 2 + (eta[last] - eta[last - 1]) ** 2
     return LineFits(
@@ -122,11 +109,8 @@ def _normal_block(eta: Array, weight: Array, starts: Indices) -> Array:
     """V (m, 2, 2) of (normal offset, direction): eq. 4.32 with a weight for each point."""
     powers = weight * np.array((np.ones(len(eta)), eta, eta * eta))
     w0, w1, w2 = np.add.reduceat(powers, starts, axis=1)
-    V = np.empty((len(starts), 2, 2))
-    V[:, 0, 0], V[:, 1, 1] = w2, w0
-    V[:, 0, 1] = V[:, 1, 0] = -w1
-    V /= (w0 * w2 - w1 * w1)[:, None, None]
-    return V
+    V = np.array(((w2, -w1), (-w1, w0))) / (w0 * w2 - w1 * w1)
+    return np.moveaxis(V, -1, 0)
 
 
 def observations(
@@ -153,12 +137,8 @@ def observations(
     own[:, 1:, 1:] = fits.V
     own[:, 1, 1] += config.floor_normal_m**2
     own[:, 2, 2] += config.floor_angle_rad**2
-    turn = np.zeros_like(own)  # rotation3 of every line at once
-    turn[:, 0, 0] = turn[:, 1, 1] = np.cos(fits.z[:, 2])
-    turn[:, 1, 0] = np.sin(fits.z[:, 2])
-    turn[:, 0, 1] = -turn[:, 1, 0]
-    turn[:, 2, 2] = 1.0
-    cov = turn @ own @ turn.transpose(0, 2, 1)
+    turn = rotation3(fits.z[:, 2])
+    cov = turn @ own @ turn.mT
     extent = fits.length[:, None] * np.array((-0.5, 0.5))
     return tuple(
         Observation("segment" if seen else "line", z, P, e)

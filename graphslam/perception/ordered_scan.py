@@ -1,18 +1,20 @@
 """A scan in a standard order: beams counter-clockwise, usable returns as points."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graphslam.core.geometry import Array, polar_points, transform
 from graphslam.core.records import Scan
+from graphslam.perception.line_moments import point_moments
 
 Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Sweep:
     """A scan with its beams counter-clockwise, so that every wall has the sensor on its left.
 
@@ -27,6 +29,11 @@ class Sweep:
     points: Array
     step_rad: float
 
+    @cached_property
+    def moments(self) -> Array:
+        """(6, k): `point_moments` of ``points``."""
+        return point_moments(self.points)
+
 
 def make_sweep(scan: Scan, max_range_m: float) -> Sweep:
     """The scan's beams in counter-clockwise order and its returns nearer than ``max_range_m``."""
@@ -39,8 +46,7 @@ def make_sweep(scan: Scan, max_range_m: float) -> Sweep:
     with np.errstate(invalid="ignore"):
         ranges = np.where((ranges > 0) & np.isfinite(ranges), ranges, np.nan)
         beam = np.flatnonzero(ranges < max_range_m)  # at the maximum a laser saturates
-    r, a = ranges[beam], angles[beam]
-    return Sweep(ranges, angles, beam, polar_points(r, a), step)
+    return Sweep(ranges, angles, beam, polar_points(ranges[beam], angles[beam]), step)
 
 
 def _open_circle(ranges: Array, angles: Array) -> tuple[Array, Array]:
@@ -51,16 +57,7 @@ def _open_circle(ranges: Array, angles: Array) -> tuple[Array, Array]:
 
 
 def scan_points(scan: Scan, max_range_m: float) -> Array:
-    """Returns of a scan as points.
-
-    Args:
-        scan: the scan, with its mount.
-        max_range_m: returns at this range or farther are left out.
-
-    Returns:
-        Points (n, 2), m, in the robot's base frame, in the scan's order; missing returns left out.
-    """
+    """Returns nearer than ``max_range_m``: (n, 2), m, robot's base frame, in the scan's order."""
     with np.errstate(invalid="ignore"):
         kept = (scan.ranges > 0) & (scan.ranges < max_range_m)
-    r, a = scan.ranges[kept], scan.angles[kept]
-    return transform(scan.mount, polar_points(r, a))
+    return transform(scan.mount, polar_points(scan.ranges[kept], scan.angles[kept]))

@@ -20,23 +20,12 @@ SHALLOW_RAD = 0.7
 
 
 def fully_visible(
-    sweep: Sweep,
-    first: Indices,
-    last: Indices,
-    fits: LineFits,
-    config: FrontEndConfig,
+    sweep: Sweep, first: Indices, last: Indices, fits: LineFits, config: FrontEndConfig
 ) -> Mask:
-    """Which segments show both ends of their wall.
+    """Which of m segments show both ends of their wall: neither is occluded or unknown.
 
-    Args:
-        sweep: all beams of the scan.
-        first: (m,) beam of each segment's first point, in increasing order.
-        last: (m,) beam of its last point.
-        fits: the m lines, laser frame.
-        config: ``split_m``, ``gap_m`` and ``gap_ratio``.
-
-    Returns:
-        (m,) True where neither end is occluded or unknown.
+    ``first`` and ``last`` (m,) are the beams of each segment's first and last point, in increasing
+    order.
     """
     real = _ends_real(sweep, np.array((first, last)), fits, config)
     r = sweep.ranges

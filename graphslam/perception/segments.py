@@ -17,7 +17,7 @@ from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.records import Observation
 from graphslam.perception.line_fit import LineFits, fit_lines, observations
-from graphslam.perception.line_moments import fitted_lines, mean_square, point_moments
+from graphslam.perception.line_moments import fitted_lines, mean_square
 from graphslam.perception.ordered_scan import Indices, Mask, Sweep
 from graphslam.perception.segment_ends import fully_visible
 
@@ -63,39 +63,27 @@ class Segments:
 
 
 def segments(sweep: Sweep, config: FrontEndConfig) -> tuple[Observation, ...]:
-    """Line segments of one scan, thesis 4.7.5-4.7.8.
+    """Line segments of one scan, thesis 4.7.5-4.7.8, laser frame, in the order of the beams.
 
-    Args:
-        sweep: one scan, in order.
-        config: thresholds and noise.
-
-    Returns:
-        Observations in the order of the beams, counter-clockwise, laser frame: ``segment`` where
-        both ends of the wall were seen, else ``line``.
+    Of kind ``segment`` where both ends of the wall were seen, else ``line``.
     """
     found = find_segments(sweep, config)
-    if found is None:
-        return ()
     return observations(found.fits[found.valid], found.whole[found.valid], config)
 
 
-def find_segments(sweep: Sweep, config: FrontEndConfig) -> Segments | None:
-    """The segments of one scan with their returns; None where there are none."""
-    moments = point_moments(sweep.points)
-    pieces = _split(sweep, moments, config)
+def find_segments(sweep: Sweep, config: FrontEndConfig) -> Segments:
+    """The segments of one scan with their returns."""
+    pieces = _split(sweep, config)
     # Twice: an object in front of a wall keeps the parts of the wall from being neighbours, and can
     # be distinguished from small pieces of the wall only after those have been merged.
-    pieces = _merge(pieces, sweep, moments, config)
+    pieces = _merge(pieces, sweep, config)
     pieces = pieces[pieces.moments[0] >= fewest_points(config)]
-    pieces = _merge(pieces, sweep, moments, config)
-    if not len(pieces.first):
-        return None
-    rows, starts = _members(pieces, sweep, moments, config)
-    if not len(starts):
-        return None
+    pieces = _merge(pieces, sweep, config)
+    rows, counts = _members(pieces, sweep, config)
+    starts = np.cumsum(counts) - counts
     fits = fit_lines(sweep.points[rows], starts, config)
-    stops = np.append(starts[1:], len(rows)) - 1
-    whole = fully_visible(sweep, sweep.beam[rows[starts]], sweep.beam[rows[stops]], fits, config)
+    last = starts + counts - 1
+    whole = fully_visible(sweep, sweep.beam[rows[starts]], sweep.beam[rows[last]], fits, config)
     return Segments(rows, starts, fits, whole, valid_lines(fits, config))
 
 
@@ -122,10 +110,7 @@ def _misfit(pieces: Array, unions: Array, config: FrontEndConfig) -> Array:
     deviation over that from its own line is limited too: n times it is chi-square with two degrees
     of freedom if there is one wall, plus an allowance for walls that are not flat.
 
-    Args:
-        pieces: (6, p), moments.
-        unions: (6, p - 1), moments of neighbours together.
-        config: ``split_m`` and ``range_sigma_m``.
+    ``pieces`` (6, p) and ``unions`` of neighbours (6, p - 1) are given by their moments.
     """
     p = pieces.shape[1]
     everything = np.concatenate((pieces, unions), axis=1)
@@ -161,7 +146,7 @@ def _chain_starts(sweep: Sweep, config: FrontEndConfig) -> Indices:
     return np.concatenate(([0], np.flatnonzero(cut) + 1))
 
 
-def _split(sweep: Sweep, moments: Array, config: FrontEndConfig) -> Pieces:
+def _split(sweep: Sweep, config: FrontEndConfig) -> Pieces:
     """Pieces within split_m of the chord between their ends: thesis 4.7.6, steps 0 to 3.
 
     The thesis splits by the recursion of Douglas and Peucker. So does OpenCV, which then drops
@@ -186,11 +171,11 @@ def _split(sweep: Sweep, moments: Array, config: FrontEndConfig) -> Pieces:
     chain = np.repeat(np.arange(len(chains)), [len(c) for c in chains])
     same = chain[1:] == chain[:-1]
     first, last = vertex[:-1][same], vertex[1:][same]
-    sums = np.cumsum(moments, axis=1)
-    return Pieces(first, last, sums[:, last] - sums[:, first] + moments[:, first])
+    sums = np.cumsum(sweep.moments, axis=1)
+    return Pieces(first, last, sums[:, last] - sums[:, first] + sweep.moments[:, first])
 
 
-def _merge(pieces: Pieces, sweep: Sweep, moments: Array, config: FrontEndConfig) -> Pieces:
+def _merge(pieces: Pieces, sweep: Sweep, config: FrontEndConfig) -> Pieces:
     """Neighbours joined while the line through both fits each of them: thesis 4.7.6.
 
     Of two unions that share a piece the better one is made first, so the result does not depend on
@@ -199,7 +184,7 @@ def _merge(pieces: Pieces, sweep: Sweep, moments: Array, config: FrontEndConfig)
     while len(pieces.first) > 1:
         a, b = pieces[:-1], pieces[1:]
         shared = a.last == b.first
-        union = a.moments + b.moments - shared * moments[:, b.first]
+        union = a.moments + b.moments - shared * sweep.moments[:, b.first]
         cost = _misfit(pieces.moments, union, config)
         cost[cost > 1] = np.inf
         for i in np.flatnonzero(np.isfinite(cost) & ~shared).tolist():
@@ -234,17 +219,15 @@ def _bridged(pieces: Pieces, i: int, sweep: Sweep, config: FrontEndConfig) -> bo
     return not np.any(left < -2 * config.split_m)  # missing returns, NaN, compare False
 
 
-def _members(
-    pieces: Pieces, sweep: Sweep, moments: Array, config: FrontEndConfig
-) -> tuple[Indices, Indices]:
-    """Rows of the returns of each segment, one after the other, and where each begins.
+def _members(pieces: Pieces, sweep: Sweep, config: FrontEndConfig) -> tuple[Indices, Indices]:
+    """Rows of the returns of each segment, one after the other, and how many each has (m,).
 
     Returns farther than split_m from the segment's line are left out: a pole in front of the wall,
     mixed pixels. The line is fitted without the end points, which are the doubtful ones; a return
     that two pieces share goes to the closer line. Segments with too few returns are dropped.
     """
-    inner = pieces.moments - moments[:, pieces.first] - moments[:, pieces.last]
-    line = fitted_lines(inner)
+    moments = sweep.moments
+    line = fitted_lines(pieces.moments - moments[:, pieces.first] - moments[:, pieces.last])
     counts = pieces.last - pieces.first + 1
     owner = np.repeat(np.arange(len(counts)), counts)
     rows = np.arange(len(owner)) + (pieces.first + counts - np.cumsum(counts))[owner]
@@ -253,7 +236,5 @@ def _members(
     shared = np.flatnonzero(rows[1:] == rows[:-1])
     near[np.where(square[shared] <= square[shared + 1], shared + 1, shared)] = False
     size = np.bincount(owner[near], minlength=len(counts))
-    near &= (size >= fewest_points(config))[owner]
-    rows, owner = rows[near], owner[near]
-    starts = np.flatnonzero(owner[1:] != owner[:-1]) + 1
-    return rows, np.concatenate(([0], starts)) if len(rows) else starts
+    enough = size >= fewest_points(config)
+    return rows[near & enough[owner]], size[enough]

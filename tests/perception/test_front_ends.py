@@ -12,7 +12,7 @@ from graphslam.core.config import FrontEndConfig
 from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import compose, rotate_cov, rotation, wrap
 from graphslam.perception.front_ends import FRONT_ENDS
-from graphslam.perception.line_fit import fit_line, fit_lines
+from graphslam.perception.line_fit import fit_lines, observations
 from graphslam.perception.ordered_scan import scan_points
 
 segments = FRONT_ENDS["segments"]
@@ -21,6 +21,12 @@ HONEST = FrontEndConfig(floor_normal_m=0.0, floor_angle_rad=0.0)
 FRONT_WALL = [[3.0, -1.0], [3.0, 1.0]]
 BACK_WALL = [[8.0, -60.0], [8.0, 60.0]]
 ROOM = [[[-1, -2], [4, -2]], [[4, -2], [4, 3]], [[4, 3], [-1, 3]], [[-1, 3], [-1, -2]]]
+
+
+def fit_line(points, config, fully_visible):
+    """One line through points (k, 2), m, laser frame, in the order of the beams."""
+    fits = fit_lines(points, np.zeros(1, dtype=np.intp), config)
+    return observations(fits, np.array([fully_visible]), config)[0]
 
 
 # ---------------------------------------------------------------- the table's contract
