@@ -14,8 +14,7 @@ from graphslam.core.config import Config
 from graphslam.core.config_io import load_config
 from graphslam.core.errors import ConfigError
 from graphslam.simulation import load_scenario
-from graphslam.simulation.errors import ScenarioError
-from graphslam.simulation.scenario import NOT_NEGATIVE, POSITIVE, Point
+from graphslam.simulation.scenario import NOT_NEGATIVE, POSITIVE, Point, ScenarioError
 from graphslam.simulation.scenario_parser import build
 
 _FOLDER = Path(__file__).parent / "experiments"

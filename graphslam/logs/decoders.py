@@ -2,6 +2,7 @@
 
 A decoder is a function of the message and of the topic's `TopicContext`. It raises
 `UnusableMessageError` with a reason when the message must be dropped; the caller counts reasons.
+Every decoder requires finite numbers and positive definite covariances.
 """
 
 import math
@@ -58,9 +59,6 @@ def scan(message: Any, topic: TopicContext) -> records.Scan:
 
     ROS uses inf and NaN for no return, many drivers use 0. Negative ranges and ranges above
     `MAX_RANGE_M` are driver errors: these beams are dropped and counted.
-
-    Raises:
-        UnusableMessageError: no beams, or an angle increment that is zero or not finite.
     """
     ranges = np.asarray(message.ranges, dtype=float)
     start, step = float(message.angle_min), float(message.angle_increment)
@@ -69,16 +67,14 @@ def scan(message: Any, topic: TopicContext) -> records.Scan:
     if not (np.isfinite(start) and np.isfinite(step) and step):
         raise UnusableMessageError("scan: angle increment is zero or angles are not finite")
     finite = np.isfinite(ranges)
-    negative, absurd = finite & (ranges < 0), finite & (ranges > MAX_RANGE_M)
-    if not finite.all():
-        nan = int(np.isnan(ranges).sum())
-        infinite = len(ranges) - int(finite.sum()) - nan
-        topic.beams.update({"range: NaN": nan} if nan else {})
-        topic.beams.update({"range: infinite": infinite} if infinite else {})
-    if negative.any():
-        topic.beams["range: negative"] += int(negative.sum())
-    if absurd.any():
-        topic.beams["range: absurd"] += int(absurd.sum())
+    for defect, beams in (
+        ("NaN", np.isnan(ranges)),
+        ("infinite", np.isinf(ranges)),
+        ("negative", finite & (ranges < 0)),
+        ("absurd", finite & (ranges > MAX_RANGE_M)),
+    ):
+        if beams.any():
+            topic.beams[f"range: {defect}"] += int(beams.sum())
     low, high = float(message.range_min), float(message.range_max)
     usable = finite & (ranges > 0) & (ranges <= MAX_RANGE_M) & (ranges < topic.no_return_m)
     # limits of 0, NaN or inf were not set by the driver: no limit
@@ -94,17 +90,12 @@ def scan(message: Any, topic: TopicContext) -> records.Scan:
     if step < 0:
         start, step = start + step * (len(ranges) - 1), -step
         ranges = ranges[::-1].copy()
-    stamp = stamp_of(message)
     mount = topic.mounts.get(frame, _NO_MOUNT)
-    return records.Scan(topic.robot, stamp, stamp, ranges, start, step, mount)
+    return records.Scan(*_source(message, topic), ranges, start, step, mount)
 
 
 def odometry(message: schemas.PlanarOdometry, topic: TopicContext) -> records.OdometryPose:
-    """nav_msgs/Odometry: the pose (3,) of the base in the odometry frame.
-
-    Raises:
-        UnusableMessageError: the pose is not finite or its quaternion is not a rotation.
-    """
+    """nav_msgs/Odometry: the pose (3,) of the base in the odometry frame."""
     stamp, x, y, (q_x, q_y, q_z, q_w) = message
     norm = q_x * q_x + q_y * q_y + q_z * q_z + q_w * q_w
     if not 0.5 < norm < 2.0:  # also false for NaN
@@ -116,44 +107,29 @@ def odometry(message: schemas.PlanarOdometry, topic: TopicContext) -> records.Od
 
 
 def joint_state(message: Any, topic: TopicContext) -> records.WheelAngles:
-    """sensor_msgs/JointState: the angles of the left and the right wheel, rad.
-
-    Raises:
-        UnusableMessageError: a wheel is missing or named twice, or its angle is not finite.
-    """
+    """sensor_msgs/JointState: the angles of the left and the right wheel, rad."""
     positions = dict(zip(message.name, np.asarray(message.position).tolist(), strict=False))
     left = _joint(positions, topic.left_joint, "left")
     right = _joint(positions, topic.right_joint, "right")
     _check_finite("joints", np.array([left, right]))
-    stamp = stamp_of(message)
-    return records.WheelAngles(topic.robot, stamp, stamp, left, right)
+    return records.WheelAngles(*_source(message, topic), left, right)
 
 
 def sighting(message: Any, topic: TopicContext) -> records.Sighting:
-    """graphslam_msgs/Sighting.
-
-    Raises:
-        UnusableMessageError: a number is not finite, or the range or covariance is not positive.
-    """
+    """graphslam_msgs/Sighting: bearing rad, range m and, if measured, direction rad."""
     size = 2 if np.isnan(message.direction) else 3
     z = np.array([message.bearing, message.range, message.direction])[:size]
     cov = _covariance("sighting", message.covariance, size)
     _check_finite("sighting", z)
     if z[1] <= 0:
         raise UnusableMessageError("sighting: range is not positive")
-    stamp = stamp_of(message)
     mount = topic.mounts.get(frame_of(message), _NO_MOUNT)
     identity, seen = message.identity or None, message.robot or None
-    return records.Sighting(topic.robot, stamp, stamp, z, cov, identity, seen, mount)
+    return records.Sighting(*_source(message, topic), z, cov, identity, seen, mount)
 
 
 def odometry_increment(message: Any, topic: TopicContext) -> records.OdometryIncrement:
-    """graphslam_msgs/OdometryIncrement.
-
-    Raises:
-        UnusableMessageError: its end is not after its start, a number is not finite, or the
-            covariance is not positive definite.
-    """
+    """graphslam_msgs/OdometryIncrement; it must end after its start."""
     start, stamp = schemas.stamp_ns(message.start), stamp_of(message)
     if stamp <= start:
         raise UnusableMessageError("increment: does not end after its start")
@@ -163,34 +139,21 @@ def odometry_increment(message: Any, topic: TopicContext) -> records.OdometryInc
 
 
 def relative_pose(message: Any, topic: TopicContext) -> records.RelativePose:
-    """graphslam_msgs/RelativePose.
-
-    Raises:
-        UnusableMessageError: a number is not finite, or the covariance is not positive definite.
-    """
-    start, stamp = schemas.stamp_ns(message.start), stamp_of(message)
+    """graphslam_msgs/RelativePose; without another robot it is relative to the robot itself."""
+    start = schemas.stamp_ns(message.start)
     delta = _pose("relative pose", message)
     cov = _covariance("relative pose", message.covariance, 3)
     other = message.other or topic.robot
-    return records.RelativePose(topic.robot, stamp, stamp, other, start, delta, cov)
+    return records.RelativePose(*_source(message, topic), other, start, delta, cov)
 
 
 def true_pose(message: Any, topic: TopicContext) -> records.Truth:
-    """graphslam_msgs/TruePose.
-
-    Raises:
-        UnusableMessageError: the pose is not finite.
-    """
-    stamp = stamp_of(message)
-    return records.Truth(topic.robot, stamp, stamp, _pose("truth", message))
+    """graphslam_msgs/TruePose: pose (3,) of the base in the world frame."""
+    return records.Truth(*_source(message, topic), _pose("truth", message))
 
 
 def true_landmark(message: Any, _topic: TopicContext) -> records.TrueLandmark:
-    """graphslam_msgs/TrueLandmark.
-
-    Raises:
-        UnusableMessageError: unknown kind, position not finite, or extent of a wrong size.
-    """
+    """graphslam_msgs/TrueLandmark; ``phi`` of a point may be NaN."""
     if message.kind not in ("point", "segment", "line"):
         raise UnusableMessageError("true landmark: kind is not point, segment or line")
     pose = np.array([message.x, message.y, message.phi])
@@ -204,16 +167,11 @@ def true_landmark(message: Any, _topic: TopicContext) -> records.TrueLandmark:
 
 
 def true_associations(message: Any, topic: TopicContext) -> records.TrueAssociations:
-    """graphslam_msgs/TrueAssociations.
-
-    Raises:
-        UnusableMessageError: a target is not among the names.
-    """
+    """graphslam_msgs/TrueAssociations; every target must be among the names."""
     names, targets = tuple(message.names), np.asarray(message.targets, dtype=np.int64)
     if len(targets) and not -1 <= targets.min() <= targets.max() < len(names):
         raise UnusableMessageError("true associations: a target is not among the names")
-    stamp = stamp_of(message)
-    return records.TrueAssociations(topic.robot, stamp, stamp, names, targets)
+    return records.TrueAssociations(*_source(message, topic), names, targets)
 
 
 DECODERS: dict[str, Decoder] = {
@@ -239,6 +197,12 @@ def stamp_of(message: Any) -> int:
 def frame_of(message: Any) -> str:
     """Frame of a message's header, without the leading slash that ROS 1 tools write."""
     return str(message.header.frame_id).lstrip("/")
+
+
+def _source(message: Any, topic: TopicContext) -> tuple[str, int, int]:
+    """The first fields of every record: robot, stamp and time, which is the stamp at first."""
+    stamp = stamp_of(message)
+    return topic.robot, stamp, stamp
 
 
 def _check_finite(what: str, values: Array) -> None:

@@ -24,7 +24,6 @@ from graphslam.logs.writer import DEFAULT_ROBOT, LogWriter
 
 Ranges = NDArray[np.float32]
 
-_ROBOT = DEFAULT_ROBOT
 _TRAILER = 3  # fields at the end: ipc time, host, logger time
 _SCAN_TAIL = 6  # fields after the ranges: laser pose and odometry pose
 _SAMPLE_EVERY = 20  # every 20th scan is searched for the no-return value
@@ -38,10 +37,6 @@ class _Odometry(NamedTuple):
 class _Scan(NamedTuple):
     stamp_ns: int
     ranges: Ranges
-
-
-class _LaserOffset(NamedTuple):
-    forward_m: float
 
 
 def import_carmen(source: Path, target: Path) -> ImportSummary:
@@ -58,22 +53,24 @@ def import_carmen(source: Path, target: Path) -> ImportSummary:
     malformed: Counter[str] = Counter()
     # all in memory, about 4 bytes per beam: the log times are computed from the end
     entries = list(_entries(source, malformed))
-    offsets = [entry.forward_m for entry in entries if isinstance(entry, _LaserOffset)]
-    stamped = [entry for entry in entries if not isinstance(entry, _LaserOffset)]
+    offsets = [entry for entry in entries if isinstance(entry, float)]
+    stamped = [entry for entry in entries if not isinstance(entry, float)]
     if not stamped:
         raise LogError(f"{source}: has no readable FLASER or ODOM line; is it CARMEN? Name the log")
-    log_times = _recording_times([entry.stamp_ns for entry in stamped])
+    # log times that never decrease, so that readers keep the order of the file: a line was written
+    # before all lines after it, hence not later than the earliest of their stamps
+    log_times = list(accumulate((entry.stamp_ns for entry in reversed(stamped)), min))[::-1]
     range_max = _range_max([entry.ranges for entry in stamped if isinstance(entry, _Scan)])
     notes = {"format": "carmen", "source": source.name, "stamps": "ipc time, exact"}
     with LogWriter(target, notes) as log:
-        log.mount(_ROBOT, log_times[0], (offsets[-1] if offsets else 0.0, 0.0, 0.0))
+        log.mount(DEFAULT_ROBOT, log_times[0], (offsets[-1] if offsets else 0.0, 0.0, 0.0))
         for entry, log_time_ns in zip(stamped, log_times, strict=True):
             if isinstance(entry, _Odometry):
-                log.odometry(_ROBOT, entry.stamp_ns, entry.pose, log_time_ns=log_time_ns)
+                log.odometry(DEFAULT_ROBOT, entry.stamp_ns, entry.pose, log_time_ns=log_time_ns)
             else:
                 start, step = _beam_angles(len(entry.ranges))
                 log.scan(
-                    _ROBOT,
+                    DEFAULT_ROBOT,
                     entry.stamp_ns,
                     entry.ranges,
                     angle_min_rad=start,
@@ -83,14 +80,6 @@ def import_carmen(source: Path, target: Path) -> ImportSummary:
                 )
     warnings = [f"{source}: {n} {tag} lines cannot be read" for tag, n in sorted(malformed.items())]
     return ImportSummary(source, target, log.counts, tuple(warnings))
-
-
-def _recording_times(stamps_ns: Sequence[int]) -> list[int]:
-    """Log times that never decrease, so that readers keep the order of the file.
-
-    A line was written before all lines after it, hence not later than the earliest of their stamps.
-    """
-    return list(accumulate(reversed(stamps_ns), min))[::-1]
 
 
 def _range_max(scans: Sequence[Ranges]) -> float:
@@ -123,8 +112,11 @@ def _beam_angles(beams: int) -> tuple[float, float]:
     return -np.pi / 2, np.pi / (beams - beams % 2) if beams > 1 else np.pi
 
 
-def _entries(source: Path, malformed: Counter[str]) -> Iterator[_Odometry | _Scan | _LaserOffset]:
-    """The parsed lines of a log in the order of the file; malformed lines are counted by tag."""
+def _entries(source: Path, malformed: Counter[str]) -> Iterator[_Odometry | _Scan | float]:
+    """The parsed lines of a log in the order of the file; malformed lines are counted by tag.
+
+    A number is the distance, m, of the laser ahead of the base.
+    """
     for line in text_lines(source):
         fields = line.split()
         if not fields or fields[0] not in _PARSERS:
@@ -155,12 +147,12 @@ def _scan(fields: list[str]) -> _Scan:
     return _Scan(parse_stamp_ns(fields[-_TRAILER]), ranges)
 
 
-def _parameter(fields: list[str]) -> _LaserOffset | None:
+def _parameter(fields: list[str]) -> float | None:
     """PARAM name value ipc_timestamp host logger_timestamp."""
-    return _LaserOffset(float(fields[2])) if fields[1] == "robot_frontlaser_offset" else None
+    return float(fields[2]) if fields[1] == "robot_frontlaser_offset" else None
 
 
-_PARSERS: dict[str, Callable[[list[str]], _Odometry | _Scan | _LaserOffset | None]] = {
+_PARSERS: dict[str, Callable[[list[str]], _Odometry | _Scan | float | None]] = {
     "ODOM": _odometry,
     "FLASER": _scan,
     "PARAM": _parameter,

@@ -11,8 +11,7 @@ import heapq
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from functools import partial
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from graphslam.core.geometry import Array, compose, exp
 from graphslam.logs.import_carmen import parse_stamp_ns
 from graphslam.logs.import_summary import ImportSummary
 from graphslam.logs.source_files import first_and_all, text_files
-from graphslam.logs.writer import LogWriter
+from graphslam.logs.writer import Event, LogWriter
 
 #: subjects 1 .. 5 are robots, the others landmarks; part of the format
 ROBOTS = 5
@@ -50,8 +49,6 @@ _FILES = re.compile(
 )
 
 Rows = list[tuple[int, list[float]]]
-#: stamp ns, and what writes the message
-Entry = tuple[int, Callable[[LogWriter], None]]
 
 
 def import_mrclam(source: Path, target: Path) -> ImportSummary:
@@ -79,7 +76,7 @@ def import_mrclam(source: Path, target: Path) -> ImportSummary:
         raise LogError(f"{source}: has no Barcodes.dat, the table of barcodes; add it")
     problems: Counter[str] = Counter()
     subjects = _subjects(texts["Barcodes.dat"], problems)
-    streams: list[Iterator[Entry]] = []
+    streams: list[Iterator[Event]] = []
     for number in sorted(numbers):
         files = {kind: f"Robot{number}_{kind}.dat" for kind in ("Odometry", "Measurement")}
         truth = f"Robot{number}_Groundtruth.dat"
@@ -89,8 +86,8 @@ def import_mrclam(source: Path, target: Path) -> ImportSummary:
         streams.append(_sightings(number, seen, subjects, problems))
         streams.append(_truth(number, _rows(truth, texts, 3, problems)))
         problems.update({f"{name} is missing": 1 for name in files.values() if name not in texts})
-    (first_ns, _), entries = first_and_all(
-        heapq.merge(*streams, key=lambda entry: entry[0]),
+    first, events = first_and_all(
+        heapq.merge(*streams, key=lambda event: event.stamp_ns),
         f"{source}: no line of its files can be read; is it MRCLAM?",
     )
     notes = {
@@ -103,9 +100,9 @@ def import_mrclam(source: Path, target: Path) -> ImportSummary:
     }
     with LogWriter(target, notes) as log:
         for subject, x, y in _landmarks(texts.get("Landmark_Groundtruth.dat", ""), problems):
-            log.true_landmark(first_ns, str(subject), "point", (x, y, np.nan))
-        for _, write in entries:
-            write(log)
+            log.true_landmark(first.stamp_ns, str(subject), "point", (x, y, np.nan))
+        for event in events:
+            event.write(log)
     warnings = [f"{source}: {n} x {reason}" for reason, n in sorted(problems.items())]
     return ImportSummary(source, target, log.counts, tuple(warnings))
 
@@ -113,7 +110,7 @@ def import_mrclam(source: Path, target: Path) -> ImportSummary:
 # ---------------------------------------------------------------- messages of one robot
 
 
-def _odometry(number: int, rows: Rows) -> Iterator[Entry]:
+def _odometry(number: int, rows: Rows) -> Iterator[Event]:
     """Poses that result from the velocities, each of which holds until the next row."""
     times = np.array([stamp for stamp, _ in rows], dtype=np.int64)
     seconds = np.diff(times) * 1e-9
@@ -121,11 +118,7 @@ def _odometry(number: int, rows: Rows) -> Iterator[Entry]:
     twists = np.column_stack([speeds[:, 0], np.zeros(len(speeds)), speeds[:, 1]])
     poses = _integrate(twists * seconds[:, None])
     for k in _thinned(times.tolist()):
-        stamp_ns, pose = int(times[k]), poses[k]
-        yield (
-            stamp_ns,
-            partial(LogWriter.odometry, robot=_name(number), stamp_ns=stamp_ns, pose=pose),
-        )
+        yield Event.of(LogWriter.odometry, _name(number), int(times[k]), pose=poses[k])
 
 
 def _thinned(times: list[int]) -> Iterator[int]:
@@ -149,7 +142,7 @@ def _integrate(twists: Array) -> Array:
 
 def _sightings(
     number: int, rows: Rows, subjects: Mapping[int, int], problems: Counter[str]
-) -> Iterator[Entry]:
+) -> Iterator[Event]:
     """Sightings of subjects; unknown barcodes and the robot's own are counted."""
     for stamp_ns, (barcode, range_m, bearing) in rows:
         subject = subjects.get(int(barcode))
@@ -161,23 +154,20 @@ def _sightings(
             problems[f"sighting by {_name(number)} with a range that is not positive"] += 1
         else:
             sigmas = [BEARING_SIGMA_RAD, RANGE_SIGMA_M + RANGE_SIGMA_SHARE * range_m]
-            yield (
+            yield Event.of(
+                LogWriter.sighting,
+                _name(number),
                 stamp_ns,
-                partial(
-                    LogWriter.sighting,
-                    robot=_name(number),
-                    stamp_ns=stamp_ns,
-                    z=(bearing, range_m),
-                    cov=np.diag(np.square(sigmas)),
-                    identity=None if subject <= ROBOTS else str(subject),
-                    seen_robot=_name(subject) if subject <= ROBOTS else None,
-                ),
+                z=(bearing, range_m),
+                cov=np.diag(np.square(sigmas)),
+                identity=None if subject <= ROBOTS else str(subject),
+                seen_robot=_name(subject) if subject <= ROBOTS else None,
             )
 
 
-def _truth(number: int, rows: Rows) -> Iterator[Entry]:
+def _truth(number: int, rows: Rows) -> Iterator[Event]:
     for stamp_ns, pose in rows:
-        yield stamp_ns, partial(LogWriter.truth, robot=_name(number), stamp_ns=stamp_ns, pose=pose)
+        yield Event.of(LogWriter.truth, _name(number), stamp_ns, pose=pose)
 
 
 def _name(subject: int) -> str:

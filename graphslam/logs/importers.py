@@ -2,8 +2,8 @@
 
 from graphslam.logs.import_carmen import import_carmen
 from graphslam.logs.import_mrclam import import_mrclam
-from graphslam.logs.import_pose_graph import import_pose_graph, pose_stamp_ns
-from graphslam.logs.import_summary import Importer, ImportSummary
+from graphslam.logs.import_pose_graph import import_pose_graph
+from graphslam.logs.import_summary import Importer
 from graphslam.logs.import_tinyslam import import_tinyslam
 
 IMPORTERS: dict[str, Importer] = {
@@ -13,5 +13,3 @@ IMPORTERS: dict[str, Importer] = {
     "mrclam": import_mrclam,
     "tinyslam": import_tinyslam,
 }
-
-__all__ = ["IMPORTERS", "ImportSummary", "Importer", "pose_stamp_ns"]

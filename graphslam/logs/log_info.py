@@ -1,8 +1,8 @@
 """Contents and defects of logs, as printed by `graphslam info`."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,9 @@ from graphslam.core.errors import LogError
 from graphslam.core.geometry import Array, between
 from graphslam.logs import time_order
 from graphslam.logs.decoders import TopicContext
-from graphslam.logs.future_stamps import repair_future_stamps
-from graphslam.logs.log_set import LogFile, decode_message, describe_damage
-from graphslam.logs.mcap_file import McapFile, open_mcap, raw_messages
+from graphslam.logs.future_stamps import Recorded
+from graphslam.logs.log_set import FileReader, LogFile, damage, merged_notes
+from graphslam.logs.mcap_file import McapFile, open_mcap
 from graphslam.logs.schemas import SIGHTING
 from graphslam.logs.topic_context import ScanShape, scan_shape, topic_contexts
 from graphslam.logs.topics import (
@@ -119,7 +119,7 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
         LogError: a file is missing, not MCAP or without a message.
     """
     files = [open_mcap(Path(path)) for path in paths]
-    warnings = [*config.warnings, *(describe_damage(file) for file in files if file.damage)]
+    warnings = [*config.warnings, *damage(files)]
     topics: list[Topic] = []
     chosen: list[Topic] = []
     problem = ""
@@ -132,7 +132,7 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
     contexts, assumed = topic_contexts(files, topics, config)
     dropped: Counter[str] = Counter()
     readings = {
-        topic.name: _read_topic(files, topic, contexts[topic.name], config, dropped)
+        topic.name: _read_topic(files, topic, contexts, config, dropped)
         for topic in topics
         if topic.count
     }
@@ -146,14 +146,11 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
         _robot_info(name, topics, chosen, readings, config.robot(name))
         for name in sorted({t.robot for t in topics if t.record is not records.TrueLandmark})
     ]
-    notes: dict[str, str] = {}
-    for file in files:
-        notes |= file.notes
     return LogInfo(
-        files=tuple(LogFile(f.path, f.sha256, f.messages, f.lost) for f in files),
+        files=tuple(map(LogFile.of, files)),
         topics=tuple(sorted(infos, key=lambda info: info.name)),
         robots=tuple(robots),
-        notes=notes,
+        notes=merged_notes(files),
         dropped=dict(dropped),
         warnings=tuple(warnings + assumed + _defects(infos, robots)),
         problem=problem,
@@ -167,51 +164,49 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
 class _Reading:
     """Data kept from one pass over a topic."""
 
-    stamps_ns: list[int]
-    times_ns: list[int]
-    motion: list[Array]  # poses, increments or wheel angles, in time order
-    beams: int
-    empty_beams: int
-    counts: Counter[str]
+    stamps_ns: list[int] = field(default_factory=list)  # in the order of recording
+    times_ns: list[int] = field(default_factory=list)  # sorted
+    motion: list[Array] = field(default_factory=list)  # poses, increments or wheel angles
+    beams: int = 0
+    empty_beams: int = 0
+    counts: Counter[str] = field(default_factory=Counter)
+
+    def add_recorded(self, recorded: Iterable[Recorded]) -> Iterator[Recorded]:
+        """Count stamps and beams of messages in the order of recording, and pass them on."""
+        for topic, message, log_time_ns in recorded:
+            self.stamps_ns.append(message.stamp_ns)
+            if isinstance(message, records.Scan):
+                self.beams += len(message.ranges)
+                self.empty_beams += int(np.isnan(message.ranges).sum())
+            yield topic, message, log_time_ns
+
+    def add_sorted(self, message: records.Message) -> None:
+        """Keep time and motion of the next message in the order of time."""
+        self.times_ns.append(message.time_ns)
+        if isinstance(message, records.OdometryPose):
+            self.motion.append(message.pose)
+        elif isinstance(message, records.OdometryIncrement):
+            self.motion.append(message.delta)
+        elif isinstance(message, records.WheelAngles):
+            self.motion.append(np.array([message.left_rad, message.right_rad]))
 
 
 def _read_topic(
     files: Sequence[McapFile],
     topic: Topic,
-    context: TopicContext,
+    contexts: Mapping[str, TopicContext],
     config: Config,
     dropped: Counter[str],
 ) -> _Reading:
-    reading = _Reading([], [], [], 0, 0, Counter())
+    reading = _Reading()
     for file in files:
-        sorter = time_order.MessageSorter(round(config.logs.reorder_s * 1e9))
-        decoded = (
-            (topic.name, message, raw.log_time_ns)
-            for raw in raw_messages(file, {topic.name})
-            if (message := decode_message(raw, topic, context, dropped)) is not None
-        )
-        for _, message, _ in repair_future_stamps(decoded, time_order.SAMPLED):
-            reading.stamps_ns.append(message.stamp_ns)
-            if isinstance(message, records.Scan):
-                reading.beams += len(message.ranges)
-                reading.empty_beams += int(np.isnan(message.ranges).sum())
-            for placed in sorter.push(topic.name, message):
-                _add_placed(reading, placed)
-        for placed in sorter.finish():
-            _add_placed(reading, placed)
-        reading.counts += sorter.counts.get(topic.name, Counter())
-    dropped.update(context.beams)
+        reader = FileReader(file, config)
+        recorded = reader.recorded({topic.name: topic}, contexts)
+        for message in reader.sorted(reading.add_recorded(recorded)):
+            reading.add_sorted(message)
+        reading.counts += reader.sorter.counts.get(topic.name, Counter())
+        dropped.update(reader.dropped)
     return reading
-
-
-def _add_placed(reading: _Reading, message: records.Message) -> None:
-    reading.times_ns.append(message.time_ns)
-    if isinstance(message, records.OdometryPose):
-        reading.motion.append(message.pose)
-    elif isinstance(message, records.OdometryIncrement):
-        reading.motion.append(message.delta)
-    elif isinstance(message, records.WheelAngles):
-        reading.motion.append(np.array([message.left_rad, message.right_rad]))
 
 
 def _topic_info(
@@ -221,7 +216,7 @@ def _topic_info(
     reading: _Reading | None,
     contexts: Mapping[str, TopicContext],
 ) -> TopicInfo:
-    if reading is None or not reading.stamps_ns:
+    if reading is None or not reading.times_ns:
         return TopicInfo(topic.name, topic.schema, topic.robot, used, topic.count)
     times = np.sort(np.array(reading.times_ns, dtype=np.int64))
     period_s = _median_period_s(times)

@@ -1,7 +1,7 @@
 """Logs opened together: their robots, topics and messages sorted by time."""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -30,6 +30,11 @@ class LogFile:
     messages: int
     lost: int | None
 
+    @classmethod
+    def of(cls, file: McapFile) -> "LogFile":
+        """The summary of an indexed file."""
+        return cls(file.path, file.sha256, file.messages, file.lost)
+
 
 @dataclass
 class LogSet:
@@ -44,6 +49,7 @@ class LogSet:
         dropped: number of dropped messages (of dropped beams, where the reason begins with
             ``range:``) by reason; filled when `messages` is exhausted.
         repaired: the same for messages that are used in spite of a defect.
+        opened: the indexed MCAP files, in the order of ``files``.
         config: the settings that the logs were opened with.
     """
 
@@ -54,17 +60,12 @@ class LogSet:
     warnings: list[str]
     dropped: Counter[str]
     repaired: Counter[str]
-    _mcap: Sequence[McapFile] = field(repr=False)
+    opened: Sequence[McapFile] = field(repr=False)
     _contexts: Mapping[str, TopicContext] = field(repr=False)
     config: Config = field(repr=False)
 
     def __post_init__(self) -> None:
         self._opening_warnings = len(self.warnings)
-
-    @property
-    def opened(self) -> Sequence[McapFile]:
-        """The opened MCAP files, in the order of ``files``."""
-        return self._mcap
 
     def has_scans(self, robot: str) -> bool:
         """Whether the logs hold laser scans of ``robot``."""
@@ -88,7 +89,7 @@ class LogSet:
         second process to read ahead, which pays if the caller takes all and works on each.
         """
         topics = {topic.name: topic for topic in self.topics if topic.record not in exclude}
-        self._update(_ReadReport(Counter(), Counter(), []))
+        self._update(_ReadReport())
         prefetch &= self.count(exclude) >= WORKER_MIN_MESSAGES
         for item in Prefetch(lambda: self._read(topics)) if prefetch else self._read(topics):
             if isinstance(item, _ReadReport):
@@ -98,15 +99,14 @@ class LogSet:
 
     def _read(self, topics: Mapping[str, Topic]) -> Iterator["Message | _ReadReport"]:
         """Messages of ``topics`` and, last, the report about all of them."""
-        window_ns = round(self.config.logs.reorder_s * 1e9)
-        readers = [_FileReader(file, time_order.MessageSorter(window_ns)) for file in self._mcap]
-        streams = [reader.messages(topics, self._contexts) for reader in readers]
+        readers = [FileReader(file, self.config) for file in self.opened]
+        streams = [reader.sorted(reader.recorded(topics, self._contexts)) for reader in readers]
         yield from time_order.merge(streams)
-        report = _ReadReport(Counter(), Counter(), [])
-        for file, reader in zip(self._mcap, readers, strict=True):
+        report = _ReadReport()
+        for reader in readers:
             report.dropped.update(reader.dropped)
             for topic, counts in sorted(reader.sorter.counts.items()):
-                report.warnings.extend(_stamp_warnings(file, topic, counts))
+                report.warnings.extend(_stamp_warnings(reader.file, topic, counts))
                 report.dropped[time_order.TOO_LATE] += counts.pop(time_order.TOO_LATE, 0)
                 report.repaired.update(counts)
         yield report
@@ -122,9 +122,9 @@ class LogSet:
 class _ReadReport:
     """What is known after all messages were read; see `LogSet`."""
 
-    dropped: Counter[str]
-    repaired: Counter[str]
-    warnings: list[str]
+    dropped: Counter[str] = field(default_factory=Counter)
+    repaired: Counter[str] = field(default_factory=Counter)
+    warnings: list[str] = field(default_factory=list)
 
 
 def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
@@ -142,34 +142,41 @@ def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
             raise LogError(f"{file.path}: is given twice; name each log once")
     topics, warnings = choose_topics(files, find_topics(files, config))
     contexts, assumed = topic_contexts(files, topics, config)
-    notes: dict[str, str] = {}
-    for file in files:
-        notes |= file.notes
     return LogSet(
         robots=tuple(sorted({t.robot for t in topics if t.record in ODOMETRY_KINDS})),
-        files=tuple(LogFile(f.path, f.sha256, f.messages, f.lost) for f in files),
+        files=tuple(map(LogFile.of, files)),
         topics=tuple(topics),
-        notes=notes,
-        warnings=[
-            *config.warnings,
-            *(describe_damage(file) for file in files if file.damage),
-            *warnings,
-            *assumed,
-        ],
+        notes=merged_notes(files),
+        warnings=[*config.warnings, *damage(files), *warnings, *assumed],
         dropped=Counter(),
         repaired=Counter(),
-        _mcap=files,
+        opened=files,
         _contexts=contexts,
         config=config,
     )
+
+
+def merged_notes(files: Iterable[McapFile]) -> dict[str, str]:
+    """The notes of all files; of notes with the same key that of the last file."""
+    return {key: note for file in files for key, note in file.notes.items()}
+
+
+def damage(files: Iterable[McapFile]) -> list[str]:
+    """One line about the losses in each damaged file."""
+    return [
+        f"{f.path}: damaged, {'an unknown number of' if f.lost is None else f.lost} messages are "
+        f"lost, {f.messages} are read: {f.damage}"
+        for f in files
+        if f.damage
+    ]
 
 
 def decode_message(
     raw: RawMessage, topic: Topic, context: TopicContext, dropped: Counter[str]
 ) -> Message | None:
     """The record of a raw message; None if it must be dropped, which is counted by reason."""
+    _, decode, deserialize = DECODERS[topic.schema]
     try:
-        _, decode, deserialize = DECODERS[topic.schema]
         data = deserialize(raw.data) if deserialize else schemas.decode(topic.schema, raw.data)
         return decode(data, context)
     except UnusableMessageError as reason:
@@ -179,27 +186,24 @@ def decode_message(
     return None
 
 
-@dataclass
-class _FileReader:
-    """One pass over the messages of one file."""
+class FileReader:
+    """One pass over the messages of one file.
 
-    file: McapFile
-    sorter: time_order.MessageSorter
-    dropped: Counter[str] = field(default_factory=Counter)
+    Attributes:
+        sorter: its counts are those of the messages sorted so far.
+        dropped: number of messages and beams dropped so far, by reason.
+    """
 
-    def messages(
-        self, topics: Mapping[str, Topic], contexts: Mapping[str, TopicContext]
-    ) -> Iterator[Message]:
-        """Sorted messages of ``topics``."""
-        recorded = self._recorded(topics, contexts)
-        for topic, message, _ in repair_future_stamps(recorded, time_order.SAMPLED):
-            yield from self.sorter.push(topic, message)
-        yield from self.sorter.finish()
+    def __init__(self, file: McapFile, config: Config) -> None:
+        """Prepare to read ``file`` with the window of ``config.logs``."""
+        self.file = file
+        self.sorter = time_order.MessageSorter(round(config.logs.reorder_s * 1e9))
+        self.dropped: Counter[str] = Counter()
 
-    def _recorded(
+    def recorded(
         self, topics: Mapping[str, Topic], contexts: Mapping[str, TopicContext]
     ) -> Iterator[Recorded]:
-        """Messages in the order of recording, with their topic and log time."""
+        """Messages of ``topics`` in the order of recording, with their topic and log time."""
         # decoders count dropped beams in the counter of this pass
         own = {name: replace(context, beams=self.dropped) for name, context in contexts.items()}
         for raw in raw_messages(self.file, topics.keys()):
@@ -207,29 +211,25 @@ class _FileReader:
             if message is not None:
                 yield raw.topic, message, raw.log_time_ns
 
+    def sorted(self, recorded: Iterable[Recorded]) -> Iterator[Message]:
+        """The messages in the order of their repaired times."""
+        for topic, message, _ in repair_future_stamps(recorded, time_order.SAMPLED):
+            yield from self.sorter.push(topic, message)
+        yield from self.sorter.finish()
+
+
+_STAMP_DEFECTS = {
+    time_order.GLITCH: "stamps contradict the order of recording; placed between their neighbours",
+    time_order.DUPLICATE: "messages repeat a stamp; kept",
+    time_order.TOO_LATE: "messages came too late and were dropped; raise logs.reorder_s to "
+    "keep them",
+}
+
 
 def _stamp_warnings(file: McapFile, topic: str, counts: Counter[str]) -> list[str]:
     """One line per kind of defect among the stamps of a topic."""
-    where = f"{file.path}: {topic}"
-    lines = []
-    if counts[time_order.GLITCH]:
-        lines.append(
-            f"{where}: {counts[time_order.GLITCH]} stamps contradict the order of recording; "
-            "placed between their neighbours"
-        )
-    if counts[time_order.DUPLICATE]:
-        lines.append(f"{where}: {counts[time_order.DUPLICATE]} messages repeat a stamp; kept")
-    if counts[time_order.TOO_LATE]:
-        lines.append(
-            f"{where}: {counts[time_order.TOO_LATE]} messages came too late and were dropped; "
-            "raise logs.reorder_s to keep them"
-        )
-    return lines
-
-
-def describe_damage(file: McapFile) -> str:
-    """One line about the losses in a damaged file."""
-    lost = "an unknown number of" if file.lost is None else str(file.lost)
-    return (
-        f"{file.path}: damaged, {lost} messages are lost, {file.messages} are read: {file.damage}"
-    )
+    return [
+        f"{file.path}: {topic}: {counts[kind]} {text}"
+        for kind, text in _STAMP_DEFECTS.items()
+        if counts[kind]
+    ]

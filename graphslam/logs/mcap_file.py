@@ -12,7 +12,7 @@ import struct
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from io import SEEK_CUR, BytesIO
+from io import SEEK_CUR, BufferedReader, BytesIO
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, TypeVar
@@ -22,15 +22,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import (
-    Channel,
-    Chunk,
-    McapRecord,
-    Message,
-    Metadata,
-    Schema,
-    Statistics,
-)
+from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema, Statistics
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.summary import Summary
 
@@ -306,7 +298,7 @@ def _block_messages(
 class _Indexer:
     """One pass over a file: `run` does it, the other methods are its steps."""
 
-    def __init__(self, path: Path, stream: BinaryIO) -> None:
+    def __init__(self, path: Path, stream: BufferedReader) -> None:
         self.path, self.stream = path, stream
         self.size = path.stat().st_size
         self.position = len(MAGIC)  # where the next record begins
@@ -370,12 +362,8 @@ class _Indexer:
 
     def close_loose_block(self) -> None:
         if self.loose:
-            messages = [message for _, message in self.loose]
-            self.add_block(
-                self.loose[0][0],
-                [message.channel_id for message in messages],
-                [message.log_time for message in messages],
-            )
+            times = [message.log_time for _, message in self.loose]
+            self.add_block(self.loose[0][0], [m.channel_id for _, m in self.loose], times)
             self.loose = []
 
     def recover(self, error: Exception) -> None:
@@ -409,20 +397,23 @@ class _Indexer:
         for block in self.blocks:
             counts.update(block.counts)
         known = {n: c for n, c in self.channels.items() if c.schema_id in self.schemas}
-        topics: dict[str, RawTopic] = {}
+        per_topic: Counter[str] = Counter()
         for number, channel in known.items():
-            before = topics[channel.topic].count if channel.topic in topics else 0
-            schema = self.schemas[channel.schema_id].name
-            topics[channel.topic] = RawTopic(
-                channel.topic, schema, channel.message_encoding, before + counts[number]
+            per_topic[channel.topic] += counts[number]
+        topics = {
+            c.topic: RawTopic(
+                c.topic, self.schemas[c.schema_id].name, c.message_encoding, per_topic[c.topic]
             )
+            for c in known.values()
+        }
         messages = sum(counts.values())
+        self.stream.seek(0)
         lost: int | None = None if self.damage else 0
         if self.statistics is not None:
             lost = max(0, self.statistics.message_count - messages)
         return McapFile(
             path=self.path,
-            sha256=_sha256(self.stream),
+            sha256=hashlib.file_digest(self.stream, "sha256").hexdigest(),
             topics=tuple(sorted(topics.values())),
             messages=messages,
             lost=lost,
@@ -432,14 +423,6 @@ class _Indexer:
             blocks=tuple(self.blocks),
             channels={number: channel.topic for number, channel in known.items()},
         )
-
-
-def _sha256(stream: BinaryIO) -> str:
-    stream.seek(0)
-    digest = hashlib.sha256()
-    while piece := stream.read(1 << 20):
-        digest.update(piece)
-    return digest.hexdigest()
 
 
 def _one_line(error: Exception) -> str:

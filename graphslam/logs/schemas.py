@@ -6,7 +6,8 @@ file, so that any ROS 2 or MCAP tool can decode them. docs/logs.md explains them
 """
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -164,10 +165,7 @@ def decode_true_poses(data: Sequence[bytes]) -> tuple[IntArray, Array]:
     """Stamps (n,) ns and poses (n, 3) of many `TRUE_POSE` messages at once.
 
     Ground truth of motion capture can be most of a log. Messages that differ in frame or byte order
-    are decoded one by one.
-
-    Raises:
-        CdrError: the bytes of a message are cut short or are not such a message.
+    are decoded one by one; those that cannot be decoded are left out.
     """
     first = data[0] if data else b""
     # CDR: four header bytes, the second is the byte order; 8-byte numbers are aligned, counted
@@ -193,8 +191,15 @@ def decode_true_poses(data: Sequence[bytes]) -> tuple[IntArray, Array]:
     return rows["sec"].astype(np.int64) * 1_000_000_000 + rows["nanosec"], rows["pose"].copy()
 
 
+def decode_all(schema: str, data: Iterable[bytes]) -> Iterator[Any]:
+    """The messages in ``data`` that can be decoded, see `decode`."""
+    for encoded in data:
+        with suppress(CdrError):
+            yield decode(schema, encoded)
+
+
 def _true_poses_singly(data: Sequence[bytes]) -> tuple[IntArray, Array]:
-    found = [decode(TRUE_POSE, d) for d in data]
+    found = list(decode_all(TRUE_POSE, data))
     stamps = np.array([stamp_ns(m.header.stamp) for m in found], dtype=np.int64)
     return stamps, np.array([(m.x, m.y, m.phi) for m in found], dtype=float).reshape(-1, 3)
 
@@ -229,11 +234,9 @@ def build(schema: str, **fields: Any) -> Any:
 
 def definition(schema: str) -> bytes:
     """The ros2msg text of ``schema`` with its nested types, as MCAP stores it."""
-    if schema in DEFINITIONS:
-        # our own text with its comments; rosbags generates the nested types
-        nested = _typestore().generate_msgdef(schema, ros_version=2)[0].partition("=" * 80)
-        return (DEFINITIONS[schema] + nested[1] + nested[2]).encode()
-    return _typestore().generate_msgdef(schema, ros_version=2)[0].encode()
+    own, separator, nested = _typestore().generate_msgdef(schema, 2)[0].partition("=" * 80)
+    # of our own types the text above, with its comments
+    return (DEFINITIONS.get(schema, own) + separator + nested).encode()
 
 
 def time(stamp_ns: int) -> Any:

@@ -8,28 +8,18 @@ import tarfile
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import chain
 from pathlib import Path, PurePosixPath
 from typing import TextIO, TypeVar
 
 from graphslam.core.errors import LogError
 
-_OPENERS: dict[str, Callable[..., TextIO]] = {
-    ".bz2": bz2.open,
-    ".gz": gzip.open,
-    ".xz": lzma.open,
-}
+_OPENERS: dict[str, Callable[..., TextIO]] = {".bz2": bz2.open, ".gz": gzip.open, ".xz": lzma.open}
 _ARCHIVE_SUFFIXES = {".zip", ".tar", ".tgz", ".tbz2", ".txz", *_OPENERS}
 _T = TypeVar("_T")
 
-_READ_ERRORS = (
-    OSError,
-    EOFError,
-    tarfile.TarError,
-    zipfile.BadZipFile,
-    lzma.LZMAError,
-    zlib.error,
-)
+_READ_ERRORS = (OSError, EOFError, tarfile.TarError, zipfile.BadZipFile, lzma.LZMAError, zlib.error)
 
 
 def text_lines(path: Path) -> Iterator[str]:
@@ -75,52 +65,38 @@ def text_files(source: Path, names: re.Pattern[str]) -> dict[str, str]:
     Raises:
         LogError: no such file, not readable to its end, or two files of the same name.
     """
+    texts: dict[str, str] = {}
     try:
-        if source.is_dir():
-            found = [(p.name, p.read_bytes) for p in sorted(source.rglob("*")) if p.is_file()]
-            return _texts(source, [(n, read()) for n, read in found if names.fullmatch(n)])
-        if zipfile.is_zipfile(source):
-            with zipfile.ZipFile(source) as packed:
-                inside = [(_base_name(name), name) for name in packed.namelist()]
-                return _texts(
-                    source, [(n, packed.read(path)) for n, path in inside if names.fullmatch(n)]
-                )
-        if source.is_file() and not source.stat().st_size:
-            return {}
-        return _texts(source, _tar_members(source, names))
+        for path, read in _members(source):
+            name = PurePosixPath(path).name
+            if not names.fullmatch(name):
+                continue
+            if name in texts:
+                raise LogError(f"{source}: holds two files {name}; name the folder of one data set")
+            texts[name] = read().decode("utf-8", errors="replace")
     except _READ_ERRORS as error:
         raise _unreadable(source, error) from error
-
-
-def _tar_members(source: Path, names: re.Pattern[str]) -> list[tuple[str, bytes]]:
-    """Base name and bytes of matching members of a tar file; streamed: seeking in .xz is slow."""
-    members = []
-    try:
-        packed = tarfile.open(source, "r|*")  # noqa: SIM115 (closed below)
-    except tarfile.ReadError:
-        if source.suffix.lower() in _ARCHIVE_SUFFIXES:
-            raise
-        return []  # a plain file of another kind: nothing in it matches
-    with packed:
-        for member in packed:
-            name = _base_name(member.name)
-            content = packed.extractfile(member) if names.fullmatch(name) else None
-            if content is not None:
-                members.append((name, content.read()))
-    return members
-
-
-def _base_name(path: str) -> str:
-    return PurePosixPath(path).name
-
-
-def _texts(source: Path, found: list[tuple[str, bytes]]) -> dict[str, str]:
-    texts: dict[str, str] = {}
-    for name, content in found:
-        if name in texts:
-            raise LogError(f"{source}: holds two files {name}; name the folder of one data set")
-        texts[name] = content.decode("utf-8", errors="replace")
     return texts
+
+
+def _members(source: Path) -> Iterator[tuple[str, Callable[[], bytes]]]:
+    """Path and reader of each file in a folder or archive; none if it is another kind of file.
+
+    Each must be read before the next is taken: tar is streamed, as seeking in .xz is slow.
+    """
+    if source.is_dir():
+        yield from ((p.name, p.read_bytes) for p in sorted(source.rglob("*")) if p.is_file())
+    elif zipfile.is_zipfile(source):
+        with zipfile.ZipFile(source) as packed:
+            for name in packed.namelist():
+                yield name, partial(packed.read, name)
+    elif source.stat().st_size and (
+        source.suffix.lower() in _ARCHIVE_SUFFIXES or tarfile.is_tarfile(source)
+    ):
+        with tarfile.open(source, "r|*") as archive:
+            for member in archive:
+                if content := archive.extractfile(member):
+                    yield member.name, content.read
 
 
 def _unreadable(source: Path, error: Exception) -> LogError:

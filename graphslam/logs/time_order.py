@@ -32,13 +32,7 @@ _LONG_AGO, _FAR_AHEAD = -(1 << 63), 1 << 63
 _Odometry = records.OdometryPose | records.WheelAngles | records.OdometryIncrement
 # Samples of a continuous process, for which the order of recording is evidence of time.
 # Increments and relative poses contain both of their times.
-SAMPLED = (
-    records.OdometryPose,
-    records.WheelAngles,
-    records.Scan,
-    records.Sighting,
-    records.Truth,
-)
+SAMPLED = (records.OdometryPose, records.WheelAngles, records.Scan, records.Sighting, records.Truth)
 _ONE_PER_STAMP = (_Odometry, records.Scan, records.Truth)
 _RANKS = ((_Odometry, 0), (records.Truth | records.TrueLandmark, 1), (records.RelativePose, 2))
 
@@ -100,7 +94,7 @@ class MessageSorter:
     def finish(self) -> Iterator[Message]:
         """The remaining messages, sorted, after the last `push`."""
         for name, repair in self._repairs.items():
-            self._place(name, repair.finish())
+            self._place(name, repair.settle_before(_FAR_AHEAD))
         yield from self._emit(_FAR_AHEAD)
 
     def _place(self, topic: str, messages: Iterable[Message]) -> None:
@@ -166,12 +160,6 @@ class _GlitchRepair:
     def settle_before(self, stamp_ns: int) -> list[Message]:
         settled = []
         while self._stamps and self._stamps[0] < stamp_ns:
-            settled += self._settle()
-        return settled
-
-    def finish(self) -> list[Message]:
-        settled = []
-        while self._stamps:
             settled += self._settle()
         return settled
 

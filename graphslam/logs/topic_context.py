@@ -1,6 +1,6 @@
 """Decoding context of each topic, from a sample of its messages: mounts and no-return values."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,10 +36,8 @@ def scan_shape(files: Sequence[McapFile], topic: Topic) -> ScanShape | None:
     for message in sample_decoded(files, topic):
         beams = len(message.ranges)
         view = abs(float(message.angle_increment)) * max(beams - 1, 0)
-        low, high = float(message.range_min), float(message.range_max)
-        return ScanShape(
-            beams, view, low if np.isfinite(low) else None, high if np.isfinite(high) else None
-        )
+        limits = (float(message.range_min), float(message.range_max))
+        return ScanShape(beams, view, *(limit if np.isfinite(limit) else None for limit in limits))
     return None
 
 
@@ -82,11 +80,9 @@ def topic_contexts(
 def sample_decoded(files: Sequence[McapFile], topic: Topic) -> Iterator[Any]:
     """Decoded messages of ``topic``, sampled evenly over the log."""
     for file in files:
-        for data in sample_messages(file, topic.name, _SAMPLE_BLOCKS, _SAMPLE_PER_BLOCK):
-            try:
-                yield schemas.decode(topic.schema, data)
-            except schemas.CdrError:
-                continue  # counted when the topic is read
+        data = sample_messages(file, topic.name, _SAMPLE_BLOCKS, _SAMPLE_PER_BLOCK)
+        # damaged messages are counted when the topic is read
+        yield from schemas.decode_all(topic.schema, data)
 
 
 def _base_frame(files: Sequence[McapFile], topic: Topic) -> str:
@@ -104,16 +100,10 @@ def _transforms(files: Sequence[McapFile], robot: str) -> TransformTree:
     tree: dict[str, tuple[str, Array]] = {}
     for file in files:
         own = [n for n in static_transform_topics(file) if robot_of(n) in (DEFAULT_ROBOT, robot)]
-        tree |= transform_tree(_decoded(raw.data for raw in raw_messages(file, own)))
+        data = (raw.data for raw in raw_messages(file, own))
+        # a mount that is missing because its message is damaged causes a warning
+        tree |= transform_tree(schemas.decode_all(schemas.TF_MESSAGE, data))
     return tree
-
-
-def _decoded(transforms: Iterable[bytes]) -> Iterator[Any]:
-    for data in transforms:
-        try:
-            yield schemas.decode(schemas.TF_MESSAGE, data)
-        except schemas.CdrError:
-            continue  # a mount that is missing therefore causes a warning
 
 
 def _mount(

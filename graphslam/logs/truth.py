@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from graphslam.core.config import Config
-from graphslam.core.geometry import Array
 from graphslam.core.records import Trajectory, TrueAssociations, TrueLandmark, Truth
 from graphslam.logs import schemas
 from graphslam.logs.decoders import TopicContext
@@ -91,25 +90,8 @@ def read_true_associations(
 
 def _trajectory(messages: Sequence[bytes]) -> Trajectory:
     """The poses sorted by header stamp; malformed messages are left out."""
-    try:
-        stamps, poses = schemas.decode_true_poses(messages)
-    except schemas.CdrError:
-        stamps, poses = _decodable(messages)
+    stamps, poses = schemas.decode_true_poses(messages)
     finite = np.isfinite(poses).all(axis=1)
     stamps, poses = stamps[finite], poses[finite]
     order = np.argsort(stamps, kind="stable")
     return Trajectory(stamps[order], poses[order], np.full((len(order), 3, 3), np.nan))
-
-
-def _decodable(messages: Sequence[bytes]) -> tuple[schemas.IntArray, Array]:
-    """Stamps (n,) ns and poses (n, 3) of the messages that can be decoded."""
-    stamps: list[schemas.IntArray] = [np.zeros(0, dtype=np.int64)]
-    poses = [np.zeros((0, 3))]
-    for data in messages:
-        try:
-            stamp, pose = schemas.decode_true_poses([data])
-        except schemas.CdrError:
-            continue
-        stamps.append(stamp)
-        poses.append(pose)
-    return np.concatenate(stamps), np.concatenate(poses)

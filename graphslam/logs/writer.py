@@ -4,11 +4,11 @@ The only module that writes with `mcap`.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from functools import cache
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, Self
+from typing import Any, BinaryIO, NamedTuple, Self
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
@@ -340,6 +340,18 @@ class LogWriter:
                 topic, "cdr", self._schemas[schema], {"offered_qos_profiles": ""}
             )
         return self._channels[topic]
+
+
+class Event(NamedTuple):
+    """A message to be written: its stamp, and the call that writes it."""
+
+    stamp_ns: int
+    write: Callable[[LogWriter], None]
+
+    @classmethod
+    def of(cls, method: Callable[..., None], robot: str, stamp_ns: int, **fields: Any) -> "Event":
+        """A call of a `LogWriter` method."""
+        return cls(stamp_ns, partial(method, robot=robot, stamp_ns=stamp_ns, **fields))
 
 
 @cache

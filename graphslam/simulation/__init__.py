@@ -3,8 +3,7 @@
 `load_scenario` reads a scenario, `simulate` writes its log.
 """
 
-from graphslam.simulation.errors import ScenarioError
-from graphslam.simulation.scenario import Scenario
+from graphslam.simulation.scenario import Scenario, ScenarioError
 from graphslam.simulation.scenario_files import SCENARIOS, load_scenario
 from graphslam.simulation.simulate import Simulation, simulate
 

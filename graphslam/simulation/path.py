@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from graphslam.core.geometry import Array, wrap
-from graphslam.simulation.errors import ScenarioError
+from graphslam.simulation.scenario import ScenarioError
 
 Ints = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 

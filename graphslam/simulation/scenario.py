@@ -8,12 +8,19 @@ docs/simulator.md explains the keys.
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from graphslam.core.errors import GraphSlamError
+
 Point = tuple[float, float]
 
 POSITIVE = {"above": 0.0}
 NOT_NEGATIVE = {"least": 0.0}
 SHARE = {"least": 0.0, "most": 1.0}
 RELATIVE = {"above": -1.0, "most": 1.0}
+
+
+class ScenarioError(GraphSlamError):
+    """A scenario is unreadable or infeasible; the message names file and key or position."""
+
 
 # ---------------------------------------------------------------- the world
 

@@ -7,13 +7,13 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from graphslam.simulation.errors import ScenarioError
 from graphslam.simulation.scenario import (
     Laser,
     LaterVisit,
     Leg,
     Robot,
     Scenario,
+    ScenarioError,
     SightingSensor,
     StaticObjects,
 )

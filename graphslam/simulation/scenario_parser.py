@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from math import isfinite
 from typing import Any
 
-from graphslam.simulation.errors import ScenarioError
+from graphslam.simulation.scenario import ScenarioError
 
 _NONE: Mapping[str, Any] = {}
 

@@ -8,9 +8,8 @@ import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam.simulation.drive import Drive, plan_drive
-from graphslam.simulation.errors import ScenarioError
 from graphslam.simulation.robot_shapes import contacts, encloses, outline_shapes
-from graphslam.simulation.scenario import Body, LaterVisit, Robot, Scenario
+from graphslam.simulation.scenario import Body, LaterVisit, Robot, Scenario, ScenarioError
 from graphslam.simulation.world import (
     Outline,
     Shapes,

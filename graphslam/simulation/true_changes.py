@@ -5,14 +5,15 @@ removed or added, and beams of the other visit passed through it.
 """
 
 from collections.abc import Iterator, Mapping
+from itertools import compress
 from typing import Any
 
 import numpy as np
 
-from graphslam.core.geometry import Array, between, inverse, transform, unit_vectors
+from graphslam.core.geometry import Array, inverse, transform, unit_vectors
 from graphslam.logs.writer import xy_phi
 from graphslam.simulation.laser import beam_fan
-from graphslam.simulation.raycast import NO_SURFACE
+from graphslam.simulation.raycast import points_in_frames
 from graphslam.simulation.recording import NoiseFreeScans, Recording
 from graphslam.simulation.scenario import LaterVisit, Scenario
 from graphslam.simulation.scene import SimulatedVisit
@@ -71,11 +72,11 @@ def _polygon(visit: SimulatedVisit, name: str) -> list[list[float]] | None:
     """Corners (k, 2) m of an object's outline; None if the visit does not have it."""
     for outline in visit.world.outlines:
         if outline.name == name:
-            if not outline.radius_m:
-                return [[float(x), float(y)] for x, y in outline.points]
-            angles = 2 * np.pi * np.arange(_CORNERS) / _CORNERS
-            ring = outline.radius_m * unit_vectors(angles)
-            return [[float(x), float(y)] for x, y in outline.points[0] + ring]
+            points = outline.points
+            if outline.radius_m:
+                angles = 2 * np.pi * np.arange(_CORNERS) / _CORNERS
+                points = points + outline.radius_m * unit_vectors(angles)
+            return [[float(x), float(y)] for x, y in points]
     return None
 
 
@@ -84,28 +85,16 @@ def _cells(recording: Recording, names: set[str]) -> dict[tuple[int, int], str]:
     world = recording.visit.world
     cells: dict[tuple[int, int], str] = {}
     for scans in recording.scans.values():
-        surfaces = scans.hits.surfaces
+        ranges, surfaces = scans.hits.ranges, scans.hits.surfaces
         numbers = [n for n, t in enumerate(world.things) if world.outlines[t].name in names]
-        scan, beam = np.nonzero(np.isin(surfaces, numbers) & _within_range(scans))
-        points = _end_points(scans, scan, beam)
-        for (x, y), surface in zip(
-            np.floor(points / CELL_M).astype(int).tolist(), surfaces[scan, beam], strict=True
-        ):
+        chosen = np.isin(surfaces, numbers) & (ranges <= scans.laser.range_max_m)
+        scan, beam = np.nonzero(chosen)
+        along = unit_vectors(scans.poses[scan, 2] + beam_fan(scans.laser).angles[beam])
+        points = scans.poses[scan, :2] + ranges[chosen][:, None] * along
+        ends = np.floor(points / CELL_M).astype(int).tolist()
+        for (x, y), surface in zip(ends, surfaces[chosen], strict=True):
             cells[x, y] = world.outlines[world.things[surface]].name
     return dict(sorted(cells.items()))
-
-
-def _within_range(scans: NoiseFreeScans) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Which beams (scans, beams) have a return within the range limit."""
-    reported = scans.hits.ranges <= scans.laser.range_max_m
-    return np.asarray(reported & (scans.hits.surfaces != NO_SURFACE))
-
-
-def _end_points(scans: NoiseFreeScans, scan: Any, beam: Any) -> Array:
-    """World points (n, 2) m where beams ended."""
-    direction = scans.poses[scan, 2] + beam_fan(scans.laser).angles[beam]
-    along = unit_vectors(direction)
-    return np.asarray(scans.poses[scan, :2] + scans.hits.ranges[scan, beam, None] * along)
 
 
 def _rows(
@@ -124,14 +113,13 @@ def _rows(
     for scans in other.values():
         free |= _observed_free(scans, centers)
     rows = []
-    for center, name in zip(centers[free], np.array(list(cells.values()))[free], strict=True):
-        motion = motions.get(str(name))
+    for center, name in zip(centers[free], compress(cells.values(), free), strict=True):
         moved = None
-        if motion is not None:
-            pose = inverse(motion) if back else motion
-            moved = float(np.hypot(*(transform(pose, center[None])[0] - center)))
+        if name in motions:
+            motion = inverse(motions[name]) if back else motions[name]
+            moved = float(np.hypot(*(transform(motion, center[None])[0] - center)))
         x, y = center.tolist()
-        rows.append({"kind": kind, "x": x, "y": y, "name": str(name), "displacement_m": moved})
+        rows.append({"kind": kind, "x": x, "y": y, "name": name, "displacement_m": moved})
     return rows
 
 
@@ -140,13 +128,11 @@ def _observed_free(scans: NoiseFreeScans, centers: Array) -> np.ndarray[Any, np.
     found = np.zeros(len(centers), dtype=bool)
     fan = beam_fan(scans.laser)
     angles = fan.angles
-    points = np.column_stack([centers, np.zeros(len(centers))])
     for pose, ranges in zip(scans.poses, scans.hits.ranges, strict=True):
-        x, y = between(pose[None], points)[:, :2].T
-        nearest = np.round(np.arctan2(y, x) / fan.step_rad + (fan.count - 1) / 2).astype(int)
-        inside = (nearest >= 0) & (nearest < fan.count)
+        x, y = points_in_frames(pose[None], centers)[0].T
+        nearest = np.round((np.arctan2(y, x) - fan.start_rad) / fan.step_rad).astype(int)
         beam = np.clip(nearest, 0, fan.count - 1)
-        angle = angles[beam]
+        inside, angle = nearest == beam, angles[beam]
         aside = np.abs(x * np.sin(angle) - y * np.cos(angle))
         along = x * np.cos(angle) + y * np.sin(angle)
         reach = np.minimum(ranges[beam], scans.laser.range_max_m)

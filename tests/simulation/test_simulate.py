@@ -7,11 +7,10 @@ import pytest
 
 from graphslam.core.geometry import between, log
 from graphslam.simulation.drive import TrapezoidalProfile, plan_drive
-from graphslam.simulation.errors import ScenarioError
 from graphslam.simulation.path import round_corners
 from graphslam.simulation.raycast import NO_SURFACE, BeamFan, cast_beams
 from graphslam.simulation.robot_shapes import contacts, encloses, outline_shapes
-from graphslam.simulation.scenario import Body, Leg, Move, Robot
+from graphslam.simulation.scenario import Body, Leg, Move, Robot, ScenarioError
 from graphslam.simulation.world import Shapes, displacement
 
 HALF_DEG = BeamFan(-pi / 2, pi / 360, 361)
