@@ -137,7 +137,7 @@ def is_quick(pipeline: Pipeline) -> bool:
 
 def reoptimise(pipeline: Pipeline, estimate: Estimate) -> Estimate:
     """The whole log solved again from a rough estimate; the pipeline's steps follow the result."""
-    tracks = {name: run.track for name, run in pipeline.runs.items() if run.started}
+    tracks = {name: run.track for name, run in pipeline.started.items()}
     config = pipeline.config
     if is_quick(pipeline):
         estimate, steps = reoptimise_sighting_log(
@@ -163,12 +163,11 @@ def reoptimise(pipeline: Pipeline, estimate: Estimate) -> Estimate:
 def find(pipeline: Pipeline, estimate: Estimate) -> Findings:
     """What a pass tells besides its estimate; a rough estimate is good enough for it."""
     frames = pipeline.frames
-    started = {name: run for name, run in sorted(pipeline.runs.items()) if run.started}
+    started = pipeline.started
     causal = {
-        name: run.causal(
-            pipeline.starts[frames.of[name]].pose, frames.away.get(frames.of[name], 0.0)
-        )
+        name: run.causal(pipeline.starts[frame].pose, frames.away.get(frame, 0.0))
         for name, run in started.items()
+        for frame in [frames.of[name]]
     }
     tracks = {name: run.track for name, run in started.items()}
     of_robots = [s for s in pipeline.sources if s.seen_robot]

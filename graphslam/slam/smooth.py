@@ -57,7 +57,7 @@ def make_result(finished: FinishedPass, began: float) -> Result:
         began: when the job began (`time.perf_counter`).
     """
     pipeline, causal = finished.pipeline, finished.findings.causal
-    runs = {name: run for name, run in sorted(pipeline.runs.items()) if run.started}
+    runs = pipeline.started
     with timed(pipeline.seconds, "trajectories"):
         causal_only = all(
             run.is_causal(finished.estimate.states[name]) for name, run in runs.items()

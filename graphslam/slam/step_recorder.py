@@ -66,6 +66,11 @@ class StepRecorder:
         self.seconds: dict[str, float] = defaultdict(float)
         self.first_ns, self.last_ns = 1 << 63, 0
 
+    @property
+    def started(self) -> dict[str, RobotState]:
+        """The robots that have a state, sorted by name."""
+        return {name: run for name, run in sorted(self.runs.items()) if run.started}
+
     def start(self, robot: str, time_ns: int) -> None:
         """Give a robot its first state.
 

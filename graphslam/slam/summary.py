@@ -46,7 +46,7 @@ def summarise(
     log, counts, associator, known = (
         pipeline.log, pipeline.counts, pipeline.associator, pipeline.known
     )  # fmt: skip
-    runs = {name: run for name, run in sorted(pipeline.runs.items()) if run.started}
+    runs = pipeline.started
     log_s = 1e-9 * (pipeline.last_ns - pipeline.first_ns)
     scans, total = counts["scans"], max(pipeline.seconds["all"], 1e-9)
     all_dropped = Counter(log.dropped) + pipeline.dropped + pipeline.robot_detector.counts
