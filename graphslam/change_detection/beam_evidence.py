@@ -76,22 +76,16 @@ class Evidence:
 def beams_past_surfaces(
     surface: Surface, visit: Visit, sigma_m: float, config: ChangesConfig
 ) -> Evidence:
-    """Evidence of the beams of ``visit`` on surfaces of the other visit.
-
-    Args:
-        surface: pieces of the other visit.
-        visit: beams, in the same frame.
-        sigma_m: range noise of the beams.
-        config: settings.
-    """
+    """Evidence of the beams of ``visit``, of range noise ``sigma_m``, on the other's surfaces."""
     used = np.nonzero(visit.surface & (visit.range_m <= config.max_range_m))[0]
     ends, directions = visit.ends[used], visit.directions[used]
     row, e, found = surface_offsets(surface, ends, config.gate_m)
     cosine = np.einsum("ni,ni->n", surface.normals[row], directions[found])
     near = (row, used[found], np.sign(cosine) * e, np.abs(cosine))
-    far = crossings(surface, visit, used, config.gate_m)
+    row, beam, cosine = crossings(surface, visit, used, config.gate_m)
+    far = (row, beam, np.full(len(row), config.gate_m), cosine)
     row, beam, e, cosine = map(np.concatenate, zip(near, far, strict=True))
-    passed = np.concatenate([np.zeros(len(near[0])), np.ones(len(far[0]))])
+    passed = np.repeat([0.0, 1.0], [len(near[0]), len(far[0])])
     n = len(surface.cells)
     weight = 1 / ((sigma_m * cosine) ** 2 + config.flatness_m**2)
     own, common = pose_variance(visit, beam, visit.ends[beam], surface.normals[row])
@@ -101,10 +95,9 @@ def beams_past_surfaces(
         weight, weight * e, weight * own, weight * common, weight * cosine, np.ones(len(row)),
         passed, weight**2, weight**2 * e, weight**2 * e**2,
     )  # fmt: skip
-    sums = np.column_stack([row_sums(row, t, n) for t in terms])
     inner = inner_windows(surface)
-    sums = window_sums(sums, inner).T
-    total, sum_e, sum_own, sum_common, sum_cos, count, through, *squares = sums
+    sums = window_sums(np.column_stack([row_sums(row, t, n) for t in terms]), inner)
+    total, sum_e, sum_own, sum_common, sum_cos, count, through, *squares = sums.T
     safe = np.where(total > 0, total, 1.0)
     mean = sum_e / safe
     # Beams that contradict each other (most end on the surface, a few graze past its edge) carry
@@ -130,34 +123,22 @@ def beams_past_surfaces(
 
 def inner_windows(surface: Surface) -> list[Ints]:
     """The inner 3 x 3 neighbourhood of a surface's windows."""
-    side = 2 * WINDOW + 1
-    return [
-        surface.windows[i * side + j]
-        for i in range(WINDOW - 1, WINDOW + 2)
-        for j in range(WINDOW - 1, WINDOW + 2)
-    ]
+    side, inner = 2 * WINDOW + 1, range(WINDOW - 1, WINDOW + 2)
+    return [surface.windows[i * side + j] for i in inner for j in inner]
 
 
 def crossings(
     surface: Surface, visit: Visit, used: Ints, gate_m: float
-) -> tuple[Ints, Ints, Array, Array]:
-    """Beams that cross a piece and end more than ``gate_m`` behind it.
-
-    Args:
-        surface: pieces.
-        visit: beams.
-        used: (k,) indices of the beams to use.
-        gate_m: m.
+) -> tuple[Ints, Ints, Array]:
+    """Beams, of those in ``used`` (k,), that cross a piece and end over ``gate_m`` behind it.
 
     Returns:
-        Rows (p,) of pieces, beams (p,), offsets (p,) m limited to the gate, cosines (p,).
+        Rows (p,) of pieces, beams (p,), and cosines of incidence (p,).
     """
-    parts = [
-        _crossings(surface, visit, used[i : i + _CHUNK], gate_m)
-        for i in range(0, len(used), _CHUNK)
-    ]
-    row, beam, cosine = (np.concatenate(p) for p in zip(*parts, strict=True))
-    return row, beam, np.full(len(row), gate_m), cosine
+    chunks = (used[i : i + _CHUNK] for i in range(0, len(used), _CHUNK))
+    parts = [_crossings(surface, visit, chunk, gate_m) for chunk in chunks]
+    row, beam, cosine = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return row, beam, cosine
 
 
 def _crossings(
@@ -249,14 +230,10 @@ def null_sigma(evidence: tuple[Evidence, ...]) -> float:
     (an empirical null, doi:10.1198/016214504000000089); the tails, where changes are, are not used.
     Pieces are weighted by their number of beams, as the requested false-alarm rate is per beam.
     """
-    scores = np.abs(np.concatenate([e.scores(1.0)[e.tested] for e in evidence]))
-    weight = np.concatenate([e.count[e.tested] for e in evidence])
+    scores = np.concatenate([e.scores(1.0)[e.tested] for e in evidence])
     if len(scores) < _MIN_SCORES:
         return 1.0
-    order = np.argsort(scores)
-    share = np.cumsum(weight[order]) / weight.sum()
-    found = float(scores[order][np.searchsorted(share, _BULK)] / norm.ppf((1 + _BULK) / 2))
-    return max(_TAILS * found, _MIN_SIGMA)
+    return max(_TAILS * _robust_sigma(scores, evidence, _BULK), _MIN_SIGMA)
 
 
 def repeatability(evidence: tuple[Evidence, ...]) -> float:
@@ -265,10 +242,16 @@ def repeatability(evidence: tuple[Evidence, ...]) -> float:
     It includes what the covariances leave out: bias of other materials that affected the alignment
     of the scans, and walls that are not flat.
     """
-    offsets = np.abs(np.concatenate([e.offset[e.tested] for e in evidence]))
-    weight = np.concatenate([e.count[e.tested] for e in evidence])
-    if not len(offsets):
-        return 0.0
-    order = np.argsort(offsets)
-    half = int(np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum()))
-    return float(offsets[order][half] / norm.ppf(0.75))
+    offsets = np.concatenate([e.offset[e.tested] for e in evidence])
+    return _robust_sigma(offsets, evidence, 0.5) if len(offsets) else 0.0
+
+
+def _robust_sigma(values: Array, evidence: tuple[Evidence, ...], share: float) -> float:
+    """Sigma of a normal distribution with the quantile ``share`` of the absolute values (k,).
+
+    The values, of all tested pieces, are weighted by the number of beams.
+    """
+    order = np.argsort(np.abs(values))
+    weight = np.concatenate([e.count[e.tested] for e in evidence])[order]
+    at = int(np.searchsorted(np.cumsum(weight) / weight.sum(), share))
+    return float(np.abs(values[order[at]]) / norm.ppf((1 + share) / 2))

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphslam.change_detection.detect import ChangeResult
-from graphslam.change_detection.grid import Grid
 from graphslam.change_detection.objects import Change
 from graphslam.core.geometry import Array
 from graphslam.logs import schemas
@@ -31,27 +30,15 @@ def overlay_map(found: ChangeResult) -> tuple[NDArray[np.uint8], str]:
     """
     grid = found.surfaces[0].nearest.grid
     image = np.full(grid.shape[::-1], _UNKNOWN, dtype=np.uint8)
-    for gone in (True, False):  # what is there now is drawn over what was there before
-        for change in found.changes:
-            polygon = _old_outline(change) if gone else _new_outline(change)
+    old = [c.polygon if c.kind == "vanished" else c.before for c in found.changes]
+    new = [c.polygon for c in found.changes if c.kind != "vanished"]
+    for polygons, value in ((old, _FREE), (new, _OCCUPIED)):  # the new are drawn over the old
+        for polygon in polygons:
             if polygon is not None:
                 cells = (polygon - np.array(grid.origin_m)) / grid.cell_m - 0.5
-                value = _FREE if gone else _OCCUPIED
                 cv2.fillPoly(image, [np.round(cells).astype(np.int32)], value)
-    return np.ascontiguousarray(image[::-1]), _yaml(grid)
-
-
-def _old_outline(change: Change) -> Array | None:
-    return change.polygon if change.kind == "vanished" else change.before
-
-
-def _new_outline(change: Change) -> Array | None:
-    return None if change.kind == "vanished" else change.polygon
-
-
-def _yaml(grid: Grid) -> str:
     x, y = grid.origin_m
-    return (
+    return np.ascontiguousarray(image[::-1]), (
         "# changes: occupied = appeared or moved here, free = vanished or moved away\n"
         f"image: changes.pgm\nmode: trinary\nresolution: {grid.cell_m:.6g}\n"
         f"origin: [{x:.6f}, {y:.6f}, 0.0]\nnegate: 0\n"

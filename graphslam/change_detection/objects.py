@@ -1,7 +1,6 @@
 """Changes from regions: what vanished, what appeared, and which pairs are one moved object."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -114,15 +113,8 @@ def assemble_changes(
 ) -> tuple[Change, ...]:
     """Changes from regions; an object that moved is one change instead of two.
 
-    Shapes with corners are the least ambiguous, then lines of both maps (of a box they may be
-    opposite sides), then other straight shapes.
-
-    Args:
-        vanished: regions of the reference.
-        appeared: regions of the later visit.
-        fits: pairs of shapes, see `match_shapes`.
-        segments: see `match_segments`.
-        lines: line landmarks of both maps.
+    Of the ``fits`` of `match_shapes` those with corners are the least ambiguous, then the
+    ``segments`` of `match_segments` (of a box they may be opposite sides), then straight shapes.
     """
     found: list[Change] = []
     old_left, new_left = set(range(len(vanished))), set(range(len(appeared)))
@@ -132,11 +124,11 @@ def assemble_changes(
             new = [j for j in pair.new if j in new_left]
             if not (old and new if needs_both else old or new):
                 continue
-            # other parts of the same object: the motion brings them onto it
-            before = [vanished[i].points for i in old]
-            after = [appeared[j].points for j in new]
-            motion = pair.motion.motion
             if old and new:
+                # other parts of the same object: the motion brings them onto it
+                before = [vanished[i].points for i in old]
+                after = [appeared[j].points for j in new]
+                motion = pair.motion.motion
                 old += [
                     i for i in sorted(old_left - set(old))
                     if _mostly_near(transform(motion, vanished[i].points), after)
@@ -145,38 +137,23 @@ def assemble_changes(
                     j for j in sorted(new_left - set(new))
                     if _mostly_near(transform(inverse(motion), appeared[j].points), before)
                 ]  # fmt: skip
-            parts = [appeared[j] for j in new] or [vanished[i] for i in old]
-            change = _moved(parts, [vanished[i] for i in old] if new else [], pair.motion)
-            on = _lines_on(lines[0], [vanished[i] for i in old])
-            now = _lines_on(lines[1], [appeared[j] for j in new])
-            found.append(replace(change, lines_before=on, lines_now=now))
+            parts = [vanished[i] for i in old], [appeared[j] for j in new]
+            found.append(_change("moved", *parts, lines, pair.motion))
             old_left -= set(old)
             new_left -= set(new)
-    kinds: Mapping[Kind, list[Region]] = {
-        "vanished": [vanished[i] for i in sorted(old_left)],
-        "appeared": [appeared[j] for j in sorted(new_left)],
-    }
-    for kind, rest in kinds.items():
-        for r in rest:
-            change = Change(kind, r.outline, r.probability, None, r.beams, r.first_ns)
-            if kind == "vanished":
-                change = replace(change, lines_before=_lines_on(lines[0], [r]))
-            else:
-                change = replace(change, lines_now=_lines_on(lines[1], [r]))
-            found.append(change)
+    found += [_change("vanished", [vanished[i]], [], lines) for i in sorted(old_left)]
+    found += [_change("appeared", [], [appeared[j]], lines) for j in sorted(new_left)]
     return tuple(sorted(found, key=lambda c: (-c.beams, c.kind, c.first_seen_ns)))
 
 
 def _lines_on(lines: Lines, regions: list[Region]) -> tuple[int, ...]:
     """Ids of the lines that lie on regions for most of their length."""
-    if not regions:
-        return ()
     points = [region.points for region in regions]
     steps = np.linspace(0, 1, _LINE_SAMPLES)[:, None]
     return tuple(
         number
         for number, ends in lines
-        if _mostly_near(ends[0] + steps * (ends[1] - ends[0]), points)
+        if points and _mostly_near(ends[0] + steps * (ends[1] - ends[0]), points)
     )
 
 
@@ -190,11 +167,19 @@ def _mostly_on_segment(region: Region, ends: Array) -> bool:
     return len(near_segment(region.points, ends, _NEAR_M)) > 0.5 * len(region.points)
 
 
-def _moved(new: list[Region], old: list[Region], motion: Displacement) -> Change:
-    largest = max(new, key=lambda r: len(r.rows))
-    before = max(old, key=lambda r: len(r.rows)).outline if old else None
+def _change(
+    kind: Kind,
+    old: list[Region],
+    new: list[Region],
+    lines: tuple[Lines, Lines],
+    motion: Displacement | None = None,
+) -> Change:
+    """The change made of ``old`` regions of the reference and ``new`` ones of the later visit."""
+    outlines = [max(side, key=lambda r: len(r.rows)).outline for side in (new, old) if side]
     every = [*new, *old]
     return Change(
-        "moved", largest.outline, max(r.probability for r in every), motion,
-        sum(r.beams for r in every), min(r.first_ns for r in every), before,
+        kind, outlines[0], max(r.probability for r in every), motion,
+        sum(r.beams for r in every), min(r.first_ns for r in every),
+        outlines[1] if len(outlines) > 1 else None,
+        _lines_on(lines[0], old), _lines_on(lines[1], new),
     )  # fmt: skip

@@ -55,15 +55,9 @@ def find_regions(
 
     A region needs `min_length_m` of pieces whose scores a run without changes shows anywhere with a
     probability of at most `run_false_alarm_rate`: the tests of a run are many (Bonferroni).
-
-    Args:
-        surface: pieces.
-        evidence: of the other visit's beams on them.
-        beams: (p,) later beams that observed pieces, with ``beam_rows`` (p,) the pieces.
-        beam_rows: see above.
-        first_ns: (n,) stamp at which the later visit first observed a piece.
-        sigma: see `graphslam.change_detection.beam_evidence.null_sigma`.
-        config: settings.
+    ``beams`` (p,) are the later beams that observed pieces, ``beam_rows`` (p,) those pieces, and
+    ``first_ns`` (n,) the stamps at which the later visit first observed each piece. ``sigma``: see
+    `graphslam.change_detection.beam_evidence.null_sigma`.
     """
     # not less than the stated sigmas: what is reported must be certain
     grid, scores = surface.nearest.grid, evidence.scores(max(sigma, 1.0))
@@ -108,13 +102,10 @@ def outline(grid: Grid, cells: Ints) -> Array:
     ij = np.column_stack(np.divmod(cells, grid.shape[1]))
     pad = _JOIN_CELLS + 2
     low = ij.min(axis=0) - pad
+    mask = np.zeros(ij.max(axis=0) - low + pad + 1, dtype=np.uint8)
+    mask[tuple((ij - low).T)] = 1
     scale = 2  # half cells: the outline may follow the edges of cells
-    size = (ij.max(axis=0) - low + pad + 1) * scale
-    mask = np.zeros(size, dtype=np.uint8)
-    at = (ij - low) * scale
-    for di in range(scale):
-        for dj in range(scale):
-            mask[at[:, 0] + di, at[:, 1] + dj] = 1
+    mask = mask.repeat(scale, axis=0).repeat(scale, axis=1)
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (4 * _JOIN_CELLS - 1,) * 2)
     mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, disk)
     # half a cell larger: the returns of a piece lie on both sides of it

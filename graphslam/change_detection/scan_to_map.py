@@ -30,13 +30,10 @@ _BEAMS = 150
 def align_scans(
     visit: Visit, surface: Surface, gates_m: tuple[float, ...], changed: Bools | None = None
 ) -> Visit:
-    """The visit with poses and covariances updated by alignment with a surface map.
+    """The visit with poses and covariances updated by alignment with a surface map in its frame.
 
-    Args:
-        visit: scans in the frame of the surfaces, with their prior covariances.
-        surface: the surface map.
-        gates_m: largest distance of a return from its surface, one per iteration.
-        changed: (n,) beams to leave out, as they hit something that changed.
+    ``gates_m``: largest distance of a return from its surface, one per iteration; ``changed`` (n,):
+    beams to leave out, as they hit something that changed.
     """
     usable = visit.surface if changed is None else visit.surface & ~changed
     beams = np.nonzero(usable)[0]
@@ -61,14 +58,8 @@ def scan_normal_equations(
 ) -> tuple[Array, Array]:
     """Normal equations of point-to-line alignment with a surface map, per scan.
 
-    Args:
-        visit: scans in the frame of the surfaces.
-        surface: the surface map.
-        beams: (k,) beams to use.
-        gate_m: largest distance of a return from its surface.
-
-    Returns:
-        Information (s, 3, 3) and right-hand side (s, 3).
+    Information (s, 3, 3) and right-hand side (s, 3) from ``beams`` (k,) that end within ``gate_m``
+    of a surface.
     """
     ends, size = visit.ends[beams], len(visit.poses)
     row, e, found = surface_offsets(surface, ends, gate_m)
@@ -82,12 +73,7 @@ def scan_normal_equations(
 
 
 def surface_offsets(surface: Surface, ends: Array, gate_m: float) -> tuple[Ints, Array, Ints]:
-    """Distances of points from the surface next to them.
-
-    Args:
-        surface: pieces.
-        ends: (k, 2) m.
-        gate_m: largest distance.
+    """Distances of points ``ends`` (k, 2) m from the surface next to them.
 
     Returns:
         For those points whose nearest piece is good, within the gate, and beside them: rows (f,) of

@@ -62,13 +62,9 @@ class Surface:
 
 
 def fit_surfaces(visit: Visit, grid: Grid, sigma_m: float, config: ChangesConfig) -> Surface:
-    """The surfaces of a visit on a grid.
+    """The surfaces of a visit on a grid in its frame; only cells with returns take memory.
 
-    Args:
-        visit: in the grid's frame.
-        grid: cells; only those with returns take memory.
-        sigma_m: range noise; a piece with more scatter than it explains is not straight.
-        config: settings.
+    A piece with more scatter than range noise of ``sigma_m`` explains is not straight.
     """
     used = np.nonzero(visit.surface & (visit.range_m <= config.max_range_m))[0]
     ends = visit.ends[used]
@@ -130,8 +126,8 @@ def window_max(values: Ints, windows: list[Ints]) -> Array:
 
 def _direction_variance(normals: Array, weight: Array, windows: list[Ints]) -> Array:
     """Variance (n,) rad² of the directions of the pieces in each window."""
-    double = np.array([2.0]) * np.arctan2(normals[:, 1], normals[:, 0])[:, None]
-    parts = weight[:, None] * np.hstack([np.cos(double), np.sin(double), np.ones_like(double)])
+    double = 2 * np.arctan2(normals[:, 1], normals[:, 0])
+    parts = np.column_stack([weight * np.cos(double), weight * np.sin(double), weight])
     x, y, total = window_sums(parts, windows).T
     # 1 - R of doubled angles is half of their variance, which is four times that of the angles
     return np.asarray(np.maximum(1 - np.hypot(x, y) / total, 0.0) / 2)
@@ -169,10 +165,8 @@ def _window_moments(moments: Array, windows: list[Ints], cell_m: float) -> tuple
         total[:, 5] += yy + 2 * dy * y + dy * dy * c
     m = total[:, 0]
     x, y, xx, xy, yy = (total[:, 1:] / m[:, None]).T
-    cov = np.empty((len(m), 2, 2))
-    cov[:, 0, 0], cov[:, 1, 1] = xx - x * x, yy - y * y
-    cov[:, 0, 1] = cov[:, 1, 0] = xy - x * y
-    return m, np.column_stack([x, y]), cov
+    cov = np.array([[xx - x * x, xy - x * y], [xy - x * y, yy - y * y]])
+    return m, np.column_stack([x, y]), np.moveaxis(cov, 2, 0)
 
 
 def scans_per_cell(row: Ints, scan: Ints, scans: int, rows: int) -> Ints:

@@ -7,11 +7,12 @@ the method's detection and false-alarm rates. Applications use `detect_changes`.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import label
 from scipy.spatial import cKDTree
 
 from graphslam.change_detection.grid import Grid
 from graphslam.change_detection.visit import Bools, Ints
-from graphslam.core.geometry import Array, unit_vectors
+from graphslam.core.geometry import Array, unit_vectors, wrap
 
 #: V_0 of 5.10, m³; it cancels out of every comparison
 VOLUME = 1.0
@@ -49,9 +50,7 @@ class DentMap:
 
 def scan_points(pose: Array, angles: Array, ranges: Array) -> Array:
     """World points (n, 2) m of a scan from ``pose`` (3,); NaN where there is no return."""
-    heading = pose[2] + angles
-    along = unit_vectors(heading)
-    return np.asarray(pose[:2] + ranges[:, None] * along)
+    return np.asarray(pose[:2] + ranges[:, None] * unit_vectors(pose[2] + angles))
 
 
 def point_covariances(
@@ -59,12 +58,7 @@ def point_covariances(
 ) -> Array:
     """Covariances (n, 2, 2) m² of the points of a scan, world axes (5.1-5.6).
 
-    Args:
-        pose: (3,) of the laser in the world.
-        cov: (3, 3) of the pose.
-        angles: (n,) rad in the laser's frame.
-        ranges: (n,) m.
-        noise: of a beam.
+    The laser's ``pose`` (3,) has ``cov`` (3, 3); ``angles`` (n,) rad are in its frame.
     """
     across = noise.phi1_m + (noise.phi2_rad + np.sqrt(cov[2, 2])) * ranges
     c, s = np.cos(pose[2] + angles), np.sin(pose[2] + angles)
@@ -141,8 +135,7 @@ def expected_measurements(
     """
     step = dents.grid.cell_m / _STEPS_PER_CELL
     r = np.arange(1, int(reach_m / step) + 1) * step
-    heading = pose[2] + angles
-    d = unit_vectors(heading)
+    d = unit_vectors(pose[2] + angles)
     along = pose[:2] + r[None, :, None] * d[:, None, :]
     cell = dents.grid.cells(along.reshape(-1, 2)).reshape(len(angles), len(r))
     depth = np.where(cell >= 0, dents.depth[cell], 0.0)
@@ -184,8 +177,7 @@ def occlusion_map(grid: Grid, pose: Array, angles: Array, ranges: Array, margin_
     """
     centers = grid.centers(np.arange(grid.shape[0] * grid.shape[1]))
     away = centers - pose[:2]
-    bearing = np.arctan2(away[:, 1], away[:, 0]) - pose[2] - angles[0]
-    bearing = np.mod(bearing + np.pi, 2 * np.pi) - np.pi
+    bearing = wrap(np.arctan2(away[:, 1], away[:, 0]) - pose[2] - angles[0])
     beam = np.round(bearing / (angles[1] - angles[0])).astype(int)
     inside = (beam >= 0) & (beam < len(angles))
     seen = ranges[np.clip(beam, 0, len(angles) - 1)] + margin_m
@@ -203,7 +195,7 @@ def changed_beams(
     gate: float,
     consecutive: int = 1,
 ) -> tuple[Bools, Bools]:
-    """The thesis' detector for one scan.
+    """The thesis' detector for one scan: which beams (n,) are compared, and which show a change.
 
     Args:
         dents: reference map.
@@ -215,9 +207,6 @@ def changed_beams(
         noise: of a beam.
         gate: on the squared distance of 5.14.
         consecutive: least number of flagged neighbours in a row; 1 = the rule is off.
-
-    Returns:
-        Which beams (n,) could be compared, and which of them show a change.
     """
     reach = float(np.nanmax(ranges)) + 1.0
     expected, expected_covs = expected_measurements(dents, pose, angles, reach)
@@ -235,13 +224,8 @@ def changed_beams(
 
 def consecutive_runs(marked: Bools, least: int) -> Bools:
     """Which of ``marked`` (n,) are in a run of at least ``least`` marked ones (5.3)."""
-    edges = np.diff(np.concatenate([[0], marked.astype(int), [0]]))
-    begin, end = np.nonzero(edges == 1)[0], np.nonzero(edges == -1)[0]
-    out = np.zeros(len(marked) + 1, dtype=int)
-    long = end - begin >= least
-    np.add.at(out, begin[long], 1)
-    np.add.at(out, end[long], -1)
-    return np.asarray(np.cumsum(out)[:-1] > 0)
+    run, _ = label(marked)
+    return np.asarray(marked & (np.bincount(run)[run] >= least))
 
 
 def stable_points(points: Array, others: list[Array], within_m: float, least: int) -> Bools:
@@ -250,10 +234,8 @@ def stable_points(points: Array, others: list[Array], within_m: float, least: in
     Rule of 5.3: points must be stable over time before they enter the map or the comparison.
     """
     usable = np.isfinite(points).all(axis=1)
-    count = np.zeros(len(points), dtype=int)
-    for other in others:
-        tree = cKDTree(other[np.isfinite(other).all(axis=1)])
-        near = np.zeros(len(points), dtype=bool)
-        near[usable] = np.isfinite(tree.query(points[usable], distance_upper_bound=within_m)[0])
-        count += near
-    return np.asarray(usable & (count >= least))
+    trees = [cKDTree(other[np.isfinite(other).all(axis=1)]) for other in others]
+    away = [tree.query(points[usable], distance_upper_bound=within_m)[0] for tree in trees]
+    stable = np.zeros(len(points), dtype=bool)
+    stable[usable] = np.isfinite(away).sum(axis=0) >= least
+    return stable

@@ -24,13 +24,7 @@ _DILATION_CELLS = 2 * WINDOW
 
 
 def seen_through(surface: Surface, visit: Visit, config: ChangesConfig) -> Bools:
-    """Which pieces (n,) of a visit's own surfaces its own beams passed through.
-
-    Args:
-        surface: of the visit.
-        visit: its beams, in the same frame.
-        config: settings.
-    """
+    """Which pieces (n,) of a visit's own surfaces its own beams passed through."""
     used = np.nonzero(visit.surface & (visit.range_m <= config.max_range_m))[0]
     through = crossings(surface, visit, used, config.gate_m)[0]
     ended = surface.beams[surface.beams >= 0]
@@ -43,13 +37,7 @@ def seen_through(surface: Surface, visit: Visit, config: ChangesConfig) -> Bools
 def without_transparent(
     surfaces: tuple[Surface, Surface], visits: tuple[Visit, Visit], config: ChangesConfig
 ) -> tuple[Surface, Surface]:
-    """The surfaces of two visits without those that either of them looked through.
-
-    Args:
-        surfaces: of the two visits, on one grid.
-        visits: aligned.
-        config: settings.
-    """
+    """The surfaces of two aligned visits, on one grid, less those that either looked through."""
     grid = surfaces[0].nearest.grid
     mask = np.zeros(grid.shape, dtype=np.uint8)
     for surface, visit in zip(surfaces, visits, strict=True):

@@ -90,15 +90,9 @@ def visit_from_scans(
     landmarks: tuple[Landmark, ...] = (),
     config: ChangesConfig = _DEFAULTS,
 ) -> Visit:
-    """A visit from scans.
+    """A visit from scans with stamps (s,), poses (s, 3) of the laser in the world, covs (s, 3, 3).
 
-    Args:
-        stamps_ns: (s,).
-        poses: (s, 3) of the laser in the world.
-        covs: (s, 3, 3).
-        sweeps: per scan its bearings (k,) rad, ascending, and ranges (k,) m, NaN without a return.
-        landmarks: of the run's map.
-        config: settings.
+    ``sweeps``: per scan its bearings (k,) rad, ascending, and ranges (k,) m, NaN without a return.
     """
     counts = [len(angles) for angles, _ in sweeps]
     return Visit(
@@ -112,15 +106,10 @@ def visit_from_scans(
 
 
 def on_surface(angles: Array, ranges: Array, config: ChangesConfig = _DEFAULTS) -> Bools:
-    """Which returns (k,) have close neighbours on both sides.
+    """Which returns, at bearings (k,) rad and ranges (k,) m, have close neighbours on both sides.
 
     The others are at an edge, where a beam that meets two surfaces measures the range of neither,
-    or on a surface seen at a grazing angle, which contributes little.
-
-    Args:
-        angles: (k,) rad.
-        ranges: (k,) m, NaN without a return.
-        config: `min_range_m`, `edge_gap_m`, `edge_gap_ratio`.
+    or on a surface seen at a grazing angle, which contributes little. NaN: no return.
     """
     points = polar_points(ranges, angles)
     gap = np.hypot(*np.diff(points, axis=0).T)
@@ -134,10 +123,7 @@ def on_surface(angles: Array, ranges: Array, config: ChangesConfig = _DEFAULTS) 
 def load_visit(saved: SavedResult, directory: Path, config: ChangesConfig = _DEFAULTS) -> Visit:
     """The visit of a result folder: ranges from the logs that it names, poses from the folder.
 
-    Args:
-        saved: the loaded result folder.
-        directory: where it is, for messages.
-        config: settings.
+    ``directory`` of the folder is for messages only.
 
     Raises:
         LogError: a log is missing or has changed.
@@ -148,7 +134,6 @@ def load_visit(saved: SavedResult, directory: Path, config: ChangesConfig = _DEF
     for entry, file in zip(logs, log.files, strict=True):
         if entry["sha256"] != file.sha256:
             raise LogError(f"{file.path}: is not the log that {directory} was smoothed from")
-    stamps, poses, covs, sweeps = [], [], [], []
     laser_poses: dict[tuple[str, int], tuple[Array, Array]] = {}
     for name, robot in saved.robots.items():
         if robot.scan_final is None:
@@ -162,20 +147,22 @@ def load_visit(saved: SavedResult, directory: Path, config: ChangesConfig = _DEF
             (name, int(stamp)): (pose, cov)
             for stamp, pose, cov in zip(laser.stamps_ns, laser.poses, laser.covs, strict=True)
         }
-    for message in log.messages():
-        if isinstance(message, Scan) and (message.robot, message.stamp_ns) in laser_poses:
-            pose, cov = laser_poses[message.robot, message.stamp_ns]
-            stamps.append(message.stamp_ns)
-            poses.append(pose)
-            covs.append(cov)
-            order = slice(None) if message.angle_step_rad > 0 else slice(None, None, -1)
-            sweeps.append((message.angles[order], message.ranges[order]))
-    if not stamps:
+    scans = [
+        message
+        for message in log.messages()
+        if isinstance(message, Scan) and (message.robot, message.stamp_ns) in laser_poses
+    ]
+    if not scans:
         raise OutputError(f"{directory}: has no laser scans to compare")
+    poses, covs = zip(*(laser_poses[scan.robot, scan.stamp_ns] for scan in scans), strict=True)
+    stamps = np.array([scan.stamp_ns for scan in scans], dtype=np.int64)
+    sweeps = [
+        (s.angles, s.ranges) if s.angle_step_rad > 0 else (s.angles[::-1], s.ranges[::-1])
+        for s in scans
+    ]
     visit = visit_from_scans(
-        np.array(stamps, dtype=np.int64), np.array(poses), np.array(covs), sweeps,
-        saved.landmarks, config,
-    )  # fmt: skip
+        stamps, np.array(poses), np.array(covs), sweeps, saved.landmarks, config
+    )
     return replace(visit, robots=len({name for name, _ in laser_poses}))
 
 
