@@ -378,7 +378,7 @@ def speed(seeds: Sequence[int], folder: Path) -> None:
         poses = poses + rng.normal(size=poses.shape) * [0.01, 0.01, 0.004]
         stamps = np.arange(1000, dtype=np.int64)
         visits.append(visit_from_scans(stamps, poses, covs, [(fan.angles, r) for r in ranges]))
-    known = Registration(np.zeros(3), 1e-6 * np.eye(3), np.zeros((0, 2), int), np.zeros(0, int))
+    known = Registration(np.zeros(3), 1e-6 * np.eye(3), np.zeros((0, 2), int))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     began, cpu = time.perf_counter(), time.process_time()
     found = detect_changes(visits[0], visits[1], ChangesConfig(), known)

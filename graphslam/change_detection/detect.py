@@ -92,9 +92,7 @@ class ChangeResult:
 def identity_registration(visit: Visit) -> Registration:
     """The registration of two time spans of one run, which share its world frame."""
     every = np.arange(len(visit.landmarks))
-    return Registration(
-        np.zeros(3), np.zeros((3, 3)), np.column_stack([every, every]), np.zeros(0, dtype=np.int64)
-    )
+    return Registration(np.zeros(3), np.zeros((3, 3)), np.column_stack([every, every]))
 
 
 def detect_changes(
@@ -103,13 +101,9 @@ def detect_changes(
     config: ChangesConfig,
     registration: Registration | None = None,
 ) -> ChangeResult:
-    """Find what changed between two visits.
+    """Find what changed between two visits, each in its own world frame.
 
-    Args:
-        reference: in its world frame.
-        later: in its own.
-        config: settings.
-        registration: of the later frame in the reference's; by default found from both maps.
+    ``registration`` of the later frame in the reference's is by default found from both maps.
 
     Raises:
         OutputError: the two cannot be registered, or have nothing in common.
@@ -144,9 +138,8 @@ def detect_changes(
         config.bias_sigma_m, repeatability(evidence), a.nearest.grid.cell_m,
         config.max_displacement_m,
     )  # fmt: skip
-    landmarks = (reference.landmarks, later.landmarks)
     moves = segment_motions(
-        landmarks, registration, surfaces, (reference, later), (on_a, on_b), settings, sigma
+        registration, surfaces, (reference, later), (on_a, on_b), settings, sigma
     )
     lines = (_lines(reference, np.zeros(3)), _lines(later, registration.pose))
     fits, segments = match_shapes(*shapes, settings), match_segments(vanished, appeared, moves)

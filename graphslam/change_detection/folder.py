@@ -22,14 +22,9 @@ def changes_between(
     reference_span_s: Span | None = None,
     later_span_s: Span | None = None,
 ) -> ChangeResult:
-    """Compare two result folders of `smooth`, or two time spans of one.
+    """Compare two result folders of `smooth`, or time spans of them, s since the first scan.
 
-    Args:
-        reference: result folder of the visit to compare with.
-        later: result folder of the later visit; may be the same one with other spans.
-        config: settings.
-        reference_span_s: scans to use, s since the first one.
-        later_span_s: the same for the later visit.
+    ``later`` may be the reference itself, with another span.
 
     Raises:
         OutputError: a folder is not a result, has no scans or covariances, or the two have nothing

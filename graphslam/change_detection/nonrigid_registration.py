@@ -45,16 +45,8 @@ def register_nonrigid(
 ) -> tuple[Visit, Visit, Registration]:
     """Both visits with refined paths in one frame, in which the reference's first scan stays.
 
-    Later scans that do not fit the reference's surfaces are left out.
-
-    Args:
-        reference: in its world frame.
-        later: in its own.
-        config: settings.
-
-    Returns:
-        The reference, the later visit, and the mean motion of its scans with their scatter as
-        covariance.
+    Later scans that do not fit the reference's surfaces are left out. The registration is the mean
+    motion of the others, with their scatter as covariance.
 
     Raises:
         OutputError: too few of the scans fit.
@@ -81,8 +73,7 @@ def register_nonrigid(
     away = motions - mean
     away[:, 2] = wrap(away[:, 2])
     cov = away.T @ away / len(away) + _SCAN_COV
-    none = np.zeros((0, 2), dtype=np.int64)
-    registration = Registration(mean, cov, none, np.zeros(0, dtype=np.int64))
+    registration = Registration(mean, cov, np.zeros((0, 2), dtype=np.int64))
     return _with_stated_cov(reference), _with_stated_cov(fitted.select(kept)), registration
 
 

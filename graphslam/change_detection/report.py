@@ -31,17 +31,13 @@ def render_changes(
     square = max(_SQUARE_M, float((limits[:, 1] - limits[:, 0]).max()) / _MAX_SQUARES)
     unseen = ~(_observed(found.reference, limits, square) & _observed(found.later, limits, square))
     start = found.later.stamps_ns.min()
-    marks = []
-    for change in found.changes:
-        motion, sigmas = None, None
-        if change.displacement is not None:
-            motion, sigmas = _motion_of_middle(change.polygon, change.displacement)
-        marks.append(
-            ChangeMark(
-                change.kind, change.polygon, change.before, motion, sigmas, change.probability,
-                change.beams, float((change.first_seen_ns - start) * 1e-9),
-            )
-        )  # fmt: skip
+    marks = [
+        ChangeMark(
+            c.kind, c.polygon, c.before, *_motion_of_middle(c.polygon, c.displacement),
+            c.probability, c.beams, float((c.first_seen_ns - start) * 1e-9),
+        )
+        for c in found.changes
+    ]  # fmt: skip
     compared, flagged = int(found.compared.sum()), int(found.flagged.sum())
     sigma = np.sqrt(np.diag(found.registration.cov))
     facts = {
@@ -63,15 +59,13 @@ def render_changes(
     )  # fmt: skip
 
 
-def _motion_of_middle(polygon: Array, by: Displacement) -> tuple[Array, Array]:
-    """Shift and rotation (3,) m, rad, of the middle of a polygon, and their sigmas (3,).
+def _motion_of_middle(polygon: Array, by: Displacement | None) -> tuple[Array | None, Array | None]:
+    """Shift and rotation (3,) m, rad, of the middle of a new outline (c, 2) m, and sigmas (3,).
 
-    Those of the world's origin would depend on its distance.
-
-    Args:
-        polygon: (c, 2) m, the new outline.
-        by: the motion of the world.
+    Those of the world's origin would depend on its distance. None without a displacement.
     """
+    if by is None:
+        return None, None
     middle = polygon.mean(axis=0)
     arm = middle - by.motion[:2]
     shift = middle - transform(inverse(by.motion), middle[None])[0]

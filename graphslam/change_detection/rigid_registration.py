@@ -43,14 +43,12 @@ _MIN_INFORMATION = 1e2
 class Registration:
     """Pose (3,) of the later world frame in the reference's, with covariance (3, 3).
 
-    ``matched`` (k, 2): indices of landmarks (reference, later) that agree; ``moved``: indices of
-    later landmarks without a match.
+    ``matched`` (k, 2): indices of landmarks (reference, later) that agree.
     """
 
     pose: Array
     cov: Array
     matched: Ints
-    moved: Ints
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,11 +72,7 @@ class _Points:
 
 
 def register(reference: Sequence[Landmark], later: Sequence[Landmark]) -> Registration:
-    """The pose of the later world frame in the reference's.
-
-    Args:
-        reference: landmarks of the reference, in its world frame.
-        later: those of the later run, in its own.
+    """The pose of the later world frame in the reference's, from landmarks in these frames.
 
     Raises:
         OutputError: there are not enough landmarks in common to fix a pose.
@@ -115,10 +109,9 @@ def _points(landmarks: Sequence[Landmark]) -> _Points:
     )
 
 
-def _pairs(n: int, weight: Array) -> tuple[Ints, Ints]:
-    """Ordered pairs of different indices below n; of many only those of the largest weights."""
-    limit = int(np.sqrt(_MAX_PAIRS))
-    chosen = np.argsort(-weight, kind="stable")[: limit if n > limit else n]
+def _pairs(weight: Array) -> tuple[Ints, Ints]:
+    """Ordered pairs of different indices into ``weight`` (n,), of many those of large weights."""
+    chosen = np.argsort(-weight, kind="stable")[: int(np.sqrt(_MAX_PAIRS))]
     i, j = np.meshgrid(chosen, chosen, indexing="ij")
     different = i != j
     return i[different], j[different]
@@ -128,14 +121,13 @@ def _motions_of_lines(a: _Lines, b: _Lines) -> Array:
     """Motions (k, 3) that bring two crossing lines of b onto two of a, for all congruent pairs."""
     parts = []
     for m in (a, b):
-        length = np.hypot(*(m.ends[:, 1] - m.ends[:, 0]).T) if len(m.index) else np.zeros(0)
-        i, j = _pairs(len(m.index), length)
+        i, j = _pairs(np.hypot(*(m.ends[:, 1] - m.ends[:, 0]).T))
         angle = wrap(m.normal[j] - m.normal[i])
         crossing = np.abs(np.sin(angle)) > np.sin(_CROSSING_RAD)
         i, j, angle = i[crossing], j[crossing], angle[crossing]
-        n = unit_vectors(m.normal)
-        N = np.stack([n[i], n[j]], axis=-2)
-        at = np.linalg.solve(N, np.stack([m.offset[i], m.offset[j]], axis=-1)[..., None])[..., 0]
+        both = np.column_stack([i, j])
+        N = unit_vectors(m.normal)[both]
+        at = np.linalg.solve(N, m.offset[both][..., None])[..., 0]
         parts.append((m.normal[i], angle, at))
     (normal_a, angle_a, at_a), (normal_b, angle_b, at_b) = parts
     p, q = np.nonzero(np.abs(wrap(angle_a[:, None] - angle_b[None, :])) < _ANGLE_RAD)
@@ -148,7 +140,7 @@ def _motions_of_points(a: _Points, b: _Points) -> Array:
     """Motions (k, 3) that bring two points of b onto two of a, for all congruent pairs."""
     parts = []
     for m in (a, b):
-        i, j = _pairs(len(m.index), np.ones(len(m.index)))
+        i, j = _pairs(np.ones(len(m.index)))
         d = m.xy[j] - m.xy[i]
         parts.append(((m.xy[i] + m.xy[j]) / 2, np.hypot(*d.T), np.arctan2(d[:, 1], d[:, 0])))
     (middle_a, length_a, angle_a), (middle_b, length_b, angle_b) = parts
@@ -158,8 +150,7 @@ def _motions_of_points(a: _Points, b: _Points) -> Array:
 
 def _motions(phi: Array, to: Array, start: Array) -> Array:
     """Motions (k, 3) that turn by ``phi`` (k,) and bring ``start`` (k, 2) to ``to`` (k, 2)."""
-    zero = np.zeros(len(phi))
-    return compose(np.column_stack([to, phi]), np.column_stack([-start, zero]))
+    return compose(np.column_stack([to, phi]), np.column_stack([-start, np.zeros(len(phi))]))
 
 
 def _vote_peaks(votes: Array) -> list[Array]:
@@ -203,9 +194,7 @@ def _refine(
         pose = np.array([*(pose[:2] + step[:2]), wrap(pose[2] + step[2])])
     if len(pairs) < 2:
         return None
-    everything = np.concatenate([b[0].index, b[1].index])
-    moved = np.setdiff1d(everything, pairs[:, 1])
-    return score, Registration(pose, cov, pairs, moved)
+    return score, Registration(pose, cov, pairs)
 
 
 _Rows = tuple[Array, Array, Array, Array]
@@ -225,20 +214,18 @@ def _match_lines(pose: Array, a: _Lines, b: _Lines, slack: float) -> tuple[Ints,
     i, j = np.nonzero(np.abs(wrap(a.normal[:, None] - normal[None])) < 0.03 * slack + 0.03)
     na = unit_vectors(a.normal)[i]
     ta = np.column_stack([-na[:, 1], na[:, 0]])
-    angle = np.asarray(wrap(a.normal[i] - normal[j]))
     # distance from b's middle to line a, along a's normal
     across = a.offset[i] - np.einsum("ni,ni->n", na, middle[j])
-    r = np.column_stack([angle, across])
-    lever_a = np.einsum("ni,ni->n", ta, middle[j])
+    r = np.column_stack([wrap(a.normal[i] - normal[j]), across])
     arm = middle[j] - pose[:2]
-    lever_b = np.einsum("ni,ni->n", t[j], arm)
-    S = _cov_at(a.cov[i], lever_a) + _cov_at(b.cov[j], lever_b)
+    S = _cov_at(a.cov[i], np.einsum("ni,ni->n", ta, middle[j]))
+    S += _cov_at(b.cov[j], np.einsum("ni,ni->n", t[j], arm))
     S += np.diag([_FLOOR_RAD**2, _FLOOR_M**2])
     # d(predicted)/d(pose): direction by phi; the middle moves with the frame
     H = np.zeros((len(i), 2, 3))
     H[:, 0, 2], H[:, 1] = 1.0, offset_jacobian(na, arm)
     overlap = _overlap(a.ends[i], ends[j], ta)
-    d2 = np.einsum("ni,nij,nj->n", r, np.linalg.inv(S), r) if len(i) else np.zeros(0)
+    d2 = np.einsum("ni,nij,nj->n", r, np.linalg.inv(S), r)
     near = (np.abs(across) < 0.1 * slack) & (d2 < _GATE * slack**2) & (overlap > 0.1)
     keep = _best_of_each(j, i, d2, near)
     size = np.minimum(overlap[keep], 3.0)
@@ -266,17 +253,16 @@ def _overlap(a: Array, b: Array, along: Array) -> Array:
 
 def _match_points(pose: Array, a: _Points, b: _Points, slack: float) -> tuple[Ints, _Rows]:
     """As `_match_lines` for points: the residual is the difference of positions."""
-    xy = transform(pose, b.xy)
-    R = rotation(pose[2])
-    r_all = a.xy[:, None] - xy[None]
-    i, j = np.nonzero(np.hypot(r_all[..., 0], r_all[..., 1]) < 0.2 * slack)
-    r = r_all[i, j]
+    xy, R = transform(pose, b.xy), rotation(pose[2])
+    difference = a.xy[:, None] - xy
+    i, j = np.nonzero(np.hypot(difference[..., 0], difference[..., 1]) < 0.2 * slack)
+    r = difference[i, j]
     S = a.cov[i] + R @ b.cov[j] @ R.T + _FLOOR_M**2 * np.eye(2)
     arm = xy[j] - pose[:2]
     H = np.zeros((len(i), 2, 3))
     H[:, 0, 0] = H[:, 1, 1] = 1.0
     H[:, 0, 2], H[:, 1, 2] = -arm[:, 1], arm[:, 0]
-    d2 = np.einsum("ni,nij,nj->n", r, np.linalg.inv(S), r) if len(i) else np.zeros(0)
+    d2 = np.einsum("ni,nij,nj->n", r, np.linalg.inv(S), r)
     keep = _best_of_each(j, i, d2, d2 < _GATE * slack**2)
     pairs = np.column_stack([a.index[i[keep]], b.index[j[keep]]])
     return pairs, (r[keep], H[keep], S[keep], np.full(len(keep), 0.5))

@@ -69,26 +69,18 @@ class Shape:
 def extract_shape(
     surface: Surface, visit: Visit, evidence: Evidence, sigma: float, core: Array
 ) -> Shape | None:
-    """The surface connected to a changed region that the other visit does not confirm.
+    """The visit's surface connected to a changed region that the other visit does not confirm.
 
     An object that moved by less than its size occludes a part of its old place, so no beam passes
     through that. Pieces that were not tested therefore belong to the shape; pieces that were found
-    unchanged do not.
+    unchanged do not. None if there is no such surface.
 
-    Args:
-        surface: of the visit that observed the shape.
-        visit: that visit.
-        evidence: of the other visit's beams on that surface.
-        sigma: see `graphslam.change_detection.beam_evidence.null_sigma`.
-        core: (c, 2) m, points of the changed region.
-
-    Returns:
-        None if there is no such surface.
+    ``core`` (c, 2) m: points of the changed region; ``evidence``: of the other visit's beams;
+    ``sigma``: see `graphslam.change_detection.beam_evidence.null_sigma`.
     """
     unconfirmed = surface.good & (~evidence.tested | (evidence.scores(sigma) > UNCHANGED_SIGMAS))
     rows = np.nonzero(unconfirmed)[0]
-    tree = cKDTree(core)
-    away = tree.query(surface.points[rows], distance_upper_bound=_REACH_M)[0]
+    away = cKDTree(core).query(surface.points[rows], distance_upper_bound=_REACH_M)[0]
     rows, away = rows[np.isfinite(away)], away[np.isfinite(away)]
     grid = surface.nearest.grid
     label = connected_components(grid, surface.cells[rows], int(np.ceil(_GAP_M / grid.cell_m)))

@@ -4,7 +4,6 @@ The pieces of a segment determine its motion across itself and its rotation. Its
 is determined by its ends only, and only if beams passed beyond them.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,7 +31,6 @@ from graphslam.core.geometry import (
     transform,
     wrap,
 )
-from graphslam.core.records import Landmark
 
 #: segments may be the same one if their lengths differ by less than this, m; segments shorter than
 #: _MIN_LENGTH_M are too ambiguous
@@ -67,14 +65,10 @@ class WallSegment:
 
 
 def fit_wall_segment(shape: Shape, cell_m: float) -> WallSegment:
-    """The segment through a straight shape's pieces, fitted by least squares.
+    """The segment through a straight shape's pieces, of size ``cell_m``, fitted by least squares.
 
     Returns at an end are not used, as they may be mixed pixels. The true end lies beyond the last
     piece by up to a beam's spacing and a cell, uniformly distributed.
-
-    Args:
-        shape: straight.
-        cell_m: size of a piece.
     """
     middle, n = shape.points.mean(axis=0), shape.normals.mean(axis=0)
     along = np.linalg.eigh(np.cov(shape.points.T))[1][:, 1]
@@ -135,7 +129,6 @@ def _same_length(a: WallSegment, b: WallSegment) -> bool:
 
 
 def segment_motions(
-    landmarks: tuple[Sequence[Landmark], Sequence[Landmark]],
     registration: Registration,
     surfaces: tuple[Surface, Surface],
     visits: tuple[Visit, Visit],
@@ -146,16 +139,9 @@ def segment_motions(
     """Line landmarks that both maps have with the same length, but at different poses.
 
     An object that moved by less than its size occludes its old place, so no beam shows that it has
-    left: this way its motion is found nevertheless.
-
-    Args:
-        landmarks: of the reference and of the later map, each in its own frame.
-        registration: of the two.
-        surfaces: of both visits in the reference's frame.
-        visits: both, in the reference's frame.
-        evidence: of the other visit's beams on those surfaces.
-        settings: noise and limits of displacements.
-        sigma: see `graphslam.change_detection.beam_evidence.null_sigma`.
+    left: this way its motion is found nevertheless. ``surfaces``, ``visits`` and ``evidence`` are
+    those of `AlignedVisits`; landmarks are in each map's own frame. ``sigma``: see
+    `graphslam.change_detection.beam_evidence.null_sigma`.
 
     Returns:
         Per moved segment its ends (2, 2) m before and after, and its displacement.
@@ -163,10 +149,10 @@ def segment_motions(
     sides: list[list[WallSegment]] = []
     for k, frame in enumerate((np.zeros(3), registration.pose)):
         matched = set(registration.matched[:, k].tolist())
-        lines = [m for i, m in enumerate(landmarks[k]) if m.line is not None and i not in matched]
         found = [
             _segment_at(transform(frame, m.extent), surfaces[k], visits[k], evidence[k], sigma)
-            for m in lines
+            for i, m in enumerate(visits[k].landmarks)
+            if m.line is not None and i not in matched
         ]
         sides.append([s for s in found if s is not None])
     pairs = []

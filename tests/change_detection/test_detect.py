@@ -118,7 +118,6 @@ def test_registration_finds_any_pose_of_the_later_frame(pose):
 def test_a_wall_that_moved_does_not_bias_the_registration():
     found = register(walls(), walls(moved=(1, np.array([0.4, 0.0]))))
     np.testing.assert_allclose(found.pose, 0, atol=1e-4)
-    assert list(found.moved) == [1]
     assert sorted(found.matched[:, 1]) == [0, 2, 3, 4, 5]
 
 
