@@ -62,14 +62,11 @@ def occupancy_grid(
     free: Array | None = None,
     free_value: float = 0.0,
 ) -> OccupancyGrid:
-    """The grid of occupied points.
+    """The grid of occupied points (n, 2) m.
 
-    Args:
-        points: (n, 2) m, occupied.
-        cell_m: size of a cell.
-        margin: empty cells on each side, one number or (2,); at least 1.
-        free: (k, 2) m, points in free space; those outside of the grid are left out.
-        free_value: value of their cells unless they are occupied or next to it.
+    On each side are ``margin`` empty cells, one number or (2,), at least 1.
+    The cells of points (k, 2) m in ``free`` space have ``free_value`` unless they are occupied or
+    next to it; points outside of the grid are left out.
     """
     margin = np.asarray(margin)
     low = points.min(axis=0) - margin * cell_m

@@ -26,10 +26,8 @@ MIN_SHARE, MIN_RETURNS = 0.8, 3
 def was_present(points: Array, earlier: Sweep, earlier_from_here: Array) -> bool:
     """Whether an earlier scan saw an object where it is now, so that it has not moved.
 
-    Args:
-        points: (n, 2) returns of the object, laser frame.
-        earlier: the earlier scan.
-        earlier_from_here: (3,) pose of the laser in the frame of the earlier one's.
+    ``points`` (n, 2) are the object's returns, laser frame, ``earlier_from_here`` (3,) is the pose
+    of the laser in the frame of the earlier scan's.
     """
     return bool(np.mean(returns_present_before(points, earlier, earlier_from_here)) >= MIN_SHARE)
 
@@ -58,10 +56,8 @@ def _earlier_ranges(points: Array, earlier: Sweep, earlier_from_here: Array) -> 
 def dynamic_returns(sweep: Sweep, views: Sequence[tuple[Sweep, Array]]) -> Mask:
     """Which returns (k,) of a scan are of objects in space that an earlier scan saw as free.
 
-    Args:
-        sweep: the scan.
-        views: earlier scans of the same laser, each with the pose (3,) of the scan's laser in its
-            laser's frame.
+    ``views`` are earlier scans of the same laser, each with the pose (3,) of the scan's laser in
+    its laser's frame.
     """
     gone = np.zeros(len(sweep.beam), dtype=np.bool_)
     found = free_standing_clusters(sweep, WIDEST_M)

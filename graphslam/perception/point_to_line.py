@@ -19,10 +19,7 @@ _UPPER = np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])
 def point_terms(residuals: Array, metrics: Array, arms: Array) -> tuple[Array, Array]:
     """What points add to the normal equations of their pose.
 
-    Args:
-        residuals: (..., 2) m, r = T p - q.
-        metrics: (..., 2, 2), symmetric, M.
-        arms: (..., 2) m, T p - t.
+    They have residuals r (..., 2) m, symmetric metrics M (..., 2, 2) and arms a (..., 2) m.
 
     Returns:
         Distinct entries (9, ...) of Jᵀ M J and Jᵀ M r, of which `normal_equations` takes weighted
@@ -41,8 +38,7 @@ def point_terms(residuals: Array, metrics: Array, arms: Array) -> tuple[Array, A
 def normal_equations(sums: Array) -> tuple[Array, Array]:
     """Information A (..., 3, 3) and gradient g (..., 3) of poses.
 
-    Args:
-        sums: (9, ...) weighted sums of `point_terms` over the points of each pose.
+    ``sums`` (9, ...) are weighted sums of `point_terms` over the points of each pose.
     """
     last = sums.T
     return last[..., _UPPER], last[..., 6:]

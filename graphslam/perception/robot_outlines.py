@@ -75,9 +75,8 @@ class OutlineFit:
     @property
     def is_plausible(self) -> bool:
         """Whether the cluster can be the outline; a small part of one may be of anything."""
-        return self.share > MIN_VISIBLE_SHARE and self.chi2 <= float(
-            chdtri(max(self.dof, 1), FIT_PROBABILITY)
-        )
+        limit = float(chdtri(max(self.dof, 1), FIT_PROBABILITY))
+        return self.share > MIN_VISIBLE_SHARE and self.chi2 <= limit
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,16 +156,11 @@ def cluster_centres(sweep: Sweep, found: Clusters) -> Array:
 
 
 def expected_ranges(outline: Array, poses: Array, angles: Array) -> tuple[Array, Array]:
-    """What a laser at the origin measures of an outline.
-
-    Args:
-        outline: (k, 2) corners in the base frame.
-        poses: (m, 3) of the base.
-        angles: (n,) directions of beams.
+    """What a laser at the origin measures of an outline (k, 2), base frame, at m poses of the base.
 
     Returns:
-        Ranges (m, n) of the beams, for those that miss at the nearer edge, and the directions
-        (m, 2) of both edges, right then left.
+        Ranges (m, n) of beams in directions ``angles`` (n,), for those that miss at the nearer
+        edge, and the directions (m, 2) of both edges, right then left.
     """
     c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     X = poses[:, :1] + c * outline[:, 0] - s * outline[:, 1]
@@ -198,21 +192,18 @@ def fit_outline(
     heading_sigma: float,
     config: FrontEndConfig,
 ) -> OutlineFit:
-    """The pose of an outline that fits a cluster best.
+    """The pose at which an outline (k, 2), base frame, fits a cluster best.
 
-    The expected pose is only the initial value, except for a heading that the returns do not show.
-
-    Args:
-        sweep: one scan, in order.
-        first: row of the cluster's first return in `Sweep.points`.
-        last: row of its last return, inclusive.
-        unoccluded: (2,) whether its right and left edge are visible.
-        outline: (k, 2) corners in the robot's base frame.
-        expected: (3,) pose in the laser's frame.
-        heading_sigma: of its heading, rad.
-        config: ``range_sigma_m``, ``floor_normal_m``.
+    The cluster reaches from row ``first`` of `Sweep.points` to row ``last``, inclusive;
+    ``unoccluded`` (2,) tells whether its right and its left edge are visible. The ``expected`` pose
+    (3,), laser frame, is only the initial value, except for a heading that the returns do not show;
+    that one has ``heading_sigma``, rad.
     """
-    view = _view(sweep, first, last, unoccluded, outline, config)
+    beam = sweep.beam[first : last + 1]
+    edges, sigma = _edges_seen(sweep, first, last)
+    w = np.concatenate([np.full(len(beam), config.range_sigma_m**-2), unoccluded * sigma**-2])
+    w[[0, len(beam) - 1]] = MIXED_M**-2
+    view = _ClusterView(outline, sweep.angles[beam], sweep.ranges[beam], edges, w)
     fixed = _levenberg_marquardt(_initial_pose(view, expected), 2, view)
     floor = _floor(fixed, outline, sweep.step_rad, config)
     dof = int(np.count_nonzero(view.w)) - 2
@@ -223,9 +214,8 @@ def fit_outline(
         # a heading far from the expected one may be that of another face
         off2 = float(wrap(turned[2] - expected[2])) ** 2
         if P[2, 2] < MAX_HEADING_SIGMA_RAD**2 and off2 < 9 * (heading_sigma**2 + P[2, 2]):
-            return OutlineFit(
-                turned, P + floor, True, float(view.w @ e**2), dof - 1, _share(turned, view)
-            )
+            chi2 = float(view.w @ e**2)
+            return OutlineFit(turned, P + floor, True, chi2, dof - 1, _share(turned, view))
     e, J = _linearise(fixed, view)
     P = np.linalg.inv(J[:, :2].T @ (view.w[:, None] * J[:, :2]) + np.eye(2))
     # derivative of the position by the heading, which is the expected one
@@ -252,16 +242,6 @@ def _floor(pose: Array, outline: Array, step_rad: float, config: FrontEndConfig)
     P = np.diag([flat, flat, 2 * flat / outline_radius(outline)]) ** 2
     P[:2, :2] += np.outer(across, across)
     return P
-
-
-def _view(
-    sweep: Sweep, first: int, last: int, unoccluded: Mask, outline: Array, config: FrontEndConfig
-) -> _ClusterView:
-    beam = sweep.beam[first : last + 1]
-    edges, sigma = _edges_seen(sweep, first, last)
-    w = np.concatenate([np.full(len(beam), config.range_sigma_m**-2), unoccluded * sigma**-2])
-    w[[0, len(beam) - 1]] = MIXED_M**-2
-    return _ClusterView(outline, sweep.angles[beam], sweep.ranges[beam], edges, w)
 
 
 def _edges_seen(sweep: Sweep, first: int, last: int) -> tuple[Array, Array]:
@@ -291,9 +271,8 @@ def _initial_pose(view: _ClusterView, expected: Array) -> Array:
         _, edges = expected_ranges(view.outline, pose[None], a)
         turn = float(wrap((a[0] + a[-1]) / 2 - edges[0].mean()))
         pose[:2] = rotation(turn) @ pose[:2]
-        middle = a[len(a) // 2]
         miss = float(np.median(r - expected_ranges(view.outline, pose[None], a)[0][0]))
-        pose[:2] += miss * unit_vectors(middle)
+        pose[:2] += miss * unit_vectors(a[len(a) // 2])
     return pose
 
 

@@ -39,6 +39,8 @@ CLUTTER_SIGMAS, SAME_SIGMAS = 2.0, 5.0
 #: points whose errors count as one: materials, curvature and the submap's own shape are shared
 CORRELATED_POINTS = 10
 ITERATIONS = 12
+#: variance (m², rad²) of each component of a pose without neighbours
+UNKNOWN_VAR = 1e4
 #: steps of the search: cells are this share of the reach of the alignment, which does the rest, and
 #: a step in heading (rad) moves points at 6 m by one cell
 SEARCH_CELL, STEP_RAD = 0.25, np.radians(1.5)
@@ -75,8 +77,16 @@ class Submap:
 
         NaN without a return.
         """
-        returns = _range_images(self.clouds)
-        return np.concatenate([np.roll(returns, turn, axis=2) for turn in (-1, 0, 1)])
+        x, y = np.concatenate(self.clouds).T
+        scan = np.repeat(np.arange(len(self.clouds)), [len(cloud) for cloud in self.clouds])
+        r, at = np.hypot(x, y), scan * BEAMS + _beam(x, y)
+        returns = np.full((2, len(self.clouds) * BEAMS), np.inf)
+        np.minimum.at(returns[0], at, r)
+        np.minimum.at(returns[1], at, -r)
+        returns[1] *= -1.0
+        returns[~np.isfinite(returns)] = np.nan
+        per_scan = returns.reshape(2, len(self.clouds), BEAMS)
+        return np.concatenate([np.roll(per_scan, turn, axis=2) for turn in (-1, 0, 1)])
 
     @cached_property
     def free(self) -> Array:
@@ -104,12 +114,9 @@ class Match:
 def make_submap(
     poses: Array, clouds: Sequence[Array], config: ScanMatchingConfig | None = None
 ) -> Submap:
-    """A submap of some scans.
+    """A submap of k scans at ``poses`` (k, 3): of the sensor, in the submap's frame.
 
-    Args:
-        poses: (k, 3) of the sensor in the submap's frame.
-        clouds: k arrays (n, 2) of points in the sensor's frame, m.
-        config: settings; by default the default ones.
+    ``clouds`` are k arrays (n, 2) of points in the sensor's frame, m.
     """
     config = config or ScanMatchingConfig()
     points = np.concatenate([transform(p, c) for p, c in zip(poses, clouds, strict=True)])
@@ -119,19 +126,6 @@ def make_submap(
     tree = cKDTree(points)
     information = _information(points, tree, config)
     return Submap(points, information, np.asarray(poses), clouds, tree, config)
-
-
-def _range_images(clouds: Sequence[Array]) -> Array:
-    """Nearest and farthest return (2, k, `BEAMS`) per degree of k scans, NaN without one."""
-    x, y = np.concatenate(clouds).T
-    scan = np.repeat(np.arange(len(clouds)), [len(cloud) for cloud in clouds])
-    r, at = np.hypot(x, y), scan * BEAMS + _beam(x, y)
-    images = np.full((2, len(clouds) * BEAMS), np.inf)
-    np.minimum.at(images[0], at, r)
-    np.minimum.at(images[1], at, -r)
-    images[1] *= -1.0
-    images[~np.isfinite(images)] = np.nan
-    return images.reshape(2, len(clouds), BEAMS)
 
 
 def _beam(x: Array, y: Array) -> IntArray:
@@ -165,15 +159,9 @@ def search(
 ) -> list[Array]:
     """Poses (3,) of ``source`` in ``target`` at which many points of one lie on the other's.
 
-    Args:
-        source: the submap to be placed.
-        target: the submap that it is placed in.
-        guess: (3,) middle of the window.
-        window: (3,) m, m, rad: half its size.
-        min_score: least share of points on points; those in a neighbouring cell count half.
-
-    Returns:
-        The best ones, best first, no two of them close together.
+    They are within ``window`` (3,) m, m, rad of ``guess`` (3,), the best first, and no two of them
+    are close together. ``min_score`` is the least share of points on points; those in a
+    neighbouring cell count half.
     """
     points = _subsample(source.points, SEARCH_POINTS)
     cell_m, apart_m = SEARCH_CELL * target.config.reach_m, target.config.reach_m
@@ -215,14 +203,12 @@ def align(source: Submap, target: Submap, guess: Array) -> tuple[Array, Array]:
     x = np.array(guess, dtype=float)
     points = _subsample(source.points, ALIGN_POINTS)
     first, last = target.config.reach_m, SAME_SIGMAS * target.config.point_sigma_m
-    A = np.eye(3)
     for k in range(ITERATIONS):
         reach = first * (last / first) ** min(1.0, 2 * k / ITERATIONS)
-        equations = _linearise(points, target, x, reach)
-        if equations is None:
-            return x, np.diag([1e4, 1e4, 1e4])
-        A = equations.information
-        step = gauss_newton_step(A, equations.gradient)
+        A, g, weight = _linearise(points, target, x, reach)
+        if not weight:
+            return x, UNKNOWN_VAR * np.eye(3)
+        step = gauss_newton_step(A, g)
         x = step_poses(x, step)
         if k > ITERATIONS // 2 and np.abs(step).max() < 1e-4:
             break
@@ -238,38 +224,29 @@ def fit(source: Submap, target: Submap, pose: Array) -> tuple[float, Array, Arra
         `align`.
     """
     points = _subsample(source.points, ALIGN_POINTS)
-    equations = _linearise(points, target, pose, SAME_SIGMAS * target.config.point_sigma_m)
-    if equations is None:
-        return 0.0, np.zeros(3), np.diag([1e4, 1e4, 1e4])
-    A = equations.information
-    step = gauss_newton_step(A, equations.gradient)
-    return equations.weight / len(points), step, _covariance(A, target.config)
+    A, g, weight = _linearise(points, target, pose, SAME_SIGMAS * target.config.point_sigma_m)
+    if not weight:
+        return 0.0, np.zeros(3), UNKNOWN_VAR * np.eye(3)
+    return weight / len(points), gauss_newton_step(A, g), _covariance(A, target.config)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _NormalEquations:
-    """``information`` (3, 3), ``gradient`` (3,), and the sum of the points' robust weights."""
+def _linearise(points: Array, target: Submap, x: Array, reach: float) -> tuple[Array, Array, float]:
+    """Normal equations of points (n, 2) seen from x (3,) and their neighbours within ``reach``, m.
 
-    information: Array
-    gradient: Array
-    weight: float
-
-
-def _linearise(points: Array, target: Submap, x: Array, reach: float) -> _NormalEquations | None:
-    """Equations of points (n, 2) seen from x (3,) and their neighbours within ``reach``, m.
-
-    None where there are hardly any.
+    Returns:
+        Information (3, 3), gradient (3,), and the sum of the points' robust weights: all 0 where
+        there are hardly any neighbours.
     """
     placed = transform(x, points)
     distance, near = target.tree.query(placed, distance_upper_bound=reach)
     ok = np.isfinite(distance)
     if ok.sum() < 10:
-        return None
+        return np.zeros((3, 3)), np.zeros(3), 0.0
     near, p = near[ok], placed[ok]
     terms, squared = point_terms(p - target.points[near], target.information[near], p - x[:2])
     w = 1.0 / (1.0 + squared / 4.0)
     A, g = normal_equations(terms @ w)
-    return _NormalEquations(A + np.diag([1e-4, 1e-4, 1e-4]), g, float(w.sum()))
+    return A + np.diag([1e-4, 1e-4, 1e-4]), g, float(w.sum())
 
 
 def _covariance(information: Array, config: ScanMatchingConfig) -> Array:
@@ -284,10 +261,7 @@ def agreement(source: Submap, target: Submap, pose: Array) -> tuple[float, float
     whatever other scans saw: a door that was open once is no contradiction.
     """
     same = absent = 0
-    for a, b, x in (
-        (source, target, pose),
-        (target, source, between(pose, np.zeros(3))),
-    ):
+    for a, b, x in ((source, target, pose), (target, source, between(pose, np.zeros(3)))):
         confirmed, free = _compare_with_scans(transform(x, a.points), b)
         same += int(confirmed.sum())
         absent += int((free & ~confirmed).sum())
@@ -323,9 +297,8 @@ def match(
     found: list[Match] = []
     for start in search(source, target, guess, window, min_score):
         pose, cov = align(source, target, start)
-        if any(_duplicates(pose, m.pose, target.config) for m in found):
-            continue
-        found.append(Match(pose, cov, *agreement(source, target, pose)))
+        if not any(_duplicates(pose, m.pose, target.config) for m in found):
+            found.append(Match(pose, cov, *agreement(source, target, pose)))
     return sorted(found, key=lambda m: m.absent - m.same)
 
 
