@@ -123,7 +123,7 @@ def on_surface(angles: Array, ranges: Array, config: ChangesConfig = _DEFAULTS) 
 def load_visit(saved: SavedResult, directory: Path, config: ChangesConfig = _DEFAULTS) -> Visit:
     """The visit of a result folder: ranges from the logs that it names, poses from the folder.
 
-    ``directory`` of the folder is for messages only.
+    ``directory``: where the folder is, for messages.
 
     Raises:
         LogError: a log is missing or has changed.
