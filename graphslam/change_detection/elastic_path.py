@@ -27,11 +27,9 @@ def fit_elastic_path(
 ) -> Visit:
     """The visit with the poses that fit both the surfaces and the shape of the path.
 
-    Args:
-        visit: scans near where they belong, in the frame of the surfaces.
-        shape: poses (s, 3) of the path in any frame; only the motions between them count.
-        surface: the surfaces to fit.
-        gates_m: farthest that a return may lie from its surface to count, one per iteration.
+    The visit is near where it belongs, in the frame of the surfaces; ``shape`` (s, 3) are the poses
+    of its path in any frame, as only the motions between them count. Farther than ``gates_m``, one
+    per iteration, from its surface a return does not count.
     """
     beams = np.nonzero(visit.surface)[0]
     motions = between(shape[:-1], shape[1:])
@@ -46,13 +44,10 @@ def fit_elastic_path(
 def motion_terms(
     poses: Array, motions: Array, sigmas: Array, doubted: float = np.inf
 ) -> tuple[Array, Array, Array]:
-    """Normal equations of the motions between neighbouring poses of a path.
+    """Normal equations of the motions (s - 1, 3) from each pose (s, 3) to the next, in its frame.
 
-    Args:
-        poses: (s, 3).
-        motions: (s - 1, 3) from each pose to the next, in its frame.
-        sigmas: (3,) of a motion, m, m, rad; the first two are equal, so they hold in any direction.
-        doubted: scale of the robust weight (Cauchy), in sigmas.
+    The first two ``sigmas`` (3,) of a motion, m, m, rad, are equal, so they hold in any direction;
+    ``doubted`` is the scale of the robust weight (Cauchy), in sigmas.
 
     Returns:
         Blocks (s, 3, 3) on the diagonal, (s - 1, 3, 3) above it, and right-hand side (s, 3).
@@ -74,10 +69,7 @@ def motion_terms(
 
 
 def _solve_banded(diagonal: Array, above: Array, right: Array) -> Array:
-    """Solution (s, 3) of a symmetric block tridiagonal system.
-
-    Its blocks are ``diagonal`` (s, 3, 3) and ``above`` it (s - 1, 3, 3).
-    """
+    """Solution (s, 3) of a system with blocks on the ``diagonal`` and, symmetric, ``above`` it."""
     size = len(diagonal)
     banded = np.zeros((6, 3 * size))  # upper form: banded[5 + i - j, j] = A[i, j]
     for a in range(3):

@@ -57,12 +57,8 @@ def relax_scan_network(
 ) -> Array:
     """The poses (s, 3) at which all scans agree best; the first one is fixed.
 
-    Args:
-        poses: (s, 3) initial values, among neighbours right to a few decimetres.
-        cloud: returns.
-        motion: (s - 1, 3) from each pose to the next, in its frame.
-        sigmas: (3,) of the motion, m, m, rad.
-        doubted: robust scale of the motion, see `motion_terms`.
+    The initial ``poses`` are right to a few decimetres among neighbours. ``motion`` (s - 1, 3) from
+    each to the next, its ``sigmas`` and robust scale ``doubted`` are those of `motion_terms`.
     """
     tree = cKDTree(np.column_stack([cloud.points, _PLANE_SPACING_M * cloud.scan]))
     chosen, weight = _thin(cloud.scan, len(poses))

@@ -45,11 +45,6 @@ def motion_between(a: Shape, b: Shape, known: MotionSettings) -> tuple[float, Di
     same from all sides. For the same reason no motion with a large turn is stated: most likely the
     object did not turn, and another side of it was seen.
 
-    Args:
-        a: before.
-        b: after.
-        known: how well the pieces are known.
-
     Returns:
         Share of both that agrees, and the motion.
     """

@@ -50,11 +50,8 @@ def fit_lines(points: Array, starts: Indices, config: FrontEndConfig) -> LineFit
     would correlate weight and error. With ``"thesis"`` every point weighs
     1/range_sigma_m², as in eq. 4.32.
 
-    Args:
-        points: (k, 2), m, laser frame: the lines' points one line after the other, those of one
-            line in the order of the beams (either way round).
-        starts: (m,) row where each line's points begin; increasing, the first 0.
-        config: ``covariance``, ``range_sigma_m`` and ``floor_normal_m``.
+    ``points`` (k, 2), m, laser frame, are those of one line after the other, each line's in the
+    order of the beams (either way round) and from its row in ``starts`` (m,) on.
 
     Raises:
         EstimationError: the points of a line do not define a direction.
@@ -116,19 +113,12 @@ def _normal_block(eta: Array, weight: Array, starts: Indices) -> Array:
 def observations(
     fits: LineFits, fully_visible: Mask, config: FrontEndConfig
 ) -> tuple[Observation, ...]:
-    """Lines as observations with covariance, eq. 4.34.
+    """Lines as observations, eq. 4.34: ``segment`` where ``fully_visible`` (m,), else ``line``.
 
-    The floors are added to V in the line's frame: they do not shrink with the number of points.
-
-    Args:
-        fits: m lines, laser frame.
-        fully_visible: (m,): True makes a ``segment``, False a ``line``. The variance along a
-            ``line`` carries no meaning; it is finite (length²/12) so that the matrix is regular.
-        config: ``floor_normal_m``, ``floor_angle_rad`` and ``end_sigma_m``.
-
-    Returns:
-        One observation per line; ``cov`` (3, 3) of additive errors (x, y, phi) along the axes of
-        the laser frame.
+    Their ``cov`` (3, 3) is of additive errors (x, y, phi) along the axes of the laser frame. The
+    floors are added to V in the line's frame: they do not shrink with the number of points. The
+    variance along a ``line`` carries no meaning; it is finite (length²/12) so that the matrix is
+    regular.
     """
     own = np.zeros((len(fits.z), 3, 3))
     own[:, 0, 0] = np.where(
