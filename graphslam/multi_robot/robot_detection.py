@@ -1,5 +1,7 @@
 """Detection of robots in each other's scans, where the joint estimate expects them.
 
+Robots of unknown start are found by `mutual_detection` instead.
+
 A detection becomes a `Sighting`, as if a camera had made it. Its returns are removed from the scan,
 so that no landmark is made of them. A cluster is the robot if it has the outline's shape, lies
 within the gate of the expected pose, and no other does. Returns of unknown dynamic objects are

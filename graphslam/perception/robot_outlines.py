@@ -21,7 +21,7 @@ from graphslam.perception.ordered_scan import Indices, Mask, Sweep
 
 #: m, beams, m: returns farther apart are not of one free-standing object: a distance, as many times
 #: the distance between beams if that is more (a side at grazing incidence), and an upper limit
-APART_M, APART_BEAMS, APART_MOST_M = 0.25, 6.0, 0.5
+MIN_GAP_M, GAP_BEAMS, MAX_GAP_M = 0.25, 6.0, 0.5
 #: fewest returns that a pose, and also a heading, is fitted to
 MIN_RETURNS, MIN_RETURNS_FOR_HEADING = 3, 6
 #: beams: sigma of an edge between two beams, as the last one may be a mixed pixel, and of the error
@@ -131,7 +131,7 @@ def free_standing_clusters(sweep: Sweep, widest_m: float) -> Clusters:
     r = sweep.ranges[sweep.beam]
     step = np.hypot(x[1:] - x[:-1], y[1:] - y[:-1])
     near = np.minimum(r[1:], r[:-1])
-    apart = np.clip(APART_BEAMS * sweep.step_rad * near, APART_M, APART_MOST_M)
+    apart = np.clip(GAP_BEAMS * sweep.step_rad * near, MIN_GAP_M, MAX_GAP_M)
     border = np.concatenate(([0], np.flatnonzero(step > apart) + 1, [k]))
     first, last = border[:-1], border[1:] - 1
     rise = np.concatenate(([np.inf], r[1:] - r[:-1], [-np.inf]))

@@ -1,4 +1,4 @@
-"""Logs of several robots in which one is not there all the time: handled, and named."""
+"""Logs of several robots in which one is missing for part of the time: handled, with a warning."""
 
 import numpy as np
 import pytest
@@ -66,8 +66,8 @@ def named(result, robot):
     return line
 
 
-def test_a_robot_whose_odometry_stops_is_known_until_then(tmp_path):
-    """Its camera goes on, and the others still see it: none of that has a place."""
+def test_a_robot_whose_odometry_stops_is_estimated_until_then(tmp_path):
+    """Its camera goes on, and the others still see it: these sightings are dropped."""
     log = write(tmp_path / "log.mcap", STARTS, odometry={"b": (0, 30)})
     result = smoothed([log], STARTS)
     for robot, end in (("a", 59.9), ("b", 29.9), ("c", 59.9)):
@@ -79,7 +79,7 @@ def test_a_robot_whose_odometry_stops_is_known_until_then(tmp_path):
     assert "0.0 to 29.9 s of 59.9 s" in named(result, "b")
 
 
-def test_a_robot_seen_before_its_log_begins_is_known_from_then(tmp_path):
+def test_a_robot_seen_before_its_log_begins_is_estimated_from_then(tmp_path):
     spans = {"b": (30, SECONDS)}
     log = write(tmp_path / "log.mcap", STARTS, odometry=spans, sees=spans)
     result = smoothed([log], STARTS | {"b": pose("b", 30)})
@@ -90,7 +90,7 @@ def test_a_robot_seen_before_its_log_begins_is_known_from_then(tmp_path):
     assert "30.0 to 59.9 s of 59.9 s" in named(result, "b")
 
 
-def test_logs_without_any_time_in_common_share_the_map_and_are_named(tmp_path):
+def test_logs_without_common_time_share_the_map_with_a_warning(tmp_path):
     logs = [
         write(tmp_path / "a.mcap", ["a"]),
         write(tmp_path / "b.mcap", ["b"], shift_s=1000),
@@ -102,6 +102,6 @@ def test_logs_without_any_time_in_common_share_the_map_and_are_named(tmp_path):
         assert "no time of which is another robot's" in named(result, robot)
 
 
-def test_robots_that_are_there_all_the_time_are_not_named(tmp_path):
+def test_robots_present_all_the_time_cause_no_warning(tmp_path):
     result = smoothed([write(tmp_path / "log.mcap", STARTS)], STARTS)
     assert result.summary["warnings"] == []

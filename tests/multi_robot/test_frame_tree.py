@@ -1,4 +1,4 @@
-"""Robots that do not know where the others are: joined by what they see, or left alone, said so."""
+"""Robots of unknown start: placed by common observations, or in a frame of their own."""
 
 import json
 import tarfile
@@ -55,7 +55,7 @@ EVIDENCE = {
 @pytest.mark.parametrize("seed", SEEDS[:2])
 @pytest.mark.parametrize("what", EVIDENCE)
 def test_unknown_starts_are_found(tmp_path, what, seed):
-    """By whatever robots have in common; the path is then as good as the sightings have it."""
+    """By any common observations; the path is then as accurate as the sightings allow."""
     result = run(tmp_path, seed=seed, **EVIDENCE[what])
     assert result.summary["frames"] == dict.fromkeys(STARTS, "a")
     assert set(result.summary["starts_found"]) == {"b", "c"}
@@ -70,7 +70,7 @@ def test_unknown_starts_are_found(tmp_path, what, seed):
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_found_start_costs_nothing_against_a_known_one(tmp_path, seed):
-    """The map turns a little about the robot that is known; what is in it stays the same."""
+    """The map turns a little about the robot whose start is given; within it nothing changes."""
     given = [f"start.poses.{r}=[{x}, {y}, {phi}]" for r, (x, y, phi) in STARTS.items()]
     errors = [
         evaluate(run(tmp_path, *starts, seed=seed), truth())["joint"]["final"]
@@ -80,7 +80,7 @@ def test_a_found_start_costs_nothing_against_a_known_one(tmp_path, seed):
     assert found < 1.1 * known
 
 
-def test_the_robot_that_is_known_defines_the_world(tmp_path):
+def test_the_robot_with_a_given_start_defines_the_world(tmp_path):
     """Not the first by name, if another one's start is given."""
     result = run(tmp_path, "start.poses.c=[2.0, 5.0, -1.5]")
     assert result.summary["frames"] == dict.fromkeys(STARTS, "c")
@@ -88,7 +88,7 @@ def test_the_robot_that_is_known_defines_the_world(tmp_path):
 
 
 def test_without_identities_sightings_of_robots_are_enough(tmp_path):
-    """Landmarks that nobody names join nobody, and are one in the joint map."""
+    """Landmarks without identity relate no robots, and are merged in the joint map."""
     result = run(tmp_path, "association.identities=ignore")
     assert result.summary["frames"] == dict.fromkeys(STARTS, "a")
     assert len(result.landmarks) == len(LANDMARKS)
@@ -104,7 +104,7 @@ def test_every_back_end_starts_where_robots_were_found(tmp_path, backend):
 
 @pytest.mark.parametrize("marks", [{}, {"6": LANDMARKS["6"]}])
 def test_a_robot_that_never_meets_keeps_a_frame_of_its_own(tmp_path, marks):
-    """One landmark in common does not say how the frames are turned, and ties nothing."""
+    """One common landmark does not determine the relative heading, so it relates nothing."""
     others = {"9": (4.0, 3.0)}
     result = run(
         tmp_path,
@@ -126,7 +126,7 @@ def test_a_robot_that_never_meets_keeps_a_frame_of_its_own(tmp_path, marks):
         np.testing.assert_allclose(found[frame, name], at[:2], atol=0.3)
 
 
-def test_frames_are_in_the_folder_and_judged_apart(tmp_path):
+def test_frames_are_in_the_folder_and_evaluated_apart(tmp_path):
     """The files of a robot in its own frame are there; errors of it alone, none joint."""
     result = run(tmp_path, meets=lambda a, b: a != "c" and b != "c")
     save(result, tmp_path / "out", force=False)
@@ -144,8 +144,8 @@ def test_frames_are_in_the_folder_and_judged_apart(tmp_path):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_sightings_that_are_partly_outliers_do_no_harm(tmp_path, seed):
-    """Two of five that b and c make of robots lead anywhere."""
+def test_outliers_among_sightings_of_robots_do_no_harm(tmp_path, seed):
+    """Two of five sightings of robots by b and c are outliers."""
 
     def spoil(z, rng, observer, seen, _):
         if observer == "a" or seen not in STARTS or rng.random() > 0.4:
@@ -157,8 +157,8 @@ def test_sightings_that_are_partly_outliers_do_no_harm(tmp_path, seed):
     assert max(misfit(result, robot) for robot in STARTS) < 0.2
 
 
-def test_what_has_two_meanings_joins_nobody(tmp_path):
-    """For half of the time c is seen as if it had begun elsewhere: both fit, so neither is taken.
+def test_two_possible_relative_poses_relate_no_robots(tmp_path):
+    """For half of the time c is seen as if it had begun elsewhere: both fit, so neither is used.
 
     Nothing within either half contradicts it.
     """
@@ -184,8 +184,8 @@ def test_what_has_two_meanings_joins_nobody(tmp_path):
 
 
 @pytest.mark.parametrize("pair", [("b", "c"), ("b", "7")])
-def test_exchanged_names_are_put_right_all_the_same(tmp_path, pair):
-    """Landmarks in common join the robots, false names notwithstanding; then names are seen."""
+def test_swapped_identities_are_corrected_with_unknown_starts(tmp_path, pair):
+    """Common landmarks relate the robots despite false identities; then the swap is detected."""
     result = run(tmp_path, names=dict(zip(pair, pair[::-1], strict=True)))
     assert [w for w in result.summary["warnings"] if "exchanged" in w]
     assert result.summary["frames"] == dict.fromkeys(STARTS, "a")
@@ -216,8 +216,8 @@ def real(tmp_path_factory):
 
 
 @pytest.mark.parametrize("known", ["robot1", "robot4"])
-def test_real_robots_are_found_whoever_is_known(real, known):
-    """Within four sigmas of where they truly began, and then as good as if that had been told.
+def test_real_robots_are_placed_whichever_start_is_given(real, known):
+    """Within four sigmas of where they truly began, and then as good as with starts given.
 
     As good after alignment: the turn of the whole map hangs on how exactly one robot drove away.
     Nearly: true starts of four robots are data too, 10 % worth in an excerpt, 1 % in the whole set.

@@ -1,4 +1,4 @@
-"""Two subjects under each other's names: found from where they are seen, and put right."""
+"""Two subjects with swapped identities: detected by where they are seen, and corrected."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def run(tmp_path, names):
 
 
 @pytest.mark.parametrize("pair", [(), ("b", "c"), ("b", "7")])
-def test_exchanged_names_are_found_and_put_right(tmp_path, pair):
+def test_swapped_identities_are_found_and_corrected(tmp_path, pair):
     """A robot with a robot, a robot with a landmark; where nothing is wrong nothing is changed."""
     result = run(tmp_path, dict(zip(pair, pair[::-1], strict=True)))
     told = [w for w in result.summary["warnings"] if "exchanged" in w]
@@ -35,8 +35,8 @@ def test_exchanged_names_are_found_and_put_right(tmp_path, pair):
         np.testing.assert_allclose(found[identity], at, atol=0.15)
 
 
-def test_landmarks_exchanged_among_themselves_are_only_names(tmp_path):
-    """Nothing in the log contradicts it, so nothing is claimed and the paths are as good."""
+def test_swapped_landmarks_do_not_change_the_estimate(tmp_path):
+    """Nothing in the log contradicts it, so nothing is reported and the paths are as good."""
     result = run(tmp_path, {"6": "7", "7": "6"})
     assert not [w for w in result.summary["warnings"] if "exchanged" in w]
     found = {mark.identity: mark.position[:2] for mark in result.landmarks}

@@ -1,4 +1,4 @@
-"""Robots of unknown start in others' scans: found by their motion, and nothing else is."""
+"""Robots of unknown start in others' scans: found by their motion, without false detections."""
 
 from dataclasses import replace
 
@@ -98,7 +98,7 @@ def off(found, name, robots):
 
 
 def fits(found, name, robots):
-    """Within 99.9 % of what is stated, which says something."""
+    """The error is within the 99.9 % ellipse of a covariance that is small."""
     e, P = off(found, name, robots)
     assert e @ np.linalg.solve(P, e) < 16.3
     assert np.sqrt(P[0, 0] + P[1, 1]) < 0.6
@@ -157,7 +157,7 @@ def test_the_observer_may_be_the_one_to_be_found(tmp_path):
     fits(found, "a", robots)
 
 
-def test_two_that_see_the_same_robot_are_joined_by_it(tmp_path):
+def test_two_robots_that_see_the_same_robot_are_related_by_it(tmp_path):
     """c is seen by nobody: where it is follows from where it sees b."""
     robots = {"a": A, "b": B, "c": robot((-6.5, -5.0), deg=30.0)}
     found = joined(tmp_path, robots)
@@ -167,7 +167,7 @@ def test_two_that_see_the_same_robot_are_joined_by_it(tmp_path):
         fits(found, name, robots)
 
 
-def test_like_robots_are_told_by_their_ways(tmp_path):
+def test_robots_of_one_shape_are_distinguished_by_their_paths(tmp_path):
     other = robot(
         (-1.0, 4.2), (-3.0, 3.6), (-4.5, 1.0), (-3.0, -1.8), (-0.5, -2.5), (2.5, -3.5), deg=200.0
     )
@@ -202,7 +202,7 @@ def test_nothing_else_that_moves_is_the_robot(tmp_path, what, seen):
         fits(found, "b", robots)
 
 
-def test_a_robot_that_drives_straight_is_anything_that_does(tmp_path):
+def test_a_straight_path_is_not_accepted(tmp_path):
     """One of its shape goes as far as fast elsewhere: nothing tells them apart."""
     away = robot((14.0, -2.0), (20.0, -2.0))
     other = robot((-2.0, 2.5), (4.0, 2.5), laser=None)
@@ -211,8 +211,8 @@ def test_a_robot_that_drives_straight_is_anything_that_does(tmp_path):
     assert "moved too simply" in found.undecided["b"]
 
 
-def test_robots_that_drive_alike_are_not_told_apart(tmp_path):
-    """Both seen: either is either, though each knows where the other is. One seen: one of them."""
+def test_robots_that_drive_alike_are_not_distinguished(tmp_path):
+    """Both visible: undecided, though one start is known. One visible: it may be either."""
     few = replace(LASER, period_s=0.5, step_deg=1.0)
     standing = robot((-7.0, -5.0))
     behind = robot((-1.2, -3.0), *((x - 1.7, y) for x, y in WAY), deg=45.0, laser=few)
@@ -251,7 +251,7 @@ def test_sightings_of_robots_may_be_ignored(tmp_path):
 
 
 @pytest.mark.parametrize("exact", [1.0, 1e-6])
-def test_errors_of_a_way_are_a_covariance(exact):
+def test_the_joint_covariance_of_a_path_is_positive_definite(exact):
     """Positive definite, also where odometry adds nearly nothing to the floor of each motion."""
     config = OdometryConfig()
     tiny = {k: exact * getattr(config, k) for k in ("k_x_m", "k_y_m", "k_phi_m", "k_phi_rad")}
@@ -289,7 +289,7 @@ def test_only_scans_between_which_a_robot_drove_are_kept():
     assert kept.scans[-1].time_ns <= 10 * S
 
 
-def test_errors_of_a_way_go_together_as_those_of_its_parts():
+def test_the_joint_covariance_of_a_path_agrees_with_that_of_its_parts():
     """What the error at one time does not explain of that at a later one is the error of the motion
     in between. Breaks when the lever of the heading or the shared calibration is forgotten."""
     track = driven(30)

@@ -1,4 +1,4 @@
-"""Robots that do not know where the others are and see nothing with a name: joined by their maps.
+"""Robots of unknown start that see nothing with an identity: related by their maps.
 
 Walls are those of the simulated office, whose corridors and doors repeat themselves: what looks
 alike elsewhere is in every one of these runs.
@@ -94,7 +94,7 @@ def halls(path, seed):
 
 
 def forest(path, seed, *, together=True):
-    """Two robots that see trees, none of them with a name; they share a third of them, or none."""
+    """Two robots that see trees without identity; they have a third of them in common, or none."""
     a = {"laser": None, "drive": through((9.0, -1.5), (16.0, 2.0), (17.0, 9.0), (9.0, 12.0))}
     b = {"laser": None, "start_m": (1.0, 9.5), "start_deg": 180.0,
          "drive": through((0.0, 0.0), (8.0, 4.5), (8.5, 9.0), (3.0, 9.0), wait_s=60.0)}  # fmt: skip
@@ -122,7 +122,7 @@ def starts(path):
 
 
 @pytest.mark.parametrize("make", [office, forest])
-def test_robots_are_joined_by_what_has_no_name(tmp_path, make):
+def test_robots_are_related_by_anonymous_maps(tmp_path, make):
     """Within the sigmas that are stated, and then the map is as good as with the start given."""
     off, known, found = [], [], []
     for seed in SEEDS:
@@ -155,8 +155,8 @@ def test_robots_are_joined_by_what_has_no_name(tmp_path, make):
     ],
     ids=["elsewhere in a building", "the same, another seed", "elsewhere in a wood", "like halls"],
 )
-def test_robots_that_were_not_in_one_place_stay_apart(tmp_path, make, why):
-    """Corridors look alike, and of two halls one is like the other: that joins nobody."""
+def test_robots_that_were_in_different_places_stay_apart(tmp_path, make, why):
+    """Corridors look alike, and so do two halls: that relates no robots."""
     result = run(make(tmp_path / "log.mcap"))
     assert result.summary["frames"] == {"a": "a", "b": "b"}
     said = [w for w in result.summary["warnings"] if "in a frame of its own" in w]
@@ -173,7 +173,7 @@ def test_starts_that_are_given_are_taken(tmp_path, monkeypatch):
     assert result.summary["frames"] == {"a": "a", "b": "a"}
 
 
-# ---------------------------------------------------------------- which meetings to believe
+# ---------------------------------------------------------------- choice between matches
 
 TURNED = np.array([12.0, -5.0, 2.0])
 
@@ -187,8 +187,8 @@ def row(count, frame):
     ]
 
 
-def met(here, there, start, pairs, same=0.8):
-    """Meetings by which the other robot began at ``start`` (3,)."""
+def matches(here, there, start, pairs, same=0.8):
+    """Matches by which the other robot began at ``start`` (3,)."""
     return [
         PlaceMatch(i, j, Match(pose, np.diag([0.02, 0.02, 0.005]) ** 2, same, 0.0))
         for i, j in pairs
@@ -196,7 +196,7 @@ def met(here, there, start, pairs, same=0.8):
     ]
 
 
-def believed(monkeypatch, found, here, there):
+def chosen(monkeypatch, found, here, there):
     monkeypatch.setattr("graphslam.multi_robot.place_recognition.verify_places", lambda *_: ([], 0))
     P = np.kron(np.eye(len(here)), np.diag([0.02, 0.02, 0.005]) ** 2)
     return choose_alignment(
@@ -204,38 +204,38 @@ def believed(monkeypatch, found, here, there):
     )
 
 
-def test_meetings_that_agree_say_where_the_other_began(monkeypatch):
+def test_matches_that_agree_determine_the_start(monkeypatch):
     """Some that do not agree with each other change nothing."""
     here, there = row(8, np.zeros(3)), row(8, TURNED)
-    found = met(here, there, TURNED, [(k, k) for k in range(5)])
-    found += met(here, there, np.array([3.0, 1.0, -1.0]), [(2, 6)])
-    found += met(here, there, np.array([-3.0, 4.0, 1.0]), [(5, 0)])
-    relation = believed(monkeypatch, found, here, there)
+    found = matches(here, there, TURNED, [(k, k) for k in range(5)])
+    found += matches(here, there, np.array([3.0, 1.0, -1.0]), [(2, 6)])
+    found += matches(here, there, np.array([-3.0, 4.0, 1.0]), [(5, 0)])
+    relation = chosen(monkeypatch, found, here, there)
     assert isinstance(relation, RelativeFrame)
     assert relation.weight == 5
     assert relation.pose == pytest.approx(TURNED, abs=1e-6)
 
 
-def test_three_meetings_are_not_enough(monkeypatch):
-    """They may agree by chance, which is no doubt to speak of."""
+def test_three_matches_are_not_enough(monkeypatch):
+    """They may agree by chance; that is not worth a warning."""
     here, there = row(8, np.zeros(3)), row(8, TURNED)
-    found = met(here, there, TURNED, [(0, 0), (2, 2), (4, 4)])
-    assert believed(monkeypatch, found, here, there) == ""
+    found = matches(here, there, TURNED, [(0, 0), (2, 2), (4, 4)])
+    assert chosen(monkeypatch, found, here, there) == ""
 
 
-def test_what_is_as_large_as_a_room_may_be_another_room(monkeypatch):
+def test_matches_within_a_room_are_not_enough(monkeypatch):
     """However often one robot was there."""
     here, there = row(8, np.zeros(3)), row(8, TURNED)
     for k, place in enumerate(there):
         place.pose = there[k % 2].pose
-    found = met(here, there, TURNED, [(k % 2, k) for k in range(8)])
-    assert "no larger than a room" in believed(monkeypatch, found, here, there)
+    found = matches(here, there, TURNED, [(k % 2, k) for k in range(8)])
+    assert "no larger than a room" in chosen(monkeypatch, found, here, there)
 
 
 def test_places_that_differ_contradict(monkeypatch):
     """Two of five where the other robot saw something else are too many."""
     here, there = row(8, np.zeros(3)), row(8, TURNED)
-    found = met(here, there, TURNED, [(k, k) for k in range(5)])
+    found = matches(here, there, TURNED, [(k, k) for k in range(5)])
     monkeypatch.setattr("graphslam.multi_robot.place_recognition.verify_places", lambda *_: ([], 2))
     P = np.zeros((24, 24))
     assert "surroundings differ" in str(
@@ -244,18 +244,18 @@ def test_places_that_differ_contradict(monkeypatch):
 
 
 @pytest.mark.parametrize(("alike", "joined"), [(0.8, False), (0.5, True)])
-def test_two_meanings_leave_it_undecided(monkeypatch, alike, joined):
-    """If either shows the places as well; half as well is how corridors are alike."""
+def test_two_alignments_leave_it_undecided(monkeypatch, alike, joined):
+    """If both match equally well; corridors that look alike match half as well."""
     here, there = row(8, np.zeros(3)), row(8, TURNED)
-    found = met(here, there, TURNED, [(k, k) for k in range(5)])
+    found = matches(here, there, TURNED, [(k, k) for k in range(5)])
     other = compose(TURNED, np.array([3.0, 0.0, 0.0]))
-    found += met(here, there, other, [(k + 1, k) for k in range(5)], same=alike)
-    relation = believed(monkeypatch, found, here, there)
+    found += matches(here, there, other, [(k + 1, k) for k in range(5)], same=alike)
+    relation = chosen(monkeypatch, found, here, there)
     assert isinstance(relation, RelativeFrame) is joined
     assert joined or "imply one relative" in relation
 
 
-# ---------------------------------------------------------------- points without name
+# ---------------------------------------------------------------- points without identity
 
 
 def cloud(points, rng, sigma=0.1):
@@ -268,8 +268,8 @@ def related(p, q):
     return relate_points("a", "b", p, q, AssociationConfig().floor_m)
 
 
-def test_points_in_common_say_where_the_other_began():
-    """Half of 60 points on 30 m square, a tenth of them missed by each: always found, and rightly.
+def test_points_in_common_determine_the_start():
+    """Half of 60 points on 30 m square, a tenth of them missed by each: always found, correctly.
 
     Breaks with a turn of the wrong sense, pairs that are not one to one, a mirror image.
     """
@@ -286,16 +286,16 @@ def test_points_in_common_say_where_the_other_began():
     assert 0.3 < np.mean(off) < 2.0
 
 
-def test_points_that_have_nothing_in_common_say_nothing():
-    """However many moves are tried, chance brings too few together: 10 pairs of maps."""
+def test_points_with_nothing_in_common_relate_nothing():
+    """However many transforms are tried, too few points match by chance: 10 pairs of maps."""
     for seed in range(10):
         rng = np.random.default_rng(100 + seed)
         here, there = (rng.uniform(0.0, 30.0, (50, 2)) for _ in range(2))
         assert related(cloud(here, rng), cloud(there, rng)) == ""
 
 
-def test_an_orchard_has_many_meanings():
-    """Trees in rows lie alike wherever one is among them."""
+def test_an_orchard_is_ambiguous():
+    """Trees in rows match at many shifts."""
     rng = np.random.default_rng(5)
     trees = np.stack(np.meshgrid(np.arange(8) * 4.0, np.arange(6) * 4.0), axis=-1).reshape(-1, 2)
     relation = related(cloud(trees, rng), cloud(transform(inverse(TURNED), trees), rng))
@@ -303,8 +303,8 @@ def test_an_orchard_has_many_meanings():
     assert "match at another relative pose" in relation
 
 
-def test_what_has_names_and_what_has_none_may_contradict():
-    """Then the robot keeps a frame of its own, and it is said why."""
+def test_relations_that_contradict_place_no_robot():
+    """Then the robot keeps a frame of its own, with a reason."""
     start = Start(np.zeros(3), np.diag([0.01, 0.01, 0.01]) ** 2)
     cov = np.diag([0.05, 0.05, 0.01]) ** 2
     relations = [RelativeFrame("b", "a", pose, cov, 5.0) for pose in (TURNED, -TURNED)]
@@ -340,7 +340,7 @@ START = np.array([3.0, -2.0, 0.8])
 
 
 @pytest.mark.parametrize(("niche_m", "clear"), [(0.0, False), (4.0, True)])
-def test_a_plain_hall_lies_as_well_the_other_way_round(niche_m, clear):
+def test_a_plain_hall_fits_as_well_the_other_way_round(niche_m, clear):
     """Turned by half a turn; one with a niche does not."""
     at = (-4.0, -1.0, 2.0, 5.0)
     others = alternative_alignments(
@@ -354,9 +354,9 @@ def test_a_plain_hall_lies_as_well_the_other_way_round(niche_m, clear):
 
 
 @pytest.mark.parametrize(("niche_m", "joined"), [(0.0, False), (4.0, True)])
-def test_robots_that_saw_a_plain_hall_are_not_joined(niche_m, joined):
+def test_robots_that_saw_a_plain_hall_are_not_related(niche_m, joined):
     """Both drove from its middle to its end, so only one of five places was seen the other way
-    round as well: that is no second meaning, but neither does anything contradict it."""
+    round as well: that is no second alignment, but nothing contradicts it either."""
     at = (0.0, 2.5, 5.0, 7.5, 10.0)
     here, there = in_hall(niche_m, 28.0, at), in_hall(niche_m, 28.0, at, START)
     P = np.kron(np.eye(len(at)), np.diag([0.02, 0.02, 0.005]) ** 2)

@@ -1,4 +1,4 @@
-"""Robots of known outline in scans: found where they are, as well as stated, nothing else is."""
+"""Robots of known outline in scans: found with consistent covariance, no false detections."""
 
 from dataclasses import replace
 
@@ -86,7 +86,7 @@ def error(sighting, truth):
 
 @pytest.mark.parametrize("name", BODIES)
 @pytest.mark.parametrize("distance_m", [2.0, 5.0, 9.0])
-def test_a_robot_is_found_where_it_is_as_well_as_stated(name, distance_m):
+def test_a_detected_pose_has_a_consistent_covariance(name, distance_m):
     """NEES per degree of freedom over 100 seeds: never above 1.3 (chi-square of 200 and more
     degrees of freedom is below 1.26 with 99.5 %), and not so cautious that the sighting is wasted.
     Breaks when the edges, the laser's mount or the lever arm of the direction are wrong."""
@@ -106,7 +106,7 @@ def test_a_robot_is_found_where_it_is_as_well_as_stated(name, distance_m):
     assert 0.2 < sum(d2) / dof < 1.3
 
 
-def test_directions_are_told_only_where_they_are_seen():
+def test_a_heading_is_measured_only_where_it_is_visible():
     """A round robot has none; a few beams do not show that of a box."""
     sizes = {}
     for name, step_deg in (("round", 0.5), ("box", 0.5), ("box", 2.0)):
@@ -119,7 +119,7 @@ def test_directions_are_told_only_where_they_are_seen():
 
 
 @pytest.mark.parametrize("name", BODIES)
-def test_a_robots_returns_leave_the_scan_and_no_others(name):
+def test_the_returns_of_a_robot_are_removed_and_no_others(name):
     for seed in range(30):
         scan, truth, expected = one_robot(BODIES[name], 4.0, seed)
         left = detect_robots(scan, {"b": expected}, {"b": outline(BODIES[name])}, CONFIG).scan
@@ -131,7 +131,7 @@ def test_a_robots_returns_leave_the_scan_and_no_others(name):
 
 
 def test_no_robot_is_found_where_there_is_none():
-    """Among a crate, a post and a pillar, expected anywhere near them: of other sizes they are."""
+    """Among a crate, a post and a pillar of other sizes, expected anywhere near them."""
     things = replace(
         HALL,
         boxes=(Box("crate", (4.0, 3.0), (1.6, 1.4), 20.0),),
@@ -166,8 +166,8 @@ def test_what_was_there_while_the_robot_was_elsewhere_is_not_the_robot():
     assert not detect_robots(now, known, outlines, CONFIG, {"b": [view]}).sightings
 
 
-def test_two_like_robots_side_by_side_are_not_told_apart():
-    """Expected between them: either may be it, so there is no sighting; both leave the scan."""
+def test_two_robots_of_one_shape_side_by_side_are_not_distinguished():
+    """Expected between them: either may be it, so no sighting; both are removed from the scan."""
     body, rng = BODIES["round"], np.random.default_rng(2)
     at = {name: np.array([[4.0, y, 0.0]]) for name, y in (("b", 0.5), ("c", -0.5))}
     (scan,) = scans(np.zeros((1, 3)), HALL, {n: (body, p) for n, p in at.items()}, rng)
@@ -256,7 +256,7 @@ def test_no_landmark_is_made_of_a_robot(tmp_path):
     assert summary["dropped"]["range: of a robot"] > 100
 
 
-def test_what_moves_leaves_the_scans(tmp_path):
+def test_dynamic_objects_are_removed_from_the_scans(tmp_path):
     """Nobody knows its outline, but where it is now the laser looked through before."""
     scenario = beside((7.0, -6.0), (7.0, 2.0), 0.5)
     kept, told = inside(tmp_path, scenario, "front_end.dynamic_objects=keep")
@@ -267,6 +267,6 @@ def test_what_moves_leaves_the_scans(tmp_path):
 
 
 @pytest.mark.parametrize("bad", ["[[0, 0], [1, 0]]", "[[0, 0], [1, 0], [1]]", "[[-0.2]]", "[[]]"])
-def test_a_bad_outline_is_refused_by_its_key(bad):
+def test_a_bad_outline_is_an_error_that_names_its_key(bad):
     with pytest.raises(ConfigError, match="outline: needs three corners"):
         load_config(overrides=[f"robots.b.outline={bad}"])
