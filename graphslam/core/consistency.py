@@ -7,11 +7,12 @@ Hypotheses are judged in pairs first; the largest set that agrees in pairs is lo
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from graphslam.core.gaussian import chi2_quantile
+from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared
 from graphslam.core.geometry import Array, transform, wrap
 
 IntArray = NDArray[np.int64]
@@ -50,9 +51,8 @@ def largest_consistent_set(r: Array, S: Array, probability: float, starts: int) 
     rest = r[:, None] - (gain @ r[None, :, :, None])[..., 0]
     left = own[:, None] - gain @ blocks.transpose(1, 0, 2, 3)
     left[np.arange(n), np.arange(n)] = np.eye(3)  # of itself nothing is left
-    given = (rest * np.linalg.solve(left, rest[..., None])[..., 0]).sum(axis=-1)
-    fits = given <= gate
-    alone = np.flatnonzero(np.einsum("ai,aij,aj->a", r, np.linalg.inv(own), r) <= gate)
+    fits = mahalanobis_squared(rest, left) <= gate
+    alone = np.flatnonzero(mahalanobis_squared(r, own) <= gate)
     agree = (fits & fits.T)[np.ix_(alone, alone)]
     np.fill_diagonal(agree, False)
     best = greedy_max_clique(agree, np.ones(len(alone)), starts)
@@ -87,9 +87,8 @@ def leave_one_out_distances(information: Array, r: Array) -> Array:
     diagonal block (d, d) of ``information`` (nd, nd), the inverse of the joint covariance.
     """
     n, d = r.shape
-    pull = (information @ r.ravel()).reshape(n, d, 1)
     own = information.reshape(n, d, n, d)[np.arange(n), :, np.arange(n)]
-    return np.asarray((pull.mT @ np.linalg.solve(own, pull)).ravel())
+    return mahalanobis_squared((information @ r.ravel()).reshape(n, d), own)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,7 +135,7 @@ def rival_set(agree: Array, worth: Array | NDArray[np.float32], rest: IntArray) 
 
 
 def greedy_max_clique(
-    agree: Array, worth: Array | NDArray[np.float32], starts: int | None = None
+    agree: NDArray[Any], worth: Array | NDArray[np.float32], starts: int | None = None
 ) -> IntArray:
     """Indices, in order, of the set found of which all agree in pairs and that is worth most.
 
@@ -193,4 +192,4 @@ def fit_rigid_transform(p: Array, q: Array, variance: Array) -> tuple[Array, Arr
 def poses_differ(a: Array, cov_a: Array, b: Array, cov_b: Array) -> bool:
     """Whether two poses (3,) are more apart than their covariances (3, 3) allow."""
     off = np.append(a[:2] - b[:2], wrap(a[2] - b[2]))
-    return bool(off @ np.linalg.solve(cov_a + cov_b, off) > chi2_quantile(FIT, 3))
+    return bool(mahalanobis_squared(off, cov_a + cov_b) > chi2_quantile(FIT, 3))

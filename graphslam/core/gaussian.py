@@ -1,10 +1,9 @@
-"""Kalman filtering on arrays: the linear filter, and a joint Gaussian whose members come and go.
+"""Kalman filtering on arrays: linear updates, and a joint Gaussian whose members come and go.
 
-`predict` and `update` are the linear filter (thesis 3.1-3.8), pure functions on plain arrays. An
-extended filter (`graphslam.estimation.ekf`) keeps a `JointGaussian`: the same algebra where a
-measurement touches two members of hundreds, so nothing is multiplied that is known to be zero.
-What an error is, and how a
-mean is corrected by one, is the caller's: poses and points are all the same here.
+`move_block` and `update` are the linear filter (thesis 3.1-3.8) on plain arrays. An extended filter
+(`graphslam.estimation.ekf`) keeps a `JointGaussian`: the same algebra where a measurement touches
+two members of hundreds, so nothing is multiplied that is known to be zero. What an error is, and
+how it corrects a mean, is up to the caller: poses and points are treated alike here.
 """
 
 from collections.abc import Hashable, Iterator, Mapping, Sequence
@@ -29,34 +28,48 @@ def chi2_quantile(probability: ArrayLike, dof: ArrayLike) -> Array:
     return np.asarray(chdtri(dof, 1.0 - np.asarray(probability)))
 
 
-def predict(x: Array, P: Array, F: Array, Q: Array, Gu: Array | float = 0.0) -> tuple[Array, Array]:
-    """Time update of the linear filter, thesis 3.3-3.4: F x + G u and F P Fᵀ + Q.
+def mahalanobis_squared(r: Array, S: Array) -> Array:
+    """Squared Mahalanobis distances (...,) of innovations (..., n), covariances S (..., n, n)."""
+    return np.asarray((r * np.linalg.solve(S, r[..., None])[..., 0]).sum(axis=-1))
 
-    Args:
-        x: mean (n,).
-        P: covariance (n, n).
-        F: system matrix (n, n).
-        Q: covariance (n, n) of the system noise.
-        Gu: what the known input adds, (n,).
+
+def move_block(P: Array, block: slice, F: Array, Q: Array) -> None:
+    """System update in place of one block of a covariance (n, n), thesis 3.4 and 3.12.
+
+    The block's error e becomes F e + noise of covariance Q (d, d); only its rows and columns
+    change.
     """
-    return np.asarray(F @ x + Gu), np.asarray(F @ P @ F.T + Q)
+    own = symmetric(F @ P[block, block] @ F.T + Q)
+    P[block] = F @ P[block]
+    P[:, block] = P[block].T
+    P[block, block] = own
 
 
-def update(x: Array, P: Array, z: Array, H: Array, R: Array) -> tuple[Array, Array]:
-    """Measurement update of the linear filter, thesis 3.5-3.8, for z = H x + noise.
+def update(
+    x: Array, P: Array, H: Array, R: Array, innovation: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Measurement update of the linear filter, thesis 3.5-3.8, of any number of Gaussians.
 
     Args:
-        x: mean (n,).
-        P: covariance (n, n).
-        z: measurement (k,).
-        H: measurement matrix (k, n).
-        R: covariance (k, k) of z.
+        x: means (..., n).
+        P: covariances (..., n, n).
+        H: measurement matrices (..., k, n).
+        R: covariances (..., k, k) of the measurements.
+        innovation: measured minus expected, (..., k).
+
+    Returns:
+        Means, covariances, squared normalised innovations (...,) and the log determinants (...,)
+        of the innovations' covariances.
 
     Raises:
-        numpy.linalg.LinAlgError: the innovation's covariance is not positive definite.
+        numpy.linalg.LinAlgError: an innovation's covariance is not positive definite.
     """
-    B, whitened, _ = whiten(P @ H.T, H @ P @ H.T + R, z - H @ x)
-    return x + B.T @ whitened, P - B.T @ B
+    L = np.linalg.cholesky(H @ P @ H.mT + R)
+    solved = np.linalg.solve(L, np.concatenate([H @ P, innovation[..., None]], axis=-1))
+    B, w = solved[..., :-1], solved[..., -1:]
+    log_det = 2 * np.log(np.diagonal(L, axis1=-2, axis2=-1)).sum(axis=-1)
+    d2 = np.square(w[..., 0]).sum(axis=-1)
+    return x + (B.mT @ w)[..., 0], P - B.mT @ B, d2, log_det
 
 
 def whiten(PHt: Array, S: Array, innovation: Array) -> tuple[Array, Array, float]:
@@ -257,11 +270,7 @@ class JointGaussian(Generic[Name]):
 
         Only its own rows and columns change.
         """
-        block, P = self._slots[name], self.P
-        own = symmetric(F @ P[block, block] @ F.T + Q)
-        P[block] = F @ P[block]
-        P[:, block] = P[block].T
-        P[block, block] = own
+        move_block(self.P, self._slots[name], F, Q)
 
     def project(self, H: Mapping[Name, Array], rows: int) -> tuple[Array, Array]:
         """``P Hᵀ`` (n, rows) and ``H P Hᵀ`` (rows, rows) for H given by its blocks."""

@@ -18,6 +18,7 @@ from typing import Literal
 import numpy as np
 
 from graphslam.core.config import Config
+from graphslam.core.gaussian import update
 from graphslam.core.geometry import Array, compose, compose_jacobians, wrap
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Motion, Start, Step
@@ -151,7 +152,9 @@ class RbpfBackend(FilterBackend):
             H[:, :, self._blocks[target]] = H_t
         else:
             R = R + H_t @ self._landmarks[target].cov @ H_t.mT
-        self._weigh(*_update(self._x, self._P, H, R, -row.residual(z, x, t)), row.rows)
+        innovation = -row.residual(z, x, t)
+        self._x, self._P, d2, log_det = update(self._x, self._P, H, R, innovation)
+        self._weigh(d2, log_det, row.rows)
 
     def _sample_pose(self, robot: str) -> None:
         """Sample the latest pose of a robot, and condition the poses of the others on it.
@@ -189,12 +192,14 @@ class RbpfBackend(FilterBackend):
         R = row.noise(z, self._each(seen.cov), x, landmark.mean)
         np.linalg.cholesky(R[0])  # as in `_update_poses`
         innovation = -row.residual(z, x, landmark.mean)
-        likelihood = _update(landmark.mean, landmark.cov, H, R, innovation)
+        landmark.mean, landmark.cov, d2, log_det = update(
+            landmark.mean, landmark.cov, H, R, innovation
+        )
         if weigh:
-            self._weigh(*likelihood, row.rows)
+            self._weigh(d2, log_det, row.rows)
 
     def _weigh(self, d2: Array, log_det: Array, rows: int) -> None:
-        """Multiply each particle's weight by the likelihood of its innovation, see `_update`."""
+        """Multiply each particle's weight by the likelihood of its innovation, see `update`."""
         self._log_weights -= 0.5 * (d2 + log_det)
         self._twice_error += float(self._weights @ d2)
         self._dof += rows
@@ -278,28 +283,3 @@ class RbpfBackend(FilterBackend):
             cov = (self._weights * off.T) @ off + self._within(landmark.cov)
             marginals[i] = (mean, 0.5 * (cov + cov.T))
         return marginals
-
-
-def _update(x: Array, P: Array, H: Array, R: Array, innovation: Array) -> tuple[Array, Array]:
-    """Kalman update in place, thesis 3.5-3.8, of N Gaussians at once.
-
-    Args:
-        x: means (N, n).
-        P: covariances (N, n, n).
-        H: measurement matrices (N, k, n).
-        R: covariances (N, k, k).
-        innovation: (N, k).
-
-    Returns:
-        Squared normalised innovations (N,) and log determinants of their covariances (N,).
-
-    Raises:
-        numpy.linalg.LinAlgError: a covariance is not positive definite.
-    """
-    L = np.linalg.cholesky(H @ P @ H.mT + R)
-    solved = np.linalg.solve(L, np.concatenate([H @ P, innovation[..., None]], axis=-1))
-    B, w = solved[..., :-1], solved[..., -1:]
-    x += (B.mT @ w)[..., 0]
-    P -= B.mT @ B
-    log_det = 2 * np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1)
-    return np.square(w[..., 0]).sum(axis=1), log_det

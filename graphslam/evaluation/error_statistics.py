@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.core.gaussian import chi2_quantile
+from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared
 from graphslam.core.geometry import Array
 
 #: probability of the ellipsoids whose coverage is counted, and the tails of the NEES' bounds
@@ -28,8 +28,7 @@ def nees(errors: Array, covs: Array) -> Array:
     values = np.full(len(errors), np.nan)
     good = np.flatnonzero(np.isfinite(covs).all(axis=(1, 2)))
     good = good[np.linalg.eigvalsh(covs[good])[:, 0] > 0]
-    solved = np.linalg.solve(covs[good], errors[good][..., None])[..., 0]
-    values[good] = np.sum(errors[good] * solved, axis=1)
+    values[good] = mahalanobis_squared(errors[good], covs[good])
     return values
 
 

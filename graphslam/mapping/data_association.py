@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphslam.core.config import AssociationConfig
+from graphslam.core.gaussian import move_block
 from graphslam.core.geometry import Array, compose, compose_jacobians, rotate_cov
 from graphslam.core.records import Association, Motion, Observation
 from graphslam.estimation.backend import Backend, Joint
@@ -43,9 +44,7 @@ def predicted_joint(joint: Joint, motion: Motion | None) -> Joint:
         return joint
     F, W = compose_jacobians(joint.pose, motion.delta)
     P = joint.cov.copy()
-    P[:3] = F @ P[:3]
-    P[:, :3] = P[:, :3] @ F.T
-    P[:3, :3] += W @ motion.cov @ W.T
+    move_block(P, slice(0, 3), F, W @ motion.cov @ W.T)
     return replace(joint, pose=compose(joint.pose, motion.delta), cov=P)
 
 

@@ -14,7 +14,7 @@ from itertools import combinations
 import numpy as np
 
 from graphslam.core.consistency import RIVAL_D2
-from graphslam.core.gaussian import chi2_quantile
+from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared, whiten
 from graphslam.core.geometry import Array, between, rotate_cov, wrap
 from graphslam.core.records import Association, Step
 from graphslam.estimation.backend import Joint
@@ -219,7 +219,7 @@ def _distances(marks: _Map, i: IntArray, j: IntArray, r: Array, H_i: Array, H_j:
     blocks = P.reshape(len(P) // 3, 3, -1, 3).transpose(0, 2, 1, 3)
     cross = H_i @ blocks[i, j] @ H_j.mT
     S = H_i @ blocks[i, i] @ H_i.mT + H_j @ blocks[j, j] @ H_j.mT + cross + cross.mT + floor
-    return np.asarray(np.sum(r * np.linalg.solve(S, r[..., None])[..., 0], axis=1))
+    return mahalanobis_squared(r, S)
 
 
 def _condition(marks: _Map, a: int, b: int, r: Array, H_a: Array, H_b: Array) -> None:
@@ -227,9 +227,8 @@ def _condition(marks: _Map, a: int, b: int, r: Array, H_a: Array, H_b: Array) ->
     P, floor = marks.P, _FLOORS[int(marks.point[a])]
     PHt = P[:, 3 * a : 3 * a + 3] @ H_a.T + P[:, 3 * b : 3 * b + 3] @ H_b.T
     S = H_a @ PHt[3 * a : 3 * a + 3] + H_b @ PHt[3 * b : 3 * b + 3] + floor[: len(r), : len(r)]
-    L = np.linalg.cholesky(S)
-    B = np.linalg.solve(L, PHt.T)
-    marks.x -= (B.T @ np.linalg.solve(L, r)).reshape(-1, 3)
+    B, w, _ = whiten(PHt, S, -r)
+    marks.x += (w @ B).reshape(-1, 3)
     P -= B.T @ B
 
 

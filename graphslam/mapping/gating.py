@@ -14,7 +14,7 @@ from scipy.linalg import block_diag
 from scipy.optimize import linear_sum_assignment
 
 from graphslam.core.config import AssociationConfig
-from graphslam.core.gaussian import chi2_quantile
+from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared
 from graphslam.core.geometry import Array, between, compose, wrap
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Observation
@@ -209,7 +209,7 @@ def compare(
         tt, xt = P_tt[which][:, : model.dim, : model.dim], P_xt[which][:, :, : model.dim]
         cross = H_x @ xt @ H_t.mT
         S = H_x @ P_xx[which] @ H_x.mT + cross + cross.mT + H_t @ tt @ H_t.mT + R
-        d2[which] = np.einsum("ki,ki->k", r, np.linalg.solve(S, r[..., None])[..., 0])
+        d2[which] = mahalanobis_squared(r, S)
         dof[which] = model.rows
         for place, n in enumerate(which):
             residuals[n], noises[n] = r[place], R[place]
@@ -276,7 +276,7 @@ def jointly_compatible(
         rows = slice(row, row + len(compared.residuals[k]))
         H[rows, :3], H[rows, where] = compared.H_x[k], compared.H_t[k]
         row = rows.stop
-    d2 = float(r @ np.linalg.solve(H @ P @ H.T + R, r))
+    d2 = float(mahalanobis_squared(r, H @ P @ H.T + R))
     return d2 < float(chi2_quantile(probability, len(r)))
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from graphslam.core.config import LoopClosureConfig
 from graphslam.core.consistency import has_rival, largest_consistent_set
+from graphslam.core.gaussian import mahalanobis_squared
 from graphslam.core.geometry import Array, between, log, rotate_cov, rotation3
 from graphslam.core.records import Closure, Trajectory
 from graphslam.core.worker import parallel_map
@@ -246,7 +247,7 @@ def inflate_covariances(
     inflated = []
     for closure, r in zip(closures, residuals(closures, states), strict=True):
         turned = rotate_cov(closure.cov, -float(closure.delta[2]))
-        scale = float(r @ np.linalg.solve(turned, r)) / 9.0
+        scale = float(mahalanobis_squared(r, turned)) / 9.0
         inflated.append(replace(closure, cov=scale * closure.cov) if scale > 1.0 else closure)
     return inflated
 

@@ -24,7 +24,7 @@ import numpy as np
 from graphslam.core.config import BackendConfig, Config, RobustConfig
 from graphslam.core.consistency import FIT, greedy_max_clique, has_rival, rival_set
 from graphslam.core.frame_forest import PRIOR_INFLATION, grow_frame_forest
-from graphslam.core.gaussian import chi2_quantile
+from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared
 from graphslam.core.geometry import Array, adjoint, between, compose, inverse, log, rotate_cov
 from graphslam.core.records import Closure, Estimate, Motion, RelativePose, Start, Step
 from graphslam.estimation.isam2 import Isam2Backend, Reoptimiser
@@ -213,8 +213,7 @@ def _loops(messages: Sequence[RelativePose], odometry: Mapping[str, _Chain]) -> 
         there *= np.sign(i - i[a])[:, None, None]
         back *= np.sign(j - j[a])[:, None, None]
         S = there + A[a] @ back @ A[a].T + R[a] + turn @ R @ turn.mT
-        e = log(loop)[:, :, None]
-        agree[a] = (e.mT @ np.linalg.solve(S, e)).ravel() <= gate
+        agree[a] = mahalanobis_squared(log(loop), S) <= gate
     agree &= agree.T
     np.fill_diagonal(agree, False)
     return E, agree

@@ -21,7 +21,7 @@ from graphslam.core.consistency import (
     has_rival,
     rival_set,
 )
-from graphslam.core.gaussian import chi2_quantile
+from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared
 from graphslam.core.geometry import (
     Array,
     between,
@@ -291,14 +291,8 @@ def _pairwise_agreement(found: Sequence[PlaceMatch], starts: Array, covs: Array)
     place = np.array([m.index_b for m in found])
     different = place[:, None] != place
     S[~different] = np.eye(3)
-    d2 = _squared_distances(innovation, S)
+    d2 = mahalanobis_squared(innovation, S)
     return np.asarray(different & (d2 <= chi2_quantile(AGREE, 3)))
-
-
-def _squared_distances(innovation: Array, S: Array) -> Array:
-    """Squared Mahalanobis distances (...) of innovations (..., 3), covariances S (..., 3, 3)."""
-    weighted = np.linalg.solve(S, innovation[..., None])[..., 0]
-    return np.asarray((innovation * weighted).sum(axis=-1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -329,7 +323,7 @@ def _consensus(starts: Array, covs: Array, members: IntArray) -> _Consensus:
     own = covs[np.arange(n), np.arange(n)]
     S = own + fit.cov - cross - cross.mT
     S[members] = own[members]
-    d2 = _squared_distances(off - fit.x, S)
+    d2 = mahalanobis_squared(off - fit.x, S)
     d2[members] = 0.0
     pose = reference + fit.x
     pose[2] = wrap(pose[2])

@@ -18,7 +18,7 @@ import numpy as np
 
 from graphslam.core.config import Config, FrontEndConfig
 from graphslam.core.consistency import RIVAL_D2
-from graphslam.core.gaussian import chi2_quantile
+from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared, move_block
 from graphslam.core.geometry import (
     Array,
     between,
@@ -99,9 +99,7 @@ def expected_pose(
         if step is None:
             continue
         F, W = compose_jacobians(poses[k], step.delta)
-        P[own] = F @ P[own]
-        P[:, own] = P[:, own] @ F.T
-        P[own, own] += W @ step.cov @ W.T
+        move_block(P, own, F, W @ step.cov @ W.T)
         poses[k] = compose(poses[k], step.delta)
     h = between(poses[0], poses[1])
     H = np.hstack(MODELS["robot-pose"].jacobians(h, *poses))
@@ -183,7 +181,7 @@ def _fit_clusters(
         off = fit.pose - pose
         off[2] = wrap(off[2])
         S = cov[:n, :n] + fit.cov[:n, :n] + MODEL_SIGMA_M**2 * np.eye(n)
-        d2 = float(off[:n] @ np.linalg.solve(S, off[:n]))
+        d2 = float(mahalanobis_squared(off[:n], S))
         points = sweep.points[span[0] : span[1] + 1]
         stood = any(was_present(points, before, here) for before, here in without_robot)
         if d2 < chi2_quantile(GATE_PROBABILITY, n) and not stood:

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from graphslam.core.config import ScanMatchingConfig
-from graphslam.core.gaussian import chi2_quantile
+from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared, symmetric, update
 from graphslam.core.geometry import Array, rotation, wrap
 from graphslam.core.records import Closure, Motion, Observation
 from graphslam.perception.scan_matching import Submap, align, fit, make_submap, match
@@ -52,7 +52,7 @@ def checked_against_scans(motion: Motion, before: Submap, now: Submap) -> Motion
         now: scan of the state where it ends.
     """
     here, step, cov = fit(now, before, motion.delta)
-    if here >= USUAL and _distance(step, motion.cov + cov) < LOOK:
+    if here >= USUAL and mahalanobis_squared(step, motion.cov + cov) < LOOK:
         return motion
     guesses = [align(now, before, motion.delta)]
     if fit(now, before, guesses[0][0])[0] < max(FITS, here + BETTER):
@@ -62,29 +62,32 @@ def checked_against_scans(motion: Motion, before: Submap, now: Submap) -> Motion
     there, (pose, cov) = max(
         ((fit(now, before, pose)[0], (pose, cov)) for pose, cov in guesses), key=lambda g: g[0]
     )
-    off, information = _sure(_difference(pose, motion.delta), cov)
+    axes, variances = _measured_directions(cov)
+    measured_off = axes.T @ _difference(pose, motion.delta)
+    off = axes @ measured_off
     if (
         there < max(FITS, here + BETTER)
         or (np.hypot(off[0], off[1]) < SMALLEST_M and abs(off[2]) < SMALLEST_RAD)
-        or _distance(off, motion.cov + cov) < CONTRADICTED
+        or mahalanobis_squared(off, motion.cov + cov) < CONTRADICTED
     ):
         return motion
-    return fused(replace(motion, cov=motion.cov + np.outer(off, off)), off, information)
+    inflated = replace(motion, cov=motion.cov + np.outer(off, off))
+    return fused(inflated, axes.T, np.diag(variances), measured_off)
 
 
-def fused(motion: Motion, off: Array, information: Array) -> Motion:
-    """A motion and a measurement of it as one.
+def fused(motion: Motion, H: Array, R: Array, innovation: Array) -> Motion:
+    """A motion after a measurement of it; calibration errors no longer explain what is left.
 
     Args:
-        motion: the motion. Calibration errors no longer tell what the result is off by.
-        off: (3,) how the measurement differs from it.
-        information: (3, 3) of the measurement, along the same axes; may be singular.
+        motion: the motion.
+        H: (k, 3) the measured combinations of its components.
+        R: (k, k) their covariance.
+        innovation: (k,) measured minus the motion's.
     """
-    P = np.linalg.inv(np.linalg.inv(motion.cov) + information)
-    delta = motion.delta + P @ information @ off
+    delta, cov, _, _ = update(motion.delta, motion.cov, H, R, innovation)
     delta[2] = wrap(delta[2])
     D = np.zeros_like(motion.d_delta_d_calibration)
-    return replace(motion, delta=delta, cov=(P + P.T) / 2, d_delta_d_calibration=D, matched=True)
+    return replace(motion, delta=delta, cov=symmetric(cov), d_delta_d_calibration=D, matched=True)
 
 
 def _difference(a: Array, b: Array) -> Array:
@@ -93,14 +96,14 @@ def _difference(a: Array, b: Array) -> Array:
     return np.asarray(off)
 
 
-def _sure(off: Array, cov: Array) -> tuple[Array, Array]:
-    """A difference and its information in the directions whose sigma is below `SURE`.
+def _measured_directions(cov: Array) -> tuple[Array, Array]:
+    """Axes (3, k) along which a sigma is below `SURE`, and the variances (k,) along them.
 
     The noise of points looks like a little structure, also along a corridor.
     """
-    values, axes = np.linalg.eigh(cov)
-    axes, values = axes[:, values < SURE**2], values[values < SURE**2]
-    return axes @ (axes.T @ off), (axes / values) @ axes.T
+    variances, axes = np.linalg.eigh(cov)
+    measured = variances < SURE**2
+    return axes[:, measured], variances[measured]
 
 
 def measured(motion: Motion, before: Submap, robot: str, points: Array) -> Closure | None:
@@ -116,7 +119,7 @@ def measured(motion: Motion, before: Submap, robot: str, points: Array) -> Closu
     if source is None:
         return None
     pose, cov = align(source, before, motion.delta)
-    if _distance(_difference(pose, motion.delta), motion.cov + cov) > CONTRADICTED:
+    if mahalanobis_squared(_difference(pose, motion.delta), motion.cov + cov) > CONTRADICTED:
         return None
     return Closure(robot, motion.end_ns, robot, motion.start_ns, pose, cov)
 
@@ -132,7 +135,3 @@ def beside_lines(points: Array, seen: Sequence[Observation]) -> Array:
         near = (x > o.extent[0] - BESIDE_M) & (x < o.extent[1] + BESIDE_M)
         free &= ~(near & (np.abs(y) < BESIDE_M))
     return points[free]
-
-
-def _distance(off: Array, cov: Array) -> float:
-    return float(off @ np.linalg.solve(cov, off))

@@ -97,7 +97,7 @@ def test_fusion_is_that_of_informations():
     rng = np.random.default_rng(0)
     A, B = (m @ m.T + np.eye(3) for m in rng.normal(size=(2, 3, 3)))
     a = np.array([1.0, 2.0, np.pi - 0.05])
-    found = fused(Motion(0, S, a, A, D, 1.0), np.array([0.5, -1.0, 0.1]), np.linalg.inv(B))
+    found = fused(Motion(0, S, a, A, D, 1.0), np.eye(3), B, np.array([0.5, -1.0, 0.1]))
     P = np.linalg.inv(np.linalg.inv(A) + np.linalg.inv(B))
     mean = a + P @ np.linalg.solve(B, [0.5, -1.0, 0.1])
     np.testing.assert_allclose(found.cov, P, rtol=1e-9)
