@@ -43,10 +43,11 @@ def calibrate(
         for track in tracks.values():
             track.calibration = track.calibration.held()
         steps = rebuild(estimate, last)
-        solved = solve_calibrated(steps, estimate, priors, initial, robust, rough=not last)
-        estimate = solved.estimate
+        estimate, solved = solve_calibrated(
+            steps, estimate, priors, initial, robust, rough=not last
+        )
         for name, track in tracks.items():
-            track.calibration = solved.calibrations[name]
+            track.calibration = solved[name]
     return estimate, steps
 
 

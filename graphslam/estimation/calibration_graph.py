@@ -6,7 +6,6 @@ is estimated jointly, and its uncertainty is in every covariance.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import gtsam
@@ -25,14 +24,6 @@ IntArray = np.ndarray[Any, np.dtype[np.int64]]
 CONVERGED_ERROR = 1e-5
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CalibratedEstimate:
-    """The estimate, and each robot's calibration estimated with it."""
-
-    estimate: Estimate
-    calibrations: Mapping[str, Calibration]
-
-
 def solve_calibrated(
     steps: Sequence[Step],
     start: Estimate,
@@ -41,20 +32,23 @@ def solve_calibrated(
     kernel: RobustConfig,
     *,
     rough: bool = False,
-) -> CalibratedEstimate:
+) -> tuple[Estimate, dict[str, Calibration]]:
     """Optimise all states, landmarks and calibrations together.
 
     Motions are linear in the calibration, around the one that they were computed with, and
-    linearised in their states at ``start``: recompute them and solve again from the result.
+    linearised in their states at ``start``: recompute them and solve again from the result. Their
+    covariances must not include the calibration's.
 
     Args:
-        steps: all steps; the covariances of their motions must not include the calibration's.
+        steps: all steps.
         start: an estimate of every variable.
         priors: robot -> its calibration before any data.
         now: robot -> the calibration that the motions were computed with.
         kernel: of observations.
-        rough: stop early, in a fraction of the time, as a start for another round; covariances are
-            NaN.
+        rough: stop early, see `Reoptimiser.solve`; covariances are NaN.
+
+    Returns:
+        The estimate and each robot's calibration.
 
     Raises:
         EstimationError: a covariance is not positive definite, or a state is unknown.
@@ -64,8 +58,8 @@ def solve_calibrated(
     keys = {robot: int(gtsam.symbol("c", k)) for k, robot in enumerate(sorted(priors))}
     free = {r: np.flatnonzero(np.diag(c.cov) > HELD_SIGMA**2) for r, c in priors.items()}
     for robot, prior in priors.items():
-        if len(free[robot]):
-            key, use = keys[robot], free[robot]
+        key, use = keys[robot], free[robot]
+        if len(use):
             values.insert(key, now[robot].mean[use])
             noise = factors.gaussian(prior.cov[np.ix_(use, use)])
             graph.add(gtsam.PriorFactorVector(key, prior.mean[use], noise))
@@ -109,7 +103,7 @@ def solve_calibrated(
             mean[use] = values.atVector(keys[robot])
             cov[np.ix_(use, use)] = np.nan if rough else covs[keys[robot]]
         calibrations[robot] = Calibration(prior.names, mean, cov)
-    return CalibratedEstimate(estimate, calibrations)
+    return estimate, calibrations
 
 
 def _linear_motions(

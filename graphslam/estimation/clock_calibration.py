@@ -65,13 +65,8 @@ def estimate_clocks(
 ) -> dict[str, ClockEstimate]:
     """The clocks of all robots but the first, whose clock is the common one.
 
-    Args:
-        steps: as recorded, with clocks ``applied``.
-        estimate: of all their states and landmarks.
-        sightings: the observations of robots in the steps, as read from the log.
-        tracks: odometry of every robot.
-        applied: clocks that the log was read with.
-        config: settings.
+    The steps are as recorded with the clocks ``applied``; ``sightings`` are the observations of
+    robots in them, as read from the log.
     """
     if len(tracks) < 2:
         return {}
@@ -156,15 +151,9 @@ class _Path:
 def offsets_from_paths(
     sightings: Iterable[Sighting], tracks: Mapping[str, Track], max_offset_s: float
 ) -> dict[str, ClockOffset]:
-    """How far each robot's clock is ahead of the first robot's.
+    """How far each robot's clock is ahead of the first robot's, where that is clearly not zero.
 
-    Args:
-        sightings: of robots.
-        tracks: odometry of every robot.
-        max_offset_s: largest offset tried.
-
-    Returns:
-        Robot -> offset, of the robots whose offset is clearly not zero.
+    ``tracks`` is the odometry of every robot, ``max_offset_s`` the largest offset tried.
     """
     pairs: dict[tuple[str, str], list[Sighting]] = defaultdict(list)
     for sighting in sightings:
@@ -177,12 +166,12 @@ def offsets_from_paths(
     paths = {robot: _path(tracks[robot], start_ns) for robot in involved}
     steps = round(max_offset_s / STEP_S)
     tried = np.asarray(STEP_S * np.arange(-steps, steps + 1))
-    offsets = {}
-    for pair, seen in pairs.items():
-        offset = _relative_offset(seen, paths[pair[0]], paths[pair[1]], start_ns, tried)
-        if offset is not None:
-            offsets[pair] = offset
-    return _combined(offsets, min(tracks))
+    offsets = {
+        (a, b): _relative_offset(seen, paths[a], paths[b], start_ns, tried)
+        for (a, b), seen in pairs.items()
+    }
+    clear = {pair: offset for pair, offset in offsets.items() if offset is not None}
+    return _combined(clear, min(tracks))
 
 
 def _path(track: Track, start_ns: int) -> _Path:
@@ -198,12 +187,8 @@ def _relative_offset(
 ) -> ClockOffset | None:
     """How far the target's clock is ahead of the observer's; None if that is not clear.
 
-    Args:
-        seen: sightings of the target.
-        observer: path of the one.
-        target: path of the other.
-        start_ns: time zero of the paths.
-        offsets: (g,) offsets to try, s, evenly spaced around zero.
+    ``start_ns`` is time zero of the paths; ``offsets`` (g,) are those to try, s, evenly spaced
+    around zero.
     """
     times = np.array([1e-9 * (s.time_ns - start_ns) for s in seen])
     span = np.floor(times / SPAN_S).astype(int)

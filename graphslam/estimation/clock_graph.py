@@ -53,14 +53,9 @@ def clock_errors(
 ) -> ClockErrors:
     """One Gauss-Newton step for the clocks, with all states and landmarks as variables.
 
-    Args:
-        steps: as recorded.
-        estimate: of all their states and landmarks.
-        velocities: (n, 3) twists per second of the observed robots, along their own axes, in the
-            order of `robot_associations`.
-        after_s: (n,) time since the clocks' epoch.
-        prior: robot -> correction (2,) so far, of the clocks to estimate; others are correct.
-        kernel: of observations.
+    ``velocities`` (n, 3) are the twists per second of the observed robots, along their own axes, in
+    the order of `robot_associations`; ``after_s`` (n,) is the time since the clocks' epoch.
+    ``prior``: robot -> correction (2,) so far, of the clocks to estimate; others are correct.
 
     Raises:
         EstimationError: the estimate is indeterminate.

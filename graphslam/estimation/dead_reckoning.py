@@ -14,8 +14,8 @@ from graphslam.estimation.backend import Joint, StateTable, TrajectoryRecorder
 from graphslam.estimation.input_checks import (
     check_finite,
     check_positive,
+    describe,
     describe_motion,
-    describe_observation,
     describe_start,
 )
 
@@ -45,12 +45,12 @@ class DeadReckoningBackend:
         for seen in step.associations:
             number = self._states.number(seen.robot, seen.time_ns)
             if isinstance(seen.target, int) and seen.target not in self._landmarks:
-                check_finite(describe_observation(seen), seen.z, seen.cov)
+                check_finite(describe(seen), seen.z, seen.cov)
                 x, P = self._state(seen.robot, number)
                 model = MODELS[seen.model]
                 G_x, G_z = model.invert_jacobians(seen.z, x)
                 noise = G_z @ seen.cov @ G_z.T
-                check_positive(noise, describe_observation(seen))
+                check_positive(noise, describe(seen))
                 self._landmarks[seen.target] = (model.invert(seen.z, x), G_x @ P @ G_x.T + noise)
 
     def _append(self, robot: str, time_ns: int, pose: Array, cov: Array) -> None:

@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
+from scipy.cluster.hierarchy import DisjointSet
 
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array
@@ -51,11 +52,10 @@ class Measurement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Message:
-    """What a robot sends to the others: factors, values of their variables, and its bytes."""
+    """What a robot sends to the others: factors, and values of their variables."""
 
-    factors: tuple[gtsam.NonlinearFactor, ...]
+    factors: Sequence[gtsam.NonlinearFactor]
     values: Mapping[int, Array]
-    size: int
 
 
 @dataclass(slots=True, eq=False)
@@ -115,22 +115,18 @@ class LocalSmoother:
         unsent, self.unsent = self.unsent, []
         estimate = self.isam.calculateBestEstimate()
         content: list[gtsam.NonlinearFactor] = []
-        size = 0
         for section, inner in _sections(unsent, shared):
             as_measured = sum(measurement.size for measurement in section)
             if inner:
                 made, smaller = _condensed(section, inner, estimate, self.dims)
                 if smaller < as_measured:
                     content += made
-                    size += smaller
+                    self.sent += smaller
                     continue
             content += [factor for measurement in section for factor in measurement.factors]
-            size += as_measured
+            self.sent += as_measured
         keys = {key for factor in content for key in factor.keys()}  # noqa: SIM118
-        self.sent += size
-        return Message(
-            tuple(content), {key: factors.read(estimate, key, self.dims[key]) for key in keys}, size
-        )
+        return Message(content, {key: factors.read(estimate, key, self.dims[key]) for key in keys})
 
 
 def _sections(
@@ -140,24 +136,17 @@ def _sections(
 
     Measurements without any such state form one section.
     """
-    root: dict[int, int] = {}
-
-    def find(key: int) -> int:
-        while root[key] != key:
-            key = root[key]
-        return key
-
     inner = [[k for k in m.keys() if factors.is_state(k) and k not in shared] for m in unsent]  # noqa: SIM118
+    connected = DisjointSet({key for keys in inner for key in keys})
     for keys in inner:
-        for key in keys:
-            root.setdefault(key, key)
-            root[find(key)] = find(keys[0])
+        for key in keys[1:]:
+            connected.merge(keys[0], key)
     sections: dict[int | None, list[Measurement]] = defaultdict(list)
     states: dict[int | None, set[int]] = defaultdict(set)
     for measurement, keys in zip(unsent, inner, strict=True):
-        label = find(keys[0]) if keys else None
+        label = connected[keys[0]] if keys else None
         sections[label].append(measurement)
-        states[label] |= set(keys)
+        states[label].update(keys)
     for label, section in sections.items():
         yield section, sorted(states[label])
 
@@ -220,9 +209,8 @@ class DecentralisedBackend(GraphBackend):
             self._next_ns = step.time_ns + self._period_ns
         if step.time_ns >= self._next_ns:
             self.exchange()
-            self._next_ns += self._period_ns * (
-                1 + (step.time_ns - self._next_ns) // self._period_ns
-            )
+            elapsed = (step.time_ns - self._next_ns) // self._period_ns
+            self._next_ns += self._period_ns * (1 + elapsed)
         for group in self.builder.factor_groups(step, self.value):
             self._add(group)
         self._update()

@@ -38,12 +38,7 @@ from graphslam.estimation.filter_base import (
     unknown_landmark,
     with_sigma_along_line,
 )
-from graphslam.estimation.input_checks import (
-    check_positive,
-    describe_closure,
-    describe_observation,
-    indeterminate,
-)
+from graphslam.estimation.input_checks import check_positive, describe, indeterminate
 from graphslam.estimation.m_estimators import robust_weight
 
 
@@ -130,14 +125,14 @@ class EkfBackend(FilterBackend):
             ends = self._closure_ends(closure)
             if ends is not None:  # as if the one robot had been seen from the other
                 kernel = RobustConfig("none") if closure.verified else self._robust
-                model, what = MODELS["robot-pose"], describe_closure(closure)
+                model, what = MODELS["robot-pose"], describe(closure)
                 self._update(*ends, model, closure.delta, closure.cov, what, kernel)
 
     def _observe(self, seen: Association, source: Member, target: Member) -> None:
         """One observation of ``target`` from ``source``: an update, or a new landmark."""
         if target in self._gaussian:
             model, cov = self._model_and_cov(seen)
-            what = describe_observation(seen)
+            what = describe(seen)
             self._update(source, target, model, seen.z, cov, what, self._robust)
         else:
             self._augment(seen, source)
@@ -160,7 +155,7 @@ class EkfBackend(FilterBackend):
         T = self._to_error(mean)
         G_x, G_z = T @ G_x @ self._to_world(x), T @ G_z
         noise = G_z @ cov @ G_z.T
-        check_positive(noise, describe_observation(seen))
+        check_positive(noise, describe(seen))
         self._gaussian.add(seen.target, mean, noise, {source: G_x})
 
     def _update(

@@ -33,9 +33,8 @@ from graphslam.estimation.backend import (
     block_slices,
 )
 from graphslam.estimation.input_checks import (
-    describe_closure,
+    describe,
     describe_motion,
-    describe_observation,
     describe_start,
     indeterminate,
 )
@@ -78,11 +77,8 @@ class GraphBuilder:
     ) -> None:
         """Begin an empty graph.
 
-        Args:
-            kernel: of observations.
-            late: whether late evidence is used.
-            wide: gauge of lines, see `line_gauge_factor`; wide where factors are relinearised.
-            lines: whether to make the factors of lines, or leave them to the caller.
+        ``late``: whether late evidence is used; ``wide``: see `line_gauge_factor`; ``lines``:
+        whether to make the factors of lines, or leave them to the caller.
         """
         self.kernel = kernel
         self.states = StateTable()
@@ -162,17 +158,17 @@ class GraphBuilder:
             self.skipped[PAST_OBSERVATION] += 1
             return None
         key, model = self.state_key(seen.robot, number), MODELS[seen.model]
-        known = not isinstance(seen.target, int) or seen.target in self.landmark_dims
         if isinstance(seen.target, int):
-            target = factors.landmark_key(seen.target)
+            target, known = factors.landmark_key(seen.target), seen.target in self.landmark_dims
         else:
-            target = self.state_key(seen.target, self.states.number(seen.target, time_ns))
+            observed = self.states.number(seen.target, time_ns)
+            target, known = self.state_key(seen.target, observed), True
         self.rows += model.rows
         if known and seen.model == "line" and not self._make_lines:
             return FactorGroup((), "", observed=(key, target, seen))  # its factor is made later
         # only new landmarks and lines need an estimate, which is expensive
         x = t = np.zeros(3)
-        what = describe_observation(seen)
+        what = describe(seen)
         made: list[gtsam.NonlinearFactor] = []
         new = None
         if not known:
@@ -201,7 +197,7 @@ class GraphBuilder:
                 self.skipped[PAST_CLOSURE] += 1
                 continue
             key, other = (self.state_key(*number) for number in numbers)
-            what = describe_closure(closure)
+            what = describe(closure)
             with _covariance_of(what, closure.cov):
                 factor = factors.closure_factor(key, other, closure, self.kernel)
             self.rows += 3

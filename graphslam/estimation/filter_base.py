@@ -17,9 +17,8 @@ from graphslam.estimation.backend import (
 )
 from graphslam.estimation.input_checks import (
     check_finite,
-    describe_closure,
+    describe,
     describe_motion,
-    describe_observation,
     describe_start,
 )
 
@@ -92,21 +91,18 @@ class FilterBackend(ABC):
 
     def _ends(self, seen: Association, time_ns: int) -> tuple[Member, Member] | None:
         """Observer and target of an observation; None, and counted, if it cannot be used."""
-        source, target = self._state(seen.robot, seen.time_ns), self._target(seen, time_ns)
+        source: Member | None = self._state(seen.robot, seen.time_ns)
+        target: Member | None = seen.target
+        if isinstance(seen.target, str):
+            target = self._state(seen.target, time_ns)
         if seen.late and not self._past_states:
             self.skipped[LATE_EVIDENCE] += 1
         elif source is None or target is None:
             self.skipped[PAST_OBSERVATION] += 1
         else:
-            check_finite(describe_observation(seen), seen.z, seen.cov)
+            check_finite(describe(seen), seen.z, seen.cov)
             return source, target
         return None
-
-    def _target(self, seen: Association, time_ns: int) -> Member | None:
-        """A landmark, or a robot's state at ``time_ns``."""
-        if isinstance(seen.target, str):
-            return self._state(seen.target, time_ns)
-        return seen.target
 
     def _closure_ends(self, closure: Closure) -> tuple[Member, Member] | None:
         """``other`` and ``robot`` of a closure, as observer and target; None as in `_ends`."""
@@ -115,7 +111,7 @@ class FilterBackend(ABC):
         if source is None or target is None:
             self.skipped[PAST_CLOSURE] += 1
             return None
-        check_finite(describe_closure(closure), closure.delta, closure.cov)
+        check_finite(describe(closure), closure.delta, closure.cov)
         return source, target
 
     def finish(self) -> Estimate:

@@ -87,11 +87,10 @@ class FixedLagBackend(GraphBackend):
                 key, value = group.new
                 factors.write(self._values, key, value)
                 self._dims[key] = len(value)
-            for factor in group.factors:
-                last = factor is group.factors[-1]
-                observed = group.observed if last else None
-                keys, robust = tuple(factor.keys()), last and group.robust
-                self._window.append(WindowFactor(factor, keys, observed, robust))
+            *others, last = group.factors
+            self._window += [WindowFactor(factor, tuple(factor.keys())) for factor in others]
+            keys = tuple(last.keys())
+            self._window.append(WindowFactor(last, keys, group.observed, group.robust))
         self._optimise()
         self._marginalise_before(step.time_ns - self._horizon_ns)
 

@@ -20,15 +20,12 @@ def describe_motion(robot: str, time_ns: int) -> str:
     return f"motion of robot {robot} to {time_ns} ns"
 
 
-def describe_observation(seen: Association) -> str:
-    """An observation of a landmark or a robot."""
-    kind = "robot" if isinstance(seen.target, str) else "landmark"
-    return f"{kind} {seen.target}, seen from robot {seen.robot} at {seen.time_ns} ns"
-
-
-def describe_closure(closure: Closure) -> str:
-    """A relative pose of two states."""
-    return f"closure of robot {closure.robot} at {closure.time_ns} ns"
+def describe(record: Association | Closure) -> str:
+    """An observation of a landmark or a robot, or a closure."""
+    if isinstance(record, Closure):
+        return f"closure of robot {record.robot} at {record.time_ns} ns"
+    kind = "robot" if isinstance(record.target, str) else "landmark"
+    return f"{kind} {record.target}, seen from robot {record.robot} at {record.time_ns} ns"
 
 
 def indeterminate(

@@ -300,22 +300,17 @@ class Isam2Backend(GraphBackend):
                 raise self._builder.explain(error) from error
             return covs
 
-    def _result(self, values: gtsam.Values) -> Estimate:
+    def _result(self, values: gtsam.Values, *, rough: bool = False) -> Estimate:
         self._finished = values
         self._joints.clear()
-        return self._estimate(values, self._marginals(values))
+        return self._estimate(values, {} if rough else self._marginals(values))
 
 
 class Reoptimiser(Isam2Backend):
     """Solves recorded steps repeatedly, with varying closures."""
 
     def __init__(self, config: Config, steps: Iterable[Step], start: Estimate) -> None:
-        """Build the graph.
-
-        Args:
-            config: settings.
-            steps: all, as recorded.
-            start: an estimate of all their variables, where optimisation starts.
+        """Build the graph of all steps; optimisation begins at ``start``.
 
         Raises:
             EstimationError: a covariance is not positive definite and finite.
@@ -329,15 +324,16 @@ class Reoptimiser(Isam2Backend):
     def solve(self, closures: Iterable[Closure] = (), *, rough: bool = False) -> Estimate:
         """Optimise from the last solution.
 
-        Args:
-            closures: in addition to those in the steps; those of the last call are removed.
-            rough: stop early, in a fraction of the time, as a start for another round; covariances
-                are NaN (`joint` and `state_covariance` have them).
+        ``closures`` are in addition to those in the steps; those of the last call are removed.
+        ``rough``: stop early, in a fraction of the time, as a start for another round; covariances
+        are NaN (`joint` and `state_covariance` have them).
 
         Raises:
             EstimationError: the steps make the estimate indeterminate.
         """
-        builder, values = self._builder, self._values()
+        builder, values = self._builder, self._finished
+        if values is None:
+            values = self._isam.calculateBestEstimate()
         builder.graph.resize(self._size)
         builder.rows = self._rows
         builder.add_closures(closures)
@@ -348,12 +344,7 @@ class Reoptimiser(Isam2Backend):
             values = optimise(builder.graph, values, self._config.robust, CONVERGED_ERROR_ROUGH)
         except RuntimeError as error:
             raise builder.explain(error) from error
-        self._finished = values
-        self._joints.clear()
-        return self._estimate(values, {})
-
-    def _values(self) -> gtsam.Values:
-        return self._isam.calculateBestEstimate() if self._finished is None else self._finished
+        return self._result(values, rough=True)
 
 
 def marginals_of(marginals: gtsam.Marginals, keys: Sequence[int]) -> dict[int, Array]:

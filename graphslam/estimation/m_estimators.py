@@ -28,11 +28,8 @@ def robust_weight(innovation: Array, HPHt: Array, R: Array, robust: RobustConfig
     innovation in their axes. Each round of reweighting lowers w or leaves it, so starting at 1 it
     converges to the largest weight that agrees with the residual it leaves.
 
-    Args:
-        innovation: (k,) measured minus expected.
-        HPHt: (k, k) covariance of the expected measurement.
-        R: (k, k) covariance of the measurement.
-        robust: kernel and scale; `none` gives 1.
+    ``innovation`` (k,) is measured minus expected, ``HPHt`` (k, k) the covariance of the expected
+    measurement, ``R`` (k, k) that of the measurement.
     """
     if robust.kernel == "none":
         return 1.0

@@ -25,7 +25,7 @@ from graphslam.core.records import Association, Motion, Start, Step
 from graphslam.estimation.backend import Joint, block_slices
 from graphslam.estimation.factors import FILTER_GAUGE_SIGMA_M
 from graphslam.estimation.filter_base import FilterBackend, unknown_landmark, with_sigma_along_line
-from graphslam.estimation.input_checks import describe_closure, describe_observation, errors_at
+from graphslam.estimation.input_checks import describe, errors_at
 
 #: resample when the effective number of particles is below this share of them
 RESAMPLE_BELOW = 0.5
@@ -34,12 +34,8 @@ RESAMPLE_BELOW = 0.5
 def low_variance_sample(weights: Array, share: float) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     """Indices of N particles that survive: each as often as N times its weight, rounded up or down.
 
-    One random number for all (J. Carpenter et al., IEE Proc. Radar Sonar Navig. 146(1), 1999,
-    https://doi.org/10.1049/ip-rsn:19990255).
-
-    Args:
-        weights: (N,), sum 1.
-        share: uniformly drawn from [0, 1).
+    One random number for all, ``share``, uniform in [0, 1) (J. Carpenter et al., IEE Proc. Radar
+    Sonar Navig. 146(1), 1999, https://doi.org/10.1049/ip-rsn:19990255).
     """
     n = len(weights)
     edges = np.cumsum(weights)
@@ -99,10 +95,10 @@ class RbpfBackend(FilterBackend):
             return
         for seen in associations:
             if isinstance(seen.target, str):
-                with errors_at(describe_observation(seen)):
+                with errors_at(describe(seen)):
                     self._update_poses(seen.robot, seen.target, seen.model, seen.z, seen.cov)
         for c in closures:
-            with errors_at(describe_closure(c)):
+            with errors_at(describe(c)):
                 self._update_poses(c.other, c.robot, "robot-pose", c.delta, c.cov)
         for robot in sorted({seen.robot for seen in associations}):
             own = [(s, s.target) for s in associations if s.robot == robot]
@@ -118,12 +114,12 @@ class RbpfBackend(FilterBackend):
         # a second observation of a landmark is independent only after the first corrected it
         first = {target: s for s, target in reversed(seen) if target in self._landmarks}
         for target, s in first.items():
-            with errors_at(describe_observation(s)):
+            with errors_at(describe(s)):
                 self._update_poses(robot, target, s.model, s.z, s.cov)
         if self._proposal == "observation":
             self._sample_pose(robot)
         for s, target in seen:
-            with errors_at(describe_observation(s)):
+            with errors_at(describe(s)):
                 if target in self._landmarks:
                     self._update_landmark(s, target, weigh=s is not first.get(target))
                 else:

@@ -36,12 +36,9 @@ def replay(
     backend: Backend,
     watch: Callable[[Step, Backend], None] = lambda _step, _backend: None,
 ) -> Replay:
-    """Give ``steps`` to ``backend`` in order.
+    """Give ``steps`` to a fresh ``backend`` in order.
 
-    Args:
-        steps: as recorded.
-        backend: a fresh one.
-        watch: called after each step, outside the measured time.
+    ``watch`` is called after each step, outside the measured time.
 
     Raises:
         EstimationError: the steps make the estimate indeterminate.

@@ -155,7 +155,8 @@ class Associator:
             [seen[n] for n in free], image.predicted, means, extents, is_point, whole, self._config
         )
         entries = [self.map.entries[int(ids[j])] for j in pairs.landmark]
-        recent = np.array([self._is_recent(e, image) for e in entries], dtype=bool)
+        last_m = np.array([e.path_m.get(image.robot, -np.inf) for e in entries])
+        recent = image.path_m - last_m <= self._config.reacquire_m
         keep = _worth_comparing(pairs, entries, recent, self._config.reacquire_min)
         pairs, recent = pairs.only(keep), recent[keep]
         entries = [e for e, k in zip(entries, keep, strict=True) if k]
@@ -189,10 +190,6 @@ class Associator:
         if not self._has_identity(o) or o.identity not in self.map.by_identity:
             return None
         return self.map.entries[self.map.by_identity[str(o.identity)]]
-
-    def _is_recent(self, entry: Entry, image: Image) -> bool:
-        path_m = entry.path_m.get(image.robot, -np.inf)
-        return image.path_m - path_m <= self._config.reacquire_m
 
     def _compare(
         self,
@@ -288,8 +285,7 @@ class Associator:
                 self.rejected["identity: known as a landmark of another kind"] += 1
                 continue
             else:
-                identity = o.identity if self._has_identity(o) else None
-                o = replace(o, identity=identity)
+                o = replace(o, identity=o.identity if self._has_identity(o) else None)
                 entry, model = self.map.add(o, image.predicted, image.time_ns), o.kind
             out += self._record(image, entry, model, o, self._has_identity(o))
         return tuple(out)

@@ -24,27 +24,14 @@ def line_parameters(pose: Array, cov: Array) -> tuple[float, float, Array]:
 def make_landmark(entry: Entry, mean: Array, cov: Array) -> Landmark:
     """Bookkeeping and estimate (``mean`` (2,) or (3,), ``cov``; world axes) as one record."""
     if entry.kind == "point":
-        position = np.array([mean[0], mean[1], np.nan])
+        position, line = np.array([mean[0], mean[1], np.nan]), None
         extent = np.array([mean, mean])
-        line = None
     else:
-        position = mean
+        position, line = mean, line_parameters(mean, cov)
         low, high = entry.extent_at(mean)
-        ends = np.array([[low, 0.0], [high, 0.0]])
-        extent = transform(mean, ends)
-        line = line_parameters(mean, cov)
-    return Landmark(
-        entry.id,
-        entry.kind,
-        position,
-        cov,
-        extent,
-        line,
-        entry.sightings,
-        entry.first_ns,
-        entry.last_ns,
-        entry.identity,
-    )
+        extent = transform(mean, np.array([[low, 0.0], [high, 0.0]]))
+    history = entry.sightings, entry.first_ns, entry.last_ns, entry.identity
+    return Landmark(entry.id, entry.kind, position, cov, extent, line, *history)
 
 
 def make_landmarks(landmarks: LandmarkMap, estimate: Estimate) -> tuple[Landmark, ...]:

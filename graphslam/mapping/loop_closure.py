@@ -148,7 +148,8 @@ def loop_closures(
     for (later, earlier, _, _), result in zip(pairs, results, strict=True):
         if result is not None:
             is_searched, pose, cov = result
-            closure = _closure(later, earlier, pose, cov)
+            images = min(len(later.submap.clouds), len(earlier.submap.clouds))
+            closure = Closure(*later.state, *earlier.state, pose, cov, images=images)
             (correcting if is_searched else confirming).append(closure)
     return correcting, confirming
 
@@ -167,11 +168,6 @@ def _verify_pair(
         return False, *in_place
     best = verify_match(match(later.submap, earlier.submap, guess, window, MIN_COARSE_OVERLAP))
     return None if best is None else (True, best.pose, best.cov)
-
-
-def _closure(later: SubmapPose, earlier: SubmapPose, pose: Array, cov: Array) -> Closure:
-    images = min(len(end.submap.clouds) for end in (later, earlier))
-    return Closure(*later.state, *earlier.state, pose, cov, images=images)
 
 
 def verify_in_place(source: Submap, target: Submap, guess: Array) -> tuple[Array, Array] | None:

@@ -76,13 +76,9 @@ def verify(
     starts: Mapping[str, Start],
     config: Config,
 ) -> Verified:
-    """Decide which relative poses to use.
+    """Decide which relative poses of a log to use.
 
-    Args:
-        messages: all of a log. Those with an end outside the odometry are not judged.
-        tracks: the complete odometry of every robot.
-        starts: of the robots whose start is known.
-        config: settings.
+    Those with an end outside the odometry are not judged. ``starts`` are the known ones.
 
     Raises:
         EstimationError: a covariance is not positive definite.
