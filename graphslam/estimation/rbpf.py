@@ -32,7 +32,7 @@ RESAMPLE_BELOW = 0.5
 
 
 def low_variance_sample(weights: Array, share: float) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-    """Indices of N particles that survive: each as often as N times its weight, rounded up or down.
+    """Indices (N,) of the particles that survive: each N times its weight, rounded up or down.
 
     One random number for all, ``share``, uniform in [0, 1) (J. Carpenter et al., IEE Proc. Radar
     Sonar Navig. 146(1), 1999, https://doi.org/10.1049/ip-rsn:19990255).
