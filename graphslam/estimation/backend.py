@@ -102,14 +102,13 @@ class StateTable:
         Raises:
             EstimationError: there is none, or the robot has not started.
         """
-        self.latest(robot, time_ns)
-        try:
-            return self._number[robot, time_ns]
-        except KeyError:
+        self.latest(robot, time_ns)  # raises if it has not started
+        if (robot, time_ns) not in self._number:
             raise EstimationError(
                 f"robot {robot} has no state at {time_ns} ns: a step refers to a state that no "
                 "earlier step made"
-            ) from None
+            )
+        return self._number[robot, time_ns]
 
     def latest(self, robot: str, at_ns: int | None = None) -> int:
         """Number of the robot's latest state; ``at_ns``, for the message, is when it is needed.

@@ -71,10 +71,7 @@ class Compared:
 
 
 def gate_distance(probability: float, dof: IntArray | int) -> Array:
-    """Chi-square gates on d², shaped like ``dof`` (0-d or (k,)).
-
-    Thesis eq. 3.25; 1 to 9 degrees of freedom.
-    """
+    """Chi-square gates on d² (eq. 3.25), shaped like ``dof`` (0-d or (k,)), which is 1 to 9."""
     return np.asarray(_quantiles(probability)[np.asarray(dof) - 1])
 
 
@@ -102,6 +99,8 @@ def candidate_pairs(
 ) -> Pairs:
     """Pairs that pass the gates that need no covariance: distance, direction, overlap.
 
+    They are sorted by observation.
+
     Args:
         seen: n observations in the robot's base frame.
         pose: predicted pose (3,) of the robot, world frame.
@@ -110,9 +109,6 @@ def candidate_pairs(
         is_point: (m,) points rather than lines.
         whole: (m,) segments whose both ends are known.
         config: gates.
-
-    Returns:
-        The candidate pairs, sorted by observation.
     """
     if not len(seen) or not len(means):
         nothing = np.zeros(0, np.int64)

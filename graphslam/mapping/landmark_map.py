@@ -90,14 +90,13 @@ class LandmarkMap:
     def add(self, seen: Observation, pose: Array, time_ns: int) -> Entry:
         """A new tentative landmark from an observation made at ``pose`` (3,), in its frame."""
         model = MODELS[seen.kind]
-        mean, extent = np.zeros(3), np.zeros(2)
+        mean = np.zeros(3)
         state = model.invert(seen.z, pose)
         mean[: len(state)] = state
         cov = np.zeros((3, 3))
         _, G_z = model.invert_jacobians(seen.z, pose)
         cov[: len(state), : len(state)] = G_z @ seen.cov @ G_z.T
-        if seen.extent is not None:
-            extent = seen.extent.copy()
+        extent = np.zeros(2) if seen.extent is None else seen.extent.copy()
         entry = Entry(self._next, seen.kind, mean, cov, extent, time_ns, time_ns, seen.identity)
         self.entries[entry.id] = entry
         if seen.identity is not None:
