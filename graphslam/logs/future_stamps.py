@@ -51,10 +51,8 @@ def repair_future_stamps(
                 valid_ns, run = run[0][2], []
             run.append((topic, message, log_ns))
             continue
-        if run:
-            yield from _spread(run, valid_ns)
-            run = []
-        valid_ns = message.time_ns
+        yield from _spread(run, valid_ns)
+        run, valid_ns = [], message.time_ns
         yield topic, message, log_ns
     yield from _spread(run, valid_ns)
 

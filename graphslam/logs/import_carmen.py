@@ -6,7 +6,7 @@ relations refer to it.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from decimal import Decimal, DecimalException
 from itertools import accumulate
 from pathlib import Path
@@ -60,7 +60,10 @@ def import_carmen(source: Path, target: Path) -> ImportSummary:
     # log times that never decrease, so that readers keep the order of the file: a line was written
     # before all lines after it, hence not later than the earliest of their stamps
     log_times = list(accumulate((entry.stamp_ns for entry in reversed(stamped)), min))[::-1]
-    range_max = _range_max([entry.ranges for entry in stamped if isinstance(entry, _Scan)])
+    scans = [entry.ranges for entry in stamped if isinstance(entry, _Scan)]
+    no_return = find_no_return(scans[::_SAMPLE_EVERY])
+    # without a no-return value the limit for any laser
+    range_max = MAX_RANGE_M if no_return is None else float(np.nextafter(np.float32(no_return), 0))
     notes = {"format": "carmen", "source": source.name, "stamps": "ipc time, exact"}
     with LogWriter(target, notes) as log:
         log.mount(DEFAULT_ROBOT, log_times[0], (offsets[-1] if offsets else 0.0, 0.0, 0.0))
@@ -80,12 +83,6 @@ def import_carmen(source: Path, target: Path) -> ImportSummary:
                 )
     warnings = [f"{source}: {n} {tag} lines cannot be read" for tag, n in sorted(malformed.items())]
     return ImportSummary(source, target, log.counts, tuple(warnings))
-
-
-def _range_max(scans: Sequence[Ranges]) -> float:
-    """Largest float32 below the no-return range; without one, the limit for any laser."""
-    no_return = find_no_return(scans[::_SAMPLE_EVERY])
-    return MAX_RANGE_M if no_return is None else float(np.nextafter(np.float32(no_return), 0))
 
 
 def parse_stamp_ns(text: str) -> int:

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
@@ -22,9 +21,8 @@ from graphslam.logs.import_summary import ImportSummary
 from graphslam.logs.source_files import text_lines
 from graphslam.logs.writer import DEFAULT_ROBOT, LogWriter
 
-_T = TypeVar("_T")
-
 _SECOND_NS = 1_000_000_000
+_UNEQUAL = "landmark lines have unequal variances; sigmas of 1 rad and 1 m are used"
 _STAMPS = "invented: the source has none; pose number k (from 0) is stamped k+1 seconds"
 
 
@@ -86,8 +84,12 @@ def import_pose_graph(source: Path, target: Path) -> ImportSummary:
     number = {pose: k for k, pose in enumerate(poses)}
     odometry, others = split_odometry(graph.edges, poses)
     robots = assign_robots(source, odometry, poses)
-    closures = _by_pose(others, lambda edge: edge.end)
-    sightings = _by_pose(graph.sightings, lambda seen: seen.pose)
+    closures: dict[int, list[Edge]] = {}
+    for edge in others:
+        closures.setdefault(edge.end, []).append(edge)
+    sightings: dict[int, list[LandmarkEdge]] = {}
+    for seen in graph.sightings:
+        sightings.setdefault(seen.pose, []).append(seen)
     notes = {"format": "pose graph", "source": source.name, "stamps": _STAMPS}
     if others:
         # closures refer to poses of the graph, so every one of them must be a keyframe
@@ -114,13 +116,6 @@ def import_pose_graph(source: Path, target: Path) -> ImportSummary:
     if unlinked:
         warnings.append(f"{source}: {unlinked} sightings from poses without an edge are not used")
     return ImportSummary(source, target, log.counts, (*warnings, f"{source}: stamps are {_STAMPS}"))
-
-
-def _by_pose(items: Iterable[_T], pose: Callable[[_T], int]) -> dict[int, list[_T]]:
-    table: dict[int, list[_T]] = {}
-    for item in items:
-        table.setdefault(pose(item), []).append(item)
-    return table
 
 
 def _write(write: Callable[..., None], number: dict[int, int], edge: Edge) -> None:
@@ -240,9 +235,7 @@ def _landmark(graph: PoseGraph, fields: Sequence[str], is_g2o: bool) -> None:
         cov = np.diag([noise[0] / 10.0, noise[0]])
     else:
         cov = np.eye(2)
-        graph.assumed[
-            "landmark lines have unequal variances; sigmas of 1 rad and 1 m are used"
-        ] += 1
+        graph.assumed[_UNEQUAL] += 1
     z = np.array([np.arctan2(y, x), np.sqrt(squared)])
     graph.sightings.append(LandmarkEdge(int(fields[0]), int(fields[1]), z, _checked(cov)))
 

@@ -1,6 +1,6 @@
-"""What every importer takes and returns."""
+"""What every importer returns."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +13,3 @@ class ImportSummary:
     target: Path
     counts: Mapping[str, int]
     warnings: tuple[str, ...]
-
-
-#: from the source's path and the MCAP file to be written
-Importer = Callable[[Path, Path], ImportSummary]

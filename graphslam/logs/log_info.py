@@ -219,7 +219,7 @@ def _topic_info(
     if reading is None or not reading.times_ns:
         return TopicInfo(topic.name, topic.schema, topic.robot, used, topic.count)
     times = np.sort(np.array(reading.times_ns, dtype=np.int64))
-    period_s = _median_period_s(times)
+    span_s, period_s = float(times[-1] - times[0]) * 1e-9, _median_period_s(times)
     no_return = contexts[topic.name].no_return_m
     is_scan = topic.record is records.Scan
     return TopicInfo(
@@ -230,7 +230,7 @@ def _topic_info(
         count=topic.count,
         first_ns=int(times[0]),
         last_ns=int(times[-1]),
-        rate_hz=_rate_hz(times),
+        rate_hz=(len(times) - 1) / span_s if span_s > 0 else None,
         median_period_s=period_s or None,
         gaps=_gaps(times, period_s),
         jumps_back=int(np.count_nonzero(np.diff(np.array(reading.stamps_ns)) < 0)),
@@ -241,11 +241,6 @@ def _topic_info(
         no_return_m=float(no_return) if is_scan and np.isfinite(no_return) else None,
         dropouts=reading.empty_beams / reading.beams if reading.beams else None,
     )
-
-
-def _rate_hz(times_ns: NDArray[np.int64]) -> float | None:
-    span_s = float(times_ns[-1] - times_ns[0]) * 1e-9
-    return (len(times_ns) - 1) / span_s if span_s > 0 else None
 
 
 def _median_period_s(times_ns: NDArray[np.int64]) -> float:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from graphslam.core.geometry import Array
 
@@ -80,16 +81,12 @@ def _ancestors(tree: TransformTree, frame: str) -> dict[str, Array]:
 
 
 def _matrix(transform: Any) -> Array:
+    """The transform as a matrix (4, 4); NaN if its quaternion is zero or not finite."""
     t, q = transform.translation, transform.rotation
-    norm = np.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
-    if not norm > 0:
+    quaternion = np.array([q.x, q.y, q.z, q.w])
+    if not np.linalg.norm(quaternion) > 0:
         return np.full((4, 4), np.nan)
-    x, y, z, w = q.x / norm, q.y / norm, q.z / norm, q.w / norm
     matrix = np.eye(4)
-    matrix[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
+    matrix[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
     matrix[:3, 3] = [t.x, t.y, t.z]
     return matrix

@@ -172,8 +172,6 @@ def decode_true_poses(data: Sequence[bytes]) -> tuple[IntArray, Array]:
     # from the end of the header
     size = struct.unpack_from("<I", first, 12)[0] if len(first) >= 16 else 0
     gap = -(12 + size) % 8
-    if len(first) != 4 + 12 + size + gap + 24 or first[1] != 1:
-        return _true_poses_singly(data)
     layout = np.dtype(
         [
             ("order", "V4"),
@@ -184,8 +182,13 @@ def decode_true_poses(data: Sequence[bytes]) -> tuple[IntArray, Array]:
             ("pose", "<f8", 3),
         ]
     )
-    alike = [len(d) == len(first) and d[:4] == first[:4] and d[12:16] == first[12:16] for d in data]
-    if not all(alike):
+    if (
+        len(first) != layout.itemsize
+        or first[1] != 1
+        or not all(
+            len(d) == len(first) and d[:4] == first[:4] and d[12:16] == first[12:16] for d in data
+        )
+    ):
         return _true_poses_singly(data)
     rows = np.frombuffer(b"".join(data), dtype=layout)
     return rows["sec"].astype(np.int64) * 1_000_000_000 + rows["nanosec"], rows["pose"].copy()

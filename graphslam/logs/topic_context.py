@@ -56,12 +56,9 @@ def topic_contexts(
         no_return = None
         if topic.record in (records.Scan, records.Sighting):
             messages = list(sample_decoded(files, topic))
-            frames = sorted({frame_of(message) for message in messages})
-            tree = _transforms(files, topic.robot)
-            for frame in frames:
-                base = bases.get(topic.robot, "base_link")
-                pose, upside_down, notes = _mount(topic, tree, base, frame, settings.laser)
-                mounts[frame] = pose
+            tree, base = _transforms(files, topic.robot), bases.get(topic.robot, "base_link")
+            for frame in sorted({frame_of(message) for message in messages}):
+                mounts[frame], upside_down, notes = _mount(topic, tree, base, frame, settings.laser)
                 inverted |= {frame} if upside_down else set()
                 warnings += notes
             if topic.record is records.Scan:

@@ -102,14 +102,19 @@ def choose_topics(
     chosen, warnings = [], []
     for robot in sorted({topic.robot for topic in filled}):
         own = [topic for topic in filled if topic.robot == robot]
-        odometry = sorted((t for t in own if t.record in ODOMETRY_KINDS), key=_odometry_preference)
-        lasers = sorted(
-            (t for t in own if t.record is records.Scan), key=lambda t: (-t.count, t.name)
-        )
-        _require_odometry(names, robot, own, odometry)
+        own.sort(key=lambda t: (-t.count, t.name))
+        odometry = [t for kind in ODOMETRY_KINDS for t in own if t.record is kind]
+        lasers = [t for t in own if t.record is records.Scan]
+        sensors = lasers + [t for t in own if t.record is records.Sighting]
+        if sensors and not odometry:
+            raise LogError(
+                f"{names}: a {'scan' if lasers else 'sighting'} without odometry: robot {robot} "
+                f"has {sensors[0].name} but no odometry; record it, or assign topics to robots in "
+                "logs.topics"
+            )
         # true associations are read by `logs.truth` only
         others = (*ODOMETRY_KINDS, records.Scan, records.TrueAssociations)
-        rest = [t for t in own if t.record not in others]
+        rest = [t for t in filled if t.robot == robot and t.record not in others]
         chosen += odometry[:1] + lasers[:1] + rest
         warnings += _unused("odometry", robot, odometry) + _unused("laser", robot, lasers)
     if not any(topic.record in ODOMETRY_KINDS for topic in chosen):
@@ -118,22 +123,6 @@ def choose_topics(
             "smoothing needs nav_msgs/Odometry, JointState or OdometryIncrement"
         )
     return chosen, warnings
-
-
-def _odometry_preference(topic: Topic) -> tuple[int, int, str]:
-    return ODOMETRY_KINDS.index(topic.record), -topic.count, topic.name
-
-
-def _require_odometry(
-    names: str, robot: str, own: Sequence[Topic], odometry: Sequence[Topic]
-) -> None:
-    for topic in own:
-        if topic.record in (records.Scan, records.Sighting) and not odometry:
-            what = "scan" if topic.record is records.Scan else "sighting"
-            raise LogError(
-                f"{names}: a {what} without odometry: robot {robot} has {topic.name} but no "
-                "odometry; record it, or assign topics to robots in logs.topics"
-            )
 
 
 def _unused(what: str, robot: str, topics: Sequence[Topic]) -> list[str]:

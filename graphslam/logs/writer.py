@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO, NamedTuple, Self
 
 import numpy as np
@@ -65,12 +64,7 @@ class LogWriter:
         self._writer.start(profile="ros2", library=f"graphslam {__version__}")
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Finish and rename the file, or remove it if the block raised."""
         assert self._stream is not None  # __enter__ opened it
         try:
@@ -177,12 +171,13 @@ class LogWriter:
     def mount(self, robot: str, stamp_ns: int, pose: ArrayLike, sensor: str = "laser") -> None:
         """tf2_msgs/TFMessage on ``/tf_static``: pose (3,) of the sensor in the base frame."""
         x, y, phi = np.asarray(pose, dtype=float).tolist()
+        rotation = _rotation(math.sin(phi / 2), math.cos(phi / 2))
         transform = schemas.build(
             "geometry_msgs/msg/TransformStamped",
             header=schemas.header(stamp_ns, frame(robot, "base_link")),
             child_frame_id=frame(robot, sensor),
             transform=schemas.build(
-                "geometry_msgs/msg/Transform", translation=_vector(x, y), rotation=_quaternion(phi)
+                "geometry_msgs/msg/Transform", translation=_vector(x, y), rotation=rotation
             ),
         )
         message = schemas.build(schemas.TF_MESSAGE, transforms=[transform])
@@ -358,15 +353,17 @@ class Event(NamedTuple):
 def _odometry_template(robot: str) -> schemas.Template:
     """nav_msgs/Odometry with the numbers x, y and the quaternion's z, w."""
     x, y, z, w = marks = (1.25, 2.25, 3.25, 4.25)
-    rotation = schemas.build("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=z, w=w)
+    rotation = _rotation(z, w)
     point = schemas.build("geometry_msgs/msg/Point", x=x, y=y, z=0.0)
     pose = schemas.build("geometry_msgs/msg/Pose", position=point, orientation=rotation)
+    at_rest = _vector(0.0, 0.0)
+    twist = schemas.build("geometry_msgs/msg/Twist", linear=at_rest, angular=at_rest)
     message = schemas.build(
         schemas.ODOMETRY,
         header=schemas.header(0, frame(robot, "odom")),
         child_frame_id=frame(robot, "base_link"),
         pose=_with_covariance("Pose", pose=pose),
-        twist=_with_covariance("Twist", twist=_twist()),
+        twist=_with_covariance("Twist", twist=twist),
     )
     return schemas.Template(schemas.ODOMETRY, message, marks)
 
@@ -401,15 +398,8 @@ def _vector(x: float, y: float) -> Any:
     return schemas.build("geometry_msgs/msg/Vector3", x=x, y=y, z=0.0)
 
 
-def _quaternion(phi: float) -> Any:
-    z, w = np.sin(phi / 2), np.cos(phi / 2)
-    return schemas.build("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=float(z), w=float(w))
-
-
-def _twist() -> Any:
-    return schemas.build(
-        "geometry_msgs/msg/Twist", linear=_vector(0.0, 0.0), angular=_vector(0.0, 0.0)
-    )
+def _rotation(z: float, w: float) -> Any:
+    return schemas.build("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=z, w=w)
 
 
 def _with_covariance(kind: str, **fields: Any) -> Any:

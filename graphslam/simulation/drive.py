@@ -95,7 +95,7 @@ class TurnOnSpot:
         return self.profile.duration_s if self.profile else self.wait_s
 
     def at(self, time_s: Array) -> BaseStates:
-        """States at times (n,) s since the leg began; see `Follow.at`."""
+        """States at times (n,) s since the leg began; see `CurveMotion.at`."""
         turned = np.zeros(len(time_s))
         if self.profile:
             turned = np.sign(self.angle_rad) * self.profile.at(time_s)
@@ -145,19 +145,17 @@ def plan_drive(start: Array, legs: Sequence[Leg], robot: Robot) -> Drive:
         ScenarioError: a leg's points coincide or turn back sharply.
     """
     motions: list[CurveMotion | TurnOnSpot] = []
-    pose = start
+    pose, begins_s, travel, turned = start, [0.0], [0.0], [0.0]
     for leg in legs:
         for motion in _motions(pose, leg, robot):
             motions.append(motion)
-            pose = motion.at(np.array([motion.duration_s])).poses[0]
+            end = motion.at(np.array([motion.duration_s]))
+            pose = end.poses[0]
+            begins_s.append(begins_s[-1] + motion.duration_s)
+            travel.append(travel[-1] + float(end.travel[0]))
+            turned.append(turned[-1] + float(end.turned[0]))
     motions.append(TurnOnSpot(pose, 0.0, None))  # at rest from now on
-    ends = [m.at(np.array([m.duration_s])) for m in motions[:-1]]
-    return Drive(
-        tuple(motions),
-        tuple(np.cumsum([0.0, *(m.duration_s for m in motions[:-1])]).tolist()),
-        tuple(np.cumsum([0.0, *(float(e.travel[0]) for e in ends)]).tolist()),
-        tuple(np.cumsum([0.0, *(float(e.turned[0]) for e in ends)]).tolist()),
-    )
+    return Drive(tuple(motions), tuple(begins_s), tuple(travel), tuple(turned))
 
 
 def _motions(pose: Array, leg: Leg, robot: Robot) -> list[CurveMotion | TurnOnSpot]:

@@ -109,9 +109,8 @@ def round_corners(points: Sequence[Sequence[float]], corner_m: float) -> Curve:
             s += arc
     knots.append(s + lengths[-1] - before)
     curvature.append(0.0)
-    first = np.append(
-        True, np.diff(knots) > 1e-12
-    )  # adjacent corners have no straight part in between
+    # adjacent corners have no straight part in between
+    first = np.append(True, np.diff(knots) > 1e-12)
     return curve_from_curvature(
         path[0], float(headings[0]), np.array(knots)[first], np.array(curvature)[first]
     )

@@ -5,7 +5,6 @@ walls these are a few per cent of all pairs, and the cost does not grow with bea
 pair is intersected in closed form, without approximation.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,16 +49,15 @@ def cast_beams(poses: Array, fan: BeamFan, shapes: Shapes, reach_m: float) -> Hi
     Surfaces beyond ``reach_m`` may be left out. Shapes with a leading axis of n move: those of
     scan i are ``segments[i]``, ``circles[i]``. A circle around the laser is not seen.
     """
-    n = len(poses)
-    hits = Hits(
-        np.full((n, fan.count), np.inf), np.full((n, fan.count), NO_SURFACE, dtype=np.int64)
-    )
+    n, shape = len(poses), (len(poses), fan.count)
+    hits = Hits(np.full(shape, np.inf), np.full(shape, NO_SURFACE, dtype=np.int64))
     size = max(1, _CHUNK // max(shapes.count, 1))
     for first in range(0, n, size):
         part = slice(first, first + size)
         segments = shapes.segments[part] if shapes.segments.ndim == 4 else shapes.segments
         circles = shapes.circles[part] if shapes.circles.ndim == 3 else shapes.circles
-        _cast(poses[part], fan, Shapes(segments, circles), reach_m, hits, part)
+        here = Hits(hits.ranges[part], hits.surfaces[part])
+        _cast(poses[part], fan, Shapes(segments, circles), reach_m, here)
     return hits
 
 
@@ -72,22 +70,18 @@ def nearest_hits(first: Hits, second: Hits, offset: int) -> Hits:
     )
 
 
-def _cast(
-    poses: Array, fan: BeamFan, shapes: Shapes, reach_m: float, hits: Hits, part: slice
-) -> None:
-    ranges = np.full(len(poses) * fan.count, np.inf)
-    surfaces = np.full(len(poses) * fan.count, NO_SURFACE, dtype=np.int64)
+def _cast(poses: Array, fan: BeamFan, shapes: Shapes, reach_m: float, hits: Hits) -> None:
+    """Write the first surface on each beam to ``hits``, which are empty."""
+    ranges, surfaces = hits.ranges.reshape(-1), hits.surfaces.reshape(-1)  # views, not copies
     beams = unit_vectors(fan.angles)
     straight = shapes.segments.shape[-3]
     for place, surface, r in (
-        *_segments(poses, fan, beams, shapes.segments, reach_m),
-        *_circles(poses, fan, beams, shapes.circles, reach_m, straight),
+        _segments(poses, fan, beams, shapes.segments, reach_m),
+        _circles(poses, fan, beams, shapes.circles, reach_m, straight),
     ):
         np.minimum.at(ranges, place, r)
         first = r == ranges[place]
         surfaces[place[first]] = surface[first]
-    hits.ranges[part] = ranges.reshape(len(poses), -1)
-    hits.surfaces[part] = surfaces.reshape(len(poses), -1)
 
 
 def points_in_frames(poses: Array, points: Array) -> Array:
@@ -99,10 +93,8 @@ def points_in_frames(poses: Array, points: Array) -> Array:
 
 def _segments(
     poses: Array, fan: BeamFan, beams: Array, segments: Array, reach_m: float
-) -> Iterator[tuple[Ints, Ints, Array]]:
+) -> tuple[Ints, Ints, Array]:
     """(beam index, surface, range) of each hit on a face; the index is into all scans, flat."""
-    if not segments.shape[-3]:
-        return
     a = points_in_frames(poses, segments[..., 0, :])
     b = points_in_frames(poses, segments[..., 1, :])
     e = b - a
@@ -121,15 +113,13 @@ def _segments(
         u = (a[:, 0] * d[:, 1] - a[:, 1] * d[:, 0]) / cross_de
         r = (a[:, 0] * e[:, 1] - a[:, 1] * e[:, 0]) / cross_de
         met = (u >= -_SEAM) & (u <= 1 + _SEAM) & (r > 0)
-    yield (scan[pair] * fan.count + beam)[met], surface[pair][met], r[met]
+    return (scan[pair] * fan.count + beam)[met], surface[pair][met], r[met]
 
 
 def _circles(
     poses: Array, fan: BeamFan, beams: Array, circles: Array, reach_m: float, offset: int
-) -> Iterator[tuple[Ints, Ints, Array]]:
+) -> tuple[Ints, Ints, Array]:
     """The same for circles (..., m, 3), whose surfaces are numbered from ``offset``."""
-    if not circles.shape[-2]:
-        return
     c = points_in_frames(poses, circles[..., :2])
     radius = np.broadcast_to(circles[..., 2], c.shape[:2])
     distance = np.hypot(c[..., 0], c[..., 1])
@@ -144,7 +134,7 @@ def _circles(
     inside = radius[pair] ** 2 - across**2
     met = (inside >= 0) & (along > 0)
     r = along[met] - np.sqrt(inside[met])
-    yield (scan[pair] * fan.count + beam)[met], surface[pair][met] + offset, r
+    return (scan[pair] * fan.count + beam)[met], surface[pair][met] + offset, r
 
 
 def _beams_between(fan: BeamFan, begin_rad: Array, width_rad: Array) -> tuple[Ints, Ints]:

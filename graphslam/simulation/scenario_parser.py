@@ -6,11 +6,13 @@ import types
 import typing
 from collections.abc import Mapping
 from math import isfinite
+from operator import ge, gt, le
 from typing import Any
 
 from graphslam.simulation.scenario import ScenarioError
 
 _NONE: Mapping[str, Any] = {}
+_BOUNDS = (("above", gt, "above"), ("least", ge, "at least"), ("most", le, "at most"))
 
 
 def build(kind: Any, value: Any, key: str = "", bounds: Mapping[str, Any] = _NONE) -> Any:
@@ -80,10 +82,7 @@ def _scalar(kind: Any, value: Any, key: str, bounds: Mapping[str, Any]) -> Any:
     if kind in (int, float):
         if not isfinite(value):
             raise ScenarioError(f"{key}: must be finite, got {value}")
-        if "above" in bounds and not value > bounds["above"]:
-            raise ScenarioError(f"{key}: must be above {bounds['above']:g}, got {value:g}")
-        if "least" in bounds and not value >= bounds["least"]:
-            raise ScenarioError(f"{key}: must be at least {bounds['least']:g}, got {value:g}")
-        if "most" in bounds and not value <= bounds["most"]:
-            raise ScenarioError(f"{key}: must be at most {bounds['most']:g}, got {value:g}")
+        for bound, holds, text in _BOUNDS:
+            if bound in bounds and not holds(value, bounds[bound]):
+                raise ScenarioError(f"{key}: must be {text} {bounds[bound]:g}, got {value:g}")
     return value

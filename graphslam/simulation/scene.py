@@ -116,15 +116,13 @@ def _collisions(world: World, actors: Mapping[str, SimulatedRobot], end_s: float
     times = np.append(np.arange(0.0, end_s, step_s), end_s)
     poses = {name: actor.drive.at(times).poses for name, actor in actors.items()}
     for name, actor in actors.items():
-        hit = _first_collision(actor.robot.body, poses[name], world)
-        if hit is not None:
+        if hit := _first_collision(actor.robot.body, poses[name], world):
             sample, surface = hit
             yield _describe(name, poses[name][sample], times[sample], world.names[surface])
         for other, theirs in poses.items():
             if other > name:
-                body = actors[other].robot.body
-                hit = _first_contact(actor.robot.body, poses[name], outline_shapes(body, theirs))
-                if hit is not None:
+                moving = outline_shapes(actors[other].robot.body, theirs)
+                if hit := _first_contact(actor.robot.body, poses[name], moving):
                     yield _describe(name, poses[name][hit[0]], times[hit[0]], f"robot {other}")
 
 

@@ -104,21 +104,19 @@ def make_world(outlines: Iterable[Outline]) -> World:
     The faces of an object with several are NAME/1, NAME/2, ...
     """
     outlines = tuple(outlines)
-    faces, circles, names, names_of_circles, things, circle_outlines = [], [], [], [], [], []
+    names, things = [], []
     for number, outline in enumerate(outlines):
         count = len(outline.faces)
-        faces.append(outline.faces)
         things += [number] * count
         names += [f"{outline.name}/{i + 1}" if count > 1 else outline.name for i in range(count)]
-        if outline.radius_m:
-            circles.append([*outline.points[0], outline.radius_m])
-            names_of_circles.append(outline.name)
-            circle_outlines.append(number)
+    round_ones = [n for n, outline in enumerate(outlines) if outline.radius_m]
+    circles = [[*outlines[n].points[0], outlines[n].radius_m] for n in round_ones]
     shapes = Shapes(
-        np.concatenate([np.zeros((0, 2, 2)), *faces]), np.array(circles, dtype=float).reshape(-1, 3)
+        np.concatenate([np.zeros((0, 2, 2)), *(outline.faces for outline in outlines)]),
+        np.array(circles, dtype=float).reshape(-1, 3),
     )
-    everything = np.array([*things, *circle_outlines], dtype=np.int64)
-    return World(outlines, shapes, (*names, *names_of_circles), everything)
+    names += [outlines[n].name for n in round_ones]
+    return World(outlines, shapes, tuple(names), np.array(things + round_ones, dtype=np.int64))
 
 
 def displacement(move: Move) -> Array:
