@@ -43,14 +43,11 @@ class TopicContext:
     beams: Counter[str] = field(default_factory=Counter)
 
 
-Decode = Callable[[Any, TopicContext], records.Message]
-
-
 class Decoder(NamedTuple):
     """A row of `DECODERS`: record type, decoder, and optionally a faster `schemas.decode`."""
 
     record: type[records.Message]
-    decode: Decode
+    decode: Callable[[Any, TopicContext], records.Message]
     deserialize: Callable[[bytes], Any] | None = None
 
 

@@ -21,7 +21,6 @@ from graphslam.logs.import_summary import ImportSummary
 from graphslam.logs.source_files import text_lines
 from graphslam.logs.writer import DEFAULT_ROBOT, LogWriter
 
-_SECOND_NS = 1_000_000_000
 _UNEQUAL = "landmark lines have unequal variances; sigmas of 1 rad and 1 m are used"
 _STAMPS = "invented: the source has none; pose number k (from 0) is stamped k+1 seconds"
 
@@ -61,7 +60,7 @@ class PoseGraph:
 
 def pose_stamp_ns(number: int) -> int:
     """Invented stamp, ns, of pose ``number`` of the odometry chain, counted from 0."""
-    return (number + 1) * _SECOND_NS
+    return (number + 1) * 10**9
 
 
 def import_pose_graph(source: Path, target: Path) -> ImportSummary:

@@ -23,8 +23,7 @@ LASER_FORWARD_M = 0.145
 BEAMS, SECTOR_RAD = 682, np.deg2rad(240.0)
 RANGE_MAX_M = 5.6  # of the URG-04LX
 
-_FIRST_RANGE = 24
-_LEFT, _RIGHT = 2, 3
+_LEFT, _RIGHT, _FIRST_RANGE = 2, 3, 24  # fields of a line
 
 
 def import_tinyslam(source: Path, target: Path) -> ImportSummary:

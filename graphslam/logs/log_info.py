@@ -147,7 +147,7 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
         for name in sorted({t.robot for t in topics if t.record is not records.TrueLandmark})
     ]
     return LogInfo(
-        files=tuple(map(LogFile.of, files)),
+        files=tuple(LogFile(f.path, f.sha256, f.messages, f.lost) for f in files),
         topics=tuple(sorted(infos, key=lambda info: info.name)),
         robots=tuple(robots),
         notes=merged_notes(files),
@@ -258,10 +258,8 @@ def _gaps(times_ns: NDArray[np.int64], period_s: float) -> tuple[Gap, ...]:
 
 def _other_topics(files: Sequence[McapFile], known: set[str]) -> list[TopicInfo]:
     counts: Counter[tuple[str, str]] = Counter()
-    for file in files:
-        for raw in file.topics:
-            if raw.name not in known:
-                counts[raw.name, raw.schema] += raw.count
+    for raw in (raw for file in files for raw in file.topics if raw.name not in known):
+        counts[raw.name, raw.schema] += raw.count
     static = {name for file in files for name in static_transform_topics(file)}
     return [
         TopicInfo(name, schema, None, name in static, n) for (name, schema), n in counts.items()

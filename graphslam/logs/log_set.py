@@ -30,11 +30,6 @@ class LogFile:
     messages: int
     lost: int | None
 
-    @classmethod
-    def of(cls, file: McapFile) -> "LogFile":
-        """The summary of an indexed file."""
-        return cls(file.path, file.sha256, file.messages, file.lost)
-
 
 @dataclass
 class LogSet:
@@ -144,7 +139,7 @@ def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
     contexts, assumed = topic_contexts(files, topics, config)
     return LogSet(
         robots=tuple(sorted({t.robot for t in topics if t.record in ODOMETRY_KINDS})),
-        files=tuple(map(LogFile.of, files)),
+        files=tuple(LogFile(f.path, f.sha256, f.messages, f.lost) for f in files),
         topics=tuple(topics),
         notes=merged_notes(files),
         warnings=[*config.warnings, *damage(files), *warnings, *assumed],
@@ -189,9 +184,7 @@ def decode_message(
 class FileReader:
     """One pass over the messages of one file.
 
-    Attributes:
-        sorter: its counts are those of the messages sorted so far.
-        dropped: number of messages and beams dropped so far, by reason.
+    ``dropped`` and the counts of ``sorter`` are those of the messages read so far.
     """
 
     def __init__(self, file: McapFile, config: Config) -> None:

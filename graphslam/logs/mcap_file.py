@@ -222,14 +222,13 @@ def _chunk_at(stream: BinaryIO, offset: int) -> _Contents:
         One of `_DAMAGE` when the chunk is damaged in any other way, its CRC included.
     """
     stream.seek(offset)
-    head = stream.read(9)
-    if len(head) < 9 or head[0] != Opcode.CHUNK:
+    head = stream.read(_RECORD.size)
+    if len(head) < _RECORD.size or head[0] != Opcode.CHUNK:
         raise McapError("no chunk where the index has one")
-    body = stream.read(int.from_bytes(head[1:], "little"))
+    length = _RECORD.unpack(head)[1]
+    body = stream.read(length)
     chunk = Chunk.read(ReadDataStream(BytesIO(body)))
-    if len(body) == int.from_bytes(head[1:], "little"):
-        return _records_in(chunk)
-    return _cut_chunk(chunk)
+    return _records_in(chunk) if len(body) == length else _cut_chunk(chunk)
 
 
 def _records_in(chunk: Chunk) -> _Contents:
@@ -350,20 +349,20 @@ class _Indexer:
     def add_chunk(self, offset: int, found: _Contents) -> None:
         for record in found.others:
             self.describe(record)
-        self.add_block(offset, [m[0] for m in found.messages], [m[1] for m in found.messages])
+        if found.messages:
+            self.add_block(offset, [message[:2] for message in found.messages])
 
-    def add_block(self, offset: int, channels: Sequence[int], times: Sequence[int]) -> None:
-        """A block of messages with these channels and log times."""
-        if not times:
-            return
+    def add_block(self, offset: int, messages: Sequence[tuple[int, int]]) -> None:
+        """Add a block of messages, given by channel and log time; at least one."""
+        channels, times = zip(*messages, strict=True)
         self.in_order &= all(a <= b for a, b in pairwise((self.latest_ns, *times)))
         self.latest_ns = max(self.latest_ns, *times)
         self.blocks.append(_Block(offset, min(times), max(times), dict(Counter(channels))))
 
     def close_loose_block(self) -> None:
         if self.loose:
-            times = [message.log_time for _, message in self.loose]
-            self.add_block(self.loose[0][0], [m.channel_id for _, m in self.loose], times)
+            messages = [(message.channel_id, message.log_time) for _, message in self.loose]
+            self.add_block(self.loose[0][0], messages)
             self.loose = []
 
     def recover(self, error: Exception) -> None:

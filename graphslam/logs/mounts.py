@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from graphslam.core.geometry import Array
 
@@ -83,10 +82,12 @@ def _ancestors(tree: TransformTree, frame: str) -> dict[str, Array]:
 def _matrix(transform: Any) -> Array:
     """The transform as a matrix (4, 4); NaN if its quaternion is zero or not finite."""
     t, q = transform.translation, transform.rotation
-    quaternion = np.array([q.x, q.y, q.z, q.w])
-    if not np.linalg.norm(quaternion) > 0:
+    norm = np.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
+    if not norm > 0:
         return np.full((4, 4), np.nan)
+    x, y, z, w = q.x / norm, q.y / norm, q.z / norm, q.w / norm
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])  # times v: (x, y, z) x v
     matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+    matrix[:3, :3] += 2 * (w * cross + cross @ cross)
     matrix[:3, 3] = [t.x, t.y, t.z]
     return matrix

@@ -26,13 +26,12 @@ def find_no_return(scans: Iterable[ArrayLike]) -> float | None:
     once, with almost no ranges above it and few just below it.
     """
     candidates: Counter[float] = Counter()
-    values, scan_count = [], 0
+    values = []  # of scans with a return
     for scan in scans:
         ranges = np.asarray(scan)
         ranges = ranges[np.isfinite(ranges)]
         if not len(ranges):
             continue
-        scan_count += 1
         maximum = ranges.max()
         if np.count_nonzero(ranges == maximum) >= _MIN_BEAMS:
             candidates[float(maximum)] += 1
@@ -43,7 +42,7 @@ def find_no_return(scans: Iterable[ArrayLike]) -> float | None:
     ranges = np.concatenate(values)
     above = np.count_nonzero(ranges > value)
     just_below = np.count_nonzero((ranges < value) & (ranges > value - _BAND_M))
-    frequent = count >= max(3, _MIN_SHARE_OF_SCANS * scan_count)
+    frequent = count >= max(3, _MIN_SHARE_OF_SCANS * len(values))
     farthest = above <= _MAX_SHARE_ABOVE * len(ranges)
     alone = np.count_nonzero(ranges == value) > _BAND_FACTOR * just_below
     return value if frequent and farthest and alone else None

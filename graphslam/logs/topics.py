@@ -1,8 +1,7 @@
 """Selection of the topics of a log that are used, and their robots."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from graphslam.core import records
 from graphslam.core.config import Config
@@ -52,7 +51,7 @@ def find_topics(files: Sequence[McapFile], config: Config) -> list[Topic]:
             robot = config.logs.topics.get(raw.name, robot_of(raw.name))
             record = DECODERS[raw.schema].record
             found[raw.name] = Topic(raw.name, raw.schema, robot, record, before + raw.count)
-    names = _names(file.path for file in files)
+    names = ", ".join(str(file.path) for file in files)
     if not found:
         there = ", ".join(sorted(others)) or "nothing"
         raise LogError(
@@ -92,7 +91,7 @@ def choose_topics(
     Raises:
         LogError: all topics are empty, or a robot has scans or sightings but no odometry.
     """
-    names = _names(file.path for file in files)
+    names = ", ".join(str(file.path) for file in files)
     filled = [topic for topic in topics if topic.count]
     if not filled:
         raise LogError(
@@ -131,7 +130,3 @@ def _unused(what: str, robot: str, topics: Sequence[Topic]) -> list[str]:
         return []
     others = ", ".join(topic.name for topic in topics[1:])
     return [f"robot {robot}: {what} is taken from {topics[0].name}; not used: {others}"]
-
-
-def _names(paths: Iterable[Path]) -> str:
-    return ", ".join(map(str, paths))

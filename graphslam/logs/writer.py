@@ -247,8 +247,7 @@ class LogWriter:
         self, robot: str, stamp_ns: int, pose: ArrayLike, *, log_time_ns: int | None = None
     ) -> None:
         """TruePose on ``truth``: pose (3,) of the base in the world frame."""
-        x, y, phi = np.asarray(pose, dtype=float).tolist()
-        data = _truth_template().filled(stamp_ns, x, y, phi)
+        data = _truth_template().filled(stamp_ns, *np.asarray(pose, dtype=float).tolist())
         self._add(_topic(robot, "truth"), schemas.TRUE_POSE, data, stamp_ns, log_time_ns)
 
     def true_landmark(
@@ -294,8 +293,6 @@ class LogWriter:
             names=list(names),
             targets=np.asarray(targets, dtype=np.int16),
         )
-
-    # ------------------------------------------------------------ anything else
 
     def message(self, topic: str, schema: str, message: Any, stamp_ns: int) -> None:
         """Any ROS 2 message, made by `schemas.build`, on ``topic`` (with its leading slash)."""

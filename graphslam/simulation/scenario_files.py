@@ -83,8 +83,7 @@ def _inconsistencies(scenario: Scenario) -> Iterator[str]:
     """Problems with combinations of keys that are valid one by one."""
     if not scenario.robots:
         yield "robots: is empty; give at least one [robots.NAME]"
-    names = Counter(scenario.world.names)
-    for name, count in names.items():
+    for name, count in Counter(scenario.world.names).items():
         if count > 1:
             yield f"world: {count} things are named {name!r}; names must differ"
     for name, robot in scenario.robots.items():

@@ -46,15 +46,9 @@ def _record(kind: Any, value: Any, key: str) -> Any:
             close = difflib.get_close_matches(name, known, n=1)
             hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(known)}"
             raise ScenarioError(f"{prefix}{name}: unknown key; {hint}")
-    missing = [
-        name
-        for name, f in known.items()
-        if name not in value
-        and f.default is dataclasses.MISSING
-        and f.default_factory is dataclasses.MISSING
-    ]
-    if missing:
-        raise ScenarioError(f"{prefix}{missing[0]}: missing; give it")
+    for name, f in known.items():
+        if name not in value and f.default is f.default_factory is dataclasses.MISSING:
+            raise ScenarioError(f"{prefix}{name}: missing; give it")
     return kind(
         **{n: build(hints[n], v, f"{prefix}{n}", known[n].metadata) for n, v in value.items()}
     )

@@ -86,9 +86,8 @@ def simulate_sightings(
         visible &= (distance <= sensor.range_max_m) & (z[:, 1] > 0)
         visible &= _line_of_sight(poses, bearing, distance, target)
         cov = np.diag(sigma**2)
-        found += [
-            SimulatedSighting(int(i), target.name, z[i], cov) for i in np.flatnonzero(visible)
-        ]
+        samples = np.flatnonzero(visible).tolist()
+        found += [SimulatedSighting(i, target.name, z[i], cov) for i in samples]
     return sorted(found, key=lambda seen: seen.sample)
 
 

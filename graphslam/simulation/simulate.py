@@ -10,7 +10,7 @@ from graphslam.core.errors import OutputError
 from graphslam.core.output_folder import atomic_folder
 from graphslam.simulation.recording import Recording, record_visit
 from graphslam.simulation.scenario import Scenario
-from graphslam.simulation.scene import SimulatedVisit, prepare_visits
+from graphslam.simulation.scene import prepare_visits
 from graphslam.simulation.true_changes import true_changes
 
 
@@ -46,12 +46,6 @@ def simulate(scenario: Scenario, target: Path, seed: int = 0) -> Simulation:
             raise OutputError(f"{target}: is a folder; this scenario makes one log: -o LOG.mcap")
         recording = record_visit(scenario, visits[0], target, seed)
         return Simulation(scenario.name, seed, target, (recording,), 0)
-    return _two_visits(scenario, (visits[0], visits[1]), target, seed)
-
-
-def _two_visits(
-    scenario: Scenario, visits: tuple[SimulatedVisit, SimulatedVisit], target: Path, seed: int
-) -> Simulation:
     if target.is_file() or target.suffix == ".mcap":
         raise OutputError(f"{target}: this scenario makes two logs; name a folder: -o DIR")
     with atomic_folder(target) as part:

@@ -4,7 +4,7 @@ A cell counts as changed if noise-free beams of one visit ended in it on an obje
 removed or added, and beams of the other visit passed through it.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from itertools import compress
 from typing import Any
 
@@ -29,10 +29,10 @@ def true_changes(
     """The contents of truth.json; see docs/simulator.md. World frame of the simulator."""
     later = scenario.later or LaterVisit()
     before, after = recordings
-    moved = {move.name for move in later.moved}
-    appeared = _cells(after, moved | set(later.appeared.names))
-    vanished = _cells(before, moved | set(later.vanished))
     motions = {move.name: displacement(move) for move in later.moved}
+    kinds = {"moved": motions, "vanished": later.vanished, "appeared": later.appeared.names}
+    appeared = _cells(after, {*motions, *later.appeared.names})
+    vanished = _cells(before, {*motions, *later.vanished})
     return {
         "format": 1,
         "scenario": scenario.name,
@@ -53,19 +53,14 @@ def true_changes(
                 "after": _polygon(after.visit, name),
                 "displacement": xy_phi(motions[name]) if name in motions else None,
             }
-            for name, kind in _kinds(later)
+            for kind, names in kinds.items()
+            for name in names
         ],
         "cells": [
             *_rows("appeared", appeared, before.scans, motions, back=True),
             *_rows("vanished", vanished, after.scans, motions, back=False),
         ],
     }
-
-
-def _kinds(later: LaterVisit) -> Iterator[tuple[str, str]]:
-    yield from ((move.name, "moved") for move in later.moved)
-    yield from ((name, "vanished") for name in later.vanished)
-    yield from ((name, "appeared") for name in later.appeared.names)
 
 
 def _polygon(visit: SimulatedVisit, name: str) -> list[list[float]] | None:
