@@ -112,13 +112,6 @@ class RelativePose(Message):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Truth(Message):
-    """True pose (3,) of a robot's base in the world frame; used by evaluation only."""
-
-    pose: Array
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class TrueLandmark(Message):
     """A landmark as it truly is; ``robot`` is empty. ``kind`` point | segment | line.
 
@@ -141,6 +134,13 @@ class TrueAssociations(Message):
 
     names: tuple[str, ...]
     targets: np.ndarray[tuple[int], np.dtype[np.int64]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth(Message):
+    """True pose (3,) of a robot's base in the world frame; used by evaluation only."""
+
+    pose: Array
 
 
 # ---------------------------------------------------------------- what the pipeline passes on
