@@ -20,7 +20,7 @@ PAGE = Path(__file__).with_suffix(".md")
 HEAD = """\
 # Configuration
 
-Made from `graphslam/core/config.py` by `make docs`; change it there.
+Made from `graphslam/core/config.py` and `sensor_config.py` by `make docs`; change it there.
 
 One tree of settings. `graphslam smooth` takes the defaults, then `--config FILE.toml`, then its
 own options (`--backend isam2` is `backend.name`, `--front-end` is `front_end.name`, `--start` is
