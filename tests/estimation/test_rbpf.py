@@ -7,9 +7,9 @@ import pytest
 from backend_cases import MOTION_COV, PLAIN, WORLD, motion, run, see, two_robots
 from scipy.stats import multivariate_normal
 
-from graphslam.core.config import ConfigError, RbpfConfig
+from graphslam.core.config import RbpfConfig
 from graphslam.core.config_io import load_config
-from graphslam.core.errors import EstimationError
+from graphslam.core.errors import ConfigError, EstimationError
 from graphslam.core.geometry import compose
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Closure, Start, Step

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graphslam.core.config import ConfigError
 from graphslam.core.config_io import load_config
+from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import between, compose, wrap
 from graphslam.core.records import Scan
 from graphslam.logs import open_logs
