@@ -4,23 +4,23 @@ import gc
 import os
 from collections.abc import Sequence
 
-#: what tells the libraries under numpy and scipy how many threads to use, when they are loaded
+#: environment variables by which the libraries under numpy and scipy choose their threads
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
-#: new objects before Python looks for cycles: a run makes millions of records, and hardly a cycle,
-#: so that looking every 700 of them took a tenth of the time
-COLLECT_EVERY = 100_000
+#: new objects between two garbage collections: a run makes millions of records and hardly any
+#: reference cycle, and with the default of 700 collecting took a tenth of the time
+COLLECTION_INTERVAL = 100_000
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run one command and leave with its exit code; the arguments are the process' own if None.
+    """Run one command and exit with its code; ``arguments`` None means those of the process.
 
-    Matrices here are small: a second thread takes a core and gains nothing, so there is one unless
-    the environment says otherwise.
+    The matrices are small and gain nothing from a second thread, so libraries use one unless the
+    environment says otherwise.
 
     Raises:
-        SystemExit: always. 0 done, 1 an error that was told in one line, 2 wrong usage.
+        SystemExit: always. 0 done, 1 an error, reported in one line, 2 wrong usage.
     """
-    gc.set_threshold(COLLECT_EVERY, *gc.get_threshold()[1:])
+    gc.set_threshold(COLLECTION_INTERVAL, *gc.get_threshold()[1:])
     for name in THREADS:
         os.environ.setdefault(name, "1")
     from graphslam.cli.commands import app  # noqa: PLC0415

@@ -1,4 +1,4 @@
-"""What a command prints for people; with --json none of this is used."""
+"""The output of the commands for people; --json uses none of it."""
 
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -23,11 +23,11 @@ from graphslam.results.report_comparison import (
 )
 from graphslam.simulation import Simulation
 
-_PIPE_WIDTH = 200  # a pipe has no width; tables take what they need of this
+_PIPE_WIDTH = 200  # columns; output into a pipe has no width of its own
 
 
 def log_info(info: LogInfo) -> None:
-    """Files, topics, robots, then what is odd and whether the log can be smoothed."""
+    """Files, topics and robots, warnings, and whether the log can be smoothed."""
     console = _console()
     for file in info.files:
         lost = "an unknown number" if file.lost is None else _number(file.lost)
@@ -56,7 +56,7 @@ def log_info(info: LogInfo) -> None:
 
 
 def imported(done: ImportSummary) -> None:
-    """Where the log is, how many messages it has per topic, what was odd."""
+    """The log, its messages per topic, warnings."""
     console = _console()
     console.print(f"{done.target}: {_number(sum(done.counts.values()))} messages")
     for topic, count in sorted(done.counts.items()):
@@ -84,7 +84,7 @@ def simulation(done: Simulation) -> dict[str, Any]:
 
 
 def simulated(done: Simulation) -> None:
-    """Where the logs are, what each robot did in them, how far off its odometry ends."""
+    """The logs, the drive of each robot, and the error of its dead reckoning at the end."""
     console = _console()
     head = ["log", "robot", "path, m", "s", "scans", "sightings", "dead reckoning ends off, m"]
     rows = [
@@ -106,7 +106,7 @@ def simulated(done: Simulation) -> None:
 
 
 def smoothed(result: Result, directory: Path) -> None:
-    """The headline of a run, what was rejected or dropped and why, where the report lies."""
+    """A line on the run, what was rejected or dropped and why, and where the report is."""
     console, summary, robots = _console(), result.summary, len(result.robots)
     counts = summary["counts"]
     parts = [f"{robots} robot{'s' * (robots > 1)}"]
@@ -131,19 +131,19 @@ def smoothed(result: Result, directory: Path) -> None:
 
 
 def _unobservable(console: Console, calibration: Mapping[str, Any]) -> None:
-    """Which calibration parameters this drive does not tell."""
+    """The calibration parameters that are not observable in this log."""
     names = [name for name, p in calibration.items() if not p["observable"] and p["sigma"] > 0]
     if names:
         console.print(f"calibration: not observable in this log: {', '.join(names)}")
 
 
 def _clock(found: Mapping[str, Any]) -> str:
-    """How far a clock is ahead of the first robot's, and whether that was made up for."""
+    """Offset and drift of a clock against the first robot's, and whether they were corrected."""
     if not found["observable"]:
         return "not observable: too few sightings between moving robots"
-    told = f"{found['offset_s']:+.3f} ± {found['offset_sigma_s']:.3f} s"
-    told += f", {found['drift_ppm']:+.0f} ± {found['drift_sigma_ppm']:.0f} ppm"
-    return f"{told}; {'made up for' if found['applied'] else 'no different from zero, not applied'}"
+    text = f"{found['offset_s']:+.3f} ± {found['offset_sigma_s']:.3f} s"
+    text += f", {found['drift_ppm']:+.0f} ± {found['drift_sigma_ppm']:.0f} ppm"
+    return f"{text}; {'corrected' if found['applied'] else 'not significant, not applied'}"
 
 
 def evaluation(errors: Mapping[str, Any]) -> None:
@@ -164,13 +164,13 @@ def evaluation(errors: Mapping[str, Any]) -> None:
 
 
 def stage(text: str) -> None:
-    """What is done now, on stderr, where someone is watching."""
+    """Print on stderr what is done now, if it is a terminal."""
     if sys.stderr.isatty():
         Console(stderr=True, markup=False, highlight=False).print(f"{text} ...")
 
 
 def comparison(found: Mapping[str, Any], directory: Path) -> None:
-    """A table per kind of number, the best of a column with a star; then what failed."""
+    """Tables with a star at the best of each column; then what failed."""
     console = _console()
     console.print(headline(found))
     for title, (heads, rows) in comparison_tables(found).items():
@@ -199,12 +199,12 @@ def comparison(found: Mapping[str, Any], directory: Path) -> None:
 
 
 def changes(found: Mapping[str, Any], directory: Path) -> None:
-    """What changed, how many beams say so, where the report lies."""
+    """The changes, the beams compared and flagged, and where the report is."""
     console = _console()
     compared, flagged = found["beams_compared"], found["beams_flagged"]
     console.print(
         f"{_number(compared)} beams compared, {100 * flagged / max(compared, 1):.2f} % flagged; "
-        f"{100 * found['false_alarm_rate_requested']:g} % would be where nothing changed"
+        f"{100 * found['false_alarm_rate_requested']:g} % are expected where nothing changed"
     )
     rows = []
     for change in found["changes"]:
@@ -226,14 +226,14 @@ def changes(found: Mapping[str, Any], directory: Path) -> None:
     if rows:
         console.print(_table([*head, "beams"], rows))
     else:
-        console.print("nothing changed, as far as both visits could see")
+        console.print("no change was found where both visits observed")
     for warning in found["warnings"]:
         console.print(f"warning: {warning}")
     console.print(f"report: {directory / 'report.html'}")
 
 
 def experiment(found: Mapping[str, Any], directory: Path) -> None:
-    """A line per variant and noise scale; what failed; where the report lies."""
+    """A line per variant and noise scale, what failed, and where the report is."""
     console = _console()
     rows = []
     for row in found["table"]:
@@ -262,7 +262,7 @@ def experiment(found: Mapping[str, Any], directory: Path) -> None:
 
 
 def _console() -> Console:
-    """Plain text: names of topics may hold what looks like markup."""
+    """A console for plain text: names of topics may look like markup."""
     width = None if sys.stdout.isatty() else _PIPE_WIDTH
     return Console(width=width, markup=False, highlight=False, emoji=False, soft_wrap=True)
 
@@ -278,7 +278,7 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[object]], texts: int = 1
 
 
 def _number(value: object) -> str:
-    """A cell: integers in groups of three, other numbers with three or more digits."""
+    """Text of a cell: integers in groups of three, other numbers with at least three digits."""
     if value is None:
         return "-"
     if isinstance(value, bool):
@@ -317,7 +317,7 @@ def _robot_row(robot: RobotInfo) -> tuple[object, ...]:
 
 def _scan(topic: TopicInfo) -> str:
     """The laser in one line."""
-    assert topic.scan is not None  # the caller asks only for topics with scans
+    assert topic.scan is not None  # only called for topics with scans
     scan = topic.scan
     parts = [
         f"{scan.beams} beams over {degrees(scan.field_of_view_rad):.0f} deg",
@@ -329,7 +329,7 @@ def _scan(topic: TopicInfo) -> str:
 
 
 def _span(topics: Sequence[TopicInfo]) -> str:
-    """From when to when, over all topics; UTC."""
+    """Duration and start, UTC, over all topics."""
     times = [t for topic in topics for t in (topic.first_ns, topic.last_ns) if t is not None]
     if not times:
         return "no time"

@@ -1,1 +1,1 @@
-"""How good a result is: metrics against truth, comparison of back ends, Monte Carlo experiments."""
+"""Metrics against ground truth, comparison of back ends, Monte Carlo experiments."""

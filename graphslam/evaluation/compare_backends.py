@@ -1,4 +1,4 @@
-"""Every back end judged: its row of numbers, and what the report draws of it."""
+"""Comparison of back ends on one recording: a row of numbers and the curves of each."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -22,9 +22,9 @@ from graphslam.results.report_comparison import BackendCurves, Comparison, Error
 from graphslam.slam.pipeline import Progress
 
 FORMAT = "graphslam-comparison-1"
-#: the same recorded steps for all, or each associates for itself
+#: the same recorded steps for all, or each with its own data association
 MODES = ("replay", "associate")
-#: the settings that recorded steps follow from: in mode `replay` they are the same for all
+#: tables of settings that the recorded steps depend on: in mode `replay` the same for all
 PERCEPTION = ("logs", "robots", "odometry", "keyframe", "front_end", "association", "start")
 
 
@@ -40,25 +40,26 @@ def compare(
     say: Callable[[str], None] = lambda _text: None,
     run: Callable[[Sequence[Step], Config], TimedReplay] = timed_replay_in_process,
 ) -> Comparison:
-    """Every back end of ``rows`` on one log, one after another, in the order given.
+    """Run every back end of ``rows`` on one log, one after another.
 
     A back end that fails has its error in its row, and the others go on.
 
     Args:
         log: opened logs.
         config: settings of the recording in mode ``replay``.
-        rows: see `variants`.
-        mode: one of `MODES`, see the package.
-        truth: true poses and landmarks; without, rows are compared with each other only.
+        rows: see `parse_variants`.
+        mode: one of `MODES`.
+        truth: true poses and landmarks; without it rows are compared with each other only.
         relations: reference relations between scans, see `evaluate`.
         progress: called with the number of messages read so far.
-        say: told what is done next.
-        run: how a back end is run: `play_apart`, or `play`, where memory then means nothing.
+        say: called with a line on what is done next.
+        run: how a back end is run: `timed_replay_in_process`, or `timed_replay`, with which
+            numbers on memory are meaningless.
 
     Raises:
         LogError: no message of the log could be used.
         ConfigError: no such mode, or rows differ in more than estimation in mode ``replay``.
-        EstimationError: the log cannot be associated, or no back end came to an end.
+        EstimationError: data association failed, or every back end did.
         OutputError: the truth is of other robots.
     """
     if mode not in MODES:
@@ -74,20 +75,18 @@ def compare(
         _check_perception(config, rows)
         say(f"associating with {NAMES.get(config.backend.name, config.backend.name)}")
         shared = record_steps(log, config, progress)
-    runs: list[_Run] = []
+    runs: list[_BackendRun] = []
     for variant in rows:
         say(variant.label)
         try:
             recording = shared or record_steps(log, variant.config, progress)
-            runs.append(_Run.of(variant, recording, run(recording.steps, variant.config)))
+            runs.append(_BackendRun.of(variant, recording, run(recording.steps, variant.config)))
         except GraphSlamError as error:
-            runs.append(_Run(variant, error=str(error)))
+            runs.append(_BackendRun(variant, error=str(error)))
     done = [run for run in runs if run.result is not None]
     if not done:
-        raise EstimationError(
-            f"no back end came to an end; {runs[0].variant.spec}: {runs[0].error}"
-        )
-    # the best that is there: batch, else what revises the past, else the first
+        raise EstimationError(f"every back end failed; {runs[0].variant.spec}: {runs[0].error}")
+    # the reference: batch, else a smoother, else the first
     reference = min(
         done,
         key=lambda one: (
@@ -97,11 +96,11 @@ def compare(
     )
     warnings = [text for variant in rows for text in variant.config.warnings]
     for one in done:
-        one.judge(truth, relations, reference, warnings)
+        one.evaluate_against(truth, relations, reference, warnings)
     given = config.start.from_truth or bool(config.start.poses)
     if truth.trajectories and not given:
         warnings.append(
-            "the start was not given: only aligned errors mean something (give --start truth)"
+            "the start was not given: only aligned errors are meaningful (give --start truth)"
         )
     known = {
         name: path
@@ -118,7 +117,7 @@ def compare(
         "rows": [run.row for run in runs],
         "warnings": list(dict.fromkeys([*log.warnings, *warnings])),
     }
-    lanes = [one.lane(known, reference, in_place=given) for one in done]
+    lanes = [one.curves(known, reference, same_frame=given) for one in done]
     return Comparison(found, tuple(lanes), {name: t.poses[:, :2] for name, t in known.items()})
 
 
@@ -128,12 +127,12 @@ def _check_perception(config: Config, rows: Sequence[Variant]) -> None:
             if getattr(variant.config, table) != getattr(config, table):
                 raise ConfigError(
                     f"--backends {variant.spec}: {table}.* belongs to the recording, which is the "
-                    "same for all; give it by --set, or compare with --mode associate"
+                    "same for all; give it with --set, or compare with --mode associate"
                 )
 
 
-class _Run:
-    """One back end of a comparison: its row, and what the report draws of it."""
+class _BackendRun:
+    """One back end of a comparison: its row, and the curves of the report."""
 
     def __init__(self, variant: Variant, error: str | None = None) -> None:
         self.variant = variant
@@ -143,14 +142,14 @@ class _Run:
 
     @property
     def error(self) -> str | None:
-        """Why it did not come to an end."""
-        found: str | None = self.row["error"]
-        return found
+        """Why it failed; None if it did not."""
+        error: str | None = self.row["error"]
+        return error
 
     @classmethod
-    def of(cls, variant: Variant, recording: RecordedSteps, played: TimedReplay) -> "_Run":
-        """A run that came to an end."""
-        self, done = cls(variant), played.replay
+    def of(cls, variant: Variant, recording: RecordedSteps, timed: TimedReplay) -> "_BackendRun":
+        """A run that succeeded."""
+        self, done = cls(variant), timed.replay
         result = recording.result(done, variant.config)
         is_filter = all(robot.final is robot.causal for robot in result.robots.values())
         self.result, self.step_ms = result, done.step_ms
@@ -158,48 +157,48 @@ class _Run:
         p50, p99, most = np.quantile(done.step_ms, [0.5, 0.99, 1.0]).tolist()
         name = variant.config.backend.name
         if name == "ekf" or (is_filter and name != "dead-reckoning"):
-            # filters differ by it as much as from a smoother
-            self.row["label"] += f", {played.error_frame}-frame errors"
+            # this choice changes a filter as much as smoothing does
+            self.row["label"] += f", {timed.error_frame}-frame errors"
         self.row |= {
-            "error_frame": played.error_frame,
+            "error_frame": timed.error_frame,
             "final_is_causal": is_filter,
             "steps": len(recording.steps),
             "states": sum(map(len, done.causal.values())),
             "map_landmarks": len(result.landmarks),
             "associations": recording.associations,
             "late": done.late,
-            "skipped": dict(played.skipped),
+            "skipped": dict(timed.skipped),
             "recording_s": recording.seconds,
             "ms_per_step": {"p50": p50, "p99": p99, "max": most},
             "finish_ms": done.finish_ms,
             "total_s": 1e-3 * (float(done.step_ms.sum()) + done.finish_ms),
-            "memory_mb": {"peak": played.peak_mb, "growth": played.peak_mb - played.before_mb},
+            "memory_mb": {"peak": timed.peak_mb, "growth": timed.peak_mb - timed.before_mb},
             "growth_exponent": {
                 "landmarks": growth_exponent(self.landmarks, done.step_ms),
                 "path": growth_exponent(self.path_m, done.step_ms),
             },
         }
-        if played.exchanged is not None:
-            sent, measured = played.exchanged
+        if timed.exchanged is not None:
+            sent, measured = timed.exchanged
             self.row["exchanged"] = {
                 robot: {"sent_bytes": sent[robot], "measured_bytes": measured[robot]}
                 for robot in sorted(sent)
             }
         return self
 
-    def judge(
+    def evaluate_against(
         self,
         truth: GroundTruth,
         relations: Relations | None,
-        reference: "_Run",
+        reference: "_BackendRun",
         warnings: list[str],
     ) -> None:
-        """Put the errors and the distance to the reference into the row."""
-        assert self.result is not None  # only runs that came to an end are judged
+        """Add the errors and the distance to the reference to the row."""
+        assert self.result is not None  # only runs that succeeded are evaluated
         try:
             self.row |= evaluate(self.result, truth.trajectories, truth.landmarks, relations)
         except OutputError as error:
-            # of another time, or relations without scans: no reason to lose the rest
+            # truth of another time, or relations without scans: the rest is still valid
             warnings.append(f"not evaluated: {error}")
         self.row["difference"] = {
             kind: _difference([pairs for _, pairs in self.pairs(kind, reference.final())])
@@ -208,32 +207,32 @@ class _Run:
 
     def final(self) -> dict[str, Trajectory]:
         """The final trajectory of each robot."""
-        assert self.result is not None  # see `judge`
+        assert self.result is not None  # see `evaluate_against`
         return {name: robot.final for name, robot in self.result.robots.items()}
 
     def pairs(self, kind: str, other: Mapping[str, Trajectory]) -> Iterator[tuple[str, PosePairs]]:
-        """Poses of each robot beside those of ``other``, as far as there are any."""
-        assert self.result is not None  # see `judge`
+        """Poses of each robot paired with those of ``other``, as far as there are any."""
+        assert self.result is not None  # see `evaluate_against`
         for name, robot in self.result.robots.items():
             if name in other and len(found := pair_poses(getattr(robot, kind), other[name])):
                 yield name, found
 
-    def lane(
-        self, truth: Mapping[str, Trajectory], reference: "_Run", *, in_place: bool
+    def curves(
+        self, truth: Mapping[str, Trajectory], reference: "_BackendRun", *, same_frame: bool
     ) -> BackendCurves:
-        """What the report draws; aligned with the truth unless the estimate is in its place."""
-        assert self.result is not None  # see `judge`
+        """What the report draws; aligned with the truth if not in its frame."""
+        assert self.result is not None  # see `evaluate_against`
         paths, curves = {}, {}
         for kind in ("final", "causal"):
             moved = np.zeros(3)
             found = dict(self.pairs(kind, truth or reference.final()))
-            if truth and not in_place and found:
+            if truth and not same_frame and found:
                 moved = align(
                     np.concatenate([p.estimate[:, :2] for p in found.values()]),
                     np.concatenate([p.truth[:, :2] for p in found.values()]),
                 )
             curves[kind] = {
-                name: _curve(p, moved, consistency=bool(truth) and in_place)
+                name: _curve(p, moved, consistency=bool(truth) and same_frame)
                 for name, p in found.items()
             }
             paths[kind] = {
@@ -247,7 +246,7 @@ class _Run:
 
 
 def _difference(pairs: Sequence[PosePairs]) -> dict[str, float] | None:
-    """Distance between two estimates of the same poses, over all robots."""
+    """Distance between two estimates of the same poses of all robots; None without any."""
     if not pairs:
         return None
     off = np.concatenate([p.estimate - p.truth for p in pairs])
@@ -260,7 +259,7 @@ def _difference(pairs: Sequence[PosePairs]) -> dict[str, float] | None:
 
 
 def _curve(pairs: PosePairs, moved: Array, *, consistency: bool) -> ErrorCurve:
-    """Errors over time after the estimate was put at ``moved`` (3,)."""
+    """Errors over time after the estimate was moved by ``moved`` (3,)."""
     off = pairs.estimate - pairs.truth
     off[:, 2] = wrap(off[:, 2] + moved[2])
     off[:, :2] = transform(moved, pairs.estimate[:, :2]) - pairs.truth[:, :2]

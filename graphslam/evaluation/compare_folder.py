@@ -11,7 +11,7 @@ from graphslam.results.report_comparison import Comparison, render_comparison
 
 
 def is_comparison(directory: Path) -> bool:
-    """Whether `save_comparison` wrote this folder: nothing else is replaced by another one."""
+    """Whether `save_comparison` wrote this folder; no other folder may be replaced."""
     try:
         found = json.loads((directory / "compare.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -22,7 +22,7 @@ def is_comparison(directory: Path) -> bool:
 def save_comparison(
     comparison: Comparison, config: Config, directory: Path, *, force: bool
 ) -> None:
-    """Write compare.json, config.toml and report.html, all or nothing.
+    """Write compare.json, config.toml and report.html atomically.
 
     Raises:
         OutputError: the target exists and may not be replaced, or the disk refuses.

@@ -1,4 +1,4 @@
-"""What is compared: specs of back ends and the settings they mean."""
+"""Variants of a comparison: specifications of back ends, and the settings they stand for."""
 
 import math
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ from graphslam.core.config_io import parse_setting, with_settings
 from graphslam.core.errors import ConfigError
 from graphslam.estimation.backends import BACKENDS
 
-#: how back ends are called in tables; others go by the name in `BACKENDS`
+#: names of back ends in tables; the others have the name in `BACKENDS`
 NAMES = {
     "batch": "Batch",
     "dead-reckoning": "Dead reckoning",
@@ -21,7 +21,7 @@ NAMES = {
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """One row: the spec as asked for, its name for people, the settings it means."""
+    """One row: its specification, its label in tables, and its settings."""
 
     spec: str
     label: str
@@ -29,22 +29,22 @@ class Variant:
 
     @property
     def horizon_s(self) -> float | None:
-        """How long it keeps past poses; None where the back end has no horizon."""
+        """How long past poses are kept, s; None where the back end has no horizon."""
         return self.config.backend.horizon_s if self.config.backend.name == "isam2" else None
 
 
 def parse_variants(specs: Sequence[str], config: Config | None = None) -> tuple[Variant, ...]:
-    """The rows that ``specs`` ask for, over the settings of ``config``.
+    """The variants of ``specs``, each over the settings of ``config``.
 
     Raises:
-        ConfigError: a spec is unknown, malformed or there twice; it names the spec.
+        ConfigError: a specification is unknown, malformed or given twice; the message names it.
     """
     found = tuple(_variant(spec, config or Config()) for spec in specs)
     if not found:
         raise ConfigError("--backends: names no back end")
     for number, variant in enumerate(found):
         if variant.config in [other.config for other in found[:number]]:
-            raise ConfigError(f"--backends: {variant.spec} is there twice")
+            raise ConfigError(f"--backends: {variant.spec} is given twice")
     return found
 
 
@@ -64,7 +64,7 @@ def _variant(spec: str, config: Config) -> Variant:
     label = NAMES.get(name, name)
     if name == "isam2" and math.isfinite(config.backend.horizon_s):
         label += f", horizon {config.backend.horizon_s:g} s"
-    # the horizon is said, the error frame is added to what a filter is called
-    said = ("backend.horizon_s=", "ekf.error=") if name == "ekf" else ("backend.horizon_s=",)
-    extra = [text for text in settings if not text.startswith(said)]
+    # the horizon is in the label, the error frame is added to that of a filter
+    shown = ("backend.horizon_s=", "ekf.error=") if name == "ekf" else ("backend.horizon_s=",)
+    extra = [text for text in settings if not text.startswith(shown)]
     return Variant(spec, ", ".join([label, *extra]), config)

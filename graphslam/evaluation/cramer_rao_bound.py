@@ -1,8 +1,8 @@
 """The Cramér-Rao bound of the bench: no unbiased estimator has a smaller covariance.
 
 The information of the graph is evaluated at the truth with the Jacobians of `MODELS`, in numpy and
-independently of the estimators, and averaged over draws of the start, which is the only part of
-the truth that is random: a hybrid bound, for a random start and deterministic rest.
+independently of the estimators. It is averaged over draws of the start, the only random part of
+the truth: a hybrid bound, with a random start and the rest deterministic.
 
 Source: H. L. Van Trees, Detection, Estimation, and Modulation Theory, Part I, 1968, section 2.4,
 DOI 10.1002/0471221082; for filters P. Tichavský, C. H. Muravchik, A. Nehorai, Posterior
@@ -21,7 +21,7 @@ from graphslam.core.records import Association
 from graphslam.evaluation.monte_carlo_bench import BenchRun, Noise, draw_run
 from graphslam.evaluation.monte_carlo_definition import Bench
 
-#: starts over which the information is averaged; it hardly depends on them
+#: starts over which the information is averaged; the result hardly depends on their number
 _DRAWS = 200
 
 
@@ -51,7 +51,7 @@ class Bound:
 
 @dataclass(frozen=True, slots=True)
 class _Layout:
-    """Where each state lies in the information matrix: poses by robot and time, then landmarks."""
+    """Index of each state in the information matrix: poses by time and robot, then landmarks."""
 
     names: tuple[str, ...]
     steps: int
@@ -63,12 +63,12 @@ class _Layout:
         return 3 * len(self.names) * (self.steps + 1) + 2 * (self.points + self.lines)
 
     def pose(self, robot: str, k: int) -> slice:
-        place = 3 * (k * len(self.names) + self.names.index(robot))
-        return slice(place, place + 3)
+        start = 3 * (k * len(self.names) + self.names.index(robot))
+        return slice(start, start + 3)
 
     def landmark(self, i: int) -> slice:
-        place = 3 * len(self.names) * (self.steps + 1) + 2 * i
-        return slice(place, place + 2)
+        start = 3 * len(self.names) * (self.steps + 1) + 2 * i
+        return slice(start, start + 2)
 
 
 def cramer_rao_bound(bench: Bench, scale: float, rng: np.random.Generator) -> Bound:
@@ -99,7 +99,7 @@ def cramer_rao_bound(bench: Bench, scale: float, rng: np.random.Generator) -> Bo
 
 
 def _variances(J: Array, seen: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Array:
-    """Diagonal (n,) of the inverse of the information about what was seen; infinite elsewhere."""
+    """Diagonal (n,) of the inverse information (n, n) of the observed states; else infinite."""
     out = np.full(len(J), np.inf)
     out[seen] = np.diag(np.linalg.inv(J[np.ix_(seen, seen)]))
     return out
@@ -108,10 +108,10 @@ def _variances(J: Array, seen: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Ar
 def _rows(
     run: BenchRun, noise: Noise, starts: dict[str, Array], layout: _Layout, k: int
 ) -> Iterator[tuple[list[int], Array, Array]]:
-    """Of everything that enters at step k: its columns, Jacobian and covariance."""
+    """Columns, Jacobian and covariance of every measurement of step k."""
 
-    def columns(*places: slice) -> list[int]:
-        return [i for place in places for i in range(place.start, place.stop)]
+    def columns(*blocks: slice) -> list[int]:
+        return [i for block in blocks for i in range(block.start, block.stop)]
 
     def pose(name: str, at: int) -> Array:
         return starts[name] if at == 0 else run.truth[name][at][None]
@@ -128,23 +128,23 @@ def _rows(
         V = model.noise(z, noise.motion, before, after)
         yield columns(layout.pose(name, k - 1), layout.pose(name, k)), H, V
     for seen in step.associations:
-        x, t, place = pose(seen.robot, k), *_target(run, layout, seen, k)
+        x, t, target = pose(seen.robot, k), *_target(run, layout, seen, k)
         model = MODELS[seen.model]
         H_x, H_t = model.jacobians(seen.z[None], x, t)
         if seen.model == "line":
-            # normal offset and direction; along the line is a gauge
+            # normal offset and direction; the position along the line is a gauge
             c, s = np.cos(t[0, 2]), np.sin(t[0, 2])
             H_t = H_t @ np.array([[-s, 0.0], [c, 0.0], [0.0, 1.0]])
         V = model.noise(seen.z[None], seen.cov, x, t)
         yield (
-            columns(layout.pose(seen.robot, k), place),
+            columns(layout.pose(seen.robot, k), target),
             np.concatenate([H_x, H_t], axis=-1),
             np.broadcast_to(V, (len(H_x), *V.shape[-2:])),
         )
 
 
 def _target(run: BenchRun, layout: _Layout, seen: Association, k: int) -> tuple[Array, slice]:
-    """True state (1, d) of what is seen at step k, and its place."""
+    """True state (1, d) of what is observed at step k, and its block."""
     if isinstance(seen.target, int):
         return run.landmarks[seen.target][None], layout.landmark(seen.target)
     return run.truth[seen.target][k][None], layout.pose(seen.target, k)
@@ -155,7 +155,7 @@ def _landmarks(variance: Array, layout: _Layout, run: BenchRun) -> dict[str, flo
     for i in run.landmarks:
         block = variance[layout.landmark(i)]
         if not np.isfinite(block).all():
-            continue  # never seen
+            continue  # never observed
         if i < layout.points:
             values["points_m2"].append(float(block.sum()))
         else:

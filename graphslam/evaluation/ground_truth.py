@@ -1,4 +1,4 @@
-"""Where evaluation takes its truth from: the logs of a run, another log, or TUM files."""
+"""Ground truth for an evaluation: from the logs of a run, other logs, or TUM files."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,17 +14,17 @@ _NO_TRUTH = "holds no true poses or landmarks; give --truth or --relations"
 
 
 def truth_of_logs(log: LogSet, config: Config) -> GroundTruth:
-    """What open logs say about the truth, perhaps nothing."""
+    """The truth in opened logs; empty if there is none."""
     if not any(topic.record in (Truth, TrueLandmark) for topic in log.topics):
-        return GroundTruth({}, ())  # spares reading them once more
+        return GroundTruth({}, ())  # without reading the logs again
     return truth_from_mcap(log.opened, config)
 
 
 def truth_of_run(result: Result | SavedResult) -> GroundTruth:
-    """What the logs that a result came from say about the truth.
+    """The truth in the logs that a result was made from.
 
     Raises:
-        LogError: a log is not where it was or is another one now, or none holds any truth.
+        LogError: a log has moved or changed, or none holds any truth.
     """
     logs = result.summary["logs"]
     found = read_truth([Path(log["path"]) for log in logs], result.config)
@@ -40,12 +40,12 @@ def truth_of_files(sources: Sequence[str], robots: Sequence[str]) -> GroundTruth
     """Truth from logs (``LOG.mcap``) and TUM files (``FILE.tum``, ``ROBOT=FILE.tum``).
 
     Args:
-        sources: files as given on the command line; several add up.
-        robots: names of the result's robots; a TUM file may go without one if there is only one.
+        sources: files as given on the command line; what they hold is combined.
+        robots: names of the result's robots; with only one, a TUM file needs no name.
 
     Raises:
         LogError: a log cannot be read or holds no truth.
-        OutputError: a TUM file cannot be read, or it is not clear whose it is.
+        OutputError: a TUM file cannot be read, or it is not clear of which robot it is.
     """
     trajectories: dict[str, Trajectory] = {}
     landmarks: list[TrueLandmark] = []
@@ -69,5 +69,6 @@ def _robot_and_path(source: str, robots: Sequence[str]) -> tuple[str, Path]:
     if len(robots) == 1 and (not separator or Path(source).exists()):
         return robots[0], Path(source)
     raise OutputError(
-        f"--truth {source}: whose is it? write ROBOT=FILE.tum with one of {', '.join(robots)}"
+        f"--truth {source}: of which robot is it? write ROBOT=FILE.tum, ROBOT one of "
+        f"{', '.join(robots)}"
     )

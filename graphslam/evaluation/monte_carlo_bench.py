@@ -1,8 +1,8 @@
-"""Steps of robots in a room, drawn from exactly the noise that they state; no log, no front end.
+"""Simulated steps with exactly the noise that they state and true associations, without a log.
 
-The robots follow a planned path; only where they start is drawn from the prior, so the first
-motion differs from run to run and every later pose is as planned. Every run therefore has the same
-graph, and one Cramér-Rao bound holds for all of them (see `graphslam.evaluation.cramer_rao_bound`).
+The robots follow a planned path. Only the start is drawn from the prior, so the first motion
+differs from run to run and every later pose is as planned. All runs therefore have the same graph
+and one Cramér-Rao bound (see `graphslam.evaluation.cramer_rao_bound`).
 """
 
 from collections.abc import Mapping
@@ -20,11 +20,11 @@ STEP_NS = 1_000_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BenchRun:
-    """The steps of a run and the truth behind them.
+    """The steps of a run and the truth.
 
     ``truth[robot]`` (K+1, 3) is the true pose at each step, the start first; ``landmarks[id]`` is
-    (2,) of a point, (3,) of a line: a pose on it, where it is first seen, x axis along it. Points
-    have the first numbers. World frame.
+    (2,) of a point, (3,) of a line: a pose on it where it is first observed, x axis along it. The
+    ids of points come first. World frame.
     """
 
     steps: tuple[Step, ...]
@@ -34,7 +34,7 @@ class BenchRun:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Noise:
-    """Covariances (3, 3) or (2, 2) of what a run draws: m and rad, along the axes of each frame."""
+    """Covariances (3, 3) or (2, 2) of the errors of a run: m and rad, along each frame's axes."""
 
     start: Array
     motion: Array
@@ -44,7 +44,7 @@ class Noise:
 
     @classmethod
     def of(cls, bench: Bench, scale: float) -> "Noise":
-        """At a noise scale, which multiplies every standard deviation."""
+        """The noise of a bench; ``scale`` multiplies every standard deviation."""
         s = bench.sigma
 
         def cov(*sigmas: float) -> Array:
@@ -54,14 +54,14 @@ class Noise:
             start=cov(s.start_m, s.start_m, np.radians(s.start_deg)),
             motion=cov(s.along_m, s.across_m, np.radians(s.turn_deg)),
             point=cov(np.radians(s.bearing_deg), s.range_m),
-            # along a line there is no information; what stands there must not matter
+            # there is no information along a line: the first value must not matter
             line=cov(s.line_m, s.line_m, np.radians(s.line_deg)),
             robot=cov(s.robot_m, s.robot_m, np.radians(s.robot_deg)),
         )
 
 
 def planned_path(robot: BenchRobot) -> Array:
-    """Poses (K+1, 3) of the plan, world frame."""
+    """Poses (K+1, 3) of the planned path, world frame."""
     poses = [np.array([*robot.start_m, np.radians(robot.start_deg)])]
     for leg in robot.path:
         delta = np.array([leg.forward_m, 0.0, np.radians(leg.turn_deg)])
@@ -71,18 +71,18 @@ def planned_path(robot: BenchRobot) -> Array:
 
 
 def run_seed(seed: int, scale: float, run: int) -> np.random.SeedSequence:
-    """The randomness of a run: of the experiment, the scale and the run alone.
+    """The seed of a run: it depends on the experiment, the scale and the run alone.
 
-    Not of the variant, nor of which process runs it when: all variants get the same draws.
+    All variants get the same draws, whichever process runs them.
     """
     return np.random.SeedSequence(seed, spawn_key=(round(1e6 * scale), run))
 
 
 def draw_run(bench: Bench, scale: float, rng: np.random.Generator | None) -> BenchRun:
-    """A run; without ``rng`` the one in which every error happens to be zero.
+    """Draw a run; without ``rng`` all errors are zero.
 
-    Start and motions get additive errors, sightings of points too; the pose of a line or a robot
-    is disturbed along its own axes, as its covariance is given.
+    Errors of starts, motions and sightings of points are additive; those of the pose of a line or a
+    robot are along its own axes, as its covariance is given.
     """
     noise = Noise.of(bench, scale)
 
@@ -114,10 +114,10 @@ def draw_run(bench: Bench, scale: float, rng: np.random.Generator | None) -> Ben
                     z = MODELS["point"].predict(x, landmarks[i]) + error(noise.point)
                     seen.append(Association(name, now, i, "point", z, noise.point))
             for i, wall in enumerate(bench.walls_m, start=len(bench.points_m)):
-                spot = _nearest(np.array(wall), x[:2])
-                if np.hypot(*(spot[:2] - x[:2])) <= bench.line_reach_m:
-                    landmarks.setdefault(i, spot)
-                    z = _disturbed(between(x, spot), error(noise.line))
+                nearest = _nearest(np.array(wall), x[:2])
+                if np.hypot(*(nearest[:2] - x[:2])) <= bench.line_reach_m:
+                    landmarks.setdefault(i, nearest)
+                    z = _disturbed(between(x, nearest), error(noise.line))
                     cov = rotate_cov(noise.line, z[2])
                     seen.append(Association(name, now, i, "line", z, cov))
         if bench.meet_every and k % bench.meet_every == 0:
@@ -129,13 +129,13 @@ def draw_run(bench: Bench, scale: float, rng: np.random.Generator | None) -> Ben
     return BenchRun(tuple(steps), truth, landmarks)
 
 
-def _nearest(wall: Array, place: Array) -> Array:
-    """The point of a wall (2, 2) that is nearest to ``place`` (2,), as a pose along the wall."""
+def _nearest(wall: Array, point: Array) -> Array:
+    """The point of a wall (2, 2) that is nearest to ``point`` (2,), as a pose along the wall."""
     along = wall[1] - wall[0]
-    share = np.clip((place - wall[0]) @ along / (along @ along), 0.0, 1.0)
+    share = np.clip((point - wall[0]) @ along / (along @ along), 0.0, 1.0)
     return np.array([*(wall[0] + share * along), np.arctan2(along[1], along[0])])
 
 
 def _disturbed(z: Array, error: Array) -> Array:
-    """The measured pose (3,), from which the true one ``z`` is off by ``error`` in its own axes."""
+    """The measured pose (3,): the true one ``z`` is off by ``error`` (3,) along its own axes."""
     return compose(z, inverse(error))

@@ -1,4 +1,4 @@
-"""One run on the bench: the drawn steps through one estimator, judged against the truth."""
+"""One run on the bench: the drawn steps through one estimator, evaluated against the truth."""
 
 from typing import Any
 
@@ -18,13 +18,13 @@ from graphslam.evaluation.monte_carlo_consistency import (
 
 
 def run_bench(run: BenchRun, config: Config) -> dict[str, Any]:
-    """What an estimator makes of a run, as plain numbers for a row of results.jsonl.
+    """Errors and NEES of an estimator on a run, as plain numbers for a row of results.jsonl.
 
     ``nees`` of the final joint state with ``dof`` degrees of freedom: the robots' latest poses and
     all landmarks, at the final estimate. ``final`` and ``causal``: mean over the robots of squared
     errors at each step (K+1,), position m² and heading rad²; ``causal.nees`` of the robots' latest
     poses together, 3 degrees of freedom each. ``landmarks``: mean squares of the final map.
-    ``end``: final poses at the last step. ``error_frame``: in which the errors are taken.
+    ``end``: final poses at the last step. ``error_frame``: the frame of the errors.
 
     Raises:
         EstimationError: the estimate is indeterminate.
@@ -35,13 +35,13 @@ def run_bench(run: BenchRun, config: Config) -> dict[str, Any]:
         backend.add(step)
         errors, nees = _latest(backend, run, k)
         causal["nees"].append(nees)
-        _note(causal, errors[:, None])
+        _append_squares(causal, errors[:, None])
     estimate = backend.finish()
     nees, dof = _joint(backend, run, estimate)
     truth = np.array(list(run.truth.values()))
     poses = np.array([estimate.states[name].poses for name in run.truth])
     final: dict[str, Any] = {"position_m2": [], "heading_rad2": []}
-    _note(final, poses - truth)
+    _append_squares(final, poses - truth)
     return {
         "error_frame": backend.error_frame,
         "dof": dof,
@@ -53,8 +53,8 @@ def run_bench(run: BenchRun, config: Config) -> dict[str, Any]:
     }
 
 
-def _note(curves: dict[str, Any], errors: Array) -> None:
-    """Append means over the robots of errors (robots, steps, 3)."""
+def _append_squares(curves: dict[str, Any], errors: Array) -> None:
+    """Append squares of errors (robots, steps, 3), averaged over the robots."""
     curves["position_m2"] += np.square(errors[..., :2]).sum(axis=2).mean(axis=0).tolist()
     curves["heading_rad2"] += np.square(wrap(errors[..., 2])).mean(axis=0).tolist()
 

@@ -1,8 +1,8 @@
-"""All runs of an experiment, on all cores, kept as they end, and taken up again where they stopped.
+"""All runs of an experiment, in parallel processes; an interrupted experiment can be resumed.
 
 The folder of an experiment holds definition.json (what it is) and results.jsonl (a row per run).
-A run's randomness is of its seed alone, so neither the number of processes nor the order in which
-runs end changes a row.
+A run is random by its seed alone, so neither the number of processes nor the order in which runs
+end changes a row.
 """
 
 import hashlib
@@ -36,7 +36,7 @@ ROWS, DEFINITION = "results.jsonl", "definition.json"
 
 @dataclass(frozen=True)
 class Job:
-    """Which run. ``scenario`` and ``front_end`` are empty on the bench."""
+    """Identifies a run. ``scenario`` and ``front_end`` are empty on the bench."""
 
     scenario: str
     front_end: str
@@ -46,7 +46,7 @@ class Job:
 
 
 def list_jobs(definition: Definition) -> list[Job]:
-    """Every run of an experiment; all variants of a run follow each other."""
+    """Every run of an experiment; all variants of a run are neighbours."""
     if definition.logs is None:
         sources = [("", "")]
     else:
@@ -61,7 +61,7 @@ def list_jobs(definition: Definition) -> list[Job]:
 
 
 def run_job(definition: Definition, job: Job) -> Row:
-    """The row of a run, without what says which run it is.
+    """The results of a run, as a row without its identification.
 
     Raises:
         GraphSlamError: the run failed.
@@ -83,21 +83,20 @@ def run_campaign(
     force: bool = False,
     progress: Callable[[int], None] = lambda _done: None,
 ) -> list[Row]:
-    """Run what is not in ``directory`` yet; all rows, in the order of `jobs_of`.
+    """Run what is not in ``directory`` yet; returns all rows, in the order of `list_jobs`.
 
     A run that fails is a row with its error. Rows are appended whole, one at a time; after an
-    interruption the rest is run by calling again.
+    interruption another call runs the rest.
 
     Args:
         definition: the experiment.
-        directory: its folder, made if it is not there.
+        directory: its folder, made if necessary.
         jobs: processes; None = one per core.
-        force: throw away what is there instead of taking it up.
+        force: delete existing rows instead of resuming.
         progress: called with the number of runs that are done.
 
     Raises:
-        OutputError: the folder holds another experiment or something else, cannot be written, or a
-            process died.
+        OutputError: the folder holds something else, cannot be written, or a process died.
     """
     wanted = list_jobs(definition)
     try:
@@ -125,7 +124,7 @@ def _run(
         pool = ProcessPoolExecutor(
             min(processes or os.cpu_count() or 1, len(missing)), get_context("spawn")
         )
-        with _without_ctrl_c():  # processes start as runs are submitted
+        with _without_ctrl_c():  # processes start when runs are submitted
             futures = {pool.submit(_timed, definition, job): job for job in missing}
         try:
             for future in as_completed(futures):
@@ -141,12 +140,12 @@ def _timed(definition: Definition, job: Job) -> Row:
 
 
 def _row(definition: Definition, job: Job, future: "Future[Row]") -> Row:
-    """A whole row: which run, by which code, and what came out of it or went wrong."""
+    """A complete row: which run, by which code, and its results or its error."""
     error = future.exception()
     if isinstance(error, BrokenProcessPool):
         raise OutputError(
             "a process of the experiment died (out of memory?); run it again with fewer --jobs: "
-            "it goes on where it stopped"
+            "it continues where it stopped"
         ) from error
     row: Row = {
         **asdict(job),
@@ -172,11 +171,11 @@ def _finite(value: Any) -> Any:
 
 @contextmanager
 def _without_ctrl_c() -> Iterator[None]:
-    """Processes started inside never notice Ctrl-C, which reaches all of a terminal's.
+    """Processes started inside ignore Ctrl-C, which a terminal sends to all of its processes.
 
-    Only the parent is to act on it, and does as soon as this is over: children inherit the mask.
+    Only the parent acts on it, as soon as the block ends: children inherit the signal mask.
     """
-    resource_tracker.ensure_running()  # lifts the mask when it starts, so it starts before
+    resource_tracker.ensure_running()  # its start would lift the mask
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -186,7 +185,7 @@ def _without_ctrl_c() -> Iterator[None]:
 
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
-    """Children use one thread each: as many processes as cores leave nothing for more."""
+    """Child processes use one thread each: there are as many of them as cores."""
     names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
     before = {name: os.environ.get(name) for name in names}
     os.environ.update(dict.fromkeys(names, "1"))
@@ -202,7 +201,7 @@ def _one_thread_each() -> Iterator[None]:
 
 @cache
 def code_version() -> str:
-    """First digits of the SHA-256 of the package's sources: which code made a row."""
+    """First digits of the SHA-256 of the package's sources, to identify the code of a row."""
     root = Path(__file__).parents[1]
     digest = hashlib.sha256()
     for path in sorted(root.rglob("*.py")):
@@ -214,39 +213,41 @@ def code_version() -> str:
 
 
 def _prepare(definition: Definition, directory: Path, force: bool) -> None:
-    """Make the folder, or see that it belongs to this very experiment."""
+    """Make the folder, or check that it belongs to this experiment."""
     text = _identity(definition)
-    known = directory / DEFINITION
+    existing = directory / DEFINITION
     if directory.exists() and not directory.is_dir():
         raise OutputError(f"{directory}: is not a folder")
     if directory.is_dir() and any(directory.iterdir()):
-        if not known.is_file():
+        if not existing.is_file():
             raise OutputError(
                 f"{directory}: is not the folder of an experiment; choose another name"
             )
-        if not force and known.read_text(encoding="utf-8") != text:
+        if not force and existing.read_text(encoding="utf-8") != text:
             raise OutputError(
                 f"{directory}: holds another experiment or an earlier definition of this one; "
-                "choose another folder, or give --force to throw its runs away"
+                "choose another folder, or give --force to delete its runs"
             )
         if force:
             (directory / ROWS).unlink(missing_ok=True)
     directory.mkdir(parents=True, exist_ok=True)
-    known.write_text(text, encoding="utf-8")
+    existing.write_text(text, encoding="utf-8")
 
 
 def _identity(definition: Definition) -> str:
-    """What makes two definitions the same: all but how many runs, which may grow, and the words."""
+    """What identifies a definition: all that the rows depend on but the number of runs."""
     tree = {
         key: value
         for key, value in asdict(definition).items()
         if key not in ("runs", "description", "name")
     }
+    if tree["logs"]:
+        del tree["logs"]["diverged_m"]  # of the summary only
     return json.dumps(tree, indent=1, sort_keys=True) + "\n"
 
 
 def _read(path: Path) -> Iterator[tuple[Job, Row]]:
-    """Rows that are there. A last line that was cut short, by a power cut say, is taken off."""
+    """Existing rows. An incomplete last line, for example after a power cut, is removed."""
     if not path.is_file():
         return
     data = path.read_bytes()

@@ -1,4 +1,4 @@
-"""Errors of an estimate in the frame in which its covariance is meant, and how likely they are."""
+"""Errors of a joint estimate in the frame of its covariance, and their NEES."""
 
 from collections.abc import Mapping, Sequence
 from typing import Literal
@@ -22,8 +22,8 @@ def joint_errors(
 
     A pose has three errors: along world axes, or (``body``) those of log(estimate⁻¹ truth) with
     the covariance turned into the estimated body frame. A point has two, along world axes. A line
-    has two: normal offset of the true line at the estimated origin, and direction; where on the
-    line the origin lies is a gauge, and that row is left out.
+    has two: normal offset of the true line at the estimated origin, and direction; the position of
+    the origin along the line is a gauge, and its row is left out.
     """
     means = [joint.pose, *joint.landmarks, *joint.others]
     truths = [true_pose, *true_landmarks, *true_others]
@@ -34,10 +34,10 @@ def joint_errors(
         select = np.zeros((block.stop - block.start, len(joint.cov)))
         select[:, block] = np.eye(block.stop - block.start)
         if is_line:
-            seen = between(mean, truth)
-            # the point of the true line on the estimated normal
-            offset = seen[1] - seen[0] * np.tan(seen[2])
-            errors.append(np.array([offset, seen[2]]))
+            line = between(mean, truth)
+            # where the true line crosses the estimated normal
+            offset = line[1] - line[0] * np.tan(line[2])
+            errors.append(np.array([offset, line[2]]))
             rows.append((rotation3(-mean[2]) @ select)[1:])
         elif len(mean) == 3 and frame == "body":
             errors.append(log(between(mean, truth)))
@@ -54,7 +54,7 @@ def joint_errors(
 def joint_nees(error: Array, cov: Array) -> float:
     """Normalised estimation error squared of errors (D,) with covariance (D, D).
 
-    NaN where the covariance is not positive definite: such an estimate says nothing.
+    NaN where the covariance is not positive definite.
     """
     try:
         L = np.linalg.cholesky(cov)
@@ -68,15 +68,15 @@ def landmark_squares(
 ) -> dict[str, float]:
     """Mean squared errors of points (m²), of lines' offsets (m²) and directions (rad²).
 
-    Kinds that the map does not have are left out.
+    Kinds without a landmark in the map are left out.
     """
     points, offsets, directions = [], [], []
     for i, (mean, _) in landmarks.items():
         if len(mean) == 2:
             points.append(float(np.sum(np.square(mean - truth[i]))))
         else:
-            seen = between(mean, truth[i])
-            offsets.append(float((seen[1] - seen[0] * np.tan(seen[2])) ** 2))
-            directions.append(float(seen[2] ** 2))
+            line = between(mean, truth[i])
+            offsets.append(float((line[1] - line[0] * np.tan(line[2])) ** 2))
+            directions.append(float(line[2] ** 2))
     found = {"points_m2": points, "lines_m2": offsets, "lines_rad2": directions}
     return {name: float(np.mean(values)) for name, values in found.items() if values}

@@ -1,7 +1,7 @@
-"""What an experiment is: a TOML file, or the name of one that comes with the package.
+"""The definition of an experiment: a TOML file, or the name of one of the package.
 
-Bounds of the numbers are in the fields' metadata and are checked as those of scenarios are. Angles
-in files are degrees, since people write them.
+Bounds of the numbers are in the metadata of the fields and are checked as those of scenarios.
+Angles in files are degrees.
 """
 
 import tomllib
@@ -19,7 +19,7 @@ from graphslam.simulation.scenario_parser import build
 
 _FOLDER = Path(__file__).parent / "experiments"
 
-#: name -> file of an experiment that comes with the package
+#: name -> file of an experiment of the package
 EXPERIMENTS: dict[str, Path] = {
     name: _FOLDER / f"{name}.toml" for name in ("ekf-versus-smoothing", "filters", "thesis")
 }
@@ -27,7 +27,7 @@ EXPERIMENTS: dict[str, Path] = {
 
 @dataclass(frozen=True)
 class Motions:
-    """A stretch of a planned path: ``steps`` equal motions, ahead and then turning."""
+    """A part of a planned path: ``steps`` equal motions, each forward and then a turn."""
 
     steps: int = field(metadata={"least": 1})
     forward_m: float
@@ -36,7 +36,7 @@ class Motions:
 
 @dataclass(frozen=True)
 class BenchRobot:
-    """A robot on the bench: where its prior lies, and how it drives."""
+    """A robot on the bench: the mean of its prior, and its path."""
 
     start_m: Point
     path: tuple[Motions, ...]
@@ -48,8 +48,8 @@ class Sigmas:
     """Standard deviations at noise scale 1; those of motions are per step.
 
     start_m, start_deg: of the start. along_m, across_m, turn_deg: of a motion. bearing_deg,
-    range_m: of a sighted point. line_m, line_deg: normal offset and direction of a line where it
-    is seen. robot_m, robot_deg: position and direction of another robot.
+    range_m: of a sighting of a point. line_m, line_deg: normal offset and direction of a line where
+    it is observed. robot_m, robot_deg: position and direction of another robot.
     """
 
     start_m: float = field(metadata=POSITIVE)
@@ -69,9 +69,9 @@ class Sigmas:
 class Bench:
     """A room, robots and noise, from which steps are drawn without a log.
 
-    point_reach_m, line_reach_m: how far points and lines are seen; which are seen follows from the
-    planned path, so every run has the same graph. meet_every: the alphabetically first robot sees
-    the others every so many steps; 0 = never.
+    point_reach_m, line_reach_m: ranges at which points and lines are observed; which are observed
+    follows from the planned path, so every run has the same graph. meet_every: the alphabetically
+    first robot observes the others every so many steps; 0 = never.
     """
 
     robots: Mapping[str, BenchRobot]
@@ -85,10 +85,14 @@ class Bench:
 
 @dataclass(frozen=True)
 class Logs:
-    """Simulated logs: scenarios by name or file, and front ends."""
+    """Simulated logs: scenarios by name or file, and front ends.
+
+    diverged_m: a run has diverged if its final trajectory is ever farther off than this.
+    """
 
     scenarios: tuple[str, ...]
     front_ends: tuple[str, ...] = ("segments",)
+    diverged_m: float = field(default=1.0, metadata=POSITIVE)
 
 
 @dataclass(frozen=True)
@@ -156,7 +160,7 @@ def load_definition(name: str | Path) -> Definition:
 
 
 def _plain(node: Any) -> Any:
-    """With dictionaries for read-only mappings, which cannot be sent to another process."""
+    """With dictionaries in place of read-only mappings, which cannot be pickled."""
     if is_dataclass(node) and not isinstance(node, type):
         return replace(node, **{f.name: _plain(getattr(node, f.name)) for f in fields(node)})
     if isinstance(node, Mapping):
@@ -165,7 +169,7 @@ def _plain(node: Any) -> Any:
 
 
 def _problem(found: Definition) -> str:
-    """What the single keys allow and their combination does not; empty if nothing."""
+    """What is wrong with the combination of keys; empty if nothing."""
     if not found.variants:
         return "variants: is empty; give at least one, for example isam2 = []"
     if (found.bench is None) == (found.logs is None):

@@ -1,4 +1,4 @@
-"""What an experiment's folder holds beside the rows: the summary, the page, the figures."""
+"""The folder of an experiment beside its rows: summary, report and figures."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,12 +9,12 @@ from graphslam.results.file_formats import to_json
 
 
 def save_summary(summary: Mapping[str, Any], directory: Path) -> None:
-    """Write summary.json, report.html and figures/*.svg; each appears when it is whole.
+    """Write summary.json, report.html and figures/*.svg, each atomically.
 
     Raises:
         OutputError: nothing can be written there.
     """
-    # matplotlib takes half a second to import, and the processes that run need none
+    # importing matplotlib takes half a second, and the worker processes do not need it
     from graphslam.results.report_experiment import experiment_figures, experiment_page  # noqa: PLC0415
 
     files = {"summary.json": to_json(summary, "summary"), "report.html": experiment_page(summary)}

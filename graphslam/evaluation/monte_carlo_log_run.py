@@ -1,4 +1,4 @@
-"""One run by way of a log: simulate, smooth, evaluate."""
+"""One run over a simulated log: simulate, smooth, evaluate."""
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
@@ -15,7 +15,7 @@ from graphslam.simulation import load_scenario, simulate
 from graphslam.simulation.scenario import Scenario
 from graphslam.slam.smooth import smooth
 
-#: keys of scenarios that a noise scale multiplies: everything by which sensors err
+#: keys of scenarios that a noise scale multiplies: all errors of the sensors
 NOISE = {
     "axle_error",
     "bearing_sigma_deg",
@@ -30,8 +30,8 @@ NOISE = {
 
 def scale_noise(scenario: Scenario, scale: float) -> Scenario:
     """The scenario with all errors of its sensors multiplied by ``scale``."""
-    found: Scenario = _scaled(scenario, scale)
-    return found
+    result: Scenario = _scaled(scenario, scale)
+    return result
 
 
 def _scaled(node: Any, scale: float) -> Any:
@@ -50,13 +50,13 @@ def _scaled(node: Any, scale: float) -> Any:
 
 
 def run_log(scenario: str, scale: float, seed: int, config: Config) -> dict[str, Any]:
-    """What the pipeline makes of a simulated log, as plain numbers for a row of results.jsonl.
+    """Errors of the pipeline on a simulated log, as plain numbers for a row of results.jsonl.
 
-    Keys as in ``evaluate --json``, and of the summary ``counts``, ``scans_per_s`` and ``warnings``.
+    Keys as in ``evaluate --json``, and ``counts``, ``scans_per_s`` and ``warnings`` of the summary.
     Every robot starts at its true pose, with the configured sigma of a given start.
 
     Raises:
-        GraphSlamError: any that simulating, smoothing or evaluating raises.
+        GraphSlamError: simulating, smoothing or evaluating failed.
     """
     with TemporaryDirectory(prefix="graphslam-") as folder:
         path = Path(folder) / "log.mcap"

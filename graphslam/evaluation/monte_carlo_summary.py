@@ -1,4 +1,4 @@
-"""From rows to numbers with their spread: tables, curves over time, against bounds."""
+"""The summary of an experiment: tables and curves over time, against the Cramér-Rao bound."""
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -16,25 +16,18 @@ Row = Mapping[str, Any]
 
 #: two-sided level of the test of the joint NEES, over all noise scales together
 LEVEL = 0.999
-#: of bands around curves and of intervals
+#: probability of the bands around curves and of intervals
 BAND = 0.95
-#: a run on the bench has diverged if its final joint NEES is so unlikely, or its error so large
-UNLIKELY, TIMES_BOUND = 1e-6, 4.0
-#: m: a run over a log has diverged if it is ever farther off than this
-LOST_M = 1.0
-
-DIVERGED = {
-    "bench": f"final joint NEES above the chi-square quantile of 1 - {UNLIKELY:g}, or root mean "
-    f"square position error over the run above {TIMES_BOUND:g} times the Cramér-Rao bound",
-    "logs": f"the final trajectory is more than {LOST_M:g} m off somewhere",
-}
+#: a run on the bench has diverged if its final joint NEES has less than this tail probability, or
+#: if its position error is more than this many times the bound
+DIVERGED_TAIL, DIVERGED_RATIO = 1e-6, 4.0
 
 
 def summarise(definition: Definition, rows: Sequence[Row]) -> dict[str, Any]:
-    """What an experiment found: plain numbers, named with their units.
+    """The results of an experiment: plain numbers, named with their units.
 
     ``table`` has a row per variant and noise scale (and scenario and front end); of an experiment
-    on the bench ``curves[scale]`` has what is over time. Runs that failed are counted and are in
+    on the bench ``curves[scale]`` has the curves over time. Runs that failed are counted and are in
     no mean; runs that diverged are in all.
     """
     bench = definition.bench is not None
@@ -64,13 +57,23 @@ def summarise(definition: Definition, rows: Sequence[Row]) -> dict[str, Any]:
         "rows": len(rows),
         "seconds": round(sum(row.get("seconds", 0.0) for row in rows), 1),
         "code": codes,
-        "diverged_if": DIVERGED["bench" if bench else "logs"],
+        "diverged_if": _diverged_if(definition),
         "errors": dict(sorted(errors.items())),
         "warnings": warnings,
     }
     if bench:
         return {**found, **_bench(definition, groups)}
-    return {**found, "table": [_log_row(key, group) for key, group in groups.items()]}
+    limit = definition.logs.diverged_m if definition.logs else 0.0
+    return {**found, "table": [_log_row(key, group, limit) for key, group in groups.items()]}
+
+
+def _diverged_if(definition: Definition) -> str:
+    if definition.logs:
+        return f"the final trajectory is more than {definition.logs.diverged_m:g} m off somewhere"
+    return (
+        f"final joint NEES above the chi-square quantile of 1 - {DIVERGED_TAIL:g}, or root mean "
+        f"square position error over the run above {DIVERGED_RATIO:g} times the Cramér-Rao bound"
+    )
 
 
 # ---------------------------------------------------------------- on the bench
@@ -105,13 +108,15 @@ def _bench(definition: Definition, groups: Mapping[tuple[Any, ...], list[Row]]) 
 def _bench_row(rows: Sequence[Row], bound: Bound, scales: int) -> dict[str, Any]:
     dof = int(rows[0]["dof"])
     nees = _array(rows, _at("nees"))
-    known = nees[np.isfinite(nees)]
+    finite = nees[np.isfinite(nees)]
     # Bonferroni: all scales together leave the bounds with 1 - LEVEL
-    low, high = _quantiles(dof * len(known), 1 - (1 - LEVEL) / scales) if len(known) else (0.0, 0.0)
-    mean = float(known.mean() / dof) if len(known) else None
+    low, high = (
+        _quantiles(dof * len(finite), 1 - (1 - LEVEL) / scales) if len(finite) else (0.0, 0.0)
+    )
+    mean = float(finite.mean() / dof) if len(finite) else None
     position = _array(rows, _at("final", "position_m2"))
-    limit = TIMES_BOUND**2 * float(bound.final.position_m2.mean())
-    lost = ~(nees <= chi2.isf(UNLIKELY, dof)) | ~(position <= limit)
+    limit = DIVERGED_RATIO**2 * float(bound.final.position_m2.mean())
+    lost = ~(nees <= chi2.isf(DIVERGED_TAIL, dof)) | ~(position <= limit)
     verdict = None if mean is None else _verdict(mean, low, high)
     return {
         "error_frame": rows[0]["error_frame"],
@@ -119,7 +124,7 @@ def _bench_row(rows: Sequence[Row], bound: Bound, scales: int) -> dict[str, Any]
         "nees_per_dof": mean,
         "nees_bounds": [low, high],
         "nees_verdict": verdict,
-        "nees_undefined": len(nees) - len(known),
+        "nees_undefined": len(nees) - len(finite),
         "diverged": int(lost.sum()),
         "diverged_interval": _share_interval(int(lost.sum()), len(rows)),
         "final": _against(rows, "final", asdict(bound.final)),
@@ -136,7 +141,7 @@ def _verdict(value: float, low: float, high: float) -> str:
 
 
 def _against(rows: Sequence[Row], kind: str, bound: Mapping[str, Array]) -> dict[str, Any]:
-    """Root mean squares over all runs and times, against the bound."""
+    """Root mean squares over all runs and times, and their ratio to the bound."""
     return {
         name: _ratio(_array(rows, _at(kind, name)), float(value.mean()))
         for name, value in bound.items()
@@ -144,7 +149,7 @@ def _against(rows: Sequence[Row], kind: str, bound: Mapping[str, Array]) -> dict
 
 
 def _ratio(squares: Array, bound: float) -> dict[str, float]:
-    """Root mean square of runs (n,), the bound's root, and their ratio with its standard error."""
+    """Root mean square of runs (n,), root of the bound, and their ratio with its standard error."""
     mean = float(squares.mean())
     error = float(squares.std(ddof=1) / np.sqrt(len(squares))) if len(squares) > 1 else 0.0
     ratio = float(np.sqrt(mean / bound))
@@ -178,7 +183,7 @@ def _curves(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def _band(values: Array, *, root: bool) -> dict[str, Any]:
-    """Mean of runs (n, K) with a normal band for it; of squares the root of all three."""
+    """Mean of runs (n, K) with its normal confidence band; of squares the root of all three."""
     mean = np.nanmean(values, axis=0)
     n = np.isfinite(values).sum(axis=0)
     error = np.nanstd(values, axis=0) / np.sqrt(np.maximum(n - 1, 1))
@@ -203,7 +208,7 @@ def _bound_curves(bound: Bound) -> dict[str, Any]:
 # ---------------------------------------------------------------- over logs
 
 
-def _log_row(key: tuple[Any, ...], rows: Sequence[Row]) -> dict[str, Any]:
+def _log_row(key: tuple[Any, ...], rows: Sequence[Row], diverged_m: float) -> dict[str, Any]:
     scenario, front_end, scale, variant = key
     good = [row for row in rows if not row["error"]]
     found: dict[str, Any] = {
@@ -216,7 +221,7 @@ def _log_row(key: tuple[Any, ...], rows: Sequence[Row]) -> dict[str, Any]:
     }
     if not good:
         return found
-    lost = sum(row["joint"]["final"]["max_m"] > LOST_M for row in good)
+    lost = sum(row["joint"]["final"]["max_m"] > diverged_m for row in good)
     found |= {"diverged": lost, "diverged_interval": _share_interval(lost, len(good))}
     for kind in ("final", "causal"):
         found[kind] = {
@@ -233,7 +238,7 @@ def _log_row(key: tuple[Any, ...], rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def _spread(values: Array) -> dict[str, float | None]:
-    """Mean, standard deviation, median and largest of runs; what is undefined is left out."""
+    """Mean, standard deviation, median and maximum over runs; undefined values are left out."""
     values = values[np.isfinite(values)]
     if not len(values):
         return dict.fromkeys(("mean", "std", "median", "max"))
@@ -250,7 +255,7 @@ def _spread(values: Array) -> dict[str, float | None]:
 
 
 def _at(*keys: str) -> Callable[[Any], Any]:
-    """What takes the number at a place of a row, of a list the mean."""
+    """A function that finds a number of a row by its keys; of a list the mean."""
 
     def value(row: Any) -> Any:
         for key in keys:

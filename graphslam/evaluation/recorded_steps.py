@@ -1,4 +1,4 @@
-"""One run over a log, kept as steps, and the way from states to trajectories and a map."""
+"""The steps of one run over a log, and a result from what a back end makes of them."""
 
 import time
 from collections.abc import Mapping
@@ -24,7 +24,7 @@ from graphslam.slam.robot_state import RobotState
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedSteps:
-    """The steps of one run over a log, and what turns states into trajectories and a map.
+    """The steps of one run over a log, and what is needed to make a result of their estimate.
 
     ``start`` (3,) is where the prior put the robot that defines the world frame, ``worlds`` what
     takes estimates there; ``seconds`` the wall time of the run.
@@ -43,7 +43,7 @@ class RecordedSteps:
         return sum(len(step.associations) for step in self.steps)
 
     def growth(self) -> tuple[Array, Array]:
-        """Landmarks in the map and path driven by all robots, m, (n,) after each step."""
+        """Landmarks in the map (n,) and path driven by all robots (n,), m, after each step."""
         known: set[int | str] = set()
         counts, driven = [], []
         for step in self.steps:
@@ -53,7 +53,7 @@ class RecordedSteps:
         return np.array(counts), np.cumsum(driven)
 
     def result(self, done: Replay, config: Config) -> SavedResult:
-        """Trajectories and map from what a back end made of the steps, as `smooth` has them.
+        """Trajectories and map of a replay, as `smooth` makes them.
 
         The odometry between the states, the calibration and the mounts are those of the recording.
         """
@@ -83,7 +83,7 @@ class RecordedSteps:
 def record_steps(
     log: LogSet, config: Config, progress: Progress = lambda _count: None
 ) -> RecordedSteps:
-    """Run over the log with the back end of ``config`` and keep the steps; optimise nothing.
+    """Run over the log with the back end of ``config`` and keep the steps, without optimising.
 
     Raises:
         LogError: no message of the log could be used.
@@ -99,7 +99,7 @@ def record_steps(
     apart = pipeline.frames.away
     if apart:
         raise EstimationError(
-            f"robot {min(apart)}: its start is unknown and nothing in the log tells it; "
+            f"robot {min(apart)}: its start is unknown and cannot be found from the log; "
             f"back ends are compared in one frame: give --start {min(apart)}=x,y,phi"
         )
     runs = {name: run for name, run in sorted(pipeline.runs.items()) if run.started}

@@ -1,4 +1,4 @@
-"""Recorded steps through one back end, with what that costs."""
+"""Replay of recorded steps into one back end, with its time and memory."""
 
 import resource
 import signal
@@ -20,16 +20,16 @@ from graphslam.estimation.backends import BACKENDS
 from graphslam.estimation.decentralised import exchanged_bytes
 from graphslam.estimation.replay import Replay, replay
 
-#: steps given to a back end before the one that counts: libraries load and caches fill meanwhile
+#: steps given to another instance first, so that libraries are loaded and caches filled
 WARM_UP = 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TimedReplay:
-    """A replay, and the largest size of the process, MB, before and after it.
+    """A replay, and the peak memory of the process, MB, before and after it.
 
-    ``skipped``: what of the steps the back end could not use, counted by reason. ``exchanged``:
-    bytes that each robot sent and bytes that it measured; None where there is one estimate of all.
+    ``skipped`` counts by reason what the back end could not use of the steps. ``exchanged``: bytes
+    that each robot sent, and bytes that it measured; None for a back end with one joint estimate.
     """
 
     replay: Replay
@@ -52,19 +52,19 @@ def timed_replay(steps: Sequence[Step], config: Config) -> TimedReplay:
     before = _peak_mb()
     backend = BACKENDS[config.backend.name](config)
     done = replay(steps, backend)
-    told, skipped = exchanged_bytes(backend), dict(backend.skipped)
-    return TimedReplay(done, backend.error_frame, skipped, before, _peak_mb(), told)
+    exchanged, skipped = exchanged_bytes(backend), dict(backend.skipped)
+    return TimedReplay(done, backend.error_frame, skipped, before, _peak_mb(), exchanged)
 
 
 def timed_replay_in_process(steps: Sequence[Step], config: Config) -> TimedReplay:
-    """`play` in a fresh process, so that memory and time are of this back end alone.
+    """`timed_replay` in a new process, so that memory and time are of this back end alone.
 
     The process is spawned: a script that calls this needs ``if __name__ == "__main__":``.
 
     Raises:
         EstimationError: the steps make the estimate indeterminate, or the process died.
     """
-    # the default handler: a child that Ctrl-C ends says nothing, this process does
+    # with the default handler Ctrl-C ends the child silently; this process reports it
     with ProcessPoolExecutor(
         1,
         mp_context=get_context("spawn"),
@@ -74,13 +74,13 @@ def timed_replay_in_process(steps: Sequence[Step], config: Config) -> TimedRepla
         try:
             return pool.submit(timed_replay, steps, config).result()
         except BrokenProcessPool as error:
-            raise EstimationError("its process died; perhaps memory ran out") from error
+            raise EstimationError("its process died; perhaps it ran out of memory") from error
 
 
 def _peak_mb() -> float:
     """Largest resident size of this process so far.
 
-    From /proc where there is one: ru_maxrss of a spawned process starts at its parent's.
+    From /proc where it exists: ru_maxrss of a spawned process starts at that of its parent.
     """
     try:
         lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
@@ -91,14 +91,14 @@ def _peak_mb() -> float:
 
 
 def growth_exponent(size: Array, ms: Array) -> float | None:
-    """Exponent b of ms ~ size^b: a line through medians of bins on logarithmic axes.
+    """Exponent b of ms ~ size^b, by a line through medians of bins on logarithmic axes.
 
     Args:
         size: (n,) landmarks in the map or m driven, at each step.
         ms: (n,) wall time of the step.
 
     Returns:
-        None where size does not grow by a factor of two over five bins of ten steps.
+        None unless size grows by a factor of two over at least five bins of ten steps.
     """
     use = (size > 0) & (ms > 0)
     order = np.argsort(size[use], kind="stable")

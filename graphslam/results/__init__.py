@@ -1,1 +1,1 @@
-"""What is written: the result folder, and the report pages with their figures."""
+"""The result folder and its file formats; the HTML reports and their figures."""

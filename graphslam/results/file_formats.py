@@ -56,7 +56,7 @@ def cov_text(trajectory: Trajectory) -> str:
 
 
 def landmark_json(landmark: Landmark) -> dict[str, Any]:
-    """One entry of landmarks.json (contract), plain Python values; a point's phi is null."""
+    """An entry of landmarks.json (docs/formats.md) as plain Python values; phi of a point: None."""
     x, y, phi = landmark.position.tolist()
     entry: dict[str, Any] = {
         "id": landmark.id,
@@ -87,7 +87,7 @@ def to_json(value: object, where: str) -> str:
     """JSON text; numpy scalars and arrays as plain values.
 
     Raises:
-        OutputError: a number is not finite or a value has no form in JSON; names ``where``.
+        OutputError: a number is not finite or a value has no JSON form; names ``where``.
     """
     try:
         text = json.dumps(value, indent=1, default=_plain, allow_nan=False, ensure_ascii=False)
@@ -128,9 +128,9 @@ def stamp_ns(text: str) -> int:
 
 
 def read_trajectory(path: Path, cov_path: Path | None = None) -> Trajectory:
-    """A TUM file ``stamp x y z qx qy qz qw``, ours or another tool's, sorted by stamp.
+    """A TUM file ``stamp x y z qx qy qz qw``, of this or another tool, sorted by stamp.
 
-    The heading is the yaw of the quaternion; z, roll and pitch are left out. Covariances come
+    The heading is the yaw of the quaternion; z, roll and pitch are ignored. Covariances come
     from ``cov_path`` (see `cov_text`), which must have the same stamps; they are NaN without it.
 
     Raises:

@@ -1,5 +1,5 @@
 # ruff: noqa: RUF001 -- σ, ± and – are meant: people read them
-"""The page about changes: where they are, how sure each is, whether the scores are as stated."""
+"""The report on changes: where they are, how certain, and the distribution of the scores."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -28,9 +28,9 @@ from graphslam.results.report_html import (
 COLORS = {"appeared": PALETTE[2], "vanished": PALETTE[1], "moved": PALETTE[3]}
 _REFERENCE, _LATER, _UNSEEN = "#7d8590", PALETTE[0], "#a8adb3"
 _MAX_CLOSE_UPS = 8
-_STRIPES = 7  # pixels from stripe to stripe of what was not seen, of which one is drawn
+_STRIPE_SPACING = 7  # pixels from stripe to stripe of the hatching
 
-#: only here: the colours of the kinds beside the words
+#: only on this page: the colours of the kinds of changes in the table
 _CSS = "".join(
     f".{kind}::before {{ content: ''; display: inline-block; width: .7em; height: .7em; "
     f"margin-right: .45em; border-radius: 2px; background: var(--robot{PALETTE.index(color)}); }}\n"
@@ -41,9 +41,9 @@ _CSS += "tbody th { white-space: nowrap; }\n"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChangeMark:
-    """One change: outlines (c, 2) m now and ``before`` (if it moved), and what the table says.
+    """One change: its outline (c, 2) m, that ``before`` (if it moved), and the cells of its row.
 
-    ``motion`` (3,) and ``sigmas`` (3,) m, m, rad: of the place of its middle, None if unknown.
+    ``motion`` (3,) of its centre and ``sigmas`` (3,): m, m, rad, None if unknown.
     """
 
     kind: str
@@ -60,9 +60,10 @@ class ChangeMark:
 class ChangesPicture:
     """What the page shows, in the reference's world frame.
 
-    ``reference``, ``later``: (n, 2) m where beams ended. ``unseen`` (columns, rows): squares of
-    ``limits`` [[x_min, x_max], [y_min, y_max]] that not both visits saw. ``scores`` (k,): of all
-    pieces of surface, normal with sigma ``spread`` where nothing changed. ``facts``: for the tiles.
+    ``reference``, ``later``: (n, 2) m ends of beams. ``unseen`` (columns, rows): cells of
+    ``limits`` [[x_min, x_max], [y_min, y_max]] that at least one visit did not observe. ``scores``
+    (k,) of all pieces of surface: normal with sigma ``spread`` where nothing changed. ``facts``:
+    name and value of the tiles.
     """
 
     names: tuple[str, str]
@@ -82,21 +83,21 @@ def changes_page(picture: ChangesPicture) -> str:
     """One self-contained HTML document."""
     title = f"{picture.names[1]} against {picture.names[0]}"
     legend = (
-        "Grey: surfaces of the reference. Blue: later returns. Hatched: not seen by both, so "
-        "nothing is said about it."
+        "Grey: returns of the reference. Blue: later returns. Hatched: not observed by both "
+        "visits, so not compared."
     )
     figures = [
         figure(_map(picture), "Changes.", legend),
         figure(
             _scores(picture),
             "Scores.",
-            "How far the beams of one visit end behind each piece of the other's surfaces, in "
-            "stated sigmas; the line is the normal distribution by which they are judged. Changes "
-            "are in the right tail.",
+            "Distance of the ends of beams of one visit behind each piece of the other's surfaces, "
+            "in stated sigmas. The line is the normal distribution of the test; changes are in the "
+            "right tail.",
         ),
     ]
     figures += [
-        figure(_close_up(picture, i), f"{i + 1}: {mark.kind}.", _words(mark))
+        figure(_close_up(picture, i), f"{i + 1}: {mark.kind}.", _caption(mark))
         for i, mark in enumerate(picture.marks[:_MAX_CLOSE_UPS])
     ]
     notes = [f"Note: {line}." for line in picture.warnings]
@@ -113,19 +114,19 @@ def _headline(picture: ChangesPicture) -> str:
     kinds = [mark.kind for mark in picture.marks]
     parts = [f"{kinds.count(kind)} {kind}" for kind in COLORS if kind in kinds]
     if not parts:
-        return "Nothing changed, as far as both visits could see."
+        return "No change was found where both visits observed."
     changes = "change" if len(kinds) == 1 else "changes"
     return f"{len(kinds)} {changes}: {', '.join(parts)}."
 
 
-def _words(mark: ChangeMark) -> str:
+def _caption(mark: ChangeMark) -> str:
     x, y = mark.polygon.mean(axis=0)
     text = f"At x {x:.2f} m, y {y:.2f} m."
     if mark.motion is None or mark.sigmas is None:
         return text
     away = float(np.hypot(*mark.motion[:2]))
     return (
-        f"{text} Its middle moved {100 * away:.0f} cm, and it turned "
+        f"{text} Its centre moved {100 * away:.0f} cm, and it turned "
         f"{np.degrees(mark.motion[2]):.1f}° ± {np.degrees(mark.sigmas[2]):.1f}° (1σ)."
     )
 
@@ -169,7 +170,7 @@ def _map(picture: ChangesPicture) -> str:
 
     def draw(figure: Figure) -> None:
         axes = map_axes(figure, picture.limits)
-        _ground(axes, picture, picture.limits, 900)
+        _background(axes, picture, picture.limits, 900)
         for i, mark in enumerate(picture.marks):
             _outlines(axes, mark)
             axes.annotate(
@@ -199,7 +200,7 @@ def _close_up(picture: ChangesPicture, index: int) -> str:
             (picture.later, _LATER, 1.4),
         ):
             shown = ((cloud > limits[:, 0]) & (cloud < limits[:, 1])).all(axis=1)
-            # no more points than the eye tells apart; the page stays small
+            # more points cannot be told apart and enlarge the page
             chosen = cloud[shown]
             chosen = chosen[:: max(1, len(chosen) // 2500)]
             axes.plot(*chosen.T, ".", color=color, markersize=size, markeredgewidth=0, alpha=0.55,
@@ -209,8 +210,8 @@ def _close_up(picture: ChangesPicture, index: int) -> str:
     return svg(f"Change {index + 1}, close up", 0.72 * WIDTH_IN, draw)
 
 
-def _ground(axes: Axes, picture: ChangesPicture, limits: Array, pixels: int) -> None:
-    """What was not seen, then both visits' returns."""
+def _background(axes: Axes, picture: ChangesPicture, limits: Array, pixels: int) -> None:
+    """Hatching where nothing was compared, then the returns of both visits."""
     extent = (limits[0, 0], limits[0, 1], limits[1, 0], limits[1, 1])
     for image in (
         _hatched(picture.unseen, pixels),
@@ -227,7 +228,7 @@ def _hatched(unseen: NDArray[np.bool_], pixels: int) -> NDArray[np.uint8]:
     row, column = np.indices(large.shape)
     image = np.zeros((*large.shape, 4), dtype=np.uint8)
     image[:, :, :3] = [int(_UNSEEN[i : i + 2], 16) for i in (1, 3, 5)]
-    image[:, :, 3] = np.where(large & ((row + column) % _STRIPES == 0), 170, 0)
+    image[:, :, 3] = np.where(large & ((row + column) % _STRIPE_SPACING == 0), 170, 0)
     return image
 
 
@@ -253,7 +254,7 @@ def _scores(picture: ChangesPicture) -> str:
         axes.set_yscale("log")
         axes.set_ylim(0.7, max(10.0, 2 * scale / (picture.spread * 2.5)))
         axes.set_xlim(edges[0], edges[-1])
-        axes.set_xlabel("score, σ (what is beyond is in the last bin)")
+        axes.set_xlabel("score, σ (values beyond are in the last bin)")
         axes.set_ylabel("pieces of surface")
 
     return svg("Histogram of the scores", 0.8 * WIDTH_IN, draw)

@@ -1,8 +1,8 @@
-"""From a drawing to a piece of SVG that stands in the page and takes its colours.
+"""Figures as inline SVG in the colours of the page.
 
-Figures are drawn with the colours of the light page. In the SVG text they become CSS variables, so
-the page decides about light and dark. Text stays text. Everything is deterministic: no dates, no
-random identifiers.
+Figures are drawn in the colours of the light page, which become CSS variables in the SVG, so that
+the page chooses light or dark. Text stays text. The output is deterministic: no dates, no random
+identifiers.
 """
 
 import io
@@ -65,9 +65,9 @@ _STYLE: Any = {
 
 def svg(label: str, height_in: float, draw: Callable[[Figure], None]) -> str:
     """What ``draw`` draws as an inline SVG element, described by ``label`` for screen readers."""
-    # The salt makes identifiers repeatable, and different for figures on one page.
+    # the salt makes identifiers repeatable, and different between the figures of a page
     with mpl.rc_context():
-        mpl.rcdefaults()  # a user's matplotlibrc has no say in the report
+        mpl.rcdefaults()  # independent of the user's matplotlibrc
         mpl.rcParams.update({**_STYLE, "svg.hashsalt": label})
         figure = Figure(figsize=(WIDTH_IN, height_in), dpi=200, facecolor="none")
         FigureCanvasSVG(figure)
@@ -78,10 +78,10 @@ def svg(label: str, height_in: float, draw: Callable[[Figure], None]) -> str:
 
 
 def _clean(text: str, label: str) -> str:
-    """The <svg> element alone: page colours, page font, no size of its own, no spare names."""
+    """The <svg> element alone: colours and font of the page, no fixed size, no unused ids."""
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.DOTALL)
-    # matplotlib's own style sheet would hold for the whole page; ours says the same of drawings
+    # matplotlib's style sheet would apply to the whole page; that of the page has its rules
     text = re.sub(r"<defs>\s*<style.*?</defs>\s*", "", text, flags=re.DOTALL)
     for size in ("width", "height"):
         text = re.sub(rf'(<svg[^>]*?) {size}="[^"]*"', r"\1", text, count=1)
@@ -101,11 +101,11 @@ def robot_color(index: int) -> str:
 
 
 def density(points: Array, limits: Array, color: str, pixels: int = 900) -> Array:
-    """Points (n, 2) as a picture (rows, columns, 4) of one colour, opaque where they are many.
+    """Density of points (n, 2) as an image (rows, columns, 4) of one colour and varying opacity.
 
     Args:
         points: world frame, m.
-        limits: [[x_min, x_max], [y_min, y_max]] of the picture; points beyond are left out.
+        limits: [[x_min, x_max], [y_min, y_max]] of the image; points outside are left out.
         color: hexadecimal.
         pixels: of the longer side.
 
@@ -118,9 +118,9 @@ def density(points: Array, limits: Array, color: str, pixels: int = 900) -> Arra
     cell = cell[((cell >= 0) & (cell < shape)).all(axis=1)]
     count = np.bincount(cell[:, 1] * shape[0] + cell[:, 0], minlength=int(shape.prod()))
     hit = count > 0
-    # One return is visible, a wall seen often is solid; between them by the square root.
-    strong = np.quantile(count[hit], 0.95) if hit.any() else 1.0
-    alpha = np.where(hit, 0.25 + 0.75 * np.sqrt(np.minimum(count / strong, 1.0)), 0.0)
+    # a single return is visible, the densest cells are solid; the square root between them
+    dense = np.quantile(count[hit], 0.95) if hit.any() else 1.0
+    alpha = np.where(hit, 0.25 + 0.75 * np.sqrt(np.minimum(count / dense, 1.0)), 0.0)
     image = np.empty((len(count), 4), dtype=np.uint8)
     image[:, :3] = [int(color[i : i + 2], 16) for i in (1, 3, 5)]
     # few levels of opacity keep the PNG small
@@ -129,11 +129,11 @@ def density(points: Array, limits: Array, color: str, pixels: int = 900) -> Arra
 
 
 def map_axes(figure: Figure, limits: Array) -> Axes:
-    """Axes in metres with equal scales that hold ``limits`` [[x_min, x_max], [y_min, y_max]]."""
+    """Axes in metres with equal scales that include ``limits`` [[x_min, x_max], [y_min, y_max]]."""
     width, height = figure.get_size_inches()
     left, bottom, right, top = 0.5, 0.42, 0.08, 0.24
     box = np.array([width - left - right, height - bottom - top])
-    # widen the narrower direction, so that a metre is as long both ways
+    # widen the narrower direction for equal scales
     scale = ((limits[:, 1] - limits[:, 0]) / box).max()
     half, middle = box * scale / 2, limits.mean(axis=1)
     axes = figure.add_axes((left / width, bottom / height, *(box / (width, height))))
@@ -166,7 +166,7 @@ def time_rows(figure: Figure, rows: int, label: str) -> list[Axes]:
 
 
 def legend(axes: Axes) -> None:
-    """One row above the axes, where it hides nothing; each name once."""
+    """A legend in one row above the axes; each name once."""
     handles, labels = axes.get_legend_handles_labels()
     first = dict(reversed(list(zip(labels, handles, strict=True))))
     names = list(dict.fromkeys(labels))
@@ -187,17 +187,17 @@ def positive(values: Array, smallest: float = SMALLEST) -> Array:
 
 
 def log_scale(axes: Axes, label: str) -> None:
-    """A logarithmic y axis with plain numbers; 1, 2 and 5 are named where decades are few."""
+    """A logarithmic y axis with plain numbers; ticks at 1, 2 and 5 where decades are few."""
     axes.set_yscale("log")
     low, high = axes.get_ylim()
-    low = max(low, 1e-4 * high)  # where a difference passes through zero says nothing
-    if high < 3 * low:  # hardly any spread: give it room rather than magnify noise
+    low = max(low, 1e-4 * high)  # a difference that passes through zero goes below any limit
+    if high < 3 * low:  # a small spread is not magnified
         middle = float(np.sqrt(low * high))
         low, high = middle / 2, middle * 2
     axes.set_ylim(low, high)
     subs = (1.0,) if high > 300 * low else (1.0, 2.0, 5.0)
     axes.yaxis.set_major_locator(LogLocator(subs=subs))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_locator(NullLocator())  # hundreds of ticks take longer than all else
+    axes.yaxis.set_minor_locator(NullLocator())  # hundreds of ticks would take most of the time
     axes.set_ylabel(label)
     axes.margins(x=0.01)

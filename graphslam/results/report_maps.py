@@ -1,4 +1,4 @@
-"""Plans seen from above: scans, trajectories with uncertainty, landmarks with numbers."""
+"""Maps of a result: scans, trajectories with uncertainty, landmarks with their numbers."""
 
 from collections.abc import Iterable, Sequence
 
@@ -43,15 +43,15 @@ def poses_at(trajectory: Trajectory, stamps_ns: Sequence[int]) -> Array:
 def overview(result: Result, *, dead_reckoning: bool) -> str:
     """All scans and paths on the final trajectory, or on odometry alone.
 
-    Without scans the landmarks take their place beside the final trajectory.
+    Without scans the final trajectory is shown with the landmarks.
     """
     paths = {
         name: robot.dead_reckoning if dead_reckoning else robot.final
         for name, robot in sorted(result.robots.items())
     }
     clouds = {name: _cloud(result, name, path, dead_reckoning) for name, path in paths.items()}
-    marks = () if result.pictures or dead_reckoning else result.landmarks
-    extents = [landmark.extent for landmark in marks]
+    landmarks = () if result.pictures or dead_reckoning else result.landmarks
+    extents = [landmark.extent for landmark in landmarks]
     limits = _limits([*(p.poses[:, :2] for p in paths.values()), *clouds.values(), *extents])
 
     def draw(figure: Figure) -> None:
@@ -68,7 +68,7 @@ def overview(result: Result, *, dead_reckoning: bool) -> str:
         for i, (name, path) in enumerate(paths.items()):
             color = ACCENT if len(paths) == 1 else robot_color(i)
             axes.plot(*path.poses[:, :2].T, color=color, linewidth=0.9, label=name)
-        _draw_landmarks(axes, marks, 1.0)
+        _draw_landmarks(axes, landmarks, 1.0)
         if len(paths) > 1:
             legend(axes)
 
@@ -77,15 +77,16 @@ def overview(result: Result, *, dead_reckoning: bool) -> str:
 
 
 def landmark_map(result: Result) -> tuple[str, int]:
-    """Landmarks with the numbers of the strongest and 95 % bounds, and how much those are enlarged.
+    """Landmarks with their ids and 95 % bounds, and the enlargement of the bounds.
 
-    An ellipse bounds a point; a bar across each end bounds where a line runs there.
+    A point has an ellipse, a line a bar across each end. Ids and bounds are of the landmarks with
+    the most sightings.
     """
     landmarks = result.landmarks
     paths = [robot.final.poses[:, :2] for robot in result.robots.values()]
     limits = _limits([*paths, *(landmark.extent for landmark in landmarks)])
-    strongest = sorted(landmarks, key=lambda m: (-m.sightings, m.id))
-    shown = strongest[:MAX_ELLIPSES]
+    by_sightings = sorted(landmarks, key=lambda m: (-m.sightings, m.id))
+    shown = by_sightings[:MAX_ELLIPSES]
     factor = _enlargement([_size(m) for m in shown], limits)
 
     def draw(figure: Figure) -> None:
@@ -95,7 +96,7 @@ def landmark_map(result: Result) -> tuple[str, int]:
         _draw_landmarks(axes, landmarks, 1.6)
         bounds = [b for landmark in shown for b in _bounds(landmark, factor)]
         axes.add_collection(LineCollection(bounds, colors=ACCENT, linewidths=0.8))
-        for landmark, (x, y) in _spread(strongest, limits):
+        for landmark, (x, y) in _label_positions(by_sightings, limits):
             axes.annotate(
                 str(landmark.id),
                 (x, y),
@@ -111,9 +112,9 @@ def landmark_map(result: Result) -> tuple[str, int]:
 def trajectory_map(result: Result) -> tuple[str, int]:
     """Final and causal paths with 95 % ellipses along the final one, and their enlargement."""
     robots = sorted(result.robots.items())
-    # the causal path may stray far and is cut off where it does
+    # the causal path may leave these limits and is cut off there
     limits = _limits([robot.final.poses[:, :2] for _, robot in robots])
-    samples = {name: _every(robot.final, max(40 // len(robots), 12)) for name, robot in robots}
+    samples = {name: _sample(robot.final, max(40 // len(robots), 12)) for name, robot in robots}
     factor = _enlargement([float(s) for _, c in samples.values() for s in _semi_axes(c)], limits)
 
     def draw(figure: Figure) -> None:
@@ -139,7 +140,7 @@ def trajectory_map(result: Result) -> tuple[str, int]:
 
 
 def map_height(result: Result) -> float:
-    """Height in inches of the maps of a result: its own proportions, within reason."""
+    """Height of the maps of a result, inches: in proportion to its extent, within limits."""
     paths = [robot.final for robot in result.robots.values()]
     clouds = [_cloud(result, name, r.final, False) for name, r in result.robots.items()]
     (x0, x1), (y0, y1) = _limits([*(p.poses[:, :2] for p in paths), *clouds])
@@ -165,9 +166,9 @@ def _cloud(result: Result, robot: str, path: Trajectory, dead_reckoning: bool) -
 
 
 def _limits(parts: Iterable[Array]) -> Array:
-    """[[x_min, x_max], [y_min, y_max]] around most of all points; a few stray returns do not count.
+    """[[x_min, x_max], [y_min, y_max]] around the points but for a few outlying returns.
 
-    Each part counts for itself: a path stays whole however many points its scans have.
+    Outliers are those of each part: a path stays whole however many points the scans have.
     """
     boxes = []
     for points in parts:
@@ -189,11 +190,11 @@ def _draw_landmarks(axes: Axes, landmarks: Sequence[Landmark], width: float) -> 
     axes.add_collection(LineCollection(walls, colors=INK, linewidths=width))
 
 
-def _spread(strongest: Sequence[Landmark], limits: Array) -> list[tuple[Landmark, Array]]:
-    """The strongest landmarks whose numbers do not lie on each other, with where to write them."""
+def _label_positions(landmarks: Sequence[Landmark], limits: Array) -> list[tuple[Landmark, Array]]:
+    """The first landmarks whose ids do not overlap, each with the position of its id."""
     room = np.array([0.05, 0.035]) * (limits[:, 1] - limits[:, 0]).max()
     placed: list[tuple[Landmark, Array]] = []
-    for landmark in strongest:
+    for landmark in landmarks:
         spot = landmark.extent.mean(axis=0)
         if len(placed) < MAX_LABELS and all((np.abs(spot - p) > room).any() for _, p in placed):
             placed.append((landmark, spot))
@@ -201,7 +202,7 @@ def _spread(strongest: Sequence[Landmark], limits: Array) -> list[tuple[Landmark
 
 
 def _enlargement(sizes: Sequence[float], limits: Array) -> int:
-    """How much to enlarge 95 % bounds so that the median one is visible: 1, 2, 5, 10, 20, ..."""
+    """Enlargement that makes the median of the 95 % bounds visible: 1, 2, 5, 10, 20, ..."""
     sizes = [s for s in sizes if np.isfinite(s) and s > 0]
     if not sizes:
         return 1
@@ -210,7 +211,7 @@ def _enlargement(sizes: Sequence[float], limits: Array) -> int:
     return next((step for step in steps if step >= wanted), steps[-1])
 
 
-def _every(trajectory: Trajectory, count: int) -> tuple[Array, Array]:
+def _sample(trajectory: Trajectory, count: int) -> tuple[Array, Array]:
     """Positions (k, 2) and covariances (k, 2, 2) at even intervals of path."""
     xy = trajectory.poses[:, :2]
     path = path_length(xy)
@@ -234,13 +235,13 @@ def _ellipse(mean: Array, cov: Array, factor: float) -> Array:
     return np.asarray(mean + (vectors @ (axes[:, None] * circle)).T)
 
 
-def _across(landmark: Landmark) -> Array:
-    """95 % half widths (2,) across a line at its two ends, m.
+def _half_widths(landmark: Landmark) -> Array:
+    """95 % half widths (2,) of the bounds across a line at its two ends, m.
 
     The normal offset of a point at ``t`` along the line varies as offset error - t * direction
     error: [-t, 1] C [-t, 1]^T.
     """
-    assert landmark.line is not None  # callers ask for lines
+    assert landmark.line is not None  # only called for lines
     normal, _, cov = landmark.line
     t = landmark.extent @ np.array([-np.sin(normal), np.cos(normal)])
     a = np.column_stack([-t, np.ones(2)])
@@ -250,15 +251,15 @@ def _across(landmark: Landmark) -> Array:
 
 def _size(landmark: Landmark) -> float:
     if landmark.line is not None:
-        return float(_across(landmark).mean())
+        return float(_half_widths(landmark).mean())
     return float(_semi_axes(landmark.cov[None, :2, :2])[0])
 
 
 def _bounds(landmark: Landmark, factor: float) -> list[Array]:
-    """Lines to draw for the uncertainty of a landmark."""
+    """Polylines of the 95 % bounds of a landmark."""
     if landmark.line is None:
         return [_ellipse(landmark.position[:2], landmark.cov[:2, :2], factor)]
     normal = landmark.line[0]
     n = unit_vectors(normal)
-    half = factor * _across(landmark)[:, None] * n
+    half = factor * _half_widths(landmark)[:, None] * n
     return [np.stack([e - h, e + h]) for e, h in zip(landmark.extent, half, strict=True)]

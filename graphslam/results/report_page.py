@@ -89,7 +89,7 @@ def _map_section(result: Result) -> str:
         lines = any(m.line is not None for m in result.landmarks)
         bounds = " and ".join(["ellipses"] * points + ["bars across the ends"] * lines)
         named = min(len(result.landmarks), maps.MAX_LABELS)
-        which = "" if named == len(result.landmarks) else " of those seen most often"
+        which = "" if named == len(result.landmarks) else " of those with the most sightings"
         figures.append(
             figure(
                 drawing,
@@ -122,13 +122,13 @@ def _uncertainty_section(result: Result) -> str:
         figure(
             plots.uncertainty(result),
             "Standard deviations.",
-            "Final (strong) and causal (pale); position along its worst direction.",
+            "Final (strong) and causal (pale); position in its worst direction.",
         ),
         figure(
             plots.revision(result),
             "Final against causal.",
             "Distance of the causal estimate (solid) and of odometry alone (dashed) from the "
-            "final trajectory: what later data changed.",
+            "final trajectory: the effect of later data.",
         ),
     ]
     return section("Over time", figure_grid(figures))
@@ -142,8 +142,8 @@ def _estimator_section(result: Result) -> str:
                 plots.innovations(result.innovations),
                 "Innovations.",
                 "Normalised innovation squared per degree of freedom of accepted associations; "
-                "with its running mean, in orange its expectation 1 and (dashed) 95 % quantile. "
-                "A mean below 1 says that the stated noise is cautious; the gate cuts the tail.",
+                "with its running mean; orange: expectation 1 and (dashed) 95 % quantile. A "
+                "mean below 1 means that the stated noise is too large; the gate cuts the tail.",
             )
         )
     if len(result.step_ms):

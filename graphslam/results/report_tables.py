@@ -1,5 +1,5 @@
 # ruff: noqa: RUF001 -- σ and – are meant: people read them
-"""Numbers as HTML: the headline, tables of counts and reasons, quality, landmarks."""
+"""Tables of the report of a result: counts, reasons, times, calibration, errors, landmarks."""
 
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -14,14 +14,14 @@ from graphslam.results.report_html import number, table
 
 
 def headline(result: Result) -> str:
-    """One sentence: what went in, what came out, how certain, how fast."""
+    """One sentence on the input, the result, its uncertainty and the speed."""
     counts = result.summary.get("counts", {})
     robots = len(result.robots)
     fleet = "one robot" if robots == 1 else f"{robots} robots"
     paths = [robot.final for robot in result.robots.values()]
-    # of the states: they are in the order of time, which late stamps in a trajectory are not
-    driven = result.estimate.states.values()
-    metres = sum(float(path_length(p.poses)[-1]) for p in driven)
+    # states are in the order of time; a trajectory may have late stamps
+    states = result.estimate.states.values()
+    metres = sum(float(path_length(p.poses)[-1]) for p in states)
     span = (max(p.stamps_ns[-1] for p in paths) - min(p.stamps_ns[0] for p in paths)) / 1e9
     source = f"{number(counts['scans'])} scans of {fleet}" if counts.get("scans") else fleet
     kinds = {landmark.kind for landmark in result.landmarks}
@@ -52,7 +52,7 @@ def median_sigma(result: Result) -> float | None:
 
 
 def counts(summary: Mapping[str, Any]) -> str:
-    """What went in and came out."""
+    """Counts of messages, keyframes and landmarks; error and degrees of freedom of the graph."""
     rows = [(name.replace("_", " "), value) for name, value in summary.get("counts", {}).items()]
     graph = summary.get("graph", {})
     if graph:
@@ -61,7 +61,7 @@ def counts(summary: Mapping[str, Any]) -> str:
 
 
 def reasons(summary: Mapping[str, Any]) -> str:
-    """Observations rejected and data dropped, with why; says so where there was none."""
+    """Rejected observations and dropped data by reason; also where there are none."""
     parts = []
     for key, caption in (("rejected", "Observations rejected"), ("dropped", "Data dropped")):
         found = sorted(summary.get(key, {}).items(), key=lambda item: (-item[1], item[0]))
@@ -128,7 +128,7 @@ def landmarks(found: Sequence[Landmark]) -> str:
 
 
 def landmark_sigma(landmark: Landmark) -> float:
-    """Standard deviation, m: of a point in its worst direction, of a line across its seen middle.
+    """Standard deviation, m: of a point in its worst direction, of a line across its middle.
 
     At ``t`` along the line its normal offset varies as offset error - t * direction error.
     """

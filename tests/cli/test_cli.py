@@ -383,7 +383,7 @@ BAD_TRUTH = {
     "bad relations": (("--relations", "bad"), "bad:2: expected 8 numbers, got 3"),
     "no relations": (("--relations", "missing"), "missing: cannot be read"),
     "bad TUM": (("--truth", "bad"), "bad:1: expected 8 numbers, got 9"),
-    "TUM of a stranger": (("--truth", "nobody=bad"), "whose is it"),
+    "TUM of a stranger": (("--truth", "nobody=bad"), "of which robot is it"),
     "a log without truth": (("--truth", "log.mcap"), "log.mcap: holds no true poses"),
 }
 

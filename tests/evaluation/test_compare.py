@@ -236,7 +236,7 @@ def test_specs_say_back_end_horizon_and_settings():
         (["isam2:soon"], "expected float"),
         (["isam2+robust"], "write it as key=value"),
         (["isam2+robust.kernal=none"], "did you mean kernel"),
-        (["isam2", "batch", "isam2:inf"], "isam2:inf is there twice"),
+        (["isam2", "batch", "isam2:inf"], "isam2:inf is given twice"),
     ],
 )
 def test_wrong_specs_are_named(specs, what):
@@ -285,7 +285,7 @@ def test_a_back_end_that_fails_has_its_error_in_its_row(two, broken):
 
 
 def test_nothing_is_left_where_every_back_end_fails(two, broken):
-    with pytest.raises(EstimationError, match="no back end came to an end; batch: indeterminate"):
+    with pytest.raises(EstimationError, match="every back end failed; batch: indeterminate"):
         compare(
             two.log,
             two.config,
@@ -526,7 +526,7 @@ def test_the_command_prints_what_it_wrote(two, here, tmp_path):
     ("options", "what"),
     [
         (("--backends", "isam9"), "'isam9' is not one of"),
-        (("--backends", "isam2", "--truth", "nobody.tum"), "whose is it"),
+        (("--backends", "isam2", "--truth", "nobody.tum"), "of which robot is it"),
         (("--backends", "isam2", "--config", "missing.toml"), "missing.toml"),
     ],
 )
