@@ -13,17 +13,8 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from graphslam.core.geometry import Array
+from graphslam.results import report_html as html
 from graphslam.results.report_figure import INK, PALETTE, WIDTH_IN, density, map_axes, svg
-from graphslam.results.report_html import (
-    details,
-    document,
-    figure,
-    figure_grid,
-    header,
-    number,
-    section,
-    table,
-)
 
 COLORS = {"appeared": PALETTE[2], "vanished": PALETTE[1], "moved": PALETTE[3]}
 _REFERENCE, _LATER, _UNSEEN = "#7d8590", PALETTE[0], "#a8adb3"
@@ -87,8 +78,8 @@ def changes_page(picture: ChangesPicture) -> str:
         "visits, so not compared."
     )
     figures = [
-        figure(_map(picture), "Changes.", legend),
-        figure(
+        html.figure(_map(picture), "Changes.", legend),
+        html.figure(
             _scores(picture),
             "Scores.",
             "Distance of the ends of beams of one visit behind each piece of the other's surfaces, "
@@ -97,17 +88,17 @@ def changes_page(picture: ChangesPicture) -> str:
         ),
     ]
     figures += [
-        figure(_close_up(picture, i), f"{i + 1}: {mark.kind}.", _caption(mark))
+        html.figure(_close_up(picture, i), f"{i + 1}: {mark.kind}.", _caption(mark))
         for i, mark in enumerate(picture.marks[:_MAX_CLOSE_UPS])
     ]
     notes = [f"Note: {line}." for line in picture.warnings]
     sections = [
-        header("graphslam changes", title, _headline(picture), picture.facts.items(), notes),
+        html.header("graphslam changes", title, _headline(picture), picture.facts.items(), notes),
         _table(picture),
-        section("Map", figure_grid(figures)),
-        details("Settings", f"<pre>{escape(picture.settings)}</pre>"),
+        html.section("Map", html.figure_grid(figures)),
+        html.details("Settings", f"<pre>{escape(picture.settings)}</pre>"),
     ]
-    return document(title, sections, _CSS)
+    return html.document(title, sections, _CSS)
 
 
 def _headline(picture: ChangesPicture) -> str:
@@ -157,11 +148,11 @@ def _table(picture: ChangesPicture) -> str:
         )
     head = ["change", "at x, y, m", "size, m", "probability", "moved, cm", "turned, °"]
     head += ["beams", "first seen, s"]
-    html = table(head, rows)
+    rows_html = html.table(head, rows)
     for kind in COLORS:
-        html = html.replace(f" {kind}</th>", f' <span class="{kind}">{kind}</span></th>')
+        rows_html = rows_html.replace(f" {kind}</th>", f' <span class="{kind}">{kind}</span></th>')
     note = "First seen: seconds since the later visit's first scan. ±: 1σ."
-    return section("Changes", f"{html}<p class=note>{note}</p>")
+    return html.section("Changes", f"{rows_html}<p class=note>{note}</p>")
 
 
 def _map(picture: ChangesPicture) -> str:
@@ -262,4 +253,4 @@ def _scores(picture: ChangesPicture) -> str:
 
 def tile(value: float, unit: str) -> str:
     """A number with its unit for a tile."""
-    return f"{number(value)}{unit}"
+    return f"{html.number(value)}{unit}"

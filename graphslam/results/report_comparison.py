@@ -14,22 +14,13 @@ from typing import Any
 import numpy as np
 
 from graphslam.core.geometry import Array
+from graphslam.results import report_html as html
 from graphslam.results.metric_tables import (
     Column,
     converted,
     landmark_columns,
     trajectory_columns,
     value_at,
-)
-from graphslam.results.report_html import (
-    details,
-    document,
-    figure_grid,
-    header,
-    number,
-    section,
-    table,
-    warning_box,
 )
 
 Stamps = np.ndarray[tuple[int], np.dtype[np.int64]]
@@ -218,8 +209,8 @@ def headline(summary: Mapping[str, Any]) -> str:
     if summary["mode"] == "associate":
         return f"{count}, each with its own data association: a comparison of whole systems."
     return (
-        f"{count} on the same {number(done[0]['steps'])} recorded steps with "
-        f"{number(done[0]['associations'])} associations, made by {summary['recorded_by']}: "
+        f"{count} on the same {html.number(done[0]['steps'])} recorded steps with "
+        f"{html.number(done[0]['associations'])} associations, made by {summary['recorded_by']}: "
         "a comparison of estimation alone."
     )
 
@@ -237,11 +228,11 @@ def reading_notes(summary: Mapping[str, Any]) -> list[str]:
     late = max(row["late"] for row in done)
     if late:
         texts.append(
-            f"{number(late)} associations are late: from before their landmark was confirmed."
+            f"{html.number(late)} associations are late: from before their landmark was confirmed."
         )
     for row in done:
         for reason, count in sorted(row["skipped"].items()):
-            texts.append(f"{row['spec']} could not use {number(count)} x {reason}.")
+            texts.append(f"{row['spec']} could not use {html.number(count)} x {reason}.")
     if any("joint" in row for row in done):
         texts.append(
             "The NEES bounds are for independent poses. Poses of one run are correlated, so a "
@@ -288,21 +279,21 @@ def render_comparison(comparison: Comparison, settings: str = "") -> str:
         _table(summary, colors, name, *cells) for name, cells in comparison_tables(summary).items()
     )
     if wins:
-        numbers += table(FILTER_WIN_HEADS, wins, "Where a filter is ahead of every smoother")
+        numbers += html.table(FILTER_WIN_HEADS, wins, "Where a filter is ahead of every smoother")
     for text in ("Best in bold.", *reading_notes(summary)):
         numbers += f"<p class=note>{escape(text)}</p>"
     sections = [
-        header("graphslam compare", title, headline(summary)),
-        warning_box(summary["warnings"]),
-        section("Numbers", numbers),
+        html.header("graphslam compare", title, headline(summary)),
+        html.warning_box(summary["warnings"]),
+        html.section("Numbers", numbers),
         *(
-            section(name, legend + figure_grid(drawings))
+            html.section(name, legend + html.figure_grid(drawings))
             for name, drawings in plots.figures(comparison).items()
             if drawings
         ),
         _reproduce(summary, settings),
     ]
-    return document(f"{title}, compared", sections)
+    return html.document(f"{title}, compared", sections)
 
 
 def _swatch(colors: Mapping[str, str], spec: str) -> str:
@@ -326,7 +317,7 @@ def _table(
         name = f'<th scope="row">{_swatch(colors, row["spec"])}{escape(label)}</th>'
         if row["error"] is None:
             content = "".join(
-                f"<td{' class=best' * best}>{number(value)}</td>" for value, best in cells
+                f"<td{' class=best' * best}>{html.number(value)}</td>" for value, best in cells
             )
         else:
             content = f"<td class=none colspan={len(heads)}>failed: {escape(row['error'])}</td>"
@@ -348,7 +339,7 @@ def _reproduce(summary: Mapping[str, Any], settings: str) -> str:
         f"<p class=note>{escape(str(log['path']))} sha256 <code>{log['sha256']}</code></p>"
         for log in summary["logs"]
     )
-    return details(
+    return html.details(
         "How to reproduce this",
         f"<p>With the config.toml beside this file: <code>{escape(command)}</code></p>{sums}"
         f"<pre>{escape(settings)}</pre>",

@@ -13,18 +13,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from graphslam.results import report_html as html
 from graphslam.results.report_figure import ACCENT, FAINT, INK, legend, positive, robot_color, svg
-from graphslam.results.report_html import (
-    details,
-    document,
-    figure,
-    figure_grid,
-    header,
-    number,
-    section,
-    table,
-    warning_box,
-)
 
 Summary = Mapping[str, Any]
 
@@ -33,18 +23,21 @@ def experiment_page(summary: Summary) -> str:
     """The report of an experiment as one self-contained HTML document."""
     sections = [_header(summary), _warnings(summary)]
     if summary["kind"] == "bench":
+        drawings = [html.figure(draw(summary), *text) for draw, *text in FIGURES.values()]
         sections += [
-            section("Consistency", _consistency(summary)),
-            section("Errors against the Cramér-Rao bound", _errors(summary)),
-            section(
+            html.section("Consistency", _consistency(summary)),
+            html.section("Errors against the Cramér-Rao bound", _errors(summary)),
+            html.section(
                 "Figures",
-                figure_grid([figure(draw(summary), *text) for draw, *text in FIGURES.values()]),
+                html.figure_grid(
+                    [html.figure(draw(summary), *text) for draw, *text in FIGURES.values()]
+                ),
             ),
         ]
     else:
-        sections.append(section("Errors over logs", _logs(summary)))
+        sections.append(html.section("Errors over logs", _logs(summary)))
     sections.append(_reproduce(summary))
-    return document(str(summary["name"]), sections)
+    return html.document(str(summary["name"]), sections)
 
 
 def experiment_figures(summary: Summary) -> dict[str, str]:
@@ -82,13 +75,13 @@ def _header(summary: Summary) -> str:
         f"A run has diverged if: {summary['diverged_if']}. Failed runs are in no mean, diverged "
         "ones in all."
     )
-    tiles = [(name, number(value)) for name, value in counts]
+    tiles = [(name, html.number(value)) for name, value in counts]
     lead = f"{summary['description']}."
-    return header("graphslam experiment", str(summary["name"]), lead, tiles, [note])
+    return html.header("graphslam experiment", str(summary["name"]), lead, tiles, [note])
 
 
 def _warnings(summary: Summary) -> str:
-    return warning_box(
+    return html.warning_box(
         [*summary["warnings"], *(f"{n} × {text}" for text, n in summary["errors"].items())]
     )
 
@@ -118,7 +111,7 @@ def _consistency(summary: Summary) -> str:
         f"Bounds: two-sided chi-square, {100 * summary['level']:g} % over all noise scales "
         "together. Of a filter, final is causal.</p>"
     )
-    return table(columns, rows) + note
+    return html.table(columns, rows) + note
 
 
 def _errors(summary: Summary) -> str:
@@ -147,7 +140,7 @@ def _errors(summary: Summary) -> str:
         "<p class=note>Root mean square error over its Cramér-Rao bound, with its standard error: "
         "final against the bound of all data, causal against that of the data up to each time.</p>"
     )
-    return table(columns, rows) + note
+    return html.table(columns, rows) + note
 
 
 def _logs(summary: Summary) -> str:
@@ -162,7 +155,7 @@ def _logs(summary: Summary) -> str:
         rows.append(cells)
     columns = ["", "runs", "failed", "diverged", "final ATE, m", "worst", "NEES/dof"]
     columns += ["causal ATE, m", "worst", "NEES/dof", "landmark RMSE, m", "matched", "extra"]
-    return table(columns, rows) + "<p class=note>Mean ± standard deviation over the runs.</p>"
+    return html.table(columns, rows) + "<p class=note>Mean ± standard deviation over the runs.</p>"
 
 
 def _plus_minus(found: Mapping[str, Any]) -> str | None:
@@ -179,12 +172,12 @@ def _mean(row: Mapping[str, Any], kind: str, name: str) -> float | None:
 def _reproduce(summary: Summary) -> str:
     settings = [(name, " ".join(values)) for name, values in summary["variants"].items()]
     command = f"graphslam experiment {summary['name']} --runs {summary['runs']} -o DIR"
-    return details(
+    return html.details(
         "How to reproduce this",
         f"<p><code>{escape(command)}</code></p>"
         f"<p class=note>Seed {summary['seed']}; code {escape(', '.join(summary['code']))}; "
         f"settings of all: {escape(' '.join(summary['settings']) or 'none')}</p>"
-        f"{table(['variant', 'settings'], settings)}",
+        f"{html.table(['variant', 'settings'], settings)}",
     )
 
 

@@ -10,20 +10,10 @@ import numpy as np
 
 from graphslam.core.config_io import dump_config
 from graphslam.core.records import Result
+from graphslam.results import report_html as html
 from graphslam.results import report_maps as maps
 from graphslam.results import report_plots as plots
 from graphslam.results import report_tables as tables
-from graphslam.results.report_html import (
-    details,
-    document,
-    figure,
-    figure_grid,
-    header,
-    number,
-    section,
-    table,
-    warning_box,
-)
 
 
 def page(result: Result, evaluation: Mapping[str, Any] | None) -> str:
@@ -41,7 +31,7 @@ def page(result: Result, evaluation: Mapping[str, Any] | None) -> str:
         _landmark_section(result),
         _reproduce_section(result),
     ]
-    return document(title, sections)
+    return html.document(title, sections)
 
 
 def _header(result: Result, title: str) -> str:
@@ -57,14 +47,14 @@ def _header(result: Result, title: str) -> str:
         ("peak memory", summary.get("peak_memory_mb"), " MB"),
     ]
     # what is zero or unknown (no scans, no closures) has no tile
-    shown = [(name, f"{number(value)}{unit}") for name, value, unit in tiles if value]
-    return header("graphslam", title, tables.headline(result), shown)
+    shown = [(name, f"{html.number(value)}{unit}") for name, value, unit in tiles if value]
+    return html.header("graphslam", title, tables.headline(result), shown)
 
 
 def _warnings(summary: Mapping[str, Any]) -> str:
     stamps = summary.get("notes", {}).get("stamps", "")
     texts = [f"stamps: {stamps}"] if stamps.startswith("invented") else []
-    return warning_box([*texts, *map(str, summary.get("warnings", []))])
+    return html.warning_box([*texts, *map(str, summary.get("warnings", []))])
 
 
 def _map_section(result: Result) -> str:
@@ -72,12 +62,12 @@ def _map_section(result: Result) -> str:
     what = "Superposed scans" if scans else "Paths"
     landmark_note = "" if scans else " Triangles are landmarks."
     figures = [
-        figure(
+        html.figure(
             maps.overview(result, dead_reckoning=False),
             "Final trajectory.",
             f"{what} on the trajectory from all data.{landmark_note}",
         ),
-        figure(
+        html.figure(
             maps.overview(result, dead_reckoning=True),
             "Dead reckoning.",
             f"The same {'scans' if scans else 'paths'} by odometry alone.",
@@ -91,7 +81,7 @@ def _map_section(result: Result) -> str:
         named = min(len(result.landmarks), maps.MAX_LABELS)
         which = "" if named == len(result.landmarks) else " of those with the most sightings"
         figures.append(
-            figure(
+            html.figure(
                 drawing,
                 "Landmarks.",
                 f"Numbers{which} as in landmarks.json; 95 % {bounds}{_times(factor)}.",
@@ -99,14 +89,14 @@ def _map_section(result: Result) -> str:
         )
     drawing, factor = maps.trajectory_map(result)
     figures.append(
-        figure(
+        html.figure(
             drawing,
             "Uncertainty of the trajectory.",
             f"95 % ellipses{_times(factor)}; a dot marks the start; "
             "the faint line is the causal estimate.",
         )
     )
-    return section("Map", figure_grid(figures))
+    return html.section("Map", html.figure_grid(figures))
 
 
 def _times(factor: int) -> str:
@@ -114,31 +104,31 @@ def _times(factor: int) -> str:
 
 
 def _quality_section(evaluation: Mapping[str, Any]) -> str:
-    return section("Against the truth", tables.quality(evaluation))
+    return html.section("Against the truth", tables.quality(evaluation))
 
 
 def _uncertainty_section(result: Result) -> str:
     figures = [
-        figure(
+        html.figure(
             plots.uncertainty(result),
             "Standard deviations.",
             "Final (strong) and causal (pale); position in its worst direction.",
         ),
-        figure(
+        html.figure(
             plots.revision(result),
             "Final against causal.",
             "Distance of the causal estimate (solid) and of odometry alone (dashed) from the "
             "final trajectory: the effect of later data.",
         ),
     ]
-    return section("Over time", figure_grid(figures))
+    return html.section("Over time", html.figure_grid(figures))
 
 
 def _estimator_section(result: Result) -> str:
     figures = []
     if any(len(values) for values in result.innovations.values()):
         figures.append(
-            figure(
+            html.figure(
                 plots.innovations(result.innovations),
                 "Innovations.",
                 "Normalised innovation squared per degree of freedom of accepted associations; "
@@ -149,15 +139,15 @@ def _estimator_section(result: Result) -> str:
     if len(result.step_ms):
         p50, p99 = np.quantile(result.step_ms, [0.5, 0.99])
         figures.append(
-            figure(
+            html.figure(
                 plots.timing(result.step_ms),
                 "Wall time per keyframe.",
-                f"With its running median; p50 {number(float(p50))} ms, "
-                f"p99 {number(float(p99))} ms, max "
-                f"{number(float(result.step_ms.max()))} ms.",
+                f"With its running median; p50 {html.number(float(p50))} ms, "
+                f"p99 {html.number(float(p99))} ms, max "
+                f"{html.number(float(result.step_ms.max()))} ms.",
             )
         )
-    return section("Estimator", figure_grid(figures)) if figures else ""
+    return html.section("Estimator", html.figure_grid(figures)) if figures else ""
 
 
 def _accounting_section(summary: Mapping[str, Any]) -> str:
@@ -168,14 +158,14 @@ def _accounting_section(summary: Mapping[str, Any]) -> str:
         tables.calibration(summary),
     ]
     content = "\n".join(part for part in parts if part)
-    return section("Accounts", f'<div class="accounts">{content}</div>')
+    return html.section("Accounts", f'<div class="accounts">{content}</div>')
 
 
 def _landmark_section(result: Result) -> str:
     if not result.landmarks:
         return ""
-    count = number(len(result.landmarks))
-    return details(f"All {count} landmarks", tables.landmarks(result.landmarks))
+    count = html.number(len(result.landmarks))
+    return html.details(f"All {count} landmarks", tables.landmarks(result.landmarks))
 
 
 def _reproduce_section(result: Result) -> str:
@@ -191,7 +181,7 @@ def _reproduce_section(result: Result) -> str:
         f"<p>With the config.toml beside this file: <code>{escape(command)}</code></p>",
         f"<p class=note>Versions: {escape(versions)}. Configuration sha256 "
         f"<code>{escape(str(summary.get('config_sha256', '–')))}</code></p>",
-        table(["log", "messages", "lost", "sha256"], logs),
+        html.table(["log", "messages", "lost", "sha256"], logs),
         f"<pre>{escape(dump_config(result.config))}</pre>",
     ]
-    return details("How to reproduce this", "\n".join(parts))
+    return html.details("How to reproduce this", "\n".join(parts))
