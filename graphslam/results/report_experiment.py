@@ -27,12 +27,7 @@ def experiment_page(summary: Summary) -> str:
         sections += [
             html.section("Consistency", _consistency(summary)),
             html.section("Errors against the Cramér-Rao bound", _errors(summary)),
-            html.section(
-                "Figures",
-                html.figure_grid(
-                    [html.figure(draw(summary), *text) for draw, *text in FIGURES.values()]
-                ),
-            ),
+            html.section("Figures", html.figure_grid(drawings)),
         ]
     else:
         sections.append(html.section("Errors over logs", _logs(summary)))
