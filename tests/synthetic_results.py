@@ -15,9 +15,9 @@ from graphslam.core.geometry import between, compose, exp, wrap
 from graphslam.core.records import (
     Association,
     Estimate,
+    KeyframeScan,
     Landmark,
     Motion,
-    Picture,
     Result,
     RobotResult,
     Start,
@@ -184,13 +184,13 @@ def room(keyframes=300, beams=181, seed=3):
     scan_final = Trajectory(stamps, compose(final.poses, mount), final.covs)
     scan_causal = Trajectory(stamps, compose(causal.poses, mount), causal.covs)
     angles = np.linspace(-np.pi / 2, np.pi / 2, beams)
-    pictures = []
+    keyframe_scans = []
     for stamp, pose in zip(stamps.tolist(), truth, strict=True):
         laser = compose(compose(origin, pose), mount)
         ranges = cast(WALLS, angles, laser, 30.0) + rng.normal(0, 0.02, beams)
         ok = np.isfinite(ranges)
         points = np.column_stack([ranges * np.cos(angles), ranges * np.sin(angles)])[ok] + mount[:2]
-        pictures.append(Picture("robot", stamp, points))
+        keyframe_scans.append(KeyframeScan("robot", stamp, points))
     walls = room_walls()
     landmarks = tuple(wall_landmark(i, wall, rng) for i, wall in enumerate(walls))
     start = Start(final.poses[0], np.diag([1e-6, 1e-6, 1e-6]))
@@ -213,7 +213,7 @@ def room(keyframes=300, beams=181, seed=3):
         landmarks=landmarks,
         estimate=estimate,
         steps=tuple(steps),
-        pictures=tuple(pictures),
+        keyframe_scans=tuple(keyframe_scans),
         innovations={"line": nis(rng, 2, 2200, span), "segment": nis(rng, 3, 900, span, 1.4)},
         step_ms=rng.gamma(3, 1.2, keyframes) + np.linspace(0.5, 5, keyframes),
         summary=summary(
@@ -299,7 +299,7 @@ def orchard(keyframes=400, trees=60, seed=5):
             estimates, {m.id: (m.position[:2], m.cov) for m in landmarks}, 300.0, 700
         ),
         steps=tuple(steps),
-        pictures=(),
+        keyframe_scans=(),
         innovations={
             "point": nis(rng, 2, 1500, keyframes, 1.2),
             "robot-point": nis(rng, 2, 300, keyframes),

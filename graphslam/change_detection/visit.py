@@ -13,7 +13,7 @@ from graphslam.core.errors import LogError, OutputError
 from graphslam.core.geometry import Array, between, compose, compose_cov, polar_points, unit_vectors
 from graphslam.core.records import Landmark, Scan
 from graphslam.logs import open_logs
-from graphslam.odometry.interpolation import mounted
+from graphslam.odometry.interpolation import trajectory_of_mount
 from graphslam.results.folder import SavedResult
 
 Ints = NDArray[np.int64]
@@ -142,7 +142,7 @@ def load_visit(saved: SavedResult, directory: Path, config: ChangesConfig = _DEF
             raise OutputError(
                 f"{directory}: {name} has no covariances; smooth its log with another back end"
             )
-        laser = mounted(robot.final, between(robot.final.poses, robot.scan_final.poses))
+        laser = trajectory_of_mount(robot.final, between(robot.final.poses, robot.scan_final.poses))
         laser_poses |= {
             (name, int(stamp)): (pose, cov)
             for stamp, pose, cov in zip(laser.stamps_ns, laser.poses, laser.covs, strict=True)

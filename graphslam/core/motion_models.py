@@ -18,7 +18,7 @@ from graphslam.core.geometry import Array, compose, exp, exp_jacobian, inverse, 
 #: a calibration parameter whose prior sigma is smaller, in any unit, is held
 HELD_SIGMA = 1e-6
 #: 1/m: robots that turn more tightly lose no more of their path; they hardly drive at all
-TIGHTEST_PER_M = 6.0
+MAX_CURVATURE_PER_M = 6.0
 
 
 def wheel_twist(angles_rad: Array, robot: RobotConfig) -> Array:
@@ -121,7 +121,7 @@ def command_increments(
     to second order too large by d²/2 times the squared curvature.
     """
     path = np.maximum(np.hypot(rows[:, 0], rows[:, 1]), 1e-12)
-    curvature = np.minimum(np.abs(rows[:, 2]) / path, TIGHTEST_PER_M)
+    curvature = np.minimum(np.abs(rows[:, 2]) / path, MAX_CURVATURE_PER_M)
     d_twist = np.zeros((len(rows), 3, 4))
     d_twist[:, :2, 0] = rows[:, :2]
     d_twist[:, 2, 1] = rows[:, 2]

@@ -207,7 +207,7 @@ class Association:
     extent: Array | None = None
     source: int | None = None
 
-    def measured(self, z: Array, cov: Array) -> "Association":
+    def with_measurement(self, z: Array, cov: Array) -> "Association":
         """The same with another measurement (k,) and covariance (k, k)."""
         # `dataclasses.replace` takes twice as long, and there are many
         same = self.robot, self.time_ns, self.target, self.model
@@ -343,7 +343,7 @@ class RobotResult:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Picture:
+class KeyframeScan:
     """Points of a keyframe's scan: (n, 2) in the frame of its state, seen from ``sensor`` (3,)."""
 
     robot: str
@@ -364,7 +364,7 @@ class Result:
     landmarks: tuple[Landmark, ...]
     estimate: Estimate
     steps: tuple[Step, ...]
-    pictures: tuple[Picture, ...]
+    keyframe_scans: tuple[KeyframeScan, ...]
     innovations: Mapping[str, Array]
     step_ms: Array
     summary: Mapping[str, Any]

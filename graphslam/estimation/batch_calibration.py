@@ -35,7 +35,7 @@ def calibrate(
     Raises:
         EstimationError: the estimate is indeterminate.
     """
-    priors = {name: track.nominal for name, track in tracks.items()}
+    priors = {name: track.prior for name, track in tracks.items()}
     steps: tuple[Step, ...] = ()
     for k in range(ROUNDS):
         last = k == ROUNDS - 1
@@ -72,6 +72,6 @@ def _recomputed(motions: Sequence[Motion], track: Track) -> list[Motion]:
         return []
     ends = np.array([(m.start_ns, m.end_ns) for m in motions], dtype=np.int64)
     new = track.motions(ends[:, 0], ends[:, 1])
-    for k in np.flatnonzero(track.uncovered(ends[:, 0], ends[:, 1])):
-        new.cov[k] += np.diag(track.unseen(*ends[k].tolist()) ** 2)
+    for k in np.flatnonzero(track.is_uncovered(ends[:, 0], ends[:, 1])):
+        new.cov[k] += np.diag(track.uncovered_bound(*ends[k].tolist()) ** 2)
     return [new.one(k, m.start_ns, m.end_ns) for k, m in enumerate(motions)]

@@ -16,7 +16,7 @@ from graphslam.core.geometry import (
     transform,
     wrap,
 )
-from graphslam.core.records import Picture, Trajectory
+from graphslam.core.records import KeyframeScan, Trajectory
 from graphslam.perception.scan_matching import Submap, make_submap
 
 #: m of path and rad turned between the scans of a submap: nearer ones show the same
@@ -48,13 +48,13 @@ class SubmapPose:
 
 
 def build_submaps(
-    states: Mapping[str, Trajectory], pictures: Iterable[Picture], config: Config
+    states: Mapping[str, Trajectory], keyframe_scans: Iterable[KeyframeScan], config: Config
 ) -> list[SubmapPose]:
-    """Submaps along every robot's path, of the scan points in ``pictures``.
+    """Submaps along every robot's path, of the scan points in ``keyframe_scans``.
 
     Of ``config`` it uses ``loop_closure``, the spacing and reach of submaps, and ``scan_matching``.
     """
-    clouds = {(p.robot, p.time_ns): p for p in pictures if len(p.points) >= MIN_POINTS}
+    clouds = {(p.robot, p.time_ns): p for p in keyframe_scans if len(p.points) >= MIN_POINTS}
     found = []
     for robot, states_of in states.items():
         seen = np.array([(robot, int(t)) in clouds for t in states_of.stamps_ns], dtype=bool)

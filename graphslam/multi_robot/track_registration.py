@@ -166,7 +166,7 @@ def odometry_cross_covariance(robot: RobotEstimate, times_ns: IntArray) -> Array
     calibration = moved.d_cal[:, None] @ robot.track.calibration.cov @ moved.d_cal[None].mT
     # the floor is added once to every motion, however short, and does not accumulate
     drove = (moved.length_m > 0) | (moved.delta[:, 2] != 0)
-    once = np.where(drove[:, None, None], robot.track.floor, 0.0)
+    once = np.where(drove[:, None, None], robot.track.floor_cov, 0.0)
     walk = moved.cov - calibration[k, k] - once
     F = np.tile(np.eye(3), (n, n, 1, 1))
     F[..., 0, 2] = at[:, None, 1] - at[None, :, 1]

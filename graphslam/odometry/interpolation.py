@@ -93,13 +93,13 @@ def final_at(
     return Trajectory(stamps_ns, poses, np.where(inside[:, None, None], bridge, beyond))
 
 
-def mounted(base: Trajectory, mounts: Array) -> Trajectory:
+def trajectory_of_mount(base: Trajectory, mounts: Array) -> Trajectory:
     """Trajectory of frames that sit at ``mounts`` (n, 3) or (3,) in the base frame, rigidly."""
     F, _ = compose_jacobians(base.poses, mounts)
     return Trajectory(base.stamps_ns, compose(base.poses, mounts), F @ base.covs @ F.mT)
 
 
-def moved_world(trajectory: Trajectory, world: Array) -> Trajectory:
+def transform_trajectory(trajectory: Trajectory, world: Array) -> Trajectory:
     """The same trajectory after its world frame was put at ``world`` (3,) or (n, 3)."""
     turn = rotation3(world[..., 2])
     poses = compose(np.broadcast_to(world, trajectory.poses.shape), trajectory.poses)
@@ -115,7 +115,7 @@ class FrameTransforms:
 
     def estimate(self, estimate: Estimate) -> Estimate:
         """The same estimate after the frames of everything were put there."""
-        states = {n: moved_world(t, self.robots[n]) for n, t in estimate.states.items()}
+        states = {n: transform_trajectory(t, self.robots[n]) for n, t in estimate.states.items()}
         landmarks = {}
         for number, (mean, cov) in estimate.landmarks.items():
             world = self.landmarks[number]

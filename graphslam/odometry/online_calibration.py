@@ -39,7 +39,7 @@ class Calibrator:
         self._vector = np.zeros(0)
         self._names: tuple[str, ...] = ()
 
-    def learn(
+    def update(
         self, current: Calibration, motion: Motion, moved: Array, observed: Array
     ) -> Calibration:
         """The calibration after one more motion.
@@ -78,7 +78,7 @@ class Calibrator:
         cov = solve(self._info, np.eye(len(self._info)))
         return Calibration(current.names, cov @ self._vector, cov + REMAINING**2 * self._prior)
 
-    def found(self) -> dict[str, tuple[float, float, bool]]:
+    def summary(self) -> dict[str, tuple[float, float, bool]]:
         """What the data say so far, see `told`.
 
         The sigma is that of the remembered stretch, so it does not shrink for ever.

@@ -32,7 +32,7 @@ from graphslam.core.motion_models import (
 )
 from graphslam.core.records import Motion
 from graphslam.odometry.increment_sums import IncrementSums, Motions, PathSums
-from graphslam.odometry.readings import BoolArray, IntArray, Readings, settle
+from graphslam.odometry.readings import BoolArray, IntArray, Readings, integrate_pending
 
 #: m and rad: what a robot that reports no motion may still have moved between two states
 STANDING_SIGMA = 1e-4
@@ -52,13 +52,13 @@ class Track(Readings):
         """An empty track; ``mounted``: its motions are those of a sensor's frame, see `motion`."""
         super().__init__(config, robot)
         self.calibration = nominal_calibration("given", config, False)
-        self.nominal = self.calibration  # before any data
+        self.prior = self.calibration  # before any data
         self._mounted = mounted
 
     def _begin(self, source: str, time_ns: int) -> None:
         super()._begin(source, time_ns)
         self._mounted &= source != "given"
-        self.calibration = self.nominal = nominal_calibration(source, self._config, self._mounted)
+        self.calibration = self.prior = nominal_calibration(source, self._config, self._mounted)
 
     @property
     def is_mounted(self) -> bool:
@@ -90,22 +90,22 @@ class Track(Readings):
         return slice(self.increment_parameters, self.increment_parameters + 3)
 
     @property
-    def floor(self) -> Array:
+    def floor_cov(self) -> Array:
         """Covariance (3, 3) that is added once to every motion, however short."""
-        return np.zeros((3, 3)) if self.source == "given" else self.floor_of(True)
+        return np.zeros((3, 3)) if self.source == "given" else self.floor_cov_of(True)
 
     @property
     def used_calibration(self) -> Calibration:
         """The calibration as it is applied: without latency where the stamps do not allow one."""
         known = self.calibration
-        if self.is_mounted and self.bursty:
+        if self.is_mounted and self.has_burst_stamps:
             return Calibration(known.names, np.append(known.mean[:-1], 0.0), known.cov)
         return known
 
     @property
     def latency_ns(self) -> int:
         """By how long the times of states are late against the odometry's; 0 if unobservable."""
-        if self.is_mounted and not self.bursty:
+        if self.is_mounted and not self.has_burst_stamps:
             return round(float(self.calibration.mean[-1]) * 1e9)
         return 0
 
@@ -134,14 +134,14 @@ class Track(Readings):
         whole = self._base_motion(start_ns, end_ns, self.latency_ns)
         if whole is None:
             d_cal = np.zeros((3, len(self.calibration.mean)))
-            return Motion(start_ns, end_ns, np.zeros(3), self.floor_of(False), d_cal, 0.0)
+            return Motion(start_ns, end_ns, np.zeros(3), self.floor_cov_of(False), d_cal, 0.0)
         delta, d_cal, cov = whole.delta, whole.d_cal, whole.cov
         if self.is_mounted:
             by_latency = self._by_latency(start_ns, end_ns, delta)
             delta, cov, d_cal = _of_mount(delta, cov, d_cal, self.mount, by_latency)
         cov = cov + d_cal @ self.calibration.cov @ d_cal.T
         if self.source != "given":
-            cov = cov + self.floor_of(whole.length_m > 0 or delta[2] != 0)
+            cov = cov + self.floor_cov_of(whole.length_m > 0 or delta[2] != 0)
         return Motion(start_ns, end_ns, delta, cov, d_cal, whole.length_m)
 
     def _base_motion(self, start_ns: int, end_ns: int, late_ns: int) -> Compounded | None:
@@ -153,24 +153,24 @@ class Track(Readings):
 
     def _by_latency(self, start_ns: int, end_ns: int, delta: Array) -> Array:
         """Derivative (3,) of the base's motion by the latency, /s; a one-sided difference."""
-        if self.bursty:
+        if self.has_burst_stamps:
             return np.zeros(3)
         later = self._base_motion(start_ns, end_ns, self.latency_ns + LATENCY_STEP_NS)
         change = (later.delta if later is not None else np.zeros(3)) - delta
         change[2] = wrap(change[2])
         return np.asarray(change * (1e9 / LATENCY_STEP_NS))
 
-    def uncovered(self, start_ns: IntArray | int, end_ns: IntArray | int) -> BoolArray:
+    def is_uncovered(self, start_ns: IntArray | int, end_ns: IntArray | int) -> BoolArray:
         """Whether motions (...,) are in part where there are no readings yet, or no more."""
         late = self.latency_ns
         return np.asarray((start_ns - late < self.first_ns) | (end_ns - late > self.last_ns))
 
-    def unseen(self, start_ns: int, end_ns: int) -> Array:
+    def uncovered_bound(self, start_ns: int, end_ns: int) -> Array:
         """Bound (3,) on the part of a motion that no readings cover, at the speed next to it.
 
         `motion` takes the robot to stand there; by so much it may be wrong.
         """
-        if not self.uncovered(start_ns, end_ns):
+        if not self.is_uncovered(start_ns, end_ns):
             return np.zeros(3)
         begin, end = start_ns - self.latency_ns, end_ns - self.latency_ns
         most = min(end - begin, self.last_ns - self.first_ns)
@@ -237,7 +237,7 @@ class Track(Readings):
         cov = cov + d_cal @ cal_cov[:, :used, :used] @ d_cal.mT
         if self.source != "given":
             drove = (self.effort(end) > self.effort(begin))[:, None, None]
-            cov = cov + np.where(drove, self.floor_of(True), self.floor_of(False))
+            cov = cov + np.where(drove, self.floor_cov_of(True), self.floor_cov_of(False))
         return delta, np.where((end_ns > start_ns)[:, None, None], cov, 0.0)
 
     def _coarse(self, begin: IntArray, end: IntArray, calibration: Array) -> PathSums:
@@ -278,7 +278,7 @@ class Track(Readings):
         delta = delta + np.einsum("nij,nj->ni", part.d_cal, calibration)
         return replace(part, delta=delta)
 
-    def floor_of(self, moved: bool) -> Array:
+    def floor_cov_of(self, moved: bool) -> Array:
         """Covariance (3, 3) added once per interval; never zero, or two states would be welded."""
         if not moved:
             return np.diag([STANDING_SIGMA**2] * 3)
@@ -297,7 +297,7 @@ def motions_of(asked: Sequence[tuple[Track, IntArray, IntArray]]) -> list[Motion
     of_track: dict[Track, list[int]] = defaultdict(list)
     for k, (track, _, _) in enumerate(asked):
         of_track[track].append(k)
-    settle(of_track)
+    integrate_pending(of_track)
     alike: dict[Hashable, list[Track]] = defaultdict(list)
     for track in of_track:
         alike[track.batch_key].append(track)
@@ -336,13 +336,13 @@ def _motions(
         mount = np.array([track.mount for track in tracks])[which]
         change = between(earlier[a], earlier[b]) - delta
         change[:, 2] = wrap(change[:, 2])
-        rate = np.array([0.0 if track.bursty else 1e9 / LATENCY_STEP_NS for track in tracks])
-        by_latency = change * rate[which, None]
+        observable = np.array([not track.has_burst_stamps for track in tracks])
+        by_latency = change * np.where(observable, 1e9 / LATENCY_STEP_NS, 0.0)[which, None]
         delta, cov, d_cal = _of_mount(delta, cov, d_cal, mount, by_latency)
     known = np.array([track.calibration.cov for track in tracks])[which]
     cov = (cov + cov.mT) / 2 + d_cal @ known @ d_cal.mT
     moved = (length > 0) | (delta[:, 2] != 0)
-    cov = cov + np.where(moved[:, None, None], first.floor, first.floor_of(False))
+    cov = cov + np.where(moved[:, None, None], first.floor_cov, first.floor_cov_of(False))
     back = np.concatenate(end_ns) < np.concatenate(start_ns)
     if back.any():
         cov[back] = inverse_cov(delta[back], cov[back])

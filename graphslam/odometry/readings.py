@@ -93,15 +93,15 @@ class Readings:
         return self._times[: self._count]
 
     @property
-    def bursty(self) -> bool:
+    def has_burst_stamps(self) -> bool:
         """Whether many readings were stamped in bursts: then a shift of time means nothing."""
-        self._settle()
+        self._integrate_pending()
         return self._bursts > MAX_BURST_SHARE * self._count
 
     @property
     def resets(self) -> int:
         """Times that the odometry jumped."""
-        self._settle()
+        self._integrate_pending()
         return self._resets
 
     def add(self, message: Odometry) -> None:
@@ -126,7 +126,7 @@ class Readings:
             self._fresh.append(value)
         else:
             # a second reading of one time: its motion belongs to the interval that ends here
-            self._settle()
+            self._integrate_pending()
             row, n = self._row(value, 0), self._count - 1
             if n:
                 self._bursts -= int(self._burst[n])
@@ -145,10 +145,10 @@ class Readings:
             full = getattr(self, name)
             setattr(self, name, np.concatenate([full, np.empty_like(full)]))
 
-    def _settle(self) -> None:
+    def _integrate_pending(self) -> None:
         """Integrate the readings that came since a motion was last needed, all at once."""
         if self._settled < self._count:
-            settle((self,))
+            integrate_pending((self,))
 
     def _row(self, value: Array, apart_ns: int) -> Array:
         """`_rows` of one reading, which follows the last one after ``apart_ns``."""
@@ -185,7 +185,7 @@ class Readings:
         """Whether the motion up to ``time_ns`` is known without looking beyond a reading."""
         return self._count > 0 and self.last_ns >= time_ns
 
-    def near(self, time_ns: int, gap_ns: int) -> bool:
+    def covers(self, time_ns: int, gap_ns: int) -> bool:
         """Whether ``time_ns`` lies between readings at most ``gap_ns`` apart, or just outside."""
         if not self._count:
             return False
@@ -212,7 +212,7 @@ class Readings:
 
     def times_of_effort(self, effort_m: Array) -> IntArray:
         """Times (n,), ns, at which accumulated `effort` reaches values (n,), m."""
-        self._settle()
+        self._integrate_pending()
         known = self._totals[: self._count, _EFFORT]
         return np.interp(effort_m, known, self.times).astype(np.int64)
 
@@ -227,7 +227,7 @@ class Readings:
 
     def rows_between(self, start_ns: int, end_ns: int) -> Array:
         """Rows (m, k) of the readings between two times, a share of those cut by a time."""
-        self._settle()
+        self._integrate_pending()
         first = max(int(np.searchsorted(self.times, start_ns, side="right")), 1)
         last = min(int(np.searchsorted(self.times, end_ns, side="left")), self._count - 1)
         if end_ns <= start_ns or last < first:
@@ -252,7 +252,7 @@ class Readings:
 
     def _interval(self, times_ns: IntArray) -> tuple[IntArray, Array]:
         """The reading (...,) that ends the interval of a time, and the share of it reached."""
-        self._settle()
+        self._integrate_pending()
         if self._count < 2:
             return np.ones_like(times_ns), np.zeros(times_ns.shape)
         i = np.minimum(np.maximum(self.times.searchsorted(times_ns), 1), self._count - 1)
@@ -269,7 +269,7 @@ class Readings:
         return np.asarray(np.where(self._burst[i], share >= 1.0, share))
 
 
-def settle(many: Iterable[Readings]) -> None:
+def integrate_pending(many: Iterable[Readings]) -> None:
     """Integrate the readings of several robots that are not integrated yet, at once.
 
     NumPy's cost per call outweighs that of few numbers, so five robots take little more time than

@@ -102,18 +102,18 @@ def _measured_directions(cov: Array) -> tuple[Array, Array]:
     The noise of points looks like a little structure, also along a corridor.
     """
     variances, axes = np.linalg.eigh(cov)
-    measured = variances < SURE**2
-    return axes[:, measured], variances[measured]
+    match_off_lines = variances < SURE**2
+    return axes[:, match_off_lines], variances[match_off_lines]
 
 
-def measured(motion: Motion, before: Submap, robot: str, points: Array) -> Closure | None:
+def match_off_lines(motion: Motion, before: Submap, robot: str, points: Array) -> Closure | None:
     """A second source of a motion: from points that lie on no line, so nothing counts twice.
 
     Args:
         motion: according to odometry, where the search begins.
         before: scan of the state where it starts, in that state's frame.
         robot: whose.
-        points: (n, 2) of the scan where it ends, in that state's frame, see `beside_lines`.
+        points: (n, 2) of the scan where it ends, in that state's frame, see `points_off_lines`.
     """
     source = scan_submap(points, before.config)
     if source is None:
@@ -124,7 +124,7 @@ def measured(motion: Motion, before: Submap, robot: str, points: Array) -> Closu
     return Closure(robot, motion.end_ns, robot, motion.start_ns, pose, cov)
 
 
-def beside_lines(points: Array, seen: Sequence[Observation]) -> Array:
+def points_off_lines(points: Array, seen: Sequence[Observation]) -> Array:
     """Those of the points (n, 2) that lie on none of the observed lines; both in one frame."""
     free = np.ones(len(points), dtype=np.bool_)
     for o in seen:

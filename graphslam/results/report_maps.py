@@ -50,7 +50,7 @@ def overview(result: Result, *, dead_reckoning: bool) -> str:
         for name, robot in sorted(result.robots.items())
     }
     clouds = {name: _cloud(result, name, path, dead_reckoning) for name, path in paths.items()}
-    landmarks = () if result.pictures or dead_reckoning else result.landmarks
+    landmarks = () if result.keyframe_scans or dead_reckoning else result.landmarks
     extents = [landmark.extent for landmark in landmarks]
     limits = _limits([*(p.poses[:, :2] for p in paths.values()), *clouds.values(), *extents])
 
@@ -148,14 +148,14 @@ def map_height(result: Result) -> float:
 
 
 def _cloud(result: Result, robot: str, path: Trajectory, dead_reckoning: bool) -> Array:
-    """All points (n, 2) of a robot's pictures in the world frame."""
-    pictures = [p for p in result.pictures if p.robot == robot and len(p.points)]
-    if not pictures:
+    """All points (n, 2) of a robot's scans in the world frame."""
+    scans = [p for p in result.keyframe_scans if p.robot == robot and len(p.points)]
+    if not scans:
         return np.empty((0, 2))
     source = path if dead_reckoning else result.estimate.states.get(robot, path)
-    poses = poses_at(source, [p.time_ns for p in pictures])
-    poses = np.repeat(poses, [len(p.points) for p in pictures], axis=0)
-    points = np.concatenate([p.points for p in pictures])
+    poses = poses_at(source, [p.time_ns for p in scans])
+    poses = np.repeat(poses, [len(p.points) for p in scans], axis=0)
+    points = np.concatenate([p.points for p in scans])
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     return np.column_stack(
         [

@@ -58,7 +58,7 @@ def _warnings(summary: Mapping[str, Any]) -> str:
 
 
 def _map_section(result: Result) -> str:
-    scans = bool(result.pictures)
+    scans = bool(result.keyframe_scans)
     what = "Superposed scans" if scans else "Paths"
     landmark_note = "" if scans else " Triangles are landmarks."
     figures = [

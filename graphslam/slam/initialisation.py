@@ -146,7 +146,7 @@ def anonymous_maps(run: Pipeline, views: Mapping[str, RobotEstimate]) -> dict[st
     """Submaps and points without identity of each robot, after the pass that gave ``views``."""
     assert isinstance(run.backend, Isam2Backend)
     estimates = {robot: view.states for robot, view in views.items()}
-    found = build_submaps(estimates, run.pictures, run.config)
+    found = build_submaps(estimates, run.keyframe_scans, run.config)
     seen = {}
     for robot, view in views.items():
         own = [place for place in found if place.state[0] == robot]

@@ -149,7 +149,7 @@ def reoptimise(pipeline: Pipeline, estimate: Estimate) -> Estimate:
             estimate,
             tracks,
             pipeline.associator.map,
-            pipeline.pictures,
+            pipeline.keyframe_scans,
             config,
             pipeline.tamper,
         )

@@ -17,10 +17,10 @@ from graphslam.core.observation_models import transport
 from graphslam.core.records import (
     Association,
     Closure,
+    KeyframeScan,
     Message,
     Motion,
     Observation,
-    Picture,
     RelativePose,
     Scan,
     Sighting,
@@ -34,11 +34,11 @@ from graphslam.mapping.data_association import Image
 from graphslam.multi_robot.identity_swaps import rename_identities
 from graphslam.multi_robot.mutual_detection import ScanBuffer
 from graphslam.multi_robot.robot_detection import RobotDetector
-from graphslam.odometry.readings import settle
+from graphslam.odometry.readings import integrate_pending
 from graphslam.odometry.scan_odometry import (
-    beside_lines,
     checked_against_scans,
-    measured,
+    match_off_lines,
+    points_off_lines,
     scan_submap,
 )
 from graphslam.perception.front_ends import FRONT_ENDS
@@ -95,7 +95,7 @@ class Pipeline(StepRecorder):
         self.sources: list[Sighting] = []
         self.robot_sightings: list[Sighting] = []
         self.unrelated_sightings: list[Sighting] = []
-        self.pictures: list[Picture] = []
+        self.keyframe_scans: list[KeyframeScan] = []
         self.dropped: Counter[str] = Counter()
         self.step_ms: list[float] = []
 
@@ -164,7 +164,7 @@ class Pipeline(StepRecorder):
             mutual |= {robot for s in image if s.seen_robot for robot in (s.robot, s.seen_robot)}
         for robot in sorted(mutual):  # states in an order that no hash decides
             self.start_if_needed(robot, step_ns)
-        settle(self.runs[robot].track for robot in batch.robots)
+        integrate_pending(self.runs[robot].track for robot in batch.robots)
         last_ns = {
             robot: run.state_ns
             for robot, run in ((robot, self.runs[robot]) for robot in batch.robots)
@@ -277,7 +277,7 @@ class Pipeline(StepRecorder):
         run.contradicted += motion.matched
         if self.config.odometry.scan_matching == "auto" or motion.matched:
             return motion, None
-        return motion, measured(motion, last[1], scan.robot, beside_lines(points, seen))
+        return motion, match_off_lines(motion, last[1], scan.robot, points_off_lines(points, seen))
 
     def observations(self, event: Sequence[Message], since: Motion | None) -> list[Observation]:
         """Landmarks seen, in the base frame of the state (at the start of ``since``, if given)."""
@@ -332,8 +332,8 @@ class Pipeline(StepRecorder):
         for message in event:
             if isinstance(message, Scan):
                 points = scan_points(message, self.config.front_end.max_range_m)
-                self.pictures.append(
-                    Picture(robot, state_ns, points.astype(np.float32), message.mount)
+                self.keyframe_scans.append(
+                    KeyframeScan(robot, state_ns, points.astype(np.float32), message.mount)
                 )
 
     def robot_sighting(

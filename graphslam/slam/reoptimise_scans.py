@@ -14,7 +14,7 @@ import numpy as np
 
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array
-from graphslam.core.records import Closure, Estimate, Picture, Step
+from graphslam.core.records import Closure, Estimate, KeyframeScan, Step
 from graphslam.estimation.batch_calibration import calibrate, recompute_motions
 from graphslam.estimation.isam2 import Reoptimiser
 from graphslam.mapping.duplicate_landmarks import (
@@ -61,7 +61,7 @@ def reoptimise_scan_log(
     estimate: Estimate,
     tracks: Mapping[str, Track],
     landmarks: LandmarkMap,
-    pictures: Iterable[Picture],
+    keyframe_scans: Iterable[KeyframeScan],
     config: Config,
     tamper: Tamper | None = None,
 ) -> tuple[Estimate, tuple[Step, ...], Counter[str]]:
@@ -72,7 +72,7 @@ def reoptimise_scan_log(
         estimate: of all their states and landmarks.
         tracks: odometry of every robot, with its final calibration.
         landmarks: the map beside the estimate; merged landmarks leave it.
-        pictures: scan points seen from the states.
+        keyframe_scans: scan points seen from the states.
         config: settings.
         tamper: for tests, see `Tamper`.
 
@@ -88,7 +88,7 @@ def reoptimise_scan_log(
     closures: list[Closure] = []
     if config.backend.close_loops:
         steps, closures, estimate = _close_loops(
-            steps, estimate, pictures, landmarks, solve, tamper, counts, config
+            steps, estimate, keyframe_scans, landmarks, solve, tamper, counts, config
         )
     association = config.association
     for factor_m, factor_rad in GATE_FACTORS:
@@ -160,7 +160,7 @@ class _Solver:
 def _close_loops(
     steps: tuple[Step, ...],
     estimate: Estimate,
-    pictures: Iterable[Picture],
+    keyframe_scans: Iterable[KeyframeScan],
     landmarks: LandmarkMap,
     solve: _Solver,
     tamper: Tamper | None,
@@ -179,7 +179,7 @@ def _close_loops(
     split = split_by_visit(steps, estimate.states, landmarks, config.loop_closure.revisit_path_m)
     closed = split.start(estimate)
     prior = solve(split.steps, closed)
-    submaps = build_submaps(prior.states, pictures, config)  # bent by no wrong association
+    submaps = build_submaps(prior.states, keyframe_scans, config)  # bent by no wrong association
     accepted: dict[Pair, Closure] = {}
     correcting: set[Pair] = set()  # those of them that correct the estimate
     refused: dict[Pair, Closure] = {}

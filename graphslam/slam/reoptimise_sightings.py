@@ -146,7 +146,7 @@ def _recomputed(
         z, cov = _at_states(group, estimate, observer, other)
         cov = cov * group.share[:, None, None]
         for (n, k), z_k, cov_k in zip(group.where.tolist(), z, cov, strict=True):
-            associations[n][k] = associations[n][k].measured(z_k, cov_k)
+            associations[n][k] = associations[n][k].with_measurement(z_k, cov_k)
     return tuple(
         # in the order of the step: it is the order of the states
         replace(step, motions={r: new[r] for r in step.motions}, associations=tuple(found))
@@ -219,7 +219,9 @@ def _with_wider_sightings(step: Step, factors: Mapping[str, Array]) -> Step:
     """A step with the variances of robots' sightings of points times their factors (2,)."""
     scales = {robot: np.sqrt(np.outer(f, f)) for robot, f in factors.items()}
     associations = tuple(
-        a.measured(a.z, a.cov * scales[a.robot]) if a.robot in scales and len(a.z) == 2 else a
+        a.with_measurement(a.z, a.cov * scales[a.robot])
+        if a.robot in scales and len(a.z) == 2
+        else a
         for a in step.associations
     )
     return replace(step, associations=associations)

@@ -13,9 +13,9 @@ from graphslam.odometry.interpolation import (
     IntArray,
     causal_at,
     final_at,
-    mounted,
-    moved_world,
     origin_shift,
+    trajectory_of_mount,
+    transform_trajectory,
 )
 from graphslam.odometry.online_calibration import Calibrator, to_summary
 from graphslam.odometry.preintegration import Track
@@ -78,7 +78,7 @@ class RobotState:
             observed: (3, 3) see `Calibrator.learn`.
         """
         moved = between(self.causal_poses[-1], pose)
-        self.track.calibration = self.calibrator.learn(
+        self.track.calibration = self.calibrator.update(
             self.track.calibration, motion, moved, observed
         )
 
@@ -89,8 +89,8 @@ class RobotState:
     def calibration_found(self) -> dict[str, tuple[float, float, bool]]:
         """Parameter -> (value, sigma, observable) of the estimated calibration."""
         if self.is_calibrated:
-            return to_summary(self.track.calibration, self.track.nominal.cov)
-        return self.calibrator.found()
+            return to_summary(self.track.calibration, self.track.prior.cov)
+        return self.calibrator.summary()
 
     def causal(self, start: Array, away_m: float = 0.0) -> "Causal":
         """The causal trajectories.
@@ -106,9 +106,9 @@ class RobotState:
         # the mount known then, for the base pose and for the frame that starts at it
         last = known.index_before(times)
         mount = np.array([self.track.mount_of(c) for c in self.calibrations])[last]
-        causal = moved_world(causal, origin_shift(start, mount))
-        scan = mounted(causal, laser) if self.scans else None
-        return Causal(mounted(causal, inverse(mount)), scan)
+        causal = transform_trajectory(causal, origin_shift(start, mount))
+        scan = trajectory_of_mount(causal, laser) if self.scans else None
+        return Causal(trajectory_of_mount(causal, inverse(mount)), scan)
 
     def result(
         self, states: Trajectory, causal: "Causal", *, causal_only: bool = False
@@ -123,14 +123,14 @@ class RobotState:
         """
         stamps, times, laser = self._report_times()
         final = final_at(states, self.track, times, stamps)
-        base = mounted(final, inverse(self.track.mount))
+        base = trajectory_of_mount(final, inverse(self.track.mount))
         at_start = compose(states.poses[0], inverse(self.track.mount))
         odometry = between(self.track.pose(self.times[0]), self.track.pose(times))
         unknown = np.full((len(times), 3, 3), np.nan)
         return RobotResult(
             causal.base if causal_only else base,
             causal.base,
-            causal.scan if causal_only or not self.scans else mounted(final, laser),
+            causal.scan if causal_only or not self.scans else trajectory_of_mount(final, laser),
             causal.scan,
             Trajectory(stamps, compose(at_start, odometry), unknown),
         )

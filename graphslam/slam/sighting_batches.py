@@ -267,7 +267,7 @@ def inflate_repeated(associations: Sequence[Association]) -> tuple[Association, 
     """
     count = Counter((a.robot, a.target) for a in associations)
     return tuple(
-        a.measured(a.z, a.cov * n) if (n := count[a.robot, a.target]) > 1 else a
+        a.with_measurement(a.z, a.cov * n) if (n := count[a.robot, a.target]) > 1 else a
         for a in associations
     )
 

@@ -84,7 +84,7 @@ def make_result(finished: FinishedPass, began: float) -> Result:
         landmarks,
         estimate,
         steps,
-        tuple(pipeline.pictures[:: 1 + len(pipeline.pictures) // MAX_PICTURES]),
+        tuple(pipeline.keyframe_scans[:: 1 + len(pipeline.keyframe_scans) // MAX_PICTURES]),
         innovations,
         np.array(pipeline.step_ms),
         summarise(pipeline, estimate, len(landmarks), finished.findings.clocks),

@@ -54,7 +54,7 @@ def synchronise(
                 covered = all(track and track.reaches(head.time_ns) for track in needed + shown)
                 if not covered and not final and now_ns - head.time_ns <= max_gap_ns:
                     return None
-                if not all(track and track.near(head.time_ns, max_gap_ns) for track in needed):
+                if not all(track and track.covers(head.time_ns, max_gap_ns) for track in needed):
                     waiting.popleft()
                     dropped[f"{type(head).__name__.lower()}: no odometry near it"] += 1
                     continue

@@ -23,7 +23,7 @@ from graphslam.core.motion_models import (
 )
 from graphslam.core.records import OdometryIncrement, OdometryPose, WheelAngles
 from graphslam.odometry.preintegration import STANDING_SIGMA, Track, motions_of
-from graphslam.odometry.readings import EDGE_NS, settle
+from graphslam.odometry.readings import EDGE_NS, integrate_pending
 
 ROBOT = RobotConfig(wheel_radius_left_m=0.11, wheel_radius_right_m=0.1, axle_m=0.6)
 EVEN = RobotConfig(wheel_radius_left_m=0.1, wheel_radius_right_m=0.1, axle_m=0.5)
@@ -447,16 +447,16 @@ def test_track_grows_beyond_its_first_arrays():
 
 def test_reaches_and_near_tell_what_odometry_covers():
     track = Track(NOISE, EVEN)
-    assert not track.reaches(0) and not track.near(0, SECOND)
+    assert not track.reaches(0) and not track.covers(0, SECOND)
     track = odometry_track([10, 11, 14], [[0, 0, 0], [1, 0, 0], [2, 0, 0]])
     assert track.reaches(14 * SECOND) and not track.reaches(14 * SECOND + 1)
     # between readings: they are no farther apart than the gap
-    assert track.near(10 * SECOND + 1, SECOND) and not track.near(12 * SECOND, SECOND)
-    assert track.near(12 * SECOND, 3 * SECOND)
+    assert track.covers(10 * SECOND + 1, SECOND) and not track.covers(12 * SECOND, SECOND)
+    assert track.covers(12 * SECOND, 3 * SECOND)
     # outside: the robot is taken to stand for half a second, whatever the gap
     first, last = 10 * SECOND - EDGE_NS, 14 * SECOND + EDGE_NS
-    assert track.near(first, 9 * SECOND) and track.near(last, 9 * SECOND)
-    assert not track.near(first - 1, 9 * SECOND) and not track.near(last + 1, 9 * SECOND)
+    assert track.covers(first, 9 * SECOND) and track.covers(last, 9 * SECOND)
+    assert not track.covers(first - 1, 9 * SECOND) and not track.covers(last + 1, 9 * SECOND)
 
 
 @pytest.mark.parametrize("source", ["poses", "wheels"])
@@ -484,7 +484,7 @@ def test_readings_asked_for_one_by_one_are_those_worked_out_at_once(source):
     at = np.append(many.times, many.times[:-1] + SECOND // 50)
     np.testing.assert_allclose(one.pose(at), many.pose(at), atol=1e-11)
     np.testing.assert_allclose(one.effort(at), many.effort(at), atol=1e-11)
-    assert (one.resets, one.bursty) == (many.resets, many.bursty)
+    assert (one.resets, one.has_burst_stamps) == (many.resets, many.has_burst_stamps)
     assert one.resets == (2 if source == "poses" else 0)
     whole = many.first_ns, many.last_ns
     assert one.moved(*whole) == pytest.approx(many.moved(*whole), abs=1e-11)
@@ -494,7 +494,7 @@ def test_readings_asked_for_one_by_one_are_those_worked_out_at_once(source):
 def test_a_second_reading_of_one_time_belongs_to_the_interval_that_ends_there():
     """Nothing of the way is lost, and no interval is empty."""
     track = odometry_track([0, 1, 1, 2], [[0, 0, 0], [1, 0, 0], [1.5, 0, 0], [2, 0, 0]])
-    assert len(track) == 3 and not track.bursty
+    assert len(track) == 3 and not track.has_burst_stamps
     np.testing.assert_allclose(track.motion(0, SECOND).delta, [1.5, 0, 0], atol=1e-12)
     np.testing.assert_allclose(track.motion(SECOND, 2 * SECOND).delta, [0.5, 0, 0], atol=1e-12)
     assert track.motion(0, 2 * SECOND).length_m == pytest.approx(2.0)
@@ -599,7 +599,7 @@ def test_readings_of_several_robots_at_once_are_those_of_each():
         for track, own in zip(together, readings, strict=True):
             for reading in own[part]:
                 track.add(reading)
-        settle(together)
+        integrate_pending(together)
     for one, other, own in zip(single, together, readings, strict=True):
         times = np.array([r.time_ns for r in own])
         times = np.sort(np.concatenate([times, times + 37_000_000]))
@@ -619,8 +619,8 @@ def test_who_stands_beside_one_who_drives_has_not_moved():
         for track, x in ((drives, place), (stands, min(place, 0.5) / 30)):
             track.add(OdometryPose("r", k * SECOND, k * SECOND, np.array([x, 0.0, 0.0])))
         if k == 10:
-            settle([drives, stands])
-    settle([drives, stands])
+            integrate_pending([drives, stands])
+    integrate_pending([drives, stands])
     begin, end = 10 * SECOND, 899 * SECOND
     assert stands.effort(end) == stands.effort(begin)
     assert stands.moved(begin, end) == (0.0, 0.0)

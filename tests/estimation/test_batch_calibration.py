@@ -148,9 +148,9 @@ def test_what_odometry_does_not_cover_is_no_standstill():
     track = Track(OdometryConfig(), RobotConfig())
     for k in range(20):
         track.add(OdometryPose("r", k * S // 10, k * S // 10, np.array([0.05 * k, 0.0, 0.0])))
-    np.testing.assert_allclose(track.unseen(-S // 5, S), [0.1, 0, 0], atol=1e-9)
-    np.testing.assert_allclose(track.unseen(S, 21 * S // 10), [0.1, 0, 0], atol=1e-9)
-    np.testing.assert_array_equal(track.unseen(0, S), np.zeros(3))
+    np.testing.assert_allclose(track.uncovered_bound(-S // 5, S), [0.1, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(track.uncovered_bound(S, 21 * S // 10), [0.1, 0, 0], atol=1e-9)
+    np.testing.assert_array_equal(track.uncovered_bound(0, S), np.zeros(3))
 
 
 # ------------------------------------------------------------ only parallel walls

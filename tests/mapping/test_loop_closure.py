@@ -8,7 +8,7 @@ from walls import L_ROOM, cloud
 
 from graphslam.core.config import Config, LoopClosureConfig
 from graphslam.core.geometry import between, compose
-from graphslam.core.records import Closure, Picture, Trajectory
+from graphslam.core.records import Closure, KeyframeScan, Trajectory
 from graphslam.mapping.loop_closure import (
     candidates,
     consistent_closures,
@@ -25,14 +25,14 @@ CONFIG = LoopClosureConfig()
 
 
 def drive(poses, seen_from):
-    """Trajectory at ``poses`` (n, 3) and pictures of what is seen from ``seen_from`` (n, 3)."""
+    """Trajectory at ``poses`` (n, 3) and scans as seen from ``seen_from`` (n, 3)."""
     stamps = np.arange(len(poses), dtype=np.int64) * 1_000_000_000
     states = {"robot": Trajectory(stamps, poses, np.zeros((len(poses), 3, 3)))}
-    pictures = [
-        Picture("robot", int(t), cloud(p, L_ROOM).astype(np.float32))
+    keyframe_scans = [
+        KeyframeScan("robot", int(t), cloud(p, L_ROOM).astype(np.float32))
         for t, p in zip(stamps, seen_from, strict=True)
     ]
-    return states, pictures
+    return states, keyframe_scans
 
 
 def round_trip():
@@ -57,8 +57,8 @@ def test_a_drifted_run_meets_itself():
     """Breaks if closures are of the wrong pair, the wrong way round, or not found at all: each one
     found says where the later place truly lies in the earlier."""
     true = round_trip()
-    states, pictures = drive(drifting(true), true)
-    found = build_submaps(states, pictures, Config())
+    states, keyframe_scans = drive(drifting(true), true)
+    found = build_submaps(states, keyframe_scans, Config())
     P = np.kron(np.eye(len(found)), np.diag([0.05, 0.05, 0.03]) ** 2)
     closures, _ = loop_closures(found, P, {}, CONFIG)
     assert len(closures) >= 3
@@ -74,8 +74,8 @@ def test_a_drifted_run_meets_itself():
 def test_a_run_that_is_right_needs_no_closure():
     """Breaks with closures where nothing is to be closed: what is there is only confirmed."""
     true = round_trip()
-    states, pictures = drive(true, true)
-    found = build_submaps(states, pictures, Config())
+    states, keyframe_scans = drive(true, true)
+    found = build_submaps(states, keyframe_scans, Config())
     P = np.kron(np.eye(len(found)), np.diag([0.05, 0.05, 0.03]) ** 2)
     assert candidates(found, P, CONFIG)
     lost, confirmed = loop_closures(found, P, {}, CONFIG)
@@ -89,8 +89,8 @@ def test_a_run_that_is_right_needs_no_closure():
 def test_a_pair_is_looked_at_once():
     """Breaks if rounds cost as much as the first one where nothing has moved."""
     true = round_trip()
-    states, pictures = drive(drifting(true), true)
-    found = build_submaps(states, pictures, Config())
+    states, keyframe_scans = drive(drifting(true), true)
+    found = build_submaps(states, keyframe_scans, Config())
     P = np.kron(np.eye(len(found)), np.diag([0.05, 0.05, 0.03]) ** 2)
     looked = {}
     assert loop_closures(found, P, looked, CONFIG)[0]
@@ -119,8 +119,8 @@ def test_what_makes_a_match_unbelievable(bad):
 
 def closed_loops(poses, true):
     """Places along ``poses`` where ``true`` ones were driven, true poses of them, true closures."""
-    states, pictures = drive(poses, true)
-    found = build_submaps(states, pictures, Config())
+    states, keyframe_scans = drive(poses, true)
+    found = build_submaps(states, keyframe_scans, Config())
     at = {int(t): k for k, t in enumerate(states["robot"].stamps_ns)}
     where = np.array([true[at[p.state[1]]] for p in found])
     good = [

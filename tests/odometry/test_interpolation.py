@@ -13,9 +13,9 @@ from graphslam.core.records import OdometryPose, Trajectory
 from graphslam.odometry.interpolation import (
     causal_at,
     final_at,
-    mounted,
-    moved_world,
     origin_shift,
+    trajectory_of_mount,
+    transform_trajectory,
 )
 from graphslam.odometry.preintegration import Track
 
@@ -275,7 +275,7 @@ def test_mounted_is_composition_with_covariance():
     """Every pose has its own mount (a log may carry several lasers); rigid, so nothing is added."""
     rng = np.random.default_rng(6)
     mounts = rng.normal(0, 0.4, size=(len(STATES), 3))
-    found = mounted(STATES, mounts)
+    found = trajectory_of_mount(STATES, mounts)
     for n in range(len(STATES)):
         expected = compose(STATES.poses[n], mounts[n])
         cov = compose_cov(STATES.poses[n], STATES.covs[n], mounts[n], np.zeros((3, 3)))
@@ -284,16 +284,16 @@ def test_mounted_is_composition_with_covariance():
     np.testing.assert_array_equal(found.stamps_ns, STATES.stamps_ns)
 
 
-def test_moved_world_is_composition_from_the_left_with_covariance():
+def test_transform_trajectory_is_composition_from_the_left_with_covariance():
     """Per pose or for all of them; the covariance turns with the axes and gains nothing."""
     rng = np.random.default_rng(8)
     worlds = rng.normal(0, 2.0, size=(len(STATES), 3))
-    found = moved_world(STATES, worlds)
+    found = transform_trajectory(STATES, worlds)
     for n, world in enumerate(worlds):
         cov = compose_cov(world, np.zeros((3, 3)), STATES.poses[n], STATES.covs[n])
         assert_same_pose(found.poses[n], compose(world, STATES.poses[n]))
         np.testing.assert_allclose(found.covs[n], cov, atol=1e-16)
-    once = moved_world(STATES, worlds[0])
+    once = transform_trajectory(STATES, worlds[0])
     assert_same_pose(once.poses[0], found.poses[0], atol=0)
     assert_same_pose(
         between(once.poses[0], once.poses[1:]), between(STATES.poses[0], STATES.poses[1:])

@@ -93,10 +93,10 @@ class Drive:
         for start, end in zip(self.states[:-1], self.states[1:], strict=True):
             motion = self.track.motion(int(start), int(end))
             moved = self.moved(start, end)
-            self.track.calibration = self.calibrator.learn(
+            self.track.calibration = self.calibrator.update(
                 self.track.calibration, motion, moved, PLENTY
             )
-        return self.calibrator.found()
+        return self.calibrator.summary()
 
 
 def test_known_errors_are_found_from_perfect_motions():
@@ -131,13 +131,13 @@ def test_one_step_is_the_information_filter_by_hand():
     drive = Drive(weaving(100, np.random.default_rng(1)), mounted=False)
     prior, motion = drive.track.calibration, drive.track.motion(SECOND, 3 * SECOND)
     moved = motion.delta + np.array([0.02, 0.01, -0.01])
-    after = drive.calibrator.learn(prior, motion, moved, PLENTY)
+    after = drive.calibrator.update(prior, motion, moved, PLENTY)
     D = motion.d_delta_d_calibration
     noise = motion.cov - D @ prior.cov @ D.T + np.diag(np.square(RELATIVE_SIGMA))
     info = np.linalg.inv(prior.cov) + D.T @ np.linalg.solve(noise, D)
     expected = np.linalg.solve(info, D.T @ np.linalg.solve(noise, moved - motion.delta))
     np.testing.assert_allclose(after.mean, expected, rtol=1e-7)
-    found = [sigma for _, sigma, _ in drive.calibrator.found().values()]
+    found = [sigma for _, sigma, _ in drive.calibrator.summary().values()]
     np.testing.assert_allclose(found, np.sqrt(np.diag(np.linalg.inv(info))), rtol=1e-7)
 
 
@@ -160,8 +160,8 @@ def test_wheels_of_unequal_size_are_found():
     for k in range(0, n, 10):
         motion = track.motion(k * PERIOD_NS, (k + 10) * PERIOD_NS)
         moved = between(true[k], true[k + 10]) + rng.normal(0, RELATIVE_SIGMA)
-        track.calibration = calibrator.learn(track.calibration, motion, moved, PLENTY)
-    found = calibrator.found()
+        track.calibration = calibrator.update(track.calibration, motion, moved, PLENTY)
+    found = calibrator.summary()
     errors = {"wheel_radius_left_m": 4e-3, "wheel_radius_right_m": 2e-3, "axle_m": 0.01}
     assert set(found) == set(errors)
     for name, value in errors.items():
@@ -179,8 +179,8 @@ def test_a_jump_of_the_estimate_teaches_nothing(jump):
     motion = drive.track.motion(2 * SECOND, 2 * SECOND + STATE_NS)
     current = drive.track.calibration
     moved = drive.moved(2 * SECOND, 2 * SECOND + STATE_NS) + jump
-    assert drive.calibrator.learn(current, motion, moved, PLENTY) is current
-    assert drive.calibrator.found() == before
+    assert drive.calibrator.update(current, motion, moved, PLENTY) is current
+    assert drive.calibrator.summary() == before
 
 
 def test_the_gate_of_jumps_is_chi_square():
@@ -195,7 +195,7 @@ def test_headings_are_compared_the_short_way_round():
         track.add(OdometryPose("r", k * PERIOD_NS, k * PERIOD_NS, np.array([0, 0, phi])))
     motion = track.motion(0, 49 * PERIOD_NS)
     calibrator = Calibrator()
-    after = calibrator.learn(track.calibration, motion, np.array([0, 0, -np.pi + 0.01]), PLENTY)
+    after = calibrator.update(track.calibration, motion, np.array([0, 0, -np.pi + 0.01]), PLENTY)
     assert 0 < after.mean[1] < 0.02 / np.pi
 
 
@@ -268,7 +268,7 @@ def test_without_landmarks_nothing_is_learned():
     """The estimate is odometry then: agreement with itself is no evidence."""
     drive = Drive(weaving(100, np.random.default_rng(1)))
     current, motion = drive.track.calibration, drive.track.motion(SECOND, 3 * SECOND)
-    after = drive.calibrator.learn(current, motion, motion.delta, np.zeros((3, 3)))
+    after = drive.calibrator.update(current, motion, motion.delta, np.zeros((3, 3)))
     np.testing.assert_array_equal(after.mean, current.mean)
     np.testing.assert_array_equal(after.cov, current.cov)
 
@@ -281,10 +281,10 @@ def test_a_corridor_does_not_show_the_scale_of_the_path():
         motion = drive.track.motion(int(start), int(end))
         moved = drive.moved(start, end)
         moved[0] = motion.delta[0]
-        drive.track.calibration = drive.calibrator.learn(
+        drive.track.calibration = drive.calibrator.update(
             drive.track.calibration, motion, moved, walls
         )
-    found = drive.calibrator.found()
+    found = drive.calibrator.summary()
     assert found["translation_scale"][1] == pytest.approx(PRIOR["translation_scale"], rel=1e-4)
     assert found["drift_rad_per_m"][2] and not found["translation_scale"][2]
 
@@ -328,8 +328,8 @@ def test_given_increments_are_left_alone():
     calibrator, current = Calibrator(), track.calibration
     for k in range(20):
         motion = track.motion(k * SECOND, (k + 1) * SECOND)
-        assert calibrator.learn(current, motion, np.array([0.6, 0.05, 0.2]), PLENTY) is current
-    assert calibrator.found() == {}
+        assert calibrator.update(current, motion, np.array([0.6, 0.05, 0.2]), PLENTY) is current
+    assert calibrator.summary() == {}
     np.testing.assert_array_equal(track.mount, 0)
 
 
@@ -341,5 +341,5 @@ def test_a_robot_that_stands_teaches_nothing():
     calibrator, current = Calibrator(), track.calibration
     for k in range(4):
         motion = track.motion(k * SECOND, (k + 1) * SECOND)
-        assert calibrator.learn(current, motion, np.array([0.01, 0.0, 0.005]), PLENTY) is current
-    assert calibrator.found() == {}
+        assert calibrator.update(current, motion, np.array([0.01, 0.0, 0.005]), PLENTY) is current
+    assert calibrator.summary() == {}

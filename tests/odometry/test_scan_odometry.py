@@ -11,10 +11,10 @@ from graphslam.core.geometry import compose, wrap
 from graphslam.core.records import Motion, Observation
 from graphslam.logs import open_logs
 from graphslam.odometry.scan_odometry import (
-    beside_lines,
     checked_against_scans,
     fused,
-    measured,
+    match_off_lines,
+    points_off_lines,
     scan_submap,
 )
 from graphslam.slam.smooth import smooth
@@ -112,7 +112,7 @@ def test_points_on_lines_are_left_out():
     line = Observation("line", np.array([1.0, 2.0, np.pi / 2]), np.eye(3), np.array([-1.0, 1.0]))
     post = Observation("point", np.array([0.1, 3.0]), np.eye(2))
     points = np.array([[1.05, 2.5], [0.95, 1.0], [1.3, 2.0], [1.0, 3.5]])
-    np.testing.assert_array_equal(beside_lines(points, [line, post]), points[2:])
+    np.testing.assert_array_equal(points_off_lines(points, [line, post]), points[2:])
 
 
 def test_clutter_measures_the_motion_that_walls_do_not():
@@ -134,12 +134,14 @@ def test_clutter_measures_the_motion_that_walls_do_not():
             Observation("line", np.array([0, y, 0.0]), np.eye(3), np.array([-30.0, 30.0]))
             for y in (-1.0, 1.0)
         ]
-        found = measured(motion, scan_submap(clouds[0]), "r", beside_lines(clouds[1], walls))
+        found = match_off_lines(
+            motion, scan_submap(clouds[0]), "r", points_off_lines(clouds[1], walls)
+        )
         assert found is not None and (found.other_time_ns, found.time_ns) == (0, S)
         off = found.delta - straight
         assert np.sqrt(found.cov[0, 0]) < 0.05
         d2.append(off @ np.linalg.solve(found.cov, off))
-        assert measured(motion, scan_submap(clouds[0]), "r", np.zeros((0, 2))) is None
+        assert match_off_lines(motion, scan_submap(clouds[0]), "r", np.zeros((0, 2))) is None
     assert np.sum(d2) < chi2.ppf(0.999, 30)
 
 

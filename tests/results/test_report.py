@@ -182,7 +182,9 @@ def test_a_single_standing_pose_renders(indoors):
 
     fields = (f.name for f in dataclasses.fields(robot))
     one = dataclasses.replace(robot, **{name: first(getattr(robot, name)) for name in fields})
-    standing = dataclasses.replace(result, robots={"robot": one}, pictures=result.pictures[:1])
+    standing = dataclasses.replace(
+        result, robots={"robot": one}, keyframe_scans=result.keyframe_scans[:1]
+    )
     read(render(standing))
 
 

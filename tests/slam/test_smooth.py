@@ -16,7 +16,7 @@ from graphslam.core.observation_models import MODELS
 from graphslam.core.records import OdometryPose, RelativePose, Trajectory
 from graphslam.evaluation.trajectory_metrics import align
 from graphslam.logs import LogWriter, open_logs
-from graphslam.odometry.interpolation import moved_world, origin_shift
+from graphslam.odometry.interpolation import origin_shift, transform_trajectory
 from graphslam.odometry.preintegration import Track
 from graphslam.slam.pipeline import Pipeline
 from graphslam.slam.robot_state import RobotState
@@ -469,7 +469,7 @@ def test_base_is_found_from_states_that_are_rigid_to_the_laser():
         robot.causal_covs.append(1e-6 * np.eye(3))
     covs = np.array(robot.causal_covs)
     world = origin_shift(start, mount)
-    final = moved_world(Trajectory(times, states, covs), world)
+    final = transform_trajectory(Trajectory(times, states, covs), world)
     found = robot.result(final, robot.causal(start))
     at = np.isin(found.final.stamps_ns, times)
     assert_same_pose(found.final.poses[at], base, atol=1e-12)
