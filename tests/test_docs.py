@@ -128,6 +128,17 @@ def test_what_a_page_names_is_there(page):
     assert not wrong, f"{page.name}: {', '.join(wrong)}"
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_keys_of_the_summary_are_not_modules(page):
+    """What a page says is "in summary.json", or that it "has", is a key of docs/formats.md."""
+    keys = re.findall(r"^\| `(\w+)`", (ROOT / "docs/formats.md").read_text("utf-8"), flags=re.M)
+    text = page.read_text(encoding="utf-8")
+    names = re.findall(r"`([^`\n]+)` in\s`?summary\.json", text)
+    names += re.findall(r"`?summary\.json`? (?:has|counts)\s[^.;,]*?`([^`\n]+)`", text)
+    wrong = [n for n in names if n.split(".")[0] not in keys or ("." in n and exists(n))]
+    assert not wrong, f"{page.name}: {', '.join(wrong)}"
+
+
 @pytest.mark.parametrize(("old", "new"), RENAMED_KEYS.items())
 def test_the_changelog_has_every_renamed_setting(old, new):
     assert f"| {old} | `{new}` |" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
