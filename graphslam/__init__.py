@@ -362,12 +362,12 @@ def _settle(
         return load_config(config, **settings)
     settled = load_config(recording.config if config is None else config, **settings)
     if (settled.logs, settled.robots) != (recording.config.logs, recording.config.robots):
-        raise ConfigError("logs.*, robots.*: are settings of open_logs, which is done already")
+        raise ConfigError("logs.*, robots.*: must be passed to open_logs")
     return settled
 
 
 def _open(recording: Recording, config: Config) -> Callable[[], LogSet]:
-    """What returns the logs; they are opened while the caller goes on."""
+    """A function that returns the logs; they are opened in the background."""
     from graphslam.core.worker import Future
     from graphslam.logs import LogSet, open_logs
 

@@ -209,5 +209,5 @@ def consistency_warnings(aligned: AlignedVisits) -> tuple[str, ...]:
         return ()
     return (
         f"the surfaces of the two runs disagree by {sigma:.1f} times what their covariances "
-        "allow, all over: a path is worse than its covariances say, and changes may be false",
+        "allow, everywhere; a trajectory's covariance is too small, and changes may be false",
     )

@@ -38,8 +38,8 @@ from graphslam.core.geometry import Array, transform
 
 _NONRIGID = (
     "the maps bend differently, so no one motion brings their landmarks together: both paths were "
-    "straightened by their scans and the later one bent onto the reference; only large changes "
-    "are found, and where they are is known to decimetres"
+    "refined by scan matching and registered nonrigidly; only large changes are found, and their "
+    "positions are known to decimetres"
 )
 
 

@@ -135,7 +135,9 @@ LaterFolder = Annotated[
 ]
 Span = Annotated[
     str | None,
-    typer.Option(metavar="A:B", callback=_check_span, help="Only scans of these seconds of it."),
+    typer.Option(
+        metavar="A:B", callback=_check_span, help="Use only scans in [A, B] s after the first."
+    ),
 ]
 TruthFiles = Annotated[
     list[str] | None,
@@ -175,7 +177,7 @@ Starts = Annotated[
         metavar="truth|ROBOT=x,y,phi",
         callback=check_start,
         help="Where a robot starts (m, m, rad), or one true pose per robot from the log; "
-        "repeatable. Default: the first robot is the origin, others as their sightings have it.",
+        "repeatable. Default: the first robot is the origin, others are estimated.",
     ),
 ]
 Backends = Annotated[
@@ -189,14 +191,18 @@ Backends = Annotated[
 ]
 ComparisonMode = Annotated[
     str,
-    _choice(MODES, "The same recorded steps for all, or each associates for itself.", "--mode"),
+    _choice(
+        MODES,
+        "The same recorded steps for all, or each back end does its own association.",
+        "--mode",
+    ),
 ]
 ConfigFile = Annotated[Path | None, typer.Option("--config", metavar="FILE.toml", help="Settings.")]
 Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="One setting, over the file's; repeatable."),
 ]
-Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Other noise.")]
+Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of the random noise.")]
 Runs = Annotated[int | None, typer.Option(metavar="N", min=1, help="Seeds, instead of the file's.")]
 Jobs = Annotated[int | None, typer.Option(metavar="N", min=1, help="Processes; one per core.")]
 

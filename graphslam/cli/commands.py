@@ -172,7 +172,7 @@ def smooth(
     options += [f"front_end.name={front_end}"] if front_end else []
     tree = load_config(config, [*options, *(start or ()), *(settings or ())])
     if horizon is not None and tree.backend.name != "isam2":
-        raise ConfigError(f"--horizon: only isam2 has one, not {tree.backend.name}; leave it")
+        raise ConfigError(f"only isam2 supports --horizon, not {tree.backend.name}; omit it")
     with progress_bar("smoothing") as progress:
         result = graphslam.smooth(logs, config=tree, output=output, force=force, progress=progress)
     return Output(result.summary, lambda: show.smoothed(result, output))
@@ -233,7 +233,7 @@ def changes(
     settings: Settings = None,
     force: Force = False,
 ) -> Output:
-    """Find what is different since the last visit, and how sure.
+    """Find what is different since the last visit, and with what probability.
 
     Writes changes.json, report.html, a map and an MCAP file of them. REFERENCE and LATER may be
     one folder with two spans.
@@ -257,7 +257,7 @@ def experiment(
     """Run a Monte Carlo experiment: many seeds, estimators and noise scales.
 
     Writes results.jsonl, a row per run as it ends, then summary.json, report.html and figures.
-    Stopped, it goes on where it was when it is called again.
+    An interrupted run is resumed when it is called again.
     """
     from graphslam.evaluation.monte_carlo_campaign import list_jobs, run_campaign
     from graphslam.evaluation.monte_carlo_definition import load_definition

@@ -35,7 +35,7 @@ from graphslam.estimation.isam2 import isam2_parameters, isam2_tree, optimise
 
 #: bytes of a number, and of a variable's key
 NUMBER_BYTES, KEY_BYTES = 8, 8
-NOT_SENT = "evidence about a state before the last message: its robot keeps it"
+NOT_SENT = "evidence about a state before the last message: kept locally, not sent"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -186,7 +186,10 @@ def choose_alignment(
         _extent([places_b[found[k].index_b] for k in best]),
     )
     if min(extents) < config.min_place_extent_m:
-        return f"{a} and {b} saw nothing alike but what is no larger than a room"
+        return (
+            f"the places that {a} and {b} have in common extend over less than "
+            "multi_robot.min_place_extent_m"
+        )
     # a match with a clearly lower score at its place does not speak for another alignment
     best_score = {found[k].index_b: scores[k] for k in best}
     equivalent = np.array(
@@ -200,7 +203,7 @@ def choose_alignment(
             f"pose and {len(rival)} another"
         )
     if differing > MAX_DIFFERING_SHARE * len(best):
-        return f"{a} and {b} saw places that look alike, but their surroundings differ"
+        return f"the surroundings of the places common to {a} and {b} contradict each other"
     own = (PlaceMap(m.places, COVARIANCE_INFLATION * m.cov) for m in (map_a, map_b))
     start = _consensus(*_start_estimates(found, *own), best)
     return RelativeFrame(b, a, start.pose, start.cov, float(len(best)))

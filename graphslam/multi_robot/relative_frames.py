@@ -152,7 +152,7 @@ def estimate_relative_frame(
     variance = p.variance + q.variance + noise
     best = _remove_outliers(greedy_max_clique(agree, weight), p.points, q.points, variance)
     if weight[best].sum() < MIN_EVIDENCE:
-        return f"too little of what {a} and {b} saw in common agrees"
+        return f"too few consistent correspondences between {a} and {b}"
     pose, cov = fit_rigid_transform(p.points[best], q.points[best], variance[best])
     if cov[2, 2] > MAX_HEADING_SIGMA_RAD**2:
         return f"what {a} and {b} saw in common does not determine their relative heading"

@@ -79,7 +79,7 @@ class Calibrator:
         return Calibration(current.names, cov @ self._vector, cov + REMAINING**2 * self._prior)
 
     def summary(self) -> dict[str, tuple[float, float, bool]]:
-        """What the data say so far, see `told`.
+        """The estimate from the data so far, see `to_summary`.
 
         The sigma is that of the remembered stretch, so it does not shrink for ever.
         """

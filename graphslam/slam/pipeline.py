@@ -143,7 +143,7 @@ class Pipeline(StepRecorder):
                 self.dropped["sighting: of a robot, ignored by association.robot_sightings"] += 1
             elif self.frames.crosses_frames(message):
                 kind = type(message).__name__.lower()
-                self.dropped[f"{kind}: of a robot in a frame of its own"] += 1
+                self.dropped[f"{kind}: between robots in separate frames"] += 1
                 if isinstance(message, Sighting):
                     self.unrelated_sightings.append(message)
             else:

@@ -93,15 +93,15 @@ def between_states(
         message: as recorded.
         state_ns: time of the state nearest before its later end.
         runs: of every robot.
-        recorded: which relative poses are believed.
+        recorded: which relative poses are accepted.
     """
     other = runs.get(message.other)
     if closure_id(message) in recorded.refused:
-        return "not believed, see closures"
+        return "rejected, see closures.refused"
     if message.other == message.robot and message.start_ns >= message.time_ns:
-        return "it does not begin before it ends"
+        return "its start is not before its end"
     if other is None or not other.started or message.start_ns < other.times[0]:
-        return "its first end has no state"
+        return "no keyframe at its start time"
     other_ns = other.times[int(np.searchsorted(other.times, message.start_ns, "right")) - 1]
     delta, cov = message.delta, message.cov
     if other_ns < message.start_ns:

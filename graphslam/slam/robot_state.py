@@ -171,9 +171,9 @@ def span_warnings(tracks: Mapping[str, Track], *, unplaced: bool) -> list[str]:
         part = f"its odometry covers {1e-9 * (a - begin):.1f} to {1e-9 * (b - begin):.1f} s of "
         part += f"{1e-9 * (end - begin):.1f} s"
         if not any(a <= d and c <= b for other, (c, d) in spans.items() if other != name):
-            lines.append(f"{name}: {part}, no time of which is another robot's; are clocks right?")
-        elif unplaced and max(a - begin, end - b) > EDGE_NS:
             lines.append(
-                f"{name}: {part}; what it saw, and who saw it, outside of that is not used"
+                f"{name}: {part}, does not overlap any other robot's in time; check the clocks"
             )
+        elif unplaced and max(a - begin, end - b) > EDGE_NS:
+            lines.append(f"{name}: {part}; sightings outside this interval are dropped")
     return lines

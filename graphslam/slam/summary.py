@@ -143,7 +143,7 @@ def run_warnings(pipeline: Pipeline) -> list[str]:
     """What a user should know about a run although it went through."""
     known = pipeline.known
     warnings = [
-        f"{name}: its odometry jumped {run.track.resets} times; taken to have gone on as before"
+        f"{name}: its odometry jumped {run.track.resets} times; bridged at the previous speed"
         for name, run in pipeline.runs.items()
         if run.track.resets
     ]
@@ -161,7 +161,7 @@ def run_warnings(pipeline: Pipeline) -> list[str]:
         == RobotConfig()
     ]
     warnings += [
-        f"{a} and {b}: bore each other's code in all sightings; their names were exchanged back"
+        f"{a} and {b}: their identities were swapped in all sightings; corrected"
         for a, b in known.identities.items()
         if a < b
     ]
@@ -174,15 +174,16 @@ def run_warnings(pipeline: Pipeline) -> list[str]:
         for reason, count in sorted(pipeline.backend.skipped.items())
     ]
     warnings += [
-        f"{robot}: {known.joined.undecided.get(robot, 'nothing says where it was')}; its poses "
-        f"are in a frame of its own, which begins where it began; --start {robot}=x,y,phi places it"
+        f"{robot}: {known.joined.undecided.get(robot, 'nothing in the log tells its start pose')}; "
+        "its poses are in a separate frame with its origin at its first pose; "
+        f"--start {robot}=x,y,phi places it"
         for robot, run in pipeline.runs.items()
         if run.started and robot == pipeline.frames.of[robot] != known.joined.world
     ]
     if known.recorded.refused:
         warnings.append(
-            f"{len(known.recorded.refused)} recorded closures are not believed; closures.refused"
-            " in summary.json lists them"
+            f"{len(known.recorded.refused)} recorded closures were rejected as inconsistent; "
+            "closures.refused in summary.json lists them"
         )
     if not any(step.associations or step.closures for step in pipeline.steps):
         warnings.append("no observation entered the estimate: this is dead reckoning")

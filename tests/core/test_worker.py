@@ -125,8 +125,8 @@ def test_shared_results_are_in_the_order_of_the_arguments():
 
 
 def test_nothing_forks_unless_it_may():
-    """Neither before `allow`, nor beside a thread, nor in what was forked, nor where nothing tells
-    how many threads there are, nor without memory."""
+    """Neither before `allow_fork`, nor beside a thread, nor in what was forked, nor where nothing
+    tells how many threads there are, nor without memory."""
     lines = printed("""
         import threading
         makes = lambda: Future(os.getpid).result() != here

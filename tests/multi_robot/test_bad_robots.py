@@ -99,7 +99,7 @@ def test_logs_without_common_time_share_the_map_with_a_warning(tmp_path):
     assert error(result, "a")[0] < NEAR_M and error(result, "b", 1000)[0] < NEAR_M
     assert len(result.landmarks) == len(LANDMARKS)
     for robot in "ab":
-        assert "no time of which is another robot's" in named(result, robot)
+        assert "does not overlap any other robot's" in named(result, robot)
 
 
 def test_robots_present_all_the_time_cause_no_warning(tmp_path):

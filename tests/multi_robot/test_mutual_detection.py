@@ -146,7 +146,7 @@ def test_a_found_start_costs_nothing_against_a_known_one(tmp_path):
         clock = result.summary["clocks"]["b"]
         assert abs(clock["offset_s"] - 0.4) < 4 * clock["offset_sigma_s"] < 0.1
     assert set(result.summary["starts_found"]) == {"b"}
-    assert not [w for w in result.summary["warnings"] if "frame of its own" in w]
+    assert not [w for w in result.summary["warnings"] if "separate frame" in w]
     assert errors[1] < 1.1 * errors[0]
 
 
@@ -235,8 +235,8 @@ def test_a_robot_that_nobody_sees_keeps_a_frame_of_its_own(tmp_path):
     config = settings(robots, ["a"], ["b"])
     result = smooth(open_logs([log], config), config)
     assert result.summary["frames"] == {"a": "a", "b": "b"}
-    (told,) = [w for w in result.summary["warnings"] if "frame of its own" in w]
-    assert told.startswith("b: nothing says where it was")
+    (told,) = [w for w in result.summary["warnings"] if "separate frame" in w]
+    assert told.startswith("b: nothing in the log tells its start pose")
 
 
 def test_sightings_of_robots_may_be_ignored(tmp_path):
