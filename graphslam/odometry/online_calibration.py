@@ -1,11 +1,11 @@
-"""Learning a motion source's calibration errors while the estimate grows.
+"""Online calibration of odometry by recursive least squares.
 
-A wrong wheel radius is one constant of the whole run. Left unmodelled, part of it leaks into the
-heading whenever landmarks are handed over to new ones, and the map bends. So after every state the
-motion that the estimate found is compared with what odometry said, and a recursive least-squares
-filter keeps the parameters that explain the difference (thesis 4.8-4.13 has the derivatives, but
-treats the errors as white). The estimate is itself pulled towards odometry, by some per cent; as
-the learned values are used for the next motions, that share vanishes geometrically.
+A wrong wheel radius is one constant of the whole run. Unmodelled, part of the error enters the
+heading whenever new landmarks replace old ones, and the map bends. So after every state the
+estimated motion is compared with the odometry, and a recursive least-squares filter estimates the
+parameters that explain the difference (thesis 4.8-4.13 has the derivatives, but treats the errors
+as white). The estimate is itself biased towards odometry, by some per cent; as the learned values
+are used for the next motions, that bias vanishes geometrically.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,15 +18,16 @@ from graphslam.core.motion_models import HELD_SIGMA, Calibration
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Motion
 
-#: m and rad: what landmarks cannot know better about one motion (stamps, walls that are not flat)
+#: m, m, rad: least sigma of a motion from landmarks (errors of time stamps, walls not flat)
 RELATIVE_SIGMA = (0.02, 0.02, 0.01)
-#: weight of the past per state: remembers about 1/(1 - FORGET) states, so tyres may warm up
-FORGET = 0.995
-#: share of the prior sigma that always remains in a motion's covariance: no constant is constant
-REMAINING = 0.5
-#: squared Mahalanobis distance, 3 dof, beyond which a difference is no calibration error but a
-#: jump of the estimate (a loop closure) or a slip: 99.9 %
-OUTLIER = 16.3
+#: weight of the past per state: the memory is about 1 / (1 - FORGETTING_FACTOR) states, so that
+#: parameters may change slowly (tyres warm up)
+FORGETTING_FACTOR = 0.995
+#: share of the prior sigma that always remains in a motion's covariance, as parameters may change
+MIN_SIGMA_SHARE = 0.5
+#: squared Mahalanobis distance (99.9 %, 3 dof) beyond which a difference is no calibration error
+#: but a jump of the estimate (a loop closure) or a slip
+OUTLIER_D2 = 16.3
 
 
 class Calibrator:
@@ -49,7 +50,8 @@ class Calibrator:
             motion: what odometry said.
             moved: (3,) the same motion according to the estimate, in the frame of its start.
             observed: (3, 3) information about the motion's end that came from landmarks, along the
-                axes of its start. Without any the estimate *is* odometry and teaches nothing.
+                axes of its start. Without any, the estimate equals the odometry and the
+                calibration is not updated.
 
         Returns:
             Mean, and the covariance to be used for coming motions.
@@ -69,19 +71,22 @@ class Calibrator:
         # (noise + observed⁻¹)⁻¹, for an information matrix that may be singular
         W = solve(np.eye(3) + observed @ noise, observed)
         total = noise + D @ self._prior @ D.T
-        if miss @ solve(total, miss) > OUTLIER or not W.any():
+        if miss @ solve(total, miss) > OUTLIER_D2 or not W.any():
             return current
         weighted = D.T @ W
-        # relative to nominal values: what is missing now plus what was already corrected
-        self._info = FORGET * self._info + (1 - FORGET) * self._prior_info + weighted @ D
-        self._vector = FORGET * self._vector + weighted @ (miss + D @ current.mean)
+        # relative to nominal values: the remaining error plus the present correction
+        past = FORGETTING_FACTOR
+        self._info = past * self._info + (1 - past) * self._prior_info + weighted @ D
+        self._vector = past * self._vector + weighted @ (miss + D @ current.mean)
         cov = solve(self._info, np.eye(len(self._info)))
-        return Calibration(current.names, cov @ self._vector, cov + REMAINING**2 * self._prior)
+        return Calibration(
+            current.names, cov @ self._vector, cov + MIN_SIGMA_SHARE**2 * self._prior
+        )
 
     def summary(self) -> dict[str, tuple[float, float, bool]]:
         """The estimate from the data so far, see `to_summary`.
 
-        The sigma is that of the remembered stretch, so it does not shrink for ever.
+        The sigma refers to the memory of the filter, so it has a lower bound.
         """
         if self._prior is None:
             return {}

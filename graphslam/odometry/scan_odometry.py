@@ -1,11 +1,11 @@
-"""What two neighbouring scans say about the motion between them, beside odometry.
+"""Scan matching between consecutive keyframes: detects odometry errors and corrects them.
 
-Wheels slip, counters are unsigned, clocks jump: then odometry is wrong by far more than its
-covariance says, and the lines of the next scan are looked for in the wrong places. So every scan is
-laid on the one before by the motion that odometry tells. Where that does not fit and another motion
-does, odometry is contradicted: its covariance grows by the disagreement, and the scans' motion
-with its own covariance is fused with it. Directions that the scans do not show (along a corridor)
-stay odometry's.
+Wheels slip, counters are unsigned, clocks jump: then the odometry error is far larger than its
+covariance, and the lines of the next scan are searched in the wrong places. So every scan is
+compared with the previous one at the motion of the odometry. If they do not overlap there but do at
+another motion, the covariance of the odometry is inflated by the disagreement, and the motion from
+the scans is fused with it. Along directions that the scans do not determine (a corridor) the
+motion remains that of the odometry.
 """
 
 from collections.abc import Sequence
@@ -19,32 +19,34 @@ from graphslam.core.geometry import Array, rotation, wrap
 from graphslam.core.records import Closure, Motion, Observation
 from graphslam.perception.scan_matching import Submap, align, fit, make_submap, match
 
-#: points of a scan at least, to say anything
-FEWEST = 30
-#: squared Mahalanobis distance, 3 dof: worth a closer look; a contradiction
-LOOK, CONTRADICTED = chi2_quantile([0.9, 0.999], 3)
-#: m, rad: smaller disagreements are left to the landmarks
+#: scans with fewer points are not matched
+MIN_POINTS = 30
+#: squared Mahalanobis distance (90 and 99.9 %, 3 dof) between odometry and scans from which a
+#: motion is searched for, and from which the scans contradict the odometry
+SUSPECT_D2, CONTRADICTION_D2 = chi2_quantile([0.9, 0.999], 3)
+#: m, rad: smaller differences are not corrected here; landmarks correct them
 SMALLEST_M, SMALLEST_RAD = 0.05, 0.03
-#: m, rad: directions in which scans are less sure are left to odometry
-SURE = 0.08
-#: share of points that lie on the scan before: fewer are worth a closer look; at least at another
-#: motion, and so many more than at odometry's
-USUAL, FITS, BETTER = 0.6, 0.5, 0.05
-#: m, rad: window searched beside twice the motion (an unsigned counter reports it reversed)
+#: m, rad: largest sigma of a scan match along a direction in which it is used
+MAX_SIGMA = 0.08
+#: share of points that lie on the previous scan: below the first a motion is searched for; one
+#: that is found needs at least the second, and the third more than at the odometry's motion
+USUAL_OVERLAP, MIN_OVERLAP, MIN_OVERLAP_GAIN = 0.6, 0.5, 0.05
+#: m, m, rad: half the search window beyond twice the motion (the motion reported by an unsigned
+#: counter may be reversed)
 MARGIN = np.array([0.5, 0.5, 0.2])
-#: m: no nearer to a line than this is what lies on no line
-BESIDE_M = 0.1
+#: m: points nearer to an observed line than this belong to it
+LINE_MARGIN_M = 0.1
 
 
 def scan_submap(points: Array, config: ScanMatchingConfig | None = None) -> Submap | None:
     """The points (n, 2) of one scan, in the frame of its state; None where there are few."""
-    if len(points) < FEWEST:
+    if len(points) < MIN_POINTS:
         return None
     return make_submap(np.zeros((1, 3)), [np.asarray(points, dtype=float)], config)
 
 
 def checked_against_scans(motion: Motion, before: Submap, now: Submap) -> Motion:
-    """The motion, or what scans make of it if they contradict it (``matched``).
+    """The motion, corrected by scan matching if the scans contradict it (``matched``).
 
     Args:
         motion: according to odometry.
@@ -52,10 +54,10 @@ def checked_against_scans(motion: Motion, before: Submap, now: Submap) -> Motion
         now: scan of the state where it ends.
     """
     here, step, cov = fit(now, before, motion.delta)
-    if here >= USUAL and mahalanobis_squared(step, motion.cov + cov) < LOOK:
+    if here >= USUAL_OVERLAP and mahalanobis_squared(step, motion.cov + cov) < SUSPECT_D2:
         return motion
     guesses = [align(now, before, motion.delta)]
-    if fit(now, before, guesses[0][0])[0] < max(FITS, here + BETTER):
+    if fit(now, before, guesses[0][0])[0] < max(MIN_OVERLAP, here + MIN_OVERLAP_GAIN):
         window = MARGIN + 2 * np.abs(motion.delta)
         found = match(now, before, motion.delta, window)
         guesses += [(m.pose, m.cov) for m in found]
@@ -66,9 +68,9 @@ def checked_against_scans(motion: Motion, before: Submap, now: Submap) -> Motion
     measured_off = axes.T @ _difference(pose, motion.delta)
     off = axes @ measured_off
     if (
-        there < max(FITS, here + BETTER)
+        there < max(MIN_OVERLAP, here + MIN_OVERLAP_GAIN)
         or (np.hypot(off[0], off[1]) < SMALLEST_M and abs(off[2]) < SMALLEST_RAD)
-        or mahalanobis_squared(off, motion.cov + cov) < CONTRADICTED
+        or mahalanobis_squared(off, motion.cov + cov) < CONTRADICTION_D2
     ):
         return motion
     inflated = replace(motion, cov=motion.cov + np.outer(off, off))
@@ -76,7 +78,7 @@ def checked_against_scans(motion: Motion, before: Submap, now: Submap) -> Motion
 
 
 def fused(motion: Motion, H: Array, R: Array, innovation: Array) -> Motion:
-    """A motion after a measurement of it; calibration errors no longer explain what is left.
+    """A motion updated by a measurement; its error no longer depends on the calibration.
 
     Args:
         motion: the motion.
@@ -97,29 +99,29 @@ def _difference(a: Array, b: Array) -> Array:
 
 
 def _measured_directions(cov: Array) -> tuple[Array, Array]:
-    """Axes (3, k) along which a sigma is below `SURE`, and the variances (k,) along them.
+    """Axes (3, k) along which a sigma is below `MAX_SIGMA`, and the variances (k,) along them.
 
-    The noise of points looks like a little structure, also along a corridor.
+    Without the limit the noise of points would count as structure, even along a corridor.
     """
     variances, axes = np.linalg.eigh(cov)
-    match_off_lines = variances < SURE**2
-    return axes[:, match_off_lines], variances[match_off_lines]
+    measured = variances < MAX_SIGMA**2
+    return axes[:, measured], variances[measured]
 
 
 def match_off_lines(motion: Motion, before: Submap, robot: str, points: Array) -> Closure | None:
-    """A second source of a motion: from points that lie on no line, so nothing counts twice.
+    """A second measurement of a motion, from points on no line, so no information counts twice.
 
     Args:
         motion: according to odometry, where the search begins.
         before: scan of the state where it starts, in that state's frame.
-        robot: whose.
+        robot: its name.
         points: (n, 2) of the scan where it ends, in that state's frame, see `points_off_lines`.
     """
     source = scan_submap(points, before.config)
     if source is None:
         return None
     pose, cov = align(source, before, motion.delta)
-    if mahalanobis_squared(_difference(pose, motion.delta), motion.cov + cov) > CONTRADICTED:
+    if mahalanobis_squared(_difference(pose, motion.delta), motion.cov + cov) > CONTRADICTION_D2:
         return None
     return Closure(robot, motion.end_ns, robot, motion.start_ns, pose, cov)
 
@@ -132,6 +134,6 @@ def points_off_lines(points: Array, seen: Sequence[Observation]) -> Array:
             continue
         back = rotation(-float(o.z[2]))
         x, y = back @ (points - o.z[:2]).T
-        near = (x > o.extent[0] - BESIDE_M) & (x < o.extent[1] + BESIDE_M)
-        free &= ~(near & (np.abs(y) < BESIDE_M))
+        near = (x > o.extent[0] - LINE_MARGIN_M) & (x < o.extent[1] + LINE_MARGIN_M)
+        free &= ~(near & (np.abs(y) < LINE_MARGIN_M))
     return points[free]

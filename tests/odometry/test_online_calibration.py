@@ -12,10 +12,10 @@ from graphslam.core.motion_models import wheel_twist
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, OdometryIncrement, OdometryPose, WheelAngles
 from graphslam.odometry.online_calibration import (
-    FORGET,
-    OUTLIER,
+    FORGETTING_FACTOR,
+    MIN_SIGMA_SHARE,
+    OUTLIER_D2,
     RELATIVE_SIGMA,
-    REMAINING,
     Calibrator,
     observed_information,
 )
@@ -185,7 +185,7 @@ def test_a_jump_of_the_estimate_teaches_nothing(jump):
 
 def test_the_gate_of_jumps_is_chi_square():
     """Three degrees of freedom, 99.9 %."""
-    assert chi2.sf(OUTLIER, 3) == pytest.approx(1e-3, rel=0.02)
+    assert chi2.sf(OUTLIER_D2, 3) == pytest.approx(1e-3, rel=0.02)
 
 
 def test_headings_are_compared_the_short_way_round():
@@ -240,9 +240,9 @@ def test_what_was_learned_is_not_forgotten_below_the_prior():
 
 
 def test_tyres_may_warm_up():
-    """The scale changes by 2 % half way: after 3 / (1 - FORGET) states 5 % of the old one is left,
-    and the prior takes 4 %."""
-    n = round(3 / (1 - FORGET)) * STATE_NS // PERIOD_NS + 100
+    """The scale changes by 2 % half way: after 3 / (1 - FORGETTING_FACTOR) states 5 % of the old
+    one is left, and the prior takes 4 %."""
+    n = round(3 / (1 - FORGETTING_FACTOR)) * STATE_NS // PERIOD_NS + 100
     cold = Drive(weaving(n, np.random.default_rng(6)), NOTHING, CENTRED, mounted=False)
     cold.learn()
     warm_scales = NOTHING | {"translation_scale": 0.02}
@@ -258,7 +258,7 @@ def test_coming_motions_stay_uncertain():
     found = drive.learn()
     used = np.sqrt(np.diag(drive.track.calibration.cov))
     for sigma, (_, known, _), prior in zip(used, found.values(), PRIOR.values(), strict=True):
-        assert sigma == pytest.approx(np.hypot(known, REMAINING * prior), rel=1e-9)
+        assert sigma == pytest.approx(np.hypot(known, MIN_SIGMA_SHARE * prior), rel=1e-9)
 
 
 # ------------------------------------------------------------ what landmarks show of a motion
