@@ -37,7 +37,7 @@ _BULK = 0.8
 #: the tails (corners, curves, edges) are wider than those of a normal distribution fitted to the
 #: bulk by this factor (1.05 +- 0.02 at 1 % and 0.1 %, over seeds of visits without changes)
 _TAILS = 1.05
-#: least sigma of the null distribution that is believed, and fewest scores to estimate it from
+#: lower bound on the estimated sigma of the null distribution, and least number of scores for it
 _MIN_SIGMA, _MIN_SCORES = 0.86, 100
 #: beams traced at a time, which bounds the memory
 _CHUNK = 400_000
@@ -158,7 +158,7 @@ def _crossings(
     grid = surface.nearest.grid
     behind = (visit.range_m[beam] - reach) * np.abs(cosine)
     hit = np.nonzero(steep & (reach > 0) & (aside < 0.75 * grid.cell_m) & (behind > gate_m))[0]
-    # the surface goes on to both sides
+    # the surface continues on both sides
     P = visit.covs[scan[hit]]
     sideways = P[:, 0, 0] + P[:, 1, 1] + P[:, 2, 2] * reach[hit] ** 2
     margin = _INSIDE_SIGMAS * np.sqrt(sideways) + half_beam_spacing(visit) * reach[hit]

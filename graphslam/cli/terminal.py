@@ -27,7 +27,7 @@ def errors_in_one_line(debug: bool) -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         raise typer.Exit(INTERRUPTED) from None
-    except (typer.Exit, BrokenPipeError):  # nobody reads the output any more
+    except (typer.Exit, BrokenPipeError):  # the output is no longer read
         raise
     except Exception as error:
         if debug:

@@ -199,10 +199,10 @@ class MultiRobotConfig:
     sampling_m: a robot is looked for in scans, and a sighting of it is used, once it or its
     observer moved this far since the last time. min_detections: a robot found by its motion in
     scans needs so many detections. min_path_residual_m: root mean square distance of its path
-    there from a straight one at constant speed, which anybody might drive. place_cell_m: cells of
+    there from a straight one at constant speed, which is not distinctive. place_cell_m: cells of
     the grid on which a submap is searched for in the map of another robot; of free space, only what
     is nearer to the laser than place_range_m counts. min_place_extent_m: submaps that two robots
-    have in common must extend over more than this in both maps, since rooms are alike.
+    have in common must extend over more than this in both maps, since rooms look alike.
     """
 
     sampling_m: float = 0.1

@@ -256,7 +256,7 @@ def _check_range(key: str, value: float) -> None:
 #: settings that may be infinite
 _INFINITE = {"backend.horizon_s"}
 
-#: settings that divide, or weld states together, at 0
+#: settings that would be a divisor of 0, or make a covariance singular
 _NOT_ZERO = {
     "scale",
     "split_m",

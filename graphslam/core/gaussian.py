@@ -1,4 +1,4 @@
-"""Kalman filtering on arrays: linear updates, and a joint Gaussian whose members come and go.
+"""Linear Kalman updates, and a joint Gaussian with blocks that can be added and removed.
 
 `move_block` and `update` are the linear filter (thesis 3.1-3.8) on plain arrays. An extended filter
 (`graphslam.estimation.ekf`) keeps a `JointGaussian`: the same algebra where a measurement touches

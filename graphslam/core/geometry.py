@@ -51,7 +51,7 @@ def rotation3(angle_rad: ArrayLike) -> Array:
 def compose(a: Array, b: Array) -> Array:
     """``a`` followed by ``b`` given in the frame of ``a``: poses ``(..., 3)``, thesis eq. 4.4."""
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
-    if a.ndim == b.ndim == 1:  # one pose: most calls, and arrays of three numbers are dear
+    if a.ndim == b.ndim == 1:  # one pose: most calls, and operations on small arrays are slow
         (ax, ay, at), (bx, by, bt) = a.tolist(), b.tolist()
         cos, sin = math.cos(at), math.sin(at)
         return np.array([ax + cos * bx - sin * by, ay + sin * bx + cos * by, _wrap(at + bt)])

@@ -127,7 +127,7 @@ class TrueLandmark(Message):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrueAssociations(Message):
-    """What the beams of a scan, or the sightings of one stamp, truly met.
+    """True targets of the beams of a scan, or of the sightings of one stamp.
 
     ``targets`` (n,) are places in ``names`` (landmarks' identities, robots' names), -1 for nothing.
     """
@@ -226,8 +226,8 @@ class Start:
 class Closure:
     """Pose (3,) of state (robot, time) in the frame of state (other, other_time), with cov.
 
-    ``verified``: it was held against all that is known, so no robust kernel belongs on it.
-    ``images``: of how many it was made; where it contradicts what was seen it counts like so many.
+    ``verified``: its consistency with all other data was tested, so it gets no robust kernel.
+    ``images``: number of images it was made of; it has their weight against other observations.
     """
 
     robot: str

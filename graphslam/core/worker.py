@@ -1,9 +1,9 @@
-"""Work in a second process, while this one goes on.
+"""Concurrent work in a second process.
 
-The second process is a fork: it begins with everything there is here, uncopied, and only what it
-makes is sent back. A fork must be the program's own decision, and its only thread must be this one,
-so nothing forks before `allow`; else, and wherever there is nothing to gain, the same work is done
-here. Nor is anything lost when the second process dies: the rest is made here.
+The second process is a fork: it shares this process' memory (copy on write), and only its results
+are sent back. Only a program that has a single thread may fork, so nothing forks before
+`allow_fork`. Otherwise, and where nothing would be gained, the same work is done in this process.
+If the second process dies, the remaining work is done here.
 """
 
 import gc
@@ -42,11 +42,11 @@ def can_fork() -> bool:
 
 
 class Prefetch(Generic[_T]):
-    """What an iterator yields, made ahead of the one who takes it, as far as a pipe is long.
+    """The items of an iterator, computed ahead of the consumer as far as the pipe has room.
 
-    To be iterated over once. ``make`` is called again where the second process came to an end
-    before its work did, also because of an error, which is then raised here. ``forked``: whether
-    there is a second process.
+    To be iterated over once. ``make`` is called again if the second process ended before its work
+    was complete, also because of an error, which is then raised here. ``forked``: whether there is
+    a second process.
     """
 
     def __init__(self, make: Callable[[], Iterator[_T]]) -> None:
@@ -58,7 +58,7 @@ class Prefetch(Generic[_T]):
         self._source, sink = os.pipe()
         try:
             self._pid = os.fork()
-        except OSError:  # no memory, or no process, to be had
+        except OSError:  # no memory or no process available
             os.close(self._source)
             os.close(sink)
             return False
@@ -69,7 +69,7 @@ class Prefetch(Generic[_T]):
         try:
             os.close(self._source)
             allow_fork(second=False)
-            gc.freeze()  # or looking for cycles would copy what is shared
+            gc.freeze()  # else the search for cycles would copy shared memory
             with os.fdopen(sink, "wb") as stream:
                 items = self._make()
                 while batch := list(islice(items, BATCH)):
@@ -77,7 +77,7 @@ class Prefetch(Generic[_T]):
                 pickle.dump([], stream)
             done = 0
         finally:
-            os._exit(done)  # nothing of the program that was forked may run on here
+            os._exit(done)  # nothing else of the forked program may run here
 
     def __iter__(self) -> Iterator[_T]:
         """The items."""
@@ -90,7 +90,7 @@ class Prefetch(Generic[_T]):
                         taken += len(batch)
                 return
             except (EOFError, pickle.UnpicklingError):
-                pass  # it came to an end too early
+                pass  # it ended before its work was complete
             finally:
                 os.kill(self._pid, signal.SIGKILL)
                 os.waitpid(self._pid, 0)
@@ -98,11 +98,11 @@ class Prefetch(Generic[_T]):
 
 
 class Future(Generic[_T]):
-    """A task that is begun, and its result; ``done`` where there is nothing to wait for.
+    """A task running in a second process; ``done``: its result is available.
 
-    Where there is no second process it is done at once, so that it always finds things as they
-    are when it begins; only if that process dies is it done by `result`, and finds them as they
-    are then. Its result must be picklable.
+    Without a second process the task runs at once, so that it always uses the state of the program
+    at its start; only if that process dies does it run in `result`, with the state at that time.
+    Its result must be picklable.
     """
 
     def __init__(self, task: Callable[[], _T]) -> None:
@@ -113,7 +113,7 @@ class Future(Generic[_T]):
             self._result = next(iter(self._made))
 
     def result(self) -> _T:
-        """What it returned; raises what it raised."""
+        """The task's return value; raises its exception."""
         if not self.done:
             (self._result,) = self._made
             self.done = True
@@ -123,9 +123,9 @@ class Future(Generic[_T]):
 def parallel_map(
     function: Callable[[_S], _T], arguments: Sequence[_S], *, fewest: int = 2
 ) -> list[_T]:
-    """Results of a function for each argument, every other one found by a second process.
+    """Results of a function for each argument, every other one from a second process.
 
-    ``fewest`` arguments are worth one.
+    With less than ``fewest`` arguments there is no second process.
     """
     if len(arguments) < fewest or not can_fork():
         return [function(a) for a in arguments]

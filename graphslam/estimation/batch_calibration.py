@@ -29,7 +29,7 @@ def calibrate(
 ) -> tuple[Estimate, tuple[Step, ...]]:
     """Solve for states, landmarks and calibrations together, `ROUNDS` times.
 
-    ``rebuild`` computes the steps anew in every round, the first by ``estimate``. The calibration
+    ``rebuild`` computes the steps again in every round, the first by ``estimate``. The calibration
     of ``tracks`` is set to the one found. Returns the estimate and the steps behind it.
 
     Raises:

@@ -235,7 +235,7 @@ class DecentralisedBackend(GraphBackend):
             # a landmark of other robots, of which this one has no message yet
             _, target, seen = group.observed
             new[target] = MODELS[seen.model].invert(seen.z, self.value(key, 3))
-            if seen.model == "line":  # until then it needs a gauge of its own
+            if seen.model == "line":  # until then its gauge must be fixed here
                 robot.add([factors.line_gauge_factor(key, target, seen)], {})
         robot.add(group.factors, new)
         if late:

@@ -128,7 +128,7 @@ class LandmarkMap:
     def follow(self, steps: Sequence[Step], estimate: Estimate) -> None:
         """Move to an estimate of the steps; landmarks without observations leave the map.
 
-        Extents of lines are computed anew from what was observed of them, by the latest estimate:
+        Extents of lines are computed again from their observations with the latest estimate:
         closing a loop may move a wall by metres.
         """
         for number, entry in list(self.entries.items()):

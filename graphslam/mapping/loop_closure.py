@@ -1,10 +1,10 @@
-"""Loop closure: places seen again are found and verified by matching submaps.
+"""Loop closure: revisited places are found and verified by matching submaps.
 
-Where two submaps may show one place, as far as the estimate can tell, the later one is searched for
-in the earlier (`scan_matching`). A match is verified if most of what either submap saw is confirmed
-by the other, little of it is looked through, its position is certain in every direction, and no
-second match in the window is nearly as good. Of all verified closures the largest consistent set is
-used, under the joint covariance of the estimate: J. Mangelson et al., ICRA 2018, DOI
+Where two submaps may overlap according to the estimate, the later one is searched for in the
+earlier (`scan_matching`). A match is verified if most points of either submap are confirmed by the
+other, few points lie in the other's free space, its position has a small sigma in every direction,
+and no second match in the window is nearly as good. Of all verified closures the largest consistent
+set is used, under the joint covariance of the estimate: J. Mangelson et al., ICRA 2018, DOI
 10.1109/ICRA.2018.8460217, who judge pairwise consistency by odometry.
 """
 
@@ -28,7 +28,7 @@ NEAR_M = 3.0
 SIGMAS, MARGIN = 3.0, np.array([0.6, 0.6, 0.08])
 #: pairs of submaps from which on a second process is used to match them
 MANY = 16
-#: verified: shares of points that are confirmed at least, and looked through at most, of both
+#: verified: least share of points confirmed, largest share in free space, of both submaps
 MIN_CONFIRMED, MAX_SEEN_THROUGH = 0.4, 0.15
 #: share of points on others in a coarse search below which `MIN_CONFIRMED` is out of reach, so that
 #: it is not refined. Of 167 searches in Intel, 64 end here; the largest share confirmed in any of

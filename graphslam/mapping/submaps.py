@@ -25,7 +25,7 @@ SCAN_M, SCAN_RAD = 0.5, 0.4
 MIN_POINTS = 20
 #: submaps of a robot's path, at most; a longer path has them farther apart
 MAX_SUBMAPS = 400
-#: m, m, rad per root of a metre: drift of an estimate that its covariance does not know of
+#: m, m, rad per root of a metre: unmodelled drift of an estimate
 DRIFT = np.array([0.02, 0.02, 0.01])
 
 #: state of a robot: its name and time

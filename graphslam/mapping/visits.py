@@ -1,8 +1,8 @@
-"""Landmarks split by visit before loop closure, and joined again after it.
+"""Landmarks are split by visit before loop closure and merged again after it.
 
-Associations made while little was known may be wrong: one of two parallel walls is taken for the
-other, and the whole map follows. So loops are closed with separate landmarks for every visit.
-Afterwards the landmarks that were one become one again where the solved estimate has them together.
+Associations made with a large uncertainty may be wrong: one of two parallel walls is taken for the
+other, which distorts the whole map. So loops are closed with separate landmarks for every visit.
+Afterwards the parts of a landmark are merged again where their estimates agree.
 """
 
 from collections.abc import Mapping, Sequence

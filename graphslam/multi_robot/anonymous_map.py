@@ -1,6 +1,6 @@
-"""Relative poses of robots from what has no identity: places and points in the maps of both.
+"""Relative poses of robots from places and points without identity in the maps of both.
 
-Used only between robots that nothing with an identity relates.
+Used only between robots that no observation with an identity relates.
 """
 
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ from graphslam.multi_robot.relative_frames import RelativeFrame
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AnonymousMap:
-    """What one robot saw that has no identity, in the frame in which it began.
+    """Observations of one robot without identity, in the frame of its start.
 
     ``places``: its submaps; ``points``: means (m, 2), covariances (m, 2, 2).
     """
@@ -32,7 +32,7 @@ def relate_anonymous_maps(
 
     Args:
         maps: of each robot by itself.
-        frames: robot -> its frame, by all that has an identity.
+        frames: robot -> its frame, from all observations with an identity.
         config: settings.
     """
     relations: list[RelativeFrame] = []

@@ -1,7 +1,7 @@
 """Start poses and frames of robots whose start is unknown, from relative poses of two at a time.
 
 1. A robot is placed relative to placed robots, by all relations to them that agree.
-2. What nothing relates to a placed robot gets a frame of its own.
+2. Robots without relation to a placed robot get a separate frame.
 """
 
 from collections import defaultdict

@@ -1,4 +1,4 @@
-"""Identities that were exchanged: two codes swapped in the table of who bears which.
+"""Swapped identities: two codes interchanged in the table of identities.
 
 A camera recognises a subject by its code, so a mistake in that table is consistent: every sighting
 of either of two robots, or of a robot and a landmark, has the other's identity. It shows in where

@@ -171,7 +171,7 @@ def _select_transforms(tried: Array, p: Array, v: Array, q: Array, w: Array) -> 
 def _refine(
     start: Array, p: Array, v: Array, q: Array, w: Array, tree: cKDTree, tried: int
 ) -> _Fit | None:
-    """A transform fitted to the points that it matches, matched anew in each round.
+    """A transform fitted to the points that it matches; these are matched again in each round.
 
     ``tree`` is of the points ``p``, ``tried`` the number of all transforms.
     """

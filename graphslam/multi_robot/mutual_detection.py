@@ -8,9 +8,9 @@ After every robot has been estimated by itself, for each observer and each robot
    contradict the hypothesis.
 2. The start and the offset of the robot's clock follow from all its detections
    (`track_registration`).
-3. It is accepted with many detections, hardly contradicted, of a motion that is its own (not
-   straight at constant speed, as anybody's), if no other hypothesis has half as much support, and
-   if the detections are not as well those of another robot.
+3. It is accepted if it has many detections and hardly any contradictions, if its motion is
+   distinctive (not straight at constant speed), if no other hypothesis has half as much support,
+   and if its detections do not fit another robot as well.
 
 False detections: in ten minutes of a real building with people in it, searched for robots of three
 outlines that were never there, the best hypothesis had 7 detections; `multi_robot.min_detections`

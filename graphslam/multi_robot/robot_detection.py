@@ -1,11 +1,9 @@
 """Detection of robots in each other's scans, where the joint estimate expects them.
 
-Robots of unknown start are found by `mutual_detection` instead.
-
-A detection becomes a `Sighting`, as if a camera had made it. Its returns are removed from the scan,
-so that no landmark is made of them. A cluster is the robot if it has the outline's shape, lies
-within the gate of the expected pose, and no other does. Returns of unknown dynamic objects are
-removed too. Robots of unknown start are detected by `mutual_detection`.
+A detection becomes a `Sighting`, like one of a camera. Its returns are removed from the scan, so
+that they create no landmark. A cluster is accepted as the robot if it has the outline's shape and
+is the only one within the gate of the expected pose. Returns of unknown dynamic objects are removed
+too. Robots of unknown start are detected by `mutual_detection`.
 """
 
 from collections import Counter, defaultdict, deque
@@ -60,7 +58,7 @@ MAX_POSITION_SIGMA_M = 0.3
 SAMPLING_RAD = 0.1
 #: ns: half the span over which a robot's velocity is taken
 HALF_SPAN_NS = 300_000_000
-#: number of earlier scans in which dynamic objects may have been looked through
+#: number of earlier scans that may show free space at a dynamic object
 COMPARED_SCANS = 4
 #: number of scans that are kept, and ns between them where the observer stands
 KEPT_SCANS, KEPT_INTERVAL_NS = 8, 1_000_000_000

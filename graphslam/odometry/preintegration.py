@@ -166,9 +166,9 @@ class Track(Readings):
         return np.asarray((start_ns - late < self.first_ns) | (end_ns - late > self.last_ns))
 
     def uncovered_bound(self, start_ns: int, end_ns: int) -> Array:
-        """Bound (3,) on the part of a motion that no readings cover, at the speed next to it.
+        """Bound (3,) on the part of a motion without readings, at the speed next to it.
 
-        `motion` takes the robot to stand there; by so much it may be wrong.
+        `motion` assumes that the robot stands there; this is its possible error.
         """
         if not self.is_uncovered(start_ns, end_ns):
             return np.zeros(3)
@@ -279,7 +279,7 @@ class Track(Readings):
         return replace(part, delta=delta)
 
     def floor_cov_of(self, moved: bool) -> Array:
-        """Covariance (3, 3) added once per interval; never zero, or two states would be welded."""
+        """Covariance (3, 3) added once per interval; never zero, as it is inverted."""
         if not moved:
             return np.diag([STANDING_SIGMA**2] * 3)
         return np.diag([self._config.floor_sigma_m**2] * 2 + [self._config.floor_sigma_rad**2])

@@ -94,7 +94,7 @@ class Readings:
 
     @property
     def has_burst_stamps(self) -> bool:
-        """Whether many readings were stamped in bursts: then a shift of time means nothing."""
+        """Whether many readings were stamped in bursts: then latency cannot be estimated."""
         self._integrate_pending()
         return self._bursts > MAX_BURST_SHARE * self._count
 
@@ -310,7 +310,7 @@ def _integrate(group: Sequence[Readings]) -> None:
         """Sums (n, ...) of each robot's own, from what it had ``before`` (m, ...)."""
         sums = np.cumsum(each, axis=0)
         others = np.concatenate([np.zeros((1, *each.shape[1:])), sums[firsts[1:] - 1]])
-        # the difference first: who stands has exactly what it had
+        # the difference first: the sums of a robot at rest stay exactly the same
         return np.asarray((sums - others[of]) + before[of])
 
     last = [one._settled - 1 for one in group]
@@ -336,9 +336,8 @@ def _integrate(group: Sequence[Readings]) -> None:
 def _rows(group: Sequence[Readings], firsts: IntArray, apart_ns: IntArray) -> Array:
     """Rows (n, k) of fresh readings of one kind that follow each robot's last one.
 
-    A pose that is no continuation of the one before tells that the odometry was set anew: it is
-    faster than any robot over an interval that is no burst. The motion in it is unknown; the
-    robot is taken to have gone on as before.
+    A jump of the pose, faster than any robot over an interval that is no burst, is a reset of the
+    odometry. Its motion is unknown and is replaced by that at the previous speed.
 
     Args:
         group: the robots' readings.

@@ -17,7 +17,7 @@ from graphslam.perception.robot_outlines import free_standing_clusters
 WIDEST_M = 1.5
 #: m: space is free if an earlier beam went so much farther
 BEHIND_M = 0.4
-#: m: an earlier beam that ended so near to an object met the same one
+#: m: an earlier beam that ended so near to an object hit the same one
 SAME_M = 0.1
 #: share of its returns for which that holds at least; fewest returns of an object
 MIN_SHARE, MIN_RETURNS = 0.8, 3

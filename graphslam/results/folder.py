@@ -64,7 +64,7 @@ def check_target(
     Args:
         directory: the folder to be written.
         force: replace an existing one.
-        replaceable: tells of an existing folder whether ``force`` may replace it; default: result
+        replaceable: whether, of an existing folder, ``force`` may replace it; default: result
             folders. An empty folder is always replaced.
 
     Raises:

@@ -29,7 +29,7 @@ MAX_CLOCK_PASSES = 4
 
 
 class Findings(NamedTuple):
-    """What a pass tells besides its estimate.
+    """Results of a pass besides its estimate.
 
     ``swapped``: false identity -> right one, of identities that were swapped; ``clocks``: the
     robots' clocks as their sightings of each other show them; ``causal``: causal trajectories.
@@ -109,7 +109,7 @@ def decide_next_pass(
 
 
 def run_pass(pipeline: Pipeline, progress: Progress) -> Pipeline:
-    """The pipeline after its log went by.
+    """The pipeline after it has processed its log.
 
     Raises:
         LogError: no message of the log could be used.
@@ -123,7 +123,7 @@ def run_pass(pipeline: Pipeline, progress: Progress) -> Pipeline:
 
 
 def current_estimate(pipeline: Pipeline) -> tuple[Estimate, bool]:
-    """What the back end has after a pass, and whether that is only where `reoptimise` begins."""
+    """The back end's estimate after a pass, and whether it is only the start of `reoptimise`."""
     backend, settings = pipeline.backend, pipeline.config.backend
     if isinstance(backend, Isam2Backend) and settings.optimise_at_end and settings.reoptimise:
         return backend.current_estimate(), True
@@ -161,7 +161,7 @@ def reoptimise(pipeline: Pipeline, estimate: Estimate) -> Estimate:
 
 
 def find(pipeline: Pipeline, estimate: Estimate) -> Findings:
-    """What a pass tells besides its estimate; a rough estimate is good enough for it."""
+    """Results of a pass besides its estimate; an estimate that is not optimised is enough."""
     frames = pipeline.frames
     started = pipeline.started
     causal = {

@@ -112,7 +112,7 @@ class Pipeline(StepRecorder):
             self.dropped,
             tuple(self.robot_detector.outlines),
         )
-        # one robot has nobody to share a step with, and a scan makes its own
+        # a single robot shares no step with others, and every scan makes a step of its own
         alone = len(tracks) < 2 or any(map(self.log.has_scans, tracks))
         alone |= self.config.keyframe.mode == "all"
         span_ns = 0 if alone else round(1e9 * self.config.keyframe.sighting_window_s)
@@ -264,7 +264,7 @@ class Pipeline(StepRecorder):
 
         Returns:
             The motion, from the scans where these contradict odometry; and, if scan matching is on,
-            a second source of it.
+            a second, independent measurement of it.
         """
         run = self.runs[scan.robot]
         points = scan_points(scan, self.config.front_end.max_range_m)

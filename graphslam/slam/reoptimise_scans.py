@@ -240,8 +240,8 @@ def _with_observed_motion_noise(
 ) -> tuple[tuple[Step, ...], Estimate]:
     """Steps with motions as noisy as the log shows them, and the estimate from them.
 
-    Motions that are believed too much keep an estimate from showing how noisy they are, so their
-    noise is estimated again until it grows no more.
+    Motions with too small a covariance hide their own errors in the estimate, so their noise is
+    estimated again until it no longer grows.
     """
     scaled, scales = steps, {robot: np.ones(3) for robot in estimate.states}
     for _ in range(MAX_NOISE_ROUNDS):

@@ -1,6 +1,6 @@
 """A whole log of sightings solved again: calibration, noise and all states together.
 
-Motions and sightings are computed anew with the calibration found so far, and everything is solved
+Motions and sightings are computed again with the current calibration, and everything is solved
 together. What the residuals say about the noise of each robot's motions and sightings is used in
 the last round.
 """

@@ -27,7 +27,7 @@ def smooth(
     progress: Progress = lambda _count: None,
     tamper: Tamper | None = None,
 ) -> Result:
-    """Estimate everything that a log tells: the main job.
+    """Estimate trajectories, landmarks and calibration from a log: the main function.
 
     Args:
         log: opened logs.

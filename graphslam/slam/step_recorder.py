@@ -28,7 +28,7 @@ class PriorKnowledge:
     """What is known before a log is read: what was given, and what earlier passes found.
 
     ``joined``: start poses and frames of the robots. ``recorded``: which relative poses of the log
-    are believed. ``identities``: false identity -> right one, of what is sighted. ``clocks``: of
+    are accepted. ``identities``: false identity -> right one, of what is sighted. ``clocks``: of
     robots whose clock is not that of the first.
     """
 
@@ -50,7 +50,7 @@ class StepRecorder:
     """The back end, the landmark map and the robots of one pass; all change step by step."""
 
     def __init__(self, log: LogSet, config: Config, known: PriorKnowledge) -> None:
-        """No state yet; what the log notes of keyframes counts where ``config`` has defaults."""
+        """Without states; keyframe settings noted in the log replace defaults of ``config``."""
         self.given_config = config
         config = replace(config, keyframe=noted(config.keyframe, "keyframe", log.notes))
         self.log, self.config, self.known = log, config, known
