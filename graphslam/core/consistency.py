@@ -1,6 +1,6 @@
 """Which of many hypotheses agree: maximal consistent sets, leave-one-out tests, rivals, fits.
 
-Hypotheses are judged in pairs first; the largest set that agrees in pairs is looked for greedily
+Hypotheses are judged in pairs first; the largest set that agrees in pairs is searched for greedily
 (J. Mangelson et al., Pairwise consistent measurement set maximization, ICRA 2018, DOI
 10.1109/ICRA.2018.8460217), and members that all the others contradict leave it.
 """

@@ -17,13 +17,13 @@ def grow_frame_forest(
     origin: Place,
     next_edge: Callable[[Mapping[str, Place]], tuple[str, str, Place] | None],
 ) -> tuple[dict[str, Place], dict[str, str]]:
-    """Place every robot: along the best relation to a placed robot, else in a frame of its own.
+    """Place every robot: along the best relation to a placed robot, else in a separate frame.
 
     Args:
         robots: all of them; where no relation is left, the next in this order begins a frame.
         starts: where robots are whose start is known, all in frame ``world``.
         world: name of their frame.
-        origin: where a robot is in a frame of its own.
+        origin: start pose of a robot in a separate frame.
         next_edge: the best relation to the robots placed so far: the new robot, the placed one, and
             where the new one then is; None if there is none.
 

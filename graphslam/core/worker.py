@@ -34,9 +34,9 @@ def allow_fork(*, second: bool = True) -> None:
 
 
 def can_fork() -> bool:
-    """Whether work begun now is done in a second process.
+    """Whether work started now would run in a second process.
 
-    Not where a library runs threads of its own: a fork has none of them, but all of their locks.
+    Not where a library runs threads of its own: a fork has their locks but not these threads.
     """
     return _allowed.get() and THREADS.is_dir() and sum(1 for _ in THREADS.iterdir()) == 1
 

@@ -66,7 +66,7 @@ NOTHING_RECORDED = Verified({}, frozenset(), {}, {})
 
 
 def own_frame() -> Start:
-    """Start of a robot in a frame of its own."""
+    """Start of a robot in a separate frame."""
     return Start(np.zeros(3), ORIGIN)
 
 
@@ -228,7 +228,7 @@ def _initial_starts(
     """Initial start poses of robots that have none, and the frame of each robot.
 
     The largest set that connects a robot without a start to one with a start is followed first; if
-    there is none, the next robot begins a frame of its own.
+    there is none, the next robot begins a separate frame.
     """
     edges = sorted(
         ((a, b) for a, b in sets if a != b and (a, b) in clear), key=lambda p: -len(sets[p])

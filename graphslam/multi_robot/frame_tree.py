@@ -30,7 +30,7 @@ class FrameAssignment:
     """Start pose of every robot, and its frame, named after the robot that begins at its origin.
 
     ``world`` is the frame of the world. ``found``: robot -> the relation by which it was placed.
-    ``undecided``: robot -> why it has a frame of its own although it shares observations with
+    ``undecided``: robot -> why it has a separate frame although it shares observations with
     others.
     """
 
@@ -48,7 +48,7 @@ class FrameAssignment:
 
     @classmethod
     def separate_frames(cls, robots: Iterable[str], origin: Start) -> "FrameAssignment":
-        """Every robot at the ``origin`` of a frame of its own."""
+        """Every robot at the ``origin`` of a separate frame."""
         frames = {robot: robot for robot in robots}
         return cls(dict.fromkeys(frames, origin), frames, min(frames, default=""))
 
@@ -88,7 +88,7 @@ def build_frame_tree(
         sightings: all sightings of robots by robots.
         starts: of the robots whose start is known, at least one.
         config: settings.
-        origin: start of a robot in a frame of its own.
+        origin: start of a robot in a separate frame.
         more: relations that were found in other ways.
         doubts: robot -> why those ways do not determine its start.
     """

@@ -71,7 +71,7 @@ HEADING_SIGMA_RAD = 0.1
 
 
 class ScanBuffer:
-    """Scans in which robots are to be looked for when a pass over the log is over.
+    """Scans in which robots are searched for after a pass over the log.
 
     One for every ``sampling_m`` that another robot of known outline drove: a robot that stands adds
     nothing.

@@ -1,6 +1,6 @@
 """The relative pose of two robots' frames, from landmarks and sightings that both have in common.
 
-Each robot has been estimated by itself, in a frame of its own. Correspondences are pairs of points
+Each robot has been estimated by itself, in a separate frame. Correspondences are pairs of points
 that are one point: a named landmark in both maps, or a robot where it was seen and where it
 estimated itself to be. A rigid transform keeps distances, so two correspondences agree if their
 points are as far apart in one frame as in the other.

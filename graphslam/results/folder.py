@@ -64,7 +64,7 @@ def check_target(
     Args:
         directory: the folder to be written.
         force: replace an existing one.
-        replaceable: whether, of an existing folder, ``force`` may replace it; default: result
+        replaceable: whether ``force`` may replace a given existing folder; default: result
             folders. An empty folder is always replaced.
 
     Raises:
@@ -101,7 +101,7 @@ def save(
 
     Raises:
         OutputError: the target exists and may not be replaced, a number is not finite, or the
-            disk refuses; nothing is left behind.
+            disk cannot be written; no partial output is left.
     """
     check_target(directory, force=force)
     write_folder(directory, _files(result, report))
@@ -111,7 +111,7 @@ def write_folder(directory: Path, files: Sequence[tuple[str, str]]) -> None:
     """Write files (name, text) as a folder that appears whole or not at all.
 
     Raises:
-        OutputError: the disk refuses; nothing is left behind.
+        OutputError: the disk cannot be written; no partial output is left.
     """
     with atomic_folder(directory) as part:
         for name, text in files:

@@ -1,7 +1,7 @@
 """Start poses of the robots: what is known of a log before its first pass.
 
 Robots whose start is not given are placed relative to others by what they have observed in common.
-That takes a pass over the log in which every robot is estimated in a frame of its own. Afterwards
+That takes a pass over the log in which every robot is estimated in a separate frame. Afterwards
 frames are related by landmarks with an identity, by robots detected in each other's scans, and else
 by scans and points without identities.
 """
@@ -115,7 +115,7 @@ def estimate_start_poses(
 
 
 def separate_estimates(run: Pipeline) -> dict[str, RobotEstimate]:
-    """Every robot's own estimate, after a pass in which each had a frame of its own."""
+    """Every robot's own estimate, after a pass in which each had a separate frame."""
     estimate, entries = run.backend.finish(), run.associator.map.entries
     moved = run.transforms().estimate(estimate)
     frames = run.frames.landmark_frames(entries.values())
