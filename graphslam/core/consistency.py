@@ -18,7 +18,7 @@ from graphslam.core.geometry import Array, transform, wrap
 IntArray = NDArray[np.int64]
 
 #: probability up to which a point or a relative pose still fits what it is compared with
-FIT = 0.9999
+FIT_PROBABILITY = 0.9999
 #: an alternative with more than this share of the best one's support leaves a decision open
 RIVAL_SHARE = 0.5
 #: the same for squared Mahalanobis distances: an alternative at most this much farther off is a
@@ -192,4 +192,4 @@ def fit_rigid_transform(p: Array, q: Array, variance: Array) -> tuple[Array, Arr
 def poses_differ(a: Array, cov_a: Array, b: Array, cov_b: Array) -> bool:
     """Whether two poses (3,) are more apart than their covariances (3, 3) allow."""
     off = np.append(a[:2] - b[:2], wrap(a[2] - b[2]))
-    return bool(mahalanobis_squared(off, cov_a + cov_b) > chi2_quantile(FIT, 3))
+    return bool(mahalanobis_squared(off, cov_a + cov_b) > chi2_quantile(FIT_PROBABILITY, 3))

@@ -163,7 +163,7 @@ class Motion:
     cov: Array
     d_delta_d_calibration: Array
     length_m: float
-    matched: bool = False
+    from_scans: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -237,7 +237,7 @@ class Closure:
     delta: Array
     cov: Array
     verified: bool = False
-    images: int = 1
+    scan_count: int = 1
 
     @property
     def pair(self) -> tuple[tuple[str, int], tuple[str, int]]:

@@ -18,7 +18,7 @@ PAST_CLOSURE = "closure to a past state"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Joint:
+class JointMarginal:
     """Joint marginal of a robot's latest pose, landmarks and other robots' latest poses, in world.
 
     ``pose`` (3,); ``landmarks`` one array (2,) or (3,) each; ``others`` (3,) each. ``cov`` (D, D)
@@ -33,7 +33,7 @@ class Joint:
     others: tuple[Array, ...] = ()
 
     @classmethod
-    def of(cls, means: Sequence[Array], landmarks: int, cov: Array) -> "Joint":
+    def of(cls, means: Sequence[Array], landmarks: int, cov: Array) -> "JointMarginal":
         """From the means of the pose, so many landmarks and others, and their covariance."""
         n, slices = 1 + landmarks, block_slices([len(mean) for mean in means[1:]])
         return cls(means[0], tuple(means[1:n]), cov, slices, tuple(means[n:]))
@@ -65,7 +65,9 @@ class Backend(Protocol):
         """
         ...
 
-    def joint(self, robot: str, landmarks: Sequence[int], others: Sequence[str] = ()) -> Joint:
+    def joint(
+        self, robot: str, landmarks: Sequence[int], others: Sequence[str] = ()
+    ) -> JointMarginal:
         """Joint marginal of the robot's latest pose, landmarks and others, from data so far."""
         ...
 

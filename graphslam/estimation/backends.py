@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 
 from graphslam.core.config import Config
-from graphslam.estimation.backend import Backend, Joint
+from graphslam.estimation.backend import Backend
 from graphslam.estimation.compressed_filter import BatchBackend, CompressedBackend
 from graphslam.estimation.dead_reckoning import DeadReckoningBackend
 from graphslam.estimation.decentralised import DecentralisedBackend
@@ -39,4 +39,4 @@ BACKENDS: dict[str, Callable[[Config], Backend]] = {
     "rbpf": RbpfBackend,
 }
 
-__all__ = ["BACKENDS", "Backend", "Joint"]
+__all__ = ["BACKENDS", "Backend"]

@@ -59,7 +59,7 @@ def recompute_motions(steps: Sequence[Step], tracks: Mapping[str, Track]) -> tup
     """
     motions: list[dict[str, Motion]] = [dict(step.motions) for step in steps]
     for robot, track in tracks.items():
-        own = [made for made in motions if robot in made and not made[robot].matched]
+        own = [made for made in motions if robot in made and not made[robot].from_scans]
         recomputed = _recomputed([made[robot] for made in own], track)
         for made, motion in zip(own, recomputed, strict=True):
             made[robot] = motion

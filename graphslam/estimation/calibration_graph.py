@@ -16,7 +16,7 @@ from graphslam.core.geometry import Array, adjoint, between, inverse, log, rotat
 from graphslam.core.motion_models import HELD_SIGMA, Calibration
 from graphslam.core.records import Estimate, Step
 from graphslam.estimation import factors
-from graphslam.estimation.isam2 import CONVERGED_ERROR_ROUGH, WholeGraph, marginals_of, with_means
+from graphslam.estimation.isam2 import CONVERGED_ERROR_ROUGH, BatchGraph, marginals_of, with_means
 
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
@@ -53,7 +53,7 @@ def solve_calibrated(
     Raises:
         EstimationError: a covariance is not positive definite, or a state is unknown.
     """
-    builder, values = WholeGraph(kernel, defer_lines=True), gtsam.Values()
+    builder, values = BatchGraph(kernel, defer_lines=True), gtsam.Values()
     graph = builder.graph
     keys = {robot: int(gtsam.symbol("c", k)) for k, robot in enumerate(sorted(priors))}
     free = {r: np.flatnonzero(np.diag(c.cov) > HELD_SIGMA**2) for r, c in priors.items()}

@@ -15,7 +15,7 @@ import numpy as np
 from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array
 from graphslam.core.records import Association, Estimate, Step
-from graphslam.estimation.isam2 import WholeGraph
+from graphslam.estimation.isam2 import BatchGraph
 
 #: prior sigmas of the offset, s, and the drift, s/s, which are also the units of the variables: the
 #: offset is practically free, and 100 ppm is more than any crystal drifts
@@ -60,7 +60,7 @@ def clock_errors(
     Raises:
         EstimationError: the estimate is indeterminate.
     """
-    builder, values = WholeGraph.at_estimate(steps, estimate, kernel)
+    builder, values = BatchGraph.at_estimate(steps, estimate, kernel)
     builder.rebuild_lines(values)
     robots = tuple(sorted(prior))
     clock = int(gtsam.symbol("t", 0))

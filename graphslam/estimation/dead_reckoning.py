@@ -10,7 +10,7 @@ from graphslam.core.config import Config
 from graphslam.core.geometry import Array, compose, compose_cov
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Estimate, Step
-from graphslam.estimation.backend import Joint, StateTable, TrajectoryRecorder
+from graphslam.estimation.backend import JointMarginal, StateTable, TrajectoryRecorder
 from graphslam.estimation.input_checks import (
     check_finite,
     check_positive,
@@ -61,13 +61,15 @@ class DeadReckoningBackend:
         """Pose (3,) and covariance (3, 3) of a robot's state."""
         return self._track.poses[robot][number], self._track.covs[robot][number]
 
-    def joint(self, robot: str, landmarks: Sequence[int], others: Sequence[str] = ()) -> Joint:
+    def joint(
+        self, robot: str, landmarks: Sequence[int], others: Sequence[str] = ()
+    ) -> JointMarginal:
         """See `Backend`; poses and landmarks are taken as independent."""
         marginals = [self._state(robot, self._states.latest(robot))]
         marginals += [self._landmarks[i] for i in landmarks]
         marginals += [self._state(other, self._states.latest(other)) for other in others]
         means, covs = zip(*marginals, strict=True)
-        return Joint.of(means, len(landmarks), block_diag(*covs))
+        return JointMarginal.of(means, len(landmarks), block_diag(*covs))
 
     def state_mean(self, robot: str) -> Array:
         """See `Backend`."""

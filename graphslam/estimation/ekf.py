@@ -31,7 +31,7 @@ from graphslam.core.geometry import (
 from graphslam.core.observation_models import MODELS, ObservationModel
 from graphslam.core.records import Association, Motion, Start, Step
 from graphslam.estimation import factors
-from graphslam.estimation.backend import Joint
+from graphslam.estimation.backend import JointMarginal
 from graphslam.estimation.filter_base import (
     FilterBackend,
     Member,
@@ -230,7 +230,9 @@ class EkfBackend(FilterBackend):
             raise unknown_landmark(landmark)
         return self._mean(landmark)
 
-    def joint(self, robot: str, landmarks: Sequence[int], others: Sequence[str] = ()) -> Joint:
+    def joint(
+        self, robot: str, landmarks: Sequence[int], others: Sequence[str] = ()
+    ) -> JointMarginal:
         """See `Backend`.
 
         Raises:
@@ -239,7 +241,7 @@ class EkfBackend(FilterBackend):
         means = [self.state_mean(robot), *self.landmark_means(landmarks)]
         means += [self.state_mean(other) for other in others]
         cov = self._gaussian.marginal([robot, *landmarks, *others])
-        joint = Joint.of(means, len(landmarks), cov)
+        joint = JointMarginal.of(means, len(landmarks), cov)
         for block, mean in zip((slice(0, 3), *joint.slices), means, strict=True):
             T = self._to_world(mean)
             cov[block] = T @ cov[block]

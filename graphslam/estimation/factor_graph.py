@@ -28,7 +28,7 @@ from graphslam.estimation.backend import (
     LATE_EVIDENCE,
     PAST_CLOSURE,
     PAST_OBSERVATION,
-    Joint,
+    JointMarginal,
     StateTable,
     block_slices,
 )
@@ -307,7 +307,7 @@ class GraphBackend(ABC):
 
     def __init__(self, builder: GraphBuilder) -> None:
         self.builder = builder
-        self._joints: dict[str, Joint] = {}  # queried since the last step
+        self._joints: dict[str, JointMarginal] = {}  # queried since the last step
 
     @property
     def skipped(self) -> Counter[str]:
@@ -326,13 +326,15 @@ class GraphBackend(ABC):
             EstimationError: it is indeterminate.
         """
 
-    def joint(self, robot: str, landmarks: Sequence[int], others: Sequence[str] = ()) -> Joint:
+    def joint(
+        self, robot: str, landmarks: Sequence[int], others: Sequence[str] = ()
+    ) -> JointMarginal:
         """See `Backend`; for a pose alone it uses the latest joint since the last step, if any."""
         builder = self.builder
         key = builder.latest_key(robot)
         if robot in self._joints and not landmarks and not others:
             cached = self._joints[robot]
-            return Joint(cached.pose, (), cached.cov[:3, :3], ())
+            return JointMarginal(cached.pose, (), cached.cov[:3, :3], ())
         dims = [builder.landmark_dims[i] for i in landmarks] + [3] * len(others)
         keys = [factors.landmark_key(i) for i in landmarks]
         keys += [builder.latest_key(other) for other in others]
@@ -342,7 +344,7 @@ class GraphBackend(ABC):
         for block, mean in zip((slice(0, 3), *block_slices(dims)), means, strict=True):
             if len(mean) == 3:
                 turn[block, block] = rotation3(mean[2])
-        self._joints[robot] = Joint.of(means, len(landmarks), turn @ cov @ turn.T)
+        self._joints[robot] = JointMarginal.of(means, len(landmarks), turn @ cov @ turn.T)
         return self._joints[robot]
 
     def state_mean(self, robot: str) -> Array:

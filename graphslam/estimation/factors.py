@@ -117,7 +117,7 @@ def closure_factor(
     The kernel's scale grows with the root of the number n of images behind the closure: in its
     tails, where the cost is proportional to the scale squared, it then costs as much as n closures.
     """
-    wide = replace(kernel, scale=kernel.scale * math.sqrt(closure.images))
+    wide = replace(kernel, scale=kernel.scale * math.sqrt(closure.scan_count))
     kernel = NO_KERNEL if closure.verified else wide
     return relative_pose_factor(other_key, key, closure.delta, closure.cov, kernel)
 

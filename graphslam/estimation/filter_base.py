@@ -11,7 +11,7 @@ from graphslam.estimation.backend import (
     LATE_EVIDENCE,
     PAST_CLOSURE,
     PAST_OBSERVATION,
-    Joint,
+    JointMarginal,
     StateTable,
     TrajectoryRecorder,
 )
@@ -74,7 +74,9 @@ class FilterBackend(ABC):
         """Use the step's associations and closures."""
 
     @abstractmethod
-    def joint(self, robot: str, landmarks: Sequence[int], others: Sequence[str] = ()) -> Joint:
+    def joint(
+        self, robot: str, landmarks: Sequence[int], others: Sequence[str] = ()
+    ) -> JointMarginal:
         """See `Backend`."""
 
     @abstractmethod

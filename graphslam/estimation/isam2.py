@@ -35,7 +35,7 @@ PARALLEL_MARGINALS = 500
 NEVER = 1 << 30
 
 
-class WholeGraph(GraphBuilder):
+class BatchGraph(GraphBuilder):
     """Keeps every factor, in ``graph``.
 
     With ``defer_lines`` the factors of lines are missing until `rebuild_lines` makes them, all at
@@ -53,7 +53,7 @@ class WholeGraph(GraphBuilder):
     @classmethod
     def at_estimate(
         cls, steps: Iterable[Step], start: Estimate, kernel: RobustConfig
-    ) -> tuple["WholeGraph", gtsam.Values]:
+    ) -> tuple["BatchGraph", gtsam.Values]:
         """The graph of recorded steps, lines deferred, and its variables' values in ``start``."""
         builder, values = cls(kernel, defer_lines=True), gtsam.Values()
         for step in steps:
@@ -151,9 +151,9 @@ def isam2_tree(
 class Isam2Backend(GraphBackend):
     """Incremental smoothing of all states; see the module's docstring."""
 
-    def __init__(self, config: Config, builder: WholeGraph | None = None) -> None:
+    def __init__(self, config: Config, builder: BatchGraph | None = None) -> None:
         self._config = config
-        self._builder = builder or WholeGraph(config.robust)
+        self._builder = builder or BatchGraph(config.robust)
         super().__init__(self._builder)
         self._factorization = "CHOLESKY"
         self._isam = gtsam.ISAM2(isam2_parameters(config, self._factorization))
@@ -315,7 +315,7 @@ class Reoptimiser(Isam2Backend):
         Raises:
             EstimationError: a covariance is not positive definite and finite.
         """
-        builder, values = WholeGraph.at_estimate(steps, start, config.robust)
+        builder, values = BatchGraph.at_estimate(steps, start, config.robust)
         super().__init__(config, builder)
         self._builder.reserve_lines()
         self._finished = values

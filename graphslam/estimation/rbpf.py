@@ -22,7 +22,7 @@ from graphslam.core.gaussian import update
 from graphslam.core.geometry import Array, compose, compose_jacobians, wrap
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Motion, Start, Step
-from graphslam.estimation.backend import Joint, block_slices
+from graphslam.estimation.backend import JointMarginal, block_slices
 from graphslam.estimation.factors import FILTER_GAUGE_SIGMA_M
 from graphslam.estimation.filter_base import FilterBackend, unknown_landmark, with_sigma_along_line
 from graphslam.estimation.input_checks import describe, errors_at
@@ -217,7 +217,9 @@ class RbpfBackend(FilterBackend):
         """The same value for every particle, (N, ...)."""
         return np.broadcast_to(value, (self._count, *value.shape))
 
-    def joint(self, robot: str, landmarks: Sequence[int], others: Sequence[str] = ()) -> Joint:
+    def joint(
+        self, robot: str, landmarks: Sequence[int], others: Sequence[str] = ()
+    ) -> JointMarginal:
         """See `Backend`.
 
         Within one particle, landmarks are independent of each other and of all latest poses.
@@ -238,7 +240,7 @@ class RbpfBackend(FilterBackend):
         index = np.concatenate([np.r_[self._blocks[name]] for name in robots])
         rows = np.concatenate([np.r_[block] for block in (slice(0, 3), *slices[n:])])
         cov[np.ix_(rows, rows)] += self._within(self._P[:, index[:, None], index])
-        return Joint.of(means, n, 0.5 * (cov + cov.T))
+        return JointMarginal.of(means, n, 0.5 * (cov + cov.T))
 
     def _poses(self, robot: str) -> Array:
         """The robot's latest poses (N, 3)."""

@@ -6,13 +6,13 @@ from typing import Literal
 import numpy as np
 
 from graphslam.core.geometry import Array, between, log, rotation3, wrap
-from graphslam.estimation.backend import Joint
+from graphslam.estimation.backend import JointMarginal
 
 Frame = Literal["body", "world"]
 
 
 def joint_errors(
-    joint: Joint,
+    joint: JointMarginal,
     true_pose: Array,
     true_landmarks: Sequence[Array],
     true_others: Sequence[Array],

@@ -75,7 +75,7 @@ class RecordedSteps:
             robots[name] = SavedRobot(
                 found.final, found.causal, found.scan_final, found.scan_causal
             )
-        moved = self.landmarks.in_worlds(self.worlds.landmarks)
+        moved = self.landmarks.transformed(self.worlds.landmarks)
         landmarks = make_landmarks(moved, estimate)
         return SavedResult(robots, landmarks, {}, config)
 

@@ -15,10 +15,10 @@ from graphslam.core.config import AssociationConfig
 from graphslam.core.gaussian import move_block
 from graphslam.core.geometry import Array, compose, compose_jacobians, rotate_cov
 from graphslam.core.records import Association, Motion, Observation
-from graphslam.estimation.backend import Backend, Joint
+from graphslam.estimation.backend import Backend, JointMarginal
 from graphslam.mapping.gating import (
     BoolArray,
-    Compared,
+    PairDistances,
     Pairs,
     assign,
     candidate_pairs,
@@ -38,7 +38,7 @@ REFRESH_EVERY = 50
 NEAREST_RECENT, NEAREST_OLD = 3, 4
 
 
-def predicted_joint(joint: Joint, motion: Motion | None) -> Joint:
+def predicted_joint(joint: JointMarginal, motion: Motion | None) -> JointMarginal:
     """The joint after the robot moved on: system update of the pose block, thesis 4.4-4.7."""
     if motion is None:
         return joint
@@ -83,10 +83,10 @@ class Candidates:
     place in it.
     """
 
-    joint: Joint
+    joint: JointMarginal
     where: dict[int, int]
     pairs: Pairs
-    compared: Compared
+    compared: PairDistances
     recent: BoolArray
     entries: tuple[Entry, ...]
 
@@ -171,7 +171,7 @@ class Associator:
             np.array([e.id for e in entries] + [e.id for _, e in known], dtype=np.int64),
             pairs.model + tuple(seen[n].kind for n, _ in known),
             np.append(pairs.flipped, np.zeros(len(known), dtype=bool)),
-            np.append(pairs.miss, np.zeros(len(known))),
+            np.append(pairs.rough_distance, np.zeros(len(known))),
         )
         entries += [e for _, e in known]
         recent = np.append(recent, np.ones(len(known), dtype=bool))
@@ -196,9 +196,9 @@ class Associator:
         image: Image,
         pairs: Pairs,
         entries: Sequence[Entry],
-        joint: Joint,
+        joint: JointMarginal,
         where: dict[int, int],
-    ) -> Compared:
+    ) -> PairDistances:
         """Distances of all candidate pairs.
 
         A tentative landmark is known relative to the robot that saw it, so its distance has the
@@ -295,7 +295,7 @@ class Associator:
     ) -> list[Association]:
         """Record an observation, and what enters the graph with it: none, it alone, all so far."""
         robot, time_ns = image.robot, image.time_ns
-        self.map.saw(entry, o, image.predicted, time_ns, robot, image.path_m)
+        self.map.record_observation(entry, o, image.predicted, time_ns, robot, image.path_m)
         seen = Association(
             robot, time_ns, entry.id, model, o.z, o.cov, extent=o.extent, source=o.source
         )
@@ -327,7 +327,7 @@ def _worth_comparing(
         old = np.zeros_like(old)
     for group, limit in ((in_graph & recent, NEAREST_RECENT), (old, NEAREST_OLD)):
         members = np.flatnonzero(group)
-        members = members[np.lexsort((pairs.miss[members], pairs.observation[members]))]
+        members = members[np.lexsort((pairs.rough_distance[members], pairs.observation[members]))]
         rank = np.arange(len(members)) - np.searchsorted(
             pairs.observation[members], pairs.observation[members]
         )
@@ -336,7 +336,7 @@ def _worth_comparing(
 
 
 def _assign_pairs(
-    pairs: Pairs, compared: Compared, gate: Array, which: BoolArray, n: int, method: str
+    pairs: Pairs, compared: PairDistances, gate: Array, which: BoolArray, n: int, method: str
 ) -> dict[int, int]:
     """Observation -> pair among the pairs ``which``.
 

@@ -17,7 +17,7 @@ from graphslam.core.consistency import RIVAL_D2
 from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared, whiten
 from graphslam.core.geometry import Array, between, rotate_cov, wrap
 from graphslam.core.records import Association, Step
-from graphslam.estimation.backend import Joint
+from graphslam.estimation.backend import JointMarginal
 from graphslam.mapping.gating import BoolArray, IntArray
 from graphslam.mapping.landmark_map import Entry, LandmarkMap, retarget
 
@@ -54,7 +54,9 @@ class _Map:
         return bool(self.apart[np.ix_(in_a, in_b)].any())
 
 
-def partners(entries: Sequence[Entry], together: Iterable[frozenset[int]]) -> list[Entry]:
+def possible_duplicates(
+    entries: Sequence[Entry], together: Iterable[frozenset[int]]
+) -> list[Entry]:
     """Landmarks that have another one near enough to be a duplicate.
 
     Only these need a joint covariance. ``together``: pairs that one image showed as two things.
@@ -68,7 +70,7 @@ def partners(entries: Sequence[Entry], together: Iterable[frozenset[int]]) -> li
 
 
 def duplicates(
-    entries: Sequence[Entry], joint: Joint, together: Iterable[frozenset[int]]
+    entries: Sequence[Entry], joint: JointMarginal, together: Iterable[frozenset[int]]
 ) -> list[tuple[int, int]]:
     """Pairs of landmarks that are one, the most certain pair first; the older landmark first.
 
@@ -97,7 +99,7 @@ def duplicates(
     return [(min(pair), max(pair)) for pair in found]
 
 
-def _padded(joint: Joint) -> tuple[Array, Array]:
+def _padded(joint: JointMarginal) -> tuple[Array, Array]:
     """Means (n, 3) and joint covariance (3n, 3n) of landmarks; the heading of points is 0."""
     x = np.zeros((len(joint.landmarks), 3))
     places: list[int] = []

@@ -45,18 +45,22 @@ class Pairs:
     landmark: IntArray
     model: tuple[str, ...]
     flipped: BoolArray
-    miss: Array
+    rough_distance: Array
 
     def only(self, keep: BoolArray) -> "Pairs":
         """The pairs for which ``keep`` (k,) holds."""
         models = tuple(m for m, k in zip(self.model, keep, strict=True) if k)
         return Pairs(
-            self.observation[keep], self.landmark[keep], models, self.flipped[keep], self.miss[keep]
+            self.observation[keep],
+            self.landmark[keep],
+            models,
+            self.flipped[keep],
+            self.rough_distance[keep],
         )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Compared:
+class PairDistances:
     """Squared Mahalanobis distances (k,) of pairs, with what a joint test needs.
 
     ``residuals``, ``H_x`` and ``H_t`` hold one array per pair.
@@ -169,7 +173,7 @@ def compare(
     P_xt: Array,
     P_tt: Array,
     floor: Mapping[str, Array],
-) -> Compared:
+) -> PairDistances:
     """Squared Mahalanobis distance of each pair, eq. 3.22, vectorised over pairs of one model.
 
     Args:
@@ -210,7 +214,7 @@ def compare(
         for place, n in enumerate(which):
             residuals[n], noises[n] = r[place], R[place]
             H_xs[n], H_ts[n] = H_x[place], H_t[place]
-    return Compared(d2, dof, tuple(residuals), tuple(H_xs), tuple(H_ts), tuple(noises))
+    return PairDistances(d2, dof, tuple(residuals), tuple(H_xs), tuple(H_ts), tuple(noises))
 
 
 def assign(cost: Array, gate: Array, method: str) -> list[tuple[int, int]]:
@@ -250,7 +254,7 @@ def assign(cost: Array, gate: Array, method: str) -> list[tuple[int, int]]:
 
 
 def jointly_compatible(
-    compared: Compared,
+    compared: PairDistances,
     chosen: Sequence[int],
     slices: Sequence[slice],
     P: Array,
@@ -276,7 +280,7 @@ def jointly_compatible(
     return d2 < float(chi2_quantile(probability, len(r)))
 
 
-def fixes_pose(compared: Compared, chosen: Sequence[int]) -> bool:
+def fixes_pose(compared: PairDistances, chosen: Sequence[int]) -> bool:
     """Whether the chosen pairs determine the robot's whole pose.
 
     Parallel walls, or a single point, leave a direction open. By the information of the pairs alone

@@ -43,7 +43,8 @@ class Entry:
         """The extent (2,) at another estimate (2,) or (3,).
 
         The extent of a line stays where it is in the world, as the line's origin may slide along it
-        by metres; that of a segment moves with it. For walls that moved see `LandmarkMap.follow`.
+        by metres; that of a segment moves with it. See `LandmarkMap.update_from` for walls
+        that moved.
         """
         return self.extent - between(self.mean, mean)[0] if self.kind == "line" else self.extent
 
@@ -104,7 +105,7 @@ class LandmarkMap:
         self._next += 1
         return entry
 
-    def saw(
+    def record_observation(
         self, entry: Entry, seen: Observation, pose: Array, time_ns: int, robot: str, path_m: float
     ) -> None:
         """Record a sighting: count it and extend the landmark to what was seen.
@@ -125,7 +126,7 @@ class LandmarkMap:
         for i, mean in zip(ids, backend.landmark_means(ids), strict=True):
             self.entries[i].move(mean)
 
-    def follow(self, steps: Sequence[Step], estimate: Estimate) -> None:
+    def update_from(self, steps: Sequence[Step], estimate: Estimate) -> None:
         """Move to an estimate of the steps; landmarks without observations leave the map.
 
         Extents of lines are computed again from their observations with the latest estimate:
@@ -149,7 +150,7 @@ class LandmarkMap:
         )
         self._next = max(self._next, new + 1)
 
-    def in_worlds(self, worlds: Mapping[int, Array]) -> "LandmarkMap":
+    def transformed(self, worlds: Mapping[int, Array]) -> "LandmarkMap":
         """The same map after the frame of each landmark was put at ``worlds[id]`` (3,)."""
         moved = LandmarkMap()
         for i, entry in self.entries.items():

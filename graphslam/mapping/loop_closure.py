@@ -27,7 +27,7 @@ NEAR_M = 3.0
 #: half the window of a search: so many sigmas of the relative pose, and this much more (m, m, rad)
 SIGMAS, MARGIN = 3.0, np.array([0.6, 0.6, 0.08])
 #: pairs of submaps from which on a second process is used to match them
-MANY = 16
+MIN_PARALLEL_PAIRS = 16
 #: verified: least share of points confirmed, largest share in free space, of both submaps
 MIN_CONFIRMED, MAX_SEEN_THROUGH = 0.4, 0.15
 #: share of points on others in a coarse search below which `MIN_CONFIRMED` is out of reach, so that
@@ -40,12 +40,12 @@ MAX_SIGMA_M = 0.08
 RIVAL_SHARE = 0.8
 #: probability of the chi-square limits between closures, and factor on the covariance of the
 #: estimate, which does not know of wrong associations
-AGREE, TRUST = 0.99, 16.0
+AGREE, COV_INFLATION = 0.99, 16.0
 #: closures from which the search for the largest consistent set begins
-STARTS = 20
+CLIQUE_STARTS = 20
 #: m, rad: pairs that lie as near as this need no closure; closures with larger residuals than the
 #: second after the solution are taken back
-CLOSED, MAX_RESIDUAL = (0.06, 0.01), (0.2, 0.03)
+ALREADY_CLOSED, MAX_RESIDUAL = (0.06, 0.01), (0.2, 0.03)
 
 #: the later and the earlier state of a closure
 Pair = tuple[State, State]
@@ -134,22 +134,22 @@ def loop_closures(
         the two submaps match as they lie.
     """
     pairs: list[tuple[SubmapPose, SubmapPose, Array, Array]] = []
-    for i, j, window in candidates(found, TRUST * P, config):
+    for i, j, window in candidates(found, COV_INFLATION * P, config):
         later, earlier = found[i], found[j]
         guess = between(earlier.pose, later.pose)
         pair = later.state, earlier.state
-        if pair in examined and _near(examined[pair], guess, CLOSED):
+        if pair in examined and _near(examined[pair], guess, ALREADY_CLOSED):
             continue
         examined[pair] = guess
         pairs.append((later, earlier, guess, window))
     correcting: list[Closure] = []
     confirming: list[Closure] = []
-    results = parallel_map(_verify_pair, pairs, fewest=MANY)
+    results = parallel_map(_verify_pair, pairs, fewest=MIN_PARALLEL_PAIRS)
     for (later, earlier, _, _), result in zip(pairs, results, strict=True):
         if result is not None:
             is_searched, pose, cov = result
             images = min(len(later.submap.clouds), len(earlier.submap.clouds))
-            closure = Closure(*later.state, *earlier.state, pose, cov, images=images)
+            closure = Closure(*later.state, *earlier.state, pose, cov, scan_count=images)
             (correcting if is_searched else confirming).append(closure)
     return correcting, confirming
 
@@ -176,7 +176,7 @@ def verify_in_place(source: Submap, target: Submap, guess: Array) -> tuple[Array
     None if they do not. The covariance is large along directions that the points leave open.
     """
     pose, cov = align(source, target, guess)
-    if not _near(guess, pose, CLOSED):
+    if not _near(guess, pose, ALREADY_CLOSED):
         return None
     return (pose, cov) if _is_confirmed(*agreement(source, target, pose)) else None
 
@@ -195,13 +195,13 @@ def consistent_closures(
 ) -> list[Closure]:
     """The largest set found of closures that agree with the estimate and with each other.
 
-    The covariance ``P`` (3n, 3n) of the estimate, see `candidates`, is inflated by `TRUST` and by
-    drift that it does not know of; see `largest_consistent_set` for the rule.
+    The covariance ``P`` (3n, 3n) of the estimate, see `candidates`, is inflated by `COV_INFLATION`
+    and unmodelled drift; see `largest_consistent_set` for the rule.
     """
     if not closures:
         return []
-    r, S = _innovations(closures, found, TRUST * P + drift_covariance(found))
-    return [closures[k] for k in largest_consistent_set(r, S, AGREE, STARTS)]
+    r, S = _innovations(closures, found, COV_INFLATION * P + drift_covariance(found))
+    return [closures[k] for k in largest_consistent_set(r, S, AGREE, CLIQUE_STARTS)]
 
 
 def _innovations(

@@ -22,7 +22,7 @@ from itertools import pairwise
 import numpy as np
 
 from graphslam.core.config import BackendConfig, Config, RobustConfig
-from graphslam.core.consistency import FIT, greedy_max_clique, has_rival, rival_set
+from graphslam.core.consistency import FIT_PROBABILITY, greedy_max_clique, has_rival, rival_set
 from graphslam.core.frame_forest import PRIOR_INFLATION, grow_frame_forest
 from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared
 from graphslam.core.geometry import Array, adjoint, between, compose, inverse, log, rotate_cov
@@ -49,7 +49,7 @@ UNSUPPORTED = "no other closure supports it"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Verified:
+class ClosureDecision:
     """The decision: ``refused`` (index of the message -> why) and the indices ``kept``.
 
     ``starts``: start poses found for robots that had none; ``frames``: robot -> the robot whose
@@ -62,10 +62,10 @@ class Verified:
     frames: Mapping[str, str]
 
 
-NOTHING_RECORDED = Verified({}, frozenset(), {}, {})
+NOTHING_RECORDED = ClosureDecision({}, frozenset(), {}, {})
 
 
-def own_frame() -> Start:
+def origin_prior() -> Start:
     """Start of a robot in a separate frame."""
     return Start(np.zeros(3), ORIGIN)
 
@@ -75,7 +75,7 @@ def verify(
     tracks: Mapping[str, Track],
     starts: Mapping[str, Start],
     config: Config,
-) -> Verified:
+) -> ClosureDecision:
     """Decide which relative poses of a log to use.
 
     Those with an end outside the odometry are not judged. ``starts`` are the known ones.
@@ -125,7 +125,7 @@ def verify(
         for robot, s in estimate.states.items()
         if robot not in starts
     }
-    return Verified(refused, frozenset(believed), found, frames)
+    return ClosureDecision(refused, frozenset(believed), found, frames)
 
 
 def _has_ends(m: RelativePose, tracks: Mapping[str, Track]) -> bool:
@@ -141,7 +141,7 @@ def _has_ends(m: RelativePose, tracks: Mapping[str, Track]) -> bool:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Chain:
+class _OdometryChain:
     """A robot's odometry at the ends of closures: times (n,), poses (n, 3) from its first reading.
 
     ``spread`` (n, 3, 3) is the covariance of the odometry up to there, in the left tangent space of
@@ -158,7 +158,9 @@ class _Chain:
         return np.searchsorted(self.times_ns, np.array(list(times_ns), dtype=np.int64))
 
 
-def _odometry(messages: Iterable[RelativePose], tracks: Mapping[str, Track]) -> dict[str, _Chain]:
+def _odometry(
+    messages: Iterable[RelativePose], tracks: Mapping[str, Track]
+) -> dict[str, _OdometryChain]:
     """Robot -> its odometry between the ends of closures, beginning with its first reading."""
     times: dict[str, set[int]] = defaultdict(set)
     for m in messages:
@@ -175,14 +177,16 @@ def _odometry(messages: Iterable[RelativePose], tracks: Mapping[str, Track]) -> 
         steps = A @ rotate_cov(moved.cov, -moved.delta[:, 2]) @ A.mT
         spread = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(steps, axis=0)])
         motions = tuple(moved.one(k, int(a), int(b)) for k, (a, b) in enumerate(pairwise(at)))
-        chains[robot] = _Chain(at, poses, spread, motions)
+        chains[robot] = _OdometryChain(at, poses, spread, motions)
     return chains
 
 
 # ---------------------------------------------------------------- pairs
 
 
-def _loops(messages: Sequence[RelativePose], odometry: Mapping[str, _Chain]) -> tuple[Array, Array]:
+def _loops(
+    messages: Sequence[RelativePose], odometry: Mapping[str, _OdometryChain]
+) -> tuple[Array, Array]:
     """Closures between the same two robots, compared in pairs.
 
     Closure a sees the first pose of its robot's odometry at E_a in the frame of the other's. The
@@ -222,7 +226,7 @@ def _initial_starts(
     sets: Mapping[tuple[str, str], Sequence[int]],
     clear: set[tuple[str, str]],
     seen: Mapping[int, Array],
-    odometry: Mapping[str, _Chain],
+    odometry: Mapping[str, _OdometryChain],
     starts: Mapping[str, Start],
 ) -> tuple[dict[str, Start], dict[str, str]]:
     """Initial start poses of robots that have none, and the frame of each robot.
@@ -263,7 +267,7 @@ class _Joint:
     def __init__(
         self,
         messages: Sequence[RelativePose],
-        odometry: Mapping[str, _Chain],
+        odometry: Mapping[str, _OdometryChain],
         starts: Mapping[str, Start],
         config: Config,
     ) -> None:
@@ -282,7 +286,7 @@ class _Joint:
 
     def settle(self, believed: set[int], candidates: Sequence[int]) -> tuple[set[int], Estimate]:
         """The candidates that support each other, beginning with ``believed``; and the estimate."""
-        gate = chi2_quantile(FIT, 3)
+        gate = chi2_quantile(FIT_PROBABILITY, 3)
         backend: Isam2Backend = Isam2Backend(self._plain)
         for step in self._steps(believed):
             backend.add(step)

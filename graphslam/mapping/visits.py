@@ -22,12 +22,12 @@ class SplitVisits:
     """Steps with separate landmarks per visit; ``origin``: new landmark -> the one it was."""
 
     steps: tuple[Step, ...]
-    origin: Mapping[int, int]
+    original_id: Mapping[int, int]
 
     def start(self, estimate: Estimate) -> Estimate:
         """The estimate with every new landmark at the mean of the one it was."""
         landmarks = dict(estimate.landmarks)
-        landmarks.update((new, landmarks[old]) for new, old in self.origin.items())
+        landmarks.update((new, landmarks[old]) for new, old in self.original_id.items())
         return replace(estimate, landmarks=landmarks)
 
 
@@ -89,7 +89,7 @@ def rejoin_visits(
     """
     groups: dict[int, list[int]] = {}
     into: dict[int, int] = {}
-    for new, old in sorted(split.origin.items()):
+    for new, old in sorted(split.original_id.items()):
         entry = landmarks.entries[old]
         mean = estimate.landmarks[new][0]
         for leader in groups.setdefault(old, [old]):

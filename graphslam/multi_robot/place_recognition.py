@@ -30,7 +30,7 @@ from graphslam.core.geometry import (
     rotation3,
     wrap,
 )
-from graphslam.mapping.loop_closure import TRUST, verify_match
+from graphslam.mapping.loop_closure import COV_INFLATION, verify_match
 from graphslam.mapping.submaps import SubmapPose, drift_covariance
 from graphslam.multi_robot.place_search import (
     alternative_alignments,
@@ -167,7 +167,8 @@ def choose_alignment(
     """
     places_a, places_b = map_a.places, map_b.places
     wide_a, wide_b = (
-        PlaceMap(m.places, TRUST * m.cov + drift_covariance(m.places)) for m in (map_a, map_b)
+        PlaceMap(m.places, COV_INFLATION * m.cov + drift_covariance(m.places))
+        for m in (map_a, map_b)
     )
     starts, covs = _start_estimates(found, wide_a, wide_b)
     best = greedy_max_clique(_pairwise_agreement(found, starts, covs), _scores(found))

@@ -18,7 +18,7 @@ import numpy as np
 
 from graphslam.core.config import Config
 from graphslam.core.consistency import (
-    FIT,
+    FIT_PROBABILITY,
     fit_rigid_transform,
     greedy_max_clique,
     has_rival,
@@ -164,7 +164,10 @@ def estimate_relative_frame(
         if determined and poses_differ(pose, cov, other, other_cov):
             # a correspondence may support both
             support, support_other = (
-                weight[_squared_residuals(x, p.points, q.points, variance) <= chi2_quantile(FIT, 2)]
+                weight[
+                    _squared_residuals(x, p.points, q.points, variance)
+                    <= chi2_quantile(FIT_PROBABILITY, 2)
+                ]
                 .sum()
                 for x in (pose, other)
             )  # fmt: skip
@@ -254,7 +257,7 @@ def _remove_outliers(members: IntArray, p: Array, q: Array, variance: Array) -> 
     while len(members) > 1:
         pose, _ = fit_rigid_transform(p[members], q[members], variance[members])
         d2 = _squared_residuals(pose, p[members], q[members], variance[members])
-        if d2.max() <= chi2_quantile(FIT, 2):
+        if d2.max() <= chi2_quantile(FIT_PROBABILITY, 2):
             break
         members = np.delete(members, d2.argmax())
     return members

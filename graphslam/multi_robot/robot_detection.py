@@ -29,7 +29,7 @@ from graphslam.core.geometry import (
 )
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Motion, Scan, Sighting
-from graphslam.estimation.backend import Backend, Joint
+from graphslam.estimation.backend import Backend, JointMarginal
 from graphslam.odometry.preintegration import Track
 from graphslam.perception.dynamic_objects import dynamic_returns, was_present
 from graphslam.perception.ordered_scan import Sweep, make_sweep
@@ -77,7 +77,7 @@ class ExpectedPose:
 
 
 def expected_pose(
-    joint: Joint, motion: Motion | None, other: Motion | None, clock_shift: Array
+    joint: JointMarginal, motion: Motion | None, other: Motion | None, clock_shift: Array
 ) -> ExpectedPose:
     """Pose of another robot as seen from the observer, from the joint estimate of their states.
 

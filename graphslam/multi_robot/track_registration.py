@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphslam.core.consistency import (
-    FIT,
+    FIT_PROBABILITY,
     LeastSquaresFit,
     generalised_least_squares,
     leave_one_out_distances,
@@ -91,7 +91,7 @@ def fit_start(
     while len(use) >= MIN_SIGHTINGS:
         x, fit = _gauss_newton(x, path.subset(use), cov[np.ix_(use, use)], robot, clock_sigma_s)
         d2 = leave_one_out_distances(fit.information, fit.residuals.reshape(-1, 2))
-        if d2.max() <= chi2_quantile(FIT, 2):
+        if d2.max() <= chi2_quantile(FIT_PROBABILITY, 2):
             first_ns = int(times_ns[use[0]])
             drift = encounter_covariance(
                 x[:3], observer, robot, first_ns, first_ns + round(1e9 * x[3])

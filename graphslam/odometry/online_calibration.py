@@ -57,7 +57,7 @@ class Calibrator:
             Mean, and the covariance to be used for coming motions.
         """
         D = motion.d_delta_d_calibration
-        if motion.matched or not D.shape[1] or (motion.length_m == 0 and motion.delta[2] == 0):
+        if motion.from_scans or not D.shape[1] or (motion.length_m == 0 and motion.delta[2] == 0):
             return current
         if self._prior is None:
             self._prior = current.cov

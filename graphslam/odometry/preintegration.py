@@ -191,7 +191,7 @@ class Track(Readings):
 
     def motions(self, start_ns: IntArray, end_ns: IntArray) -> Motions:
         """What `between` gives, for times (n,) and (n,), at once; see `motions_of`."""
-        return motions_of([(self, start_ns, end_ns)])[0]
+        return preintegrate_batch([(self, start_ns, end_ns)])[0]
 
     @property
     def batch_key(self) -> Hashable:
@@ -285,7 +285,7 @@ class Track(Readings):
         return np.diag([self._config.floor_sigma_m**2] * 2 + [self._config.floor_sigma_rad**2])
 
 
-def motions_of(asked: Sequence[tuple[Track, IntArray, IntArray]]) -> list[Motions]:
+def preintegrate_batch(asked: Sequence[tuple[Track, IntArray, IntArray]]) -> list[Motions]:
     """What `Track.between` gives for many times and several robots, at once.
 
     Args:

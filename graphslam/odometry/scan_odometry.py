@@ -89,7 +89,9 @@ def fused(motion: Motion, H: Array, R: Array, innovation: Array) -> Motion:
     delta, cov, _, _ = update(motion.delta, motion.cov, H, R, innovation)
     delta[2] = wrap(delta[2])
     D = np.zeros_like(motion.d_delta_d_calibration)
-    return replace(motion, delta=delta, cov=symmetric(cov), d_delta_d_calibration=D, matched=True)
+    return replace(
+        motion, delta=delta, cov=symmetric(cov), d_delta_d_calibration=D, from_scans=True
+    )
 
 
 def _difference(a: Array, b: Array) -> Array:

@@ -12,7 +12,7 @@ from graphslam.perception.cylinders import cylinders
 from graphslam.perception.hough import hough_lines
 from graphslam.perception.ordered_scan import Sweep, make_sweep
 from graphslam.perception.segments import segments
-from graphslam.perception.segments_and_hough import both
+from graphslam.perception.segments_and_hough import segments_and_hough
 
 FrontEnd = Callable[[Scan, FrontEndConfig], tuple[Observation, ...]]
 
@@ -41,6 +41,6 @@ def _none(scan: Scan, config: FrontEndConfig) -> tuple[Observation, ...]:
 FRONT_ENDS: dict[str, FrontEnd] = {
     "segments": _front_end(segments),
     "hough": _front_end(hough_lines),
-    "both": _front_end(both),
+    "both": _front_end(segments_and_hough),
     "none": _none,
 }

@@ -18,7 +18,7 @@ from graphslam.perception.segments import Segments, fewest_points, find_segments
 SHARED = 0.5
 
 
-def both(sweep: Sweep, config: FrontEndConfig) -> tuple[Observation, ...]:
+def segments_and_hough(sweep: Sweep, config: FrontEndConfig) -> tuple[Observation, ...]:
     """Whole segments, Hough lines of the other returns, and segments that no Hough line covers.
 
     Observations are in the laser frame: whole segments in the order of the beams, then Hough lines,

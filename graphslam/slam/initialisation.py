@@ -28,7 +28,7 @@ from graphslam.multi_robot.mutual_detection import (
 )
 from graphslam.multi_robot.place_recognition import PlaceMap
 from graphslam.multi_robot.relative_frames import RelativeFrame, RobotEstimate
-from graphslam.slam.pipeline import CLOCK_DOUBT_S, Pipeline
+from graphslam.slam.pipeline import CLOCK_OFFSET_SIGMA_S, Pipeline
 from graphslam.slam.recorded_closures import RecordedClosures, judge_recorded_closures
 from graphslam.slam.robot_settings import outlines
 from graphslam.slam.start_priors import origin, start_poses
@@ -55,7 +55,7 @@ def with_identities(
     """What is known with the right identities, as robots may have been placed by false ones."""
     starts = start_poses(log, config)
     joined = estimate_start_poses(log, config, identities, starts, known.recorded)
-    return replace(known, identities=identities, joined=joined)
+    return replace(known, identities=identities, frame_assignment=joined)
 
 
 def estimate_start_poses(
@@ -103,9 +103,11 @@ def estimate_start_poses(
         return joined({}, (), ((), {}))
     views, meetings = separate_estimates(pipeline), pipeline.unrelated_sightings
     looked = MutualDetections((), {})
-    if watchable(log, shapes, starts):
+    if has_detectable_robots(log, shapes, starts):
         scans = pipeline.scan_buffer.scans
-        looked = find_robots_in_scans(views, scans, shapes, tuple(starts), CLOCK_DOUBT_S, config)
+        looked = find_robots_in_scans(
+            views, scans, shapes, tuple(starts), CLOCK_OFFSET_SIGMA_S, config
+        )
     by_name = joined(views, meetings, (looked.relations, looked.undecided))
     if len(set(by_name.frames.values())) == 1:
         return by_name
@@ -156,7 +158,7 @@ def anonymous_maps(run: Pipeline, views: Mapping[str, RobotEstimate]) -> dict[st
     return seen
 
 
-def watchable(log: LogSet, outlines: Collection[str], placed: Collection[str]) -> bool:
+def has_detectable_robots(log: LogSet, outlines: Collection[str], placed: Collection[str]) -> bool:
     """Whether some robot has scans that may show another one, not yet placed relative to it."""
     return any(
         log.has_scans(observer) and name != observer and not {name, observer} <= set(placed)

@@ -18,7 +18,9 @@ MIN_MOTIONS = 50
 MEDIAN_OF_NORMAL = 0.6745
 
 
-def noise_scales(steps: Sequence[Step], estimate: Estimate) -> dict[str, Array]:
+def noise_scales(
+    steps: Sequence[Step], estimate: Estimate, window_ns: int | None = None
+) -> dict[str, Array]:
     """Robot -> factor (3,) on the sigmas of its motions; 1 where they are as noisy as stated.
 
     Stated noise is never reduced. Robots with fewer than `MIN_MOTIONS` motions have none.
@@ -26,6 +28,8 @@ def noise_scales(steps: Sequence[Step], estimate: Estimate) -> dict[str, Array]:
     Args:
         steps: with motions as computed.
         estimate: of all their states.
+        window_ns: residuals within such a window are added up, which shows correlated errors too;
+            None judges each motion by itself.
     """
     scales = {}
     for robot, states in estimate.states.items():
@@ -37,8 +41,17 @@ def noise_scales(steps: Sequence[Step], estimate: Estimate) -> dict[str, Array]:
         )
         residuals = between(first, last) - np.array([m.delta for m in motions])
         residuals[:, 2] = wrap(residuals[:, 2])
-        normalised = np.abs(residuals) / np.sqrt([np.diag(m.cov) for m in motions])
-        scales[robot] = np.maximum(1.0, np.median(normalised, axis=0) / MEDIAN_OF_NORMAL)
+        normalised = residuals / np.sqrt([np.diag(m.cov) for m in motions])
+        if window_ns is not None:
+            moving = np.array([m.length_m != 0 or m.delta[2] != 0 for m in motions])
+            if not moving.any():
+                continue
+            windows = np.array([m.end_ns // window_ns for m in motions])[moving]
+            _, index, count = np.unique(windows, return_inverse=True, return_counts=True)
+            sums = np.zeros((len(count), 3))
+            np.add.at(sums, index, normalised[moving])
+            normalised = sums / np.sqrt(count)[:, None]
+        scales[robot] = np.maximum(1.0, np.median(np.abs(normalised), axis=0) / MEDIAN_OF_NORMAL)
     return scales
 
 

@@ -35,7 +35,7 @@ class Findings(NamedTuple):
     robots' clocks as their sightings of each other show them; ``causal``: causal trajectories.
     """
 
-    swapped: Mapping[str, str]
+    swapped_identities: Mapping[str, str]
     clocks: Mapping[str, ClockEstimate]
     causal: Mapping[str, Causal]
 
@@ -73,9 +73,9 @@ def run_passes(
         pipeline = run_pass(Pipeline(log, config, known, tamper), progress)
         with timed(pipeline.seconds, "final optimisation"):
             estimate, is_rough = current_estimate(pipeline)
-            finding = Future(partial(find, pipeline, estimate))
+            finding = Future(partial(pass_findings, pipeline, estimate))
             # a log is seldom read again, so where reoptimisation is quick it does not wait to know
-            at_once = is_rough and is_quick(pipeline) and not finding.done
+            at_once = is_rough and is_sighting_log(pipeline) and not finding.done
             final = reoptimise(pipeline, estimate) if at_once else estimate
             findings = finding.result()
             following = decide_next_pass(known, findings, log, config, clock_passes)
@@ -99,8 +99,8 @@ def decide_next_pass(
         config: settings.
         clock_passes: passes so far whose clocks differed from those of the one before.
     """
-    if findings.swapped and not known.identities:
-        return with_identities(known, log, config, findings.swapped)
+    if findings.swapped_identities and not known.identities:
+        return with_identities(known, log, config, findings.swapped_identities)
     if clock_passes < MAX_CLOCK_PASSES and any(
         c.needs_correction for c in findings.clocks.values()
     ):
@@ -118,7 +118,7 @@ def run_pass(pipeline: Pipeline, progress: Progress) -> Pipeline:
     if not pipeline.steps:
         path = pipeline.log.files[0].path
         raise LogError(f"{path}: nothing in it could be used; see `graphslam info`")
-    pipeline.note_covariances()
+    pipeline.record_covariances()
     return pipeline
 
 
@@ -130,7 +130,7 @@ def current_estimate(pipeline: Pipeline) -> tuple[Estimate, bool]:
     return backend.finish(), False
 
 
-def is_quick(pipeline: Pipeline) -> bool:
+def is_sighting_log(pipeline: Pipeline) -> bool:
     """Whether `reoptimise` solves a log of sightings: without loop closure, in a second or two."""
     return bool(pipeline.sources)
 
@@ -139,7 +139,7 @@ def reoptimise(pipeline: Pipeline, estimate: Estimate) -> Estimate:
     """The whole log solved again from a rough estimate; the pipeline's steps follow the result."""
     tracks = {name: run.track for name, run in pipeline.started.items()}
     config = pipeline.config
-    if is_quick(pipeline):
+    if is_sighting_log(pipeline):
         estimate, steps = reoptimise_sighting_log(
             pipeline.steps, estimate, tracks, pipeline.sources, config
         )
@@ -160,7 +160,7 @@ def reoptimise(pipeline: Pipeline, estimate: Estimate) -> Estimate:
     return estimate
 
 
-def find(pipeline: Pipeline, estimate: Estimate) -> Findings:
+def pass_findings(pipeline: Pipeline, estimate: Estimate) -> Findings:
     """Results of a pass besides its estimate; an estimate that is not optimised is enough."""
     frames = pipeline.frames
     started = pipeline.started

@@ -61,7 +61,7 @@ from graphslam.slam.step_recorder import PriorKnowledge, StepRecorder, timed
 from graphslam.slam.synchronisation import ODOMETRY, synchronise
 
 #: s: sigma of the difference of two robots' clocks before anything is known
-CLOCK_DOUBT_S = 0.5
+CLOCK_OFFSET_SIGMA_S = 0.5
 #: messages between two reports of progress
 REPORT_EVERY = 500
 
@@ -89,7 +89,7 @@ class Pipeline(StepRecorder):
         )
         self.keyframes = KeyframeSelector(self.config.keyframe)
         self.robot_detector = RobotDetector(
-            self.backend, self.runs, outlines(log, config), config, CLOCK_DOUBT_S
+            self.backend, self.runs, outlines(log, config), config, CLOCK_OFFSET_SIGMA_S
         )
         self.scan_buffer = ScanBuffer({}, {}, 0.0)
         self.sources: list[Sighting] = []
@@ -156,8 +156,8 @@ class Pipeline(StepRecorder):
         it by odometry, those of other robots to their last state.
         """
         step_ns = batch.time_ns
-        self.note_time(batch.first_ns)
-        self.note_time(step_ns)
+        self.record_time(batch.first_ns)
+        self.record_time(step_ns)
         mutual: set[str] = set()  # robots that saw a robot or were seen
         for image in batch.images:
             self.start_if_needed(image[0].robot, image[0].time_ns)
@@ -198,8 +198,8 @@ class Pipeline(StepRecorder):
                 associations += self.associate_image(image, own, state_ns[image[0].robot], motions)
                 count = sum(s.seen_robot is not None for s in image)
                 associations += tuple(itertools.islice(robots, count))
-            self.note_covariances()
-        self.enter(Step(step_ns, {}, motions, inflate_repeated(associations)), known)
+            self.record_covariances()
+        self.add_step(Step(step_ns, {}, motions, inflate_repeated(associations)), known)
 
     def associate_image(
         self,
@@ -231,7 +231,7 @@ class Pipeline(StepRecorder):
         """One event: everything one robot perceived at one time."""
         first = event[0]
         run, time_ns = self.runs[first.robot], first.time_ns
-        self.note_time(time_ns)
+        self.record_time(time_ns)
         self.start_if_needed(first.robot, time_ns)
         if isinstance(first, ODOMETRY) and self.config.keyframe.mode != "all":
             return  # most of a log; the track has it already
@@ -274,8 +274,8 @@ class Pipeline(StepRecorder):
             return motion, None
         run.motions += 1
         motion = checked_against_scans(motion, last[1], now)
-        run.contradicted += motion.matched
-        if self.config.odometry.scan_matching == "auto" or motion.matched:
+        run.contradicted += motion.from_scans
+        if self.config.odometry.scan_matching == "auto" or motion.from_scans:
             return motion, None
         return motion, match_off_lines(motion, last[1], scan.robot, points_off_lines(points, seen))
 
@@ -325,10 +325,10 @@ class Pipeline(StepRecorder):
                     associations += (self.robot_sighting(message, state_ns, motions),)
             given = [self.closure(m, state_ns) for m in event if isinstance(m, RelativePose)]
             closures = tuple(c for c in (second, *given) if c)
-            self.note_covariances()
+            self.record_covariances()
         if not (motions or associations or closures):
             return
-        self.enter(Step(time_ns, {}, motions, associations, closures), known)
+        self.add_step(Step(time_ns, {}, motions, associations, closures), known)
         for message in event:
             if isinstance(message, Scan):
                 points = scan_points(message, self.config.front_end.max_range_m)

@@ -10,7 +10,7 @@ from graphslam.core.config import Config
 from graphslam.core.geometry import compose, compose_cov, inverse, inverse_cov
 from graphslam.core.records import Closure, RelativePose, Scan, Sighting, Start, TrueLandmark, Truth
 from graphslam.logs import LogSet
-from graphslam.mapping.recorded_closure_verification import NOTHING_RECORDED, own_frame, verify
+from graphslam.mapping.recorded_closure_verification import NOTHING_RECORDED, origin_prior, verify
 from graphslam.slam.robot_settings import make_tracks
 from graphslam.slam.robot_state import RobotState
 from graphslam.slam.synchronisation import ODOMETRY
@@ -65,7 +65,7 @@ def judge_recorded_closures(
         found = {robot: start for robot, start in found.items() if frames[robot] != robot}
     elif RelativePose in kinds:
         for robot in sorted(set(log.robots) - {*starts, *found}):
-            found[robot], frames[robot] = own_frame(), robot
+            found[robot], frames[robot] = origin_prior(), robot
     world = min(starts, default="")
     kept = frozenset(closure_id(messages[k]) for k in verified.kept)
     refused = {closure_id(messages[k]): why for k, why in verified.refused.items()}

@@ -22,12 +22,12 @@ from graphslam.mapping.duplicate_landmarks import (
     merge_entries,
     merge_targets,
     merged_steps,
-    partners,
+    possible_duplicates,
     seen_together,
 )
 from graphslam.mapping.landmark_map import LandmarkMap
 from graphslam.mapping.loop_closure import (
-    CLOSED,
+    ALREADY_CLOSED,
     MAX_RESIDUAL,
     Pair,
     consistent_closures,
@@ -115,7 +115,7 @@ def reoptimise_scan_log(
     if closures:
         # those stay that the landmarks do not satisfy without them
         estimate = solve(steps, estimate)
-        missed = violated(closures, estimate.states, CLOSED)
+        missed = violated(closures, estimate.states, ALREADY_CLOSED)
         closures = [c for c, off in zip(closures, missed, strict=True) if off]
         counts["closures_kept"] = len(closures)
     if config.odometry.calibrate:
@@ -130,7 +130,7 @@ def reoptimise_scan_log(
     else:
         estimate = solve(steps, estimate, closures, rough=False)
         steps = with_closures(steps, closures)
-    landmarks.follow(steps, estimate)
+    landmarks.update_from(steps, estimate)
     return estimate, steps, counts
 
 
@@ -257,10 +257,10 @@ def _duplicates(
     estimate: Estimate, backend: Reoptimiser, landmarks: LandmarkMap, steps: Sequence[Step]
 ) -> dict[int, int]:
     """Landmark that goes -> landmark that it becomes; the map follows the estimate."""
-    landmarks.follow(steps, estimate)
+    landmarks.update_from(steps, estimate)
     known = [entry for entry in landmarks.entries.values() if entry.id in estimate.landmarks]
     together = seen_together(steps)
-    known = partners(known, together)
+    known = possible_duplicates(known, together)
     if not known:
         return {}
     joint = backend.joint(min(estimate.states), [entry.id for entry in known])

@@ -18,7 +18,7 @@ from graphslam.core.observation_models import MODELS, transport
 from graphslam.core.records import Estimate, Motion, Sighting, Step
 from graphslam.estimation.batch_calibration import calibrate
 from graphslam.odometry.increment_sums import Motions
-from graphslam.odometry.preintegration import Track, motions_of
+from graphslam.odometry.preintegration import Track, preintegrate_batch
 from graphslam.odometry.readings import IntArray
 from graphslam.perception.sightings import sighting_observation
 from graphslam.slam.motion_noise import noise_scales, scale_motion_noise
@@ -26,10 +26,12 @@ from graphslam.slam.sighting_batches import transport_batch, transport_target
 
 #: ns: residuals of one target's sightings farther apart are taken as independent
 WINDOW_NS = 10_000_000_000
+#: ns: errors of motions, which are short here, are correlated over as long as this
+MOTION_WINDOW_NS = 3_000_000_000
 #: residuals are cut at this many of their own sigmas when their noise is measured
-CUT = 3.0
+CLIP_SIGMAS = 3.0
 #: smallest factor on a variance: what a log states is not doubted downwards beyond
-SMALLEST = 1.0
+MIN_VARIANCE_FACTOR = 1.0
 
 
 def reoptimise_sighting_log(
@@ -64,7 +66,7 @@ def reoptimise_sighting_log(
             return made
         # once only: estimated from its own result again and again, noise would collapse
         factors = sighting_variances(made, groups, estimate)
-        made = scale_motion_noise(made, noise_scales(made, estimate))
+        made = scale_motion_noise(made, noise_scales(made, estimate, MOTION_WINDOW_NS))
         return tuple(_with_wider_sightings(step, factors) for step in made)
 
     return calibrate(rebuild, estimate, tracks, config.robust)
@@ -133,7 +135,7 @@ def _recomputed(
         for group in groups
         if group.other is not None
     ]
-    results = iter(motions_of(queries))
+    results = iter(preintegrate_batch(queries))
     motions: list[dict[str, Motion]] = [{} for _ in steps]
     for robot, old in recorded.items():
         one = next(results).one
@@ -206,12 +208,12 @@ def sighting_variances(
         t = np.array([estimate.landmarks[int(i)][0] for i in targets])
         r = MODELS["point"].residual(np.array([a.z for a in made]), x, t)
         r /= np.sqrt(np.array([np.diag(a.cov) for a in made]))
-        cut = CUT * 1.4826 * np.median(np.abs(r), axis=0)
+        cut = CLIP_SIGMAS * 1.4826 * np.median(np.abs(r), axis=0)
         windows = np.column_stack([targets, group.seen_ns // WINDOW_NS])
         _, window = np.unique(windows, axis=0, return_inverse=True)
         sums = np.zeros((window.max() + 1, 2))
         np.add.at(sums, window.ravel(), np.clip(r, -cut, cut))
-        factors[group.robot] = np.maximum(np.square(sums).sum(axis=0) / len(r), SMALLEST)
+        factors[group.robot] = np.maximum(np.square(sums).sum(axis=0) / len(r), MIN_VARIANCE_FACTOR)
     return factors
 
 

@@ -32,7 +32,9 @@ def make_tracks(log: LogSet, config: Config) -> dict[str, Track]:
     """An empty track for every robot of a log."""
     return {
         name: Track(
-            sensing(odometry_settings(config.odometry, log.notes), log.has_scans(name)),
+            without_laser_calibration(
+                odometry_settings(config.odometry, log.notes), log.has_scans(name)
+            ),
             robot_settings(name, config, log.notes),
             mounted=True,
         )
@@ -40,7 +42,7 @@ def make_tracks(log: LogSet, config: Config) -> dict[str, Track]:
     }
 
 
-def sensing(config: OdometryConfig, scans: bool) -> OdometryConfig:
+def without_laser_calibration(config: OdometryConfig, scans: bool) -> OdometryConfig:
     """Odometry settings for a robot with or without scans: without, only latency is calibrated."""
     if scans:
         return config
@@ -60,8 +62,12 @@ def outlines(log: LogSet, config: Config) -> dict[str, Array]:
 
 def robot_settings(name: str, config: Config, notes: Mapping[str, str]) -> RobotConfig:
     """Settings of a robot: from the configuration where set there, else from the log's notes."""
-    noted = [f"{key}={value}" for key, value in notes.items() if key.startswith(f"robots.{name}.")]
-    return _noted(config.robot(name), load_config(overrides=noted).robot(name), RobotConfig())
+    with_log_notes = [
+        f"{key}={value}" for key, value in notes.items() if key.startswith(f"robots.{name}.")
+    ]
+    return _noted(
+        config.robot(name), load_config(overrides=with_log_notes).robot(name), RobotConfig()
+    )
 
 
 def odometry_settings(config: OdometryConfig, notes: Mapping[str, str]) -> OdometryConfig:

@@ -15,7 +15,7 @@ import numpy as np
 from graphslam.core.geometry import Array, compose, compose_cov, inverse, inverse_cov, rotation3
 from graphslam.core.observation_models import MODELS, transport
 from graphslam.core.records import Association, Message, Motion, Observation, Sighting
-from graphslam.odometry.preintegration import Track, motions_of
+from graphslam.odometry.preintegration import Track, preintegrate_batch
 from graphslam.odometry.readings import IntArray
 from graphslam.perception.sightings import sighting_observation
 from graphslam.slam.synchronisation import ODOMETRY
@@ -120,7 +120,7 @@ def batch_motions(
     there: dict[tuple[str, int], Motion] = {}
     new: dict[str, Motion] = {}
     for robot, (_, start_ns, end_ns), moved in zip(
-        times, queries, motions_of(queries), strict=True
+        times, queries, preintegrate_batch(queries), strict=True
     ):
         made = map(moved.one, itertools.count(), start_ns.tolist(), end_ns.tolist())
         images = itertools.islice(made, len(times[robot]))

@@ -71,7 +71,7 @@ def make_result(finished: FinishedPass, began: float) -> Result:
 
         robots = dict(zip(runs, parallel_map(robot_result, list(runs)), strict=True))
     associator = pipeline.associator
-    landmarks = make_landmarks(associator.map.in_worlds(transforms.landmarks), estimate)
+    landmarks = make_landmarks(associator.map.transformed(transforms.landmarks), estimate)
     landmarks = pipeline.frames.label_landmarks(landmarks, associator.map.entries.values())
     t0 = min(trajectory.stamps_ns[0] for trajectory in estimate.states.values())
     innovations = {

@@ -32,7 +32,7 @@ class PriorKnowledge:
     robots whose clock is not that of the first.
     """
 
-    joined: FrameAssignment
+    frame_assignment: FrameAssignment
     recorded: RecordedClosures
     identities: Mapping[str, str] = field(default_factory=dict)
     clocks: Mapping[str, Clock] = field(default_factory=dict)
@@ -60,7 +60,10 @@ class StepRecorder:
             name: RobotState(track, clock=known.clocks.get(name, Clock()))
             for name, track in make_tracks(log, config).items()
         }
-        self.starts, self.frames = known.joined.starts, RobotFrames(known.joined)
+        self.starts, self.frames = (
+            known.frame_assignment.starts,
+            RobotFrames(known.frame_assignment),
+        )
         self.steps: list[Step] = []
         self.counts: Counter[str] = Counter()
         self.seconds: dict[str, float] = defaultdict(float)
@@ -89,10 +92,10 @@ class StepRecorder:
             cov = start.cov + rotate_cov(2 * self.runs[robot].track.mount_cov, start.pose[2])
             start = replace(start, cov=cov)
         step = Step(time_ns, starts={robot: start})
-        self.note_covariances()
+        self.record_covariances()
         self.backend.add(step)
         self.steps.append(step)
-        self.note_state(robot, time_ns, self.backend.state_mean(robot))
+        self.record_state(robot, time_ns, self.backend.state_mean(robot))
 
     def start_if_needed(self, robot: str, time_ns: int) -> None:
         """Give a robot its first state, at ``time_ns`` or where its odometry begins, if earlier."""
@@ -114,7 +117,7 @@ class StepRecorder:
             return None
         return run.track.motion(run.state_ns, time_ns)
 
-    def enter(self, step: Step, known: set[int]) -> None:
+    def add_step(self, step: Step, known: set[int]) -> None:
         """Give a step to the back end and learn from it; ``known`` landmarks were there before."""
         if not (step.motions or step.associations or step.closures):
             return
@@ -126,7 +129,7 @@ class StepRecorder:
             if self.config.odometry.calibrate:
                 self.learn(step, poses, known)
             for name, pose in poses.items():
-                self.note_state(name, step.time_ns, pose)
+                self.record_state(name, step.time_ns, pose)
 
     def learn(self, step: Step, poses: Mapping[str, Array], known: set[int]) -> None:
         """Improve robots' calibration from a step.
@@ -147,16 +150,16 @@ class StepRecorder:
             turn = rotation3(-float(self.runs[robot].causal_poses[-1][2]))
             self.runs[robot].learn(step.motions[robot], pose, turn @ observed[robot] @ turn.T)
 
-    def note_time(self, time_ns: int) -> None:
+    def record_time(self, time_ns: int) -> None:
         """Extend the span of the log by a time."""
         self.first_ns, self.last_ns = min(self.first_ns, time_ns), max(self.last_ns, time_ns)
 
-    def note_state(self, robot: str, time_ns: int, pose: Array) -> None:
+    def record_state(self, robot: str, time_ns: int, pose: Array) -> None:
         """Record a new state, whose estimate is ``pose`` (3,)."""
         self.runs[robot].append(time_ns, pose)
         self.counts["keyframes"] += 1
 
-    def note_covariances(self) -> None:
+    def record_covariances(self) -> None:
         """Record the causal covariance of states that have none yet.
 
         Asked for as late as possible, just before the next step: by then association has needed

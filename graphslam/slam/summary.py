@@ -90,9 +90,9 @@ def summarise(
         },
         "consolidated": {name: counts[name] for name in REOPTIMISED if name in counts},
         "closures": known.recorded.to_summary(),
-        "world": known.joined.world,
-        "frames": dict(sorted(known.joined.frames.items())),
-        "starts_found": known.joined.to_summary(),
+        "world": known.frame_assignment.world,
+        "frames": dict(sorted(known.frame_assignment.frames.items())),
+        "starts_found": known.frame_assignment.to_summary(),
         "rejected": dict(sorted(associator.rejected.items())),
         "dropped": dict(sorted(all_dropped.items())),
         "repaired": dict(sorted(log.repaired.items())),
@@ -142,6 +142,7 @@ def _peak_memory_mb() -> float:
 def run_warnings(pipeline: Pipeline) -> list[str]:
     """What a user should know about a run although it went through."""
     known = pipeline.known
+    undecided = known.frame_assignment.undecided
     warnings = [
         f"{name}: its odometry jumped {run.track.resets} times; bridged at the previous speed"
         for name, run in pipeline.runs.items()
@@ -174,11 +175,11 @@ def run_warnings(pipeline: Pipeline) -> list[str]:
         for reason, count in sorted(pipeline.backend.skipped.items())
     ]
     warnings += [
-        f"{robot}: {known.joined.undecided.get(robot, 'nothing in the log tells its start pose')}; "
+        f"{robot}: {undecided.get(robot, 'nothing in the log tells its start pose')}; "
         "its poses are in a separate frame with its origin at its first pose; "
         f"--start {robot}=x,y,phi places it"
         for robot, run in pipeline.runs.items()
-        if run.started and robot == pipeline.frames.of[robot] != known.joined.world
+        if run.started and robot == pipeline.frames.of[robot] != known.frame_assignment.world
     ]
     if known.recorded.refused:
         warnings.append(

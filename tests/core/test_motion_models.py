@@ -22,7 +22,7 @@ from graphslam.core.motion_models import (
     wheel_twist,
 )
 from graphslam.core.records import OdometryIncrement, OdometryPose, WheelAngles
-from graphslam.odometry.preintegration import STANDING_SIGMA, Track, motions_of
+from graphslam.odometry.preintegration import STANDING_SIGMA, Track, preintegrate_batch
 from graphslam.odometry.readings import EDGE_NS, integrate_pending
 
 ROBOT = RobotConfig(wheel_radius_left_m=0.11, wheel_radius_right_m=0.1, axle_m=0.6)
@@ -644,7 +644,7 @@ def test_motions_of_several_robots_at_once_are_those_of_each():
     for track in [*tracks, tracks[1], tracks[3], still]:
         asked.append((track, *rng.integers(-SECOND, 17 * SECOND, size=(2, 12))))
     asked.append((tracks[2], *np.zeros((2, 0), dtype=np.int64)))
-    for (track, start, end), found in zip(asked, motions_of(asked), strict=True):
+    for (track, start, end), found in zip(asked, preintegrate_batch(asked), strict=True):
         assert len(found.delta) == len(start)
         if not len(start):
             continue

@@ -162,13 +162,13 @@ def test_closure_factor_is_the_pose_of_the_first_seen_from_the_other():
 def test_a_closure_of_n_images_costs_what_n_of_one_do(images):
     """Breaks if a whole submap gives way to a few observations of one wall as if it were one more
     of them: n rho(r / sqrt n) is what n closures of one image, each off by so much less, cost."""
-    closure = Closure("a", 5, "b", 0, np.zeros(3), np.diag([0.01, 0.01, 0.01]), images=images)
+    closure = Closure("a", 5, "b", 0, np.zeros(3), np.diag([0.01, 0.01, 0.01]), scan_count=images)
     kernel = RobustConfig("cauchy", 2.0)
     for off in (0.3, 30.0):
         one, many = (
             factors.closure_factor(X, T, each, kernel).error(at(np.array([r, 0, 0]), np.zeros(3)))
             for each, r in (
-                (replace(closure, images=1), off / np.sqrt(images)),
+                (replace(closure, scan_count=1), off / np.sqrt(images)),
                 (closure, off),
             )
         )

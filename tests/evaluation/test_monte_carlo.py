@@ -18,7 +18,7 @@ from scipy.stats import chi2
 from graphslam.core.errors import ConfigError, OutputError
 from graphslam.core.geometry import between, compose, exp, rotation3
 from graphslam.core.observation_models import MODELS
-from graphslam.estimation.backend import Joint
+from graphslam.estimation.backend import JointMarginal
 from graphslam.evaluation import cramer_rao_bound as bound
 from graphslam.evaluation import monte_carlo_campaign as campaign
 from graphslam.evaluation.monte_carlo_bench import Noise, draw_run, planned_path, run_seed
@@ -181,7 +181,7 @@ def test_nees_of_errors_drawn_from_the_covariance(frame):
         turn[:3, :3], turn[8:, 8:] = rotation3(pose[2]), rotation3(other[2])
     cov = turn @ own @ turn.T
     slices = (slice(3, 6), slice(6, 8), slice(8, 11))
-    joint = Joint(pose, (line, point), cov, slices, (other,))
+    joint = JointMarginal(pose, (line, point), cov, slices, (other,))
     found, wrong = [], []
     for _ in range(400):
         e = A @ rng.standard_normal(11)

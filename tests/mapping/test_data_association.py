@@ -10,7 +10,7 @@ from graphslam.core.config import AssociationConfig, OdometryConfig, RobotConfig
 from graphslam.core.geometry import between, compose, compose_cov, compose_jacobians, rotate_cov
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Motion, Observation, OdometryPose
-from graphslam.estimation.backend import Joint, block_slices
+from graphslam.estimation.backend import JointMarginal, block_slices
 from graphslam.mapping.data_association import (
     NEAREST_OLD,
     NEAREST_RECENT,
@@ -45,7 +45,7 @@ class KnownPoses:
         slices = block_slices([len(mean) for mean in means])
         cov = np.zeros((3 + sum(map(len, means)),) * 2)
         cov[:3, :3] = self.pose_cov
-        return Joint(self.pose, means, cov, slices)
+        return JointMarginal(self.pose, means, cov, slices)
 
     def landmark_means(self, landmarks):
         return [self.landmarks[i] for i in landmarks]
@@ -473,7 +473,7 @@ def test_prediction_moves_the_pose_block_and_its_correlations():
     """System update 4.4-4.7: P_xx as `compose_cov` has it, P_xt by F, P_tt not at all."""
     rng = np.random.default_rng(2)
     root = rng.normal(size=(8, 8))
-    joint = Joint(np.array([1.0, 2.0, 0.5]), (np.ones(2), np.ones(3)), root @ root.T, ())
+    joint = JointMarginal(np.array([1.0, 2.0, 0.5]), (np.ones(2), np.ones(3)), root @ root.T, ())
     motion = Motion(0, 1, np.array([0.5, 0.1, 0.3]), 0.01 * np.eye(3), np.zeros((3, 0)), 0.5)
     moved = predicted_joint(joint, motion)
     F, _ = compose_jacobians(joint.pose, motion.delta)

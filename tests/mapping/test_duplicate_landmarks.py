@@ -9,7 +9,7 @@ from finite_differences import jacobian
 
 from graphslam.core.geometry import between, compose
 from graphslam.core.records import Association, Estimate, Step, Trajectory
-from graphslam.estimation.backend import Joint, block_slices
+from graphslam.estimation.backend import JointMarginal, block_slices
 from graphslam.estimation.backends import BACKENDS
 from graphslam.estimation.isam2 import Reoptimiser
 from graphslam.mapping.duplicate_landmarks import (
@@ -38,7 +38,7 @@ def joint_of(means, cov):
     whole = np.zeros((3 + 3 * len(means),) * 2)
     whole[:3, :3] = 1e-6 * np.eye(3)
     whole[3:, 3:] = cov
-    return Joint(np.zeros(3), tuple(means), whole, block_slices(dims))
+    return JointMarginal(np.zeros(3), tuple(means), whole, block_slices(dims))
 
 
 def two_visits(shift, sigma, own=0.005):
@@ -135,7 +135,7 @@ def tied_trees(means, cov, names=(None,) * 8, together=()):
     entries = [replace(entry(k, "point"), identity=name) for k, name in enumerate(names)]
     whole = np.zeros((19, 19))
     whole[3:, 3:] = cov
-    joint = Joint(np.zeros(3), tuple(means), whole, block_slices([2] * 8))
+    joint = JointMarginal(np.zeros(3), tuple(means), whole, block_slices([2] * 8))
     return sorted(duplicates(entries, joint, [frozenset(pair) for pair in together]))
 
 
@@ -298,7 +298,7 @@ def test_a_line_ends_where_its_observations_end(map_moved, slid):
     landmarks = LandmarkMap()
     landmarks.entries[0] = replace(entry(0), kind="line", mean=np.array([0.4, 2.0, np.pi]))
     steps, estimate = seen_along(map_moved, slid)
-    landmarks.follow(steps, estimate)
+    landmarks.update_from(steps, estimate)
     wall = landmarks.entries[0]
     ends = [compose(wall.mean, np.array([end, 0.0, 0.0]))[0] for end in wall.extent]
     np.testing.assert_allclose(ends, [4.5 + map_moved, -0.5 + map_moved], atol=1e-12)

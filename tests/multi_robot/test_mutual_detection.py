@@ -87,7 +87,7 @@ def recorded(folder, robots, seed=0):
 def joined(folder, robots, known=("a",), outlined=("b",), seed=0, draw=None):
     log = recorded(folder, robots, seed)
     config = settings(robots, known, outlined, draw)
-    return initialise(open_logs([log], config), config).joined
+    return initialise(open_logs([log], config), config).frame_assignment
 
 
 def off(found, name, robots):
@@ -243,7 +243,7 @@ def test_sightings_of_robots_may_be_ignored(tmp_path):
     log = recorded(tmp_path, {"a": A, "b": B})
     config = settings({"a": A}, ["a"], ["b"])
     config = replace(config, association=replace(config.association, robot_sightings="ignore"))
-    found = initialise(open_logs([log], config), config).joined
+    found = initialise(open_logs([log], config), config).frame_assignment
     assert found.frames == {"a": "a", "b": "b"}
 
 

@@ -60,7 +60,7 @@ def test_a_wrong_motion_is_taken_from_the_scans(wrong):
         rng = np.random.default_rng(seed)
         found = checked_against_scans(said(STEP + wrong), *scans(L_ROOM, rng))
         off = found.delta - STEP
-        assert found.matched
+        assert found.from_scans
         assert np.hypot(off[0], off[1]) < 0.02 and abs(off[2]) < 0.01
         assert off @ np.linalg.solve(found.cov, off) < chi2.ppf(0.999, 3)
         assert not found.d_delta_d_calibration.any()
@@ -75,7 +75,7 @@ def test_along_a_corridor_odometry_stays():
         slipped = said(straight + np.array([0.3, 0, 0]))
         assert checked_against_scans(slipped, before, now) is slipped
         found = checked_against_scans(said(straight + np.array([0, 0, 0.2])), before, now)
-        assert found.matched and abs(found.delta[2]) < 0.01
+        assert found.from_scans and abs(found.delta[2]) < 0.01
         assert abs(found.delta[0] - 0.25) < 0.02
         assert found.cov[0, 0] > 0.5 * SIGMAS[0] ** 2
 
