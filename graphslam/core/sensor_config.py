@@ -89,7 +89,11 @@ class OdometryConfig:
     floor_sigma_m and floor_sigma_rad are added once per interval in which the robot moved.
     calibrate: estimate the calibration errors online, and at the end jointly with the trajectory.
     fixed_calibration: parameters held at what the log and [robots.*] say.
-    max_gap_s: longest span without odometry that is bridged.
+    calibration_floor_m, calibration_floor_rad: error of an estimated motion that calibration does
+    not explain by odometry (stamps, walls that are not flat).
+    max_gap_s: longest span without odometry that is bridged. max_speed_m_s, max_turn_rad_s: a
+    faster motion between two readings means stamps in a burst, which do not tell when it took
+    place; half of max_speed_m_s for 10 ms or longer means that the odometry was reset.
     scan_matching: use of relative motions from matching consecutive scans: `auto` = they replace
     odometry motions that they contradict; `on` = in addition every motion is fused with the match
     of the returns that lie on no line; `off`.
@@ -117,7 +121,11 @@ class OdometryConfig:
     floor_sigma_rad: float = 0.005
     calibrate: bool = True
     fixed_calibration: tuple[CalibrationParameter, ...] = ()
+    calibration_floor_m: float = 0.02
+    calibration_floor_rad: float = 0.01
     max_gap_s: float = 5.0
+    max_speed_m_s: float = 20.0
+    max_turn_rad_s: float = 20.0
     scan_matching: Literal["auto", "on", "off"] = "auto"
 
 
@@ -190,7 +198,9 @@ class ScanMatchingConfig:
     that are matched are thinned to one per cell of this size. reach_m: largest distance of a point
     from its counterpart where the alignment begins. free_margin_m: a beam shows that space is free
     up to so far before its return. floor_m, floor_rad: errors of a match that do not shrink with
-    the number of points.
+    the number of points. contradiction_m, contradiction_rad: smallest disagreement of consecutive
+    scans with odometry that is acted on. search_m, search_rad: half the window in which another
+    motion is then searched for, beside twice the motion.
     """
 
     point_sigma_m: float = 0.03
@@ -199,3 +209,7 @@ class ScanMatchingConfig:
     free_margin_m: float = 0.4
     floor_m: float = 0.02
     floor_rad: float = 0.004
+    contradiction_m: float = 0.05
+    contradiction_rad: float = 0.03
+    search_m: float = 0.5
+    search_rad: float = 0.2

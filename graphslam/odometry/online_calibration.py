@@ -1,39 +1,40 @@
-"""Online calibration of odometry by recursive least squares.
+"""Online calibration: odometry and mount parameters by recursive least squares.
 
-A wrong wheel radius is one constant of the whole run. Unmodelled, part of the error enters the
-heading whenever new landmarks replace old ones, and the map bends. So after every state the
-estimated motion is compared with the odometry, and a recursive least-squares filter estimates the
-parameters that explain the difference (thesis 4.8-4.13 has the derivatives, but treats the errors
-as white). The estimate is itself biased towards odometry, by some per cent; as the learned values
-are used for the next motions, that bias vanishes geometrically.
+A wrong wheel radius is one constant of the whole run. If it is not modelled, part of it leaks into
+the heading whenever tracking passes from landmarks to new ones, and the map bends. So after every
+state the estimated motion is compared with that of odometry, and a recursive least-squares filter
+estimates the parameters that explain the difference (thesis 4.8-4.13 has the derivatives, but
+treats the errors as white). The estimated motion itself is biased towards odometry by some per
+cent; since the parameters are applied to the next motions, that bias decays geometrically.
 """
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from graphslam.core.gaussian import solve
+from graphslam.core.config import OdometryConfig
+from graphslam.core.gaussian import chi2_quantile, solve
 from graphslam.core.geometry import Array, wrap
 from graphslam.core.motion_models import HELD_SIGMA, Calibration
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Motion
 
-#: m, m, rad: least sigma of a motion from landmarks (errors of time stamps, walls not flat)
-RELATIVE_SIGMA = (0.02, 0.02, 0.01)
 #: weight of the past per state: the memory is about 1 / (1 - FORGETTING_FACTOR) states, so that
 #: parameters may change slowly (tyres warm up)
 FORGETTING_FACTOR = 0.995
 #: share of the prior sigma that always remains in a motion's covariance, as parameters may change
 MIN_SIGMA_SHARE = 0.5
-#: squared Mahalanobis distance (99.9 %, 3 dof) beyond which a difference is no calibration error
-#: but a jump of the estimate (a loop closure) or a slip
-OUTLIER_D2 = 16.3
+#: squared Mahalanobis distance beyond which a difference is no calibration error but a jump of the
+#: estimate (a loop closure) or a slip
+OUTLIER_D2 = float(chi2_quantile(0.999, 3))
 
 
 class Calibrator:
     """Recursive least squares over one robot's motions."""
 
-    def __init__(self) -> None:
+    def __init__(self, config: OdometryConfig) -> None:
+        sigmas = [config.calibration_floor_m] * 2 + [config.calibration_floor_rad]
+        self._floor = np.diag(np.square(sigmas))
         self._prior: Array | None = None
         self._info: Array = np.zeros((0, 0))
         self._prior_info: Array = np.zeros((0, 0))
@@ -46,8 +47,8 @@ class Calibrator:
         """The calibration after one more motion.
 
         Args:
-            current: what ``motion`` was computed with.
-            motion: what odometry said.
+            current: the calibration that ``motion`` was computed with.
+            motion: according to odometry.
             moved: (3,) the same motion according to the estimate, in the frame of its start.
             observed: (3, 3) information about the motion's end that came from landmarks, along the
                 axes of its start. Without any, the estimate equals the odometry and the
@@ -67,7 +68,7 @@ class Calibrator:
             self._names = current.names
         miss = moved - motion.delta
         miss[2] = wrap(miss[2])
-        noise = motion.cov - D @ current.cov @ D.T + np.diag(np.square(RELATIVE_SIGMA))
+        noise = motion.cov - D @ current.cov @ D.T + self._floor
         # (noise + observed⁻¹)⁻¹, for an information matrix that may be singular
         W = solve(np.eye(3) + observed @ noise, observed)
         total = noise + D @ self._prior @ D.T
@@ -98,7 +99,7 @@ class Calibrator:
 def to_summary(known: Calibration, prior: Array) -> dict[str, tuple[float, float, bool]]:
     """Parameter -> (value, sigma, observable); ``prior`` (p, p) is the covariance before data.
 
-    Observable: the data halve the prior's sigma at least. One that is held has the sigma 0.
+    Observable: the data at least halve the prior's sigma. A parameter that is held has sigma 0.
     """
     sigmas, before = np.sqrt(np.diag(known.cov)), np.sqrt(np.diag(prior))
     held = before < HELD_SIGMA
@@ -115,12 +116,12 @@ def to_summary(known: Calibration, prior: Array) -> dict[str, tuple[float, float
 def observed_information(
     seen: Sequence[Association], poses: Mapping[str, Array], landmarks: Sequence[Array]
 ) -> dict[str, Array]:
-    """Information (3, 3) about robots' poses in observations of landmarks that are known.
+    """Information (3, 3) about robots' poses in observations of landmarks, along world axes.
 
     Args:
         seen: observations from these poses.
-        poses: robot -> (3,), world frame; along its axes the result is.
-        landmarks: targets of ``seen``, world frame.
+        poses: robot -> (3,), world frame.
+        landmarks: targets of ``seen``, world frame, taken as exact.
     """
     info = {robot: np.zeros((3, 3)) for robot in poses}
     for name in sorted({association.model for association in seen}):  # sums in one order

@@ -58,7 +58,7 @@ class Track(Readings):
     def _begin(self, source: str, time_ns: int) -> None:
         super()._begin(source, time_ns)
         self._mounted &= source != "given"
-        self.calibration = self.prior = nominal_calibration(source, self._config, self._mounted)
+        self.calibration = self.prior = nominal_calibration(source, self.config, self._mounted)
 
     @property
     def is_mounted(self) -> bool:
@@ -111,7 +111,7 @@ class Track(Readings):
 
     def increments(self, rows: Array, calibration: Array) -> Increments:
         """Increments (n) of rows (n, k), by calibration parameters (p,) or (n, p)."""
-        return MOTION_SOURCES[self.source](rows, calibration, self._robot, self._config)
+        return MOTION_SOURCES[self.source](rows, calibration, self._robot, self.config)
 
     def mounted_pose(self, times_ns: IntArray) -> Array:
         """Poses (n, 3) of the frame at ``mount``, the times ``latency_ns`` late; see `pose`.
@@ -200,7 +200,7 @@ class Track(Readings):
         Tracks of wheels are never integrated together: their geometry is of the robot.
         """
         own = self if self.source == "wheels" else None
-        return self.source, len(self) > 1, len(self.calibration.mean), self._config, own
+        return self.source, len(self) > 1, len(self.calibration.mean), self.config, own
 
     def coarse_motions(
         self,
@@ -282,7 +282,7 @@ class Track(Readings):
         """Covariance (3, 3) added once per interval; never zero, as it is inverted."""
         if not moved:
             return np.diag([STANDING_SIGMA**2] * 3)
-        return np.diag([self._config.floor_sigma_m**2] * 2 + [self._config.floor_sigma_rad**2])
+        return np.diag([self.config.floor_sigma_m**2] * 2 + [self.config.floor_sigma_rad**2])
 
 
 def preintegrate_batch(asked: Sequence[tuple[Track, IntArray, IntArray]]) -> list[Motions]:

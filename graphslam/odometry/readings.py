@@ -7,7 +7,7 @@ matter of `graphslam.odometry.preintegration`.
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,12 +21,9 @@ IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 Odometry = OdometryPose | OdometryIncrement | WheelAngles
 
-#: m/s and rad/s: no wheeled robot's odometry says more. An interval that implies it was stamped
-#: in a burst (a logger that fell behind): its stamps do not tell when the motion took place, so a
-#: time inside it belongs to the reading before, as the order of recording has it
-MAX_SPEED_M_S, MAX_TURN_RAD_S = 20.0, 20.0
-#: m/s over at least this many ns (and half a metre): the odometry jumped, see `_rows`
-RESET_SPEED_M_S, SHORTEST_RESET_NS = 10.0, 10_000_000
+#: the odometry was reset if it moves faster than this share of ``odometry.max_speed_m_s`` for this
+#: long or longer, in ns, and by this much more, in m: stamps of single readings are not that exact
+RESET_SPEED_RATIO, SHORTEST_RESET_NS, RESET_SLACK_M = 0.5, 10_000_000, 0.5
 #: share of readings in bursts above which the stamps are not good enough to learn a latency
 MAX_BURST_SHARE = 0.01
 #: ns: how long before the first reading or after the last a robot is taken to stand
@@ -63,10 +60,10 @@ class Readings:
     def __init__(self, config: OdometryConfig, robot: RobotConfig) -> None:
         """No readings yet."""
         self.source = ""
-        self._config, self._robot = config, robot
+        self.config, self._robot = config, robot
         self._count, self._bursts, self._resets = 0, 0, 0
-        self._settled = 0  # readings that are integrated; the others' values wait in `_fresh`
-        self._fresh: list[Array] = []
+        self._integrated = 0  # readings that are integrated; the others' values wait in `_pending`
+        self._pending: list[Array] = []
         self._times = np.empty(1024, dtype=np.int64)  # time of the end of each row's interval
         self._rows = np.empty((1024, 0))
         self._totals = np.empty((1024, 0))  # accumulated, see `_PATH` and its like
@@ -100,7 +97,7 @@ class Readings:
 
     @property
     def resets(self) -> int:
-        """Times that the odometry jumped."""
+        """How often the odometry was reset."""
         self._integrate_pending()
         return self._resets
 
@@ -115,7 +112,7 @@ class Readings:
         else:
             value = np.array([message.left_rad, message.right_rad])
         if not self._count:
-            poses = "commands" if self._config.commanded_velocities else "odometry"
+            poses = "commands" if self.config.commanded_velocities else "odometry"
             self._begin("wheels" if isinstance(message, WheelAngles) else poses, message.time_ns)
             self._last = value
         elif message.time_ns > self.last_ns:
@@ -123,7 +120,7 @@ class Readings:
                 self._grow()
             self._times[self._count] = message.time_ns
             self._count += 1
-            self._fresh.append(value)
+            self._pending.append(value)
         else:
             # a second reading of one time: its motion belongs to the interval that ends here
             self._integrate_pending()
@@ -133,8 +130,8 @@ class Readings:
                 self._enter(n, self._rows[n] + row)
 
     def _begin(self, source: str, time_ns: int) -> None:
-        """The first reading, from which all motion counts."""
-        self.source, self._count, self._settled = source, 1, 1
+        """Start at the first reading, the origin of `pose`."""
+        self.source, self._count, self._integrated = source, 1, 1
         self._rows = np.zeros((len(self._times), _ROW_SIZE[source]))
         self._totals = np.zeros((len(self._times), _ROW + _ROW_SIZE[source]))
         self._times[0] = time_ns
@@ -147,7 +144,7 @@ class Readings:
 
     def _integrate_pending(self) -> None:
         """Integrate the readings that came since a motion was last needed, all at once."""
-        if self._settled < self._count:
+        if self._integrated < self._count:
             integrate_pending((self,))
 
     def _row(self, value: Array, apart_ns: int) -> Array:
@@ -158,9 +155,9 @@ class Readings:
         if self.source == "wheels":
             return np.asarray(value - before)
         row = log(between(before, value))
-        if _jumped(row, apart_ns):
+        if _is_reset(row, apart_ns, self.config.max_speed_m_s):
             self._resets += 1
-            return np.asarray(self._rows[self._settled - 1])
+            return np.asarray(self._rows[self._integrated - 1])
         return row
 
     def _enter(self, n: int, row: Array) -> None:
@@ -177,7 +174,8 @@ class Readings:
         step = path, turned, path + TURNING_EFFORT_M * turn, *row.tolist()
         self._totals[n] = self._totals[n - 1] + step
         seconds = 1e-9 * int(self._times[n] - self._times[n - 1])
-        burst = path > MAX_SPEED_M_S * seconds or turn > MAX_TURN_RAD_S * seconds
+        limits = self.config.max_speed_m_s * seconds, self.config.max_turn_rad_s * seconds
+        burst = path > limits[0] or turn > limits[1]
         self._burst[n] = burst
         self._bursts += burst
 
@@ -261,7 +259,9 @@ class Readings:
     def _share(self, i: IntArray, time_ns: IntArray | int) -> Array:
         """Share (...,) of the intervals that end at readings i that times have reached.
 
-        Of an interval in a burst, see `MAX_SPEED_M_S`, nothing is reached before its end.
+        An interval is in a burst if its motion is faster than ``odometry.max_speed_m_s`` or
+        ``max_turn_rad_s``: a logger that fell behind stamped it. A time inside such an interval
+        belongs to the reading before, which is the order of recording.
         """
         begin, end = self._times[i - 1], self._times[i]
         share = (time_ns - begin) / np.maximum(end - begin, 1)
@@ -275,16 +275,17 @@ def integrate_pending(many: Iterable[Readings]) -> None:
     NumPy's cost per call outweighs that of few numbers, so five robots take little more time than
     one.
     """
-    alike: dict[str, list[Readings]] = defaultdict(list)
+    alike: dict[Hashable, list[Readings]] = defaultdict(list)
     for one in many:
-        if one._settled < one._count:
-            alike[one.source].append(one)
+        if one._integrated < one._count:
+            limits = one.config.max_speed_m_s, one.config.max_turn_rad_s
+            alike[one.source, *limits].append(one)
     for group in alike.values():
-        if len(group) == 1 and len(group[0]._fresh) == 1:  # the rule where each scan asks
+        if len(group) == 1 and len(group[0]._pending) == 1:  # the rule where each scan asks
             (one,) = group
-            n = one._settled
-            row = one._row(one._fresh.pop(), int(one._times[n] - one._times[n - 1]))
-            one._settled = one._count
+            n = one._integrated
+            row = one._row(one._pending.pop(), int(one._times[n] - one._times[n - 1]))
+            one._integrated = one._count
             one._enter(n, row)
         else:
             _integrate(group)
@@ -292,9 +293,9 @@ def integrate_pending(many: Iterable[Readings]) -> None:
 
 def _integrate(group: Sequence[Readings]) -> None:
     """`settle` of readings from one kind of source: arrays (n, ...) robot after robot."""
-    counts = [len(one._fresh) for one in group]
+    counts = [len(one._pending) for one in group]
     firsts = np.cumsum([0, *counts[:-1]])
-    times = [one._times[one._settled - 1 : one._count] for one in group]
+    times = [one._times[one._integrated - 1 : one._count] for one in group]
     apart_ns = np.concatenate([t[1:] - t[:-1] for t in times])
     rows = _rows(group, firsts, apart_ns)
     twists = rows[:, :3]
@@ -313,7 +314,7 @@ def _integrate(group: Sequence[Readings]) -> None:
         # the difference first: the sums of a robot at rest stay exactly the same
         return np.asarray((sums - others[of]) + before[of])
 
-    last = [one._settled - 1 for one in group]
+    last = [one._integrated - 1 for one in group]
     poses = np.array([one._poses[n] for one, n in zip(group, last, strict=True)])
     totals = np.array([one._totals[n] for one, n in zip(group, last, strict=True)])
     heading = summed(turned, poses[:, 2])
@@ -323,46 +324,48 @@ def _integrate(group: Sequence[Readings]) -> None:
     sums = summed(step, np.column_stack([poses[:, :2], totals]))
     poses = np.column_stack([sums[:, :2], wrap(heading)])
     seconds = 1e-9 * apart_ns
-    burst = (path > MAX_SPEED_M_S * seconds) | (turn > MAX_TURN_RAD_S * seconds)
+    config = group[0].config
+    burst = (path > config.max_speed_m_s * seconds) | (turn > config.max_turn_rad_s * seconds)
     for one, first, count in zip(group, firsts.tolist(), counts, strict=True):
-        new, own = slice(one._settled, one._count), slice(first, first + count)
+        new, own = slice(one._integrated, one._count), slice(first, first + count)
         one._rows[new], one._totals[new], one._poses[new] = rows[own], sums[own, 2:], poses[own]
         one._burst[new] = burst[own]
         one._bursts += int(np.count_nonzero(burst[own]))
-        one._settled = one._count
-        one._fresh.clear()
+        one._integrated = one._count
+        one._pending.clear()
 
 
 def _rows(group: Sequence[Readings], firsts: IntArray, apart_ns: IntArray) -> Array:
-    """Rows (n, k) of fresh readings of one kind that follow each robot's last one.
+    """Rows (n, k) of the pending readings of robots with one kind of source.
 
-    A jump of the pose, faster than any robot over an interval that is no burst, is a reset of the
-    odometry. Its motion is unknown and is replaced by that at the previous speed.
+    A jump of the odometry pose, see `_is_reset`, is not a motion: the odometry was reset. The
+    motion in that interval is unknown; the previous interval's is taken for it.
 
     Args:
         group: the robots' readings.
         firsts: (m,) where in n those of each begin.
         apart_ns: (n,) since the reading before.
     """
-    values = np.array([value for one in group for value in one._fresh])
+    values = np.array([value for one in group for value in one._pending])
     if group[0].source == "given":
         return values
     earlier = np.roll(values, 1, axis=0)
     earlier[firsts] = [one._last for one in group]
     for one in group:
-        one._last = one._fresh[-1]
+        one._last = one._pending[-1]
     if group[0].source == "wheels":
         return np.asarray(values - earlier)
     rows = log(between(earlier, values))
-    for k in np.flatnonzero(_jumped(rows, apart_ns)).tolist():
+    resets = _is_reset(rows, apart_ns, group[0].config.max_speed_m_s)
+    for k in np.flatnonzero(resets).tolist():
         g = int(np.searchsorted(firsts, k, side="right")) - 1
         group[g]._resets += 1
-        rows[k] = rows[k - 1] if k > firsts[g] else group[g]._rows[group[g]._settled - 1]
+        rows[k] = rows[k - 1] if k > firsts[g] else group[g]._rows[group[g]._integrated - 1]
     return rows
 
 
-def _jumped(rows: Array, apart_ns: IntArray | int) -> BoolArray:
-    """Whether rows (..., 3) are faster than any robot, over intervals (...,) that are no bursts."""
-    limit_m = RESET_SPEED_M_S * 1e-9 * np.asarray(apart_ns) + 0.5
+def _is_reset(rows: Array, apart_ns: IntArray | int, max_speed_m_s: float) -> BoolArray:
+    """Whether rows (..., 3) over intervals (...,) are resets, see `RESET_SPEED_RATIO`."""
+    limit_m = RESET_SPEED_RATIO * max_speed_m_s * 1e-9 * np.asarray(apart_ns) + RESET_SLACK_M
     long = np.asarray(apart_ns) >= SHORTEST_RESET_NS
     return np.asarray(long & (np.hypot(rows[..., 0], rows[..., 1]) > limit_m))

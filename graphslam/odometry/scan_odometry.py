@@ -24,18 +24,13 @@ MIN_POINTS = 30
 #: squared Mahalanobis distance (90 and 99.9 %, 3 dof) between odometry and scans from which a
 #: motion is searched for, and from which the scans contradict the odometry
 SUSPECT_D2, CONTRADICTION_D2 = chi2_quantile([0.9, 0.999], 3)
-#: m, rad: smaller differences are not corrected here; landmarks correct them
-SMALLEST_M, SMALLEST_RAD = 0.05, 0.03
-#: m, rad: largest sigma of a scan match along a direction in which it is used
-MAX_SIGMA = 0.08
+#: largest sigma, m or rad, of a scan match along a direction in which it is used, in ``floor_m``
+MAX_SIGMA_FLOORS = 4.0
 #: share of points that lie on the previous scan: below the first a motion is searched for; one
 #: that is found needs at least the second, and the third more than at the odometry's motion
 USUAL_OVERLAP, MIN_OVERLAP, MIN_OVERLAP_GAIN = 0.6, 0.5, 0.05
-#: m, m, rad: half the search window beyond twice the motion (the motion reported by an unsigned
-#: counter may be reversed)
-MARGIN = np.array([0.5, 0.5, 0.2])
-#: m: points nearer to an observed line than this belong to it
-LINE_MARGIN_M = 0.1
+#: points within so many cells of matched points of an observed line belong to it
+LINE_CELLS = 2.0
 
 
 def scan_submap(points: Array, config: ScanMatchingConfig | None = None) -> Submap | None:
@@ -53,23 +48,28 @@ def checked_against_scans(motion: Motion, before: Submap, now: Submap) -> Motion
         before: scan of the state where it starts, in that state's frame.
         now: scan of the state where it ends.
     """
+    config = before.config
     here, step, cov = fit(now, before, motion.delta)
     if here >= USUAL_OVERLAP and mahalanobis_squared(step, motion.cov + cov) < SUSPECT_D2:
         return motion
     guesses = [align(now, before, motion.delta)]
     if fit(now, before, guesses[0][0])[0] < max(MIN_OVERLAP, here + MIN_OVERLAP_GAIN):
-        window = MARGIN + 2 * np.abs(motion.delta)
+        window = np.array([config.search_m, config.search_m, config.search_rad])
+        window += 2 * np.abs(motion.delta)  # an unsigned counter reports the reverse of a motion
         found = match(now, before, motion.delta, window)
         guesses += [(m.pose, m.cov) for m in found]
     there, (pose, cov) = max(
         ((fit(now, before, pose)[0], (pose, cov)) for pose, cov in guesses), key=lambda g: g[0]
     )
-    axes, variances = _measured_directions(cov)
+    axes, variances = _measured_directions(cov, MAX_SIGMA_FLOORS * config.floor_m)
     measured_off = axes.T @ _difference(pose, motion.delta)
     off = axes @ measured_off
     if (
         there < max(MIN_OVERLAP, here + MIN_OVERLAP_GAIN)
-        or (np.hypot(off[0], off[1]) < SMALLEST_M and abs(off[2]) < SMALLEST_RAD)
+        or (
+            np.hypot(off[0], off[1]) < config.contradiction_m
+            and abs(off[2]) < config.contradiction_rad
+        )
         or mahalanobis_squared(off, motion.cov + cov) < CONTRADICTION_D2
     ):
         return motion
@@ -100,13 +100,13 @@ def _difference(a: Array, b: Array) -> Array:
     return np.asarray(off)
 
 
-def _measured_directions(cov: Array) -> tuple[Array, Array]:
-    """Axes (3, k) along which a sigma is below `MAX_SIGMA`, and the variances (k,) along them.
+def _measured_directions(cov: Array, max_sigma: float) -> tuple[Array, Array]:
+    """Axes (3, k) along which the sigma is below ``max_sigma``, and the variances (k,) along them.
 
     Without the limit the noise of points would count as structure, even along a corridor.
     """
     variances, axes = np.linalg.eigh(cov)
-    measured = variances < MAX_SIGMA**2
+    measured = variances < max_sigma**2
     return axes[:, measured], variances[measured]
 
 
@@ -128,14 +128,17 @@ def match_off_lines(motion: Motion, before: Submap, robot: str, points: Array) -
     return Closure(robot, motion.end_ns, robot, motion.start_ns, pose, cov)
 
 
-def points_off_lines(points: Array, seen: Sequence[Observation]) -> Array:
+def points_off_lines(
+    points: Array, seen: Sequence[Observation], config: ScanMatchingConfig
+) -> Array:
     """Those of the points (n, 2) that lie on none of the observed lines; both in one frame."""
+    margin_m = LINE_CELLS * config.cell_m
     free = np.ones(len(points), dtype=np.bool_)
     for o in seen:
         if o.extent is None:
             continue
         back = rotation(-float(o.z[2]))
         x, y = back @ (points - o.z[:2]).T
-        near = (x > o.extent[0] - LINE_MARGIN_M) & (x < o.extent[1] + LINE_MARGIN_M)
-        free &= ~(near & (np.abs(y) < LINE_MARGIN_M))
+        near = (x > o.extent[0] - margin_m) & (x < o.extent[1] + margin_m)
+        free &= ~(near & (np.abs(y) < margin_m))
     return points[free]

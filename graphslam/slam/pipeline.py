@@ -277,7 +277,8 @@ class Pipeline(StepRecorder):
         run.contradicted += motion.from_scans
         if self.config.odometry.scan_matching == "auto" or motion.from_scans:
             return motion, None
-        return motion, match_off_lines(motion, last[1], scan.robot, points_off_lines(points, seen))
+        free = points_off_lines(points, seen, self.config.scan_matching)
+        return motion, match_off_lines(motion, last[1], scan.robot, free)
 
     def observations(self, event: Sequence[Message], since: Motion | None) -> list[Observation]:
         """Landmarks seen, in the base frame of the state (at the start of ``since``, if given)."""

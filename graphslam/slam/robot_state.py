@@ -39,7 +39,7 @@ class RobotState:
     """
 
     track: Track
-    calibrator: Calibrator = field(default_factory=Calibrator)
+    calibrator: Calibrator = field(init=False)
     path_m: float = 0.0
     scanned_ns: int | None = None
     times: list[int] = field(default_factory=list)
@@ -52,6 +52,10 @@ class RobotState:
     motions: int = 0
     contradicted: int = 0
     clock: Clock = field(default_factory=Clock)
+
+    def __post_init__(self) -> None:
+        """Calibrate the track's odometry by its own settings."""
+        self.calibrator = Calibrator(self.track.config)
 
     @property
     def started(self) -> bool:
@@ -75,7 +79,7 @@ class RobotState:
         Args:
             motion: according to odometry.
             pose: (3,) estimate of the new state.
-            observed: (3, 3) see `Calibrator.learn`.
+            observed: (3, 3) see `Calibrator.update`.
         """
         moved = between(self.causal_poses[-1], pose)
         self.track.calibration = self.calibrator.update(

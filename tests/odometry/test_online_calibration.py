@@ -15,7 +15,6 @@ from graphslam.odometry.online_calibration import (
     FORGETTING_FACTOR,
     MIN_SIGMA_SHARE,
     OUTLIER_D2,
-    RELATIVE_SIGMA,
     Calibrator,
     observed_information,
 )
@@ -29,7 +28,9 @@ SCALES = {"translation_scale": 0.03, "rotation_scale": -0.04, "drift_rad_per_m":
 LASER = {"laser_x_m": 0.08, "laser_y_m": -0.06, "laser_yaw_rad": 0.02, "laser_latency_s": 0.04}
 NOTHING = dict.fromkeys(SCALES, 0.0)
 CENTRED = dict.fromkeys(LASER, 0.0)
-#: information from landmarks that show a motion as well as `RELATIVE_SIGMA` lets them
+#: what an estimated motion is off by in itself
+FLOOR = [OdometryConfig().calibration_floor_m] * 2 + [OdometryConfig().calibration_floor_rad]
+#: information from landmarks that show a motion as well as `FLOOR` lets them
 PLENTY = 1e12 * np.eye(3)
 #: sigmas of the prior, from the settings
 PRIOR = {
@@ -80,13 +81,13 @@ class Drive:
         *mount, late = laser.values()
         self._mount, self._late_ns = np.array(mount), round(late * SECOND)
         self.states = np.arange(SECOND, len(twists) * PERIOD_NS - SECOND, STATE_NS)
-        self.calibrator = Calibrator()
+        self.calibrator = Calibrator(OdometryConfig())
 
     def moved(self, start_ns, end_ns):
-        """True motion of the laser, as landmarks show it: noise `RELATIVE_SIGMA` if any."""
+        """True motion of the laser, as landmarks show it: noise `FLOOR` if any."""
         times = np.array([start_ns, end_ns]) - self._late_ns
         start, end = compose(self._truth.pose(times), self._mount)
-        noise = 0.0 if self.rng is None else self.rng.normal(0, RELATIVE_SIGMA)
+        noise = 0.0 if self.rng is None else self.rng.normal(0, FLOOR)
         return between(start, end) + noise
 
     def learn(self):
@@ -133,7 +134,7 @@ def test_one_step_is_the_information_filter_by_hand():
     moved = motion.delta + np.array([0.02, 0.01, -0.01])
     after = drive.calibrator.update(prior, motion, moved, PLENTY)
     D = motion.d_delta_d_calibration
-    noise = motion.cov - D @ prior.cov @ D.T + np.diag(np.square(RELATIVE_SIGMA))
+    noise = motion.cov - D @ prior.cov @ D.T + np.diag(np.square(FLOOR))
     info = np.linalg.inv(prior.cov) + D.T @ np.linalg.solve(noise, D)
     expected = np.linalg.solve(info, D.T @ np.linalg.solve(noise, moved - motion.delta))
     np.testing.assert_allclose(after.mean, expected, rtol=1e-7)
@@ -156,10 +157,10 @@ def test_wheels_of_unequal_size_are_found():
     for k, (left, right) in enumerate(np.cumsum(np.vstack([[0, 0], steps]), axis=0)):
         track.add(WheelAngles("r", k * PERIOD_NS, k * PERIOD_NS, left, right))
     true = chain(wheel_twist(steps, real))
-    calibrator = Calibrator()
+    calibrator = Calibrator(OdometryConfig())
     for k in range(0, n, 10):
         motion = track.motion(k * PERIOD_NS, (k + 10) * PERIOD_NS)
-        moved = between(true[k], true[k + 10]) + rng.normal(0, RELATIVE_SIGMA)
+        moved = between(true[k], true[k + 10]) + rng.normal(0, FLOOR)
         track.calibration = calibrator.update(track.calibration, motion, moved, PLENTY)
     found = calibrator.summary()
     errors = {"wheel_radius_left_m": 4e-3, "wheel_radius_right_m": 2e-3, "axle_m": 0.01}
@@ -194,7 +195,7 @@ def test_headings_are_compared_the_short_way_round():
     for k, phi in enumerate(np.linspace(0, np.pi - 0.01, 50)):
         track.add(OdometryPose("r", k * PERIOD_NS, k * PERIOD_NS, np.array([0, 0, phi])))
     motion = track.motion(0, 49 * PERIOD_NS)
-    calibrator = Calibrator()
+    calibrator = Calibrator(OdometryConfig())
     after = calibrator.update(track.calibration, motion, np.array([0, 0, -np.pi + 0.01]), PLENTY)
     assert 0 < after.mean[1] < 0.02 / np.pi
 
@@ -325,7 +326,7 @@ def test_given_increments_are_left_alone():
         start, end = k * SECOND, (k + 1) * SECOND
         step = np.array([0.5, 0, 0.1])
         track.add(OdometryIncrement("r", end, end, start, step, 1e-4 * np.eye(3)))
-    calibrator, current = Calibrator(), track.calibration
+    calibrator, current = Calibrator(OdometryConfig()), track.calibration
     for k in range(20):
         motion = track.motion(k * SECOND, (k + 1) * SECOND)
         assert calibrator.update(current, motion, np.array([0.6, 0.05, 0.2]), PLENTY) is current
@@ -338,7 +339,7 @@ def test_a_robot_that_stands_teaches_nothing():
     track = Track(OdometryConfig(), RobotConfig(), mounted=True)
     for k in range(100):
         track.add(OdometryPose("r", k * PERIOD_NS, k * PERIOD_NS, np.ones(3)))
-    calibrator, current = Calibrator(), track.calibration
+    calibrator, current = Calibrator(OdometryConfig()), track.calibration
     for k in range(4):
         motion = track.motion(k * SECOND, (k + 1) * SECOND)
         assert calibrator.update(current, motion, np.array([0.01, 0.0, 0.005]), PLENTY) is current

@@ -6,6 +6,7 @@ from scipy.stats import chi2
 from walls import CORRIDOR, L_ROOM, cloud
 from wrong_odometry import CHANGES, recorded, run
 
+from graphslam.core.config import ScanMatchingConfig
 from graphslam.core.config_io import load_config
 from graphslam.core.geometry import compose, wrap
 from graphslam.core.records import Motion, Observation
@@ -112,7 +113,9 @@ def test_points_on_lines_are_left_out():
     line = Observation("line", np.array([1.0, 2.0, np.pi / 2]), np.eye(3), np.array([-1.0, 1.0]))
     post = Observation("point", np.array([0.1, 3.0]), np.eye(2))
     points = np.array([[1.05, 2.5], [0.95, 1.0], [1.3, 2.0], [1.0, 3.5]])
-    np.testing.assert_array_equal(points_off_lines(points, [line, post]), points[2:])
+    np.testing.assert_array_equal(
+        points_off_lines(points, [line, post], ScanMatchingConfig()), points[2:]
+    )
 
 
 def test_clutter_measures_the_motion_that_walls_do_not():
@@ -135,7 +138,10 @@ def test_clutter_measures_the_motion_that_walls_do_not():
             for y in (-1.0, 1.0)
         ]
         found = match_off_lines(
-            motion, scan_submap(clouds[0]), "r", points_off_lines(clouds[1], walls)
+            motion,
+            scan_submap(clouds[0]),
+            "r",
+            points_off_lines(clouds[1], walls, ScanMatchingConfig()),
         )
         assert found is not None and (found.other_time_ns, found.time_ns) == (0, S)
         off = found.delta - straight
