@@ -22,7 +22,7 @@ from graphslam.core.worker import parallel_map
 from graphslam.mapping.submaps import State, SubmapPose, drift_covariance
 from graphslam.perception.scan_matching import IntArray, Match, Submap, agreement, align, match
 
-#: m between the middles of submaps that may show one place: as far as each reaches along the path
+#: m between the middles of submaps that may show one place: the default reach of a submap
 NEAR_M = 3.0
 #: half the window of a search: so many sigmas of the relative pose, and this much more (m, m, rad)
 SIGMAS, MARGIN = 3.0, np.array([0.6, 0.6, 0.08])

@@ -15,8 +15,8 @@ from graphslam.slam.robot_settings import make_tracks
 from graphslam.slam.robot_state import RobotState
 from graphslam.slam.synchronisation import ODOMETRY
 
-#: robot, time, other robot, its time, relative pose as bytes: identifies a recorded closure
-ClosureId = tuple[str, int, str, int, bytes]
+#: robot, time, other robot, its time, relative pose: identifies a recorded closure
+ClosureId = tuple[str, int, str, int, tuple[float, ...]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +76,7 @@ def judge_recorded_closures(
 def closure_id(message: RelativePose) -> ClosureId:
     """Identifies a recorded closure in every pass over the log."""
     ends = message.robot, message.time_ns, message.other, message.start_ns
-    return (*ends, message.delta.tobytes())
+    return (*ends, tuple(message.delta.tolist()))
 
 
 def between_states(

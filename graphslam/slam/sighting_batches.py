@@ -275,10 +275,11 @@ def inflate_repeated(associations: Sequence[Association]) -> tuple[Association, 
 def events(messages: Iterable[Message]) -> Iterator[list[Message]]:
     """Messages grouped to events: the sightings of one robot at one time are one image."""
 
-    def key(message: Message) -> tuple[object, ...]:
+    def key(numbered: tuple[int, Message]) -> tuple[object, ...]:
+        number, message = numbered
         if isinstance(message, Sighting):
             return (message.robot, message.time_ns)
-        return (id(message),)
+        return (number,)  # an event of its own
 
-    for _, group in itertools.groupby(messages, key):
-        yield list(group)
+    for _, group in itertools.groupby(enumerate(messages), key):
+        yield [message for _, message in group]
