@@ -2,7 +2,7 @@
 
 Hypotheses are judged in pairs first; the largest set that agrees in pairs is searched for greedily
 (J. Mangelson et al., Pairwise consistent measurement set maximization, ICRA 2018, DOI
-10.1109/ICRA.2018.8460217), and members that all the others contradict leave it.
+10.1109/ICRA.2018.8460217), and members that contradict all the others are removed.
 """
 
 from collections.abc import Iterable
@@ -35,19 +35,19 @@ def largest_consistent_set(r: Array, S: Array, probability: float, starts: int) 
     """Indices of the largest set found of measurements that agree with each other.
 
     Each must agree with the estimate alone. Two agree if, given either, the other is within its
-    chi-square limit. Of those that agree in pairs the worst leaves until each agrees with all the
-    others together.
+    chi-square limit. From a set that agrees in pairs the worst is removed until each agrees with
+    all the others together.
 
     Args:
         r: (n, 3) innovations of the measurements.
         S: (3n, 3n) their joint covariance, positive definite.
         probability: of the chi-square limits (3 degrees of freedom).
-        starts: with how many measurements the search begins, those first that most agree with.
+        starts: number of measurements to start the search from, the best connected first.
     """
     n, gate = len(r), chi2_quantile(probability, 3)
     blocks = S.reshape(n, 3, n, 3).transpose(0, 2, 1, 3)
     own = blocks[np.arange(n), np.arange(n)]
-    gain = blocks @ np.linalg.inv(own)[None]  # [a, b]: what b says of a
+    gain = blocks @ np.linalg.inv(own)[None]  # [a, b]: gain of a by b
     rest = r[:, None] - (gain @ r[None, :, :, None])[..., 0]
     left = own[:, None] - gain @ blocks.transpose(1, 0, 2, 3)
     left[np.arange(n), np.arange(n)] = np.eye(3)  # of itself nothing is left
@@ -60,7 +60,7 @@ def largest_consistent_set(r: Array, S: Array, probability: float, starts: int) 
 
 
 def leave_one_out(chosen: IntArray, r: Array, S: Array, probability: float) -> list[int]:
-    """Those of the chosen measurements that all the others bear out; the worst leaves first.
+    """The chosen measurements that agree with all the others; the worst is removed first.
 
     Each removal inverts the covariance again, O(n³).
 
@@ -137,15 +137,15 @@ def rival_set(agree: Array, worth: Array | NDArray[np.float32], rest: IntArray) 
 def greedy_max_clique(
     agree: NDArray[Any], worth: Array | NDArray[np.float32], starts: int | None = None
 ) -> IntArray:
-    """Indices, in order, of the set found of which all agree in pairs and that is worth most.
+    """Indices, in order, of a set that agrees in pairs and whose total worth is largest.
 
-    Greedily from each that might have a better one: next comes whatever agrees with most of what
-    is left.
+    Greedily from each start that may lead to a better one: the next member is the one that agrees
+    with most of what is left.
 
     Args:
         agree: (n, n) bool, symmetric, False on the diagonal.
         worth: (n,) of each; single precision takes half the time where n is 1000.
-        starts: from how many the search begins at most, the best connected first.
+        starts: number of members to start from, the best connected first; None = all.
     """
     best: list[int] = []
     most = 0.0

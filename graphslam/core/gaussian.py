@@ -73,7 +73,7 @@ def update(
 
 
 def whiten(PHt: Array, S: Array, innovation: Array) -> tuple[Array, Array, float]:
-    """What a measurement update is made of, without inverting S: with S = L Lᵀ and K = P Hᵀ S⁻¹,
+    """The parts of a measurement update, without inverting S: with S = L Lᵀ and K = P Hᵀ S⁻¹,
     the mean moves by K ν = Bᵀ w and the covariance loses K S Kᵀ = Bᵀ B.
 
     Args:
@@ -112,8 +112,8 @@ def solve(A: Array, B: Array) -> Array:
 class JointGaussian(Generic[Name]):
     """Named members with one mean and one covariance, both growing.
 
-    Room is made by doubling, so a member costs O(n) to add on average. Blocks are packed: what is
-    removed leaves no hole. The covariance is symmetric to the digit, always.
+    Storage grows by doubling, so adding a member costs O(n) on average. Blocks are contiguous, also
+    after a removal. The covariance is always exactly symmetric.
     """
 
     def __init__(self, room: int = 64) -> None:
@@ -187,7 +187,7 @@ class JointGaussian(Generic[Name]):
             name: of the new member.
             mean: (d,).
             cov: covariance (d, d) of its fresh noise.
-            given: member i -> G_i (d, d_i); nothing: it is independent of all others.
+            given: member i -> G_i (d, d_i); None: it is independent of all others.
         """
         n, d = self._size, len(cov)
         self._make_room(d)
@@ -294,5 +294,5 @@ class JointGaussian(Generic[Name]):
 
 
 def symmetric(P: Array) -> Array:
-    """The symmetric part (n, n) of a matrix that is symmetric but for rounding."""
+    """The symmetric part (n, n) of a matrix that rounding made asymmetric."""
     return np.asarray(0.5 * (P + P.T))

@@ -17,8 +17,8 @@ Array = NDArray[np.float64]
 def wrap(angle_rad: ArrayLike) -> Array:
     """Angles (...,) in [-pi, pi), rad: the one place where angles are wrapped.
 
-    An angle that is inside already comes back to the digit: adding pi and taking it away again
-    would leave nothing of a turn below 4e-16 rad.
+    An angle inside is returned unchanged: adding and subtracting pi would lose turns below 4e-16
+    rad.
     """
     angle = np.asarray(angle_rad, dtype=float)
     return np.asarray(angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi)))
@@ -121,7 +121,7 @@ def _sinc(phi: float) -> float:
 
 
 def _sinc_terms(phi: Array) -> tuple[Array, Array]:
-    """``sin(phi)/phi`` and ``(1 - cos phi)/phi`` without cancellation near zero.
+    """``sin(phi)/phi`` and ``(1 - cos phi)/phi`` (...,) without cancellation near zero.
 
     sin phi = 2 sin(phi/2) cos(phi/2) and 1 - cos phi = 2 sin²(phi/2), so both are exact to
     rounding: sinc(phi/2) cos(phi/2) and phi/2 sinc²(phi/2).
@@ -251,7 +251,7 @@ def exp_jacobian(twist: Array) -> Array:
     )
     db_series = 0.5 - w2 / 8 * (1 - w2 / 18 * (1 - w2 / 40 * (1 - w2 / 70 * (1 - w2 / 108))))
     da, db = da_series, db_series
-    if not small.all():  # increments of odometry hardly ever turn so far
+    if not small.all():  # increments of odometry rarely turn so far
         safe = np.where(small, 1.0, w)
         cos, sin = np.cos(safe), np.sin(safe)
         da = np.where(small, da, (safe * cos - sin) / safe**2)

@@ -1,4 +1,4 @@
-"""From what wheels and odometry report to motions with covariance (thesis ch. 2.1 and 4.8-4.15).
+"""Motion models: from wheels and odometry to increments with covariance (thesis 2.1, 4.8-4.15).
 
 Every source of motion is brought to *twists*: motion on a circle segment, ``exp(twist)``. A twist
 has two kinds of error. The white one is fresh in every increment, so its variance adds up. The
@@ -17,7 +17,8 @@ from graphslam.core.geometry import Array, compose, exp, exp_jacobian, inverse, 
 
 #: a calibration parameter whose prior sigma is smaller, in any unit, is held
 HELD_SIGMA = 1e-6
-#: 1/m: robots that turn more tightly lose no more of their path; they hardly drive at all
+#: 1/m: the shortening of the path by `command_increments` grows up to this curvature; robots that
+#: turn more tightly hardly drive at all
 MAX_CURVATURE_PER_M = 6.0
 
 
@@ -115,10 +116,10 @@ def command_increments(
 ) -> Increments:
     """Increments of commanded velocities, compounded to poses: ``rows`` (n, 3) are twists.
 
-    Calibration parameters: those of `odometry_increments`, and by how much less a robot drives
-    while it turns, in m²: the path is shorter by this times the squared curvature. So it is where
-    the speed meant is that of a point at distance d from the middle of the axle, hypot(v, d ω):
-    to second order too large by d²/2 times the squared curvature.
+    Calibration parameters: those of `odometry_increments`, and the turning loss, in m²: the path is
+    shorter by this times the squared curvature. This is the case if the commanded speed is that of
+    a point at distance d from the middle of the axle, hypot(v, d ω): to second order too large by
+    d²/2 times the squared curvature.
     """
     path = np.maximum(np.hypot(rows[:, 0], rows[:, 1]), 1e-12)
     curvature = np.minimum(np.abs(rows[:, 2]) / path, MAX_CURVATURE_PER_M)
@@ -147,7 +148,7 @@ def wheel_increments(
 ) -> Increments:
     """Increments of wheel rotations: ``rows`` (n, 2) left and right, rad.
 
-    Calibration parameters: what is to be added to left radius, right radius and axle length, m.
+    Calibration parameters: corrections of left radius, right radius and axle length, m.
     The counting error of one reading enters two neighbouring increments with opposite signs and
     nearly cancels; it is treated as white here (cautious), thesis eq. 4.9.
     """
@@ -179,11 +180,11 @@ def mounted_motion(delta: Array, mount: Array) -> tuple[Array, Array]:
 
 
 def nominal_calibration(source: str, config: OdometryConfig, mounted: bool) -> Calibration:
-    """What is known about a source's calibration before any data: zero, with prior sigmas.
+    """Prior of a source's calibration: mean zero, covariance from the settings' sigmas.
 
-    With ``mounted`` the last four parameters are where the sensor really sits, relative to where
-    the log says (x m, y m, yaw rad, base axes), and by how long its stamps are late against the
-    odometry's (s): the estimated states are rigid to the sensor and its clock.
+    With ``mounted`` the last four parameters are the error of the sensor's mounting pose in the log
+    (x m, y m, yaw rad, base axes) and the latency of its stamps against the odometry's (s): the
+    estimated states are rigid to the sensor and its clock.
     """
     sigmas = {
         "given": {},

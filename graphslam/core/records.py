@@ -1,11 +1,11 @@
-"""The frozen records that travel between the modules.
+"""The frozen records that modules exchange: messages, motions, observations, estimates, results.
 
 All arrays are float64. Poses are ``(3,)``: x m, y m, heading rad. Covariances are of *additive*
 errors (x, y, heading) along the axes of the frame that the quantity is given in, unless a field
 says otherwise. Time is integer nanoseconds.
 
-A message has two times. ``stamp_ns`` is its header stamp to the digit, which names it in every
-output. ``time_ns`` is where it is placed on the time line: equal to the stamp except where the
+A message has two times. ``stamp_ns`` is its header stamp, unchanged; it identifies the message in
+every output. ``time_ns`` is the time it is processed with: equal to the stamp except where the
 stamp contradicts the order of recording (see `graphslam.logs.time_order`).
 """
 
@@ -21,12 +21,12 @@ from graphslam.core.geometry import Array
 #: a time or times (...,), ns
 Stamps = int | Sequence[int] | np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
-# ---------------------------------------------------------------- what a log says
+# ---------------------------------------------------------------- messages of a log
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Message:
-    """What every message of a log has: the robot that recorded it and its two times."""
+    """Base of all messages of a log: the robot that recorded it and its two times."""
 
     robot: str
     stamp_ns: int
@@ -35,7 +35,7 @@ class Message:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OdometryPose(Message):
-    """Pose (3,) of the base in the odometry frame; only differences of it mean anything."""
+    """Pose (3,) of the base in the odometry frame, whose origin is arbitrary."""
 
     pose: Array
 
@@ -64,7 +64,7 @@ class WheelAngles(Message):
 class Scan(Message):
     """One sweep of a planar laser.
 
-    ``ranges`` (n,) m, NaN where the beam gave nothing usable; beam i points along
+    ``ranges`` (n,) m, NaN where the beam gave no usable range; beam i points along
     ``angle_min_rad + i * angle_step_rad`` in the laser frame; ``mount`` (3,) is the pose of the
     laser in the base frame.
     """
@@ -85,7 +85,7 @@ class Sighting(Message):
     """A landmark or another robot measured by bearing and range, perhaps with its direction.
 
     ``z`` is (bearing rad, range m) or (bearing, range, direction rad) in the sensor's frame, the
-    direction being the heading of the thing seen relative to the sensor. ``cov`` is (2, 2) or
+    direction being the heading of the target relative to the sensor. ``cov`` is (2, 2) or
     (3, 3). ``identity`` is None when unknown. ``seen_robot`` names a robot, None for a landmark.
     Sightings of one robot at one stamp form one image: they exclude each other.
     """
@@ -101,7 +101,8 @@ class Sighting(Message):
 class RelativePose(Message):
     """Pose (3,) of ``robot`` at ``time_ns`` in the frame of ``other`` at ``start_ns``.
 
-    A loop closure (``other`` is the robot itself, long ago) or a meeting of two robots.
+    A loop closure (``other`` is the robot itself at an earlier time) or a measurement between two
+    robots.
     ``cov`` (3, 3) is along the axes of the frame at ``start_ns``.
     """
 
@@ -113,7 +114,7 @@ class RelativePose(Message):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrueLandmark(Message):
-    """A landmark as it truly is; ``robot`` is empty. ``kind`` point | segment | line.
+    """The true state of a landmark; ``robot`` is empty. ``kind`` point | segment | line.
 
     ``pose`` (3,) in the world frame (heading NaN for a point), ``extent`` (2, 2) its end points
     or None.
@@ -143,7 +144,7 @@ class Truth(Message):
     pose: Array
 
 
-# ---------------------------------------------------------------- what the pipeline passes on
+# ---------------------------------------------------------------- input of an estimator
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,7 +169,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """One landmark as a front end saw it, in the frame of the sensor.
+    """One observation of a landmark by a front end, in the frame of the sensor.
 
     ``kind`` says what ``z`` is: ``point`` (bearing, range); ``segment`` and ``line`` a pose on
     the line (its middle, x axis along the line, the sensor on its left). ``cov`` has z's size;
@@ -260,7 +261,7 @@ class Step:
     closures: tuple[Closure, ...] = ()
 
 
-# ---------------------------------------------------------------- what comes out
+# ---------------------------------------------------------------- estimates and results
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -290,7 +291,7 @@ class Trajectory:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """What a back end knows at the end: every state and every landmark, world frame.
+    """The result of a back end: every state and every landmark, world frame.
 
     ``states[robot]`` is over the robot's states; ``landmarks[id]`` is (state, covariance): (2,)
     and (2, 2) for points, (3,) and (3, 3) for lines and segments, additive world-axis errors.
@@ -329,10 +330,11 @@ class Landmark:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RobotResult:
-    """One robot's trajectories; every pair final (all data) and causal (data up to its time).
+    """One robot's trajectories: final (by all data) and causal (by data up to each pose's time).
 
-    ``base`` poses of the base frame, ``scan`` poses of the laser at each scan (None without
-    scans), ``dead_reckoning`` the base by odometry alone, at the same stamps as ``base``.
+    ``final`` and ``causal`` are poses of the base, ``scan_final`` and ``scan_causal`` poses of the
+    laser at each scan (None without scans); ``dead_reckoning`` is the base by odometry alone, at
+    the stamps of ``final``.
     """
 
     final: Trajectory

@@ -200,7 +200,7 @@ class ScanMatchingConfig:
     up to so far before its return. floor_m, floor_rad: errors of a match that do not shrink with
     the number of points. contradiction_m, contradiction_rad: smallest disagreement of consecutive
     scans with odometry that is acted on. search_m, search_rad: half the window in which another
-    motion is then searched for, beside twice the motion.
+    motion is then searched for, beyond twice the motion.
     """
 
     point_sigma_m: float = 0.03

@@ -1,7 +1,4 @@
-"""Trajectories at any stamps, from the states that an estimator keeps and the odometry between.
-
-And what it takes to move a whole result into another world frame.
-"""
+"""Trajectories at any stamps, by odometry between states; results in other world frames."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -35,10 +32,10 @@ def causal_at(
     times_ns: IntArray,
     stamps_ns: IntArray,
 ) -> Trajectory:
-    """Poses at ``times_ns``: the last state before it, carried on by odometry.
+    """Poses at ``times_ns``: the last state before each, propagated by odometry.
 
-    Nothing after the time is used if the states are causal: ``calibrations[i]`` is what was known
-    when state i was made. The covariance grows by odometry.
+    If the states are causal, so is the result: ``calibrations[i]`` is the calibration when state i
+    was created. The covariance grows by that of odometry.
 
     Args:
         states: the states, stamped with their times.
@@ -83,13 +80,13 @@ def final_at(
     poses = compose(poses, exp(share[:, None] * np.where(inside[:, None], miss, 0.0)))
     F, _ = compose_jacobians(states.poses[i], between(states.poses[i], poses))
     s, turn = share[:, None, None], rotation3(states.poses[i, 2])
-    carried = F @ states.covs[i] @ F.mT
+    propagated = F @ states.covs[i] @ F.mT
     bridge = (
-        (1 - s) * carried
+        (1 - s) * propagated
         + s * states.covs[following]
         + turn @ (s * (1 - s) * whole_noise) @ turn.mT
     )
-    beyond = carried + turn @ noise @ turn.mT
+    beyond = propagated + turn @ noise @ turn.mT
     return Trajectory(stamps_ns, poses, np.where(inside[:, None, None], bridge, beyond))
 
 
@@ -100,7 +97,7 @@ def trajectory_of_mount(base: Trajectory, mounts: Array) -> Trajectory:
 
 
 def transform_trajectory(trajectory: Trajectory, world: Array) -> Trajectory:
-    """The same trajectory after its world frame was put at ``world`` (3,) or (n, 3)."""
+    """The trajectory in the frame in which its world frame is at ``world`` (3,) or (n, 3)."""
     turn = rotation3(world[..., 2])
     poses = compose(np.broadcast_to(world, trajectory.poses.shape), trajectory.poses)
     return Trajectory(trajectory.stamps_ns, poses, turn @ trajectory.covs @ turn.mT)
@@ -108,13 +105,13 @@ def transform_trajectory(trajectory: Trajectory, world: Array) -> Trajectory:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameTransforms:
-    """World frames (3,) that robots, by name, and landmarks, by number, are put into."""
+    """Poses (3,) of the old world frames in the new one, by robot and by landmark."""
 
     robots: Mapping[str, Array]
     landmarks: Mapping[int, Array]
 
     def estimate(self, estimate: Estimate) -> Estimate:
-        """The same estimate after the frames of everything were put there."""
+        """The estimate in the new frame."""
         states = {n: transform_trajectory(t, self.robots[n]) for n, t in estimate.states.items()}
         landmarks = {}
         for number, (mean, cov) in estimate.landmarks.items():
@@ -125,7 +122,7 @@ class FrameTransforms:
         return Estimate(states, landmarks, estimate.error, estimate.dof)
 
     def step(self, step: Step) -> Step:
-        """The same step after the frames were put there: its starts move along."""
+        """The step with its starts in the new frame."""
         starts = {}
         for robot, start in step.starts.items():
             world = self.robots[robot]

@@ -34,10 +34,11 @@ from graphslam.core.records import Motion
 from graphslam.odometry.increment_sums import IncrementSums, Motions, PathSums
 from graphslam.odometry.readings import BoolArray, IntArray, Readings, integrate_pending
 
-#: m and rad: what a robot that reports no motion may still have moved between two states
+#: m and rad: sigma of the motion of a robot that reports none
 STANDING_SIGMA = 1e-4
 
-#: m of effort (see `Track.effort`): so short a motion is close enough to an arc to be one increment
+#: m of effort (see `Track.effort`): a motion this short is close enough to an arc to be integrated
+#: as one increment
 COARSE_M = 0.3
 #: ns: step of the difference quotient by latency; about one period of common odometry
 LATENCY_STEP_NS = 50_000_000
@@ -116,7 +117,7 @@ class Track(Readings):
     def mounted_pose(self, times_ns: IntArray) -> Array:
         """Poses (n, 3) of the frame at ``mount``, the times ``latency_ns`` late; see `pose`.
 
-        Between two of them lies `motion` but for the calibration of the odometry. Cheap.
+        The motion between two of them is `motion` without the calibration of the odometry. Cheap.
         """
         return compose(self.pose(times_ns - self.latency_ns), self.mount)
 
