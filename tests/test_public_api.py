@@ -184,7 +184,7 @@ def test_progress_is_of_the_messages_that_are_read(tmp_path):
 
 def test_settings_of_reading_are_refused_where_it_is_done(room):
     logs = graphslam.open_logs(room.log)
-    with pytest.raises(graphslam.ConfigError, match="settings of open_logs"):
+    with pytest.raises(graphslam.ConfigError, match="must be passed to open_logs"):
         graphslam.smooth(logs, logs={"reorder_s": 5.0})
     assert graphslam.smooth(logs, backend="dead-reckoning").config.backend.name == "dead-reckoning"
 

@@ -187,7 +187,7 @@ def test_two_possible_relative_poses_relate_no_robots(tmp_path):
 def test_swapped_identities_are_corrected_with_unknown_starts(tmp_path, pair):
     """Common landmarks relate the robots despite false identities; then the swap is detected."""
     result = run(tmp_path, names=dict(zip(pair, pair[::-1], strict=True)))
-    assert [w for w in result.summary["warnings"] if "exchanged" in w]
+    assert [w for w in result.summary["warnings"] if "swapped" in w]
     assert result.summary["frames"] == dict.fromkeys(STARTS, "a")
     assert max(misfit(result, robot) for robot in STARTS) < 0.15
 

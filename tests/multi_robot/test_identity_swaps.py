@@ -20,7 +20,7 @@ def run(tmp_path, names):
 def test_swapped_identities_are_found_and_corrected(tmp_path, pair):
     """A robot with a robot, a robot with a landmark; where nothing is wrong nothing is changed."""
     result = run(tmp_path, dict(zip(pair, pair[::-1], strict=True)))
-    told = [w for w in result.summary["warnings"] if "exchanged" in w]
+    told = [w for w in result.summary["warnings"] if "swapped" in w]
     assert len(told) == bool(pair)
     assert all(name in told[0] for name in pair)
     for name, robot in result.robots.items():
@@ -38,6 +38,6 @@ def test_swapped_identities_are_found_and_corrected(tmp_path, pair):
 def test_swapped_landmarks_do_not_change_the_estimate(tmp_path):
     """Nothing in the log contradicts it, so nothing is reported and the paths are as good."""
     result = run(tmp_path, {"6": "7", "7": "6"})
-    assert not [w for w in result.summary["warnings"] if "exchanged" in w]
+    assert not [w for w in result.summary["warnings"] if "swapped" in w]
     found = {mark.identity: mark.position[:2] for mark in result.landmarks}
     np.testing.assert_allclose(found["6"], LANDMARKS["7"], atol=0.15)
