@@ -275,6 +275,32 @@ def test_functions_that_raise_our_errors_say_so():
     assert not missing, "\n".join(missing)
 
 
+#: names in docstrings and comments that are not of this package: libraries, values of settings
+FOREIGN = {"scipy.special", "scipy.stats", "gtsam.readG2o", "readG2o", "load2D", "mcap", "rosbags"}
+
+
+def test_names_in_docstrings_and_comments_exist():
+    """A name in single backticks is a module, an identifier or a value of a setting: a renamed
+    function must not live on in what is written about it."""
+    known = {part for name in FOREIGN for part in name.split(".")} | {"toml"}
+    for path in FILES:
+        known |= set(path.relative_to(ROOT.parent).with_suffix("").parts)
+        for node in ast.walk(tree_of(path)):
+            for field in ("id", "attr", "name", "arg"):
+                value = getattr(node, field, None)
+                known |= set(value.split(".")) if isinstance(value, str) else set()
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                known |= {node.value} if node.value.isidentifier() else set()
+    wrong = [
+        f"{place(path, number)} `{name}`"
+        for path in FILES
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+        for name in re.findall(r"(?<!`)`([A-Za-z_][\w.]*)`(?!`)", line)
+        if not set(name.split(".")) <= known
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
 # ------------------------------------------------------------ below the command line
 
 

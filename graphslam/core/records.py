@@ -154,8 +154,8 @@ class Motion:
     ``delta`` (3,) is the end pose in the frame of the start pose, ``cov`` (3, 3) along the start
     frame's axes. ``d_delta_d_calibration`` (3, p) is its derivative with respect to the motion
     source's p calibration parameters (see `graphslam.core.motion_models`); its part of ``cov`` is
-    already included. ``length_m`` is the path driven. ``matched``: the sensors were contradicted by
-    scans, and this is what the scans make of it (`graphslam.odometry.scan_odometry`).
+    already included. ``length_m`` is the path driven. ``from_scans``: scans contradicted the
+    sensors and corrected the motion (`graphslam.odometry.scan_odometry`).
     """
 
     start_ns: int
@@ -228,7 +228,7 @@ class Closure:
     """Pose (3,) of state (robot, time) in the frame of state (other, other_time), with cov.
 
     ``verified``: its consistency with all other data was tested, so it gets no robust kernel.
-    ``images``: number of images it was made of; it has their weight against other observations.
+    ``scan_count``: number of scans it was made of; it has their weight against other observations.
     """
 
     robot: str

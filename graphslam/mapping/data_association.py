@@ -8,6 +8,7 @@ compatible (a loop closure); a tentative landmark; a new one. Else it is rejecte
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -48,7 +49,7 @@ def predicted_joint(joint: JointMarginal, motion: Motion | None) -> JointMargina
     return replace(joint, pose=compose(joint.pose, motion.delta), cov=P)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Image:
     """One image to associate: the observations ``seen`` in the robot's base frame at one state.
 
@@ -68,7 +69,7 @@ class Image:
     path_m: float
     gathering: bool = False
 
-    @property
+    @cached_property
     def predicted(self) -> Array:
         """Predicted pose (3,) at the image."""
         return self.pose if self.motion is None else compose(self.pose, self.motion.delta)

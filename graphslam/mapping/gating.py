@@ -37,8 +37,8 @@ class Pairs:
     """Candidate pairs (k,) of observation and landmark that passed the cheap gates.
 
     ``model`` names the row of `MODELS` per pair; ``flipped``: the measured direction is
-    turned by pi before it is compared (eq. 3.24). ``miss`` is a crude distance without covariance,
-    in units of `TYPICAL_M` and `TYPICAL_RAD`.
+    turned by pi before it is compared (eq. 3.24). ``rough_distance`` is one without
+    covariance, in units of `TYPICAL_M` and `TYPICAL_RAD`.
     """
 
     observation: IntArray

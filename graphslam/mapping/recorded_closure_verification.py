@@ -30,8 +30,8 @@ from graphslam.core.records import Closure, Estimate, Motion, RelativePose, Star
 from graphslam.estimation.isam2 import Isam2Backend, Reoptimiser
 from graphslam.odometry.preintegration import Track
 
-#: probability up to which two closures agree; against all others together `FIT` is the limit, so
-#: that true closures are rarely lost (false ones miss by far more)
+#: probability up to which two closures agree; against all others together it is
+#: `FIT_PROBABILITY`, so that true closures are rarely lost (false ones miss by far more)
 AGREE = 0.99
 #: closures compared with each other at once, in order of time; the work grows with its square
 CHUNK = 1000

@@ -19,7 +19,7 @@ from graphslam.mapping.landmark_map import LandmarkMap
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SplitVisits:
-    """Steps with separate landmarks per visit; ``origin``: new landmark -> the one it was."""
+    """Steps with separate landmarks per visit; ``original_id``: new landmark -> the one it was."""
 
     steps: tuple[Step, ...]
     original_id: Mapping[int, int]

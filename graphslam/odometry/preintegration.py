@@ -191,7 +191,7 @@ class Track(Readings):
         return replace(forth, start_ns=start_ns, end_ns=end_ns, delta=inverse(forth.delta), cov=cov)
 
     def motions(self, start_ns: IntArray, end_ns: IntArray) -> Motions:
-        """What `between` gives, for times (n,) and (n,), at once; see `motions_of`."""
+        """What `between` gives, for times (n,) and (n,), at once; see `preintegrate_batch`."""
         return preintegrate_batch([(self, start_ns, end_ns)])[0]
 
     @property
@@ -319,7 +319,7 @@ def preintegrate_batch(asked: Sequence[tuple[Track, IntArray, IntArray]]) -> lis
 def _motions(
     tracks: Sequence[Track], start_ns: Sequence[IntArray], end_ns: Sequence[IntArray]
 ) -> Motions:
-    """`motions_of` tracks with one `Track.batch_key`, track after track."""
+    """`preintegrate_batch` tracks with one `Track.batch_key`, track after track."""
     times, starts, ends, passed = [], [], [], 0
     for track, start, end in zip(tracks, start_ns, end_ns, strict=True):
         both = np.concatenate([np.minimum(start, end), np.maximum(start, end)])

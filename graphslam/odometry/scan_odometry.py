@@ -41,7 +41,7 @@ def scan_submap(points: Array, config: ScanMatchingConfig | None = None) -> Subm
 
 
 def checked_against_scans(motion: Motion, before: Submap, now: Submap) -> Motion:
-    """The motion, corrected by scan matching if the scans contradict it (``matched``).
+    """The motion, corrected by scan matching if the scans contradict it (``from_scans``).
 
     Args:
         motion: according to odometry.

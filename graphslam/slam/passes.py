@@ -31,7 +31,7 @@ MAX_CLOCK_PASSES = 4
 class Findings(NamedTuple):
     """Results of a pass besides its estimate.
 
-    ``swapped``: false identity -> right one, of identities that were swapped; ``clocks``: the
+    ``swapped_identities``: false identity -> right one; ``clocks``: the
     robots' clocks as their sightings of each other show them; ``causal``: causal trajectories.
     """
 

@@ -21,7 +21,7 @@ ClosureId = tuple[str, int, str, int, tuple[float, ...]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedClosures:
-    """Which relative poses of a log are used, see `mapping.recorded_closure_verification.Verified`.
+    """Which relative poses of a log are used; see `ClosureDecision`.
 
     ``refused`` and ``kept`` by `closure_id`; ``frames`` of all robots that have a start.
     """

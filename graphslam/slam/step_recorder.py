@@ -27,9 +27,9 @@ from graphslam.slam.robot_state import RobotState
 class PriorKnowledge:
     """What is known before a log is read: what was given, and what earlier passes found.
 
-    ``joined``: start poses and frames of the robots. ``recorded``: which relative poses of the log
-    are accepted. ``identities``: false identity -> right one, of what is sighted. ``clocks``: of
-    robots whose clock is not that of the first.
+    ``frame_assignment``: start poses and frames of the robots. ``recorded``: which relative poses
+    of the log are accepted. ``identities``: false identity -> right one, of what is sighted.
+    ``clocks``: of robots whose clock is not that of the first.
     """
 
     frame_assignment: FrameAssignment
@@ -60,10 +60,8 @@ class StepRecorder:
             name: RobotState(track, clock=known.clocks.get(name, Clock()))
             for name, track in make_tracks(log, config).items()
         }
-        self.starts, self.frames = (
-            known.frame_assignment.starts,
-            RobotFrames(known.frame_assignment),
-        )
+        self.starts = known.frame_assignment.starts
+        self.frames = RobotFrames(known.frame_assignment)
         self.steps: list[Step] = []
         self.counts: Counter[str] = Counter()
         self.seconds: dict[str, float] = defaultdict(float)
