@@ -10,8 +10,9 @@ import os
 import resource
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -51,22 +52,24 @@ class Used:
     peak_mb: float
 
 
+def measured_process(arguments: Sequence[str]) -> tuple[bytes, Used]:
+    """What a command prints, and what it and the processes that it waited for used.
+
+    Raises:
+        subprocess.CalledProcessError: its exit code is not 0.
+    """
+    with tempfile.NamedTemporaryFile("r") as report:
+        launcher = [sys.executable, "-S", str(ROOT / "benchmarks/launch.py"), report.name]
+        done = subprocess.run([*launcher, *arguments], stdout=subprocess.PIPE, check=True)
+        wall_s, cpu_s, maxrss = map(float, report.read().split())
+    return done.stdout, Used(wall_s, cpu_s, megabytes(maxrss))
+
+
 def measured_command(*arguments: str) -> tuple[dict[str, Any], Used]:
     """What a graphslam command in a process of its own prints with --json, and what it used."""
-    began = time.perf_counter()
-    with subprocess.Popen(
-        [sys.executable, "-m", "graphslam", *arguments, "--json"], stdout=subprocess.PIPE
-    ) as process:
-        assert process.stdout is not None
-        printed = process.stdout.read()
-        _, status, used = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        raise subprocess.CalledProcessError(process.returncode, process.args)
+    printed, used = measured_process([sys.executable, "-m", "graphslam", *arguments, "--json"])
     found: dict[str, Any] = json.loads(printed)
-    return found, Used(
-        time.perf_counter() - began, used.ru_utime + used.ru_stime, megabytes(used.ru_maxrss)
-    )
+    return found, used
 
 
 def command(*arguments: str) -> dict[str, Any]:
