@@ -203,18 +203,21 @@ class GraphBuilder:
             self.rows += 3
             yield FactorGroup((factor,), what, robust=not closure.verified)
 
-    def factor_at_estimate(
-        self, observed: tuple[int, int, Association], estimate: Estimates
-    ) -> gtsam.NonlinearFactor:
-        """The factor of an observation, built again at the current estimate.
+    def line_factors_at_estimate(
+        self, observed: Sequence[tuple[int, int, Association]], estimate: Estimates
+    ) -> list[gtsam.NonlinearFactor]:
+        """The factors of observations of lines, built again at the current estimate.
 
         A line's measurement is slid along the line to face the landmark's origin at the estimate
         (see `LineModel`). It must follow when the estimate moves, or the factor would carry false
         information along the line.
         """
-        key, target, seen = observed
-        x, t = estimate(key, 3), estimate(target, MODELS[seen.model].dim)
-        return factors.observation_factor(key, target, seen, self.kernel, x, t)
+        if not observed:
+            return []
+        keys, targets, seen = zip(*observed, strict=True)
+        z, cov = np.array([each.z for each in seen]), np.array([each.cov for each in seen])
+        x, t = (np.array([estimate(key, 3) for key in ends]) for ends in (keys, targets))
+        return factors.line_factors(keys, targets, z, cov, x, t, self.kernel)
 
     def value_in(self, estimate: Estimate, key: int) -> Array:
         """Value (2,) or (3,) of a variable in an estimate of the same steps."""
@@ -227,9 +230,13 @@ class GraphBuilder:
         """GTSAM's error about an indeterminate variable, in terms of the log."""
         # the symbol itself has only the first digits of the key
         found = re.search(r"(\d+) \(Symbol: [xl]", str(error))
+        return self.indeterminate_at(int(found[1]) if found else None)
+
+    def indeterminate_at(self, key: int | None) -> EstimationError:
+        """The error that a variable is indeterminate, in terms of the log; None: some variable."""
         what = "some variable"
-        if found:
-            robot, number = factors.number_of(int(found[1]))
+        if key is not None:
+            robot, number = factors.number_of(key)
             if robot is None:
                 what = self._first_seen[number]
             else:

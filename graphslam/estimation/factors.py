@@ -14,7 +14,7 @@ import numpy as np
 
 from graphslam.core.config import RobustConfig
 from graphslam.core.errors import EstimationError
-from graphslam.core.geometry import Array, is_positive, rotate_cov
+from graphslam.core.geometry import Array, compose, exp, is_positive, rotate_cov
 from graphslam.core.observation_models import LineModel
 from graphslam.core.records import Association, Closure, Motion, Start
 
@@ -71,6 +71,16 @@ def read(values: gtsam.Values, key: int, dim: int) -> Array:
 def write(values: gtsam.Values, key: int, value: Array) -> None:
     """Insert a variable with its value (2,) or (3,)."""
     values.insert(key, pose2(value) if len(value) == 3 else value)
+
+
+def overwrite(values: gtsam.Values, key: int, value: Array) -> None:
+    """Replace the value (2,) or (3,) of a variable."""
+    values.update(key, pose2(value) if len(value) == 3 else value)
+
+
+def retracted(point: Array, z: Array) -> Array:
+    """A pose (..., 3) or point (..., 2) corrected by z, of that shape, in its tangent space."""
+    return compose(point, exp(z)) if point.shape[-1] == 3 else point + z
 
 
 def gaussian(cov: Array) -> gtsam.noiseModel.Base:

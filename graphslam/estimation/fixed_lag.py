@@ -1,8 +1,10 @@
 """Fixed-lag smoothing: states older than the horizon are marginalised out, landmarks stay.
 
-The window is a nonlinear graph, optimised at every step; the size of the map bounds its cost. When
-a state leaves, its factors are linearised for the last time and it is eliminated from them. What
-remains of them about its neighbours, mostly landmarks, is a linear factor, the prior.
+The window is a nonlinear graph, optimised at every step. When a state leaves, its factors are
+linearised for the last time and it is eliminated from them. What remains of them about its
+neighbours, mostly landmarks, is linear, the prior. Landmarks of the prior that no state of the
+window sees are eliminated from it, too, but kept as a Gaussian given the others, which loses
+nothing (`dormant_variables`). So a step costs what its window costs, however large the map is.
 
 The prior has no information on the position and heading of the whole map, as long as the null space
 is the same for every factor. It depends on the linearisation point, so a variable that the prior
@@ -17,41 +19,19 @@ EKF SLAM estimators, IJRR 2010, https://doi.org/10.1177/0278364909353640.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
-
-import gtsam
-import numpy as np
+from dataclasses import replace
 
 from graphslam.core.config import Config, RobustConfig
 from graphslam.core.geometry import Array
-from graphslam.core.records import Association, Estimate, Step
+from graphslam.core.records import Estimate, Step
 from graphslam.estimation import factors
-from graphslam.estimation.factor_graph import (
-    GraphBackend,
-    GraphBuilder,
-    joint_marginal,
-    root_covariance,
-    square_root,
-)
+from graphslam.estimation.dormant_variables import DormantVariables, covariance
+from graphslam.estimation.factor_graph import GraphBackend, GraphBuilder
+from graphslam.estimation.square_root import eliminate, stacked
+from graphslam.estimation.window import IndeterminateWindowError, Window, WindowFactor
 
-#: largest number of Gauss-Newton iterations per step, and the norm of the update (m, rad) that ends
-#: them. A step starts where the last one ended, so two are the rule.
-MAX_ITERATIONS, CONVERGED = 6, 1e-3
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class WindowFactor:
-    """A factor of the window and its keys.
-
-    ``observed``: its association with both keys, if any; ``robust``: whether the kernel applies;
-    ``prior``: whether it is what marginalised states left.
-    """
-
-    factor: gtsam.NonlinearFactor
-    keys: tuple[int, ...]
-    observed: tuple[int, int, Association] | None = None
-    robust: bool = False
-    prior: bool = False
+#: variables whose marginals are read together at the end
+AT_ONCE = 32
 
 
 class FixedLagBackend(GraphBackend):
@@ -62,108 +42,72 @@ class FixedLagBackend(GraphBackend):
     """
 
     def __init__(self, config: Config) -> None:
-        # weights are of residuals at the current estimate, so the kernel is applied here
+        # weights are of residuals at the current estimate, so the window applies the kernel
         super().__init__(GraphBuilder(RobustConfig(kernel="none"), wide=False))
-        self._kernel = config.robust
         self._horizon_ns = round(1e9 * config.backend.horizon_s)
-        self._values = gtsam.Values()
-        self._dims: dict[int, int] = {}
-        self._window: list[WindowFactor] = []
-        self._first: dict[int, Array] = {}  # linearisation points of what the prior involves
-        self._tree: gtsam.GaussianBayesTree | None = None
+        self._window = Window(config.robust)
+        self._dormant = DormantVariables()
+        self._points: dict[int, Array] = {}  # linearisation points of dormant landmarks
+        self._z: dict[int, Array] | None = None  # their corrections, if computed since the step
         self._past: dict[int, tuple[Array, Array]] = {}  # states that left
-        self._qr = False
 
     def value(self, key: int, dim: int) -> Array:
         """See `GraphBackend`."""
-        return factors.read(self._values, key, dim)
+        if key not in self._dormant:
+            return factors.read(self._window.values, key, dim)
+        return factors.retracted(self._points[key], self._corrections()[key])
+
+    def _corrections(self) -> dict[int, Array]:
+        """z of all dormant variables."""
+        if self._z is None:
+            self._z = self._dormant.solve(self._window.z.__getitem__)
+        return self._z
+
+    def covariance(self, keys: list[int]) -> Array:
+        """See `GraphBackend`."""
+        return covariance(self._window.root, self._window.slices, self._dormant, keys)
 
     def add(self, step: Step) -> None:
         """See `Backend`."""
         self._joints.clear()
-        self._tree = None
+        seen = {
+            factors.landmark_key(a.target) for a in step.associations if isinstance(a.target, int)
+        }
+        self._wake([key for key in seen if key in self._dormant])
+        self._put_to_sleep(seen)
+        window = self._window
         for group in self.builder.factor_groups(step, self.value):
             if group.new is not None:
-                key, value = group.new
-                factors.write(self._values, key, value)
-                self._dims[key] = len(value)
+                window.insert(*group.new)
             *others, last = group.factors
-            self._window += [WindowFactor(factor, tuple(factor.keys())) for factor in others]
+            window.factors += [WindowFactor(factor, tuple(factor.keys())) for factor in others]
             keys = tuple(last.keys())
-            self._window.append(WindowFactor(last, keys, group.observed, group.robust))
-        self._optimise()
+            window.factors.append(WindowFactor(last, keys, group.observed, group.robust))
+        self._z = None
+        try:
+            window.optimise()
+        except IndeterminateWindowError as error:
+            raise self.builder.indeterminate_at(error.key) from error
         self._marginalise_before(step.time_ns - self._horizon_ns)
 
-    def _optimise(self) -> None:
-        for _ in range(MAX_ITERATIONS):
-            delta = self._eliminated().optimize()
-            size = delta.norm()
-            if not np.isfinite(size):
-                raise self.builder.diagnose(self._linear(self._window), self._values)
-            self._values, self._tree = self._values.retract(delta), None
-            if size < CONVERGED:
-                break
+    def _wake(self, keys: Sequence[int]) -> None:
+        """Take dormant landmarks that are seen again into the window."""
+        if keys:
+            z = self._corrections()
+            for key in keys:
+                self._window.insert(key, self._points.pop(key), z[key])
+            self._window.absorb(self._dormant.wake(keys))
 
-    def _eliminated(self) -> gtsam.GaussianBayesTree:
-        """The window, linearised and eliminated: by Cholesky, or by QR where that fails."""
-        if self._tree is None:
-            linear, order = self._linear(self._window), gtsam.Ordering.OrderingType.COLAMD
-            by_qr = (order, gtsam.EliminateQR) if self._qr else ()
-            try:
-                self._tree = linear.eliminateMultifrontal(*by_qr)
-            except RuntimeError as error:
-                if self._qr:
-                    raise self.builder.explain(error) from error
-                self._qr = True
-                return self._eliminated()
-        return self._tree
-
-    def _linear(self, window: Iterable[WindowFactor]) -> gtsam.GaussianFactorGraph:
-        """Factors with residuals at the estimate and first-estimates Jacobians (see `_first`)."""
-        first = gtsam.Values(self._values)
-        for key, value in self._first.items():
-            first.update(key, factors.pose2(value) if len(value) == 3 else value)
-        graph = gtsam.GaussianFactorGraph()
-        for each in window:
-            linear = each.factor.linearize(self._values)
-            if not each.prior:
-                involved = not self._first.keys().isdisjoint(each.keys)
-                weighted = each.robust and self._kernel.kernel != "none"
-                if involved or weighted:
-                    A, b = linear.jacobian()
-                    if involved:
-                        A = each.factor.linearize(first).jacobian()[0]
-                    root = np.sqrt(self._noise(len(b)).weight(b)) if weighted else 1.0
-                    dims = {key: self._dims[key] for key in each.keys}
-                    linear = factors.jacobian_factor(root * A, root * b, dims)
-            graph.push_back(linear)
-        return graph
-
-    def _noise(self, rows: int) -> gtsam.noiseModel.Base:
-        """The kernel on whitened residuals (rows,)."""
-        return factors.robust(gtsam.noiseModel.Unit.Create(rows), self._kernel)
-
-    def covariance(self, keys: list[int]) -> Array:
-        """See `GraphBackend`."""
-        tree = self._eliminated()
-        if self._qr:
-            return self._qr_covariance(keys)
-        try:
-            return joint_marginal(tree, keys)
-        except RuntimeError:
-            self._qr, self._tree = True, None
-            return self.covariance(keys)
-
-    def _qr_covariance(self, keys: list[int]) -> Array:
-        """By QR throughout: a tree computes marginals by Cholesky, however it was made."""
-        linear = self._linear(self._window)
-        others = gtsam.Ordering([key for key in self._dims if key not in keys])
-        rest = linear.eliminatePartialSequential(others, gtsam.EliminateQR)[1]
-        net = rest.eliminateSequential(gtsam.Ordering(keys), gtsam.EliminateQR)
-        R, columns = square_root(net, self._dims)
-        if not (np.isfinite(R).all() and np.diag(R).all()):
-            raise self.builder.diagnose(linear, self._values)
-        return root_covariance(R, columns, keys)
+    def _put_to_sleep(self, needed: Iterable[int]) -> None:
+        """Make landmarks dormant that the window does not see, nor the next step."""
+        window = self._window
+        seen = {*needed, *(key for each in window.factors for key in each.keys)}
+        idle = [k for k in window.prior.dims if not factors.is_state(k) and k not in seen]
+        keys = self._dormant.due(idle, [key for key in window.prior.dims if key in self._past])
+        if keys:
+            self._points |= {key: window.point(key) for key in keys}
+            window.prior = self._dormant.add(window.prior, keys)
+            window.remove(keys)
 
     def _marginalise_before(self, before_ns: int) -> None:
         """Marginalise the states before ``before_ns`` out, but no robot's latest."""
@@ -177,47 +121,46 @@ class FixedLagBackend(GraphBackend):
         if leaving:
             for key in leaving:
                 self._past[key] = self.value(key, 3), self.covariance([key])
-            self._marginalise(leaving)
+            self._marginalise(set(leaving))
 
-    def _marginalise(self, leaving: Sequence[int]) -> None:
-        involved = [f for f in self._window if not set(leaving).isdisjoint(f.keys)]
+    def _marginalise(self, leaving: set[int]) -> None:
+        """Turn the factors of states into prior, and eliminate those that no block is given."""
+        window = self._window
+        involved = [each for each in window.factors if not leaving.isdisjoint(each.keys)]
+        window.factors = [each for each in window.factors if leaving.isdisjoint(each.keys)]
         # lines are built a last time, at the best estimate that there will be
-        linear, order = self._linear(map(self._rebuilt, involved)), gtsam.Ordering(list(leaving))
-        by_qr = (gtsam.EliminateQR,) if self._qr else ()
-        _, rest = linear.eliminatePartialSequential(order, *by_qr)
-        self._window = [f for f in self._window if set(leaving).isdisjoint(f.keys)]
-        prior = gtsam.LinearContainerFactor.ConvertLinearGraph(rest, self._values)
-        for n in range(prior.size()):
-            factor = prior.at(n)
-            keys = tuple(factor.keys())
-            self._window.append(WindowFactor(factor, keys, prior=True))
-            for key in keys:
-                self._first.setdefault(key, self.value(key, self._dims[key]))
-        for key in leaving:
-            self._values.erase(key)
-            self._first.pop(key, None)
-            del self._dims[key]
+        window.absorb(window.weighted_rows(self._rebuilt(involved)))
+        gone = [key for key in window.prior.dims if key in leaving - self._dormant.anchors]
+        if gone:
+            first = {key: 3 for key in gone}
+            order = {**first, **{k: d for k, d in window.prior.dims.items() if k not in first}}
+            _, window.prior = eliminate(stacked([window.prior], order), len(gone))
+            window.remove(gone)
 
-    def _rebuilt(self, old: WindowFactor) -> WindowFactor:
-        """A line's factor at the current estimate; others as they are."""
-        if old.observed is None or old.observed[2].model != "line":
-            return old
-        return replace(old, factor=self.builder.factor_at_estimate(old.observed, self.value))
+    def _rebuilt(self, old: Sequence[WindowFactor]) -> list[WindowFactor]:
+        """The factors of lines at the current estimate; others as they are."""
+        lines = [
+            (key, target, seen)
+            for key, target, seen in (each.observed for each in old if each.observed is not None)
+            if seen.model == "line"
+        ]
+        made = iter(self.builder.line_factors_at_estimate(lines, self.value))
+        return [
+            replace(each, factor=next(made), rows=None)
+            if each.observed is not None and each.observed[2].model == "line"
+            else each
+            for each in old
+        ]
 
     def finish(self) -> Estimate:
         """See `Backend`."""
         marginals = dict(self._past)
-        for key, dim in self._dims.items():
-            marginals[key] = self.value(key, dim), self.covariance([key])
-        return self.builder.estimate(marginals, self._half_error())
-
-    def _half_error(self) -> float:
-        """Half the weighted squared residuals, including those in the prior."""
-        total = 0.0
-        for each in self._window:
-            if each.robust:
-                b = each.factor.linearize(self._values).jacobian()[1]
-                total += self._noise(len(b)).loss(float(b @ b))
-            else:
-                total += each.factor.error(self._values)
-        return total
+        dims = {**self._window.dims, **self._dormant.dims}
+        left = [key for key in dims if key not in marginals]
+        for first in range(0, len(left), AT_ONCE):
+            keys = left[first : first + AT_ONCE]
+            cov, end = self.covariance(keys), 0
+            for key in keys:
+                begin, end = end, end + dims[key]
+                marginals[key] = self.value(key, dims[key]), cov[begin:end, begin:end]
+        return self.builder.estimate(marginals, self._window.half_error())

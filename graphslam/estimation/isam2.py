@@ -101,7 +101,7 @@ class BatchGraph(GraphBuilder):
         self._line_indices += range(size, size + missing)
 
     def rebuild_lines(self, values: gtsam.Values) -> None:
-        """Make the factors of all lines again at ``values``; see `factor_at_estimate`."""
+        """Make the factors of all lines again at ``values``; see `line_factors_at_estimate`."""
         if not self._lines:
             return
         self.reserve_lines()

@@ -681,9 +681,10 @@ def window_sizes(horizon_s, steps):
     backend, sizes = configured("isam2", horizon_s), []
     for step in steps:
         backend.add(step)
-        linear = [placed.factor.linearize(backend._values) for placed in backend._window]
+        window = backend._window
+        linear = [each.factor.linearize(window.values) for each in window.factors]
         rows = [len(factor.jacobian()[1]) for factor in linear]
-        sizes.append((backend._values.size(), len(rows), sum(rows)))
+        sizes.append((len(window.dims), len(rows), sum(rows) + len(window.prior.b)))
     return np.array(sizes)
 
 

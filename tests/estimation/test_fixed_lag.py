@@ -1,0 +1,141 @@
+"""Landmarks out of the window's sight: exact, bounded in cost, and never lost."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from graphslam.core.config import Config, RobustConfig
+from graphslam.core.geometry import compose, rotate_cov, wrap
+from graphslam.core.observation_models import MODELS
+from graphslam.core.records import Association, Motion, Start, Step
+from graphslam.estimation import dormant_variables, window
+from graphslam.estimation.backends import BACKENDS
+
+S = 1_000_000_000
+RADIUS_M, SIGHT_M, LANDMARKS = 12.0, 4.0, 36
+LAP_S = 48  # steps of a round, one a second
+KINDS = ("point", "segment", "line")
+
+
+def ring():
+    """Landmarks of all kinds along a circle: number -> model and true place."""
+    angles = 2 * np.pi * np.arange(LANDMARKS) / LANDMARKS
+    out = {}
+    for i, angle in enumerate(angles):
+        radius = RADIUS_M + (1.5 if i % 2 else -1.5)
+        place = np.array([radius * np.cos(angle), radius * np.sin(angle), wrap(angle + np.pi / 2)])
+        model = KINDS[i % 3]
+        out[i] = model, place[: MODELS[model].dim]
+    return out
+
+
+def rounds(seed, steps, robots="a"):
+    """Robots on the circle, half a round apart, that see what is near; all noise as claimed."""
+    rng = np.random.default_rng(seed)
+    turn = 2 * np.pi / LAP_S
+    delta = np.array([RADIUS_M * np.sin(turn), RADIUS_M * (1 - np.cos(turn)), turn])
+    motion_cov = np.diag([4e-4, 1e-4, 2e-5])
+    where = {"a": np.array([RADIUS_M, 0.0, np.pi / 2]), "b": np.array([-RADIUS_M, 0.0, -np.pi / 2])}
+    where = {robot: where[robot] for robot in robots}
+    made = [Step(0, {robot: Start(x, 1e-4 * np.eye(3)) for robot, x in where.items()})]
+    for k in range(1, steps + 1):
+        motions, seen = {}, []
+        for robot, x in where.items():
+            where[robot] = compose(x, delta)
+            noisy = delta + rng.multivariate_normal(np.zeros(3), motion_cov)
+            motions[robot] = Motion((k - 1) * S, k * S, noisy, motion_cov, np.zeros((3, 0)), 1.5)
+            for i, (model, place) in ring().items():
+                if np.hypot(*(place - where[robot][: len(place)])[:2]) < SIGHT_M:
+                    z = MODELS[model].predict(where[robot], place)
+                    cov = np.diag([1e-4, 4e-4])
+                    if len(z) == 3:
+                        cov = rotate_cov(np.diag([2e-3, 4e-4, 2e-4]), z[2])
+                    z = z + rng.multivariate_normal(np.zeros(len(z)), cov)
+                    seen.append(Association(robot, k * S, i, model, z, cov))
+        made.append(Step(k * S, {}, motions, tuple(seen)))
+    return made
+
+
+def smoother(horizon_s, kernel="cauchy"):
+    config = Config(robust=RobustConfig(kernel))
+    backend = replace(config.backend, name="isam2", horizon_s=horizon_s)
+    return BACKENDS["isam2"](replace(config, backend=backend))
+
+
+def joints(steps, horizon_s):
+    """The joint of both robots and all landmarks so far after every step, and the estimate."""
+    backend, seen, out = smoother(horizon_s), set(), []
+    for step in steps:
+        backend.add(step)
+        seen |= {a.target for a in step.associations}
+        out.append(backend.joint("a", sorted(seen), ["b"]))
+    return out, backend.finish()
+
+
+@pytest.mark.parametrize("horizon_s", [0.0, 2.0, 5.0])
+def test_landmarks_out_of_use_are_exact(monkeypatch, horizon_s):
+    """After every step, the joint of robots and map is that of a back end in which
+    nothing sleeps. Without their correlations, or with means that stay behind when the second
+    round corrects the map, it would be sigmas off."""
+    steps = rounds(3, 2 * LAP_S // 3, "ab")  # each sees again what the other saw
+    # to the same end: iterations stop by how far the variables in use have moved
+    monkeypatch.setattr(window, "CONVERGED", 1e-10)
+    monkeypatch.setattr(window, "RELINEARISE", 1e-8)
+    monkeypatch.setattr(window, "MAX_ITERATIONS", 100)
+    monkeypatch.setattr(dormant_variables, "AT_ONCE", 4)
+    found, estimate = joints(steps, horizon_s)
+    monkeypatch.setattr(dormant_variables, "AT_ONCE", 10**6)
+    expected, whole = joints(steps, horizon_s)
+    for mine, other in zip(found, expected, strict=True):
+        sigmas = np.sqrt(np.diag(other.cov))
+        assert np.max(np.abs(mine.cov - other.cov) / np.outer(sigmas, sigmas)) < 1e-4
+        for a, b in zip([mine.pose, *mine.landmarks], [other.pose, *other.landmarks], strict=True):
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-6)
+    assert estimate.error == pytest.approx(whole.error, rel=1e-6)
+    for landmark, (mean, cov) in whole.landmarks.items():
+        np.testing.assert_allclose(estimate.landmarks[landmark][0], mean, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(estimate.landmarks[landmark][1], cov, rtol=1e-4, atol=1e-8)
+
+
+def test_a_step_costs_its_window_and_not_the_map(monkeypatch):
+    """The number of variables that a step solves: in the second round, with all landmarks in the
+    map, it is no more than in the first half of the first, but for what waits to sleep."""
+    monkeypatch.setattr(dormant_variables, "AT_ONCE", 4)
+    backend, sizes = smoother(4.0), []
+    for step in rounds(1, 2 * LAP_S):
+        backend.add(step)
+        sizes.append(len(backend._window.dims))
+    assert len(backend.finish().landmarks) == LANDMARKS
+    assert max(sizes[LAP_S:]) <= max(sizes[: LAP_S // 2]) + 4 < 0.7 * LANDMARKS
+
+
+def test_without_sleep_a_step_costs_the_map(monkeypatch):
+    """So that the bound above is one that can be missed."""
+    monkeypatch.setattr(dormant_variables, "AT_ONCE", 10**6)
+    backend, sizes = smoother(4.0), []
+    for step in rounds(1, 2 * LAP_S):
+        backend.add(step)
+        sizes.append(len(backend._window.dims))
+    assert max(sizes[LAP_S:]) > 1.5 * max(sizes[: LAP_S // 2])
+
+
+@pytest.mark.parametrize("horizon_s", [0.0, 3.0])
+def test_no_landmark_vanishes_from_the_result(monkeypatch, horizon_s):
+    """However long it sleeps: every landmark that was ever seen is in the estimate, with the mean
+    and covariance that the back end gave when asked, near the truth within its sigma."""
+    monkeypatch.setattr(dormant_variables, "AT_ONCE", 4)
+    backend = smoother(horizon_s, "none")
+    for step in rounds(2, LAP_S - 2):
+        backend.add(step)
+        seen = {a.target for a in step.associations}
+    estimate = backend.finish()
+    assert set(estimate.landmarks) == set(ring()) and len(seen) < 8
+    joint = backend.joint("a", sorted(ring()))
+    for i, mean, at in zip(sorted(ring()), joint.landmarks, joint.slices, strict=True):
+        np.testing.assert_allclose(estimate.landmarks[i][0], mean, atol=1e-12)
+        np.testing.assert_allclose(estimate.landmarks[i][1], joint.cov[at, at], rtol=1e-9)
+        model, place = ring()[i]
+        if model != "line":
+            sigmas = np.sqrt(np.diag(joint.cov[at, at]))
+            assert np.all(np.abs(mean - place) < 5 * sigmas)
