@@ -16,7 +16,6 @@ from typing import Literal
 
 import gtsam
 import numpy as np
-from scipy.linalg.blas import dtrsm
 
 from graphslam.core.config import RobustConfig
 from graphslam.core.errors import EstimationError
@@ -44,6 +43,8 @@ Estimates = Callable[[int, int], Array]
 
 #: why a graph is indeterminate
 UNDERDETERMINED = "it has too few or too weak observations"
+#: variables whose marginals are read together
+READ_AT_ONCE = 32
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -333,6 +334,17 @@ class GraphBackend(ABC):
             EstimationError: it is indeterminate.
         """
 
+    def marginals(self, dims: Mapping[int, int]) -> dict[int, tuple[Array, Array]]:
+        """Mean and covariance of variables, given with their dimensions; a few are read at once."""
+        out, keys = {}, list(dims)
+        for first in range(0, len(keys), READ_AT_ONCE):
+            some = keys[first : first + READ_AT_ONCE]
+            cov, end = self.covariance(some), 0
+            for key in some:
+                begin, end = end, end + dims[key]
+                out[key] = self.value(key, dims[key]), cov[begin:end, begin:end]
+        return out
+
     def joint(
         self, robot: str, landmarks: Sequence[int], others: Sequence[str] = ()
     ) -> JointMarginal:
@@ -363,30 +375,6 @@ class GraphBackend(ABC):
         return [
             self.value(factors.landmark_key(i), self.builder.landmark_dims[i]) for i in landmarks
         ]
-
-
-def square_root(
-    net: gtsam.GaussianBayesNet, dims: Mapping[int, int]
-) -> tuple[Array, dict[int, slice]]:
-    """Upper triangular square root information R (D, D) of a Bayes net; each variable's columns.
-
-    ``dims`` are the variables' dimensions. The net has its own order: elimination goes through
-    unconnected components one by one.
-    """
-    keys = [net.at(n).firstFrontalKey() for n in range(net.size())]
-    ends = np.cumsum([dims[key] for key in keys])
-    columns = {k: slice(int(e - dims[k]), int(e)) for k, e in zip(keys, ends, strict=True)}
-    return net.matrix()[0], columns
-
-
-def root_covariance(R: Array, slices: Mapping[int, slice], keys: Sequence[int]) -> Array:
-    """Joint covariance (d, d) of ``keys``, in this order: their rows of R⁻¹ R⁻ᵀ."""
-    wanted = np.concatenate([np.arange(slices[k].start, slices[k].stop) for k in keys])
-    columns = np.zeros((len(R), len(wanted)))
-    columns[wanted, np.arange(len(wanted))] = 1.0
-    # not solve_triangular: LAPACK's starts a thread per core for a matrix of any size
-    columns = dtrsm(1.0, R, columns, trans_a=1)
-    return np.asarray(columns.T @ columns)
 
 
 def joint_marginal(tree: gtsam.ISAM2 | gtsam.GaussianBayesTree, keys: list[int]) -> Array:

@@ -30,9 +30,6 @@ from graphslam.estimation.factor_graph import GraphBackend, GraphBuilder
 from graphslam.estimation.square_root import eliminate, stacked
 from graphslam.estimation.window import IndeterminateWindowError, Window, WindowFactor
 
-#: variables whose marginals are read together at the end
-AT_ONCE = 32
-
 
 class FixedLagBackend(GraphBackend):
     """The smoother; see the module's docstring.
@@ -58,7 +55,7 @@ class FixedLagBackend(GraphBackend):
         return factors.retracted(self._points[key], self._corrections()[key])
 
     def _corrections(self) -> dict[int, Array]:
-        """z of all dormant variables."""
+        """Z of all dormant variables."""
         if self._z is None:
             self._z = self._dormant.solve(self._window.z.__getitem__)
         return self._z
@@ -132,7 +129,7 @@ class FixedLagBackend(GraphBackend):
         window.absorb(window.weighted_rows(self._rebuilt(involved)))
         gone = [key for key in window.prior.dims if key in leaving - self._dormant.anchors]
         if gone:
-            first = {key: 3 for key in gone}
+            first = dict.fromkeys(gone, 3)
             order = {**first, **{k: d for k, d in window.prior.dims.items() if k not in first}}
             _, window.prior = eliminate(stacked([window.prior], order), len(gone))
             window.remove(gone)
@@ -154,13 +151,6 @@ class FixedLagBackend(GraphBackend):
 
     def finish(self) -> Estimate:
         """See `Backend`."""
-        marginals = dict(self._past)
         dims = {**self._window.dims, **self._dormant.dims}
-        left = [key for key in dims if key not in marginals]
-        for first in range(0, len(left), AT_ONCE):
-            keys = left[first : first + AT_ONCE]
-            cov, end = self.covariance(keys), 0
-            for key in keys:
-                begin, end = end, end + dims[key]
-                marginals[key] = self.value(key, dims[key]), cov[begin:end, begin:end]
-        return self.builder.estimate(marginals, self._window.half_error())
+        left = {key: dim for key, dim in dims.items() if key not in self._past}
+        return self.builder.estimate(self._past | self.marginals(left), self._window.half_error())

@@ -4,6 +4,7 @@ GTSAM's QR is given two variables, the eliminated ones stacked and the others st
 dense factorisation does what one per variable would do, in a small part of the time.
 """
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -15,6 +16,8 @@ from graphslam.core.geometry import Array
 IntArray = np.ndarray[tuple[int], np.dtype[np.int64]]
 #: a coefficient below this part of the largest one of its rows is rounding
 NEGLIGIBLE = 1e-13
+#: the order that eliminates the first of two stacked variables
+_FIRST = gtsam.Ordering([0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,6 +79,21 @@ def stacked(parts: Sequence[Rows], dims: Mapping[int, int]) -> Rows:
     return Rows(dims, A, np.concatenate([part.b for part in parts]) if parts else np.zeros(0))
 
 
+def triangular(A: Array, b: Array) -> tuple[Array, Array, float]:
+    """R (n, n) upper triangular and d (n,): R z = d says of z what A z = b says.
+
+    Also the length of what no z can make smaller.
+
+    Raises:
+        RuntimeError: there are fewer rows than columns.
+    """
+    graph = gtsam.GaussianFactorGraph()
+    graph.push_back(gtsam.JacobianFactor(0, A, b, gtsam.noiseModel.Unit.Create(len(b))))
+    made, _ = gtsam.EliminateQR(graph, _FIRST)
+    R, d = made.R().copy(), made.d().copy()  # views of what `made` owns
+    return R, d, math.sqrt(max(b @ b - d @ d, 0.0))  # QR keeps the length of b
+
+
 def eliminate(rows: Rows, count: int) -> tuple[Conditional, Rows]:
     """Eliminate the first ``count`` variables: what determines them given the others, and the rest.
 
@@ -87,23 +105,20 @@ def eliminate(rows: Rows, count: int) -> tuple[Conditional, Rows]:
     keys = list(rows.dims)
     dims = {key: rows.dims[key] for key in keys[:count]}
     given = {key: rows.dims[key] for key in keys[count:]}
+    if not given:
+        R, d, lost = triangular(rows.A, rows.b)
+        nothing = Rows({}, np.zeros((1, 0)), np.array([lost]))
+        return Conditional(dims, given, R, np.zeros((len(R), 0)), d), nothing
     n, unit = sum(dims.values()), gtsam.noiseModel.Unit.Create(len(rows.b))
-    if given:
-        factor = gtsam.JacobianFactor(0, rows.A[:, :n], 1, rows.A[:, n:], rows.b, unit)
-    else:
-        factor = gtsam.JacobianFactor(0, rows.A, rows.b, unit)
     graph = gtsam.GaussianFactorGraph()
-    graph.push_back(factor)
-    made, rest = gtsam.EliminateQR(graph, gtsam.Ordering([0]))
-    # copies: these are views of what `made` owns
-    R, d = np.array(made.R()), np.array(made.d())
-    S = np.array(made.S()) if given else np.zeros((n, 0))
+    graph.push_back(gtsam.JacobianFactor(0, rows.A[:, :n], 1, rows.A[:, n:], rows.b, unit))
+    made, rest = gtsam.EliminateQR(graph, _FIRST)
+    R, S, d = made.R().copy(), made.S().copy(), made.d().copy()
     A, b = np.zeros((1, S.shape[1])), np.zeros(1)
     if not rest.empty():
         left, of = rest.jacobian()
         A, b = np.vstack([left, A]), np.append(of, b)
-    # QR keeps the length of b
-    b[-1] = np.sqrt(max(rows.b @ rows.b - d @ d - b @ b, 0.0))
+    b[-1] = math.sqrt(max(rows.b @ rows.b - d @ d - b @ b, 0.0))
     return Conditional(dims, given, R, S, d), Rows(given, A, b)
 
 

@@ -7,7 +7,7 @@ one; the window is solved as one dense matrix, which for a few hundred rows is q
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import gtsam
