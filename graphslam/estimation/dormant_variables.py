@@ -21,32 +21,32 @@ from scipy.linalg.blas import dtrsm
 from graphslam.core.geometry import Array
 from graphslam.estimation import factors
 from graphslam.estimation.square_root import (
-    Conditional,
     IntArray,
     Rows,
     column_slices,
     columns_of,
-    eliminate,
-    pruned,
+    eliminate_columns,
     stacked,
 )
 
 #: so many landmarks become dormant together: fewer would make as many blocks to go through
 AT_ONCE = 16
+#: a coefficient below this part of the largest one of its block is rounding
+NEGLIGIBLE = 1e-13
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Block:
-    """A conditional solved for its variables: z = c + G y + R⁻¹ noise.
+    """R z = d - S y + noise of unit covariance: coordinates z given others y.
 
-    ``own``, ``given``: where z and y are in a vector of all variables that the chain knows.
+    R (n, n) is upper triangular. ``own`` (n,) and ``given`` (p,) are the numbers of z and y.
     """
 
-    conditional: Conditional
-    c: Array
-    G: Array
     own: IntArray
     given: IntArray
+    R: Array
+    S: Array
+    d: Array
 
 
 class DormantVariables:
@@ -60,88 +60,112 @@ class DormantVariables:
         self.anchors: set[int] = set()
         self.dims: dict[int, int] = {}
         self._blocks: list[_Block] = []
-        self._slices: dict[int, slice] = {}  # places of all variables ever in a block
-        self._size = 0
+        self._slices: dict[int, slice] = {}  # coordinates of all variables ever in a block
+        self._keys: list[int] = []  # coordinate -> its variable
 
     def __contains__(self, key: object) -> bool:
         """Whether a variable is dormant."""
         return key in self.dims
 
-    def due(self, landmarks: Collection[int], states: Iterable[int]) -> list[int]:
-        """What is to become dormant.
+    def due(self, landmarks: Collection[int], past_states: Iterable[int]) -> list[int]:
+        """What is to become dormant, if anything.
 
-        ``landmarks`` are those out of use, ``states`` those that are not estimated any more.
+        ``landmarks`` are those out of use, ``past_states`` the states in use that are not estimated
+        any more.
         """
         if len(landmarks) < AT_ONCE:
             return []
-        return [*landmarks, *(key for key in states if key in self.anchors)]
+        return [*landmarks, *(key for key in past_states if key in self.anchors)]
 
     def add(self, rows: Rows, keys: Collection[int]) -> Rows:
         """Make ``keys`` dormant, all information on which is in ``rows``; the remaining rows."""
         first = {key: rows.dims[key] for key in keys}
-        order = {**first, **{key: d for key, d in rows.dims.items() if key not in first}}
-        conditional, rest = eliminate(stacked([rows], order), len(first))
-        self.dims.update(first)
-        block = self._block(conditional)
-        self._blocks.append(block)
-        self.anchors -= first.keys()
-        self.anchors |= {key for key in block.conditional.given if factors.is_state(key)}
-        return rest
+        others = {key: dim for key, dim in rows.dims.items() if key not in first}
+        whole = stacked([rows], {**first, **others})
+        own = self._coordinates(first)
+        n = len(own)
+        R, S, d, A, b = eliminate_columns(whole.A, whole.b, n)
+        self._append(self._blocks, own, self._coordinates(others), (R, S, d))
+        self.dims |= first
+        given = {self._keys[n] for n in self._blocks[-1].given}
+        self.anchors = (self.anchors - first.keys()) | set(filter(factors.is_state, given))
+        return Rows(others, A, b)
 
     def wake(self, keys: Iterable[int]) -> list[Rows]:
         """The rows of dormant variables that are measured again: they are in use from now on."""
-        wanted = {key for key in keys if key in self.dims}
-        if not wanted:
+        woken = {key: self.dims.pop(key) for key in keys}
+        if not woken:
             return []
-        kept: list[_Block] = []
-        carried: list[Rows] = []
+        carried, A, b = np.zeros(0, dtype=np.int64), np.zeros((0, 0)), np.zeros(0)
+        position = np.zeros(len(self._keys), dtype=np.int64)
+        wanted, involved = (np.zeros(len(self._keys), dtype=bool) for _ in range(2))
+        wanted[columns_of(woken, self._slices)] = True
+        blocks: list[_Block] = []
         for block in self._blocks:
-            old = block.conditional
-            if wanted.isdisjoint(old.dims) and all(
-                old.dims.keys().isdisjoint(rows.dims) for rows in carried
-            ):
-                kept.append(block)
+            leaves = wanted[block.own]
+            if not (leaves.any() or involved[block.own].any()):
+                blocks.append(block)
                 continue
-            stay = {key: d for key, d in old.dims.items() if key not in wanted}
-            parts = [old.rows(), *carried]
-            others = {k: d for part in parts for k, d in part.dims.items() if k not in stay}
-            rows = stacked(parts, {**stay, **others})
-            carried = [rows]
-            if stay:
-                conditional, rest = eliminate(rows, len(stay))
-                kept.append(self._block(conditional))
-                carried = [rest]
-        self._blocks = kept
-        for key in wanted:
-            del self.dims[key]
-        return carried
+            own = block.own[~leaves]
+            involved[block.own] = involved[block.given] = True
+            involved[own] = False
+            others = np.flatnonzero(involved)
+            n, m = len(own), len(block.d)
+            position[own], position[others] = np.arange(n), n + np.arange(len(others))
+            whole = np.zeros((m + len(b), n + len(others)))
+            whole[:m, position[block.own]] = block.R
+            whole[:m, position[block.given]] = block.S
+            whole[m:, position[carried]] = A
+            R, S, d, A, b = eliminate_columns(whole, np.append(block.d, b), n)
+            carried = others
+            if n:
+                self._append(blocks, own, others, (R, S, d))
+        self._blocks = blocks
+        dims = {key: self._slices[key] for key in dict.fromkeys(self._keys[n] for n in carried)}
+        sizes = {key: at.stop - at.start for key, at in dims.items()}
+        out = np.zeros((len(b), sum(sizes.values())))
+        position[columns_of(sizes, self._slices)] = np.arange(out.shape[1])
+        out[:, position[carried]] = A
+        return [Rows(sizes, out, b)]
 
-    def _block(self, conditional: Conditional) -> _Block:
-        made = pruned(conditional)
-        for key, dim in {**made.dims, **made.given}.items():
+    def _coordinates(self, dims: Mapping[int, int]) -> IntArray:
+        """Numbers of the coordinates of variables; new ones are numbered."""
+        for key, dim in dims.items():
             if key not in self._slices:
-                self._slices[key] = slice(self._size, self._size + dim)
-                self._size += dim
-        solved = dtrsm(1.0, made.R, np.hstack([made.d[:, None], -made.S]))
-        own, given = (columns_of(keys, self._slices) for keys in (made.dims, made.given))
-        return _Block(made, solved[:, 0], solved[:, 1:], own, given)
+                self._slices[key] = slice(len(self._keys), len(self._keys) + dim)
+                self._keys += [key] * dim
+        return columns_of(dims, self._slices)
+
+    @staticmethod
+    def _append(
+        blocks: list[_Block],
+        own: IntArray,
+        given: IntArray,
+        solved: tuple[Array, Array, Array],
+    ) -> None:
+        """Append a block, without the coordinates that it depends on by rounding only."""
+        R, S, d = solved
+        kept = np.abs(S).max(axis=0, initial=0.0) > NEGLIGIBLE * np.abs(R).max()
+        blocks.append(_Block(own, given[kept], R, S[:, kept], d))
 
     def solve(self, in_use: Callable[[int], Array], *, changes: int = 0) -> dict[int, Array]:
         """Dormant variables (d,) that follow from those in use, or so many changes (d, n) of them.
 
         ``in_use`` gives a variable in use, (d,) or its changes (d, n).
         """
-        z = np.zeros((self._size, max(changes, 1)))
-        own = {key for block in self._blocks for key in block.conditional.dims}
+        z = np.zeros((len(self._keys), max(changes, 1)))
+        known = np.zeros(len(self._keys), dtype=bool)
         for block in self._blocks:
-            for key in block.conditional.given:
-                if key not in own:
-                    z[self._slices[key]] = in_use(key).reshape(-1, z.shape[1])
-                    own.add(key)
+            known[block.given] = True
+        for block in self._blocks:
+            known[block.own] = False
+        for key in dict.fromkeys(self._keys[n] for n in np.flatnonzero(known)):
+            z[self._slices[key]] = in_use(key).reshape(-1, z.shape[1])
         for block in reversed(self._blocks):
-            z[block.own] = block.G @ z[block.given]
+            right = -block.S @ z[block.given]
             if not changes:
-                z[block.own] += block.c[:, None]
+                right += block.d[:, None]
+            z[block.own] = dtrsm(1.0, block.R, right)
         found = z if changes else z[:, 0]
         return {key: found[self._slices[key]] for key in self.dims}
 
@@ -152,21 +176,20 @@ class DormantVariables:
             W: for variables y in use, the stacked ``keys`` are Σ W[y]ᵀ y + noise; W[y] (d, D).
             The covariance (D, D) of that noise.
         """
-        own = column_slices({key: self.dims[key] for key in keys})
-        total = sum(self.dims[key] for key in keys)
-        W, noise = np.zeros((self._size, total)), np.zeros((total, total))
-        for key, at in own.items():
-            W[self._slices[key], at] = np.eye(at.stop - at.start)
-        pending = set(keys)
+        wanted = columns_of(keys, self._slices)
+        W, noise = np.zeros((len(self._keys), len(wanted))), np.zeros((len(wanted),) * 2)
+        W[wanted, np.arange(len(wanted))] = 1.0
+        involved = np.zeros(len(self._keys), dtype=bool)
+        involved[wanted] = True
         for block in self._blocks:
-            if pending.isdisjoint(block.conditional.dims):
-                continue
-            E = W[block.own]
-            half = dtrsm(1.0, block.conditional.R, E, trans_a=1)
-            noise += half.T @ half
-            W[block.given] += block.G.T @ E
-            pending.update(block.conditional.given)
-        return {k: W[self._slices[k]] for k in pending if k not in self.dims}, noise
+            if involved[block.own].any():
+                half = dtrsm(1.0, block.R, W[block.own], trans_a=1)
+                noise += half.T @ half
+                W[block.given] -= block.S.T @ half
+                involved[block.given] = True
+                involved[block.own] = False
+        given = dict.fromkeys(self._keys[n] for n in np.flatnonzero(involved))
+        return {key: W[self._slices[key]] for key in given}, noise
 
 
 def covariance(

@@ -281,7 +281,7 @@ class FactorEkfBackend(GraphBackend):
 def linear(
     factor: gtsam.NonlinearFactor, values: Mapping[int, Array], z: Callable[[int], Array]
 ) -> Rows:
-    """``factor`` at the estimate, in terms of z: A (z - z_now) = b is A z = b + A z_now."""
+    """``factor`` at the estimate, in terms of z (d,): A (z - z_now) = b is A z = b + A z_now."""
     here = gtsam.Values()
     for key in factor.keys():  # noqa: SIM118 (GTSAM's factors are no mappings)
         factors.write(here, key, values[key])
@@ -293,7 +293,7 @@ def linear(
 
 
 def determined(A: Array, b: Array, what: str) -> tuple[Array, Array, float]:
-    """`triangular`.
+    """`triangular` R (n, n) and d (n,) of rows A (m, n) and b (m,), and the length of what is left.
 
     Raises:
         EstimationError: ``what`` does not determine its variables.

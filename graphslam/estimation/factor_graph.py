@@ -335,7 +335,7 @@ class GraphBackend(ABC):
         """
 
     def marginals(self, dims: Mapping[int, int]) -> dict[int, tuple[Array, Array]]:
-        """Mean and covariance of variables, given with their dimensions; a few are read at once."""
+        """Mean (d,) and covariance (d, d) of variables, given with their dimensions d."""
         out, keys = {}, list(dims)
         for first in range(0, len(keys), READ_AT_ONCE):
             some = keys[first : first + READ_AT_ONCE]

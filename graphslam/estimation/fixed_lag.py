@@ -131,7 +131,7 @@ class FixedLagBackend(GraphBackend):
         if gone:
             first = dict.fromkeys(gone, 3)
             order = {**first, **{k: d for k, d in window.prior.dims.items() if k not in first}}
-            _, window.prior = eliminate(stacked([window.prior], order), len(gone))
+            window.prior = eliminate(stacked([window.prior], order), len(gone))
             window.remove(gone)
 
     def _rebuilt(self, old: Sequence[WindowFactor]) -> list[WindowFactor]:

@@ -14,8 +14,6 @@ import numpy as np
 from graphslam.core.geometry import Array
 
 IntArray = np.ndarray[tuple[int], np.dtype[np.int64]]
-#: a coefficient below this part of the largest one of its rows is rounding
-NEGLIGIBLE = 1e-13
 #: the order that eliminates the first of two stacked variables
 _FIRST = gtsam.Ordering([0])
 
@@ -30,24 +28,6 @@ class Rows:
     dims: Mapping[int, int]
     A: Array
     b: Array
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Conditional:
-    """R z = d - S y + noise of unit covariance: variables z given others y.
-
-    R (n, n) is upper triangular, S (n, p). ``dims`` and ``given``: dimensions by key, in order.
-    """
-
-    dims: Mapping[int, int]
-    given: Mapping[int, int]
-    R: Array
-    S: Array
-    d: Array
-
-    def rows(self) -> Rows:
-        """The same as rows of all its variables."""
-        return Rows({**self.dims, **self.given}, np.hstack([self.R, self.S]), self.d)
 
 
 def column_slices(dims: Mapping[int, int]) -> dict[int, slice]:
@@ -91,49 +71,44 @@ def triangular(A: Array, b: Array) -> tuple[Array, Array, float]:
     graph.push_back(gtsam.JacobianFactor(0, A, b, gtsam.noiseModel.Unit.Create(len(b))))
     made, _ = gtsam.EliminateQR(graph, _FIRST)
     R, d = made.R().copy(), made.d().copy()  # views of what `made` owns
-    return R, d, math.sqrt(max(b @ b - d @ d, 0.0))  # QR keeps the length of b
+    return R, d, math.sqrt(max(float(b @ b - d @ d), 0.0))  # QR keeps the length of b
 
 
-def eliminate(rows: Rows, count: int) -> tuple[Conditional, Rows]:
-    """Eliminate the first ``count`` variables: what determines them given the others, and the rest.
+def eliminate_columns(A: Array, b: Array, n: int) -> tuple[Array, Array, Array, Array, Array]:
+    """A z = b in two parts, the first n columns and what is left when they are eliminated.
 
-    The rest ends in a row without coefficients: what no estimate can make smaller.
+    Returns:
+        R (n, n) upper triangular, S and d, of the first columns: R z₁ = d - S z₂.
+        A and b of the others. The last row has no coefficients: what no z can make smaller.
+
+    Raises:
+        RuntimeError: there are too few rows to determine the first columns.
+    """
+    if n == A.shape[1]:
+        R, d, lost = triangular(A, b)
+        return R, np.zeros((n, 0)), d, np.zeros((1, 0)), np.array([lost])
+    if n == 0:
+        return np.zeros((0, 0)), A[:0], b[:0], A, b
+    graph = gtsam.GaussianFactorGraph()
+    unit = gtsam.noiseModel.Unit.Create(len(b))
+    graph.push_back(gtsam.JacobianFactor(0, A[:, :n], 1, A[:, n:], b, unit))
+    made, rest = gtsam.EliminateQR(graph, _FIRST)
+    R, S, d = made.R().copy(), made.S().copy(), made.d().copy()
+    left = np.zeros((1, S.shape[1])), np.zeros(1)
+    if not rest.empty():
+        A2, b2 = rest.jacobian()
+        left = np.concatenate([A2, left[0]]), np.append(b2, 0.0)
+    left[1][-1] = math.sqrt(max(float(b @ b - d @ d - left[1] @ left[1]), 0.0))
+    return R, S, d, *left
+
+
+def eliminate(rows: Rows, count: int) -> Rows:
+    """The rows that are left when the first ``count`` variables are eliminated.
 
     Raises:
         RuntimeError: there are too few rows to determine them.
     """
     keys = list(rows.dims)
-    dims = {key: rows.dims[key] for key in keys[:count]}
-    given = {key: rows.dims[key] for key in keys[count:]}
-    if not given:
-        R, d, lost = triangular(rows.A, rows.b)
-        nothing = Rows({}, np.zeros((1, 0)), np.array([lost]))
-        return Conditional(dims, given, R, np.zeros((len(R), 0)), d), nothing
-    n, unit = sum(dims.values()), gtsam.noiseModel.Unit.Create(len(rows.b))
-    graph = gtsam.GaussianFactorGraph()
-    graph.push_back(gtsam.JacobianFactor(0, rows.A[:, :n], 1, rows.A[:, n:], rows.b, unit))
-    made, rest = gtsam.EliminateQR(graph, _FIRST)
-    R, S, d = made.R().copy(), made.S().copy(), made.d().copy()
-    A, b = np.zeros((1, S.shape[1])), np.zeros(1)
-    if not rest.empty():
-        left, of = rest.jacobian()
-        A, b = np.vstack([left, A]), np.append(of, b)
-    b[-1] = math.sqrt(max(rows.b @ rows.b - d @ d - b @ b, 0.0))
-    return Conditional(dims, given, R, S, d), Rows(given, A, b)
-
-
-def pruned(conditional: Conditional) -> Conditional:
-    """Without the variables that it depends on by rounding only."""
-    if not conditional.given:
-        return conditional
-    limit = NEGLIGIBLE * np.abs(conditional.R).max()
-    starts = [at.start for at in column_slices(conditional.given).values()]
-    largest = np.maximum.reduceat(np.abs(conditional.S).max(axis=0), starts)
-    keys = list(conditional.given)
-    given = {keys[n]: conditional.given[keys[n]] for n in np.flatnonzero(largest > limit)}
-    if len(given) == len(keys):
-        return conditional
-    kept = columns_of(given, column_slices(conditional.given))
-    return Conditional(
-        conditional.dims, given, conditional.R, conditional.S[:, kept], conditional.d
-    )
+    n = sum(rows.dims[key] for key in keys[:count])
+    *_, A, b = eliminate_columns(rows.A, rows.b, n)
+    return Rows({key: rows.dims[key] for key in keys[count:]}, A, b)

@@ -20,7 +20,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.records import Association
 from graphslam.estimation import factors
 from graphslam.estimation.m_estimators import WEIGHTS
-from graphslam.estimation.square_root import IntArray, Rows, column_slices, stacked
+from graphslam.estimation.square_root import Rows, column_slices, stacked
 
 #: largest number of Gauss-Newton iterations per step, and the norm of the update (m, rad) that ends
 #: them. A step starts where the last one ended, so two are the rule.
@@ -31,6 +31,7 @@ RELINEARISE = 1e-3
 #: Cholesky is used while no variable's variance exceeds by more what it is given all others: it
 #: loses as many digits, and QR half of them
 WORST_RATIO = 1e10
+IndexArray = np.ndarray[tuple[int, int], np.dtype[np.int64]]
 #: columns of a factor's rows: two variables of three, and the right side
 _WIDTH = 7
 
@@ -128,7 +129,7 @@ class Window:
             if size < CONVERGED:
                 break
 
-    def _columns(self) -> IntArray:
+    def _columns(self) -> IndexArray:
         """Columns (m, 7) of each factor's rows; behind the right side is one for empty places."""
         n = sum(self.dims.values())
         places = {key: list(range(at.start, at.stop)) for key, at in self.slices.items()}
@@ -138,7 +139,7 @@ class Window:
             out.append(own + [n + 1] * (_WIDTH - 1 - len(own)) + [n])
         return np.array(out, dtype=np.int64).reshape(-1, _WIDTH)
 
-    def _linearised(self, columns: IntArray, z: Array) -> Array:
+    def _linearised(self, columns: IndexArray, z: Array) -> Array:
         """Rows (m, 3, 7) of all factors; ``z`` is changed where linearisation points are."""
         read = np.concatenate([self._read[key] for key in self.slices])
         moved = np.zeros(len(z) + 2, dtype=bool)
@@ -150,7 +151,7 @@ class Window:
                 z[at] = 0.0
                 self.z[key] = z[at].copy()
             self._read[key] = self.z[key]
-        outdated = moved[columns[:, :-1]].any(axis=1)
+        outdated = np.asarray(moved[columns[:, :-1]].any(axis=1))
         for n, each in enumerate(self.factors):
             if outdated[n] or each.rows is None:
                 each.rows = self._linearise(each)
@@ -173,7 +174,7 @@ class Window:
         rows[: len(b), -1] = b + A @ np.concatenate([self.z[key] for key in each.keys])
         return rows
 
-    def _weights(self, rows: Array, columns: IntArray, z: Array) -> Array:
+    def _weights(self, rows: Array, columns: IndexArray, z: Array) -> Array:
         """Weight (m,) of each factor under the kernel."""
         weights = np.ones(len(rows))
         if self._kernel.kernel == "none":
@@ -195,7 +196,7 @@ class Window:
             delta.insert(key, self.z[key])
         self.values = self._points.retract(delta)
 
-    def _qr(self, rows: Array, columns: IntArray, prior: Array) -> Array:
+    def _qr(self, rows: Array, columns: IndexArray, prior: Array) -> Array:
         """Square root information (n, n) by QR of all rows.
 
         Raises:
@@ -254,12 +255,12 @@ class Window:
         self.prior = stacked([self.prior, *parts], dims)
 
 
-def _normal_equations(rows: Array, columns: IntArray, n: int) -> Array:
+def _normal_equations(rows: Array, columns: IndexArray, n: int) -> Array:
     """[A b]ᵀ [A b] (n + 1, n + 1) of rows (m, 3, 7) with these columns (m, 7)."""
     products = rows.mT @ rows
     index = columns[:, :, None] * (n + 2) + columns[:, None, :]
     total = np.bincount(index.ravel(), products.ravel(), minlength=(n + 2) ** 2)
-    return total.reshape(n + 2, n + 2)[: n + 1, : n + 1]
+    return np.asarray(total, dtype=float).reshape(n + 2, n + 2)[: n + 1, : n + 1]
 
 
 def _cholesky(H: Array) -> Array | None:
