@@ -740,7 +740,7 @@ def test_the_state_stays_bounded(past_states):
                 Step(k, motions={"r": cases.motion(k - 1, k, [0.1, 0, 0], cases.MOTION_COV)})
             )
         ekf = isinstance(backend, EkfBackend)
-        size = len(backend._gaussian) if ekf else len(backend._matrix()[0])
+        size = len(backend._gaussian) if ekf else len(backend._root.A)
         assert size == 3 * (1 + past_states) + 2
 
 
