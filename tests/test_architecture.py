@@ -42,7 +42,7 @@ MOST_LINES = 450
 KEEPERS = {
     "cv2": {"perception", "results", "change_detection"},
     "gtsam": {"estimation"},
-    "matplotlib": {"results"},
+    "matplotlib": set(),  # takes half a second to import; for benchmarks only
     "mcap": {"logs"},
     "rich": {"cli"},
     "rosbags": {"logs"},

@@ -10,6 +10,7 @@ from graphslam.change_detection.shapes import Displacement
 from graphslam.change_detection.visit import Bools, Visit
 from graphslam.core.config import ChangesConfig
 from graphslam.core.geometry import Array, inverse, transform
+from graphslam.results.report_changes import ChangeMark, ChangesPicture, changes_page, tile
 
 #: the picture of the observed area: least size of its squares, m; most squares of a side; most
 #: scans that are used
@@ -20,9 +21,6 @@ def render_changes(
     found: ChangeResult, config: ChangesConfig, names: tuple[str, str] = ("reference", "later")
 ) -> str:
     """The report as one self-contained HTML document; ``names`` of the two visits."""
-    # matplotlib takes half a second to import, and --json may do without
-    from graphslam.results.report_changes import ChangeMark, ChangesPicture, changes_page, tile  # noqa: PLC0415
-
     reference, later = (v.ends[v.surface] for v in (found.reference, found.later))
     every = np.concatenate([reference, later])
     low, high = np.quantile(every, [0.002, 0.998], axis=0)

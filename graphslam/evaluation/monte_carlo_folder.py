@@ -6,6 +6,7 @@ from typing import Any
 
 from graphslam.core.errors import OutputError
 from graphslam.results.file_formats import to_json
+from graphslam.results.report_experiment import experiment_figures, experiment_page
 
 
 def save_summary(summary: Mapping[str, Any], directory: Path) -> None:
@@ -14,9 +15,6 @@ def save_summary(summary: Mapping[str, Any], directory: Path) -> None:
     Raises:
         OutputError: nothing can be written there.
     """
-    # importing matplotlib takes half a second, and the worker processes do not need it
-    from graphslam.results.report_experiment import experiment_figures, experiment_page  # noqa: PLC0415
-
     files = {"summary.json": to_json(summary, "summary"), "report.html": experiment_page(summary)}
     figures = experiment_figures(summary)
     files |= {f"figures/{name}.svg": text for name, text in figures.items()}

@@ -1,14 +1,14 @@
 """One HTML file that shows a result, readable offline, on a phone, in light and in dark.
 
 `report_page` has the order and the words, `report_maps` and `report_plots` draw, `report_tables`
-has the numbers, `report_figure` turns drawings into SVG in the colours of the page. Importing this
-module does not import matplotlib: the modules that need it are imported when a report is rendered.
+has the numbers, `report_figure` and `drawing` turn drawings into SVG in the colours of the page.
 """
 
 from collections.abc import Mapping
 from typing import Any
 
 from graphslam.core.records import Result
+from graphslam.results.report_page import page
 
 
 def render(
@@ -22,7 +22,4 @@ def render(
         evaluation: its errors against the truth, from `graphslam.evaluation.metrics.evaluate`;
             adds a section.
     """
-    # importing matplotlib takes half a second
-    from graphslam.results.report_page import page  # noqa: PLC0415
-
     return page(result, evaluation)

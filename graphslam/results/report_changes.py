@@ -6,15 +6,13 @@ from dataclasses import dataclass
 from html import escape
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.patches import Polygon
 from numpy.typing import NDArray
-from scipy.stats import norm
 
 from graphslam.core.geometry import Array
 from graphslam.results import report_html as html
-from graphslam.results.report_figure import INK, PALETTE, WIDTH_IN, density, map_axes, svg
+from graphslam.results.drawing import Axes
+from graphslam.results.drawing_elements import INK, OPAQUE, PALETTE, Levels, Shade, Style
+from graphslam.results.report_figure import WIDTH_IN, Drawing, density, map_axes, svg
 
 COLORS = {"appeared": PALETTE[2], "vanished": PALETTE[1], "moved": PALETTE[3]}
 _REFERENCE, _LATER, _UNSEEN = "#7d8590", PALETTE[0], "#a8adb3"
@@ -159,19 +157,13 @@ def _map(picture: ChangesPicture) -> str:
     (x0, x1), (y0, y1) = picture.limits
     height = WIDTH_IN * float(np.clip((y1 - y0) / (x1 - x0), 0.6, 1.15))
 
-    def draw(figure: Figure) -> None:
-        axes = map_axes(figure, picture.limits)
+    def draw(drawing: Drawing) -> None:
+        axes = map_axes(drawing, picture.limits)
         _background(axes, picture, picture.limits, 900)
         for i, mark in enumerate(picture.marks):
             _outlines(axes, mark)
-            axes.annotate(
-                str(i + 1),
-                mark.polygon[mark.polygon.sum(axis=1).argmax()],
-                (4, 4),
-                textcoords="offset points",
-                fontsize=9,
-                gid=f"halo{i}",
-            )
+            x, y = mark.polygon[mark.polygon.sum(axis=1).argmax()].tolist()
+            axes.text(x, y, str(i + 1), 9, (4, 4))
 
     return svg("Changes on a map of both visits", height, draw)
 
@@ -184,18 +176,17 @@ def _close_up(picture: ChangesPicture, index: int) -> str:
     room = half * np.array([1.0, 0.7])
     limits = np.column_stack([middle - room, middle + room])
 
-    def draw(figure: Figure) -> None:
-        axes = map_axes(figure, limits)
+    def draw(drawing: Drawing) -> None:
+        axes = map_axes(drawing, limits)
         for cloud, color, size in (
-            (picture.reference, _REFERENCE, 2.2),
-            (picture.later, _LATER, 1.4),
+            (picture.reference, _REFERENCE, 1.1),
+            (picture.later, _LATER, 0.7),
         ):
             shown = ((cloud > limits[:, 0]) & (cloud < limits[:, 1])).all(axis=1)
             # more points cannot be told apart and enlarge the page
             chosen = cloud[shown]
             chosen = chosen[:: max(1, len(chosen) // 2500)]
-            axes.plot(*chosen.T, ".", color=color, markersize=size, markeredgewidth=0, alpha=0.55,
-                      rasterized=True)  # fmt: skip
+            axes.dots(chosen[:, 0], chosen[:, 1], color, size, 0.55)
         _outlines(axes, mark)
 
     return svg(f"Change {index + 1}, close up", 0.72 * WIDTH_IN, draw)
@@ -203,50 +194,49 @@ def _close_up(picture: ChangesPicture, index: int) -> str:
 
 def _background(axes: Axes, picture: ChangesPicture, limits: Array, pixels: int) -> None:
     """Hatching where nothing was compared, then the returns of both visits."""
-    extent = (limits[0, 0], limits[0, 1], limits[1, 0], limits[1, 1])
-    for image in (
-        _hatched(picture.unseen, pixels),
-        density(picture.reference, limits, _REFERENCE, pixels),
-        density(picture.later, limits, _LATER, pixels),
-    ):
-        axes.imshow(image, extent=extent, origin="lower", interpolation="none", aspect="auto")
+    axes.image(Shade(_hatched(picture.unseen, pixels), _UNSEEN), limits)
+    axes.image(density(picture.reference, limits, _REFERENCE, pixels), limits)
+    axes.image(density(picture.later, limits, _LATER, pixels), limits)
 
 
-def _hatched(unseen: NDArray[np.bool_], pixels: int) -> NDArray[np.uint8]:
-    """Stripes where ``unseen`` (columns, rows) is true, as an image (rows, columns, 4)."""
+def _hatched(unseen: NDArray[np.bool_], pixels: int) -> Levels:
+    """Stripes (rows, columns) where ``unseen`` (columns, rows) is true."""
     factor = max(1, pixels // max(unseen.shape))
     large = np.kron(unseen.T, np.ones((factor, factor), dtype=bool))
     row, column = np.indices(large.shape)
-    image = np.zeros((*large.shape, 4), dtype=np.uint8)
-    image[:, :, :3] = [int(_UNSEEN[i : i + 2], 16) for i in (1, 3, 5)]
-    image[:, :, 3] = np.where(large & ((row + column) % _STRIPE_SPACING == 0), 170, 0)
-    return image
+    stripes = large & ((row + column) % _STRIPE_SPACING == 0)
+    return np.where(stripes, 2 * OPAQUE // 3, 0).astype(np.uint8)
 
 
 def _outlines(axes: Axes, mark: ChangeMark) -> None:
     color = COLORS[mark.kind]
-    axes.add_patch(Polygon(mark.polygon, facecolor=color, alpha=0.25, edgecolor="none"))
-    axes.add_patch(Polygon(mark.polygon, fill=False, edgecolor=color, linewidth=1.2))
+    axes.area(mark.polygon, color, 0.25)
+    axes.lines([_closed(mark.polygon)], Style(color, 1.2))
     if mark.before is not None:
-        axes.add_patch(
-            Polygon(mark.before, fill=False, edgecolor=color, linewidth=1.0, linestyle=(0, (3, 2)))
-        )
+        axes.lines([_closed(mark.before)], Style(color, 1.0, dashes=(3, 2)))
+
+
+def _closed(polygon: Array) -> Array:
+    return np.concatenate([polygon, polygon[:1]])
 
 
 def _scores(picture: ChangesPicture) -> str:
-    def draw(figure: Figure) -> None:
-        axes = figure.add_axes((0.12, 0.14, 0.85, 0.8))
+    def draw(drawing: Drawing) -> None:
+        axes = drawing.axes(0.59, 0.55, 0.15, 0.24)
         edges = np.linspace(-8, 12, 81)
-        inside = np.clip(picture.scores, edges[0], edges[-1] - 1e-9)
-        axes.hist(inside, edges.tolist(), color=_LATER, alpha=0.6)
+        count, _ = np.histogram(np.clip(picture.scores, edges[0], edges[-1] - 1e-9), edges)
+        axes.log_y = True
+        # bars as one outline, from below the axis
+        heights = np.concatenate([[0.1], np.repeat(np.maximum(count, 0.1), 2), [0.1]])
+        axes.area(np.column_stack([np.repeat(edges, 2), heights]), _LATER, 0.6)
         x = np.linspace(edges[0], edges[-1], 400)
-        scale = len(inside) * (edges[1] - edges[0])
-        axes.plot(x, scale * norm.pdf(x, scale=picture.spread), color=INK, linewidth=1.0)
-        axes.set_yscale("log")
-        axes.set_ylim(0.7, max(10.0, 2 * scale / (picture.spread * 2.5)))
-        axes.set_xlim(edges[0], edges[-1])
-        axes.set_xlabel("score, σ (values beyond are in the last bin)")
-        axes.set_ylabel("pieces of surface")
+        scale = len(picture.scores) * (edges[1] - edges[0]) / np.sqrt(2 * np.pi)
+        normal = scale / picture.spread * np.exp(-0.5 * (x / picture.spread) ** 2)
+        axes.line(x, np.maximum(normal, 0.1), Style(INK, 1.0))
+        axes.set_y(0.7, max(10.0, 2 * np.sqrt(2 * np.pi) * scale / (picture.spread * 2.5)))
+        axes.set_x(edges[0], edges[-1])
+        axes.x_label = "score, σ (values beyond are in the last bin)"
+        axes.y_label = "pieces of surface"
 
     return svg("Histogram of the scores", 0.8 * WIDTH_IN, draw)
 

@@ -256,7 +256,7 @@ def render_comparison(comparison: Comparison, settings: str = "") -> str:
         comparison: what `graphslam.evaluation.compare_backends.compare` returned.
         settings: the effective configuration (TOML), printed in full.
     """
-    # importing matplotlib takes half a second
+    # it imports this module
     from graphslam.results import report_comparison_plots as plots  # noqa: PLC0415
 
     summary, backends = comparison.summary, comparison.backends

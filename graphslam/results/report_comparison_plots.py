@@ -1,24 +1,20 @@
 """Figures of a comparison of back ends: paths, errors and consistency over time, cost."""
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
+from graphslam.results.drawing import Axes
+from graphslam.results.drawing_elements import ACCENT, INK, PALETTE, Style, robot_color
 from graphslam.results.report_comparison import BackendCurves, Comparison, ErrorCurve
 from graphslam.results.report_figure import (
-    ACCENT,
-    INK,
-    PALETTE,
     WIDTH_IN,
+    Drawing,
     log_scale,
     map_axes,
     positive,
-    robot_color,
     svg,
     time_axis,
     time_rows,
@@ -74,13 +70,13 @@ def _paths(comparison: Comparison, kind: str) -> str:
     size = limits[:, 1] - limits[:, 0]
     height = float(np.clip(WIDTH_IN * size[1] / size[0], 2.2, 5.5))
 
-    def draw(drawing: Figure) -> None:
+    def draw(drawing: Drawing) -> None:
         axes = map_axes(drawing, limits)
         for backend, style in _styled(comparison.backends):
             for path in backend.paths[kind].values():
-                axes.plot(*path.T, **style)
+                axes.path(path, style)
         for path in comparison.truth.values():
-            axes.plot(*path.T, color=INK, linewidth=0.7, linestyle=(0, (4, 2.5)), zorder=9)
+            axes.path(path, Style(INK, 0.7, dashes=(4, 2.5)), layer=8)
 
     return svg(f"Paths of all back ends, {kind}", height, draw)
 
@@ -88,13 +84,13 @@ def _paths(comparison: Comparison, kind: str) -> str:
 def _errors(comparison: Comparison, kind: str) -> str:
     start, unit, label = _clock(comparison)
 
-    def draw(drawing: Figure) -> None:
+    def draw(drawing: Drawing) -> None:
         top, bottom = time_rows(drawing, 2, label)
         for _, style, curve in _curves(comparison, kind):
             t = (curve.stamps_ns - start) / unit
             for axes, values in ((top, curve.position_m), (bottom, np.degrees(curve.heading_rad))):
                 middle, squares = _averaged(t, values**2)
-                axes.plot(middle, positive(np.sqrt(squares)), **style)
+                axes.line(middle, positive(np.sqrt(squares)), style)
         _log(top, "position, m")
         _log(bottom, "heading, °")
 
@@ -104,21 +100,21 @@ def _errors(comparison: Comparison, kind: str) -> str:
 def _nees(comparison: Comparison, kind: str) -> str:
     start, unit, label = _clock(comparison)
 
-    def draw(drawing: Figure) -> None:
+    def draw(drawing: Drawing) -> None:
         (axes,) = time_rows(drawing, 1, label)
         for _, style, curve in _curves(comparison, kind):
             t = (curve.stamps_ns - start) / unit
-            axes.plot(*_averaged(t, curve.nees), **style)
+            axes.line(*_averaged(t, curve.nees), style)
         for bound in chi2_quantile([0.025, 0.975], 3) / 3:
-            axes.axhline(bound, color=ACCENT, linewidth=1, linestyle=(0, (4, 2.5)), zorder=9)
-        axes.axhline(1.0, color=ACCENT, linewidth=0.9, zorder=9)
+            axes.level(float(bound), Style(ACCENT, 1.0, dashes=(4, 2.5)), layer=8)
+        axes.level(1.0, Style(ACCENT, 0.9), layer=8)
         _log(axes, "NEES / dof")
 
     return svg(f"Consistency over time, {kind}", 2.6, draw)
 
 
 def _cost(backends: tuple[BackendCurves, ...], label: str, axis: str | None) -> str:
-    def draw(drawing: Figure) -> None:
+    def draw(drawing: Drawing) -> None:
         (axes,) = time_rows(drawing, 1, label)
         for backend, style in _styled(backends):
             size = np.arange(len(backend.step_ms)) if axis is None else getattr(backend, axis)
@@ -127,10 +123,10 @@ def _cost(backends: tuple[BackendCurves, ...], label: str, axis: str | None) -> 
             x = np.array([np.median(size[part]) for part in parts])
             middle = np.array([np.median(backend.step_ms[part]) for part in parts])
             sizes = np.unique(x)  # a map may keep its size for many steps
-            axes.plot(sizes, [float(np.median(middle[x == value])) for value in sizes], **style)
+            axes.line(sizes, [float(np.median(middle[x == value])) for value in sizes], style)
             if axis is None:
                 high = [float(np.quantile(backend.step_ms[part], 0.99)) for part in parts]
-                axes.plot(x, high, **(style | {"linewidth": 0.7, "alpha": 0.45}))
+                axes.line(x, high, style._replace(width=0.7, opacity=0.45))
         _log(axes, "ms")
 
     return svg(f"Time per step by {label}", 2.6, draw)
@@ -138,25 +134,21 @@ def _cost(backends: tuple[BackendCurves, ...], label: str, axis: str | None) -> 
 
 def _log(axes: Axes, label: str) -> None:
     """A logarithmic axis over at most three decades: zero crossings go below any limit."""
-    values = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in axes.lines])
-    values = values[np.isfinite(values) & (values > 0)]
-    if len(values):
-        high = float(values.max())
-        axes.set_ylim(max(float(values.min()), 1e-3 * high) / 1.2, 1.2 * high)
-        log_scale(axes, label)
+    axes.log_y = True
+    low, high = axes.data_range(1)
+    if high > 0:
+        log_scale(axes, label, max(low, 1e-3 * high) / 1.2)
 
 
-def _styled(backends: tuple[BackendCurves, ...]) -> Iterator[tuple[BackendCurves, dict[str, Any]]]:
+def _styled(backends: tuple[BackendCurves, ...]) -> Iterator[tuple[BackendCurves, Style]]:
     """Back ends with their line styles: later ones thinner, so that equal curves are all seen."""
     widths = np.linspace(2.6, 1.0, len(backends)) if len(backends) > 1 else [1.2]
     for i, (backend, width) in enumerate(zip(backends, widths, strict=True)):
-        stroke = "-" if i < len(PALETTE) else (0, (3, 1.2))  # the colours repeat
-        yield backend, {"color": robot_color(i), "linewidth": float(width), "linestyle": stroke}
+        dashes = () if i < len(PALETTE) else (3, 1.2)  # the colours repeat
+        yield backend, Style(robot_color(i), float(width), dashes=dashes)
 
 
-def _curves(
-    comparison: Comparison, kind: str
-) -> Iterator[tuple[BackendCurves, dict[str, Any], ErrorCurve]]:
+def _curves(comparison: Comparison, kind: str) -> Iterator[tuple[BackendCurves, Style, ErrorCurve]]:
     for backend, style in _styled(comparison.backends):
         for curve in backend.curves[kind].values():
             yield backend, style, curve

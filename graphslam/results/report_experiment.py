@@ -10,11 +10,11 @@ from html import escape
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from graphslam.results import report_html as html
-from graphslam.results.report_figure import ACCENT, FAINT, INK, legend, positive, robot_color, svg
+from graphslam.results.drawing import Axes
+from graphslam.results.drawing_elements import ACCENT, FAINT, INK, Style, robot_color
+from graphslam.results.report_figure import Drawing, panels, positive, svg
 
 Summary = Mapping[str, Any]
 
@@ -184,37 +184,31 @@ def _panels(summary: Summary, draw: Callable[[Axes, str], None], label: str) -> 
     scales = list(summary["curves"])
     rows = (len(scales) + 1) // 2
 
-    def whole(fig: Figure) -> None:
-        grid = fig.subplots(rows, min(2, len(scales)), squeeze=False, sharex=True)
-        for axes, scale in zip(grid.flat, scales, strict=False):
+    def whole(drawing: Drawing) -> None:
+        grid = panels(drawing, len(scales), min(2, len(scales)), "step")
+        for axes, scale in zip(grid, scales, strict=True):
             draw(axes, scale)
-            axes.set_title(f"noise × {scale}", loc="left", fontsize=8)
-        for axes in grid.flat[len(scales) :]:
-            axes.set_visible(False)
-        for axes in grid[-1]:
-            axes.set_xlabel("step", labelpad=1)
-        handles, names = grid.flat[0].get_legend_handles_labels()
-        fig.legend(handles, names, loc="upper center", ncols=min(len(names), 6), fontsize=7,
-                   handlelength=1.4, columnspacing=1.0)  # fmt: skip
-        fig.subplots_adjust(0.1, 0.46 / fig.get_figheight(), 0.98, 1 - 0.5 / fig.get_figheight(),
-                            wspace=0.36, hspace=0.28)  # fmt: skip
+            axes.title = f"noise × {scale}"
+        drawing.common_legend()
 
     return svg(label, 0.9 + 1.45 * rows, whole)
 
 
-def _styles(summary: Summary) -> dict[str, dict[str, Any]]:
+def _styles(summary: Summary) -> dict[str, Style]:
     """Colour and stroke of each variant; strokes differ, since some curves coincide."""
-    strokes = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)))
+    strokes: tuple[tuple[float, ...], ...] = ((), (5, 1.5), (1.2, 1.2))
     return {
-        name: {"color": robot_color(i), "linestyle": strokes[i % 3], "linewidth": 1.1}
+        name: Style(robot_color(i), 1.1, dashes=strokes[i % 3])
         for i, name in enumerate(summary["variants"])
     }
 
 
-def _curve(axes: Axes, band: Mapping[str, Any], label: str, style: dict[str, Any]) -> None:
+def _curve(axes: Axes, band: Mapping[str, Any], label: str, style: Style) -> None:
     steps = np.arange(len(band["mean"]))
-    axes.fill_between(steps, band["low"], band["high"], color=style["color"], alpha=0.18, lw=0)
-    axes.plot(steps, band["mean"], label=label, **style)
+    there_and_back = np.concatenate([steps, steps[::-1]])
+    outline = np.concatenate([band["low"], band["high"][::-1]])
+    axes.area(np.column_stack([there_and_back, outline]), style.color, 0.18)
+    axes.line(steps, band["mean"], style, label)
 
 
 def nees_over_time(summary: Summary) -> str:
@@ -223,10 +217,11 @@ def nees_over_time(summary: Summary) -> str:
 
     def draw(axes: Axes, scale: str) -> None:
         found = summary["curves"][scale]
-        axes.axhspan(*found["nees_bounds"], color=ACCENT, alpha=0.2, lw=0)
+        low, high = found["nees_bounds"]
+        axes.band(low, high, ACCENT, 0.2)
         for name, curves in found["variants"].items():
             _curve(axes, curves["nees_per_dof"], name, styles[name])
-        axes.set_ylabel("NEES / dof", labelpad=1)
+        axes.y_label = "NEES / dof"
 
     return _panels(summary, draw, "Mean NEES over time")
 
@@ -239,9 +234,9 @@ def _rmse_over_time(summary: Summary, kind: str, label: str) -> str:
         for name, curves in found["variants"].items():
             _curve(axes, curves[f"{kind}_position_m"], name, styles[name])
         bound = found["bound"][f"{kind}_position_m"]
-        axes.plot(np.arange(len(bound)), bound, color=INK, linewidth=1.4, label="bound", zorder=4)
-        axes.set_ylabel("RMSE, m", labelpad=1)
-        axes.set_ylim(bottom=0.0)
+        axes.line(np.arange(len(bound)), bound, Style(INK, 1.4), "bound", layer=4)
+        axes.y_label = "RMSE, m"
+        axes.set_y(0.0, axes.y.high)
 
     return _panels(summary, draw, label)
 
@@ -261,29 +256,26 @@ def error_against_noise(summary: Summary) -> str:
     styles = _styles(summary)
     lines = {name: _of_variant(summary, name) for name in summary["variants"]}
 
-    def draw(fig: Figure) -> None:
-        left, right = fig.subplots(1, 2)
+    def draw(drawing: Drawing) -> None:
+        left, right = panels(drawing, 2, 2, "noise scale")
         for name, rows in lines.items():
             scales = [row["scale"] for row in rows]
             rmse = [row["final"]["position_m2"]["rmse"] for row in rows]
             gap = np.array([row["from_reference_m"] or np.nan for row in rows], dtype=float)
-            left.plot(scales, rmse, marker=".", label=name, **styles[name])
+            left.line(scales, rmse, styles[name], name)
+            left.symbols(np.column_stack([scales, rmse]), styles[name].color, 3)
             if np.nanmax(gap, initial=0.0) > 0:
-                right.plot(scales, positive(gap, 0.0), marker=".", label=name, **styles[name])
+                right.line(scales, positive(gap, 0.0), styles[name])
+                right.symbols(np.column_stack([scales, positive(gap, 0.0)]), styles[name].color, 3)
         rows = next((rows for rows in lines.values() if rows), [])
         bound = [row["final"]["position_m2"]["bound"] for row in rows]
         scales = [row["scale"] for row in rows]
-        left.plot(scales, bound, color=INK, label="bound", linewidth=1.4)
-        left.set_ylabel("final position RMSE, m")
-        right.set_ylabel(f"end's distance from {summary['reference']}, m")
+        left.line(scales, bound, Style(INK, 1.4), "bound")
+        left.y_label = "final position RMSE, m"
+        right.y_label = f"end's distance from {summary['reference']}, m"
         for axes in (left, right):
-            axes.set_xscale("log")
-            axes.set_yscale("log")
-            axes.set_xlabel("noise scale", labelpad=1)
-        handles, names = left.get_legend_handles_labels()
-        fig.legend(handles, names, loc="upper center", ncols=6, fontsize=7, handlelength=1.4,
-                   columnspacing=1.0)  # fmt: skip
-        fig.subplots_adjust(0.12, 0.16, 0.98, 0.87, wspace=0.38)
+            axes.log_x = axes.log_y = True
+        drawing.common_legend()
 
     return svg("Error against noise", 2.6, draw)
 
@@ -296,21 +288,21 @@ def consistency_against_noise(summary: Summary) -> str:
     """NEES of the final joint state over the noise, with the bounds of the test."""
     styles = _styles(summary)
 
-    def draw(fig: Figure) -> None:
-        axes = fig.add_axes((0.12, 0.16, 0.86, 0.71))
+    def draw(drawing: Drawing) -> None:
+        (axes,) = panels(drawing, 1, 1, "noise scale")
         low = high = 1.0
         for name in summary["variants"]:
             rows = [row for row in _of_variant(summary, name) if row["nees_per_dof"] is not None]
             values = [row["nees_per_dof"] for row in rows]
-            axes.plot([row["scale"] for row in rows], values, marker=".", label=name,
-                      **styles[name])  # fmt: skip
+            scales = [row["scale"] for row in rows]
+            axes.line(scales, values, styles[name], name)
+            axes.symbols(np.column_stack([scales, values]), styles[name].color, 3)
             for row in rows:
                 low, high = row["nees_bounds"]
-        axes.axhspan(low, high, color=ACCENT, alpha=0.2, lw=0)
-        axes.set_xscale("log")
-        axes.set_xlabel("noise scale", labelpad=1)
-        axes.set_ylabel("final joint NEES / dof")
-        legend(axes)
+        axes.band(low, high, ACCENT, 0.2)
+        axes.log_x = True
+        axes.y_label = "final joint NEES / dof"
+        drawing.common_legend()
 
     return svg("Consistency against noise", 2.6, draw)
 

@@ -3,23 +3,13 @@
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
 
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, interpolate, path_length, unit_vectors
 from graphslam.core.records import Landmark, Result, Trajectory
-from graphslam.results.report_figure import (
-    ACCENT,
-    INK,
-    WIDTH_IN,
-    density,
-    legend,
-    map_axes,
-    robot_color,
-    svg,
-)
+from graphslam.results.drawing import Axes
+from graphslam.results.drawing_elements import ACCENT, INK, Style, robot_color
+from graphslam.results.report_figure import WIDTH_IN, Drawing, density, map_axes, svg
 
 MAX_LABELS = 40
 MAX_ELLIPSES = 400
@@ -40,7 +30,7 @@ def poses_at(trajectory: Trajectory, stamps_ns: Sequence[int]) -> Array:
     return interpolate(trajectory.poses[before], trajectory.poses[after], share)
 
 
-def overview(result: Result, *, dead_reckoning: bool) -> str:
+def overview(result: Result, height_in: float, *, dead_reckoning: bool) -> str:
     """All scans and paths on the final trajectory, or on odometry alone.
 
     Without scans the final trajectory is shown with the landmarks.
@@ -54,29 +44,22 @@ def overview(result: Result, *, dead_reckoning: bool) -> str:
     extents = [landmark.extent for landmark in landmarks]
     limits = _limits([*(p.poses[:, :2] for p in paths.values()), *clouds.values(), *extents])
 
-    def draw(figure: Figure) -> None:
-        axes = map_axes(figure, limits)
+    def draw(drawing: Drawing) -> None:
+        axes = map_axes(drawing, limits)
         for i, cloud in enumerate(clouds.values()):
             if len(cloud):
-                axes.imshow(
-                    density(cloud, limits, robot_color(i)),
-                    extent=(limits[0, 0], limits[0, 1], limits[1, 0], limits[1, 1]),
-                    origin="lower",
-                    interpolation="none",
-                    aspect="auto",  # the axes have equal scales already
-                )
+                axes.image(density(cloud, limits, robot_color(i)), limits)
+        several = len(paths) > 1
         for i, (name, path) in enumerate(paths.items()):
-            color = ACCENT if len(paths) == 1 else robot_color(i)
-            axes.plot(*path.poses[:, :2].T, color=color, linewidth=0.9, label=name)
+            style = Style(robot_color(i) if several else ACCENT, 0.9)
+            axes.path(path.poses[:, :2], style, name if several else None)
         _draw_landmarks(axes, landmarks, 1.0)
-        if len(paths) > 1:
-            legend(axes)
 
     what = "odometry alone" if dead_reckoning else "the final trajectory"
-    return svg(f"Scans and paths on {what}", map_height(result), draw)
+    return svg(f"Scans and paths on {what}", height_in, draw)
 
 
-def landmark_map(result: Result) -> tuple[str, int]:
+def landmark_map(result: Result, height_in: float) -> tuple[str, int]:
     """Landmarks with their ids and 95 % bounds, and the enlargement of the bounds.
 
     A point has an ellipse, a line a bar across each end. Ids and bounds are of the landmarks with
@@ -89,27 +72,19 @@ def landmark_map(result: Result) -> tuple[str, int]:
     shown = by_sightings[:MAX_ELLIPSES]
     factor = _enlargement([_size(m) for m in shown], limits)
 
-    def draw(figure: Figure) -> None:
-        axes = map_axes(figure, limits)
+    def draw(drawing: Drawing) -> None:
+        axes = map_axes(drawing, limits)
         for path in paths:
-            axes.plot(*path.T, color=INK, linewidth=0.5, alpha=0.35)
+            axes.path(path, Style(INK, 0.5, 0.35))
         _draw_landmarks(axes, landmarks, 1.6)
-        bounds = [b for landmark in shown for b in _bounds(landmark, factor)]
-        axes.add_collection(LineCollection(bounds, colors=ACCENT, linewidths=0.8))
+        axes.lines([b for m in shown for b in _bounds(m, factor)], Style(ACCENT, 0.8))
         for landmark, (x, y) in _label_positions(by_sightings, limits):
-            axes.annotate(
-                str(landmark.id),
-                (x, y),
-                (3, 3),
-                textcoords="offset points",
-                fontsize=7.5,
-                gid=f"halo{landmark.id}",
-            )
+            axes.text(float(x), float(y), str(landmark.id), 7.5, (3, 3))
 
-    return svg("Landmarks with numbers and 95 % bounds", map_height(result), draw), factor
+    return svg("Landmarks with numbers and 95 % bounds", height_in, draw), factor
 
 
-def trajectory_map(result: Result) -> tuple[str, int]:
+def trajectory_map(result: Result, height_in: float) -> tuple[str, int]:
     """Final and causal paths with 95 % ellipses along the final one, and their enlargement."""
     robots = sorted(result.robots.items())
     # the causal path may leave these limits and is cut off there
@@ -117,26 +92,20 @@ def trajectory_map(result: Result) -> tuple[str, int]:
     samples = {name: _sample(robot.final, max(40 // len(robots), 12)) for name, robot in robots}
     factor = _enlargement([float(s) for _, c in samples.values() for s in _semi_axes(c)], limits)
 
-    def draw(figure: Figure) -> None:
-        axes = map_axes(figure, limits)
+    def draw(drawing: Drawing) -> None:
+        axes = map_axes(drawing, limits)
+        one = len(robots) == 1
         for i, (name, robot) in enumerate(robots):
             color = robot_color(i)
-            label = name if len(robots) > 1 else "final"
-            axes.plot(
-                *robot.causal.poses[:, :2].T,
-                color=INK if len(robots) == 1 else color,
-                linewidth=0.5,
-                alpha=0.4,
-                label="causal" if len(robots) == 1 else None,
-            )
-            axes.plot(*robot.final.poses[:, :2].T, color=color, linewidth=1.1, label=label)
-            axes.plot(*robot.final.poses[0, :2], marker="o", color=color, markersize=5.5)
+            causal = Style(INK if one else color, 0.5, 0.4)
+            axes.path(robot.causal.poses[:, :2], causal, "causal" if one else None)
+            axes.path(robot.final.poses[:, :2], Style(color, 1.1), "final" if one else name)
+            axes.symbols(robot.final.poses[:1, :2], color, 5.5)
             means, covs = samples[name]
             ellipses = [_ellipse(m, c, factor) for m, c in zip(means, covs, strict=True)]
-            axes.add_collection(LineCollection(ellipses, colors=ACCENT, linewidths=0.7))
-        legend(axes)
+            axes.lines(ellipses, Style(ACCENT, 0.7))
 
-    return svg("Trajectory with 95 % ellipses", map_height(result), draw), factor
+    return svg("Trajectory with 95 % ellipses", height_in, draw), factor
 
 
 def map_height(result: Result) -> float:
@@ -185,9 +154,8 @@ def _limits(parts: Iterable[Array]) -> Array:
 def _draw_landmarks(axes: Axes, landmarks: Sequence[Landmark], width: float) -> None:
     """Points as triangles, lines over the extent seen."""
     points = np.array([m.position[:2] for m in landmarks if m.kind == "point"]).reshape(-1, 2)
-    axes.plot(*points.T, "^", color=INK, markersize=2.5, markeredgewidth=0)
-    walls = [m.extent for m in landmarks if m.kind != "point"]
-    axes.add_collection(LineCollection(walls, colors=INK, linewidths=width))
+    axes.symbols(points, INK, 2.5, triangles=True)
+    axes.lines([m.extent for m in landmarks if m.kind != "point"], Style(INK, width))
 
 
 def _label_positions(landmarks: Sequence[Landmark], limits: Array) -> list[tuple[Landmark, Array]]:

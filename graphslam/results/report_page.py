@@ -61,20 +61,21 @@ def _map_section(result: Result) -> str:
     scans = bool(result.keyframe_scans)
     what = "Superposed scans" if scans else "Paths"
     landmark_note = "" if scans else " Triangles are landmarks."
+    height_in = maps.map_height(result)
     figures = [
         html.figure(
-            maps.overview(result, dead_reckoning=False),
+            maps.overview(result, height_in, dead_reckoning=False),
             "Final trajectory.",
             f"{what} on the trajectory from all data.{landmark_note}",
         ),
         html.figure(
-            maps.overview(result, dead_reckoning=True),
+            maps.overview(result, height_in, dead_reckoning=True),
             "Dead reckoning.",
             f"The same {'scans' if scans else 'paths'} by odometry alone.",
         ),
     ]
     if result.landmarks:
-        drawing, factor = maps.landmark_map(result)
+        drawing, factor = maps.landmark_map(result, height_in)
         points = any(m.kind == "point" for m in result.landmarks)
         lines = any(m.line is not None for m in result.landmarks)
         bounds = " and ".join(["ellipses"] * points + ["bars across the ends"] * lines)
@@ -87,7 +88,7 @@ def _map_section(result: Result) -> str:
                 f"Numbers{which} as in landmarks.json; 95 % {bounds}{_times(factor)}.",
             )
         )
-    drawing, factor = maps.trajectory_map(result)
+    drawing, factor = maps.trajectory_map(result, height_in)
     figures.append(
         html.figure(
             drawing,

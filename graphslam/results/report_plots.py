@@ -5,19 +5,17 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, wrap
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Result, Trajectory
+from graphslam.results.drawing_elements import ACCENT, INK, Style, robot_color
+from graphslam.results.drawing_scales import linear_scale
 from graphslam.results.report_figure import (
-    ACCENT,
-    INK,
-    legend,
+    Drawing,
     log_scale,
     positive,
-    robot_color,
     svg,
     time_axis,
     time_rows,
@@ -30,19 +28,17 @@ def uncertainty(result: Result) -> str:
     """Standard deviations of position (worst direction) and heading over time."""
     axis = _TimeAxis(result)
 
-    def draw(figure: Figure) -> None:
-        top, bottom = time_rows(figure, 2, axis.label)
+    def draw(drawing: Drawing) -> None:
+        top, bottom = time_rows(drawing, 2, axis.label)
         for i, (name, robot) in enumerate(sorted(result.robots.items())):
             both = ((robot.final, 1.0, 3, "final"), (robot.causal, 0.5, 2, "causal"))
-            for path, alpha, layer, kind in both:
+            for path, opacity, layer, kind in both:
                 label = _legend_text(name, kind, len(result.robots))
-                t = axis.time(path)
-                style: dict[str, Any] = {"color": robot_color(i), "alpha": alpha, "zorder": layer}
-                top.plot(t, _worst_sigma(path), label=label, **style)
-                bottom.plot(t, np.degrees(_root(path.covs[:, 2, 2])), **style)
+                t, style = axis.time(path), Style(robot_color(i), opacity=opacity)
+                top.line(t, _worst_sigma(path), style, label, layer)
+                bottom.line(t, np.degrees(_root(path.covs[:, 2, 2])), style, layer=layer)
         log_scale(top, "position σ, m")
         log_scale(bottom, "heading σ, °")
-        legend(top)
 
     return svg("Uncertainty over time", 3.5, draw)
 
@@ -51,26 +47,27 @@ def revision(result: Result) -> str:
     """How far causal estimates and dead reckoning are from the final trajectory, over time."""
     axis = _TimeAxis(result)
 
-    def draw(figure: Figure) -> None:
-        top, bottom = time_rows(figure, 2, axis.label)
+    def draw(drawing: Drawing) -> None:
+        top, bottom = time_rows(drawing, 2, axis.label)
         for i, (name, robot) in enumerate(sorted(result.robots.items())):
-            others: tuple[tuple[Trajectory, dict[str, Any], str], ...] = (
-                (robot.causal, {"zorder": 3}, "causal"),
-                (robot.dead_reckoning, {"linestyle": (0, (2, 1.2)), "alpha": 0.8}, "odometry"),
+            solid = Style(robot_color(i), 1.0)
+            dashed = solid._replace(opacity=0.8, dashes=(2, 1.2))
+            others = (
+                (robot.causal, solid, 3, "causal"),
+                (robot.dead_reckoning, dashed, 2, "odometry"),
             )
-            for path, style, kind in others:
+            for path, style, layer, kind in others:
                 if len(path) != len(robot.final):
                     continue  # at other stamps: cannot be compared
                 off = path.poses - robot.final.poses
-                t, color = axis.time(path), robot_color(i)
+                t = axis.time(path)
                 label = _legend_text(name, kind, len(result.robots))
                 distance = np.hypot(off[:, 0], off[:, 1])
-                top.plot(t, positive(distance), color=color, label=label, linewidth=1, **style)
+                top.line(t, positive(distance), style, label, layer)
                 turn = np.degrees(np.abs(wrap(off[:, 2])))
-                bottom.plot(t, positive(turn), color=color, linewidth=1, **style)
+                bottom.line(t, positive(turn), style, layer=layer)
         log_scale(top, "position, m")
         log_scale(bottom, "heading, °")
-        legend(top)
 
     return svg("Distance from the final trajectory over time", 3.5, draw)
 
@@ -83,24 +80,24 @@ def innovations(found: Mapping[str, Array]) -> str:
     """
     found = {model: values for model, values in sorted(found.items()) if len(values)}
 
-    def draw(figure: Figure) -> None:
-        rows = time_rows(figure, len(found), "time, s")
+    def draw(drawing: Drawing) -> None:
+        rows = time_rows(drawing, len(found), "time, s")
+        times = np.concatenate([values[:, 0] for values in found.values()])
+        span = linear_scale(float(times.min()), float(times.max()), 0.01)
         for axes, (model, values) in zip(rows, found.items(), strict=True):
+            axes.set_x(span.low, span.high)
             dots = values[:: max(1, len(values) // _MAX_DOTS)]
-            axes.plot(
-                dots[:, 0], positive(dots[:, 1], 1e-3), ".", color=robot_color(0), markersize=2.5,
-                alpha=0.55, markeredgewidth=0, rasterized=True,
-            )  # fmt: skip
-            axes.plot(*_running(values, np.mean), color=INK, linewidth=1.2)
-            axes.axhline(1.0, color=ACCENT, linewidth=1.0)
+            axes.dots(dots[:, 0], positive(dots[:, 1], 1e-3), robot_color(0), 1.25, 0.55)
+            axes.line(*_running(values, np.mean), Style(INK))
+            axes.level(1.0, Style(ACCENT, 1.0))
             title = f"{model}: n {len(values)}, mean {values[:, 1].mean():.2f}"
             if model in MODELS:
                 limit = float(chi2_quantile(0.95, MODELS[model].rows)) / MODELS[model].rows
-                axes.axhline(limit, color=ACCENT, linewidth=0.8, linestyle="--")
+                axes.level(limit, Style(ACCENT, 0.8, dashes=(3.7, 1.6)))
                 title += f", {100 * np.mean(values[:, 1] > limit):.1f} % above the dashes"
-            axes.set_title(title, loc="left", pad=3)
-            axes.set_ylim(bottom=max(1e-3, float(np.quantile(values[:, 1], 0.005)) / 2))
-            log_scale(axes, "NIS / dof")
+            axes.title = title
+            low = max(1e-3, float(np.quantile(values[:, 1], 0.005)) / 2)
+            log_scale(axes, "NIS / dof", low)
 
     return svg("Innovations per observation model", 0.75 + 1.35 * len(found), draw)
 
@@ -110,15 +107,10 @@ def timing(step_ms: Array) -> str:
     number = np.arange(len(step_ms))
     dots = slice(None, None, max(1, len(step_ms) // _MAX_DOTS))
 
-    def draw(figure: Figure) -> None:
-        (axes,) = time_rows(figure, 1, "keyframe")
-        axes.plot(
-            number[dots], positive(step_ms[dots], 1e-3), ".", color=robot_color(0), markersize=3,
-            alpha=0.6, markeredgewidth=0, rasterized=True,
-        )  # fmt: skip
-        axes.plot(
-            *_running(np.column_stack([number, step_ms]), np.median), color=INK, linewidth=1.2
-        )
+    def draw(drawing: Drawing) -> None:
+        (axes,) = time_rows(drawing, 1, "keyframe")
+        axes.dots(number[dots], positive(step_ms[dots], 1e-3), robot_color(0), 1.5, 0.6)
+        axes.line(*_running(np.column_stack([number, step_ms]), np.median), Style(INK))
         log_scale(axes, "ms")
 
     return svg("Wall time per keyframe", 2.6, draw)

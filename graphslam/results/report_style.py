@@ -40,7 +40,7 @@ figcaption b { color: var(--ink); }
 figure svg { display: block; width: 100%; height: auto; color: var(--ink); }
 figure svg * { stroke-linejoin: round; stroke-linecap: butt; }
 svg text { fill: currentColor; }
-svg .halo text { paint-order: stroke; stroke: var(--card); stroke-width: 2.5px;
+svg .halo { paint-order: stroke; stroke: var(--card); stroke-width: 25px;
   stroke-linejoin: round; font-weight: 600; }
 .warn { background: var(--warn); border-left: 4px solid var(--warn-edge); border-radius: 6px;
   padding: 10px 16px; margin-top: 1.2rem; }

@@ -2,11 +2,10 @@
 
 import dataclasses
 import re
-import subprocess
-import sys
 import xml.etree.ElementTree as ET
 from html.parser import HTMLParser
 
+import cv2
 import numpy as np
 import pytest
 from synthetic_results import orchard, room
@@ -14,9 +13,12 @@ from synthetic_results import orchard, room
 from graphslam.core.config import Config
 from graphslam.core.records import Estimate, Trajectory
 from graphslam.evaluation.metrics import evaluate
+from graphslam.results.drawing import Axes
+from graphslam.results.drawing_elements import FAINT, INK, OPAQUE, Box, Shade, Style, path_data, png
+from graphslam.results.drawing_scales import Scale, linear_scale, log_scale
 from graphslam.results.folder import SavedResult
 from graphslam.results.report import render
-from graphslam.results.report_figure import FAINT, INK, density
+from graphslam.results.report_figure import density
 from graphslam.results.report_maps import poses_at
 from graphslam.results.report_tables import headline, landmark_sigma, number
 
@@ -227,31 +229,94 @@ def test_many_points_stay_small():
     assert len(render(result)) < 6e6
 
 
-def test_importing_the_package_does_not_import_matplotlib():
-    code = "import sys, graphslam.results.report; sys.exit('matplotlib' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
-def test_drawing_leaves_the_settings_of_matplotlib_alone(outdoors):
-    import matplotlib as mpl
-
-    with mpl.rc_context({"font.size": 23.0}):
-        render(outdoors[0])
-        assert mpl.rcParams["font.size"] == 23.0
-        assert mpl.rcParams["svg.hashsalt"] is None
-    assert "matplotlib.pyplot" not in sys.modules
-
-
 # ---------------------------------------------------------------- the parts
 
 
 def test_scans_are_drawn_where_they_were_measured():
     # four points at the corners of a 3 x 3 picture and one outside
     points = np.array([[0.5, 0.5], [2.5, 0.5], [0.5, 2.5], [2.5, 2.5], [9.0, 9.0]])
-    image = density(points, np.array([[0.0, 3.0], [0.0, 3.0]]), "#4477aa", pixels=3)
-    assert image.shape == (3, 3, 4)
-    assert (image[..., 3] > 0).tolist() == [[True, False, True], [False] * 3, [True, False, True]]
-    assert image[0, 0, :3].tolist() == [0x44, 0x77, 0xAA]
+    shade = density(points, np.array([[0.0, 3.0], [0.0, 3.0]]), "#4477aa", pixels=3)
+    assert (shade.levels > 0).tolist() == [[True, False, True], [False] * 3, [True, False, True]]
+    assert shade.color == "#4477aa"
+
+
+@pytest.mark.parametrize("columns", [4, 5])
+def test_a_picture_is_read_back_as_it_was(columns):
+    """Breaks if two pixels of a byte are exchanged, or an odd row is cut."""
+    levels = (np.arange(3 * columns, dtype=np.uint8) % (OPAQUE + 1)).reshape(3, columns)
+    read = cv2.imdecode(np.frombuffer(png(Shade(levels, "#4477aa")), np.uint8), -1)
+    assert (read[..., 3] == levels * 17).all()
+    assert (read[..., :3] == [0xAA, 0x77, 0x44]).all()  # blue, green, red
+
+
+def places_of(path):
+    """The places (n, 2) on a path with a single run."""
+    head, _, steps = path.removeprefix("M").partition("l")
+    moves = np.array([head.split(), *np.array(steps.split()).reshape(-1, 2)], dtype=int)
+    return np.cumsum(moves, axis=0)
+
+
+def test_a_thinned_curve_keeps_its_ends_and_extremes_and_stays_near():
+    """Breaks if a peak between two others is lost, or a loop is cut off."""
+    noise = np.random.default_rng(1).normal(size=20_000)
+    noise[7777] = 9.0
+    curve = np.column_stack([np.linspace(0, 3000, 20_000), 500 + 50 * noise])
+    seen = places_of(path_data(curve))
+    assert len(seen) < 5000
+    assert (seen[[0, -1]] == np.rint(curve[[0, -1]])).all()
+    assert seen[:, 1].max() == 950
+    turn = np.linspace(0, 2 * np.pi, 5000)
+    circle = 1000 * np.column_stack([np.cos(turn), np.sin(turn)])
+    seen = places_of(path_data(circle))
+    assert len(seen) < 2000
+    between = np.linspace(seen[:-1], seen[1:], 5).reshape(-1, 2)
+    assert np.abs(np.hypot(*between.T) - 1000).max() < 4.5  # half a pixel
+
+
+def test_a_curve_has_gaps_where_it_has_no_values():
+    path = path_data(np.array([[0.0, 0], [10, 0], [np.nan, 0], [20, 0], [30, 5]]))
+    assert path == "M0 0l10 0M20 0l10 5"
+    assert path_data(np.full((3, 2), np.nan)) == ""
+
+
+@pytest.mark.parametrize(
+    ("scale", "ticks"),
+    [
+        (Scale(-10.3, 20.4), "\u221210 \u22125 0 5 10 15 20"),
+        (Scale(0.0, 1.0), "0.0 0.2 0.4 0.6 0.8 1.0"),
+        (Scale(1.2e-3, 2.9e-3), "0.0015 0.0020 0.0025"),
+        (Scale(0.04, 2.2, is_log=True), "0.05 0.1 0.2 0.5 1 2"),
+        (Scale(1e-3, 200.0, is_log=True), "0.001 0.01 0.1 1 10 100"),
+        (Scale(21.0, 28.0, is_log=True), "22 24 26 28"),
+    ],
+)
+def test_ticks_are_round_and_within_the_scale(scale, ticks):
+    assert " ".join(scale.labels(scale.ticks(7))) == ticks
+
+
+def test_scales_reach_a_little_beyond_the_data():
+    assert linear_scale(0.0, 10.0, 0.1) == Scale(-1.0, 11.0)
+    assert log_scale(1.0, 100.0, 0.5) == Scale(0.1, 1000.0, is_log=True)
+    assert linear_scale(3.0, 3.0, 0.0) == Scale(2.5, 3.5)
+    assert linear_scale(np.nan, np.nan, 0.0) == Scale(0.0, 1.0)
+    assert log_scale(np.nan, np.nan, 0.0) == Scale(0.1, 1.0, is_log=True)
+
+
+def test_what_is_drawn_lies_where_the_axes_say():
+    axes = Axes(Box(100, 50, 1100, 450), "a")
+    axes.log_y = True
+    axes.set_x(0.0, 10.0)
+    axes.set_y(0.1, 1000.0)
+    places = axes.place(np.array([0.0, 10.0, 5.0, 5.0]), np.array([0.1, 1000.0, 10.0, -1.0]))
+    assert np.allclose(places[:3], [[100, 450], [1100, 50], [600, 250]])
+    assert np.isnan(places[3, 1])
+
+
+def test_a_legend_names_each_curve_once():
+    axes = Axes(Box(0, 100, 3000, 400), "a")
+    for name in ("ekf", "isam2", "ekf"):
+        axes.line([0, 1], [0, 1], Style(INK), name)
+    assert re.findall(r">([a-z]+2?)</text>", axes.to_svg()) == ["isam2", "ekf"]
 
 
 def test_poses_between_stamps_lie_on_the_twist_and_ends_stand():
