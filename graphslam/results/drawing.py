@@ -27,9 +27,9 @@ from graphslam.results.drawing_elements import (
 from graphslam.results.drawing_scales import Scale, linear_scale, log_scale
 
 TEXT_PT, TICK_TEXT_PT = 8.5, 8.0
-_LETTER = 0.6  # mean width of a letter, of the height of the text
+_LETTER = 0.57  # mean width of a letter, of the height of the text
 _FAR = 10**6  # user units: what lies beyond is cut off anyway
-_DOT_PIXELS = 2.8  # per point, of pictures of dots
+_DOT_PIXELS = 4.0  # per point, of pictures of dots
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,14 +223,13 @@ class Axes:
     def _grid(self) -> list[str]:
         """Lines and numbers at the ticks of both axes."""
         box, parts, texts = self.box, "", []
-        ticks = self.x.ticks(max(2, round((box.right - box.left) / (38 * UNIT))))
+        ticks = self.x.ticks(_most_ticks(box.right - box.left, 34))
         at = self.place(np.array(ticks), np.full(len(ticks), self.y.low))[:, 0]
         for x, label in zip(at, self.x.labels(ticks), strict=True):
             parts += f"M{x:.0f} {box.top:.0f}V{box.bottom + 3 * UNIT:.0f}"
             if self.has_x_numbers:
                 texts.append(words(label, x, box.bottom + 12 * UNIT, TICK_TEXT_PT, "middle"))
-        room_pt = 15 if self.log_y else 24
-        ticks = self.y.ticks(max(2, round((box.bottom - box.top) / (room_pt * UNIT))))
+        ticks = self.y.ticks(_most_ticks(box.bottom - box.top, 16))
         at = self.place(np.full(len(ticks), self.x.low), np.array(ticks))[:, 1]
         for y, label in zip(at, self.y.labels(ticks), strict=True):
             parts += f"M{box.left - 3 * UNIT:.0f} {y:.0f}H{box.right:.0f}"
@@ -268,14 +267,18 @@ def legend(entries: Sequence[tuple[str, Style]], left: float, right: float, y: f
         room -= width
     found = []
     for row in reversed(rows):
-        x = right
-        for name, style, width in reversed(row):
-            sample = x - width + 9 * UNIT
-            found.append(words(name, x, y, TICK_TEXT_PT, "end"))
-            found.append(stroked(f"M{sample:.0f} {y - 3 * UNIT:.0f}h{11 * UNIT}", style))
-            x -= width
+        x = right - sum(width for *_, width in row)
+        for name, style, width in row:
+            found.append(stroked(f"M{x + 8 * UNIT:.0f} {y - 3 * UNIT:.0f}h{11 * UNIT}", style))
+            found.append(words(name, x + 23 * UNIT, y, TICK_TEXT_PT))
+            x += width
         y -= 10 * UNIT
     return found
+
+
+def _most_ticks(length: float, room_pt: float) -> int:
+    """Ticks at most on an axis, from the room that a number needs along it."""
+    return int(np.clip(round(length / (room_pt * UNIT)), 2, 8))
 
 
 def _extent(values: Array) -> Array:
