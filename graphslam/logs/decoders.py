@@ -1,14 +1,14 @@
 """ROS messages to the records of `graphslam.core.records`: one row of `DECODERS` per schema.
 
-A decoder is a function of the message and of the topic's `TopicContext`. It raises
-`UnusableMessageError` with a reason when the message must be dropped; the caller counts reasons.
-Every decoder requires finite numbers and positive definite covariances.
+`decode_messages` decodes messages of a topic in its `TopicContext`. What must be dropped is counted
+by reason. Every decoder requires finite numbers and positive definite covariances.
 """
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +16,7 @@ import numpy as np
 from graphslam.core import records
 from graphslam.core.geometry import Array, is_positive
 from graphslam.logs import schemas
+from graphslam.logs.cdr import CdrError
 
 # No planar laser measures farther; some drivers write 1e6 or 65535 for an error.
 MAX_RANGE_M = 1000.0
@@ -31,7 +32,8 @@ class TopicContext:
 
     ``mounts`` gives the pose (3,) of each sensor frame in the base frame; ``inverted`` names the
     frames of sensors that are mounted upside down. Ranges of ``no_return_m`` or more mean no
-    return. ``beams`` counts dropped beams of scans that are kept, by reason.
+    return. ``beams`` counts dropped beams of scans that are kept, by reason. With
+    ``without_ranges`` scans get no ranges: only when they were taken is of interest.
     """
 
     robot: str
@@ -41,66 +43,104 @@ class TopicContext:
     left_joint: str = ""
     right_joint: str = ""
     beams: Counter[str] = field(default_factory=Counter)
+    without_ranges: bool = False
 
 
 class Decoder(NamedTuple):
-    """A row of `DECODERS`: record type, decoder, and optionally a faster `schemas.decode`."""
+    """A row of `DECODERS`: type of record and decoder.
+
+    With ``table`` the decoder takes the rows of many messages at once, see `schemas.scan_table`,
+    and returns a record or a reason for dropping it for each; else one message at a time.
+    """
 
     record: type[records.Message]
-    decode: Callable[[Any, TopicContext], records.Message]
-    deserialize: Callable[[bytes], Any] | None = None
+    decode: Callable[[Any, TopicContext], Any]
+    table: Callable[[Sequence[bytes]], Any] | None = None
 
 
-def scan(message: Any, topic: TopicContext) -> records.Scan:
+def scans(rows: Any, topic: TopicContext) -> list[records.Scan | str]:
     """sensor_msgs/LaserScan: ranges (n,) m, NaN without a return; beams counter-clockwise.
 
     ROS uses inf and NaN for no return, many drivers use 0. Negative ranges and ranges above
     `MAX_RANGE_M` are driver errors: these beams are dropped and counted.
     """
-    ranges = np.asarray(message.ranges, dtype=float)
-    start, step = float(message.angle_min), float(message.angle_increment)
-    if not len(ranges):
-        raise UnusableMessageError("scan: no beams")
-    if not (np.isfinite(start) and np.isfinite(step) and step):
-        raise UnusableMessageError("scan: angle increment is zero or angles are not finite")
-    finite = np.isfinite(ranges)
-    for defect, beams in (
-        ("NaN", np.isnan(ranges)),
-        ("infinite", np.isinf(ranges)),
-        ("negative", finite & (ranges < 0)),
-        ("absurd", finite & (ranges > MAX_RANGE_M)),
-    ):
-        if beams.any():
-            topic.beams[f"range: {defect}"] += int(beams.sum())
-    low, high = float(message.range_min), float(message.range_max)
-    usable = finite & (ranges > 0) & (ranges <= MAX_RANGE_M) & (ranges < topic.no_return_m)
+    beams = rows["ranges"].shape[1]
+    ranges, usable = ((), ()) if topic.without_ranges else _usable_ranges(rows, topic.no_return_m)
+    frame = rows["frame"][0].decode().lstrip("/")
+    mount, inverted = topic.mounts.get(frame, _NO_MOUNT), frame in topic.inverted
+    starts, steps = (rows[n].astype(float).tolist() for n in ("angle_min", "angle_increment"))
+    found: list[records.Scan | str] = []
+    for i, stamp in enumerate(schemas.stamps_ns(rows).tolist()):
+        start, step = starts[i], steps[i]
+        if not beams:
+            found.append("scan: no beams")
+            continue
+        if not (math.isfinite(start) and math.isfinite(step) and step):
+            found.append("scan: angle increment is zero or angles are not finite")
+            continue
+        own = _NO_RANGES
+        if not topic.without_ranges:
+            own, fine = ranges[i].copy(), usable[i]  # a view would keep the scans of all rows
+            if not fine.all():
+                _count_defects(own[~fine], topic.beams)
+                own[~fine] = np.nan
+        if inverted:
+            # seen from above, an upside-down laser scans clockwise
+            start, step = -start, -step
+        if step < 0:
+            start, step = start + step * (beams - 1), -step
+            own = own[::-1].copy()
+        found.append(records.Scan(topic.robot, stamp, stamp, own, start, step, mount))
+    return found
+
+
+def _usable_ranges(rows: Any, no_return_m: float) -> tuple[Array, Array]:
+    """Ranges (n, b) m, and which of them are measurements."""
+    ranges = rows["ranges"].astype(float)
+    low, high = (rows[name].astype(float)[:, None] for name in ("range_min", "range_max"))
+    least = np.where(low > 0, low, 0.0)
     # limits of 0, NaN or inf were not set by the driver: no limit
-    if low > 0:
-        usable &= ranges >= low
-    if high > 0:
-        usable &= ranges <= high
-    ranges[~usable] = np.nan
-    frame = frame_of(message)
-    if frame in topic.inverted:
-        # seen from above, an upside-down laser scans clockwise
-        start, step = -start, -step
-    if step < 0:
-        start, step = start + step * (len(ranges) - 1), -step
-        ranges = ranges[::-1].copy()
-    mount = topic.mounts.get(frame, _NO_MOUNT)
-    return records.Scan(*_source(message, topic), ranges, start, step, mount)
+    most = np.where(high > 0, np.minimum(high, MAX_RANGE_M), MAX_RANGE_M)
+    usable = (ranges > 0) & (ranges >= least) & (ranges <= most) & (ranges < no_return_m)
+    return ranges, usable
 
 
-def odometry(message: schemas.PlanarOdometry, topic: TopicContext) -> records.OdometryPose:
+def _count_defects(ranges: Array, beams: Counter[str]) -> None:
+    """Count ranges that are no measurements, by reason."""
+    odd = ranges[~((ranges >= 0) & (ranges <= MAX_RANGE_M))]
+    if not len(odd):
+        return
+    finite = odd[np.isfinite(odd)]
+    for defect, count in (
+        ("NaN", np.count_nonzero(np.isnan(odd))),
+        ("infinite", np.count_nonzero(np.isinf(odd))),
+        ("negative", np.count_nonzero(finite < 0)),
+        ("absurd", np.count_nonzero(finite > 0)),
+    ):
+        if count:
+            beams[f"range: {defect}"] += int(count)
+
+
+def odometry(rows: Any, topic: TopicContext) -> list[records.OdometryPose | str]:
     """nav_msgs/Odometry: the pose (3,) of the base in the odometry frame."""
-    stamp, x, y, (q_x, q_y, q_z, q_w) = message
-    norm = q_x * q_x + q_y * q_y + q_z * q_z + q_w * q_w
-    if not 0.5 < norm < 2.0:  # also false for NaN
-        raise UnusableMessageError("odometry: quaternion is not a rotation")
-    if not math.isfinite(x + y):
-        raise UnusableMessageError("odometry: not finite")
-    yaw = math.atan2(2 * (q_w * q_z + q_x * q_y), norm - 2 * (q_y * q_y + q_z * q_z))
-    return records.OdometryPose(topic.robot, stamp, stamp, np.array([x, y, yaw]))
+    q_x, q_y, q_z, q_w = rows["rotation"].T
+    with np.errstate(all="ignore"):  # of numbers that are not finite
+        norm = q_x * q_x + q_y * q_y + q_z * q_z + q_w * q_w
+        sine, cosine = 2 * (q_w * q_z + q_x * q_y), norm - 2 * (q_y * q_y + q_z * q_z)
+    # numpy's arctan2 depends on the machine in the last digit
+    yaw = list(map(math.atan2, sine.tolist(), cosine.tolist()))
+    poses = np.column_stack([rows["xyz"][:, :2], yaw])
+    is_rotation = ((norm > 0.5) & (norm < 2.0)).tolist()  # also false for NaN
+    finite = np.isfinite(poses[:, :2]).all(axis=1).tolist()
+    found: list[records.OdometryPose | str] = []
+    for i, stamp in enumerate(schemas.stamps_ns(rows).tolist()):
+        if not is_rotation[i]:
+            found.append("odometry: quaternion is not a rotation")
+        elif not finite[i]:
+            found.append("odometry: not finite")
+        else:
+            found.append(records.OdometryPose(topic.robot, stamp, stamp, poses[i].copy()))
+    return found
 
 
 def joint_state(message: Any, topic: TopicContext) -> records.WheelAngles:
@@ -172,8 +212,8 @@ def true_associations(message: Any, topic: TopicContext) -> records.TrueAssociat
 
 
 DECODERS: dict[str, Decoder] = {
-    schemas.LASER_SCAN: Decoder(records.Scan, scan),
-    schemas.ODOMETRY: Decoder(records.OdometryPose, odometry, schemas.decode_odometry),
+    schemas.LASER_SCAN: Decoder(records.Scan, scans, schemas.scan_table),
+    schemas.ODOMETRY: Decoder(records.OdometryPose, odometry, schemas.odometry_table),
     schemas.JOINT_STATE: Decoder(records.WheelAngles, joint_state),
     schemas.SIGHTING: Decoder(records.Sighting, sighting),
     schemas.ODOMETRY_INCREMENT: Decoder(records.OdometryIncrement, odometry_increment),
@@ -184,6 +224,7 @@ DECODERS: dict[str, Decoder] = {
 }
 
 _NO_MOUNT = np.zeros(3)
+_NO_RANGES = np.empty(0)
 
 
 def stamp_of(message: Any) -> int:
@@ -215,11 +256,18 @@ def _pose(what: str, message: Any) -> Array:
 
 def _covariance(what: str, values: Any, size: int) -> Array:
     """The upper left (size, size) block of nine numbers, made exactly symmetric."""
-    cov = np.asarray(values, dtype=float).reshape(3, 3)[:size, :size]
+    return _checked_covariance(what, np.asarray(values, dtype=float).tobytes(), size)
+
+
+@lru_cache(maxsize=1024)
+def _checked_covariance(what: str, values: bytes, size: int) -> Array:
+    """See `_covariance`: sensors mostly state the same one, so messages share it."""
+    cov = np.frombuffer(values).reshape(3, 3)[:size, :size]
     cov = np.asarray((cov + cov.T) / 2)
     _check_finite(what, cov)
     if not is_positive(cov):
         raise UnusableMessageError(f"{what}: covariance is not positive definite")
+    cov.flags.writeable = False
     return cov
 
 
@@ -230,3 +278,31 @@ def _joint(positions: Mapping[str, float], name: str, side: str) -> float:
             f"joints: {side} wheel missing or ambiguous; set robots.NAME.{side}_joint"
         )
     return positions[names[0]]
+
+
+def decode_messages(
+    schema: str, data: Sequence[bytes], topic: TopicContext, dropped: Counter[str]
+) -> list[records.Message | None]:
+    """The records of messages of one topic; None for those that must be dropped.
+
+    Args:
+        schema: of the topic, a key of `DECODERS`.
+        data: encoded messages, at least one.
+        topic: its context.
+        dropped: counts what is dropped by reason.
+    """
+    _, decode, table = DECODERS[schema]
+    found: list[records.Message | str]
+    try:
+        if table is not None:
+            found = decode(table(data), topic)
+        else:
+            found = [decode(schemas.decode(schema, one), topic) for one in data]
+    except CdrError:
+        found = [f"{schema}: cannot be decoded"]
+    except UnusableMessageError as reason:
+        found = [str(reason)]
+    if len(found) < len(data):  # not all of them can be decoded together
+        return [one for d in data for one in decode_messages(schema, [d], topic, dropped)]
+    dropped.update(reason for reason in found if isinstance(reason, str))
+    return [None if isinstance(one, str) else one for one in found]

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 
 from graphslam.core import records
@@ -10,12 +11,14 @@ from graphslam.core.config import Config
 from graphslam.core.errors import LogError
 from graphslam.core.records import Message
 from graphslam.core.worker import Prefetch
-from graphslam.logs import schemas, time_order
-from graphslam.logs.decoders import DECODERS, TopicContext, UnusableMessageError
+from graphslam.logs import time_order
+from graphslam.logs.decoders import TopicContext, decode_messages
 from graphslam.logs.future_stamps import Recorded, repair_future_stamps
-from graphslam.logs.mcap_file import McapFile, RawMessage, open_mcap, raw_messages
+from graphslam.logs.mcap_file import McapFile, open_mcap, raw_messages
 from graphslam.logs.topic_context import topic_contexts
 from graphslam.logs.topics import ODOMETRY_KINDS, Topic, choose_topics, find_topics
+
+Odometry = records.OdometryIncrement | records.OdometryPose | records.WheelAngles
 
 #: fewer messages are read faster without a second process
 WORKER_MIN_MESSAGES = 10_000
@@ -80,22 +83,43 @@ class LogSet:
         """All messages sorted by ``time_ns``; at equal times odometry comes first.
 
         Topics of the records ``exclude`` are skipped without decoding. Memory holds the messages of
-        ``logs.reorder_s``, not the log. Every call starts at the beginning. ``prefetch``: allows a
-        second process to read ahead, which pays if the caller takes all and works on each.
+        ``logs.reorder_s`` and a hundred more, not the log. Every call starts at the beginning.
+        ``prefetch``: allows a second process to read ahead, which pays if the caller takes all and
+        works on each.
         """
         topics = {topic.name: topic for topic in self.topics if topic.record not in exclude}
         self._update(_ReadReport())
         prefetch &= self.count(exclude) >= WORKER_MIN_MESSAGES
-        for item in Prefetch(lambda: self._read(topics)) if prefetch else self._read(topics):
+
+        def read() -> Iterator[Message | _ReadReport]:
+            return self._read(topics, self._contexts)
+
+        for item in Prefetch(read) if prefetch else read():
             if isinstance(item, _ReadReport):
                 self._update(item)
             else:
                 yield item
 
-    def _read(self, topics: Mapping[str, Topic]) -> Iterator["Message | _ReadReport"]:
+    def odometry(self, exclude: tuple[type[Message], ...] = ()) -> Iterator[Odometry]:
+        """The odometry among `messages` with the same ``exclude``, at the same times.
+
+        Much faster, since the ranges of scans are not looked at. When they were taken has to be
+        known: late stamps are repaired by the order in which all topics were recorded.
+        """
+        topics = {topic.name: topic for topic in self.topics if topic.record not in exclude}
+        contexts = {
+            name: replace(context, without_ranges=True) for name, context in self._contexts.items()
+        }
+        for item in self._read(topics, contexts):
+            if isinstance(item, Odometry):
+                yield item
+
+    def _read(
+        self, topics: Mapping[str, Topic], contexts: Mapping[str, TopicContext]
+    ) -> Iterator["Message | _ReadReport"]:
         """Messages of ``topics`` and, last, the report about all of them."""
         readers = [FileReader(file, self.config) for file in self.opened]
-        streams = [reader.sorted(reader.recorded(topics, self._contexts)) for reader in readers]
+        streams = [reader.sorted(reader.recorded(topics, contexts)) for reader in readers]
         yield from time_order.merge(streams)
         report = _ReadReport()
         for reader in readers:
@@ -166,19 +190,8 @@ def damage(files: Iterable[McapFile]) -> list[str]:
     ]
 
 
-def decode_message(
-    raw: RawMessage, topic: Topic, context: TopicContext, dropped: Counter[str]
-) -> Message | None:
-    """The record of a raw message; None if it must be dropped, which is counted by reason."""
-    _, decode, deserialize = DECODERS[topic.schema]
-    try:
-        data = deserialize(raw.data) if deserialize else schemas.decode(topic.schema, raw.data)
-        return decode(data, context)
-    except UnusableMessageError as reason:
-        dropped[str(reason)] += 1
-    except schemas.CdrError:
-        dropped[f"{topic.schema}: cannot be decoded"] += 1
-    return None
+#: messages that are decoded together: enough for arrays to pay, few enough to hold in memory
+_BATCH = 128
 
 
 class FileReader:
@@ -199,10 +212,21 @@ class FileReader:
         """Messages of ``topics`` in the order of recording, with their topic and log time."""
         # decoders count dropped beams in the counter of this pass
         own = {name: replace(context, beams=self.dropped) for name, context in contexts.items()}
-        for raw in raw_messages(self.file, topics.keys()):
-            message = decode_message(raw, topics[raw.topic], own[raw.topic], self.dropped)
-            if message is not None:
-                yield raw.topic, message, raw.log_time_ns
+        raws = raw_messages(self.file, topics.keys())
+        while batch := list(islice(raws, _BATCH)):
+            places: dict[str, list[int]] = {}
+            for place, raw in enumerate(batch):
+                places.setdefault(raw.topic, []).append(place)
+            found: list[Message | None] = [None] * len(batch)
+            for name, at in places.items():
+                data = [batch[place].data for place in at]
+                schema = topics[name].schema
+                decoded = decode_messages(schema, data, own[name], self.dropped)
+                for place, message in zip(at, decoded, strict=True):
+                    found[place] = message
+            for raw, decoded_one in zip(batch, found, strict=True):
+                if decoded_one is not None:
+                    yield raw.topic, decoded_one, raw.log_time_ns
 
     def sorted(self, recorded: Iterable[Recorded]) -> Iterator[Message]:
         """The messages in the order of their repaired times."""

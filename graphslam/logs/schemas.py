@@ -1,26 +1,22 @@
 """Message types of a log, ROS 2's and our own, and their CDR encoding.
 
-The only module that imports rosbags. Messages are rosbags' dataclasses whose number arrays are
-numpy arrays. Our own types are defined here as ros2msg text, which `LogWriter` also puts into the
-file, so that any ROS 2 or MCAP tool can decode them. docs/logs.md explains them.
+Our own types are defined here as ros2msg text, which `LogWriter` also puts into the file, so that
+any ROS 2 or MCAP tool can decode them. docs/logs.md explains them. Messages are read by `cdr` and
+written by rosbags, which is imported only for that: its definitions of all types of all versions of
+ROS 2 take a tenth of a second.
 """
 
 import struct
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from functools import cache
-from typing import Any, NamedTuple
+from functools import cache, lru_cache
+from typing import Any
 
 import numpy as np
-from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
 
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import Array
-
-#: numbers in a nav_msgs/Odometry: pose, twist and their covariances
-_ODOMETRY_NUMBERS = 7 + 36 + 6 + 36
+from graphslam.logs.cdr import HEADER, CdrError, Decoder, Layout, byte_order, u32
 
 IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
@@ -106,12 +102,60 @@ int16[] targets
 }
 
 
-class CdrError(Exception):
-    """The bytes of one message do not fit its schema."""
+#: types of ROS 2 that are read, and those in their fields
+_ROS_DEFINITIONS: dict[str, str] = {
+    LASER_SCAN: """\
+std_msgs/Header header
+float32 angle_min
+float32 angle_max
+float32 angle_increment
+float32 time_increment
+float32 scan_time
+float32 range_min
+float32 range_max
+float32[] ranges
+float32[] intensities
+""",
+    ODOMETRY: """\
+std_msgs/Header header
+string child_frame_id
+geometry_msgs/PoseWithCovariance pose
+geometry_msgs/TwistWithCovariance twist
+""",
+    JOINT_STATE: """\
+std_msgs/Header header
+string[] name
+float64[] position
+float64[] velocity
+float64[] effort
+""",
+    TF_MESSAGE: "geometry_msgs/TransformStamped[] transforms",
+    "geometry_msgs/TransformStamped": """\
+std_msgs/Header header
+string child_frame_id
+geometry_msgs/Transform transform
+""",
+    "geometry_msgs/Transform": """\
+geometry_msgs/Vector3 translation
+geometry_msgs/Quaternion rotation
+""",
+    "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose\nfloat64[36] covariance",
+    "geometry_msgs/TwistWithCovariance": "geometry_msgs/Twist twist\nfloat64[36] covariance",
+    "geometry_msgs/Pose": "geometry_msgs/Vector3 position\ngeometry_msgs/Quaternion orientation",
+    "geometry_msgs/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular",
+    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
+    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
+    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
+    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
+}
+
+_DECODER = Decoder(_ROS_DEFINITIONS | DEFINITIONS)
 
 
 @cache
-def _typestore() -> Typestore:
+def _typestore() -> Any:
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: PLC0415
+
     store = get_typestore(Stores.ROS2_HUMBLE)
     for name, text in DEFINITIONS.items():
         store.register(get_types_from_msg(text, name))
@@ -124,74 +168,112 @@ def decode(schema: str, data: bytes) -> Any:
     Raises:
         CdrError: the bytes are cut short or are not such a message.
     """
-    try:
-        return _typestore().deserialize_cdr(data, schema)
-    except (SerdeError, IndexError, MemoryError, OverflowError) as error:
-        raise CdrError(str(error)) from error
+    return _DECODER.decode(schema, data)
 
 
-class PlanarOdometry(NamedTuple):
-    """The used part of a nav_msgs/Odometry: stamp, position in the plane, quaternion x y z w."""
+# ---------------------------------------------------------------- many messages at once
 
-    stamp_ns: int
-    x: float
-    y: float
-    rotation: tuple[float, float, float, float]
+#: place of the length of frame_id in a std_msgs/Header at the beginning of a message
+_FRAME_SIZE = HEADER + 8
 
 
-def decode_odometry(data: bytes) -> PlanarOdometry:
-    """The beginning of a nav_msgs/Odometry; faster than `decode`, which makes ten objects of each.
+def _after_frame(size: int) -> int:
+    """Place of what follows a frame_id of ``size`` bytes, aligned to four bytes."""
+    return _FRAME_SIZE + 4 + size + -size % 4
+
+
+def odometry_table(data: Sequence[bytes]) -> Any:
+    """Rows (n,) of nav_msgs/Odometry with stamp, position ``xyz`` and ``rotation`` (x y z w).
 
     Raises:
-        CdrError: the bytes are cut short.
+        CdrError: the messages are cut short or differ in the lengths of their frames.
     """
-    order = "<" if data[1:2] == b"\x01" else ">"
+    order = byte_order(data[0])
+    size = u32(data[0], _FRAME_SIZE, order)
+    child_size = u32(data[0], _after_frame(size), order)
+    return _odometry_layout(order, size, child_size).table(data, ("frame_size", "child_size"))
+
+
+@lru_cache
+def _odometry_layout(order: str, frame_size: int, child_size: int) -> Layout:
+    layout = _with_header(order, frame_size)
+    layout.string("child", child_size)
+    layout.number("xyz", "d", 3)
+    layout.number("rotation", "d", 4)
+    layout.skip(8 * (36 + 6 + 36))  # covariance of the pose, twist, covariance of the twist
+    return layout
+
+
+def scan_table(data: Sequence[bytes]) -> Any:
+    """Rows (n,) of sensor_msgs/LaserScan with stamp, ``frame``, limits and ``ranges`` (b,).
+
+    Raises:
+        CdrError: the messages are cut short or differ in their frames or in the number of beams.
+    """
+    order = byte_order(data[0])
+    size = u32(data[0], _FRAME_SIZE, order)
+    at = _after_frame(size) + 4 * len(_LIMITS)
+    beams = u32(data[0], at, order)
+    intensities = u32(data[0], at + 4 + 4 * beams, order)
+    same = ("frame_size", "frame", "ranges_size", "intensities_size")
+    rows = _scan_layout(order, size, beams, intensities).table(data, same)
     try:
-        seconds, nanoseconds, size = struct.unpack_from(f"{order}iII", data, 4)
-        # numbers are aligned to their size, counted from the end of CDR's four bytes
-        at = 16 + size + -size % 4
-        (size,) = struct.unpack_from(f"{order}I", data, at)
-        at += 4 + size
-        at += -(at - 4) % 8
-        x, y, _, *rotation = struct.unpack_from(f"{order}7d", data, at)
-    except struct.error as error:
+        rows["frame"][0].decode()
+    except UnicodeDecodeError as error:
         raise CdrError(str(error)) from error
-    if len(data) < at + _ODOMETRY_NUMBERS * 8:
-        raise CdrError("cut short")
-    return PlanarOdometry(seconds * 1_000_000_000 + nanoseconds, x, y, tuple(rotation))
+    return rows
+
+
+_LIMITS = (
+    "angle_min", "angle_max", "angle_increment", "time_increment", "scan_time", "range_min",
+    "range_max",
+)  # fmt: skip
+
+
+@lru_cache
+def _scan_layout(order: str, frame_size: int, beams: int, intensities: int) -> Layout:
+    layout = _with_header(order, frame_size)
+    for name in _LIMITS:
+        layout.number(name, "f")
+    layout.number("ranges_size", "I")
+    layout.number("ranges", "f", beams)
+    layout.number("intensities_size", "I")
+    layout.skip(4 * intensities)
+    return layout
+
+
+def _true_pose_table(data: Sequence[bytes]) -> Any:
+    order = byte_order(data[0])
+    layout = _with_header(order, u32(data[0], _FRAME_SIZE, order))
+    layout.number("pose", "d", 3)
+    return layout.table(data, ("frame_size",))
+
+
+def _with_header(order: str, frame_size: int) -> Layout:
+    """A layout that begins with a std_msgs/Header."""
+    layout = Layout(order)
+    layout.number("sec", "i")
+    layout.number("nanosec", "I")
+    layout.string("frame", frame_size)
+    return layout
+
+
+def stamps_ns(rows: Any) -> IntArray:
+    """Stamps (n,) ns of the rows of a table."""
+    return np.asarray(rows["sec"].astype(np.int64) * 1_000_000_000 + rows["nanosec"])
 
 
 def decode_true_poses(data: Sequence[bytes]) -> tuple[IntArray, Array]:
     """Stamps (n,) ns and poses (n, 3) of many `TRUE_POSE` messages at once.
 
-    Ground truth of motion capture can be most of a log. Messages that differ in frame or byte order
-    are decoded one by one; those that cannot be decoded are left out.
+    Ground truth of motion capture can be most of a log. Messages that differ in the length of
+    their frames are decoded one by one; those that cannot be decoded are left out.
     """
-    first = data[0] if data else b""
-    # CDR: four header bytes, the second is the byte order; 8-byte numbers are aligned, counted
-    # from the end of the header
-    size = struct.unpack_from("<I", first, 12)[0] if len(first) >= 16 else 0
-    gap = -(12 + size) % 8
-    layout = np.dtype(
-        [
-            ("order", "V4"),
-            ("sec", "<i4"),
-            ("nanosec", "<u4"),
-            ("frame_size", "<u4"),
-            ("frame", f"V{size + gap}"),
-            ("pose", "<f8", 3),
-        ]
-    )
-    if (
-        len(first) != layout.itemsize
-        or first[1] != 1
-        or not all(
-            len(d) == len(first) and d[:4] == first[:4] and d[12:16] == first[12:16] for d in data
-        )
-    ):
+    try:
+        rows = _true_pose_table(data)
+    except (CdrError, IndexError):  # IndexError: there are none
         return _true_poses_singly(data)
-    rows = np.frombuffer(b"".join(data), dtype=layout)
-    return rows["sec"].astype(np.int64) * 1_000_000_000 + rows["nanosec"], rows["pose"].copy()
+    return stamps_ns(rows), rows["pose"].astype(float)
 
 
 def decode_all(schema: str, data: Iterable[bytes]) -> Iterator[Any]:
@@ -239,7 +321,7 @@ def definition(schema: str) -> bytes:
     """The ros2msg text of ``schema`` with its nested types, as MCAP stores it."""
     own, separator, nested = _typestore().generate_msgdef(schema, 2)[0].partition("=" * 80)
     # of our own types the text above, with its comments
-    return (DEFINITIONS.get(schema, own) + separator + nested).encode()
+    return bytes((DEFINITIONS.get(schema, own) + separator + nested).encode())
 
 
 def time(stamp_ns: int) -> Any:

@@ -10,8 +10,7 @@ import numpy as np
 from graphslam.core.config import Config
 from graphslam.core.records import Trajectory, TrueAssociations, TrueLandmark, Truth
 from graphslam.logs import schemas
-from graphslam.logs.decoders import TopicContext
-from graphslam.logs.log_set import decode_message
+from graphslam.logs.decoders import TopicContext, decode_messages
 from graphslam.logs.mcap_file import McapFile, open_mcap, raw_messages
 from graphslam.logs.topics import find_topics
 
@@ -56,7 +55,8 @@ def truth_from_mcap(files: Sequence[McapFile], config: Config) -> GroundTruth:
             if topic.record is Truth:
                 poses.setdefault(topic.robot, []).append(raw.data)
                 continue
-            message = decode_message(raw, topic, TopicContext(topic.robot), unusable)
+            context = TopicContext(topic.robot)
+            (message,) = decode_messages(topic.schema, [raw.data], context, unusable)
             if isinstance(message, TrueLandmark):
                 landmarks[message.identity or f"without identity {len(landmarks)}"] = message
     trajectories = {robot: _trajectory(found) for robot, found in sorted(poses.items())}
@@ -82,7 +82,8 @@ def read_true_associations(
     for file in files:
         for raw in raw_messages(file, topics.keys()):
             topic = topics[raw.topic]
-            message = decode_message(raw, topic, TopicContext(topic.robot), unusable)
+            context = TopicContext(topic.robot)
+            (message,) = decode_messages(topic.schema, [raw.data], context, unusable)
             if isinstance(message, TrueAssociations):
                 found[raw.topic].append(message)
     return {name: tuple(messages) for name, messages in found.items()}
