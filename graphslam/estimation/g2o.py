@@ -81,7 +81,8 @@ def graph_g2o(steps: Sequence[Step], estimate: Estimate) -> str:
     ids = number_vertices(estimate)
     states = [pose for robot in sorted(estimate.states) for pose in estimate.states[robot].poses]
     states += [estimate.landmarks[landmark][0] for landmark in ids.landmarks]
-    lines = [_record(VERTICES[len(x)], (i,), x.tolist()) for i, x in enumerate(states)]
+    wrapped = _wrapped(_padded(states)).tolist()
+    lines = [_vertex(i, x[: len(states[i])]) for i, x in enumerate(wrapped)]
     edges = [edge for step in steps for edge in _edges(step, ids)]
     rows = [""] * len(edges)
     alike: dict[str, list[int]] = defaultdict(list)
@@ -94,20 +95,26 @@ def graph_g2o(steps: Sequence[Step], estimate: Estimate) -> str:
         x, t = (_padded([states[edge.ends[end]] for edge in group]) for end in (0, -1))
         tag, z, cov = EDGES[model](z, cov, x, t)
         infos = _informations(cov, z.shape[1], group)
-        for place, edge, values, upper in zip(places, group, z.tolist(), infos, strict=True):
-            rows[place] = _record(tag, edge.ends, values, upper)
+        numbers = np.column_stack([_wrapped(z), infos])
+        form = " ".join([tag, *["%d"] * len(group[0].ends), *["%r"] * numbers.shape[1]])
+        for place, edge, values in zip(places, group, numbers.tolist(), strict=True):
+            rows[place] = form % (*edge.ends, *values)
     return "\n".join(lines + rows) + "\n"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Edge:
-    """An edge before it is written: a row of `EDGES`, vertices, measurement and covariance."""
+    """An edge before it is written: a row of `EDGES`, vertices, measurement and covariance.
+
+    ``robot`` and ``time_ns`` are of its later end.
+    """
 
     model: str
     ends: tuple[int, ...]
     z: Array
     cov: Array
-    what: str
+    robot: str
+    time_ns: int
 
 
 def _edges(step: Step, ids: GraphIds) -> Iterator[_Edge]:
@@ -117,18 +124,17 @@ def _edges(step: Step, ids: GraphIds) -> Iterator[_Edge]:
         if (robot, step.time_ns) in states:
             ends = (states[robot, step.time_ns],)
             # along world axes, as the prior is given
-            yield _Edge("start", ends, start.pose, start.cov, f"start of {robot}")
+            yield _Edge("start", ends, start.pose, start.cov, robot, step.time_ns)
     for robot, motion in sorted(step.motions.items()):
         a, b = states.get((robot, motion.start_ns)), states.get((robot, motion.end_ns))
         if a is not None and b is not None:
-            what = f"motion of {robot} to {motion.end_ns}"
-            yield _Edge("motion", (a, b), motion.delta, motion.cov, what)
+            yield _Edge("motion", (a, b), motion.delta, motion.cov, robot, motion.end_ns)
     for closure in step.closures:
         a = states.get((closure.other, closure.other_time_ns))
         b = states.get((closure.robot, closure.time_ns))
         if a is not None and b is not None:
-            what = f"closure of {closure.robot} at {closure.time_ns}"
-            yield _Edge("closure", (a, b), closure.delta, closure.cov, what)
+            found = closure.delta, closure.cov, closure.robot, closure.time_ns
+            yield _Edge("closure", (a, b), *found)
     for seen in step.associations:
         a = states.get((seen.robot, seen.time_ns))
         if isinstance(seen.target, str):
@@ -136,8 +142,7 @@ def _edges(step: Step, ids: GraphIds) -> Iterator[_Edge]:
         else:
             b = ids.landmarks.get(seen.target)
         if a is not None and b is not None:
-            what = f"{seen.model} seen by {seen.robot} at {seen.time_ns}"
-            yield _Edge(seen.model, (a, b), seen.z, seen.cov, what)
+            yield _Edge(seen.model, (a, b), seen.z, seen.cov, seen.robot, seen.time_ns)
 
 
 def _padded(states: Sequence[Array]) -> Array:
@@ -204,24 +209,27 @@ EDGES: Mapping[str, Callable[[Array, Array, Array, Array], _EdgeParts]] = {
 }
 
 
-def _informations(cov: Array, size: int, edges: Sequence[_Edge]) -> list[list[float]]:
-    """Upper triangles, row by row, of the inverses of covariances (n, m, m), m <= ``size``."""
+def _informations(cov: Array, size: int, edges: Sequence[_Edge]) -> Array:
+    """Upper triangles (n, k), by rows, of the inverses of covariances (n, m, m), m <= ``size``."""
     try:
         half = np.linalg.inv(np.linalg.cholesky(cov))
     except np.linalg.LinAlgError as error:
-        what = next(edge.what for edge, P in zip(edges, cov, strict=True) if not is_positive(P))
+        bad = next(edge for edge, P in zip(edges, cov, strict=True) if not is_positive(P))
+        what = f"{bad.model} of {bad.robot} at {bad.time_ns}"
         raise OutputError(f"graph.g2o: the covariance of {what} is not positive") from error
     m = cov.shape[1]
     info = np.zeros((len(cov), size, size))
     info[:, range(size), range(size)] = NO_INFORMATION
     info[:, size - m :, size - m :] = half.mT @ half
     i, j = np.triu_indices(size)
-    upper: list[list[float]] = info[:, i, j].tolist()
-    return upper
+    return np.asarray(info[:, i, j])
 
 
-def _record(tag: str, ids: Sequence[int], values: list[float], upper: Sequence[float] = ()) -> str:
-    """One line: tag, vertex numbers, values (heading wrapped), upper triangle of information."""
-    if len(values) == 3:
-        values = [*values[:2], float(wrap(values[2]))]
-    return " ".join([tag, *map(str, ids), *map(repr, values), *map(repr, upper)])
+def _vertex(number: int, values: list[float]) -> str:
+    """The line of a state."""
+    return f"{VERTICES[len(values)]} {number} {' '.join(map(repr, values))}"
+
+
+def _wrapped(z: Array) -> Array:
+    """Measurements or states (n, k), of poses (k = 3) with the heading wrapped."""
+    return np.column_stack([z[:, :2], wrap(z[:, 2])]) if z.shape[1] == 3 else z

@@ -42,7 +42,7 @@ def repair_future_stamps(
     late: Counter[str] = Counter()
     total: Counter[str] = Counter()
     for topic, message, log_ns in recorded:
-        is_late = isinstance(message, sampled) and message.stamp_ns > log_ns + TOLERANCE_NS
+        is_late = message.stamp_ns > log_ns + TOLERANCE_NS and isinstance(message, sampled)
         total[topic] += 1
         late[topic] += is_late
         if is_late and 2 * late[topic] <= total[topic] and valid_ns is not None:
@@ -51,8 +51,10 @@ def repair_future_stamps(
                 valid_ns, run = run[0][2], []
             run.append((topic, message, log_ns))
             continue
-        yield from _spread(run, valid_ns)
-        run, valid_ns = [], message.time_ns
+        if run:
+            yield from _spread(run, valid_ns)
+            run = []
+        valid_ns = message.time_ns
         yield topic, message, log_ns
     yield from _spread(run, valid_ns)
 

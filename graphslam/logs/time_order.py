@@ -8,7 +8,7 @@ glitches are detected per topic in the order of recording; then all topics are s
 
 import heapq
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
 
@@ -33,14 +33,21 @@ _Odometry = records.OdometryPose | records.WheelAngles | records.OdometryIncreme
 # Samples of a continuous process, for which the order of recording is evidence of time.
 # Increments and relative poses contain both of their times.
 SAMPLED = (records.OdometryPose, records.WheelAngles, records.Scan, records.Sighting, records.Truth)
+_SAMPLED = frozenset(SAMPLED)
 _ONE_PER_STAMP = (_Odometry, records.Scan, records.Truth)
-_RANKS = ((_Odometry, 0), (records.Truth | records.TrueLandmark, 1), (records.RelativePose, 2))
+_RANKS: Mapping[type[Message], int] = {
+    records.OdometryPose: 0,
+    records.WheelAngles: 0,
+    records.OdometryIncrement: 0,
+    records.Truth: 1,
+    records.TrueLandmark: 1,
+    records.RelativePose: 2,
+}
 
 
 def sort_key(message: Message) -> tuple[int, int]:
     """Time, then rank: odometry before truth, relative poses, scans and sightings."""
-    rank = next((rank for kinds, rank in _RANKS if isinstance(message, kinds)), 3)
-    return message.time_ns, rank
+    return message.time_ns, _RANKS.get(type(message), 3)
 
 
 class MessageSorter:
@@ -73,16 +80,24 @@ class MessageSorter:
         self._recorded = 0
         self._latest_ns = self._emitted_ns = self._checked_ns = _LONG_AGO
 
-    def push(self, topic: str, message: Message) -> Iterator[Message]:
-        """Add the next message recorded; yield, sorted, those whose order is now final."""
-        if topic not in self._repairs:
+    def push(self, topic: str, message: Message) -> Iterable[Message]:
+        """Add the next message recorded; those whose order is now final, sorted."""
+        repair = self._repairs.get(topic)
+        if repair is None:
             self.counts[topic] = Counter()
-            self._repairs[topic] = _GlitchRepair(self._window_ns, self.counts[topic])
+            repair = self._repairs[topic] = _GlitchRepair(self._window_ns, self.counts[topic])
         self._recorded += 1
-        self.counts[topic][GLITCH] += message.time_ns != message.stamp_ns
-        self._place(topic, self._repairs[topic].push(message, self._recorded))
+        if message.time_ns != message.stamp_ns:
+            self.counts[topic][GLITCH] += 1
+        settled = repair.push(message, self._recorded)
+        if settled:
+            self._place(topic, settled)
         if self._latest_ns < self._checked_ns + self._window_ns // _EMISSIONS_PER_WINDOW:
-            return
+            return ()
+        return self._release()
+
+    def _release(self) -> Iterator[Message]:
+        """The messages, sorted, that nothing can precede any more."""
         self._checked_ns = self._latest_ns
         for name, repair in self._repairs.items():
             # a slow topic must not delay the others until its next message
@@ -115,6 +130,8 @@ class MessageSorter:
 
 def merge(files: Sequence[Iterable[Message]]) -> Iterator[Message]:
     """One sorted stream from several sorted ones; ties keep the order of the files."""
+    if len(files) == 1:
+        return iter(files[0])  # `heapq.merge` takes as long for each message as to sort it
     return heapq.merge(*files, key=sort_key)
 
 
@@ -136,7 +153,7 @@ class _GlitchRepair:
         return self._placed_ns if self._stamps else _FAR_AHEAD
 
     def push(self, message: Message, number: int) -> list[Message]:
-        if not isinstance(message, SAMPLED):
+        if type(message) not in _SAMPLED:
             return [message]
         # its time so far, see `future_stamps`; usually its stamp
         stamp_ns, stamps = message.time_ns, self._stamps

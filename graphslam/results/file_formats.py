@@ -1,8 +1,9 @@
 """The text formats of the result folder, written and read back: TUM, covariances as CSV, JSON."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from decimal import Decimal, InvalidOperation
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -35,10 +36,8 @@ def tum_text(trajectory: Trajectory) -> str:
     x, y = poses[:, 0].tolist(), poses[:, 1].tolist()
     half = poses[:, 2] / 2
     qz, qw = np.sin(half).tolist(), np.cos(half).tolist()
-    return "".join(
-        f"{_seconds(t)} {a:.9f} {b:.9f} 0 0 0 {z:.12f} {w:.12f}\n"
-        for t, a, b, z, w in zip(stamps.tolist(), x, y, qz, qw, strict=True)
-    )
+    times = map(_seconds, stamps.tolist())
+    return _lines("%s %.9f %.9f 0 0 0 %.12f %.12f\n", zip(times, x, y, qz, qw, strict=True))
 
 
 def cov_text(trajectory: Trajectory) -> str:
@@ -47,12 +46,15 @@ def cov_text(trajectory: Trajectory) -> str:
     Additive errors along world axes, m², m·rad, rad².
     """
     order = np.argsort(trajectory.stamps_ns, kind="stable")
-    upper = trajectory.covs[order][:, *_UPPER].tolist()
-    rows = (
-        f"{t},{','.join(map(repr, row))}"
-        for t, row in zip(trajectory.stamps_ns[order].tolist(), upper, strict=True)
-    )
-    return "\n".join([COV_HEADER, *rows]) + "\n"
+    upper = trajectory.covs[order][:, *_UPPER]
+    rows = zip(trajectory.stamps_ns[order].tolist(), *upper.T.tolist(), strict=True)
+    return f"{COV_HEADER}\n" + _lines("%d,%r,%r,%r,%r,%r,%r\n", rows)
+
+
+def _lines(form: str, rows: Iterable[tuple[object, ...]]) -> str:
+    """A line of each row; many at a time, which takes half the time."""
+    values = list(rows)
+    return form * len(values) % tuple(chain.from_iterable(values))
 
 
 def landmark_json(landmark: Landmark) -> dict[str, Any]:
@@ -105,8 +107,9 @@ def _plain(value: object) -> object:
 
 
 def _seconds(stamp_ns: int) -> str:
-    sign = "-" if stamp_ns < 0 else ""
-    return f"{sign}{abs(stamp_ns) // _NS}.{abs(stamp_ns) % _NS:09d}"
+    if stamp_ns < 0:
+        return f"-{_seconds(-stamp_ns)}"
+    return f"{stamp_ns // _NS}.{stamp_ns % _NS:09d}"
 
 
 # ---------------------------------------------------------------- reading

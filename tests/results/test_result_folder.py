@@ -371,7 +371,7 @@ def test_vertices_hold_every_bit(made):
 def test_a_singular_covariance_is_one_line(made):
     motion = dataclasses.replace(made.steps[1].motions["robot"], cov=np.zeros((3, 3)))
     step = Step(made.steps[1].time_ns, motions={"robot": motion})
-    with pytest.raises(OutputError, match="motion of robot to"):
+    with pytest.raises(OutputError, match="motion of robot at"):
         graph_g2o([step], made.estimate)
 
 
