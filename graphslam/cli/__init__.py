@@ -23,8 +23,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     gc.set_threshold(COLLECTION_INTERVAL, *gc.get_threshold()[1:])
     for name in THREADS:
         os.environ.setdefault(name, "1")
-    from graphslam.cli.commands import app  # noqa: PLC0415
-    from graphslam.core.worker import allow_fork  # noqa: PLC0415 (numpy is loaded from here on)
+    from graphslam.cli.commands import app
+    from graphslam.core.worker import allow_fork
 
     allow_fork()
     app(args=arguments, prog_name="graphslam")

@@ -13,7 +13,6 @@ from typing import Annotated, Any
 import typer
 
 import graphslam
-from graphslam.cli import show
 from graphslam.cli.arguments import (
     Backend,
     Backends,
@@ -51,8 +50,7 @@ from graphslam.cli.arguments import (
 from graphslam.cli.terminal import errors_in_one_line, progress_bar
 from graphslam.core.config_io import load_config
 from graphslam.core.errors import ConfigError, EstimationError, OutputError
-from graphslam.logs import IMPORTERS, inspect_logs
-from graphslam.results.file_formats import to_json
+from graphslam.logs import IMPORTERS
 
 app = typer.Typer(
     help="Logs of wheeled robots in; trajectories, a landmark map and their covariances out.",
@@ -96,6 +94,8 @@ def command(name: str) -> Callable[[Callable[..., Output]], None]:
 
     def register(function: Callable[..., Output]) -> None:
         def run(*, json: Json = False, debug: Debug = False, **arguments: Any) -> None:
+            from graphslam.results.file_formats import to_json
+
             with errors_in_one_line(debug):
                 output = function(**arguments)
                 if json:
@@ -120,6 +120,9 @@ def command(name: str) -> Callable[[Callable[..., Output]], None]:
 @command("info")
 def info(logs: Logs, config: ConfigFile = None, settings: Settings = None) -> Output:
     """Say what is in a log, what is usable, what is odd."""
+    from graphslam.cli import show
+    from graphslam.logs import inspect_logs
+
     found = inspect_logs(logs, load_config(config, settings or ()))
     return Output(found.to_dict(), lambda: show.log_info(found))
 
@@ -132,6 +135,8 @@ def import_log(
 
     True poses and landmarks, where SOURCE has any, go in too.
     """
+    from graphslam.cli import show
+
     if os.path.lexists(output) and not force:
         raise OutputError(f"{output}: already exists; give --force to replace it")
     done = IMPORTERS[format_name](source, output)
@@ -147,6 +152,8 @@ def simulate(
 
     Equal scenarios and seeds give equal bytes.
     """
+    from graphslam.cli import show
+
     done = graphslam.simulate(scenario, output, seed=seed, force=force)
     return Output(show.simulation(done), lambda: show.simulated(done))
 
@@ -167,6 +174,8 @@ def smooth(
 
     Writes a folder with trajectories, landmarks, covariances, the factor graph and report.html.
     """
+    from graphslam.cli import show
+
     options = [f"backend.name={backend}"] if backend else []
     options += [] if horizon is None else [f"backend.horizon_s={horizon}"]
     options += [f"front_end.name={front_end}"] if front_end else []
@@ -186,6 +195,8 @@ def evaluate(
 
     That is true poses and landmarks, or reference relations between the scans.
     """
+    from graphslam.cli import show
+
     errors = graphslam.evaluate(directory, truth=truth or None, relations=relations)
     return Output(errors, lambda: show.evaluation(errors))
 
@@ -208,6 +219,8 @@ def compare(
 
     Writes a folder with compare.json and report.html.
     """
+    from graphslam.cli import show
+
     options = [f"front_end.name={front_end}"] if front_end else []
     tree = load_config(config, [*options, *(start or ()), *(settings or ())])
     with progress_bar("associating") as progress:
@@ -238,6 +251,8 @@ def changes(
     Writes changes.json, report.html, a map and an MCAP file of them. REFERENCE and LATER may be
     one folder with two spans.
     """
+    from graphslam.cli import show
+
     found = graphslam.changes_between(
         reference, later, reference_span_s=span_of(reference_span),
         later_span_s=span_of(later_span), config=load_config(config, settings or ()),
@@ -259,6 +274,7 @@ def experiment(
     Writes results.jsonl, a row per run as it ends, then summary.json, report.html and figures.
     An interrupted run is resumed when it is called again.
     """
+    from graphslam.cli import show
     from graphslam.evaluation.monte_carlo_campaign import list_jobs, run_campaign
     from graphslam.evaluation.monte_carlo_definition import load_definition
     from graphslam.evaluation.monte_carlo_folder import save_summary

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from math import degrees
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
@@ -21,7 +21,9 @@ from graphslam.results.report_comparison import (
     headline,
     reading_notes,
 )
-from graphslam.simulation import Simulation
+
+if TYPE_CHECKING:
+    from graphslam.simulation import Simulation
 
 _PIPE_WIDTH = 200  # columns; output into a pipe has no width of its own
 
@@ -65,7 +67,7 @@ def imported(done: ImportSummary) -> None:
         console.print(f"warning: {warning}")
 
 
-def simulation(done: Simulation) -> dict[str, Any]:
+def simulation(done: "Simulation") -> dict[str, Any]:
     """What ``simulate --json`` prints."""
     return {
         "scenario": done.scenario,
@@ -83,7 +85,7 @@ def simulation(done: Simulation) -> dict[str, Any]:
     }
 
 
-def simulated(done: Simulation) -> None:
+def simulated(done: "Simulation") -> None:
     """The logs, the drive of each robot, and the error of its dead reckoning at the end."""
     console = _console()
     head = ["log", "robot", "path, m", "s", "scans", "sightings", "dead reckoning ends off, m"]

@@ -7,8 +7,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from graphslam.core.errors import GraphSlamError
 
@@ -57,9 +55,17 @@ def progress_bar(doing: str) -> Iterator[Callable[[int, int], None]]:
     if not sys.stderr.isatty():
         yield lambda _done, _total: None
         return
-    columns = TextColumn(doing), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    from rich import progress as bars
+    from rich.console import Console
+
+    columns = (
+        bars.TextColumn(doing),
+        bars.BarColumn(),
+        bars.MofNCompleteColumn(),
+        bars.TimeRemainingColumn(),
+    )
     # without a drawing thread: a process with threads does not fork, see `core.worker`
-    bar = Progress(*columns, console=Console(stderr=True), transient=True, auto_refresh=False)
+    bar = bars.Progress(*columns, console=Console(stderr=True), transient=True, auto_refresh=False)
     drawn_s = -math.inf
     with bar as progress:
         task = progress.add_task("", total=None)

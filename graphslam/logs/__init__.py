@@ -3,13 +3,34 @@
 No other package imports `mcap` or `rosbags`. See docs/logs.md.
 """
 
-from graphslam.logs.import_pose_graph import pose_stamp_ns
-from graphslam.logs.import_summary import ImportSummary
-from graphslam.logs.importers import IMPORTERS
-from graphslam.logs.log_info import LogInfo, RobotInfo, TopicInfo, inspect_logs
-from graphslam.logs.log_set import LogFile, LogSet, open_logs
-from graphslam.logs.truth import GroundTruth, read_true_associations, read_truth, truth_from_mcap
-from graphslam.logs.writer import LogWriter
+from typing import TYPE_CHECKING
+
+from graphslam.core.lazy_exports import lazy_exports
+
+if TYPE_CHECKING:
+    from graphslam.logs.import_pose_graph import pose_stamp_ns
+    from graphslam.logs.import_summary import ImportSummary
+    from graphslam.logs.importers import IMPORTERS
+    from graphslam.logs.log_info import LogInfo, RobotInfo, TopicInfo, inspect_logs
+    from graphslam.logs.log_set import LogFile, LogSet, open_logs
+    from graphslam.logs.truth import (
+        GroundTruth,
+        read_true_associations,
+        read_truth,
+        truth_from_mcap,
+    )
+    from graphslam.logs.writer import LogWriter
+
+#: module -> the names that it defines
+_NAMES = {
+    "import_pose_graph": ("pose_stamp_ns",),
+    "import_summary": ("ImportSummary",),
+    "importers": ("IMPORTERS",),
+    "log_info": ("LogInfo", "RobotInfo", "TopicInfo", "inspect_logs"),
+    "log_set": ("LogFile", "LogSet", "open_logs"),
+    "truth": ("GroundTruth", "read_true_associations", "read_truth", "truth_from_mcap"),
+    "writer": ("LogWriter",),
+}
 
 __all__ = [
     "IMPORTERS",
@@ -28,3 +49,6 @@ __all__ = [
     "read_truth",
     "truth_from_mcap",
 ]
+
+if not TYPE_CHECKING:  # a type checker would take every name for defined
+    __getattr__ = lazy_exports(__name__, _NAMES)

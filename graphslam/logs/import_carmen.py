@@ -19,8 +19,9 @@ from graphslam.core.errors import LogError
 from graphslam.logs.decoders import MAX_RANGE_M
 from graphslam.logs.import_summary import ImportSummary
 from graphslam.logs.no_return import find_no_return
+from graphslam.logs.schemas import DEFAULT_ROBOT
 from graphslam.logs.source_files import text_lines
-from graphslam.logs.writer import DEFAULT_ROBOT, LogWriter
+from graphslam.logs.writer import LogWriter
 
 Ranges = NDArray[np.float32]
 

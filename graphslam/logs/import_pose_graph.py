@@ -18,8 +18,9 @@ import numpy as np
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import Array, adjoint, inverse, rotate_cov, wrap
 from graphslam.logs.import_summary import ImportSummary
+from graphslam.logs.schemas import DEFAULT_ROBOT
 from graphslam.logs.source_files import text_lines
-from graphslam.logs.writer import DEFAULT_ROBOT, LogWriter
+from graphslam.logs.writer import LogWriter
 
 _UNEQUAL = "landmark lines have unequal variances; sigmas of 1 rad and 1 m are used"
 _STAMPS = "invented: the source has none; pose number k (from 0) is stamped k+1 seconds"

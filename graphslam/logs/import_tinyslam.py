@@ -15,8 +15,9 @@ import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam.logs.import_summary import ImportSummary
+from graphslam.logs.schemas import DEFAULT_ROBOT
 from graphslam.logs.source_files import first_and_all, text_lines
-from graphslam.logs.writer import DEFAULT_ROBOT, LogWriter
+from graphslam.logs.writer import LogWriter
 
 WHEEL_RADIUS_M, AXLE_M, TICKS_PER_TURN = 0.077, 2 * 0.165, 2000
 LASER_FORWARD_M = 0.145

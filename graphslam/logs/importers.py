@@ -1,19 +1,45 @@
-"""Converters of other formats to MCAP: one row of `IMPORTERS` per format."""
+"""Converters of other formats to MCAP: one row of `IMPORTERS` per format.
+
+Each is imported when it is used.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
 
-from graphslam.logs.import_carmen import import_carmen
-from graphslam.logs.import_mrclam import import_mrclam
-from graphslam.logs.import_pose_graph import import_pose_graph
 from graphslam.logs.import_summary import ImportSummary
-from graphslam.logs.import_tinyslam import import_tinyslam
+
+# ruff: noqa: PLC0415
+
+
+def _carmen(source: Path, target: Path) -> ImportSummary:
+    from graphslam.logs.import_carmen import import_carmen
+
+    return import_carmen(source, target)
+
+
+def _pose_graph(source: Path, target: Path) -> ImportSummary:
+    from graphslam.logs.import_pose_graph import import_pose_graph
+
+    return import_pose_graph(source, target)
+
+
+def _mrclam(source: Path, target: Path) -> ImportSummary:
+    from graphslam.logs.import_mrclam import import_mrclam
+
+    return import_mrclam(source, target)
+
+
+def _tinyslam(source: Path, target: Path) -> ImportSummary:
+    from graphslam.logs.import_tinyslam import import_tinyslam
+
+    return import_tinyslam(source, target)
+
 
 #: from the source's path and the MCAP file to be written
 IMPORTERS: dict[str, Callable[[Path, Path], ImportSummary]] = {
-    "carmen": import_carmen,
-    "g2o": import_pose_graph,
-    "isam": import_pose_graph,
-    "mrclam": import_mrclam,
-    "tinyslam": import_tinyslam,
+    "carmen": _carmen,
+    "g2o": _pose_graph,
+    "isam": _pose_graph,
+    "mrclam": _mrclam,
+    "tinyslam": _tinyslam,
 }

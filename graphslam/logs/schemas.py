@@ -20,6 +20,8 @@ from graphslam.logs.cdr import HEADER, CdrError, Decoder, Layout, byte_order, u3
 
 IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
+DEFAULT_ROBOT = "robot"  # its topics have no namespace
+
 LASER_SCAN = "sensor_msgs/msg/LaserScan"
 ODOMETRY = "nav_msgs/msg/Odometry"
 JOINT_STATE = "sensor_msgs/msg/JointState"

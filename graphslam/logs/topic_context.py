@@ -14,8 +14,8 @@ from graphslam.logs.decoders import TopicContext, frame_of
 from graphslam.logs.mcap_file import McapFile, raw_messages, sample_messages
 from graphslam.logs.mounts import TransformTree, find_mount, is_level, transform_tree
 from graphslam.logs.no_return import find_no_return
+from graphslam.logs.schemas import DEFAULT_ROBOT
 from graphslam.logs.topics import ODOMETRY_KINDS, Topic, robot_of, static_transform_topics
-from graphslam.logs.writer import DEFAULT_ROBOT
 
 # 16 x 16 messages over the whole log: enough to find a frequent value, quick to read
 _SAMPLE_BLOCKS, _SAMPLE_PER_BLOCK = 16, 16

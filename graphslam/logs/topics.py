@@ -8,8 +8,7 @@ from graphslam.core.config import Config
 from graphslam.core.errors import LogError
 from graphslam.logs.decoders import DECODERS
 from graphslam.logs.mcap_file import McapFile
-from graphslam.logs.schemas import TF_MESSAGE
-from graphslam.logs.writer import DEFAULT_ROBOT
+from graphslam.logs.schemas import DEFAULT_ROBOT, TF_MESSAGE
 
 # Sources of odometry in order of preference: an increment has its covariance, wheel angles need
 # the wheel geometry from the configuration.

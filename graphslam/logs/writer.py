@@ -18,8 +18,8 @@ from graphslam.core.errors import OutputError
 from graphslam.core.geometry import Array
 from graphslam.logs import schemas
 from graphslam.logs.mcap_file import NOTES
+from graphslam.logs.schemas import DEFAULT_ROBOT
 
-DEFAULT_ROBOT = "robot"  # its topics have no namespace
 # Small chunks: a damaged one loses less; costs a few per cent of compression.
 _CHUNK_BYTES = 64 * 1024
 

@@ -17,26 +17,9 @@ from graphslam.simulation.scenario import (
     SightingSensor,
     StaticObjects,
 )
+from graphslam.simulation.scenario_names import SCENARIOS
 from graphslam.simulation.scenario_parser import build
 from graphslam.simulation.sightings import LANDMARKS, ROBOTS
-
-_FOLDER = Path(__file__).parent / "scenarios"
-
-#: name -> file; docs/simulator.md says what each is for
-SCENARIOS: dict[str, Path] = {
-    name: _FOLDER / f"{name}.toml"
-    for name in (
-        "lab",
-        "corridor",
-        "two-robots",
-        "robots-in-scans",
-        "change",
-        "office-loop",
-        "long-corridor",
-        "forest",
-        "fleet",
-    )
-}
 
 
 def load_scenario(scenario: str | Path) -> Scenario:

@@ -316,7 +316,7 @@ def test_a_legend_names_each_curve_once():
     axes = Axes(Box(0, 100, 3000, 400), "a")
     for name in ("ekf", "isam2", "ekf"):
         axes.line([0, 1], [0, 1], Style(INK), name)
-    assert re.findall(r">([a-z]+2?)</text>", axes.to_svg()) == ["isam2", "ekf"]
+    assert re.findall(r">([a-z]+2?)</text>", axes.to_svg()) == ["ekf", "isam2"]
 
 
 def test_poses_between_stamps_lie_on_the_twist_and_ends_stand():
