@@ -23,7 +23,6 @@ from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
-from scipy.cluster.hierarchy import DisjointSet
 
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array
@@ -137,6 +136,8 @@ def _sections(
     Measurements without any such state form one section.
     """
     inner = [[k for k in m.keys() if factors.is_state(k) and k not in shared] for m in unsent]  # noqa: SIM118
+    from scipy.cluster.hierarchy import DisjointSet  # noqa: PLC0415 (slow to import)
+
     connected = DisjointSet({key for keys in inner for key in keys})
     for keys in inner:
         for key in keys[1:]:
