@@ -56,6 +56,8 @@ def log_scale(low: float, high: float, margin: float = MARGIN) -> Scale:
     """The logarithmic scale of positive data; 0.1 to 1 without data."""
     if not 0 < low <= high:
         low, high = 0.1, 1.0
+    if low == high:
+        low, high = low / 2, high * 2
     room = (high / low) ** margin
     return Scale(low / room, high * room, is_log=True)
 

@@ -299,6 +299,7 @@ def test_scales_reach_a_little_beyond_the_data():
     assert log_scale(1.0, 100.0, 0.5) == Scale(0.1, 1000.0, is_log=True)
     assert linear_scale(3.0, 3.0, 0.0) == Scale(2.5, 3.5)
     assert linear_scale(np.nan, np.nan, 0.0) == Scale(0.0, 1.0)
+    assert log_scale(4.0, 4.0, 0.0) == Scale(2.0, 8.0, is_log=True)
     assert log_scale(np.nan, np.nan, 0.0) == Scale(0.1, 1.0, is_log=True)
 
 
