@@ -129,9 +129,17 @@ def generalised_least_squares(
     return LeastSquaresFit(x, scale * N, gain, scale, e, np.asarray(information))
 
 
-def rival_set(agree: Array, worth: Array | NDArray[np.float32], rest: IntArray) -> IntArray:
-    """The set among ``rest`` (k,) of which all agree in pairs and that is worth most, indices."""
-    return rest[greedy_max_clique(agree[np.ix_(rest, rest)], worth[rest])]
+def rival_set(
+    agree: Array,
+    worth: Array | NDArray[np.float32],
+    rest: IntArray,
+    starts: int | None = None,
+) -> IntArray:
+    """The set among ``rest`` (k,) of which all agree in pairs and that is worth most, indices.
+
+    See `greedy_max_clique`.
+    """
+    return rest[greedy_max_clique(agree[np.ix_(rest, rest)], worth[rest], starts)]
 
 
 def greedy_max_clique(
@@ -149,17 +157,20 @@ def greedy_max_clique(
     """
     best: list[int] = []
     most = 0.0
-    links = agree * worth
-    degree = links.sum(axis=1) + worth
+    links = agree * worth[:, None]  # what each is worth to those that agree with it
+    degree = links.sum(axis=0) + worth
     for first in np.argsort(-degree, kind="stable")[:starts]:
         if degree[first] <= most:
             break
-        chosen, free, total = [int(first)], agree[first].copy(), worth[first]
+        chosen, free, total = [int(first)], agree[first], worth[first]
+        gain = links[free].sum(axis=0)
         while free.any() and total + worth[free].sum() > most:
-            k = int(np.where(free, links @ free, -1.0).argmax())
+            k = int(np.where(free, gain, -1.0).argmax())
             chosen.append(k)
             total += worth[k]
-            free &= agree[k]
+            left = free & agree[k]
+            gain = gain - links[free & ~left].sum(axis=0)
+            free = left
         if total > most:
             best, most = chosen, float(total)
     return np.array(sorted(best), dtype=np.int64)

@@ -91,7 +91,7 @@ def solve_calibrated(
     parameters.setMaxIterations(50)
     try:
         values = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-        covs = {} if rough else marginals_of(gtsam.Marginals(graph, values), graph.keyVector())
+        covs = {} if rough else marginals_of(graph, values).marginals
     except RuntimeError as error:
         raise builder.explain(error) from error
     marginals = with_means(values, builder.dims(), covs)

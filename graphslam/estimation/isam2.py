@@ -12,9 +12,9 @@ import numpy as np
 from graphslam.core.config import Config, RobustConfig
 from graphslam.core.geometry import Array
 from graphslam.core.records import Association, Closure, Estimate, Step
-from graphslam.core.worker import parallel_map
 from graphslam.estimation import factors
 from graphslam.estimation.factor_graph import Estimates, FactorGroup, GraphBackend, GraphBuilder
+from graphslam.estimation.selected_inverse import CovarianceBlocks, covariance_blocks
 
 #: m or rad: the estimate has converged when all variables together move less than this
 CONVERGED = 1e-6
@@ -29,8 +29,6 @@ CONVERGED_ERROR, CONVERGED_ERROR_ROBUST, CONVERGED_ERROR_ROUGH = 1e-10, 1e-6, 1e
 #: steps after which the interval between relinearisations has doubled, since each costs as much as
 #: there are steps
 INTERVAL_DOUBLES = 1000
-#: marginals from which on a second process is worth while
-PARALLEL_MARGINALS = 500
 #: `relinearizeSkip` that leaves the decision to `Isam2Backend`
 NEVER = 1 << 30
 
@@ -287,18 +285,12 @@ class Isam2Backend(GraphBackend):
             raise self._builder.explain(error) from error
         return values
 
-    def _marginals(self, values: gtsam.Values) -> dict[int, Array]:
-        """Marginal covariance of every key: by Cholesky, or by QR where that fails."""
-        keys = values.keys()
+    def _marginals(self, values: gtsam.Values) -> Mapping[int, Array]:
+        """Marginal covariance of every key."""
         try:
-            return marginals_of(gtsam.Marginals(self._builder.graph, values), keys)
+            return marginals_of(self._builder.graph, values).marginals
         except RuntimeError as error:
-            tree = isam2_tree(self._config, "QR", self._builder.graph, values)
-            covs = {key: tree.marginalCovariance(key) for key in keys}
-            # QR does not fail on an indeterminate graph, it returns NaN
-            if not all(np.isfinite(cov).all() for cov in covs.values()):
-                raise self._builder.explain(error) from error
-            return covs
+            raise self._builder.explain(error) from error
 
     def _result(self, values: gtsam.Values, *, rough: bool = False) -> Estimate:
         self._finished = values
@@ -347,15 +339,26 @@ class Reoptimiser(Isam2Backend):
         return self._result(values, rough=True)
 
 
-def marginals_of(marginals: gtsam.Marginals, keys: Sequence[int]) -> dict[int, Array]:
-    """Marginal covariance (d, d) of each key, errors in body frames.
+def marginals_of(
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    pairs: Iterable[tuple[int, int]] = (),
+) -> CovarianceBlocks:
+    """Covariances of all variables and of pairs of poses: by Cholesky, or by QR where that fails.
+
+    Errors are in body frames.
 
     Raises:
         RuntimeError: one is indeterminate.
     """
-    keys = list(keys)
-    covs = parallel_map(marginals.marginalCovariance, keys, fewest=PARALLEL_MARGINALS)
-    return dict(zip(keys, covs, strict=True))
+    try:
+        return covariance_blocks(graph.linearize(values), pairs)
+    except RuntimeError:
+        blocks = covariance_blocks(graph.linearize(values), pairs, use_qr=True)
+        # QR does not fail on an indeterminate graph, its covariances are not finite
+        if not all(np.isfinite(cov).all() for cov in blocks.marginals.values()):
+            raise
+        return blocks
 
 
 def with_means(

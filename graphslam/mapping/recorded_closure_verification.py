@@ -16,18 +16,27 @@ Recorded closures may be outliers, so none is accepted by itself.
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
-from graphslam.core.config import BackendConfig, Config, RobustConfig
+from graphslam.core.config import RobustConfig
 from graphslam.core.consistency import FIT_PROBABILITY, greedy_max_clique, has_rival, rival_set
 from graphslam.core.frame_forest import PRIOR_INFLATION, grow_frame_forest
-from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared
+from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, adjoint, between, compose, inverse, log, rotate_cov
-from graphslam.core.records import Closure, Estimate, Motion, RelativePose, Start, Step
-from graphslam.estimation.isam2 import Isam2Backend, Reoptimiser
+from graphslam.core.records import (
+    Closure,
+    Estimate,
+    Motion,
+    RelativePose,
+    Start,
+    Step,
+)
+from graphslam.estimation.closure_graph import ClosureGraph
+from graphslam.estimation.initial_estimate import initial_estimate
 from graphslam.odometry.preintegration import Track
 
 #: probability up to which two closures agree; against all others together it is
@@ -35,6 +44,8 @@ from graphslam.odometry.preintegration import Track
 AGREE = 0.99
 #: closures compared with each other at once, in order of time; the work grows with its square
 CHUNK = 1000
+#: closures from which the largest consistent set is searched for; what it lacks is added later
+SEARCH_STARTS = 16
 #: scale of the redescending kernel of the joint solution, in sigmas
 KERNEL_SIGMAS = 3.0
 #: share of the information in a direction that the other closures must have for a comparison
@@ -43,6 +54,8 @@ MIN_SHARE = 1e-3
 MAX_ROUNDS = 30
 #: prior covariance (m, rad) of the origin of a robot's own frame
 ORIGIN = np.diag([1e-3, 1e-3, 1e-3]) ** 2
+
+_UPPER = np.triu_indices(3)
 
 CONTRADICTED = "it contradicts the others"
 UNSUPPORTED = "no other closure supports it"
@@ -74,7 +87,6 @@ def verify(
     messages: Sequence[RelativePose],
     tracks: Mapping[str, Track],
     starts: Mapping[str, Start],
-    config: Config,
 ) -> ClosureDecision:
     """Decide which relative poses of a log to use.
 
@@ -100,11 +112,13 @@ def verify(
             E, agree = _loops([messages[k] for k in chunk], odometry)
             frames_seen.update(zip(chunk, E, strict=True))
             worth = np.ones(len(chunk), dtype=np.float32)
-            best = greedy_max_clique(agree, worth)
-            rival = rival_set(agree, worth, np.setdiff1d(np.arange(len(chunk)), best))
+            best = greedy_max_clique(agree, worth, SEARCH_STARTS)
             sets[pair] = sets.get(pair, []) + [chunk[n] for n in best]
-            if not has_rival(len(best), [len(rival)]):
-                clear.add(pair)
+            if pair[0] != pair[1]:
+                rest = np.setdiff1d(np.arange(len(chunk)), best)
+                rival = rival_set(agree, worth, rest, SEARCH_STARTS)
+                if not has_rival(len(best), [len(rival)]):
+                    clear.add(pair)
     placed, frames = _initial_starts(sets, clear, frames_seen, odometry, starts)
     believed = {
         k
@@ -112,9 +126,14 @@ def verify(
         for k in numbers
         if frames[a] == frames[b] and (a == b or (a, b) in clear or {a, b} <= set(starts))
     }
-    solver = _Joint(messages, odometry, {**placed, **starts}, config)
     candidates = [k for k in judged if frames[messages[k].robot] == frames[messages[k].other]]
-    believed, estimate = solver.settle(believed, candidates)
+    believed, estimate = _settle(
+        [messages[k] for k in candidates],
+        {n for n, k in enumerate(candidates) if k in believed},
+        odometry,
+        {**placed, **starts},
+    )
+    believed = {candidates[n] for n in believed}
     refused = {
         k: CONTRADICTED if k in candidates else UNSUPPORTED for k in judged if k not in believed
     }
@@ -200,23 +219,48 @@ def _loops(
     i, j = other.at(m.start_ns for m in messages), own.at(m.time_ns for m in messages)
     z = np.array([m.delta for m in messages])
     seen = compose(other.poses[i], z)
-    E = compose(seen, inverse(own.poses[j]))
-    A = adjoint(seen)
-    R = A @ rotate_cov(np.array([m.cov for m in messages]), -z[:, 2]) @ A.mT
+    back = inverse(own.poses[j])
+    E = compose(seen, back)
+    R = rotate_cov(np.array([m.cov for m in messages]), -z[:, 2])
+    at_other, at_own = adjoint(seen), adjoint(inverse(back))
+    R_other, R_own = at_other @ R @ at_other.mT, at_own @ R @ at_own.mT
+    A = _congruence(adjoint(E))
+    # symmetric matrices by their upper triangles, so that taking them from frame to frame is linear
+    there, here, R_other, R_own = (
+        M[:, *_UPPER] for M in (other.spread[i], own.spread[j], R_other, R_own)
+    )
     gate = chi2_quantile(AGREE, 3)
     agree = np.zeros((len(z), len(z)), dtype=bool)
-    A = adjoint(E)
+    first = inverse(E)
     for a in range(len(z)):  # row by row: a matrix of 3 x 3 blocks would not fit
-        loop = compose(E[a], inverse(E))
-        turn = adjoint(loop)
-        there, back = other.spread[i] - other.spread[i[a]], own.spread[j] - own.spread[j[a]]
-        there *= np.sign(i - i[a])[:, None, None]
-        back *= np.sign(j - j[a])[:, None, None]
-        S = there + A[a] @ back @ A[a].T + R[a] + turn @ R @ turn.mT
-        agree[a] = mahalanobis_squared(log(loop), S) <= gate
+        r = log(compose(E[a], first))
+        S = R_other[a] + np.sign(i - i[a])[:, None] * (there - there[a])
+        S += (np.sign(j - j[a])[:, None] * (here - here[a]) + R_own) @ A[a].T
+        agree[a] = _squared_distances(r, S) <= gate
     agree &= agree.T
     np.fill_diagonal(agree, False)
     return E, agree
+
+
+def _congruence(A: Array) -> Array:
+    """Matrices (n, 6, 6) that take the upper triangle of M to that of A M Aᵀ, for A (n, 3, 3)."""
+    i, j = _UPPER
+    out = A[:, i[:, None], i] * A[:, j[:, None], j]
+    swapped = A[:, i[:, None], j] * A[:, j[:, None], i]
+    return np.asarray(out + np.where(i == j, 0.0, swapped))
+
+
+def _squared_distances(r: Array, S: Array) -> Array:
+    """Squared Mahalanobis distances (n,) of r (n, 3) for covariances by upper triangle (n, 6).
+
+    The square root is written out: NumPy's solution of small systems takes ten times as long.
+    """
+    (x, y, turn), (xx, xy, xt, yy, yt, tt) = r.T, S.T
+    a, b = xy / xx, xt / xx
+    y, yy, yt = y - a * x, yy - a * xy, yt - a * xt
+    c = yt / yy
+    turn, tt = turn - b * x - c * y, tt - b * xt - c * yt
+    return np.asarray(x * x / xx + y * y / yy + turn * turn / tt)
 
 
 # ---------------------------------------------------------------- frames
@@ -261,82 +305,83 @@ def _initial_starts(
 # ---------------------------------------------------------------- everything together
 
 
-class _Joint:
-    """Solves odometry between the ends of closures together with any set of closures."""
+def _settle(
+    messages: Sequence[RelativePose],
+    believed: set[int],
+    odometry: Mapping[str, _OdometryChain],
+    starts: Mapping[str, Start],
+) -> tuple[set[int], Estimate]:
+    """The closures that support each other, beginning with ``believed``; and the estimate.
 
-    def __init__(
-        self,
-        messages: Sequence[RelativePose],
-        odometry: Mapping[str, _OdometryChain],
-        starts: Mapping[str, Start],
-        config: Config,
-    ) -> None:
-        kernel = RobustConfig("geman-mcclure", KERNEL_SIGMAS)
-        self._plain = replace(config, robust=RobustConfig("none"), backend=BackendConfig())
-        self._robust = replace(self._plain, robust=kernel)
-        self._closures = [
-            Closure(m.robot, m.time_ns, m.other, m.start_ns, m.delta, m.cov) for m in messages
-        ]
-        self._starts: dict[int, dict[str, Start]] = defaultdict(dict)
-        self._motions: dict[int, dict[str, Motion]] = defaultdict(dict)
-        for robot, chain in odometry.items():
-            self._starts[int(chain.times_ns[0])][robot] = starts[robot]
-            for motion in chain.motions:
-                self._motions[motion.end_ns][robot] = motion
+    It is of the states at the ends of all closures.
+    """
+    gate = chi2_quantile(FIT_PROBABILITY, 3)
+    closures = [Closure(m.robot, m.time_ns, m.other, m.start_ns, m.delta, m.cov) for m in messages]
+    steps = _steps(odometry, starts)
+    start = initial_estimate(steps, [closures[k] for k in sorted(believed)])
+    graph = ClosureGraph(steps, start, closures, RobustConfig("geman-mcclure", KERNEL_SIGMAS))
+    graph.solve(sorted(believed), robust=False)
+    barred: set[int] = set()
+    for _ in range(MAX_ROUNDS if closures else 0):
+        graph.solve(sorted(believed), robust=True)
+        used = np.isin(np.arange(len(closures)), sorted(believed))
+        d2 = _misfits(closures, used, *graph.ends())
+        wrong = sorted((k for k in believed if d2[k] > gate), key=lambda k: -d2[k])
+        new = set(np.flatnonzero(d2 <= gate).tolist()) - believed - barred
+        if not wrong and not new:
+            break
+        # one outlier makes others look like outliers, so the worst are removed first
+        gone = set(wrong[: max(1, len(wrong) // 4)])
+        barred |= gone
+        believed = believed - gone if gone else believed | new
+    graph.solve(sorted(believed), robust=False, rough=False)
+    return believed, graph.estimate()
 
-    def settle(self, believed: set[int], candidates: Sequence[int]) -> tuple[set[int], Estimate]:
-        """The candidates that support each other, beginning with ``believed``; and the estimate."""
-        gate = chi2_quantile(FIT_PROBABILITY, 3)
-        backend: Isam2Backend = Isam2Backend(self._plain)
-        for step in self._steps(believed):
-            backend.add(step)
-        estimate = backend.finish()
-        barred: set[int] = set()
-        for _ in range(MAX_ROUNDS):
-            batch = Reoptimiser(self._robust, self._steps(believed), estimate)
-            estimate = batch.solve(rough=True)
-            d2 = {k: self._misfit(k, k in believed, batch, estimate) for k in candidates}
-            wrong = sorted((k for k in believed if d2[k] > gate), key=lambda k: -d2[k])
-            new = {k for k in candidates if k not in believed | barred and d2[k] <= gate}
-            if not wrong and not new:
-                break
-            # one outlier makes others look like outliers, so the worst are removed first
-            gone = set(wrong[: max(1, len(wrong) // 4)])
-            barred |= gone
-            believed = believed - gone if gone else believed | new
-        return believed, Reoptimiser(self._plain, self._steps(believed), estimate).solve()
 
-    def _steps(self, believed: Iterable[int]) -> list[Step]:
-        """Steps in the order of time, each closure where both of its ends are there."""
-        at: dict[int, list[Closure]] = defaultdict(list)
-        for k in sorted(believed):
-            closure = self._closures[k]
-            at[max(closure.time_ns, closure.other_time_ns)].append(closure)
-        return [
-            Step(t, self._starts.get(t, {}), self._motions.get(t, {}), (), tuple(at[t]))
-            for t in sorted({*self._starts, *self._motions, *at})
-        ]
+def _steps(odometry: Mapping[str, _OdometryChain], starts: Mapping[str, Start]) -> list[Step]:
+    """Starts and motions of all robots, in the order of time."""
+    first: dict[int, dict[str, Start]] = defaultdict(dict)
+    motions: dict[int, dict[str, Motion]] = defaultdict(dict)
+    for robot, chain in odometry.items():
+        first[int(chain.times_ns[0])][robot] = starts[robot]
+        for motion in chain.motions:
+            motions[motion.end_ns][robot] = motion
+    times = sorted({*first, *motions})
+    return [Step(t, first.get(t, {}), motions.get(t, {})) for t in times]
 
-    def _misfit(self, k: int, used: bool, backend: Reoptimiser, estimate: Estimate) -> float:
-        """Squared Mahalanobis distance of a closure from what all others predict (leave one out).
 
-        In units of the closure's own sigmas, along directions in which the estimate is independent:
-        with m the variance of the relative pose by the estimate, r the residual and w the weight
-        that the closure has in it (0 unless used), all others together predict r / (1 - w m) with
-        variance m / (1 - w m). Directions in which they have hardly any information are left out.
-        """
-        c = self._closures[k]
-        ends = (c.other, c.other_time_ns), (c.robot, c.time_ns)
-        x, y = (estimate.states[robot].at(t) for robot, t in ends)
-        h = between(x, y)
-        L = np.linalg.cholesky(rotate_cov(c.cov, -float(c.delta[2])))
-        r = np.linalg.solve(L, log(between(c.delta, h)))
-        if ends[0] == ends[1]:
-            return float(r @ r)
-        J = np.linalg.solve(L, np.hstack([-adjoint(inverse(h)), np.eye(3)]))
-        m, Q = np.linalg.eigh(J @ backend.state_covariance(ends) @ J.T)
-        w = (KERNEL_SIGMAS**2 / (KERNEL_SIGMAS**2 + r @ r)) ** 2 if used else 0.0
-        rest = 1.0 - w * m
-        known = rest > MIN_SHARE
-        r, m, rest = (Q.T @ r)[known], m[known], rest[known]
-        return float(np.sum(r**2 / (rest * (rest + m))))
+def _misfits(
+    closures: Sequence[Closure],
+    used: NDArray[np.bool_],
+    x: Array,
+    y: Array,
+    P: Array,
+) -> Array:
+    """Squared Mahalanobis distances (n,) of closures from what all others predict (leave one out).
+
+    In units of each closure's own sigmas, along directions in which the estimate is independent:
+    with m the variance of the relative pose by the estimate, r the residual and w the weight
+    that the closure has in it (0 unless used), all others together predict r / (1 - w m) with
+    variance m / (1 - w m). Directions in which they have hardly any information are left out.
+
+    Args:
+        closures: as measured.
+        used: (n,) whether each is in the estimate.
+        x: (n, 3) estimates of the states in whose frames they are.
+        y: (n, 3) estimates of the others.
+        P: (n, 6, 6) joint covariances of both, errors along each one's axes.
+    """
+    delta, cov = (np.array([getattr(c, name) for c in closures]) for name in ("delta", "cov"))
+    h = between(x, y)
+    L = np.linalg.cholesky(rotate_cov(cov, -delta[:, 2]))
+    r = np.linalg.solve(L, log(between(delta, h))[:, :, None])
+    unit = np.broadcast_to(np.eye(3), L.shape)
+    J = np.linalg.solve(L, np.concatenate([-adjoint(inverse(h)), unit], axis=2))
+    m, Q = np.linalg.eigh(J @ P @ J.mT)
+    squared = (r * r).sum(axis=(1, 2))
+    w = np.where(used, (KERNEL_SIGMAS**2 / (KERNEL_SIGMAS**2 + squared)) ** 2, 0.0)
+    rest = 1.0 - w[:, None] * m
+    r = (Q.mT @ r)[:, :, 0]
+    known = rest > MIN_SHARE
+    rest = np.where(known, rest, 1.0)
+    return np.asarray(np.where(known, r**2 / (rest * (rest + m)), 0.0).sum(axis=1))

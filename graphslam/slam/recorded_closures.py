@@ -58,7 +58,7 @@ def judge_recorded_closures(
                 tracks[message.robot].add(message)
             elif isinstance(message, RelativePose):
                 messages.append(message)
-        verified = verify(messages, tracks, starts, config)
+        verified = verify(messages, tracks, starts)
     found, frames = dict(verified.starts), dict(verified.frames)
     if kinds & {Scan, Sighting}:
         # these may place a robot too, so only starts relative to another robot are used

@@ -1,0 +1,113 @@
+"""Motions of robots with any choice of candidate closures, solved again and again.
+
+Factors are built once; each solution begins at the one before.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+
+from graphslam.core.config import RobustConfig
+from graphslam.core.geometry import Array
+from graphslam.core.records import Closure, Estimate, Step
+from graphslam.estimation import factors
+from graphslam.estimation.isam2 import (
+    CONVERGED_ERROR_ROUGH,
+    BatchGraph,
+    marginals_of,
+    optimise,
+    with_means,
+)
+from graphslam.estimation.selected_inverse import CovarianceBlocks
+
+NO_KERNEL = RobustConfig("none")
+
+
+class ClosureGraph:
+    """A pose graph whose closures are chosen in every solution."""
+
+    def __init__(
+        self,
+        steps: Iterable[Step],
+        start: Estimate,
+        closures: Sequence[Closure],
+        kernel: RobustConfig,
+    ) -> None:
+        """Build all factors.
+
+        Args:
+            steps: starts and motions of all states.
+            start: their poses, where the first solution begins.
+            closures: the candidates.
+            kernel: of the candidates, where it is asked for.
+
+        Raises:
+            EstimationError: a covariance is not positive definite and finite.
+        """
+        self._builder, self._values = BatchGraph.at_estimate(steps, start, kernel)
+        self._graph, self._size = self._builder.graph, self._builder.graph.size()
+        self._kernel, self._rows = kernel, self._builder.rows
+        self._robust = self._factors(closures)
+        self._plain = self._factors([replace(closure, verified=True) for closure in closures])
+        self._ends = [(other, key) for other, key in (f.keys() for f in self._plain)]
+
+    def _factors(self, closures: Iterable[Closure]) -> list[gtsam.NonlinearFactor]:
+        return [group.factors[0] for group in self._builder.closure_groups(closures)]
+
+    def solve(self, used: Iterable[int], *, robust: bool, rough: bool = True) -> None:
+        """Optimise with the candidates of these numbers, from the solution before.
+
+        Args:
+            used: indices into the closures.
+            robust: under the kernel.
+            rough: stop where the error decreases by less than a thousandth.
+
+        Raises:
+            EstimationError: the graph is indeterminate.
+        """
+        self._graph.resize(self._size)
+        made = self._robust if robust else self._plain
+        chosen = [made[k] for k in used]
+        for factor in chosen:
+            self._graph.add(factor)
+        self._builder.rows = self._rows + 3 * len(chosen)
+        kernel, until = self._kernel if robust else NO_KERNEL, CONVERGED_ERROR_ROUGH
+        try:
+            self._values = optimise(self._graph, self._values, kernel, until if rough else None)
+        except RuntimeError as error:
+            raise self._builder.explain(error) from error
+
+    def ends(self) -> tuple[Array, Array, Array]:
+        """Both ends of every candidate in the solution.
+
+        Returns:
+            Poses (n, 3) of the states in whose frames the candidates are, poses (n, 3) of the
+            others, and their joint covariances (n, 6, 6), errors along each one's axes.
+
+        Raises:
+            EstimationError: the graph is indeterminate.
+        """
+        joint = self._covariances(self._ends).joint
+        x, y = (
+            np.array([factors.read(self._values, pair[end], 3) for pair in self._ends])
+            for end in (0, 1)
+        )
+        return x, y, np.array([joint[pair] for pair in self._ends])
+
+    def estimate(self) -> Estimate:
+        """The solution with its covariances.
+
+        Raises:
+            EstimationError: the graph is indeterminate.
+        """
+        builder = self._builder
+        means = with_means(self._values, builder.dims(), self._covariances().marginals)
+        return builder.estimate(means, float(self._graph.error(self._values)))
+
+    def _covariances(self, pairs: Sequence[tuple[int, int]] = ()) -> CovarianceBlocks:
+        try:
+            return marginals_of(self._graph, self._values, pairs)
+        except RuntimeError as error:
+            raise self._builder.explain(error) from error
