@@ -102,7 +102,7 @@ class Pipeline(StepRecorder):
     def run(self, progress: Progress) -> None:
         """Take in every message of the log; ``progress`` gets the number of messages read."""
         tracks = {name: run.track for name, run in self.runs.items()}
-        read = _counted(
+        read = counted(
             self.log.messages((Truth, TrueLandmark), prefetch=True), self.counts, progress
         )
         messages = synchronise(
@@ -368,9 +368,10 @@ class Pipeline(StepRecorder):
         return closure
 
 
-def _counted(
+def counted(
     messages: Iterable[Message], counts: Counter[str], progress: Progress
 ) -> Iterator[Message]:
+    """The messages, counted in ``counts`` and reported now and then."""
     for message in messages:
         counts["messages"] += 1
         if counts["messages"] % REPORT_EVERY == 0:

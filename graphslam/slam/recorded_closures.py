@@ -1,16 +1,25 @@
 """Relative poses recorded in a log: which are used, and their conversion to closures."""
 
-from collections.abc import Mapping
+from bisect import bisect_right
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from graphslam.core.config import Config
 from graphslam.core.geometry import compose, compose_cov, inverse, inverse_cov
-from graphslam.core.records import Closure, RelativePose, Scan, Sighting, Start, TrueLandmark, Truth
+from graphslam.core.records import (
+    Closure,
+    Message,
+    RelativePose,
+    Scan,
+    Sighting,
+    Start,
+    TrueLandmark,
+    Truth,
+)
 from graphslam.logs import LogSet
 from graphslam.mapping.recorded_closure_verification import NOTHING_RECORDED, origin_prior, verify
+from graphslam.odometry.preintegration import Track
 from graphslam.slam.robot_settings import make_tracks
 from graphslam.slam.robot_state import RobotState
 from graphslam.slam.synchronisation import ODOMETRY
@@ -50,14 +59,37 @@ def judge_recorded_closures(
     """
     kinds = {topic.record for topic in log.topics}
     messages: list[RelativePose] = []
-    verified = NOTHING_RECORDED
+    tracks = make_tracks(log, config)
     if RelativePose in kinds and config.backend.verify_closures:
-        tracks = make_tracks(log, config)
-        for message in log.messages((Truth, TrueLandmark, Scan, Sighting)):
-            if isinstance(message, ODOMETRY):
-                tracks[message.robot].add(message)
-            elif isinstance(message, RelativePose):
-                messages.append(message)
+        read = log.messages((Truth, TrueLandmark, Scan, Sighting))
+        messages = take_relative_poses(read, tracks)
+    return accept_closures(log, config, starts, messages, tracks)
+
+
+def take_relative_poses(
+    messages: Iterable[Message], tracks: Mapping[str, Track]
+) -> list[RelativePose]:
+    """The relative poses among the messages of a log, whose odometry goes into ``tracks``."""
+    found: list[RelativePose] = []
+    for message in messages:
+        if isinstance(message, ODOMETRY):
+            tracks[message.robot].add(message)
+        elif isinstance(message, RelativePose):
+            found.append(message)
+    return found
+
+
+def accept_closures(
+    log: LogSet,
+    config: Config,
+    starts: Mapping[str, Start],
+    messages: Sequence[RelativePose],
+    tracks: Mapping[str, Track],
+) -> RecordedClosures:
+    """See `judge_recorded_closures`, for the relative poses and the odometry of a log."""
+    kinds = {topic.record for topic in log.topics}
+    verified = NOTHING_RECORDED
+    if config.backend.verify_closures:
         verified = verify(messages, tracks, starts)
     found, frames = dict(verified.starts), dict(verified.frames)
     if kinds & {Scan, Sighting}:
@@ -102,7 +134,7 @@ def between_states(
         return "its start is not before its end"
     if other is None or not other.started or message.start_ns < other.times[0]:
         return "no keyframe at its start time"
-    other_ns = other.times[int(np.searchsorted(other.times, message.start_ns, "right")) - 1]
+    other_ns = other.times[bisect_right(other.times, message.start_ns) - 1]
     delta, cov = message.delta, message.cov
     if other_ns < message.start_ns:
         lead = other.track.motion(other_ns, message.start_ns)

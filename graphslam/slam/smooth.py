@@ -12,6 +12,7 @@ from graphslam.mapping.landmark_records import make_landmarks
 from graphslam.slam.initialisation import initialise
 from graphslam.slam.passes import FinishedPass, run_passes
 from graphslam.slam.pipeline import Progress
+from graphslam.slam.pose_graph import is_pose_graph, solve_pose_graph
 from graphslam.slam.reoptimise_scans import Tamper
 from graphslam.slam.robot_settings import check_robots
 from graphslam.slam.step_recorder import timed
@@ -42,6 +43,8 @@ def smooth(
     """
     began = time.perf_counter()
     check_robots(log, config)
+    if is_pose_graph(log, config):
+        return make_result(solve_pose_graph(log, config, progress), began)
     known = initialise(log, config)
     initialised = time.perf_counter()
     finished = run_passes(log, config, known, progress, tamper)

@@ -1,0 +1,193 @@
+"""Logs of relative poses only (g2o, iSAM, TORO files), solved at once.
+
+There is nothing to associate in such a log. So it is not processed step by step: the log is read
+once, recorded closures are judged, all states, motions and closures are made together, and one
+graph is optimised from poses along its most accurate paths (`estimation.initial_estimate`).
+"""
+
+import math
+from bisect import bisect_right
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from graphslam.core.config import Config
+from graphslam.core.errors import LogError
+from graphslam.core.records import (
+    Closure,
+    Estimate,
+    Motion,
+    OdometryIncrement,
+    RelativePose,
+    Start,
+    Step,
+    TrueAssociations,
+    TrueLandmark,
+    Truth,
+)
+from graphslam.estimation.initial_estimate import initial_estimate
+from graphslam.estimation.isam2 import Reoptimiser
+from graphslam.estimation.replay import replay
+from graphslam.logs import LogSet
+from graphslam.slam.initialisation import estimate_start_poses
+from graphslam.slam.motion_noise import noise_scales, scale_motion_noise
+from graphslam.slam.passes import FinishedPass, pass_findings
+from graphslam.slam.pipeline import Pipeline, Progress, counted
+from graphslam.slam.recorded_closures import accept_closures, take_relative_poses
+from graphslam.slam.robot_settings import make_tracks
+from graphslam.slam.robot_state import RobotState
+from graphslam.slam.start_priors import start_poses
+from graphslam.slam.step_recorder import PriorKnowledge, timed
+
+#: back ends whose final estimate is the optimum of the whole graph
+BATCH_BACKENDS = frozenset({"batch", "isam2"})
+#: times that the noise of motions is estimated, at most; it is settled when it grows by less than
+MAX_NOISE_ROUNDS, NOISE_GROWTH = 4, 1.1
+
+
+def is_pose_graph(log: LogSet, config: Config) -> bool:
+    """Whether a log is only relative poses, and its solution is asked for, not a back end's way."""
+    kinds = {topic.record for topic in log.topics} - {Truth, TrueLandmark, TrueAssociations}
+    backend = config.backend
+    at_once = backend.name in BATCH_BACKENDS and math.isinf(backend.horizon_s)
+    at_once &= backend.optimise_at_end and backend.reoptimise
+    return at_once and kinds == {OdometryIncrement, RelativePose}
+
+
+def solve_pose_graph(log: LogSet, config: Config, progress: Progress) -> FinishedPass:
+    """Solve a log of relative poses.
+
+    Args:
+        log: opened logs.
+        config: settings.
+        progress: see `graphslam.slam.smooth.smooth`.
+
+    Raises:
+        LogError: no message of the log could be used.
+        EstimationError: the estimate is indeterminate, or a given start pose is malformed.
+    """
+    seconds: dict[str, float] = defaultdict(float)
+    counts: Counter[str] = Counter()
+    with timed(seconds, "read"):
+        tracks = make_tracks(log, config)
+        read = counted(log.messages((Truth, TrueLandmark), prefetch=True), counts, progress)
+        messages = take_relative_poses(read, tracks)
+    with timed(seconds, "starts"):
+        starts = start_poses(log, config)
+        recorded = accept_closures(log, config, starts, messages, tracks)
+        frames = estimate_start_poses(log, config, {}, starts, recorded)
+    pipeline = Pipeline(log, config, PriorKnowledge(frames, recorded))
+    pipeline.seconds.update(seconds)
+    pipeline.counts.update(counts)
+    for robot, run in pipeline.runs.items():
+        run.track = tracks[robot]
+    with timed(pipeline.seconds, "motions"):
+        steps = _make_steps(pipeline, messages)
+    if not steps:
+        raise LogError(f"{log.files[0].path}: nothing in it could be used; see `graphslam info`")
+    with timed(pipeline.seconds, "final optimisation"):
+        estimate, pipeline.steps = _solve(steps, config)
+    with timed(pipeline.seconds, "causal trajectories"):
+        _record_causal(pipeline)
+    return FinishedPass(pipeline, estimate, pass_findings(pipeline, estimate))
+
+
+# ---------------------------------------------------------------- from messages to steps
+
+
+def _make_steps(pipeline: Pipeline, messages: Iterable[RelativePose]) -> list[Step]:
+    """Steps of the whole log; the times of the states are recorded in ``pipeline.runs``."""
+    usable = [message for message in messages if _is_usable(message, pipeline)]
+    ends: dict[str, set[int]] = defaultdict(set)
+    for message in usable:
+        ends[message.robot].add(message.time_ns)
+    starts: dict[int, dict[str, Start]] = defaultdict(dict)
+    motions: dict[int, dict[str, Motion]] = defaultdict(dict)
+    for robot, run in sorted(pipeline.runs.items()):
+        if not len(run.track):
+            continue
+        run.times = _state_times(pipeline, run, sorted(ends[robot]))
+        pipeline.counts["keyframes"] += len(run.times)
+        for time_ns in (run.times[0], run.track.last_ns, *ends[robot]):
+            pipeline.record_time(time_ns)
+        start = pipeline.frames.offset_start(robot, pipeline.starts[robot])
+        starts[run.times[0]][robot] = start
+        at = np.array(run.times, dtype=np.int64)
+        moved = run.track.motions(at[:-1], at[1:])
+        for k, (begin_ns, end_ns) in enumerate(pairwise(run.times)):
+            motions[end_ns][robot] = moved.one(k, begin_ns, end_ns)
+    closures: dict[int, list[Closure]] = defaultdict(list)
+    for message in usable:
+        times = pipeline.runs[message.robot].times
+        closure = pipeline.closure(message, times[bisect_right(times, message.time_ns) - 1])
+        if closure is not None:
+            closures[max(closure.time_ns, closure.other_time_ns)].append(closure)
+    return [
+        Step(t, starts.get(t, {}), motions.get(t, {}), (), tuple(closures.get(t, ())))
+        for t in sorted({*starts, *motions})
+    ]
+
+
+def _is_usable(message: RelativePose, pipeline: Pipeline) -> bool:
+    """Whether odometry covers the time of a relative pose; those left out are counted."""
+    run = pipeline.runs.get(message.robot)
+    max_gap_ns = round(1e9 * pipeline.config.odometry.max_gap_s)
+    if run is None or not run.track.covers(message.time_ns, max_gap_ns):
+        pipeline.dropped["relativepose: no odometry near it"] += 1
+        return False
+    if pipeline.frames.crosses_frames(message):
+        pipeline.dropped["relativepose: between robots in separate frames"] += 1
+        return False
+    return True
+
+
+def _state_times(pipeline: Pipeline, run: RobotState, ends_ns: Sequence[int]) -> list[int]:
+    """Times of a robot's states: of every message, or of closures a keyframe's motion apart."""
+    first_ns = min([run.track.first_ns, *ends_ns[:1]])
+    if pipeline.config.keyframe.mode == "all":
+        return sorted({first_ns, *run.track.times.tolist(), *ends_ns})
+    times = [first_ns]
+    for end_ns in ends_ns:
+        if end_ns > times[-1] and pipeline.keyframes.has_moved(run, times[-1], end_ns):
+            times.append(end_ns)
+    return times
+
+
+# ---------------------------------------------------------------- from steps to the estimate
+
+
+def _solve(steps: Sequence[Step], config: Config) -> tuple[Estimate, list[Step]]:
+    """The estimate, and the steps with motions as noisy as the log shows them.
+
+    Verified closures are taken for true. If others are used, the better of two solutions counts:
+    one begins without them, the other follows them.
+
+    Raises:
+        EstimationError: the estimate is indeterminate.
+    """
+    closures = [closure for step in steps for closure in step.closures]
+    verified = [closure for closure in closures if closure.verified]
+    solved = [
+        Reoptimiser(config, steps, initial_estimate(steps, followed)).solve(rough=True)
+        for followed in ([verified] if len(verified) == len(closures) else [verified, closures])
+    ]
+    estimate = min(solved, key=lambda estimate: estimate.error)
+    scaled, scales = steps, {robot: np.ones(3) for robot in estimate.states}
+    for _ in range(MAX_NOISE_ROUNDS):
+        before, scales = scales, scales | noise_scales(steps, estimate)
+        if all(np.all(scale <= NOISE_GROWTH * before[robot]) for robot, scale in scales.items()):
+            break
+        scaled = scale_motion_noise(steps, scales)
+        estimate = Reoptimiser(config, scaled, estimate).solve(rough=True)
+    return Reoptimiser(config, scaled, estimate).solve(), list(scaled)
+
+
+def _record_causal(pipeline: Pipeline) -> None:
+    """Estimate every state from the steps up to it, with the incremental back end."""
+    causal = replay(pipeline.steps, pipeline.backend).causal
+    for robot, run in pipeline.started.items():
+        run.causal_poses = list(causal[robot].poses)
+        run.causal_covs = list(causal[robot].covs)
+        run.calibrations = [run.track.used_calibration] * len(run.times)
