@@ -49,12 +49,16 @@ class ClosureGraph:
         self._builder, self._values = BatchGraph.at_estimate(steps, start, kernel)
         self._graph, self._size = self._builder.graph, self._builder.graph.size()
         self._kernel, self._rows = kernel, self._builder.rows
-        self._robust = self._factors(closures)
-        self._plain = self._factors([replace(closure, verified=True) for closure in closures])
-        self._ends = [(other, key) for other, key in (f.keys() for f in self._plain)]
-
-    def _factors(self, closures: Iterable[Closure]) -> list[gtsam.NonlinearFactor]:
-        return [group.factors[0] for group in self._builder.closure_groups(closures)]
+        groups = self._builder.closure_groups(replace(c, verified=True) for c in closures)
+        self._plain = [factor for group in groups for factor in group.factors]
+        self._ends: list[tuple[int, int]] = []
+        self._robust: list[gtsam.NonlinearFactor] = []
+        for factor in self._plain:
+            assert isinstance(factor, gtsam.BetweenFactorPose2)
+            other, key = factor.keys()
+            noise = factors.robust(factor.noiseModel(), kernel)
+            self._ends.append((other, key))
+            self._robust.append(gtsam.BetweenFactorPose2(other, key, factor.measured(), noise))
 
     def solve(self, used: Iterable[int], *, robust: bool, rough: bool = True) -> None:
         """Optimise with the candidates of these numbers, from the solution before.

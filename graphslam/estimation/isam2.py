@@ -92,6 +92,11 @@ class BatchGraph(GraphBuilder):
         elif isinstance(seen.target, str):
             self.robot_observations.append((self.graph.size() - 1, group.observed))
 
+    @property
+    def has_lines(self) -> bool:
+        """Whether lines were observed."""
+        return bool(self._lines)
+
     def reserve_lines(self) -> None:
         """Reserve indices in the graph for the factors of deferred lines."""
         size, missing = self.graph.size(), len(self._lines) - len(self._line_indices)
@@ -274,8 +279,9 @@ class Isam2Backend(GraphBackend):
     def _optimised(self, values: gtsam.Values) -> gtsam.Values:
         """Optimise, and build the lines' factors again, until nothing moves."""
         plain = self._config.robust.kernel == "none"
+        rounds = MAX_LINE_ROUNDS if plain else MAX_LINE_ROUNDS_ROBUST
         try:
-            for _ in range(MAX_LINE_ROUNDS if plain else MAX_LINE_ROUNDS_ROBUST):
+            for _ in range(rounds if self._builder.has_lines else 1):
                 before = values
                 self._builder.rebuild_lines(values)
                 values = optimise(self._builder.graph, values, self._config.robust)

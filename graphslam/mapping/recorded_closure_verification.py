@@ -29,7 +29,6 @@ from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, adjoint, between, compose, inverse, log, rotate_cov
 from graphslam.core.records import (
     Closure,
-    Estimate,
     Motion,
     RelativePose,
     Start,
@@ -45,7 +44,7 @@ AGREE = 0.99
 #: closures compared with each other at once, in order of time; the work grows with its square
 CHUNK = 1000
 #: closures from which the largest consistent set is searched for; what it lacks is added later
-SEARCH_STARTS = 16
+SEARCH_STARTS = 4
 #: scale of the redescending kernel of the joint solution, in sigmas
 KERNEL_SIGMAS = 3.0
 #: share of the information in a direction that the other closures must have for a comparison
@@ -127,24 +126,23 @@ def verify(
         if frames[a] == frames[b] and (a == b or (a, b) in clear or {a, b} <= set(starts))
     }
     candidates = [k for k in judged if frames[messages[k].robot] == frames[messages[k].other]]
-    believed, estimate = _settle(
+    supported, graph = _settle(
         [messages[k] for k in candidates],
         {n for n, k in enumerate(candidates) if k in believed},
         odometry,
         {**placed, **starts},
     )
-    believed = {candidates[n] for n in believed}
-    refused = {
-        k: CONTRADICTED if k in candidates else UNSUPPORTED for k in judged if k not in believed
-    }
-    found = {
-        robot: Start(
-            s.poses[0], ORIGIN if frames[robot] == robot else PRIOR_INFLATION**2 * s.covs[0]
-        )
-        for robot, s in estimate.states.items()
-        if robot not in starts
-    }
-    return ClosureDecision(refused, frozenset(believed), found, frames)
+    kept = frozenset(candidates[n] for n in supported)
+    apart = set(judged) - set(candidates)
+    refused = {k: UNSUPPORTED if k in apart else CONTRADICTED for k in judged if k not in kept}
+    found: dict[str, Start] = {}
+    if placed:
+        graph.solve(sorted(supported), robust=False, rough=False)
+        for robot, states in graph.estimate().states.items():
+            if robot in placed:
+                wide = PRIOR_INFLATION**2 * states.covs[0]
+                found[robot] = Start(states.poses[0], ORIGIN if frames[robot] == robot else wide)
+    return ClosureDecision(refused, kept, found, frames)
 
 
 def _has_ends(m: RelativePose, tracks: Mapping[str, Track]) -> bool:
@@ -310,10 +308,10 @@ def _settle(
     believed: set[int],
     odometry: Mapping[str, _OdometryChain],
     starts: Mapping[str, Start],
-) -> tuple[set[int], Estimate]:
-    """The closures that support each other, beginning with ``believed``; and the estimate.
+) -> tuple[set[int], ClosureGraph]:
+    """The closures that support each other, beginning with ``believed``; and the graph of all.
 
-    It is of the states at the ends of all closures.
+    Its states are those at the ends of closures.
     """
     gate = chi2_quantile(FIT_PROBABILITY, 3)
     closures = [Closure(m.robot, m.time_ns, m.other, m.start_ns, m.delta, m.cov) for m in messages]
@@ -334,8 +332,7 @@ def _settle(
         gone = set(wrong[: max(1, len(wrong) // 4)])
         barred |= gone
         believed = believed - gone if gone else believed | new
-    graph.solve(sorted(believed), robust=False, rough=False)
-    return believed, graph.estimate()
+    return believed, graph
 
 
 def _steps(odometry: Mapping[str, _OdometryChain], starts: Mapping[str, Start]) -> list[Step]:

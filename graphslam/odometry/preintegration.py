@@ -251,14 +251,19 @@ class Track(Readings):
         _, group = np.unique(begin, return_inverse=True)
         passed = np.zeros(len(begin), dtype=np.int64)  # pieces before each end
         knot = begin.copy()  # the last one before each end
-        pieces: list[IntArray] = []  # knots of each group, its start included
         order = np.argsort(group, kind="stable")
         members = np.split(order, np.flatnonzero(np.diff(group[order])) + 1)
-        for own in members:
-            far = float(effort_end[own].max())
-            levels = np.arange(effort_begin[own[0]] + COARSE_M, far, COARSE_M)
-            knots = np.append(begin[own[0]], self.times_of_effort(levels))
-            passed[own] = np.searchsorted(knots[1:], end[own], side="right")
+        levels = [
+            np.arange(effort_begin[own[0]] + COARSE_M, float(effort_end[own].max()), COARSE_M)
+            for own in members
+        ]
+        # of all groups at once: the whole odometry is searched
+        reached = self.times_of_effort(np.concatenate([np.zeros(0), *levels]))
+        inner = np.split(reached, np.cumsum([len(own) for own in levels]))
+        pieces: list[IntArray] = []  # knots of each group, its start included
+        for own, after in zip(members, inner, strict=False):
+            knots = np.append(begin[own[0]], after)
+            passed[own] = np.searchsorted(after, end[own], side="right")
             knot[own] = knots[passed[own]]
             pieces.append(knots)
         counts = np.array([len(knots) - 1 for knots in pieces])

@@ -169,19 +169,19 @@ def _solve(steps: Sequence[Step], config: Config) -> tuple[Estimate, list[Step]]
     """
     closures = [closure for step in steps for closure in step.closures]
     verified = [closure for closure in closures if closure.verified]
-    solved = [
-        Reoptimiser(config, steps, initial_estimate(steps, followed)).solve(rough=True)
-        for followed in ([verified] if len(verified) == len(closures) else [verified, closures])
-    ]
-    estimate = min(solved, key=lambda estimate: estimate.error)
-    scaled, scales = steps, {robot: np.ones(3) for robot in estimate.states}
+    found = []
+    for followed in [verified] if len(verified) == len(closures) else [verified, closures]:
+        solver = Reoptimiser(config, steps, initial_estimate(steps, followed))
+        found.append(solver.solve())
+    estimate = min(found, key=lambda estimate: estimate.error)
+    scaled, scales = tuple(steps), {robot: np.ones(3) for robot in estimate.states}
     for _ in range(MAX_NOISE_ROUNDS):
         before, scales = scales, scales | noise_scales(steps, estimate)
         if all(np.all(scale <= NOISE_GROWTH * before[robot]) for robot, scale in scales.items()):
             break
         scaled = scale_motion_noise(steps, scales)
-        estimate = Reoptimiser(config, scaled, estimate).solve(rough=True)
-    return Reoptimiser(config, scaled, estimate).solve(), list(scaled)
+        estimate = Reoptimiser(config, scaled, estimate).solve()
+    return estimate, list(scaled)
 
 
 def _record_causal(pipeline: Pipeline) -> None:
