@@ -1,0 +1,165 @@
+"""Logs of relative poses only: solved at once, with the same result as step by step."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pose_checks import assert_same_pose
+
+from graphslam.core.config import Config
+from graphslam.core.config_io import load_config
+from graphslam.core.geometry import between, compose
+from graphslam.logs import LogWriter, open_logs
+from graphslam.slam import smooth as job
+from graphslam.slam.pose_graph import is_pose_graph
+from graphslam.slam.smooth import smooth
+
+S = 1_000_000_000
+SIGMAS = np.array([0.05, 0.05, 0.02])
+COV = np.diag(SIGMAS**2)
+#: where b begins in the frame of a
+START = np.array([1.0, 2.0, 0.7])
+
+
+def grid_drive(n, rng):
+    """n poses on a grid 6 m wide, one apart, with turns by 90 degrees."""
+    at, poses = np.array([3.0, 3.0, 0.0]), []
+    for _ in range(n):
+        poses.append(at)
+        turn = rng.choice([0.0, 0.0, np.pi / 2, -np.pi / 2])
+        ahead = compose(compose(at, np.array([0.0, 0.0, turn])), np.array([1.0, 0.0, 0.0]))
+        while not ((ahead[:2] >= -0.5) & (ahead[:2] <= 6.5)).all():
+            turn += np.pi / 2
+            ahead = compose(compose(at, np.array([0.0, 0.0, turn])), np.array([1.0, 0.0, 0.0]))
+        at = ahead
+    return np.array(poses)
+
+
+def write_log(path, *, n=150, stated=1.0, closures=1.0, links=1, robots=("a", "b"), notes=True):
+    """Noisy odometry of robots with one pose per second, and closures between poses near each
+    other; the odometry states ``stated`` times its sigmas, closures have ``closures`` times as much
+    noise, ``links`` per pose."""
+    rng = np.random.default_rng(0)
+    truth = {robot: grid_drive(n, rng) for robot in robots}
+    stamps = [(k + 1) * S for k in range(n)]
+
+    def drawn(x, y, scale):
+        return between(x, compose(y, scale * SIGMAS * rng.normal(size=3)))
+
+    with LogWriter(path, {"keyframe.mode": "all"} if notes else {}) as log:
+        for k in range(1, n):
+            for robot, poses in truth.items():
+                delta = drawn(poses[k - 1], poses[k], 1.0)
+                log.increment(robot, stamps[k - 1], stamps[k], delta=delta, cov=stated**2 * COV)
+                other = robots[int(rng.integers(len(robots)))]
+                off = np.hypot(*(truth[other][:k] - poses[k])[:, :2].T)
+                near = np.flatnonzero((off < 1.5) & (np.arange(k) < k - 5))
+                for j in rng.permutation(near)[: links if k % 2 or links > 1 else 0].tolist():
+                    log.relative_pose(
+                        robot,
+                        stamps[j],
+                        stamps[k],
+                        delta=drawn(truth[other][j], poses[k], closures),
+                        other=other,
+                        cov=closures**2 * COV,
+                    )
+    return path
+
+
+def run(path, config, monkeypatch=None):
+    """Smoothed; with ``monkeypatch`` step by step, as logs of other kinds are."""
+    if monkeypatch is not None:
+        monkeypatch.setattr(job, "is_pose_graph", lambda _log, _config: False)
+    return smooth(open_logs([path], config), config)
+
+
+@pytest.mark.parametrize("settings", [(), ("keyframe.mode=motion", "keyframe.distance_m=2.5")])
+def test_at_once_is_the_same_as_step_by_step(settings, tmp_path, monkeypatch):
+    """Two robots, the second placed by closures: the same states, closures, poses, covariances and
+    error, with a state for every pose and with states only where the robot has driven far enough,
+    between which closures are carried by odometry."""
+    path = write_log(tmp_path / "log.mcap", notes=not settings)
+    config = load_config(overrides=settings)
+    at_once, stepwise = run(path, config), run(path, config, monkeypatch)
+    for name in ("counts", "closures", "dropped", "frames", "world", "warnings"):
+        assert at_once.summary[name] == stepwise.summary[name], name
+    assert at_once.summary["frames"] == {"a": "a", "b": "a"}
+    assert at_once.estimate.dof == stepwise.estimate.dof > 0
+    assert at_once.estimate.error == pytest.approx(stepwise.estimate.error, rel=1e-4)
+    for robot, expected in stepwise.robots.items():
+        found = at_once.robots[robot].final
+        np.testing.assert_array_equal(found.stamps_ns, expected.final.stamps_ns)
+        assert_same_pose(found.poses, expected.final.poses, atol=1e-3)
+        np.testing.assert_allclose(found.covs, expected.final.covs, rtol=0.02, atol=1e-6)
+    made, expected = (
+        sorted((c.pair, *c.delta) for step in result.steps for c in step.closures)
+        for result in (at_once, stepwise)
+    )
+    assert [pair for pair, *_ in made] == [pair for pair, *_ in expected]
+    deltas = [np.array([delta for _, *delta in found]) for found in (made, expected)]
+    assert_same_pose(*deltas, atol=1e-9)
+
+
+def test_odometry_that_is_noisier_than_it_states_is_found_out(tmp_path, monkeypatch):
+    """Stated at half of its noise, against many closures less noisy: its sigmas are scaled up, as they
+    are step by step."""
+    path = write_log(tmp_path / "log.mcap", n=150, stated=0.5, closures=0.2, links=8, robots=("a",))
+    at_once, stepwise = run(path, Config()), run(path, Config(), monkeypatch)
+    sigmas = {
+        name: np.sqrt([np.diag(s.motions["a"].cov) for s in result.steps if s.motions])
+        for name, result in (("at once", at_once), ("stepwise", stepwise))
+    }
+    assert np.median(sigmas["at once"], axis=0)[:2] == pytest.approx(SIGMAS[:2], rel=0.35)
+    np.testing.assert_allclose(sigmas["at once"], sigmas["stepwise"], rtol=0.1)
+
+
+def test_relative_poses_that_cannot_be_used_are_counted(tmp_path, monkeypatch):
+    """Of a robot that is not there, from before the first pose, and after the last: the same
+    reasons as step by step."""
+    path = tmp_path / "log.mcap"
+    with LogWriter(path, {"keyframe.mode": "all"}) as log:
+        for k in range(10):
+            log.increment("a", k * S, (k + 1) * S, delta=np.array([1.0, 0, 0]), cov=COV)
+        straight = {"delta": np.array([3.0, 0, 0]), "cov": COV}
+        log.relative_pose("a", 2 * S, 5 * S, **straight)
+        log.relative_pose("a", 2 * S, 5 * S, other="nobody", **straight)
+        log.relative_pose("a", -2 * S, 1 * S, **straight)
+        log.relative_pose("a", 9 * S, 12 * S, **straight)
+    found = run(path, Config()).summary
+    assert found["counts"]["loop_closures"] == 1
+    assert found["dropped"] == run(path, Config(), monkeypatch).summary["dropped"]
+    assert sum(found["dropped"].values()) == 3
+
+
+def test_what_is_asked_of_a_back_end_is_done_by_it(tmp_path):
+    """A filter, a finite horizon, or the back end's own end goes through the log step by step."""
+    config = Config()
+    log = open_logs([write_log(tmp_path / "log.mcap", n=20)], config)
+    assert is_pose_graph(log, config)
+    for changes in ({"name": "ekf"}, {"horizon_s": 5.0}, {"reoptimise": False}):
+        assert not is_pose_graph(log, replace(config, backend=replace(config.backend, **changes)))
+    with LogWriter(tmp_path / "seen.mcap") as other:
+        other.increment("a", 0, S, delta=np.zeros(3), cov=COV)
+        other.relative_pose("a", 0, S, delta=np.zeros(3), cov=COV)
+        other.sighting("a", S, [0.0, 1.0], np.eye(2), identity="tree")
+    assert not is_pose_graph(open_logs([tmp_path / "seen.mcap"], config), config)
+
+
+def test_false_closures_taken_for_true_do_not_decide_where_the_solution_begins(tmp_path):
+    """Closures are not verified, and every fifth is false: what the kernel leaves of the error is
+    no more than from the true poses."""
+    path, rng = tmp_path / "log.mcap", np.random.default_rng(1)
+    truth = grid_drive(120, rng)
+    with LogWriter(path, {"keyframe.mode": "all"}) as log:
+        for k in range(1, len(truth)):
+            delta = between(truth[k - 1], truth[k])
+            log.increment("a", k * S, (k + 1) * S, delta=delta, cov=COV)
+            if k > 10 and k % 2:
+                j = int(rng.integers(k - 8))
+                delta = between(truth[j], truth[k])
+                if k % 5 == 0:
+                    delta = rng.uniform([-5, -5, -3], [5, 5, 3])
+                log.relative_pose("a", (j + 1) * S, (k + 1) * S, delta=delta, cov=COV)
+    found = run(path, load_config(overrides=["backend.verify_closures=false"]))
+    states = found.estimate.states["a"]
+    assert_same_pose(states.poses, between(truth[0], truth), atol=0.05)
