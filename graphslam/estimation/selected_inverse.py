@@ -115,7 +115,9 @@ class _Clique:
                 rows = above.rows[key]
                 self.rows[key] = slice(end, end := end + rows.stop - rows.start)
         root, rest = self._square_root(own, end)
-        inverse, _ = dtrtri(root)
+        inverse, singular = dtrtri(root)
+        if singular:
+            inverse = np.full((own, own), np.nan)
         gain = inverse @ rest
         cov = np.empty((end, end))
         cross = gain @ joint
