@@ -9,14 +9,14 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import lru_cache, partial
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from graphslam.core.errors import LogError
-from graphslam.core.geometry import Array, adjoint, inverse, rotate_cov, wrap
+from graphslam.core.geometry import Array, adjoint, inverse, is_positive, rotate_cov, wrap
 from graphslam.logs.import_summary import ImportSummary
 from graphslam.logs.schemas import DEFAULT_ROBOT
 from graphslam.logs.source_files import text_lines
@@ -212,7 +212,8 @@ def _edge(graph: PoseGraph, fields: Sequence[str], is_g2o: bool) -> None:
     start, end, delta, noise = int(fields[0]), int(fields[1]), _numbers(fields[2:5], 3), fields[5:]
     if start == end:
         raise ValueError("start and end are the same pose")
-    graph.edges.append(Edge(start, end, delta, _pose_covariance(_numbers(noise, 6), is_g2o)))
+    cov = _pose_covariance(tuple(_numbers(noise, 6).tolist()), is_g2o)
+    graph.edges.append(Edge(start, end, delta, cov))
 
 
 def _landmark(graph: PoseGraph, fields: Sequence[str], is_g2o: bool) -> None:
@@ -247,7 +248,8 @@ def _bearing_range(graph: PoseGraph, fields: Sequence[str], _is_g2o: bool) -> No
     graph.sightings.append(LandmarkEdge(int(fields[0]), int(fields[1]), z, cov))
 
 
-def _pose_covariance(v: Array, is_g2o: bool) -> Array:
+@lru_cache(maxsize=1024)  # most files have few different ones
+def _pose_covariance(v: tuple[float, ...], is_g2o: bool) -> Array:
     """Covariance (3, 3) from six numbers of noise, whose layout is guessed as load2D does.
 
     g2o has the upper triangle of the information matrix. Otherwise the zeros decide: [a 0 b c 0 0]
@@ -257,7 +259,7 @@ def _pose_covariance(v: Array, is_g2o: bool) -> Array:
     upper = np.array([[v[0], v[1], v[2]], [v[1], v[3], v[4]], [v[2], v[4], v[5]]])
     if is_g2o:
         return _checked(np.asarray(np.linalg.inv(_checked(upper))))
-    zero = tuple(v == 0)
+    zero = tuple(value == 0 for value in v)
     if zero == (False, True, False, False, True, True):
         return _checked(np.array([[v[0], v[1], v[4]], [v[1], v[2], v[5]], [v[4], v[5], v[3]]]))
     if zero == (False, True, True, False, True, False):
@@ -268,7 +270,7 @@ def _pose_covariance(v: Array, is_g2o: bool) -> Array:
 
 
 def _checked(matrix: Array) -> Array:
-    if np.linalg.eigvalsh(matrix)[0] <= 0:
+    if not is_positive(matrix):
         raise ValueError("the noise is not positive definite")
     return matrix
 

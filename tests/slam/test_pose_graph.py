@@ -101,8 +101,8 @@ def test_at_once_is_the_same_as_step_by_step(settings, tmp_path, monkeypatch):
 
 
 def test_odometry_that_is_noisier_than_it_states_is_found_out(tmp_path, monkeypatch):
-    """Stated at half of its noise, against many closures less noisy: its sigmas are scaled up, as they
-    are step by step."""
+    """Stated at half of its noise, against many closures less noisy: its sigmas grow, as they do
+    step by step."""
     path = write_log(tmp_path / "log.mcap", n=150, stated=0.5, closures=0.2, links=8, robots=("a",))
     at_once, stepwise = run(path, Config()), run(path, Config(), monkeypatch)
     sigmas = {
