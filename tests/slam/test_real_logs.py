@@ -11,7 +11,6 @@ from paths import real_data
 
 from graphslam.core.config import Config
 from graphslam.core.records import Trajectory
-from graphslam.estimation.backends import BACKENDS
 from graphslam.estimation.isam2 import Isam2Backend
 from graphslam.estimation.replay import replay
 from graphslam.evaluation.relation_metrics import read_relations, relation_metrics
@@ -51,7 +50,7 @@ def test_isam2_solves_mit_though_cholesky_fails_on_the_way(tmp_path, monkeypatch
         use_qr(backend, error)
 
     monkeypatch.setattr(Isam2Backend, "_use_qr", counted)
-    found = replay(result.steps, BACKENDS["isam2"](Config())).estimate
+    found = replay(result.steps, Isam2Backend(Config())).estimate
     assert fallbacks
     assert found.error <= 20.7 and abs(found.error - result.estimate.error) < 1e-5
 
