@@ -92,9 +92,18 @@ class Prefetch(Generic[_T]):
             except (EOFError, pickle.UnpicklingError):
                 pass  # it ended before its work was complete
             finally:
-                os.kill(self._pid, signal.SIGKILL)
-                os.waitpid(self._pid, 0)
+                self._end()
         yield from islice(self._make(), taken, None)
+
+    def cancel(self) -> None:
+        """End the second process; there is nothing to iterate over any more."""
+        if self.forked:
+            os.close(self._source)
+            self._end()
+
+    def _end(self) -> None:
+        os.kill(self._pid, signal.SIGKILL)
+        os.waitpid(self._pid, 0)
 
 
 class Future(Generic[_T]):
@@ -111,6 +120,11 @@ class Future(Generic[_T]):
         self.done = not self._made.forked
         if self.done:
             self._result = next(iter(self._made))
+
+    def cancel(self) -> None:
+        """End the task; its result is not wanted any more."""
+        if not self.done:
+            self._made.cancel()
 
     def result(self) -> _T:
         """The task's return value; raises its exception."""

@@ -25,9 +25,13 @@ Rebuild = Callable[[Estimate, bool], tuple[Step, ...]]
 
 
 def calibrate(
-    rebuild: Rebuild, estimate: Estimate, tracks: Mapping[str, Track], robust: RobustConfig
+    rebuild: Rebuild,
+    estimate: Estimate,
+    tracks: Mapping[str, Track],
+    robust: RobustConfig,
+    rounds: int = ROUNDS,
 ) -> tuple[Estimate, tuple[Step, ...]]:
-    """Solve for states, landmarks and calibrations together, `ROUNDS` times.
+    """Solve for states, landmarks and calibrations together, ``rounds`` times.
 
     ``rebuild`` computes the steps again in every round, the first by ``estimate``. The calibration
     of ``tracks`` is set to the one found. Returns the estimate and the steps behind it.
@@ -37,8 +41,8 @@ def calibrate(
     """
     priors = {name: track.prior for name, track in tracks.items()}
     steps: tuple[Step, ...] = ()
-    for k in range(ROUNDS):
-        last = k == ROUNDS - 1
+    for k in range(rounds):
+        last = k == rounds - 1
         initial = {name: track.calibration for name, track in tracks.items()}
         for track in tracks.values():
             track.calibration = track.calibration.held()

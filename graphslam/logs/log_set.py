@@ -22,6 +22,8 @@ Odometry = records.OdometryIncrement | records.OdometryPose | records.WheelAngle
 
 #: fewer messages are read faster without a second process
 WORKER_MIN_MESSAGES = 10_000
+#: messages that are held in memory at most, some 400 bytes each
+KEPT_MESSAGES = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +66,7 @@ class LogSet:
 
     def __post_init__(self) -> None:
         self._opening_warnings = len(self.warnings)
+        self._kept: dict[tuple[str, ...], list[Message | _ReadReport]] = {}
 
     def has_scans(self, robot: str) -> bool:
         """Whether the logs hold laser scans of ``robot``."""
@@ -78,27 +81,45 @@ class LogSet:
         return sum(topic.count for topic in self.topics if topic.record not in exclude)
 
     def messages(
-        self, exclude: tuple[type[Message], ...] = (), *, prefetch: bool = False
+        self,
+        exclude: tuple[type[Message], ...] = (),
+        *,
+        prefetch: bool = False,
+        keep: bool = False,
     ) -> Iterator[Message]:
         """All messages sorted by ``time_ns``; at equal times odometry comes first.
 
         Topics of the records ``exclude`` are skipped without decoding. Memory holds the messages of
         ``logs.reorder_s`` and a hundred more, not the log. Every call starts at the beginning.
         ``prefetch``: allows a second process to read ahead, which pays if the caller takes all and
-        works on each.
+        works on each. ``keep``: a log without scans, if not longer than `KEPT_MESSAGES`, is held in
+        memory from then on, so that it is decoded once however often it is read.
         """
         topics = {topic.name: topic for topic in self.topics if topic.record not in exclude}
         self._update(_ReadReport())
-        prefetch &= self.count(exclude) >= WORKER_MIN_MESSAGES
 
         def read() -> Iterator[Message | _ReadReport]:
             return self._read(topics, self._contexts)
 
-        for item in Prefetch(read) if prefetch else read():
+        count, kept = self.count(exclude), self._kept.get(tuple(topics))
+        if kept is not None:
+            items: Iterable[Message | _ReadReport] = kept
+        elif prefetch and count >= WORKER_MIN_MESSAGES:
+            items = Prefetch(read)
+        else:
+            items = read()
+        keep &= kept is None and count <= KEPT_MESSAGES
+        keep &= not any(topic.record is records.Scan for topic in topics.values())
+        taken: list[Message | _ReadReport] = []
+        for item in items:
+            if keep:
+                taken.append(item)
             if isinstance(item, _ReadReport):
                 self._update(item)
             else:
                 yield item
+        if keep:
+            self._kept[tuple(topics)] = taken
 
     def odometry(self, exclude: tuple[type[Message], ...] = ()) -> Iterator[Odometry]:
         """The odometry among `messages` with the same ``exclude``, at the same times.

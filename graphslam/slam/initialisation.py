@@ -14,7 +14,7 @@ import numpy as np
 
 from graphslam.core.config import BackendConfig, Config
 from graphslam.core.geometry import Array
-from graphslam.core.records import Scan, Sighting, Start, Trajectory
+from graphslam.core.records import Estimate, Scan, Sighting, Start, Trajectory
 from graphslam.estimation.isam2 import Isam2Backend
 from graphslam.logs import LogSet
 from graphslam.mapping.submaps import build_submaps
@@ -31,6 +31,8 @@ from graphslam.multi_robot.relative_frames import RelativeFrame, RobotEstimate
 from graphslam.slam.pipeline import CLOCK_OFFSET_SIGMA_S, Pipeline
 from graphslam.slam.recorded_closures import RecordedClosures, judge_recorded_closures
 from graphslam.slam.robot_settings import outlines
+from graphslam.slam.sighting_pass import SightingPass, can_solve_at_once
+from graphslam.slam.sighting_solution import solve_robots_apart
 from graphslam.slam.start_priors import origin, start_poses
 from graphslam.slam.step_recorder import PriorKnowledge
 
@@ -46,7 +48,8 @@ def initialise(log: LogSet, config: Config) -> PriorKnowledge:
     """
     starts = start_poses(log, config)
     recorded = judge_recorded_closures(log, config, starts)
-    return PriorKnowledge(estimate_start_poses(log, config, {}, starts, recorded), recorded)
+    frames, alone = estimate_start_poses(log, config, {}, starts, recorded)
+    return PriorKnowledge(frames, recorded, alone=alone)
 
 
 def with_identities(
@@ -54,8 +57,8 @@ def with_identities(
 ) -> PriorKnowledge:
     """What is known with the right identities, as robots may have been placed by false ones."""
     starts = start_poses(log, config)
-    joined = estimate_start_poses(log, config, identities, starts, known.recorded)
-    return replace(known, identities=identities, frame_assignment=joined)
+    frames, alone = estimate_start_poses(log, config, identities, starts, known.recorded)
+    return replace(known, identities=identities, frame_assignment=frames, alone=alone)
 
 
 def estimate_start_poses(
@@ -64,7 +67,7 @@ def estimate_start_poses(
     identities: Mapping[str, str],
     starts: Mapping[str, Start],
     recorded: RecordedClosures,
-) -> FrameAssignment:
+) -> tuple[FrameAssignment, Mapping[str, RobotEstimate]]:
     """Start poses and frames of all robots, of which the ``starts`` of some are known.
 
     The others are placed by what they observed in common. That takes a pass over the log in which
@@ -77,12 +80,15 @@ def estimate_start_poses(
         starts: known start poses.
         recorded: relative poses of the log, and starts that follow from them.
 
+    Returns:
+        The start poses, and the estimates by which they were found.
+
     Raises:
         EstimationError: the estimate of a robot by itself is indeterminate.
     """
     every = {**starts, **recorded.starts}
     if set(log.robots) <= set(every):
-        return FrameAssignment(every, recorded.frames, min(starts, default=""))
+        return FrameAssignment(every, recorded.frames, min(starts, default="")), {}
     starts = {r: s for r, s in every.items() if recorded.frames[r] == recorded.frames[min(starts)]}
     own = origin(config)
 
@@ -92,16 +98,24 @@ def estimate_start_poses(
         return build_frame_tree(log.robots, views, meetings, starts, config, own, *found)
 
     if not any(topic.record in (Sighting, Scan) for topic in log.topics):
-        return joined({}, (), ((), {}))
+        return joined({}, (), ((), {})), {}
     apart = PriorKnowledge(FrameAssignment.separate_frames(log.robots, own), recorded, identities)
-    pipeline = Pipeline(log, replace(config, backend=BackendConfig()), apart)
+    config_apart = replace(config, backend=BackendConfig())
+    if can_solve_at_once(log, config):
+        together = SightingPass(log, config_apart, apart)
+        together.run(lambda _count: None)
+        if together.all_named and together.steps:
+            views = separate_estimates(together, solve_robots_apart(together))
+            return joined(views, together.unrelated_sightings, ((), {})), views
+    pipeline = Pipeline(log, config_apart, apart)
     shapes = outlines(log, config) if config.association.robot_sightings != "ignore" else {}
     tracks = {name: run.track for name, run in pipeline.runs.items()}
     pipeline.scan_buffer = ScanBuffer(tracks, shapes, config.multi_robot.sampling_m)
     pipeline.run(lambda _count: None)
     if not pipeline.steps:
-        return joined({}, (), ((), {}))
-    views, meetings = separate_estimates(pipeline), pipeline.unrelated_sightings
+        return joined({}, (), ((), {})), {}
+    views = separate_estimates(pipeline, pipeline.backend.finish())
+    meetings = pipeline.unrelated_sightings
     looked = MutualDetections((), {})
     if has_detectable_robots(log, shapes, starts):
         scans = pipeline.scan_buffer.scans
@@ -110,15 +124,15 @@ def estimate_start_poses(
         )
     by_name = joined(views, meetings, (looked.relations, looked.undecided))
     if len(set(by_name.frames.values())) == 1:
-        return by_name
+        return by_name, views
     more, doubts = relate_anonymous_maps(anonymous_maps(pipeline, views), by_name.frames, config)
     found = (*looked.relations, *more), {**doubts, **looked.undecided}
-    return joined(views, meetings, found)
+    return joined(views, meetings, found), views
 
 
-def separate_estimates(run: Pipeline) -> dict[str, RobotEstimate]:
+def separate_estimates(run: Pipeline, estimate: Estimate) -> dict[str, RobotEstimate]:
     """Every robot's own estimate, after a pass in which each had a separate frame."""
-    estimate, entries = run.backend.finish(), run.associator.map.entries
+    entries = run.associator.map.entries
     moved = run.transforms().estimate(estimate)
     frames = run.frames.landmark_frames(entries.values())
     marks: dict[str, dict[str, tuple[Array, Array]]] = defaultdict(dict)

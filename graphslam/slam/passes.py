@@ -163,13 +163,19 @@ def reoptimise(pipeline: Pipeline, estimate: Estimate) -> Estimate:
 def pass_findings(pipeline: Pipeline, estimate: Estimate) -> Findings:
     """Results of a pass besides its estimate; an estimate that is not optimised is enough."""
     frames = pipeline.frames
-    started = pipeline.started
     causal = {
         name: run.causal(pipeline.starts[frame].pose, frames.away.get(frame, 0.0))
-        for name, run in started.items()
+        for name, run in pipeline.started.items()
         for frame in [frames.of[name]]
     }
-    tracks = {name: run.track for name, run in started.items()}
+    return Findings(*find_false_names_and_clocks(pipeline, estimate), causal)
+
+
+def find_false_names_and_clocks(
+    pipeline: Pipeline, estimate: Estimate
+) -> tuple[dict[str, str], dict[str, ClockEstimate]]:
+    """`Findings.swapped_identities` and `Findings.clocks` by an estimate of a pass."""
+    tracks = {name: run.track for name, run in pipeline.started.items()}
     of_robots = [s for s in pipeline.sources if s.seen_robot]
     clocks = estimate_clocks(
         pipeline.steps,
@@ -183,4 +189,4 @@ def pass_findings(pipeline: Pipeline, estimate: Estimate) -> Findings:
     if pipeline.sources and pipeline.config.association.identities != "ignore":
         pairs = find_swapped_identities(pipeline.sources, estimate, tracks)
         swapped = {a: b for pair in pairs for a, b in (pair, pair[::-1])}
-    return Findings(swapped, clocks, causal)
+    return swapped, clocks

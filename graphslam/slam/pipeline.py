@@ -103,7 +103,9 @@ class Pipeline(StepRecorder):
         """Take in every message of the log; ``progress`` gets the number of messages read."""
         tracks = {name: run.track for name, run in self.runs.items()}
         read = counted(
-            self.log.messages((Truth, TrueLandmark), prefetch=True), self.counts, progress
+            self.log.messages((Truth, TrueLandmark), prefetch=True, keep=True),
+            self.counts,
+            progress,
         )
         messages = synchronise(
             self.accepted(to_common_clock(read, self.known.clocks)),

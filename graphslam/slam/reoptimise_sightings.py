@@ -16,7 +16,7 @@ from graphslam.core.config import Config
 from graphslam.core.geometry import Array
 from graphslam.core.observation_models import MODELS, transport
 from graphslam.core.records import Estimate, Motion, Sighting, Step
-from graphslam.estimation.batch_calibration import calibrate
+from graphslam.estimation.batch_calibration import ROUNDS, calibrate
 from graphslam.odometry.increment_sums import Motions
 from graphslam.odometry.preintegration import Track, preintegrate_batch
 from graphslam.odometry.readings import IntArray
@@ -58,10 +58,21 @@ def reoptimise_sighting_log(
     """
     if not config.odometry.calibrate:
         return estimate, tuple(steps)
-    groups = group_sightings(steps, sources)
+    return solve_sighting_log(steps, estimate, tracks, group_sightings(steps, sources), config)
+
+
+def solve_sighting_log(
+    steps: Sequence[Step],
+    estimate: Estimate,
+    tracks: Mapping[str, Track],
+    groups: Sequence["SightingGroup"],
+    config: Config,
+    rounds: int = ROUNDS,
+) -> tuple[Estimate, tuple[Step, ...]]:
+    """`reoptimise_sighting_log` by the groups of the sightings, in so many ``rounds``."""
 
     def rebuild(estimate: Estimate, last: bool) -> tuple[Step, ...]:
-        made = _recomputed(steps, estimate, tracks, groups)
+        made = recompute_steps(steps, estimate, tracks, groups)
         if not last:
             return made
         # once only: estimated from its own result again and again, noise would collapse
@@ -69,7 +80,7 @@ def reoptimise_sighting_log(
         made = scale_motion_noise(made, noise_scales(made, estimate, MOTION_WINDOW_NS))
         return tuple(_with_wider_sightings(step, factors) for step in made)
 
-    return calibrate(rebuild, estimate, tracks, config.robust)
+    return calibrate(rebuild, estimate, tracks, config.robust, rounds)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,6 +102,14 @@ class SightingGroup:
     z: Array
     cov: Array
     share: Array
+
+    def of_steps(self, numbers: range) -> "SightingGroup":
+        """The sightings of consecutive steps, by their numbers; `where` counts from the first."""
+        i, j = np.searchsorted(self.where[:, 0], [numbers.start, numbers.stop])
+        own = slice(int(i), int(j))
+        arrays = (self.state_ns, self.seen_ns, self.step_ns, self.z, self.cov, self.share)
+        where = self.where[own] - np.array([numbers.start, 0])
+        return SightingGroup(self.robot, self.other, where, *(a[own] for a in arrays))
 
 
 def group_sightings(steps: Sequence[Step], sources: Sequence[Sighting]) -> list[SightingGroup]:
@@ -114,13 +133,20 @@ def group_sightings(steps: Sequence[Step], sources: Sequence[Sighting]) -> list[
     ]
 
 
-def _recomputed(
+def recompute_steps(
     steps: Sequence[Step],
     estimate: Estimate,
     tracks: Mapping[str, Track],
     groups: Sequence[SightingGroup],
 ) -> tuple[Step, ...]:
-    """Steps with motions and measurements computed with the tracks' present calibration."""
+    """Steps with motions and measurements computed with the tracks' present calibration.
+
+    Args:
+        steps: as recorded.
+        estimate: of the states of robots that see each other; only their headings are used.
+        tracks: odometry of every robot.
+        groups: the sightings of ``steps``.
+    """
     recorded = {
         robot: [(n, step.motions[robot]) for n, step in enumerate(steps) if robot in step.motions]
         for robot in tracks

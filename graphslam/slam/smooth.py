@@ -15,6 +15,7 @@ from graphslam.slam.pipeline import Progress
 from graphslam.slam.pose_graph import is_pose_graph, solve_pose_graph
 from graphslam.slam.reoptimise_scans import Tamper
 from graphslam.slam.robot_settings import check_robots
+from graphslam.slam.sighting_passes import run_sighting_passes
 from graphslam.slam.step_recorder import timed
 from graphslam.slam.summary import summarise
 
@@ -47,7 +48,9 @@ def smooth(
         return make_result(solve_pose_graph(log, config, progress), began)
     known = initialise(log, config)
     initialised = time.perf_counter()
-    finished = run_passes(log, config, known, progress, tamper)
+    finished = run_sighting_passes(log, config, known, progress)
+    if finished is None:
+        finished = run_passes(log, config, known, progress, tamper)
     finished.pipeline.seconds["starts"] = initialised - began
     return make_result(finished, began)
 

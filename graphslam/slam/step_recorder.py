@@ -9,13 +9,14 @@ from dataclasses import dataclass, field, replace
 from graphslam.core.config import Config
 from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import Array, rotate_cov, rotation3
-from graphslam.core.records import Motion, Step
+from graphslam.core.records import Motion, Start, Step
 from graphslam.estimation.backends import BACKENDS
 from graphslam.logs import LogSet
 from graphslam.logs.clock import Clock
 from graphslam.mapping.data_association import Associator
 from graphslam.multi_robot.frame_tree import FrameAssignment
 from graphslam.multi_robot.frames import RobotFrames
+from graphslam.multi_robot.relative_frames import RobotEstimate
 from graphslam.odometry.interpolation import FrameTransforms
 from graphslam.odometry.online_calibration import observed_information
 from graphslam.slam.recorded_closures import RecordedClosures
@@ -29,13 +30,15 @@ class PriorKnowledge:
 
     ``frame_assignment``: start poses and frames of the robots. ``recorded``: which relative poses
     of the log are accepted. ``identities``: false identity -> right one, of what is sighted.
-    ``clocks``: of robots whose clock is not that of the first.
+    ``clocks``: of robots whose clock is not that of the first. ``alone``: estimates of robots by
+    themselves, from which their relative poses were found.
     """
 
     frame_assignment: FrameAssignment
     recorded: RecordedClosures
     identities: Mapping[str, str] = field(default_factory=dict)
     clocks: Mapping[str, Clock] = field(default_factory=dict)
+    alone: Mapping[str, RobotEstimate] = field(default_factory=dict)
 
 
 @contextmanager
@@ -72,11 +75,11 @@ class StepRecorder:
         """The robots that have a state, sorted by name."""
         return {name: run for name, run in sorted(self.runs.items()) if run.started}
 
-    def start(self, robot: str, time_ns: int) -> None:
-        """Give a robot its first state.
+    def prior(self, robot: str) -> Start:
+        """The prior of a robot's first state.
 
         Raises:
-            EstimationError: it is not known where.
+            EstimationError: it is not known where the robot starts.
         """
         if robot not in self.starts:
             raise EstimationError(
@@ -89,7 +92,15 @@ class StepRecorder:
             # where that of the first robot sits, to which the world is fixed
             cov = start.cov + rotate_cov(2 * self.runs[robot].track.mount_cov, start.pose[2])
             start = replace(start, cov=cov)
-        step = Step(time_ns, starts={robot: start})
+        return start
+
+    def start(self, robot: str, time_ns: int) -> None:
+        """Give a robot its first state.
+
+        Raises:
+            EstimationError: it is not known where.
+        """
+        step = Step(time_ns, starts={robot: self.prior(robot)})
         self.record_covariances()
         self.backend.add(step)
         self.steps.append(step)

@@ -1,0 +1,139 @@
+"""The causal trajectories of a `SightingPass`: its steps replayed into an incremental back end.
+
+Nothing that enters a state's estimate is later than the state. The calibration is learnt on the
+way, and applied to the motions and sightings of the next `BLOCK` steps, which are computed at once.
+"""
+
+import time
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphslam.core.geometry import Array, between, compose, rotation3
+from graphslam.core.motion_models import Calibration
+from graphslam.core.records import Estimate, Step, Trajectory
+from graphslam.estimation.compressed_filter import CompressedBackend
+from graphslam.odometry.online_calibration import observed_information
+from graphslam.odometry.preintegration import Track
+from graphslam.slam.reoptimise_sightings import SightingGroup, group_sightings, recompute_steps
+from graphslam.slam.robot_state import Causal, RobotState
+from graphslam.slam.sighting_pass import SightingPass
+
+#: steps whose motions are computed at once, with the calibration known before the first of them
+BLOCK = 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CausalReplay:
+    """Causal trajectories by robot, and the time of each step of the back end (n,), ms."""
+
+    trajectories: dict[str, Causal]
+    step_ms: Array
+
+
+def replay_causally(one: SightingPass) -> CausalReplay:
+    """Replay the steps of a pass; the pass is as before afterwards.
+
+    Raises:
+        EstimationError: the estimate is indeterminate.
+    """
+    tracks = {name: run.track for name, run in one.started.items()}
+    before = {name: track.calibration for name, track in tracks.items()}
+    for track in tracks.values():
+        track.calibration = track.prior
+    try:
+        return _replay(one, tracks)
+    finally:
+        for name, track in tracks.items():
+            track.calibration = before[name]
+
+
+def _replay(one: SightingPass, tracks: Mapping[str, Track]) -> CausalReplay:
+    backend = CompressedBackend(one.config)
+    runs = {name: RobotState(track, clock=one.runs[name].clock) for name, track in tracks.items()}
+    groups = group_sightings(one.steps, one.sources)
+    known: set[int | str] = set()
+    step_ms: list[float] = []
+    for first in range(0, len(one.steps), BLOCK):
+        block = range(first, min(first + BLOCK, len(one.steps)))
+        used = {name: run.track.calibration for name, run in runs.items()}
+        for step in _computed(one.steps[first : block.stop], groups, block, runs):
+            began = time.perf_counter()
+            backend.add(step)
+            poses = {name: backend.state_mean(name) for name in (*step.starts, *step.motions)}
+            if one.config.odometry.calibrate and step.motions:
+                _learn(step, poses, runs, used, known, backend)
+            step_ms.append(1e3 * (time.perf_counter() - began))
+            known.update(a.target for a in step.associations)
+            for name, pose in poses.items():
+                runs[name].append(step.time_ns, pose)
+                runs[name].causal_covs.append(backend.joint(name, []).cov)
+    frames = one.frames
+    trajectories = {
+        name: run.causal(one.starts[frame].pose, frames.away.get(frame, 0.0))
+        for name, run in runs.items()
+        for frame in [frames.of[name]]
+    }
+    return CausalReplay(trajectories, np.array(step_ms))
+
+
+def _computed(
+    steps: Sequence[Step],
+    groups: Sequence[SightingGroup],
+    numbers: range,
+    runs: Mapping[str, RobotState],
+) -> tuple[Step, ...]:
+    """Consecutive steps by their ``numbers``, computed with the calibration known before them."""
+    states = {}
+    for name, run in runs.items():
+        starts = [step for step in steps if name in step.starts]
+        if not run.started and not starts:
+            continue
+        begin_ns = run.state_ns if run.started else starts[0].time_ns
+        pose = run.causal_poses[-1] if run.started else starts[0].starts[name].pose
+        ends = [step.motions[name].end_ns for step in steps if name in step.motions]
+        times = np.array([begin_ns, *ends], dtype=np.int64)
+        path = run.track.mounted_pose(times)
+        predicted = compose(pose, between(path[0], path))
+        states[name] = Trajectory(times, predicted, np.full((len(times), 3, 3), np.nan))
+    tracks = {name: runs[name].track for name in states}
+    own = [part for group in groups if len((part := group.of_steps(numbers)).where)]
+    return recompute_steps(steps, Estimate(states, {}, 0.0, 0), tracks, own)
+
+
+def _learn(
+    step: Step,
+    poses: Mapping[str, Array],
+    runs: Mapping[str, RobotState],
+    used: Mapping[str, Calibration],
+    known: Collection[int | str],
+    backend: CompressedBackend,
+) -> None:
+    """Improve robots' calibrations from a step.
+
+    Args:
+        step: as the back end has it.
+        poses: (3,) estimates of the states that it made.
+        runs: the robots, without these states.
+        used: the calibrations that its motions were computed with.
+        known: landmarks that were there before it.
+        backend: after the step.
+    """
+    seen = [
+        a
+        for a in step.associations
+        if a.target in known and a.robot in step.motions and a.time_ns == step.time_ns
+    ]
+    seen = [a for a in seen if isinstance(a.target, int)]
+    landmarks = backend.landmark_means([int(a.target) for a in seen])
+    observed = observed_information(seen, poses, landmarks)
+    for name, motion in step.motions.items():
+        run = runs[name]
+        last = run.causal_poses[-1]
+        turn = rotation3(-float(last[2]))
+        better = run.calibrator.update(
+            used[name], motion, between(last, poses[name]), turn @ observed[name] @ turn.T
+        )
+        if better is not used[name]:
+            run.track.calibration = better

@@ -1,0 +1,63 @@
+"""Passes over a log of named sightings, solved as a whole; see `sighting_pass`."""
+
+from functools import partial
+
+from graphslam.core.config import Config
+from graphslam.core.errors import LogError
+from graphslam.core.worker import Future
+from graphslam.logs import LogSet
+from graphslam.slam.causal_sightings import replay_causally
+from graphslam.slam.passes import (
+    Findings,
+    FinishedPass,
+    decide_next_pass,
+    find_false_names_and_clocks,
+)
+from graphslam.slam.pipeline import Progress
+from graphslam.slam.sighting_pass import SightingPass, can_solve_at_once
+from graphslam.slam.sighting_solution import solve_together
+from graphslam.slam.step_recorder import PriorKnowledge, timed
+
+
+def run_sighting_passes(
+    log: LogSet, config: Config, known: PriorKnowledge, progress: Progress
+) -> FinishedPass | None:
+    """`run_passes` without an incremental estimate; None for logs that need one.
+
+    The causal trajectories are estimated in the second process.
+
+    Raises:
+        LogError: no message of the log could be used.
+        EstimationError: the estimate is indeterminate, or a robot's start is unknown.
+    """
+    settings = config.backend
+    whole = settings.name == "batch" and settings.reoptimise and settings.optimise_at_end
+    if not (whole and can_solve_at_once(log, config)):
+        return None
+    clock_passes = 0
+    while True:
+        one = SightingPass(log, config, known)
+        one.run(progress)
+        if not one.all_named:
+            return None
+        if not one.steps:
+            path = log.files[0].path
+            raise LogError(f"{path}: nothing in it could be used; see `graphslam info`")
+        replayed = Future(partial(replay_causally, one))
+        with timed(one.seconds, "final optimisation"):
+            estimate, steps = solve_together(one)
+            one.steps = list(steps)
+            for run in one.started.values():
+                run.is_calibrated = True
+            swapped, clocks = find_false_names_and_clocks(one, estimate)
+        following = decide_next_pass(
+            known, Findings(swapped, clocks, {}), log, config, clock_passes
+        )
+        if following is None:
+            with timed(one.seconds, "causal"):
+                causal = replayed.result()
+            one.step_ms = causal.step_ms.tolist()
+            return FinishedPass(one, estimate, Findings(swapped, clocks, causal.trajectories))
+        replayed.cancel()
+        clock_passes += following.clocks is not known.clocks
+        known = following

@@ -1,0 +1,150 @@
+"""The solution of a `SightingPass`: all its robots together, or every robot by itself.
+
+The initial values are those of odometry, which drifts by metres. A kernel wide enough not to reject
+what the drift puts far off leads to the neighbourhood of the solution; from there on the kernel is
+the configured one (graduated optimisation, e.g. H. Yang et al., Graduated non-convexity for robust
+spatial perception, RA-L 2020, DOI 10.1109/LRA.2020.2965893). Motions are with the uncertainty of
+their calibration until then.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import chain
+
+import numpy as np
+
+from graphslam.core.config import Config
+from graphslam.core.geometry import Array, between, compose
+from graphslam.core.motion_models import Calibration
+from graphslam.core.observation_models import MODELS
+from graphslam.core.records import Estimate, Step, Trajectory
+from graphslam.core.worker import parallel_map
+from graphslam.estimation.isam2 import Reoptimiser
+from graphslam.mapping.landmark_map import observed_from
+from graphslam.multi_robot.relative_frames import RobotEstimate
+from graphslam.odometry.preintegration import Track
+from graphslam.slam.reoptimise_sightings import (
+    SightingGroup,
+    group_sightings,
+    recompute_steps,
+    solve_sighting_log,
+)
+from graphslam.slam.sighting_pass import SightingPass
+
+#: how much wider the kernel is in the beginning
+WIDE = 10.0
+#: times that everything is solved with the calibration: from its nominal values, and from those
+#: of robots by themselves
+ROUNDS_NOMINAL, ROUNDS_KNOWN = 3, 2
+
+
+def solve_together(one: SightingPass) -> tuple[Estimate, tuple[Step, ...]]:
+    """The estimate of all robots, and the steps behind it; sets the calibration of their tracks.
+
+    Raises:
+        EstimationError: the estimate is indeterminate.
+    """
+    tracks = {name: run.track for name, run in one.started.items()}
+    groups = group_sightings(one.steps, one.sources)
+    states = {robot: states_by_odometry(one.steps, robot, track) for robot, track in tracks.items()}
+    alone = one.known.alone
+    if set(tracks) <= set(alone):
+        states = {robot: _moved(alone[robot], states[robot]) for robot in states}
+        for robot, track in tracks.items():
+            track.calibration = alone[robot].track.calibration
+    start = _with_landmarks(states, one.steps, tracks, groups)
+    if not alone:
+        start = _wide_solution(start, one.steps, tracks, groups, one.config)
+    rounds = ROUNDS_KNOWN if alone else ROUNDS_NOMINAL
+    return solve_sighting_log(one.steps, start, tracks, groups, one.config, rounds)
+
+
+def solve_robots_apart(one: SightingPass) -> Estimate:
+    """The estimates of robots that have nothing in common, each in its own frame; as above."""
+
+    def solve(robot: str) -> tuple[Estimate, Calibration]:
+        track = one.runs[robot].track
+        steps, tracks = steps_of_robot(one.steps, robot), {robot: track}
+        groups = group_sightings(steps, one.sources)
+        states = {robot: states_by_odometry(steps, robot, track)}
+        start = _with_landmarks(states, steps, tracks, groups)
+        start = _wide_solution(start, steps, tracks, groups, one.config)
+        estimate, _ = solve_sighting_log(steps, start, tracks, groups, one.config, ROUNDS_NOMINAL)
+        return estimate, track.calibration
+
+    robots = list(one.started)
+    solved = dict(zip(robots, parallel_map(solve, robots), strict=True))
+    for robot, (_, calibration) in solved.items():
+        one.runs[robot].track.calibration = calibration
+    estimates = [estimate for estimate, _ in solved.values()]
+    return Estimate(
+        {robot: estimate.states[robot] for robot, (estimate, _) in solved.items()},
+        dict(chain.from_iterable(estimate.landmarks.items() for estimate in estimates)),
+        sum(estimate.error for estimate in estimates),
+        sum(estimate.dof for estimate in estimates),
+    )
+
+
+def steps_of_robot(steps: Sequence[Step], robot: str) -> tuple[Step, ...]:
+    """What of the steps is about one robot and its landmarks."""
+    own = []
+    for step in steps:
+        seen = tuple(a for a in step.associations if a.robot == robot)
+        starts, motions = (
+            {robot: each[robot]} if robot in each else {} for each in (step.starts, step.motions)
+        )
+        if starts or motions or seen:
+            own.append(Step(step.time_ns, starts, motions, seen))
+    return tuple(own)
+
+
+def states_by_odometry(steps: Sequence[Step], robot: str, track: Track) -> Trajectory:
+    """A robot's states by odometry alone, from its start, with unknown covariances."""
+    begin = next(step for step in steps if robot in step.starts)
+    ends = [step.motions[robot].end_ns for step in steps if robot in step.motions]
+    times = np.array([begin.time_ns, *ends], dtype=np.int64)
+    path = track.mounted_pose(times)
+    poses = compose(begin.starts[robot].pose, between(path[0], path))
+    return Trajectory(times, poses, np.full((len(times), 3, 3), np.nan))
+
+
+def _moved(alone: RobotEstimate, states: Trajectory) -> Trajectory:
+    """A robot's ``states`` as estimated by itself, from where they begin."""
+    poses, _ = alone.at(states.stamps_ns)
+    return replace(states, poses=compose(states.poses[0], between(poses[0], poses)))
+
+
+def _with_landmarks(
+    states: Mapping[str, Trajectory],
+    steps: Sequence[Step],
+    tracks: Mapping[str, Track],
+    groups: Sequence[SightingGroup],
+) -> Estimate:
+    """States, and landmarks where most of their sightings from there lie."""
+    estimate = Estimate(states, {}, 0.0, 0)
+    made = recompute_steps(steps, estimate, tracks, groups)
+    seen = [a for step in made for a in step.associations if isinstance(a.target, int)]
+    x = observed_from(seen, estimate)
+    number = np.array([a.target for a in seen])
+    landmarks: dict[int, tuple[Array, Array]] = {}
+    for landmark in np.unique(number).tolist():
+        own = np.flatnonzero(number == landmark)
+        model, z = MODELS[seen[own[0]].model], np.array([seen[k].z for k in own])
+        found = model.invert(z, x[own])
+        # the first one's direction: there is no median of angles
+        mean = np.append(np.median(found[:, :2], axis=0), found[0, 2:])
+        landmarks[landmark] = (mean, np.full((len(mean),) * 2, np.nan))
+    return Estimate(states, landmarks, 0.0, 0)
+
+
+def _wide_solution(
+    start: Estimate,
+    steps: Sequence[Step],
+    tracks: Mapping[str, Track],
+    groups: Sequence[SightingGroup],
+    config: Config,
+) -> Estimate:
+    """The rough solution with a wide kernel, the calibration as uncertain as before any data."""
+    made = recompute_steps(steps, start, tracks, groups)
+    wide = replace(config.robust, scale=WIDE * config.robust.scale)
+    return Reoptimiser(replace(config, robust=wide), made, start).solve(rough=True)
