@@ -13,7 +13,8 @@ import numpy as np
 
 from graphslam.core.config import RobustConfig
 from graphslam.core.records import Estimate, Motion, Step
-from graphslam.estimation.calibration_graph import solve_calibrated
+from graphslam.estimation.calibration_graph import CalibrationGraph, solve_calibrated
+from graphslam.estimation.isam2 import CONVERGED_ERROR_ROUGH
 from graphslam.odometry.preintegration import Track
 
 #: times that everything is solved: after the first the calibration moves by a tenth of its sigma
@@ -53,6 +54,36 @@ def calibrate(
         for name, track in tracks.items():
             track.calibration = solved[name]
     return estimate, steps
+
+
+def calibrate_roughly(
+    steps: Sequence[Step],
+    estimate: Estimate,
+    tracks: Mapping[str, Track],
+    kernel: RobustConfig,
+    rounds: int,
+) -> Estimate:
+    """A rough estimate of states, landmarks and calibrations, from initial values far off.
+
+    First the motions are those of ``steps``, whose covariances contain that of the calibration.
+    Then they are computed again and the calibration is solved for, ``rounds`` times. The
+    observations are in the graph once. The calibration of ``tracks`` is set to the one found.
+
+    Raises:
+        EstimationError: the estimate is indeterminate.
+    """
+    priors = {name: track.prior for name, track in tracks.items()}
+    now = {name: track.calibration for name, track in tracks.items()}
+    problem = CalibrationGraph(steps, estimate, priors, now, kernel)
+    estimate, _ = problem.solve(CONVERGED_ERROR_ROUGH)
+    for _ in range(rounds):
+        for name, track in tracks.items():
+            track.calibration = now[name].held()
+        problem.calibrate_motions(recompute_motions(steps, tracks), now)
+        estimate, now = problem.solve(CONVERGED_ERROR_ROUGH)
+    for name, track in tracks.items():
+        track.calibration = now[name]
+    return estimate
 
 
 def recompute_motions(steps: Sequence[Step], tracks: Mapping[str, Track]) -> tuple[Step, ...]:

@@ -5,6 +5,7 @@ trajectory, it is biased towards the calibration that the trajectory was made wi
 is estimated jointly, and its uncertainty is in every covariance.
 """
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array, adjoint, between, inverse, log, rotation3
 from graphslam.core.motion_models import HELD_SIGMA, Calibration
-from graphslam.core.records import Estimate, Step
+from graphslam.core.records import Estimate, Motion, Step
 from graphslam.estimation import factors
 from graphslam.estimation.isam2 import CONVERGED_ERROR_ROUGH, BatchGraph, marginals_of, with_means
 
@@ -53,68 +54,118 @@ def solve_calibrated(
     Raises:
         EstimationError: a covariance is not positive definite, or a state is unknown.
     """
-    builder, values = BatchGraph(kernel, defer_lines=True), gtsam.Values()
-    graph = builder.graph
-    keys = {robot: int(gtsam.symbol("c", k)) for k, robot in enumerate(sorted(priors))}
-    free = {r: np.flatnonzero(np.diag(c.cov) > HELD_SIGMA**2) for r, c in priors.items()}
-    for robot, prior in priors.items():
-        key, use = keys[robot], free[robot]
-        if len(use):
-            values.insert(key, now[robot].mean[use])
-            noise = factors.gaussian(prior.cov[np.ix_(use, use)])
-            graph.add(gtsam.PriorFactorVector(key, prior.mean[use], noise))
+    problem = CalibrationGraph(steps, start, priors, now, kernel)
+    problem.calibrate_motions(steps, now)
+    if rough:
+        return problem.solve(CONVERGED_ERROR_ROUGH)
+    return problem.solve(CONVERGED_ERROR, marginals=True)
 
-    unit = gtsam.noiseModel.Unit.Create(3)
-    linear = {
-        robot: _linear_motions(steps, robot, start.states[robot].poses, use)
-        for robot, use in free.items()
-    }
-    for step in steps:
-        builder.insert(Step(step.time_ns, step.starts), start, values)
-        for robot, motion in step.motions.items():
-            last = builder.latest_key(robot, step.time_ns)
-            number = builder.states.append(robot, step.time_ns)
-            key = builder.state_key(robot, number)
-            values.insert(key, factors.pose2(start.states[robot].poses[number]))
-            builder.rows += 3
-            if len(free[robot]):
-                A_x, R, A_c, b = next(linear[robot])
-                row = gtsam.JacobianFactor(last, A_x, key, R, keys[robot], A_c, b, unit)
-                graph.add(gtsam.LinearContainerFactor(row, values))
-            else:
-                graph.add(factors.motion_factor(last, key, motion))
-        rest = Step(step.time_ns, {}, {}, step.associations, step.closures)
-        builder.insert(rest, start, values)
-    builder.rebuild_lines(values)
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setRelativeErrorTol(CONVERGED_ERROR_ROUGH if rough else CONVERGED_ERROR)
-    parameters.setMaxIterations(50)
-    try:
-        values = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-        covs = {} if rough else marginals_of(graph, values).marginals
-    except RuntimeError as error:
-        raise builder.explain(error) from error
-    marginals = with_means(values, builder.dims(), covs)
-    estimate = builder.estimate(marginals, float(graph.error(values)))
-    calibrations = {}
-    for robot, prior in priors.items():
-        mean, cov, use = prior.mean.copy(), prior.cov.copy(), free[robot]
-        if len(use):
-            mean[use] = values.atVector(keys[robot])
-            cov[np.ix_(use, use)] = np.nan if rough else covs[keys[robot]]
-        calibrations[robot] = Calibration(prior.names, mean, cov)
-    return estimate, calibrations
+
+class CalibrationGraph:
+    """The graph of steps with calibrations as variables, whose motions can be exchanged.
+
+    The motions are first those of the steps, with nothing about calibrations.
+    """
+
+    def __init__(
+        self,
+        steps: Sequence[Step],
+        start: Estimate,
+        priors: Mapping[str, Calibration],
+        now: Mapping[str, Calibration],
+        kernel: RobustConfig,
+    ) -> None:
+        """Build the graph; for the arguments see `solve_calibrated`.
+
+        Raises:
+            EstimationError: a covariance is not positive definite, or a state is unknown.
+        """
+        self._builder = builder = BatchGraph(kernel, defer_lines=True)
+        self._values, self._priors = gtsam.Values(), priors
+        self._keys = {r: int(gtsam.symbol("c", k)) for k, r in enumerate(sorted(priors))}
+        self._free = {r: np.flatnonzero(np.diag(c.cov) > HELD_SIGMA**2) for r, c in priors.items()}
+        self._motions: dict[str, list[tuple[int, int, int]]] = defaultdict(list)  # index, two keys
+        for robot, prior in priors.items():
+            key, use = self._keys[robot], self._free[robot]
+            if len(use):
+                self._values.insert(key, now[robot].mean[use])
+                noise = factors.gaussian(prior.cov[np.ix_(use, use)])
+                builder.graph.add(gtsam.PriorFactorVector(key, prior.mean[use], noise))
+        for step in steps:
+            for robot in step.motions:
+                last = builder.latest_key(robot, step.time_ns)
+                index = builder.graph.size() + len(step.starts) + list(step.motions).index(robot)
+                self._motions[robot].append((index, last, last + 1))
+            builder.insert(step, start, self._values)
+        builder.rebuild_lines(self._values)
+
+    def calibrate_motions(self, steps: Sequence[Step], now: Mapping[str, Calibration]) -> None:
+        """Put motions in the graph that depend on the calibration.
+
+        Args:
+            steps: with motions between the same states, computed with ``now``.
+            now: robot -> calibration, around which motions are linear.
+        """
+        graph, values = self._builder.graph, self._values
+        unit = gtsam.noiseModel.Unit.Create(3)
+        for robot, use in self._free.items():
+            if not len(use):
+                continue
+            values.update(self._keys[robot], now[robot].mean[use])
+            motions = [step.motions[robot] for step in steps if robot in step.motions]
+            poses = [factors.read(values, key, 3) for key in self._builder.state_keys(robot)]
+            linear = _linear_motions(motions, np.array(poses), use)
+            for (index, last, key), (A_x, R, A_c, b) in zip(
+                self._motions[robot], linear, strict=True
+            ):
+                row = gtsam.JacobianFactor(last, A_x, key, R, self._keys[robot], A_c, b, unit)
+                graph.replace(index, gtsam.LinearContainerFactor(row, values))
+
+    def solve(
+        self, converged: float, *, marginals: bool = False
+    ) -> tuple[Estimate, dict[str, Calibration]]:
+        """Optimise from the last solution; see `solve_calibrated`.
+
+        Args:
+            converged: relative decrease of the error at which it ends.
+            marginals: whether covariances are wanted; else they are NaN.
+
+        Raises:
+            EstimationError: the estimate is indeterminate.
+        """
+        builder, graph = self._builder, self._builder.graph
+        parameters = gtsam.LevenbergMarquardtParams()
+        parameters.setRelativeErrorTol(converged)
+        parameters.setMaxIterations(50)
+        covs: dict[int, Array] = {}
+        try:
+            values = gtsam.LevenbergMarquardtOptimizer(graph, self._values, parameters).optimize()
+            if marginals:
+                covs = dict(marginals_of(graph, values).marginals)
+        except RuntimeError as error:
+            raise builder.explain(error) from error
+        self._values = values
+        means = with_means(values, builder.dims(), covs)
+        estimate = builder.estimate(means, float(graph.error(values)))
+        calibrations = {}
+        for robot, prior in self._priors.items():
+            mean, cov, use = prior.mean.copy(), prior.cov.copy(), self._free[robot]
+            if len(use):
+                key = self._keys[robot]
+                mean[use] = values.atVector(key)
+                cov[np.ix_(use, use)] = covs.get(key, np.nan)
+            calibrations[robot] = Calibration(prior.names, mean, cov)
+        return estimate, calibrations
 
 
 def _linear_motions(
-    steps: Sequence[Step], robot: str, poses: Array, use: IntArray
+    motions: Sequence[Motion], poses: Array, use: IntArray
 ) -> Iterator[tuple[Array, Array, Array, Array]]:
     """Motions of a robot as A_x x + R y + A_c c = b around ``poses`` (n + 1, 3): A_x, R, A_c, b.
 
     Error log(delta(c)⁻¹ x⁻¹ y) along the axes of the measured end, whitened; ``use`` (p,) are the
     indices of the parameters that are not held.
     """
-    motions = [step.motions[robot] for step in steps if robot in step.motions]
     if not motions:
         return iter(())
     delta = np.array([m.delta for m in motions])

@@ -89,13 +89,13 @@ class InvolvedVariables:
                 root = math.sqrt(self._weight(H, rows.b))
             A.append(root * H)
             b.append(root * rows.b)
-        self.R, self.d, lost = determined(np.concatenate(A), np.concatenate(b), group.what)
+        self.R, self.d, lost = determined(np.concatenate(A), np.concatenate(b), group.name)
         if group.new is not None:
             return  # its factors have no error at its initial value: nothing moves
         z = dtrsm(1.0, self.R, self.d[:, None])[:, 0]
         change, self.z = z - self.z, z
         if not np.isfinite(change).all():
-            raise indeterminate(group.what, UNDERDETERMINED)
+            raise indeterminate(group.name, UNDERDETERMINED)
         self.error += 0.5 * lost**2
         self.changes.append(change)
         for keys, columns in self._blocks:
@@ -212,7 +212,7 @@ class FactorEkfBackend(GraphBackend):
             assert group.new is not None
             self._z[group.new[0]] = np.zeros(3)
             parts += [linear(each, self._values, self._z.__getitem__) for each in group.factors]
-            what = group.what
+            what = group.name
         gone = {key for key in self._z if self._is_past(key)} - self._dormant.anchors
         last = self._keys_of(step)
         dims = {key: len(z) for key, z in self._z.items()}

@@ -45,16 +45,17 @@ Estimates = Callable[[int, int], Array]
 UNDERDETERMINED = "it has too few or too weak observations"
 #: variables whose marginals are read together
 READ_AT_ONCE = 32
+_UNUSED = np.zeros(3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FactorGroup:
     """Factors that must be added together: without one of them a new variable is indeterminate.
 
-    ``what`` names them in terms of the log. ``new`` is the variable that they introduce, with its
-    initial value (2,) or (3,); ``replaces`` the robot's previous state, where that variable is its
-    next one. ``observed`` is the association of the last factor, with its two keys; ``robust``
-    whether a kernel applies to that factor.
+    ``what`` names them in terms of the log, unless they are of an observation. ``new`` is the
+    variable that they introduce, with its initial value (2,) or (3,); ``replaces`` the robot's
+    previous state, where that variable is its next one. ``observed`` is the association of the last
+    factor, with its two keys; ``robust`` whether a kernel applies to that factor.
     """
 
     factors: tuple[gtsam.NonlinearFactor, ...]
@@ -63,6 +64,11 @@ class FactorGroup:
     replaces: int | None = None
     observed: tuple[int, int, Association] | None = None
     robust: bool = False
+
+    @property
+    def name(self) -> str:
+        """What the factors are of, in terms of the log."""
+        return self.what if self.observed is None else describe(self.observed[2])
 
 
 class GraphBuilder:
@@ -89,7 +95,7 @@ class GraphBuilder:
         self.oldest: dict[str, int] = defaultdict(int)
         self.skipped: Counter[str] = Counter()
         self._late, self._wide, self._make_lines = late, wide, lines
-        self._first_seen: dict[int, str] = {}  # landmark -> its first observation in words
+        self._first_seen: dict[int, Association] = {}  # landmark -> its first observation
 
     def state_key(self, robot: str, number: int) -> int:
         """Key of a robot's state."""
@@ -168,8 +174,7 @@ class GraphBuilder:
         if known and seen.model == "line" and not self._make_lines:
             return FactorGroup((), "", observed=(key, target, seen))  # its factor is made later
         # only new landmarks and lines need an estimate, which is expensive
-        x = t = np.zeros(3)
-        what = describe(seen)
+        x = t = _UNUSED
         made: list[gtsam.NonlinearFactor] = []
         new = None
         if not known:
@@ -178,16 +183,20 @@ class GraphBuilder:
             new = (target, t)
         elif seen.model == "line":
             x, t = estimate(key, 3), estimate(target, model.dim)
-        with _covariance_of(what, seen.cov):
+        # there are many: no words are made for errors that do not occur
+        try:
+            _check_finite(seen.cov)
             if new is not None and seen.model == "line":
                 made.append(factors.line_gauge_factor(key, target, seen, wide=self._wide))
                 self.rows += 1
             if self._make_lines or seen.model != "line":
                 made.append(factors.observation_factor(key, target, seen, self.kernel, x, t))
+        except (EstimationError, np.linalg.LinAlgError) as error:
+            raise EstimationError(f"{describe(seen)}: {error}") from error
         if new is not None and isinstance(seen.target, int):
             self.landmark_dims[seen.target] = model.dim
-            self._first_seen[seen.target] = what
-        return FactorGroup(tuple(made), what, new, observed=(key, target, seen), robust=True)
+            self._first_seen[seen.target] = seen
+        return FactorGroup(tuple(made), "", new, observed=(key, target, seen), robust=True)
 
     def closure_groups(self, closures: Iterable[Closure]) -> Iterator[FactorGroup]:
         """Factors of closures between states that are still estimated."""
@@ -239,7 +248,7 @@ class GraphBuilder:
         if key is not None:
             robot, number = factors.number_of(key)
             if robot is None:
-                what = self._first_seen[number]
+                what = describe(self._first_seen[number])
             else:
                 name = self.robots[robot]
                 what = f"robot {name} at {self.states.times[name][number]} ns"
@@ -297,15 +306,19 @@ class GraphBuilder:
 @contextmanager
 def _covariance_of(what: str, cov: Array) -> Iterator[None]:
     """Checks a covariance (k, k); errors inside name ``what`` it is of."""
-    # the sum of finite numbers is finite; for so few Python is faster than NumPy
-    if not math.isfinite(sum(map(sum, cov.tolist()))):
-        raise EstimationError(
-            f"{what}: its covariance is not finite, so it determines nothing: {cov.tolist()}"
-        )
     try:
+        _check_finite(cov)
         yield
     except (EstimationError, np.linalg.LinAlgError) as error:
         raise EstimationError(f"{what}: {error}") from error
+
+
+def _check_finite(cov: Array) -> None:
+    # the sum of finite numbers is finite; for so few Python is faster than NumPy
+    if not math.isfinite(sum(map(sum, cov.tolist()))):
+        raise EstimationError(
+            f"its covariance is not finite, so it determines nothing: {cov.tolist()}"
+        )
 
 
 class GraphBackend(ABC):

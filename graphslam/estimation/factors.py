@@ -8,6 +8,7 @@ frame in which a quantity is given; the conversions are here.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import gtsam
 import numpy as np
@@ -105,7 +106,12 @@ def robust(noise: gtsam.noiseModel.Base, config: RobustConfig) -> gtsam.noiseMod
     """``noise`` under the configured kernel."""
     if config.kernel == "none":
         return noise
-    return gtsam.noiseModel.Robust.Create(_KERNELS[config.kernel](config.scale), noise)
+    return gtsam.noiseModel.Robust.Create(_kernel(config.kernel, config.scale), noise)
+
+
+@lru_cache
+def _kernel(name: str, scale: float) -> gtsam.noiseModel.mEstimator.Base:
+    return _KERNELS[name](scale)
 
 
 def start_factor(key: int, start: Start) -> gtsam.NonlinearFactor:

@@ -16,7 +16,7 @@ from graphslam.core.records import Estimate, Step, Trajectory
 from graphslam.estimation.compressed_filter import CompressedBackend
 from graphslam.odometry.online_calibration import observed_information
 from graphslam.odometry.preintegration import Track
-from graphslam.slam.reoptimise_sightings import SightingGroup, group_sightings, recompute_steps
+from graphslam.slam.reoptimise_sightings import SightingGroup, recompute_steps
 from graphslam.slam.robot_state import Causal, RobotState
 from graphslam.slam.sighting_pass import SightingPass
 
@@ -52,13 +52,12 @@ def replay_causally(one: SightingPass) -> CausalReplay:
 def _replay(one: SightingPass, tracks: Mapping[str, Track]) -> CausalReplay:
     backend = CompressedBackend(one.config)
     runs = {name: RobotState(track, clock=one.runs[name].clock) for name, track in tracks.items()}
-    groups = group_sightings(one.steps, one.sources)
     known: set[int | str] = set()
     step_ms: list[float] = []
     for first in range(0, len(one.steps), BLOCK):
         block = range(first, min(first + BLOCK, len(one.steps)))
         used = {name: run.track.calibration for name, run in runs.items()}
-        for step in _computed(one.steps[first : block.stop], groups, block, runs):
+        for step in _computed(one.steps[first : block.stop], one.groups, block, runs):
             began = time.perf_counter()
             backend.add(step)
             poses = {name: backend.state_mean(name) for name in (*step.starts, *step.motions)}

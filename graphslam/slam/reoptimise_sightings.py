@@ -122,7 +122,9 @@ def group_sightings(steps: Sequence[Step], sources: Sequence[Sighting]) -> list[
                 continue
             sighting = sources[a.source]
             o = sighting_observation(sighting)
-            z, cov = transport(o.z, o.cov, sighting.mount, np.zeros((3, 3)))
+            z, cov = o.z, o.cov
+            if sighting.mount.any():
+                z, cov = transport(z, cov, sighting.mount, np.zeros((3, 3)))
             other = a.target if isinstance(a.target, str) else None
             times = (a.time_ns, sighting.time_ns, step.time_ns)
             row = ((n, k), *times, z, cov, count[a.robot, a.target])

@@ -5,6 +5,7 @@ what it is of, the steps follow from odometry alone. Motions and measurements ar
 steps are solved (`sighting_solution`) or replayed (`causal_sightings`), many at once.
 """
 
+from functools import cached_property
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from graphslam.logs import LogSet
 from graphslam.odometry.readings import integrate_pending
 from graphslam.perception.sightings import sighting_observation
 from graphslam.slam.pipeline import Pipeline, Progress
+from graphslam.slam.reoptimise_sightings import SightingGroup, group_sightings
 from graphslam.slam.sighting_batches import SightingBatch
 from graphslam.slam.step_recorder import PriorKnowledge
 
@@ -71,6 +73,11 @@ class SightingPass(Pipeline):
             if step.motions or step.associations:
                 self.steps.append(step)
         self.steps += starts[done:]
+
+    @cached_property
+    def groups(self) -> list[SightingGroup]:
+        """The sightings of the steps as arrays."""
+        return group_sightings(self.steps, self.sources)
 
     def start(self, robot: str, time_ns: int) -> None:
         """See `StepRecorder`; there is no back end."""

@@ -43,6 +43,7 @@ def run_sighting_passes(
         if not one.steps:
             path = log.files[0].path
             raise LogError(f"{path}: nothing in it could be used; see `graphslam info`")
+        _ = one.groups  # once for both processes
         replayed = Future(partial(replay_causally, one))
         with timed(one.seconds, "final optimisation"):
             estimate, steps = solve_together(one)

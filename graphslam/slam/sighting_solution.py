@@ -19,7 +19,7 @@ from graphslam.core.motion_models import Calibration
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Estimate, Step, Trajectory
 from graphslam.core.worker import parallel_map
-from graphslam.estimation.isam2 import Reoptimiser
+from graphslam.estimation.batch_calibration import calibrate_roughly
 from graphslam.mapping.landmark_map import observed_from
 from graphslam.multi_robot.relative_frames import RobotEstimate
 from graphslam.odometry.preintegration import Track
@@ -33,9 +33,8 @@ from graphslam.slam.sighting_pass import SightingPass
 
 #: how much wider the kernel is in the beginning
 WIDE = 10.0
-#: times that everything is solved with the calibration: from its nominal values, and from those
-#: of robots by themselves
-ROUNDS_NOMINAL, ROUNDS_KNOWN = 3, 2
+#: rounds of the rough solution, after which the latency of odometry no longer changes much
+ROUNDS = 3
 
 
 def solve_together(one: SightingPass) -> tuple[Estimate, tuple[Step, ...]]:
@@ -45,18 +44,13 @@ def solve_together(one: SightingPass) -> tuple[Estimate, tuple[Step, ...]]:
         EstimationError: the estimate is indeterminate.
     """
     tracks = {name: run.track for name, run in one.started.items()}
-    groups = group_sightings(one.steps, one.sources)
     states = {robot: states_by_odometry(one.steps, robot, track) for robot, track in tracks.items()}
     alone = one.known.alone
     if set(tracks) <= set(alone):
         states = {robot: _moved(alone[robot], states[robot]) for robot in states}
         for robot, track in tracks.items():
             track.calibration = alone[robot].track.calibration
-    start = _with_landmarks(states, one.steps, tracks, groups)
-    if not alone:
-        start = _wide_solution(start, one.steps, tracks, groups, one.config)
-    rounds = ROUNDS_KNOWN if alone else ROUNDS_NOMINAL
-    return solve_sighting_log(one.steps, start, tracks, groups, one.config, rounds)
+    return _solution(states, one.steps, tracks, one.groups, one.config)
 
 
 def solve_robots_apart(one: SightingPass) -> Estimate:
@@ -67,9 +61,7 @@ def solve_robots_apart(one: SightingPass) -> Estimate:
         steps, tracks = steps_of_robot(one.steps, robot), {robot: track}
         groups = group_sightings(steps, one.sources)
         states = {robot: states_by_odometry(steps, robot, track)}
-        start = _with_landmarks(states, steps, tracks, groups)
-        start = _wide_solution(start, steps, tracks, groups, one.config)
-        estimate, _ = solve_sighting_log(steps, start, tracks, groups, one.config, ROUNDS_NOMINAL)
+        estimate, _ = _solution(states, steps, tracks, groups, one.config)
         return estimate, track.calibration
 
     robots = list(one.started)
@@ -119,8 +111,8 @@ def _with_landmarks(
     steps: Sequence[Step],
     tracks: Mapping[str, Track],
     groups: Sequence[SightingGroup],
-) -> Estimate:
-    """States, and landmarks where most of their sightings from there lie."""
+) -> tuple[Estimate, tuple[Step, ...]]:
+    """States with landmarks where most sightings from there lie, and the steps computed there."""
     estimate = Estimate(states, {}, 0.0, 0)
     made = recompute_steps(steps, estimate, tracks, groups)
     seen = [a for step in made for a in step.associations if isinstance(a.target, int)]
@@ -134,17 +126,18 @@ def _with_landmarks(
         # the first one's direction: there is no median of angles
         mean = np.append(np.median(found[:, :2], axis=0), found[0, 2:])
         landmarks[landmark] = (mean, np.full((len(mean),) * 2, np.nan))
-    return Estimate(states, landmarks, 0.0, 0)
+    return Estimate(states, landmarks, 0.0, 0), made
 
 
-def _wide_solution(
-    start: Estimate,
+def _solution(
+    states: Mapping[str, Trajectory],
     steps: Sequence[Step],
     tracks: Mapping[str, Track],
     groups: Sequence[SightingGroup],
     config: Config,
-) -> Estimate:
-    """The rough solution with a wide kernel, the calibration as uncertain as before any data."""
-    made = recompute_steps(steps, start, tracks, groups)
+) -> tuple[Estimate, tuple[Step, ...]]:
+    """The estimate from initial ``states``, and the steps behind it."""
+    start, made = _with_landmarks(states, steps, tracks, groups)
     wide = replace(config.robust, scale=WIDE * config.robust.scale)
-    return Reoptimiser(replace(config, robust=wide), made, start).solve(rough=True)
+    rough = calibrate_roughly(made, start, tracks, wide, ROUNDS)
+    return solve_sighting_log(steps, rough, tracks, groups, config, 1)
