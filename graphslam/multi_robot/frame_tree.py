@@ -18,6 +18,7 @@ from graphslam.core.consistency import has_rival, poses_differ
 from graphslam.core.frame_forest import PRIOR_INFLATION, grow_frame_forest
 from graphslam.core.geometry import compose, compose_cov
 from graphslam.core.records import Sighting, Start
+from graphslam.core.worker import parallel_map
 from graphslam.multi_robot.relative_frames import (
     RelativeFrame,
     RobotEstimate,
@@ -97,14 +98,16 @@ def build_frame_tree(
         by_pair[min(s.robot, str(s.seen_robot)), max(s.robot, str(s.seen_robot))].append(s)
     relations = [either for relation in more for either in (relation, relation.reversed())]
     undecided = dict(doubts)
-    for a, b in combinations(sorted(estimates), 2):
-        if a in starts and b in starts:
-            continue
-        relation = estimate_relative_frame(a, b, estimates, by_pair[a, b], config)
+    pairs = [pair for pair in combinations(sorted(estimates), 2) if not {*pair} <= set(starts)]
+
+    def relate(pair: tuple[str, str]) -> RelativeFrame | str:
+        return estimate_relative_frame(*pair, estimates, by_pair[pair], config)
+
+    for pair, relation in zip(pairs, parallel_map(relate, pairs), strict=True):
         if isinstance(relation, RelativeFrame):
             relations += [relation, relation.reversed()]
         elif relation:
-            undecided |= dict.fromkeys((a, b), relation)
+            undecided |= dict.fromkeys(pair, relation)
     world = min(starts, default="")
     found: dict[str, RelativeFrame] = {}
 

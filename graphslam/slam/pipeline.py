@@ -102,13 +102,8 @@ class Pipeline(StepRecorder):
     def run(self, progress: Progress) -> None:
         """Take in every message of the log; ``progress`` gets the number of messages read."""
         tracks = {name: run.track for name, run in self.runs.items()}
-        read = counted(
-            self.log.messages((Truth, TrueLandmark), prefetch=True, keep=True),
-            self.counts,
-            progress,
-        )
         messages = synchronise(
-            self.accepted(to_common_clock(read, self.known.clocks)),
+            self.accepted(to_common_clock(self.messages(progress), self.known.clocks)),
             tracks,
             self.config.odometry.max_gap_s,
             self.dropped,
@@ -131,6 +126,11 @@ class Pipeline(StepRecorder):
             clock = time.perf_counter()
             if len(self.steps) > steps:
                 self.step_ms.append(1e3 * (clock - began))
+
+    def messages(self, progress: Progress) -> Iterator[Message]:
+        """The messages of the log but truth, counted; for ``progress`` see `run`."""
+        read = self.log.messages((Truth, TrueLandmark), prefetch=True, keep=True)
+        return counted(read, self.counts, progress)
 
     def accepted(self, messages: Iterable[Message]) -> Iterator[Message]:
         """Messages under their right identities, without sightings that are not to be used."""

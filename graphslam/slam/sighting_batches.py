@@ -88,6 +88,17 @@ def batch_sightings(
         yield filling
 
 
+def sighting_batches(sightings: Iterable[Sighting], span_ns: int) -> list[SightingBatch]:
+    """The batches of sightings in order of time, with nothing in between; see `batch_sightings`."""
+    batches: list[SightingBatch] = []
+    for _, group in itertools.groupby(sightings, lambda s: (s.robot, s.time_ns)):
+        image = list(group)
+        if not batches or image[0].time_ns - batches[-1].first_ns > span_ns:
+            batches.append(SightingBatch())
+        batches[-1].images.append(image)
+    return batches
+
+
 def batch_motions(
     batch: SightingBatch,
     state_ns: Mapping[str, int],

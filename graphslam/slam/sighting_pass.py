@@ -5,6 +5,8 @@ what it is of, the steps follow from odometry alone. Motions and measurements ar
 steps are solved (`sighting_solution`) or replayed (`causal_sightings`), many at once.
 """
 
+from collections import deque
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -19,12 +21,14 @@ from graphslam.core.records import (
     Step,
 )
 from graphslam.logs import LogSet
+from graphslam.logs.clock import to_common_clock
 from graphslam.odometry.readings import integrate_pending
 from graphslam.perception.sightings import sighting_observation
 from graphslam.slam.pipeline import Pipeline, Progress
 from graphslam.slam.reoptimise_sightings import SightingGroup, group_sightings
-from graphslam.slam.sighting_batches import SightingBatch
-from graphslam.slam.step_recorder import PriorKnowledge
+from graphslam.slam.sighting_batches import SightingBatch, sighting_batches
+from graphslam.slam.step_recorder import PriorKnowledge, timed
+from graphslam.slam.synchronisation import ODOMETRY
 
 
 def can_solve_at_once(log: LogSet, config: Config) -> bool:
@@ -56,55 +60,94 @@ class SightingPass(Pipeline):
         """Reads nothing yet."""
         super().__init__(log, config, known)
         self.all_named = True
-        self._batches: list[tuple[int, SightingBatch]] = []  # after so many starts
 
     def run(self, progress: Progress) -> None:
-        """See `Pipeline`."""
-        super().run(progress)
-        starts, self.steps = self.steps, []
-        if not (self.all_named and self._batches):
+        """Read the log and make the steps; see `Pipeline`."""
+        with timed(self.seconds, "read"):
+            sightings = self._covered(self._read(progress))
+        self.all_named = all(s.identity or s.seen_robot for s in sightings)
+        if not self.all_named:
             return
-        integrate_pending(run.track for run in self.runs.values())
-        done = 0
-        for before, batch in self._batches:
-            self.steps += starts[done:before]
-            done = before
+        span_ns = round(1e9 * self.config.keyframe.sighting_window_s)
+        batches = sighting_batches(sightings, span_ns)
+        starts = deque(self._starts(batches))
+        for batch in batches:
+            while starts and starts[0][0] <= batch.time_ns:
+                self._start(*starts.popleft())
             step = self._step(batch)
             if step.motions or step.associations:
                 self.steps.append(step)
-        self.steps += starts[done:]
+        while starts:
+            self._start(*starts.popleft())
+
+    def _read(self, progress: Progress) -> list[Sighting]:
+        """All sightings that may be used; odometry goes into the tracks."""
+        sightings = []
+        read = self.messages(progress)
+        for message in self.accepted(to_common_clock(read, self.known.clocks)):
+            if isinstance(message, ODOMETRY):
+                self.runs[message.robot].track.add(message)
+            elif isinstance(message, Sighting):
+                sightings.append(message)
+            else:
+                continue
+            self.record_time(message.time_ns)
+        return sightings
+
+    def _covered(self, sightings: Sequence[Sighting]) -> list[Sighting]:
+        """The sightings at times that the odometry of all their robots covers."""
+        integrate_pending(run.track for run in self.runs.values())
+        max_gap_ns = round(1e9 * self.config.odometry.max_gap_s)
+        covered = []
+        for s in sightings:
+            robots = (s.robot,) if s.seen_robot is None else (s.robot, s.seen_robot)
+            if s.seen_robot is not None and s.seen_robot not in self.runs:
+                self.dropped[f"sighting: robot {s.seen_robot} is not in the log"] += 1
+            elif all(
+                robot in self.runs and self.runs[robot].track.covers(s.time_ns, max_gap_ns)
+                for robot in robots
+            ):
+                covered.append(s)
+            else:
+                self.dropped["sighting: no odometry near it"] += 1
+        return covered
+
+    def _starts(self, batches: Iterable[SightingBatch]) -> list[tuple[int, str]]:
+        """When each robot starts: with its odometry, or with its first sighting if that is earlier.
+
+        Sorted by time.
+        """
+        first_ns = {name: run.track.first_ns for name, run in self.runs.items() if len(run.track)}
+        for batch in batches:
+            for image in batch.images:
+                for robot in {image[0].robot, *(s.seen_robot for s in image if s.seen_robot)}:
+                    first_ns[robot] = min(first_ns[robot], image[0].time_ns)
+        return sorted((time_ns, robot) for robot, time_ns in first_ns.items())
+
+    def _start(self, time_ns: int, robot: str) -> None:
+        """Give a robot its first state."""
+        start = self.prior(robot)
+        self.steps.append(Step(time_ns, starts={robot: start}))
+        self.record_state(robot, time_ns, start.pose)
 
     @cached_property
     def groups(self) -> list[SightingGroup]:
         """The sightings of the steps as arrays."""
         return group_sightings(self.steps, self.sources)
 
-    def start(self, robot: str, time_ns: int) -> None:
-        """See `StepRecorder`; there is no back end."""
-        start = self.prior(robot)
-        self.steps.append(Step(time_ns, starts={robot: start}))
-        self.record_state(robot, time_ns, start.pose)
-
-    def record_covariances(self) -> None:
-        """Nothing: without a back end there are none."""
-
-    def add_sighting_batch(self, batch: SightingBatch) -> None:
-        """Note a batch; its step is made when the odometry of the whole log is there."""
-        self.record_time(batch.first_ns)
-        self.record_time(batch.time_ns)
-        for image in batch.images:
-            self.start_if_needed(image[0].robot, image[0].time_ns)
-        for robot in sorted(_mutual(batch)):
-            self.start_if_needed(robot, batch.time_ns)
-        self.all_named &= all(s.identity or s.seen_robot for image in batch.images for s in image)
-        self._batches.append((len(self.steps), batch))
-
     def _step(self, batch: SightingBatch) -> Step:
         """The step of a batch: who gets a state there, and what was seen from which state.
 
         The rule is that of `Pipeline.add_sighting_batch`.
         """
-        step_ns, mutual = batch.time_ns, _mutual(batch)
+        step_ns = batch.time_ns
+        mutual = {
+            robot
+            for image in batch.images
+            for s in image
+            if s.seen_robot is not None
+            for robot in (s.robot, s.seen_robot)
+        }
         motions = {}
         for robot in batch.robots:
             run = self.runs[robot]
@@ -149,17 +192,6 @@ class SightingPass(Pipeline):
         return Association(
             robot, run.state_ns, entry.id, o.kind, o.z, o.cov, extent=o.extent, source=source
         )
-
-
-def _mutual(batch: SightingBatch) -> set[str]:
-    """Robots that saw a robot or were seen."""
-    return {
-        robot
-        for image in batch.images
-        for s in image
-        if s.seen_robot is not None
-        for robot in (s.robot, s.seen_robot)
-    }
 
 
 def _timed_motion(start_ns: int, end_ns: int) -> Motion:
