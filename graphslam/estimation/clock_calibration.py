@@ -65,8 +65,14 @@ def estimate_clocks(
 ) -> dict[str, ClockEstimate]:
     """The clocks of all robots but the first, whose clock is the common one.
 
-    The steps are as recorded with the clocks ``applied``; ``sightings`` are the observations of
-    robots in them, as read from the log.
+    Args:
+        steps: as recorded with the clocks ``applied``.
+        estimate: of all their states and landmarks.
+        sightings: observations of robots in them, as read from the log, for clocks of which nothing
+            is known; empty where `clocks_from_paths` has been tried.
+        tracks: odometry of every robot.
+        applied: clocks that the log was read with.
+        config: settings.
     """
     if len(tracks) < 2:
         return {}
@@ -96,6 +102,28 @@ def estimate_clocks(
         better = clock.adjusted(*mean.tolist()) if observable else clock
         out[robot] = ClockEstimate(better, offset_sigma, drift_sigma, observable, clock)
     return out
+
+
+def clocks_from_paths(
+    sightings: Iterable[Sighting], tracks: Mapping[str, Track], config: Config
+) -> dict[str, Clock]:
+    """Clocks that are clearly wrong, without any estimate; empty if none is.
+
+    The offsets are coarse, but a log that was read with them needs one correction at most.
+    """
+    epoch_ns = min(track.first_ns for track in tracks.values())
+    at_first = Clock(0.0, 0.0, epoch_ns)
+    coarse = offsets_from_paths(sightings, tracks, config.logs.max_clock_offset_s)
+    found = {
+        robot: ClockEstimate(
+            at_first.adjusted(offset.value_s, 0.0), offset.sigma_s, DRIFT, True, at_first
+        )
+        for robot, offset in coarse.items()
+    }
+    if not any(clock.needs_correction for clock in found.values()):
+        return {}
+    others = sorted(tracks)[1:]
+    return {robot: found[robot].clock if robot in found else at_first for robot in others}
 
 
 def _velocities(

@@ -38,7 +38,7 @@ def replay_causally(one: SightingPass) -> CausalReplay:
     Raises:
         EstimationError: the estimate is indeterminate.
     """
-    tracks = {name: run.track for name, run in one.started.items()}
+    tracks = one.tracks
     before = {name: track.calibration for name, track in tracks.items()}
     for track in tracks.values():
         track.calibration = track.prior

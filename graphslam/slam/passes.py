@@ -24,8 +24,8 @@ from graphslam.slam.reoptimise_sightings import reoptimise_sighting_log
 from graphslam.slam.robot_state import Causal
 from graphslam.slam.step_recorder import PriorKnowledge, timed
 
-#: passes at most that differ in the robots' clocks
-MAX_CLOCK_PASSES = 4
+#: how often a log is read again at most, with corrected clocks
+MAX_CLOCK_PASSES = 1
 
 
 class Findings(NamedTuple):
@@ -172,15 +172,18 @@ def pass_findings(pipeline: Pipeline, estimate: Estimate) -> Findings:
 
 
 def find_false_names_and_clocks(
-    pipeline: Pipeline, estimate: Estimate
+    pipeline: Pipeline, estimate: Estimate, *, coarsely: bool = True
 ) -> tuple[dict[str, str], dict[str, ClockEstimate]]:
-    """`Findings.swapped_identities` and `Findings.clocks` by an estimate of a pass."""
+    """`Findings.swapped_identities` and `Findings.clocks` by an estimate of a pass.
+
+    ``coarsely``: clocks may be seconds off.
+    """
     tracks = {name: run.track for name, run in pipeline.started.items()}
     of_robots = [s for s in pipeline.sources if s.seen_robot]
     clocks = estimate_clocks(
         pipeline.steps,
         estimate,
-        [*of_robots, *pipeline.robot_sightings],
+        [*of_robots, *pipeline.robot_sightings] if coarsely else (),
         tracks,
         pipeline.known.clocks,
         pipeline.config,

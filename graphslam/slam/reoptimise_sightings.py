@@ -107,9 +107,10 @@ class SightingGroup:
         """The sightings of consecutive steps, by their numbers; `where` counts from the first."""
         i, j = np.searchsorted(self.where[:, 0], [numbers.start, numbers.stop])
         own = slice(int(i), int(j))
-        arrays = (self.state_ns, self.seen_ns, self.step_ns, self.z, self.cov, self.share)
         where = self.where[own] - np.array([numbers.start, 0])
-        return SightingGroup(self.robot, self.other, where, *(a[own] for a in arrays))
+        times = self.state_ns[own], self.seen_ns[own], self.step_ns[own]
+        measured = self.z[own], self.cov[own], self.share[own]
+        return SightingGroup(self.robot, self.other, where, *times, *measured)
 
 
 def group_sightings(steps: Sequence[Step], sources: Sequence[Sighting]) -> list[SightingGroup]:

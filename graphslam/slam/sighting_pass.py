@@ -22,6 +22,7 @@ from graphslam.core.records import (
 )
 from graphslam.logs import LogSet
 from graphslam.logs.clock import to_common_clock
+from graphslam.odometry.preintegration import Track
 from graphslam.odometry.readings import integrate_pending
 from graphslam.perception.sightings import sighting_observation
 from graphslam.slam.pipeline import Pipeline, Progress
@@ -129,6 +130,16 @@ class SightingPass(Pipeline):
         start = self.prior(robot)
         self.steps.append(Step(time_ns, starts={robot: start}))
         self.record_state(robot, time_ns, start.pose)
+
+    @property
+    def tracks(self) -> dict[str, Track]:
+        """Odometry of the robots that have a state."""
+        return {name: run.track for name, run in self.started.items()}
+
+    @property
+    def seen_robots(self) -> list[Sighting]:
+        """Sightings of robots in the steps."""
+        return [sighting for sighting in self.sources if sighting.seen_robot]
 
     @cached_property
     def groups(self) -> list[SightingGroup]:

@@ -1,10 +1,12 @@
 """Passes over a log of named sightings, solved as a whole; see `sighting_pass`."""
 
+from dataclasses import replace
 from functools import partial
 
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError
 from graphslam.core.worker import Future
+from graphslam.estimation.clock_calibration import clocks_from_paths
 from graphslam.logs import LogSet
 from graphslam.slam.causal_sightings import replay_causally
 from graphslam.slam.passes import (
@@ -15,7 +17,7 @@ from graphslam.slam.passes import (
 )
 from graphslam.slam.pipeline import Progress
 from graphslam.slam.sighting_pass import SightingPass, can_solve_at_once
-from graphslam.slam.sighting_solution import solve_together
+from graphslam.slam.sighting_solution import solve_finely, solve_roughly
 from graphslam.slam.step_recorder import PriorKnowledge, timed
 
 
@@ -46,19 +48,24 @@ def run_sighting_passes(
         _ = one.groups  # once for both processes
         replayed = Future(partial(replay_causally, one))
         with timed(one.seconds, "final optimisation"):
-            estimate, steps = solve_together(one)
+            rough = solve_roughly(one)
+            # before anything finer, as all of it depends on the clocks; paths need the calibration
+            clocks = {} if known.clocks else clocks_from_paths(one.seen_robots, one.tracks, config)
+            if clocks:
+                replayed.cancel()
+                known = replace(known, clocks=clocks)
+                continue
+            estimate, steps = solve_finely(one, rough)
             one.steps = list(steps)
             for run in one.started.values():
                 run.is_calibrated = True
-            swapped, clocks = find_false_names_and_clocks(one, estimate)
-        following = decide_next_pass(
-            known, Findings(swapped, clocks, {}), log, config, clock_passes
-        )
+            swapped, found = find_false_names_and_clocks(one, estimate, coarsely=False)
+        following = decide_next_pass(known, Findings(swapped, found, {}), log, config, clock_passes)
         if following is None:
             with timed(one.seconds, "causal"):
                 causal = replayed.result()
             one.step_ms = causal.step_ms.tolist()
-            return FinishedPass(one, estimate, Findings(swapped, clocks, causal.trajectories))
+            return FinishedPass(one, estimate, Findings(swapped, found, causal.trajectories))
         replayed.cancel()
         clock_passes += following.clocks is not known.clocks
         known = following

@@ -35,33 +35,51 @@ from graphslam.slam.sighting_pass import SightingPass
 WIDE = 10.0
 #: rounds of the rough solution, after which the latency of odometry no longer changes much
 ROUNDS = 3
+#: the same from estimates of robots by themselves
+ROUNDS_AGAIN = 1
 
 
-def solve_together(one: SightingPass) -> tuple[Estimate, tuple[Step, ...]]:
-    """The estimate of all robots, and the steps behind it; sets the calibration of their tracks.
+def solve_roughly(one: SightingPass) -> Estimate:
+    """An estimate near that of all robots together; sets the calibration of their tracks.
 
     Raises:
         EstimationError: the estimate is indeterminate.
     """
-    tracks = {name: run.track for name, run in one.started.items()}
+    tracks, alone = one.tracks, one.known.alone
     states = {robot: states_by_odometry(one.steps, robot, track) for robot, track in tracks.items()}
-    alone = one.known.alone
-    if set(tracks) <= set(alone):
-        states = {robot: _moved(alone[robot], states[robot]) for robot in states}
-        for robot, track in tracks.items():
-            track.calibration = alone[robot].track.calibration
-    return _solution(states, one.steps, tracks, one.groups, one.config)
+    if not set(tracks) <= set(alone):
+        return _rough(states, one.steps, tracks, one.groups, one.config, ROUNDS)
+    for robot, track in tracks.items():
+        states[robot] = _moved(alone[robot], states[robot])
+        track.calibration = alone[robot].track.calibration
+    return _rough(states, one.steps, tracks, one.groups, one.config, ROUNDS_AGAIN)
+
+
+def solve_finely(one: SightingPass, rough: Estimate) -> tuple[Estimate, tuple[Step, ...]]:
+    """The estimate of all robots together, from a rough one, and the steps behind it.
+
+    Raises:
+        EstimationError: the estimate is indeterminate.
+    """
+    return solve_sighting_log(one.steps, rough, one.tracks, one.groups, one.config, 1)
 
 
 def solve_robots_apart(one: SightingPass) -> Estimate:
-    """The estimates of robots that have nothing in common, each in its own frame; as above."""
+    """The estimates of robots that have nothing in common, each in its own frame.
+
+    It sets the calibration of their tracks.
+
+    Raises:
+        EstimationError: one is indeterminate.
+    """
 
     def solve(robot: str) -> tuple[Estimate, Calibration]:
         track = one.runs[robot].track
         steps, tracks = steps_of_robot(one.steps, robot), {robot: track}
         groups = group_sightings(steps, one.sources)
         states = {robot: states_by_odometry(steps, robot, track)}
-        estimate, _ = _solution(states, steps, tracks, groups, one.config)
+        rough = _rough(states, steps, tracks, groups, one.config, ROUNDS)
+        estimate, _ = solve_sighting_log(steps, rough, tracks, groups, one.config, 1)
         return estimate, track.calibration
 
     robots = list(one.started)
@@ -82,9 +100,8 @@ def steps_of_robot(steps: Sequence[Step], robot: str) -> tuple[Step, ...]:
     own = []
     for step in steps:
         seen = tuple(a for a in step.associations if a.robot == robot)
-        starts, motions = (
-            {robot: each[robot]} if robot in each else {} for each in (step.starts, step.motions)
-        )
+        starts = {robot: step.starts[robot]} if robot in step.starts else {}
+        motions = {robot: step.motions[robot]} if robot in step.motions else {}
         if starts or motions or seen:
             own.append(Step(step.time_ns, starts, motions, seen))
     return tuple(own)
@@ -129,15 +146,15 @@ def _with_landmarks(
     return Estimate(states, landmarks, 0.0, 0), made
 
 
-def _solution(
+def _rough(
     states: Mapping[str, Trajectory],
     steps: Sequence[Step],
     tracks: Mapping[str, Track],
     groups: Sequence[SightingGroup],
     config: Config,
-) -> tuple[Estimate, tuple[Step, ...]]:
-    """The estimate from initial ``states``, and the steps behind it."""
+    rounds: int,
+) -> Estimate:
+    """A rough estimate from initial ``states``."""
     start, made = _with_landmarks(states, steps, tracks, groups)
     wide = replace(config.robust, scale=WIDE * config.robust.scale)
-    rough = calibrate_roughly(made, start, tracks, wide, ROUNDS)
-    return solve_sighting_log(steps, rough, tracks, groups, config, 1)
+    return calibrate_roughly(made, start, tracks, wide, rounds)
