@@ -188,8 +188,13 @@ def find_false_names_and_clocks(
         pipeline.known.clocks,
         pipeline.config,
     )
-    swapped: dict[str, str] = {}
-    if pipeline.sources and pipeline.config.association.identities != "ignore":
-        pairs = find_swapped_identities(pipeline.sources, estimate, tracks)
-        swapped = {a: b for pair in pairs for a, b in (pair, pair[::-1])}
-    return swapped, clocks
+    return find_swapped_names(pipeline, estimate), clocks
+
+
+def find_swapped_names(pipeline: Pipeline, estimate: Estimate) -> dict[str, str]:
+    """`Findings.swapped_identities` by an estimate of a pass."""
+    if not pipeline.sources or pipeline.config.association.identities == "ignore":
+        return {}
+    tracks = {name: run.track for name, run in pipeline.started.items()}
+    pairs = find_swapped_identities(pipeline.sources, estimate, tracks)
+    return {a: b for pair in pairs for a, b in (pair, pair[::-1])}

@@ -9,15 +9,21 @@ from graphslam.core.worker import Future
 from graphslam.estimation.clock_calibration import clocks_from_paths
 from graphslam.logs import LogSet
 from graphslam.slam.causal_sightings import replay_causally
+from graphslam.slam.initialisation import with_identities
 from graphslam.slam.passes import (
     Findings,
     FinishedPass,
     decide_next_pass,
     find_false_names_and_clocks,
+    find_swapped_names,
 )
 from graphslam.slam.pipeline import Progress
 from graphslam.slam.sighting_pass import SightingPass, can_solve_at_once
-from graphslam.slam.sighting_solution import solve_finely, solve_roughly
+from graphslam.slam.sighting_solution import (
+    solve_finely,
+    solve_roughly,
+    solve_without_contradiction,
+)
 from graphslam.slam.step_recorder import PriorKnowledge, timed
 
 
@@ -49,6 +55,13 @@ def run_sighting_passes(
         replayed = Future(partial(replay_causally, one))
         with timed(one.seconds, "final optimisation"):
             rough = solve_roughly(one)
+            if rough.error > rough.dof and not known.identities:
+                # residuals twice as large as stated: some sightings may be of something else
+                swapped = find_swapped_names(one, solve_without_contradiction(one))
+                if swapped:
+                    replayed.cancel()
+                    known = with_identities(known, log, config, swapped)
+                    continue
             # before anything finer, as all of it depends on the clocks; paths need the calibration
             clocks = {} if known.clocks else clocks_from_paths(one.seen_robots, one.tracks, config)
             if clocks:

@@ -45,14 +45,38 @@ def solve_roughly(one: SightingPass) -> Estimate:
     Raises:
         EstimationError: the estimate is indeterminate.
     """
-    tracks, alone = one.tracks, one.known.alone
-    states = {robot: states_by_odometry(one.steps, robot, track) for robot, track in tracks.items()}
-    if not set(tracks) <= set(alone):
-        return _rough(states, one.steps, tracks, one.groups, one.config, ROUNDS)
-    for robot, track in tracks.items():
-        states[robot] = _moved(alone[robot], states[robot])
-        track.calibration = alone[robot].track.calibration
-    return _rough(states, one.steps, tracks, one.groups, one.config, ROUNDS_AGAIN)
+    rounds = ROUNDS_AGAIN if set(one.tracks) <= set(one.known.alone) else ROUNDS
+    return _rough(_initial_states(one), one.steps, one.tracks, one.groups, one.config, rounds)
+
+
+def solve_without_contradiction(one: SightingPass) -> Estimate:
+    """An estimate by those sightings that agree with most others, leaving out the rest.
+
+    It may be far off, but unlike that of a wide kernel it is not bent by sightings under a false
+    identity. The calibration of the tracks is as before afterwards.
+
+    Raises:
+        EstimationError: the estimate is indeterminate.
+    """
+    before = {name: track.calibration for name, track in one.tracks.items()}
+    states = _initial_states(one)
+    start, made = _with_landmarks(states, one.steps, one.tracks, one.groups)
+    estimate = calibrate_roughly(made, start, one.tracks, one.config.robust, 0)
+    for name, track in one.tracks.items():
+        track.calibration = before[name]
+    return estimate
+
+
+def _initial_states(one: SightingPass) -> dict[str, Trajectory]:
+    """States before any sighting of a robot is used; sets the calibration of the tracks."""
+    states, alone = {}, one.known.alone
+    for robot, track in one.tracks.items():
+        track.calibration = track.prior
+        states[robot] = states_by_odometry(one.steps, robot, track)
+        if set(one.tracks) <= set(alone):
+            states[robot] = _moved(alone[robot], states[robot])
+            track.calibration = alone[robot].track.calibration
+    return states
 
 
 def solve_finely(one: SightingPass, rough: Estimate) -> tuple[Estimate, tuple[Step, ...]]:
