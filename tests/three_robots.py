@@ -17,7 +17,9 @@ def pose(robot, seconds):
     return compose(np.array(STARTS[robot]), exp(np.array(TWISTS[robot]) * seconds))
 
 
-def write(path, seed=1, marks=LANDMARKS, meets=lambda a, b: True, names=None, spoil=None):
+def write(
+    path, seed=1, marks=LANDMARKS, meets=lambda a, b: True, names=None, spoil=None, seconds=60.0
+):
     """Three robots on circles, their odometry 2 % off in turns, see landmarks and each other.
 
     ``meets(observer, seen)`` says who sees whom or what; ``names`` are exchanged; ``spoil(z, rng,
@@ -26,7 +28,7 @@ def write(path, seed=1, marks=LANDMARKS, meets=lambda a, b: True, names=None, sp
     rng = np.random.default_rng(seed)
     names = names or {}
     with LogWriter(path) as log:
-        for k in range(600):
+        for k in range(round(10 * seconds)):
             stamp = T0 + k * S // 10
             for robot in STARTS:
                 turned = exp(np.array([1.0, 1.0, 1.02]) * TWISTS[robot] * k / 10)

@@ -77,7 +77,7 @@ def solve_pose_graph(log: LogSet, config: Config, progress: Progress) -> Finishe
     with timed(seconds, "starts"):
         starts = start_poses(log, config)
         recorded = accept_closures(log, config, starts, messages, tracks)
-        frames = estimate_start_poses(log, config, {}, starts, recorded)
+        frames, _ = estimate_start_poses(log, config, {}, starts, recorded)
     pipeline = Pipeline(log, config, PriorKnowledge(frames, recorded))
     pipeline.seconds.update(seconds)
     pipeline.counts.update(counts)

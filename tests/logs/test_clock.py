@@ -113,8 +113,8 @@ def test_the_offset_of_two_files_is_found_and_made_up_for(tmp_path, offset_s):
     assert ate(result, offset_s) < 0.03
 
 
-@pytest.mark.parametrize("backend", ["ekf", "isam2"])
-def test_a_filters_clock_is_found_too(tmp_path, backend):
+@pytest.mark.parametrize("backend", ["ekf", "isam2", "batch"])
+def test_a_clock_is_found_with_any_back_end(tmp_path, backend):
     result = run(write(tmp_path, 0.3), f"backend.name={backend}")
     assert abs(result.summary["clocks"]["b"]["offset_s"] - 0.3) < 0.02
 

@@ -1,0 +1,108 @@
+"""Named sightings solved as a whole, against the estimate that is made while the log is read."""
+
+import os
+
+import numpy as np
+import pytest
+import three_robots
+
+from graphslam.core import worker
+from graphslam.core.config_io import load_config
+from graphslam.logs import open_logs
+from graphslam.slam.initialisation import initialise
+from graphslam.slam.sighting_passes import run_sighting_passes
+from graphslam.slam.smooth import smooth
+
+STARTS = [
+    f"start.poses.{robot}=[{x}, {y}, {phi}]" for robot, (x, y, phi) in three_robots.STARTS.items()
+]
+S, T0 = three_robots.S, three_robots.T0
+
+
+def solved(path, *settings, backend="batch"):
+    config = load_config(overrides=[f"backend.name={backend}", *settings])
+    return smooth(open_logs([path], config), config)
+
+
+def error_m(result, which="final"):
+    """Root mean square distance of all robots from the truth, m."""
+    errors = []
+    for robot, found in result.robots.items():
+        path = getattr(found, which)
+        true = [three_robots.pose(robot, 1e-9 * (t - T0)) for t in path.stamps_ns]
+        errors.append((path.poses - true)[:, :2])
+    return float(np.sqrt(np.mean(np.sum(np.concatenate(errors) ** 2, axis=1))))
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    path = tmp_path_factory.mktemp("sightings") / "log.mcap"
+    three_robots.write(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole(log):
+    return solved(log, *STARTS)
+
+
+def test_the_same_steps_as_while_reading_and_no_worse_an_estimate(log, whole):
+    """Both of the final and of the causal poses; a state or a sighting that is lost shows."""
+    other = solved(log, *STARTS, backend="isam2")
+    assert whole.summary["counts"] == other.summary["counts"]
+    assert [(s.time_ns, set(s.motions), len(s.associations)) for s in whole.steps] == [
+        (s.time_ns, set(s.motions), len(s.associations)) for s in other.steps
+    ]
+    assert error_m(whole) < 1.05 * error_m(other)
+    assert error_m(whole, "causal") < 1.05 * error_m(other, "causal")
+    assert error_m(whole) < 0.7 * error_m(whole, "causal")
+
+
+def test_what_is_causal_knows_nothing_of_the_rest_of_the_log(tmp_path, whole):
+    """Of a log that ends after half of the time, the causal poses are those of the whole log."""
+    three_robots.write(tmp_path / "half.mcap", seconds=30.0)
+    half = solved(tmp_path / "half.mcap", *STARTS)
+    for robot, found in half.robots.items():
+        known = found.causal.stamps_ns < T0 + 28 * S
+        same = whole.robots[robot].causal
+        k = same.index(found.causal.stamps_ns[known])
+        np.testing.assert_allclose(found.causal.poses[known], same.poses[k], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(found.causal.covs[known], same.covs[k], rtol=0, atol=1e-9)
+        assert not np.allclose(found.final.poses[known], whole.robots[robot].final.poses[k])
+
+
+def test_starts_that_are_not_given_are_found(log):
+    """Of one robot alone, which fixes the world."""
+    result = solved(log, STARTS[0])
+    assert set(result.summary["starts_found"]) == {"b", "c"}
+    assert error_m(result) < 0.1
+
+
+def test_exchanged_identities_are_found(tmp_path):
+    """A wide kernel would follow the sightings of b that are of a landmark."""
+    path = tmp_path / "exchanged.mcap"
+    three_robots.write(path, names={"b": "7", "7": "b"})
+    result = solved(path, *STARTS)
+    assert any("7 and b: their identities were swapped" in w for w in result.summary["warnings"])
+    assert error_m(result) < 0.1
+
+
+def test_a_sighting_without_identity_needs_an_estimate(log):
+    """Association of others is not decided at once: the log is read by the incremental pass."""
+    config = load_config(overrides=["backend.name=batch", "association.identities=ignore", *STARTS])
+    opened = open_logs([log], config)
+    known = initialise(opened, config)
+    assert run_sighting_passes(opened, config, known, lambda _count: None) is None
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a second process")
+def test_a_second_process_changes_nothing(log, whole, monkeypatch):
+    """To the last bit, trajectories, covariances and the graph."""
+    monkeypatch.setattr(worker, "can_fork", lambda: True)
+    other = solved(log, *STARTS)
+    for robot, found in whole.robots.items():
+        for which in ("final", "causal"):
+            a, b = getattr(found, which), getattr(other.robots[robot], which)
+            assert np.array_equal(a.poses, b.poses)
+            assert np.array_equal(a.covs, b.covs)
+    assert whole.estimate.error == other.estimate.error
