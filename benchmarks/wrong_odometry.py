@@ -93,7 +93,7 @@ def run(
                 pose, last = compose(pose, exp(twist)), m
                 if reported:
                     out.odometry(m.robot, m.stamp_ns + round(late_s * S), pose)
-    config = load_config(overrides=settings)
+    config = load_config(overrides=["backend.causal=true", *settings])
     result = smooth_log(path, config)
     (robot,) = result.robots.values()
     t, *true = np.array(truth).T

@@ -166,6 +166,14 @@ Horizon = Annotated[
         "default); backend.horizon_s in the configuration.",
     ),
 ]
+Causal = Annotated[
+    bool,
+    typer.Option(
+        "--causal",
+        help="Estimate causal trajectories of a log of scans too: each pose from the data up to "
+        "its time; backend.causal in the configuration.",
+    ),
+]
 FrontEnd = Annotated[
     str | None,
     _choice(FRONT_ENDS, "What finds landmarks in scans; front_end.name in the configuration."),

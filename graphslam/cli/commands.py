@@ -16,6 +16,7 @@ import graphslam
 from graphslam.cli.arguments import (
     Backend,
     Backends,
+    Causal,
     ComparisonMode,
     ConfigFile,
     Debug,
@@ -48,7 +49,7 @@ from graphslam.cli.arguments import (
     span_of,
 )
 from graphslam.cli.terminal import errors_in_one_line, progress_bar
-from graphslam.core.config_io import load_config
+from graphslam.core.config_io import load_config, named_backend
 from graphslam.core.errors import ConfigError, EstimationError, OutputError
 from graphslam.logs import IMPORTERS
 
@@ -166,6 +167,7 @@ def smooth(
     horizon: Horizon = None,
     front_end: FrontEnd = None,
     start: Starts = None,
+    causal: Causal = False,
     config: ConfigFile = None,
     settings: Settings = None,
     force: Force = False,
@@ -176,12 +178,17 @@ def smooth(
     """
     from graphslam.cli import show
 
+    named = backend or named_backend(config, settings or ())
+    if horizon is not None and named not in (None, "isam2"):
+        raise ConfigError(f"only isam2 supports --horizon, not {named}; omit it")
+    if horizon is not None:
+        backend = "isam2"
     options = [f"backend.name={backend}"] if backend else []
+    if causal:
+        options.append("backend.causal=true")
     options += [] if horizon is None else [f"backend.horizon_s={horizon}"]
     options += [f"front_end.name={front_end}"] if front_end else []
     tree = load_config(config, [*options, *(start or ()), *(settings or ())])
-    if horizon is not None and tree.backend.name != "isam2":
-        raise ConfigError(f"only isam2 supports --horizon, not {tree.backend.name}; omit it")
     with progress_bar("smoothing") as progress:
         result = graphslam.smooth(logs, config=tree, output=output, force=force, progress=progress)
     return Output(result.summary, lambda: show.smoothed(result, output))

@@ -93,7 +93,9 @@ class RobustConfig:
 class BackendConfig:
     """The estimator.
 
-    name: which one. relinearize_threshold: change of a variable (m, rad) above which it is
+    name: which one; batch solves a whole log at once. causal: of a log of scans, estimate the
+    causal trajectories too, which takes as long as isam2 (other back ends, and logs of sightings,
+    always have them). relinearize_threshold: change of a variable (m, rad) above which it is
     relinearised; relinearize_every: steps between two checks for that in the first 1000 steps,
     twice as many in the next 1000, and so on. local_landmarks: how many landmarks the filter in
     front of isam2's tree holds; querying another one updates the tree, which takes longer than a
@@ -108,7 +110,8 @@ class BackendConfig:
 
     name: Literal[
         "isam2", "batch", "ekf", "invariant-ekf", "rbpf", "dead-reckoning", "decentralised"
-    ] = "isam2"
+    ] = "batch"
+    causal: bool = False
     horizon_s: float = math.inf
     exchange_s: float = 30.0
     relinearize_threshold: float = 0.05
@@ -118,6 +121,11 @@ class BackendConfig:
     reoptimise: bool = True
     close_loops: bool = True
     verify_closures: bool = True
+
+    def __post_init__(self) -> None:
+        """A finite horizon is that of isam2: a batch has none."""
+        if self.name == "batch" and math.isfinite(self.horizon_s):
+            object.__setattr__(self, "name", "isam2")
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,26 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Conf
         ConfigError: the file cannot be read, a key is unknown, a value has the wrong type, or the
             file or the overrides give one setting by its old and its new name.
     """
+    tree = _read(path)
+    settings = map(parse_setting, overrides)
+    return _override(tree, [(_split_key(key), value) for key, value in settings])
+
+
+def named_backend(path: Path | None, overrides: Sequence[str] = ()) -> str | None:
+    """The back end that a file and overrides, see `load_config`, ask for; None if neither does.
+
+    Raises:
+        ConfigError: the file cannot be read, or an override has another form.
+    """
+    table = _read(path).get("backend", {})
+    name = table.get("name") if isinstance(table, dict) else None
+    for key, value in map(parse_setting, overrides):
+        name = value if key == "backend.name" else name
+    return None if name is None else str(name)
+
+
+def _read(path: Path | None) -> dict[str, Any]:
+    """The tree of a TOML file; empty without a file."""
     tree: dict[str, Any] = {}
     if path is not None:
         try:
@@ -50,8 +70,7 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Conf
             raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise ConfigError(f"{path}: not valid TOML: {error}") from error
-    settings = map(parse_setting, overrides)
-    return _override(tree, [(_split_key(key), value) for key, value in settings])
+    return tree
 
 
 def parse_setting(text: str) -> tuple[str, Any]:

@@ -97,6 +97,13 @@ def transform(pose: Array, points: Array) -> Array:
     return np.asarray(points @ rotation(pose[2]).T + pose[:2])
 
 
+def transform_each(poses: Array, points: Array) -> Array:
+    """Points (n, 2), each in the frame of its own pose (n, 3), in the poses' reference frame."""
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    x, y = points[:, 0], points[:, 1]
+    return np.column_stack([c * x - s * y + poses[:, 0], s * x + c * y + poses[:, 1]])
+
+
 def unit_vectors(angle_rad: ArrayLike) -> Array:
     """Vectors (..., 2) of length 1 in directions (...,)."""
     return np.stack([np.cos(angle_rad), np.sin(angle_rad)], axis=-1)

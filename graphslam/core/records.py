@@ -333,12 +333,12 @@ class RobotResult:
     """One robot's trajectories: final (by all data) and causal (by data up to each pose's time).
 
     ``final`` and ``causal`` are poses of the base, ``scan_final`` and ``scan_causal`` poses of the
-    laser at each scan (None without scans); ``dead_reckoning`` is the base by odometry alone, at
-    the stamps of ``final``.
+    laser at each scan (None without scans); the causal ones are None where they were not asked for.
+    ``dead_reckoning`` is the base by odometry alone, at the stamps of ``final``.
     """
 
     final: Trajectory
-    causal: Trajectory
+    causal: Trajectory | None
     scan_final: Trajectory | None
     scan_causal: Trajectory | None
     dead_reckoning: Trajectory

@@ -48,11 +48,10 @@ def calibrate(
         for track in tracks.values():
             track.calibration = track.calibration.held()
         steps = rebuild(estimate, last)
-        estimate, solved = solve_calibrated(
-            steps, estimate, priors, initial, robust, rough=not last
-        )
+        solved = solve_calibrated(steps, estimate, priors, initial, robust, rough=not last)
+        estimate = solved.estimate
         for name, track in tracks.items():
-            track.calibration = solved[name]
+            track.calibration = solved.calibrations[name]
     return estimate, steps
 
 

@@ -7,6 +7,7 @@ is estimated jointly, and its uncertainty is in every covariance.
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import gtsam
@@ -17,6 +18,7 @@ from graphslam.core.geometry import Array, adjoint, between, inverse, log, rotat
 from graphslam.core.motion_models import HELD_SIGMA, Calibration
 from graphslam.core.records import Estimate, Motion, Step
 from graphslam.estimation import factors
+from graphslam.estimation.backend import JointMarginal
 from graphslam.estimation.isam2 import CONVERGED_ERROR_ROUGH, BatchGraph, marginals_of, with_means
 
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
@@ -33,7 +35,7 @@ def solve_calibrated(
     kernel: RobustConfig,
     *,
     rough: bool = False,
-) -> tuple[Estimate, dict[str, Calibration]]:
+) -> "CalibratedSolution":
     """Optimise all states, landmarks and calibrations together.
 
     Motions are linear in the calibration, around the one that they were computed with, and
@@ -48,17 +50,13 @@ def solve_calibrated(
         kernel: of observations.
         rough: stop early, see `Reoptimiser.solve`; covariances are NaN.
 
-    Returns:
-        The estimate and each robot's calibration.
-
     Raises:
         EstimationError: a covariance is not positive definite, or a state is unknown.
     """
     problem = CalibrationGraph(steps, start, priors, now, kernel)
     problem.calibrate_motions(steps, now)
-    if rough:
-        return problem.solve(CONVERGED_ERROR_ROUGH)
-    return problem.solve(CONVERGED_ERROR, marginals=True)
+    converged = CONVERGED_ERROR_ROUGH if rough else CONVERGED_ERROR
+    return CalibratedSolution(*problem.solve(converged, marginals=not rough), problem)
 
 
 class CalibrationGraph:
@@ -156,6 +154,43 @@ class CalibrationGraph:
                 cov[np.ix_(use, use)] = covs.get(key, np.nan)
             calibrations[robot] = Calibration(prior.names, mean, cov)
         return estimate, calibrations
+
+    def landmark_covariance(self, landmarks: Sequence[int]) -> Array:
+        """Joint covariance (D, D) of landmarks at the last solution, along world axes.
+
+        Raises:
+            EstimationError: it is indeterminate.
+        """
+        keys = [factors.landmark_key(i) for i in landmarks]
+        dims = [self._builder.landmark_dims[i] for i in landmarks]
+        try:
+            marginals = gtsam.Marginals(self._builder.graph, self._values)
+            own = marginals.jointMarginalCovariance(keys).fullMatrix()
+        except RuntimeError as error:
+            raise self._builder.explain(error) from error
+        turn, ends = np.eye(len(own)), np.cumsum(dims)
+        for key, dim, end in zip(keys, dims, ends, strict=True):
+            if dim == 3:
+                block = slice(end - 3, end)
+                turn[block, block] = rotation3(factors.read(self._values, key, 3)[2])
+        return np.asarray(turn @ own @ turn.T)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibratedSolution:
+    """The estimate and each robot's calibration; the ``graph`` that was solved."""
+
+    estimate: Estimate
+    calibrations: Mapping[str, Calibration]
+    graph: CalibrationGraph
+
+    def joint(self, landmarks: Sequence[int]) -> JointMarginal:
+        """Joint marginal of landmarks; the pose in front of them is left out (zeros)."""
+        own = self.graph.landmark_covariance(landmarks)
+        means = [np.zeros(3), *(self.estimate.landmarks[i][0] for i in landmarks)]
+        cov = np.zeros((3 + len(own), 3 + len(own)))
+        cov[3:, 3:] = own
+        return JointMarginal.of(means, len(landmarks), cov)
 
 
 def _linear_motions(

@@ -1,6 +1,7 @@
 """Comparison of back ends on one recording: a row of numbers and the curves of each."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from graphslam.evaluation.trajectory_metrics import PosePairs, align, pair_poses
 from graphslam.logs import GroundTruth, LogSet
 from graphslam.results.folder import SavedResult
 from graphslam.results.report_comparison import BackendCurves, Comparison, ErrorCurve
-from graphslam.slam.pipeline import Progress
+from graphslam.slam.log_pass import Progress
 
 FORMAT = "graphslam-comparison-1"
 #: the same recorded steps for all, or each with its own data association
@@ -73,6 +74,8 @@ def compare(
     shared = None
     if mode == "replay":
         _check_perception(config, rows)
+        if config.backend.name == "batch":  # nothing causal comes of a batch
+            config = replace(config, backend=replace(config.backend, name="isam2"))
         say(f"associating with {NAMES.get(config.backend.name, config.backend.name)}")
         shared = record_steps(log, config, progress)
     runs: list[_BackendRun] = []

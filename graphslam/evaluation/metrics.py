@@ -60,7 +60,11 @@ def _compare_trajectories(
 ) -> dict[str, Any]:
     """``robots`` and ``joint`` of `evaluate`."""
     pairs = {
-        name: {k: pair_poses(getattr(robot, k), truth[name]) for k in ("final", "causal")}
+        name: {
+            kind: pair_poses(path, truth[name])
+            for kind, path in (("final", robot.final), ("causal", robot.causal))
+            if path is not None
+        }
         for name, robot in result.robots.items()
         if name in truth and len(truth[name])
     }
@@ -76,7 +80,11 @@ def _compare_trajectories(
     }
     in_world = [both for name, both in pairs.items() if name not in own_frame]
     if in_world:
-        groups |= {(None, kind): [both[kind] for both in in_world] for kind in in_world[0]}
+        groups |= {
+            (None, kind): [both[kind] for both in in_world]
+            for kind in in_world[0]
+            if all(kind in both for both in in_world)
+        }
     values = parallel_map(trajectory_metrics, list(groups.values()))
     metrics = dict(zip(groups, values, strict=True))
     found: dict[str, Any] = {
@@ -89,7 +97,9 @@ def _compare_trajectories(
         }
     }
     if in_world:
-        found["joint"] = {kind: metrics[None, kind] for kind in in_world[0]}
+        found["joint"] = {
+            kind: metrics[None, kind] for kind in in_world[0] if (None, kind) in metrics
+        }
     return found
 
 
@@ -98,11 +108,12 @@ def _compare_relations(result: Result | SavedResult, relations: Relations) -> di
     scans = [
         (robot.scan_final, robot.scan_causal)
         for robot in result.robots.values()
-        if robot.scan_final is not None and robot.scan_causal is not None
+        if robot.scan_final is not None
     ]
     if not scans:
         raise OutputError("relations need the poses of scans, and this result has none")
     final, causal = max(
         scans, key=lambda both: int(find_stamps(relations.from_ns, both[0].stamps_ns)[1].sum())
     )
-    return {**relation_metrics(relations, final), "causal": relation_metrics(relations, causal)}
+    found = relation_metrics(relations, final)
+    return found if causal is None else {**found, "causal": relation_metrics(relations, causal)}

@@ -61,7 +61,11 @@ def run_log(scenario: str, scale: float, seed: int, config: Config) -> dict[str,
     with TemporaryDirectory(prefix="graphslam-") as folder:
         path = Path(folder) / "log.mcap"
         simulate(scale_noise(load_scenario(scenario), scale), path, seed)
-        config = replace(config, start=replace(config.start, from_truth=True))
+        config = replace(
+            config,
+            start=replace(config.start, from_truth=True),
+            backend=replace(config.backend, causal=True),
+        )
         log = open_logs([path], config)
         result = smooth(log, config)
         known = truth_of_logs(log, config)

@@ -17,7 +17,8 @@ from graphslam.mapping.landmark_records import make_landmarks
 from graphslam.odometry.interpolation import FrameTransforms
 from graphslam.results.folder import SavedResult, SavedRobot
 from graphslam.slam.initialisation import initialise
-from graphslam.slam.pipeline import Pipeline, Progress
+from graphslam.slam.log_pass import Progress
+from graphslam.slam.pipeline import Pipeline
 from graphslam.slam.robot_settings import check_robots
 from graphslam.slam.robot_state import RobotState
 
@@ -108,6 +109,6 @@ def record_steps(
         runs,
         pipeline.starts[pipeline.frames.world].pose,
         pipeline.transforms(),
-        pipeline.associator.map,
+        pipeline.landmarks,
         time.perf_counter() - began,
     )

@@ -12,7 +12,7 @@ import numpy as np
 
 from graphslam.core.geometry import Array, between, compose
 from graphslam.core.observation_models import MODELS
-from graphslam.core.records import Association, Estimate, Observation, Step
+from graphslam.core.records import Association, Estimate, Observation, Step, Trajectory
 from graphslam.estimation.backend import Backend
 from graphslam.mapping.gating import BoolArray, IntArray
 
@@ -208,3 +208,22 @@ def seen_extents(steps: Sequence[Step], estimate: Estimate) -> dict[int, Array]:
     np.minimum.at(low, wall, ends[:, 0])
     np.maximum.at(high, wall, ends[:, 1])
     return dict(zip(walls.tolist(), np.column_stack([low, high]), strict=True))
+
+
+def first_estimates(
+    steps: Sequence[Step], states: Mapping[str, Trajectory]
+) -> dict[int, tuple[Array, Array]]:
+    """Number of each landmark -> where its first observation shows it, and an unknown covariance.
+
+    Mean (2,) or (3,) by the poses of ``states``, which are those of the steps.
+    """
+    first: dict[int, Association] = {}
+    for step in steps:
+        for a in step.associations:
+            if isinstance(a.target, int):
+                first.setdefault(a.target, a)
+    found = {}
+    for number, seen in first.items():
+        mean = MODELS[seen.model].invert(seen.z, states[seen.robot].at(seen.time_ns))
+        found[number] = mean, np.full((len(mean), len(mean)), np.nan)
+    return found

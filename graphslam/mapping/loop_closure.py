@@ -14,13 +14,14 @@ from dataclasses import replace
 import numpy as np
 
 from graphslam.core.config import LoopClosureConfig
-from graphslam.core.consistency import has_rival, largest_consistent_set
+from graphslam.core.consistency import largest_consistent_set
 from graphslam.core.gaussian import mahalanobis_squared
-from graphslam.core.geometry import Array, between, log, rotate_cov, rotation3
+from graphslam.core.geometry import Array, between, log, rotate_cov, rotation3, wrap
 from graphslam.core.records import Closure, Trajectory
 from graphslam.core.worker import parallel_map
+from graphslam.mapping.submap_graph import relative_jacobian
 from graphslam.mapping.submaps import State, SubmapPose, drift_covariance
-from graphslam.perception.scan_matching import IntArray, Match, Submap, agreement, align, match
+from graphslam.perception.scan_matching import IntArray, Match, Submap, agreement, align, fit, match
 
 #: m between the middles of submaps that may show one place: the default reach of a submap
 NEAR_M = 3.0
@@ -38,6 +39,11 @@ MIN_COARSE_OVERLAP = 0.2
 MAX_SIGMA_M = 0.08
 #: the second best match may have at most this share of the best one's score
 RIVAL_SHARE = 0.8
+#: m, rad: matches that differ less, across and in heading, differ along a corridor only; m: sigma
+#: of a match along it; m: directions with larger sigmas do not count in a residual
+SAME_ACROSS, UNKNOWN_ALONG_M, UNKNOWN_M = (0.1, 0.02), 5.0, 0.5
+#: m: a match shifted by so much must have less than this share of the points on others
+OPEN_SHIFT_M, OPEN_SHARE = 0.3, 0.95
 #: probability of the chi-square limits between closures, and factor on the covariance of the
 #: estimate, which does not know of wrong associations
 AGREE, COV_INFLATION = 0.99, 16.0
@@ -89,32 +95,53 @@ def _relative(blocks: Array, h: Array, i: int, j: IntArray) -> Array:
     """
     own = np.broadcast_to(blocks[i, i], (len(j), 3, 3))
     both = np.block([[blocks[j, j], blocks[j, i]], [blocks[i, j], own]])
-    H = _jacobian(h)
+    H = relative_jacobian(h)
     return np.asarray(H @ both @ H.mT)
-
-
-def _jacobian(h: Array) -> Array:
-    """Jacobian (..., 3, 6) of relative poses h (..., 3) by both poses, along their own axes."""
-    H = np.zeros((*h.shape[:-1], 3, 6))
-    H[..., 0, 0] = H[..., 1, 1] = H[..., 2, 2] = -1.0
-    H[..., 0, 2], H[..., 1, 2] = h[..., 1], -h[..., 0]
-    H[..., 3:] = rotation3(h[..., 2])
-    return H
 
 
 def verify_match(matches: Sequence[Match]) -> Match | None:
     """The first and best of the matches if it is verified, see the module's docstring."""
-    if not matches:
+    if not matches or _rivals(matches):
         return None
     best = matches[0]
-    score = best.same - best.absent
     sigma = np.sqrt(np.linalg.eigvalsh(best.cov[:2, :2])[-1])
-    good = (
-        _is_confirmed(best.same, best.absent)
-        and sigma <= MAX_SIGMA_M
-        and not has_rival(score, (m.same - m.absent for m in matches[1:]), RIVAL_SHARE)
-    )
-    return best if good else None
+    return best if _is_confirmed(best.same, best.absent) and sigma <= MAX_SIGMA_M else None
+
+
+def verify_match_across(matches: Sequence[Match]) -> Match | None:
+    """As `verify_match`, but of several matches one behind the other along a corridor.
+
+    If all that are nearly as good as the best differ in this one direction only, the best is
+    returned with a covariance that leaves it open.
+    """
+    rivals = _rivals(matches)
+    along = common_direction(matches[0], rivals) if rivals else None
+    if along is None:
+        return verify_match(matches)
+    best = matches[0]
+    sigma = np.sqrt(np.linalg.eigvalsh(best.cov[:2, :2])[-1])
+    if not _is_confirmed(best.same, best.absent) or sigma > MAX_SIGMA_M:
+        return None
+    return replace(best, cov=_open_along(best.cov, along))
+
+
+def _rivals(matches: Sequence[Match]) -> list[Match]:
+    """Matches that are nearly as good as the first and best."""
+    if not matches:
+        return []
+    least = RIVAL_SHARE * (matches[0].same - matches[0].absent)
+    return [m for m in matches[1:] if m.same - m.absent > least]
+
+
+def common_direction(best: Match, rivals: Sequence[Match]) -> Array | None:
+    """Unit vector (2,) along which all rivals differ from the best match; None if they do not."""
+    off = np.array([m.pose for m in rivals]) - best.pose
+    turned = np.abs(wrap(off[:, 2]))
+    _, axes = np.linalg.eigh(off[:, :2].T @ off[:, :2])
+    along = axes[:, 1]
+    beside = np.abs(off[:, :2] @ axes[:, 0])
+    is_line = beside.max() <= SAME_ACROSS[0] and turned.max() <= SAME_ACROSS[1]
+    return along if is_line else None
 
 
 def loop_closures(
@@ -138,13 +165,13 @@ def loop_closures(
         later, earlier = found[i], found[j]
         guess = between(earlier.pose, later.pose)
         pair = later.state, earlier.state
-        if pair in examined and _near(examined[pair], guess, ALREADY_CLOSED):
+        if pair in examined and are_near(examined[pair], guess, ALREADY_CLOSED):
             continue
         examined[pair] = guess
         pairs.append((later, earlier, guess, window))
     correcting: list[Closure] = []
     confirming: list[Closure] = []
-    results = parallel_map(_verify_pair, pairs, fewest=MIN_PARALLEL_PAIRS)
+    results = parallel_map(verify_pair, pairs, fewest=MIN_PARALLEL_PAIRS)
     for (later, earlier, _, _), result in zip(pairs, results, strict=True):
         if result is not None:
             is_searched, pose, cov = result
@@ -154,20 +181,47 @@ def loop_closures(
     return correcting, confirming
 
 
-def _verify_pair(
-    pair: tuple[SubmapPose, SubmapPose, Array, Array],
+def verify_pair(
+    pair: tuple[SubmapPose, SubmapPose, Array, Array], *, along: bool = False
 ) -> tuple[bool, Array, Array] | None:
     """Whether a pair had to be searched for, its relative pose (3,) and covariance (3, 3).
 
     None if it is not verified. ``pair``: the later and the earlier submap, the estimated relative
-    pose (3,), and half the window (3,) to search.
+    pose (3,), and half the window (3,) to search. ``along``: matches that leave the direction of a
+    corridor open are verified too, see `verify_match_across`.
     """
     later, earlier, guess, window = pair
     in_place = verify_in_place(later.submap, earlier.submap, guess)
     if in_place is not None:
-        return False, *in_place
-    best = verify_match(match(later.submap, earlier.submap, guess, window, MIN_COARSE_OVERLAP))
-    return None if best is None else (True, best.pose, best.cov)
+        pose, cov = in_place
+    else:
+        found = match(later.submap, earlier.submap, guess, window, MIN_COARSE_OVERLAP)
+        best = verify_match_across(found) if along else verify_match(found)
+        if best is None:
+            return None
+        pose, cov = best.pose, best.cov
+    if along:
+        cov = leave_open(later.submap, earlier.submap, pose, cov)
+    return in_place is None, pose, cov
+
+
+def leave_open(source: Submap, target: Submap, pose: Array, cov: Array) -> Array:
+    """Covariance (3, 3) of a match, its weakest direction open if a shift along it fits as well.
+
+    Between parallel walls the noise of points looks like structure along them.
+    """
+    along = np.linalg.eigh(cov[:2, :2])[1][:, 1]
+    shift = OPEN_SHIFT_M * np.append(along, 0.0)
+    here = fit(source, target, pose)[0]
+    beside = max(fit(source, target, pose + sign * shift)[0] for sign in (-1.0, 1.0))
+    return _open_along(cov, along) if beside >= OPEN_SHARE * here else cov
+
+
+def _open_along(cov: Array, along: Array) -> Array:
+    """A covariance (3, 3) that knows nothing in a direction (2,)."""
+    opened = cov.copy()
+    opened[:2, :2] += UNKNOWN_ALONG_M**2 * np.outer(along, along)
+    return opened
 
 
 def verify_in_place(source: Submap, target: Submap, guess: Array) -> tuple[Array, Array] | None:
@@ -176,7 +230,7 @@ def verify_in_place(source: Submap, target: Submap, guess: Array) -> tuple[Array
     None if they do not. The covariance is large along directions that the points leave open.
     """
     pose, cov = align(source, target, guess)
-    if not _near(guess, pose, ALREADY_CLOSED):
+    if not are_near(guess, pose, ALREADY_CLOSED):
         return None
     return (pose, cov) if _is_confirmed(*agreement(source, target, pose)) else None
 
@@ -185,7 +239,8 @@ def _is_confirmed(same: float, absent: float) -> bool:
     return same >= MIN_CONFIRMED and absent <= MAX_SEEN_THROUGH * (same + absent)
 
 
-def _near(a: Array, b: Array, limits: tuple[float, float]) -> bool:
+def are_near(a: Array, b: Array, limits: tuple[float, float]) -> bool:
+    """Whether two poses (3,) are within limits (m, rad) of each other."""
     off = between(a, b)
     return bool(np.hypot(off[0], off[1]) <= limits[0] and abs(off[2]) <= limits[1])
 
@@ -217,7 +272,7 @@ def _innovations(
         h = between(found[j].pose, found[i].pose)
         r[k] = log(between(closure.delta, h))
         turn = rotation3(-closure.delta[2])
-        H, rows = turn @ _jacobian(h), slice(3 * k, 3 * k + 3)
+        H, rows = turn @ relative_jacobian(h), slice(3 * k, 3 * k + 3)
         J[rows, 3 * j : 3 * j + 3], J[rows, 3 * i : 3 * i + 3] = H[:, :3], H[:, 3:]
         R[rows, rows] = turn @ closure.cov @ turn.T
     return r, J @ P @ J.T + R
@@ -230,6 +285,17 @@ def residuals(closures: Sequence[Closure], states: Mapping[str, Trajectory]) -> 
         earlier, later = states[c.other].at(c.other_time_ns), states[c.robot].at(c.time_ns)
         r[k] = log(between(c.delta, between(earlier, later)))
     return r
+
+
+def known_part(r: Array, closures: Sequence[Closure]) -> Array:
+    """Residuals (n, 3) of closures without what lies along directions that they leave open."""
+    if not closures:
+        return r
+    turn = np.array([c.delta[2] for c in closures])
+    cov = rotate_cov(np.array([c.cov for c in closures]), -turn)[:, :2, :2]
+    variances, axes = np.linalg.eigh(cov)
+    along = (axes.mT @ r[:, :2, None])[:, :, 0] * (variances <= UNKNOWN_M**2)
+    return np.column_stack([(axes @ along[:, :, None])[:, :, 0], r[:, 2]])
 
 
 def inflate_covariances(
@@ -248,9 +314,14 @@ def inflate_covariances(
     return inflated
 
 
+def fix_position(closures: Sequence[Closure]) -> list[bool]:
+    """Which closures determine a relative pose in all directions."""
+    return [bool(np.linalg.eigvalsh(c.cov[:2, :2])[-1] <= UNKNOWN_M**2) for c in closures]
+
+
 def violated(
     closures: Sequence[Closure], states: Mapping[str, Trajectory], limits: tuple[float, float]
 ) -> list[bool]:
     """Which closures have residuals larger than ``limits`` (m, rad) at an estimate."""
-    off = residuals(closures, states)
+    off = known_part(residuals(closures, states), closures)
     return list((np.hypot(off[:, 0], off[:, 1]) > limits[0]) | (np.abs(off[:, 2]) > limits[1]))

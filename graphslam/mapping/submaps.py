@@ -17,7 +17,7 @@ from graphslam.core.geometry import (
     wrap,
 )
 from graphslam.core.records import KeyframeScan, Trajectory
-from graphslam.perception.scan_matching import Submap, make_submap
+from graphslam.perception.scan_matching import IntArray, Submap, make_submap
 
 #: m of path and rad turned between the scans of a submap: nearer ones show the same
 SCAN_M, SCAN_RAD = 0.5, 0.4
@@ -54,7 +54,7 @@ def build_submaps(
 
     Of ``config`` it uses ``loop_closure``, the spacing and reach of submaps, and ``scan_matching``.
     """
-    clouds = {(p.robot, p.time_ns): p for p in keyframe_scans if len(p.points) >= MIN_POINTS}
+    clouds = _clouds(keyframe_scans)
     found = []
     for robot, states_of in states.items():
         seen = np.array([(robot, int(t)) in clouds for t in states_of.stamps_ns], dtype=bool)
@@ -62,28 +62,83 @@ def build_submaps(
         if len(poses) < 2:
             continue
         path = path_length(poses)
-        turned = np.concatenate([[0.0], np.cumsum(np.abs(wrap(np.diff(poses[:, 2]))))])
         spacing = max(config.loop_closure.submap_spacing_m, path[-1] / MAX_SUBMAPS)
-        for middle in np.unique(np.searchsorted(path, np.arange(0.0, path[-1], spacing))):
-            used: list[int] = []
-            within = np.abs(path - path[middle]) <= config.loop_closure.submap_reach_m
-            for k in np.flatnonzero(within):
-                if (
-                    not used
-                    or path[k] - path[used[-1]] >= SCAN_M
-                    or turned[k] - turned[used[-1]] >= SCAN_RAD
-                ):
-                    used.append(int(k))
-            seen_there = [clouds[robot, int(stamps[k])] for k in used]
-            sensors = np.array([p.sensor for p in seen_there])
-            submap = make_submap(
-                compose(between(poses[middle], poses[used]), sensors),
-                [transform(inverse(p.sensor), p.points.astype(float)) for p in seen_there],
-                config.scan_matching,
-            )
-            state = robot, int(stamps[middle])
-            span = int(stamps[used[0]]), int(stamps[used[-1]])
-            found.append(SubmapPose(state, poses[middle], float(path[middle]), span, submap))
+        middles = np.unique(np.searchsorted(path, np.arange(0.0, path[-1], spacing)))
+        found += _submaps(robot, poses, stamps, middles, clouds, config)
+    return found
+
+
+def submaps_at(
+    middles: Mapping[str, IntArray],
+    states: Mapping[str, Trajectory],
+    keyframe_scans: Iterable[KeyframeScan],
+    config: Config,
+) -> tuple[list[SubmapPose], IntArray]:
+    """Submaps whose middles are given states of each robot.
+
+    Args:
+        middles: robot -> (k,) numbers of states; those without scans have no submap.
+        states: robot -> its states.
+        keyframe_scans: scan points seen from the states.
+        config: see `build_submaps`.
+
+    Returns:
+        The submaps, and (n,) which of all middles, robot after robot, each belongs to.
+    """
+    clouds = _clouds(keyframe_scans)
+    found: list[SubmapPose] = []
+    numbers: list[int] = []
+    first = 0
+    for robot, states_of in states.items():
+        seen = np.array([(robot, int(t)) in clouds for t in states_of.stamps_ns], dtype=bool)
+        own = np.asarray(middles[robot])
+        has_scan = seen[own]
+        poses, stamps = states_of.poses[seen], states_of.stamps_ns[seen]
+        place = (np.cumsum(seen) - 1)[own[has_scan]]
+        found += _submaps(robot, poses, stamps, place, clouds, config)
+        numbers += (first + np.flatnonzero(has_scan)).tolist()
+        first += len(own)
+    return found, np.array(numbers, dtype=np.int64)
+
+
+def _clouds(keyframe_scans: Iterable[KeyframeScan]) -> dict[State, KeyframeScan]:
+    """State -> its scan, if it has points enough."""
+    return {(p.robot, p.time_ns): p for p in keyframe_scans if len(p.points) >= MIN_POINTS}
+
+
+def _submaps(
+    robot: str,
+    poses: Array,
+    stamps: Array,
+    middles: IntArray,
+    clouds: Mapping[State, KeyframeScan],
+    config: Config,
+) -> list[SubmapPose]:
+    """Submaps of one robot around the ``middles`` (k,) among its states with scans."""
+    found = []
+    path = path_length(poses)
+    turned = np.concatenate([[0.0], np.cumsum(np.abs(wrap(np.diff(poses[:, 2]))))])
+    reach = config.loop_closure.submap_reach_m
+    for middle in middles:
+        used: list[int] = []
+        first, last = np.searchsorted(path, [path[middle] - reach, path[middle] + reach + 1e-9])
+        for k in range(first, last):
+            if (
+                not used
+                or path[k] - path[used[-1]] >= SCAN_M
+                or turned[k] - turned[used[-1]] >= SCAN_RAD
+            ):
+                used.append(int(k))
+        seen_there = [clouds[robot, int(stamps[k])] for k in used]
+        sensors = np.array([p.sensor for p in seen_there])
+        submap = make_submap(
+            compose(between(poses[middle], poses[used]), sensors),
+            [transform(inverse(p.sensor), p.points.astype(float)) for p in seen_there],
+            config.scan_matching,
+        )
+        state = robot, int(stamps[middle])
+        span = int(stamps[used[0]]), int(stamps[used[-1]])
+        found.append(SubmapPose(state, poses[middle], float(path[middle]), span, submap))
     return found
 
 

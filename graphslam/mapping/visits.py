@@ -5,16 +5,32 @@ other, which distorts the whole map. So loops are closed with separate landmarks
 Afterwards the parts of a landmark are merged again where their estimates agree.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from graphslam.core.config import AssociationConfig
 from graphslam.core.geometry import Array, between, path_length
 from graphslam.core.records import Estimate, Step, Trajectory
-from graphslam.mapping.duplicate_landmarks import merged_steps
-from graphslam.mapping.landmark_map import LandmarkMap
+from graphslam.mapping.duplicate_landmarks import (
+    OVERLAP_SHARE,
+    merged_steps,
+)
+from graphslam.mapping.gating import BoolArray, IntArray
+from graphslam.mapping.landmark_map import Entry, LandmarkMap
+
+#: m across, rad: walls of two visits that differ less, in a solution with closed loops, are one
+TIE_M, TIE_RAD = 0.06, 0.03
+#: m, rad: sigmas of the distance and the direction between two visits up to which that holds
+CERTAIN_M, CERTAIN_RAD = 0.04, 0.02
+#: m: walls are sampled at this distance to find those near each other
+SAMPLE_M = 1.0
+
+
+#: see `tie_visits`
+PairUncertainty = Callable[[IntArray, IntArray, Array, Array], Array]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,3 +128,103 @@ def _is_same(a: Array, b: Array, kind: str, config: AssociationConfig) -> bool:
     across = abs(off[1]) if kind == "line" else np.hypot(off[0], off[1])
     is_near = across <= config.reassociation_gate_m
     return bool(is_near and abs(off[2]) <= config.reassociation_gate_rad)
+
+
+def tie_visits(
+    landmarks: LandmarkMap, uncertainty: PairUncertainty, apart: Iterable[frozenset[int]]
+) -> dict[int, int]:
+    """Which landmarks of different visits are one, as they lie on each other.
+
+    The map must be where a solution with closed loops puts it. Landmarks of visits whose relative
+    pose is not known well enough to tell a wall from its neighbour stay apart. The work grows with
+    the number of pairs of landmarks that are near each other.
+
+    Args:
+        landmarks: as estimated. Of a wall that one visit saw whole and another in part, the ends
+            are not known: it becomes a line.
+        uncertainty: (numbers (m,), numbers (m,), places (m, 2), normals (m, 2)) -> sigmas (m, 2) of
+            the distance across and of the direction between two landmarks there.
+        apart: pairs that one image showed as two things.
+
+    Returns:
+        Landmark -> the one into which it is to be merged.
+    """
+    entries = list(landmarks.entries.values())
+    others: dict[int, set[int]] = {}
+    for pair in apart:
+        for number in pair:
+            others.setdefault(number, set()).update(pair - {number})
+    group = {e.id: {e.id} for e in entries}
+    into: dict[int, int] = {}
+    for i, j in _pairs_that_lie_together(entries, uncertainty):
+        one, other = group[entries[i].id], group[entries[j].id]
+        if one is other or any(not other.isdisjoint(others.get(a, ())) for a in one):
+            continue
+        one |= other
+        for number in other:
+            group[number] = one
+    for members in group.values():
+        leader = min(members)
+        into.update((number, leader) for number in members if number != leader)
+    for gone, leader in into.items():
+        if landmarks.entries[gone].kind == "line":
+            landmarks.entries[leader].kind = "line"
+    return into
+
+
+def _pairs_that_lie_together(
+    entries: Sequence[Entry], uncertainty: PairUncertainty
+) -> list[tuple[int, int]]:
+    """Pairs of indices of landmarks that may be one by where they lie, the nearest first."""
+    if len(entries) < 2:
+        return []
+    x = np.array([e.mean for e in entries])
+    extents = np.array([e.extent for e in entries])
+    point = np.array([e.kind == "point" for e in entries], dtype=bool)
+    i, j = near_pairs(x, extents, point)
+    same = point[i] == point[j]
+    i, j = i[same], j[same]
+    off = between(x[i], x[j])
+    apart = np.hypot(off[:, 0], off[:, 1])
+    a, b = extents[i], extents[j] + off[:, :1]
+    shared = np.minimum(a[:, 1], b[:, 1]) - np.maximum(a[:, 0], b[:, 0])
+    shorter = np.minimum(a[:, 1] - a[:, 0], b[:, 1] - b[:, 0])
+    middle = 0.5 * (np.maximum(a[:, 0], b[:, 0]) + np.minimum(a[:, 1], b[:, 1]))
+    across = np.abs(off[:, 1] + (middle - off[:, 0]) * off[:, 2])
+    walls = ~point[i]
+    fits = np.where(
+        walls,
+        (across <= TIE_M) & (np.abs(off[:, 2]) <= TIE_RAD) & (shared >= OVERLAP_SHARE * shorter),
+        apart <= TIE_M,
+    )
+    far = np.where(walls, np.hypot(across / TIE_M, off[:, 2] / TIE_RAD), apart / TIE_M)
+    order = np.flatnonzero(fits)
+    numbers = np.array([e.id for e in entries])
+    c, s = np.cos(x[i, 2]), np.sin(x[i, 2])
+    at = x[i, :2] + np.where(walls, middle, 0.0)[:, None] * np.column_stack([c, s])
+    sigma = uncertainty(
+        numbers[i[order]], numbers[j[order]], at[order], np.column_stack([-s, c])[order]
+    )
+    order = order[(sigma[:, 0] <= CERTAIN_M) & (sigma[:, 1] <= CERTAIN_RAD)]
+    order = order[np.argsort(far[order], kind="stable")]
+    return list(zip(i[order].tolist(), j[order].tolist(), strict=True))
+
+
+def near_pairs(x: Array, extents: Array, point: BoolArray) -> tuple[IntArray, IntArray]:
+    """Pairs (m,), (m,) of landmarks of which some parts are within a metre or so.
+
+    ``x`` (n, 3) are the landmarks, ``extents`` (n, 2) m along each one's x axis, ``point`` (n,).
+    Walls are sampled, and samples looked up in a tree: the work grows with the number of landmarks
+    and of pairs, not with the square of the former.
+    """
+    length = np.where(point, 0.0, extents[:, 1] - extents[:, 0])
+    count = 2 + np.ceil(length / SAMPLE_M).astype(np.int64)
+    of = np.repeat(np.arange(len(x)), count)
+    k = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
+    along = extents[of, 0] + k / (count[of] - 1) * length[of]
+    along[point[of]] = 0.0
+    at = x[of, :2] + along[:, None] * np.column_stack([np.cos(x[of, 2]), np.sin(x[of, 2])])
+    pairs = cKDTree(at).query_pairs(SAMPLE_M, output_type="ndarray")
+    i, j = np.sort(of[pairs], axis=1).T
+    found = np.unique(i[i != j] * len(x) + j[i != j])
+    return found // len(x), found % len(x)

@@ -150,7 +150,7 @@ def detect_robots(
             gone |= np.hypot(*(sweep.points - at[:2]).T) < radius_m
     if not gone.any():
         return DetectedRobots(scan, tuple(sightings))
-    return DetectedRobots(_without_returns(scan, sweep, gone), tuple(sightings))
+    return DetectedRobots(without_returns(scan, sweep, gone), tuple(sightings))
 
 
 def _fit_clusters(
@@ -199,7 +199,7 @@ def _sighting(scan: Scan, name: str, fit: OutlineFit) -> Sighting:
     return Sighting(scan.robot, scan.stamp_ns, scan.time_ns, z, cov, None, name, scan.mount)
 
 
-def _without_returns(scan: Scan, sweep: Sweep, gone: Flags) -> Scan:
+def without_returns(scan: Scan, sweep: Sweep, gone: Flags) -> Scan:
     """The scan without returns of rows ``gone`` (k,) of its sweep."""
     angles = sweep.angles[sweep.beam[gone]]
     beams = np.rint((angles - scan.angle_min_rad) / scan.angle_step_rad).astype(np.int64)
@@ -208,10 +208,10 @@ def _without_returns(scan: Scan, sweep: Sweep, gone: Flags) -> Scan:
     return replace(scan, ranges=ranges)
 
 
-def _without_moving(scan: Scan, sweep: Sweep, views: Sequence[tuple[int, View]]) -> Scan:
+def without_moving(scan: Scan, sweep: Sweep, views: Sequence[tuple[int, View]]) -> Scan:
     """The scan, whose returns are ``sweep``, without dynamic objects."""
     gone = dynamic_returns(sweep, [view for _, view in views[-COMPARED_SCANS:]])
-    return _without_returns(scan, sweep, gone) if gone.any() else scan
+    return without_returns(scan, sweep, gone) if gone.any() else scan
 
 
 class TrackedRobot(Protocol):
@@ -293,7 +293,7 @@ class RobotDetector:
             return (found.scan, *found.sightings)
         if found.scan is not scan:
             sweep = make_sweep(found.scan, self._config.max_range_m)
-        still = _without_moving(found.scan, sweep, views)
+        still = without_moving(found.scan, sweep, views)
         self._count("thing that moves", found.scan, still)
         return (still, *found.sightings)
 

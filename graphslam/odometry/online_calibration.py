@@ -9,11 +9,12 @@ cent; since the parameters are applied to the next motions, that bias decays geo
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from graphslam.core.config import OdometryConfig
-from graphslam.core.gaussian import chi2_quantile, solve
+from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared, solve
 from graphslam.core.geometry import Array, wrap
 from graphslam.core.motion_models import HELD_SIGMA, Calibration
 from graphslam.core.observation_models import MODELS
@@ -94,6 +95,68 @@ class Calibrator:
         cov: Array = np.asarray(np.linalg.inv(self._info), dtype=np.float64)
         known = Calibration(self._names, cov @ self._vector, cov)
         return to_summary(known, self._prior)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackedMotions:
+    """Motions (n) of one robot according to odometry and after tracking.
+
+    ``delta`` (n, 3) and ``cov`` (n, 3, 3) are those of odometry, with calibration parameters
+    ``calibration`` (n, p) whose covariance (n, p, p) ``calibration_cov`` is part of ``cov``;
+    ``d_cal`` (n, 3, p) is the derivative by them. ``moved`` (n, 3) and ``moved_cov`` (n, 3, 3) are
+    the estimates from odometry and landmarks together. All along the axes of each start.
+    """
+
+    delta: Array
+    cov: Array
+    d_cal: Array
+    calibration: Array
+    calibration_cov: Array
+    moved: Array
+    moved_cov: Array
+
+
+def calibration_from_motions(
+    found: TrackedMotions, prior: Calibration, config: OdometryConfig
+) -> Calibration:
+    """The calibration that explains how tracked motions differ from those of odometry.
+
+    Least squares over all motions at once. What landmarks alone say about a motion is what the
+    estimate knows beyond odometry: information O = P⁻¹ - Q⁻¹ for covariances P after tracking and Q
+    of odometry, and O (z - m) = P⁻¹ (moved - m) for its own measurement z. Motions that are far off
+    (slip) do not count.
+
+    Returns:
+        Mean, and the covariance to be used for motions, see `MIN_SIGMA_SHARE`.
+    """
+    if not found.d_cal.shape[2] or not len(found.delta):
+        return prior
+    miss = found.moved - found.delta
+    miss[:, 2] = wrap(miss[:, 2])
+    D = found.d_cal
+    after = np.linalg.inv(found.moved_cov)
+    seen = after - np.linalg.inv(found.cov)
+    values, axes = np.linalg.eigh(0.5 * (seen + seen.mT))
+    seen = (axes * np.maximum(values, 0.0)[:, None]) @ axes.mT
+    sigmas = [config.calibration_floor_m] * 2 + [config.calibration_floor_rad]
+    noise = found.cov - D @ found.calibration_cov @ D.mT + np.diag(np.square(sigmas))
+    gain = np.linalg.inv(np.eye(3) + seen @ noise)
+    used = mahalanobis_squared(miss, found.cov + np.diag(np.square(sigmas))) <= OUTLIER_D2
+    W, weighted = (gain @ seen)[used], (gain @ after @ miss[:, :, None])[used]
+    D, past = D[used], found.calibration[used]
+    free = np.flatnonzero(np.diag(prior.cov) > HELD_SIGMA**2)
+    if not len(free):
+        return prior
+    own = D[:, :, free]
+    information = np.linalg.inv(prior.cov[np.ix_(free, free)])
+    total = information + (own.mT @ W @ own).sum(axis=0)
+    vector = information @ prior.mean[free]
+    vector = vector + (own.mT @ (weighted + W @ D @ past[:, :, None])).sum(axis=0)[:, 0]
+    cov = np.linalg.inv(total)
+    mean, known = prior.mean.copy(), prior.cov.copy()
+    mean[free] = cov @ vector
+    known[np.ix_(free, free)] = cov + MIN_SIGMA_SHARE**2 * prior.cov[np.ix_(free, free)]
+    return Calibration(prior.names, mean, known)
 
 
 def to_summary(known: Calibration, prior: Array) -> dict[str, tuple[float, float, bool]]:

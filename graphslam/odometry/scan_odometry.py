@@ -8,6 +8,7 @@ the scans is fused with it. Along directions that the scans do not determine (a 
 motion remains that of the odometry.
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -18,6 +19,7 @@ from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared, symmetri
 from graphslam.core.geometry import Array, rotation, wrap
 from graphslam.core.records import Closure, Motion, Observation
 from graphslam.perception.scan_matching import Submap, align, fit, make_submap, match
+from graphslam.perception.scan_pairs import fit_pairs
 
 #: scans with fewer points are not matched
 MIN_POINTS = 30
@@ -50,7 +52,7 @@ def checked_against_scans(motion: Motion, before: Submap, now: Submap) -> Motion
     """
     config = before.config
     here, step, cov = fit(now, before, motion.delta)
-    if here >= USUAL_OVERLAP and mahalanobis_squared(step, motion.cov + cov) < SUSPECT_D2:
+    if not is_suspect(here, step, motion.cov + cov):
         return motion
     guesses = [align(now, before, motion.delta)]
     if fit(now, before, guesses[0][0])[0] < max(MIN_OVERLAP, here + MIN_OVERLAP_GAIN):
@@ -75,6 +77,39 @@ def checked_against_scans(motion: Motion, before: Submap, now: Submap) -> Motion
         return motion
     inflated = replace(motion, cov=motion.cov + np.outer(off, off))
     return fused(inflated, axes.T, np.diag(variances), measured_off)
+
+
+def is_suspect(share: float, step: Array, cov: Array) -> bool:
+    """Whether a motion has to be searched for, by how the scans at its ends lie on each other.
+
+    ``share`` of points on others; the step (3,) to where they lie best, with covariance (3, 3).
+    """
+    return share < USUAL_OVERLAP or bool(mahalanobis_squared(step, cov) >= SUSPECT_D2)
+
+
+def suspect_motions(
+    motions: Sequence[Motion], ends: Sequence[tuple[Array, Array]], config: ScanMatchingConfig
+) -> list[bool]:
+    """Which motions between consecutive scans `checked_against_scans` has to look at.
+
+    ``ends`` are the points (k, 2) of the scans at the start and at the end of each motion, in the
+    frames of their states and in the order of the beams.
+    """
+    if not motions:
+        return []
+    number: dict[int, int] = {}
+    clouds: list[Array] = []
+    for cloud in itertools.chain.from_iterable(ends):
+        if id(cloud) not in number:
+            number[id(cloud)] = len(clouds)
+            clouds.append(cloud)
+    target, source = (np.array([number[id(pair[k])] for pair in ends]) for k in (0, 1))
+    delta = np.array([m.delta for m in motions])
+    fits = fit_pairs(clouds, target, source, delta, config)
+    return [
+        is_suspect(float(share), step, m.cov + cov)
+        for share, step, cov, m in zip(fits.share, fits.step, fits.cov, motions, strict=True)
+    ]
 
 
 def fused(motion: Motion, H: Array, R: Array, innovation: Array) -> Motion:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from graphslam.core.geometry import Array, transform
+from graphslam.core.geometry import Array, transform, transform_each
 from graphslam.perception.ordered_scan import Mask, Sweep
 from graphslam.perception.robot_outlines import free_standing_clusters
 
@@ -72,4 +72,42 @@ def dynamic_returns(sweep: Sweep, views: Sequence[tuple[Sweep, Array]]) -> Mask:
         share = (sums[found.last + 1] - sums[found.first]) / count
         for k in np.flatnonzero((count >= MIN_RETURNS) & (share >= MIN_SHARE)):
             gone[found.first[k] : found.last[k] + 1] = True
+    return gone
+
+
+def dynamic_returns_of_all(sweep: Sweep, earlier_from_here: Sequence[Array]) -> Mask:
+    """`dynamic_returns` of many scans at once: which returns (k,) of joined scans.
+
+    ``earlier_from_here[lag - 1]`` (s, 3) are the poses of each scan's laser in the frame of the
+    laser ``lag`` scans before, not used where there is none.
+    """
+    gone = np.zeros(len(sweep.beam), dtype=np.bool_)
+    found = free_standing_clusters(sweep, WIDEST_M)
+    count = found.last - found.first + 1
+    enough = np.flatnonzero(count >= MIN_RETURNS)
+    if not len(enough):
+        return gone
+    # only returns of clusters are compared
+    first, count = found.first[enough], count[enough]
+    cluster = np.repeat(np.arange(len(enough)), count)
+    ends = np.cumsum(count)
+    rows = np.arange(len(cluster)) - np.repeat(ends - count, count) + first[cluster]
+    scan, points = sweep.scan[rows], sweep.points[rows]
+    size = np.diff(sweep.starts, append=len(sweep.ranges))
+    for lag, poses in enumerate(earlier_from_here, 1):
+        other = scan - lag
+        there = transform_each(poses[scan], points)
+        known = (other >= 0) & (size[other] > 0)
+        start = sweep.starts[other]
+        a = np.arctan2(there[:, 1], there[:, 0])
+        begin = sweep.angles[np.minimum(start, len(sweep.angles) - 1)]
+        turn = np.mod(a - begin + sweep.step_rad / 2, 2 * np.pi)
+        beam = np.floor(turn / sweep.step_rad).astype(np.int64)[:, None] + np.array([-1, 0, 1])
+        inside = (beam >= 0) & (beam < size[other][:, None]) & known[:, None]
+        at = np.where(inside, start[:, None] + beam, 0)
+        before = np.where(inside, sweep.ranges[at], np.nan)
+        # both neighbouring beams must have passed as well: the laser may have turned a little less
+        through = np.min(before, axis=1) > np.hypot(*there.T) + BEHIND_M
+        share = np.bincount(cluster[through], minlength=len(count)) / count
+        gone[rows[(share >= MIN_SHARE)[cluster]]] = True
     return gone

@@ -4,14 +4,19 @@ A front end is a pure function of the scan and the settings. It returns its obse
 frame of the LASER; the caller transforms them to the base frame with ``scan.mount``.
 """
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
+
+import numpy as np
 
 from graphslam.core.config import FrontEndConfig
+from graphslam.core.observation_arrays import ObservationArrays
 from graphslam.core.records import Observation, Scan
 from graphslam.perception.cylinders import cylinders
 from graphslam.perception.hough import hough_lines
-from graphslam.perception.ordered_scan import Sweep, make_sweep
-from graphslam.perception.segments import segments
+from graphslam.perception.line_fit import observation_arrays
+from graphslam.perception.ordered_scan import Sweep, join_sweeps, make_sweep
+from graphslam.perception.segments import find_segments, segments
 from graphslam.perception.segments_and_hough import segments_and_hough
 
 FrontEnd = Callable[[Scan, FrontEndConfig], tuple[Observation, ...]]
@@ -36,6 +41,26 @@ def _front_end(lines: Callable[[Sweep, FrontEndConfig], tuple[Observation, ...]]
 def _none(scan: Scan, config: FrontEndConfig) -> tuple[Observation, ...]:
     """No observations: for logs whose landmarks come as sightings."""
     return ()
+
+
+def observe_block(
+    scans: Sequence[Scan], sweeps: Sequence[Sweep], config: FrontEndConfig
+) -> list[ObservationArrays]:
+    """What the configured front end finds in each of many scans, in the frame of the laser.
+
+    Segments are extracted from all scans at once. ``sweeps`` are those of ``scans``.
+    """
+    steps = {sweep.step_rad for sweep in sweeps}
+    if config.name != "segments" or config.cylinders or len(steps) != 1:
+        front_end = FRONT_ENDS[config.name]
+        return [ObservationArrays.of(front_end(scan, config)) for scan in scans]
+    joined = join_sweeps(sweeps)
+    found = find_segments(joined, config)
+    valid = found.valid
+    seen = observation_arrays(found.fits[valid], found.whole[valid], config)
+    scan = joined.scan[found.rows[found.starts[valid]]]
+    border = np.searchsorted(scan, np.arange(len(sweeps) + 1))
+    return [seen.part(int(a), int(b)) for a, b in itertools.pairwise(border)]
 
 
 FRONT_ENDS: dict[str, FrontEnd] = {

@@ -11,6 +11,7 @@ import numpy as np
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import Array, rotation3, wrap
+from graphslam.core.observation_arrays import LINE, SEGMENT, ObservationArrays
 from graphslam.core.records import Observation
 from graphslam.perception.ordered_scan import Indices, Mask
 
@@ -120,6 +121,14 @@ def observations(
     variance along a ``line`` carries no meaning; it is finite (length²/12) so that the matrix is
     regular.
     """
+    seen = observation_arrays(fits, fully_visible, config)
+    return tuple(seen.one(k) for k in range(len(seen)))
+
+
+def observation_arrays(
+    fits: LineFits, fully_visible: Mask, config: FrontEndConfig
+) -> ObservationArrays:
+    """`observations` as arrays."""
     own = np.zeros((len(fits.z), 3, 3))
     own[:, 0, 0] = np.where(
         fully_visible, fits.end_var + config.end_sigma_m**2, fits.length**2 / 12
@@ -130,7 +139,5 @@ def observations(
     turn = rotation3(fits.z[:, 2])
     cov = turn @ own @ turn.mT
     extent = fits.length[:, None] * np.array((-0.5, 0.5))
-    return tuple(
-        Observation("segment" if seen else "line", z, P, e)
-        for seen, z, P, e in zip(fully_visible, fits.z, cov, extent, strict=True)
-    )
+    kind = np.where(fully_visible, SEGMENT, LINE)
+    return ObservationArrays(kind, fits.z, cov, extent)

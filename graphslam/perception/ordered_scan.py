@@ -1,6 +1,7 @@
 """A scan in a standard order: beams counter-clockwise, usable returns as points."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -16,11 +17,14 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """A scan with its beams counter-clockwise, so that every wall has the sensor on its left.
+    """Scans with their beams counter-clockwise, so that every wall has the sensor on its left.
+
+    Mostly one; several of them one after the other are worked on at once (`join_sweeps`).
 
     ``ranges`` (n,) m, NaN for a missing return, and ``angles`` (n,) rad are of all beams.
     ``points`` (k, 2) m, laser frame, are the returns that lines may be fitted to, and ``beam``
-    (k,) their beams. ``step_rad`` > 0 is the angle between beams.
+    (k,) their beams. ``step_rad`` > 0 is the angle between beams; ``starts`` (s,) are the first
+    beams of the scans.
     """
 
     ranges: Array
@@ -28,11 +32,40 @@ class Sweep:
     beam: Indices
     points: Array
     step_rad: float
+    starts: Indices = field(default_factory=lambda: np.zeros(1, dtype=np.intp))
 
     @cached_property
     def moments(self) -> Array:
         """(6, k): `point_moments` of ``points``."""
         return point_moments(self.points)
+
+    @cached_property
+    def scan_of_beam(self) -> Indices:
+        """(n,): which of the scans each beam belongs to."""
+        return _repeated(self.starts, len(self.ranges))
+
+    @cached_property
+    def scan(self) -> Indices:
+        """(k,): which of the scans each point belongs to."""
+        return self.scan_of_beam[self.beam]
+
+
+def _repeated(starts: Indices, total: int) -> Indices:
+    """0, 1, ... (total,), each from its place in ``starts`` up to the next."""
+    return np.repeat(np.arange(len(starts)), np.diff(starts, append=total))
+
+
+def join_sweeps(sweeps: Sequence[Sweep]) -> Sweep:
+    """Scans of one laser, all with the same angle between beams, as one; at least one scan."""
+    starts = np.cumsum([0, *(len(s.ranges) for s in sweeps[:-1])])
+    return Sweep(
+        np.concatenate([s.ranges for s in sweeps]),
+        np.concatenate([s.angles for s in sweeps]),
+        np.concatenate([s.beam + start for s, start in zip(sweeps, starts, strict=True)]),
+        np.concatenate([s.points for s in sweeps]),
+        sweeps[0].step_rad,
+        starts,
+    )
 
 
 def make_sweep(scan: Scan, max_range_m: float) -> Sweep:

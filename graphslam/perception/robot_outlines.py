@@ -132,16 +132,18 @@ def free_standing_clusters(sweep: Sweep, widest_m: float) -> Clusters:
     step = np.hypot(x[1:] - x[:-1], y[1:] - y[:-1])
     near = np.minimum(r[1:], r[:-1])
     apart = np.clip(GAP_BEAMS * sweep.step_rad * near, MIN_GAP_M, MAX_GAP_M)
-    border = np.concatenate(([0], np.flatnonzero(step > apart) + 1, [k]))
+    new_scan = sweep.scan[1:] != sweep.scan[:-1]
+    border = np.concatenate(([0], np.flatnonzero((step > apart) | new_scan) + 1, [k]))
     first, last = border[:-1], border[1:] - 1
     rise = np.concatenate(([np.inf], r[1:] - r[:-1], [-np.inf]))
     before, after = -rise[first], rise[last + 1]
-    # what lies beyond the ends of the scan is unknown
-    before[0] = after[-1] = -np.inf
-    if sweep.beam[0] > 0:
-        before[0] = np.inf
-    if sweep.beam[-1] < len(sweep.ranges) - 1:
-        after[-1] = np.inf
+    # what lies beyond the ends of a scan is unknown, unless beams there have no return
+    begins, ends = np.append(True, new_scan)[first], np.append(new_scan, True)[last]
+    stops = np.append(sweep.starts[1:], len(sweep.ranges)) - 1
+    inside = sweep.beam[first] > sweep.starts[sweep.scan[first]]
+    before[begins] = np.where(inside, np.inf, -np.inf)[begins]
+    inside = sweep.beam[last] < stops[sweep.scan[last]]
+    after[ends] = np.where(inside, np.inf, -np.inf)[ends]
     visible = np.array((before > 0, after > 0)).T
     width = np.hypot(x[last] - x[first], y[last] - y[first])
     keep = (width <= widest_m) & visible.any(axis=1)

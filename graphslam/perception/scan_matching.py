@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from graphslam.core.config import ScanMatchingConfig
 from graphslam.core.geometry import Array, between, transform
 from graphslam.perception.correlation import occupancy_grid
+from graphslam.perception.nearest_points import NearestPoints
 from graphslam.perception.point_to_line import (
     gauss_newton_step,
     line_metrics,
@@ -39,6 +40,10 @@ CLUTTER_SIGMAS, SAME_SIGMAS = 2.0, 5.0
 #: points whose errors count as one: materials, curvature and the submap's own shape are shared
 CORRELATED_POINTS = 10
 ITERATIONS = 12
+#: cell of the grid of nearest points, as a share of that to which points are thinned
+NEAREST_CELL = 1.0
+#: points that must have a neighbour, at least
+MIN_NEIGHBOURS = 10
 #: variance (m², rad²) of each component of a pose without neighbours
 UNKNOWN_VAR = 1e4
 #: steps of the search: cells are this share of the reach of the alignment, which does the rest, and
@@ -69,6 +74,11 @@ class Submap:
     clouds: Sequence[Array]
     tree: cKDTree
     config: ScanMatchingConfig
+
+    @cached_property
+    def nearest(self) -> NearestPoints:
+        """The nearest point of each place."""
+        return NearestPoints.of(self.points, NEAREST_CELL * self.config.cell_m, self.config.reach_m)
 
     # computed on demand: few single scans are ever compared with another one beam by beam
     @cached_property
@@ -238,11 +248,10 @@ def _linearise(points: Array, target: Submap, x: Array, reach: float) -> tuple[A
         there are hardly any neighbours.
     """
     placed = transform(x, points)
-    distance, near = target.tree.query(placed, distance_upper_bound=reach)
-    ok = np.isfinite(distance)
-    if ok.sum() < 10:
+    found, near = target.nearest.query(placed, reach, target.points)
+    if len(found) < MIN_NEIGHBOURS:
         return np.zeros((3, 3)), np.zeros(3), 0.0
-    near, p = near[ok], placed[ok]
+    p = placed[found]
     terms, squared = point_terms(p - target.points[near], target.information[near], p - x[:2])
     w = 1.0 / (1.0 + squared / 4.0)
     A, g = normal_equations(terms @ w)

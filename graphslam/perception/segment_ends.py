@@ -31,6 +31,7 @@ def fully_visible(
     r = sweep.ranges
     meet = np.abs(r[first[1:]] - r[last[:-1]]) < _corner_m(r[last[:-1]], sweep, config)
     meet &= first[1:] - last[:-1] <= BEAMS_BESIDE
+    meet &= sweep.scan_of_beam[first[1:]] == sweep.scan_of_beam[last[:-1]]
     direction = fits.z[:, 2]
     shallow = meet & (np.abs(wrap(direction[1:] - direction[:-1])) < SHALLOW_RAD)
     real[1:] &= ~shallow
@@ -53,6 +54,7 @@ def _ends_real(sweep: Sweep, ends: Indices, fits: LineFits, config: FrontEndConf
     # a beam outside of the scan counts as a missing return
     known = (beams >= 0) & (beams < len(sweep.ranges))
     beams = np.where(known, beams, 0)
+    known &= sweep.scan_of_beam[beams] == sweep.scan_of_beam[ends][:, :, None]
     r = np.where(known, sweep.ranges[beams], np.nan)
     here, after = r[..., :-1], r[..., 1:]
     occluded = here - after > _corner_m(here, sweep, config)

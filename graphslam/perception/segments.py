@@ -143,6 +143,7 @@ def _chain_starts(sweep: Sweep, config: FrontEndConfig) -> Indices:
     cut[1:] &= ~(ahead & (aside < config.split_m * into) & (out_of < STEP_GROWTH * into))
     cut[:-1] &= ~(ahead & (aside < config.split_m * out_of) & (into < STEP_GROWTH * out_of))
     cut |= sweep.beam[1:] - sweep.beam[:-1] > MISSING_BEAMS + 1
+    cut |= sweep.scan[1:] != sweep.scan[:-1]
     return np.concatenate(([0], np.flatnonzero(cut) + 1))
 
 
@@ -164,11 +165,16 @@ def _split(sweep: Sweep, config: FrontEndConfig) -> Pieces:
     if not chains:
         none = np.zeros(0, dtype=np.intp)
         return Pieces(none, none, np.zeros((6, 0)))
-    # Vertices are bitwise copies of points: x and y read as one integer identify the point.
-    key, vertex_key = points.view(np.int64)[:, 0], np.concatenate(chains).view(np.int64)[:, 0]
-    order = np.argsort(key)
-    vertex = order[np.searchsorted(key, vertex_key, sorter=order)]
     chain = np.repeat(np.arange(len(chains)), [len(c) for c in chains])
+    # Vertices are bitwise copies of points: x and y read as one integer identify the point, the
+    # first of its chain, as scans of a robot that stands are alike.
+    own = np.flatnonzero(stops - starts >= 3)
+    key, vertex_key = points.view(np.int64)[:, 0], np.concatenate(chains).view(np.int64)[:, 0]
+    order = np.lexsort((np.arange(len(key)), key))
+    values, rank = np.unique(key, return_inverse=True)
+    place = rank[order] * len(key) + order
+    wanted = np.searchsorted(values, vertex_key) * len(key) + starts[own][chain]
+    vertex = order[np.searchsorted(place, wanted)]
     same = chain[1:] == chain[:-1]
     first, last = vertex[:-1][same], vertex[1:][same]
     sums = np.cumsum(sweep.moments, axis=1)
@@ -187,6 +193,7 @@ def _merge(pieces: Pieces, sweep: Sweep, config: FrontEndConfig) -> Pieces:
         union = a.moments + b.moments - shared * sweep.moments[:, b.first]
         cost = _misfit(pieces.moments, union, config)
         cost[cost > 1] = np.inf
+        cost[sweep.scan[a.last] != sweep.scan[b.first]] = np.inf
         for i in np.flatnonzero(np.isfinite(cost) & ~shared).tolist():
             if not _bridged(pieces, i, sweep, config):
                 cost[i] = np.inf

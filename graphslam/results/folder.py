@@ -38,7 +38,7 @@ class SavedRobot:
     """
 
     final: Trajectory
-    causal: Trajectory
+    causal: Trajectory | None
     scan_final: Trajectory | None
     scan_causal: Trajectory | None
 
@@ -136,10 +136,13 @@ def _files(result: Result, report: Callable[[Result], str] | None) -> list[tuple
         stem = f"trajectories/{_file_name(name)}"
         files += [
             (f"{stem}.tum", tum_text(robot.final)),
-            (f"{stem}.causal.tum", tum_text(robot.causal)),
             (f"{stem}.cov.csv", cov_text(robot.final)),
-            (f"{stem}.causal.cov.csv", cov_text(robot.causal)),
         ]
+        if robot.causal is not None:
+            files += [
+                (f"{stem}.causal.tum", tum_text(robot.causal)),
+                (f"{stem}.causal.cov.csv", cov_text(robot.causal)),
+            ]
         for kind, scan in (("scan", robot.scan_final), ("scan.causal", robot.scan_causal)):
             if scan is not None:
                 files.append((f"{stem}.{kind}.tum", tum_text(scan)))
@@ -196,9 +199,10 @@ def _load_robot(stem: Path) -> SavedRobot:
     def scan(suffix: str) -> Trajectory | None:
         return read_trajectory(path(suffix)) if path(suffix).exists() else None
 
+    causal = path(".causal.tum")
     return SavedRobot(
         read_trajectory(path(".tum"), path(".cov.csv")),
-        read_trajectory(path(".causal.tum"), path(".causal.cov.csv")),
+        read_trajectory(causal, path(".causal.cov.csv")) if causal.exists() else None,
         scan(".scan.tum"),
         scan(".scan.causal.tum"),
     )

@@ -97,8 +97,9 @@ def trajectory_map(result: Result, height_in: float) -> tuple[str, int]:
         one = len(robots) == 1
         for i, (name, robot) in enumerate(robots):
             color = robot_color(i)
-            causal = Style(INK if one else color, 0.5, 0.4)
-            axes.path(robot.causal.poses[:, :2], causal, "causal" if one else None)
+            if robot.causal is not None:
+                causal = Style(INK if one else color, 0.5, 0.4)
+                axes.path(robot.causal.poses[:, :2], causal, "causal" if one else None)
             axes.path(robot.final.poses[:, :2], Style(color, 1.1), "final" if one else name)
             axes.symbols(robot.final.poses[:1, :2], color, 5.5)
             means, covs = samples[name]

@@ -93,11 +93,15 @@ def _map_section(result: Result) -> str:
         html.figure(
             drawing,
             "Uncertainty of the trajectory.",
-            f"95 % ellipses{_times(factor)}; a dot marks the start; "
-            "the faint line is the causal estimate.",
+            f"95 % ellipses{_times(factor)}; a dot marks the start"
+            + ("; the faint line is the causal estimate." if _has_causal(result) else "."),
         )
     )
     return html.section("Map", html.figure_grid(figures))
+
+
+def _has_causal(result: Result) -> bool:
+    return all(robot.causal is not None for robot in result.robots.values())
 
 
 def _times(factor: int) -> str:
@@ -109,17 +113,22 @@ def _quality_section(evaluation: Mapping[str, Any]) -> str:
 
 
 def _uncertainty_section(result: Result) -> str:
+    causal = _has_causal(result)
     figures = [
         html.figure(
             plots.uncertainty(result),
             "Standard deviations.",
-            "Final (strong) and causal (pale); position in its worst direction.",
+            "Final (strong) and causal (pale); position in its worst direction."
+            if causal
+            else "Position in its worst direction.",
         ),
         html.figure(
             plots.revision(result),
-            "Final against causal.",
+            "Final against causal." if causal else "Final against odometry.",
             "Distance of the causal estimate (solid) and of odometry alone (dashed) from the "
-            "final trajectory: the effect of later data.",
+            "final trajectory: the effect of later data."
+            if causal
+            else "Distance of odometry alone from the final trajectory.",
         ),
     ]
     return html.section("Over time", html.figure_grid(figures))

@@ -33,6 +33,8 @@ def uncertainty(result: Result) -> str:
         for i, (name, robot) in enumerate(sorted(result.robots.items())):
             both = ((robot.final, 1.0, 3, "final"), (robot.causal, 0.5, 2, "causal"))
             for path, opacity, layer, kind in both:
+                if path is None:
+                    continue  # not asked for
                 label = _legend_text(name, kind, len(result.robots))
                 t, style = axis.time(path), Style(robot_color(i), opacity=opacity)
                 top.line(t, _worst_sigma(path), style, label, layer)
@@ -57,8 +59,8 @@ def revision(result: Result) -> str:
                 (robot.dead_reckoning, dashed, 2, "odometry"),
             )
             for path, style, layer, kind in others:
-                if len(path) != len(robot.final):
-                    continue  # at other stamps: cannot be compared
+                if path is None or len(path) != len(robot.final):
+                    continue  # not asked for, or at other stamps
                 off = path.poses - robot.final.poses
                 t = axis.time(path)
                 label = _legend_text(name, kind, len(result.robots))

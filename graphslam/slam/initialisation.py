@@ -28,13 +28,13 @@ from graphslam.multi_robot.mutual_detection import (
 )
 from graphslam.multi_robot.place_recognition import PlaceMap
 from graphslam.multi_robot.relative_frames import RelativeFrame, RobotEstimate
+from graphslam.slam.log_pass import PriorKnowledge
 from graphslam.slam.pipeline import CLOCK_OFFSET_SIGMA_S, Pipeline
 from graphslam.slam.recorded_closures import RecordedClosures, judge_recorded_closures
 from graphslam.slam.robot_settings import outlines
 from graphslam.slam.sighting_pass import SightingPass, can_solve_at_once
 from graphslam.slam.sighting_solution import solve_robots_apart
 from graphslam.slam.start_priors import origin, start_poses
-from graphslam.slam.step_recorder import PriorKnowledge
 
 #: relative frames found without identities, and robot -> why it has none
 Found = tuple[Sequence[RelativeFrame], Mapping[str, str]]
@@ -132,7 +132,7 @@ def estimate_start_poses(
 
 def separate_estimates(run: Pipeline, estimate: Estimate) -> dict[str, RobotEstimate]:
     """Every robot's own estimate, after a pass in which each had a separate frame."""
-    entries = run.associator.map.entries
+    entries = run.landmarks.entries
     moved = run.transforms().estimate(estimate)
     frames = run.frames.landmark_frames(entries.values())
     marks: dict[str, dict[str, tuple[Array, Array]]] = defaultdict(dict)

@@ -17,12 +17,13 @@ from graphslam.estimation.clock_calibration import ClockEstimate, estimate_clock
 from graphslam.estimation.isam2 import Isam2Backend
 from graphslam.logs import LogSet
 from graphslam.multi_robot.identity_swaps import find_swapped_identities
+from graphslam.slam.causal import causal_of
 from graphslam.slam.initialisation import with_identities
-from graphslam.slam.pipeline import Pipeline, Progress
+from graphslam.slam.log_pass import LogPass, PriorKnowledge, Progress, timed
+from graphslam.slam.pipeline import Pipeline
 from graphslam.slam.reoptimise_scans import Tamper, reoptimise_scan_log
 from graphslam.slam.reoptimise_sightings import reoptimise_sighting_log
 from graphslam.slam.robot_state import Causal
-from graphslam.slam.step_recorder import PriorKnowledge, timed
 
 #: how often a log is read again at most, with corrected clocks
 MAX_CLOCK_PASSES = 1
@@ -43,7 +44,7 @@ class Findings(NamedTuple):
 class FinishedPass(NamedTuple):
     """The last pass over a log, its final estimate and what it found."""
 
-    pipeline: Pipeline
+    pipeline: LogPass
     estimate: Estimate
     findings: Findings
 
@@ -148,7 +149,7 @@ def reoptimise(pipeline: Pipeline, estimate: Estimate) -> Estimate:
             pipeline.steps,
             estimate,
             tracks,
-            pipeline.associator.map,
+            pipeline.landmarks,
             pipeline.keyframe_scans,
             config,
             pipeline.tamper,
@@ -162,13 +163,7 @@ def reoptimise(pipeline: Pipeline, estimate: Estimate) -> Estimate:
 
 def pass_findings(pipeline: Pipeline, estimate: Estimate) -> Findings:
     """Results of a pass besides its estimate; an estimate that is not optimised is enough."""
-    frames = pipeline.frames
-    causal = {
-        name: run.causal(pipeline.starts[frame].pose, frames.away.get(frame, 0.0))
-        for name, run in pipeline.started.items()
-        for frame in [frames.of[name]]
-    }
-    return Findings(*find_false_names_and_clocks(pipeline, estimate), causal)
+    return Findings(*find_false_names_and_clocks(pipeline, estimate), causal_of(pipeline))
 
 
 def find_false_names_and_clocks(

@@ -7,8 +7,7 @@ end. Landmark kinds, front ends and back ends are rows of tables.
 
 import itertools
 import time
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -45,6 +44,7 @@ from graphslam.perception.front_ends import FRONT_ENDS
 from graphslam.perception.ordered_scan import scan_points
 from graphslam.perception.sightings import sighting_observation
 from graphslam.slam.keyframes import KeyframeSelector
+from graphslam.slam.log_pass import PriorKnowledge, Progress, counted, timed
 from graphslam.slam.recorded_closures import between_states
 from graphslam.slam.reoptimise_scans import Tamper
 from graphslam.slam.robot_settings import outlines
@@ -57,15 +57,11 @@ from graphslam.slam.sighting_batches import (
     robot_observations,
     to_state_frame,
 )
-from graphslam.slam.step_recorder import PriorKnowledge, StepRecorder, timed
+from graphslam.slam.step_recorder import StepRecorder
 from graphslam.slam.synchronisation import ODOMETRY, synchronise
 
 #: s: sigma of the difference of two robots' clocks before anything is known
 CLOCK_OFFSET_SIGMA_S = 0.5
-#: messages between two reports of progress
-REPORT_EVERY = 500
-
-Progress = Callable[[int], None]
 
 
 class Pipeline(StepRecorder):
@@ -92,12 +88,8 @@ class Pipeline(StepRecorder):
             self.backend, self.runs, outlines(log, config), config, CLOCK_OFFSET_SIGMA_S
         )
         self.scan_buffer = ScanBuffer({}, {}, 0.0)
-        self.sources: list[Sighting] = []
-        self.robot_sightings: list[Sighting] = []
+        self.removed_returns = self.robot_detector.counts
         self.unrelated_sightings: list[Sighting] = []
-        self.keyframe_scans: list[KeyframeScan] = []
-        self.dropped: Counter[str] = Counter()
-        self.step_ms: list[float] = []
 
     def run(self, progress: Progress) -> None:
         """Take in every message of the log; ``progress`` gets the number of messages read."""
@@ -126,6 +118,7 @@ class Pipeline(StepRecorder):
             clock = time.perf_counter()
             if len(self.steps) > steps:
                 self.step_ms.append(1e3 * (clock - began))
+        self.counts["loop_closures"] += self.associator.closures
 
     def messages(self, progress: Progress) -> Iterator[Message]:
         """The messages of the log but truth, counted; for ``progress`` see `run`."""
@@ -368,14 +361,3 @@ class Pipeline(StepRecorder):
             return None
         self.counts["loop_closures"] += 1
         return closure
-
-
-def counted(
-    messages: Iterable[Message], counts: Counter[str], progress: Progress
-) -> Iterator[Message]:
-    """The messages, counted in ``counts`` and reported now and then."""
-    for message in messages:
-        counts["messages"] += 1
-        if counts["messages"] % REPORT_EVERY == 0:
-            progress(counts["messages"])
-        yield message

@@ -5,7 +5,6 @@ once, recorded closures are judged, all states, motions and closures are made to
 graph is optimised from poses along its most accurate paths (`estimation.initial_estimate`).
 """
 
-import math
 from bisect import bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
@@ -32,17 +31,15 @@ from graphslam.estimation.isam2 import Reoptimiser
 from graphslam.estimation.replay import replay
 from graphslam.logs import LogSet
 from graphslam.slam.initialisation import estimate_start_poses
+from graphslam.slam.log_pass import PriorKnowledge, Progress, counted, timed
 from graphslam.slam.motion_noise import noise_scales, scale_motion_noise
-from graphslam.slam.passes import FinishedPass, pass_findings
-from graphslam.slam.pipeline import Pipeline, Progress, counted
+from graphslam.slam.passes import Findings, FinishedPass, pass_findings
+from graphslam.slam.pipeline import Pipeline
 from graphslam.slam.recorded_closures import accept_closures, take_relative_poses
 from graphslam.slam.robot_settings import make_tracks
 from graphslam.slam.robot_state import RobotState
 from graphslam.slam.start_priors import start_poses
-from graphslam.slam.step_recorder import PriorKnowledge, timed
 
-#: back ends whose final estimate is the optimum of the whole graph
-BATCH_BACKENDS = frozenset({"batch", "isam2"})
 #: times that the noise of motions is estimated, at most; it is settled when it grows by less than
 MAX_NOISE_ROUNDS, NOISE_GROWTH = 4, 1.1
 
@@ -51,8 +48,7 @@ def is_pose_graph(log: LogSet, config: Config) -> bool:
     """Whether a log is only relative poses, and its solution is asked for, not a back end's way."""
     kinds = {topic.record for topic in log.topics} - {Truth, TrueLandmark, TrueAssociations}
     backend = config.backend
-    at_once = backend.name in BATCH_BACKENDS and math.isinf(backend.horizon_s)
-    at_once &= backend.optimise_at_end and backend.reoptimise
+    at_once = backend.name == "batch" and backend.optimise_at_end and backend.reoptimise
     return at_once and kinds == {OdometryIncrement, RelativePose}
 
 
@@ -89,6 +85,8 @@ def solve_pose_graph(log: LogSet, config: Config, progress: Progress) -> Finishe
         raise LogError(f"{log.files[0].path}: nothing in it could be used; see `graphslam info`")
     with timed(pipeline.seconds, "final optimisation"):
         estimate, pipeline.steps = _solve(steps, config)
+    if not config.backend.causal:
+        return FinishedPass(pipeline, estimate, Findings({}, {}, {}))
     with timed(pipeline.seconds, "causal trajectories"):
         _record_causal(pipeline)
     return FinishedPass(pipeline, estimate, pass_findings(pipeline, estimate))

@@ -82,7 +82,7 @@ def reoptimise_scan_log(
     Raises:
         EstimationError: the estimate is indeterminate.
     """
-    solve = _Solver(config)
+    solve = Solver(config)
     steps, estimate = _with_observed_motion_noise(recompute_motions(steps, tracks), estimate, solve)
     counts: Counter[str] = Counter()
     closures: list[Closure] = []
@@ -93,12 +93,8 @@ def reoptimise_scan_log(
     association = config.association
     for factor_m, factor_rad in GATE_FACTORS:
         estimate = solve(steps, estimate, closures)
-        into = _duplicates(estimate, solve.backend, landmarks, steps)
-        if into:
-            kinds = {number: landmarks.entries[number].kind for number in into.values()}
-            steps = merged_steps(steps, into, kinds)
-            merge_entries(landmarks, into)
-            counts["landmarks_merged"] += len(into)
+        steps, merged = merge_duplicates(steps, estimate, solve.backend, landmarks)
+        counts["landmarks_merged"] += merged
         # duplicates are merged first: else observations would move to and fro between the two
         again = reassociate(
             steps,
@@ -108,7 +104,7 @@ def reoptimise_scan_log(
             factor_rad * association.reassociation_gate_rad,
             association.overlap_gap_m,
         )
-        if into or again.moved or again.dropped:
+        if merged or again.moved or again.dropped:
             steps = again.steps
         counts["observations_reassociated"] += again.moved
         counts["observations_dropped"] += again.dropped
@@ -134,7 +130,7 @@ def reoptimise_scan_log(
     return estimate, steps, counts
 
 
-class _Solver:
+class Solver:
     """Solves steps with closures; ``backend`` is the latest one, for its covariances."""
 
     def __init__(self, config: Config) -> None:
@@ -162,7 +158,7 @@ def _close_loops(
     estimate: Estimate,
     keyframe_scans: Iterable[KeyframeScan],
     landmarks: LandmarkMap,
-    solve: _Solver,
+    solve: Solver,
     tamper: Tamper | None,
     counts: Counter[str],
     config: Config,
@@ -217,7 +213,7 @@ def _close_loops(
 
 
 def _tightened(
-    steps: Sequence[Step], closures: Sequence[Closure], estimate: Estimate, solve: _Solver
+    steps: Sequence[Step], closures: Sequence[Closure], estimate: Estimate, solve: Solver
 ) -> Estimate:
     """Solved with closures whose covariances are inflated first, and tightened step by step."""
     before = np.inf
@@ -236,7 +232,7 @@ def _tightened(
 
 
 def _with_observed_motion_noise(
-    steps: tuple[Step, ...], estimate: Estimate, solve: _Solver
+    steps: tuple[Step, ...], estimate: Estimate, solve: Solver
 ) -> tuple[tuple[Step, ...], Estimate]:
     """Steps with motions as noisy as the log shows them, and the estimate from them.
 
@@ -267,12 +263,29 @@ def _duplicates(
     return merge_targets(duplicates(known, joint, together))
 
 
-def with_closures(steps: Iterable[Step], closures: Iterable[Closure]) -> tuple[Step, ...]:
-    """Steps that hold closures too, each in the step of its time."""
+def merge_duplicates(
+    steps: tuple[Step, ...], estimate: Estimate, backend: Reoptimiser, landmarks: LandmarkMap
+) -> tuple[tuple[Step, ...], int]:
+    """Steps in which landmarks that are one are merged, and how many went; the map follows."""
+    into = _duplicates(estimate, backend, landmarks, steps)
+    if into:
+        kinds = {number: landmarks.entries[number].kind for number in into.values()}
+        steps = merged_steps(steps, into, kinds)
+        merge_entries(landmarks, into)
+    return steps, len(into)
+
+
+def with_closures(steps: Sequence[Step], closures: Iterable[Closure]) -> tuple[Step, ...]:
+    """Steps that hold closures too, each in the last step of the time when both states are known.
+
+    Robots may have steps at the same time.
+    """
+    last = {step.time_ns: n for n, step in enumerate(steps)}
     at: dict[int, tuple[Closure, ...]] = {}
     for closure in closures:
-        at[closure.time_ns] = (*at.get(closure.time_ns, ()), closure)
+        n = last[max(closure.time_ns, closure.other_time_ns)]
+        at[n] = (*at.get(n, ()), closure)
     return tuple(
-        replace(step, closures=(*step.closures, *at[step.time_ns])) if step.time_ns in at else step
-        for step in steps
+        replace(step, closures=(*step.closures, *at[n])) if n in at else step
+        for n, step in enumerate(steps)
     )

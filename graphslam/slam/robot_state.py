@@ -115,13 +115,13 @@ class RobotState:
         return Causal(trajectory_of_mount(causal, inverse(mount)), scan)
 
     def result(
-        self, states: Trajectory, causal: "Causal", *, causal_only: bool = False
+        self, states: Trajectory, causal: "Causal | None", *, causal_only: bool = False
     ) -> RobotResult:
         """Trajectories of the robot at the stamps that it is reported at.
 
         Args:
             states: the final states, world frame.
-            causal: the causal trajectories.
+            causal: the causal trajectories; None if they are not asked for.
             causal_only: final poses are the causal ones, also between the states, as a back end
                 that revises no state does not revise the motion between states either.
         """
@@ -131,13 +131,13 @@ class RobotState:
         at_start = compose(states.poses[0], inverse(self.track.mount))
         odometry = between(self.track.pose(self.times[0]), self.track.pose(times))
         unknown = np.full((len(times), 3, 3), np.nan)
-        return RobotResult(
-            causal.base if causal_only else base,
-            causal.base,
-            causal.scan if causal_only or not self.scans else trajectory_of_mount(final, laser),
-            causal.scan,
-            Trajectory(stamps, compose(at_start, odometry), unknown),
-        )
+        by_odometry = Trajectory(stamps, compose(at_start, odometry), unknown)
+        if causal is not None and causal_only:
+            return RobotResult(causal.base, causal.base, causal.scan, causal.scan, by_odometry)
+        scan = trajectory_of_mount(final, laser) if self.scans else None
+        if causal is None:
+            return RobotResult(base, None, scan, None, by_odometry)
+        return RobotResult(base, causal.base, scan, causal.scan, by_odometry)
 
     def _report_times(self) -> tuple[IntArray, IntArray, Array]:
         """Stamps (n,), times (n,) and, for scans, laser mounts (n, 3), sorted by stamp."""

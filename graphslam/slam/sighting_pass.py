@@ -25,10 +25,10 @@ from graphslam.logs.clock import to_common_clock
 from graphslam.odometry.preintegration import Track
 from graphslam.odometry.readings import integrate_pending
 from graphslam.perception.sightings import sighting_observation
-from graphslam.slam.pipeline import Pipeline, Progress
+from graphslam.slam.log_pass import PriorKnowledge, Progress, timed
+from graphslam.slam.pipeline import Pipeline
 from graphslam.slam.reoptimise_sightings import SightingGroup, group_sightings
 from graphslam.slam.sighting_batches import SightingBatch, sighting_batches
-from graphslam.slam.step_recorder import PriorKnowledge, timed
 from graphslam.slam.synchronisation import ODOMETRY
 
 
@@ -127,7 +127,7 @@ class SightingPass(Pipeline):
 
     def _start(self, time_ns: int, robot: str) -> None:
         """Give a robot its first state."""
-        start = self.prior(robot)
+        start = self.start_prior(robot)
         self.steps.append(Step(time_ns, starts={robot: start}))
         self.record_state(robot, time_ns, start.pose)
 

@@ -10,6 +10,7 @@ from graphslam.estimation.clock_calibration import clocks_from_paths
 from graphslam.logs import LogSet
 from graphslam.slam.causal_sightings import replay_causally
 from graphslam.slam.initialisation import with_identities
+from graphslam.slam.log_pass import PriorKnowledge, Progress, timed
 from graphslam.slam.passes import (
     Findings,
     FinishedPass,
@@ -17,14 +18,12 @@ from graphslam.slam.passes import (
     find_false_names_and_clocks,
     find_swapped_names,
 )
-from graphslam.slam.pipeline import Progress
 from graphslam.slam.sighting_pass import SightingPass, can_solve_at_once
 from graphslam.slam.sighting_solution import (
     solve_finely,
     solve_roughly,
     solve_without_contradiction,
 )
-from graphslam.slam.step_recorder import PriorKnowledge, timed
 
 
 def run_sighting_passes(

@@ -10,13 +10,13 @@ from graphslam.core.worker import parallel_map
 from graphslam.logs import LogSet
 from graphslam.mapping.landmark_records import make_landmarks
 from graphslam.slam.initialisation import initialise
+from graphslam.slam.log_pass import Progress, timed
 from graphslam.slam.passes import FinishedPass, run_passes
-from graphslam.slam.pipeline import Progress
 from graphslam.slam.pose_graph import is_pose_graph, solve_pose_graph
 from graphslam.slam.reoptimise_scans import Tamper
 from graphslam.slam.robot_settings import check_robots
+from graphslam.slam.scan_log import is_scan_log, solve_scan_log
 from graphslam.slam.sighting_passes import run_sighting_passes
-from graphslam.slam.step_recorder import timed
 from graphslam.slam.summary import summarise
 
 #: scans that a result keeps for pictures, at most
@@ -48,9 +48,11 @@ def smooth(
         return make_result(solve_pose_graph(log, config, progress), began)
     known = initialise(log, config)
     initialised = time.perf_counter()
-    finished = run_sighting_passes(log, config, known, progress)
-    if finished is None:
-        finished = run_passes(log, config, known, progress, tamper)
+    if is_scan_log(log, config):
+        finished: FinishedPass | None = solve_scan_log(log, config, known, progress, tamper)
+    else:
+        finished = run_sighting_passes(log, config, known, progress)
+    finished = finished or run_passes(log, config, known, progress, tamper)
     finished.pipeline.seconds["starts"] = initialised - began
     return make_result(finished, began)
 
@@ -65,7 +67,7 @@ def make_result(finished: FinishedPass, began: float) -> Result:
     pipeline, causal = finished.pipeline, finished.findings.causal
     runs = pipeline.started
     with timed(pipeline.seconds, "trajectories"):
-        causal_only = all(
+        causal_only = bool(causal) and all(
             run.is_causal(finished.estimate.states[name]) for name, run in runs.items()
         )
         transforms = pipeline.transforms()
@@ -73,16 +75,19 @@ def make_result(finished: FinishedPass, began: float) -> Result:
         steps = tuple(map(transforms.step, pipeline.steps))
 
         def robot_result(name: str) -> RobotResult:
-            return runs[name].result(estimate.states[name], causal[name], causal_only=causal_only)
+            return runs[name].result(
+                estimate.states[name], causal.get(name), causal_only=causal_only
+            )
 
         robots = dict(zip(runs, parallel_map(robot_result, list(runs)), strict=True))
-    associator = pipeline.associator
-    landmarks = make_landmarks(associator.map.transformed(transforms.landmarks), estimate)
-    landmarks = pipeline.frames.label_landmarks(landmarks, associator.map.entries.values())
+    moved = pipeline.landmarks.transformed(transforms.landmarks)
+    landmarks = pipeline.frames.label_landmarks(
+        make_landmarks(moved, estimate), pipeline.landmarks.entries.values()
+    )
     t0 = min(trajectory.stamps_ns[0] for trajectory in estimate.states.values())
     innovations = {
         model: np.array([((t - t0) * 1e-9, d2) for t, d2 in values]).reshape(-1, 2)
-        for model, values in sorted(associator.innovations.items())
+        for model, values in sorted(pipeline.innovations.items())
     }
     pipeline.seconds["all"] = time.perf_counter() - began
     return Result(

@@ -15,7 +15,7 @@ from graphslam.core.config import RobotConfig
 from graphslam.core.config_io import dump_config
 from graphslam.core.records import Estimate
 from graphslam.estimation.clock_calibration import ClockEstimate
-from graphslam.slam.pipeline import Pipeline
+from graphslam.slam.log_pass import LogPass
 from graphslam.slam.robot_settings import robot_settings
 from graphslam.slam.robot_state import span_warnings
 
@@ -24,6 +24,7 @@ FORMAT = "graphslam-result-1"
 #: counts of what `reoptimise_scans` may change
 REOPTIMISED = (
     "closures_verified",
+    "closures_across",
     "closures_refused",
     "closures_kept",
     "landmarks_merged",
@@ -33,7 +34,7 @@ REOPTIMISED = (
 
 
 def summarise(
-    pipeline: Pipeline, estimate: Estimate, landmarks: int, clocks: Mapping[str, ClockEstimate]
+    pipeline: LogPass, estimate: Estimate, landmarks: int, clocks: Mapping[str, ClockEstimate]
 ) -> dict[str, Any]:
     """The keys of summary.json (see docs/formats.md).
 
@@ -43,15 +44,13 @@ def summarise(
         landmarks: how many there are.
         clocks: of the robots, as found.
     """
-    log, counts, associator, known = (
-        pipeline.log, pipeline.counts, pipeline.associator, pipeline.known
-    )  # fmt: skip
+    log, counts, known = pipeline.log, pipeline.counts, pipeline.known
     runs = pipeline.started
     log_s = 1e-9 * (pipeline.last_ns - pipeline.first_ns)
     scans, total = counts["scans"], max(pipeline.seconds["all"], 1e-9)
-    all_dropped = Counter(log.dropped) + pipeline.dropped + pipeline.robot_detector.counts
-    if associator.map.deleted:
-        all_dropped["tentative landmark: not seen often enough"] += associator.map.deleted
+    all_dropped = Counter(log.dropped) + pipeline.dropped + pipeline.removed_returns
+    if pipeline.landmarks.deleted:
+        all_dropped["tentative landmark: not seen often enough"] += pipeline.landmarks.deleted
     return {
         "format": FORMAT,
         "versions": {
@@ -84,16 +83,14 @@ def summarise(
             "keyframes": counts["keyframes"],
             "observations": counts["observations"],
             "landmarks": landmarks,
-            "loop_closures": counts["loop_closures"]
-            + associator.closures
-            + counts["closures_verified"],
+            "loop_closures": counts["loop_closures"] + counts["closures_verified"],
         },
         "consolidated": {name: counts[name] for name in REOPTIMISED if name in counts},
         "closures": known.recorded.to_summary(),
         "world": known.frame_assignment.world,
         "frames": dict(sorted(known.frame_assignment.frames.items())),
         "starts_found": known.frame_assignment.to_summary(),
-        "rejected": dict(sorted(associator.rejected.items())),
+        "rejected": dict(sorted(pipeline.rejected.items())),
         "dropped": dict(sorted(all_dropped.items())),
         "repaired": dict(sorted(log.repaired.items())),
         "graph": {"error": estimate.error, "dof": estimate.dof},
@@ -139,7 +136,7 @@ def _peak_memory_mb() -> float:
     return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
 
 
-def run_warnings(pipeline: Pipeline) -> list[str]:
+def run_warnings(pipeline: LogPass) -> list[str]:
     """What a user should know about a run although it went through."""
     known = pipeline.known
     undecided = known.frame_assignment.undecided
@@ -172,7 +169,7 @@ def run_warnings(pipeline: Pipeline) -> list[str]:
     )
     warnings += [
         f"the back end could not use {count} x {reason}"
-        for reason, count in sorted(pipeline.backend.skipped.items())
+        for reason, count in sorted(pipeline.skipped.items())
     ]
     warnings += [
         f"{robot}: {undecided.get(robot, 'nothing in the log tells its start pose')}; "

@@ -31,7 +31,7 @@ def room(tmp_path_factory):
     """The log, the folder that smooth made of it, and what it printed with --json."""
     folder = tmp_path_factory.mktemp("room")
     log = drive(folder / "room.mcap")
-    done = call("smooth", log, "-o", folder / "out", "--start", "truth", "--json")
+    done = call("smooth", log, "-o", folder / "out", "--start", "truth", "--causal", "--json")
     assert done.code == 0, done.err
     return SimpleNamespace(folder=folder, log=log, out=folder / "out", done=done)
 
@@ -53,6 +53,19 @@ def test_smooth_writes_every_file_of_the_contract(room):
         *(f"trajectories/robot.{stem}" for stem in stems),
     }
     assert sorted(p.name for p in room.folder.iterdir()) == ["out", "room.mcap"]
+
+
+def test_causal_files_of_a_log_of_scans_are_written_where_they_are_asked_for(room, tmp_path):
+    """Without --causal there are none, nor is anything else missing; a back end that is causal by
+    nature always writes them."""
+    for chosen, extra in (((), set()), (("--backend", "ekf"), {"causal.tum", "causal.cov.csv"})):
+        out = tmp_path / f"out{len(chosen)}"
+        assert call("smooth", room.log, "-o", out, *chosen).code == 0
+        stems = {p.name.removeprefix("robot.") for p in (out / "trajectories").iterdir()}
+        assert stems - {"scan.causal.tum"} == {"tum", "scan.tum", "cov.csv"} | extra
+        assert ("scan.causal.tum" in stems) == bool(extra)
+    report = (tmp_path / "out0" / "report.html").read_text()
+    assert "causal estimate" not in report and "Final against odometry" in report
 
 
 def test_smooth_prints_the_summary_that_it_wrote(room):

@@ -12,13 +12,17 @@ from graphslam.core.records import Closure, KeyframeScan, Trajectory
 from graphslam.mapping.loop_closure import (
     candidates,
     consistent_closures,
+    fix_position,
     inflate_covariances,
+    known_part,
+    leave_open,
     loop_closures,
     verify_match,
+    verify_match_across,
     violated,
 )
 from graphslam.mapping.submaps import build_submaps
-from graphslam.perception.scan_matching import Match
+from graphslam.perception.scan_matching import Match, make_submap
 
 COV = np.diag([0.02, 0.02, 0.005]) ** 2
 CONFIG = LoopClosureConfig()
@@ -198,3 +202,52 @@ def test_slack_closures_draw_within_three_sigmas():
     assert violated([far, near], states, (0.1, 0.1)) == [True, False]
     r = np.array([1.0, 0.0, 0.3])
     assert r @ np.linalg.solve(drawn[0].cov, r) == pytest.approx(9.0, rel=0.1)
+
+
+# ------------------------------------------------------------ along a corridor
+
+
+def behind_each_other(*along, across=0.0, turn=0.0):
+    """Matches as good as `GOOD`, so far along the x axis of the earlier submap."""
+    return [replace(GOOD, pose=GOOD.pose + np.array([x, across, turn])) for x in along]
+
+
+def test_matches_one_behind_the_other_leave_that_direction_open():
+    """The best is used for what all of them say: across and heading. Along, nothing is known."""
+    assert verify_match([GOOD, *behind_each_other(0.6, -0.5)]) is None
+    found = verify_match_across([GOOD, *behind_each_other(0.6, -0.5)])
+    assert found is not None
+    assert np.sqrt(found.cov[0, 0]) > 4.0
+    np.testing.assert_allclose(found.cov[1:, 1:], GOOD.cov[1:, 1:], atol=1e-9)
+
+
+@pytest.mark.parametrize("other", [{"across": 0.3}, {"turn": 0.1}])
+def test_matches_that_differ_otherwise_are_rivals(other):
+    """Also when one of several does: another corridor, or the same the other way round."""
+    rivals = [*behind_each_other(0.6), *behind_each_other(0.3, **other)]
+    assert verify_match_across([GOOD, *rivals]) is None
+
+
+def test_between_parallel_walls_a_match_is_open_along_them_and_in_a_room_it_is_not():
+    """However it was found: points that fit as well 0.3 m on tell nothing of that direction."""
+    x = np.linspace(-6, 6, 400)
+    walls = np.concatenate([np.column_stack([x, np.full(400, y)]) for y in (-1.0, 1.0)])
+    y = np.linspace(-1, 1, 80)
+    ends = np.concatenate([np.column_stack([np.full(80, x), y]) for x in (-2, 3)])
+    for points, is_open in ((walls, True), (np.concatenate([walls, ends]), False)):
+        submap = make_submap(np.zeros((1, 3)), [points])
+        cov = np.diag([0.05, 0.02, 0.005]) ** 2
+        found = leave_open(submap, submap, np.zeros(3), cov)
+        assert bool(np.sqrt(found[0, 0]) > 4.0) is is_open
+        assert np.sqrt(found[1, 1]) == pytest.approx(0.02)
+
+
+def test_what_a_closure_leaves_open_is_no_residual():
+    cov = np.diag([25.0, 4e-4, 1e-5])
+    closures = [
+        Closure("a", 2, "a", 1, np.zeros(3), cov),
+        Closure("a", 2, "a", 1, np.zeros(3), np.diag([4e-4, 4e-4, 1e-5])),
+    ]
+    r = np.tile([1.5, 0.1, 0.01], (2, 1))
+    np.testing.assert_allclose(known_part(r, closures), [[0.0, 0.1, 0.01], [1.5, 0.1, 0.01]])
+    assert fix_position(closures) == [False, True]

@@ -76,3 +76,30 @@ def test_beyond_the_end_of_a_wall_it_is_another():
     done = reassociate(steps, estimate, {0: short, 1: entry(1)}, 0.1, 0.15, 0.3)
     assert targets_of(done.steps) == [0]
     assert done.dropped == 1
+
+
+def test_an_observation_stays_with_the_walls_of_its_visit_where_that_is_asked_for():
+    """A wall of another visit, 4 cm nearer, takes the observation only without `within_m`."""
+    path = np.column_stack([np.arange(0.0, 40.0, 1.0), np.zeros((40, 2))])
+    stamps = np.arange(40, dtype=np.int64)
+    states = {"a": Trajectory(stamps, path, np.zeros((40, 3, 3)))}
+    # wall 0 is seen from the first states only, wall 1 from the last ones; both lie along the path
+    means = {0: np.array([0.0, 2.0, 0.0]), 1: np.array([0.0, 2.1, 0.0])}
+    steps = tuple(
+        Step(int(t), associations=(
+            Association("a", int(t), 0 if t < 10 else 1, "line", np.array([0.0, 2.0, 0.0]),
+                        np.eye(3), extent=np.array([-1.0, 1.0])),
+        ))
+        for t in (*range(5), *range(35, 40))
+    )  # fmt: skip
+    estimate = Estimate(states, {n: (m, np.eye(3)) for n, m in means.items()}, 0.0, 0)
+    entries = {
+        n: Entry(n, "line", m, np.eye(3), np.array([-5.0, 45.0]), 0, 39, None, in_graph=True)
+        for n, m in means.items()
+    }
+    free = reassociate(steps, estimate, entries, 0.3, 0.15, 0.3)
+    assert free.moved == 5
+    bound = reassociate(steps, estimate, entries, 0.3, 0.15, 0.3, within_m=15.0)
+    assert bound.moved == bound.dropped == 0
+    wide = reassociate(steps, estimate, entries, 0.3, 0.15, 0.3, within_m=40.0)
+    assert wide.moved == 5

@@ -10,7 +10,7 @@ from graphslam.core.geometry import between, compose
 from graphslam.core.records import Association, Closure, Motion, Start, Step
 from graphslam.estimation.isam2 import Isam2Backend
 from graphslam.mapping.loop_closure import residuals, violated
-from graphslam.slam.reoptimise_scans import _Solver, _tightened, _with_observed_motion_noise
+from graphslam.slam.reoptimise_scans import Solver, _tightened, _with_observed_motion_noise
 
 SECOND = 10**9
 MOTION_COV = np.diag([0.01, 0.01, 0.02]) ** 2
@@ -55,7 +55,7 @@ def solved(steps):
     backend = Isam2Backend(Config())
     for step in steps:
         backend.add(step)
-    solve = _Solver(Config())
+    solve = Solver(Config())
     return solve, solve(steps, backend.finish())
 
 

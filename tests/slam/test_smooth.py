@@ -69,7 +69,9 @@ def laser(tmp_path_factory):
                 ranges = cast(ROOM, BEAMS, at, 30.0) + rng.normal(0, 0.01, len(BEAMS))
                 stamps.append(T0 + k * S // 20 + (k % 7))
                 log.scan("robot", stamps[-1], ranges, **SCAN)
-    return SimpleNamespace(path=path, stamps=np.array(stamps), result=run(path))
+    return SimpleNamespace(
+        path=path, stamps=np.array(stamps), result=run(path, "backend.causal=true")
+    )
 
 
 def test_every_scan_is_in_the_trajectory_under_its_exact_stamp(laser):
@@ -488,7 +490,7 @@ def test_causal_states_do_not_know_what_comes_later(laser, tmp_path):
     half = T0 + LASER_S * S // 2
     path = tmp_path / "half.mcap"
     copy_until(laser.path, path, half)
-    cut, whole = run(path).robots["robot"], laser.result.robots["robot"]
+    cut, whole = run(path, "backend.causal=true").robots["robot"], laser.result.robots["robot"]
     n = int(np.searchsorted(laser.stamps, half - S))
     assert n > 100
     for a, b in ((cut.causal, whole.causal), (cut.scan_causal, whole.scan_causal)):

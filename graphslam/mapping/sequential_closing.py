@@ -1,0 +1,227 @@
+"""Loops closed in the order of the path, on a pose graph of submaps.
+
+Where a robot comes back, the drift since the last closure decides how far a submap has to be
+searched for. Closed in the order of the path, that is the drift of one loop, not of the whole log:
+windows stay small and most later submaps need no search at all. A few submaps are taken at a time;
+their closures must be consistent with each other and with what is closed already. The number of
+submaps that one is compared with is bounded, so the work grows with the path, not with its square,
+however often a place is visited.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from graphslam.core.config import LoopClosureConfig
+from graphslam.core.geometry import Array, between
+from graphslam.core.records import Closure
+from graphslam.core.worker import parallel_map
+from graphslam.mapping.gating import IntArray
+from graphslam.mapping.loop_closure import (
+    ALREADY_CLOSED,
+    COV_INFLATION,
+    MARGIN,
+    MAX_RESIDUAL,
+    NEAR_M,
+    SIGMAS,
+    Pair,
+    are_near,
+    consistent_closures,
+    known_part,
+    verify_pair,
+)
+from graphslam.mapping.submap_graph import RelativePoses, SubmapGraph
+from graphslam.mapping.submaps import State, SubmapPose
+
+#: submaps that are taken at a time, and rounds until nothing more is closed among them, at most
+AT_ONCE, MAX_ROUNDS = 10, 4
+#: earlier visits that one submap is compared with, at most, the nearest first
+MAX_VISITS = 3
+#: pairs from which on a second process is used to match them
+MIN_PARALLEL = 6
+#: m, m, rad: two sigmas of a relative pose that another match would not improve
+KNOWN = np.array([0.05, 0.05, 0.012])
+
+#: stands between verifying closures and believing them: for tests, which add false ones
+Tamper = Callable[[list[Closure], Sequence[SubmapPose]], list[Closure]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClosedLoops:
+    """The result of `close_loops`.
+
+    ``correcting`` closures were found by a search, ``confirming``
+    ones where the submaps lay; ``refused`` is the number of those that were inconsistent.
+    """
+
+    correcting: tuple[Closure, ...]
+    confirming: tuple[Closure, ...]
+    refused: int
+
+
+class _Closer:
+    """The pose graph, and the closures so far."""
+
+    def __init__(
+        self,
+        submaps: Sequence[SubmapPose],
+        nodes: IntArray,
+        graph: SubmapGraph,
+        config: LoopClosureConfig,
+    ) -> None:
+        self.graph, self.config, self.submaps, self.nodes = graph, config, list(submaps), nodes
+        self.at: dict[State, int] = {s.state: k for k, s in enumerate(submaps)}
+        self.robots = np.unique([s.state[0] for s in submaps], return_inverse=True)[1]
+        self.path_m = np.array([s.path_m for s in submaps])
+        self.accepted: dict[Pair, Closure] = {}
+        self.correcting: set[Pair] = set()
+        self.refused: dict[Pair, Closure] = {}
+        self.examined: dict[Pair, Array] = {}
+
+    @property
+    def poses(self) -> Array:
+        """Poses (n, 3) of the submaps."""
+        return self.graph.poses[self.nodes]
+
+    def placed(self) -> list[SubmapPose]:
+        """The submaps at the poses of the graph."""
+        return [replace(s, pose=p) for s, p in zip(self.submaps, self.poses, strict=True)]
+
+    def candidates(self, later: IntArray) -> list[tuple[int, int, Array]]:
+        """Pairs that may show one place: later, earlier, and half the window (3,) to search."""
+        poses, config = self.poses, self.config
+        limit = np.array([config.search_max_m, config.search_max_m, config.search_max_rad])
+        pairs: list[tuple[int, int]] = []
+        for i in later.tolist():
+            distance = np.hypot(*(poses[:i, :2] - poses[i, :2]).T)
+            apart = self.robots[:i] != self.robots[i]
+            apart |= self.path_m[i] - self.path_m[:i] >= config.revisit_path_m
+            j = np.flatnonzero(apart & (distance <= NEAR_M + limit[0]))
+            ends = np.flatnonzero((np.diff(j) > 1) | (np.diff(self.robots[j]) != 0)) + 1
+            nearest = [s[distance[s].argmin()] for s in np.split(j, ends) if len(s)]
+            nearest.sort(key=distance.__getitem__)
+            pairs += [(i, int(k)) for k in nearest[:MAX_VISITS]]
+        if not pairs:
+            return []
+        i, j = np.array(pairs).T
+        h, cov = self.graph.relative(self.nodes[i], self.nodes[j])
+        sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
+        unknown = (2 * sigma > KNOWN).any(axis=1)
+        sigma *= np.sqrt(COV_INFLATION)
+        window = np.minimum(SIGMAS * sigma + MARGIN, limit)
+        may = np.hypot(h[:, 0], h[:, 1]) <= NEAR_M + window[:, :2].max(axis=1)
+        return [(*pairs[k], window[k]) for k in np.flatnonzero(may & unknown)]
+
+    def verified(self, later: IntArray) -> tuple[list[Closure], list[Closure]]:
+        """Closures of submaps that were searched for, and of those that match as they lie."""
+        work: list[tuple[SubmapPose, SubmapPose, Array, Array]] = []
+        for i, j, window in self.candidates(later):
+            a, b = self.submaps[i], self.submaps[j]
+            guess = between(self.poses[j], self.poses[i])
+            pair = a.state, b.state
+            if pair in self.examined and are_near(self.examined[pair], guess, ALREADY_CLOSED):
+                continue
+            self.examined[pair] = guess
+            work.append((a, b, guess, window))
+        correcting: list[Closure] = []
+        confirming: list[Closure] = []
+        results = parallel_map(partial(verify_pair, along=True), work, fewest=MIN_PARALLEL)
+        for (a, b, _, _), result in zip(work, results, strict=True):
+            if result is not None:
+                is_searched, pose, cov = result
+                images = min(len(a.submap.clouds), len(b.submap.clouds))
+                closure = Closure(*a.state, *b.state, pose, cov, scan_count=images)
+                (correcting if is_searched else confirming).append(closure)
+        return correcting, confirming
+
+    def believe(self, correcting: list[Closure], confirming: list[Closure]) -> bool:
+        """Add those that are consistent to the graph; whether any correct it."""
+        proposed = [*correcting, *confirming]
+        involved = np.unique([
+            self.at[state]
+            for c in proposed
+            for state in ((c.robot, c.time_ns), (c.other, c.other_time_ns))
+        ])  # fmt: skip
+        placed = [replace(self.submaps[k], pose=self.poses[k]) for k in involved]
+        consistent = consistent_closures(
+            proposed, placed, self.graph.covariance(self.nodes[involved])
+        )
+        added = {c.pair for c in consistent} - {c.pair for c in confirming}
+        for closure in correcting:
+            if closure.pair not in added:
+                self.refused[closure.pair] = closure
+        self.accepted |= {c.pair: c for c in consistent}
+        self.correcting |= added
+        if consistent:
+            self.solve()
+        return bool(added)
+
+    def solve(self) -> None:
+        """Solve with all accepted closures; those that the solution violates are taken back."""
+        while self.accepted:
+            self.graph.solve(self.relative_poses())
+            found = list(self.accepted.values())
+            off = np.array([between(c.delta, between(*self.poses[self.ends(c)])) for c in found])
+            off = known_part(off, found)
+            wrong = np.hypot(off[:, 0], off[:, 1]) > MAX_RESIDUAL[0]
+            wrong |= np.abs(off[:, 2]) > MAX_RESIDUAL[1]
+            if not wrong.any():
+                return
+            for pair, is_wrong in zip(list(self.accepted), wrong, strict=True):
+                if is_wrong:
+                    self.refused[pair] = self.accepted.pop(pair)
+                    self.correcting.discard(pair)
+        self.graph.solve(None)
+
+    def ends(self, closure: Closure) -> list[int]:
+        """Numbers of the earlier and the later submap."""
+        return [
+            self.at[closure.other, closure.other_time_ns],
+            self.at[closure.robot, closure.time_ns],
+        ]
+
+    def relative_poses(self) -> RelativePoses:
+        """The accepted closures as arrays."""
+        found = list(self.accepted.values())
+        ends = self.nodes[np.array([self.ends(c) for c in found])]
+        return RelativePoses(
+            ends[:, 0], ends[:, 1], np.array([c.delta for c in found]),
+            np.array([c.cov for c in found]),
+        )  # fmt: skip
+
+
+def close_loops(
+    submaps: Sequence[SubmapPose],
+    nodes: IntArray,
+    graph: SubmapGraph,
+    config: LoopClosureConfig,
+    tamper: Tamper | None = None,
+) -> ClosedLoops:
+    """Close loops in the order of the path.
+
+    Args:
+        submaps: of all robots, those of each in the order of its path.
+        nodes: (n,) of the submaps in the graph.
+        graph: of their poses; its poses change.
+        config: what counts as another visit, and how far is searched.
+        tamper: for tests, see `Tamper`.
+    """
+    closer = _Closer(submaps, nodes, graph, config)
+    # robots take turns by time, so that none is far ahead of the others
+    order = np.argsort([s.state[1] for s in submaps], kind="stable")
+    for first in range(0, len(order), AT_ONCE):
+        later = order[first : first + AT_ONCE]
+        for _ in range(MAX_ROUNDS):
+            correcting, confirming = closer.verified(later)
+            if tamper is not None:
+                told = tamper([*correcting, *confirming], closer.placed())
+                correcting = [c for c in told if c not in confirming]
+            if not (correcting or confirming) or not closer.believe(correcting, confirming):
+                break
+    return ClosedLoops(
+        tuple(c for pair, c in closer.accepted.items() if pair in closer.correcting),
+        tuple(c for pair, c in closer.accepted.items() if pair not in closer.correcting),
+        len(closer.refused),
+    )

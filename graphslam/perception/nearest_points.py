@@ -1,0 +1,65 @@
+"""Nearest neighbours among fixed points, looked up in a grid.
+
+A tree is searched for every query; where the same few hundred points are asked for thousands of
+times, as in scan matching, a grid that holds the nearest point of each cell is faster. The point is
+the nearest to the middle of the cell, so it may be farther away than the nearest one by up to a
+cell's diagonal.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from graphslam.core.geometry import Array
+
+IntArray = NDArray[np.intp]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NearestPoints:
+    """``index`` (nx, ny): number of the point that is nearest to each cell; first cell at ``low``.
+
+    Cells have sides of ``cell_m``.
+    """
+
+    index: NDArray[np.int32]
+    low: Array
+    cell_m: float
+
+    @classmethod
+    def of(cls, points: Array, cell_m: float, reach_m: float) -> "NearestPoints":
+        """The grid of points (n, 2) m, with a margin of ``reach_m`` around them."""
+        margin = int(np.ceil(reach_m / cell_m)) + 1
+        low = points.min(axis=0) - margin * cell_m
+        cells = np.floor((points - low) / cell_m).astype(np.intp)
+        occupied = np.ones(cells.max(axis=0) + margin + 1, dtype=np.uint8)
+        occupied[cells[:, 0], cells[:, 1]] = 0
+        _, label = cv2.distanceTransformWithLabels(
+            occupied, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        # OpenCV numbers the occupied cells; a cell stands for the last of its points
+        of_label = np.zeros(int(label.max()) + 1, dtype=np.int32)
+        of_label[label[cells[:, 0], cells[:, 1]]] = np.arange(len(points))
+        return cls(of_label[label], low, cell_m)
+
+    def query(self, points: Array, reach_m: float, known: Array) -> tuple[IntArray, Array]:
+        """Neighbours of points (m, 2) within ``reach_m``.
+
+        Args:
+            points: where to look.
+            reach_m: largest distance.
+            known: (n, 2) the points of which the grid was made.
+
+        Returns:
+            Indices (k,) of the points that have a neighbour, and of their neighbours (k,).
+        """
+        cells = ((points - self.low) / self.cell_m).astype(np.intp)
+        size = self.index.shape
+        x, y = cells.T
+        inside = np.flatnonzero((x >= 0) & (x < size[0]) & (y >= 0) & (y < size[1]))
+        near = self.index[x[inside], y[inside]]
+        d = points[inside] - known[near]
+        ok = (d * d).sum(axis=1) < reach_m * reach_m
+        return inside[ok], near[ok].astype(np.intp)

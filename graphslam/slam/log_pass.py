@@ -1,0 +1,137 @@
+"""What one pass over a log accumulates, whatever it does with the messages."""
+
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+
+from graphslam.core.config import Config
+from graphslam.core.errors import EstimationError
+from graphslam.core.geometry import rotate_cov
+from graphslam.core.records import KeyframeScan, Message, Sighting, Start, Step
+from graphslam.logs import LogSet
+from graphslam.logs.clock import Clock
+from graphslam.mapping.landmark_map import LandmarkMap
+from graphslam.multi_robot.frame_tree import FrameAssignment
+from graphslam.multi_robot.frames import RobotFrames
+from graphslam.multi_robot.relative_frames import RobotEstimate
+from graphslam.odometry.interpolation import FrameTransforms
+from graphslam.slam.recorded_closures import RecordedClosures
+from graphslam.slam.robot_settings import make_tracks, noted
+from graphslam.slam.robot_state import RobotState
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PriorKnowledge:
+    """What is known before a log is read: what was given, and what earlier passes found.
+
+    ``frame_assignment``: start poses and frames of the robots. ``recorded``: which relative poses
+    of the log are accepted. ``identities``: false identity -> right one, of what is sighted.
+    ``clocks``: of robots whose clock is not that of the first. ``alone``: estimates of robots by
+    themselves, from which their relative poses were found.
+    """
+
+    frame_assignment: FrameAssignment
+    recorded: RecordedClosures
+    identities: Mapping[str, str] = field(default_factory=dict)
+    clocks: Mapping[str, Clock] = field(default_factory=dict)
+    alone: Mapping[str, RobotEstimate] = field(default_factory=dict)
+
+
+@contextmanager
+def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    """Adds the wall time of its body to a stage's."""
+    began = time.perf_counter()
+    yield
+    seconds[stage] += time.perf_counter() - began
+
+
+#: messages between two reports of progress
+REPORT_EVERY = 500
+
+Progress = Callable[[int], None]
+
+
+class LogPass:
+    """The robots, landmarks and steps of one pass over a log, and its counts and times.
+
+    ``sources`` are the sightings that `Association.source` numbers (steps of several images only);
+    ``robot_sightings`` those of robots that entered at their own time. ``rejected`` counts
+    observations and ``removed_returns`` returns that were not used, by reason; ``innovations``:
+    model -> (time, squared distance per degree of freedom) of accepted observations.
+    """
+
+    def __init__(self, log: LogSet, config: Config, known: PriorKnowledge) -> None:
+        """Without states; keyframe settings noted in the log replace defaults of ``config``."""
+        self.given_config = config
+        config = replace(config, keyframe=noted(config.keyframe, "keyframe", log.notes))
+        self.log, self.config, self.known = log, config, known
+        self.runs = {
+            name: RobotState(track, clock=known.clocks.get(name, Clock()))
+            for name, track in make_tracks(log, config).items()
+        }
+        self.starts = known.frame_assignment.starts
+        self.frames = RobotFrames(known.frame_assignment)
+        self.landmarks = LandmarkMap()
+        self.steps: list[Step] = []
+        self.sources: list[Sighting] = []
+        self.robot_sightings: list[Sighting] = []
+        self.keyframe_scans: list[KeyframeScan] = []
+        self.counts: Counter[str] = Counter()
+        self.dropped: Counter[str] = Counter()
+        self.rejected: Counter[str] = Counter()
+        self.removed_returns: Counter[str] = Counter()
+        self.innovations: dict[str, list[tuple[int, float]]] = {}
+        self.seconds: dict[str, float] = defaultdict(float)
+        self.step_ms: list[float] = []
+        self.first_ns, self.last_ns = 1 << 63, 0
+
+    @property
+    def skipped(self) -> Mapping[str, int]:
+        """Number of observations and closures that the back end could not use, by reason."""
+        return {}
+
+    @property
+    def started(self) -> dict[str, RobotState]:
+        """The robots that have a state, sorted by name."""
+        return {name: run for name, run in sorted(self.runs.items()) if run.started}
+
+    def start_prior(self, robot: str) -> Start:
+        """Prior of a robot's first state.
+
+        Raises:
+            EstimationError: it is not known where.
+        """
+        if robot not in self.starts:
+            raise EstimationError(
+                f"robot {robot}: its start is unknown; give --start {robot}=x,y,phi (m, rad) or "
+                "--start truth"
+            )
+        start = self.frames.offset_start(robot, self.starts[robot])
+        if robot != self.frames.of[robot]:
+            # priors are on the base, states on the sensor: where it sits is not known yet, nor is
+            # where that of the first robot sits, to which the world is fixed
+            cov = start.cov + rotate_cov(2 * self.runs[robot].track.mount_cov, start.pose[2])
+            start = replace(start, cov=cov)
+        return start
+
+    def record_time(self, time_ns: int) -> None:
+        """Extend the span of the log by a time."""
+        self.first_ns, self.last_ns = min(self.first_ns, time_ns), max(self.last_ns, time_ns)
+
+    def transforms(self) -> FrameTransforms:
+        """What takes every robot and landmark from where it was estimated into its frame."""
+        tracks = {name: run.track for name, run in self.runs.items()}
+        return self.frames.transforms(tracks, self.landmarks.entries.values())
+
+
+def counted(
+    messages: Iterable[Message], counts: Counter[str], progress: Progress
+) -> Iterator[Message]:
+    """The messages, counted; ``progress`` gets their number now and then."""
+    for message in messages:
+        counts["messages"] += 1
+        if counts["messages"] % REPORT_EVERY == 0:
+            progress(counts["messages"])
+        yield message

@@ -1,0 +1,170 @@
+"""Tracked paths whose loops are closed on a pose graph of submaps, and what it says about them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphslam.core.geometry import Array, between, compose, exp, log, path_length, rotate_cov
+from graphslam.core.records import Closure, Step, Trajectory
+from graphslam.mapping.gating import IntArray
+from graphslam.mapping.redundant_closures import Span
+from graphslam.mapping.sequential_closing import Tamper, close_loops
+from graphslam.mapping.submap_graph import RelativePoses, SubmapGraph
+from graphslam.mapping.submaps import State, SubmapPose, submaps_at
+from graphslam.slam.scan_tracking import ScanLog, TrackedPath
+
+#: factor on the covariance of the chain of submaps: tracking knows only what is around the robot,
+#: and takes its errors for independent. Of Intel and ACES, errors are 1 to 2 sigmas of it
+CHAIN_INFLATION = 4.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClosedPaths:
+    """Paths after their loops were closed.
+
+    ``states``: robot -> poses at all its states. ``closures`` are those that corrected the paths,
+    ``refused`` the number of inconsistent ones; ``spans``: state of a submap -> the time that its
+    robot was around there. ``graph`` is that of the submaps, ``times`` and ``first``: robot ->
+    times of its nodes in it, and the number of the first.
+    """
+
+    states: Mapping[str, Trajectory]
+    closures: Sequence[Closure]
+    refused: int
+    spans: Mapping[State, Span]
+    graph: SubmapGraph
+    times: Mapping[str, IntArray]
+    first: Mapping[str, int]
+
+    def node(self, robot: str, time_ns: int) -> int:
+        """The node of the graph that was passed last at a time."""
+        before = int(np.searchsorted(self.times[robot], time_ns, side="right")) - 1
+        return self.first[robot] + max(before, 0)
+
+    def uncertainty(self, steps: Sequence[Step]) -> "LandmarkUncertainty":
+        """How well the relative position of landmarks is known that ``steps`` have."""
+        first: dict[int, int] = {}
+        for step in steps:
+            for a in step.associations:
+                if isinstance(a.target, int) and a.target not in first:
+                    first[a.target] = self.node(a.robot, a.time_ns)
+        return LandmarkUncertainty(self.graph, first)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LandmarkUncertainty:
+    """What the graph of submaps says about the relative position of landmarks.
+
+    ``node``: landmark -> the submap where it was seen first. Called as `PairUncertainty`.
+    """
+
+    graph: SubmapGraph
+    node: Mapping[int, int]
+
+    def __call__(self, a: IntArray, b: IntArray, at: Array, normals: Array) -> Array:
+        """Sigmas (m, 2): across at a place (m, 2) with normals (m, 2), and of the direction."""
+        if not len(a):
+            return np.zeros((0, 2))
+        i, j = (np.array([self.node[n] for n in numbers.tolist()]) for numbers in (a, b))
+        h, cov = self.graph.relative(i, j)
+        cov = CHAIN_INFLATION * cov
+        base = self.graph.poses[j]
+        c, s = np.cos(base[:, 2]), np.sin(base[:, 2])
+        d = at - base[:, :2]
+        # everything in the frame of submap j, in which errors of submap i are given
+        x, y = c * d[:, 0] + s * d[:, 1] - h[:, 0], c * d[:, 1] - s * d[:, 0] - h[:, 1]
+        nx, ny = c * normals[:, 0] + s * normals[:, 1], c * normals[:, 1] - s * normals[:, 0]
+        g = np.column_stack([nx, ny, ny * x - nx * y])
+        across = np.einsum("mi,mij,mj->m", g, cov, g)
+        variances = np.column_stack([across, cov[:, 2, 2]])
+        return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
+
+
+def unclosed_paths(scan_log: ScanLog) -> dict[str, Trajectory]:
+    """The states of every robot as tracked; their covariances are unknown."""
+    return {name: tracked_states(scan_log.paths[name]) for name in scan_log.started}
+
+
+def tracked_states(path: TrackedPath) -> Trajectory:
+    """The states as tracked; their covariances are unknown."""
+    unknown = np.full((len(path.times), 3, 3), np.nan)
+    return Trajectory(np.array(path.times, dtype=np.int64), np.array(path.poses), unknown)
+
+
+def close_paths(
+    scan_log: ScanLog, tamper: Tamper | None = None, *, match: bool = True
+) -> ClosedPaths:
+    """Loops closed on a pose graph of submaps, and the paths that follow its solution.
+
+    Without ``match`` nothing is closed.
+    """
+    config, tracked = scan_log.config, unclosed_paths(scan_log)
+    anchors = {name: np.array(scan_log.paths[name].anchors) for name in tracked}
+    poses: list[Array] = []
+    begin: list[int] = []
+    delta, cov, first_nodes, start_covs = [], [], [], []
+    starts = {name: start for step in scan_log.steps for name, start in step.starts.items()}
+    for name, states in tracked.items():
+        path, first = scan_log.paths[name], len(poses)
+        first_nodes.append(first)
+        start = starts[name]
+        start_covs.append(rotate_cov(start.cov, -float(start.pose[2])))
+        poses += list(states.poses[anchors[name]])
+        begin += range(first, len(poses) - 1)
+        steps, noise = path.anchor_steps()
+        delta.append(steps)
+        cov.append(noise)
+    chain = RelativePoses(
+        np.array(begin, dtype=np.int64),
+        np.array(begin, dtype=np.int64) + 1,
+        np.concatenate(delta),
+        np.concatenate(cov),
+    )
+    graph = SubmapGraph(np.array(poses), chain, first_nodes, np.array(start_covs))
+    submaps: list[SubmapPose] = []
+    numbers: IntArray = np.zeros(0, dtype=np.int64)
+    if match:
+        submaps, numbers = submaps_at(anchors, tracked, scan_log.keyframe_scans, config)
+    closed = close_loops(submaps, numbers, graph, config.loop_closure, tamper)
+    moved, times, firsts, first = {}, {}, {}, 0
+    for name, states in tracked.items():
+        own = anchors[name]
+        moved[name] = replace(
+            states, poses=follow(states.poses, own, graph.poses[first : first + len(own)])
+        )
+        times[name], firsts[name] = states.stamps_ns[own], first
+        first += len(own)
+    return ClosedPaths(
+        moved, closed.correcting, closed.refused, neighbourhoods(submaps), graph, times, firsts
+    )
+
+
+def neighbourhoods(submaps: Sequence[SubmapPose]) -> dict[State, Span]:
+    """State of each submap -> the time that its robot was around there: also its neighbours'."""
+    found = {}
+    for k, submap in enumerate(submaps):
+        near = [
+            other.span_ns
+            for other in submaps[max(k - 1, 0) : k + 2]
+            if other.state[0] == submap.state[0]
+        ]
+        found[submap.state] = min(a for a, _ in near), max(b for _, b in near)
+    return found
+
+
+def follow(poses: Array, anchors: Array, at: Array) -> Array:
+    """A path (n, 3) after its poses ``anchors`` (k,), the first and last included, moved to ``at``.
+
+    In between, the disagreement is spread over the path in proportion to its length.
+    """
+    i = np.clip(np.searchsorted(anchors, np.arange(len(poses)), side="right") - 1, 0, None)
+    j = np.minimum(i + 1, len(anchors) - 1)
+    from_last = between(poses[anchors[i]], poses)
+    placed = compose(at[i], from_last)
+    whole = between(poses[anchors[i]], poses[anchors[j]])
+    miss = log(between(compose(at[i], whole), at[j]))
+    driven = path_length(poses)
+    along, length = driven - driven[anchors[i]], driven[anchors[j]] - driven[anchors[i]]
+    share = np.where(length > 0, along / np.where(length > 0, length, 1.0), 0.0)
+    return compose(placed, exp(share[:, None] * miss))
