@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from graphslam.core.geometry import Array, between, unit_vectors, wrap
+from graphslam.core.geometry import Array, unit_vectors, wrap
 from graphslam.core.records import Landmark, TrueLandmark
 from graphslam.evaluation.error_statistics import nees, rms
 
@@ -99,7 +99,7 @@ def _match(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]) -> list[
     columns = [j for j in range(len(true)) if j not in taken]
     if not rows or not columns:
         return pairs
-    cost = np.array([[_match_distance(estimated[i], true[j]) for j in columns] for i in rows])
+    cost = _match_distances([estimated[i] for i in rows], [true[j] for j in columns])
     wall = np.array([estimated[i].kind != "point" for i in rows])
     nearest = cost.argmin(axis=1)
     pairs += [
@@ -117,21 +117,30 @@ def _match(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]) -> list[
     return pairs + matched
 
 
-def _match_distance(estimated: Landmark, true: TrueLandmark) -> float:
-    """Distance between a landmark and a true one, m; infinite where they cannot match."""
-    if (estimated.kind == "point") != (true.kind == "point"):
-        return np.inf
-    if estimated.kind == "point":
-        distance = _point_distance(estimated, true)
-    else:
-        turn = float(wrap(2 * (estimated.position[2] - true.pose[2]))) / 2  # modulo pi
-        x, y = between(true.pose, np.array([*estimated.extent.mean(axis=0), 0.0]))[:2]
-        beyond = 0.0
-        if true.extent is not None:
-            ends = between(true.pose, np.column_stack([true.extent, np.zeros(2)]))[:, 0]
-            beyond = float(x - np.clip(x, ends.min(), ends.max()))
-        distance = float(np.hypot(beyond, y)) if abs(turn) <= MATCH_ANGLE_RAD else np.inf
-    return distance if distance <= MATCH_DISTANCE_M else np.inf
+def _match_distances(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]) -> Array:
+    """Distances (n, m) between landmarks and true ones, m; infinite where they cannot match."""
+    poses = np.array([t.pose for t in true])
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    position = np.array([e.position for e in estimated])
+    middle = np.array([e.extent.mean(axis=0) for e in estimated])
+    points = np.array([e.kind == "point" for e in estimated], dtype=bool)
+    true_points = np.array([t.kind == "point" for t in true], dtype=bool)
+    # where each true wall begins and ends along its own x axis
+    ends = np.full((len(true), 2), [-np.inf, np.inf])
+    for k, one in enumerate(true):
+        if one.extent is not None and not true_points[k]:
+            along = (one.extent - one.pose[:2]) @ np.array([c[k], s[k]])
+            ends[k] = along.min(), along.max()
+    apart = np.hypot(*(position[:, None, :2] - poses[:, :2]).transpose(2, 0, 1))
+    off = middle[:, None] - poses[:, :2]
+    x, y = c * off[..., 0] + s * off[..., 1], c * off[..., 1] - s * off[..., 0]
+    beyond = x - np.clip(x, ends[:, 0], ends[:, 1])
+    turn = wrap(2 * (position[:, None, 2] - poses[:, 2])) / 2  # modulo pi
+    with np.errstate(invalid="ignore"):  # points have no direction
+        walls = np.where(np.abs(turn) <= MATCH_ANGLE_RAD, np.hypot(beyond, y), np.inf)
+    distance = np.where(points[:, None], apart, walls)
+    distance[points[:, None] != true_points] = np.inf
+    return np.where(distance <= MATCH_DISTANCE_M, distance, np.inf)
 
 
 def _landmark_error(estimated: Landmark, true: TrueLandmark) -> tuple[float, Array, Array]:
