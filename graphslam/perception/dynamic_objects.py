@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from graphslam.core.geometry import Array, transform, transform_each
-from graphslam.perception.ordered_scan import Mask, Sweep
+from graphslam.perception.ordered_scan import Mask, Sweep, join_sweeps
 from graphslam.perception.robot_outlines import free_standing_clusters
 
 #: m: wider objects are part of the building
@@ -75,12 +75,33 @@ def dynamic_returns(sweep: Sweep, views: Sequence[tuple[Sweep, Array]]) -> Mask:
     return gone
 
 
-def dynamic_returns_of_all(sweep: Sweep, earlier_from_here: Sequence[Array]) -> Mask:
-    """`dynamic_returns` of many scans at once: which returns (k,) of joined scans.
+def dynamic_returns_of_all(
+    sweeps: Sequence[Sweep], earlier_from_here: Sequence[Array]
+) -> list[Mask]:
+    """`dynamic_returns` of each of many scans, at once where all have one angle between beams.
 
     ``earlier_from_here[lag - 1]`` (s, 3) are the poses of each scan's laser in the frame of the
     laser ``lag`` scans before, not used where there is none.
     """
+    if len({sweep.step_rad for sweep in sweeps}) == 1:
+        joined = join_sweeps(sweeps)
+        gone = _dynamic_returns_of_joined(joined, earlier_from_here)
+        return np.split(gone, np.searchsorted(joined.scan, np.arange(1, len(sweeps))))
+    return [
+        dynamic_returns(
+            sweep,
+            [
+                (sweeps[k - lag], poses[k])
+                for lag, poses in enumerate(earlier_from_here, 1)
+                if k >= lag
+            ],
+        )
+        for k, sweep in enumerate(sweeps)
+    ]
+
+
+def _dynamic_returns_of_joined(sweep: Sweep, earlier_from_here: Sequence[Array]) -> Mask:
+    """Which returns (k,) of joined scans are of moving objects."""
     gone = np.zeros(len(sweep.beam), dtype=np.bool_)
     found = free_standing_clusters(sweep, WIDEST_M)
     count = found.last - found.first + 1

@@ -42,8 +42,9 @@ CORRELATED_POINTS = 10
 ITERATIONS = 12
 #: cell of the grid of nearest points, as a share of that to which points are thinned
 NEAREST_CELL = 1.0
-#: points that must have a neighbour, at least
-MIN_NEIGHBOURS = 10
+#: points that must have a neighbour, at least; information (1/m², 1/rad²) added to that of a pose,
+#: so that it can be inverted
+MIN_NEIGHBOURS, REGULAR = 10, 1e-4
 #: variance (m², rad²) of each component of a pose without neighbours
 UNKNOWN_VAR = 1e4
 #: steps of the search: cells are this share of the reach of the alignment, which does the rest, and
@@ -154,6 +155,17 @@ def _information(points: Array, tree: cKDTree, config: ScanMatchingConfig) -> Ar
     d = (around - mean[:, None]) * used[..., None]
     xx, yy = (d[..., 0] ** 2).sum(axis=1), (d[..., 1] ** 2).sum(axis=1)
     xy = (d[..., 0] * d[..., 1]).sum(axis=1)
+    return information_from_scatter(count, xx, xy, yy, config)
+
+
+def information_from_scatter(
+    count: Array, xx: Array, xy: Array, yy: Array, config: ScanMatchingConfig
+) -> Array:
+    """Information (n, 2, 2) of points, see `Submap`, by the scatter of their neighbours.
+
+    ``count`` (n,) of neighbours, the point included; ``xx``, ``xy``, ``yy`` (n,) of their second
+    central moments, all of a point times the same factor.
+    """
     along = 0.5 * np.arctan2(2 * xy, xx - yy)
     spread = np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
     small, large = 0.5 * (xx + yy) - spread, 0.5 * (xx + yy) + spread
@@ -255,7 +267,7 @@ def _linearise(points: Array, target: Submap, x: Array, reach: float) -> tuple[A
     terms, squared = point_terms(p - target.points[near], target.information[near], p - x[:2])
     w = 1.0 / (1.0 + squared / 4.0)
     A, g = normal_equations(terms @ w)
-    return A + np.diag([1e-4, 1e-4, 1e-4]), g, float(w.sum())
+    return A + REGULAR * np.eye(3), g, float(w.sum())
 
 
 def _covariance(information: Array, config: ScanMatchingConfig) -> Array:

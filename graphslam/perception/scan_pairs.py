@@ -14,14 +14,15 @@ from scipy.spatial import cKDTree
 
 from graphslam.core.config import ScanMatchingConfig
 from graphslam.core.geometry import Array, transform_each
-from graphslam.perception.point_to_line import line_metrics, normal_equations, point_terms
+from graphslam.perception.point_to_line import normal_equations, point_terms
 from graphslam.perception.scan_matching import (
-    CLUTTER_SIGMAS,
     CORRELATED_POINTS,
-    FEWEST_NEIGHBOURS,
+    MIN_NEIGHBOURS,
     NEIGHBOURHOOD_CELLS,
+    REGULAR,
     SAME_SIGMAS,
     UNKNOWN_VAR,
+    information_from_scatter,
 )
 
 IntArray = NDArray[np.intp]
@@ -30,10 +31,6 @@ IntArray = NDArray[np.intp]
 APART_M = 1e4
 #: returns on either side of one that show the surface there
 BESIDE = 4
-#: returns that must have a neighbour, at least
-MIN_PAIRS = 10
-#: information added to that of a pose, so that it can be inverted
-REGULAR = 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,7 +81,7 @@ def fit_pairs(
     weight = np.bincount(pair, w, minlength=n)
     A, g = normal_equations(sums)
     A = A + REGULAR * np.eye(3)
-    known = np.bincount(pair, minlength=n) >= MIN_PAIRS
+    known = np.bincount(pair, minlength=n) >= MIN_NEIGHBOURS
     step = -np.linalg.solve(A, g[:, :, None])[:, :, 0]
     floor = np.diag([config.floor_m**2, config.floor_m**2, config.floor_rad**2])
     cov = CORRELATED_POINTS * np.linalg.inv(A) + floor
@@ -116,12 +113,4 @@ def surface_information(points: Array, scan: IntArray, config: ScanMatchingConfi
         sums[:, k:] += each * np.array([1.0, -1.0, -1.0, 1.0, 1.0, 1.0])[:, None]
     count = sums[0]
     x, y, xx, xy, yy = sums[1:] / count
-    xx, xy, yy = xx - x * x, xy - x * y, yy - y * y
-    along = 0.5 * np.arctan2(2 * xy, xx - yy)
-    spread = np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
-    small, large = 0.5 * (xx + yy) - spread, 0.5 * (xx + yy) + spread
-    variance = config.point_sigma_m**2
-    found = line_metrics(np.column_stack([-np.sin(along), np.cos(along)])) / variance
-    found[small >= 0.1 * large] = np.eye(2) / (CLUTTER_SIGMAS**2 * variance)
-    found[count < FEWEST_NEIGHBOURS] = 0.0
-    return np.asarray(found)
+    return information_from_scatter(count, xx - x * x, xy - x * y, yy - y * y, config)

@@ -42,7 +42,7 @@ from graphslam.odometry.scan_odometry import (
 )
 from graphslam.perception.dynamic_objects import dynamic_returns_of_all
 from graphslam.perception.front_ends import observe_block
-from graphslam.perception.ordered_scan import Sweep, join_sweeps, make_sweep, scan_points
+from graphslam.perception.ordered_scan import Sweep, make_sweep, scan_points
 from graphslam.perception.scan_matching import Submap
 from graphslam.slam.keyframes import KeyframeSelector
 from graphslam.slam.log_pass import LogPass, PriorKnowledge, Progress, counted, timed
@@ -274,15 +274,11 @@ class ScanLog(LogPass):
         for lag in range(1, COMPARED_SCANS + 1):
             moved = between(np.roll(poses, lag, axis=0), poses)
             views.append(compose(compose(inverse(mounts), moved), mounts))
-        joined = join_sweeps(every)
-        gone = dynamic_returns_of_all(joined, views)
-        for k in np.unique(joined.scan[gone]):
-            if k < len(past):
-                continue
-            own, n = gone[joined.scan == k], int(k) - len(past)
-            self.removed_returns["range: of a thing that moves"] += int(own.sum())
-            used[n] = without_returns(used[n], sweeps[n], own)
-            sweeps[n] = make_sweep(used[n], max_range_m)
+        for n, gone in enumerate(dynamic_returns_of_all(every, views)[len(past) :]):
+            if gone.any():
+                self.removed_returns["range: of a thing that moves"] += int(gone.sum())
+                used[n] = without_returns(used[n], sweeps[n], gone)
+                sweeps[n] = make_sweep(used[n], max_range_m)
         return used, sweeps
 
     def _matched(

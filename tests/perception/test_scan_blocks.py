@@ -1,5 +1,7 @@
 """What works on many scans at once gives what it gives for each."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from graphslam.core.records import Observation, Scan
 from graphslam.perception.dynamic_objects import dynamic_returns, dynamic_returns_of_all
 from graphslam.perception.front_ends import FRONT_ENDS, observe_block
 from graphslam.perception.nearest_points import NearestPoints
-from graphslam.perception.ordered_scan import join_sweeps, make_sweep, scan_points
+from graphslam.perception.ordered_scan import make_sweep, scan_points
 from graphslam.perception.scan_matching import fit, make_submap
 from graphslam.perception.scan_pairs import fit_pairs
 
@@ -72,6 +74,9 @@ def test_segments_of_a_block_are_those_of_each_scan(drive):
 def test_moving_objects_of_a_block_are_those_of_each_scan(drive):
     scans, poses = drive
     sweeps = [make_sweep(scan, 30.0) for scan in scans]
+    # another laser, last, with its beams twice as far apart
+    other = replace(scans[-1], ranges=scans[-1].ranges[::2], angle_step_rad=2 * STEP)
+    coarser, poses = make_sweep(other, 30.0), np.concatenate([poses, poses[-1:]])
     views, expected = [], []
     for lag in range(1, 5):
         earlier = np.roll(poses, lag, axis=0)
@@ -81,9 +86,11 @@ def test_moving_objects_of_a_block_are_those_of_each_scan(drive):
     for k, sweep in enumerate(sweeps):
         past = [(sweeps[k - lag], views[lag - 1][k]) for lag in range(1, 5) if k >= lag]
         expected.append(dynamic_returns(sweep, past))
-    found = dynamic_returns_of_all(join_sweeps(sweeps), views)
-    assert found.any()
-    np.testing.assert_array_equal(found, np.concatenate(expected))
+    for every in (sweeps, [*sweeps, coarser]):
+        found = dynamic_returns_of_all(every, views)
+        assert np.concatenate(found).any()
+        for one, alone in zip(found, expected, strict=False):
+            np.testing.assert_array_equal(one, alone)
 
 
 def test_pairs_of_a_block_fit_as_each_pair_does(drive):
