@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from graphslam.core.geometry import Array, between, compose
+from graphslam.core.geometry import Array, between, compose, rotate_cov
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Estimate, Observation, Step, Trajectory
 from graphslam.estimation.backend import Backend
@@ -178,11 +178,11 @@ def retarget(a: Association, target: int, kind: str) -> Association:
     return replace(a, target=target, model="line" if line else a.model)
 
 
-def observed_from(seen: Sequence[Association], estimate: Estimate) -> Array:
+def observed_from(seen: Sequence[Association], of_robots: Mapping[str, Trajectory]) -> Array:
     """Estimated states (n, 3) from which associations were made."""
     poses = np.empty((len(seen), 3))
     robots, times = np.array([a.robot for a in seen]), np.array([a.time_ns for a in seen])
-    for robot, states in estimate.states.items():
+    for robot, states in of_robots.items():
         own = robots == robot
         poses[own] = states.at(times[own])
     return poses
@@ -200,7 +200,7 @@ def seen_extents(steps: Sequence[Step], estimate: Estimate) -> dict[int, Array]:
         return {}
     walls, wall = np.unique([int(a.target) for a in seen], return_inverse=True)
     means = np.array([estimate.landmarks[int(number)][0] for number in walls])
-    world = compose(observed_from(seen, estimate), np.array([a.z for a in seen]))
+    world = compose(observed_from(seen, estimate.states), np.array([a.z for a in seen]))
     relative = between(means[wall], world)
     ends = relative[:, :1] + np.cos(relative[:, 2:]) * np.array([a.extent for a in seen])
     ends.sort(axis=1)  # an observation may have the opposite direction
@@ -210,20 +210,63 @@ def seen_extents(steps: Sequence[Step], estimate: Estimate) -> dict[int, Array]:
     return dict(zip(walls.tolist(), np.column_stack([low, high]), strict=True))
 
 
-def first_estimates(
+def mean_landmarks(
     steps: Sequence[Step], states: Mapping[str, Trajectory]
 ) -> dict[int, tuple[Array, Array]]:
-    """Number of each landmark -> where its first observation shows it, and an unknown covariance.
+    """Number of each landmark -> the mean of where its observations show it; covariance unknown.
 
-    Mean (2,) or (3,) by the poses of ``states``, which are those of the steps.
+    Mean (2,) or (3,) by the poses of ``states``, which are those of the steps and taken for exact.
+    Observations are weighted by their information; along a wall whose ends are not known, the mean
+    stays where the first observation shows it.
     """
-    first: dict[int, Association] = {}
-    for step in steps:
-        for a in step.associations:
-            if isinstance(a.target, int):
-                first.setdefault(a.target, a)
-    found = {}
-    for number, seen in first.items():
-        mean = MODELS[seen.model].invert(seen.z, states[seen.robot].at(seen.time_ns))
-        found[number] = mean, np.full((len(mean), len(mean)), np.nan)
+    seen = [a for step in steps for a in step.associations if isinstance(a.target, int)]
+    found: dict[int, tuple[Array, Array]] = {}
+    for is_point in (True, False):
+        some = [a for a in seen if (a.model == "point") == is_point]
+        if not some:
+            continue
+        numbers, first, which = np.unique(
+            [a.target for a in some], return_index=True, return_inverse=True
+        )
+        mean = _mean_points if is_point else _mean_walls
+        means = mean(some, observed_from(some, states), first, which)
+        unknown = np.full((means.shape[1],) * 2, np.nan)
+        found.update(
+            (number, (at, unknown)) for number, at in zip(numbers.tolist(), means, strict=True)
+        )
     return found
+
+
+def _mean_points(seen: Sequence[Association], x: Array, first: IntArray, which: IntArray) -> Array:
+    """Means (n, 2) of points, observed from ``x`` (m, 3) as number ``which`` (m,) of n."""
+    model = MODELS["point"]
+    z = np.array([a.z for a in seen])
+    _, G = model.invert_jacobians(z, x)
+    information = np.linalg.inv(G @ np.array([a.cov for a in seen]) @ G.mT)
+    at = model.invert(z, x)
+    total, weighted = np.zeros((len(first), 2, 2)), np.zeros((len(first), 2))
+    np.add.at(total, which, information)
+    np.add.at(weighted, which, (information @ at[:, :, None])[:, :, 0])
+    return np.asarray(np.linalg.solve(total, weighted[:, :, None])[:, :, 0])
+
+
+def _mean_walls(seen: Sequence[Association], x: Array, first: IntArray, which: IntArray) -> Array:
+    """Means (n, 3) of lines and segments, in the same way; ``first`` (n,) of their observations."""
+    z = np.array([a.z for a in seen])
+    world = compose(x, z)
+    middle = world[first]
+    off = between(middle[which], world)
+    own = rotate_cov(np.array([a.cov for a in seen]), -z[:, 2])
+    arm, direction = off[:, 0], own[:, 2, 2]
+    # what the observation says about the wall at the origin of the mean
+    across = off[:, 1] - arm * np.tan(off[:, 2])
+    wall = own[:, 1, 1] - 2.0 * arm * own[:, 1, 2] + arm**2 * direction
+    ends = np.array([a.model == "segment" for a in seen])
+    along = np.where(ends, 1.0 / own[:, 0, 0], 0.0)
+
+    def mean(value: Array, weight: Array) -> Array:
+        total = np.bincount(which, weight)
+        return np.bincount(which, weight * value) / np.where(total > 0, total, 1.0)
+
+    change = [mean(arm, along), mean(across, 1.0 / wall), mean(off[:, 2], 1.0 / direction)]
+    return compose(middle, np.column_stack(change))

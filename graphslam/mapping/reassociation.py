@@ -57,7 +57,7 @@ def reassociate(
     seen = [a for step in steps for a in step.associations if a.target in place]
     if not seen:
         return Reassociated(tuple(steps), 0, 0)
-    world = compose(observed_from(seen, estimate), np.array([a.z for a in seen]))
+    world = compose(observed_from(seen, estimate.states), np.array([a.z for a in seen]))
     own = np.array([place[a.target] for a in seen if isinstance(a.target, int)])
     pairs = _pairs_nearby(world, own, walls, gate_m, beyond_m)
     if math.isfinite(within_m):

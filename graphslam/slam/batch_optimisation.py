@@ -1,8 +1,8 @@
 """A tracked log of scans solved as one batch: calibration, loops, landmarks, all states at once.
 
-Tracking gives a path that is right over metres. Loops are closed on a pose graph of submaps, the
-path follows its solution, and that is the start of the full solution: with landmarks of every visit
-of their own at first, then with those tied that lie together.
+Tracking gives a path that is right over metres. Loops are closed on a pose graph of submaps, and
+the path follows its solution. There landmarks of different visits that lie together are tied; all
+is solved, tied again where the covariances show that two are one, and solved to the end.
 """
 
 import math
@@ -21,7 +21,7 @@ from graphslam.mapping.duplicate_landmarks import (
     possible_duplicates,
     seen_together,
 )
-from graphslam.mapping.landmark_map import LandmarkMap, first_estimates
+from graphslam.mapping.landmark_map import LandmarkMap, mean_landmarks
 from graphslam.mapping.loop_closure import ALREADY_CLOSED, fix_position, violated
 from graphslam.mapping.reassociation import reassociate
 from graphslam.mapping.redundant_closures import untied_closures
@@ -34,8 +34,8 @@ from graphslam.slam.path_closing import ClosedPaths, close_paths
 from graphslam.slam.reoptimise_scans import with_closures
 from graphslam.slam.scan_tracking import ScanLog
 
-#: factors on the gates of re-association (across, direction), round by round
-GATE_FACTORS = ((1.0, 1.0), (1 / 2, 2 / 3))
+#: factors on the gates of re-association (across, direction): with the closed paths, and solved
+CLOSED_FACTORS, SOLVED_FACTORS = (1.0, 1.0), (1 / 2, 2 / 3)
 
 
 def optimise_scan_log(scan_log: ScanLog, tamper: Tamper | None = None) -> Estimate:
@@ -54,7 +54,7 @@ def optimise_scan_log(scan_log: ScanLog, tamper: Tamper | None = None) -> Estima
     counts["closures_across"] = len(paths.closures) - fixing
     counts["closures_refused"] += paths.refused
     with timed(seconds, "final"):
-        start = Estimate(paths.states, first_estimates(steps, paths.states), 0.0, 0)
+        start = Estimate(paths.states, mean_landmarks(steps, paths.states), 0.0, 0)
         estimate, steps = _solved(steps, start, paths, scan_log, tracks)
     scan_log.steps = list(steps)
     return estimate
@@ -96,49 +96,66 @@ def _solve(
 
 def _solved(
     steps: tuple[Step, ...],
-    estimate: Estimate,
+    start: Estimate,
     paths: ClosedPaths,
     scan_log: ScanLog,
     tracks: Mapping[str, Track],
 ) -> tuple[Estimate, tuple[Step, ...]]:
     """All states, landmarks and the calibration, solved with landmarks tied and reassociated."""
     config, counts, landmarks = scan_log.config, scan_log.counts, scan_log.landmarks
-    association, closures = config.association, list(paths.closures)
-    for n, (factor_m, factor_rad) in enumerate(GATE_FACTORS):
-        # once landmarks of different visits are tied, closures are no longer needed
-        used = steps if n else with_closures(steps, closures)
-        solution = _solve(used, estimate, tracks, config, rough=True).solution
-        estimate = solution.estimate
-        landmarks.update_from(steps, estimate)
-        apart = seen_together(steps)
-        into = tie_visits(landmarks, paths.uncertainty(steps), apart)
-        steps = merged(steps, into, landmarks)
-        apart = {frozenset(into.get(number, number) for number in pair) for pair in apart}
-        also = find_duplicates(solution, landmarks, apart)
-        steps = merged(steps, also, landmarks)
-        counts["landmarks_merged"] += len(into) + len(also)
-        again = reassociate(
-            steps,
-            estimate,
-            landmarks.entries,
-            factor_m * association.reassociation_gate_m,
-            factor_rad * association.reassociation_gate_rad,
-            association.overlap_gap_m,
-            math.inf if n else config.loop_closure.revisit_path_m,
-        )
-        steps = again.steps
-        counts["observations_reassociated"] += again.moved
-        counts["observations_dropped"] += again.dropped
-    missed = violated(closures, estimate.states, ALREADY_CLOSED)
+    closures = list(paths.closures)
+    steps = _tied(steps, start, None, paths, scan_log)
+    rough = _solve(with_closures(steps, closures), start, tracks, config, rough=True).solution
+    steps = _tied(steps, rough.estimate, rough, paths, scan_log)
+    # once landmarks of different visits are tied, most closures are no longer needed
+    missed = violated(closures, rough.estimate.states, ALREADY_CLOSED)
     closures = [c for c, off in zip(closures, missed, strict=True) if off]
     closures = untied_closures(closures, paths.spans, steps, landmarks)
     counts["closures_kept"] = len(closures)
-    done = _solve(with_closures(steps, closures), estimate, tracks, config, rough=False)
+    done = _solve(with_closures(steps, closures), rough.estimate, tracks, config, rough=False)
     estimate, steps = done.solution.estimate, done.steps
     landmarks.update_from(steps, estimate)
     for name in tracks:
         scan_log.runs[name].is_calibrated = config.odometry.calibrate
     return estimate, steps
+
+
+def _tied(
+    steps: tuple[Step, ...],
+    estimate: Estimate,
+    solution: CalibratedSolution | None,
+    paths: ClosedPaths,
+    scan_log: ScanLog,
+) -> tuple[Step, ...]:
+    """Steps with landmarks that are one tied, and observations at the walls that they fit best.
+
+    ``estimate`` is that of the closed paths, or of a ``solution``. Only the latter has covariances,
+    and its visits lie together, so that an observation may move from one visit's wall to another's.
+    """
+    config, counts, landmarks = scan_log.config, scan_log.counts, scan_log.landmarks
+    landmarks.update_from(steps, estimate)
+    apart = seen_together(steps)
+    into = tie_visits(landmarks, paths.uncertainty(steps), apart)
+    steps = merged(steps, into, landmarks)
+    counts["landmarks_merged"] += len(into)
+    if solution:
+        apart = {frozenset(into.get(number, number) for number in pair) for pair in apart}
+        into = find_duplicates(solution, landmarks, apart)
+        steps = merged(steps, into, landmarks)
+        counts["landmarks_merged"] += len(into)
+    factor_m, factor_rad = SOLVED_FACTORS if solution else CLOSED_FACTORS
+    again = reassociate(
+        steps,
+        estimate,
+        landmarks.entries,
+        factor_m * config.association.reassociation_gate_m,
+        factor_rad * config.association.reassociation_gate_rad,
+        config.association.overlap_gap_m,
+        math.inf if solution else config.loop_closure.revisit_path_m,
+    )
+    counts["observations_reassociated"] += again.moved
+    counts["observations_dropped"] += again.dropped
+    return again.steps
 
 
 def find_duplicates(

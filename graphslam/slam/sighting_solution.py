@@ -157,7 +157,7 @@ def _with_landmarks(
     estimate = Estimate(states, {}, 0.0, 0)
     made = recompute_steps(steps, estimate, tracks, groups)
     seen = [a for step in made for a in step.associations if isinstance(a.target, int)]
-    x = observed_from(seen, estimate)
+    x = observed_from(seen, estimate.states)
     number = np.array([a.target for a in seen])
     landmarks: dict[int, tuple[Array, Array]] = {}
     for landmark in np.unique(number).tolist():
