@@ -9,7 +9,8 @@ set is used, under the joint covariance of the estimate: J. Mangelson et al., IC
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -21,14 +22,21 @@ from graphslam.core.records import Closure, Trajectory
 from graphslam.core.worker import parallel_map
 from graphslam.mapping.submap_graph import relative_jacobian
 from graphslam.mapping.submaps import State, SubmapPose, drift_covariance
-from graphslam.perception.scan_matching import IntArray, Match, Submap, agreement, align, fit, match
+from graphslam.perception.scan_matching import (
+    IntArray,
+    Match,
+    agreement,
+    align_pairs,
+    match_pairs,
+    shares_on_others,
+)
 
 #: m between the middles of submaps that may show one place: the default reach of a submap
 NEAR_M = 3.0
 #: half the window of a search: so many sigmas of the relative pose, and this much more (m, m, rad)
 SIGMAS, MARGIN = 3.0, np.array([0.6, 0.6, 0.08])
 #: pairs of submaps from which on a second process is used to match them
-MIN_PARALLEL_PAIRS = 16
+MIN_PARALLEL_PAIRS = 6
 #: verified: least share of points confirmed, largest share in free space, of both submaps
 MIN_CONFIRMED, MAX_SEEN_THROUGH = 0.4, 0.15
 #: share of points on others in a coarse search below which `MIN_CONFIRMED` is out of reach, so that
@@ -160,61 +168,140 @@ def loop_closures(
         Closures that correct the estimate, found by a search; and closures that confirm it, where
         the two submaps match as they lie.
     """
-    pairs: list[tuple[SubmapPose, SubmapPose, Array, Array]] = []
+    pairs = []
     for i, j, window in candidates(found, COV_INFLATION * P, config):
-        later, earlier = found[i], found[j]
-        guess = between(earlier.pose, later.pose)
-        pair = later.state, earlier.state
-        if pair in examined and are_near(examined[pair], guess, ALREADY_CLOSED):
+        guess = between(found[j].pose, found[i].pose)
+        pairs.append(SubmapPair(found[i], found[j], guess, window))
+    return verified_closures(pairs, examined, along=False)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SubmapPair:
+    """Two submaps that may show one place.
+
+    ``guess`` (3,) is the estimated pose of the ``later`` in the ``earlier`` one, ``window`` (3,)
+    half of what to search around it, m, m, rad.
+    """
+
+    later: SubmapPose
+    earlier: SubmapPose
+    guess: Array
+    window: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verified:
+    """A verified relative pose (3,) of two submaps, its cov (3, 3), and if it was searched for."""
+
+    pose: Array
+    cov: Array
+    is_searched: bool
+
+
+def verified_closures(
+    pairs: Sequence[SubmapPair], examined: dict[Pair, Array], *, along: bool
+) -> tuple[list[Closure], list[Closure]]:
+    """Closures of the pairs that are verified, each by itself.
+
+    For ``examined`` and what is returned see `loop_closures`, for ``along`` see `verify_pairs`.
+    """
+    new = []
+    for pair in pairs:
+        states = pair.later.state, pair.earlier.state
+        if states in examined and are_near(examined[states], pair.guess, ALREADY_CLOSED):
             continue
-        examined[pair] = guess
-        pairs.append((later, earlier, guess, window))
+        examined[states] = pair.guess
+        new.append(pair)
     correcting: list[Closure] = []
     confirming: list[Closure] = []
-    results = parallel_map(verify_pair, pairs, fewest=MIN_PARALLEL_PAIRS)
-    for (later, earlier, _, _), result in zip(pairs, results, strict=True):
-        if result is not None:
-            is_searched, pose, cov = result
+    for pair, found in zip(new, _verified(new, along=along), strict=True):
+        if found is not None:
+            later, earlier = pair.later, pair.earlier
             images = min(len(later.submap.clouds), len(earlier.submap.clouds))
-            closure = Closure(*later.state, *earlier.state, pose, cov, scan_count=images)
-            (correcting if is_searched else confirming).append(closure)
+            closure = Closure(
+                *later.state, *earlier.state, found.pose, found.cov, scan_count=images
+            )
+            (correcting if found.is_searched else confirming).append(closure)
     return correcting, confirming
 
 
-def verify_pair(
-    pair: tuple[SubmapPose, SubmapPose, Array, Array], *, along: bool = False
-) -> tuple[bool, Array, Array] | None:
-    """Whether a pair had to be searched for, its relative pose (3,) and covariance (3, 3).
+def _verified(pairs: Sequence[SubmapPair], *, along: bool) -> list[Verified | None]:
+    """`verify_pairs`, half of them in the second process if they are many."""
+    if len(pairs) < MIN_PARALLEL_PAIRS:
+        return verify_pairs(pairs, along=along)
+    found: list[Verified | None] = [None] * len(pairs)
+    found[::2], found[1::2] = parallel_map(
+        partial(verify_pairs, along=along), [pairs[::2], pairs[1::2]]
+    )
+    return found
 
-    None if it is not verified. ``pair``: the later and the earlier submap, the estimated relative
-    pose (3,), and half the window (3,) to search. ``along``: matches that leave the direction of a
-    corridor open are verified too, see `verify_match_across`.
+
+def verify_pairs(pairs: Sequence[SubmapPair], *, along: bool = False) -> list[Verified | None]:
+    """How each of the pairs is verified, None if it is not.
+
+    Where a match lies where it is guessed, nothing is searched for. ``along``: matches that leave
+    the direction of a corridor open are verified too, see `verify_match_across`.
     """
-    later, earlier, guess, window = pair
-    in_place = verify_in_place(later.submap, earlier.submap, guess)
-    if in_place is not None:
-        pose, cov = in_place
-    else:
-        found = match(later.submap, earlier.submap, guess, window, MIN_COARSE_OVERLAP)
-        best = verify_match_across(found) if along else verify_match(found)
-        if best is None:
-            return None
-        pose, cov = best.pose, best.cov
-    if along:
-        cov = leave_open(later.submap, earlier.submap, pose, cov)
-    return in_place is None, pose, cov
+    found: list[Verified | None] = verify_in_place(pairs)
+    rest = [k for k, one in enumerate(found) if one is None]
+    searched = [pairs[k] for k in rest]
+    matches = match_pairs(
+        [p.later.submap for p in searched],
+        [p.earlier.submap for p in searched],
+        [p.guess for p in searched],
+        [p.window for p in searched],
+        MIN_COARSE_OVERLAP,
+    )
+    for k, own in zip(rest, matches, strict=True):
+        best = verify_match_across(own) if along else verify_match(own)
+        if best is not None:
+            found[k] = Verified(best.pose, best.cov, True)
+    return leave_open(pairs, found) if along else found
 
 
-def leave_open(source: Submap, target: Submap, pose: Array, cov: Array) -> Array:
-    """Covariance (3, 3) of a match, its weakest direction open if a shift along it fits as well.
+def verify_in_place(pairs: Sequence[SubmapPair]) -> list[Verified | None]:
+    """The pairs that match where they are guessed; the others None.
+
+    The covariance is large along directions that the points leave open.
+    """
+    poses, covs = align_pairs(
+        [p.later.submap for p in pairs],
+        [p.earlier.submap for p in pairs],
+        [p.guess for p in pairs],
+    )
+    return [
+        Verified(pose, cov, False)
+        if are_near(pair.guess, pose, ALREADY_CLOSED)
+        and _is_confirmed(*agreement(pair.later.submap, pair.earlier.submap, pose))
+        else None
+        for pair, pose, cov in zip(pairs, poses, covs, strict=True)
+    ]
+
+
+def leave_open(
+    pairs: Sequence[SubmapPair], found: Sequence[Verified | None]
+) -> list[Verified | None]:
+    """Verified pairs, the weakest direction of each open if a shift along it fits as well.
 
     Between parallel walls the noise of points looks like structure along them.
     """
-    along = np.linalg.eigh(cov[:2, :2])[1][:, 1]
-    shift = OPEN_SHIFT_M * np.append(along, 0.0)
-    here = fit(source, target, pose)[0]
-    beside = max(fit(source, target, pose + sign * shift)[0] for sign in (-1.0, 1.0))
-    return _open_along(cov, along) if beside >= OPEN_SHARE * here else cov
+    opened = list(found)
+    matched = [(k, one) for k, one in enumerate(found) if one is not None]
+    if not matched:
+        return opened
+    along = np.linalg.eigh(np.array([one.cov[:2, :2] for _, one in matched]))[1][:, :, 1]
+    shift = OPEN_SHIFT_M * np.column_stack([along, np.zeros(len(along))])
+    poses = np.array([one.pose for _, one in matched])
+    here, before, behind = shares_on_others(
+        3 * [pairs[k].later.submap for k, _ in matched],
+        3 * [pairs[k].earlier.submap for k, _ in matched],
+        np.concatenate([poses, poses - shift, poses + shift]),
+    ).reshape(3, -1)
+    is_open = np.maximum(before, behind) >= OPEN_SHARE * here
+    for (k, one), direction, really in zip(matched, along, is_open, strict=True):
+        if really:
+            opened[k] = replace(one, cov=_open_along(one.cov, direction))
+    return opened
 
 
 def _open_along(cov: Array, along: Array) -> Array:
@@ -222,17 +309,6 @@ def _open_along(cov: Array, along: Array) -> Array:
     opened = cov.copy()
     opened[:2, :2] += UNKNOWN_ALONG_M**2 * np.outer(along, along)
     return opened
-
-
-def verify_in_place(source: Submap, target: Submap, guess: Array) -> tuple[Array, Array] | None:
-    """Pose (3,) and covariance (3, 3) of ``source`` in ``target`` if they match at ``guess`` (3,).
-
-    None if they do not. The covariance is large along directions that the points leave open.
-    """
-    pose, cov = align(source, target, guess)
-    if not are_near(guess, pose, ALREADY_CLOSED):
-        return None
-    return (pose, cov) if _is_confirmed(*agreement(source, target, pose)) else None
 
 
 def _is_confirmed(same: float, absent: float) -> bool:

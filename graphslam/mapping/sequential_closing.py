@@ -10,27 +10,24 @@ however often a place is visited.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from graphslam.core.config import LoopClosureConfig
 from graphslam.core.geometry import Array, between
 from graphslam.core.records import Closure
-from graphslam.core.worker import parallel_map
 from graphslam.mapping.gating import IntArray
 from graphslam.mapping.loop_closure import (
-    ALREADY_CLOSED,
     COV_INFLATION,
     MARGIN,
     MAX_RESIDUAL,
     NEAR_M,
     SIGMAS,
     Pair,
-    are_near,
+    SubmapPair,
     consistent_closures,
     known_part,
-    verify_pair,
+    verified_closures,
 )
 from graphslam.mapping.submap_graph import RelativePoses, SubmapGraph
 from graphslam.mapping.submaps import State, SubmapPose
@@ -39,8 +36,6 @@ from graphslam.mapping.submaps import State, SubmapPose
 AT_ONCE, MAX_ROUNDS = 10, 4
 #: earlier visits that one submap is compared with, at most, the nearest first
 MAX_VISITS = 3
-#: pairs from which on a second process is used to match them
-MIN_PARALLEL = 6
 #: m, m, rad: two sigmas of a relative pose that another match would not improve
 KNOWN = np.array([0.05, 0.05, 0.012])
 
@@ -116,25 +111,12 @@ class _Closer:
 
     def verified(self, later: IntArray) -> tuple[list[Closure], list[Closure]]:
         """Closures of submaps that were searched for, and of those that match as they lie."""
-        work: list[tuple[SubmapPose, SubmapPose, Array, Array]] = []
-        for i, j, window in self.candidates(later):
-            a, b = self.submaps[i], self.submaps[j]
-            guess = between(self.poses[j], self.poses[i])
-            pair = a.state, b.state
-            if pair in self.examined and are_near(self.examined[pair], guess, ALREADY_CLOSED):
-                continue
-            self.examined[pair] = guess
-            work.append((a, b, guess, window))
-        correcting: list[Closure] = []
-        confirming: list[Closure] = []
-        results = parallel_map(partial(verify_pair, along=True), work, fewest=MIN_PARALLEL)
-        for (a, b, _, _), result in zip(work, results, strict=True):
-            if result is not None:
-                is_searched, pose, cov = result
-                images = min(len(a.submap.clouds), len(b.submap.clouds))
-                closure = Closure(*a.state, *b.state, pose, cov, scan_count=images)
-                (correcting if is_searched else confirming).append(closure)
-        return correcting, confirming
+        poses = self.poses
+        pairs = [
+            SubmapPair(self.submaps[i], self.submaps[j], between(poses[j], poses[i]), window)
+            for i, j, window in self.candidates(later)
+        ]
+        return verified_closures(pairs, self.examined, along=True)
 
     def believe(self, correcting: list[Closure], confirming: list[Closure]) -> bool:
         """Add those that are consistent to the graph; whether any correct it."""

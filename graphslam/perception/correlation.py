@@ -14,6 +14,8 @@ from graphslam.core.geometry import Array
 
 #: value of cells next to an occupied one, which has 1: a point half a cell off still counts half
 BESIDE = 0.5
+#: values that are looked up at once
+AT_ONCE = 1 << 18
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,10 +34,15 @@ class OccupancyGrid:
         return _cells(points - self.low, self.cell_m)
 
     def correlate_window(self, points: Array, shape: tuple[int, int]) -> Array:
-        """Mean values (shape) under points (n, 2) m that are shifted by 0, 1, ... cells."""
+        """Mean values (k, *shape) under k sets of points (k, n, 2) m shifted by 0, 1, ... cells."""
         windows = np.lib.stride_tricks.sliding_window_view(self.values, shape)
-        x, y = np.clip(self.cells(points), 0, np.array(windows.shape[:2]) - 1).T
-        return np.asarray(windows[x, y].mean(axis=0))
+        last = np.array(windows.shape[:2]) - 1
+        x, y = np.moveaxis(np.clip(self.cells(points), 0, last), -1, 0)
+        at_once = max(1, AT_ONCE // (points.shape[1] * shape[0] * shape[1]))
+        return np.concatenate([
+            windows[x[k : k + at_once], y[k : k + at_once]].mean(axis=1)
+            for k in range(0, len(x), at_once)
+        ])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,6 +6,7 @@ the nearest to the middle of the cell, so it may be farther away than the neares
 cell's diagonal.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -44,22 +45,30 @@ class NearestPoints:
         of_label[label[cells[:, 0], cells[:, 1]]] = np.arange(len(points))
         return cls(of_label[label], low, cell_m)
 
-    def query(self, points: Array, reach_m: float, known: Array) -> tuple[IntArray, Array]:
-        """Neighbours of points (m, 2) within ``reach_m``.
 
-        Args:
-            points: where to look.
-            reach_m: largest distance.
-            known: (n, 2) the points of which the grid was made.
+def nearest_of_each(
+    grids: Sequence[NearestPoints], points: Array, which: IntArray, count: IntArray
+) -> IntArray:
+    """Numbers (m,) of the points that are nearest to ``points`` (m, 2), each in a grid of its own.
 
-        Returns:
-            Indices (k,) of the points that have a neighbour, and of their neighbours (k,).
-        """
-        cells = ((points - self.low) / self.cell_m).astype(np.intp)
-        size = self.index.shape
-        x, y = cells.T
-        inside = np.flatnonzero((x >= 0) & (x < size[0]) & (y >= 0) & (y < size[1]))
-        near = self.index[x[inside], y[inside]]
-        d = points[inside] - known[near]
-        ok = (d * d).sum(axis=1) < reach_m * reach_m
-        return inside[ok], near[ok].astype(np.intp)
+    Outside of a grid, it is any that is beyond the reach of the grid.
+
+    Args:
+        grids: n, with cells of one size.
+        points: where to look.
+        which: (m,) their grids by number, in ascending order.
+        count: (n,) how many points there are for each grid.
+    """
+    low = np.array([grid.low for grid in grids])
+    last = np.array([grid.index.shape for grid in grids]) - 1
+    x, y = (
+        np.clip((points[:, k] - low[which, k]) / grids[0].cell_m, 0, last[which, k]).astype(np.intp)
+        for k in (0, 1)
+    )
+    cells = x * (last[which, 1] + 1) + y
+    near = np.empty(len(points), dtype=np.int32)
+    end = 0
+    for grid, m in zip(grids, count.tolist(), strict=True):
+        begin, end = end, end + m
+        grid.index.take(cells[begin:end], out=near[begin:end], mode="clip")
+    return near.astype(np.intp)

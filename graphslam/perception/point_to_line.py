@@ -61,8 +61,8 @@ def redescending(squared: Array, gate_m: float) -> Array:
 
 
 def gauss_newton_step(information: Array, gradient: Array) -> Array:
-    """The additive step (3,) of a pose, -A⁻¹ g."""
-    return -np.asarray(np.linalg.solve(information, gradient), dtype=float)
+    """The additive steps (..., 3) of poses, -A⁻¹ g."""
+    return -np.asarray(np.linalg.solve(information, gradient[..., None])[..., 0], dtype=float)
 
 
 def step_poses(poses: Array, step: Array) -> Array:

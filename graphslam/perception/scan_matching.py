@@ -8,6 +8,7 @@ the scans of the other confirm, and which lie in what those saw as free space.
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,9 +17,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from graphslam.core.config import ScanMatchingConfig
-from graphslam.core.geometry import Array, between, transform
+from graphslam.core.geometry import Array, between, rotation3, transform
 from graphslam.perception.correlation import occupancy_grid
-from graphslam.perception.nearest_points import NearestPoints
+from graphslam.perception.nearest_points import NearestPoints, nearest_of_each
 from graphslam.perception.point_to_line import (
     gauss_newton_step,
     line_metrics,
@@ -40,6 +41,8 @@ CLUTTER_SIGMAS, SAME_SIGMAS = 2.0, 5.0
 #: points whose errors count as one: materials, curvature and the submap's own shape are shared
 CORRELATED_POINTS = 10
 ITERATIONS = 12
+#: m, rad: an alignment has converged when nothing moves more than this
+CONVERGED = 1e-4
 #: cell of the grid of nearest points, as a share of that to which points are thinned
 NEAREST_CELL = 1.0
 #: points that must have a neighbour, at least; information (1/m², 1/rad²) added to that of a pose,
@@ -191,10 +194,8 @@ def search(
     x, y, turns = (_steps(half, size) for half, size in zip(window, sizes, strict=True))
     shape = len(x), len(y)
     grid = occupancy_grid(target.points, cell_m, np.array(shape) + 2)
-    scores = np.empty((len(turns), *shape))
-    for row, turn in enumerate(turns):
-        placed = transform(np.array([guess[0] + x[0], guess[1] + y[0], guess[2] + turn]), points)
-        scores[row] = grid.correlate_window(placed, shape)
+    turned = points @ rotation3(guess[2] + turns)[:, :2, :2].mT
+    scores = grid.correlate_window(turned + guess[:2] + np.array([x[0], y[0]]), shape)
     found: list[Array] = []
     min_score = max(MIN_SCORE_SHARE * float(scores.max()), min_score)
     while len(found) < MAX_POSES and scores.max() > min_score:
@@ -217,24 +218,42 @@ def _steps(half: float, step: float) -> Array:
 def align(source: Submap, target: Submap, guess: Array) -> tuple[Array, Array]:
     """The pose (3,) of ``source`` in ``target`` near ``guess`` (3,), and its covariance (3, 3).
 
+    See `align_pairs`.
+    """
+    poses, covs = align_pairs([source], [target], [guess])
+    return poses[0], covs[0]
+
+
+def align_pairs(
+    sources: Sequence[Submap], targets: Sequence[Submap], guesses: Sequence[Array]
+) -> tuple[Array, Array]:
+    """Poses (n, 3) of n submaps in others near ``guesses`` (3,), and their covs (n, 3, 3).
+
     Iterated least squares: each point is matched to its nearest neighbour, across a surface or in
     both directions where there is none. Points farther away than a reach that shrinks from
     iteration to iteration do not count. In directions that the points do not determine (along a
-    corridor) the covariance is large.
+    corridor) the covariance is large. A pair's result does not depend on the other pairs.
     """
-    x = np.array(guess, dtype=float)
-    points = _subsample(source.points, ALIGN_POINTS)
-    first, last = target.config.reach_m, SAME_SIGMAS * target.config.point_sigma_m
+    x = np.array(guesses, dtype=float).reshape(-1, 3)
+    information = np.zeros((len(x), 3, 3))
+    if not len(x):
+        return x, information
+    config = targets[0].config
+    pairs, left = _PointPairs(sources, targets), np.arange(len(x))
+    first, last = config.reach_m, SAME_SIGMAS * config.point_sigma_m
     for k in range(ITERATIONS):
         reach = first * (last / first) ** min(1.0, 2 * k / ITERATIONS)
-        A, g, weight = _linearise(points, target, x, reach)
-        if not weight:
-            return x, UNKNOWN_VAR * np.eye(3)
-        step = gauss_newton_step(A, g)
-        x = step_poses(x, step)
-        if k > ITERATIONS // 2 and np.abs(step).max() < 1e-4:
+        information[left], g, weight = pairs.linearise(x[left], reach)
+        step = gauss_newton_step(information[left], g)
+        x[left] = step_poses(x[left], step)
+        goes_on = weight > 0
+        if k > ITERATIONS // 2:
+            goes_on &= np.abs(step).max(axis=1) >= CONVERGED
+        if not goes_on.any():
             break
-    return x, _covariance(A, target.config)
+        if not goes_on.all():
+            pairs, left = pairs.only(goes_on), left[goes_on]
+    return x, _covariance(information, config)
 
 
 def fit(source: Submap, target: Submap, pose: Array) -> tuple[float, Array, Array]:
@@ -243,36 +262,85 @@ def fit(source: Submap, target: Submap, pose: Array) -> tuple[float, Array, Arra
     Returns:
         Share of its points that lie on others (a point that is 2 sigmas off counts half); the first
         Gauss-Newton step (3,) of the pose; and the covariance (3, 3) of the pose after it, see
-        `align`.
+        `align_pairs`.
     """
-    points = _subsample(source.points, ALIGN_POINTS)
-    A, g, weight = _linearise(points, target, pose, SAME_SIGMAS * target.config.point_sigma_m)
-    if not weight:
-        return 0.0, np.zeros(3), UNKNOWN_VAR * np.eye(3)
-    return weight / len(points), gauss_newton_step(A, g), _covariance(A, target.config)
+    pairs = _PointPairs([source], [target])
+    A, g, weight = pairs.linearise(pose[None], SAME_SIGMAS * target.config.point_sigma_m)
+    share = float(weight[0] / pairs.count[0])
+    return share, gauss_newton_step(A, g)[0], _covariance(A, target.config)[0]
 
 
-def _linearise(points: Array, target: Submap, x: Array, reach: float) -> tuple[Array, Array, float]:
-    """Normal equations of points (n, 2) seen from x (3,) and their neighbours within ``reach``, m.
+def shares_on_others(sources: Sequence[Submap], targets: Sequence[Submap], poses: Array) -> Array:
+    """Shares (n,) of the points of n submaps that lie on those of others, see `fit`."""
+    if not len(poses):
+        return np.zeros(0)
+    pairs = _PointPairs(sources, targets)
+    reach = SAME_SIGMAS * targets[0].config.point_sigma_m
+    return np.asarray(pairs.linearise(poses, reach)[2] / pairs.count)
 
-    Returns:
-        Information (3, 3), gradient (3,), and the sum of the points' robust weights: all 0 where
-        there are hardly any neighbours.
-    """
-    placed = transform(x, points)
-    found, near = target.nearest.query(placed, reach, target.points)
-    if len(found) < MIN_NEIGHBOURS:
-        return np.zeros((3, 3)), np.zeros(3), 0.0
-    p = placed[found]
-    terms, squared = point_terms(p - target.points[near], target.information[near], p - x[:2])
-    w = 1.0 / (1.0 + squared / 4.0)
-    A, g = normal_equations(terms @ w)
-    return A + REGULAR * np.eye(3), g, float(w.sum())
+
+class _PointPairs:
+    """Points of n submaps and the nearest ones of n others, as arrays over all pairs."""
+
+    def __init__(self, sources: Sequence[Submap], targets: Sequence[Submap]) -> None:
+        clouds = [_subsample(s.points, ALIGN_POINTS) for s in sources]
+        self.points = np.concatenate(clouds)
+        self.count = np.array([len(c) for c in clouds])
+        # submap -> where its points begin in the table of all
+        distinct = {id(t): t for t in targets}
+        sizes = [len(t.points) for t in distinct.values()]
+        begins = dict(zip(distinct, np.cumsum([0, *sizes]), strict=False))
+        self.known = np.concatenate([t.points for t in distinct.values()])
+        self.information = np.concatenate([t.information for t in distinct.values()])
+        self.begin = np.array([begins[id(t)] for t in targets])
+        self.grids = [t.nearest for t in targets]
+        self._number()
+
+    def _number(self) -> None:
+        self.pair = np.repeat(np.arange(len(self.count)), self.count)
+        self.first = np.cumsum(self.count) - self.count
+
+    def only(self, which: BoolArray) -> "_PointPairs":
+        """Some of the pairs."""
+        kept = copy(self)
+        kept.points, kept.count = self.points[which[self.pair]], self.count[which]
+        kept.begin = self.begin[which]
+        kept.grids = [grid for grid, one in zip(self.grids, which, strict=True) if one]
+        kept._number()
+        return kept
+
+    def linearise(self, poses: Array, reach_m: float) -> tuple[Array, Array, Array]:
+        """Normal equations of points seen from poses (n, 3) and their neighbours within reach.
+
+        Returns:
+            Information (n, 3, 3), gradient (n, 3), and the sums (n,) of the points' robust weights:
+            all 0 where there are hardly any neighbours.
+        """
+        c, s = np.cos(poses[:, 2])[self.pair], np.sin(poses[:, 2])[self.pair]
+        x, y = self.points.T
+        arms = np.column_stack([c * x - s * y, s * x + c * y])
+        placed = arms + poses[self.pair, :2]
+        near = nearest_of_each(self.grids, placed, self.pair, self.count) + self.begin[self.pair]
+        off = placed - self.known[near]
+        ok = (off * off).sum(axis=1) < reach_m * reach_m
+        pair = self.pair[ok]
+        terms, squared = point_terms(off[ok], self.information[near[ok]], arms[ok])
+        w = 1.0 / (1.0 + squared / 4.0)
+        terms *= w
+        n = len(poses)
+        sums = np.array([np.bincount(pair, row, minlength=n) for row in terms])
+        enough = np.bincount(pair, minlength=n) >= MIN_NEIGHBOURS
+        A, g = normal_equations(sums * enough)
+        weight = np.where(enough, np.bincount(pair, w, minlength=n), 0.0)
+        return A + REGULAR * np.eye(3), g, weight
 
 
 def _covariance(information: Array, config: ScanMatchingConfig) -> Array:
+    """Covariances (n, 3, 3) by information (n, 3, 3); that of no neighbours at all is large."""
     floor = np.diag([config.floor_m**2, config.floor_m**2, config.floor_rad**2])
-    return np.asarray(CORRELATED_POINTS * np.linalg.inv(information) + floor)
+    known = (information[:, 2, 2] > REGULAR)[:, None, None]
+    inverse = np.linalg.inv(np.where(known, information, np.eye(3)))
+    return np.where(known, CORRELATED_POINTS * inverse + floor, UNKNOWN_VAR * np.eye(3))
 
 
 def agreement(source: Submap, target: Submap, pose: Array) -> tuple[float, float]:
@@ -310,17 +378,37 @@ def _compare_with_scans(points: Array, submap: Submap) -> tuple[BoolArray, BoolA
 def match(
     source: Submap, target: Submap, guess: Array, window: Array, min_score: float = 0.0
 ) -> list[Match]:
-    """All poses of ``source`` in ``target`` within a window that fit, the most agreeing first.
+    """All poses of ``source`` in ``target`` within a window that fit, see `match_pairs`."""
+    return match_pairs([source], [target], [guess], [window], min_score)[0]
 
-    ``guess`` (3,) is the middle of the window, ``window`` (3,) half its size, m, m, rad; for
+
+def match_pairs(
+    sources: Sequence[Submap],
+    targets: Sequence[Submap],
+    guesses: Sequence[Array],
+    windows: Sequence[Array],
+    min_score: float = 0.0,
+) -> list[list[Match]]:
+    """For n pairs all poses of one in the other that fit, the most agreeing first.
+
+    ``guesses`` (3,) are the middles of windows, ``windows`` (3,) half their sizes, m, m, rad; for
     ``min_score`` see `search`.
     """
-    found: list[Match] = []
-    for start in search(source, target, guess, window, min_score):
-        pose, cov = align(source, target, start)
-        if not any(_duplicates(pose, m.pose, target.config) for m in found):
-            found.append(Match(pose, cov, *agreement(source, target, pose)))
-    return sorted(found, key=lambda m: m.absent - m.same)
+    starts = [
+        search(s, t, guess, window, min_score)
+        for s, t, guess, window in zip(sources, targets, guesses, windows, strict=True)
+    ]
+    pair = [n for n, own in enumerate(starts) for _ in own]
+    poses, covs = align_pairs(
+        [sources[n] for n in pair],
+        [targets[n] for n in pair],
+        [start for own in starts for start in own],
+    )
+    found: list[list[Match]] = [[] for _ in starts]
+    for n, pose, cov in zip(pair, poses, covs, strict=True):
+        if not any(_duplicates(pose, m.pose, targets[n].config) for m in found[n]):
+            found[n].append(Match(pose, cov, *agreement(sources[n], targets[n], pose)))
+    return [sorted(own, key=lambda m: m.absent - m.same) for own in found]
 
 
 def _duplicates(a: Array, b: Array, config: ScanMatchingConfig) -> bool:

@@ -10,6 +10,8 @@ from graphslam.core.config import Config, LoopClosureConfig
 from graphslam.core.geometry import between, compose
 from graphslam.core.records import Closure, KeyframeScan, Trajectory
 from graphslam.mapping.loop_closure import (
+    SubmapPair,
+    Verified,
     candidates,
     consistent_closures,
     fix_position,
@@ -21,7 +23,7 @@ from graphslam.mapping.loop_closure import (
     verify_match_across,
     violated,
 )
-from graphslam.mapping.submaps import build_submaps
+from graphslam.mapping.submaps import SubmapPose, build_submaps
 from graphslam.perception.scan_matching import Match, make_submap
 
 COV = np.diag([0.02, 0.02, 0.005]) ** 2
@@ -237,9 +239,12 @@ def test_between_parallel_walls_a_match_is_open_along_them_and_in_a_room_it_is_n
     for points, is_open in ((walls, True), (np.concatenate([walls, ends]), False)):
         submap = make_submap(np.zeros((1, 3)), [points])
         cov = np.diag([0.05, 0.02, 0.005]) ** 2
-        found = leave_open(submap, submap, np.zeros(3), cov)
-        assert bool(np.sqrt(found[0, 0]) > 4.0) is is_open
-        assert np.sqrt(found[1, 1]) == pytest.approx(0.02)
+        place = SubmapPose(("robot", 0), np.zeros(3), 0.0, (0, 0), submap)
+        pair = SubmapPair(place, place, np.zeros(3), np.zeros(3))
+        missing, found = leave_open([pair, pair], [None, Verified(np.zeros(3), cov, True)])
+        assert missing is None
+        assert bool(np.sqrt(found.cov[0, 0]) > 4.0) is is_open
+        assert np.sqrt(found.cov[1, 1]) == pytest.approx(0.02)
 
 
 def test_what_a_closure_leaves_open_is_no_residual():

@@ -73,5 +73,5 @@ def test_a_window_and_the_whole_grid_give_the_same_correlation():
     spectrum = grid_spectrum(grid)
     scores = spectrum.correlate(points)
     x, y = 10, 12
-    window = grid.correlate_window(points + grid.low + 0.25 * np.array([x, y]), (4, 5))
+    window = grid.correlate_window((points + grid.low + 0.25 * np.array([x, y]))[None], (4, 5))[0]
     np.testing.assert_allclose(window, scores[x : x + 4, y : y + 5], atol=1e-6)
