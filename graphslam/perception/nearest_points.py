@@ -46,29 +46,19 @@ class NearestPoints:
         return cls(of_label[label], low, cell_m)
 
 
-def nearest_of_each(
-    grids: Sequence[NearestPoints], points: Array, which: IntArray, count: IntArray
-) -> IntArray:
-    """Numbers (m,) of the points that are nearest to ``points`` (m, 2), each in a grid of its own.
+def nearest_of_each(grids: Sequence[NearestPoints], points: Array) -> IntArray:
+    """Numbers (n, m) of the points that are nearest to ``points`` (2, n, m), m in each of n grids.
 
-    Outside of a grid, it is any that is beyond the reach of the grid.
-
-    Args:
-        grids: n, with cells of one size.
-        points: where to look.
-        which: (m,) their grids by number, in ascending order.
-        count: (n,) how many points there are for each grid.
+    The grids have cells of one size. Outside of a grid, it is any point that is beyond its reach.
     """
     low = np.array([grid.low for grid in grids])
-    last = np.array([grid.index.shape for grid in grids]) - 1
+    shape = np.array([grid.index.shape for grid in grids])
     x, y = (
-        np.clip((points[:, k] - low[which, k]) / grids[0].cell_m, 0, last[which, k]).astype(np.intp)
+        np.clip((points[k] - low[:, k : k + 1]) / grids[0].cell_m, 0, shape[:, k : k + 1] - 1)
         for k in (0, 1)
     )
-    cells = x * (last[which, 1] + 1) + y
-    near = np.empty(len(points), dtype=np.int32)
-    end = 0
-    for grid, m in zip(grids, count.tolist(), strict=True):
-        begin, end = end, end + m
-        grid.index.take(cells[begin:end], out=near[begin:end], mode="clip")
+    cells = x.astype(np.intp) * shape[:, 1:] + y.astype(np.intp)
+    near = np.empty(cells.shape, dtype=np.int32)
+    for grid, there, found in zip(grids, cells, near, strict=True):
+        grid.index.take(there, out=found, mode="clip")
     return near.astype(np.intp)

@@ -41,6 +41,8 @@ CLUTTER_SIGMAS, SAME_SIGMAS = 2.0, 5.0
 #: points whose errors count as one: materials, curvature and the submap's own shape are shared
 CORRELATED_POINTS = 10
 ITERATIONS = 12
+#: m: where no point is
+FAR_M = 1e6
 #: m, rad: an alignment has converged when nothing moves more than this
 CONVERGED = 1e-4
 #: cell of the grid of nearest points, as a share of that to which points are thinned
@@ -280,33 +282,34 @@ def shares_on_others(sources: Sequence[Submap], targets: Sequence[Submap], poses
 
 
 class _PointPairs:
-    """Points of n submaps and the nearest ones of n others, as arrays over all pairs."""
+    """Points of n submaps, and the nearest ones of n others, as arrays (n, 2 * `ALIGN_POINTS`).
+
+    Where a submap has fewer points, the rest is far from everything. All rows are equally long, so
+    that a pair's sums are the same whatever the other pairs are.
+    """
 
     def __init__(self, sources: Sequence[Submap], targets: Sequence[Submap]) -> None:
-        clouds = [_subsample(s.points, ALIGN_POINTS) for s in sources]
-        self.points = np.concatenate(clouds)
-        self.count = np.array([len(c) for c in clouds])
+        clouds = [_subsample(source.points, ALIGN_POINTS) for source in sources]
+        self.points = np.full((2, len(sources), 2 * ALIGN_POINTS), FAR_M)
+        self.count = np.array([len(cloud) for cloud in clouds])
+        for k, cloud in enumerate(clouds):
+            self.points[:, k, : len(cloud)] = cloud.T
         # submap -> where its points begin in the table of all
         distinct = {id(t): t for t in targets}
         sizes = [len(t.points) for t in distinct.values()]
         begins = dict(zip(distinct, np.cumsum([0, *sizes]), strict=False))
-        self.known = np.concatenate([t.points for t in distinct.values()])
-        self.information = np.concatenate([t.information for t in distinct.values()])
+        self.known = np.concatenate([t.points for t in distinct.values()]).T.copy()
+        information = np.concatenate([t.information for t in distinct.values()])
+        self.information = information.reshape(-1, 4).T.copy()
         self.begin = np.array([begins[id(t)] for t in targets])
         self.grids = [t.nearest for t in targets]
-        self._number()
-
-    def _number(self) -> None:
-        self.pair = np.repeat(np.arange(len(self.count)), self.count)
-        self.first = np.cumsum(self.count) - self.count
 
     def only(self, which: BoolArray) -> "_PointPairs":
         """Some of the pairs."""
         kept = copy(self)
-        kept.points, kept.count = self.points[which[self.pair]], self.count[which]
+        kept.points, kept.count = self.points[:, which], self.count[which]
         kept.begin = self.begin[which]
         kept.grids = [grid for grid, one in zip(self.grids, which, strict=True) if one]
-        kept._number()
         return kept
 
     def linearise(self, poses: Array, reach_m: float) -> tuple[Array, Array, Array]:
@@ -316,23 +319,21 @@ class _PointPairs:
             Information (n, 3, 3), gradient (n, 3), and the sums (n,) of the points' robust weights:
             all 0 where there are hardly any neighbours.
         """
-        c, s = np.cos(poses[:, 2])[self.pair], np.sin(poses[:, 2])[self.pair]
-        x, y = self.points.T
-        arms = np.column_stack([c * x - s * y, s * x + c * y])
-        placed = arms + poses[self.pair, :2]
-        near = nearest_of_each(self.grids, placed, self.pair, self.count) + self.begin[self.pair]
-        off = placed - self.known[near]
-        ok = (off * off).sum(axis=1) < reach_m * reach_m
-        pair = self.pair[ok]
-        terms, squared = point_terms(off[ok], self.information[near[ok]], arms[ok])
-        w = 1.0 / (1.0 + squared / 4.0)
-        terms *= w
-        n = len(poses)
-        sums = np.array([np.bincount(pair, row, minlength=n) for row in terms])
-        enough = np.bincount(pair, minlength=n) >= MIN_NEIGHBOURS
-        A, g = normal_equations(sums * enough)
-        weight = np.where(enough, np.bincount(pair, w, minlength=n), 0.0)
-        return A + REGULAR * np.eye(3), g, weight
+        c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
+        x, y = self.points
+        arms = np.stack([c * x - s * y, s * x + c * y])
+        placed = arms + poses.T[:2, :, None]
+        near = nearest_of_each(self.grids, placed) + self.begin[:, None]
+        off = placed - self.known.take(near, axis=1, mode="clip")
+        ok = off[0] * off[0] + off[1] * off[1] < reach_m * reach_m
+        metrics = self.information.take(near, axis=1, mode="clip").reshape(2, 2, *near.shape)
+        terms, squared = point_terms(
+            np.moveaxis(off, 0, -1), np.moveaxis(metrics, (0, 1), (-2, -1)), np.moveaxis(arms, 0, -1)
+        )
+        w = ok / (1.0 + squared / 4.0)
+        enough = ok.sum(axis=1) >= MIN_NEIGHBOURS
+        A, g = normal_equations(np.einsum("knp,np->kn", terms, w) * enough)
+        return A + REGULAR * np.eye(3), g, w.sum(axis=1) * enough
 
 
 def _covariance(information: Array, config: ScanMatchingConfig) -> Array:

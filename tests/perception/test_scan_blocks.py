@@ -117,9 +117,8 @@ def test_nearest_points_are_nearest_up_to_a_cell():
     known = rng.uniform(-3, 3, (200, 2))
     asked = rng.uniform(-4, 4, (500, 2))
     grids = [NearestPoints.of(known[:100], 0.05, 0.6), NearestPoints.of(known, 0.05, 0.6)]
-    which = np.repeat([0, 1], 500)
-    near = nearest_of_each(grids, np.tile(asked, (2, 1)), which, np.array([500, 500]))
-    for size, own in ((100, near[:500]), (200, near[500:])):
+    near = nearest_of_each(grids, np.stack([asked.T, asked.T], axis=1))
+    for size, own in zip((100, 200), near, strict=True):
         distance = np.hypot(*(asked[:, None] - known[:size]).transpose(2, 0, 1))
         least = distance.min(axis=1)
         found = distance[np.arange(500), own]
