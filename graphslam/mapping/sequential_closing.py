@@ -8,7 +8,7 @@ submaps that one is compared with is bounded, so the work grows with the path, n
 however often a place is visited.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,12 +47,11 @@ Tamper = Callable[[list[Closure], Sequence[SubmapPose]], list[Closure]]
 class ClosedLoops:
     """The result of `close_loops`.
 
-    ``correcting`` closures were found by a search, ``confirming``
-    ones where the submaps lay; ``refused`` is the number of those that were inconsistent.
+    ``correcting`` closures were found by a search; those found where the submaps lay only confirm
+    the path. ``refused`` is the number of those that were inconsistent, and stayed so.
     """
 
     correcting: tuple[Closure, ...]
-    confirming: tuple[Closure, ...]
     refused: int
 
 
@@ -72,21 +71,17 @@ class _Closer:
         self.path_m = np.array([s.path_m for s in submaps])
         self.accepted: dict[Pair, Closure] = {}
         self.correcting: set[Pair] = set()
-        self.refused: dict[Pair, Closure] = {}
+        self.refused: set[Pair] = set()
         self.examined: dict[Pair, Array] = {}
 
-    @property
-    def poses(self) -> Array:
-        """Poses (n, 3) of the submaps."""
-        return self.graph.poses[self.nodes]
+    def placed(self, which: Iterable[int] | None = None) -> list[SubmapPose]:
+        """Submaps, all or some of them, at the poses of the graph."""
+        numbers = range(len(self.submaps)) if which is None else which
+        return [replace(self.submaps[k], pose=self.graph.poses[self.nodes[k]]) for k in numbers]
 
-    def placed(self) -> list[SubmapPose]:
-        """The submaps at the poses of the graph."""
-        return [replace(s, pose=p) for s, p in zip(self.submaps, self.poses, strict=True)]
-
-    def candidates(self, later: IntArray) -> list[tuple[int, int, Array]]:
-        """Pairs that may show one place: later, earlier, and half the window (3,) to search."""
-        poses, config = self.poses, self.config
+    def candidates(self, later: IntArray) -> list[SubmapPair]:
+        """Pairs that may show one place."""
+        poses, config = self.graph.poses[self.nodes], self.config
         limit = np.array([config.search_max_m, config.search_max_m, config.search_max_rad])
         pairs: list[tuple[int, int]] = []
         for i in later.tolist():
@@ -107,33 +102,20 @@ class _Closer:
         sigma *= np.sqrt(COV_INFLATION)
         window = np.minimum(SIGMAS * sigma + MARGIN, limit)
         may = np.hypot(h[:, 0], h[:, 1]) <= NEAR_M + window[:, :2].max(axis=1)
-        return [(*pairs[k], window[k]) for k in np.flatnonzero(may & unknown)]
-
-    def verified(self, later: IntArray) -> tuple[list[Closure], list[Closure]]:
-        """Closures of submaps that were searched for, and of those that match as they lie."""
-        poses = self.poses
-        pairs = [
-            SubmapPair(self.submaps[i], self.submaps[j], between(poses[j], poses[i]), window)
-            for i, j, window in self.candidates(later)
+        return [
+            SubmapPair(self.submaps[i[k]], self.submaps[j[k]], h[k], window[k])
+            for k in np.flatnonzero(may & unknown)
         ]
-        return verified_closures(pairs, self.examined, along=True)
 
     def believe(self, correcting: list[Closure], confirming: list[Closure]) -> bool:
         """Add those that are consistent to the graph; whether any correct it."""
         proposed = [*correcting, *confirming]
-        involved = np.unique([
-            self.at[state]
-            for c in proposed
-            for state in ((c.robot, c.time_ns), (c.other, c.other_time_ns))
-        ])  # fmt: skip
-        placed = [replace(self.submaps[k], pose=self.poses[k]) for k in involved]
+        involved = np.unique([self.ends(c) for c in proposed])
         consistent = consistent_closures(
-            proposed, placed, self.graph.covariance(self.nodes[involved])
+            proposed, self.placed(involved), self.graph.covariance(self.nodes[involved])
         )
         added = {c.pair for c in consistent} - {c.pair for c in confirming}
-        for closure in correcting:
-            if closure.pair not in added:
-                self.refused[closure.pair] = closure
+        self.refused |= {c.pair for c in correcting} - added
         self.accepted |= {c.pair: c for c in consistent}
         self.correcting |= added
         if consistent:
@@ -143,26 +125,28 @@ class _Closer:
     def solve(self) -> None:
         """Solve with all accepted closures; those that the solution violates are taken back."""
         while self.accepted:
-            self.graph.solve(self.relative_poses())
-            found = list(self.accepted.values())
-            off = np.array([between(c.delta, between(*self.poses[self.ends(c)])) for c in found])
-            off = known_part(off, found)
+            measured = self.relative_poses()
+            self.graph.solve(measured)
+            poses = self.graph.poses
+            off = between(measured.delta, between(poses[measured.begin], poses[measured.end]))
+            off = known_part(off, list(self.accepted.values()))
             wrong = np.hypot(off[:, 0], off[:, 1]) > MAX_RESIDUAL[0]
             wrong |= np.abs(off[:, 2]) > MAX_RESIDUAL[1]
             if not wrong.any():
                 return
-            for pair, is_wrong in zip(list(self.accepted), wrong, strict=True):
-                if is_wrong:
-                    self.refused[pair] = self.accepted.pop(pair)
-                    self.correcting.discard(pair)
+            pairs = list(self.accepted)
+            for k in np.flatnonzero(wrong):
+                self.refused.add(pairs[k])
+                self.correcting.discard(pairs[k])
+                del self.accepted[pairs[k]]
         self.graph.solve(None)
 
-    def ends(self, closure: Closure) -> list[int]:
+    def ends(self, closure: Closure) -> tuple[int, int]:
         """Numbers of the earlier and the later submap."""
-        return [
+        return (
             self.at[closure.other, closure.other_time_ns],
             self.at[closure.robot, closure.time_ns],
-        ]
+        )
 
     def relative_poses(self) -> RelativePoses:
         """The accepted closures as arrays."""
@@ -195,15 +179,17 @@ def close_loops(
     order = np.argsort([s.state[1] for s in submaps], kind="stable")
     for first in range(0, len(order), AT_ONCE):
         later = order[first : first + AT_ONCE]
+        graph.begin_with(nodes[order[: first + AT_ONCE]])
         for _ in range(MAX_ROUNDS):
-            correcting, confirming = closer.verified(later)
+            found, confirming = verified_closures(
+                closer.candidates(later), closer.examined, along=True
+            )
             if tamper is not None:
-                told = tamper([*correcting, *confirming], closer.placed())
-                correcting = [c for c in told if c not in confirming]
-            if not (correcting or confirming) or not closer.believe(correcting, confirming):
+                told = tamper([*found, *confirming], closer.placed(order[: first + AT_ONCE]))
+                found = [c for c in told if c not in confirming]
+            if not (found or confirming) or not closer.believe(found, confirming):
                 break
-    return ClosedLoops(
-        tuple(c for pair, c in closer.accepted.items() if pair in closer.correcting),
-        tuple(c for pair, c in closer.accepted.items() if pair not in closer.correcting),
-        len(closer.refused),
-    )
+    graph.begin_with(None)
+    graph.solve(closer.relative_poses() if closer.accepted else None)
+    correcting = [c for pair, c in closer.accepted.items() if pair in closer.correcting]
+    return ClosedLoops(tuple(correcting), len(closer.refused - set(closer.accepted)))

@@ -24,10 +24,12 @@ from graphslam.core.geometry import (
     rotate_cov,
     rotation3,
 )
-from graphslam.mapping.gating import IntArray
+from graphslam.mapping.gating import BoolArray, IntArray
 
 #: Gauss-Newton steps at most; m or rad: it has converged when nothing moves more than this
 MAX_STEPS, CONVERGED = 10, 1e-5
+#: m or rad: after a smaller step the matrix is not factorised again
+SMALL_STEP = 0.01
 #: submaps whose columns of the covariance are computed at once
 COLUMNS = 100
 
@@ -51,6 +53,12 @@ class RelativePoses:
             for name in ("begin", "end", "delta", "cov")
         ))  # fmt: skip
 
+    def only(self, which: BoolArray) -> "RelativePoses":
+        """Some of them."""
+        return RelativePoses(
+            self.begin[which], self.end[which], self.delta[which], self.cov[which]
+        )
+
 
 def relative_jacobian(h: Array) -> Array:
     """Jacobian (..., 3, 6) of relative poses h (..., 3) by both poses, along their own axes."""
@@ -62,36 +70,68 @@ def relative_jacobian(h: Array) -> Array:
 
 
 class SubmapGraph:
-    """``poses`` (n, 3) of submaps, by relative poses between consecutive ones and closures."""
+    """``poses`` (n, 3) of submaps, by relative poses between consecutive ones and closures.
+
+    It may be solved for the beginnings of the paths only: what follows hangs from them, and says
+    nothing about them.
+    """
 
     def __init__(
         self, poses: Array, chain: RelativePoses, first: Sequence[int], start_cov: Array
     ) -> None:
-        """Begin at ``poses``; the ``chain`` joins the submaps of each path.
+        """Begin at ``poses``; the ``chain`` joins the submaps of each path, in their order.
 
-        ``first`` (k,) are the first submaps of the paths. Where they begin is known with
-        covariances ``start_cov`` (k, 3, 3), along the axes of each one's pose.
+        ``first`` (k,) are the first submaps of the paths, in ascending order. Where they begin is
+        known with covariances ``start_cov`` (k, 3, 3), along the axes of each one's pose.
         """
         self.poses = np.array(poses)
-        self._chain, self._first = chain, np.asarray(first)
+        self._all, self._first = chain, np.asarray(first)
         self._starts, self._start_info = self.poses[self._first], np.linalg.inv(start_cov)
         self._closures: RelativePoses | None = None
+        self._set_used(np.ones(len(self.poses), dtype=bool))
+
+    def _set_used(self, used: BoolArray) -> None:
+        self._used, self._place = used, np.cumsum(used) - 1
+        self._chain = self._all.only(used[self._all.end])
         self._factor: SuperLU | None = None
+
+    def begin_with(self, last: IntArray | None) -> None:
+        """Use the paths only up to submaps ``last`` (m,), which may be several of a path.
+
+        None: all of them. What was left out so far is put where the chain says.
+        """
+        used = np.ones(len(self.poses), dtype=bool)
+        if last is not None:
+            ends = self._first - 1
+            np.maximum.at(ends, np.searchsorted(self._first, last, side="right") - 1, last)
+            path = np.searchsorted(self._first, np.arange(len(used)), side="right") - 1
+            used = np.arange(len(used)) <= np.maximum(ends, self._first)[path]
+        new = used & ~self._used
+        for edge in np.flatnonzero(new[self._all.end]):
+            begin, end = self._all.begin[edge], self._all.end[edge]
+            self.poses[end] = compose(self.poses[begin], self._all.delta[edge])
+        self._set_used(used)
 
     def solve(self, closures: RelativePoses | None = None) -> None:
         """Solve with these closures, beginning where the poses are."""
         self._closures = closures
+        edges = self._chain if closures is None else self._chain.and_also(closures)
+        information = np.linalg.inv(rotate_cov(edges.cov, -edges.delta[:, 2]))
+        largest = np.inf
         for _ in range(MAX_STEPS):
-            self._factor, gradient = self._factorised()
+            # close to the solution the factors hardly change
+            if largest > SMALL_STEP:
+                self._factor = self._factorised(edges, information)
+            gradient = self._gradient(edges, information)
             step = -self._factor.solve(gradient).reshape(-1, 3)
-            self.poses = compose(self.poses, exp(step))
-            if np.abs(step).max() < CONVERGED:
+            self.poses[self._used] = compose(self.poses[self._used], exp(step))
+            largest = np.abs(step).max()
+            if largest < CONVERGED:
                 break
 
     def covariance(self, which: IntArray) -> Array:
         """Joint covariance (3k, 3k) of submaps (k,), errors along each pose's own axes."""
-        rows = (3 * np.asarray(which)[:, None] + np.arange(3)).ravel()
-        return symmetric(self._columns(which)[rows])
+        return symmetric(self._columns(which)[self._rows(which)])
 
     def relative(self, i: IntArray, j: IntArray) -> tuple[Array, Array]:
         """Poses (m, 3) of submaps i (m,) in the frames of submaps j (m,), covariances (m, 3, 3).
@@ -105,48 +145,58 @@ class SubmapGraph:
         cross = np.zeros((len(i), 3, 3))
         for first in range(0, len(nodes), COLUMNS):
             some = nodes[first : first + COLUMNS]
-            columns = self._columns(some).reshape(len(self.poses), 3, len(some), 3)
+            columns = self._columns(some).reshape(-1, 3, len(some), 3)
             at = np.arange(len(some))
-            own[some] = columns[some, :, at]
+            own[some] = columns[self._place[some], :, at]
             which = np.flatnonzero(np.isin(i, some))
             # the inverse is symmetric: column i holds the blocks (j, i)
-            cross[which] = columns[j[which], :, np.searchsorted(some, i[which])]
+            cross[which] = columns[self._place[j[which]], :, np.searchsorted(some, i[which])]
         H = relative_jacobian(h)
         both = np.block([[own[j], cross], [cross.mT, own[i]]])
         return h, H @ both @ H.mT
 
+    def _rows(self, which: IntArray) -> IntArray:
+        """Rows (3k,) of submaps (k,) in the normal equations."""
+        return np.asarray((3 * self._place[which][:, None] + np.arange(3)).ravel())
+
     def _columns(self, which: IntArray) -> Array:
-        """Columns (3n, 3k) of the covariance of all poses that belong to submaps (k,)."""
+        """Columns (3u, 3k), of the covariance of all u poses in use, that belong to submaps (k,)."""
         if self._factor is None:
-            self._factor, _ = self._factorised()
-        rows = (3 * np.asarray(which)[:, None] + np.arange(3)).ravel()
-        columns = np.zeros((3 * len(self.poses), len(rows)))
+            edges = self._chain if self._closures is None else self._chain.and_also(self._closures)
+            information = np.linalg.inv(rotate_cov(edges.cov, -edges.delta[:, 2]))
+            self._factor = self._factorised(edges, information)
+        rows = self._rows(which)
+        columns = np.zeros((self._factor.shape[0], len(rows)))
         columns[rows, np.arange(len(rows))] = 1.0
         return np.asarray(self._factor.solve(columns))
 
-    def _factorised(self) -> tuple[SuperLU, Array]:
-        """The normal equations at the poses, factorised, and their gradient (3n,)."""
-        edges = self._chain if self._closures is None else self._chain.and_also(self._closures)
-        n, m = len(self.poses), len(edges.begin)
+    def _gradient(self, edges: RelativePoses, information: Array) -> Array:
+        """The gradient (3u,) at the u poses in use."""
         h = between(self.poses[edges.begin], self.poses[edges.end])
-        residual = log(between(edges.delta, h))
-        information = np.linalg.inv(rotate_cov(edges.cov, -edges.delta[:, 2]))
+        pull = (information @ log(between(edges.delta, h))[:, :, None])[:, :, 0]
+        gradient = np.zeros((len(self.poses), 3))
         # to first order in the residual, errors along the axes of each pose
+        np.add.at(gradient, edges.begin, -(adjoint(inverse(h)).mT @ pull[:, :, None])[:, :, 0])
+        np.add.at(gradient, edges.end, pull)
+        off = log(between(self._starts, self.poses[self._first]))
+        gradient[self._first] += (self._start_info @ off[:, :, None])[:, :, 0]
+        return gradient[self._used].ravel()
+
+    def _factorised(self, edges: RelativePoses, information: Array) -> SuperLU:
+        """The matrix of the normal equations at the poses, factorised."""
+        m = len(edges.begin)
+        h = between(self.poses[edges.begin], self.poses[edges.end])
         J = np.stack([-adjoint(inverse(h)), np.broadcast_to(np.eye(3), (m, 3, 3))], axis=1)
-        JtW = J.mT @ information[:, None]
-        blocks = JtW[:, :, None] @ J[:, None]
-        at = np.stack([edges.begin, edges.end], axis=1)
-        gradient = np.zeros((n, 3))
-        np.add.at(gradient, at, (JtW @ residual[:, None, :, None])[..., 0])
+        blocks = (J.mT @ information[:, None])[:, :, None] @ J[:, None]
+        at = self._place[np.stack([edges.begin, edges.end], axis=1)]
         rows = np.broadcast_to(
             3 * at[:, :, None, None, None] + np.arange(3)[:, None], (m, 2, 2, 3, 3)
         )
         columns = np.broadcast_to(3 * at[:, None, :, None, None] + np.arange(3), (m, 2, 2, 3, 3))
-        off = log(between(self._starts, self.poses[self._first]))
-        gradient[self._first] += (self._start_info @ off[:, :, None])[:, :, 0]
-        first = 3 * self._first[:, None, None]
+        first = 3 * self._place[self._first][:, None, None]
         first_rows = np.broadcast_to(first + np.arange(3)[:, None], self._start_info.shape)
         first_columns = np.broadcast_to(first + np.arange(3), self._start_info.shape)
+        size = 3 * int(self._used.sum())
         matrix = coo_matrix(
             (
                 np.concatenate([blocks.ravel(), self._start_info.ravel()]),
@@ -155,10 +205,9 @@ class SubmapGraph:
                     np.concatenate([columns.ravel(), first_columns.ravel()]),
                 ),
             ),
-            shape=(3 * n, 3 * n),
+            shape=(size, size),
         )
         options = {"SymmetricMode": True}
-        factor = splu(
+        return splu(
             csc_matrix(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options
         )
-        return factor, gradient.ravel()
