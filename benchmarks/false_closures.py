@@ -21,8 +21,8 @@ from graphslam.core.geometry import between, compose
 from graphslam.core.records import Closure
 from graphslam.evaluation.relation_metrics import read_relations, relation_errors
 from graphslam.logs import open_logs
+from graphslam.mapping.loop_closure import Tamper
 from graphslam.mapping.submaps import SubmapPose
-from graphslam.slam.reoptimise_scans import Tamper
 from graphslam.slam.smooth import smooth
 
 SHARES, WITHIN, GROUP = (0.1, 0.3, 0.5), 1.1, 3

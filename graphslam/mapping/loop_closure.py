@@ -8,18 +8,17 @@ set is used, under the joint covariance of the estimate: J. Mangelson et al., IC
 10.1109/ICRA.2018.8460217, who judge pairwise consistency by odometry.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
+from graphslam.core.companion import Companion
 from graphslam.core.config import LoopClosureConfig
 from graphslam.core.consistency import largest_consistent_set
 from graphslam.core.gaussian import mahalanobis_squared
 from graphslam.core.geometry import Array, between, log, rotate_cov, rotation3, wrap
 from graphslam.core.records import Closure, Trajectory
-from graphslam.core.worker import parallel_map
 from graphslam.mapping.submap_graph import relative_jacobian
 from graphslam.mapping.submaps import State, SubmapPose, drift_covariance
 from graphslam.perception.scan_matching import (
@@ -35,8 +34,6 @@ from graphslam.perception.scan_matching import (
 NEAR_M = 3.0
 #: half the window of a search: so many sigmas of the relative pose, and this much more (m, m, rad)
 SIGMAS, MARGIN = 3.0, np.array([0.6, 0.6, 0.08])
-#: pairs of submaps from which on a second process is used to match them
-MIN_PARALLEL_PAIRS = 6
 #: verified: least share of points confirmed, largest share in free space, of both submaps
 MIN_CONFIRMED, MAX_SEEN_THROUGH = 0.4, 0.15
 #: share of points on others in a coarse search below which `MIN_CONFIRMED` is out of reach, so that
@@ -63,6 +60,11 @@ ALREADY_CLOSED, MAX_RESIDUAL = (0.06, 0.01), (0.2, 0.03)
 
 #: the later and the earlier state of a closure
 Pair = tuple[State, State]
+#: a pair of submaps by their numbers, later and earlier, its guess (3,) and window (3,)
+_Question = tuple[int, int, Array, Array]
+#: stands between verifying closures and believing them: for tests, which add false ones. It gets
+#: those just verified and the submaps so far, and returns all that are to be believed
+Tamper = Callable[[list[Closure], Sequence[SubmapPose]], list[Closure]]
 
 
 def candidates(
@@ -153,7 +155,11 @@ def common_direction(best: Match, rivals: Sequence[Match]) -> Array | None:
 
 
 def loop_closures(
-    found: Sequence[SubmapPose], P: Array, examined: dict[Pair, Array], config: LoopClosureConfig
+    found: Sequence[SubmapPose],
+    P: Array,
+    examined: dict[Pair, Array],
+    config: LoopClosureConfig,
+    verify: "Verify",
 ) -> tuple[list[Closure], list[Closure]]:
     """Closures between submaps, each verified by itself.
 
@@ -163,6 +169,7 @@ def loop_closures(
         examined: relative poses (3,) of pairs at which they were examined before; those need not be
             examined again. New ones are added.
         config: what counts as another visit, and how far is searched.
+        verify: `verify_pairs`, or a `PairVerifier`.
 
     Returns:
         Closures that correct the estimate, found by a search; and closures that confirm it, where
@@ -172,7 +179,7 @@ def loop_closures(
     for i, j, window in candidates(found, COV_INFLATION * P, config):
         guess = between(found[j].pose, found[i].pose)
         pairs.append(SubmapPair(found[i], found[j], guess, window))
-    return verified_closures(pairs, examined, along=False)
+    return verified_closures(pairs, examined, verify)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -198,13 +205,14 @@ class Verified:
     is_searched: bool
 
 
-def verified_closures(
-    pairs: Sequence[SubmapPair], examined: dict[Pair, Array], *, along: bool
-) -> tuple[list[Closure], list[Closure]]:
-    """Closures of the pairs that are verified, each by itself.
+#: whether pairs are verified, each None if it is not
+Verify = Callable[[Sequence[SubmapPair]], list[Verified | None]]
 
-    For ``examined`` and what is returned see `loop_closures`, for ``along`` see `verify_pairs`.
-    """
+
+def verified_closures(
+    pairs: Sequence[SubmapPair], examined: dict[Pair, Array], verify: Verify
+) -> tuple[list[Closure], list[Closure]]:
+    """Closures of the pairs that are verified, each by itself; see `loop_closures`."""
     new = []
     for pair in pairs:
         states = pair.later.state, pair.earlier.state
@@ -214,7 +222,7 @@ def verified_closures(
         new.append(pair)
     correcting: list[Closure] = []
     confirming: list[Closure] = []
-    for pair, found in zip(new, _verified(new, along=along), strict=True):
+    for pair, found in zip(new, verify(new), strict=True):
         if found is not None:
             later, earlier = pair.later, pair.earlier
             images = min(len(later.submap.clouds), len(earlier.submap.clouds))
@@ -225,15 +233,38 @@ def verified_closures(
     return correcting, confirming
 
 
-def _verified(pairs: Sequence[SubmapPair], *, along: bool) -> list[Verified | None]:
-    """`verify_pairs`, half of them in the second process if they are many."""
-    if len(pairs) < MIN_PARALLEL_PAIRS:
-        return verify_pairs(pairs, along=along)
-    found: list[Verified | None] = [None] * len(pairs)
-    found[::2], found[1::2] = parallel_map(
-        partial(verify_pairs, along=along), [pairs[::2], pairs[1::2]]
-    )
-    return found
+class PairVerifier(Companion["list[_Question]", "list[Verified | None]"]):
+    """`verify_pairs` of given submaps, half of the pairs in a second process.
+
+    All pairs with the same earlier submap are verified in the same process, which keeps what it
+    computed of it.
+    """
+
+    def __init__(self, submaps: Sequence[SubmapPose], *, along: bool = False) -> None:
+        """Begin; for ``along`` see `verify_pairs`."""
+        self._number = {s.state: k for k, s in enumerate(submaps)}
+
+        def verify(questions: list[_Question]) -> list[Verified | None]:
+            pairs = [SubmapPair(submaps[i], submaps[j], h, w) for i, j, h, w in questions]
+            return verify_pairs(pairs, along=along)
+
+        super().__init__(verify)
+
+    def __call__(self, pairs: Sequence[SubmapPair]) -> list[Verified | None]:
+        """How each of the pairs is verified, None if it is not."""
+        number = self._number
+        questions = [
+            (number[p.later.state], number[p.earlier.state], p.guess, p.window) for p in pairs
+        ]
+        there = [k for k, (_, j, _, _) in enumerate(questions) if j % 2]
+        here = [k for k, (_, j, _, _) in enumerate(questions) if not j % 2]
+        if not self.forked:  # one batch is faster than two
+            return self._function(questions)
+        found: list[Verified | None] = [None] * len(pairs)
+        answers = self.both([questions[k] for k in here], [questions[k] for k in there])
+        for k, one in zip([*here, *there], [*answers[0], *answers[1]], strict=True):
+            found[k] = one
+        return found
 
 
 def verify_pairs(pairs: Sequence[SubmapPair], *, along: bool = False) -> list[Verified | None]:

@@ -41,7 +41,7 @@ def untied_closures(
                 (closure.other, closure.other_time_ns),
             )
         )
-        if not _fix_position(
+        if not _determine_pose(
             [
                 landmarks.entries[n].mean
                 for n in one & other
@@ -53,7 +53,7 @@ def untied_closures(
     return out
 
 
-def _fix_position(walls: Sequence[Array], points: int) -> bool:
+def _determine_pose(walls: Sequence[Array], points: int) -> bool:
     """Whether common walls (3,) and a number of points determine a relative pose."""
     if len(walls) + points < 2:
         return False

@@ -8,7 +8,7 @@ submaps that one is compared with is bounded, so the work grows with the path, n
 however often a place is visited.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,7 +24,9 @@ from graphslam.mapping.loop_closure import (
     NEAR_M,
     SIGMAS,
     Pair,
+    PairVerifier,
     SubmapPair,
+    Tamper,
     consistent_closures,
     known_part,
     verified_closures,
@@ -38,9 +40,6 @@ AT_ONCE, MAX_ROUNDS = 10, 4
 MAX_VISITS = 3
 #: m, m, rad: two sigmas of a relative pose that another match would not improve
 KNOWN = np.array([0.05, 0.05, 0.012])
-
-#: stands between verifying closures and believing them: for tests, which add false ones
-Tamper = Callable[[list[Closure], Sequence[SubmapPose]], list[Closure]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,18 +176,19 @@ def close_loops(
     closer = _Closer(submaps, nodes, graph, config)
     # robots take turns by time, so that none is far ahead of the others
     order = np.argsort([s.state[1] for s in submaps], kind="stable")
-    for first in range(0, len(order), AT_ONCE):
-        later = order[first : first + AT_ONCE]
-        graph.begin_with(nodes[order[: first + AT_ONCE]])
-        for _ in range(MAX_ROUNDS):
-            found, confirming = verified_closures(
-                closer.candidates(later), closer.examined, along=True
-            )
-            if tamper is not None:
-                told = tamper([*found, *confirming], closer.placed(order[: first + AT_ONCE]))
-                found = [c for c in told if c not in confirming]
-            if not (found or confirming) or not closer.believe(found, confirming):
-                break
+    with PairVerifier(submaps, along=True) as verify:
+        for first in range(0, len(order), AT_ONCE):
+            later, known = order[first : first + AT_ONCE], order[: first + AT_ONCE]
+            graph.begin_with(nodes[known])
+            for _ in range(MAX_ROUNDS):
+                found, confirming = verified_closures(
+                    closer.candidates(later), closer.examined, verify
+                )
+                if tamper is not None:
+                    told = tamper([*found, *confirming], closer.placed(known))
+                    found = [c for c in told if c not in confirming]
+                if not (found or confirming) or not closer.believe(found, confirming):
+                    break
     graph.begin_with(None)
     graph.solve(closer.relative_poses() if closer.accepted else None)
     correcting = [c for pair, c in closer.accepted.items() if pair in closer.correcting]

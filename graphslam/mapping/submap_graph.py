@@ -55,9 +55,7 @@ class RelativePoses:
 
     def only(self, which: BoolArray) -> "RelativePoses":
         """Some of them."""
-        return RelativePoses(
-            self.begin[which], self.end[which], self.delta[which], self.cov[which]
-        )
+        return RelativePoses(self.begin[which], self.end[which], self.delta[which], self.cov[which])
 
 
 def relative_jacobian(h: Array) -> Array:
@@ -115,19 +113,17 @@ class SubmapGraph:
     def solve(self, closures: RelativePoses | None = None) -> None:
         """Solve with these closures, beginning where the poses are."""
         self._closures = closures
-        edges = self._chain if closures is None else self._chain.and_also(closures)
-        information = np.linalg.inv(rotate_cov(edges.cov, -edges.delta[:, 2]))
-        largest = np.inf
+        edges, information = self._measured()
+        factor = self._factorised(edges, information)
         for _ in range(MAX_STEPS):
-            # close to the solution the factors hardly change
-            if largest > SMALL_STEP:
-                self._factor = self._factorised(edges, information)
-            gradient = self._gradient(edges, information)
-            step = -self._factor.solve(gradient).reshape(-1, 3)
+            step = -factor.solve(self._gradient(edges, information)).reshape(-1, 3)
             self.poses[self._used] = compose(self.poses[self._used], exp(step))
             largest = np.abs(step).max()
             if largest < CONVERGED:
                 break
+            if largest > SMALL_STEP:  # else the matrix hardly changes
+                factor = self._factorised(edges, information)
+        self._factor = factor
 
     def covariance(self, which: IntArray) -> Array:
         """Joint covariance (3k, 3k) of submaps (k,), errors along each pose's own axes."""
@@ -160,15 +156,18 @@ class SubmapGraph:
         return np.asarray((3 * self._place[which][:, None] + np.arange(3)).ravel())
 
     def _columns(self, which: IntArray) -> Array:
-        """Columns (3u, 3k), of the covariance of all u poses in use, that belong to submaps (k,)."""
+        """Columns (3u, 3k) of submaps (k,) of the covariance of all u poses in use."""
         if self._factor is None:
-            edges = self._chain if self._closures is None else self._chain.and_also(self._closures)
-            information = np.linalg.inv(rotate_cov(edges.cov, -edges.delta[:, 2]))
-            self._factor = self._factorised(edges, information)
+            self._factor = self._factorised(*self._measured())
         rows = self._rows(which)
         columns = np.zeros((self._factor.shape[0], len(rows)))
         columns[rows, np.arange(len(rows))] = 1.0
         return np.asarray(self._factor.solve(columns))
+
+    def _measured(self) -> tuple[RelativePoses, Array]:
+        """Chain and closures, and their information (m, 3, 3) along the axes of their ends."""
+        edges = self._chain if self._closures is None else self._chain.and_also(self._closures)
+        return edges, np.asarray(np.linalg.inv(rotate_cov(edges.cov, -edges.delta[:, 2])))
 
     def _gradient(self, edges: RelativePoses, information: Array) -> Array:
         """The gradient (3u,) at the u poses in use."""

@@ -39,10 +39,12 @@ class OccupancyGrid:
         last = np.array(windows.shape[:2]) - 1
         x, y = np.moveaxis(np.clip(self.cells(points), 0, last), -1, 0)
         at_once = max(1, AT_ONCE // (points.shape[1] * shape[0] * shape[1]))
-        return np.concatenate([
-            windows[x[k : k + at_once], y[k : k + at_once]].mean(axis=1)
-            for k in range(0, len(x), at_once)
-        ])
+        return np.concatenate(
+            [
+                windows[x[k : k + at_once], y[k : k + at_once]].mean(axis=1)
+                for k in range(0, len(x), at_once)
+            ]
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -328,7 +328,9 @@ class _PointPairs:
         ok = off[0] * off[0] + off[1] * off[1] < reach_m * reach_m
         metrics = self.information.take(near, axis=1, mode="clip").reshape(2, 2, *near.shape)
         terms, squared = point_terms(
-            np.moveaxis(off, 0, -1), np.moveaxis(metrics, (0, 1), (-2, -1)), np.moveaxis(arms, 0, -1)
+            np.moveaxis(off, 0, -1),
+            np.moveaxis(metrics, (0, 1), (-2, -1)),
+            np.moveaxis(arms, 0, -1),
         )
         w = ok / (1.0 + squared / 4.0)
         enough = ok.sum(axis=1) >= MIN_NEIGHBOURS

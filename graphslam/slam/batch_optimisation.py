@@ -22,10 +22,9 @@ from graphslam.mapping.duplicate_landmarks import (
     seen_together,
 )
 from graphslam.mapping.landmark_map import LandmarkMap, mean_landmarks
-from graphslam.mapping.loop_closure import ALREADY_CLOSED, fix_position, violated
+from graphslam.mapping.loop_closure import ALREADY_CLOSED, Tamper, fix_position, violated
 from graphslam.mapping.reassociation import reassociate
 from graphslam.mapping.redundant_closures import untied_closures
-from graphslam.mapping.sequential_closing import Tamper
 from graphslam.mapping.visits import tie_visits
 from graphslam.odometry.preintegration import Track
 from graphslam.slam.log_pass import timed

@@ -16,12 +16,13 @@ from graphslam.core.worker import Future
 from graphslam.estimation.clock_calibration import ClockEstimate, estimate_clocks
 from graphslam.estimation.isam2 import Isam2Backend
 from graphslam.logs import LogSet
+from graphslam.mapping.loop_closure import Tamper
 from graphslam.multi_robot.identity_swaps import find_swapped_identities
 from graphslam.slam.causal import causal_of
 from graphslam.slam.initialisation import with_identities
 from graphslam.slam.log_pass import LogPass, PriorKnowledge, Progress, timed
 from graphslam.slam.pipeline import Pipeline
-from graphslam.slam.reoptimise_scans import Tamper, reoptimise_scan_log
+from graphslam.slam.reoptimise_scans import reoptimise_scan_log
 from graphslam.slam.reoptimise_sightings import reoptimise_sighting_log
 from graphslam.slam.robot_state import Causal
 

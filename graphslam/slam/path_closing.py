@@ -8,8 +8,9 @@ import numpy as np
 from graphslam.core.geometry import Array, between, compose, exp, log, path_length, rotate_cov
 from graphslam.core.records import Closure, Step, Trajectory
 from graphslam.mapping.gating import IntArray
+from graphslam.mapping.loop_closure import Tamper
 from graphslam.mapping.redundant_closures import Span
-from graphslam.mapping.sequential_closing import Tamper, close_loops
+from graphslam.mapping.sequential_closing import close_loops
 from graphslam.mapping.submap_graph import RelativePoses, SubmapGraph
 from graphslam.mapping.submaps import State, SubmapPose, submaps_at
 from graphslam.slam.scan_tracking import ScanLog, TrackedPath

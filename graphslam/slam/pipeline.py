@@ -30,6 +30,7 @@ from graphslam.core.records import (
 from graphslam.logs import LogSet
 from graphslam.logs.clock import to_common_clock
 from graphslam.mapping.data_association import Image
+from graphslam.mapping.loop_closure import Tamper
 from graphslam.multi_robot.identity_swaps import rename_identities
 from graphslam.multi_robot.mutual_detection import ScanBuffer
 from graphslam.multi_robot.robot_detection import RobotDetector
@@ -46,7 +47,6 @@ from graphslam.perception.sightings import sighting_observation
 from graphslam.slam.keyframes import KeyframeSelector
 from graphslam.slam.log_pass import PriorKnowledge, Progress, counted, timed
 from graphslam.slam.recorded_closures import between_states
-from graphslam.slam.reoptimise_scans import Tamper
 from graphslam.slam.robot_settings import outlines
 from graphslam.slam.sighting_batches import (
     SightingBatch,

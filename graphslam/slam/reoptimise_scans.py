@@ -7,7 +7,7 @@ since both come from the same scans.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -30,6 +30,8 @@ from graphslam.mapping.loop_closure import (
     ALREADY_CLOSED,
     MAX_RESIDUAL,
     Pair,
+    PairVerifier,
+    Tamper,
     consistent_closures,
     inflate_covariances,
     loop_closures,
@@ -37,7 +39,7 @@ from graphslam.mapping.loop_closure import (
     violated,
 )
 from graphslam.mapping.reassociation import reassociate
-from graphslam.mapping.submaps import SubmapPose, build_submaps, with_poses_from
+from graphslam.mapping.submaps import build_submaps, with_poses_from
 from graphslam.mapping.visits import rejoin_visits, split_by_visit
 from graphslam.odometry.preintegration import Track
 from graphslam.slam.motion_noise import noise_scales, scale_motion_noise
@@ -51,9 +53,6 @@ MAX_CLOSING_ROUNDS = 8
 #: solutions from inflated to stated covariances of closures, at most; residuals that stay above
 #: this share of those of the solution before make no progress
 MAX_TIGHTENING_ROUNDS, NO_PROGRESS = 4, 0.9
-
-#: stands between verifying closures and believing them: for tests, which add false ones
-Tamper = Callable[[list[Closure], Sequence[SubmapPose]], list[Closure]]
 
 
 def reoptimise_scan_log(
@@ -180,30 +179,31 @@ def _close_loops(
     correcting: set[Pair] = set()  # those of them that correct the estimate
     refused: dict[Pair, Closure] = {}
     examined: dict[Pair, Array] = {}
-    for _ in range(MAX_CLOSING_ROUNDS if submaps else 0):
-        P = solve.backend.state_covariance([submap.state for submap in submaps])
-        new, confirming = loop_closures(
-            with_poses_from(submaps, closed.states), P, examined, config.loop_closure
-        )
-        if tamper is not None:
-            new = [c for c in tamper([*new, *confirming], submaps) if c not in confirming]
-        # what was inconsistent before may be consistent now
-        proposed = refused | {c.pair: c for c in new}
-        consistent = consistent_closures(
-            [*proposed.values(), *confirming], with_poses_from(submaps, prior.states), P
-        )
-        refused = {pair: c for pair, c in proposed.items() if c not in consistent}
-        added = {c.pair for c in consistent if c not in confirming}
-        if not added:
-            break
-        correcting |= added
-        accepted |= {c.pair: c for c in consistent}
-        closed = prior = _tightened(split.steps, [*accepted.values()], closed, solve)
-        off = violated([*accepted.values()], closed.states, MAX_RESIDUAL)
-        taken_back = {pair for pair, is_off in zip(accepted, off, strict=True) if is_off}
-        counts["closures_refused"] += len(taken_back & correcting)
-        accepted = {pair: c for pair, c in accepted.items() if pair not in taken_back}
-        correcting -= taken_back
+    with PairVerifier(submaps) as verify:
+        for _ in range(MAX_CLOSING_ROUNDS if submaps else 0):
+            P = solve.backend.state_covariance([submap.state for submap in submaps])
+            new, confirming = loop_closures(
+                with_poses_from(submaps, closed.states), P, examined, config.loop_closure, verify
+            )
+            if tamper is not None:
+                new = [c for c in tamper([*new, *confirming], submaps) if c not in confirming]
+            # what was inconsistent before may be consistent now
+            proposed = refused | {c.pair: c for c in new}
+            consistent = consistent_closures(
+                [*proposed.values(), *confirming], with_poses_from(submaps, prior.states), P
+            )
+            refused = {pair: c for pair, c in proposed.items() if c not in consistent}
+            added = {c.pair for c in consistent if c not in confirming}
+            if not added:
+                break
+            correcting |= added
+            accepted |= {c.pair: c for c in consistent}
+            closed = prior = _tightened(split.steps, [*accepted.values()], closed, solve)
+            off = violated([*accepted.values()], closed.states, MAX_RESIDUAL)
+            taken_back = {pair for pair, is_off in zip(accepted, off, strict=True) if is_off}
+            counts["closures_refused"] += len(taken_back & correcting)
+            accepted = {pair: c for pair, c in accepted.items() if pair not in taken_back}
+            correcting -= taken_back
     counts["closures_verified"] = len(correcting)
     counts["closures_refused"] += len(refused)
     if not correcting:

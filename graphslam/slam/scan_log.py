@@ -7,7 +7,7 @@ from graphslam.core.errors import LogError
 from graphslam.core.records import RelativePose, Sighting
 from graphslam.core.worker import Future
 from graphslam.logs import LogSet
-from graphslam.mapping.sequential_closing import Tamper
+from graphslam.mapping.loop_closure import Tamper
 from graphslam.slam.batch_optimisation import optimise_scan_log
 from graphslam.slam.causal import causal_trajectories
 from graphslam.slam.log_pass import PriorKnowledge, Progress, timed

@@ -9,11 +9,11 @@ from graphslam.core.records import Result, RobotResult
 from graphslam.core.worker import parallel_map
 from graphslam.logs import LogSet
 from graphslam.mapping.landmark_records import make_landmarks
+from graphslam.mapping.loop_closure import Tamper
 from graphslam.slam.initialisation import initialise
 from graphslam.slam.log_pass import Progress, timed
 from graphslam.slam.passes import FinishedPass, run_passes
 from graphslam.slam.pose_graph import is_pose_graph, solve_pose_graph
-from graphslam.slam.reoptimise_scans import Tamper
 from graphslam.slam.robot_settings import check_robots
 from graphslam.slam.scan_log import is_scan_log, solve_scan_log
 from graphslam.slam.sighting_passes import run_sighting_passes

@@ -21,6 +21,7 @@ from graphslam.mapping.loop_closure import (
     loop_closures,
     verify_match,
     verify_match_across,
+    verify_pairs,
     violated,
 )
 from graphslam.mapping.submaps import SubmapPose, build_submaps
@@ -66,7 +67,7 @@ def test_a_drifted_run_meets_itself():
     states, keyframe_scans = drive(drifting(true), true)
     found = build_submaps(states, keyframe_scans, Config())
     P = np.kron(np.eye(len(found)), np.diag([0.05, 0.05, 0.03]) ** 2)
-    closures, _ = loop_closures(found, P, {}, CONFIG)
+    closures, _ = loop_closures(found, P, {}, CONFIG, verify_pairs)
     assert len(closures) >= 3
     at = {int(t): k for k, t in enumerate(states["robot"].stamps_ns)}
     for c in closures:
@@ -84,7 +85,7 @@ def test_a_run_that_is_right_needs_no_closure():
     found = build_submaps(states, keyframe_scans, Config())
     P = np.kron(np.eye(len(found)), np.diag([0.05, 0.05, 0.03]) ** 2)
     assert candidates(found, P, CONFIG)
-    lost, confirmed = loop_closures(found, P, {}, CONFIG)
+    lost, confirmed = loop_closures(found, P, {}, CONFIG, verify_pairs)
     assert lost == []
     for c in confirmed:
         at = {place.state: place.pose for place in found}
@@ -99,8 +100,8 @@ def test_a_pair_is_looked_at_once():
     found = build_submaps(states, keyframe_scans, Config())
     P = np.kron(np.eye(len(found)), np.diag([0.05, 0.05, 0.03]) ** 2)
     looked = {}
-    assert loop_closures(found, P, looked, CONFIG)[0]
-    assert loop_closures(found, P, looked, CONFIG) == ([], [])
+    assert loop_closures(found, P, looked, CONFIG, verify_pairs)[0]
+    assert loop_closures(found, P, looked, CONFIG, verify_pairs) == ([], [])
 
 
 GOOD = Match(np.zeros(3), COV, same=0.7, absent=0.03)
