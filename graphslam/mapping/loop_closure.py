@@ -295,7 +295,7 @@ def verify_in_place(pairs: Sequence[SubmapPair]) -> list[Verified | None]:
 
     The covariance is large along directions that the points leave open.
     """
-    poses, covs = align_pairs(
+    poses, covs, _ = align_pairs(
         [p.later.submap for p in pairs],
         [p.earlier.submap for p in pairs],
         [p.guess for p in pairs],
