@@ -18,6 +18,7 @@ from graphslam.core.geometry import Array, between
 from graphslam.core.records import Closure
 from graphslam.mapping.gating import IntArray
 from graphslam.mapping.loop_closure import (
+    ALREADY_CLOSED,
     COV_INFLATION,
     MARGIN,
     MAX_RESIDUAL,
@@ -27,6 +28,7 @@ from graphslam.mapping.loop_closure import (
     PairVerifier,
     SubmapPair,
     Tamper,
+    are_near,
     consistent_closures,
     known_part,
     verified_closures,
@@ -92,6 +94,8 @@ class _Closer:
             nearest = [s[distance[s].argmin()] for s in np.split(j, ends) if len(s)]
             nearest.sort(key=distance.__getitem__)
             pairs += [(i, int(k)) for k in nearest[:MAX_VISITS]]
+        # covariances only of pairs that are to be examined: they take most of the time
+        pairs = [(i, j) for i, j in pairs if not self.is_examined(i, j)]
         if not pairs:
             return []
         i, j = np.array(pairs).T
@@ -105,6 +109,14 @@ class _Closer:
             SubmapPair(self.submaps[i[k]], self.submaps[j[k]], h[k], window[k])
             for k in np.flatnonzero(may & unknown)
         ]
+
+    def is_examined(self, i: int, j: int) -> bool:
+        """Whether a pair was examined where it lies now."""
+        before = self.examined.get((self.submaps[i].state, self.submaps[j].state))
+        if before is None:
+            return False
+        own, other = self.graph.poses[self.nodes[[i, j]]]
+        return are_near(before, between(other, own), ALREADY_CLOSED)
 
     def believe(self, correcting: list[Closure], confirming: list[Closure]) -> bool:
         """Add those that are consistent to the graph; whether any correct it."""
