@@ -1,6 +1,10 @@
 """Loops that are closed by matching: which closures are believed, and what they do to a run."""
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -257,3 +261,47 @@ def test_what_a_closure_leaves_open_is_no_residual():
     r = np.tile([1.5, 0.1, 0.01], (2, 1))
     np.testing.assert_allclose(known_part(r, closures), [[0.0, 0.1, 0.01], [1.5, 0.1, 0.01]])
     assert fix_position(closures) == [False, True]
+
+
+@pytest.mark.skipif(
+    sys.platform != "linux" or len(os.sched_getaffinity(0)) < 2,
+    reason="a second process is only used on Linux with two cores",
+)
+def test_the_second_process_verifies_the_same_to_the_last_bit(tmp_path):
+    """Breaks if a result depends on the pairs that it is computed with, or on its place."""
+    program = """
+import sys
+import numpy as np
+sys.path[:0] = sys.argv[1:]
+from test_loop_closure import drive, drifting, round_trip
+from graphslam.core.config import Config
+from graphslam.core.geometry import between
+from graphslam.core.worker import allow_fork
+from graphslam.mapping.loop_closure import PairVerifier, SubmapPair, verify_pairs
+from graphslam.mapping.submaps import build_submaps
+states, scans = drive(drifting(round_trip()), round_trip())
+found = build_submaps(states, scans, Config())
+window = np.array([0.6, 0.6, 0.15])
+pairs = [
+    SubmapPair(a, b, between(b.pose, a.pose), window)
+    for k, a in enumerate(found) for b in found[:k]
+]
+alone = verify_pairs(pairs, along=True)
+allow_fork()
+with PairVerifier(found, along=True) as verify:
+    print(verify.forked)
+    for _ in range(2):
+        for one, other in zip(alone, verify(pairs), strict=True):
+            assert (one is None) == (other is None)
+            if one is not None:
+                assert np.array_equal(one.pose, other.pose) and np.array_equal(one.cov, other.cov)
+                assert one.is_searched == other.is_searched
+print(sum(one is not None for one in alone) > 5)
+"""
+    here = Path(__file__).parent
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(here), str(here.parent)],
+        check=False, capture_output=True, text=True, cwd=tmp_path, timeout=60,
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
+    )  # fmt: skip
+    assert done.stdout.split() == ["True", "True"], done.stderr

@@ -87,6 +87,43 @@ def test_relative_covariances_are_those_of_the_joint():
         np.testing.assert_allclose(cov[k], H @ both @ H.T, rtol=1e-6, atol=1e-12)
 
 
+def test_what_follows_says_nothing_about_the_beginning():
+    """Solved up to a closure, poses and covariances are those of the whole graph, and what follows
+    is where the chain puts it. Breaks if what hangs behind is forgotten, or put where it was."""
+    true, chain, poses, _ = ring(n=20)
+    closure = RelativePoses(
+        np.array([2]), np.array([11]), between(true[2], true[11])[None], 0.04 * COV[None]
+    )
+    whole, part = (SubmapGraph(poses, chain, [0], START) for _ in range(2))
+    whole.solve(closure)
+    part.begin_with(np.array([5, 12]))
+    part.solve(closure)
+    np.testing.assert_allclose(part.poses[:13], whole.poses[:13], atol=1e-5)
+    assert not np.allclose(part.poses[13:], whole.poses[13:], atol=0.01)
+    which = np.array([3, 11, 12])
+    np.testing.assert_allclose(part.covariance(which), whole.covariance(which), rtol=1e-2)
+    part.begin_with(None)
+    np.testing.assert_allclose(part.poses, whole.poses, atol=1e-4)
+    part.solve(closure)
+    np.testing.assert_allclose(part.poses, whole.poses, atol=1e-5)
+
+
+def test_the_beginnings_of_several_paths():
+    """A path of which nothing is used yet is its first submap, which its closures do not move."""
+    _, chain, poses, _ = ring(n=4)
+    two = RelativePoses(*(
+        np.concatenate([a, a + 4 if k < 2 else a])
+        for k, a in enumerate((chain.begin, chain.end, chain.delta, chain.cov))
+    ))  # fmt: skip
+    graph = SubmapGraph(np.concatenate([poses, poses]), two, [0, 4], np.tile(START, (2, 1, 1)))
+    graph.begin_with(np.array([2]))
+    assert graph.covariance(np.array([2, 4])).shape == (6, 6)
+    graph.begin_with(np.array([2, 5]))
+    same = RelativePoses(np.array([1]), np.array([5]), np.zeros((1, 3)), 0.05**2 * np.eye(3)[None])
+    graph.solve(same)
+    np.testing.assert_allclose(graph.poses[5], graph.poses[1], atol=1e-3)
+
+
 def test_a_closure_moves_the_end_and_leaves_the_start():
     true, chain, poses, closure = ring()
     graph = SubmapGraph(poses, chain, [0], START)

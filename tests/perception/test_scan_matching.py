@@ -5,7 +5,15 @@ import pytest
 from walls import CORRIDOR, L_ROOM, cloud
 
 from graphslam.core.geometry import between, compose
-from graphslam.perception.scan_matching import agreement, align, make_submap, match, search
+from graphslam.perception.scan_matching import (
+    agreement,
+    align,
+    align_pairs,
+    make_submap,
+    match,
+    match_pairs,
+    search,
+)
 
 
 def submap(middle, walls, rng=None, shift=0.5):
@@ -75,3 +83,43 @@ def test_what_is_looked_through_counts_against_a_place(moved, absent):
     same, missing = agreement(b, a, np.array([1.0 + moved, 0.0, 0.0]))
     assert (missing < absent) if moved == 0 else (missing > absent)
     assert (same > 0.8) if moved == 0 else (same < 0.7)
+
+
+def pairs_of_all_kinds():
+    """Four pairs: the same room twice, a corridor, and two places with nothing in common."""
+    room = [submap(np.array([x, 1.0, 0.3]), L_ROOM) for x in (-2.0, -1.5, -1.0)]
+    corridor = [submap(np.array([x, 0.0, 0.0]), CORRIDOR) for x in (3.0, 0.0)]
+    sources = [room[0], room[2], corridor[0], room[1]]
+    targets = [room[1], room[1], corridor[1], corridor[0]]
+    near = [between(np.array([-1.5, 1.0, 0.3]), np.array([x, 1.1, 0.32])) for x in (-2.0, -1.0)]
+    return sources, targets, [*near, np.array([2.0, 0.1, 0.05]), np.array([50.0, 0.0, 0.0])]
+
+
+def test_a_pair_is_aligned_the_same_whatever_is_aligned_beside_it():
+    """To the last bit, so that it does not matter which process aligns what. Breaks with sums over
+    all points of a batch, and if a pair that has converged, or has no neighbours, holds up another.
+    """
+    sources, targets, guesses = pairs_of_all_kinds()
+    poses, covs, shares = align_pairs(sources, targets, guesses)
+    for k in range(4):
+        one = align_pairs(sources[k : k + 1], targets[k : k + 1], guesses[k : k + 1])
+        for together, alone in zip((poses, covs, shares), one, strict=True):
+            assert np.array_equal(together[k], alone[0])
+    assert shares[:3].min() > 0.7
+    assert shares[3] == 0.0
+    assert np.array_equal(poses[3], guesses[3])
+    assert covs[3, 0, 0] > 100.0
+
+
+def test_pairs_are_matched_as_each_alone():
+    """Breaks if the starts of one pair are aligned with the submaps of another."""
+    sources, targets, guesses = pairs_of_all_kinds()
+    window = [np.array([1.0, 1.0, 0.1])] * 4
+    together = match_pairs(sources, targets, guesses, window)
+    assert together[0] and not together[3]
+    for k in range(4):
+        alone = match(sources[k], targets[k], guesses[k], window[k])
+        assert len(alone) == len(together[k])
+        for a, b in zip(alone, together[k], strict=True):
+            assert np.array_equal(a.pose, b.pose)
+            assert (a.same, a.absent) == (b.same, b.absent)
