@@ -11,7 +11,7 @@ from graphslam.core.observation_arrays import ObservationArrays
 from graphslam.core.records import Observation, Scan
 from graphslam.perception.dynamic_objects import dynamic_returns, dynamic_returns_of_all
 from graphslam.perception.front_ends import FRONT_ENDS, observe_block
-from graphslam.perception.nearest_points import NearestPoints, nearest_of_each
+from graphslam.perception.nearest_points import NearestPoints
 from graphslam.perception.ordered_scan import make_sweep, scan_points
 from graphslam.perception.scan_matching import fit, make_submap
 from graphslam.perception.scan_pairs import fit_pairs
@@ -116,19 +116,15 @@ def test_nearest_points_are_nearest_up_to_a_cell():
     rng = np.random.default_rng(0)
     known = rng.uniform(-3, 3, (200, 2))
     asked = rng.uniform(-4, 4, (500, 2))
-    grids = [NearestPoints.of(known[:100], 0.05, 0.6), NearestPoints.of(known, 0.05, 0.6)]
-    near = nearest_of_each(grids, np.stack([asked.T, asked.T], axis=1))
-    for size, own in zip((100, 200), near, strict=True):
-        distance = np.hypot(*(asked[:, None] - known[:size]).transpose(2, 0, 1))
-        least = distance.min(axis=1)
-        found = distance[np.arange(500), own]
-        # a query and the nearest point are moved to their cells' middles, each by half a diagonal;
-        # the mask of the distance transform errs by 2 % of 0.6 m
-        near_enough = least < 0.5
-        np.testing.assert_array_less(
-            found[near_enough], least[near_enough] + 0.05 * np.sqrt(2) + 0.012
-        )
-        assert found[least > 0.6].min() > 0.6
+    grid = NearestPoints.of(known, 0.05, 0.6)
+    found, near = grid.query(asked, 0.6, known)
+    distance = np.hypot(*(asked[:, None] - known).transpose(2, 0, 1))
+    least = distance.min(axis=1)
+    # a query and the nearest point are moved to their cells' middles, each by half a diagonal; the
+    # mask of the distance transform errs by 2 % of 0.6 m
+    np.testing.assert_array_less(distance[found, near], least[found] + 0.05 * np.sqrt(2) + 0.012)
+    assert set(np.flatnonzero(least < 0.5)) <= set(found)
+    assert least[found].max() < 0.6
 
 
 def test_observations_as_arrays_and_back():
