@@ -25,12 +25,15 @@ from graphslam.estimation.square_root import (
     Rows,
     column_slices,
     columns_of,
+    eliminate_below,
     eliminate_columns,
     stacked,
 )
 
 #: so many landmarks become dormant together: fewer would make as many blocks to go through
 AT_ONCE = 16
+#: blocks are joined up to so many coordinates, since waking leaves small ones
+SMALL = 64
 #: a coefficient below this part of the largest one of its block is rounding
 NEGLIGIBLE = 1e-13
 
@@ -39,7 +42,8 @@ NEGLIGIBLE = 1e-13
 class _Block:
     """R z = d - S y + noise of unit covariance: coordinates z given others y.
 
-    R (n, n) is upper triangular. ``own`` (n,) and ``given`` (p,) are the numbers of z and y.
+    R (n, n) is upper triangular, in LAPACK's order of memory. ``own`` (n,) and
+    ``given`` (p,) are the numbers of z and y.
     """
 
     own: IntArray
@@ -60,6 +64,7 @@ class DormantVariables:
         self.anchors: set[int] = set()
         self.dims: dict[int, int] = {}
         self._blocks: list[_Block] = []
+        self._given_keys: list[int] | None = []  # see `_given`; None: not computed
         self._slices: dict[int, slice] = {}  # coordinates of all variables ever in a block
         self._keys: list[int] = []  # coordinate -> its variable
 
@@ -85,7 +90,8 @@ class DormantVariables:
         own = self._coordinates(first)
         n = len(own)
         R, S, d, A, b = eliminate_columns(whole.A, whole.b, n)
-        self._append(self._blocks, own, self._coordinates(others), (R, S, d))
+        self._blocks.append(_block(own, self._coordinates(others), R, S, d))
+        self._given_keys = None
         self.dims |= first
         given = {self._keys[n] for n in self._blocks[-1].given}
         self.anchors = (self.anchors - first.keys()) | set(filter(factors.is_state, given))
@@ -104,7 +110,7 @@ class DormantVariables:
         for block in self._blocks:
             leaves = wanted[block.own]
             if not (leaves.any() or involved[block.own].any()):
-                blocks.append(block)
+                _append(blocks, block)
                 continue
             own = block.own[~leaves]
             involved[block.own] = involved[block.given] = True
@@ -116,11 +122,17 @@ class DormantVariables:
             whole[:m, position[block.own]] = block.R
             whole[:m, position[block.given]] = block.S
             whole[m:, position[carried]] = A
-            R, S, d, A, b = eliminate_columns(whole, np.append(block.d, b), n)
+            right, count = np.append(block.d, b), m + len(b) - n
+            if n < m:
+                R, S, d, A, b = eliminate_columns(whole, right, n)
+                # there are as many rows as variables, so no z leaves any error
+                A, b = A[:count], b[:count]
+            else:
+                R, S, d, A, b = eliminate_below(whole, right, n)
             carried = others
             if n:
-                self._append(blocks, own, others, (R, S, d))
-        self._blocks = blocks
+                _append(blocks, _block(own, others, R, S, d))
+        self._blocks, self._given_keys = blocks, None
         dims = {key: self._slices[key] for key in dict.fromkeys(self._keys[n] for n in carried)}
         sizes = {key: at.stop - at.start for key, at in dims.items()}
         out = np.zeros((len(b), sum(sizes.values())))
@@ -136,17 +148,16 @@ class DormantVariables:
                 self._keys += [key] * dim
         return columns_of(dims, self._slices)
 
-    @staticmethod
-    def _append(
-        blocks: list[_Block],
-        own: IntArray,
-        given: IntArray,
-        solved: tuple[Array, Array, Array],
-    ) -> None:
-        """Append a block, without the coordinates that it depends on by rounding only."""
-        R, S, d = solved
-        kept = np.abs(S).max(axis=0, initial=0.0) > NEGLIGIBLE * np.abs(R).max()
-        blocks.append(_Block(own, given[kept], R, S[:, kept], d))
+    def _given(self) -> list[int]:
+        """The variables in use that the blocks are given."""
+        if self._given_keys is None:
+            known = np.zeros(len(self._keys), dtype=bool)
+            for block in self._blocks:
+                known[block.given] = True
+            for block in self._blocks:
+                known[block.own] = False
+            self._given_keys = list(dict.fromkeys(self._keys[n] for n in np.flatnonzero(known)))
+        return self._given_keys
 
     def solve(self, in_use: Callable[[int], Array], *, changes: int = 0) -> dict[int, Array]:
         """Dormant variables (d,) that follow from those in use, or so many changes (d, n) of them.
@@ -154,12 +165,7 @@ class DormantVariables:
         ``in_use`` gives a variable in use, (d,) or its changes (d, n).
         """
         z = np.zeros((len(self._keys), max(changes, 1)))
-        known = np.zeros(len(self._keys), dtype=bool)
-        for block in self._blocks:
-            known[block.given] = True
-        for block in self._blocks:
-            known[block.own] = False
-        for key in dict.fromkeys(self._keys[n] for n in np.flatnonzero(known)):
+        for key in self._given():
             z[self._slices[key]] = in_use(key).reshape(-1, z.shape[1])
         for block in reversed(self._blocks):
             right = -block.S @ z[block.given]
@@ -190,6 +196,34 @@ class DormantVariables:
                 involved[block.own] = False
         given = dict.fromkeys(self._keys[n] for n in np.flatnonzero(involved))
         return {key: W[self._slices[key]] for key in given}, noise
+
+
+def _block(own: IntArray, given: IntArray, R: Array, S: Array, d: Array) -> _Block:
+    """A block, without the coordinates that it depends on by rounding only."""
+    kept = np.abs(S).max(axis=0, initial=0.0) > NEGLIGIBLE * np.abs(R).max()
+    return _Block(own, given[kept], np.asfortranarray(R), S[:, kept], d)
+
+
+def _append(blocks: list[_Block], block: _Block) -> None:
+    """Append a block, as part of the one before if they are small."""
+    if not blocks or len(blocks[-1].own) + len(block.own) > SMALL:
+        blocks.append(block)
+        return
+    first = blocks.pop()
+    own = np.concatenate([first.own, block.own])
+    given = np.setdiff1d(np.concatenate([first.given, block.given]), own)
+    n = len(first.own)
+    columns = np.concatenate([own, given])
+    order = np.argsort(columns)
+
+    def place(of: IntArray) -> IntArray:
+        return order[np.searchsorted(columns, of, sorter=order)]
+
+    whole = np.zeros((len(own), len(columns)))
+    whole[:n, :n], whole[:n, place(first.given)] = first.R, first.S
+    whole[n:, n : len(own)], whole[n:, place(block.given)] = block.R, block.S
+    R, S = np.asfortranarray(whole[:, : len(own)]), whole[:, len(own) :].copy()
+    blocks.append(_Block(own, given, R, S, np.concatenate([first.d, block.d])))
 
 
 def covariance(

@@ -10,12 +10,15 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
+from scipy.linalg.lapack import dtpmqrt, dtpqrt
 
 from graphslam.core.geometry import Array
 
 IntArray = np.ndarray[tuple[int], np.dtype[np.int64]]
 #: the order that eliminates the first of two stacked variables
 _FIRST = gtsam.Ordering([0])
+#: columns that LAPACK eliminates at a time
+_PANEL = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,6 +103,20 @@ def eliminate_columns(A: Array, b: Array, n: int) -> tuple[Array, Array, Array, 
         left = np.concatenate([A2, left[0]]), np.append(b2, 0.0)
     left[1][-1] = math.sqrt(max(float(b @ b - d @ d - left[1] @ left[1]), 0.0))
     return R, S, d, *left
+
+
+def eliminate_below(A: Array, b: Array, n: int) -> tuple[Array, Array, Array, Array, Array]:
+    """As `eliminate_columns` where the first n rows are triangular already, by LAPACK.
+
+    The m - n other rows then cost what they are, not what all rows would. The rows that are left
+    are as many, with what no z can make smaller in all of them.
+    """
+    right = np.asfortranarray(np.concatenate([A[:, n:], b[:, None]], axis=1))
+    if len(b) == n:
+        return A[:, :n], right[:, :-1], right[:, -1], right[n:, :-1], right[n:, -1]
+    R, V, T, _ = dtpqrt(0, min(n, _PANEL), A[:n, :n], A[n:, :n])
+    S, left, _ = dtpmqrt(0, V, T, right[:n], right[n:], trans="T")
+    return np.triu(R), S[:, :-1], S[:, -1], left[:, :-1], left[:, -1]
 
 
 def eliminate(rows: Rows, count: int) -> Rows:

@@ -2,8 +2,9 @@
 
 Every variable is its linearisation point corrected by z, in the tangent space there; all rows are
 in terms of z. A factor is linearised anew where one of its variables has moved since, and the
-points of variables that the prior involves stay (see `fixed_lag`). GTSAM linearises factors one by
-one; the window is solved as one dense matrix, which for a few hundred rows is quickest.
+points of variables that the prior involves stay (see `fixed_lag`). GTSAM linearises all these
+factors in two calls; the window is solved as one dense matrix, which for a few hundred rows is
+quickest.
 """
 
 import math
@@ -20,7 +21,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.records import Association
 from graphslam.estimation import factors
 from graphslam.estimation.m_estimators import WEIGHTS
-from graphslam.estimation.square_root import Rows, column_slices, stacked
+from graphslam.estimation.square_root import IntArray, Rows, column_slices, columns_of, stacked
 
 #: largest number of Gauss-Newton iterations per step, and the norm of the update (m, rad) that ends
 #: them. A step starts where the last one ended, so two are the rule.
@@ -31,6 +32,7 @@ RELINEARISE = 1e-3
 #: Cholesky is used while no variable's variance exceeds by more what it is given all others: it
 #: loses as many digits, and QR half of them
 WORST_RATIO = 1e10
+BoolArray = np.ndarray[tuple[int], np.dtype[np.bool_]]
 IndexArray = np.ndarray[tuple[int, int], np.dtype[np.int64]]
 #: columns of a factor's rows: two variables of three, and the right side
 _WIDTH = 7
@@ -106,41 +108,54 @@ class Window:
         prior = self.prior.dims
         dims = {**prior, **{key: d for key, d in self.dims.items() if key not in prior}}
         self.slices = column_slices(dims)
-        columns = self._columns()
+        columns = self._columns(self.factors)
+        made = [each.rows for each in self.factors]
+        rows = np.array([np.zeros((3, _WIDTH)) if each is None else each for each in made])
+        rows = rows.reshape(-1, 3, _WIDTH)
+        new = np.array([each is None for each in made], dtype=bool)
+        robust = np.flatnonzero([each.robust for each in self.factors])
         z = np.concatenate([self.z[key] for key in dims])
         prior_A = np.zeros((len(self.prior.b), len(z) + 1))
         prior_A[:, : self.prior.A.shape[1]], prior_A[:, -1] = self.prior.A, self.prior.b
         prior_H = prior_A.T @ prior_A
         size = math.inf
         for _ in range(MAX_ITERATIONS):
-            rows = self._linearised(columns, z)
-            weighted = np.sqrt(self._weights(rows, columns, z))[:, None, None] * rows
+            self._relinearise(rows, columns, z, new)
+            weighted = np.sqrt(self._weights(rows, columns, z, robust))[:, None, None] * rows
             H = _normal_equations(weighted, columns, len(z))
             H += prior_H
             root = _cholesky(H[:-1, :-1])
             if root is None:
                 root = self._qr(weighted, columns, prior_A)
-            new = dtrsm(1.0, root, dtrsm(1.0, root, H[:-1, -1:], trans_a=1))[:, 0]
-            size = float(np.linalg.norm(new - z))
+            before, z = z, dtrsm(1.0, root, dtrsm(1.0, root, H[:-1, -1:], trans_a=1))[:, 0]
+            size = float(np.linalg.norm(z - before))
             if not math.isfinite(size):
                 raise IndeterminateWindowError(None)
-            z, self.root = new, root
+            self.root = root
             self._move_to(z)
             if size < CONVERGED:
                 break
+        for each, own in zip(self.factors, rows, strict=True):
+            each.rows = own
 
-    def _columns(self) -> IndexArray:
+    def _columns(self, chosen: Sequence[WindowFactor]) -> IndexArray:
         """Columns (m, 7) of each factor's rows; behind the right side is one for empty places."""
         n = sum(self.dims.values())
-        places = {key: list(range(at.start, at.stop)) for key, at in self.slices.items()}
-        out = []
-        for each in self.factors:
-            own = [column for key in each.keys for column in places[key]]
-            out.append(own + [n + 1] * (_WIDTH - 1 - len(own)) + [n])
+        places = {key: range(at.start, at.stop) for key, at in self.slices.items()}
+        out: list[int] = []
+        for each in chosen:
+            at = len(out)
+            for key in each.keys:
+                out += places[key]
+            out += [n + 1] * (at + _WIDTH - 1 - len(out))
+            out.append(n)
         return np.array(out, dtype=np.int64).reshape(-1, _WIDTH)
 
-    def _linearised(self, columns: IndexArray, z: Array) -> Array:
-        """Rows (m, 3, 7) of all factors; ``z`` is changed where linearisation points are."""
+    def _relinearise(self, rows: Array, columns: IndexArray, z: Array, new: BoolArray) -> None:
+        """Change the rows (m, 3, 7) of factors that are ``new`` (m,) or whose variables moved.
+
+        ``z`` is changed where linearisation points are, and no factor is new any more.
+        """
         read = np.concatenate([self._read[key] for key in self.slices])
         moved = np.zeros(len(z) + 2, dtype=bool)
         for key in self._moved(np.abs(z - read)):
@@ -151,11 +166,12 @@ class Window:
                 z[at] = 0.0
                 self.z[key] = z[at].copy()
             self._read[key] = self.z[key]
-        outdated = np.asarray(moved[columns[:, :-1]].any(axis=1))
-        for n, each in enumerate(self.factors):
-            if outdated[n] or each.rows is None:
-                each.rows = self._linearise(each)
-        return np.array([each.rows for each in self.factors]).reshape(-1, 3, _WIDTH)
+        outdated = np.flatnonzero(moved[columns[:, :-1]].any(axis=1) | new)
+        new[:] = False
+        if len(outdated):
+            rows[outdated] = self._linearised(
+                [self.factors[n] for n in outdated], columns[outdated], z
+            )
 
     def _moved(self, distance: Array) -> list[int]:
         """Variables that moved, by the distances (n,) of their coordinates."""
@@ -165,21 +181,35 @@ class Window:
         keys, starts = list(self.slices), [at.start for at in self.slices.values()]
         return [keys[n] for n in np.unique(np.searchsorted(starts, far, side="right") - 1)]
 
-    def _linearise(self, each: WindowFactor) -> Array:
-        """Rows (3, 7) with the residual at the estimate, Jacobians at the linearisation points."""
-        A = each.factor.linearize(self._points).jacobian()[0]
-        b = each.factor.linearize(self.values).jacobian()[1]
-        rows = np.zeros((3, _WIDTH))
-        rows[: len(b), : A.shape[1]] = A
-        rows[: len(b), -1] = b + A @ np.concatenate([self.z[key] for key in each.keys])
+    def _linearised(self, chosen: Sequence[WindowFactor], columns: IndexArray, z: Array) -> Array:
+        """Rows (m, 3, 7) with the residuals at ``z``, Jacobians at the linearisation points."""
+        graph, involved = gtsam.NonlinearFactorGraph(), gtsam.Ordering()
+        for each in chosen:
+            graph.add(each.factor)
+        keys = {key: None for each in chosen for key in each.keys}
+        for key in keys:
+            involved.push_back(key)
+        A = graph.linearize(self._points).jacobian(involved)[0]
+        b = graph.linearize(self.values).jacobian(involved)[1]
+        # the last column and the last row are empty
+        whole = np.zeros((len(b) + 1, A.shape[1] + 1))
+        whole[:-1, :-1] = A
+        place = np.full(len(z) + 2, -1)
+        place[columns_of(keys, self.slices)] = np.arange(A.shape[1])
+        size = np.array([each.factor.dim() for each in chosen])[:, None]
+        line = np.arange(3) + (np.cumsum(size)[:, None] - size)
+        line[np.arange(3) >= size] = -1
+        rows = np.empty((len(chosen), 3, _WIDTH))
+        rows[:, :, :-1] = whole[line[:, :, None], place[columns[:, None, :-1]]]
+        here = np.append(z, [0.0, 0.0])[columns[:, :-1]]
+        rows[:, :, -1] = np.append(b, 0.0)[line] + np.einsum("mij,mj->mi", rows[:, :, :-1], here)
         return rows
 
-    def _weights(self, rows: Array, columns: IndexArray, z: Array) -> Array:
-        """Weight (m,) of each factor under the kernel."""
+    def _weights(self, rows: Array, columns: IndexArray, z: Array, robust: IntArray) -> Array:
+        """Weight (m,) of each factor under the kernel, which applies to some, ``robust``."""
         weights = np.ones(len(rows))
         if self._kernel.kernel == "none":
             return weights
-        robust = np.flatnonzero([each.robust for each in self.factors])
         weight, scale = WEIGHTS[self._kernel.kernel], self._kernel.scale
         padded = np.append(z, [0.0, 0.0])
         at = padded[columns[robust, :-1]]
@@ -192,7 +222,7 @@ class Window:
         """All estimates after an update."""
         delta = gtsam.VectorValues()
         for key, at in self.slices.items():
-            self.z[key] = z[at].copy()
+            self.z[key] = z[at]
             delta.insert(key, self.z[key])
         self.values = self._points.retract(delta)
 
@@ -218,10 +248,14 @@ class Window:
 
     def weighted_rows(self, chosen: Sequence[WindowFactor]) -> list[Rows]:
         """Rows of factors at the estimate, weighted by the kernel."""
+        z = np.concatenate([self.z[key] for key in self.slices])
+        new = [each for each in chosen if each.rows is None]
+        if new:
+            for each, rows in zip(new, self._linearised(new, self._columns(new), z), strict=True):
+                each.rows = rows
         out = []
         for each in chosen:
-            if each.rows is None:
-                each.rows = self._linearise(each)
+            assert each.rows is not None
             dims = {key: self.dims[key] for key in each.keys}
             n = sum(dims.values())
             A, b = each.rows[:, :n], each.rows[:, -1]
