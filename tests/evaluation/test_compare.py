@@ -119,6 +119,7 @@ def test_the_reference_is_at_no_distance_from_itself_and_odometry_is_far(two):
     rows = rows_of(two.done)
     assert two.done.summary["reference"] == "batch"
     assert rows["batch"]["difference"]["final"]["max_m"] == 0.0
+    assert rows["isam2"]["difference"]["final"]["max_m"] < 1e-6  # the same optimum
     # odometry ends 1.07 m off in this scenario, the smoother some mm
     assert rows["dead-reckoning"]["difference"]["final"]["max_m"] > 0.5
     assert rows["isam2"]["difference"]["causal"]["rmse_m"] > 0
