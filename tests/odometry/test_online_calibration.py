@@ -16,6 +16,8 @@ from graphslam.odometry.online_calibration import (
     MIN_SIGMA_SHARE,
     OUTLIER_D2,
     Calibrator,
+    TrackedMotions,
+    calibration_from_motions,
     observed_information,
 )
 from graphslam.odometry.preintegration import Track
@@ -344,3 +346,111 @@ def test_a_robot_that_stands_teaches_nothing():
         motion = track.motion(k * SECOND, (k + 1) * SECOND)
         assert calibrator.update(current, motion, np.array([0.01, 0.0, 0.005]), PLENTY) is current
     assert calibrator.summary() == {}
+
+
+def make_tracked(delta, cov, d_cal, calibration, moved, moved_cov):
+    n = len(delta)
+    return TrackedMotions(
+        delta,
+        cov,
+        d_cal,
+        np.tile(calibration.mean, (n, 1)),
+        np.tile(calibration.cov, (n, 1, 1)),
+        moved,
+        moved_cov,
+    )
+
+
+def calibrated(found, prior):
+    return calibration_from_motions(found, prior, OdometryConfig())
+
+
+# ------------------------------------------------------------ all motions at once
+
+
+def tracked_motions(drive, landmark_cov, rng, calibration=None):
+    """Motions of a drive as tracked: means of odometry and of what landmarks show of each."""
+    track = drive.track
+    track.calibration = calibration or track.calibration
+    starts, ends = drive.states[:-1], drive.states[1:]
+    motions = [track.motion(int(a), int(b)) for a, b in zip(starts, ends, strict=True)]
+    moved, covs = [], []
+    for motion in motions:
+        Q, R = motion.cov, np.diag(landmark_cov)
+        z = drive.moved(motion.start_ns, motion.end_ns) + rng.normal(0, np.sqrt(landmark_cov))
+        P = np.linalg.inv(np.linalg.inv(Q) + np.linalg.inv(R))
+        moved.append(P @ (np.linalg.solve(Q, motion.delta) + np.linalg.solve(R, z)))
+        covs.append(P)
+    return make_tracked(
+        np.array([m.delta for m in motions]),
+        np.array([m.cov for m in motions]),
+        np.array([m.d_delta_d_calibration for m in motions]),
+        track.calibration,
+        np.array(moved),
+        np.array(covs),
+    )
+
+
+def without_margin(known, prior):
+    """Covariance of parameters by the data, see `MIN_SIGMA_SHARE`."""
+    return known.cov - MIN_SIGMA_SHARE**2 * prior.cov
+
+
+#: landmarks that show a motion to 2 cm and 0.01 rad: no better than odometry of half a second
+POOR = np.square([0.02, 0.02, 0.01])
+
+
+@pytest.mark.parametrize("landmark_cov", [POOR, 1e-4 * POOR])
+def test_scale_errors_are_found_from_tracked_motions_to_their_sigmas(landmark_cov):
+    """Also where landmarks are poor and tracked motions follow odometry most of the way: its share
+    in them is taken out. Taken as independent measurements, they would show half the error."""
+    total, n = np.zeros(len(SCALES)), 12
+    for seed in range(n):
+        rng = np.random.default_rng(seed)
+        drawn = {name: rng.normal(0, PRIOR[name]) for name in SCALES}
+        drive = Drive(weaving(2500, rng), drawn, CENTRED, mounted=False, rng=rng)
+        prior = drive.track.calibration
+        found = calibrated(tracked_motions(drive, landmark_cov, rng), prior)
+        cov = without_margin(found, prior)
+        assert np.all(np.sqrt(np.diag(cov)) < 0.5 * np.sqrt(np.diag(prior.cov)))
+        total += np.square(found.mean - list(drawn.values())) / np.diag(cov)
+    assert np.all(total / n < chi2.ppf(0.9999, n) / n), total / n
+
+
+def test_what_is_found_does_not_depend_on_the_calibration_that_motions_had():
+    """Evidence from motions by a calibration that is right already says the same as from motions
+    without any, to a tenth of a sigma (the odometry's covariance changes with it)."""
+    prior, found = None, []
+    for known in (0.0, 1.0):
+        rng = np.random.default_rng(4)
+        drive = Drive(weaving(2500, rng), SCALES, CENTRED, mounted=False)
+        prior = drive.track.calibration
+        used = replace(prior, mean=known * np.array(list(SCALES.values())))
+        found.append(calibrated(tracked_motions(drive, 1e-2 * POOR, rng, used), prior))
+    sigmas = np.sqrt(np.diag(without_margin(found[0], prior)))
+    assert np.all(np.abs(found[0].mean - found[1].mean) < 0.1 * sigmas)
+
+
+def test_without_landmarks_and_without_motions_the_prior_stays():
+    """Tracked motions that are those of odometry tell nothing."""
+    drive = Drive(weaving(300, np.random.default_rng(0)), mounted=False)
+    prior = drive.track.calibration
+    nothing = tracked_motions(drive, 1e12 * POOR, np.random.default_rng(0))
+    np.testing.assert_allclose(calibrated(nothing, prior).mean, prior.mean, atol=1e-6)
+
+
+def test_a_slipping_motion_does_not_count():
+    """A wheel that spins for half a metre would show as 5 % of scale."""
+    rng = np.random.default_rng(6)
+    drive = Drive(weaving(1000, rng), SCALES, CENTRED, mounted=False)
+    found = tracked_motions(drive, 1e-2 * POOR, rng)
+    found.moved[7, 0] -= 0.5
+    other = np.delete(np.arange(len(found.moved)), 7)
+    clean = make_tracked(
+        found.delta[other], found.cov[other], found.d_cal[other], drive.track.calibration,
+        found.moved[other], found.moved_cov[other],
+    )  # fmt: skip
+    prior = drive.track.calibration
+    np.testing.assert_allclose(
+        calibrated(found, prior).mean, calibrated(clean, prior).mean, rtol=0, atol=1e-12
+    )
