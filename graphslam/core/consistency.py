@@ -157,6 +157,7 @@ def greedy_max_clique(
     """
     best: list[int] = []
     most = 0.0
+    possible = _worth_possible(agree, worth)
     links = agree * worth[:, None]  # what each is worth to those that agree with it
     degree = links.sum(axis=0) + worth
     for first in np.argsort(-degree, kind="stable")[:starts]:
@@ -173,7 +174,28 @@ def greedy_max_clique(
             free = left
         if total > most:
             best, most = chosen, float(total)
+        if most >= possible:
+            break
     return np.array(sorted(best), dtype=np.int64)
+
+
+def _worth_possible(agree: NDArray[Any], worth: Array | NDArray[np.float32]) -> float:
+    """No set that agrees in pairs is worth more: of two that disagree it has one at most.
+
+    Disagreeing pairs are taken greedily, so the bound is tight where few disagree, and there each
+    search is longest.
+    """
+    apart = ~agree.astype(bool)
+    np.fill_diagonal(apart, False)
+    free = np.ones(len(worth), dtype=bool)
+    possible = float(worth.sum())
+    for i in np.argsort(-apart.sum(axis=1), kind="stable"):
+        rivals = np.flatnonzero(free & apart[i]) if free[i] else ()
+        if len(rivals):
+            j = rivals[np.argmax(worth[rivals])]
+            free[[i, j]] = False
+            possible -= float(min(worth[i], worth[j]))
+    return possible
 
 
 def fit_rigid_transform(p: Array, q: Array, variance: Array) -> tuple[Array, Array]:

@@ -236,6 +236,13 @@ def is_positive(cov: Array) -> bool:
     return bool(np.isfinite(factor).all())  # of NaN LAPACK makes NaN
 
 
+def are_positive(covs: Array) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """`is_positive` of each of n symmetric matrices (n, 2, 2); False where one is not finite."""
+    a, b, d = covs[:, 0, 0], covs[:, 0, 1], covs[:, 1, 1]
+    with np.errstate(all="ignore"):
+        return np.isfinite(a + b + d) & (a > 0) & (a * d - b * b > 0)
+
+
 def interpolate(a: Array, b: Array, share: ArrayLike) -> Array:
     """Pose between a and b ``(..., 3)`` at share 0..1 along the constant twist from a to b."""
     return compose(a, exp(np.asarray(share)[..., None] * log(between(a, b))))

@@ -19,7 +19,8 @@ from graphslam.core.motion_models import HELD_SIGMA, Calibration
 from graphslam.core.records import Estimate, Motion, Step
 from graphslam.estimation import factors
 from graphslam.estimation.backend import JointMarginal
-from graphslam.estimation.isam2 import CONVERGED_ERROR_ROUGH, BatchGraph, marginals_of, with_means
+from graphslam.estimation.isam2 import CONVERGED_ERROR_ROUGH, marginals_of, with_means
+from graphslam.estimation.recorded_graph import RecordedGraph
 
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
@@ -78,7 +79,7 @@ class CalibrationGraph:
         Raises:
             EstimationError: a covariance is not positive definite, or a state is unknown.
         """
-        self._builder = builder = BatchGraph(kernel, defer_lines=True)
+        self._builder = builder = RecordedGraph(kernel)
         self._values, self._priors = gtsam.Values(), priors
         self._keys = {r: int(gtsam.symbol("c", k)) for k, r in enumerate(sorted(priors))}
         self._free = {r: np.flatnonzero(np.diag(c.cov) > HELD_SIGMA**2) for r, c in priors.items()}
@@ -89,13 +90,10 @@ class CalibrationGraph:
                 self._values.insert(key, now[robot].mean[use])
                 noise = factors.gaussian(prior.cov[np.ix_(use, use)])
                 builder.graph.add(gtsam.PriorFactorVector(key, prior.mean[use], noise))
-        for step in steps:
-            for robot in step.motions:
-                last = builder.latest_key(robot, step.time_ns)
-                index = builder.graph.size() + len(step.starts) + list(step.motions).index(robot)
-                self._motions[robot].append((index, last, last + 1))
-            builder.insert(step, start, self._values)
+        builder.insert_all(steps, start, self._values)
         builder.rebuild_lines(self._values)
+        for index, robot, last, key in builder.motions:
+            self._motions[robot].append((index, last, key))
 
     def calibrate_motions(self, steps: Sequence[Step], now: Mapping[str, Calibration]) -> None:
         """Put motions in the graph that depend on the calibration.

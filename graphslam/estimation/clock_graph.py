@@ -15,7 +15,7 @@ import numpy as np
 from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array
 from graphslam.core.records import Association, Estimate, Step
-from graphslam.estimation.isam2 import BatchGraph
+from graphslam.estimation.recorded_graph import RecordedGraph
 
 #: prior sigmas of the offset, s, and the drift, s/s, which are also the units of the variables: the
 #: offset is practically free, and 100 ppm is more than any crystal drifts
@@ -60,7 +60,8 @@ def clock_errors(
     Raises:
         EstimationError: the estimate is indeterminate.
     """
-    builder, values = BatchGraph.at_estimate(steps, estimate, kernel)
+    builder, values = RecordedGraph(kernel), gtsam.Values()
+    builder.insert_all(steps, estimate, values)
     builder.rebuild_lines(values)
     robots = tuple(sorted(prior))
     clock = int(gtsam.symbol("t", 0))
@@ -73,8 +74,11 @@ def clock_errors(
     so_far = np.concatenate([prior[robot] / units for robot in robots])
     linear.add(gtsam.JacobianFactor(clock, np.eye(size), -so_far, unit))
     columns = np.column_stack([np.ones(len(after_s)), after_s]) * units
-    for n, (_, (key, target, seen)) in enumerate(builder.robot_observations):
-        factor = nonlinear[n].linearize(values)
+    number = {seen: n for n, (_, seen) in enumerate(robot_associations(steps))}
+    for observed, (_, (key, target, seen)) in zip(
+        nonlinear, builder.robot_observations, strict=True
+    ):
+        n, factor = number[seen], observed.linearize(values)
         A, b = factor.jacobian()
         first = factor.keys()[0] == key
         A_key, A_target = (A[:, :3], A[:, 3:]) if first else (A[:, 3:], A[:, :3])

@@ -90,6 +90,7 @@ class GraphBuilder:
         self.kernel = kernel
         self.states = StateTable()
         self.robots: list[str] = []
+        self._first_keys: dict[str, int] = {}  # of every robot's first state
         self.landmark_dims: dict[int, int] = {}
         self.rows = 0
         self.oldest: dict[str, int] = defaultdict(int)
@@ -99,7 +100,7 @@ class GraphBuilder:
 
     def state_key(self, robot: str, number: int) -> int:
         """Key of a robot's state."""
-        return factors.state_key(self.robots.index(robot), number)
+        return self._first_keys[robot] + number
 
     def latest_key(self, robot: str, at_ns: int | None = None) -> int:
         """Key of a robot's latest state, see `StateTable.latest`."""
@@ -132,10 +133,11 @@ class GraphBuilder:
                 step refers to was never made.
         """
         for robot, start in step.starts.items():
+            self._first_keys[robot] = factors.state_key(len(self.robots), 0)
             self.robots.append(robot)
             key = self.state_key(robot, self.states.append(robot, step.time_ns))
             what = describe_start(robot, step.time_ns)
-            with _covariance_of(what, start.cov):
+            with covariance_of(what, start.cov):
                 factor = factors.start_factor(key, start)
             self.rows += 3
             yield FactorGroup((factor,), what, (key, start.pose))
@@ -143,7 +145,7 @@ class GraphBuilder:
             last = self.latest_key(robot, step.time_ns)
             key = self.state_key(robot, self.states.append(robot, step.time_ns))
             what = describe_motion(robot, step.time_ns)
-            with _covariance_of(what, motion.cov):
+            with covariance_of(what, motion.cov):
                 factor = factors.motion_factor(last, key, motion)
             self.rows += 3
             new = key, compose(estimate(last, 3), motion.delta)
@@ -193,10 +195,15 @@ class GraphBuilder:
                 made.append(factors.observation_factor(key, target, seen, self.kernel, x, t))
         except (EstimationError, np.linalg.LinAlgError) as error:
             raise EstimationError(f"{describe(seen)}: {error}") from error
-        if new is not None and isinstance(seen.target, int):
-            self.landmark_dims[seen.target] = model.dim
-            self._first_seen[seen.target] = seen
+        if new is not None:
+            self.introduce(seen)
         return FactorGroup(tuple(made), "", new, observed=(key, target, seen), robust=True)
+
+    def introduce(self, seen: Association) -> None:
+        """A landmark is a variable from its first observation on."""
+        if isinstance(seen.target, int):
+            self.landmark_dims[seen.target] = MODELS[seen.model].dim
+            self._first_seen[seen.target] = seen
 
     def closure_groups(self, closures: Iterable[Closure]) -> Iterator[FactorGroup]:
         """Factors of closures between states that are still estimated."""
@@ -208,7 +215,7 @@ class GraphBuilder:
                 continue
             key, other = (self.state_key(*number) for number in numbers)
             what = describe(closure)
-            with _covariance_of(what, closure.cov):
+            with covariance_of(what, closure.cov):
                 factor = factors.closure_factor(key, other, closure, self.kernel)
             self.rows += 3
             yield FactorGroup((factor,), what, robust=not closure.verified)
@@ -304,8 +311,12 @@ class GraphBuilder:
 
 
 @contextmanager
-def _covariance_of(what: str, cov: Array) -> Iterator[None]:
-    """Checks a covariance (k, k); errors inside name ``what`` it is of."""
+def covariance_of(what: str, cov: Array) -> Iterator[None]:
+    """Checks a covariance (k, k); errors inside name ``what`` it is of.
+
+    Raises:
+        EstimationError: it is not finite, or not positive definite inside.
+    """
     try:
         _check_finite(cov)
         yield
@@ -378,6 +389,20 @@ class GraphBackend(ABC):
                 turn[block, block] = rotation3(mean[2])
         self._joints[robot] = JointMarginal.of(means, len(landmarks), turn @ cov @ turn.T)
         return self._joints[robot]
+
+    def pose_covariances(self, robots: Sequence[str]) -> Array:
+        """Covariances (n, 3, 3) of the latest poses of robots, along world axes.
+
+        Raises:
+            EstimationError: one is indeterminate.
+        """
+        if not robots:
+            return np.zeros((0, 3, 3))
+        keys = [self.builder.latest_key(robot) for robot in robots]
+        cov = self.covariance(keys).reshape(len(keys), 3, len(keys), 3)
+        heading = np.array([self.value(key, 3)[2] for key in keys])
+        each = range(len(keys))
+        return rotate_cov(cov[each, :, each], heading)
 
     def state_mean(self, robot: str) -> Array:
         """See `Backend`."""

@@ -212,14 +212,38 @@ def _bearing_range(factor: Callable[..., gtsam.NonlinearFactor]) -> _FactorMaker
     )
 
 
+#: rows of `MODELS` whose measurements are bearing and range -> their factor
+BEARING_RANGE: dict[str, type[gtsam.NonlinearFactor]] = {
+    "point": gtsam.BearingRangeFactor2D,
+    "robot-point": gtsam.BearingRangeFactorPose2,
+}
 #: row of `MODELS` -> its factor
 FACTORS: dict[str, _FactorMaker] = {
-    "point": _bearing_range(gtsam.BearingRangeFactor2D),
+    "point": _bearing_range(BEARING_RANGE["point"]),
     "line": _line_observation,
     "segment": _pose_observation,
     "robot-pose": _pose_observation,
-    "robot-point": _bearing_range(gtsam.BearingRangeFactorPose2),
+    "robot-point": _bearing_range(BEARING_RANGE["robot-point"]),
 }
+
+
+def bearing_range_factors(
+    model: str,
+    keys: Sequence[int],
+    targets: Sequence[int],
+    z: Array,
+    cov: Array,
+    kernel: RobustConfig,
+) -> list[gtsam.NonlinearFactor]:
+    """The factors of n bearings and ranges, as `observation_factor` makes them, faster.
+
+    ``model`` is of `BEARING_RANGE`; ``z`` (n, 2) are the measurements, ``cov`` (n, 2, 2) their
+    covariances, all positive definite.
+    """
+    plain = map(gtsam.noiseModel.Gaussian.Covariance, cov)
+    noises = (robust(noise, kernel) for noise in plain)
+    bearings = map(gtsam.Rot2, z[:, 0].tolist())
+    return list(map(BEARING_RANGE[model], keys, targets, bearings, z[:, 1].tolist(), noises))
 
 
 def observation_factor(

@@ -193,6 +193,15 @@ class Readings:
         end_ns = self.first_ns if i == 0 else self.last_ns
         return abs(time_ns - end_ns) <= EDGE_NS
 
+    def covers_each(self, times_ns: IntArray, gap_ns: int) -> BoolArray:
+        """`covers` of many times (n,)."""
+        if not self._count:
+            return np.zeros(len(times_ns), dtype=np.bool_)
+        i = self.times.searchsorted(times_ns)
+        before, after = (self.times[k.clip(0, self._count - 1)] for k in (i - 1, i))
+        near = np.minimum(abs(times_ns - before), abs(times_ns - after)) <= EDGE_NS
+        return np.asarray(np.where((i > 0) & (i < self._count), after - before <= gap_ns, near))
+
     def pose(self, times_ns: IntArray | int) -> Array:
         """Poses (..., 3) by odometry alone, in the frame of the first reading.
 

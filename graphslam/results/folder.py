@@ -17,7 +17,8 @@ from graphslam.core.config import Config
 from graphslam.core.config_io import dump_config, load_config
 from graphslam.core.errors import OutputError
 from graphslam.core.output_folder import atomic_folder
-from graphslam.core.records import Landmark, Result, Trajectory
+from graphslam.core.records import Landmark, Result, RobotResult, Trajectory
+from graphslam.core.worker import parallel_map
 from graphslam.estimation.g2o import graph_g2o, graph_ids
 from graphslam.results.file_formats import (
     cov_text,
@@ -132,22 +133,29 @@ def _files(result: Result, report: Callable[[Result], str] | None) -> list[tuple
         ("graph.g2o", graph_g2o(result.steps, result.estimate)),
         ("graph_ids.csv", graph_ids(result.estimate)),
     ]
-    for name, robot in result.robots.items():
-        stem = f"trajectories/{_file_name(name)}"
-        files += [
-            (f"{stem}.tum", tum_text(robot.final)),
-            (f"{stem}.cov.csv", cov_text(robot.final)),
-        ]
-        if robot.causal is not None:
-            files += [
-                (f"{stem}.causal.tum", tum_text(robot.causal)),
-                (f"{stem}.causal.cov.csv", cov_text(robot.causal)),
-            ]
-        for kind, scan in (("scan", robot.scan_final), ("scan.causal", robot.scan_causal)):
-            if scan is not None:
-                files.append((f"{stem}.{kind}.tum", tum_text(scan)))
+    for own in parallel_map(_trajectory_files, list(result.robots.items())):
+        files += own
     if report is not None:
         files.append(("report.html", report(result)))
+    return files
+
+
+def _trajectory_files(named: tuple[str, RobotResult]) -> list[tuple[str, str]]:
+    """Names and contents of the files of one robot."""
+    name, robot = named
+    stem = f"trajectories/{_file_name(name)}"
+    files = [
+        (f"{stem}.tum", tum_text(robot.final)),
+        (f"{stem}.cov.csv", cov_text(robot.final)),
+    ]
+    if robot.causal is not None:
+        files += [
+            (f"{stem}.causal.tum", tum_text(robot.causal)),
+            (f"{stem}.causal.cov.csv", cov_text(robot.causal)),
+        ]
+    for kind, scan in (("scan", robot.scan_final), ("scan.causal", robot.scan_causal)):
+        if scan is not None:
+            files.append((f"{stem}.{kind}.tum", tum_text(scan)))
     return files
 
 

@@ -72,13 +72,11 @@ def solve_sighting_log(
     """`reoptimise_sighting_log` by the groups of the sightings, in so many ``rounds``."""
 
     def rebuild(estimate: Estimate, last: bool) -> tuple[Step, ...]:
-        made = recompute_steps(steps, estimate, tracks, groups)
+        # once only: estimated from its own result again and again, noise would collapse
+        made = recompute_steps(steps, estimate, tracks, groups, widen=last)
         if not last:
             return made
-        # once only: estimated from its own result again and again, noise would collapse
-        factors = sighting_variances(made, groups, estimate)
-        made = scale_motion_noise(made, noise_scales(made, estimate, MOTION_WINDOW_NS))
-        return tuple(_with_wider_sightings(step, factors) for step in made)
+        return scale_motion_noise(made, noise_scales(made, estimate, MOTION_WINDOW_NS))
 
     return calibrate(rebuild, estimate, tracks, config.robust, rounds)
 
@@ -87,15 +85,16 @@ def solve_sighting_log(
 class SightingGroup:
     """Sightings of one kind by one robot of one other robot, or of landmarks (``other`` None).
 
-    ``where`` (n, 2): number of the step and of the association in it; times (n,) ns of the
-    observer's state, of the sighting, and of the step; ``z`` (n, k) and ``cov`` (n, k, k) as
-    measured, in the base frame; ``share`` (n,): how many sightings of the step are of the same
-    target, see `sighting_batches.inflate_repeated`.
+    ``where`` (n, 2): number of the step and of the association in it; ``landmarks`` (n,): their
+    numbers, -1 for robots; times (n,) ns of the observer's state, of the sighting, and of the step;
+    ``z`` (n, k) and ``cov`` (n, k, k) as measured, in the base frame; ``share`` (n,): how many
+    sightings of the step are of the same target, see `sighting_batches.inflate_repeated`.
     """
 
     robot: str
     other: str | None
     where: IntArray
+    landmarks: IntArray
     state_ns: IntArray
     seen_ns: IntArray
     step_ns: IntArray
@@ -110,7 +109,7 @@ class SightingGroup:
         where = self.where[own] - np.array([numbers.start, 0])
         times = self.state_ns[own], self.seen_ns[own], self.step_ns[own]
         measured = self.z[own], self.cov[own], self.share[own]
-        return SightingGroup(self.robot, self.other, where, *times, *measured)
+        return SightingGroup(self.robot, self.other, where, self.landmarks[own], *times, *measured)
 
 
 def group_sightings(steps: Sequence[Step], sources: Sequence[Sighting]) -> list[SightingGroup]:
@@ -126,9 +125,9 @@ def group_sightings(steps: Sequence[Step], sources: Sequence[Sighting]) -> list[
             z, cov = o.z, o.cov
             if sighting.mount.any():
                 z, cov = transport(z, cov, sighting.mount, np.zeros((3, 3)))
-            other = a.target if isinstance(a.target, str) else None
+            other, landmark = (a.target, -1) if isinstance(a.target, str) else (None, a.target)
             times = (a.time_ns, sighting.time_ns, step.time_ns)
-            row = ((n, k), *times, z, cov, count[a.robot, a.target])
+            row = ((n, k), landmark, *times, z, cov, count[a.robot, a.target])
             groups[a.robot, other, len(z)].append(row)
     return [
         SightingGroup(robot, other, *map(np.array, zip(*rows, strict=True)))
@@ -141,6 +140,8 @@ def recompute_steps(
     estimate: Estimate,
     tracks: Mapping[str, Track],
     groups: Sequence[SightingGroup],
+    *,
+    widen: bool = False,
 ) -> tuple[Step, ...]:
     """Steps with motions and measurements computed with the tracks' present calibration.
 
@@ -149,6 +150,8 @@ def recompute_steps(
         estimate: of the states of robots that see each other; only their headings are used.
         tracks: odometry of every robot.
         groups: the sightings of ``steps``.
+        widen: give measurements the variances that their residuals from ``estimate`` show, see
+            `sighting_variances`; it must have all states and landmarks then.
     """
     recorded = {
         robot: [(n, step.motions[robot]) for n, step in enumerate(steps) if robot in step.motions]
@@ -173,10 +176,15 @@ def recompute_steps(
     observers = [next(results) for _ in groups]
     others = [None if group.other is None else next(results) for group in groups]
     associations = [list(step.associations) for step in steps]
+    measured = []
     for group, observer, other in zip(groups, observers, others, strict=True):
         z, cov = _at_states(group, estimate, observer, other)
-        cov = cov * group.share[:, None, None]
-        for (n, k), z_k, cov_k in zip(group.where.tolist(), z, cov, strict=True):
+        measured.append((z, cov * group.share[:, None, None]))
+    factors = sighting_variances(groups, measured, estimate) if widen else {}
+    for group, (z, cov) in zip(groups, measured, strict=True):
+        sigmas = np.sqrt(factors.get(group.robot, np.ones(2))) if z.shape[1] == 2 else np.ones(3)
+        wider = cov * np.outer(sigmas, sigmas)
+        for (n, k), z_k, cov_k in zip(group.where.tolist(), z, wider, strict=True):
             associations[n][k] = associations[n][k].with_measurement(z_k, cov_k)
     return tuple(
         # in the order of the step: it is the order of the states
@@ -218,7 +226,7 @@ def _poses(estimate: Estimate, robot: str, times_ns: IntArray) -> Array:
 
 
 def sighting_variances(
-    steps: Sequence[Step], groups: Sequence[SightingGroup], estimate: Estimate
+    groups: Sequence[SightingGroup], measured: Sequence[tuple[Array, Array]], estimate: Estimate
 ) -> dict[str, Array]:
     """Robot -> factor (2,) on the variances of its bearings and ranges of points.
 
@@ -226,33 +234,24 @@ def sighting_variances(
     of the stated size, and larger where errors are larger or correlated, since several sightings
     then tell no more than one. (Batch means, e.g. G. S. Fishman, Discrete-Event Simulation, 2001,
     section 6.)
+
+    Args:
+        groups: of the sightings.
+        measured: their measurements (n, k) and covariances as between the states, of each group.
+        estimate: of all states and landmarks.
     """
     factors = {}
-    for group in groups:
-        if group.other is not None or group.z.shape[1] != 2:
+    for group, (z, cov) in zip(groups, measured, strict=True):
+        if group.other is not None or z.shape[1] != 2:
             continue
-        made = [steps[n].associations[k] for n, k in group.where]
-        targets = np.array([a.target for a in made])
         x = _poses(estimate, group.robot, group.state_ns)
-        t = np.array([estimate.landmarks[int(i)][0] for i in targets])
-        r = MODELS["point"].residual(np.array([a.z for a in made]), x, t)
-        r /= np.sqrt(np.array([np.diag(a.cov) for a in made]))
+        landmarks, number = np.unique(group.landmarks, return_inverse=True)
+        t = np.array([estimate.landmarks[i][0] for i in landmarks.tolist()])[number]
+        r = MODELS["point"].residual(z, x, t) / np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
         cut = CLIP_SIGMAS * 1.4826 * np.median(np.abs(r), axis=0)
-        windows = np.column_stack([targets, group.seen_ns // WINDOW_NS])
+        windows = np.column_stack([group.landmarks, group.seen_ns // WINDOW_NS])
         _, window = np.unique(windows, axis=0, return_inverse=True)
         sums = np.zeros((window.max() + 1, 2))
         np.add.at(sums, window.ravel(), np.clip(r, -cut, cut))
         factors[group.robot] = np.maximum(np.square(sums).sum(axis=0) / len(r), MIN_VARIANCE_FACTOR)
     return factors
-
-
-def _with_wider_sightings(step: Step, factors: Mapping[str, Array]) -> Step:
-    """A step with the variances of robots' sightings of points times their factors (2,)."""
-    scales = {robot: np.sqrt(np.outer(f, f)) for robot, f in factors.items()}
-    associations = tuple(
-        a.with_measurement(a.z, a.cov * scales[a.robot])
-        if a.robot in scales and len(a.z) == 2
-        else a
-        for a in step.associations
-    )
-    return replace(step, associations=associations)

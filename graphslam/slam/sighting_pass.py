@@ -99,15 +99,17 @@ class SightingPass(Pipeline):
         """The sightings at times that the odometry of all their robots covers."""
         integrate_pending(run.track for run in self.runs.values())
         max_gap_ns = round(1e9 * self.config.odometry.max_gap_s)
+        times = np.array([s.time_ns for s in sightings], dtype=np.int64)
+        reached = {
+            name: run.track.covers_each(times, max_gap_ns).tolist()
+            for name, run in self.runs.items()
+        }
         covered = []
-        for s in sightings:
+        for n, s in enumerate(sightings):
             robots = (s.robot,) if s.seen_robot is None else (s.robot, s.seen_robot)
-            if s.seen_robot is not None and s.seen_robot not in self.runs:
+            if s.seen_robot is not None and s.seen_robot not in reached:
                 self.dropped[f"sighting: robot {s.seen_robot} is not in the log"] += 1
-            elif all(
-                robot in self.runs and self.runs[robot].track.covers(s.time_ns, max_gap_ns)
-                for robot in robots
-            ):
+            elif all(robot in reached and reached[robot][n] for robot in robots):
                 covered.append(s)
             else:
                 self.dropped["sighting: no odometry near it"] += 1

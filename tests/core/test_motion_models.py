@@ -457,6 +457,13 @@ def test_reaches_and_near_tell_what_odometry_covers():
     first, last = 10 * SECOND - EDGE_NS, 14 * SECOND + EDGE_NS
     assert track.covers(first, 9 * SECOND) and track.covers(last, 9 * SECOND)
     assert not track.covers(first - 1, 9 * SECOND) and not track.covers(last + 1, 9 * SECOND)
+    # many at once
+    edges = [10 * SECOND, 11 * SECOND, 12 * SECOND, 14 * SECOND, first, last]
+    times = np.array([t + more for t in edges for more in (-1, 0, 1)], dtype=np.int64)
+    for gap_ns in (SECOND, 3 * SECOND):
+        one_by_one = [track.covers(t, gap_ns) for t in times.tolist()]
+        assert track.covers_each(times, gap_ns).tolist() == one_by_one
+    assert not Track(NOISE, EVEN).covers_each(times, SECOND).any()
 
 
 @pytest.mark.parametrize("source", ["poses", "wheels"])

@@ -6,6 +6,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from backend_cases import run, two_robots
 
 from graphslam.core.config import Config, RobustConfig
 from graphslam.core.errors import EstimationError
@@ -14,6 +15,8 @@ from graphslam.core.observation_models import MODELS, PointModel
 from graphslam.core.records import Association, Closure, Motion, Start, Step
 from graphslam.estimation import factors
 from graphslam.estimation.backends import BACKENDS
+from graphslam.estimation.isam2 import BatchGraph
+from graphslam.estimation.recorded_graph import RecordedGraph
 
 PLAIN = RobustConfig(kernel="none")
 X, T = factors.state_key(0, 0), factors.state_key(1, 0)
@@ -302,3 +305,44 @@ def test_point_rows_measure_bearing_and_range():
         moved = Association("r", 0, 0, name, off, np.diag([1e-4, 1e4]))
         factor = factors.observation_factor(X, T, moved, PLAIN, x, t)
         np.testing.assert_allclose(squared_norm(factor, at(x, t)), 1.0, rtol=1e-9)
+
+
+def test_a_recorded_graph_is_the_one_that_grows_step_by_step():
+    """The same error at any values, the same rows, and observations of robots where it says."""
+    kernel = RobustConfig()
+    steps, _ = two_robots(np.random.default_rng(3))
+    estimate = run("batch", steps).finish()
+    grown, values = BatchGraph.at_estimate(steps, estimate, kernel)
+    recorded, same = RecordedGraph(kernel), gtsam.Values()
+    recorded.insert_all(steps, estimate, same)
+    for graph, at_values in ((grown, values), (recorded, same)):
+        graph.rebuild_lines(at_values)
+    assert recorded.rows == grown.rows and recorded.graph.size() == grown.graph.size()
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        delta = gtsam.VectorValues()
+        for key, dim in grown.dims().items():
+            delta.insert(key, 0.1 * rng.normal(size=dim))
+        expected = grown.graph.error(values.retract(delta))
+        assert recorded.graph.error(same.retract(delta)) == pytest.approx(expected, rel=1e-9)
+    for index, (key, target, _) in recorded.robot_observations:
+        assert set(recorded.graph.at(index).keys()) == {key, target}
+    for index, _, last, key in recorded.motions:
+        assert list(recorded.graph.at(index).keys()) == [last, key]
+
+
+def test_a_recorded_observation_without_a_valid_covariance_is_named():
+    steps, _ = two_robots()
+    estimate = run("batch", steps).finish()
+    n, k, step, seen = next(
+        (n, k, step, seen)
+        for n, step in enumerate(steps)
+        for k, seen in enumerate(step.associations)
+        if seen.model == "point"
+    )
+    for cov, why in ((-seen.cov, "not positive definite"), (np.nan * seen.cov, "not finite")):
+        wrong = list(step.associations)
+        wrong[k] = seen.with_measurement(seen.z, cov)
+        spoilt = [*steps[:n], replace(step, associations=tuple(wrong)), *steps[n + 1 :]]
+        with pytest.raises(EstimationError, match=f"landmark {seen.target}, seen from.*{why}"):
+            RecordedGraph(PLAIN).insert_all(spoilt, estimate, gtsam.Values())
