@@ -30,6 +30,12 @@ from graphslam.mapping.gating import (
 )
 from graphslam.mapping.landmark_map import Entry
 
+#: share of the gate's floor (`association.floor_m`, `floor_rad`) by which walls differ from
+#: straight ones, as noise of observations: without it the innovations of an image together are
+#: larger than their covariance (median of the squared distance per degree of freedom 1.8 on ACES,
+#: 1.0 with it), and where a few walls are seen badly the pose jumps by many of its sigmas
+UNEVENNESS = 0.3
+
 
 @dataclass(slots=True, eq=False)
 class _Pairs:
@@ -236,7 +242,7 @@ class LocalTracker:
         self._filter.update(
             pairs.landmark[chosen],
             pairs.H[chosen],
-            pairs.noise[chosen],
+            pairs.noise[chosen] + UNEVENNESS**2 * self._floor[pairs.model[chosen]],
             pairs.residual[chosen],
             rows,
         )

@@ -189,8 +189,12 @@ def close_loops(
     # robots take turns by time, so that none is far ahead of the others
     order = np.argsort([s.state[1] for s in submaps], kind="stable")
     with PairVerifier(submaps, along=True) as verify:
-        for first in range(0, len(order), AT_ONCE):
-            later, known = order[first : first + AT_ONCE], order[: first + AT_ONCE]
+        ends = [*range(AT_ONCE, len(order) + AT_ONCE, AT_ONCE), len(order)]
+        for n, end in enumerate(ends):
+            known = order[:end]
+            # in the end all of them once more: later loops moved the path, and a place that was
+            # out of reach may be in reach now
+            later = order if n == len(ends) - 1 else known[end - AT_ONCE :]
             graph.begin_with(nodes[known])
             for _ in range(MAX_ROUNDS):
                 found, confirming = verified_closures(
