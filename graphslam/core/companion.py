@@ -1,86 +1,86 @@
-"""A second process that answers one question after another; see `worker`."""
+"""A second process that works beside this one and exchanges values with it; see `worker`.
+
+`Companion` answers one question after another; `Exchange` is a generator that works ahead.
+"""
 
 import gc
 import os
 import pickle
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from contextlib import suppress
-from typing import Generic, Self, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 from graphslam.core.worker import allow_fork, can_fork
 
 _S = TypeVar("_S")
 _T = TypeVar("_T")
 
+#: what ends the work with a process that died, maybe by an error: its work is done here
+DIED = (EOFError, OSError, pickle.UnpicklingError)
 
-class Companion(Generic[_S, _T]):
-    """A second process that applies a function, again and again, beside this one.
 
-    It has this process' memory as it is now, and keeps what it computes for later calls. Without a
-    second process the function is called here. To be used as a context, which ends the process.
+class _Partner:
+    """A fork of this process, with a pipe in either direction; ``forked``: whether there is one.
+
+    It has this process' memory as it was at the start. To be used as a context, which ends it.
     """
 
-    def __init__(self, function: Callable[[_S], _T]) -> None:
-        """Begin. Arguments and results must be picklable."""
-        self._function = function
-        self.forked = can_fork() and self._fork()
+    forked = False
 
-    def _fork(self) -> bool:
-        questions, ask = os.pipe()
-        answers, answer = os.pipe()
+    def _fork(self, serve: Callable[[Callable[[], Any], Callable[[Any], None]], None]) -> None:
+        """Begin, if this process may: ``serve`` gets functions that receive and send a value."""
+        if not can_fork():
+            return
+        theirs, ours = os.pipe()
+        back, forth = os.pipe()
         try:
             self._pid = os.fork()
         except OSError:  # no memory or no process available
-            for end in (questions, ask, answers, answer):
+            for end in (theirs, ours, back, forth):
                 os.close(end)
-            return False
+            return
         if self._pid:
-            os.close(questions)
-            os.close(answer)
-            self._ask, self._answers = os.fdopen(ask, "wb"), os.fdopen(answers, "rb")
-            return True
+            os.close(theirs)
+            os.close(forth)
+            self._sink, self._source = os.fdopen(ours, "wb"), os.fdopen(back, "rb")
+            self.forked = True
+            return
         done = 1
         try:
-            os.close(ask)
-            os.close(answers)
+            os.close(ours)
+            os.close(back)
             allow_fork(second=False)
-            gc.freeze()  # see `Prefetch`
-            with os.fdopen(questions, "rb") as asked, os.fdopen(answer, "wb") as answered:
-                while True:
-                    pickle.dump(self._function(pickle.load(asked)), answered)
-                    answered.flush()
-        except EOFError:  # no more questions
+            gc.freeze()  # else the search for cycles would copy shared memory
+            with os.fdopen(theirs, "rb") as source, os.fdopen(forth, "wb") as sink:
+
+                def send(value: Any) -> None:
+                    pickle.dump(value, sink, pickle.HIGHEST_PROTOCOL)
+                    sink.flush()
+
+                serve(lambda: pickle.load(source), send)
+            done = 0
+        except EOFError:  # nothing more is asked
             done = 0
         finally:
             os._exit(done)  # nothing else of the forked program may run here
 
-    def both(self, here: _S, there: _S) -> tuple[_T, _T]:
-        """Results for two arguments, the second one from the second process."""
-        if not self.forked:
-            return self._function(here), self._function(there)
-        try:
-            pickle.dump(there, self._ask, pickle.HIGHEST_PROTOCOL)
-            self._ask.flush()
-        except OSError:
-            self.close()
-            return self._function(here), self._function(there)
-        mine = self._function(here)
-        try:
-            return mine, pickle.load(self._answers)
-        except (EOFError, pickle.UnpicklingError):  # it ended, maybe by an error: raised here
-            self.close()
-            return mine, self._function(there)
+    def _send(self, value: Any) -> None:
+        pickle.dump(value, self._sink, pickle.HIGHEST_PROTOCOL)
+        self._sink.flush()
+
+    def _receive(self) -> Any:
+        return pickle.load(self._source)
 
     def close(self) -> None:
-        """End the second process; from now on the function is called here."""
+        """End the second process; from now on its work is done here."""
         if self.forked:
             self.forked = False
             os.kill(self._pid, signal.SIGKILL)
             os.waitpid(self._pid, 0)
-            self._answers.close()
+            self._source.close()
             with suppress(OSError):  # what was not sent is not wanted any more
-                self._ask.close()
+                self._sink.close()
 
     def __enter__(self) -> Self:
         """Itself."""
@@ -89,3 +89,98 @@ class Companion(Generic[_S, _T]):
     def __exit__(self, *_: object) -> None:
         """End the second process."""
         self.close()
+
+
+class Companion(_Partner, Generic[_S, _T]):
+    """A second process that applies a function, again and again, beside this one.
+
+    It keeps what it computes for later calls. Without a second process the function is called here.
+    """
+
+    def __init__(self, function: Callable[[_S], _T]) -> None:
+        """Begin. Arguments and results must be picklable."""
+        self._function = function
+
+        def serve(receive: Callable[[], _S], send: Callable[[_T], None]) -> None:
+            while True:
+                send(function(receive()))
+
+        self._fork(serve)
+
+    def both(self, here: _S, there: _S) -> tuple[_T, _T]:
+        """Results for two arguments, the second one from the second process."""
+        if self.forked:
+            try:
+                self._send(there)
+            except DIED:
+                self.close()
+        mine = self._function(here)
+        if self.forked:
+            try:
+                return mine, self._receive()
+            except DIED:
+                self.close()
+        return mine, self._function(there)
+
+
+class Exchange(_Partner, Generic[_S, _T]):
+    """A generator that works ahead: the items that it yields, and values sent to it meanwhile.
+
+    After each item the generator gets a value: what was sent before the next item is asked for,
+    else None. A caller that sends one as soon as it has received an item, and then works on the
+    item, lets both sides work at the same time. Without a second process, or if that one dies,
+    ``make`` is called here and gets the same values, so that the items are the same.
+    """
+
+    def __init__(self, make: Callable[[], Generator[_T, _S | None, None]]) -> None:
+        """Begin with the first item. Items and values must be picklable."""
+        self._make = make
+        self._values: list[_S | None] = []
+        self._taken = self._made = 0
+        self._generator: Generator[_T, _S | None, None] | None = None
+
+        def serve(receive: Callable[[], _S | None], send: Callable[[tuple[_T, ...]], None]) -> None:
+            generator, value = make(), None
+            with suppress(StopIteration):
+                while True:
+                    send((generator.send(value),))
+                    value = receive()
+            send(())
+
+        self._fork(serve)
+
+    def send(self, value: _S | None) -> None:
+        """What the generator gets for the latest item received; once for each."""
+        self._values.append(value)
+        if self.forked:
+            try:
+                self._send(value)
+            except DIED:
+                self.close()
+
+    def receive(self) -> _T | None:
+        """The next item; None after the last."""
+        if len(self._values) < self._taken:
+            self.send(None)
+        if self.forked:
+            try:
+                item: tuple[_T, ...] = self._receive()
+            except DIED:
+                self.close()
+            else:
+                self._taken += len(item)
+                return item[0] if item else None
+        return self._made_here()
+
+    def _made_here(self) -> _T | None:
+        if self._generator is None:
+            self._generator = self._make()
+        while True:
+            try:
+                item = self._generator.send(self._values[self._made - 1] if self._made else None)
+            except StopIteration:
+                return None
+            self._made += 1
+            if self._made > self._taken:
+                self._taken += 1
+                return item

@@ -66,7 +66,7 @@ class LogSet:
 
     def __post_init__(self) -> None:
         self._opening_warnings = len(self.warnings)
-        self._kept: dict[tuple[str, ...], list[Message | _ReadReport]] = {}
+        self._kept: dict[tuple[str, ...], list[Message | ReadReport]] = {}
 
     def has_scans(self, robot: str) -> bool:
         """Whether the logs hold laser scans of ``robot``."""
@@ -96,26 +96,26 @@ class LogSet:
         memory from then on, so that it is decoded once however often it is read.
         """
         topics = {topic.name: topic for topic in self.topics if topic.record not in exclude}
-        self._update(_ReadReport())
+        self.update(ReadReport())
 
-        def read() -> Iterator[Message | _ReadReport]:
+        def read() -> Iterator[Message | ReadReport]:
             return self._read(topics, self._contexts)
 
         count, kept = self.count(exclude), self._kept.get(tuple(topics))
         if kept is not None:
-            items: Iterable[Message | _ReadReport] = kept
+            items: Iterable[Message | ReadReport] = kept
         elif prefetch and count >= WORKER_MIN_MESSAGES:
             items = Prefetch(read)
         else:
             items = read()
         keep &= kept is None and count <= KEPT_MESSAGES
         keep &= not any(topic.record is records.Scan for topic in topics.values())
-        taken: list[Message | _ReadReport] = []
+        taken: list[Message | ReadReport] = []
         for item in items:
             if keep:
                 taken.append(item)
-            if isinstance(item, _ReadReport):
-                self._update(item)
+            if isinstance(item, ReadReport):
+                self.update(item)
             else:
                 yield item
         if keep:
@@ -137,12 +137,12 @@ class LogSet:
 
     def _read(
         self, topics: Mapping[str, Topic], contexts: Mapping[str, TopicContext]
-    ) -> Iterator["Message | _ReadReport"]:
+    ) -> Iterator["Message | ReadReport"]:
         """Messages of ``topics`` and, last, the report about all of them."""
         readers = [FileReader(file, self.config) for file in self.opened]
         streams = [reader.sorted(reader.recorded(topics, contexts)) for reader in readers]
         yield from time_order.merge(streams)
-        report = _ReadReport()
+        report = ReadReport()
         for reader in readers:
             report.dropped.update(reader.dropped)
             for topic, counts in sorted(reader.sorter.counts.items()):
@@ -151,7 +151,13 @@ class LogSet:
                 report.repaired.update(counts)
         yield report
 
-    def _update(self, report: "_ReadReport") -> None:
+    def report(self) -> "ReadReport":
+        """What the last reading of all messages told about the log."""
+        warnings = self.warnings[self._opening_warnings :]
+        return ReadReport(Counter(self.dropped), Counter(self.repaired), warnings)
+
+    def update(self, report: "ReadReport") -> None:
+        """Take over what a reading of all messages told, maybe in another process."""
         for counter, counts in ((self.dropped, report.dropped), (self.repaired, report.repaired)):
             counter.clear()
             counter.update(+counts)  # without zeros
@@ -159,7 +165,7 @@ class LogSet:
 
 
 @dataclass(frozen=True, slots=True)
-class _ReadReport:
+class ReadReport:
     """What is known after all messages were read; see `LogSet`."""
 
     dropped: Counter[str] = field(default_factory=Counter)

@@ -101,62 +101,83 @@ class Calibrator:
 class TrackedMotions:
     """Motions (n) of one robot according to odometry and after tracking.
 
-    ``delta`` (n, 3) and ``cov`` (n, 3, 3) are those of odometry, with calibration parameters
-    ``calibration`` (n, p) whose covariance (n, p, p) ``calibration_cov`` is part of ``cov``;
-    ``d_cal`` (n, 3, p) is the derivative by them. ``moved`` (n, 3) and ``moved_cov`` (n, 3, 3) are
-    the estimates from odometry and landmarks together. All along the axes of each start.
+    ``delta`` (n, 3) and ``cov`` (n, 3, 3) are those of odometry by a ``calibration`` of p
+    parameters, whose covariance is part of ``cov``; ``d_cal`` (n, 3, p) is the derivative by them.
+    ``moved`` (n, 3) and ``moved_cov`` (n, 3, 3) are the estimates from odometry and landmarks
+    together. All along the axes of each start.
     """
 
     delta: Array
     cov: Array
     d_cal: Array
-    calibration: Array
-    calibration_cov: Array
+    calibration: Calibration
     moved: Array
     moved_cov: Array
 
 
-def calibration_from_motions(
-    found: TrackedMotions, prior: Calibration, config: OdometryConfig
-) -> Calibration:
-    """The calibration that explains how tracked motions differ from those of odometry.
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationEvidence:
+    """What motions tell about the p parameters: information (p, p), and that times the mean (p,).
 
-    Least squares over all motions at once. What landmarks alone say about a motion is what the
-    estimate knows beyond odometry: information O = P⁻¹ - Q⁻¹ for covariances P after tracking and Q
-    of odometry, and O (z - m) = P⁻¹ (moved - m) for its own measurement z. Motions that are far off
-    (slip) do not count.
+    That of different motions adds up.
+    """
+
+    information: Array
+    vector: Array
+
+    def __add__(self, other: "CalibrationEvidence") -> "CalibrationEvidence":
+        return CalibrationEvidence(self.information + other.information, self.vector + other.vector)
+
+    @classmethod
+    def none(cls, parameters: int) -> "CalibrationEvidence":
+        """Nothing is known."""
+        return cls(np.zeros((parameters, parameters)), np.zeros(parameters))
+
+    @classmethod
+    def of(cls, found: TrackedMotions, config: OdometryConfig) -> "CalibrationEvidence":
+        """How tracked motions differ from those of odometry.
+
+        What landmarks alone say about a motion is what the estimate knows beyond odometry:
+        information O = P⁻¹ - Q⁻¹ for covariances P after tracking and Q of odometry, and
+        O (z - m) = P⁻¹ (moved - m) for its own measurement z. Motions that are far off (slip) do
+        not count.
+        """
+        miss = found.moved - found.delta
+        miss[:, 2] = wrap(miss[:, 2])
+        D = found.d_cal
+        after = np.linalg.inv(found.moved_cov)
+        seen = after - np.linalg.inv(found.cov)
+        values, axes = np.linalg.eigh(0.5 * (seen + seen.mT))
+        seen = (axes * np.maximum(values, 0.0)[:, None]) @ axes.mT
+        sigmas = [config.calibration_floor_m] * 2 + [config.calibration_floor_rad]
+        floor = np.diag(np.square(sigmas))
+        noise = found.cov - D @ found.calibration.cov @ D.mT + floor
+        gain = np.linalg.inv(np.eye(3) + seen @ noise)
+        used = mahalanobis_squared(miss, found.cov + floor) <= OUTLIER_D2
+        W, weighted = (gain @ seen)[used], (gain @ after @ miss[:, :, None])[used]
+        D = D[used]
+        vector = D.mT @ (weighted + W @ (D @ found.calibration.mean)[:, :, None])
+        return cls((D.mT @ W @ D).sum(axis=0), vector.sum(axis=0)[:, 0])
+
+
+def calibration_from_evidence(known: CalibrationEvidence, prior: Calibration) -> Calibration:
+    """The calibration that explains best what motions tell, by least squares.
 
     Returns:
         Mean, and the covariance to be used for motions, see `MIN_SIGMA_SHARE`.
     """
-    if not found.d_cal.shape[2] or not len(found.delta):
-        return prior
-    miss = found.moved - found.delta
-    miss[:, 2] = wrap(miss[:, 2])
-    D = found.d_cal
-    after = np.linalg.inv(found.moved_cov)
-    seen = after - np.linalg.inv(found.cov)
-    values, axes = np.linalg.eigh(0.5 * (seen + seen.mT))
-    seen = (axes * np.maximum(values, 0.0)[:, None]) @ axes.mT
-    sigmas = [config.calibration_floor_m] * 2 + [config.calibration_floor_rad]
-    noise = found.cov - D @ found.calibration_cov @ D.mT + np.diag(np.square(sigmas))
-    gain = np.linalg.inv(np.eye(3) + seen @ noise)
-    used = mahalanobis_squared(miss, found.cov + np.diag(np.square(sigmas))) <= OUTLIER_D2
-    W, weighted = (gain @ seen)[used], (gain @ after @ miss[:, :, None])[used]
-    D, past = D[used], found.calibration[used]
     free = np.flatnonzero(np.diag(prior.cov) > HELD_SIGMA**2)
     if not len(free):
         return prior
-    own = D[:, :, free]
-    information = np.linalg.inv(prior.cov[np.ix_(free, free)])
-    total = information + (own.mT @ W @ own).sum(axis=0)
-    vector = information @ prior.mean[free]
-    vector = vector + (own.mT @ (weighted + W @ D @ past[:, :, None])).sum(axis=0)[:, 0]
-    cov = np.linalg.inv(total)
-    mean, known = prior.mean.copy(), prior.cov.copy()
-    mean[free] = cov @ vector
-    known[np.ix_(free, free)] = cov + MIN_SIGMA_SHARE**2 * prior.cov[np.ix_(free, free)]
-    return Calibration(prior.names, mean, known)
+    block = np.ix_(free, free)
+    information = np.linalg.inv(prior.cov[block])
+    cov = np.linalg.inv(information + known.information[block])
+    mean, all_cov = prior.mean.copy(), prior.cov.copy()
+    held = np.setdiff1d(np.arange(len(prior.mean)), free)
+    told = known.vector[free] - known.information[np.ix_(free, held)] @ prior.mean[held]
+    mean[free] = cov @ (information @ prior.mean[free] + told)
+    all_cov[block] = cov + MIN_SIGMA_SHARE**2 * prior.cov[block]
+    return Calibration(prior.names, mean, all_cov)
 
 
 def to_summary(known: Calibration, prior: Array) -> dict[str, tuple[float, float, bool]]:

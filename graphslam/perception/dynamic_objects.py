@@ -116,9 +116,9 @@ def _dynamic_returns_of_joined(sweep: Sweep, earlier_from_here: Sequence[Array])
     scan, points = sweep.scan[rows], sweep.points[rows]
     size = np.diff(sweep.starts, append=len(sweep.ranges))
     for lag, poses in enumerate(earlier_from_here, 1):
-        other = scan - lag
+        exists, other = scan >= lag, np.maximum(scan - lag, 0)
         there = transform_each(poses[scan], points)
-        known = (other >= 0) & (size[other] > 0)
+        known = exists & (size[other] > 0)
         start = sweep.starts[other]
         a = np.arctan2(there[:, 1], there[:, 0])
         begin = sweep.angles[np.minimum(start, len(sweep.angles) - 1)]

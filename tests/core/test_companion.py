@@ -75,3 +75,60 @@ with Companion(failing) as second:
 """
     )
     assert lines == ["the second"]
+
+
+# ------------------------------------------------------------ a generator that works ahead
+
+SUMS = """
+from graphslam.core.companion import Exchange
+def sums(end=""):
+    total, k = 0, 0
+    while k < 6:
+        if end and k == 4 and os.getpid() != here:
+            exec(end)
+        value = yield k, total, os.getpid()
+        total += value or 0
+        k += 1
+def taken(end=""):
+    found = []
+    with Exchange(lambda: sums(end)) as ahead:
+        forked = ahead.forked
+        while (item := ahead.receive()) is not None:
+            if item[0] != 2:
+                ahead.send(10 ** item[0])
+            found.append(item[:2])
+            last = item[2]
+        assert ahead.receive() is None
+    return found, forked, last == here
+"""
+#: item k has the sum of what was sent for the items before it; nothing is sent for the third
+EXPECTED = [(k, sum(10**j for j in range(k) if j != 2)) for k in range(6)]
+
+
+@pytest.mark.parametrize("second", [True, False])
+def test_values_reach_the_generator_before_its_next_item(second):
+    """Breaks if values come late, or if one that was not sent is waited for."""
+    lines = printed(SUMS + f"worker.allow_fork(second={second})\nprint(*taken())")
+    assert lines == [f"{EXPECTED} {second} {not second}"]
+
+
+@pytest.mark.parametrize("end", ["os._exit(0)", "os.kill(os.getpid(), 9)", "raise LookupError"])
+def test_a_generator_that_dies_is_repeated_here_with_the_same_values(end):
+    """Breaks with an item that is lost, that comes twice, or that was made with other values."""
+    lines = printed(SUMS + f"print(*taken({end!r}))")
+    assert lines == [f"{EXPECTED} True True"]
+
+
+def test_an_exchange_that_is_left_early_leaves_no_process_behind():
+    lines = printed(
+        SUMS
+        + """
+with Exchange(sums) as ahead:
+    ahead.receive()
+try:
+    os.waitpid(-1, os.WNOHANG)
+except ChildProcessError:
+    print("none")
+"""
+    )
+    assert lines == ["none"]

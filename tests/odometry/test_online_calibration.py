@@ -15,9 +15,10 @@ from graphslam.odometry.online_calibration import (
     FORGETTING_FACTOR,
     MIN_SIGMA_SHARE,
     OUTLIER_D2,
+    CalibrationEvidence,
     Calibrator,
     TrackedMotions,
-    calibration_from_motions,
+    calibration_from_evidence,
     observed_information,
 )
 from graphslam.odometry.preintegration import Track
@@ -348,21 +349,8 @@ def test_a_robot_that_stands_teaches_nothing():
     assert calibrator.summary() == {}
 
 
-def make_tracked(delta, cov, d_cal, calibration, moved, moved_cov):
-    n = len(delta)
-    return TrackedMotions(
-        delta,
-        cov,
-        d_cal,
-        np.tile(calibration.mean, (n, 1)),
-        np.tile(calibration.cov, (n, 1, 1)),
-        moved,
-        moved_cov,
-    )
-
-
 def calibrated(found, prior):
-    return calibration_from_motions(found, prior, OdometryConfig())
+    return calibration_from_evidence(CalibrationEvidence.of(found, OdometryConfig()), prior)
 
 
 # ------------------------------------------------------------ all motions at once
@@ -381,7 +369,7 @@ def tracked_motions(drive, landmark_cov, rng, calibration=None):
         P = np.linalg.inv(np.linalg.inv(Q) + np.linalg.inv(R))
         moved.append(P @ (np.linalg.solve(Q, motion.delta) + np.linalg.solve(R, z)))
         covs.append(P)
-    return make_tracked(
+    return TrackedMotions(
         np.array([m.delta for m in motions]),
         np.array([m.cov for m in motions]),
         np.array([m.d_delta_d_calibration for m in motions]),
@@ -446,7 +434,7 @@ def test_a_slipping_motion_does_not_count():
     found = tracked_motions(drive, 1e-2 * POOR, rng)
     found.moved[7, 0] -= 0.5
     other = np.delete(np.arange(len(found.moved)), 7)
-    clean = make_tracked(
+    clean = TrackedMotions(
         found.delta[other], found.cov[other], found.d_cal[other], drive.track.calibration,
         found.moved[other], found.moved_cov[other],
     )  # fmt: skip

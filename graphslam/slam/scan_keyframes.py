@@ -1,0 +1,274 @@
+"""Keyframes of a log of scans: read, preintegrated, segmented and matched, block by block.
+
+Nothing here needs to know where the robot is, so it goes on in the second process while the
+keyframes before are tracked (`scan_tracking`). What tracking finds of the calibration is used for
+later motions.
+"""
+
+import itertools
+import time
+from collections import Counter, defaultdict, deque
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphslam.core.config import Config
+from graphslam.core.geometry import Array, between, compose, inverse
+from graphslam.core.motion_models import Calibration
+from graphslam.core.observation_arrays import ObservationArrays
+from graphslam.core.records import Closure, Message, Motion, Scan, TrueLandmark, Truth
+from graphslam.logs import LogSet
+from graphslam.logs.log_set import ReadReport
+from graphslam.multi_robot.robot_detection import COMPARED_SCANS, without_returns
+from graphslam.odometry.scan_odometry import (
+    MIN_POINTS,
+    checked_against_scans,
+    match_off_lines,
+    points_off_lines,
+    scan_submap,
+    suspect_motions,
+)
+from graphslam.perception.dynamic_objects import dynamic_returns_of_all
+from graphslam.perception.front_ends import observe_block
+from graphslam.perception.ordered_scan import Sweep, make_sweep, scan_points
+from graphslam.perception.scan_matching import Submap
+from graphslam.slam.keyframes import KeyframeSelector
+from graphslam.slam.log_pass import counted, timed
+from graphslam.slam.robot_settings import make_tracks
+from graphslam.slam.robot_state import RobotState
+from graphslam.slam.synchronisation import synchronise
+
+#: messages that are processed at once; the first blocks are smaller, as little is known of the
+#: calibration: each has twice as many as the one before
+BLOCK, FIRST_BLOCK = 2000, 250
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanKeyframe:
+    """A scan that is used, and how the robot came there.
+
+    ``motion`` is since the keyframe before; None if that has the same time. ``seen`` are
+    observations from the base, ``points`` (k, 2) m the returns in the frame of the laser, which is
+    at ``mount`` (3,). ``matched``: a second measurement of the motion, by the scan.
+    """
+
+    time_ns: int
+    mount: Array
+    motion: Motion | None
+    seen: ObservationArrays
+    points: Array
+    matched: Closure | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeBlock:
+    """Consecutive keyframes; there may be none.
+
+    ``start_ns``: time of the first state of the robot. ``calibration`` is the one of the motions,
+    ``prior`` that before any data. ``messages``: number of messages read so far; ``seconds`` that
+    all this took.
+    """
+
+    start_ns: int
+    keyframes: Sequence[ScanKeyframe]
+    calibration: Calibration
+    prior: Calibration
+    messages: int
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReadLog:
+    """What is known when all of a log was read.
+
+    ``run`` has the odometry and all scans, but no states. ``report`` is that of the log itself.
+    Counts and ``seconds`` are to be added to those of the pass.
+    """
+
+    run: RobotState
+    span_ns: tuple[int, int]
+    counts: Counter[str]
+    dropped: Counter[str]
+    removed_returns: Counter[str]
+    seconds: dict[str, float]
+    report: ReadReport
+
+
+def read_keyframes(
+    log: LogSet, config: Config, robot: str
+) -> Generator[KeyframeBlock | ReadLog, Calibration | None, None]:
+    """The keyframes of the only robot of a log, and last a `ReadLog`.
+
+    What is sent is the calibration for later motions.
+    """
+    reader = _Reader(log, config, robot)
+    for block in reader.blocks():
+        found = yield block
+        if found is not None:
+            reader.run.track.calibration = found
+    yield reader.read_log()
+
+
+class _Reader:
+    """What is kept from block to block."""
+
+    def __init__(self, log: LogSet, config: Config, robot: str) -> None:
+        self._log, self._config, self._robot = log, config, robot
+        self.run = RobotState(make_tracks(log, config)[robot])
+        self._matches_scans = config.odometry.scan_matching != "off"
+        self._keyframes = KeyframeSelector(config.keyframe)
+        self._state_ns: int | None = None
+        self._last_scan: tuple[int, Array] | None = None
+        self._earlier: deque[tuple[int, Sweep]] = deque(maxlen=COMPARED_SCANS)
+        self._counts: Counter[str] = Counter()
+        self._dropped: Counter[str] = Counter()
+        self._removed_returns: Counter[str] = Counter()
+        self._seconds: dict[str, float] = defaultdict(float)
+        self._span_ns = 1 << 63, 0
+
+    def read_log(self) -> ReadLog:
+        """What is known in the end."""
+        return ReadLog(
+            self.run, self._span_ns, self._counts, self._dropped, self._removed_returns,
+            self._seconds, self._log.report(),
+        )  # fmt: skip
+
+    def blocks(self) -> Iterator[KeyframeBlock]:
+        """The keyframes, by the latest calibration of the track."""
+        track = self.run.track
+        read = counted(self._log.messages((Truth, TrueLandmark)), self._counts, lambda _count: None)
+        max_gap_s = self._config.odometry.max_gap_s
+        messages = synchronise(read, {self._robot: track}, max_gap_s, self._dropped)
+        first_ns, size = 0, FIRST_BLOCK
+        while True:
+            began = time.perf_counter()
+            with timed(self._seconds, "read"):
+                block = list(itertools.islice(messages, size))
+            if not block:
+                return
+            size = min(2 * size, BLOCK)
+            begin, end = self._span_ns
+            self._span_ns = min(begin, block[0].time_ns), max(end, block[-1].time_ns)
+            if self._state_ns is None:
+                # the first state is where odometry begins, or earlier
+                self._state_ns = first_ns = min(track.first_ns, block[0].time_ns)
+            calibration = track.calibration
+            keyframes = self._of_block(block)
+            yield KeyframeBlock(
+                first_ns, keyframes, calibration, track.prior, self._counts["messages"],
+                time.perf_counter() - began,
+            )  # fmt: skip
+
+    def _of_block(self, block: Sequence[Message]) -> list[ScanKeyframe]:
+        run, config = self.run, self._config
+        scans = [message for message in block if isinstance(message, Scan)]
+        run.scans += [(s.stamp_ns, s.time_ns, s.mount) for s in scans]
+        self._counts["scans"] += len(scans)
+        used = [s for s in scans if self._keyframes.is_used((s,), run)]
+        if not used:
+            return []
+        with timed(self._seconds, "motions"):
+            motions = self._motions(used)
+        with timed(self._seconds, "front end"):
+            used, sweeps = self._sweeps(used)
+            found = observe_block(used, sweeps, config.front_end)
+            seen = [
+                o.from_mounts(np.broadcast_to(s.mount, (len(o), 3)))
+                for o, s in zip(found, used, strict=True)
+            ]
+            points = [scan_points(scan, config.front_end.max_range_m) for scan in used]
+        self._counts["observations"] += sum(map(len, seen))
+        matched: list[Closure | None] = [None] * len(used)
+        if self._matches_scans:
+            with timed(self._seconds, "scan matching"):
+                motions, matched = self._matched(used, motions, seen, points)
+        return [
+            ScanKeyframe(s.time_ns, s.mount, motion, image, returns, match)
+            for s, motion, image, returns, match in zip(
+                used, motions, seen, points, matched, strict=True
+            )
+        ]
+
+    def _motions(self, used: Sequence[Scan]) -> list[Motion | None]:
+        """The motion to each scan from the state before; None where a state is there already."""
+        ends = np.array([self._state_ns, *(s.time_ns for s in used)], dtype=np.int64)
+        self._state_ns = int(ends[-1])
+        many = self.run.track.motions(ends[:-1], ends[1:])
+        return [
+            many.one(k, int(ends[k]), int(ends[k + 1])) if ends[k + 1] > ends[k] else None
+            for k in range(len(used))
+        ]
+
+    def _sweeps(self, used: list[Scan]) -> tuple[list[Scan], list[Sweep]]:
+        """The scans and their sweeps without the returns of moving objects.
+
+        Those are free-standing objects where earlier scans saw free space.
+        """
+        max_range_m = self._config.front_end.max_range_m
+        sweeps = [make_sweep(scan, max_range_m) for scan in used]
+        past = list(self._earlier)
+        self._earlier += [(s.time_ns, sweep) for s, sweep in zip(used, sweeps, strict=True)]
+        every = [sweep for _, sweep in past] + sweeps
+        if self._config.front_end.dynamic_objects == "keep" or not every[0].step_rad:
+            return used, sweeps
+        times = np.array([t for t, _ in past] + [s.time_ns for s in used], dtype=np.int64)
+        poses = self.run.track.mounted_pose(times)
+        mounts = np.array([s.mount for s in used])
+        mounts = np.concatenate([np.repeat(mounts[:1], len(past), axis=0), mounts])
+        views = []
+        for lag in range(1, COMPARED_SCANS + 1):
+            moved = between(np.roll(poses, lag, axis=0), poses)
+            views.append(compose(compose(inverse(mounts), moved), mounts))
+        for n, gone in enumerate(dynamic_returns_of_all(every, views)[len(past) :]):
+            if gone.any():
+                self._removed_returns["range: of a thing that moves"] += int(gone.sum())
+                used[n] = without_returns(used[n], sweeps[n], gone)
+                sweeps[n] = make_sweep(used[n], max_range_m)
+        return used, sweeps
+
+    def _matched(
+        self,
+        used: Sequence[Scan],
+        motions: Sequence[Motion | None],
+        seen: Sequence[ObservationArrays],
+        points: Sequence[Array],
+    ) -> tuple[list[Motion | None], list[Closure | None]]:
+        """Motions checked against the scans at their ends, and second measurements of them."""
+        config, auto = self._config.scan_matching, self._config.odometry.scan_matching == "auto"
+        checked: list[Motion | None] = list(motions)
+        matched: list[Closure | None] = [None] * len(used)
+        before = [self._last_scan, *((s.time_ns, p) for s, p in zip(used, points, strict=True))]
+        self._last_scan = before[-1]
+        pairs: list[tuple[int, Motion, Array, Array]] = []
+        for k, motion in enumerate(motions):
+            last, now = before[k], points[k]
+            if motion is None or last is None or last[0] != motion.start_ns:
+                continue
+            if min(len(last[1]), len(now)) >= MIN_POINTS:
+                pairs.append((k, motion, last[1], now))
+        self.run.motions += len(pairs)
+        submaps: dict[int, Submap] = {}
+
+        def submap(cloud: Array) -> Submap:
+            if id(cloud) not in submaps:
+                found = scan_submap(cloud, config)
+                assert found is not None  # it has points enough
+                submaps[id(cloud)] = found
+            return submaps[id(cloud)]
+
+        suspect = suspect_motions(
+            [m for _, m, _, _ in pairs], [(a, b) for _, _, a, b in pairs], config
+        )
+        for (k, motion, last_points, now), is_doubtful in zip(pairs, suspect, strict=True):
+            better = motion
+            if is_doubtful:
+                better = checked_against_scans(motion, submap(last_points), submap(now))
+                checked[k] = better
+                self.run.contradicted += better.from_scans
+            if not (auto or better.from_scans):
+                lines = [seen[k].one(n) for n in range(len(seen[k]))]
+                free = points_off_lines(now, lines, config)
+                name = used[k].robot
+                matched[k] = match_off_lines(better, submap(last_points), name, free)
+        return checked, matched
