@@ -81,6 +81,7 @@ class CalibrationGraph:
         """
         self._builder = builder = RecordedGraph(kernel)
         self._values, self._priors = gtsam.Values(), priors
+        self._marginals: gtsam.Marginals | None = None  # at the last solution
         self._keys = {r: int(gtsam.symbol("c", k)) for k, r in enumerate(sorted(priors))}
         self._free = {r: np.flatnonzero(np.diag(c.cov) > HELD_SIGMA**2) for r, c in priors.items()}
         self._motions: dict[str, list[tuple[int, int, int]]] = defaultdict(list)  # index, two keys
@@ -140,7 +141,7 @@ class CalibrationGraph:
                 covs = dict(marginals_of(graph, values).marginals)
         except RuntimeError as error:
             raise builder.explain(error) from error
-        self._values = values
+        self._values, self._marginals = values, None
         means = with_means(values, builder.dims(), covs)
         estimate = builder.estimate(means, float(graph.error(values)))
         calibrations = {}
@@ -162,8 +163,9 @@ class CalibrationGraph:
         keys = [factors.landmark_key(i) for i in landmarks]
         dims = [self._builder.landmark_dims[i] for i in landmarks]
         try:
-            marginals = gtsam.Marginals(self._builder.graph, self._values)
-            own = marginals.jointMarginalCovariance(keys).fullMatrix()
+            if self._marginals is None:
+                self._marginals = gtsam.Marginals(self._builder.graph, self._values)
+            own = self._marginals.jointMarginalCovariance(keys).fullMatrix()
         except RuntimeError as error:
             raise self._builder.explain(error) from error
         turn, ends = np.eye(len(own)), np.cumsum(dims)

@@ -7,11 +7,14 @@ later merges must agree with earlier ones. What one image showed as two things i
 """
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from graphslam.core.consistency import RIVAL_D2
 from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared, whiten
@@ -29,6 +32,10 @@ OVERLAP_SHARE = 0.5
 #: m, rad: walls farther apart (across, direction), and points, are not compared
 REACH_M, REACH_RAD = 1.5, 0.3
 GATE_PROBABILITY = 0.95
+#: landmarks whose joint covariance is asked for at once, unless more may all be one
+AT_ONCE = 100
+#: m: walls are sampled at this distance to find those near each other
+SAMPLE_M = 1.0
 
 
 @dataclass(slots=True, eq=False)
@@ -54,19 +61,89 @@ class _Map:
         return bool(self.apart[np.ix_(in_a, in_b)].any())
 
 
-def possible_duplicates(
-    entries: Sequence[Entry], together: Iterable[frozenset[int]]
-) -> list[Entry]:
-    """Landmarks that have another one near enough to be a duplicate.
+def find_duplicates(
+    entries: Sequence[Entry],
+    together: Iterable[frozenset[int]],
+    joint: Callable[[Sequence[int]], JointMarginal],
+) -> dict[int, int]:
+    """Duplicate landmark -> the landmark that it is one with, the oldest of its group.
 
-    Only these need a joint covariance. ``together``: pairs that one image showed as two things.
+    Merges are judged place by place: at least all landmarks that may be duplicates of each other
+    together, see `duplicates`, so that the covariances that are needed grow with the map and not
+    with its square.
+
+    Args:
+        entries: the map.
+        together: pairs that one image showed as two things.
+        joint: numbers of landmarks -> their joint marginal; the pose in front is not used.
     """
+    others: dict[int, set[int]] = {}
+    for pair in together:
+        for number in pair:
+            others.setdefault(number, set()).update(pair - {number})
+    found: list[tuple[int, int]] = []
+    for batch in _batches(entries, others):
+        numbers = [entry.id for entry in batch]
+        apart = {
+            frozenset((a, b)) for a in numbers for b in others.get(a, set()).intersection(numbers)
+        }
+        found += duplicates(batch, joint(numbers), apart)
+    return merge_targets(found)
+
+
+def _batches(entries: Sequence[Entry], others: Mapping[int, set[int]]) -> list[list[Entry]]:
+    """Landmarks that may have duplicates, those that may be one never in different batches."""
     if len(entries) < 2:
         return []
     means = np.array([entry.mean for entry in entries])
-    means[[entry.kind == "point" for entry in entries], 2] = 0.0
-    near = np.concatenate(_near(_map(entries, means, np.zeros((0, 0)), together)))
-    return [entries[k] for k in np.unique(near)]
+    points = np.array([entry.kind == "point" for entry in entries])
+    means[points, 2] = 0.0
+    extents = np.array([entry.extent for entry in entries])
+    i, j = near_pairs(means, extents, points, REACH_M)
+    identity = [entry.identity for entry in entries]
+    may = [
+        entries[b].id not in others.get(entries[a].id, ())
+        and (identity[a] is None or identity[b] is None or identity[a] == identity[b])
+        for a, b in zip(i.tolist(), j.tolist(), strict=True)
+    ]
+    i, j = i[may], j[may]
+    i, j = _comparable(means, extents, points, i, j)
+    n = len(entries)
+    _, place = connected_components(coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n)), False)
+    sizes = np.bincount(place)
+    batches: list[list[Entry]] = []
+    for members in np.split(np.argsort(place, kind="stable"), np.cumsum(sizes)[:-1]):
+        if len(members) < 2:
+            continue
+        own = [entries[k] for k in members.tolist()]
+        if batches and len(batches[-1]) + len(own) <= AT_ONCE:
+            batches[-1] += own
+        else:
+            batches.append(own)
+    return batches
+
+
+def near_pairs(
+    x: Array, extents: Array, point: BoolArray, reach_m: float
+) -> tuple[IntArray, IntArray]:
+    """Pairs (m,), (m,) of landmarks of which some parts may be within ``reach_m``.
+
+    ``x`` (n, 3) are the landmarks, ``extents`` (n, 2) m along each one's x axis, ``point`` (n,).
+    Walls are sampled, and samples looked up in a tree: the work grows with the number of landmarks
+    and of pairs, not with the square of the former.
+    """
+    length = np.where(point, 0.0, extents[:, 1] - extents[:, 0])
+    count = 2 + np.ceil(length / SAMPLE_M).astype(np.int64)
+    of = np.repeat(np.arange(len(x)), count)
+    k = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
+    along = extents[of, 0] + k / (count[of] - 1) * length[of]
+    along[point[of]] = 0.0
+    at = x[of, :2] + along[:, None] * np.column_stack([np.cos(x[of, 2]), np.sin(x[of, 2])])
+    # half a sample's distance aside, another wall may be as near as the reach
+    pairs = cKDTree(at).query_pairs(np.hypot(reach_m, SAMPLE_M / 2), output_type="ndarray")
+    i, j = np.sort(of[pairs], axis=1).T
+    found = np.unique(i[i != j] * len(x) + j[i != j])
+    return found // len(x), found % len(x)
 
 
 def duplicates(
@@ -133,12 +210,20 @@ def _map(entries: Sequence[Entry], x: Array, P: Array, together: Iterable[frozen
 
 
 def _near(marks: _Map) -> tuple[IntArray, IntArray]:
-    """Pairs (m,), (m,) that may be one landmark by their means and extents; O(n²)."""
+    """Pairs (m,), (m,) that may be one landmark by their means and extents."""
     i, j = np.triu_indices(len(marks.x), 1)
-    points = marks.point[i]
-    near = (points == marks.point[j]) & ~marks.apart[i, j]
-    near[points] &= np.hypot(*(marks.x[j] - marks.x[i])[points, :2].T) < REACH_M
-    near[~points] &= _beside(marks, i[~points], j[~points])
+    may = ~marks.apart[i, j]
+    return _comparable(marks.x, marks.extents, marks.point, i[may], j[may])
+
+
+def _comparable(
+    x: Array, extents: Array, point: BoolArray, i: IntArray, j: IntArray
+) -> tuple[IntArray, IntArray]:
+    """Those pairs of landmarks that may be one by their means (n, 3) and extents (n, 2)."""
+    points = point[i]
+    near = points == point[j]
+    near[points] &= np.hypot(*(x[j] - x[i])[points, :2].T) < REACH_M
+    near[~points] &= _beside(x, extents, i[~points], j[~points])
     return i[near], j[near]
 
 
@@ -157,20 +242,22 @@ def _next_merge(marks: _Map, i: IntArray, j: IntArray, d2: Array, fits: BoolArra
     return None
 
 
-def _relative(marks: _Map, i: IntArray, j: IntArray) -> tuple[Array, Array, Array, Array]:
+def _relative(
+    means: Array, extents: Array, i: IntArray, j: IntArray
+) -> tuple[Array, Array, Array, Array]:
     """Wall j in the frame of wall i, (m,) each: along, across, turn; and middle of the overlap."""
-    x, y = marks.x[i], marks.x[j]
+    x, y = means[i], means[j]
     c, s, d = np.cos(x[:, 2]), np.sin(x[:, 2]), y[:, :2] - x[:, :2]
     along, across = c * d[:, 0] + s * d[:, 1], -s * d[:, 0] + c * d[:, 1]
-    low = np.maximum(marks.extents[i, 0], along + marks.extents[j, 0])
-    high = np.minimum(marks.extents[i, 1], along + marks.extents[j, 1])
+    low = np.maximum(extents[i, 0], along + extents[j, 0])
+    high = np.minimum(extents[i, 1], along + extents[j, 1])
     return along, across, wrap(y[:, 2] - x[:, 2]), 0.5 * (low + high)
 
 
-def _beside(marks: _Map, i: IntArray, j: IntArray) -> BoolArray:
+def _beside(means: Array, extents: Array, i: IntArray, j: IntArray) -> BoolArray:
     """Which pairs (m,) are near, nearly parallel, and overlap along much of their length."""
-    along, across, turn, middle = _relative(marks, i, j)
-    a, b = marks.extents[i], marks.extents[j] + along[:, None]
+    along, across, turn, middle = _relative(means, extents, i, j)
+    a, b = extents[i], extents[j] + along[:, None]
     shared = np.minimum(a[:, 1], b[:, 1]) - np.maximum(a[:, 0], b[:, 0])
     shorter = np.minimum(a[:, 1] - a[:, 0], b[:, 1] - b[:, 0])
     off = across + (middle - along) * turn
@@ -184,7 +271,7 @@ def _compare(marks: _Map, i: IntArray, j: IntArray) -> tuple[Array, Array, Array
     Rows: distance across at the overlap, direction, and for whole segments the distance of their
     middles along the wall; for points the differences in x and y.
     """
-    along, across, turn, middle = _relative(marks, i, j)
+    along, across, turn, middle = _relative(marks.x, marks.extents, i, j)
     c, s = np.cos(marks.x[i, 2]), np.sin(marks.x[i, 2])
     zero, one, arm = np.zeros(len(i)), np.ones(len(i)), middle - along
     ends = along + marks.extents[j].mean(axis=1) - marks.extents[i].mean(axis=1)
@@ -303,6 +390,17 @@ def merged_steps(
     return tuple(
         replace(step, associations=tuple(map(renamed, step.associations))) for step in steps
     )
+
+
+def merged(
+    steps: tuple[Step, ...], into: Mapping[int, int], landmarks: LandmarkMap
+) -> tuple[Step, ...]:
+    """Steps with merged landmarks; the map follows."""
+    if not into:
+        return steps
+    kinds = {number: landmarks.entries[number].kind for number in into.values()}
+    merge_entries(landmarks, into)
+    return merged_steps(steps, into, kinds)
 
 
 def merge_entries(landmarks: LandmarkMap, into: Mapping[int, int]) -> None:

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from graphslam.core.config import AssociationConfig
 from graphslam.core.geometry import Array, between, path_length
@@ -17,16 +16,17 @@ from graphslam.core.records import Estimate, Step, Trajectory
 from graphslam.mapping.duplicate_landmarks import (
     OVERLAP_SHARE,
     merged_steps,
+    near_pairs,
 )
-from graphslam.mapping.gating import BoolArray, IntArray
+from graphslam.mapping.gating import IntArray
 from graphslam.mapping.landmark_map import Entry, LandmarkMap
 
 #: m across, rad: walls of two visits that differ less, in a solution with closed loops, are one
 TIE_M, TIE_RAD = 0.06, 0.03
 #: m, rad: sigmas of the distance and the direction between two visits up to which that holds
 CERTAIN_M, CERTAIN_RAD = 0.04, 0.02
-#: m: walls are sampled at this distance to find those near each other
-SAMPLE_M = 1.0
+#: m: parts of walls farther apart are not compared
+NEAR_M = 0.9
 
 
 #: see `tie_visits`
@@ -181,7 +181,7 @@ def _pairs_that_lie_together(
     x = np.array([e.mean for e in entries])
     extents = np.array([e.extent for e in entries])
     point = np.array([e.kind == "point" for e in entries], dtype=bool)
-    i, j = near_pairs(x, extents, point)
+    i, j = near_pairs(x, extents, point, NEAR_M)
     same = point[i] == point[j]
     i, j = i[same], j[same]
     off = between(x[i], x[j])
@@ -208,23 +208,3 @@ def _pairs_that_lie_together(
     order = order[(sigma[:, 0] <= CERTAIN_M) & (sigma[:, 1] <= CERTAIN_RAD)]
     order = order[np.argsort(far[order], kind="stable")]
     return list(zip(i[order].tolist(), j[order].tolist(), strict=True))
-
-
-def near_pairs(x: Array, extents: Array, point: BoolArray) -> tuple[IntArray, IntArray]:
-    """Pairs (m,), (m,) of landmarks of which some parts are within a metre or so.
-
-    ``x`` (n, 3) are the landmarks, ``extents`` (n, 2) m along each one's x axis, ``point`` (n,).
-    Walls are sampled, and samples looked up in a tree: the work grows with the number of landmarks
-    and of pairs, not with the square of the former.
-    """
-    length = np.where(point, 0.0, extents[:, 1] - extents[:, 0])
-    count = 2 + np.ceil(length / SAMPLE_M).astype(np.int64)
-    of = np.repeat(np.arange(len(x)), count)
-    k = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
-    along = extents[of, 0] + k / (count[of] - 1) * length[of]
-    along[point[of]] = 0.0
-    at = x[of, :2] + along[:, None] * np.column_stack([np.cos(x[of, 2]), np.sin(x[of, 2])])
-    pairs = cKDTree(at).query_pairs(SAMPLE_M, output_type="ndarray")
-    i, j = np.sort(of[pairs], axis=1).T
-    found = np.unique(i[i != j] * len(x) + j[i != j])
-    return found // len(x), found % len(x)

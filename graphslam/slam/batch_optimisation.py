@@ -6,7 +6,7 @@ is solved, tied again where the covariances show that two are one, and solved to
 """
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from graphslam.core.config import Config
@@ -14,14 +14,11 @@ from graphslam.core.records import Estimate, Step
 from graphslam.estimation.batch_calibration import recompute_motions
 from graphslam.estimation.calibration_graph import CalibratedSolution, solve_calibrated
 from graphslam.mapping.duplicate_landmarks import (
-    duplicates,
-    merge_entries,
-    merge_targets,
-    merged_steps,
-    possible_duplicates,
+    find_duplicates,
+    merged,
     seen_together,
 )
-from graphslam.mapping.landmark_map import LandmarkMap, mean_landmarks
+from graphslam.mapping.landmark_map import mean_landmarks
 from graphslam.mapping.loop_closure import ALREADY_CLOSED, Tamper, fix_position, violated
 from graphslam.mapping.reassociation import reassociate
 from graphslam.mapping.redundant_closures import untied_closures
@@ -139,7 +136,8 @@ def _tied(
     counts["landmarks_merged"] += len(into)
     if solution:
         apart = {frozenset(into.get(number, number) for number in pair) for pair in apart}
-        into = find_duplicates(solution, landmarks, apart)
+        known = [e for e in landmarks.entries.values() if e.id in estimate.landmarks]
+        into = find_duplicates(known, apart, solution.joint)
         steps = merged(steps, into, landmarks)
         counts["landmarks_merged"] += len(into)
     factor_m, factor_rad = SOLVED_FACTORS if solution else CLOSED_FACTORS
@@ -155,25 +153,3 @@ def _tied(
     counts["observations_reassociated"] += again.moved
     counts["observations_dropped"] += again.dropped
     return again.steps
-
-
-def find_duplicates(
-    solution: CalibratedSolution, landmarks: LandmarkMap, apart: Collection[frozenset[int]]
-) -> dict[int, int]:
-    """Landmark -> the one it is merged into, by the joint covariance; see `duplicates`."""
-    known = [e for e in landmarks.entries.values() if e.id in solution.estimate.landmarks]
-    known = possible_duplicates(known, apart)
-    if not known:
-        return {}
-    return merge_targets(duplicates(known, solution.joint([e.id for e in known]), apart))
-
-
-def merged(
-    steps: tuple[Step, ...], into: Mapping[int, int], landmarks: LandmarkMap
-) -> tuple[Step, ...]:
-    """Steps with merged landmarks; the map follows."""
-    if not into:
-        return steps
-    kinds = {number: landmarks.entries[number].kind for number in into.values()}
-    merge_entries(landmarks, into)
-    return merged_steps(steps, into, kinds)

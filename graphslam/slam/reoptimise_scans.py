@@ -9,6 +9,7 @@ since both come from the same scans.
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -18,11 +19,8 @@ from graphslam.core.records import Closure, Estimate, KeyframeScan, Step
 from graphslam.estimation.batch_calibration import calibrate, recompute_motions
 from graphslam.estimation.isam2 import Reoptimiser
 from graphslam.mapping.duplicate_landmarks import (
-    duplicates,
-    merge_entries,
-    merge_targets,
-    merged_steps,
-    possible_duplicates,
+    find_duplicates,
+    merged,
     seen_together,
 )
 from graphslam.mapping.landmark_map import LandmarkMap
@@ -92,8 +90,12 @@ def reoptimise_scan_log(
     association = config.association
     for factor_m, factor_rad in GATE_FACTORS:
         estimate = solve(steps, estimate, closures)
-        steps, merged = merge_duplicates(steps, estimate, solve.backend, landmarks)
-        counts["landmarks_merged"] += merged
+        landmarks.update_from(steps, estimate)
+        known = [e for e in landmarks.entries.values() if e.id in estimate.landmarks]
+        joint = partial(solve.backend.joint, min(estimate.states))
+        into = find_duplicates(known, seen_together(steps), joint)
+        steps = merged(steps, into, landmarks)
+        counts["landmarks_merged"] += len(into)
         # duplicates are merged first: else observations would move to and fro between the two
         again = reassociate(
             steps,
@@ -103,7 +105,7 @@ def reoptimise_scan_log(
             factor_rad * association.reassociation_gate_rad,
             association.overlap_gap_m,
         )
-        if merged or again.moved or again.dropped:
+        if into or again.moved or again.dropped:
             steps = again.steps
         counts["observations_reassociated"] += again.moved
         counts["observations_dropped"] += again.dropped
@@ -247,32 +249,6 @@ def _with_observed_motion_noise(
         if all(np.all(scale <= NOISE_GROWTH * before[robot]) for robot, scale in scales.items()):
             break
     return scaled, estimate
-
-
-def _duplicates(
-    estimate: Estimate, backend: Reoptimiser, landmarks: LandmarkMap, steps: Sequence[Step]
-) -> dict[int, int]:
-    """Landmark that goes -> landmark that it becomes; the map follows the estimate."""
-    landmarks.update_from(steps, estimate)
-    known = [entry for entry in landmarks.entries.values() if entry.id in estimate.landmarks]
-    together = seen_together(steps)
-    known = possible_duplicates(known, together)
-    if not known:
-        return {}
-    joint = backend.joint(min(estimate.states), [entry.id for entry in known])
-    return merge_targets(duplicates(known, joint, together))
-
-
-def merge_duplicates(
-    steps: tuple[Step, ...], estimate: Estimate, backend: Reoptimiser, landmarks: LandmarkMap
-) -> tuple[tuple[Step, ...], int]:
-    """Steps in which landmarks that are one are merged, and how many went; the map follows."""
-    into = _duplicates(estimate, backend, landmarks, steps)
-    if into:
-        kinds = {number: landmarks.entries[number].kind for number in into.values()}
-        steps = merged_steps(steps, into, kinds)
-        merge_entries(landmarks, into)
-    return steps, len(into)
 
 
 def with_closures(steps: Sequence[Step], closures: Iterable[Closure]) -> tuple[Step, ...]:

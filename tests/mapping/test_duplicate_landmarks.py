@@ -17,6 +17,7 @@ from graphslam.mapping.duplicate_landmarks import (
     _Map,
     _relative,
     duplicates,
+    find_duplicates,
     merge_entries,
     merge_targets,
     merged_steps,
@@ -185,7 +186,7 @@ def test_jacobians_of_the_comparison(seed):
 
     _, H_i, H_j, _ = _compare(walls(x), i, j)
     # where the comparison is made is held: it is no part of the residual's dependence
-    middle = _relative(walls(x), i, j)[3][0]
+    middle = _relative(x, extents, i, j)[3][0]
 
     def residual(flat):
         relative = between(flat[:3], flat[3:])
@@ -195,6 +196,29 @@ def test_jacobians_of_the_comparison(seed):
 
     H = jacobian(residual, x.ravel())
     np.testing.assert_allclose(np.hstack([H_i[0], H_j[0]]), H, atol=1e-8)
+
+
+@pytest.mark.parametrize("n", [20, 80, 320])
+def test_joint_covariances_grow_with_the_map(n):
+    """Rooms far apart, with every wall seen three times; the middle sighting differs from the other
+    two by half of what is allowed, so that only all three together are one. Breaks if those that
+    may be one are separated, or if covariances are asked for of all landmarks at once."""
+    entries, asked = [], []
+    for k in range(n):
+        for shift in (0.0, 0.04, 0.08):
+            number = len(entries)
+            entries.append(replace(entry(number), mean=np.array([20.0 * k, shift, 0.0])))
+
+    def joint(numbers):
+        asked.append(len(numbers))
+        means = [entries[k].mean for k in numbers]
+        return joint_of(means, 0.02**2 * np.eye(3 * len(numbers)))
+
+    found = find_duplicates(entries, [frozenset((0, 1))], joint)
+    elsewhere = {gone: kept for gone, kept in found.items() if gone > 2}
+    assert elsewhere == {3 * k + j: 3 * k for k in range(1, n) for j in (1, 2)}
+    assert found.get(1) != 0  # seen together with 0
+    assert max(asked) <= 100 and sum(asked) <= 3 * n
 
 
 def test_survivors_are_the_oldest_of_all_that_are_one():

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from graphslam.mapping.duplicate_landmarks import near_pairs
 from graphslam.mapping.landmark_map import Entry, LandmarkMap
-from graphslam.mapping.visits import near_pairs, tie_visits
+from graphslam.mapping.visits import tie_visits
 
 
 def landmarks(*means, kind="line"):
@@ -57,6 +58,6 @@ def test_pairs_near_each_other_grow_with_the_map_not_with_its_square():
     for n in (10, 100):
         x = np.zeros((2 * n, 3))
         x[:, 0] = 10.0 * np.repeat(np.arange(n), 2)
-        i, j = near_pairs(x, np.tile([-2.0, 2.0], (2 * n, 1)), np.zeros(2 * n, dtype=bool))
+        i, j = near_pairs(x, np.tile([-2.0, 2.0], (2 * n, 1)), np.zeros(2 * n, dtype=bool), 1.0)
         np.testing.assert_array_equal(j - i, 1)
         assert len(i) == n
