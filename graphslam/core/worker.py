@@ -13,7 +13,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
-from itertools import islice, zip_longest
+from itertools import islice
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -135,14 +135,32 @@ class Future(Generic[_T]):
 
 
 def parallel_map(
-    function: Callable[[_S], _T], arguments: Sequence[_S], *, fewest: int = 2
+    function: Callable[[_S], _T],
+    arguments: Sequence[_S],
+    *,
+    fewest: int = 2,
+    efforts: Sequence[float] | None = None,
 ) -> list[_T]:
-    """Results of a function for each argument, every other one from a second process.
+    """Results of a function for each argument, half of them from a second process.
 
-    With less than ``fewest`` arguments there is no second process.
+    With less than ``fewest`` arguments there is no second process. ``efforts``: about how long each
+    takes, in any unit; equally long without.
     """
     if len(arguments) < fewest or not can_fork():
         return [function(a) for a in arguments]
-    others = Future(lambda: [function(a) for a in arguments[1::2]])
-    found = [function(a) for a in arguments[::2]]
-    return [one for pair in zip_longest(found, others.result()) for one in pair][: len(arguments)]
+    here, there = _shares(efforts or [1.0] * len(arguments))
+    others = Future(lambda: [function(arguments[k]) for k in there])
+    found = {k: function(arguments[k]) for k in here}
+    found.update(zip(there, others.result(), strict=True))
+    return [found[k] for k in range(len(arguments))]
+
+
+def _shares(efforts: Sequence[float]) -> tuple[list[int], list[int]]:
+    """Numbers of tasks for two processes: the longest first, each to who has less to do so far."""
+    shares: tuple[list[int], list[int]] = [], []
+    sums = [0.0, 0.0]
+    for k in sorted(range(len(efforts)), key=lambda k: -efforts[k]):
+        less = int(sums[1] < sums[0])
+        shares[less].append(k)
+        sums[less] += efforts[k]
+    return shares

@@ -7,6 +7,7 @@ spatial perception, RA-L 2020, DOI 10.1109/LRA.2020.2965893). Motions are with t
 their calibration until then.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
@@ -107,7 +108,9 @@ def solve_robots_apart(one: SightingPass) -> Estimate:
         return estimate, track.calibration
 
     robots = list(one.started)
-    solved = dict(zip(robots, parallel_map(solve, robots), strict=True))
+    seen = Counter(sighting.robot for sighting in one.sources)
+    efforts = [len(one.runs[robot].times) + seen[robot] for robot in robots]
+    solved = dict(zip(robots, parallel_map(solve, robots, efforts=efforts), strict=True))
     for robot, (_, calibration) in solved.items():
         one.runs[robot].track.calibration = calibration
     estimates = [estimate for estimate, _ in solved.values()]

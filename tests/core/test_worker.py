@@ -124,6 +124,16 @@ def test_shared_results_are_in_the_order_of_the_arguments():
     assert lines == ["True []", "True [True]", f"True {both[:2]}", f"True {[*both, True]}"]
 
 
+def test_both_processes_get_about_the_same_effort():
+    """The longest task alone weighs as much as the others; results stay in their order."""
+    lines = printed("""
+        task = lambda k: (10 * k, os.getpid() == here)
+        found = parallel_map(task, list(range(4)), efforts=[1.0, 2.0, 6.0, 3.0])
+        print([v for v, _ in found], [own for _, own in found])
+    """)
+    assert lines == ["[0, 10, 20, 30] [False, False, True, False]"]
+
+
 def test_nothing_forks_unless_it_may():
     """Neither before `allow_fork`, nor beside a thread, nor in what was forked, nor where nothing
     tells how many threads there are, nor without memory."""
