@@ -8,18 +8,28 @@ the scans is fused with it. Along directions that the scans do not determine (a 
 motion remains that of the odometry.
 """
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graphslam.core.config import ScanMatchingConfig
 from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared, symmetric, update
 from graphslam.core.geometry import Array, rotation, wrap
 from graphslam.core.records import Closure, Motion, Observation
-from graphslam.perception.scan_matching import Submap, align, fit, make_submap, match
-from graphslam.perception.scan_pairs import fit_pairs
+from graphslam.perception.scan_matching import (
+    Submap,
+    align,
+    align_pairs,
+    fits,
+    make_submap,
+    match_pairs,
+    shares_on_others,
+)
+from graphslam.perception.scan_pairs import IntArray, fit_pairs
+
+BoolArray = NDArray[np.bool_]
 
 #: scans with fewer points are not matched
 MIN_POINTS = 30
@@ -43,37 +53,64 @@ def scan_submap(points: Array, config: ScanMatchingConfig | None = None) -> Subm
 
 
 def checked_against_scans(motion: Motion, before: Submap, now: Submap) -> Motion:
-    """The motion, corrected by scan matching if the scans contradict it (``from_scans``).
+    """The motion, corrected by scan matching if the scans contradict it; see `check_motions`."""
+    return check_motions([motion], [before], [now])[0]
+
+
+def check_motions(
+    motions: Sequence[Motion], before: Sequence[Submap], now: Sequence[Submap]
+) -> list[Motion]:
+    """Motions, corrected by scan matching where the scans contradict them (``from_scans``).
 
     Args:
-        motion: according to odometry.
-        before: scan of the state where it starts, in that state's frame.
-        now: scan of the state where it ends.
+        motions: according to odometry.
+        before: scans of the states where they start, in these states' frames.
+        now: scans of the states where they end.
     """
-    config = before.config
-    here, step, cov = fit(now, before, motion.delta)
-    if not is_suspect(here, step, motion.cov + cov):
-        return motion
-    guesses = [align(now, before, motion.delta)]
-    if fit(now, before, guesses[0][0])[0] < max(MIN_OVERLAP, here + MIN_OVERLAP_GAIN):
-        window = np.array([config.search_m, config.search_m, config.search_rad])
-        window += 2 * np.abs(motion.delta)  # an unsigned counter reports the reverse of a motion
-        found = match(now, before, motion.delta, window)
-        guesses += [(m.pose, m.cov) for m in found]
-    there, (pose, cov) = max(
-        ((fit(now, before, pose)[0], (pose, cov)) for pose, cov in guesses), key=lambda g: g[0]
+    here, steps, covs = fits(now, before, [m.delta for m in motions])
+    checked = list(motions)
+    left = [
+        k
+        for k, motion in enumerate(motions)
+        if is_suspect(float(here[k]), steps[k], motion.cov + covs[k])
+    ]
+    if not left:
+        return checked
+    config = before[0].config
+    ends, starts = [now[k] for k in left], [before[k] for k in left]
+    poses, covs, _ = align_pairs(ends, starts, [motions[k].delta for k in left])
+    shares = shares_on_others(ends, starts, poses)
+    needed = np.maximum(MIN_OVERLAP, here[left] + MIN_OVERLAP_GAIN)
+    found = {k: [(s, p, c)] for k, s, p, c in zip(left, shares, poses, covs, strict=True)}
+    lost = [k for k, share, least in zip(left, shares, needed, strict=True) if share < least]
+    window = np.array([config.search_m, config.search_m, config.search_rad])
+    matches = match_pairs(
+        [now[k] for k in lost],
+        [before[k] for k in lost],
+        [motions[k].delta for k in lost],
+        # an unsigned counter reports the reverse of a motion
+        [window + 2 * np.abs(motions[k].delta) for k in lost],
     )
+    for k, own in zip(lost, matches, strict=True):
+        at = np.array([m.pose for m in own]).reshape(-1, 3)
+        again = shares_on_others([now[k]] * len(own), [before[k]] * len(own), at)
+        found[k] += [(share, m.pose, m.cov) for share, m in zip(again, own, strict=True)]
+    for k, least in zip(left, needed, strict=True):
+        share, pose, cov = max(found[k], key=lambda one: one[0])
+        if share >= least:
+            checked[k] = _corrected(motions[k], pose, cov, config)
+    return checked
+
+
+def _corrected(motion: Motion, pose: Array, cov: Array, config: ScanMatchingConfig) -> Motion:
+    """The motion, fused with the pose (3,) from scans and its cov (3, 3) if that contradicts it."""
     axes, variances = _measured_directions(cov, MAX_SIGMA_FLOORS * config.floor_m)
     measured_off = axes.T @ _difference(pose, motion.delta)
     off = axes @ measured_off
-    if (
-        there < max(MIN_OVERLAP, here + MIN_OVERLAP_GAIN)
-        or (
-            np.hypot(off[0], off[1]) < config.contradiction_m
-            and abs(off[2]) < config.contradiction_rad
-        )
-        or mahalanobis_squared(off, motion.cov + cov) < CONTRADICTION_D2
-    ):
+    is_small = (
+        np.hypot(off[0], off[1]) < config.contradiction_m and abs(off[2]) < config.contradiction_rad
+    )
+    if is_small or mahalanobis_squared(off, motion.cov + cov) < CONTRADICTION_D2:
         return motion
     inflated = replace(motion, cov=motion.cov + np.outer(off, off))
     return fused(inflated, axes.T, np.diag(variances), measured_off)
@@ -88,28 +125,28 @@ def is_suspect(share: float, step: Array, cov: Array) -> bool:
 
 
 def suspect_motions(
-    motions: Sequence[Motion], ends: Sequence[tuple[Array, Array]], config: ScanMatchingConfig
-) -> list[bool]:
-    """Which motions between consecutive scans `checked_against_scans` has to look at.
+    motions: Sequence[Motion],
+    clouds: Sequence[Array],
+    before: IntArray,
+    now: IntArray,
+    config: ScanMatchingConfig,
+) -> BoolArray:
+    """Which motions (n,) between consecutive scans `check_motions` has to look at.
 
-    ``ends`` are the points (k, 2) of the scans at the start and at the end of each motion, in the
-    frames of their states and in the order of the beams.
+    Args:
+        motions: according to odometry.
+        clouds: points (k, 2) of scans in the frames of their states, in the order of the beams.
+        before: (n,) numbers of the scans where the motions start.
+        now: (n,) and where they end.
+        config: noise and reach.
     """
     if not motions:
-        return []
-    number: dict[int, int] = {}
-    clouds: list[Array] = []
-    for cloud in itertools.chain.from_iterable(ends):
-        if id(cloud) not in number:
-            number[id(cloud)] = len(clouds)
-            clouds.append(cloud)
-    target, source = (np.array([number[id(pair[k])] for pair in ends]) for k in (0, 1))
+        return np.zeros(0, dtype=np.bool_)
     delta = np.array([m.delta for m in motions])
-    fits = fit_pairs(clouds, target, source, delta, config)
-    return [
-        is_suspect(float(share), step, m.cov + cov)
-        for share, step, cov, m in zip(fits.share, fits.step, fits.cov, motions, strict=True)
-    ]
+    found = fit_pairs(clouds, before, now, delta, config)
+    cov = np.array([m.cov for m in motions]) + found.cov
+    off = mahalanobis_squared(found.step, cov) >= SUSPECT_D2
+    return np.asarray((found.share < USUAL_OVERLAP) | off)
 
 
 def fused(motion: Motion, H: Array, R: Array, innovation: Array) -> Motion:

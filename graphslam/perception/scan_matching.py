@@ -266,17 +266,26 @@ def align_pairs(
 
 
 def fit(source: Submap, target: Submap, pose: Array) -> tuple[float, Array, Array]:
-    """How well ``source`` lies on ``target`` at ``pose`` (3,), without moving it.
+    """How well ``source`` lies on ``target`` at ``pose`` (3,), without moving it; see `fits`."""
+    shares, steps, covs = fits([source], [target], [pose])
+    return float(shares[0]), steps[0], covs[0]
+
+
+def fits(
+    sources: Sequence[Submap], targets: Sequence[Submap], poses: Sequence[Array]
+) -> tuple[Array, Array, Array]:
+    """How well n submaps lie on others at ``poses`` (3,), without moving them.
 
     Returns:
-        Share of its points that lie on others (a point that is 2 sigmas off counts half); the first
-        Gauss-Newton step (3,) of the pose; and the covariance (3, 3) of the pose after it, see
-        `align_pairs`.
+        Shares (n,) of their points that lie on others (a point that is 2 sigmas off counts half);
+        the first Gauss-Newton steps (n, 3) of the poses; and the covariances (n, 3, 3) of the poses
+        after them, see `align_pairs`.
     """
-    pairs = _PointPairs([source], [target])
-    A, g, weight = pairs.linearise(pose[None], SAME_SIGMAS * target.config.point_sigma_m)
-    share = float(weight[0] / pairs.count[0])
-    return share, gauss_newton_step(A, g)[0], _covariance(A, target.config)[0]
+    if not len(poses):
+        return np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 3))
+    pairs, config = _PointPairs(sources, targets), targets[0].config
+    A, g, weight = pairs.linearise(np.array(poses), SAME_SIGMAS * config.point_sigma_m)
+    return weight / pairs.count, gauss_newton_step(A, g), _covariance(A, config)
 
 
 def shares_on_others(sources: Sequence[Submap], targets: Sequence[Submap], poses: Array) -> Array:

@@ -23,16 +23,15 @@ from graphslam.logs.log_set import ReadReport
 from graphslam.multi_robot.robot_detection import COMPARED_SCANS, without_returns
 from graphslam.odometry.scan_odometry import (
     MIN_POINTS,
-    checked_against_scans,
+    check_motions,
     match_off_lines,
     points_off_lines,
-    scan_submap,
     suspect_motions,
 )
 from graphslam.perception.dynamic_objects import dynamic_returns_of_all
 from graphslam.perception.front_ends import observe_block
 from graphslam.perception.ordered_scan import Sweep, make_sweep, scan_points
-from graphslam.perception.scan_matching import Submap
+from graphslam.perception.scan_matching import make_submap
 from graphslam.slam.keyframes import KeyframeSelector
 from graphslam.slam.log_pass import counted, timed
 from graphslam.slam.robot_settings import make_tracks
@@ -238,37 +237,39 @@ class _Reader:
         config, auto = self._config.scan_matching, self._config.odometry.scan_matching == "auto"
         checked: list[Motion | None] = list(motions)
         matched: list[Closure | None] = [None] * len(used)
-        before = [self._last_scan, *((s.time_ns, p) for s, p in zip(used, points, strict=True))]
-        self._last_scan = before[-1]
-        pairs: list[tuple[int, Motion, Array, Array]] = []
-        for k, motion in enumerate(motions):
-            last, now = before[k], points[k]
-            if motion is None or last is None or last[0] != motion.start_ns:
-                continue
-            if min(len(last[1]), len(now)) >= MIN_POINTS:
-                pairs.append((k, motion, last[1], now))
+        # scan k is cloud k + 1, and that before it cloud k
+        last_ns, last = self._last_scan or (-1, np.zeros((0, 2)))
+        clouds, times = [last, *points], [last_ns, *(s.time_ns for s in used)]
+        self._last_scan = times[-1], clouds[-1]
+        pairs = [
+            (k, motion)
+            for k, motion in enumerate(motions)
+            if motion is not None
+            and times[k] == motion.start_ns
+            and min(len(clouds[k]), len(clouds[k + 1])) >= MIN_POINTS
+        ]
         self.run.motions += len(pairs)
-        submaps: dict[int, Submap] = {}
-
-        def submap(cloud: Array) -> Submap:
-            if id(cloud) not in submaps:
-                found = scan_submap(cloud, config)
-                assert found is not None  # it has points enough
-                submaps[id(cloud)] = found
-            return submaps[id(cloud)]
-
-        suspect = suspect_motions(
-            [m for _, m, _, _ in pairs], [(a, b) for _, _, a, b in pairs], config
+        before = np.array([k for k, _ in pairs], dtype=np.int64)
+        suspect = suspect_motions([m for _, m in pairs], clouds, before, before + 1, config)
+        doubtful = [pair for pair, one in zip(pairs, suspect, strict=True) if one]
+        compared = [k for k, _ in (doubtful if auto else pairs)]
+        submaps = {
+            n: make_submap(np.zeros((1, 3)), [clouds[n]], config)
+            for n in sorted({*compared, *(k + 1 for k, _ in doubtful)})
+        }
+        better = check_motions(
+            [m for _, m in doubtful],
+            [submaps[k] for k, _ in doubtful],
+            [submaps[k + 1] for k, _ in doubtful],
         )
-        for (k, motion, last_points, now), is_doubtful in zip(pairs, suspect, strict=True):
-            better = motion
-            if is_doubtful:
-                better = checked_against_scans(motion, submap(last_points), submap(now))
-                checked[k] = better
-                self.run.contradicted += better.from_scans
-            if not (auto or better.from_scans):
-                lines = [seen[k].one(n) for n in range(len(seen[k]))]
-                free = points_off_lines(now, lines, config)
-                name = used[k].robot
-                matched[k] = match_off_lines(better, submap(last_points), name, free)
+        for (k, _), motion in zip(doubtful, better, strict=True):
+            checked[k] = motion
+            self.run.contradicted += motion.from_scans
+        if not auto:
+            for k, _ in pairs:
+                one = checked[k]
+                if one is not None and not one.from_scans:
+                    lines = [seen[k].one(n) for n in range(len(seen[k]))]
+                    free = points_off_lines(points[k], lines, config)
+                    matched[k] = match_off_lines(one, submaps[k], used[k].robot, free)
         return checked, matched
