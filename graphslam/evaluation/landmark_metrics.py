@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from graphslam.core.geometry import Array, unit_vectors, wrap
 from graphslam.core.records import Landmark, TrueLandmark
@@ -110,6 +109,8 @@ def _match(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]) -> list[
         return pairs
     # a forbidden pair costs more than all allowed ones together, so as many as possible match
     forbidden = MATCH_DISTANCE_M * (1 + min(cost.shape))
+    from scipy.optimize import linear_sum_assignment  # noqa: PLC0415  (imports for long)
+
     chosen = linear_sum_assignment(np.where(np.isfinite(cost), cost, forbidden))
     matched = [
         (rows[r], columns[c]) for r, c in zip(*chosen, strict=True) if np.isfinite(cost[r, c])

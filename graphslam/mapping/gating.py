@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.optimize import linear_sum_assignment
 
 from graphslam.core.config import AssociationConfig
 from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared
@@ -245,6 +244,9 @@ def assign(cost: Array, gate: Array, method: str) -> list[tuple[int, int]]:
     alone = np.full((n, n), np.inf)
     np.fill_diagonal(alone, np.where(np.isfinite(allowed), gate, 0.0).max(axis=1))
     table = np.concatenate([allowed, alone], axis=1)
+    # a fifth of a second to import, while other processes work
+    from scipy.optimize import linear_sum_assignment  # noqa: PLC0415
+
     rows, columns = linear_sum_assignment(np.where(np.isfinite(table), table, 1e9))
     return [
         (int(i), int(j))
