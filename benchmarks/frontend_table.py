@@ -25,7 +25,7 @@ import numpy as np
 from common import best_cpu_s, parser, simulated_log
 from numpy.typing import NDArray
 
-from graphslam.core.config import Config, FrontEndConfig, StartConfig
+from graphslam.core.config import BackendConfig, Config, FrontEndConfig, StartConfig
 from graphslam.core.geometry import Array, between, rotate_cov, transform, wrap
 from graphslam.core.records import Observation, Result, Scan
 from graphslam.evaluation.ground_truth import truth_of_logs
@@ -46,6 +46,7 @@ NEAR_M, NEAR_RAD = 0.1, 0.1
 
 RUNS = ("lab", "office-loop", "corridor")
 RUN_SEEDS = (0, 1)
+CAUSAL = BackendConfig(causal=True)
 
 SCENARIOS = ("lab", "office-loop", "corridor", "forest", "fleet")
 FRONT = {
@@ -230,7 +231,9 @@ def simulated_runs(folder: Path) -> None:
     """Position errors (RMSE) in simulation over seeds; the landmarks are those of the last."""
     for name in RUNS:
         for label, front in WHOLE.items():
-            config = replace(Config(), front_end=front, start=StartConfig(from_truth=True))
+            config = replace(
+                Config(), front_end=front, start=StartConfig(from_truth=True), backend=CAUSAL
+            )
             final, causal = [], []
             for seed in RUN_SEEDS:
                 log = open_logs([simulated_log(name, seed, folder)], config)

@@ -65,6 +65,7 @@ class Run:
     """What one log gave."""
 
     relations: dict[str, Any]
+    causal: dict[str, Any]
     summary: dict[str, Any]
     used: Used
 
@@ -90,11 +91,20 @@ class Run:
 
 
 def run(name: str, folder: Path) -> Run:
+    """The measured command, and the same again with causal trajectories, which take longer."""
+    log, relations = import_freiburg(name, folder), str(FREIBURG / f"{name}.relations")
     target = folder / name
-    _, used = measured_command("smooth", str(import_freiburg(name, folder)), "-o", str(target))
-    found = command("evaluate", str(target), "--relations", str(FREIBURG / f"{name}.relations"))
+    _, used = measured_command("smooth", str(log), "-o", str(target))
+    found = command("evaluate", str(target), "--relations", relations)["relations"]
+    command("smooth", str(log), "--causal", "-o", str(causal_folder(target)))
+    causal = command("evaluate", str(causal_folder(target)), "--relations", relations)["relations"]
     summary = json.loads((target / "summary.json").read_text(encoding="utf-8"))
-    return Run(found["relations"], summary, used)
+    return Run(found, causal["causal"], summary, used)
+
+
+def causal_folder(target: Path) -> Path:
+    """Where the result with causal trajectories is, beside the one without."""
+    return target.with_name(f"{target.name}-causal")
 
 
 def print_errors(name: str, done: Run) -> None:
@@ -104,8 +114,7 @@ def print_errors(name: str, done: Run) -> None:
         f" {counts['landmarks']} landmarks, {counts['loop_closures']} loop closures"
     )
     print(f"{'':18}{'n':>6}{'mean m':>10}{'median m':>10}{'std m':>10}{'mean °':>10}{'std °':>10}")
-    causal = done.relations["causal"]
-    for label, groups in (("final", done.relations), ("causal", causal)):
+    for label, groups in (("final", done.relations), ("causal", done.causal)):
         for group in ("all", "local", "loops"):
             g = groups[group]
             numbers = [
@@ -152,9 +161,8 @@ def main() -> int:
             good &= print_bars(name, done)
             if arguments.figures:
                 relations = FREIBURG / f"{name}.relations"
-                print(
-                    real_logs_figures.draw(name, Path(folder) / name, relations, arguments.figures)
-                )
+                result = causal_folder(Path(folder, name))
+                print(real_logs_figures.draw(name, result, relations, arguments.figures))
     return 0 if good else 1
 
 
