@@ -417,8 +417,9 @@ def match_pairs(
     ``guesses`` (3,) are the middles of windows, ``windows`` (3,) half their sizes, m, m, rad; for
     ``min_score`` see `search`.
     """
+    # the guess is one too: of many that are alike the search may leave out just the nearest
     starts = [
-        search(s, t, guess, window, min_score)
+        [*search(s, t, guess, window, min_score), guess]
         for s, t, guess, window in zip(sources, targets, guesses, windows, strict=True)
     ]
     pair = [n for n, own in enumerate(starts) for _ in own]
