@@ -432,7 +432,7 @@ def match_pairs(
     np.maximum.at(most, pair, shares)
     found: list[list[Match]] = [[] for _ in starts]
     for n, pose, cov, share in zip(pair, poses, covs, shares, strict=True):
-        if share < MIN_SHARE * most[n]:
+        if share <= 0.0 or share < MIN_SHARE * most[n]:
             continue
         if not any(_duplicates(pose, m.pose, targets[n].config) for m in found[n]):
             found[n].append(Match(pose, cov, *agreement(sources[n], targets[n], pose)))

@@ -123,3 +123,16 @@ def test_pairs_are_matched_as_each_alone():
         for a, b in zip(alone, together[k], strict=True):
             assert np.array_equal(a.pose, b.pose)
             assert (a.same, a.absent) == (b.same, b.absent)
+
+
+def test_the_guess_is_a_match_where_many_places_are_alike():
+    """Bays of one shape, a metre apart, nine in the window; the search returns four places at most,
+    those with most in common. Breaks if the guess, three bays off these, is no match."""
+    bays = [((x, 0.0), (x, 0.4)) for x in np.arange(-6.0, 6.5)]
+    walls = [*bays, ((-6.0, 0.0), (6.0, 0.0)), ((-6.0, 4.0), (6.0, 4.0))]
+    rng = np.random.default_rng(3)
+    before = submap(np.array([0.0, 1.5, 0.0]), walls, rng)
+    now = submap(np.array([0.0, 1.5, 0.0]), walls, rng)
+    for guess in np.array([[-3.0, 0.0, 0.0], [3.0, 0.0, 0.0]]):
+        found = match(now, before, guess, np.array([4.4, 0.3, 0.1]))
+        assert any(np.hypot(*(m.pose - guess)[:2]) < 0.1 for m in found)
