@@ -40,7 +40,7 @@ from graphslam.slam.synchronisation import synchronise
 
 #: messages that are processed at once; the first blocks are smaller, as little is known of the
 #: calibration: each has twice as many as the one before
-BLOCK, FIRST_BLOCK = 2000, 250
+BLOCK, FIRST_BLOCK = 2000, 100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
