@@ -157,17 +157,28 @@ def smooth(
     if output is not None:
         check_target(Path(output), force=force)
     opened = _open(recording, settled)
-    from graphslam.evaluation.ground_truth import truth_of_logs
-    from graphslam.results.report import render
     from graphslam.slam.smooth import smooth
 
     log = opened()
     if output is None:
         return smooth(log, settled, _count(log, progress))
-    truth = Future(lambda: truth_of_logs(log, settled))
+
+    # what the second process needs is imported there
+
+    def read_truth() -> GroundTruth:
+        from graphslam.evaluation.ground_truth import truth_of_logs
+
+        return truth_of_logs(log, settled)
+
+    def render_report() -> str:
+        from graphslam.results.report import render
+
+        return render(result, errors)
+
+    truth = Future(read_truth)
     result = smooth(log, settled, _count(log, progress))
     errors = _errors(result, truth.result())
-    report = Future(lambda: render(result, errors))
+    report = Future(render_report)
     save(result, Path(output), force=force, report=lambda _: report.result())
     return result
 
@@ -388,11 +399,11 @@ def _count(log: LogSet, progress: Callable[[int, int], None] | None) -> Callable
 
 def _errors(result: Result, truth: GroundTruth) -> dict[str, Any] | None:
     """Errors against the truth in the logs, None without; a warning where it does not fit."""
+    if not truth:
+        return None
     from graphslam.core.errors import OutputError
     from graphslam.evaluation.metrics import evaluate
 
-    if not truth:
-        return None
     try:
         return evaluate(result, truth.trajectories, truth.landmarks)
     except OutputError as error:
