@@ -120,6 +120,8 @@ def versions() -> dict[str, str]:
 
 def main() -> int:
     """Measure, print the tables, and what else is asked for."""
+    # commands find their bytecode compiled, as after any first run
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     options = parser(__doc__)
     add = options.add_argument
     add("--only", nargs="+", default=[], metavar="NAME", help="groups or jobs to measure")
