@@ -2,6 +2,7 @@
 
 import gc
 import os
+import sys
 from collections.abc import Sequence
 
 #: environment variables by which the libraries under numpy and scipy choose their threads
@@ -18,7 +19,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     environment says otherwise.
 
     Raises:
-        SystemExit: always. 0 done, 1 an error, reported in one line, 2 wrong usage.
+        SystemExit: 0 done, 1 an error, reported in one line, 2 wrong usage. Always where
+            ``arguments`` are given; a process that runs its own ends here.
     """
     gc.set_threshold(COLLECTION_INTERVAL, *gc.get_threshold()[1:])
     for name in THREADS:
@@ -27,4 +29,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     from graphslam.core.worker import allow_fork
 
     allow_fork()
-    app(args=arguments, prog_name="graphslam")
+    try:
+        app(args=arguments, prog_name="graphslam")
+    except SystemExit as done:
+        if arguments is None and isinstance(done.code, int):
+            _end_process(done.code)
+        raise
+
+
+def _end_process(code: int) -> None:
+    """Leave everything else to the system: freeing a log's records one by one took 0.2 s."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:  # the other end of a pipe was closed: the usual way says so
+            return
+    os._exit(code)
