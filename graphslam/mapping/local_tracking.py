@@ -14,46 +14,20 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from graphslam.core.config import AssociationConfig
-from graphslam.core.gaussian import mahalanobis_squared
-from graphslam.core.geometry import Array, between, compose, wrap
+from graphslam.core.geometry import Array, between, compose
 from graphslam.core.observation_arrays import KINDS, LINE, POINT, ROWS, SEGMENT, ObservationArrays
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Motion
 from graphslam.estimation.robocentric_filter import ANCHOR, PREVIOUS, RobocentricFilter
-from graphslam.mapping.gating import (
-    LENGTH_TOLERANCE_M,
-    MAX_ANGLE_RAD,
-    BoolArray,
-    IntArray,
-    assign,
-    gate_distance,
-)
+from graphslam.mapping.gating import BoolArray, IntArray, assign, gate_distance
 from graphslam.mapping.landmark_map import Entry
+from graphslam.mapping.local_pairs import LocalLandmarks, LocalPairs, candidate_pairs
 
 #: share of the gate's floor (`association.floor_m`, `floor_rad`) by which walls differ from
 #: straight ones, as noise of observations: without it the innovations of an image together are
 #: larger than their covariance (median of the squared distance per degree of freedom 1.8 on ACES,
 #: 1.0 with it), and where a few walls are seen badly the pose jumps by many of its sigmas
 UNEVENNESS = 0.3
-
-
-@dataclass(slots=True, eq=False)
-class _Pairs:
-    """Candidate pairs (k,) of observation and landmark, by index, and how far apart they are.
-
-    ``model`` (k,) code in `KINDS`; ``flipped``: the observed line is turned by pi; ``residual`` (k,
-    3), ``H`` (k, 3, 3) by the landmark and ``noise`` (k, 3, 3) count in the first `ROWS`.
-    """
-
-    observation: IntArray
-    landmark: IntArray
-    model: IntArray
-    flipped: BoolArray
-    z: Array
-    residual: Array
-    H: Array
-    noise: Array
-    d2: Array
 
 
 @dataclass(slots=True, eq=False)
@@ -108,6 +82,8 @@ class LocalTracker:
         self.deleted = 0
         self.innovations: dict[str, list[tuple[int, float]]] = {}
         self._robot, self._config, self._numbers = robot, config, numbers
+        self._gates = gate_distance(config.gate_probability, ROWS)
+        self._new_gates = gate_distance(config.new_landmark_probability, ROWS)
         self._filter, self._table = RobocentricFilter(), _Table()
         self._evidence: dict[int, list[Association]] = {}  # of tentative landmarks
         self._first_ns: dict[int, int] = {}
@@ -146,7 +122,10 @@ class LocalTracker:
         """
         self._time_ns = time_ns
         self._expire(time_ns)
-        pairs = self._pairs(image)
+        known = LocalLandmarks(
+            self._filter.landmarks, self._filter.blocks(), self._table.kind, self._table.extent
+        )
+        pairs = candidate_pairs(image, known, self._floor, self._config)
         chosen = self._choose(pairs, len(image.kind))
         self._update(pairs, chosen)
         moved, cov = self._filter.reference(PREVIOUS)
@@ -155,74 +134,25 @@ class LocalTracker:
         used = dict(zip(pairs.observation[chosen].tolist(), chosen.tolist(), strict=True))
         return self._record(image, pairs, used), moved, cov
 
-    def _pairs(self, image: ObservationArrays) -> _Pairs:
-        """Pairs that pass the gates of distance, direction and overlap, with their distances."""
-        config, table, means = self._config, self._table, self._filter.landmarks
-        at = image.poses()
-        of_point, is_point = image.kind == POINT, table.kind == POINT
-        both_points = of_point[:, None] & is_point
-        both_lines = ~of_point[:, None] & ~is_point
-        middle = between(means[None], at[:, None])
-        turned = middle[..., 2]
-        flipped = np.zeros(turned.shape, dtype=bool)
-        if not config.directed:
-            flipped = both_lines & (np.abs(turned) > np.pi / 2)
-            turned = np.where(flipped, wrap(turned + np.pi), turned)
-        ends = middle[..., :1] + np.cos(middle[..., 2:]) * image.extent[:, None]
-        begin, end = ends.min(axis=-1), ends.max(axis=-1)
-        gap = np.maximum(begin - table.extent[:, 1], table.extent[:, 0] - end)
-        near = (
-            (np.abs(middle[..., 1]) < config.max_distance_m)
-            & (np.abs(turned) < MAX_ANGLE_RAD)
-            & (gap < config.overlap_gap_m)
-        )
-        close = np.hypot(middle[..., 0], middle[..., 1]) < config.max_distance_m
-        i, j = np.nonzero((both_points & close) | (both_lines & near))
-        length, known = np.diff(image.extent)[i, 0], np.diff(table.extent)[j, 0]
-        whole = (image.kind[i] == SEGMENT) & (table.kind[j] == SEGMENT)
-        whole &= np.abs(length - known) < LENGTH_TOLERANCE_M
-        model = np.where(of_point[i], POINT, np.where(whole, SEGMENT, LINE))
-        z = image.z[i]
-        z[flipped[i, j], 2] += np.pi
-        return self._compared(i, j, model, flipped[i, j], z, image.cov[i])
-
-    def _compared(
-        self, i: IntArray, j: IntArray, model: IntArray, flipped: BoolArray, z: Array, cov: Array
-    ) -> _Pairs:
-        """Pairs with their squared Mahalanobis distances, eq. 3.22."""
-        k, means = len(i), self._filter.landmarks
-        r, H, R = np.zeros((k, 3)), np.zeros((k, 3, 3)), np.zeros((k, 3, 3))
-        for code, kind in enumerate(KINDS):
-            which = np.flatnonzero(model == code)
-            if not len(which):
-                continue
-            compare, n = MODELS[kind], ROWS[code]
-            d = compare.dim
-            x, t = np.zeros((len(which), 3)), means[j[which], :d]
-            own_z, own_cov = z[which], cov[which]
-            if code == POINT:
-                own_z, own_cov = own_z[:, :2], own_cov[:, :2, :2]
-            r[which, :n] = compare.residual(own_z, x, t)
-            R[which, :n, :n] = compare.noise(own_z, own_cov, x, t)
-            H[which, :n, :d] = compare.jacobians(own_z, x, t)[1]
-        P = self._filter.blocks()[j]
-        d2 = mahalanobis_squared(r, H @ P @ H.mT + R + self._floor[model])
-        return _Pairs(i, j, model, flipped, z, r, H, R, d2)
-
-    def _choose(self, pairs: _Pairs, observations: int) -> IntArray:
+    def _choose(self, pairs: LocalPairs, observations: int) -> IntArray:
         """The accepted pairs (c,): landmarks of the graph first, then tentative ones."""
-        gate = gate_distance(self._config.gate_probability, ROWS[pairs.model])
-        in_graph = self._table.in_graph[pairs.landmark]
-        first = self._assigned(pairs, gate, np.flatnonzero(in_graph), observations)
-        free = ~in_graph & ~np.isin(pairs.observation, pairs.observation[first])
-        second = self._assigned(pairs, gate, np.flatnonzero(free), observations)
+        gate = self._gates[pairs.model]
+        fits, in_graph = pairs.d2 < gate, self._table.in_graph[pairs.landmark]
+        first = self._assigned(pairs, gate, np.flatnonzero(fits & in_graph), observations)
+        free = np.ones(observations, dtype=bool)
+        free[pairs.observation[first]] = False
+        others = fits & ~in_graph & free[pairs.observation]
+        if not others.any():
+            return first
+        second = self._assigned(pairs, gate, np.flatnonzero(others), observations)
         return np.concatenate([first, second])
 
-    def _assigned(self, pairs: _Pairs, gate: Array, which: IntArray, observations: int) -> IntArray:
-        """Pairs among ``which``, one per observation and landmark, within their gates."""
-        which = which[pairs.d2[which] < gate[which]]
+    def _assigned(
+        self, pairs: LocalPairs, gate: Array, which: IntArray, observations: int
+    ) -> IntArray:
+        """Pairs among ``which``, all within their gates: one per observation and landmark."""
         i, j = pairs.observation[which], pairs.landmark[which]
-        if len(np.unique(i)) == len(i) and len(np.unique(j)) == len(j):
+        if len(set(i.tolist())) == len(set(j.tolist())) == len(which):
             return which
         columns, column = np.unique(j, return_inverse=True)
         cost = np.full((observations, len(columns)), np.inf)
@@ -233,7 +163,7 @@ class LocalTracker:
         found = assign(cost, limit, self._config.method)
         return np.array([index[pair] for pair in found], dtype=np.int64)
 
-    def _update(self, pairs: _Pairs, chosen: IntArray) -> None:
+    def _update(self, pairs: LocalPairs, chosen: IntArray) -> None:
         """The landmarks and the pose by the accepted pairs."""
         if not len(chosen):
             return
@@ -251,12 +181,12 @@ class LocalTracker:
         table.extent -= np.where(table.kind == LINE, slid, 0.0)[:, None]
 
     def _record(
-        self, image: ObservationArrays, pairs: _Pairs, used: dict[int, int]
+        self, image: ObservationArrays, pairs: LocalPairs, used: dict[int, int]
     ) -> tuple[Association, ...]:
         """Count what was seen, begin new landmarks, and promote; see `track`."""
         table, time_ns = self._table, self._time_ns
-        new_gate = gate_distance(self._config.new_landmark_probability, ROWS[pairs.model])
-        doubtful = set(pairs.observation[pairs.d2 < new_gate].tolist()) - used.keys()
+        near = pairs.d2 < self._new_gates[pairs.model]
+        doubtful = set(pairs.observation[near].tolist()) - used.keys()
         if doubtful:
             reason = "between the thresholds: neither a match nor new"
             self.rejected[reason] += len(doubtful)
@@ -291,7 +221,7 @@ class LocalTracker:
         table.extent[rows, 1] = np.maximum(table.extent[rows, 1], ends.max(axis=1))
 
     def _associated(
-        self, image: ObservationArrays, pairs: _Pairs, k: int, row: int
+        self, image: ObservationArrays, pairs: LocalPairs, k: int, row: int
     ) -> list[Association]:
         """What enters the graph by an accepted pair: nothing, it alone, or all so far."""
         n = int(pairs.observation[k])
