@@ -512,15 +512,24 @@ def test_the_bar_is_drawn_on_a_terminal_only_and_never_on_stdout(capsys, monkeyp
 
 
 def test_the_module_runs_and_answers_before_anything_heavy_is_imported():
-    code = (
-        "import sys, runpy; sys.argv = ['graphslam', '--help']\n"
-        "try: runpy.run_module('graphslam', run_name='__main__')\n"
-        "finally: print('heavy:', {'gtsam', 'cv2', 'matplotlib', 'scipy.stats'} & set(sys.modules))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    for command in ("info", "import", "smooth", "evaluate"):
-        assert f"  {command} " in done.stdout
-    assert done.stdout.endswith("heavy: set()\n")
+    command = [sys.executable, "-X", "importtime", "-m", "graphslam", "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    for name in ("info", "import", "smooth", "evaluate"):
+        assert f"  {name} " in done.stdout
+    imported = {line.rsplit("|", 1)[-1].strip() for line in done.stderr.splitlines()}
+    assert "graphslam.cli" in imported
+    assert not imported & {"gtsam", "cv2", "matplotlib", "scipy.stats"}
+
+
+def test_a_process_of_its_own_ends_with_its_exit_code_and_all_of_its_output(tmp_path):
+    """It ends without the usual steps of Python: an output that is not flushed first is lost."""
+    missing = [sys.executable, "-m", "graphslam", "info", str(tmp_path / "none.mcap")]
+    done = subprocess.run(missing, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("graphslam: error: ") and done.stderr.endswith("\n")
+    version = [sys.executable, "-m", "graphslam", "--version"]
+    done = subprocess.run(version, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.strip()) == (0, call("--version").out.strip())
 
 
 def test_the_version_is_that_of_the_package():
