@@ -19,7 +19,7 @@ from graphslam.mapping.duplicate_landmarks import (
     seen_together,
 )
 from graphslam.mapping.landmark_map import mean_landmarks
-from graphslam.mapping.loop_closure import ALREADY_CLOSED, Tamper, fix_position, violated
+from graphslam.mapping.loop_closure import Tamper, fix_position
 from graphslam.mapping.reassociation import reassociate
 from graphslam.mapping.redundant_closures import untied_closures
 from graphslam.mapping.visits import tie_visits
@@ -104,8 +104,6 @@ def _solved(
     rough = _solve(with_closures(steps, closures), start, tracks, config, rough=True).solution
     steps = _tied(steps, rough.estimate, rough, paths, scan_log)
     # once landmarks of different visits are tied, most closures are no longer needed
-    missed = violated(closures, rough.estimate.states, ALREADY_CLOSED)
-    closures = [c for c, off in zip(closures, missed, strict=True) if off]
     closures = untied_closures(closures, paths.spans, steps, landmarks)
     counts["closures_kept"] = len(closures)
     done = _solve(with_closures(steps, closures), rough.estimate, tracks, config, rough=False)
