@@ -28,9 +28,10 @@ from __future__ import annotations
 import importlib
 import os
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 if TYPE_CHECKING:
     from graphslam.change_detection import Change, ChangeResult
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
     from graphslam.results.folder import SavedResult
     from graphslam.results.report_comparison import Comparison
     from graphslam.simulation import Scenario, ScenarioError, Simulation
+    from graphslam.slam.log_reader import Reading
 
     PathLike: TypeAlias = str | os.PathLike[str]
     Recording: TypeAlias = PathLike | Sequence[PathLike] | LogSet
@@ -156,31 +158,31 @@ def smooth(
     settled = _settle(recording, config, settings)
     if output is not None:
         check_target(Path(output), force=force)
-    opened = _open(recording, settled)
-    from graphslam.slam.smooth import smooth
+    ahead = _read_ahead(recording, settled)
+    with ahead or nullcontext():
+        # imported while the second process reads; what only that one needs is imported there
+        from graphslam.slam.smooth import smooth
 
-    log = opened()
-    if output is None:
-        return smooth(log, settled, _count(log, progress))
+        log = cast("LogSet", recording if ahead is None else ahead.receive())
+        if output is None:
+            return smooth(log, settled, _count(log, progress), ahead=ahead)
 
-    # what the second process needs is imported there
+        def read_truth() -> GroundTruth:
+            from graphslam.evaluation.ground_truth import truth_of_logs
 
-    def read_truth() -> GroundTruth:
-        from graphslam.evaluation.ground_truth import truth_of_logs
+            return truth_of_logs(log, settled)
 
-        return truth_of_logs(log, settled)
+        def render_report() -> str:
+            from graphslam.results.report import render
 
-    def render_report() -> str:
-        from graphslam.results.report import render
+            return render(result, errors)
 
-        return render(result, errors)
-
-    truth = Future(read_truth)
-    result = smooth(log, settled, _count(log, progress))
-    errors = _errors(result, truth.result())
-    report = Future(render_report)
-    save(result, Path(output), force=force, report=lambda _: report.result())
-    return result
+        truth = Future(read_truth)
+        result = smooth(log, settled, _count(log, progress), ahead=ahead)
+        errors = _errors(result, truth.result())
+        report = Future(render_report)
+        save(result, Path(output), force=force, report=lambda _: report.result())
+        return result
 
 
 def load_result(directory: PathLike) -> SavedResult:
@@ -385,6 +387,16 @@ def _open(recording: Recording, config: Config) -> Callable[[], LogSet]:
     if isinstance(recording, LogSet):
         return lambda: recording
     return Future(lambda: open_logs(_paths(recording), config)).result
+
+
+def _read_ahead(recording: Recording, config: Config) -> Reading | None:
+    """The logs and what follows in them, from the background; None if they are open already."""
+    from graphslam.logs import LogSet, open_logs
+    from graphslam.slam.log_reader import open_ahead
+
+    if isinstance(recording, LogSet):
+        return None
+    return open_ahead(lambda: open_logs(_paths(recording), config), config)
 
 
 def _count(log: LogSet, progress: Callable[[int, int], None] | None) -> Callable[[int], None]:

@@ -7,7 +7,7 @@ import gc
 import os
 import pickle
 import signal
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from contextlib import suppress
 from typing import Any, Generic, Self, TypeVar
 
@@ -126,17 +126,24 @@ class Companion(_Partner, Generic[_S, _T]):
 class Exchange(_Partner, Generic[_S, _T]):
     """A generator that works ahead: the items that it yields, and values sent to it meanwhile.
 
-    After each item the generator gets a value: what was sent before the next item is asked for,
-    else None. A caller that sends one as soon as it has received an item, and then works on the
-    item, lets both sides work at the same time. Without a second process, or if that one dies,
-    ``make`` is called here and gets the same values, so that the items are the same.
+    After each item the generator gets a value: those that were sent, in their order, and None where
+    none was sent before the next item is asked for. The generator works on while there are values
+    that it has not got: as many items ahead as values were sent ahead. Without a second process, or
+    if that one dies, ``make`` is called here and gets the same values, so that the items are the
+    same.
     """
 
-    def __init__(self, make: Callable[[], Generator[_T, _S | None, None]]) -> None:
-        """Begin with the first item. Items and values must be picklable."""
+    def __init__(
+        self, make: Callable[[], Generator[_T, _S | None, None]], first: Sequence[_S | None] = ()
+    ) -> None:
+        """Begin with the first item. Items and values must be picklable.
+
+        ``first`` are the values after the first items, which the generator need not wait for.
+        """
         self._make = make
         self._values: list[_S | None] = []
         self._taken = self._made = 0
+        self._ended = False
         self._generator: Generator[_T, _S | None, None] | None = None
 
         def serve(receive: Callable[[], _S | None], send: Callable[[tuple[_T, ...]], None]) -> None:
@@ -146,11 +153,15 @@ class Exchange(_Partner, Generic[_S, _T]):
                     send((generator.send(value),))
                     value = receive()
             send(())
+            while True:  # values that it did not wait for
+                receive()
 
         self._fork(serve)
+        for value in first:
+            self.send(value)
 
     def send(self, value: _S | None) -> None:
-        """What the generator gets for the latest item received; once for each."""
+        """What the generator gets after the first item for which there is no value yet."""
         self._values.append(value)
         if self.forked:
             try:
@@ -160,6 +171,8 @@ class Exchange(_Partner, Generic[_S, _T]):
 
     def receive(self) -> _T | None:
         """The next item; None after the last."""
+        if self._ended:
+            return None
         if len(self._values) < self._taken:
             self.send(None)
         if self.forked:
@@ -168,8 +181,12 @@ class Exchange(_Partner, Generic[_S, _T]):
             except DIED:
                 self.close()
             else:
-                self._taken += len(item)
-                return item[0] if item else None
+                if item:
+                    self._taken += 1
+                    return item[0]
+                self._ended = True
+                self.close()
+                return None
         return self._made_here()
 
     def _made_here(self) -> _T | None:

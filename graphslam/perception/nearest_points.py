@@ -45,17 +45,6 @@ class NearestPoints:
         of_label[label[cells[:, 0], cells[:, 1]]] = np.arange(len(points))
         return cls(of_label[label], low, cell_m)
 
-    def query(self, points: Array, reach_m: float, known: Array) -> tuple[IntArray, IntArray]:
-        """Neighbours of points (m, 2) within ``reach_m`` among those (n, 2) ``known`` to the grid.
-
-        Returns:
-            Indices (k,) of the points that have a neighbour, and of their neighbours (k,).
-        """
-        near = nearest_of_each([self], points.T[:, None])[0]
-        d = points - known[near]
-        found = np.flatnonzero((d * d).sum(axis=1) < reach_m * reach_m)
-        return found, near[found]
-
 
 def nearest_of_each(grids: Sequence[NearestPoints], points: Array) -> IntArray:
     """Numbers (n, m) of the points that are nearest to ``points`` (2, n, m), m in each of n grids.

@@ -1,15 +1,13 @@
 """What one pass over a log accumulates, whatever it does with the messages."""
 
-import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from graphslam.core.config import Config
 from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import rotate_cov
-from graphslam.core.records import KeyframeScan, Message, Sighting, Start, Step
+from graphslam.core.records import KeyframeScan, Sighting, Start, Step
 from graphslam.logs import LogSet
 from graphslam.logs.clock import Clock
 from graphslam.mapping.landmark_map import LandmarkMap
@@ -17,8 +15,9 @@ from graphslam.multi_robot.frame_tree import FrameAssignment
 from graphslam.multi_robot.frames import RobotFrames
 from graphslam.multi_robot.relative_frames import RobotEstimate
 from graphslam.odometry.interpolation import FrameTransforms
+from graphslam.slam.progress import Progress, counted, timed
 from graphslam.slam.recorded_closures import RecordedClosures
-from graphslam.slam.robot_settings import make_tracks, noted
+from graphslam.slam.robot_settings import make_tracks, with_noted_keyframes
 from graphslam.slam.robot_state import RobotState
 
 
@@ -39,20 +38,6 @@ class PriorKnowledge:
     alone: Mapping[str, RobotEstimate] = field(default_factory=dict)
 
 
-@contextmanager
-def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    """Adds the wall time of its body to a stage's."""
-    began = time.perf_counter()
-    yield
-    seconds[stage] += time.perf_counter() - began
-
-
-#: messages between two reports of progress
-REPORT_EVERY = 500
-
-Progress = Callable[[int], None]
-
-
 class LogPass:
     """The robots, landmarks and steps of one pass over a log, and its counts and times.
 
@@ -65,7 +50,7 @@ class LogPass:
     def __init__(self, log: LogSet, config: Config, known: PriorKnowledge) -> None:
         """Without states; keyframe settings noted in the log replace defaults of ``config``."""
         self.given_config = config
-        config = replace(config, keyframe=noted(config.keyframe, "keyframe", log.notes))
+        config = with_noted_keyframes(log, config)
         self.log, self.config, self.known = log, config, known
         self.runs = {
             name: RobotState(track, clock=known.clocks.get(name, Clock()))
@@ -126,12 +111,4 @@ class LogPass:
         return self.frames.transforms(tracks, self.landmarks.entries.values())
 
 
-def counted(
-    messages: Iterable[Message], counts: Counter[str], progress: Progress
-) -> Iterator[Message]:
-    """The messages, counted; ``progress`` gets their number now and then."""
-    for message in messages:
-        counts["messages"] += 1
-        if counts["messages"] % REPORT_EVERY == 0:
-            progress(counts["messages"])
-        yield message
+__all__ = ["LogPass", "PriorKnowledge", "Progress", "counted", "timed"]

@@ -28,6 +28,11 @@ def check_robots(log: LogSet, config: Config) -> None:
             raise ConfigError(f"robots.{name}: the log has no robot {name}, but {known}")
 
 
+def with_noted_keyframes(log: LogSet, config: Config) -> Config:
+    """The configuration; keyframe settings noted in the log replace its defaults."""
+    return replace(config, keyframe=noted(config.keyframe, "keyframe", log.notes))
+
+
 def make_tracks(log: LogSet, config: Config) -> dict[str, Track]:
     """An empty track for every robot of a log."""
     return {

@@ -33,14 +33,16 @@ from graphslam.perception.front_ends import observe_block
 from graphslam.perception.ordered_scan import Sweep, make_sweep, scan_points
 from graphslam.perception.scan_matching import make_submap
 from graphslam.slam.keyframes import KeyframeSelector
-from graphslam.slam.log_pass import counted, timed
-from graphslam.slam.robot_settings import make_tracks
+from graphslam.slam.progress import counted, timed
+from graphslam.slam.robot_settings import make_tracks, with_noted_keyframes
 from graphslam.slam.robot_state import RobotState
 from graphslam.slam.synchronisation import synchronise
 
 #: messages that are processed at once; the first blocks are smaller, as little is known of the
 #: calibration: each has twice as many as the one before
 BLOCK, FIRST_BLOCK = 2000, 100
+#: messages that are read while nobody waits for them, at most: some 20 MB
+READ_AHEAD = 8000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,19 +96,46 @@ class ReadLog:
     report: ReadReport
 
 
+@dataclass(frozen=True, slots=True)
+class ReadAhead:
+    """Nothing to work on: from here on the calibration is waited for."""
+
+
+ReadItem = KeyframeBlock | ReadLog | ReadAhead
+
+
 def read_keyframes(
-    log: LogSet, config: Config, robot: str
-) -> Generator[KeyframeBlock | ReadLog, Calibration | None, None]:
+    log: LogSet, config: Config, uncalibrated: int
+) -> Generator[LogSet | ReadItem, Calibration | None, None]:
     """The keyframes of the only robot of a log, and last a `ReadLog`.
 
-    What is sent is the calibration for later motions.
+    What is sent is the calibration for later motions. After ``uncalibrated`` blocks it is waited
+    for: before, some of what follows is read, then comes a `ReadAhead`.
     """
-    reader = _Reader(log, config, robot)
-    for block in reader.blocks():
+    reader = _Reader(log, with_noted_keyframes(log, config), log.robots[0])
+    for number, block in enumerate(reader.blocks(), 1):
         found = yield block
+        if number == uncalibrated:
+            reader.read_ahead()
+            found = yield ReadAhead()
         if found is not None:
             reader.run.track.calibration = found
     yield reader.read_log()
+
+
+class _Messages(Iterator[Message]):
+    """Messages, some of which may be read before they are wanted."""
+
+    def __init__(self, messages: Iterator[Message]) -> None:
+        self._messages = messages
+        self._held: deque[Message] = deque()
+
+    def read(self, count: int) -> None:
+        """Read this many, or all that are left."""
+        self._held.extend(itertools.islice(self._messages, count))
+
+    def __next__(self) -> Message:
+        return self._held.popleft() if self._held else next(self._messages)
 
 
 class _Reader:
@@ -125,6 +154,12 @@ class _Reader:
         self._removed_returns: Counter[str] = Counter()
         self._seconds: dict[str, float] = defaultdict(float)
         self._span_ns = 1 << 63, 0
+        self._messages = _Messages(iter(log.messages((Truth, TrueLandmark))))
+
+    def read_ahead(self) -> None:
+        """Read some of the messages that later blocks are made of."""
+        with timed(self._seconds, "read"):
+            self._messages.read(READ_AHEAD)
 
     def read_log(self) -> ReadLog:
         """What is known in the end."""
@@ -136,7 +171,7 @@ class _Reader:
     def blocks(self) -> Iterator[KeyframeBlock]:
         """The keyframes, by the latest calibration of the track."""
         track = self.run.track
-        read = counted(self._log.messages((Truth, TrueLandmark)), self._counts, lambda _count: None)
+        read = counted(self._messages, self._counts, lambda _count: None)
         max_gap_s = self._config.odometry.max_gap_s
         messages = synchronise(read, {self._robot: track}, max_gap_s, self._dropped)
         first_ns, size = 0, FIRST_BLOCK

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from graphslam.core.companion import Exchange
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array, compose, compose_cov, wrap
 from graphslam.core.motion_models import Calibration
@@ -25,7 +24,8 @@ from graphslam.odometry.online_calibration import (
 )
 from graphslam.odometry.preintegration import Track
 from graphslam.slam.log_pass import LogPass, PriorKnowledge, Progress, timed
-from graphslam.slam.scan_keyframes import KeyframeBlock, ReadLog, ScanKeyframe, read_keyframes
+from graphslam.slam.log_reader import Reading, read_ahead
+from graphslam.slam.scan_keyframes import KeyframeBlock, ReadLog, ScanKeyframe
 
 
 @dataclass(slots=True, eq=False)
@@ -98,17 +98,19 @@ class ScanLog(LogPass):
         self._tracker: LocalTracker | None = None
         self._anchor_m = 0.0
 
-    def run(self, progress: Progress) -> None:
-        """Take in every message of the log; ``progress`` gets the number of messages read."""
+    def run(self, progress: Progress, ahead: Reading | None = None) -> None:
+        """Take in every message of the log; ``progress`` gets the number of messages read.
+
+        ``ahead``: the keyframes, if they are read already.
+        """
         known: CalibrationEvidence | None = None
         calibration: Calibration | None = None
-        with Exchange(lambda: read_keyframes(self.log, self.config, self._robot)) as ahead:
-            while (item := ahead.receive()) is not None:
+        with ahead or read_ahead(self.log, self.given_config) as reading:
+            while (item := reading.receive()) is not None:
                 if isinstance(item, ReadLog):
                     self._finish(item, calibration)
+                if not isinstance(item, KeyframeBlock):
                     continue
-                # the next block is read with what is known before this one is tracked
-                ahead.send(calibration)
                 progress(item.messages)
                 began = time.perf_counter()
                 moved = self._track(item)
@@ -117,6 +119,8 @@ class ScanLog(LogPass):
                         found = self._evidence(item, moved)
                         known = found if known is None else known + found
                         calibration = calibration_from_evidence(known, item.prior)
+                # the next block is being read; this is for the one after it
+                reading.send(calibration)
                 if moved:
                     took = item.seconds + time.perf_counter() - began
                     self.step_ms += [1e3 * took / len(moved)] * len(moved)

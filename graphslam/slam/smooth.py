@@ -12,10 +12,11 @@ from graphslam.mapping.landmark_records import make_landmarks
 from graphslam.mapping.loop_closure import Tamper
 from graphslam.slam.initialisation import initialise
 from graphslam.slam.log_pass import Progress, timed
+from graphslam.slam.log_reader import Reading, is_scan_log
 from graphslam.slam.passes import FinishedPass, run_passes
 from graphslam.slam.pose_graph import is_pose_graph, solve_pose_graph
 from graphslam.slam.robot_settings import check_robots
-from graphslam.slam.scan_log import is_scan_log, solve_scan_log
+from graphslam.slam.scan_log import solve_scan_log
 from graphslam.slam.sighting_passes import run_sighting_passes
 from graphslam.slam.summary import summarise
 
@@ -28,6 +29,7 @@ def smooth(
     config: Config,
     progress: Progress = lambda _count: None,
     tamper: Tamper | None = None,
+    ahead: Reading | None = None,
 ) -> Result:
     """Estimate trajectories, landmarks and calibration from a log: the main function.
 
@@ -36,6 +38,7 @@ def smooth(
         config: settings.
         progress: called with the number of messages read so far.
         tamper: for tests, see `graphslam.slam.reoptimise_scans.Tamper`.
+        ahead: what `graphslam.slam.log_reader.open_ahead` gives after the log.
 
     Raises:
         LogError: no message of the log could be used.
@@ -49,7 +52,7 @@ def smooth(
     known = initialise(log, config)
     initialised = time.perf_counter()
     if is_scan_log(log, config):
-        finished: FinishedPass | None = solve_scan_log(log, config, known, progress, tamper)
+        finished: FinishedPass | None = solve_scan_log(log, config, known, progress, tamper, ahead)
     else:
         finished = run_sighting_passes(log, config, known, progress)
     finished = finished or run_passes(log, config, known, progress, tamper)

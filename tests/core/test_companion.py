@@ -112,6 +112,27 @@ def test_values_reach_the_generator_before_its_next_item(second):
     assert lines == [f"{EXPECTED} {second} {not second}"]
 
 
+@pytest.mark.parametrize("second", [True, False])
+def test_with_a_first_value_the_generator_is_an_item_ahead(second):
+    """Each value comes an item later, and the last one too late: it is not waited for, nor missed.
+    Breaks if the first value is lost, or if the second process ends before it is told to."""
+    lines = printed(
+        SUMS
+        + f"""
+worker.allow_fork(second={second})
+found = []
+with Exchange(sums, (0.5,)) as ahead:
+    while (item := ahead.receive()) is not None:
+        time.sleep(0.01)
+        ahead.send(10 ** item[0])
+        found.append(item[:2])
+    print(found, ahead.receive())
+"""
+    )
+    later = [(k, sum(10**j for j in range(k - 1)) + (0.5 if k else 0)) for k in range(6)]
+    assert lines == [f"{later} None"]
+
+
 @pytest.mark.parametrize("end", ["os._exit(0)", "os.kill(os.getpid(), 9)", "raise LookupError"])
 def test_a_generator_that_dies_is_repeated_here_with_the_same_values(end):
     """Breaks with an item that is lost, that comes twice, or that was made with other values."""

@@ -11,7 +11,6 @@ from graphslam.core.observation_arrays import ObservationArrays
 from graphslam.core.records import Observation, Scan
 from graphslam.perception.dynamic_objects import dynamic_returns, dynamic_returns_of_all
 from graphslam.perception.front_ends import FRONT_ENDS, observe_block
-from graphslam.perception.nearest_points import NearestPoints
 from graphslam.perception.ordered_scan import make_sweep, scan_points
 from graphslam.perception.scan_matching import fit, make_submap
 from graphslam.perception.scan_pairs import fit_pairs
@@ -110,21 +109,6 @@ def test_pairs_of_a_block_fit_as_each_pair_does(drive):
         share, _, cov = fit(maps[1], maps[0], true[k])
         assert abs(good.share[k] - share) < 0.1
         assert 0.5 < np.sqrt(good.cov[k, 2, 2] / cov[2, 2]) < 2.0
-
-
-def test_nearest_points_are_nearest_up_to_a_cell():
-    rng = np.random.default_rng(0)
-    known = rng.uniform(-3, 3, (200, 2))
-    asked = rng.uniform(-4, 4, (500, 2))
-    grid = NearestPoints.of(known, 0.05, 0.6)
-    found, near = grid.query(asked, 0.6, known)
-    distance = np.hypot(*(asked[:, None] - known).transpose(2, 0, 1))
-    least = distance.min(axis=1)
-    # a query and the nearest point are moved to their cells' middles, each by half a diagonal; the
-    # mask of the distance transform errs by 2 % of 0.6 m
-    np.testing.assert_array_less(distance[found, near], least[found] + 0.05 * np.sqrt(2) + 0.012)
-    assert set(np.flatnonzero(least < 0.5)) <= set(found)
-    assert least[found].max() < 0.6
 
 
 def test_observations_as_arrays_and_back():

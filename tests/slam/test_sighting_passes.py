@@ -8,6 +8,7 @@ import three_robots
 
 from graphslam.core import worker
 from graphslam.core.config_io import load_config
+from graphslam.core.geometry import wrap
 from graphslam.logs import open_logs
 from graphslam.slam.initialisation import initialise
 from graphslam.slam.sighting_passes import run_sighting_passes
@@ -46,15 +47,28 @@ def whole(log):
     return solved(log, *STARTS)
 
 
-def test_the_same_steps_as_while_reading_and_no_worse_an_estimate(log, whole):
-    """Both of the final and of the causal poses; a state or a sighting that is lost shows."""
+def difference_sigmas(a, b, which):
+    """Root mean square difference of the poses of all robots, in sigmas of each component."""
+    found = []
+    for robot, own in a.robots.items():
+        one, other = getattr(own, which), getattr(b.robots[robot], which)
+        off = one.poses - other.poses[other.index(one.stamps_ns)]
+        off[:, 2] = wrap(off[:, 2])
+        found.append(off / np.sqrt(np.diagonal(one.covs, axis1=1, axis2=2)))
+    return float(np.sqrt(np.mean(np.concatenate(found) ** 2)))
+
+
+def test_the_same_steps_as_while_reading_and_the_same_estimate(log, whole):
+    """A state or a sighting that is lost shows. What differs is where each stopped, and for causal
+    poses when it relinearised: final ones by 0.003 to 0.02 sigma, causal ones by 0.03 to 0.05, over
+    six draws of the log; twice the largest is allowed."""
     other = solved(log, *STARTS, backend="isam2")
     assert whole.summary["counts"] == other.summary["counts"]
     assert [(s.time_ns, set(s.motions), len(s.associations)) for s in whole.steps] == [
         (s.time_ns, set(s.motions), len(s.associations)) for s in other.steps
     ]
-    assert error_m(whole) < 1.05 * error_m(other)
-    assert error_m(whole, "causal") < 1.05 * error_m(other, "causal")
+    assert difference_sigmas(whole, other, "final") < 0.04
+    assert difference_sigmas(whole, other, "causal") < 0.1
     assert error_m(whole) < 0.7 * error_m(whole, "causal")
 
 

@@ -1,0 +1,32 @@
+"""How far a job is, and how long its stages take."""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+
+from graphslam.core.records import Message
+
+#: messages between two reports of progress
+REPORT_EVERY = 500
+
+Progress = Callable[[int], None]
+
+
+@contextmanager
+def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    """Adds the wall time of its body to a stage's."""
+    began = time.perf_counter()
+    yield
+    seconds[stage] += time.perf_counter() - began
+
+
+def counted(
+    messages: Iterable[Message], counts: Counter[str], progress: Progress
+) -> Iterator[Message]:
+    """The messages, counted; ``progress`` gets their number now and then."""
+    for message in messages:
+        counts["messages"] += 1
+        if counts["messages"] % REPORT_EVERY == 0:
+            progress(counts["messages"])
+        yield message
