@@ -456,7 +456,7 @@ def test_scans_without_beams_are_dropped_and_counted(tmp_path):
 
 
 def fail_with(error):
-    def smooth(*_arguments):
+    def smooth(*_arguments, **_more):
         raise error
 
     return smooth
