@@ -20,6 +20,7 @@ from graphslam.core.geometry import Array
 
 #: a time or times (...,), ns
 Stamps = int | Sequence[int] | np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
 # ---------------------------------------------------------------- messages of a log
 
@@ -290,19 +291,42 @@ class Trajectory:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class InformationRoot:
+    """Upper triangular root R of the information of an estimate: R'R, by cliques of its rows.
+
+    A row has entries in its own clique and in later rows only. From the last clique, which depends
+    on no other, to the first: ``above`` (C,) is the number of the clique whose rows begin what the
+    rows of this one depend on, -1 if there is none, and smaller than its own. ``own`` (C,) is how
+    many rows are its own; those of all cliques are numbered in this order. ``width`` (C,) is how
+    many rows of others it depends on, ``separators`` (sum of width,) which; ``values`` the dense
+    blocks (own, own + width), row by row. ``states[robot]`` (n,) is the first of the three rows of
+    each state. Errors are along the axes of each state's own frame, in the tangent space of its
+    pose, so that R is the same in every world frame.
+    """
+
+    above: IntArray
+    own: IntArray
+    width: IntArray
+    separators: IntArray
+    values: Array
+    states: Mapping[str, IntArray]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
     """The result of a back end: every state and every landmark, world frame.
 
     ``states[robot]`` is over the robot's states; ``landmarks[id]`` is (state, covariance): (2,)
     and (2, 2) for points, (3,) and (3, 3) for lines and segments, additive world-axis errors.
     ``error`` is half the weighted squared residual (robust weights applied), ``dof`` rows minus
-    unknowns.
+    unknowns. ``root`` has the covariance between any states; None where a back end has none.
     """
 
     states: Mapping[str, Trajectory]
     landmarks: Mapping[int, tuple[Array, Array]]
     error: float
     dof: int
+    root: InformationRoot | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -329,12 +353,41 @@ class Landmark:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class ScanTies:
+    """How the poses of a robot's scans follow from its states: (n,) each, in the scans' order.
+
+    A scan is ``share`` of the way, by motion, from state ``state`` to the next one; its sensor is
+    at ``mounts`` (n, 3) in the frame of the robot's states. ``covs`` (n, 3, 3) are of its error
+    between the two states, along the axes of the scan's own frame.
+    """
+
+    state: IntArray
+    share: Array
+    mounts: Array
+    covs: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointScans:
+    """What the joint covariance of all scans follows from.
+
+    ``states[robot]`` are final states, ``ties[robot]`` how the scans of the robot follow from them;
+    ``root`` is that of the information of the states.
+    """
+
+    root: InformationRoot
+    states: Mapping[str, Trajectory]
+    ties: Mapping[str, ScanTies]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class RobotResult:
     """One robot's trajectories: final (by all data) and causal (by data up to each pose's time).
 
     ``final`` and ``causal`` are poses of the base, ``scan_final`` and ``scan_causal`` poses of the
     laser at each scan (None without scans); the causal ones are None where they were not asked for.
-    ``dead_reckoning`` is the base by odometry alone, at the stamps of ``final``.
+    ``dead_reckoning`` is the base by odometry alone, at the stamps of ``final``. ``scan_ties`` are
+    of ``scan_final``; None where it does not follow from the final states.
     """
 
     final: Trajectory
@@ -342,6 +395,7 @@ class RobotResult:
     scan_final: Trajectory | None
     scan_causal: Trajectory | None
     dead_reckoning: Trajectory
+    scan_ties: ScanTies | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -31,11 +31,14 @@ def calibrate(
     tracks: Mapping[str, Track],
     robust: RobustConfig,
     rounds: int = ROUNDS,
+    *,
+    joint: bool = False,
 ) -> tuple[Estimate, tuple[Step, ...]]:
     """Solve for states, landmarks and calibrations together, ``rounds`` times.
 
     ``rebuild`` computes the steps again in every round, the first by ``estimate``. The calibration
-    of ``tracks`` is set to the one found. Returns the estimate and the steps behind it.
+    of ``tracks`` is set to the one found. Returns the estimate, with ``joint`` and the root of its
+    information, and the steps behind it.
 
     Raises:
         EstimationError: the estimate is indeterminate.
@@ -48,7 +51,9 @@ def calibrate(
         for track in tracks.values():
             track.calibration = track.calibration.held()
         steps = rebuild(estimate, last)
-        solved = solve_calibrated(steps, estimate, priors, initial, robust, rough=not last)
+        solved = solve_calibrated(
+            steps, estimate, priors, initial, robust, rough=not last, joint=joint and last
+        )
         estimate = solved.estimate
         for name, track in tracks.items():
             track.calibration = solved.calibrations[name]

@@ -19,7 +19,12 @@ from graphslam.core.motion_models import HELD_SIGMA, Calibration
 from graphslam.core.records import Estimate, Motion, Step
 from graphslam.estimation import factors
 from graphslam.estimation.backend import JointMarginal
-from graphslam.estimation.isam2 import CONVERGED_ERROR_ROUGH, marginals_of, with_means
+from graphslam.estimation.isam2 import (
+    CONVERGED_ERROR_ROUGH,
+    NO_COVARIANCES,
+    marginals_of,
+    with_means,
+)
 from graphslam.estimation.recorded_graph import RecordedGraph
 
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
@@ -36,6 +41,7 @@ def solve_calibrated(
     kernel: RobustConfig,
     *,
     rough: bool = False,
+    joint: bool = False,
 ) -> "CalibratedSolution":
     """Optimise all states, landmarks and calibrations together.
 
@@ -50,6 +56,7 @@ def solve_calibrated(
         now: robot -> the calibration that the motions were computed with.
         kernel: of observations.
         rough: stop early, see `Reoptimiser.solve`; covariances are NaN.
+        joint: whether the estimate is to have the root of the information.
 
     Raises:
         EstimationError: a covariance is not positive definite, or a state is unknown.
@@ -57,7 +64,8 @@ def solve_calibrated(
     problem = CalibrationGraph(steps, start, priors, now, kernel)
     problem.calibrate_motions(steps, now)
     converged = CONVERGED_ERROR_ROUGH if rough else CONVERGED_ERROR
-    return CalibratedSolution(*problem.solve(converged, marginals=not rough), problem)
+    found = problem.solve(converged, marginals=not rough, joint=joint)
+    return CalibratedSolution(*found, problem)
 
 
 class CalibrationGraph:
@@ -119,13 +127,14 @@ class CalibrationGraph:
                 graph.replace(index, gtsam.LinearContainerFactor(row, values))
 
     def solve(
-        self, converged: float, *, marginals: bool = False
+        self, converged: float, *, marginals: bool = False, joint: bool = False
     ) -> tuple[Estimate, dict[str, Calibration]]:
         """Optimise from the last solution; see `solve_calibrated`.
 
         Args:
             converged: relative decrease of the error at which it ends.
             marginals: whether covariances are wanted; else they are NaN.
+            joint: whether the root of the information is wanted beside them.
 
         Raises:
             EstimationError: the estimate is indeterminate.
@@ -134,16 +143,17 @@ class CalibrationGraph:
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setRelativeErrorTol(converged)
         parameters.setMaxIterations(50)
-        covs: dict[int, Array] = {}
+        found = NO_COVARIANCES
         try:
             values = gtsam.LevenbergMarquardtOptimizer(graph, self._values, parameters).optimize()
             if marginals:
-                covs = dict(marginals_of(graph, values).marginals)
+                found = marginals_of(graph, values, keep_rows=joint)
         except RuntimeError as error:
             raise builder.explain(error) from error
         self._values, self._marginals = values, None
+        covs = found.marginals
         means = with_means(values, builder.dims(), covs)
-        estimate = builder.estimate(means, float(graph.error(values)))
+        estimate = builder.estimate(means, float(graph.error(values)), found.rows)
         calibrations = {}
         for robot, prior in self._priors.items():
             mean, cov, use = prior.mean.copy(), prior.cov.copy(), self._free[robot]

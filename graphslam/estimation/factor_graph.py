@@ -31,12 +31,14 @@ from graphslam.estimation.backend import (
     StateTable,
     block_slices,
 )
+from graphslam.estimation.information_root import information_root
 from graphslam.estimation.input_checks import (
     describe,
     describe_motion,
     describe_start,
     indeterminate,
 )
+from graphslam.estimation.selected_inverse import CliqueRows
 
 #: current estimate of a variable, by its key and size
 Estimates = Callable[[int, int], Array]
@@ -289,11 +291,16 @@ class GraphBuilder:
             raise self.diagnose(graph, tree.calculateBestEstimate())
         return cov
 
-    def estimate(self, marginals: Mapping[int, tuple[Array, Array]], half_error: float) -> Estimate:
+    def estimate(
+        self,
+        marginals: Mapping[int, tuple[Array, Array]],
+        half_error: float,
+        rows: Sequence[CliqueRows] | None = None,
+    ) -> Estimate:
         """An `Estimate` of every state and landmark.
 
         ``marginals``: key -> mean and covariance, errors in body frames; ``half_error``: half the
-        weighted squared residual.
+        weighted squared residual; ``rows``: root of the information, if it is to be kept.
         """
         states, unknowns = {}, 0
         for robot in sorted(self.robots):
@@ -307,7 +314,9 @@ class GraphBuilder:
             mean, cov = marginals[factors.landmark_key(landmark)]
             landmarks[landmark] = (mean, rotate_cov(cov, mean[2]) if dim == 3 else cov)
             unknowns += dim
-        return Estimate(states, landmarks, half_error, self.rows - unknowns)
+        keys = {robot: self.state_keys(robot) for robot in states}
+        root = None if rows is None else information_root(rows, keys)
+        return Estimate(states, landmarks, half_error, self.rows - unknowns, root)
 
 
 @contextmanager

@@ -26,6 +26,8 @@ LINES_CONVERGED, MAX_LINE_ROUNDS, MAX_LINE_ROUNDS_ROBUST = 1e-6, 4, 2
 #: (reweighting converges linearly: beyond 1e-6 hundreds of iterations move nothing that shows); and
 #: where another round follows anyway
 CONVERGED_ERROR, CONVERGED_ERROR_ROBUST, CONVERGED_ERROR_ROUGH = 1e-10, 1e-6, 1e-3
+#: of an estimate that is only a start for another round
+NO_COVARIANCES = CovarianceBlocks({}, {})
 #: steps after which the interval between relinearisations has doubled, since each costs as much as
 #: there are steps
 INTERVAL_DOUBLES = 1000
@@ -245,7 +247,8 @@ class Isam2Backend(GraphBackend):
         """
         self._flush()
         if self._config.backend.optimise_at_end:
-            return self._result(self._optimised(self._isam.calculateBestEstimate()))
+            values = self._optimised(self._isam.calculateBestEstimate())
+            return self._result(values)
         return self._result(self._converged())
 
     def state_covariance(self, states: Sequence[tuple[str, int]]) -> Array:
@@ -258,12 +261,13 @@ class Isam2Backend(GraphBackend):
     def current_estimate(self) -> Estimate:
         """The tree's estimate, from which to optimise again: covariances are NaN."""
         self._flush()
-        return self._estimate(self._isam.calculateBestEstimate(), {})
+        return self._estimate(self._isam.calculateBestEstimate(), NO_COVARIANCES)
 
-    def _estimate(self, values: gtsam.Values, covs: Mapping[int, Array]) -> Estimate:
-        """The estimate with these marginal covariances; those that are missing are NaN."""
-        marginals = with_means(values, self._builder.dims(), covs)
-        return self._builder.estimate(marginals, float(self._builder.graph.error(values)))
+    def _estimate(self, values: gtsam.Values, found: CovarianceBlocks) -> Estimate:
+        """The estimate with these covariances; those that are missing are NaN."""
+        marginals = with_means(values, self._builder.dims(), found.marginals)
+        error = float(self._builder.graph.error(values))
+        return self._builder.estimate(marginals, error, found.rows)
 
     def _converged(self) -> gtsam.Values:
         nothing, no_values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -291,17 +295,19 @@ class Isam2Backend(GraphBackend):
             raise self._builder.explain(error) from error
         return values
 
-    def _marginals(self, values: gtsam.Values) -> Mapping[int, Array]:
-        """Marginal covariance of every key."""
+    def _covariances(self, values: gtsam.Values, *, joint: bool) -> CovarianceBlocks:
+        """Marginal covariance of every key, and with ``joint`` the root of the information."""
         try:
-            return marginals_of(self._builder.graph, values).marginals
+            return marginals_of(self._builder.graph, values, keep_rows=joint)
         except RuntimeError as error:
             raise self._builder.explain(error) from error
 
-    def _result(self, values: gtsam.Values, *, rough: bool = False) -> Estimate:
+    def _result(self, values: gtsam.Values, *, rough: bool = False, joint: bool = True) -> Estimate:
         self._finished = values
         self._joints.clear()
-        return self._estimate(values, {} if rough else self._marginals(values))
+        return self._estimate(
+            values, NO_COVARIANCES if rough else self._covariances(values, joint=joint)
+        )
 
 
 class Reoptimiser(Isam2Backend):
@@ -319,12 +325,15 @@ class Reoptimiser(Isam2Backend):
         self._finished = values
         self._size, self._rows = self._builder.graph.size(), self._builder.rows
 
-    def solve(self, closures: Iterable[Closure] = (), *, rough: bool = False) -> Estimate:
+    def solve(
+        self, closures: Iterable[Closure] = (), *, rough: bool = False, joint: bool = False
+    ) -> Estimate:
         """Optimise from the last solution.
 
         ``closures`` are in addition to those in the steps; those of the last call are removed.
         ``rough``: stop early, in a fraction of the time, as a start for another round; covariances
-        are NaN (`joint` and `state_covariance` have them).
+        are NaN (`joint` and `state_covariance` have them). ``joint``: whether the root of the
+        information is wanted too.
 
         Raises:
             EstimationError: the steps make the estimate indeterminate.
@@ -336,7 +345,7 @@ class Reoptimiser(Isam2Backend):
         builder.rows = self._rows
         builder.add_closures(closures)
         if not rough:
-            return self._result(self._optimised(values))
+            return self._result(self._optimised(values), joint=joint)
         try:
             builder.rebuild_lines(values)
             values = optimise(builder.graph, values, self._config.robust, CONVERGED_ERROR_ROUGH)
@@ -349,18 +358,21 @@ def marginals_of(
     graph: gtsam.NonlinearFactorGraph,
     values: gtsam.Values,
     pairs: Iterable[tuple[int, int]] = (),
+    *,
+    keep_rows: bool = False,
 ) -> CovarianceBlocks:
     """Covariances of all variables and of pairs of poses: by Cholesky, or by QR where that fails.
 
-    Errors are in body frames.
+    Errors are in body frames. ``keep_rows``: see `covariance_blocks`.
 
     Raises:
         RuntimeError: one is indeterminate.
     """
     try:
-        return covariance_blocks(graph.linearize(values), pairs)
+        return covariance_blocks(graph.linearize(values), pairs, keep_rows=keep_rows)
     except RuntimeError:
-        blocks = covariance_blocks(graph.linearize(values), pairs, use_qr=True)
+        linear = graph.linearize(values)
+        blocks = covariance_blocks(linear, pairs, use_qr=True, keep_rows=keep_rows)
         # QR does not fail on an indeterminate graph, its covariances are not finite
         if not all(np.isfinite(cov).all() for cov in blocks.marginals.values()):
             raise

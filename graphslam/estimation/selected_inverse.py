@@ -20,11 +20,30 @@ from graphslam.core.geometry import Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class CliqueRows:
+    """Rows of the root of some variables: block (n, n + m), m of the ``separator``'s dimensions.
+
+    ``own``: key -> dimension. ``above`` is the number of the clique that has the whole separator;
+    None without one.
+    """
+
+    own: Mapping[int, int]
+    separator: Sequence[int]
+    above: int | None
+    block: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class CovarianceBlocks:
-    """``marginals``: key -> (d, d) of every variable; ``joint``: two poses' keys -> (6, 6)."""
+    """``marginals``: key -> (d, d) of every variable; ``joint``: two poses' keys -> (6, 6).
+
+    ``rows``: the root of the information that they are of, from the last eliminated clique on; None
+    if it was not asked for.
+    """
 
     marginals: Mapping[int, Array]
     joint: Mapping[tuple[int, int], Array]
+    rows: tuple[CliqueRows, ...] | None = None
 
 
 def covariance_blocks(
@@ -32,6 +51,7 @@ def covariance_blocks(
     pairs: Iterable[tuple[int, int]] = (),
     *,
     use_qr: bool = False,
+    keep_rows: bool = False,
 ) -> CovarianceBlocks:
     """Covariances of all variables of a linear graph, and joint ones of ``pairs`` of poses.
 
@@ -40,6 +60,7 @@ def covariance_blocks(
         pairs: keys of two different poses each.
         use_qr: eliminate by QR, slower than Cholesky, but precise where information spans many
             orders of magnitude.
+        keep_rows: whether to return the root too.
 
     Raises:
         RuntimeError: the graph is indeterminate (by QR: covariances are not finite instead).
@@ -60,9 +81,13 @@ def covariance_blocks(
         pairs_in[max(clique_of[a], clique_of[b])].append((a, b))
     marginals: dict[int, Array] = {}
     joint: dict[tuple[int, int], Array] = {}
+    rows: list[CliqueRows] = []
     for number, clique in enumerate(cliques):
         above = None if clique.above is None else cliques[clique.above]
-        cov = clique.invert(above)
+        cov, block = clique.invert(above)
+        if keep_rows:
+            own = {key: clique.rows[key].stop - clique.rows[key].start for key in clique.own}
+            rows.append(CliqueRows(own, clique.separator, clique.above, block))
         for key in clique.own:
             marginals[key] = cov[clique.rows[key], clique.rows[key]]
         for a, b in pairs_in[number]:
@@ -70,7 +95,7 @@ def covariance_blocks(
             joint[a, b] = cov[np.ix_(which, which)]
         if above is not None:
             above.release()
-    return CovarianceBlocks(marginals, joint)
+    return CovarianceBlocks(marginals, joint, tuple(rows) if keep_rows else None)
 
 
 def _empty_factor(a: int, b: int) -> gtsam.JacobianFactor:
@@ -101,8 +126,11 @@ class _Clique:
         rows = self.rows
         return [row for key in keys for row in range(rows[key].start, rows[key].stop)]
 
-    def invert(self, above: "_Clique | None") -> Array:
-        """Covariance of the own variables and then the separator; kept while it is needed."""
+    def invert(self, above: "_Clique | None") -> tuple[Array, Array]:
+        """Covariance of the own variables and then the separator; kept while it is needed.
+
+        Also the rows (n, n + m) of the root that it is made of.
+        """
         end = 0
         for key, conditional in zip(self.own, self.conditionals, strict=True):
             self.rows[key] = slice(end, end := end + conditional.R().shape[0])
@@ -114,7 +142,8 @@ class _Clique:
             for key in self.separator:
                 rows = above.rows[key]
                 self.rows[key] = slice(end, end := end + rows.stop - rows.start)
-        root, rest = self._square_root(own, end)
+        block = self._square_root(own, end)
+        root, rest = block[:, :own], block[:, own:]
         inverse, singular = dtrtri(root)
         if singular:
             inverse = np.full((own, own), np.nan)
@@ -127,18 +156,18 @@ class _Clique:
         cov[own:, own:] = joint
         if self.below:
             self._cov = cov
-        return cov
+        return cov, block
 
-    def _square_root(self, own: int, end: int) -> tuple[Array, Array]:
+    def _square_root(self, own: int, end: int) -> Array:
         """Rows of the own variables: upper triangular (n, n), and (n, m) of the separator."""
         if len(self.own) == 1:
-            return self.conditionals[0].R(), self.conditionals[0].S()
+            return np.hstack([self.conditionals[0].R(), self.conditionals[0].S()])
         R = np.zeros((own, end))
         for key, conditional in zip(self.own, self.conditionals, strict=True):
             rows, (_, *others) = self.rows[key], conditional.keys()
             R[rows, rows] = conditional.R()
             R[rows, self.indices(others)] = conditional.S()
-        return R[:, :own], R[:, own:]
+        return R
 
     def release(self) -> None:
         """One clique less needs the covariance."""

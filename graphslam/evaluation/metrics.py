@@ -14,6 +14,7 @@ from graphslam.evaluation.landmark_metrics import landmark_metrics
 from graphslam.evaluation.relation_metrics import Relations, find_stamps, relation_metrics
 from graphslam.evaluation.trajectory_metrics import PosePairs, pair_poses, trajectory_metrics
 from graphslam.results.folder import SavedResult
+from graphslam.results.joint_file import joint_scans
 
 #: numbers that are undefined for a robot whose place in the world frame is unknown
 _WORLD_METRICS = dict.fromkeys(
@@ -106,14 +107,20 @@ def _compare_trajectories(
 def _compare_relations(result: Result | SavedResult, relations: Relations) -> dict[str, Any]:
     """``relations`` of `evaluate`."""
     scans = [
-        (robot.scan_final, robot.scan_causal)
-        for robot in result.robots.values()
+        (name, robot.scan_final, robot.scan_causal)
+        for name, robot in result.robots.items()
         if robot.scan_final is not None
     ]
     if not scans:
         raise OutputError("relations need the poses of scans, and this result has none")
-    final, causal = max(
-        scans, key=lambda both: int(find_stamps(relations.from_ns, both[0].stamps_ns)[1].sum())
+    name, final, causal = max(
+        scans, key=lambda one: int(find_stamps(relations.from_ns, one[1].stamps_ns)[1].sum())
     )
-    found = relation_metrics(relations, final)
+    if isinstance(result, SavedResult):
+        joint = result.joint
+    else:
+        joint = joint_scans(result.estimate, result.robots)
+    if joint is not None and name not in joint.ties:
+        joint = None
+    found = relation_metrics(relations, final, joint, name)
     return found if causal is None else {**found, "causal": relation_metrics(relations, causal)}

@@ -16,6 +16,7 @@ from graphslam.mapping.landmark_map import LandmarkMap
 from graphslam.mapping.landmark_records import make_landmarks
 from graphslam.odometry.interpolation import FrameTransforms
 from graphslam.results.folder import SavedResult, SavedRobot
+from graphslam.results.joint_file import joint_scans
 from graphslam.slam.initialisation import initialise
 from graphslam.slam.log_pass import Progress
 from graphslam.slam.pipeline import Pipeline
@@ -68,17 +69,17 @@ class RecordedSteps:
             for name, run in self.runs.items()
         }
         causal_only = all(run.is_causal(done.estimate.states[name]) for name, run in runs.items())
-        robots = {}
-        for name, run in runs.items():
-            found = run.result(
-                estimate.states[name], run.causal(self.start), causal_only=causal_only
-            )
-            robots[name] = SavedRobot(
-                found.final, found.causal, found.scan_final, found.scan_causal
-            )
+        found = {
+            name: run.result(estimate.states[name], run.causal(self.start), causal_only=causal_only)
+            for name, run in runs.items()
+        }
+        robots = {
+            name: SavedRobot(own.final, own.causal, own.scan_final, own.scan_causal)
+            for name, own in found.items()
+        }
         moved = self.landmarks.transformed(self.worlds.landmarks)
         landmarks = make_landmarks(moved, estimate)
-        return SavedResult(robots, landmarks, {}, config)
+        return SavedResult(robots, landmarks, {}, config, joint_scans(estimate, found))
 
 
 def record_steps(

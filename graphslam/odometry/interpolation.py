@@ -2,11 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from graphslam.core.geometry import (
     Array,
+    adjoint,
     between,
     compose,
     compose_cov,
@@ -19,7 +21,7 @@ from graphslam.core.geometry import (
     transform,
 )
 from graphslam.core.motion_models import Calibration
-from graphslam.core.records import Estimate, Start, Step, Trajectory
+from graphslam.core.records import Estimate, ScanTies, Start, Step, Trajectory
 from graphslam.odometry.preintegration import Track
 
 IntArray = np.ndarray[tuple[int], np.dtype[np.int64]]
@@ -50,6 +52,38 @@ def causal_at(
     return Trajectory(stamps_ns, compose(states.poses[i], delta), covs)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Interval:
+    """Times (n,) between two states, and the odometry: from the first to them, and all of it.
+
+    ``inside``: whether there is a second state. ``share`` of the motion that is driven; 0 if not.
+    """
+
+    before: IntArray
+    following: IntArray
+    inside: np.ndarray[Any, np.dtype[np.bool_]]
+    share: Array
+    delta: Array
+    noise: Array
+    whole: Array
+    whole_noise: Array
+
+    @classmethod
+    def of(cls, states: Trajectory, track: Track, times_ns: IntArray) -> "_Interval":
+        at, known = states.stamps_ns, [track.used_calibration]
+        i = states.index_before(times_ns)
+        following = np.minimum(i + 1, len(at) - 1)
+        same = np.zeros(len(i), dtype=np.int64)
+        delta, noise = track.coarse_motions(at[i], times_ns, known, same)
+        whole, whole_noise = track.coarse_motions(at[i], at[following], known, same)
+        inside = following > i
+        effort = track.effort(at)
+        driven = np.where(inside, effort[following] - effort[i], 0.0)
+        share = (track.effort(times_ns) - effort[i]) / np.where(driven > 0, driven, 1.0)
+        share = np.clip(np.where(driven > 0, share, 0.0), 0.0, 1.0)
+        return cls(i, following, inside, share, delta, noise, whole, whole_noise)
+
+
 def final_at(
     states: Trajectory, track: Track, times_ns: IntArray, stamps_ns: IntArray
 ) -> Trajectory:
@@ -64,18 +98,14 @@ def final_at(
         times_ns: (n,) when.
         stamps_ns: (n,) what the result is stamped with.
     """
-    at, known = states.stamps_ns, [track.used_calibration]
-    i = states.index_before(times_ns)
-    following = np.minimum(i + 1, len(at) - 1)
-    same = np.zeros(len(i), dtype=np.int64)
-    delta, noise = track.coarse_motions(at[i], times_ns, known, same)
-    whole, whole_noise = track.coarse_motions(at[i], at[following], known, same)
-    inside = following > i
-    effort = track.effort(at)
-    driven = np.where(inside, effort[following] - effort[i], 0.0)
-    share = (track.effort(times_ns) - effort[i]) / np.where(driven > 0, driven, 1.0)
-    share = np.clip(np.where(driven > 0, share, 0.0), 0.0, 1.0)
-    miss = log(between(compose(states.poses[i], whole), states.poses[following]))
+    return _final(states, _Interval.of(states, track, times_ns), stamps_ns)
+
+
+def _final(states: Trajectory, interval: _Interval, stamps_ns: IntArray) -> Trajectory:
+    i, following, inside = interval.before, interval.following, interval.inside
+    delta, noise, whole_noise = interval.delta, interval.noise, interval.whole_noise
+    share = interval.share
+    miss = log(between(compose(states.poses[i], interval.whole), states.poses[following]))
     poses = compose(states.poses[i], delta)
     poses = compose(poses, exp(share[:, None] * np.where(inside[:, None], miss, 0.0)))
     F, _ = compose_jacobians(states.poses[i], between(states.poses[i], poses))
@@ -88,6 +118,35 @@ def final_at(
     )
     beyond = propagated + turn @ noise @ turn.mT
     return Trajectory(stamps_ns, poses, np.where(inside[:, None, None], bridge, beyond))
+
+
+def final_scans(
+    states: Trajectory, track: Track, times_ns: IntArray, stamps_ns: IntArray, mounts: Array
+) -> tuple[Trajectory, ScanTies]:
+    """Poses of the states' frame at scans, see `final_at`, and how those of the scans follow.
+
+    Given both states, the error between them is that of odometry: s (1 - s) of its covariance over
+    the whole interval. After the last state it is that of the odometry since.
+
+    Args:
+        states: the states, stamped with their times.
+        track: the robot's odometry, its calibration the final one.
+        times_ns: (n,) of the scans.
+        stamps_ns: (n,) what the result is stamped with.
+        mounts: (n, 3) of the scans' sensors in the frame of the states.
+    """
+    interval = _Interval.of(states, track, times_ns)
+    final = _final(states, interval, stamps_ns)
+    i, share = interval.before, interval.share
+    noise = np.where(
+        interval.inside[:, None, None],
+        (share * (1 - share))[:, None, None] * interval.whole_noise,
+        interval.noise,
+    )
+    # from the axes of the state before to those of the robot at the scan, then about the sensor
+    noise = rotate_cov(noise, states.poses[i, 2] - final.poses[:, 2])
+    J = adjoint(inverse(mounts))
+    return final, ScanTies(i, share, mounts, J @ noise @ J.mT)
 
 
 def trajectory_of_mount(base: Trajectory, mounts: Array) -> Trajectory:
@@ -119,7 +178,7 @@ class FrameTransforms:
             M = rotation3(world[2])[: len(mean), : len(mean)]
             moved = compose(world, mean) if len(mean) == 3 else transform(world, mean)
             landmarks[number] = (moved, M @ cov @ M.T)
-        return Estimate(states, landmarks, estimate.error, estimate.dof)
+        return replace(estimate, states=states, landmarks=landmarks)
 
     def step(self, step: Step) -> Step:
         """The step with its starts in the new frame."""

@@ -1,8 +1,8 @@
 """The result folder: written atomically, and read back.
 
 The layout is documented in docs/formats.md: summary.json, config.toml, trajectories/,
-landmarks.json, graph.g2o (with graph_ids.csv naming its vertices) and report.html. The formats of
-the files are in `file_formats`.
+landmarks.json, graph.g2o (with graph_ids.csv naming its vertices), joint.npz where there are scans,
+and report.html. The formats of the files are in `file_formats` and `joint_file`.
 """
 
 import json
@@ -17,7 +17,7 @@ from graphslam.core.config import Config
 from graphslam.core.config_io import dump_config, load_config
 from graphslam.core.errors import OutputError
 from graphslam.core.output_folder import atomic_folder
-from graphslam.core.records import Landmark, Result, RobotResult, Trajectory
+from graphslam.core.records import JointScans, Landmark, Result, RobotResult, Trajectory
 from graphslam.core.worker import parallel_map
 from graphslam.estimation.g2o import graph_g2o, graph_ids
 from graphslam.results.file_formats import (
@@ -29,6 +29,7 @@ from graphslam.results.file_formats import (
     to_json,
     tum_text,
 )
+from graphslam.results.joint_file import joint_bytes, joint_scans, read_joint
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,13 +47,16 @@ class SavedRobot:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SavedResult:
-    """A result folder read back."""
+    """A result folder read back; ``joint`` is None where nothing tells how scans are correlated."""
 
     robots: Mapping[str, SavedRobot]
     landmarks: tuple[Landmark, ...]
     summary: Mapping[str, Any]
     config: Config
+    joint: JointScans | None = None
 
+
+JOINT_FILE = "joint.npz"
 
 # ---------------------------------------------------------------- writing
 
@@ -108,22 +112,22 @@ def save(
     write_folder(directory, _files(result, report))
 
 
-def write_folder(directory: Path, files: Sequence[tuple[str, str]]) -> None:
-    """Write files (name, text) as a folder that appears whole or not at all.
+def write_folder(directory: Path, files: Sequence[tuple[str, str | bytes]]) -> None:
+    """Write files (name, content) as a folder that appears whole or not at all.
 
     Raises:
         OutputError: the disk cannot be written; no partial output is left.
     """
     with atomic_folder(directory) as part:
-        for name, text in files:
+        for name, content in files:
             path = part / name
             path.parent.mkdir(exist_ok=True)
-            path.write_text(text, encoding="utf-8")
+            path.write_bytes(content if isinstance(content, bytes) else content.encode())
 
 
-def _files(result: Result, report: Callable[[Result], str] | None) -> list[tuple[str, str]]:
+def _files(result: Result, report: Callable[[Result], str] | None) -> list[tuple[str, str | bytes]]:
     """Names and contents of every file of the folder."""
-    files = [
+    files: list[tuple[str, str | bytes]] = [
         ("summary.json", to_json(result.summary, "summary.json")),
         ("config.toml", dump_config(result.config)),
         (
@@ -135,6 +139,9 @@ def _files(result: Result, report: Callable[[Result], str] | None) -> list[tuple
     ]
     for own in parallel_map(_trajectory_files, list(result.robots.items())):
         files += own
+    joint = joint_scans(result.estimate, result.robots)
+    if joint is not None:
+        files.append((JOINT_FILE, joint_bytes(joint)))
     if report is not None:
         files.append(("report.html", report(result)))
     return files
@@ -197,6 +204,7 @@ def load(directory: Path) -> SavedResult:
         read_landmarks(directory / "landmarks.json"),
         read_json(directory / "summary.json"),
         load_config(directory / "config.toml"),
+        read_joint(directory / JOINT_FILE) if (directory / JOINT_FILE).exists() else None,
     )
 
 

@@ -42,6 +42,10 @@ def converted(convert: Callable[[Any], object], *keys: str) -> Callable[[Mapping
     return found
 
 
+def _percent(share: float) -> float:
+    return 100.0 * share
+
+
 def _interval(bounds: Sequence[float]) -> str:
     return f"{bounds[0]:.3f}…{bounds[1]:.3f}"
 
@@ -57,7 +61,7 @@ def trajectory_columns(*at: str) -> tuple[Column, ...]:
         Column("RPE 10 m, m", value_at(*at, "rpe", "10_m", "trans_rmse_m")),
         Column("NEES/dof", value_at(*at, "nees_per_dof"), 1.0),
         Column("95 % bounds", converted(_interval, *at, "nees_bounds"), None),
-        Column("coverage, %", converted(lambda share: 100.0 * share, *at, "coverage"), 95.0),
+        Column("coverage, %", converted(_percent, *at, "coverage"), 95.0),
     )
 
 
@@ -82,6 +86,12 @@ _RELATION_COLUMNS = tuple(
         ("median, m", "trans_median_m"),
         ("mean, °", "rot_mean_deg"),
         ("std, °", "rot_std_deg"),
+    )
+) + tuple(
+    Column(head, converted(_percent, key), 95.0)
+    for head, key in (
+        ("in 95 % (m), %", "trans_inside"),
+        ("in 95 % (°), %", "rot_inside"),
     )
 )
 

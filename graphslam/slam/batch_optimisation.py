@@ -84,7 +84,9 @@ def _solve(
         track.calibration = track.calibration.held()
     made = recompute_motions(steps, tracks)
     made = scale_motion_noise(made, noise_scales(made, start))
-    solution = solve_calibrated(made, start, priors, initial, config.robust, rough=rough)
+    solution = solve_calibrated(
+        made, start, priors, initial, config.robust, rough=rough, joint=not rough
+    )
     for name, track in tracks.items():
         track.calibration = solution.calibrations[name]
     return _Solved(made, solution)

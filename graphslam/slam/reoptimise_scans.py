@@ -123,9 +123,9 @@ def reoptimise_scan_log(
             made = recompute_motions(closed, tracks)
             return scale_motion_noise(made, noise_scales(made, estimate))
 
-        estimate, steps = calibrate(rebuild, estimate, tracks, config.robust)
+        estimate, steps = calibrate(rebuild, estimate, tracks, config.robust, joint=True)
     else:
-        estimate = solve(steps, estimate, closures, rough=False)
+        estimate = solve(steps, estimate, closures, rough=False, joint=True)
         steps = with_closures(steps, closures)
     landmarks.update_from(steps, estimate)
     return estimate, steps, counts
@@ -145,11 +145,12 @@ class Solver:
         closures: Sequence[Closure] = (),
         *,
         rough: bool = True,
+        joint: bool = False,
     ) -> Estimate:
         """The estimate; the graph stays as long as steps are the same and go on from the last."""
         if self._solved is None or self._solved[0] is not steps or self._solved[1] is not start:
             self.backend = Reoptimiser(self._config, steps, start)
-        estimate = self.backend.solve(closures, rough=rough)
+        estimate = self.backend.solve(closures, rough=rough, joint=joint)
         self._solved = steps, estimate
         return estimate
 

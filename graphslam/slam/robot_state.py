@@ -13,6 +13,7 @@ from graphslam.odometry.interpolation import (
     IntArray,
     causal_at,
     final_at,
+    final_scans,
     origin_shift,
     trajectory_of_mount,
     transform_trajectory,
@@ -126,7 +127,11 @@ class RobotState:
                 that revises no state does not revise the motion between states either.
         """
         stamps, times, laser = self._report_times()
-        final = final_at(states, self.track, times, stamps)
+        ties = None
+        if self.scans:
+            final, ties = final_scans(states, self.track, times, stamps, laser)
+        else:
+            final = final_at(states, self.track, times, stamps)
         base = trajectory_of_mount(final, inverse(self.track.mount))
         at_start = compose(states.poses[0], inverse(self.track.mount))
         odometry = between(self.track.pose(self.times[0]), self.track.pose(times))
@@ -136,8 +141,8 @@ class RobotState:
             return RobotResult(causal.base, causal.base, causal.scan, causal.scan, by_odometry)
         scan = trajectory_of_mount(final, laser) if self.scans else None
         if causal is None:
-            return RobotResult(base, None, scan, None, by_odometry)
-        return RobotResult(base, causal.base, scan, causal.scan, by_odometry)
+            return RobotResult(base, None, scan, None, by_odometry, ties)
+        return RobotResult(base, causal.base, scan, causal.scan, by_odometry, ties)
 
     def _report_times(self) -> tuple[IntArray, IntArray, Array]:
         """Stamps (n,), times (n,) and, for scans, laser mounts (n, 3), sorted by stamp."""

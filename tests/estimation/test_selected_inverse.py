@@ -1,9 +1,10 @@
-"""Covariances by selected inversion: those of GTSAM, variable by variable, for any graph."""
+"""Covariances by selected inversion, and between any poses: those of GTSAM, for any graph."""
 
 import gtsam
 import numpy as np
 import pytest
 
+from graphslam.estimation.information_root import information_root, pair_covariances
 from graphslam.estimation.isam2 import marginals_of
 from graphslam.estimation.selected_inverse import covariance_blocks
 
@@ -77,3 +78,47 @@ def test_an_indeterminate_variable_is_an_error_not_a_number():
         marginals_of(graph, values)
     graph.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(), noise))
     assert set(marginals_of(graph, values).marginals) == {0, 1}
+
+
+def root_and_inverse(seed):
+    """The root of the mixed graph's poses, numbers of their rows, and its dense inverse."""
+    graph, _ = mixed_graph(seed)
+    ordering = gtsam.Ordering()
+    for key in sorted(graph.keyVector()):
+        ordering.push_back(key)
+    P = np.linalg.inv(graph.hessian(ordering)[0])
+    rows = covariance_blocks(graph, keep_rows=True).rows
+    # the poses come first among the keys
+    root = information_root(rows, {"a": range(POSES // 2), "b": range(POSES // 2, POSES)})
+    return root, P[: 3 * POSES, : 3 * POSES].reshape(POSES, 3, POSES, 3).swapaxes(1, 2)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_joint_covariances_of_any_poses_are_those_of_the_inverse(seed):
+    """Of single poses and of sums of two neighbours, in pairs near and far, equal and repeated, in
+    two components that have nothing in common."""
+    rng = np.random.default_rng(seed)
+    root, P = root_and_inverse(seed)
+    first = np.concatenate([root.states["a"], root.states["b"]])
+    states = np.column_stack([np.arange(POSES), np.minimum(np.arange(POSES) + 1, POSES - 1)])
+    states[POSES // 2 - 1, 1] = POSES // 2 - 1  # the next one is of the other component
+    states = states[rng.choice(POSES, 40, replace=False)]
+    maps = rng.normal(size=(len(states), 2, 3, 3))
+    maps[::3, 1] = 0.0
+    pairs = rng.integers(len(states), size=(100, 2))
+    pairs[:2] = [[3, 3], [7, 7]]
+    own, cross = pair_covariances(root, first[states], maps, pairs)
+    near, far = states[:, None, :, None], states[None, :, None, :]
+    expected = np.einsum("akij,abkhjl,bhml->abim", maps, P[near, far], maps)
+    scale = np.abs(expected).max()
+    each = np.arange(len(states))
+    np.testing.assert_allclose(own, expected[each, each], atol=1e-9 * scale)
+    np.testing.assert_allclose(cross, expected[pairs[:, 0], pairs[:, 1]], atol=1e-9 * scale)
+
+
+def test_what_no_pose_depends_on_is_left_out():
+    """Points that are eliminated first take no part in the covariance of poses."""
+    root, _ = root_and_inverse(0)
+    assert len(root.own) == len(root.above) == len(root.width)
+    assert 3 * POSES <= root.own.sum() < 3 * POSES + 2 * POINTS + 4
+    assert len(root.values) == (root.own * (root.own + root.width)).sum()

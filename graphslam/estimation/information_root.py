@@ -1,0 +1,159 @@
+"""The joint covariance of any poses, from the square root of the information of a whole graph.
+
+The root of a graph of n states is sparse, their joint covariance of n² blocks is not. So the root
+is kept, and the blocks that are asked for are computed from it: with R'R the information, the
+covariance of two linear combinations E'x and F'x is (R'⁻¹E)'(R'⁻¹F), and a column of R'⁻¹E has
+entries only in the cliques from that of its variable up to the last one. M. Kaess and F. Dellaert,
+Covariance recovery from a square root information matrix, RAS 57, 2009, DOI
+10.1016/j.robot.2009.06.008.
+"""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.linalg.lapack import dtrtrs
+
+from graphslam.core.geometry import Array
+from graphslam.core.records import InformationRoot, IntArray
+from graphslam.estimation.selected_inverse import CliqueRows
+
+#: numbers (float64) that are gathered at a time
+_CHUNK = 4_000_000
+
+
+def information_root(
+    cliques: Sequence[CliqueRows], states: Mapping[str, Sequence[int]]
+) -> InformationRoot:
+    """The root as arrays, without cliques on which no state depends.
+
+    Args:
+        cliques: from the last one on, each after the one above it.
+        states: robot -> keys of its states.
+    """
+    state_keys = {key for keys in states.values() for key in keys}
+    needed = [not state_keys.isdisjoint(clique.own) for clique in cliques]
+    for n in reversed(range(len(cliques))):
+        above = cliques[n].above
+        if needed[n] and above is not None:
+            needed[above] = True
+    kept = [clique for clique, is_needed in zip(cliques, needed, strict=True) if is_needed]
+    number = np.cumsum(needed) - 1
+    rows: dict[int, range] = {}
+    end = 0
+    aboves, owns, widths = [], [], []
+    separators: list[int] = []
+    for clique in kept:
+        begin = end
+        for key, dim in clique.own.items():
+            rows[key] = range(end, end := end + dim)
+        aboves.append(-1 if clique.above is None else int(number[clique.above]))
+        owns.append(end - begin)
+        widths.append(clique.block.shape[1] - owns[-1])
+        for key in clique.separator:
+            separators.extend(rows[key])
+    blocks = [clique.block.ravel() for clique in kept]
+    return InformationRoot(
+        np.array(aboves, dtype=np.int64),
+        np.array(owns, dtype=np.int64),
+        np.array(widths, dtype=np.int64),
+        np.array(separators, dtype=np.int64),
+        np.concatenate(blocks) if blocks else np.zeros(0),
+        {
+            robot: np.array([rows[key].start for key in keys], dtype=np.int64)
+            for robot, keys in states.items()
+        },
+    )
+
+
+def pair_covariances(
+    root: InformationRoot, rows: IntArray, maps: Array, pairs: IntArray
+) -> tuple[Array, Array]:
+    """Covariances of quantities that are linear in states, and between pairs of them.
+
+    The time is that of a forward substitution for each quantity along its cliques: with n
+    quantities of a graph whose cliques are as wide as w and d deep about n d w².
+
+    Args:
+        root: of the graph.
+        rows: (n, k) first rows of the k states that each quantity depends on.
+        maps: (n, k, 3, 3) its derivatives by their errors.
+        pairs: (p, 2) numbers of quantities.
+
+    Returns:
+        (n, 3, 3) of each with itself, (p, 3, 3) of the first of each pair with the second.
+    """
+    starts = np.concatenate([[0], np.cumsum(root.own)])
+    widths = np.concatenate([[0], np.cumsum(root.width)])
+    values = np.concatenate([[0], np.cumsum(root.own * (root.own + root.width))])
+    at = np.searchsorted(starts, rows, side="right") - 1  # (n, k) cliques
+    entering = _by_clique(at)
+    meeting = _by_clique(_first_common(root.above, at.max(axis=1), pairs)[:, None])
+    own_cov, cross = np.zeros((len(rows), 3, 3)), np.zeros((len(pairs), 3, 3))
+    below: dict[int, list[tuple[IntArray, IntArray, IntArray, Array]]] = defaultdict(list)
+    place = np.empty(len(rows), dtype=np.int64)
+    for c in reversed(range(len(root.own))):
+        n, m = int(root.own[c]), int(root.width[c])
+        parts, new = below.pop(c, []), entering.get(c)
+        if not parts and new is None:
+            continue
+        use = np.unique(
+            np.concatenate([part[0] for part in parts] + ([] if new is None else [new]))
+        )
+        active = np.concatenate([meeting.get(c, _NONE), *(part[1] for part in parts)])
+        place[use] = np.arange(len(use))
+        # the right sides: what is left of those from below, and what enters here
+        separator = root.separators[widths[c] : widths[c + 1]]
+        columns = np.concatenate([np.arange(starts[c], starts[c + 1]), separator])
+        b = np.zeros((n + m, len(use), 3))
+        for queries, _, part_rows, rest in parts:
+            b[np.ix_(_places(columns, part_rows), place[queries])] += rest
+        if new is not None:
+            for q, k in zip(*np.nonzero(at[new] == c), strict=True):
+                begin = int(rows[new[q], k] - starts[c])
+                b[begin : begin + 3, place[new[q]]] += maps[new[q], k].T
+        block = root.values[values[c] : values[c + 1]].reshape(n, n + m)
+        y, _ = dtrtrs(block[:, :n], b[:n].reshape(n, 3 * len(use)), trans=1)
+        rest = (b[n:].reshape(m, 3 * len(use)) - block[:, n:].T @ y).reshape(m, len(use), 3)
+        y = y.reshape(n, len(use), 3)
+        own_cov[use] += np.einsum("rqi,rqj->qij", y, y)
+        by_query = y.transpose(1, 2, 0)  # (q, 3, n)
+        step = max(1, _CHUNK // (6 * n))
+        for begin in range(0, len(active), step):
+            some = active[begin : begin + step]
+            ends = place[pairs[some]]
+            cross[some] += by_query[ends[:, 0]] @ by_query[ends[:, 1]].mT
+        if root.above[c] >= 0:
+            below[int(root.above[c])].append((use, active, separator, rest))
+    return own_cov, cross
+
+
+_NONE = np.zeros(0, dtype=np.int64)
+
+
+def _by_clique(at: IntArray) -> dict[int, IntArray]:
+    """Clique -> the numbers (rows) that ``at`` (n, k) puts there, each once."""
+    n, k = at.shape
+    found = np.unique(np.column_stack([at.ravel(), np.repeat(np.arange(n), k)]), axis=0)
+    found = found[found[:, 0] >= 0]
+    cliques, first = np.unique(found[:, 0], return_index=True)
+    parts = np.split(found[:, 1], first[1:]) if len(found) else []
+    return dict(zip(cliques.tolist(), parts, strict=True))
+
+
+def _first_common(above: IntArray, at: IntArray, pairs: IntArray) -> IntArray:
+    """The first clique (p,) that both ends of pairs come to on their way up; -1 without any."""
+    a, b = at[pairs[:, 0]].copy(), at[pairs[:, 1]].copy()
+    while (apart := a != b).any():
+        # what is above has a smaller number: the larger one moves
+        upper = apart & (a > b)
+        lower = apart & ~upper
+        a[upper] = above[a[upper]]
+        b[lower] = above[b[lower]]
+    return a
+
+
+def _places(columns: IntArray, wanted: IntArray) -> IntArray:
+    """Where ``wanted`` are among ``columns``, which have all of them once."""
+    order = np.argsort(columns)
+    return np.asarray(order[np.searchsorted(columns, wanted, sorter=order)])

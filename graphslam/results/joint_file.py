@@ -1,0 +1,102 @@
+"""joint.npz: what the joint covariance of any scans of a result follows from.
+
+All of their covariances would be as many numbers as there are pairs. The root of the information of
+the final states is sparse; `graphslam.estimation.information_root` computes from it what is asked
+for. The layout is documented in docs/formats.md.
+"""
+
+from collections.abc import Mapping
+from io import BytesIO
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+
+from graphslam.core.errors import OutputError
+from graphslam.core.geometry import Array
+from graphslam.core.records import (
+    Estimate,
+    InformationRoot,
+    JointScans,
+    RobotResult,
+    ScanTies,
+    Trajectory,
+)
+
+FORMAT = 1
+_UPPER = np.triu_indices(3)
+
+
+def joint_scans(estimate: Estimate, robots: Mapping[str, RobotResult]) -> JointScans | None:
+    """Of a result; None without a root, or if no scan follows from the final states."""
+    ties = {name: own.scan_ties for name, own in robots.items() if own.scan_ties is not None}
+    if estimate.root is None or not ties:
+        return None
+    return JointScans(estimate.root, {name: estimate.states[name] for name in ties}, ties)
+
+
+def joint_bytes(joint: JointScans) -> bytes:
+    """The content of the file."""
+    root = joint.root
+    arrays = {
+        "format": np.array(FORMAT),
+        "robots": np.array(sorted(joint.ties)),
+        "above": root.above.astype(np.int32),
+        "own": root.own.astype(np.int32),
+        "width": root.width.astype(np.int32),
+        "separators": root.separators.astype(np.int32),
+        "values": root.values,
+    }
+    for n, name in enumerate(sorted(joint.ties)):
+        states, ties = joint.states[name], joint.ties[name]
+        arrays |= {
+            f"state_stamps_ns_{n}": states.stamps_ns,
+            f"state_poses_{n}": states.poses,
+            f"state_rows_{n}": root.states[name].astype(np.int32),
+            f"scan_state_{n}": ties.state.astype(np.int32),
+            f"scan_share_{n}": ties.share,
+            f"scan_mount_{n}": _once(ties.mounts),
+            f"scan_cov_{n}": ties.covs[:, *_UPPER].astype(np.float32),
+        }
+    made = BytesIO()
+    np.savez(made, **arrays)  # type: ignore[arg-type]  # its stub takes the names for options
+    return made.getvalue()
+
+
+def _once(rows: Array) -> Array:
+    """Rows (n, d), or the first (1, d) if all are equal, as those of a robot's only laser are."""
+    return rows[:1] if (rows == rows[:1]).all() else rows
+
+
+def read_joint(path: Path) -> JointScans:
+    """The file read back; the covariances of the states are not in it (NaN).
+
+    Raises:
+        OutputError: it cannot be read.
+    """
+    try:
+        with np.load(path) as file:
+            return _joint({name: file[name] for name in file.files})
+    except (OSError, ValueError, KeyError, BadZipFile) as error:
+        raise OutputError(f"{path}: {error}") from error
+
+
+def _joint(arrays: Mapping[str, Array]) -> JointScans:
+    def integers(name: str) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+        return arrays[name].astype(np.int64)
+
+    names = [str(name) for name in arrays["robots"]]
+    states, rows, ties = {}, {}, {}
+    for n, name in enumerate(names):
+        poses, stamps = arrays[f"state_poses_{n}"], integers(f"state_stamps_ns_{n}")
+        states[name] = Trajectory(stamps, poses, np.full((len(poses), 3, 3), np.nan))
+        rows[name] = integers(f"state_rows_{n}")
+        upper = arrays[f"scan_cov_{n}"].astype(float)
+        covs = np.empty((len(upper), 3, 3))
+        covs[:, *_UPPER] = covs[:, _UPPER[1], _UPPER[0]] = upper
+        state, share = integers(f"scan_state_{n}"), arrays[f"scan_share_{n}"]
+        mounts = np.broadcast_to(arrays[f"scan_mount_{n}"], (len(state), 3))
+        ties[name] = ScanTies(state, share, mounts, covs)
+    above, own, width, separators = map(integers, ("above", "own", "width", "separators"))
+    root = InformationRoot(above, own, width, separators, arrays["values"], rows)
+    return JointScans(root, states, ties)
