@@ -13,7 +13,7 @@ from rich.table import Table
 
 from graphslam.core.records import Result
 from graphslam.logs import ImportSummary, LogInfo, RobotInfo, TopicInfo
-from graphslam.results.metric_tables import evaluation_tables
+from graphslam.results.metric_tables import evaluation_notes, evaluation_tables
 from graphslam.results.report_comparison import (
     FILTER_WIN_HEADS,
     comparison_tables,
@@ -153,6 +153,8 @@ def evaluation(errors: Mapping[str, Any]) -> None:
     console = _console()
     for _, heads, rows in evaluation_tables(errors):
         console.print(_table(heads, rows, texts=2))
+    for text in evaluation_notes(errors):
+        console.print(text)
     landmarks = errors.get("landmarks", {})
     if worst := landmarks.get("worst"):
         console.print(

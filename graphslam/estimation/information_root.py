@@ -10,20 +10,23 @@ Covariance recovery from a square root information matrix, RAS 57, 2009, DOI
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg.lapack import dtrtrs
 
 from graphslam.core.geometry import Array
 from graphslam.core.records import InformationRoot, IntArray
-from graphslam.estimation.selected_inverse import CliqueRows
+
+if TYPE_CHECKING:  # what reads the root of a folder needs no GTSAM
+    from graphslam.estimation.selected_inverse import CliqueRows
 
 #: numbers (float64) that are gathered at a time
 _CHUNK = 4_000_000
 
 
 def information_root(
-    cliques: Sequence[CliqueRows], states: Mapping[str, Sequence[int]]
+    cliques: "Sequence[CliqueRows]", states: Mapping[str, Sequence[int]]
 ) -> InformationRoot:
     """The root as arrays, without cliques on which no state depends.
 

@@ -83,6 +83,9 @@ def compare(
         say(variant.label)
         try:
             recording = shared or record_steps(log, variant.config, progress)
+            if variant.config.backend.name == "dead-reckoning":
+                # what the other back ends learned of the odometry is no merit of the odometry
+                recording = recording.with_recorded_odometry()
             runs.append(_BackendRun.of(variant, recording, run(recording.steps, variant.config)))
         except GraphSlamError as error:
             runs.append(_BackendRun(variant, error=str(error)))
@@ -100,11 +103,11 @@ def compare(
     warnings = [text for variant in rows for text in variant.config.warnings]
     for one in done:
         one.evaluate_against(truth, relations, reference, warnings)
-    given = config.start.from_truth or bool(config.start.poses)
-    if truth.trajectories and not given:
+    if not all(one.row.get("common_frame", True) for one in done):
         warnings.append(
             "the start was not given: only aligned errors are meaningful (give --start truth)"
         )
+    given = config.start.from_truth or bool(config.start.poses)
     known = {
         name: path
         for name, path in truth.trajectories.items()
@@ -120,7 +123,7 @@ def compare(
         "rows": [run.row for run in runs],
         "warnings": list(dict.fromkeys([*log.warnings, *warnings])),
     }
-    lanes = [one.curves(known, reference, same_frame=given) for one in done]
+    lanes = [one.curves(known, reference) for one in done]
     return Comparison(found, tuple(lanes), {name: t.poses[:, :2] for name, t in known.items()})
 
 
@@ -220,11 +223,10 @@ class _BackendRun:
             if name in other and len(found := pair_poses(getattr(robot, kind), other[name])):
                 yield name, found
 
-    def curves(
-        self, truth: Mapping[str, Trajectory], reference: "_BackendRun", *, same_frame: bool
-    ) -> BackendCurves:
+    def curves(self, truth: Mapping[str, Trajectory], reference: "_BackendRun") -> BackendCurves:
         """What the report draws; aligned with the truth if not in its frame."""
         assert self.result is not None  # see `evaluate_against`
+        same_frame = bool(self.row.get("common_frame", True))
         paths, curves = {}, {}
         for kind in ("final", "causal"):
             moved = np.zeros(3)

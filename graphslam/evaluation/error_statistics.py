@@ -1,5 +1,6 @@
 """Statistics of estimation errors: root mean square, NEES with its chi-square bounds, coverage."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,8 @@ from graphslam.core.geometry import Array
 
 #: probability of the ellipsoids whose coverage is counted, and the tails of the NEES' bounds
 PROBABILITY, TAILS = 0.95, (0.025, 0.975)
+#: what a NEES says of the covariances
+TOO_CONFIDENT, TOO_CAUTIOUS, CONSISTENT = "too confident", "too cautious", "consistent"
 
 
 def rms(values: Array) -> float | None:
@@ -32,26 +35,58 @@ def nees(errors: Array, covs: Array) -> Array:
     return values
 
 
-def nees_statistics(errors: Array, covs: Array) -> dict[str, Any]:
-    """``nees_per_dof``, its two-sided 95 % ``nees_bounds`` and ``coverage`` of the 95 % ellipsoids.
+def effective_number(whitened: Array) -> float:
+    """How many independent errors a series of ``whitened`` ones (n, d) is worth, 1 to n.
 
-    The bounds are chi-square quantiles of a mean over n *independent* poses. Poses of one run are
-    strongly correlated, so one run leaves the bounds far more often than in 5 % of cases: the
-    bounds are a scale to read the number on, and a test of consistency needs many runs. Without a
-    usable covariance all three are None.
+    n / (1 + 2 sum r(k)), r(k) the correlation of the NEES at lag k. For Gaussian errors that is
+    the squared Frobenius norm of the errors' own d x d correlation (Isserlis), whose mean is known
+    to be zero: a mean that is estimated from the series would hide what it has in common. The sum
+    ends where a pair of neighbouring lags is no longer correlated: C. Geyer, Practical Markov chain
+    Monte Carlo, Statistical Science 7, 1992, DOI 10.1214/ss/1177011137 (initial positive sequence).
+    """
+    n = len(whitened)
+    if n < 2:
+        return float(n)
+    padded = 1 << (2 * n - 1).bit_length()  # a transform of this length does not wrap around
+    F = np.fft.rfft(whitened, padded, axis=0)
+    R = np.fft.irfft(F.conj()[:, :, None] * F[:, None, :], padded, axis=0)[:n]
+    squares = np.square(R).sum(axis=(1, 2))
+    if not squares[0] > 0:
+        return float(n)
+    pairs = np.trace(R, axis1=1, axis2=2)[: n - n % 2].reshape(-1, 2).sum(axis=1)
+    ends = np.flatnonzero(pairs <= 0)
+    lags = 2 * int(ends[0]) if len(ends) else n
+    times = 2 * float(squares[:lags].sum() / squares[0]) - 1
+    return n / min(max(times, 1.0), n)
+
+
+def nees_statistics(errors: Sequence[Array], covs: Sequence[Array]) -> dict[str, Any]:
+    """``nees_per_dof``, ``effective_poses``, ``nees_bounds``, ``nees_verdict``, ``coverage``.
+
+    The two-sided 95 % bounds are chi-square quantiles of a mean over the `effective_number` of
+    independent poses, which is that of each series (of a robot), summed. The verdict says what it
+    means to be outside: covariances are `TOO_CONFIDENT` or `TOO_CAUTIOUS`, else `CONSISTENT`.
+    ``coverage`` is that of the 95 % ellipsoids. Without a usable covariance all are None.
 
     Args:
-        errors: (n, d).
-        covs: (n, d, d), along the same axes.
+        errors: of each series, (n, d), in the order of time.
+        covs: the same of their covariances (n, d, d), along the same axes.
     """
-    values = nees(errors, covs)
-    values = values[np.isfinite(values)]
-    if not len(values):
-        return {"nees_per_dof": None, "nees_bounds": None, "coverage": None}
-    dof = errors.shape[1]
-    n = dof * len(values)
-    return {
-        "nees_per_dof": float(values.mean() / dof),
-        "nees_bounds": [float(q) for q in chi2_quantile(TAILS, n) / n],
-        "coverage": float(np.mean(values <= chi2_quantile(PROBABILITY, dof))),
-    }
+    names = ("nees_per_dof", "effective_poses", "nees_bounds", "nees_verdict", "coverage")
+    values, effective, d = [], 0.0, 1
+    for e, P in zip(errors, covs, strict=True):
+        own = nees(e, P)
+        good = np.isfinite(own)
+        if good.any():
+            d = e.shape[1]
+            values.append(own[good])
+            L = np.linalg.cholesky(P[good])
+            effective += effective_number(np.linalg.solve(L, e[good][..., None])[..., 0])
+    if not values:
+        return dict.fromkeys(names)
+    each = np.concatenate(values)
+    mean = float(each.mean() / d)
+    low, high = (float(q) for q in chi2_quantile(TAILS, d * effective) / (d * effective))
+    verdict = TOO_CONFIDENT if mean > high else TOO_CAUTIOUS if mean < low else CONSISTENT
+    coverage = float(np.mean(each <= chi2_quantile(PROBABILITY, d)))
+    return dict(zip(names, (mean, effective, [low, high], verdict, coverage), strict=True))

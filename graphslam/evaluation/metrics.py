@@ -8,18 +8,30 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from graphslam.core.errors import OutputError
-from graphslam.core.records import Result, Trajectory, TrueLandmark
+from graphslam.core.records import Landmark, Result, Trajectory, TrueLandmark
 from graphslam.core.worker import parallel_map
+from graphslam.evaluation.common_frame import (
+    Alignment,
+    alignment_of_landmarks,
+    alignment_of_poses,
+    changes_matches,
+    is_common_frame,
+    is_start_given,
+    moved_landmarks,
+)
 from graphslam.evaluation.landmark_metrics import landmark_metrics
 from graphslam.evaluation.relation_metrics import Relations, find_stamps, relation_metrics
 from graphslam.evaluation.trajectory_metrics import PosePairs, pair_poses, trajectory_metrics
 from graphslam.results.folder import SavedResult
 from graphslam.results.joint_file import joint_scans
 
-#: numbers that are undefined for a robot whose place in the world frame is unknown
+#: numbers that are undefined where estimate and truth have no frame in common
 _WORLD_METRICS = dict.fromkeys(
-    ("ate_rmse_m", "max_m", "heading_rmse_rad", "nees_per_dof", "nees_bounds", "coverage")
-)
+    (
+        "ate_rmse_m", "max_m", "heading_rmse_rad", "nees_per_dof", "effective_poses",
+        "nees_bounds", "nees_verdict", "coverage",
+    )
+)  # fmt: skip
 
 
 def robots_in_own_frame(summary: Mapping[str, Any]) -> set[str]:
@@ -38,28 +50,66 @@ def evaluate(
 
     With ``truth``: ``robots`` and ``joint``. Robots without truth are left out; of robots in a
     frame of their own there are only aligned and relative errors, and they are not in ``joint``.
-    With ``true_landmarks``: ``landmarks``. With ``relations``: ``relations`` of the final poses,
-    and in their key ``causal`` of the causal ones. Relations name no robot: they are compared with
-    the robot whose scans match most of them.
+    With ``true_landmarks``: ``landmarks``. ``common_frame`` says whether the world frames of
+    estimate and truth are the same (see `common_frame`): else there are only aligned errors, and
+    landmarks match after an alignment, by the poses if their truth is known. With ``relations``:
+    ``relations`` of the final poses, and in their key ``causal`` of the causal ones. Relations name
+    no robot: they are compared with the robot whose scans match most of them.
 
     Raises:
         OutputError: no pose lies within the truth's span, or relations come without scans.
     """
     found: dict[str, Any] = {}
+    alignment = None
     if truth:
-        found |= _compare_trajectories(result, truth)
+        pairs = _pair_all(result, truth)
+        own_frame = robots_in_own_frame(result.summary)
+        in_world = {n: both["final"] for n, both in pairs.items() if n not in own_frame}
+        common = not in_world or is_common_frame(
+            result.config, in_world, result.summary.get("world")
+        )
+        found["common_frame"] = common
+        alignment = None if common else alignment_of_poses(list(in_world.values()))
+        found |= _compare_trajectories(pairs, own_frame if common else set(pairs), set(in_world))
     if true_landmarks:
-        in_world = [landmark for landmark in result.landmarks if landmark.frame is None]
-        found["landmarks"] = landmark_metrics(in_world, true_landmarks)
+        placed = [landmark for landmark in result.landmarks if landmark.frame is None]
+        if "common_frame" not in found:
+            found["common_frame"] = is_start_given(result.config) or not placed
+            if not found["common_frame"]:
+                alignment = alignment_of_landmarks(placed, true_landmarks)
+                found["common_frame"] = not (
+                    alignment is None or changes_matches(alignment, true_landmarks)
+                )
+        found["landmarks"] = _compare_landmarks(
+            placed, true_landmarks, found["common_frame"], alignment
+        )
     if relations is not None:
         found["relations"] = _compare_relations(result, relations)
     return found
 
 
-def _compare_trajectories(
-    result: Result | SavedResult, truth: Mapping[str, Trajectory]
+def _compare_landmarks(
+    estimated: Sequence[Landmark],
+    true: Sequence[TrueLandmark],
+    common: bool,
+    alignment: Alignment | None,
 ) -> dict[str, Any]:
-    """``robots`` and ``joint`` of `evaluate`."""
+    """``landmarks`` of `evaluate`; covariances are of places in the world, not of aligned ones.
+
+    Where the frames are not the same and no alignment is known, no landmark can be matched.
+    """
+    if common:
+        return {**landmark_metrics(estimated, true), "aligned_by": None}
+    if alignment is None:
+        return {**dict.fromkeys(landmark_metrics((), ())), "exchanged": [], "aligned_by": None}
+    metrics = landmark_metrics(estimated, moved_landmarks(alignment, true))
+    return {**metrics, "nees_per_dof": None, "worst": None, "aligned_by": alignment.by}
+
+
+def _pair_all(
+    result: Result | SavedResult, truth: Mapping[str, Trajectory]
+) -> dict[str, dict[str, PosePairs]]:
+    """Robot -> ``final`` and, if there are any, ``causal`` poses with their true ones."""
     pairs = {
         name: {
             kind: pair_poses(path, truth[name])
@@ -75,11 +125,23 @@ def _compare_trajectories(
             f"no pose of {', '.join(result.robots)} lies within the span of the truth, "
             f"which is of {', '.join(truth)}"
         )
-    own_frame = robots_in_own_frame(result.summary)
+    return pairs
+
+
+def _compare_trajectories(
+    pairs: Mapping[str, Mapping[str, PosePairs]], elsewhere: set[str], joined: set[str]
+) -> dict[str, Any]:
+    """``robots`` and ``joint`` of `evaluate`.
+
+    Args:
+        pairs: see `_pair_all`.
+        elsewhere: robots whose estimate is in another frame than their truth.
+        joined: robots whose estimates are in one frame, whether that is the truth's or not.
+    """
     groups: dict[tuple[str | None, str], list[PosePairs]] = {
         (name, kind): [p] for name, both in pairs.items() for kind, p in both.items()
     }
-    in_world = [both for name, both in pairs.items() if name not in own_frame]
+    in_world = [pairs[name] for name in pairs if name in joined]
     if in_world:
         groups |= {
             (None, kind): [both[kind] for both in in_world]
@@ -91,7 +153,7 @@ def _compare_trajectories(
     found: dict[str, Any] = {
         "robots": {
             name: {
-                kind: metrics[name, kind] | (_WORLD_METRICS if name in own_frame else {})
+                kind: metrics[name, kind] | (_WORLD_METRICS if name in elsewhere else {})
                 for kind in both
             }
             for name, both in pairs.items()
@@ -99,7 +161,9 @@ def _compare_trajectories(
     }
     if in_world:
         found["joint"] = {
-            kind: metrics[None, kind] for kind in in_world[0] if (None, kind) in metrics
+            kind: metrics[None, kind] | (_WORLD_METRICS if joined <= elsewhere else {})
+            for kind in in_world[0]
+            if (None, kind) in metrics
         }
     return found
 

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -53,6 +54,23 @@ class RecordedSteps:
             counts.append(float(len(known)))
             driven.append(sum(motion.length_m for motion in step.motions.values()))
         return np.array(counts), np.cumsum(driven)
+
+    def with_recorded_odometry(self) -> "RecordedSteps":
+        """The same with motions as the robots recorded them: uncalibrated, corrected by no scan."""
+        runs = {}
+        steps = [dict(step.motions) for step in self.steps]
+        for robot, run in self.runs.items():
+            track = deepcopy(run.track)
+            track.calibration = track.prior
+            known = [track.used_calibration] * len(run.times)
+            runs[robot] = replace(run, track=track, calibrations=known)
+            own = [motions for motions in steps if robot in motions]
+            ends = [(motions[robot].start_ns, motions[robot].end_ns) for motions in own]
+            made = track.motions(*np.array(ends, dtype=np.int64).reshape(-1, 2).T)
+            for n, motions in enumerate(own):
+                motions[robot] = made.one(n, *ends[n])
+        made_steps = (replace(step, motions=m) for step, m in zip(self.steps, steps, strict=True))
+        return replace(self, runs=runs, steps=tuple(made_steps))
 
     def result(self, done: Replay, config: Config) -> SavedResult:
         """Trajectories and map of a replay, as `smooth` makes them.

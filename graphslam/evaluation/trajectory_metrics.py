@@ -98,9 +98,9 @@ def relative_errors(
 def trajectory_metrics(robots: Sequence[PosePairs]) -> dict[str, Any]:
     """All trajectory numbers of one robot, or of several under one common alignment.
 
-    Absolute errors: ``ate_rmse_m`` and ``max_m`` as estimated, ``ate_aligned_rmse_m`` after one
-    `align` of all positions. Heading and consistency are of the poses as estimated. ``rpe`` as in
-    `relative_errors`, over 1 s and over 10 m. A number without data is None.
+    Absolute errors: ``ate_rmse_m``, ``max_m`` and ``heading_rmse_rad`` as estimated, those that are
+    called aligned after one `align` of all positions. Consistency is of the poses as estimated.
+    ``rpe`` as in `relative_errors`, over 1 s and over 10 m. A number without data is None.
 
     Raises:
         ValueError: there is no pair at all.
@@ -111,8 +111,10 @@ def trajectory_metrics(robots: Sequence[PosePairs]) -> dict[str, Any]:
         raise ValueError("no pair of poses")
     errors = estimate - truth
     errors[:, 2] = wrap(errors[:, 2])
+    ends = np.cumsum([len(p) for p in robots])[:-1]
     distance = np.hypot(errors[:, 0], errors[:, 1])
-    moved = transform(align(estimate[:, :2], truth[:, :2]), estimate[:, :2])
+    alignment = align(estimate[:, :2], truth[:, :2])
+    left = np.hypot(*(transform(alignment, estimate[:, :2]) - truth[:, :2]).T)
     spans: dict[str, dict[str, float]] = {"1_s": {"seconds": 1.0}, "10_m": {"metres": 10.0}}
     rpe = {
         name: _rpe(np.concatenate([relative_errors(p, **span) for p in robots]))
@@ -121,11 +123,13 @@ def trajectory_metrics(robots: Sequence[PosePairs]) -> dict[str, Any]:
     return {
         "poses": len(truth),
         "ate_rmse_m": rms(distance),
-        "ate_aligned_rmse_m": rms(np.hypot(*(moved - truth[:, :2]).T)),
+        "ate_aligned_rmse_m": rms(left),
+        "max_aligned_m": float(left.max()),
+        "heading_aligned_rmse_rad": rms(wrap(errors[:, 2] + alignment[2])),
         "max_m": float(distance.max()),
         "heading_rmse_rad": rms(errors[:, 2]),
         "rpe": rpe,
-        **nees_statistics(errors, np.concatenate([p.covs for p in robots])),
+        **nees_statistics(np.split(errors, ends), [p.covs for p in robots]),
     }
 
 

@@ -122,7 +122,10 @@ def write_folder(directory: Path, files: Sequence[tuple[str, str | bytes]]) -> N
         for name, content in files:
             path = part / name
             path.parent.mkdir(exist_ok=True)
-            path.write_bytes(content if isinstance(content, bytes) else content.encode())
+            if isinstance(content, bytes):
+                path.write_bytes(content)
+            else:
+                path.write_text(content, encoding="utf-8")
 
 
 def _files(result: Result, report: Callable[[Result], str] | None) -> list[tuple[str, str | bytes]]:

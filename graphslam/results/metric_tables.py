@@ -50,13 +50,24 @@ def _interval(bounds: Sequence[float]) -> str:
     return f"{bounds[0]:.3f}…{bounds[1]:.3f}"
 
 
+def _if_only_aligned(
+    find: Callable[[Mapping[str, Any]], Any], *at: str
+) -> Callable[[Mapping[str, Any]], Any]:
+    """The value where the row has no error in a common frame, else None."""
+    absolute = value_at(*at, "ate_rmse_m")
+    return lambda row: find(row) if absolute(row) is None else None
+
+
 def trajectory_columns(*at: str) -> tuple[Column, ...]:
     """Columns of the metrics of a trajectory, which are at the nested keys ``at`` of a row."""
+    aligned_heading = converted(degrees, *at, "heading_aligned_rmse_rad")
     return (
         Column("ATE, m", value_at(*at, "ate_rmse_m")),
         Column("aligned, m", value_at(*at, "ate_aligned_rmse_m")),
         Column("max, m", value_at(*at, "max_m")),
+        Column("aligned max, m", _if_only_aligned(value_at(*at, "max_aligned_m"), *at)),
         Column("heading, °", converted(degrees, *at, "heading_rmse_rad")),
+        Column("aligned heading, °", _if_only_aligned(aligned_heading, *at)),
         Column("RPE 1 s, m", value_at(*at, "rpe", "1_s", "trans_rmse_m")),
         Column("RPE 10 m, m", value_at(*at, "rpe", "10_m", "trans_rmse_m")),
         Column("NEES/dof", value_at(*at, "nees_per_dof"), 1.0),
@@ -129,6 +140,58 @@ def _table(
     columns: Sequence[Column],
     rows: Sequence[tuple[str, str, Mapping[str, Any]]],
 ) -> Table:
-    heads = [label, "", *(column.head for column in columns)]
-    cells = [[a, b, *(column.value(values) for column in columns)] for a, b, values in rows]
+    # what no row has is left out: absolute errors without a common frame, for one
+    known = [c for c in columns if any(c.value(values) is not None for _, _, values in rows)]
+    heads = [label, "", *(column.head for column in known)]
+    cells = [[a, b, *(column.value(values) for column in known)] for a, b, values in rows]
     return title, heads, cells
+
+
+# ---------------------------------------------------------------- words
+
+NO_COMMON_FRAME = (
+    "Estimate and truth have no world frame in common: errors are those after the best rigid "
+    "alignment, and there is no NEES, since covariances are of errors in the world. Give --start "
+    "truth (or --start ROBOT=x,y,phi) to `smooth` for absolute errors"
+)
+_ALIGNED_BY = {
+    "poses": "the alignment of the poses",
+    "identities": "an alignment by landmarks of equal identity",
+    "constellation": "an alignment by the constellation of points and corners",
+}
+
+
+def evaluation_notes(evaluation: Mapping[str, Any]) -> list[str]:
+    """What the numbers of `evaluate` mean, as far as it needs saying, one sentence each."""
+    notes = []
+    aligned_by = (evaluation.get("landmarks") or {}).get("aligned_by")
+    if not evaluation.get("common_frame", True):
+        by = f". Landmarks match after {_ALIGNED_BY[aligned_by]}" if aligned_by else ""
+        if not aligned_by and "landmarks" in evaluation:
+            by = ". Landmarks cannot be matched: no alignment is without doubt"
+        notes.append(f"{NO_COMMON_FRAME}{by}.")
+    names = dict(evaluation.get("robots", {}))
+    if len(names) > 1 and "joint" in evaluation:
+        names["all together"] = evaluation["joint"]
+    for name, both in names.items():
+        for kind, found in both.items():
+            if text := nees_in_words(found):
+                notes.append(f"{name}, {kind} poses: {text}.")
+    return notes
+
+
+def nees_in_words(found: Mapping[str, Any]) -> str:
+    """What a NEES outside its bounds says; empty if it is inside, or there is none."""
+    verdict = found.get("nees_verdict")
+    if verdict in (None, "consistent"):
+        return ""
+    low, high = found["nees_bounds"]
+    value = found["nees_per_dof"]
+    above = value > high
+    times = (value if above else 1 / max(value, 1e-9)) ** 0.5
+    side = "above" if above else "below"
+    return (
+        f"covariances are {verdict}: NEES/dof {value:.3g} is {side} its 95 % bounds {low:.3g} to "
+        f"{high:.3g} (poses count as {found['effective_poses']:.0f} independent ones); errors are "
+        f"about {times:.2g} times as {'large' if above else 'small'} as stated"
+    )

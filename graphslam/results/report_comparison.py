@@ -16,9 +16,11 @@ import numpy as np
 from graphslam.core.geometry import Array
 from graphslam.results import report_html as html
 from graphslam.results.metric_tables import (
+    NO_COMMON_FRAME,
     Column,
     converted,
     landmark_columns,
+    nees_in_words,
     trajectory_columns,
     value_at,
 )
@@ -130,16 +132,17 @@ def comparison_tables(
         if title.startswith("Associations") and summary["mode"] == "replay":
             continue  # the same for all
         done = [row for row in rows if row["error"] is None]
-        values = [[column.value(row) for row in done] for column in columns]
-        if all(value is None for column in values for value in column):
+        known = [c for c in columns if any(c.value(row) is not None for row in done)]
+        if not known:
             continue
+        values = [[column.value(row) for row in done] for column in known]
         marked = [
             list(zip(column, _best(column, head.target), strict=True))
-            for column, head in zip(values, columns, strict=True)
+            for column, head in zip(values, known, strict=True)
         ]
         cells = iter(zip(*marked, strict=True))
         tables[title.format(**summary)] = (
-            [column.head for column in columns],
+            [column.head for column in known],
             [list(next(cells)) if row["error"] is None else [] for row in rows],
         )
     return tables
@@ -233,11 +236,19 @@ def reading_notes(summary: Mapping[str, Any]) -> list[str]:
     for row in done:
         for reason, count in sorted(row["skipped"].items()):
             texts.append(f"{row['spec']} could not use {html.number(count)} x {reason}.")
+    if any(not row.get("common_frame", True) for row in done):
+        texts.append(f"{NO_COMMON_FRAME}.")
     if any("joint" in row for row in done):
         texts.append(
-            "The NEES bounds are for independent poses. Poses of one run are correlated, so a "
-            "single run is often outside. The expectation is 1."
+            "The expectation of NEES/dof is 1; its bounds are for as many independent poses as the "
+            "correlated ones of the run are worth."
         )
+    for row in done:
+        for kind, found in row.get("joint", {}).items():
+            if row["final_is_causal"] and kind == "final":
+                continue
+            if text := nees_in_words(found):
+                texts.append(f"{row['label']}, {kind} poses: {text}.")
     texts.append(
         "Times per step are of the estimator alone, without data association and covariances. Each "
         "back end ran in a process of its own, one after another; memory is the growth of that "

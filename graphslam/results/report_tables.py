@@ -9,7 +9,7 @@ import numpy as np
 
 from graphslam.core.geometry import path_length
 from graphslam.core.records import Landmark, Result
-from graphslam.results.metric_tables import evaluation_tables
+from graphslam.results.metric_tables import evaluation_notes, evaluation_tables
 from graphslam.results.report_html import number, table
 
 
@@ -143,8 +143,9 @@ def landmark_sigma(landmark: Landmark) -> float:
 
 
 def quality(evaluation: Mapping[str, Any]) -> str:
-    """Errors against truth and relations, as far as there are any."""
-    return "\n".join(
+    """Errors against truth and relations, as far as there are any, and what they mean in words."""
+    notes = (f"<p class=note>{escape(text)}</p>" for text in evaluation_notes(evaluation))
+    tables = (
         table(
             [heads[0], *heads[2:]],
             [(", ".join(filter(None, row[:2])), *row[2:]) for row in rows],
@@ -152,3 +153,4 @@ def quality(evaluation: Mapping[str, Any]) -> str:
         )
         for title, heads, rows in evaluation_tables(evaluation)
     )
+    return "\n".join([*tables, *notes])

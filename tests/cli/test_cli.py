@@ -49,7 +49,7 @@ def test_smooth_writes_every_file_of_the_contract(room):
     stems = ("tum", "causal.tum", "scan.tum", "scan.causal.tum", "cov.csv", "causal.cov.csv")
     assert names == {
         *("summary.json", "config.toml", "landmarks.json", "graph.g2o", "graph_ids.csv"),
-        "report.html",
+        *("report.html", "joint.npz"),
         *(f"trajectories/robot.{stem}" for stem in stems),
     }
     assert sorted(p.name for p in room.folder.iterdir()) == ["out", "room.mcap"]
