@@ -238,6 +238,8 @@ def changes(found: Mapping[str, Any], directory: Path) -> None:
 
 def experiment(found: Mapping[str, Any], directory: Path) -> None:
     """A line per variant and noise scale, what failed, and where the report is."""
+    from graphslam.results.report_experiment import coverage
+
     console = _console()
     rows = []
     for row in found["table"]:
@@ -250,12 +252,14 @@ def experiment(found: Mapping[str, Any], directory: Path) -> None:
         elif "final" in row:
             cells += [row[k]["ate_rmse_m"]["mean"] for k in ("final", "causal")]
             cells += [row[k]["nees_per_dof"]["mean"] for k in ("final", "causal")]
+            cells += [coverage(row, k) for k in ("final", "causal", "landmarks")]
         rows.append(cells)
     head = ["", "noise", "runs", "failed", "diverged"]
     if found["kind"] == "bench":
         head += ["NEES/dof", "bounds", "", "RMSE/bound", "causal RMSE/bound"]
     else:
-        head += ["ATE, m", "causal ATE, m", "NEES/dof", "causal NEES/dof"]
+        head += ["ATE, m", "causal ATE, m", "NEES/dof", "causal NEES/dof", "coverage, %"]
+        head += ["causal", "landmarks"]
     console.print(_table(head, [(*row, *[None] * (len(head) - len(row))) for row in rows]))
     console.print(f"diverged: {found['diverged_if']}")
     for text, count in found["errors"].items():

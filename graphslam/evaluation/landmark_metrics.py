@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, unit_vectors, wrap
 from graphslam.core.records import Landmark, TrueLandmark
-from graphslam.evaluation.error_statistics import nees, rms
+from graphslam.evaluation.error_statistics import PROBABILITY, nees, rms
 
 #: A landmark matches a true one within this distance, and a line within this angle modulo pi. Both
 #: define the metric: changing them would make numbers of different runs incomparable.
@@ -18,7 +19,7 @@ EXCHANGE_RATIO = 3.0
 
 
 def landmark_metrics(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]) -> dict[str, Any]:
-    """``rmse_m``, ``nees_per_dof``, ``worst``, ``matched``, ``missed``, ``extra`` of a map.
+    """``rmse_m``, ``nees_per_dof``, ``coverage``, ``worst``, ``matched``, ``missed``, ``extra``.
 
     Landmarks match by identity where both have one. Other points match by the assignment with the
     smallest sum of distances among pairs within 1 m. Other lines and segments each match the
@@ -28,11 +29,12 @@ def landmark_metrics(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]
     middle of its extent from the true line; its NEES has two degrees of freedom (direction and
     offset of the normal), since a position along a wall is a gauge.
 
-    ``missed`` counts true landmarks without a match, ``extra`` estimated ones. ``worst`` has
-    ``id``, ``nees_per_dof`` and ``error_m`` of the landmark with the largest NEES per degree of
-    freedom: one wrong association can dominate the mean. ``exchanged`` lists pairs of identities
-    of points that each lie at the other's true place: their names are wrong, not their positions,
-    and they are matched by position.
+    ``coverage`` is that of the ellipsoids that 95 % are to be in. ``missed`` counts true
+    landmarks without a match, ``extra`` estimated ones. ``worst`` has ``id``, ``nees_per_dof``
+    and ``error_m`` of the landmark with the largest NEES per degree of freedom: one wrong
+    association can dominate the mean. ``exchanged`` lists pairs of identities of points that
+    each lie at the other's true place: their names are wrong, not their positions, and they are
+    matched by position.
     """
     pairs, exchanged = _undo_exchanges(_match(estimated, true), estimated, true)
     errors, values, dofs = [], [], []
@@ -43,9 +45,11 @@ def landmark_metrics(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]
         dofs.append(len(difference))
     squares, dof = np.array(values), np.array(dofs)
     usable = np.flatnonzero(np.isfinite(squares))
-    mean = worst = None
+    mean = worst = coverage = None
     if len(usable):
         mean = float(squares[usable].sum() / dof[usable].sum())
+        inside = squares[usable] <= chi2_quantile(PROBABILITY, dof[usable])
+        coverage = float(inside.mean())
         k = usable[(squares[usable] / dof[usable]).argmax()]
         worst = {
             "id": estimated[pairs[k][0]].id,
@@ -55,6 +59,7 @@ def landmark_metrics(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]
     return {
         "rmse_m": rms(np.array(errors)),
         "nees_per_dof": mean,
+        "coverage": coverage,
         "worst": worst,
         "matched": len(pairs),
         "missed": len(true) - len({j for _, j in pairs}),

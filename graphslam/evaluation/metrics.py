@@ -103,7 +103,13 @@ def _compare_landmarks(
     if alignment is None:
         return {**dict.fromkeys(landmark_metrics((), ())), "exchanged": [], "aligned_by": None}
     metrics = landmark_metrics(estimated, moved_landmarks(alignment, true))
-    return {**metrics, "nees_per_dof": None, "worst": None, "aligned_by": alignment.by}
+    return {
+        **metrics,
+        "nees_per_dof": None,
+        "coverage": None,
+        "worst": None,
+        "aligned_by": alignment.by,
+    }
 
 
 def _pair_all(

@@ -72,7 +72,9 @@ def run_job(definition: Definition, job: Job) -> Row:
         run = draw_run(definition.bench, job.scale, rng)
         return run_bench(run, definition.config(job.variant))
     config = definition.config(job.variant, f"front_end.name={job.front_end}")
-    return run_log(job.scenario, job.scale, int(sequence.generate_state(1)[0]), config)
+    drawn = definition.logs is not None and definition.logs.draw_starts
+    seed = int(sequence.generate_state(1)[0])
+    return run_log(job.scenario, job.scale, seed, config, draw_starts=drawn)
 
 
 def run_campaign(

@@ -21,7 +21,8 @@ _FOLDER = Path(__file__).parent / "experiments"
 
 #: name -> file of an experiment of the package
 EXPERIMENTS: dict[str, Path] = {
-    name: _FOLDER / f"{name}.toml" for name in ("ekf-versus-smoothing", "filters", "thesis")
+    name: _FOLDER / f"{name}.toml"
+    for name in ("consistency", "ekf-versus-smoothing", "filters", "thesis")
 }
 
 
@@ -88,11 +89,14 @@ class Logs:
     """Simulated logs: scenarios by name or file, and front ends.
 
     diverged_m: a run has diverged if its final trajectory is ever farther off than this.
+    draw_starts: every robot begins where its prior says but for an error drawn from that prior. By
+    default it begins exactly there, so that the best covariance looks too large.
     """
 
     scenarios: tuple[str, ...]
     front_ends: tuple[str, ...] = ("segments",)
     diverged_m: float = field(default=1.0, metadata=POSITIVE)
+    draw_starts: bool = False
 
 
 @dataclass(frozen=True)

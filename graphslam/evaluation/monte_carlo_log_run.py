@@ -7,13 +7,16 @@ from tempfile import TemporaryDirectory
 from types import MappingProxyType
 from typing import Any
 
-from graphslam.core.config import Config
+import numpy as np
+
+from graphslam.core.config import Config, StartConfig
 from graphslam.evaluation.ground_truth import truth_of_logs
 from graphslam.evaluation.metrics import evaluate
-from graphslam.logs import open_logs
+from graphslam.logs import LogSet, open_logs
 from graphslam.simulation import load_scenario, simulate
 from graphslam.simulation.scenario import Scenario
 from graphslam.slam.smooth import smooth
+from graphslam.slam.start_priors import first_truth
 
 #: keys of scenarios that a noise scale multiplies: all errors of the sensors
 NOISE = {
@@ -49,11 +52,14 @@ def _scaled(node: Any, scale: float) -> Any:
     return node
 
 
-def run_log(scenario: str, scale: float, seed: int, config: Config) -> dict[str, Any]:
+def run_log(
+    scenario: str, scale: float, seed: int, config: Config, *, draw_starts: bool = False
+) -> dict[str, Any]:
     """Errors of the pipeline on a simulated log, as plain numbers for a row of results.jsonl.
 
     Keys as in ``evaluate --json``, and ``counts``, ``scans_per_s`` and ``warnings`` of the summary.
-    Every robot starts at its true pose, with the configured sigma of a given start.
+    Every robot starts at its true pose, with the configured sigma of a start from truth; with
+    ``draw_starts`` off it by an error drawn from that prior.
 
     Raises:
         GraphSlamError: simulating, smoothing or evaluating failed.
@@ -67,8 +73,31 @@ def run_log(scenario: str, scale: float, seed: int, config: Config) -> dict[str,
             backend=replace(config.backend, causal=True),
         )
         log = open_logs([path], config)
+        if draw_starts:
+            config = replace(config, start=drawn_starts(log, config.start, seed))
         result = smooth(log, config)
         known = truth_of_logs(log, config)
     found = evaluate(result, known.trajectories, known.landmarks)
     kept = {key: result.summary.get(key) for key in ("counts", "scans_per_s", "warnings")}
     return {**found, **kept}
+
+
+def drawn_starts(log: LogSet, start: StartConfig, seed: int) -> StartConfig:
+    """Starts off the true ones by errors drawn from the prior of a start from truth.
+
+    Raises:
+        EstimationError: a robot has no truth near its first odometry.
+    """
+    rng = np.random.default_rng(np.random.SeedSequence([seed, 1]))  # not what the sensors drew
+    sigmas = np.array([start.truth_sigma_m, start.truth_sigma_m, start.truth_sigma_rad])
+    poses = {
+        robot: tuple((pose + sigmas * rng.normal(size=3)).tolist())
+        for robot, pose in sorted(first_truth(log).items())
+    }
+    return replace(
+        start,
+        from_truth=False,
+        poses=poses,
+        given_sigma_m=start.truth_sigma_m,
+        given_sigma_rad=start.truth_sigma_rad,
+    )

@@ -18,6 +18,8 @@ Row = Mapping[str, Any]
 LEVEL = 0.999
 #: probability of the bands around curves and of intervals
 BAND = 0.95
+#: samples of a bootstrap
+RESAMPLES = 2000
 #: a run on the bench has diverged if its final joint NEES has less than this tail probability, or
 #: if its position error is more than this many times the bound
 DIVERGED_TAIL, DIVERGED_RATIO = 1e-6, 4.0
@@ -226,28 +228,32 @@ def _log_row(key: tuple[Any, ...], rows: Sequence[Row], diverged_m: float) -> di
     for kind in ("final", "causal"):
         found[kind] = {
             name: _spread(_array(good, _at("joint", kind, name)))
-            for name in ("ate_rmse_m", "heading_rmse_rad", "max_m", "nees_per_dof")
+            for name in ("ate_rmse_m", "heading_rmse_rad", "max_m", "nees_per_dof", "coverage")
         }
     marks = [row for row in good if row.get("landmarks")]
     if marks:
         found["landmarks"] = {
             name: _spread(_array(marks, _at("landmarks", name)))
-            for name in ("rmse_m", "nees_per_dof", "matched", "missed", "extra")
+            for name in ("rmse_m", "nees_per_dof", "coverage", "matched", "missed", "extra")
         }
     return found
 
 
-def _spread(values: Array) -> dict[str, float | None]:
-    """Mean, standard deviation, median and maximum over runs; undefined values are left out."""
+def _spread(values: Array) -> dict[str, Any]:
+    """Mean, standard deviation, median and maximum over runs; undefined values are left out.
+
+    Also the ``interval`` of the mean, see `bootstrap_interval`.
+    """
     values = values[np.isfinite(values)]
     if not len(values):
-        return dict.fromkeys(("mean", "std", "median", "max"))
+        return dict.fromkeys(("mean", "std", "median", "max", "interval"))
     std = float(values.std(ddof=1)) if len(values) > 1 else None
     return {
         "mean": float(values.mean()),
         "std": std,
         "median": float(np.median(values)),
         "max": float(values.max()),
+        "interval": bootstrap_interval(values),
     }
 
 
@@ -274,6 +280,20 @@ def _quantiles(dof: int, level: float) -> tuple[float, float]:
     """Two-sided bounds of a mean NEES per degree of freedom, ``dof`` of them altogether."""
     tail = (1 - level) / 2
     return float(chi2.ppf(tail, dof) / dof), float(chi2.isf(tail, dof) / dof)
+
+
+def bootstrap_interval(values: Array) -> tuple[float, float]:
+    """Interval of the mean of runs (n,) at `BAND`: percentiles of the means of drawn samples.
+
+    Poses of one run share their errors, so that their number says nothing; runs are independent.
+
+    Source: B. Efron, Bootstrap methods: another look at the jackknife, Annals of Statistics 7,
+    1979, DOI 10.1214/aos/1176344552.
+    """
+    rng = np.random.default_rng(0)
+    means = rng.choice(values, (RESAMPLES, len(values))).mean(axis=1)
+    low, high = np.quantile(means, [0.5 - BAND / 2, 0.5 + BAND / 2])
+    return float(low), float(high)
 
 
 def _share_interval(hits: int, n: int) -> tuple[float, float]:

@@ -81,6 +81,7 @@ def landmark_columns(*at: str) -> tuple[Column, ...]:
     return (
         Column("RMSE, m", value_at(*at, "rmse_m")),
         Column("NEES/dof", value_at(*at, "nees_per_dof"), 1.0),
+        Column("coverage, %", converted(_percent, *at, "coverage"), 95.0),
         Column("matched", value_at(*at, "matched"), None),
         Column("missed", value_at(*at, "missed"), None),
         Column("extra", value_at(*at, "extra"), None),

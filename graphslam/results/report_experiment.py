@@ -146,11 +146,28 @@ def _logs(summary: Summary) -> str:
         for kind in ("final", "causal"):
             ate = row.get(kind, {}).get("ate_rmse_m", {})
             cells += [_plus_minus(ate), ate.get("max"), _mean(row, kind, "nees_per_dof")]
-        cells += [_mean(row, "landmarks", name) for name in ("rmse_m", "matched", "extra")]
+            cells.append(coverage(row, kind))
+        cells += [_mean(row, "landmarks", name) for name in ("rmse_m", "nees_per_dof")]
+        cells += [coverage(row, "landmarks")]
+        cells += [_mean(row, "landmarks", name) for name in ("matched", "extra")]
         rows.append(cells)
     columns = ["", "runs", "failed", "diverged", "final ATE, m", "worst", "NEES/dof"]
-    columns += ["causal ATE, m", "worst", "NEES/dof", "landmark RMSE, m", "matched", "extra"]
-    return html.table(columns, rows) + "<p class=note>Mean ± standard deviation over the runs.</p>"
+    columns += ["coverage, %", "causal ATE, m", "worst", "NEES/dof", "coverage, %"]
+    columns += ["landmark RMSE, m", "NEES/dof", "coverage, %", "matched", "extra"]
+    note = (
+        "<p class=note>Mean ± standard deviation over the runs; coverage of 95 % ellipsoids is the "
+        "mean over runs with its bootstrap interval (95 %).</p>"
+    )
+    return html.table(columns, rows) + note
+
+
+def coverage(row: Mapping[str, Any], kind: str) -> str | None:
+    """Mean coverage of the 95 % ellipsoids over runs, %, with its bootstrap interval."""
+    found = row.get(kind, {}).get("coverage", {})
+    if found.get("mean") is None:
+        return None
+    low, high = found["interval"]
+    return f"{100 * found['mean']:.1f} ({100 * low:.1f}…{100 * high:.1f})"
 
 
 def _plus_minus(found: Mapping[str, Any]) -> str | None:

@@ -25,6 +25,7 @@ from graphslam.evaluation.ground_truth import truth_of_logs
 from graphslam.evaluation.metrics import evaluate
 from graphslam.evaluation.recorded_steps import record_steps
 from graphslam.evaluation.timed_replay import growth_exponent, timed_replay, timed_replay_in_process
+from graphslam.evaluation.trajectory_metrics import pair_poses, trajectory_metrics
 from graphslam.logs import GroundTruth, LogWriter, open_logs
 from graphslam.results.report_comparison import (
     comparison_tables,
@@ -545,3 +546,21 @@ def test_an_unknown_mode_is_wrong_usage(two, tmp_path):
     done = call("compare", two.path, "-o", tmp_path / "out", "--mode", "guess")
     assert done.code == 2
     assert "replay, associate" in done.err
+
+
+def test_dead_reckoning_is_of_odometry_as_recorded(tmp_path):
+    """Odometry that turns by 0.02 rad a metre: what other back ends learn of it, or scans correct,
+    is not its merit."""
+    path = drive(tmp_path / "room.mcap")
+    config = load_config(None, START)
+    log = open_logs([path], config)
+    truth = truth_of_logs(log, config)
+    done = compare(
+        log, config, parse_variants(["dead-reckoning", "batch"], config), truth=truth,
+        run=timed_replay,
+    )  # fmt: skip
+    (own,) = smooth(log, config).robots.values()
+    recorded = trajectory_metrics([pair_poses(own.dead_reckoning, truth.trajectories["robot"])])
+    found = rows_of(done)["dead-reckoning"]["joint"]["final"]
+    assert found["ate_aligned_rmse_m"] == pytest.approx(recorded["ate_aligned_rmse_m"], rel=0.02)
+    assert found["rpe"]["10_m"]["rot_rmse_rad"] == pytest.approx(0.2, rel=0.3)

@@ -15,6 +15,7 @@ import pytest
 from finite_differences import jacobian
 from scipy.stats import chi2
 
+from graphslam.core.config_io import load_config
 from graphslam.core.errors import ConfigError, OutputError
 from graphslam.core.geometry import between, compose, exp, rotation3
 from graphslam.core.observation_models import MODELS
@@ -30,10 +31,12 @@ from graphslam.evaluation.monte_carlo_definition import (
     Logs,
     load_definition,
 )
-from graphslam.evaluation.monte_carlo_log_run import NOISE, scale_noise
-from graphslam.evaluation.monte_carlo_summary import summarise
+from graphslam.evaluation.monte_carlo_log_run import NOISE, drawn_starts, scale_noise
+from graphslam.evaluation.monte_carlo_summary import bootstrap_interval, summarise
+from graphslam.logs import open_logs
 from graphslam.results.report_experiment import experiment_figures, experiment_page
-from graphslam.simulation import load_scenario
+from graphslam.simulation import load_scenario, simulate
+from graphslam.slam.start_priors import start_poses
 
 WHOLE = load_definition("ekf-versus-smoothing")
 SMALL = """
@@ -502,3 +505,37 @@ def test_a_run_over_a_log_is_evaluated(tmp_path):
     found = summarise(definition, [{**full, **row}])
     assert found["table"][0]["final"]["ate_rmse_m"]["mean"] == row["joint"]["final"]["ate_rmse_m"]
     assert "two-robots" in experiment_page(found)
+
+
+# ---------------------------------------------------------------- coverage over runs
+
+
+def test_the_interval_of_a_mean_is_by_runs_and_covers_it():
+    """Of 20 runs whose shares differ, as those of correlated poses do. Breaks with an interval by
+    poses, which has a tenth of the width."""
+    rng = np.random.default_rng(1)
+    hits, widths = 0, []
+    for _ in range(200):
+        low, high = bootstrap_interval(rng.normal(0.9, 0.05, 20))
+        hits += low <= 0.9 <= high
+        widths.append(high - low)
+    assert 0.88 <= hits / 200 <= 0.98
+    assert np.mean(widths) == pytest.approx(2 * 1.96 * 0.05 / np.sqrt(20), rel=0.15)
+
+
+def test_drawn_starts_are_off_by_what_the_prior_says(tmp_path):
+    """Equal seeds give equal starts, and over seeds they scatter as stated."""
+    path = tmp_path / "two.mcap"
+    simulate(load_scenario("two-robots"), path, 0)
+    config = load_config(None, ["start.from_truth=true"])
+    log = open_logs([path], config)
+    true = {robot: start.pose for robot, start in start_poses(log, config).items()}
+    off = []
+    for seed in range(60):
+        drawn = drawn_starts(log, config.start, seed)
+        assert not drawn.from_truth and set(drawn.poses) == set(true)
+        assert drawn.given_sigma_m == config.start.truth_sigma_m
+        off += [np.array(drawn.poses[robot]) - true[robot] for robot in true]
+    assert drawn_starts(log, config.start, 3).poses == drawn_starts(log, config.start, 3).poses
+    sigmas = [config.start.truth_sigma_m] * 2 + [config.start.truth_sigma_rad]
+    np.testing.assert_allclose(np.std(off, axis=0), sigmas, rtol=0.25)
