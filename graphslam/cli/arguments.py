@@ -123,7 +123,7 @@ Experiment = Annotated[
     str,
     typer.Argument(
         metavar="NAME|FILE.toml",
-        help="An experiment file, or consistency, ekf-versus-smoothing, filters or thesis.",
+        help="An experiment file, or ekf-versus-smoothing, filters, thesis or consistency.",
     ),
 ]
 EvaluatedFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Result folder of smooth.")]

@@ -22,7 +22,7 @@ _FOLDER = Path(__file__).parent / "experiments"
 #: name -> file of an experiment of the package
 EXPERIMENTS: dict[str, Path] = {
     name: _FOLDER / f"{name}.toml"
-    for name in ("consistency", "ekf-versus-smoothing", "filters", "thesis")
+    for name in ("ekf-versus-smoothing", "filters", "thesis", "consistency")
 }
 
 
