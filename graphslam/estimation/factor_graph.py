@@ -359,6 +359,10 @@ class GraphBackend(ABC):
     def value(self, key: int, dim: int) -> Array:
         """Current estimate (dim,) of a variable, m and rad."""
 
+    def values(self, keys: Sequence[int], dims: Sequence[int]) -> list[Array]:
+        """`value` of variables."""
+        return [self.value(key, dim) for key, dim in zip(keys, dims, strict=True)]
+
     @abstractmethod
     def covariance(self, keys: list[int]) -> Array:
         """Joint marginal covariance (D, D) of variables in this order, errors in body frames.
@@ -390,7 +394,7 @@ class GraphBackend(ABC):
         dims = [builder.landmark_dims[i] for i in landmarks] + [3] * len(others)
         keys = [factors.landmark_key(i) for i in landmarks]
         keys += [builder.latest_key(other) for other in others]
-        means = [self.value(k, d) for k, d in zip([key, *keys], [3, *dims], strict=True)]
+        means = self.values([key, *keys], [3, *dims])
         cov = self.covariance([key, *keys])
         turn = np.eye(len(cov))
         for block, mean in zip((slice(0, 3), *block_slices(dims)), means, strict=True):
@@ -419,9 +423,10 @@ class GraphBackend(ABC):
 
     def landmark_means(self, landmarks: Sequence[int]) -> list[Array]:
         """See `Backend`."""
-        return [
-            self.value(factors.landmark_key(i), self.builder.landmark_dims[i]) for i in landmarks
-        ]
+        dims = self.builder.landmark_dims
+        return self.values(
+            [factors.landmark_key(i) for i in landmarks], [dims[i] for i in landmarks]
+        )
 
 
 def joint_marginal(tree: gtsam.ISAM2 | gtsam.GaussianBayesTree, keys: list[int]) -> Array:

@@ -21,6 +21,8 @@ EKF SLAM estimators, IJRR 2010, https://doi.org/10.1177/0278364909353640.
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from graphslam.core.config import Config, RobustConfig
 from graphslam.core.geometry import Array
 from graphslam.core.records import Estimate, Step
@@ -53,6 +55,17 @@ class FixedLagBackend(GraphBackend):
         if key not in self._dormant:
             return factors.read(self._window.values, key, dim)
         return factors.retracted(self._points[key], self._corrections()[key])
+
+    def values(self, keys: Sequence[int], dims: Sequence[int]) -> list[Array]:
+        """See `GraphBackend`; most of many landmarks are dormant, and are corrected at once."""
+        poses = [k for k, d in zip(keys, dims, strict=True) if d == 3 and k in self._dormant]
+        found: dict[int, Array] = {}
+        if poses:
+            z = self._corrections()
+            points, moved = (np.array([of[key] for key in poses]) for of in (self._points, z))
+            found = dict(zip(poses, factors.retracted(points, moved), strict=True))
+        both = zip(keys, dims, strict=True)
+        return [found[key] if key in found else self.value(key, dim) for key, dim in both]
 
     def _corrections(self) -> dict[int, Array]:
         """Z of all dormant variables."""
