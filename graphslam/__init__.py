@@ -21,6 +21,10 @@ cannot be written is an `OutputError`. ``progress`` is called with the number of
 far and of all.
 
 What a name needs is imported when it is used, so ``import graphslam`` costs nothing.
+
+Matrices are small, and a linear algebra library that uses a thread per core for them takes up to
+half as much time again. The commands tell it to use one; a script must do so itself, in the
+environment (``OMP_NUM_THREADS=1``) or in ``os.environ`` before anything imports NumPy.
 """
 
 from __future__ import annotations

@@ -360,7 +360,7 @@ class GraphBackend(ABC):
         """Current estimate (dim,) of a variable, m and rad."""
 
     def values(self, keys: Sequence[int], dims: Sequence[int]) -> list[Array]:
-        """`value` of variables."""
+        """`value` of variables: (2,) or (3,) each, m and rad."""
         return [self.value(key, dim) for key, dim in zip(keys, dims, strict=True)]
 
     @abstractmethod
