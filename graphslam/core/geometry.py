@@ -224,17 +224,20 @@ def rotate_cov(cov: Array, angle_rad: ArrayLike) -> Array:
 
 
 def is_positive(cov: Array) -> bool:
-    """Whether a symmetric matrix (n, n) is positive definite; by its minors where it is small.
+    """Whether a symmetric matrix (n, n) is positive definite: whether it has a Cholesky factor.
 
-    Most are 2 x 2 or 3 x 3, of which there are 100 000, and LAPACK takes ten times as long.
+    It is written out for small ones. Most are 2 x 2 or 3 x 3, of which there are 100 000, and
+    LAPACK takes ten times as long. (Minors would be rounding where eigenvalues span ten decades.)
     """
     if len(cov) == 2:
         (a, b), (_, d) = cov.tolist()
-        return bool(a > 0 and a * d - b * b > 0)
+        return bool(a > 0 and d - b / a * b > 0)
     if len(cov) == 3:
         (a, b, c), (_, d, e), (_, _, f) = cov.tolist()
-        minor = a * d - b * b
-        return bool(a > 0 and minor > 0 and f * minor - a * e * e - d * c * c + 2 * b * c * e > 0)
+        if not a > 0:
+            return False
+        d, e, f = d - b / a * b, e - b / a * c, f - c / a * c
+        return bool(d > 0 and f - e / d * e > 0)
     try:
         factor = np.linalg.cholesky(cov)
     except np.linalg.LinAlgError:
@@ -246,7 +249,7 @@ def are_positive(covs: Array) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """`is_positive` of each of n symmetric matrices (n, 2, 2); False where one is not finite."""
     a, b, d = covs[:, 0, 0], covs[:, 0, 1], covs[:, 1, 1]
     with np.errstate(all="ignore"):
-        return np.isfinite(a + b + d) & (a > 0) & (a * d - b * b > 0)
+        return np.isfinite(a + b + d) & (a > 0) & (d - b / a * b > 0)
 
 
 def interpolate(a: Array, b: Array, share: ArrayLike) -> Array:

@@ -14,7 +14,7 @@ import numpy as np
 from graphslam.core.config import RobustConfig
 from graphslam.core.records import Estimate, Motion, Step
 from graphslam.estimation.calibration_graph import CalibrationGraph, solve_calibrated
-from graphslam.estimation.isam2 import CONVERGED_ERROR_ROUGH
+from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH
 from graphslam.odometry.preintegration import Track
 
 #: times that everything is solved: after the first the calibration moves by a tenth of its sigma

@@ -19,12 +19,8 @@ from graphslam.core.motion_models import HELD_SIGMA, Calibration
 from graphslam.core.records import Estimate, Motion, Step
 from graphslam.estimation import factors
 from graphslam.estimation.backend import JointMarginal
-from graphslam.estimation.isam2 import (
-    CONVERGED_ERROR_ROUGH,
-    NO_COVARIANCES,
-    marginals_of,
-    with_means,
-)
+from graphslam.estimation.isam2 import NO_COVARIANCES, with_means
+from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH, marginals_of
 from graphslam.estimation.recorded_graph import RecordedGraph
 
 IntArray = np.ndarray[Any, np.dtype[np.int64]]

@@ -13,12 +13,12 @@ from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array
 from graphslam.core.records import Closure, Estimate, Step
 from graphslam.estimation import factors
-from graphslam.estimation.isam2 import (
+from graphslam.estimation.isam2 import BatchGraph, with_means
+from graphslam.estimation.optimisation import (
     CONVERGED_ERROR_ROUGH,
-    BatchGraph,
+    is_wide,
     marginals_of,
     optimise,
-    with_means,
 )
 from graphslam.estimation.selected_inverse import CovarianceBlocks
 
@@ -46,7 +46,10 @@ class ClosureGraph:
         Raises:
             EstimationError: a covariance is not positive definite and finite.
         """
+        steps = list(steps)
         self._builder, self._values = BatchGraph.at_estimate(steps, start, kernel)
+        motions = (motion for step in steps for motion in step.motions.values())
+        self._use_qr = is_wide([*motions, *closures])
         self._graph, self._size = self._builder.graph, self._builder.graph.size()
         self._kernel, self._rows = kernel, self._builder.rows
         groups = self._builder.closure_groups(replace(c, verified=True) for c in closures)
@@ -60,13 +63,21 @@ class ClosureGraph:
             self._ends.append((other, key))
             self._robust.append(gtsam.BetweenFactorPose2(other, key, factor.measured(), noise))
 
+    def begin_at(self, start: Estimate) -> None:
+        """The next solution begins at these poses of all states."""
+        values = gtsam.Values()
+        for key in self._builder.dims():
+            factors.write(values, key, self._builder.value_in(start, key))
+        self._values = values
+
     def solve(self, used: Iterable[int], *, robust: bool, rough: bool = True) -> None:
         """Optimise with the candidates of these numbers, from the solution before.
 
         Args:
             used: indices into the closures.
             robust: under the kernel.
-            rough: stop where the error decreases by less than a thousandth.
+            rough: stop where the error decreases by less than a thousandth; ignored where the
+                information is so wide that this may be anywhere on the way.
 
         Raises:
             EstimationError: the graph is indeterminate.
@@ -77,9 +88,10 @@ class ClosureGraph:
         for factor in chosen:
             self._graph.add(factor)
         self._builder.rows = self._rows + 3 * len(chosen)
-        kernel, until = self._kernel if robust else NO_KERNEL, CONVERGED_ERROR_ROUGH
+        kernel = self._kernel if robust else NO_KERNEL
+        until = CONVERGED_ERROR_ROUGH if rough and not self._use_qr else None
         try:
-            self._values = optimise(self._graph, self._values, kernel, until if rough else None)
+            self._values = optimise(self._graph, self._values, kernel, until, use_qr=self._use_qr)
         except RuntimeError as error:
             raise self._builder.explain(error) from error
 
@@ -112,6 +124,6 @@ class ClosureGraph:
 
     def _covariances(self, pairs: Sequence[tuple[int, int]] = ()) -> CovarianceBlocks:
         try:
-            return marginals_of(self._graph, self._values, pairs)
+            return marginals_of(self._graph, self._values, pairs, use_qr=self._use_qr)
         except RuntimeError as error:
             raise self._builder.explain(error) from error

@@ -30,7 +30,8 @@ from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Estimate, Step
 from graphslam.estimation import factors
 from graphslam.estimation.factor_graph import FactorGroup, GraphBackend, GraphBuilder
-from graphslam.estimation.isam2 import isam2_parameters, isam2_tree, optimise
+from graphslam.estimation.isam2 import isam2_parameters, isam2_tree
+from graphslam.estimation.optimisation import optimise
 
 #: bytes of a number, and of a variable's key
 NUMBER_BYTES, KEY_BYTES = 8, 8

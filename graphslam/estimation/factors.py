@@ -92,7 +92,26 @@ def gaussian(cov: Array) -> gtsam.noiseModel.Base:
     """
     if not is_positive(cov):
         raise EstimationError(f"covariance is not positive definite: {cov.tolist()}")
+    if len(cov) == 3:
+        return gtsam.noiseModel.Gaussian.SqrtInformation(_square_root_information(cov), True)
     return gtsam.noiseModel.Gaussian.Covariance(cov)
+
+
+def _square_root_information(cov: Array) -> Array:
+    """Upper triangular R (3, 3) with RᵀR the inverse of a covariance (3, 3): M⁻¹ of MMᵀ = cov.
+
+    GTSAM inverts the covariance first. Where its eigenvalues span ten decades, the weakest
+    direction of the inverse is rounding; here it is as good as the covariance.
+    """
+    (xx, xy, xt), (_, yy, yt), (_, _, tt) = cov.tolist()
+    M33 = math.sqrt(tt)
+    M13, M23 = xt / M33, yt / M33
+    M22 = math.sqrt(yy - M23 * M23)
+    M12 = (xy - M13 * M23) / M22
+    M11 = math.sqrt(xx - M12 * M12 - M13 * M13)
+    R11, R22, R33 = 1.0 / M11, 1.0 / M22, 1.0 / M33
+    R13 = (M12 * M23 * R22 - M13) * R11 * R33
+    return np.array([[R11, -M12 * R11 * R22, R13], [0.0, R22, -M23 * R22 * R33], [0.0, 0.0, R33]])
 
 
 _KERNELS: dict[str, Callable[[float], gtsam.noiseModel.mEstimator.Base]] = {

@@ -14,7 +14,13 @@ from graphslam.core.geometry import Array
 from graphslam.core.records import Association, Closure, Estimate, Step
 from graphslam.estimation import factors
 from graphslam.estimation.factor_graph import Estimates, FactorGroup, GraphBackend, GraphBuilder
-from graphslam.estimation.selected_inverse import CovarianceBlocks, covariance_blocks
+from graphslam.estimation.optimisation import (
+    CONVERGED_ERROR_ROUGH,
+    is_wide,
+    marginals_of,
+    optimise,
+)
+from graphslam.estimation.selected_inverse import CovarianceBlocks
 
 #: m or rad: the estimate has converged when all variables together move less than this
 CONVERGED = 1e-6
@@ -22,10 +28,6 @@ CONVERGED = 1e-6
 #: in two without a kernel; with one it need not, as weights change too, and more rounds change
 #: nothing that shows
 LINES_CONVERGED, MAX_LINE_ROUNDS, MAX_LINE_ROUNDS_ROBUST = 1e-6, 4, 2
-#: relative decrease of the error at which optimisation ends: without a kernel; with one
-#: (reweighting converges linearly: beyond 1e-6 hundreds of iterations move nothing that shows); and
-#: where another round follows anyway
-CONVERGED_ERROR, CONVERGED_ERROR_ROBUST, CONVERGED_ERROR_ROUGH = 1e-10, 1e-6, 1e-3
 #: of an estimate that is only a start for another round
 NO_COVARIANCES = CovarianceBlocks({}, {})
 #: steps after which the interval between relinearisations has doubled, since each costs as much as
@@ -40,12 +42,14 @@ class BatchGraph(GraphBuilder):
 
     With ``defer_lines`` the factors of lines are missing until `rebuild_lines` makes them, all at
     once. ``robot_observations`` are those of robots: index in the graph, and both keys.
+    ``is_wide``: whether the information of motions and closures asks for QR, see `optimisation`.
     """
 
     def __init__(self, kernel: RobustConfig, *, defer_lines: bool = False) -> None:
         super().__init__(kernel, lines=not defer_lines)
         self.graph = gtsam.NonlinearFactorGraph()
         self.robot_observations: list[tuple[int, tuple[int, int, Association]]] = []
+        self.is_wide = False
         self._defer_lines = defer_lines
         self._lines: list[tuple[int, int, Association]] = []
         self._line_indices: list[int] = []  # of the factors of `_lines` in the graph
@@ -55,9 +59,12 @@ class BatchGraph(GraphBuilder):
         cls, steps: Iterable[Step], start: Estimate, kernel: RobustConfig
     ) -> tuple["BatchGraph", gtsam.Values]:
         """The graph of recorded steps, lines deferred, and its variables' values in ``start``."""
-        builder, values = cls(kernel, defer_lines=True), gtsam.Values()
+        builder, values, steps = cls(kernel, defer_lines=True), gtsam.Values(), list(steps)
         for step in steps:
             builder.insert(step, start, values)
+        motions = [motion for step in steps for motion in step.motions.values()]
+        closures = [closure for step in steps for closure in step.closures]
+        builder.is_wide = is_wide([*motions, *closures])
         return builder, values
 
     def expand(self, step: Step, current: Estimates) -> list[FactorGroup]:
@@ -288,7 +295,12 @@ class Isam2Backend(GraphBackend):
             for _ in range(rounds if self._builder.has_lines else 1):
                 before = values
                 self._builder.rebuild_lines(values)
-                values = optimise(self._builder.graph, values, self._config.robust)
+                values = optimise(
+                    self._builder.graph,
+                    values,
+                    self._config.robust,
+                    use_qr=self._builder.is_wide,
+                )
                 if before.localCoordinates(values).norm() < LINES_CONVERGED:
                     break
         except RuntimeError as error:
@@ -298,7 +310,8 @@ class Isam2Backend(GraphBackend):
     def _covariances(self, values: gtsam.Values, *, joint: bool) -> CovarianceBlocks:
         """Marginal covariance of every key, and with ``joint`` the root of the information."""
         try:
-            return marginals_of(self._builder.graph, values, keep_rows=joint)
+            builder = self._builder
+            return marginals_of(builder.graph, values, keep_rows=joint, use_qr=builder.is_wide)
         except RuntimeError as error:
             raise self._builder.explain(error) from error
 
@@ -348,35 +361,16 @@ class Reoptimiser(Isam2Backend):
             return self._result(self._optimised(values), joint=joint)
         try:
             builder.rebuild_lines(values)
-            values = optimise(builder.graph, values, self._config.robust, CONVERGED_ERROR_ROUGH)
+            values = optimise(
+                builder.graph,
+                values,
+                self._config.robust,
+                CONVERGED_ERROR_ROUGH,
+                use_qr=builder.is_wide,
+            )
         except RuntimeError as error:
             raise builder.explain(error) from error
         return self._result(values, rough=True)
-
-
-def marginals_of(
-    graph: gtsam.NonlinearFactorGraph,
-    values: gtsam.Values,
-    pairs: Iterable[tuple[int, int]] = (),
-    *,
-    keep_rows: bool = False,
-) -> CovarianceBlocks:
-    """Covariances of all variables and of pairs of poses: by Cholesky, or by QR where that fails.
-
-    Errors are in body frames. ``keep_rows``: see `covariance_blocks`.
-
-    Raises:
-        RuntimeError: one is indeterminate.
-    """
-    try:
-        return covariance_blocks(graph.linearize(values), pairs, keep_rows=keep_rows)
-    except RuntimeError:
-        linear = graph.linearize(values)
-        blocks = covariance_blocks(linear, pairs, use_qr=True, keep_rows=keep_rows)
-        # QR does not fail on an indeterminate graph, its covariances are not finite
-        if not all(np.isfinite(cov).all() for cov in blocks.marginals.values()):
-            raise
-        return blocks
 
 
 def with_means(
@@ -387,23 +381,3 @@ def with_means(
         key: (factors.read(values, key, dim), covs.get(key, np.full((dim, dim), np.nan)))
         for key, dim in dims.items()
     }
-
-
-def optimise(
-    graph: gtsam.NonlinearFactorGraph,
-    values: gtsam.Values,
-    kernel: RobustConfig,
-    converged: float | None = None,
-) -> gtsam.Values:
-    """Levenberg-Marquardt from ``values`` until the relative decrease of the error is small.
-
-    ``converged`` is that limit: by default `CONVERGED_ERROR`, whose 1e-10 costs nothing where
-    convergence is quadratic, or `CONVERGED_ERROR_ROBUST` with a kernel.
-    """
-    if converged is None:
-        converged = CONVERGED_ERROR if kernel.kernel == "none" else CONVERGED_ERROR_ROBUST
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setRelativeErrorTol(converged)
-    parameters.setAbsoluteErrorTol(1e-9)
-    parameters.setMaxIterations(200)
-    return gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()

@@ -23,7 +23,14 @@ from graphslam.logs.source_files import text_lines
 from graphslam.logs.writer import LogWriter
 
 _UNEQUAL = "landmark lines have unequal variances; sigmas of 1 rad and 1 m are used"
+_NO_INFORMATION = "noises have a direction without information; it is taken as a very weak one"
 _STAMPS = "invented: the source has none; pose number k (from 0) is stamped k+1 seconds"
+
+#: information of a direction without any, relative to that of the others: weaker could not be told
+#: from them once the matrix is inverted and turned
+WEAKEST = 1e-12
+#: eigenvalues more negative, relative to the largest, are not due to a file's few digits
+ROUNDING = 1e-5
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +113,7 @@ def import_pose_graph(source: Path, target: Path) -> ImportSummary:
                 stamp_ns = pose_stamp_ns(number[pose])
                 log.sighting(robot, stamp_ns, seen.z, seen.cov, identity=str(seen.landmark))
     warnings = [f"{source}: {n} {tag} lines are not used" for tag, n in graph.ignored.items()]
-    warnings += [f"{source}: {n} {reason}" for reason, n in graph.assumed.items()]
+    warnings += [f"{source}: {n} {reason}" for reason, n in graph.assumed.items() if n]
     warnings += [
         f"{source}: no edge from pose {a} to pose {b}: assumed to be the start of {robots[b]}"
         for a, b in pairwise(poses)
@@ -212,8 +219,9 @@ def _edge(graph: PoseGraph, fields: Sequence[str], is_g2o: bool) -> None:
     start, end, delta, noise = int(fields[0]), int(fields[1]), _numbers(fields[2:5], 3), fields[5:]
     if start == end:
         raise ValueError("start and end are the same pose")
-    cov = _pose_covariance(tuple(_numbers(noise, 6).tolist()), is_g2o)
+    cov, assumed = _pose_covariance(tuple(_numbers(noise, 6).tolist()), is_g2o)
     graph.edges.append(Edge(start, end, delta, cov))
+    graph.assumed[_NO_INFORMATION] += assumed
 
 
 def _landmark(graph: PoseGraph, fields: Sequence[str], is_g2o: bool) -> None:
@@ -229,7 +237,9 @@ def _landmark(graph: PoseGraph, fields: Sequence[str], is_g2o: bool) -> None:
     if not squared > 0:
         raise ValueError("the landmark coincides with the pose")
     if is_g2o:
-        cov_xy = np.linalg.inv(np.array([[noise[0], noise[1]], [noise[1], noise[2]]]))
+        info = np.array([[noise[0], noise[1]], [noise[1], noise[2]]])
+        cov_xy, assumed = _from_information(info)
+        graph.assumed[_NO_INFORMATION] += assumed
         J = np.array([[-y / squared, x / squared], [x, y] / np.sqrt(squared)])
         cov = np.asarray(J @ cov_xy @ J.T)
     elif abs(noise[0] - noise[2]) < 1e-4:
@@ -249,8 +259,10 @@ def _bearing_range(graph: PoseGraph, fields: Sequence[str], _is_g2o: bool) -> No
 
 
 @lru_cache(maxsize=1024)  # most files have few different ones
-def _pose_covariance(v: tuple[float, ...], is_g2o: bool) -> Array:
+def _pose_covariance(v: tuple[float, ...], is_g2o: bool) -> tuple[Array, bool]:
     """Covariance (3, 3) from six numbers of noise, whose layout is guessed as load2D does.
+
+    The second value is that of `_from_information`.
 
     g2o has the upper triangle of the information matrix. Otherwise the zeros decide: [a 0 b c 0 0]
     is TORO's order xx xy yy phiphi xphi yphi, [a 0 0 b 0 c] the upper triangle; load2D reads both
@@ -258,15 +270,39 @@ def _pose_covariance(v: tuple[float, ...], is_g2o: bool) -> Array:
     """
     upper = np.array([[v[0], v[1], v[2]], [v[1], v[3], v[4]], [v[2], v[4], v[5]]])
     if is_g2o:
-        return _checked(np.asarray(np.linalg.inv(_checked(upper))))
+        return _from_information(upper)
     zero = tuple(value == 0 for value in v)
     if zero == (False, True, False, False, True, True):
-        return _checked(np.array([[v[0], v[1], v[4]], [v[1], v[2], v[5]], [v[4], v[5], v[3]]]))
+        toro = np.array([[v[0], v[1], v[4]], [v[1], v[2], v[5]], [v[4], v[5], v[3]]])
+        return _checked(toro), False
     if zero == (False, True, True, False, True, False):
-        return _checked(upper)
+        return _checked(upper), False
     raise ValueError(
         "the noise is neither TORO's nor a diagonal covariance (g2o files end in .g2o)"
     )
+
+
+def _from_information(info: Array) -> tuple[Array, bool]:
+    """Covariance (k, k) of an information matrix, and whether a direction had no information.
+
+    Files round: with ten digits a matrix whose eigenvalues span eleven decades may have a negative
+    one. Nothing is known of such a direction; it gets `WEAKEST` of the information of the others.
+
+    Raises:
+        ValueError: a number on the diagonal is not positive (`readG2o` refuses that too), or an
+            eigenvalue is more negative than rounding makes it.
+    """
+    own = np.diag(info)
+    if not (own > 0).all():
+        raise ValueError("the noise is not positive definite")
+    # along axes in which each direction has information 1: metres and radians are not compared
+    scale = np.sqrt(own)
+    values, axes = np.linalg.eigh(info / np.outer(scale, scale))
+    if values[0] < -ROUNDING:
+        raise ValueError("the noise is not positive definite")
+    axes /= scale[:, None]
+    cov = (axes / np.maximum(values, WEAKEST)) @ axes.T
+    return _checked((cov + cov.T) / 2), bool(values[0] < WEAKEST)
 
 
 def _checked(matrix: Array) -> Array:

@@ -36,6 +36,7 @@ from graphslam.core.records import (
 )
 from graphslam.estimation.closure_graph import ClosureGraph
 from graphslam.estimation.initial_estimate import initial_estimate
+from graphslam.odometry.given_increments import consecutive_motions
 from graphslam.odometry.preintegration import Track
 
 #: probability up to which two closures agree; against all others together it is
@@ -49,12 +50,16 @@ SEARCH_STARTS = 4
 KERNEL_SIGMAS = 3.0
 #: share of the information in a direction that the other closures must have for a comparison
 MIN_SHARE = 1e-3
+#: share of closures that may seem not to fit although all are true
+MISFIT_SHARE = 0.01
 #: rounds of removing and adding closures
 MAX_ROUNDS = 30
 #: prior covariance (m, rad) of the origin of a robot's own frame
 ORIGIN = np.diag([1e-3, 1e-3, 1e-3]) ** 2
 
 _UPPER = np.triu_indices(3)
+#: the unit matrix by its upper triangle; precision of sums of covariances
+UNIT, ROUNDING = np.eye(3)[_UPPER], 1e-15
 
 CONTRADICTED = "it contradicts the others"
 UNSUPPORTED = "no other closure supports it"
@@ -186,7 +191,7 @@ def _odometry(
     chains = {}
     for robot, needed in sorted(times.items()):
         at = np.array(sorted(needed), dtype=np.int64)
-        moved = tracks[robot].motions(at[:-1], at[1:])
+        moved = consecutive_motions(tracks[robot], at)
         poses = np.zeros((len(at), 3))
         for k, delta in enumerate(moved.delta):
             poses[k + 1] = compose(poses[k], delta)
@@ -227,12 +232,14 @@ def _loops(
     there, here, R_other, R_own = (
         M[:, *_UPPER] for M in (other.spread[i], own.spread[j], R_other, R_own)
     )
+    # differences of the sums along the path are not more accurate than this
+    rounding = ROUNDING * max(np.abs(there).max(), np.abs(here).max()) * UNIT
     gate = chi2_quantile(AGREE, 3)
     agree = np.zeros((len(z), len(z)), dtype=bool)
     first = inverse(E)
     for a in range(len(z)):  # row by row: a matrix of 3 x 3 blocks would not fit
         r = log(compose(E[a], first))
-        S = R_other[a] + np.sign(i - i[a])[:, None] * (there - there[a])
+        S = rounding + R_other[a] + np.sign(i - i[a])[:, None] * (there - there[a])
         S += (np.sign(j - j[a])[:, None] * (here - here[a]) + R_own) @ A[a].T
         agree[a] = _squared_distances(r, S) <= gate
     agree &= agree.T
@@ -316,11 +323,22 @@ def _settle(
     gate = chi2_quantile(FIT_PROBABILITY, 3)
     closures = [Closure(m.robot, m.time_ns, m.other, m.start_ns, m.delta, m.cov) for m in messages]
     steps = _steps(odometry, starts)
-    start = initial_estimate(steps, [closures[k] for k in sorted(believed)])
-    graph = ClosureGraph(steps, start, closures, RobustConfig("geman-mcclure", KERNEL_SIGMAS))
-    graph.solve(sorted(believed), robust=False)
+    graph = ClosureGraph(
+        steps,
+        initial_estimate(steps, closures),
+        closures,
+        RobustConfig("geman-mcclure", KERNEL_SIGMAS),
+    )
+    misfits = _misfits_of_all(graph, closures)
+    if not misfits:
+        return set(range(len(closures))), graph
+    if misfits <= 1 + MISFIT_SHARE * len(closures):
+        believed = set(range(len(closures)))
+    else:
+        graph.begin_at(initial_estimate(steps, [closures[k] for k in sorted(believed)]))
+        graph.solve(sorted(believed), robust=False)
     barred: set[int] = set()
-    for _ in range(MAX_ROUNDS if closures else 0):
+    for _ in range(MAX_ROUNDS):
         graph.solve(sorted(believed), robust=True)
         used = np.isin(np.arange(len(closures)), sorted(believed))
         d2 = _misfits(closures, used, *graph.ends())
@@ -333,6 +351,19 @@ def _settle(
         barred |= gone
         believed = believed - gone if gone else believed | new
     return believed, graph
+
+
+def _misfits_of_all(graph: ClosureGraph, closures: Sequence[Closure]) -> int:
+    """How many closures do not fit when all are solved together, without a kernel.
+
+    One that is false by more than chance leads others astray, so then these are many.
+    """
+    if not closures:
+        return 0
+    graph.solve(range(len(closures)), robust=False)
+    used = np.ones(len(closures), dtype=np.bool_)
+    d2 = _misfits(closures, used, *graph.ends(), robust=False)
+    return int(np.count_nonzero(d2 > chi2_quantile(FIT_PROBABILITY, 3)))
 
 
 def _steps(odometry: Mapping[str, _OdometryChain], starts: Mapping[str, Start]) -> list[Step]:
@@ -353,6 +384,8 @@ def _misfits(
     x: Array,
     y: Array,
     P: Array,
+    *,
+    robust: bool = True,
 ) -> Array:
     """Squared Mahalanobis distances (n,) of closures from what all others predict (leave one out).
 
@@ -367,6 +400,7 @@ def _misfits(
         x: (n, 3) estimates of the states in whose frames they are.
         y: (n, 3) estimates of the others.
         P: (n, 6, 6) joint covariances of both, errors along each one's axes.
+        robust: whether the estimate is under the kernel.
     """
     delta, cov = (np.array([getattr(c, name) for c in closures]) for name in ("delta", "cov"))
     h = between(x, y)
@@ -376,7 +410,9 @@ def _misfits(
     J = np.linalg.solve(L, np.concatenate([-adjoint(inverse(h)), unit], axis=2))
     m, Q = np.linalg.eigh(J @ P @ J.mT)
     squared = (r * r).sum(axis=(1, 2))
-    w = np.where(used, (KERNEL_SIGMAS**2 / (KERNEL_SIGMAS**2 + squared)) ** 2, 0.0)
+    weight = (KERNEL_SIGMAS**2 / (KERNEL_SIGMAS**2 + squared)) ** 2 if robust else 1.0
+    w = np.where(used, weight, 0.0)
+    m = np.maximum(m, 0.0)  # rounding, where the poses are uncertain by far more than the closure
     rest = 1.0 - w[:, None] * m
     r = (Q.mT @ r)[:, :, 0]
     known = rest > MIN_SHARE

@@ -14,6 +14,8 @@ from graphslam.core.records import Estimate, Step
 
 #: motions of a robot from which their noise is estimated at least
 MIN_MOTIONS = 50
+#: factor on stated sigmas from which a log contradicts them
+UNDERSTATED = 2.0
 #: median of the absolute value of a standard normal variable
 MEDIAN_OF_NORMAL = 0.6745
 
@@ -53,6 +55,18 @@ def noise_scales(
             normalised = sums / np.sqrt(count)[:, None]
         scales[robot] = np.maximum(1.0, np.median(np.abs(normalised), axis=0) / MEDIAN_OF_NORMAL)
     return scales
+
+
+def understated_noise(steps: Sequence[Step], estimate: Estimate) -> list[str]:
+    """Warnings about robots whose motions are noisier than stated; see `noise_scales`."""
+    scales = noise_scales(steps, estimate)
+    names = ("along", "across", "in heading")
+    return [
+        f"{robot}: its odometry is {scale.max():.1f} times as noisy {names[int(scale.argmax())]} "
+        "as the log states; what is stated was used"
+        for robot, scale in sorted(scales.items())
+        if scale.max() > UNDERSTATED
+    ]
 
 
 def scale_motion_noise(steps: Sequence[Step], scales: Mapping[str, Array]) -> tuple[Step, ...]:

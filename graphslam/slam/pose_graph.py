@@ -30,18 +30,15 @@ from graphslam.estimation.initial_estimate import initial_estimate
 from graphslam.estimation.isam2 import Reoptimiser
 from graphslam.estimation.replay import replay
 from graphslam.logs import LogSet
+from graphslam.odometry.given_increments import consecutive_motions
 from graphslam.slam.initialisation import estimate_start_poses
 from graphslam.slam.log_pass import PriorKnowledge, Progress, counted, timed
-from graphslam.slam.motion_noise import noise_scales, scale_motion_noise
 from graphslam.slam.passes import Findings, FinishedPass, pass_findings
 from graphslam.slam.pipeline import Pipeline
 from graphslam.slam.recorded_closures import accept_closures, take_relative_poses
 from graphslam.slam.robot_settings import make_tracks
 from graphslam.slam.robot_state import RobotState
 from graphslam.slam.start_priors import start_poses
-
-#: times that the noise of motions is estimated, at most; it is settled when it grows by less than
-MAX_NOISE_ROUNDS, NOISE_GROWTH = 4, 1.1
 
 
 def is_pose_graph(log: LogSet, config: Config) -> bool:
@@ -84,7 +81,7 @@ def solve_pose_graph(log: LogSet, config: Config, progress: Progress) -> Finishe
     if not steps:
         raise LogError(f"{log.files[0].path}: nothing in it could be used; see `graphslam info`")
     with timed(pipeline.seconds, "final optimisation"):
-        estimate, pipeline.steps = _solve(steps, config)
+        estimate, pipeline.steps = _solve(steps, config), steps
     if not config.backend.causal:
         return FinishedPass(pipeline, estimate, Findings({}, {}, {}))
     with timed(pipeline.seconds, "causal trajectories"):
@@ -112,8 +109,7 @@ def _make_steps(pipeline: Pipeline, messages: Iterable[RelativePose]) -> list[St
             pipeline.record_time(time_ns)
         start = pipeline.frames.offset_start(robot, pipeline.starts[robot])
         starts[run.times[0]][robot] = start
-        at = np.array(run.times, dtype=np.int64)
-        moved = run.track.motions(at[:-1], at[1:])
+        moved = consecutive_motions(run.track, np.array(run.times, dtype=np.int64))
         for k, (begin_ns, end_ns) in enumerate(pairwise(run.times)):
             motions[end_ns][robot] = moved.one(k, begin_ns, end_ns)
     closures: dict[int, list[Closure]] = defaultdict(list)
@@ -156,8 +152,8 @@ def _state_times(pipeline: Pipeline, run: RobotState, ends_ns: Sequence[int]) ->
 # ---------------------------------------------------------------- from steps to the estimate
 
 
-def _solve(steps: Sequence[Step], config: Config) -> tuple[Estimate, list[Step]]:
-    """The estimate, and the steps with motions as noisy as the log shows them.
+def _solve(steps: Sequence[Step], config: Config) -> Estimate:
+    """The estimate with the noise that the log states.
 
     Verified closures are taken for true. If others are used, the better of two solutions counts:
     one begins without them, the other follows them.
@@ -171,15 +167,7 @@ def _solve(steps: Sequence[Step], config: Config) -> tuple[Estimate, list[Step]]
     for followed in [verified] if len(verified) == len(closures) else [verified, closures]:
         solver = Reoptimiser(config, steps, initial_estimate(steps, followed))
         found.append(solver.solve())
-    estimate = min(found, key=lambda estimate: estimate.error)
-    scaled, scales = tuple(steps), {robot: np.ones(3) for robot in estimate.states}
-    for _ in range(MAX_NOISE_ROUNDS):
-        before, scales = scales, scales | noise_scales(steps, estimate)
-        if all(np.all(scale <= NOISE_GROWTH * before[robot]) for robot, scale in scales.items()):
-            break
-        scaled = scale_motion_noise(steps, scales)
-        estimate = Reoptimiser(config, scaled, estimate).solve()
-    return estimate, list(scaled)
+    return min(found, key=lambda estimate: estimate.error)
 
 
 def _record_causal(pipeline: Pipeline) -> None:

@@ -16,6 +16,7 @@ from graphslam.core.config_io import dump_config
 from graphslam.core.records import Estimate
 from graphslam.estimation.clock_calibration import ClockEstimate
 from graphslam.slam.log_pass import LogPass
+from graphslam.slam.motion_noise import understated_noise
 from graphslam.slam.robot_settings import robot_settings
 from graphslam.slam.robot_state import span_warnings
 
@@ -121,6 +122,7 @@ def summarise(
         "warnings": [
             *dict.fromkeys([*pipeline.given_config.warnings, *log.warnings]),
             *run_warnings(pipeline),
+            *(understated_noise(pipeline.steps, estimate) if is_relative(pipeline) else ()),
         ],
     }
 
@@ -134,6 +136,12 @@ def _peak_memory_mb() -> float:
     """Largest resident size of this process; macOS counts bytes, Linux kilobytes."""
     peak = float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
     return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
+
+
+def is_relative(pipeline: LogPass) -> bool:
+    """Whether a log has relative poses only, whose noise is used as it is stated."""
+    given = all(run.track.source == "given" for run in pipeline.runs.values())
+    return given and not any(step.associations for step in pipeline.steps)
 
 
 def run_warnings(pipeline: LogPass) -> list[str]:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from graphslam.estimation.information_root import information_root, pair_covariances
-from graphslam.estimation.isam2 import marginals_of
+from graphslam.estimation.optimisation import marginals_of
 from graphslam.estimation.selected_inverse import covariance_blocks
 
 POSES, POINTS = 60, 15
