@@ -15,7 +15,7 @@ import numpy as np
 
 from graphslam.core.config import RobustConfig
 from graphslam.core.errors import EstimationError
-from graphslam.core.geometry import Array, compose, exp, is_positive, rotate_cov
+from graphslam.core.geometry import Array, between, compose, exp, is_positive, rotate_cov, wrap
 from graphslam.core.observation_models import LineModel
 from graphslam.core.records import Association, Closure, Motion, Start
 
@@ -26,6 +26,9 @@ from graphslam.core.records import Association, Closure, Motion, Start
 #: one makes the estimate overconfident at any noise (docs/ekf-versus-smoothing.md).
 LINE_GAUGE_SIGMA_M = 1.0
 FILTER_GAUGE_SIGMA_M = 1e-3
+#: m: the same where lines stay as they face. The error does not depend on where a line's origin is
+#: if the noise of its observations follows; where that is kept, a wide gauge would be pulled along
+LINE_HELD_SIGMA_M = 1e-4
 NO_KERNEL = RobustConfig("none")
 
 #: a symbol's letter is in its highest byte, its number in the others
@@ -189,25 +192,48 @@ def line_factors(
     x: Array,
     t: Array,
     kernel: RobustConfig,
+    *,
+    sliding: bool = False,
 ) -> list[gtsam.NonlinearFactor]:
     """The factors of n lines, as `observation_factor` makes them, computed at once.
 
     ``z`` (n, 3) are the measurements, ``cov`` (n, 3, 3) their covariances, ``x`` (n, 3) and ``t``
-    (n, 3) the estimates of the observing states and of the lines.
+    (n, 3) the estimates of the observing states and of the lines. ``sliding``: see `line_rows`.
     """
     return [
         _line_factor(*made, kernel)
-        for made in zip(keys, targets, *_facing(z, cov, x, t), strict=True)
+        for made in zip(keys, targets, *_facing(z, cov, x, t, sliding=sliding), strict=True)
     ]
 
 
-def _facing(z: Array, cov: Array, x: Array, t: Array) -> tuple[Array, Array]:
+def _facing(
+    z: Array, cov: Array, x: Array, t: Array, *, sliding: bool = False
+) -> tuple[Array, Array]:
     """Lines (..., 3) facing their landmarks, and square root information (..., 3, 3)."""
     model = LineModel()
     R = np.zeros(cov.shape)
     # upper triangular U with UᵀU = V⁻¹: from the Cholesky factor of the inverse
     R[..., 1:, 1:] = np.linalg.cholesky(np.linalg.inv(model.noise(z, cov, x, t))).mT
+    if sliding:
+        R[..., 1:, :] = R[..., 1:, 1:] @ line_rows(z, x, t)
     return model.facing(z, x, t), R
+
+
+def line_rows(z: Array, x: Array, t: Array) -> Array:
+    """Rows (..., 2, 3) that take GTSAM's residual of a line to normal offset and direction.
+
+    Where a line's origin is tells nothing. But the logarithm turns the residual by half of that of
+    the direction, so that its normal part changes as the origin slides along the line: lines and
+    states would be pulled along. With tan of that half, the sum of both parts changes no more;
+    for the measurement that faces the origin it is the normal part itself. Second order: only
+    what is said to be at its minimum needs it.
+    """
+    slope = np.tan(wrap(t[..., 2] - x[..., 2] - z[..., 2]) / 2)
+    rows = np.zeros((*slope.shape, 2, 3))
+    rows[..., 0, 1] = 1.0 / (1.0 - slope**2)
+    rows[..., 0, 0] = -slope * rows[..., 0, 1]
+    rows[..., 1, 2] = 1.0
+    return rows
 
 
 def _line_factor(
@@ -285,6 +311,15 @@ def line_gauge_factor(
     """
     R = np.diag([1.0 / (LINE_GAUGE_SIGMA_M if wide else FILTER_GAUGE_SIGMA_M), 0.0, 0.0])
     return _line_factor(key, target, seen.z, R, NO_KERNEL)
+
+
+def line_held_factor(key: int, target: int, x: Array, t: Array) -> gtsam.NonlinearFactor:
+    """Holds a line's origin where its estimate (3,) has it, along the line, seen from a state (3,).
+
+    See `LINE_HELD_SIGMA_M`.
+    """
+    R = np.diag([1.0 / LINE_HELD_SIGMA_M, 0.0, 0.0])
+    return _line_factor(key, target, between(x, t), R, NO_KERNEL)
 
 
 def jacobian_factor(A: Array, b: Array, dims: Mapping[int, int]) -> gtsam.JacobianFactor:

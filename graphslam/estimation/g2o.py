@@ -1,23 +1,41 @@
 """The factor graph in g2o's text format, and the table that identifies its vertices.
 
 g2o has neither robots nor stamps, and readers differ in their treatment of comments, so vertices
-are numbered and `graph_ids` is the table of numbers. The format has no robust kernels: the file
-contains the plain Gaussian weights.
+are numbered and `graph_ids` is the table of numbers. The format has no robust kernels either: edges
+have the plain Gaussian weights, and comments say to which a kernel applies.
+
+What the format has no edge for is written as one that is equal at the estimate: same error, same
+derivatives. So the file's error is that of the estimate, and where the estimate is a minimum, so it
+is of the file.
 """
 
+import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from graphslam.core.config import RobustConfig
 from graphslam.core.errors import OutputError
-from graphslam.core.geometry import Array, between, is_positive, rotate_cov, rotation, wrap
-from graphslam.core.observation_models import MODELS, LineModel
+from graphslam.core.geometry import (
+    Array,
+    between,
+    inverse,
+    is_positive,
+    log,
+    rotate_cov,
+    rotation3,
+    transform_each,
+    wrap,
+)
+from graphslam.core.observation_models import LineModel
 from graphslam.core.records import Estimate, Step
+from graphslam.estimation.factors import LINE_HELD_SIGMA_M, NO_KERNEL, line_rows
+from graphslam.estimation.m_estimators import LOSSES
 
-# of n edges: tag, measurements (n, k), covariances (n, m, m) of the last m entries; the entries
-# before them have no information
+# of n edges: tag, measurements (n, k), information matrices (n, m, m) of the last m entries; the
+# entries before them have no information
 _EdgeParts = tuple[str, Array, Array]
 
 # Information of a direction without any, instead of zero: GTSAM refuses a zero on the diagonal of
@@ -59,17 +77,19 @@ def graph_ids(estimate: Estimate) -> str:
     return "\n".join(["id,robot,stamp_ns,landmark", *rows]) + "\n"
 
 
-def graph_g2o(steps: Sequence[Step], estimate: Estimate) -> str:
+def graph_g2o(steps: Sequence[Step], estimate: Estimate, kernel: RobustConfig = NO_KERNEL) -> str:
     """The graph at its estimate in g2o's text format, every number to full double precision.
 
     Vertices are the estimate's states (VERTEX_SE2) and landmarks (VERTEX_XY for points,
     VERTEX_SE2 for lines and segments). Edges: EDGE_PRIOR_SE2 for starts, EDGE_SE2 for motions,
-    closures, segments, lines and robots seen, EDGE_SE2_XY for points. Information matrices are
-    the inverse covariance along the axes of the *end* frame of an edge, because g2o's residual
-    ``z^-1 * (x_i^-1 * x_j)`` lives there, while the records hold it along the start frame's.
-    A direction without information has 1e-12 in its place (see the module). Associations whose
-    state or landmark is not in the estimate (a landmark deleted later) have no edge.
+    closures, segments, lines, their gauges and robots seen, EDGE_SE2_XY for points. Information
+    matrices are the inverse covariance along the axes of the *end* frame of an edge, because the
+    residual lives there, while the records hold it along the start frame's. A direction without
+    information has 1e-12 in its place (see the module). Associations whose state or landmark is not
+    in the estimate (a landmark deleted later) have no edge. A comment ``# kernel NAME SCALE``
+    applies to all edges after it, up to the next one.
 
+    Residuals are GTSAM's: of poses the logarithm of z^-1 x_i^-1 x_j, to first order g2o's own.
     `gtsam.readG2o` reads vertices and EDGE_SE2; it skips EDGE_SE2_XY and EDGE_PRIOR_SE2.
 
     Source: R. Kümmerle et al., g2o: A general framework for graph optimization, ICRA 2011,
@@ -79,34 +99,108 @@ def graph_g2o(steps: Sequence[Step], estimate: Estimate) -> str:
         OutputError: a covariance cannot be inverted; the message names the edge.
     """
     ids = number_vertices(estimate)
-    states = [pose for robot in sorted(estimate.states) for pose in estimate.states[robot].poses]
-    states += [estimate.landmarks[landmark][0] for landmark in ids.landmarks]
+    states = _states(estimate, ids)
     wrapped = _wrapped(_padded(states)).tolist()
     lines = [_vertex(i, x[: len(states[i])]) for i, x in enumerate(wrapped)]
-    edges = [edge for step in steps for edge in _edges(step, ids)]
-    rows = [""] * len(edges)
-    alike: dict[str, list[int]] = defaultdict(list)
-    for place, edge in enumerate(edges):
-        alike[edge.model].append(place)
-    for model, places in alike.items():
-        group = [edges[place] for place in places]
+    scale = 0.0
+    # edges without a kernel first, each kind in the order of time
+    for group in sorted(_groups(steps, estimate, kernel), key=lambda group: group.scale):
+        if group.scale != scale:
+            scale = group.scale
+            lines.append(f"# kernel {kernel.kernel} {scale!r}")
+        i, j = np.triu_indices(group.z.shape[1])
+        numbers = np.column_stack([_wrapped(group.z), group.info[:, i, j]])
+        form = " ".join([group.tag, *["%d"] * len(group.ends[0]), *["%r"] * numbers.shape[1]])
+        lines += [
+            form % (*ends, *values)
+            for ends, values in zip(group.ends, numbers.tolist(), strict=True)
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def graph_error(
+    steps: Sequence[Step], estimate: Estimate, kernel: RobustConfig
+) -> tuple[float, float]:
+    """Half the weighted squared residual of the graph: under its kernels, and without them.
+
+    It is that of the edges of `graph_g2o`.
+
+    Raises:
+        OutputError: a covariance cannot be inverted; the message names the edge.
+    """
+    total = plain = 0.0
+    loss = LOSSES[kernel.kernel]
+    for group in _groups(steps, estimate, kernel):
+        squared = group.squared_residuals()
+        plain += 0.5 * float(squared.sum())
+        robust = loss(np.sqrt(squared), group.scale) if group.scale else 0.5 * squared
+        total += float(robust.sum())
+    return total, plain
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Group:
+    """Edges of one kind: measurements (n, k), information (n, k, k), estimates (n, 3) of both ends.
+
+    ``scale`` of their kernel, 0 without one.
+    """
+
+    tag: str
+    ends: list[tuple[int, ...]]
+    z: Array
+    info: Array
+    x: Array
+    t: Array
+    scale: float
+
+    def squared_residuals(self) -> Array:
+        """Squared Mahalanobis distances (n,)."""
+        if self.tag == "EDGE_SE2_XY":
+            r = transform_each(inverse(self.x), self.t[:, :2]) - self.z
+        else:
+            seen = self.t if len(self.ends[0]) == 1 else between(self.x, self.t)
+            r = log(between(self.z, seen))
+        return np.asarray(np.maximum(np.einsum("ni,nij,nj->n", r, self.info, r), 0.0))
+
+
+def _states(estimate: Estimate, ids: GraphIds) -> list[Array]:
+    """States (3,) and landmarks (2,) or (3,) in the order of their numbers."""
+    states = [pose for robot in sorted(estimate.states) for pose in estimate.states[robot].poses]
+    return states + [estimate.landmarks[landmark][0] for landmark in ids.landmarks]
+
+
+def _groups(steps: Sequence[Step], estimate: Estimate, kernel: RobustConfig) -> Iterator[_Group]:
+    """All edges, by kind and kernel."""
+    ids = number_vertices(estimate)
+    states = _padded(_states(estimate, ids))
+    alike: dict[tuple[str, float], list[_Edge]] = defaultdict(list)
+    first: set[int] = set()
+    for step in steps:
+        for edge in _edges(step, ids, kernel, first):
+            alike[edge.model, edge.scale].append(edge)
+    for (model, scale), group in alike.items():
         z, cov = (np.array([getattr(edge, name) for edge in group]) for name in ("z", "cov"))
+        ends = [edge.ends for edge in group]
         # the prior of a start has one end, and needs neither
-        x, t = (_padded([states[edge.ends[end]] for edge in group]) for end in (0, -1))
-        tag, z, cov = EDGES[model](z, cov, x, t)
-        infos = _informations(cov, z.shape[1], group)
-        numbers = np.column_stack([_wrapped(z), infos])
-        form = " ".join([tag, *["%d"] * len(group[0].ends), *["%r"] * numbers.shape[1]])
-        for place, edge, values in zip(places, group, numbers.tolist(), strict=True):
-            rows[place] = form % (*edge.ends, *values)
-    return "\n".join(lines + rows) + "\n"
+        x, t = (states[[own[end] for own in ends]] for end in (0, -1))
+        try:
+            tag, z, part = EDGES[model](z, cov, x, t)
+        except np.linalg.LinAlgError as error:
+            bad = next(edge for edge in group if not is_positive(edge.cov))
+            what = f"{bad.model} of {bad.robot} at {bad.time_ns}"
+            raise OutputError(f"graph.g2o: the covariance of {what} is not positive") from error
+        k, m = z.shape[1], part.shape[1]
+        info = np.zeros((len(z), k, k))
+        info[:, range(k), range(k)] = NO_INFORMATION
+        info[:, k - m :, k - m :] = part
+        yield _Group(tag, ends, z, info, x, t, scale)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Edge:
     """An edge before it is written: a row of `EDGES`, vertices, measurement and covariance.
 
-    ``robot`` and ``time_ns`` are of its later end.
+    ``robot`` and ``time_ns`` are of its later end; ``scale`` is its kernel's, 0 without one.
     """
 
     model: str
@@ -115,10 +209,14 @@ class _Edge:
     cov: Array
     robot: str
     time_ns: int
+    scale: float = 0.0
 
 
-def _edges(step: Step, ids: GraphIds) -> Iterator[_Edge]:
-    """Edges of one step whose ends are all in the estimate."""
+def _edges(
+    step: Step, ids: GraphIds, kernel: RobustConfig, introduced: set[int]
+) -> Iterator[_Edge]:
+    """Edges of one step whose ends are all in the estimate; ``introduced``: lines seen before."""
+    scale = 0.0 if kernel.kernel == "none" else kernel.scale
     states = ids.states
     for robot, start in sorted(step.starts.items()):
         if (robot, step.time_ns) in states:
@@ -134,7 +232,8 @@ def _edges(step: Step, ids: GraphIds) -> Iterator[_Edge]:
         b = states.get((closure.robot, closure.time_ns))
         if a is not None and b is not None:
             found = closure.delta, closure.cov, closure.robot, closure.time_ns
-            yield _Edge("closure", (a, b), *found)
+            own = 0.0 if closure.verified else scale * math.sqrt(closure.scan_count)
+            yield _Edge("closure", (a, b), *found, own)
     for seen in step.associations:
         a = states.get((seen.robot, seen.time_ns))
         if isinstance(seen.target, str):
@@ -142,7 +241,10 @@ def _edges(step: Step, ids: GraphIds) -> Iterator[_Edge]:
         else:
             b = ids.landmarks.get(seen.target)
         if a is not None and b is not None:
-            yield _Edge(seen.model, (a, b), seen.z, seen.cov, seen.robot, seen.time_ns)
+            if seen.model == "line" and b not in introduced:
+                introduced.add(b)
+                yield _Edge("gauge", (a, b), seen.z, seen.cov, seen.robot, seen.time_ns)
+            yield _Edge(seen.model, (a, b), seen.z, seen.cov, seen.robot, seen.time_ns, scale)
 
 
 def _padded(states: Sequence[Array]) -> Array:
@@ -150,29 +252,45 @@ def _padded(states: Sequence[Array]) -> Array:
     return np.array([state if len(state) == 3 else (*state, 0.0) for state in states])
 
 
+def _inverse(cov: Array) -> Array:
+    """Inverses (n, m, m) of covariances.
+
+    Raises:
+        LinAlgError: one is not positive definite.
+    """
+    half = np.linalg.inv(np.linalg.cholesky(cov))
+    return np.asarray(half.mT @ half)
+
+
 def _point_edges(z: Array, cov: Array, x: Array, t: Array) -> _EdgeParts:
     """Bearing and range as Cartesian."""
-    return "EDGE_SE2_XY", *_cartesian(z, cov)
+    return "EDGE_SE2_XY", *_cartesian(z, cov, x, t)
 
 
 def _robot_point_edges(z: Array, cov: Array, x: Array, t: Array) -> _EdgeParts:
-    """Robots' positions as pose edges without information on the heading.
+    """Robots' positions as pose edges that say nothing about the heading.
 
-    The residual of EDGE_SE2 is rotated by the measured heading. There is none, so that of the
-    estimate is used, which is exact at the estimate and first order elsewhere.
+    The residual of EDGE_SE2 is along the axes of the measured heading. There is none, so that of
+    the estimate is used. The logarithm turns the residual e of the position by half of the
+    heading's; so that the heading has no influence, e Ω times that is taken back by mixed terms.
     """
-    xy, cov = _cartesian(z, cov)
-    phi = between(x, t)[:, 2]
-    R = np.array([rotation(-angle) for angle in phi.tolist()])
+    xy, info = _cartesian(z, cov, x, t)
+    h = between(x, t)
+    R = rotation3(-h[:, 2])[:, :2, :2]
     wide = np.zeros((len(xy), 3, 3))
-    wide[:, :2, :2] = R @ cov @ R.mT
-    wide[:, 2, 2] = 1.0 / NO_INFORMATION
-    return "EDGE_SE2", np.column_stack([xy, phi]), wide
+    wide[:, :2, :2] = R @ info @ R.mT
+    e = R @ (h[:, :2] - xy)[:, :, None]
+    turned = np.concatenate([e[:, 1:], -e[:, :1]], axis=1) / 2  # d log / d heading
+    mixed = -wide[:, :2, :2] @ turned
+    wide[:, :2, 2:], wide[:, 2:, :2] = mixed, mixed.mT
+    # the least that leaves the matrix positive definite
+    wide[:, 2, 2] = NO_INFORMATION - (turned.mT @ mixed)[:, 0, 0] * (1 + 1e-9)
+    return "EDGE_SE2", np.column_stack([xy, h[:, 2]]), wide
 
 
 def _pose_edges(z: Array, cov: Array, x: Array, t: Array) -> _EdgeParts:
     """Relative poses: motions, closures, segments, robots with direction; priors likewise."""
-    return "EDGE_SE2", z, rotate_cov(cov, -z[:, 2])
+    return "EDGE_SE2", z, _inverse(rotate_cov(cov, -z[:, 2]))
 
 
 def _start_edges(z: Array, cov: Array, x: Array, t: Array) -> _EdgeParts:
@@ -183,46 +301,49 @@ def _start_edges(z: Array, cov: Array, x: Array, t: Array) -> _EdgeParts:
 def _line_edges(z: Array, cov: Array, x: Array, t: Array) -> _EdgeParts:
     """Lines, slid along themselves to face the landmarks' origins; no information along them."""
     model = LineModel()
-    return "EDGE_SE2", model.facing(z, x, t), model.noise(z, cov, x, t)
+    rows = line_rows(z, x, t)
+    info = rows.mT @ _inverse(model.noise(z, cov, x, t)) @ rows
+    info[:, 0, 0] += NO_INFORMATION
+    return "EDGE_SE2", model.facing(z, x, t), info
 
 
-def _cartesian(z: Array, cov: Array) -> tuple[Array, Array]:
-    """Bearings and ranges (n, 2) as x and y (n, 2) in the base frame, covariances (n, 2, 2)."""
-    model, origin = MODELS["point"], np.zeros((len(z), 3))
-    _, J = model.invert_jacobians(z, origin)
-    return model.invert(z, origin), J @ cov @ J.mT
+def _gauge_edges(z: Array, cov: Array, x: Array, t: Array) -> _EdgeParts:
+    """Where lines' origins are along them: where the estimate has them; see `LINE_HELD_SIGMA_M`."""
+    along = np.diag([LINE_HELD_SIGMA_M**-2, NO_INFORMATION, NO_INFORMATION])
+    return "EDGE_SE2", between(x, t), np.tile(along, (len(z), 1, 1))
+
+
+def _cartesian(z: Array, cov: Array, x: Array, t: Array) -> tuple[Array, Array]:
+    """Bearings and ranges (n, 2) as x and y (n, 2) in the base frame, information (n, 2, 2).
+
+    With r the residual of bearing and range at the estimate and J its derivative by the position
+    h there, the residual J⁻¹ r of h - J⁻¹ r with information JᵀV⁻¹J has the same square, and the
+    same derivatives.
+    """
+    h = transform_each(inverse(x), t[:, :2])
+    distance = np.hypot(h[:, 0], h[:, 1])
+    r = np.column_stack([wrap(np.arctan2(h[:, 1], h[:, 0]) - z[:, 0]), distance - z[:, 1]])
+    across = np.column_stack([-h[:, 1], h[:, 0]]) / distance[:, None] ** 2
+    J = np.stack([across, h / distance[:, None]], axis=1)
+    offset = np.linalg.solve(J, r[:, :, None])[:, :, 0]
+    return h - offset, J.mT @ _inverse(cov) @ J
 
 
 #: dimension of a state -> its tag
 VERTICES: Mapping[int, str] = {2: "VERTEX_XY", 3: "VERTEX_SE2"}
 #: kind of measurement -> its edges, from measurements (n, k), their covariances, and the estimates
-#: (n, 3) of both ends; the rows are those of `MODELS` and the other contents of steps
+#: (n, 3) of both ends; the rows are those of `MODELS`, the other contents of steps, and gauges
 EDGES: Mapping[str, Callable[[Array, Array, Array, Array], _EdgeParts]] = {
     "start": _start_edges,
     "motion": _pose_edges,
     "closure": _pose_edges,
     "point": _point_edges,
     "line": _line_edges,
+    "gauge": _gauge_edges,
     "segment": _pose_edges,
     "robot-pose": _pose_edges,
     "robot-point": _robot_point_edges,
 }
-
-
-def _informations(cov: Array, size: int, edges: Sequence[_Edge]) -> Array:
-    """Upper triangles (n, k), by rows, of the inverses of covariances (n, m, m), m <= ``size``."""
-    try:
-        half = np.linalg.inv(np.linalg.cholesky(cov))
-    except np.linalg.LinAlgError as error:
-        bad = next(edge for edge, P in zip(edges, cov, strict=True) if not is_positive(P))
-        what = f"{bad.model} of {bad.robot} at {bad.time_ns}"
-        raise OutputError(f"graph.g2o: the covariance of {what} is not positive") from error
-    m = cov.shape[1]
-    info = np.zeros((len(cov), size, size))
-    info[:, range(size), range(size)] = NO_INFORMATION
-    info[:, size - m :, size - m :] = half.mT @ half
-    i, j = np.triu_indices(size)
-    return np.asarray(info[:, i, j])
 
 
 def _vertex(number: int, values: list[float]) -> str:

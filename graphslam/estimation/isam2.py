@@ -45,6 +45,9 @@ class BatchGraph(GraphBuilder):
     ``is_wide``: whether the information of motions and closures asks for QR, see `optimisation`.
     """
 
+    #: see `factors.line_rows`
+    sliding_lines = False
+
     def __init__(self, kernel: RobustConfig, *, defer_lines: bool = False) -> None:
         super().__init__(kernel, lines=not defer_lines)
         self.graph = gtsam.NonlinearFactorGraph()
@@ -128,6 +131,7 @@ class BatchGraph(GraphBuilder):
             poses[np.searchsorted(unique, keys)],
             poses[np.searchsorted(unique, targets)],
             self.kernel,
+            sliding=self.sliding_lines,
         )
         for index, factor in zip(self._line_indices, made, strict=True):
             self.graph.replace(index, factor)

@@ -1,4 +1,4 @@
-"""Robust kernels for filters: the weight that an M-estimator gives to one observation."""
+"""Robust kernels as formulas: what an M-estimator's cost is, and the weight that it gives."""
 
 from collections.abc import Callable
 
@@ -13,6 +13,13 @@ WEIGHTS: dict[str, Callable[[float, float], float]] = {
     "huber": lambda d, k: 1.0 if d <= k else k / d,
     "cauchy": lambda d, k: k * k / (k * k + d * d),
     "geman-mcclure": lambda d, k: (k * k / (k * k + d * d)) ** 2,
+}
+#: kernel -> costs (n,) of whitened residuals with lengths (n,), for a scale k
+LOSSES: dict[str, Callable[[Array, float], Array]] = {
+    "none": lambda d, _k: 0.5 * d * d,
+    "huber": lambda d, k: np.where(d <= k, 0.5 * d * d, k * (d - 0.5 * k)),
+    "cauchy": lambda d, k: 0.5 * k * k * np.log1p(np.square(d / k)),
+    "geman-mcclure": lambda d, k: 0.5 * np.square(k * d) / (k * k + d * d),
 }
 #: relative change of a weight at which reweighting ends, and its largest number of rounds
 #: (convergence is linear)

@@ -137,7 +137,7 @@ def _files(result: Result, report: Callable[[Result], str] | None) -> list[tuple
             "landmarks.json",
             to_json([landmark_json(landmark) for landmark in result.landmarks], "landmarks.json"),
         ),
-        ("graph.g2o", graph_g2o(result.steps, result.estimate)),
+        ("graph.g2o", graph_g2o(result.steps, result.estimate, result.config.robust)),
         ("graph_ids.csv", graph_ids(result.estimate)),
     ]
     for own in parallel_map(_trajectory_files, list(result.robots.items())):

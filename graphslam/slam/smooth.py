@@ -1,12 +1,15 @@
 """The main job: from a log to a `Result`."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 
 from graphslam.core.config import Config
 from graphslam.core.records import Result, RobotResult
 from graphslam.core.worker import parallel_map
+from graphslam.estimation.g2o import graph_error
+from graphslam.estimation.settled import settled
 from graphslam.logs import LogSet
 from graphslam.mapping.landmark_records import make_landmarks
 from graphslam.mapping.loop_closure import Tamper
@@ -60,6 +63,12 @@ def smooth(
     return make_result(finished, began)
 
 
+def is_settled(config: Config) -> bool:
+    """Whether the estimate is a minimum: that of the batch, not of a filter or of a window."""
+    backend = config.backend
+    return backend.name == "batch" and backend.optimise_at_end and backend.reoptimise
+
+
 def make_result(finished: FinishedPass, began: float) -> Result:
     """Everything in the robots' own frames, as one record.
 
@@ -76,6 +85,10 @@ def make_result(finished: FinishedPass, began: float) -> Result:
         transforms = pipeline.transforms()
         estimate = transforms.estimate(finished.estimate)
         steps = tuple(map(transforms.step, pipeline.steps))
+        if is_settled(pipeline.config):
+            estimate = settled(steps, estimate, pipeline.config.robust)
+        error, plain = graph_error(steps, estimate, pipeline.config.robust)
+        estimate = replace(estimate, error=error)
 
         def robot_result(name: str) -> RobotResult:
             return runs[name].result(
@@ -101,6 +114,6 @@ def make_result(finished: FinishedPass, began: float) -> Result:
         tuple(pipeline.keyframe_scans[:: 1 + len(pipeline.keyframe_scans) // MAX_PICTURES]),
         innovations,
         np.array(pipeline.step_ms),
-        summarise(pipeline, estimate, len(landmarks), finished.findings.clocks),
+        summarise(pipeline, estimate, plain, len(landmarks), finished.findings.clocks),
         pipeline.given_config,
     )

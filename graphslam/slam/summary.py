@@ -35,13 +35,18 @@ REOPTIMISED = (
 
 
 def summarise(
-    pipeline: LogPass, estimate: Estimate, landmarks: int, clocks: Mapping[str, ClockEstimate]
+    pipeline: LogPass,
+    estimate: Estimate,
+    plain_error: float,
+    landmarks: int,
+    clocks: Mapping[str, ClockEstimate],
 ) -> dict[str, Any]:
     """The keys of summary.json (see docs/formats.md).
 
     Args:
         pipeline: the last pass, its ``seconds`` complete.
         estimate: the final one.
+        plain_error: its error without robust kernels.
         landmarks: how many there are.
         clocks: of the robots, as found.
     """
@@ -94,7 +99,11 @@ def summarise(
         "rejected": dict(sorted(pipeline.rejected.items())),
         "dropped": dict(sorted(all_dropped.items())),
         "repaired": dict(sorted(log.repaired.items())),
-        "graph": {"error": estimate.error, "dof": estimate.dof},
+        "graph": {
+            "error": estimate.error,
+            "error_without_kernels": plain_error,
+            "dof": estimate.dof,
+        },
         "calibration": {
             f"{robot}.{name}": {"value": value, "sigma": sigma, "observable": observable}
             for robot, run in runs.items()

@@ -302,7 +302,7 @@ def test_the_edge_covariance_is_that_of_the_end_frame(tmp_path):
 
 
 def test_every_model_has_an_edge_and_gtsam_reads_the_whole_file(made, two_robots, tmp_path):
-    assert set(EDGES) == {*MODELS, "start", "motion", "closure"}
+    assert set(EDGES) == {*MODELS, "start", "motion", "closure", "gauge"}
     for result in (made, two_robots):
         text = graph_g2o(result.steps, result.estimate)
         graph, values = read_back(text, tmp_path)
@@ -311,14 +311,20 @@ def test_every_model_has_an_edge_and_gtsam_reads_the_whole_file(made, two_robots
         assert graph.size() == text.count("EDGE_SE2 ")
         seen = sum(len(s.associations) for s in result.steps)
         moved = sum(len(s.motions) for s in result.steps)
-        assert text.count("EDGE_SE2 ") + text.count("EDGE_SE2_XY ") == seen + moved
+        gauges = len({a.target for s in result.steps for a in s.associations if a.model == "line"})
+        assert text.count("EDGE_SE2 ") + text.count("EDGE_SE2_XY ") == seen + moved + gauges
 
 
 def test_line_edges_know_nothing_along_the_line(made, tmp_path):
     graph, values = read_back(graph_g2o(made.steps, made.estimate), tmp_path)
     landmarks = number_vertices(made.estimate).landmarks
     edges = [graph.at(i) for i in range(graph.size())]
-    lines = [f for f in edges if f.keys()[1] in landmarks.values()]
+    on_lines = [f for f in edges if f.keys()[1] in landmarks.values()]
+    # the gauge of each line has information along it, and none else
+    gauges = [f for f in on_lines if f.noiseModel().R()[1, 1] <= 1e-6]
+    assert len(gauges) == len(landmarks)
+    assert all(f.error(values) < 1e-12 for f in gauges)
+    lines = [f for f in on_lines if f not in gauges]
     assert len(lines) == len(made.steps) - 1
     for factor in lines:
         before = factor.error(values)

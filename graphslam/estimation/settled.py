@@ -1,0 +1,67 @@
+"""The estimate of a batch, moved to the exact minimum of the steps that it is reported with.
+
+Batches end before that. Their motions are linear in the calibration around the last but one, and
+their lines face where they were a round ago. What that leaves is far below the uncertainty; but
+whoever optimises the graph of a result should find what the result says.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+
+from graphslam.core.config import RobustConfig
+from graphslam.core.records import Estimate, Step, Trajectory
+from graphslam.estimation import factors
+from graphslam.estimation.optimisation import is_wide, optimise
+from graphslam.estimation.recorded_graph import RecordedGraph
+
+#: all variables together have settled when they move less than this, m and rad; rounds until then
+#: at most, without a kernel, and with one, whose weights converge linearly
+SETTLED, ROUNDS, ROUNDS_ROBUST = 1e-7, 50, 1
+
+
+def settled(steps: Sequence[Step], estimate: Estimate, kernel: RobustConfig) -> Estimate:
+    """The estimate at the minimum of its steps, from where it is; covariances stay as they are.
+
+    Raises:
+        EstimationError: the steps make it indeterminate.
+    """
+    builder, values = RecordedGraph(kernel), gtsam.Values()
+    builder.sliding_lines = True
+    builder.insert_all(steps, estimate, values)
+    _hold_lines(builder, values)
+    motions = [motion for step in steps for motion in step.motions.values()]
+    closures = [closure for step in steps for closure in step.closures]
+    use_qr = is_wide([*motions, *closures])
+    try:
+        for _ in range(ROUNDS if kernel.kernel == "none" else ROUNDS_ROBUST):
+            before = values
+            builder.rebuild_lines(values)
+            values = optimise(builder.graph, values, kernel, use_qr=use_qr)
+            if before.localCoordinates(values).norm() < SETTLED:
+                break
+    except RuntimeError as error:
+        raise builder.explain(error) from error
+    states: dict[str, Trajectory] = {}
+    for robot, before_it in estimate.states.items():
+        poses = [factors.read(values, key, 3) for key in builder.state_keys(robot)]
+        states[robot] = replace(before_it, poses=np.array(poses))
+    landmarks = dict(estimate.landmarks)
+    for landmark, dim in builder.landmark_dims.items():
+        key = factors.landmark_key(landmark)
+        landmarks[landmark] = factors.read(values, key, dim), estimate.landmarks[landmark][1]
+    return replace(estimate, states=states, landmarks=landmarks)
+
+
+def _hold_lines(builder: RecordedGraph, values: gtsam.Values) -> None:
+    """Replace the gauges of lines by those of the estimate; lines' other factors follow later."""
+    for n in range(builder.graph.size()):
+        factor = builder.graph.at(n)
+        if isinstance(factor, gtsam.BetweenFactorPose2) and not factors.is_state(factor.keys()[1]):
+            key, target = factor.keys()
+            noise = factor.noiseModel()
+            if isinstance(noise, gtsam.noiseModel.Gaussian) and not noise.R()[1, 1]:
+                x, t = factors.read(values, key, 3), factors.read(values, target, 3)
+                builder.graph.replace(n, factors.line_held_factor(key, target, x, t))
