@@ -13,7 +13,11 @@ import numpy as np
 
 from graphslam.core.config import RobustConfig
 from graphslam.core.records import Estimate, Motion, Step
-from graphslam.estimation.calibration_graph import CalibrationGraph, solve_calibrated
+from graphslam.estimation.calibration_graph import (
+    CalibrationGraph,
+    at_calibration,
+    solve_calibrated,
+)
 from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH
 from graphslam.odometry.preintegration import Track
 
@@ -57,7 +61,7 @@ def calibrate(
         estimate = solved.estimate
         for name, track in tracks.items():
             track.calibration = solved.calibrations[name]
-    return estimate, steps
+    return estimate, at_calibration(steps, initial, solved.calibrations) if rounds else steps
 
 
 def calibrate_roughly(

@@ -7,14 +7,14 @@ is estimated jointly, and its uncertainty is in every covariance.
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gtsam
 import numpy as np
 
 from graphslam.core.config import RobustConfig
-from graphslam.core.geometry import Array, adjoint, between, inverse, log, rotation3
+from graphslam.core.geometry import Array, adjoint, between, inverse, log, rotation3, wrap
 from graphslam.core.motion_models import HELD_SIGMA, Calibration
 from graphslam.core.records import Estimate, Motion, Step
 from graphslam.estimation import factors
@@ -62,6 +62,24 @@ def solve_calibrated(
     converged = CONVERGED_ERROR_ROUGH if rough else CONVERGED_ERROR
     found = problem.solve(converged, marginals=not rough, joint=joint)
     return CalibratedSolution(*found, problem)
+
+
+def at_calibration(
+    steps: Sequence[Step],
+    now: Mapping[str, Calibration],
+    found: Mapping[str, Calibration],
+) -> tuple[Step, ...]:
+    """Steps whose motions, computed with ``now``, are as the solution has them with ``found``."""
+    change = {robot: found[robot].mean - now[robot].mean for robot in found}
+    made = []
+    for step in steps:
+        motions = dict(step.motions)
+        for robot, motion in step.motions.items():
+            if robot in change and change[robot].any():
+                delta = motion.delta + motion.d_delta_d_calibration @ change[robot]
+                motions[robot] = replace(motion, delta=np.append(delta[:2], wrap(delta[2])))
+        made.append(replace(step, motions=motions))
+    return tuple(made)
 
 
 class CalibrationGraph:

@@ -12,7 +12,11 @@ from dataclasses import dataclass
 from graphslam.core.config import Config
 from graphslam.core.records import Estimate, Step
 from graphslam.estimation.batch_calibration import recompute_motions
-from graphslam.estimation.calibration_graph import CalibratedSolution, solve_calibrated
+from graphslam.estimation.calibration_graph import (
+    CalibratedSolution,
+    at_calibration,
+    solve_calibrated,
+)
 from graphslam.mapping.duplicate_landmarks import (
     find_duplicates,
     merged,
@@ -89,7 +93,7 @@ def _solve(
     )
     for name, track in tracks.items():
         track.calibration = solution.calibrations[name]
-    return _Solved(made, solution)
+    return _Solved(at_calibration(made, initial, solution.calibrations), solution)
 
 
 def _solved(
