@@ -47,18 +47,18 @@ def wheel_jacobian(angles_rad: Array, robot: RobotConfig) -> Array:
     return J
 
 
-def model_error_cov(twists: Array, config: OdometryConfig) -> Array:
+def model_error_cov(twists: Array, seconds: Array, config: OdometryConfig) -> Array:
     """Covariance ``(n, 3, 3)`` of the white model error of motions ``(n, 3)``, eq. 4.14.
 
-    Along the axes of each increment's start frame; linear in path and turning, so it does not
-    depend on how finely the odometry is sampled.
+    Along the axes of each increment's start frame; linear in path, turning and the ``seconds``
+    (n,) in motion, so it does not depend on how finely the odometry is sampled.
     """
     path = np.hypot(twists[:, 0], twists[:, 1])
     turn = np.abs(twists[:, 2])
     cov = np.zeros((len(twists), 3, 3))
-    cov[:, 0, 0] = config.k_x_m * path + config.k_x_rad * turn
-    cov[:, 1, 1] = config.k_y_m * path + config.k_y_rad * turn
-    cov[:, 2, 2] = config.k_phi_m * path + config.k_phi_rad * turn
+    cov[:, 0, 0] = config.k_x_m * path + config.k_x_rad * turn + config.k_x_s * seconds
+    cov[:, 1, 1] = config.k_y_m * path + config.k_y_rad * turn + config.k_y_s * seconds
+    cov[:, 2, 2] = config.k_phi_m * path + config.k_phi_rad * turn + config.k_phi_s * seconds
     return cov
 
 
@@ -98,29 +98,32 @@ class Calibration:
 def odometry_increments(
     rows: Array, calibration: Array, _robot: RobotConfig, config: OdometryConfig
 ) -> Increments:
-    """Increments of an odometry that reports poses: ``rows`` (n, 3) are twists.
+    """Increments of an odometry that reports poses: ``rows`` (n, 4) are twists and seconds.
 
     Calibration parameters: relative scale of translation, relative scale of rotation, turning per
     metre driven forwards (rad/m): wheels of unequal size turn the robot the other way in reverse.
     """
+    rows, seconds = rows[:, :3], rows[:, 3]
     d_twist = np.zeros((len(rows), 3, 3))
     d_twist[:, :2, 0] = rows[:, :2]
     d_twist[:, 2, 1] = rows[:, 2]
     d_twist[:, 2, 2] = rows[:, 0]
     twists = rows + (d_twist @ calibration[..., None])[..., 0]
-    return Increments(exp(twists), model_error_cov(rows, config), exp_jacobian(twists) @ d_twist)
+    cov = model_error_cov(rows, seconds, config)
+    return Increments(exp(twists), cov, exp_jacobian(twists) @ d_twist)
 
 
 def command_increments(
     rows: Array, calibration: Array, _robot: RobotConfig, config: OdometryConfig
 ) -> Increments:
-    """Increments of commanded velocities, compounded to poses: ``rows`` (n, 3) are twists.
+    """Increments of commanded velocities, as poses: ``rows`` (n, 4) are twists and seconds.
 
     Calibration parameters: those of `odometry_increments`, and the turning loss, in m²: the path is
     shorter by this times the squared curvature. This is the case if the commanded speed is that of
     a point at distance d from the middle of the axle, hypot(v, d ω): to second order too large by
     d²/2 times the squared curvature.
     """
+    rows, seconds = rows[:, :3], rows[:, 3]
     path = np.maximum(np.hypot(rows[:, 0], rows[:, 1]), 1e-12)
     curvature = np.minimum(np.abs(rows[:, 2]) / path, MAX_CURVATURE_PER_M)
     d_twist = np.zeros((len(rows), 3, 4))
@@ -129,7 +132,8 @@ def command_increments(
     d_twist[:, 2, 2] = rows[:, 0]
     d_twist[:, :2, 3] = -rows[:, :2] * (curvature**2)[:, None]
     twists = rows + (d_twist @ calibration[..., None])[..., 0]
-    return Increments(exp(twists), model_error_cov(rows, config), exp_jacobian(twists) @ d_twist)
+    cov = model_error_cov(rows, seconds, config)
+    return Increments(exp(twists), cov, exp_jacobian(twists) @ d_twist)
 
 
 def given_increments(
@@ -146,7 +150,7 @@ def given_increments(
 def wheel_increments(
     rows: Array, calibration: Array, robot: RobotConfig, config: OdometryConfig
 ) -> Increments:
-    """Increments of wheel rotations: ``rows`` (n, 2) left and right, rad.
+    """Increments of wheel rotations: ``rows`` (n, 3) left and right, rad, and seconds.
 
     Calibration parameters: corrections of left radius, right radius and axle length, m.
     The counting error of one reading enters two neighbouring increments with opposite signs and
@@ -158,11 +162,12 @@ def wheel_increments(
         wheel_radius_right_m=robot.wheel_radius_right_m + calibration[1],
         axle_m=robot.axle_m + calibration[2],
     )
+    rows, seconds = rows[:, :2], rows[:, 2]
     twists = wheel_twist(rows, robot)
     J = exp_jacobian(twists) @ wheel_jacobian(rows, robot)
     moved = np.any(rows != 0, axis=1)
     counting = (config.count_sigma_rad**2 * moved)[:, None, None]
-    cov = model_error_cov(twists, config) + counting * (J[:, :, 2:4] @ J[:, :, 2:4].mT)
+    cov = model_error_cov(twists, seconds, config) + counting * (J[:, :, 2:4] @ J[:, :, 2:4].mT)
     return Increments(exp(twists), cov, J[:, :, [0, 1, 4]])
 
 
@@ -225,6 +230,18 @@ MOTION_SOURCES: dict[str, Callable[[Array, Array, RobotConfig, OdometryConfig], 
     "commands": command_increments,
     "wheels": wheel_increments,
 }
+
+
+def rows_of_twists(source: str, twists: Array, robot: RobotConfig) -> Array:
+    """The rows of a source without stated covariances that report twists (n, 3); 0 s in motion."""
+    if source == "wheels":
+        path, half = twists[:, 0], 0.5 * robot.axle_m * twists[:, 2]
+        turns = (
+            (path - half) / robot.wheel_radius_left_m,
+            (path + half) / robot.wheel_radius_right_m,
+        )
+        return np.column_stack([*turns, np.zeros(len(twists))])
+    return np.column_stack([twists, np.zeros(len(twists))])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

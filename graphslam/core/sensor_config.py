@@ -75,7 +75,8 @@ class OdometryConfig:
     """Noise of the motion between two states (thesis 4.8-4.15, see docs/thesis.md).
 
     The model error is white; its variance grows with path and turning (4.14): k_x_m and k_y_m in
-    m² per m, k_x_rad and k_y_rad in m² per rad, k_phi_m in rad² per m, k_phi_rad in rad² per rad.
+    m² per m, k_x_rad and k_y_rad in m² per rad, k_phi_m in rad² per m, k_phi_rad in rad² per rad;
+    and with the time in motion: k_x_s and k_y_s in m² per s, k_phi_s in rad² per s.
     Calibration errors are constant; their prior sigmas: translation_scale_sigma and
     rotation_scale_sigma are relative, drift_sigma_rad_per_m is rotation per metre driven forwards;
     for wheel angles wheel_radius_sigma_m and axle_sigma_m, and count_sigma_rad per reading (white).
@@ -105,6 +106,9 @@ class OdometryConfig:
     k_y_rad: float = 1e-5
     k_phi_m: float = 1e-4
     k_phi_rad: float = 1e-4
+    k_x_s: float = 0.0
+    k_y_s: float = 0.0
+    k_phi_s: float = 0.0
     translation_scale_sigma: float = 0.03
     rotation_scale_sigma: float = 0.04
     drift_sigma_rad_per_m: float = 0.03

@@ -21,7 +21,8 @@ from graphslam.estimation import factors
 from graphslam.estimation.backend import JointMarginal
 from graphslam.estimation.isam2 import NO_COVARIANCES, with_means
 from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH, marginals_of
-from graphslam.estimation.recorded_graph import RecordedGraph
+from graphslam.estimation.posterior_residuals import Posterior, posterior_pairs
+from graphslam.estimation.recorded_graph import ObservationNoise, RecordedGraph, Source
 
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
@@ -38,6 +39,7 @@ def solve_calibrated(
     *,
     rough: bool = False,
     joint: bool = False,
+    noise: Mapping[Source, ObservationNoise] | None = None,
 ) -> "CalibratedSolution":
     """Optimise all states, landmarks and calibrations together.
 
@@ -53,11 +55,12 @@ def solve_calibrated(
         kernel: of observations.
         rough: stop early, see `Reoptimiser.solve`; covariances are NaN.
         joint: whether the estimate is to have the root of the information.
+        noise: see `RecordedGraph`.
 
     Raises:
         EstimationError: a covariance is not positive definite, or a state is unknown.
     """
-    problem = CalibrationGraph(steps, start, priors, now, kernel)
+    problem = CalibrationGraph(steps, start, priors, now, kernel, noise)
     problem.calibrate_motions(steps, now)
     converged = CONVERGED_ERROR_ROUGH if rough else CONVERGED_ERROR
     found = problem.solve(converged, marginals=not rough, joint=joint)
@@ -95,13 +98,14 @@ class CalibrationGraph:
         priors: Mapping[str, Calibration],
         now: Mapping[str, Calibration],
         kernel: RobustConfig,
+        noise: Mapping[Source, ObservationNoise] | None = None,
     ) -> None:
-        """Build the graph; for the arguments see `solve_calibrated`.
+        """Build the graph; for the arguments see `solve_calibrated` and `RecordedGraph`.
 
         Raises:
             EstimationError: a covariance is not positive definite, or a state is unknown.
         """
-        self._builder = builder = RecordedGraph(kernel)
+        self._builder = builder = RecordedGraph(kernel, noise)
         self._values, self._priors = gtsam.Values(), priors
         self._marginals: gtsam.Marginals | None = None  # at the last solution
         self._keys = {r: int(gtsam.symbol("c", k)) for k, r in enumerate(sorted(priors))}
@@ -177,6 +181,19 @@ class CalibrationGraph:
                 cov[np.ix_(use, use)] = covs.get(key, np.nan)
             calibrations[robot] = Calibration(prior.names, mean, cov)
         return estimate, calibrations
+
+    def posterior(self) -> Posterior:
+        """The last solution with the covariances that its residuals need.
+
+        Raises:
+            EstimationError: it is indeterminate.
+        """
+        builder = self._builder
+        try:
+            blocks = marginals_of(builder.graph, self._values, posterior_pairs(builder))
+        except RuntimeError as error:
+            raise builder.explain(error) from error
+        return Posterior(builder, self._values, blocks)
 
     def landmark_covariance(self, landmarks: Sequence[int]) -> Array:
         """Joint covariance (D, D) of landmarks at the last solution, along world axes.

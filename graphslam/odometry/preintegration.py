@@ -29,6 +29,7 @@ from graphslam.core.motion_models import (
     compound,
     mounted_motion,
     nominal_calibration,
+    rows_of_twists,
 )
 from graphslam.core.records import Motion
 from graphslam.odometry.increment_sums import IncrementSums, Motions, PathSums
@@ -58,7 +59,8 @@ class Track(Readings):
 
     def _begin(self, source: str, time_ns: int) -> None:
         super()._begin(source, time_ns)
-        self._mounted &= source != "given"
+        # a laser's mount is found together with the calibration of odometry, which this has not
+        self._mounted &= source != "given" or self.config.laser_sigma_m == 0.0
         self.calibration = self.prior = nominal_calibration(source, self.config, self._mounted)
 
     @property
@@ -110,9 +112,24 @@ class Track(Readings):
             return round(float(self.calibration.mean[-1]) * 1e9)
         return 0
 
+    @property
+    def reported_late_ns(self) -> int:
+        """By how long the time of a state is later than that of the odometry it is reported at.
+
+        States have the time at which their sensor saw something. Measured odometry says when the
+        robot was there, so what is late is the sensor. A robot that follows its commands late is
+        where the sensor sees it.
+        """
+        return 0 if self.source == "commands" else self.latency_ns
+
     def increments(self, rows: Array, calibration: Array) -> Increments:
         """Increments (n) of rows (n, k), by calibration parameters (p,) or (n, p)."""
         return MOTION_SOURCES[self.source](rows, calibration, self._robot, self.config)
+
+    def derivative(self, twists: Array) -> Array:
+        """Derivative (n, 3, p) of motions on arcs, by their twists (n, 3), by the calibration."""
+        rows = rows_of_twists(self.source, twists, self._robot)
+        return self.increments(rows, self.calibration.mean[: self.increment_parameters]).d_cal
 
     def mounted_pose(self, times_ns: IntArray) -> Array:
         """Poses (n, 3) of the frame at ``mount``, the times ``latency_ns`` late; see `pose`.

@@ -31,7 +31,8 @@ EDGE_NS = 500_000_000
 #: m per rad: how much path a turn counts for when a correction is spread over an interval
 TURNING_EFFORT_M = 0.3
 
-_ROW_SIZE = {"odometry": 3, "commands": 3, "given": 12, "wheels": 2}
+#: numbers in a row: a twist or two wheel turns, and the seconds in motion; or twist and covariance
+_ROW_SIZE = {"odometry": 4, "commands": 4, "given": 12, "wheels": 3}
 #: columns of `Readings._totals`: path m, heading rad (not wrapped), effort m; then those of a row
 _PATH, _HEADING, _EFFORT, _ROW = 0, 1, 2, 3
 
@@ -53,8 +54,8 @@ class RowSpan:
 class Readings:
     """Odometry readings of one robot, in time order.
 
-    One small row per reading is kept: what its interval adds (a twist, wheel turns, or an increment
-    with its covariance).
+    One small row per reading is kept: what its interval adds (a twist or wheel turns with the
+    seconds in motion, or an increment with its covariance).
     """
 
     def __init__(self, config: OdometryConfig, robot: RobotConfig) -> None:
@@ -152,13 +153,11 @@ class Readings:
         if self.source == "given":
             return value
         before, self._last = self._last, value
-        if self.source == "wheels":
-            return np.asarray(value - before)
-        row = log(between(before, value))
-        if _is_reset(row, apart_ns, self.config.max_speed_m_s):
+        row = value - before if self.source == "wheels" else log(between(before, value))
+        if self.source != "wheels" and _is_reset(row, apart_ns, self.config.max_speed_m_s):
             self._resets += 1
             return np.asarray(self._rows[self._integrated - 1])
-        return row
+        return np.append(row, 1e-9 * apart_ns if row.any() else 0.0)
 
     def _enter(self, n: int, row: Array) -> None:
         """`_integrate` of one row, that of the n-th reading, n > 0.
@@ -362,9 +361,11 @@ def _rows(group: Sequence[Readings], firsts: IntArray, apart_ns: IntArray) -> Ar
     earlier[firsts] = [one._last for one in group]
     for one in group:
         one._last = one._pending[-1]
-    if group[0].source == "wheels":
-        return np.asarray(values - earlier)
-    rows = log(between(earlier, values))
+    wheels = group[0].source == "wheels"
+    rows = values - earlier if wheels else log(between(earlier, values))
+    rows = np.column_stack([rows, 1e-9 * apart_ns * rows.any(axis=1)])
+    if wheels:
+        return rows
     resets = _is_reset(rows, apart_ns, group[0].config.max_speed_m_s)
     for k in np.flatnonzero(resets).tolist():
         g = int(np.searchsorted(firsts, k, side="right")) - 1

@@ -17,12 +17,14 @@ from graphslam.core.geometry import Array
 from graphslam.core.observation_models import MODELS, transport
 from graphslam.core.records import Estimate, Motion, Sighting, Step
 from graphslam.estimation.batch_calibration import ROUNDS, calibrate
+from graphslam.estimation.recorded_graph import SHARED_NS
 from graphslam.odometry.increment_sums import Motions
 from graphslam.odometry.preintegration import Track, preintegrate_batch
 from graphslam.odometry.readings import IntArray
 from graphslam.perception.sightings import sighting_observation
 from graphslam.slam.motion_noise import noise_scales, scale_motion_noise
 from graphslam.slam.sighting_batches import transport_batch, transport_target
+from graphslam.slam.sighting_noise import LogNoise
 
 #: ns: residuals of one target's sightings farther apart are taken as independent
 WINDOW_NS = 10_000_000_000
@@ -68,17 +70,35 @@ def solve_sighting_log(
     groups: Sequence["SightingGroup"],
     config: Config,
     rounds: int = ROUNDS,
+    noise: LogNoise | None = None,
 ) -> tuple[Estimate, tuple[Step, ...]]:
-    """`reoptimise_sighting_log` by the groups of the sightings, in so many ``rounds``."""
+    """`reoptimise_sighting_log` by the groups of the sightings, in so many ``rounds``.
+
+    With the ``noise`` of the log; if it is not known, with that of the residuals.
+    """
+    if noise is not None:
+        groups = [with_shared_errors(group, noise) for group in groups]
 
     def rebuild(estimate: Estimate, last: bool) -> tuple[Step, ...]:
         # once only: estimated from its own result again and again, noise would collapse
-        made = recompute_steps(steps, estimate, tracks, groups, widen=last)
+        made = recompute_steps(steps, estimate, tracks, groups, widen=last and noise is None)
         if not last:
             return made
         return scale_motion_noise(made, noise_scales(made, estimate, MOTION_WINDOW_NS))
 
     return calibrate(rebuild, estimate, tracks, config.robust, rounds)
+
+
+def with_shared_errors(group: "SightingGroup", noise: LogNoise) -> "SightingGroup":
+    """Sightings with the noise of a log, an error that n of them share counted n times in each."""
+    known = noise.sightings.get((group.robot, "point" if group.other is None else "robot-point"))
+    if known is None or group.z.shape[1] != 2:
+        return group
+    spans = np.column_stack([group.landmarks, group.seen_ns // SHARED_NS])
+    _, of, count = np.unique(spans, axis=0, return_inverse=True, return_counts=True)
+    sigma = np.sqrt(known.white + count[of.ravel(), None] * known.shared)
+    cov = group.cov * sigma[:, :, None] * sigma[:, None, :]
+    return replace(group, cov=cov, share=np.ones_like(group.share))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

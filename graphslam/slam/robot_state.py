@@ -134,7 +134,10 @@ class RobotState:
             final = final_at(states, self.track, times, stamps)
         base = trajectory_of_mount(final, inverse(self.track.mount))
         at_start = compose(states.poses[0], inverse(self.track.mount))
-        odometry = between(self.track.pose(self.times[0]), self.track.pose(times))
+        late_ns = self.track.latency_ns
+        odometry = between(
+            self.track.pose(self.times[0] - late_ns), self.track.pose(times - late_ns)
+        )
         unknown = np.full((len(times), 3, 3), np.nan)
         by_odometry = Trajectory(stamps, compose(at_start, odometry), unknown)
         if causal is not None and causal_only:
@@ -152,7 +155,8 @@ class RobotState:
             return stamps, times, np.array([scan[2] for scan in scans])
         period = round(1e9 / BASE_RATE_HZ)
         times = np.arange(self.track.first_ns, self.track.last_ns + 1, period)
-        return self.clock.to_local(times), times, np.zeros((0, 3))
+        stamps = self.clock.to_local(times)
+        return stamps, times + self.track.reported_late_ns, np.zeros((0, 3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -29,6 +29,7 @@ from graphslam.slam.log_pass import PriorKnowledge, Progress, timed
 from graphslam.slam.pipeline import Pipeline
 from graphslam.slam.reoptimise_sightings import SightingGroup, group_sightings
 from graphslam.slam.sighting_batches import SightingBatch, sighting_batches
+from graphslam.slam.sighting_noise import LogNoise
 from graphslam.slam.synchronisation import ODOMETRY
 
 
@@ -41,7 +42,6 @@ def can_solve_at_once(log: LogSet, config: Config) -> bool:
     return (
         Sighting in kinds
         and not kinds & {Scan, RelativePose}
-        and len(log.robots) > 1
         and config.association.identities == "use"
         and config.keyframe.mode != "all"
         and config.keyframe.sighting_window_s > 0
@@ -61,6 +61,7 @@ class SightingPass(Pipeline):
         """Reads nothing yet."""
         super().__init__(log, config, known)
         self.all_named = True
+        self.noise = LogNoise()
 
     def run(self, progress: Progress) -> None:
         """Read the log and make the steps; see `Pipeline`."""

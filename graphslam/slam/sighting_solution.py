@@ -20,7 +20,7 @@ from graphslam.core.motion_models import Calibration
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Estimate, Step, Trajectory
 from graphslam.core.worker import parallel_map
-from graphslam.estimation.batch_calibration import calibrate_roughly
+from graphslam.estimation.batch_calibration import calibrate, calibrate_roughly
 from graphslam.mapping.landmark_map import observed_from
 from graphslam.multi_robot.relative_frames import RobotEstimate
 from graphslam.odometry.preintegration import Track
@@ -30,7 +30,14 @@ from graphslam.slam.reoptimise_sightings import (
     recompute_steps,
     solve_sighting_log,
 )
+from graphslam.slam.sighting_noise import LogNoise, estimate_noise, with_noise
 from graphslam.slam.sighting_pass import SightingPass
+from graphslam.slam.sighting_states import (
+    at_states,
+    state_times,
+    steps_at_sightings,
+    with_motions,
+)
 
 #: how much wider the kernel is in the beginning
 WIDE = 10.0
@@ -86,7 +93,50 @@ def solve_finely(one: SightingPass, rough: Estimate) -> tuple[Estimate, tuple[St
     Raises:
         EstimationError: the estimate is indeterminate.
     """
-    return solve_sighting_log(one.steps, rough, one.tracks, one.groups, one.config, 1)
+    tracks, config = one.tracks, one.config
+    one.noise = estimate_noise(one.steps, one.sources, rough, tracks, config)
+    if one.noise.is_white:
+        begun_ns = {name: step.time_ns for step in one.steps for name in step.starts}
+        late_ns = {name: track.reported_late_ns for name, track in tracks.items()}
+        steps = steps_at_sightings(one.steps, one.sources, late_ns, one.dropped)
+        start = at_states(rough, steps, tracks)
+        solved = solve_at_sightings(steps, start, tracks, one.noise, config, begun_ns)
+        for name, times in state_times(steps).items():
+            one.runs[name].times = times.tolist()
+        return solved
+    return solve_sighting_log(one.steps, rough, tracks, one.groups, config, 1, one.noise)
+
+
+def solve_at_sightings(
+    steps: Sequence[Step],
+    start: Estimate,
+    tracks: Mapping[str, Track],
+    noise: LogNoise,
+    config: Config,
+    begun_ns: Mapping[str, int],
+) -> tuple[Estimate, tuple[Step, ...]]:
+    """The estimate with a state at every sighting, and the steps behind it.
+
+    Args:
+        steps: see `steps_at_sightings`.
+        start: an estimate of their states and landmarks.
+        tracks: odometry of every robot; their calibration and noise are set to what is found.
+        noise: of the log.
+        config: settings.
+        begun_ns: see `with_motions`.
+
+    Raises:
+        EstimationError: the estimate is indeterminate.
+    """
+    for name, track in tracks.items():
+        track.config = noise.odometry.get(name, track.config)
+    widened = with_noise(steps, noise)
+    kernels = noise.kernels()
+
+    def rebuild(estimate: Estimate, _last: bool) -> tuple[Step, ...]:
+        return with_motions(widened, tracks, estimate, begun_ns)
+
+    return calibrate(rebuild, start, tracks, config.robust, noise=kernels)
 
 
 def solve_robots_apart(one: SightingPass) -> Estimate:

@@ -1,0 +1,119 @@
+"""Residuals of a batch solution, and how much of their noise the solution has absorbed.
+
+For white noise of covariance R that a linear least-squares estimate is made from, residuals have
+the covariance R - H P Hᵀ: the estimate, of covariance P, follows each measurement a little. Only
+with both parts do residuals tell how large the noise is (C. R. Rao, Estimation of variance and
+covariance components in linear models, JASA 67, 1972, DOI 10.1080/01621459.1972.10481212).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from graphslam.core.geometry import Array, adjoint, between, inverse, log, rotation3
+from graphslam.core.observation_models import MODELS
+from graphslam.estimation import factors
+from graphslam.estimation.recorded_graph import RecordedGraph, Source
+from graphslam.estimation.selected_inverse import CovarianceBlocks
+
+#: share of its variance that a residual needs at least to tell about its noise
+MIN_REDUNDANCY = 0.02
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Residuals:
+    """Residuals of n measurements of one kind.
+
+    ``residual`` (n, k); ``variance`` (n, k) of the noise as assumed; ``absorbed`` (n, k): the
+    diagonal of H P Hᵀ.
+    """
+
+    residual: Array
+    variance: Array
+    absorbed: Array
+
+    @property
+    def redundancy(self) -> Array:
+        """(n, k): the share of the noise that is left in each residual."""
+        return np.asarray(np.maximum(1.0 - self.absorbed / self.variance, MIN_REDUNDANCY))
+
+    @property
+    def normalised(self) -> Array:
+        """(n, k): residuals divided by the sigmas that they should have."""
+        return np.asarray(self.residual / np.sqrt(self.variance * self.redundancy))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Posterior:
+    """A solution: its graph, values and covariances, those of `posterior_pairs` among them.
+
+    ``blocks`` are of errors along the axes of each pose.
+    """
+
+    builder: RecordedGraph
+    values: gtsam.Values
+    blocks: CovarianceBlocks
+
+    def motions(self, robot: str, deltas: Array, variances: Array) -> Residuals:
+        """Residuals of all motions of a robot, along the axes of their starts.
+
+        Args:
+            robot: its name.
+            deltas: (n, 3) the motions as measured, by the calibration that was found.
+            variances: (n, 3) of their noise.
+        """
+        pairs = [(last, key) for _, name, last, key in self.builder.motions if name == robot]
+        moved = between(*(self._values([pair[end] for pair in pairs], 3) for end in (0, 1)))
+        turn = rotation3(deltas[:, 2])
+        r = (turn @ log(between(deltas, moved))[:, :, None])[:, :, 0]
+        H = np.concatenate([turn @ -adjoint(inverse(moved)), turn], axis=2)
+        return Residuals(r, variances, self._absorbed(H, pairs))
+
+    def sightings(self, source: Source) -> Residuals:
+        """Residuals of all bearings and ranges of a source, by its noise in the graph."""
+        seen = self.builder.bearings_and_ranges[source]
+        model = MODELS[source[1]]
+        pairs = [(key, target) for key, target, _ in seen]
+        x, t = (
+            self._values([pair[end] for pair in pairs], dim)
+            for end, dim in enumerate((3, model.dim))
+        )
+        z, cov = (np.array([getattr(a, name) for *_, a in seen]) for name in ("z", "cov"))
+        variance = np.diagonal(cov, axis1=1, axis2=2)
+        if source in self.builder.noise:
+            variance = variance * self.builder.noise[source].white
+        H_x, H_t = model.jacobians(z, x, t)
+        H_x = H_x @ rotation3(x[:, 2])
+        if model.dim == 3:
+            H_t = H_t @ rotation3(t[:, 2])
+        H = np.concatenate([H_x, H_t], axis=2)
+        return Residuals(model.residual(z, x, t), variance, self._absorbed(H, pairs))
+
+    def shared(self, source: Source) -> Residuals | None:
+        """Shared errors (n, 2) of a source, as residuals of their priors; None without any."""
+        found = self.builder.shared_errors.get(source)
+        if found is None:
+            return None
+        pairs = [(a, b) for a, b in found.keys.tolist()]
+        offset = np.subtract(*(self._values([pair[end] for pair in pairs], 2) for end in (1, 0)))
+        r = (found.axes @ offset[:, :, None])[:, :, 0]
+        H = np.concatenate([-found.axes, found.axes], axis=2)
+        return Residuals(r, found.variance, self._absorbed(H, pairs))
+
+    def _absorbed(self, H: Array, pairs: Sequence[tuple[int, int]]) -> Array:
+        P = np.array([self.blocks.joint[pair] for pair in pairs])
+        return np.asarray(np.einsum("nij,njk,nik->ni", H, P, H))
+
+    def _values(self, keys: Sequence[int], dim: int) -> Array:
+        unique, where = np.unique(np.array(keys, dtype=np.int64), return_inverse=True)
+        return np.array([factors.read(self.values, key, dim) for key in unique.tolist()])[where]
+
+
+def posterior_pairs(builder: RecordedGraph) -> list[tuple[int, int]]:
+    """Keys of the variables whose joint covariances `Posterior` needs."""
+    moved = [(last, key) for _, _, last, key in builder.motions]
+    seen = [(key, target) for own in builder.bearings_and_ranges.values() for key, target, _ in own]
+    shared = [(a, b) for found in builder.shared_errors.values() for a, b in found.keys.tolist()]
+    return moved + seen + shared

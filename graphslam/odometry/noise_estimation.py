@@ -1,0 +1,101 @@
+"""Noise of a robot's odometry, from the residuals of its motions in a solution.
+
+The model is that of `model_error_cov`: variances that grow with path, turning and time in motion.
+Its nine rates are fitted to the squared residuals, each divided by what the solution has left of
+its variance (iterated almost unbiased estimation: S. D. Horn, R. A. Horn and D. B. Duncan,
+Estimating heteroscedastic variances in linear models, JASA 70, 1975, DOI
+10.1080/01621459.1975.10479891).
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from graphslam.core.config import OdometryConfig
+from graphslam.core.geometry import Array
+from graphslam.odometry.preintegration import Track
+from graphslam.odometry.readings import IntArray
+
+#: settings of the rates
+RATES = tuple(f"k_{axis}_{unit}" for axis in ("x", "y", "phi") for unit in ("m", "rad", "s"))
+#: exponent of an extra step in the direction of the last one: without it the distance to the fixed
+#: point halves in each round where sightings are dense, with it a tenth is left
+OVER_RELAXATION = 0.7
+#: m, rad: floors of short motions; that of positions is above what cutting readings leaves out
+FLOOR_M, FLOOR_RAD = 5e-4, 1e-4
+#: residuals are cut at so many of their own sigmas: slip is left to the solution
+CLIP_SIGMAS = 3.0
+#: a median of absolute values, as the sigma of a normal variable
+SIGMA_OF_MEDIAN = 1.4826
+
+
+def is_stated(track: Track) -> bool:
+    """Whether the log or the settings say how noisy a track is."""
+    default = OdometryConfig()
+    return track.source == "given" or any(
+        getattr(track.config, name) != getattr(default, name) for name in RATES
+    )
+
+
+def without_floors(config: OdometryConfig) -> OdometryConfig:
+    """Settings by which the noise of an interval is that of its parts, however short they are."""
+    return replace(config, floor_sigma_m=FLOOR_M, floor_sigma_rad=FLOOR_RAD)
+
+
+def fit_noise(
+    track: Track,
+    times_ns: tuple[IntArray, IntArray],
+    normalised: Array,
+    redundancy: Array,
+    *,
+    relax: bool,
+) -> OdometryConfig:
+    """The settings of a track with the noise that its motions show, without floors.
+
+    Args:
+        track: of a source that does not state its noise.
+        times_ns: (n,) of the beginnings and of the ends of the motions.
+        normalised: (n, 3) residuals by the track's present noise, see `Residuals`.
+        redundancy: (n, 3) see `Residuals`.
+        relax: whether to go farther, as the present noise comes from such a fit already.
+    """
+    bare = without_floors(replace(track.config, **dict.fromkeys(RATES, 0.0)))
+    R, known = (motion_variances(track, config, times_ns) for config in (track.config, bare))
+    each = [motion_variances(track, replace(bare, **{name: 1.0}), times_ns) for name in RATES]
+    C = np.stack(each, axis=-1) - known[:, :, None]  # (n, 3, 9)
+    moved = C.any(axis=(1, 2))
+    if not moved.any():
+        return bare
+    C, R, known, left = C[moved], R[moved], known[moved], redundancy[moved]
+    cut = CLIP_SIGMAS * SIGMA_OF_MEDIAN * np.median(np.abs(normalised[moved]), axis=0)
+    squared = np.clip(normalised[moved], -cut, cut) ** 2  # expected: true variance / R
+    A = (C * (left / R)[:, :, None]).reshape(-1, len(RATES))
+    x = _non_negative(A, ((squared - known / R) * left).ravel())
+    if relax:
+        before = np.maximum(np.mean(1.0 - known / R, axis=0), 1e-9)
+        x *= np.repeat(np.clip(np.mean(C @ x / R, axis=0) / before, 0.5, 2.0) ** OVER_RELAXATION, 3)
+    return replace(bare, **dict(zip(RATES, x.tolist(), strict=True)))
+
+
+def motion_variances(
+    track: Track, config: OdometryConfig, times_ns: tuple[IntArray, IntArray]
+) -> Array:
+    """Variances (n, 3) of a track's motions along their axes by other settings."""
+    before, calibration = track.config, track.calibration
+    track.config, track.calibration = config, calibration.held()
+    try:
+        return np.diagonal(track.motions(*times_ns).cov, axis1=1, axis2=2).copy()
+    finally:
+        track.config, track.calibration = before, calibration
+
+
+def _non_negative(A: Array, b: Array) -> Array:
+    """Least squares A x = b with x ≥ 0."""
+    from scipy.optimize import nnls  # noqa: PLC0415  (imports for long)
+
+    scale = np.linalg.norm(A, axis=0)
+    scale[scale == 0] = 1.0
+    # by the normal equations: nine unknowns, tens of thousands of rows
+    root = np.linalg.qr(A / scale, mode="r")
+    x, _ = nnls(root, np.linalg.lstsq(root.T, (A / scale).T @ b, rcond=None)[0])
+    return np.asarray(x / scale)

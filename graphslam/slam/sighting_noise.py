@@ -1,0 +1,246 @@
+"""How noisy the sightings and the odometry of a log are, by a stretch of the log itself.
+
+A part of the log is solved with a state wherever something was seen, its noise is measured from
+the residuals, and it is solved again until the noise no longer changes. Two things are told apart:
+noise that is new in every sighting, and errors that sightings of one target share for seconds.
+"""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from graphslam.core.config import Config, OdometryConfig
+from graphslam.core.geometry import Array
+from graphslam.core.records import Association, Estimate, Sighting, Start, Step
+from graphslam.estimation.calibration_graph import CalibrationGraph
+from graphslam.estimation.posterior_residuals import Posterior
+from graphslam.estimation.recorded_graph import ObservationNoise, Source
+from graphslam.estimation.residual_distribution import fit_distribution, shared_variance
+from graphslam.odometry.noise_estimation import (
+    fit_noise,
+    is_stated,
+    motion_variances,
+    without_floors,
+)
+from graphslam.odometry.preintegration import Track
+from graphslam.slam.sighting_states import at_states, state_times, steps_at_sightings, with_motions
+
+#: sightings in the stretch, about
+MAX_SIGHTINGS = 6000
+#: rounds at most; the noise has converged when no variance changes by a larger share
+MAX_ROUNDS, CONVERGED_SHARE = 5, 0.1
+#: relative decrease of the error at which optimisation ends
+CONVERGED_ERROR = 1e-4
+#: sightings or motions without which nothing is said about a source
+MIN_MEASUREMENTS = 100
+#: m, rad: sigmas of the pose at which a robot's part of the stretch begins
+BEGIN_SIGMA = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class LogNoise:
+    """The noise of a log.
+
+    ``sightings``: that of bearings and ranges by source; ``odometry``: robot -> its settings,
+    without floors; ``measured``: source -> factors (2,) on the stated variances, shared errors
+    included, that the log shows, and likewise (3,) of motions whose covariances are stated.
+    """
+
+    sightings: Mapping[Source, ObservationNoise] = field(default_factory=dict)
+    odometry: Mapping[str, OdometryConfig] = field(default_factory=dict)
+    measured: Mapping[Source, Array] = field(default_factory=dict)
+
+    @property
+    def is_white(self) -> bool:
+        """Whether the errors of sightings are independent: then every one of them counts."""
+        return not any(noise.shared.any() for noise in self.sightings.values())
+
+    def kernels(self) -> dict[Source, ObservationNoise]:
+        """The noise of a graph whose covariances are those of the noise already."""
+        one, zero = np.ones(2), np.zeros(2)
+        return {s: ObservationNoise(one, zero, n.kernel_scale) for s, n in self.sightings.items()}
+
+
+def with_noise(steps: Sequence[Step], noise: LogNoise) -> tuple[Step, ...]:
+    """Steps whose sightings have the white noise of a log."""
+    sigmas = {
+        source: np.sqrt(n.white) for source, n in noise.sightings.items() if (n.white != 1).any()
+    }
+
+    def scaled(a: Association) -> Association:
+        sigma = sigmas.get((a.robot, a.model))
+        return a if sigma is None else a.with_measurement(a.z, a.cov * np.outer(sigma, sigma))
+
+    return tuple(replace(s, associations=tuple(map(scaled, s.associations))) for s in steps)
+
+
+def estimate_noise(
+    steps: Sequence[Step],
+    sources: Sequence[Sighting],
+    estimate: Estimate,
+    tracks: Mapping[str, Track],
+    config: Config,
+) -> LogNoise:
+    """The noise of a log of sightings.
+
+    Args:
+        steps: of the log.
+        sources: `Association.source` is an index into them.
+        estimate: of the states and landmarks of ``steps``.
+        tracks: odometry of every robot; they get the calibration that is found on the way.
+        config: settings.
+
+    Raises:
+        EstimationError: the estimate is indeterminate.
+    """
+    sample = steps_at_sightings(stretch(steps), sources, {}, Counter())
+    tracks = {name: tracks[name] for name in state_times(sample)}
+    estimate = at_states(estimate, sample, tracks)
+    before = {name: track.config for name, track in tracks.items()}
+    try:
+        return _estimated(_beginning_at(sample, estimate), estimate, tracks, config)
+    finally:
+        for name, track in tracks.items():
+            track.config = before[name]
+
+
+def stretch(steps: Sequence[Step]) -> tuple[Step, ...]:
+    """Steps in the middle of a log with about so many sightings, starts of robots before them."""
+    seen = np.cumsum([len(step.associations) for step in steps])
+    spare = max(0, int(seen[-1]) - MAX_SIGHTINGS)
+    first, last = np.searchsorted(seen, [spare // 2, spare // 2 + MAX_SIGHTINGS]).tolist()
+    chosen = steps[first : last + 1]
+    starts = {robot: start for step in steps[: last + 1] for robot, start in step.starts.items()}
+    begin_ns = min((chosen[0].time_ns, *(s.time_ns for s in chosen if s.associations)))
+    rest = tuple(Step(s.time_ns, {}, s.motions, s.associations) for s in chosen)
+    return (Step(begin_ns, starts), *rest)
+
+
+def _beginning_at(steps: Sequence[Step], estimate: Estimate) -> tuple[Step, ...]:
+    """Steps whose robots start at the estimate."""
+    cov = np.diag([BEGIN_SIGMA**2] * 3)
+
+    def begun(robot: str, time_ns: int) -> Start:
+        return Start(estimate.states[robot].at(time_ns), cov)
+
+    return tuple(
+        replace(step, starts={robot: begun(robot, step.time_ns) for robot in step.starts})
+        for step in steps
+    )
+
+
+def _estimated(
+    steps: Sequence[Step], estimate: Estimate, tracks: Mapping[str, Track], config: Config
+) -> LogNoise:
+    """`estimate_noise` of all ``steps``; changes the tracks."""
+    priors = {name: track.prior for name, track in tracks.items()}
+    one = np.ones(2)
+    sources = {(a.robot, a.model) for s in steps for a in s.associations if len(a.z) == 2}
+    noise = {source: ObservationNoise(one, one, config.robust.scale) for source in sources}
+    stated = {name for name, track in tracks.items() if is_stated(track)}
+    for name in stated:
+        tracks[name].config = without_floors(tracks[name].config)
+    measured: dict[Source, Array] = {}
+    for k in range(MAX_ROUNDS):
+        initial = {name: track.calibration for name, track in tracks.items()}
+        for track in tracks.values():
+            track.calibration = track.calibration.held()
+        made = with_motions(steps, tracks, estimate)
+        graph = CalibrationGraph(made, estimate, priors, initial, config.robust, noise)
+        graph.calibrate_motions(made, initial)
+        estimate, calibrations = graph.solve(CONVERGED_ERROR)
+        posterior = graph.posterior()
+        new = _sighting_noise(posterior, noise)
+        change = _largest_change(noise, new)
+        noise = new
+        for name, track in tracks.items():
+            track.calibration = calibrations[name]
+            change = max(change, _update_track(track, name, made, posterior, measured, stated, k))
+        if change < CONVERGED_SHARE or not _is_white(noise):
+            break
+    for source, found in noise.items():
+        measured[source] = found.white + found.shared
+    final = {source: _cautious(found, config) for source, found in noise.items()}
+    return LogNoise(final, {name: track.config for name, track in tracks.items()}, measured)
+
+
+def _is_white(noise: Mapping[Source, ObservationNoise]) -> bool:
+    return not any(found.shared.any() for found in noise.values())
+
+
+def _sighting_noise(
+    posterior: Posterior, noise: Mapping[Source, ObservationNoise]
+) -> dict[Source, ObservationNoise]:
+    """The noise of each source by its residuals.
+
+    A robot's sightings of robots are taken as noisy as those of landmarks, if it has these: the
+    robots' paths can take up more of their errors.
+    """
+    new = {}
+    for source, before in noise.items():
+        robot, model = source
+        if model != "point" and (robot, "point") in noise:
+            continue
+        residuals = posterior.sightings(source)
+        if len(residuals.residual) < MIN_MEASUREMENTS:
+            new[source] = ObservationNoise(np.ones(2), np.zeros(2), before.kernel_scale)
+            continue
+        found, shared = fit_distribution(residuals.normalised), posterior.shared(source)
+        part = np.zeros(2) if shared is None else shared_variance(shared) * before.shared
+        new[source] = ObservationNoise(found.variance * before.white, part, found.kernel_scale)
+    for source in noise.keys() - new.keys():
+        new[source] = new[source[0], "point"]
+    return new
+
+
+def _cautious(found: ObservationNoise, config: Config) -> ObservationNoise:
+    """Noise that is not less than what is stated.
+
+    Of slow errors much is taken up by the robots' paths: where there are any, what is stated and
+    does not show in the residuals is taken for slow.
+    """
+    if not found.shared.any():
+        return replace(found, white=np.maximum(found.white, 1.0))
+    shared = np.maximum(found.shared, 1.0 - found.white)
+    return ObservationNoise(found.white, shared, config.robust.scale)
+
+
+def _largest_change(
+    before: Mapping[Source, ObservationNoise], after: Mapping[Source, ObservationNoise]
+) -> float:
+    """Largest share by which a white variance has changed."""
+    return max(
+        (float(np.abs(after[s].white / before[s].white - 1.0).max()) for s in after), default=0.0
+    )
+
+
+def _update_track(
+    track: Track,
+    robot: str,
+    steps: Sequence[Step],
+    posterior: Posterior,
+    measured: dict[Source, Array],
+    stated: set[str],
+    k: int,
+) -> float:
+    """Give a track the noise of its motions; returns the largest share by which it has changed."""
+    own = [step.motions[robot] for step in steps if robot in step.motions]
+    if len(own) < MIN_MEASUREMENTS:
+        track.config = without_floors(track.config)
+        return 0.0
+    times = tuple(
+        np.array([getattr(m, end) for m in own], dtype=np.int64) for end in ("start_ns", "end_ns")
+    )
+    variances = motion_variances(track, track.config, times)
+    deltas = track.motions(*times).delta
+    found = posterior.motions(robot, deltas, variances)
+    if robot in stated:
+        left = found.redundancy
+        squared = np.square(found.normalised)
+        measured[robot, "motion"] = np.asarray((squared * left).sum(axis=0) / left.sum(axis=0))
+        return 0.0
+    track.config = fit_noise(track, times, found.normalised, found.redundancy, relax=k > 0)
+    after = motion_variances(track, track.config, times)
+    return float(np.abs(np.mean(after / variances, axis=0)[[0, 2]] - 1.0).max())

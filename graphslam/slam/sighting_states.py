@@ -1,0 +1,231 @@
+"""A log of sightings with a state wherever a robot saw something or was seen.
+
+Where the noise of sightings is white, every one of them counts: it enters from a state at its own
+time, and what it shares with others by odometry is in the motions between the states.
+"""
+
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from graphslam.core.geometry import Array, between, compose, exp, inverse, log, wrap
+from graphslam.core.observation_models import transport
+from graphslam.core.records import Association, Estimate, Motion, Sighting, Start, Step, Trajectory
+from graphslam.odometry.increment_sums import Motions
+from graphslam.odometry.interpolation import final_at
+from graphslam.odometry.preintegration import LATENCY_STEP_NS, Track, preintegrate_batch
+from graphslam.odometry.readings import IntArray
+from graphslam.perception.sightings import sighting_observation
+
+#: ns: velocities are the motion from so long before to so long after
+BASELINE_NS = 250_000_000
+#: m, rad: least sigma of a motion, in any direction
+MIN_SIGMA = 1e-4
+
+
+def steps_at_sightings(
+    steps: Sequence[Step],
+    sources: Sequence[Sighting],
+    late_ns: Mapping[str, int],
+    dropped: Counter[str],
+) -> tuple[Step, ...]:
+    """Steps at the times of the sightings behind the associations of ``steps``.
+
+    Args:
+        steps: with the robots' starts.
+        sources: `Association.source` is an index into them.
+        late_ns: robot -> how much later than its odometry its sightings are stamped. Its start is
+            where it was when the odometry began; what it saw before that is left out.
+        dropped: counts what was left out, by reason.
+
+    Returns:
+        Steps whose motions have times alone, and whose associations are as measured.
+    """
+    starts: dict[int, dict[str, Start]] = defaultdict(dict)
+    seen: dict[int, list[Association]] = defaultdict(list)
+    for step in steps:
+        for robot, start in step.starts.items():
+            starts[step.time_ns + max(0, late_ns.get(robot, 0))][robot] = start
+        for a in step.associations:
+            if a.source is not None:
+                sighting = sources[a.source]
+                z, cov = measured_from_base(sighting)
+                seen[sighting.time_ns].append(replace(a, time_ns=sighting.time_ns, z=z, cov=cov))
+    latest: dict[str, int] = {}
+    made = []
+    for time_ns in sorted({*starts, *seen}):
+        if time_ns in starts:
+            latest.update(dict.fromkeys(starts[time_ns], time_ns))
+            made.append(Step(time_ns, dict(starts[time_ns])))
+        own = [a for a in seen.get(time_ns, []) if _robots(a) <= latest.keys()]
+        dropped["sighting: no odometry near it"] += len(seen.get(time_ns, [])) - len(own)
+        motions = {}
+        for robot in sorted(set().union(*map(_robots, own))):
+            if latest[robot] < time_ns:
+                motions[robot] = timed_motion(latest[robot], time_ns)
+                latest[robot] = time_ns
+        if own:
+            made.append(Step(time_ns, {}, motions, tuple(own)))
+    return tuple(made)
+
+
+def _robots(a: Association) -> set[str]:
+    """The robot that saw something, and the one that it saw."""
+    return {a.robot, a.target} if isinstance(a.target, str) else {a.robot}
+
+
+def measured_from_base(sighting: Sighting) -> tuple[Array, Array]:
+    """A sighting as measured from its robot's base: z (k,) and its covariance (k, k)."""
+    o = sighting_observation(sighting)
+    if not sighting.mount.any():
+        return o.z, o.cov
+    return transport(o.z, o.cov, sighting.mount, np.zeros((3, 3)))
+
+
+def timed_motion(start_ns: int, end_ns: int) -> Motion:
+    """A motion of which only the times are known yet."""
+    unknown = np.full(3, np.nan)
+    return Motion(start_ns, end_ns, unknown, np.full((3, 3), np.nan), np.zeros((3, 0)), 0.0)
+
+
+def state_times(steps: Sequence[Step]) -> dict[str, IntArray]:
+    """Robot -> times (n,) of its states."""
+    times: dict[str, list[int]] = defaultdict(list)
+    for step in steps:
+        for robot in (*step.starts, *step.motions):
+            times[robot].append(step.time_ns)
+    return {robot: np.array(own, dtype=np.int64) for robot, own in times.items()}
+
+
+def at_states(estimate: Estimate, steps: Sequence[Step], tracks: Mapping[str, Track]) -> Estimate:
+    """An estimate with the states of other ``steps``, on the path between its own."""
+    states = {}
+    for robot, times in state_times(steps).items():
+        known = estimate.states[robot]
+        zero = Trajectory(known.stamps_ns, known.poses, np.zeros((len(known.poses), 3, 3)))
+        states[robot] = final_at(zero, tracks[robot], times, times)
+    return replace(estimate, states=states)
+
+
+def with_motions(
+    steps: Sequence[Step],
+    tracks: Mapping[str, Track],
+    estimate: Estimate,
+    begun_ns: Mapping[str, int] | None = None,
+) -> tuple[Step, ...]:
+    """Steps with their motions by the tracks' present calibration and noise.
+
+    What a calibration changes in them is computed from the ``estimate``. ``begun_ns``: robot ->
+    time of its odometry at which its start holds; that of its first state otherwise.
+    """
+    motions: list[dict[str, Motion]] = [{} for _ in steps]
+    where: dict[str, list[tuple[int, Motion]]] = defaultdict(list)
+    for n, step in enumerate(steps):
+        for robot, motion in step.motions.items():
+            where[robot].append((n, motion))
+    queries = [
+        (
+            tracks[robot],
+            np.array([m.start_ns for _, m in own], dtype=np.int64),
+            np.array([m.end_ns for _, m in own], dtype=np.int64),
+        )
+        for robot, own in where.items()
+    ]
+    for (robot, own), query, found in zip(
+        where.items(), queries, preintegrate_batch(queries), strict=True
+    ):
+        d_cal = calibration_jacobian(*query, found, estimate.states[robot])
+        made = replace(found, d_cal=d_cal, cov=_at_least(found.cov, MIN_SIGMA**2))
+        for k, (n, m) in enumerate(own):
+            motions[n][robot] = made.one(k, m.start_ns, m.end_ns)
+    return tuple(
+        replace(
+            step,
+            starts={
+                robot: moved_start(tracks[robot], start, begun_ns[robot], step.time_ns)
+                if begun_ns
+                else start
+                for robot, start in step.starts.items()
+            },
+            motions={robot: new[robot] for robot in step.motions},
+        )
+        for step, new in zip(steps, motions, strict=True)
+    )
+
+
+def moved_start(track: Track, start: Start, begun_ns: int, time_ns: int) -> Start:
+    """The start of a robot at another time than that at which it holds, by its odometry.
+
+    ``begun_ns`` is of the odometry, ``time_ns`` of what it saw: by how much that is late follows
+    from the calibration. Before the odometry begins the robot is as fast as right after.
+    """
+    apart_ns = time_ns - track.reported_late_ns - begun_ns
+    step = between(track.pose(begun_ns), track.pose(begun_ns + abs(apart_ns)))
+    return replace(start, pose=compose(start.pose, step if apart_ns > 0 else inverse(step)))
+
+
+def _at_least(cov: Array, variance: float) -> Array:
+    """Covariances (n, 3, 3) with variances of at least so much in every direction.
+
+    Where two motions divide one increment, that of the second is a difference and may be negative.
+    """
+    values, axes = np.linalg.eigh(cov)
+    low = values[:, 0] < variance
+    clipped = (axes * np.maximum(values, variance)[:, None]) @ axes.mT
+    return np.where(low[:, None, None], 0.5 * (clipped + clipped.mT), cov)
+
+
+def calibration_jacobian(
+    track: Track, start_ns: IntArray, end_ns: IntArray, found: Motions, states: Trajectory
+) -> Array:
+    """Derivative (n, 3, p) of motions by a track's calibration, at the estimated motion.
+
+    Odometry measures a motion with noise. Were the derivative taken where odometry puts it, that
+    noise would be in the residual and in the regressor, and scales would come out too small: the
+    estimated motion makes it total least squares (S. Van Huffel and J. Vandewalle, The Total Least
+    Squares Problem, 1991, DOI 10.1137/1.9781611971002).
+
+    Args:
+        track: of a robot whose states are those of its base.
+        start_ns: (n,) times of states at which the motions begin.
+        end_ns: (n,) the same of their ends.
+        found: motions between them, as measured.
+        states: the estimated ones.
+    """
+    d_cal = found.d_cal
+    p = track.increment_parameters
+    if track.mount.any() or not d_cal.shape[2]:
+        return d_cal
+    d_cal = d_cal.copy()
+    a, b = states.at(start_ns), states.at(end_ns)
+    moved = between(a, b)
+    if p:
+        d_cal[:, :, :p] += track.derivative(log(moved)) - track.derivative(log(found.delta))
+    if track.is_mounted and not track.has_burst_stamps:
+        change = between(_earlier(states, start_ns), _earlier(states, end_ns)) - moved
+        change[:, 2] = wrap(change[:, 2])
+        d_cal[:, :, -1] = change * (1e9 / LATENCY_STEP_NS)
+    return d_cal
+
+
+def _earlier(states: Trajectory, times_ns: IntArray) -> Array:
+    """Poses (n, 3) `LATENCY_STEP_NS` before times, at the mean velocity around them.
+
+    The velocity at the very time would contain the noise of the odometry there, which is in the
+    residual as well.
+    """
+    before, after = (_interpolated(states, times_ns + dt) for dt in (-BASELINE_NS, BASELINE_NS))
+    step = -LATENCY_STEP_NS / (2 * BASELINE_NS) * log(between(before, after))
+    return compose(states.at(times_ns), exp(step))
+
+
+def _interpolated(states: Trajectory, times_ns: IntArray) -> Array:
+    """Poses (n, 3) on arcs between states; at the ends the robot stands."""
+    last = len(states.stamps_ns) - 1
+    i = np.clip(states.stamps_ns.searchsorted(times_ns), 1, last)
+    begin, end = states.stamps_ns[i - 1], states.stamps_ns[i]
+    share = np.clip((times_ns - begin) / np.maximum(end - begin, 1), 0.0, 1.0)
+    twist = log(between(states.poses[i - 1], states.poses[i]))
+    return compose(states.poses[i - 1], exp(share[:, None] * twist))
