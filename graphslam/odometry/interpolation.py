@@ -29,24 +29,26 @@ IntArray = np.ndarray[tuple[int], np.dtype[np.int64]]
 
 def causal_at(
     states: Trajectory,
+    last: IntArray,
     calibrations: Sequence[Calibration],
     track: Track,
     times_ns: IntArray,
     stamps_ns: IntArray,
 ) -> Trajectory:
-    """Poses at ``times_ns``: the last state before each, propagated by odometry.
+    """Poses at ``times_ns``: the last state known at each, propagated by odometry.
 
     If the states are causal, so is the result: ``calibrations[i]`` is the calibration when state i
     was created. The covariance grows by that of odometry.
 
     Args:
         states: the states, stamped with their times.
+        last: (n,) index of the last state known at each of ``times_ns``.
         calibrations: of the odometry, one per state.
         track: the robot's odometry.
         times_ns: (n,) when.
         stamps_ns: (n,) what the result is stamped with.
     """
-    i = states.index_before(times_ns)
+    i = last
     delta, noise = track.coarse_motions(states.stamps_ns[i], times_ns, calibrations, i)
     covs = compose_cov(states.poses[i], states.covs[i], delta, noise)
     return Trajectory(stamps_ns, compose(states.poses[i], delta), covs)

@@ -112,15 +112,16 @@ class Track(Readings):
             return round(float(self.calibration.mean[-1]) * 1e9)
         return 0
 
-    @property
-    def reported_late_ns(self) -> int:
+    def reported_late_ns(self, known: Calibration) -> int:
         """By how long the time of a state is later than that of the odometry it is reported at.
 
         States have the time at which their sensor saw something. Measured odometry says when the
         robot was there, so what is late is the sensor. A robot that follows its commands late is
         where the sensor sees it.
         """
-        return 0 if self.source == "commands" else self.latency_ns
+        if self.source == "commands" or not self.is_mounted or self.has_burst_stamps:
+            return 0
+        return round(float(known.mean[-1]) * 1e9)
 
     def increments(self, rows: Array, calibration: Array) -> Increments:
         """Increments (n) of rows (n, k), by calibration parameters (p,) or (n, p)."""

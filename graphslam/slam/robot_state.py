@@ -107,9 +107,12 @@ class RobotState:
         stamps, times, laser = self._report_times()
         poses = np.array(self.causal_poses) - np.array([away_m, 0.0, 0.0])
         known = Trajectory(np.array(self.times, dtype=np.int64), poses, np.array(self.causal_covs))
-        causal = causal_at(known, self.calibrations, self.track, times, stamps)
-        # the mount known then, for the base pose and for the frame that starts at it
+        # mount and latency as known then, for the base pose and for the frame that starts at it
         last = known.index_before(times)
+        if not self.scans:
+            late_ns = np.array([self.track.reported_late_ns(c) for c in self.calibrations])
+            times = times + late_ns[last]
+        causal = causal_at(known, last, self.calibrations, self.track, times, stamps)
         mount = np.array([self.track.mount_of(c) for c in self.calibrations])[last]
         causal = transform_trajectory(causal, origin_shift(start, mount))
         scan = trajectory_of_mount(causal, laser) if self.scans else None
@@ -128,13 +131,15 @@ class RobotState:
         """
         stamps, times, laser = self._report_times()
         ties = None
+        late_ns = 0
         if self.scans:
             final, ties = final_scans(states, self.track, times, stamps, laser)
         else:
+            late_ns = self.track.reported_late_ns(self.track.calibration)
+            times = times + late_ns
             final = final_at(states, self.track, times, stamps)
         base = trajectory_of_mount(final, inverse(self.track.mount))
         at_start = compose(states.poses[0], inverse(self.track.mount))
-        late_ns = self.track.latency_ns
         odometry = between(
             self.track.pose(self.times[0] - late_ns), self.track.pose(times - late_ns)
         )
@@ -155,8 +160,7 @@ class RobotState:
             return stamps, times, np.array([scan[2] for scan in scans])
         period = round(1e9 / BASE_RATE_HZ)
         times = np.arange(self.track.first_ns, self.track.last_ns + 1, period)
-        stamps = self.clock.to_local(times)
-        return stamps, times + self.track.reported_late_ns, np.zeros((0, 3))
+        return self.clock.to_local(times), times, np.zeros((0, 3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -97,7 +97,7 @@ def solve_finely(one: SightingPass, rough: Estimate) -> tuple[Estimate, tuple[St
     one.noise = estimate_noise(one.steps, one.sources, rough, tracks, config)
     if one.noise.is_white:
         begun_ns = {name: step.time_ns for step in one.steps for name in step.starts}
-        late_ns = {name: track.reported_late_ns for name, track in tracks.items()}
+        late_ns = {name: track.reported_late_ns(track.calibration) for name, track in tracks.items()}
         steps = steps_at_sightings(one.steps, one.sources, late_ns, one.dropped)
         start = at_states(rough, steps, tracks)
         solved = solve_at_sightings(steps, start, tracks, one.noise, config, begun_ns)

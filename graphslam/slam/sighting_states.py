@@ -161,7 +161,7 @@ def moved_start(track: Track, start: Start, begun_ns: int, time_ns: int) -> Star
     ``begun_ns`` is of the odometry, ``time_ns`` of what it saw: by how much that is late follows
     from the calibration. Before the odometry begins the robot is as fast as right after.
     """
-    apart_ns = time_ns - track.reported_late_ns - begun_ns
+    apart_ns = time_ns - track.reported_late_ns(track.calibration) - begun_ns
     step = between(track.pose(begun_ns), track.pose(begun_ns + abs(apart_ns)))
     return replace(start, pose=compose(start.pose, step if apart_ns > 0 else inverse(step)))
 

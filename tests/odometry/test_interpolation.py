@@ -68,7 +68,7 @@ def at(times_s, *, causal, given=STATES, track=TRACK, known=None, stamps=None):
     stamps = times if stamps is None else stamps
     if causal:
         known = [track.calibration] * len(given) if known is None else known
-        return causal_at(given, known, track, times, stamps)
+        return causal_at(given, given.index_before(times), known, track, times, stamps)
     return final_at(given, track, times, stamps)
 
 
