@@ -19,7 +19,6 @@ from graphslam.estimation.calibration_graph import (
     solve_calibrated,
 )
 from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH
-from graphslam.estimation.recorded_graph import ObservationNoise, Source
 from graphslam.odometry.preintegration import Track
 
 #: times that everything is solved: after the first the calibration moves by a tenth of its sigma
@@ -38,11 +37,9 @@ def calibrate(
     rounds: int = ROUNDS,
     *,
     joint: bool = False,
-    noise: Mapping[Source, ObservationNoise] | None = None,
 ) -> tuple[Estimate, tuple[Step, ...]]:
     """Solve for states, landmarks and calibrations together, ``rounds`` times.
 
-    ``noise``: see `RecordedGraph`.
     ``rebuild`` computes the steps again in every round, the first by ``estimate``. The calibration
     of ``tracks`` is set to the one found. Returns the estimate, with ``joint`` and the root of its
     information, and the steps behind it.
@@ -66,7 +63,6 @@ def calibrate(
             robust,
             rough=not last,
             joint=joint and last,
-            noise=noise,
         )
         estimate = solved.estimate
         for name, track in tracks.items():

@@ -39,7 +39,6 @@ def solve_calibrated(
     *,
     rough: bool = False,
     joint: bool = False,
-    noise: Mapping[Source, ObservationNoise] | None = None,
 ) -> "CalibratedSolution":
     """Optimise all states, landmarks and calibrations together.
 
@@ -55,12 +54,11 @@ def solve_calibrated(
         kernel: of observations.
         rough: stop early, see `Reoptimiser.solve`; covariances are NaN.
         joint: whether the estimate is to have the root of the information.
-        noise: see `RecordedGraph`.
 
     Raises:
         EstimationError: a covariance is not positive definite, or a state is unknown.
     """
-    problem = CalibrationGraph(steps, start, priors, now, kernel, noise)
+    problem = CalibrationGraph(steps, start, priors, now, kernel)
     problem.calibrate_motions(steps, now)
     converged = CONVERGED_ERROR_ROUGH if rough else CONVERGED_ERROR
     found = problem.solve(converged, marginals=not rough, joint=joint)
@@ -115,8 +113,8 @@ class CalibrationGraph:
             key, use = self._keys[robot], self._free[robot]
             if len(use):
                 self._values.insert(key, now[robot].mean[use])
-                noise = factors.gaussian(prior.cov[np.ix_(use, use)])
-                builder.graph.add(gtsam.PriorFactorVector(key, prior.mean[use], noise))
+                model = factors.gaussian(prior.cov[np.ix_(use, use)])
+                builder.graph.add(gtsam.PriorFactorVector(key, prior.mean[use], model))
         builder.insert_all(steps, start, self._values)
         builder.rebuild_lines(self._values)
         for index, robot, last, key in builder.motions:
@@ -194,6 +192,13 @@ class CalibrationGraph:
         except RuntimeError as error:
             raise builder.explain(error) from error
         return Posterior(builder, self._values, blocks)
+
+    def calibration_covariance(self, robot: str, posterior: Posterior) -> Array:
+        """Covariance (p, p) of a robot's calibration at the last solution."""
+        cov, use = self._priors[robot].cov.copy(), self._free[robot]
+        if len(use):
+            cov[np.ix_(use, use)] = posterior.blocks.marginals[self._keys[robot]]
+        return cov
 
     def landmark_covariance(self, landmarks: Sequence[int]) -> Array:
         """Joint covariance (D, D) of landmarks at the last solution, along world axes.

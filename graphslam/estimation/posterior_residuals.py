@@ -15,11 +15,17 @@ import numpy as np
 from graphslam.core.geometry import Array, adjoint, between, inverse, log, rotation3
 from graphslam.core.observation_models import MODELS
 from graphslam.estimation import factors
-from graphslam.estimation.recorded_graph import RecordedGraph, Source
+from graphslam.estimation.recorded_graph import IntArray, RecordedGraph, Source
 from graphslam.estimation.selected_inverse import CovarianceBlocks
 
 #: share of its variance that a residual needs at least to tell about its noise
 MIN_REDUNDANCY = 0.02
+#: residuals are cut at so many of their own sigmas
+CLIP_SIGMAS = 3.0
+#: a median of absolute values, as the sigma of a normal variable
+SIGMA_OF_MEDIAN = 1.4826
+#: ns: errors of motions may be the same over as long as this
+SPAN_NS = 3_000_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,6 +45,13 @@ class Residuals:
         """(n, k): the share of the noise that is left in each residual."""
         return np.asarray(np.maximum(1.0 - self.absorbed / self.variance, MIN_REDUNDANCY))
 
+    def variance_factor(self) -> Array:
+        """Factors (k,) on the variances: residuals squared, each cut, over what is left of them."""
+        left, normalised = self.redundancy, self.normalised
+        cut = CLIP_SIGMAS * SIGMA_OF_MEDIAN * np.median(np.abs(normalised), axis=0)
+        squared = np.square(np.clip(normalised, -cut, cut))
+        return np.asarray((squared * left).sum(axis=0) / left.sum(axis=0))
+
     @property
     def normalised(self) -> Array:
         """(n, k): residuals divided by the sigmas that they should have."""
@@ -56,15 +69,21 @@ class Posterior:
     values: gtsam.Values
     blocks: CovarianceBlocks
 
-    def motions(self, robot: str, deltas: Array, variances: Array) -> Residuals:
+    def motions(
+        self, robot: str, deltas: Array, variances: Array, *, over_spans: bool = False
+    ) -> Residuals:
         """Residuals of all motions of a robot, along the axes of their starts.
 
         Args:
             robot: its name.
             deltas: (n, 3) the motions as measured, by the calibration that was found.
             variances: (n, 3) of their noise.
+            over_spans: the motions are those over `spans` of its states.
         """
-        pairs = [(last, key) for _, name, last, key in self.builder.motions if name == robot]
+        if over_spans:
+            pairs = span_keys(self.builder, robot)
+        else:
+            pairs = [(last, key) for _, name, last, key in self.builder.motions if name == robot]
         moved = between(*(self._values([pair[end] for pair in pairs], 3) for end in (0, 1)))
         turn = rotation3(deltas[:, 2])
         r = (turn @ log(between(deltas, moved))[:, :, None])[:, :, 0]
@@ -111,9 +130,23 @@ class Posterior:
         return np.array([factors.read(self.values, key, dim) for key in unique.tolist()])[where]
 
 
+def spans(times_ns: IntArray) -> IntArray:
+    """Indices (n, 2) of states (m,) that begin and end spans of `SPAN_NS`, or a longer motion."""
+    ends = np.append(np.flatnonzero(np.diff(times_ns // SPAN_NS)), len(times_ns) - 1)
+    ends = np.unique(np.append(0, ends))
+    return np.column_stack([ends[:-1], ends[1:]])
+
+
+def span_keys(builder: RecordedGraph, robot: str) -> list[tuple[int, int]]:
+    """Keys of a robot's states that begin and end `spans`."""
+    first = builder.state_key(robot, 0)
+    return [(first + i, first + j) for i, j in spans(builder.states.stamps(robot)).tolist()]
+
+
 def posterior_pairs(builder: RecordedGraph) -> list[tuple[int, int]]:
     """Keys of the variables whose joint covariances `Posterior` needs."""
+    over = [pair for robot in builder.robots for pair in span_keys(builder, robot)]
     moved = [(last, key) for _, _, last, key in builder.motions]
     seen = [(key, target) for own in builder.bearings_and_ranges.values() for key, target, _ in own]
     shared = [(a, b) for found in builder.shared_errors.values() for a, b in found.keys.tolist()]
-    return moved + seen + shared
+    return moved + over + seen + shared

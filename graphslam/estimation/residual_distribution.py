@@ -12,17 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphslam.core.geometry import Array
-from graphslam.estimation.posterior_residuals import Residuals
+from graphslam.estimation.posterior_residuals import CLIP_SIGMAS, SIGMA_OF_MEDIAN, Residuals
 
 #: degrees of freedom that are tried; with the most of them a kernel hardly weights anything, but
 #: still bounds the influence of a gross error
 DEGREES_OF_FREEDOM = (2.0, 3.0, 5.0, 8.0, 13.0, 20.0, 35.0, 60.0)
 #: rounds of expectation maximisation, after which the scale changes by less than a thousandth
 ROUNDS = 12
-#: residuals are cut at so many of their sigmas
-CLIP_SIGMAS = 3.0
-#: a median of absolute values, as the sigma of a normal variable
-SIGMA_OF_MEDIAN = 1.4826
 #: a shared error is significant if its variance is so many of the sigmas that it has by chance
 SIGNIFICANT_SIGMAS = 3.0
 

@@ -8,6 +8,7 @@ Estimating heteroscedastic variances in linear models, JASA 70, 1975, DOI
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -59,9 +60,9 @@ def fit_noise(
         redundancy: (n, 3) see `Residuals`.
         relax: whether to go farther, as the present noise comes from such a fit already.
     """
-    bare = without_floors(replace(track.config, **dict.fromkeys(RATES, 0.0)))
+    bare = without_floors(with_rates(track.config, np.zeros(len(RATES))))
     R, known = (motion_variances(track, config, times_ns) for config in (track.config, bare))
-    each = [motion_variances(track, replace(bare, **{name: 1.0}), times_ns) for name in RATES]
+    each = [motion_variances(track, with_rates(bare, one), times_ns) for one in np.eye(len(RATES))]
     C = np.stack(each, axis=-1) - known[:, :, None]  # (n, 3, 9)
     moved = C.any(axis=(1, 2))
     if not moved.any():
@@ -74,7 +75,13 @@ def fit_noise(
     if relax:
         before = np.maximum(np.mean(1.0 - known / R, axis=0), 1e-9)
         x *= np.repeat(np.clip(np.mean(C @ x / R, axis=0) / before, 0.5, 2.0) ** OVER_RELAXATION, 3)
-    return replace(bare, **dict(zip(RATES, x.tolist(), strict=True)))
+    return with_rates(bare, x)
+
+
+def with_rates(config: OdometryConfig, rates: Array) -> OdometryConfig:
+    """Settings with other rates (9,) of the noise, in the order of `RATES`."""
+    values: dict[str, Any] = dict(zip(RATES, rates.tolist(), strict=True))
+    return replace(config, **values)
 
 
 def motion_variances(
@@ -95,7 +102,7 @@ def _non_negative(A: Array, b: Array) -> Array:
 
     scale = np.linalg.norm(A, axis=0)
     scale[scale == 0] = 1.0
-    # by the normal equations: nine unknowns, tens of thousands of rows
-    root = np.linalg.qr(A / scale, mode="r")
-    x, _ = nnls(root, np.linalg.lstsq(root.T, (A / scale).T @ b, rcond=None)[0])
+    # nine unknowns, tens of thousands of rows
+    q, root = np.linalg.qr(A / scale)
+    x, _ = nnls(root, q.T @ b)
     return np.asarray(x / scale)

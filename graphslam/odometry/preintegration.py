@@ -49,18 +49,27 @@ class Track(Readings):
     """Odometry readings of one robot and its motions between any two times."""
 
     def __init__(
-        self, config: OdometryConfig, robot: RobotConfig, *, mounted: bool = False
+        self,
+        config: OdometryConfig,
+        robot: RobotConfig,
+        *,
+        mounted: bool = False,
+        late: bool = False,
     ) -> None:
-        """An empty track; ``mounted``: its motions are those of a sensor's frame, see `motion`."""
+        """An empty track.
+
+        ``mounted``: its motions are those of a sensor's frame, see `motion`. This takes a
+        calibration of odometry, which increments with covariances have not, unless the sensor is
+        just ``late``.
+        """
         super().__init__(config, robot)
         self.calibration = nominal_calibration("given", config, False)
         self.prior = self.calibration  # before any data
-        self._mounted = mounted
+        self._mounted, self._late = mounted, late
 
     def _begin(self, source: str, time_ns: int) -> None:
         super()._begin(source, time_ns)
-        # a laser's mount is found together with the calibration of odometry, which this has not
-        self._mounted &= source != "given" or self.config.laser_sigma_m == 0.0
+        self._mounted &= source != "given" or self._late
         self.calibration = self.prior = nominal_calibration(source, self.config, self._mounted)
 
     @property

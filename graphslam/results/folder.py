@@ -8,12 +8,12 @@ and report.html. The formats of the files are in `file_formats` and `joint_file`
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote
 
-from graphslam.core.config import Config
+from graphslam.core.config import Config, RobustConfig
 from graphslam.core.config_io import dump_config, load_config
 from graphslam.core.errors import OutputError
 from graphslam.core.output_folder import atomic_folder
@@ -137,7 +137,7 @@ def _files(result: Result, report: Callable[[Result], str] | None) -> list[tuple
             "landmarks.json",
             to_json([landmark_json(landmark) for landmark in result.landmarks], "landmarks.json"),
         ),
-        ("graph.g2o", graph_g2o(result.steps, result.estimate, result.config.robust)),
+        ("graph.g2o", graph_g2o(result.steps, result.estimate, kernel_of(result))),
         ("graph_ids.csv", graph_ids(result.estimate)),
     ]
     for own in parallel_map(_trajectory_files, list(result.robots.items())):
@@ -148,6 +148,12 @@ def _files(result: Result, report: Callable[[Result], str] | None) -> list[tuple
     if report is not None:
         files.append(("report.html", report(result)))
     return files
+
+
+def kernel_of(result: Result) -> RobustConfig:
+    """The kernel of a result's graph: as wide as the log's noise allows."""
+    scale = result.summary["graph"].get("kernel_scale", result.config.robust.scale)
+    return replace(result.config.robust, scale=scale)
 
 
 def _trajectory_files(named: tuple[str, RobotResult]) -> list[tuple[str, str]]:

@@ -3,6 +3,7 @@
 from collections import Counter, defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from graphslam.core.config import Config
 from graphslam.core.errors import EstimationError
@@ -56,6 +57,8 @@ class LogPass:
             name: RobotState(track, clock=known.clocks.get(name, Clock()))
             for name, track in make_tracks(log, config).items()
         }
+        self.kernel = config.robust  # of the final estimate
+        self.noise: dict[str, Any] = {}  # of summary.json
         self.starts = known.frame_assignment.starts
         self.frames = RobotFrames(known.frame_assignment)
         self.landmarks = LandmarkMap()

@@ -84,6 +84,8 @@ def solve_sighting_log(
         made = recompute_steps(steps, estimate, tracks, groups, widen=last and noise is None)
         if not last:
             return made
+        if noise is not None:
+            return scale_motion_noise(made, noise.motion_scales())
         return scale_motion_noise(made, noise_scales(made, estimate, MOTION_WINDOW_NS))
 
     return calibrate(rebuild, estimate, tracks, config.robust, rounds)

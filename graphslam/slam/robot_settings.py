@@ -9,6 +9,7 @@ from graphslam.core.config import Config, KeyframeConfig, OdometryConfig, RobotC
 from graphslam.core.config_io import load_config
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
+from graphslam.core.records import RelativePose, Scan, Sighting
 from graphslam.logs import LogSet
 from graphslam.odometry.preintegration import Track
 from graphslam.perception.robot_outlines import outline_of
@@ -35,6 +36,10 @@ def with_noted_keyframes(log: LogSet, config: Config) -> Config:
 
 def make_tracks(log: LogSet, config: Config) -> dict[str, Track]:
     """An empty track for every robot of a log."""
+    kinds = {topic.record for topic in log.topics}
+    # invented stamps are those of an order, not of clocks
+    late = Sighting in kinds and not kinds & {Scan, RelativePose}
+    late &= not log.notes.get("stamps", "").startswith("invented")
     return {
         name: Track(
             without_laser_calibration(
@@ -42,6 +47,7 @@ def make_tracks(log: LogSet, config: Config) -> dict[str, Track]:
             ),
             robot_settings(name, config, log.notes),
             mounted=True,
+            late=late,
         )
         for name in log.robots
     }

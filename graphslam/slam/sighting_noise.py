@@ -8,24 +8,34 @@ noise that is new in every sighting, and errors that sightings of one target sha
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
-from graphslam.core.config import Config, OdometryConfig
+from graphslam.core.config import Config, OdometryConfig, RobustConfig
 from graphslam.core.geometry import Array
+from graphslam.core.motion_models import HELD_SIGMA
 from graphslam.core.records import Association, Estimate, Sighting, Start, Step
 from graphslam.estimation.calibration_graph import CalibrationGraph
-from graphslam.estimation.posterior_residuals import Posterior
-from graphslam.estimation.recorded_graph import ObservationNoise, Source
+from graphslam.estimation.posterior_residuals import Posterior, Residuals, spans
+from graphslam.estimation.recorded_graph import SHARED_NS, ObservationNoise, Source
 from graphslam.estimation.residual_distribution import fit_distribution, shared_variance
 from graphslam.odometry.noise_estimation import (
+    RATES,
     fit_noise,
     is_stated,
     motion_variances,
     without_floors,
 )
 from graphslam.odometry.preintegration import Track
-from graphslam.slam.sighting_states import at_states, state_times, steps_at_sightings, with_motions
+from graphslam.odometry.readings import IntArray
+from graphslam.slam.sighting_states import (
+    MIN_SIGMA,
+    at_states,
+    state_times,
+    steps_at_sightings,
+    with_motions,
+)
 
 #: sightings in the stretch, about
 MAX_SIGHTINGS = 6000
@@ -35,6 +45,10 @@ MAX_ROUNDS, CONVERGED_SHARE = 5, 0.1
 CONVERGED_ERROR = 1e-4
 #: sightings or motions without which nothing is said about a source
 MIN_MEASUREMENTS = 100
+#: a latency of sightings is applied if it is so many of its sigmas
+LATENCY_SIGMAS = 4.0
+#: name of the odometry among the sources of `LogNoise.measured`
+MOTION = "motion"
 #: m, rad: sigmas of the pose at which a robot's part of the stretch begins
 BEGIN_SIGMA = 0.01
 
@@ -52,28 +66,64 @@ class LogNoise:
     odometry: Mapping[str, OdometryConfig] = field(default_factory=dict)
     measured: Mapping[Source, Array] = field(default_factory=dict)
 
+    def motion_scales(self) -> dict[str, Array]:
+        """Robot -> factor (3,) on the sigmas of its motions: the stated noise is never reduced."""
+        return {
+            robot: np.sqrt(np.maximum(1.0, factors))
+            for (robot, model), factors in self.measured.items()
+            if model == MOTION
+        }
+
     @property
     def is_white(self) -> bool:
         """Whether the errors of sightings are independent: then every one of them counts."""
         return not any(noise.shared.any() for noise in self.sightings.values())
 
-    def kernels(self) -> dict[Source, ObservationNoise]:
-        """The noise of a graph whose covariances are those of the noise already."""
-        one, zero = np.ones(2), np.zeros(2)
-        return {s: ObservationNoise(one, zero, n.kernel_scale) for s, n in self.sightings.items()}
+    def to_summary(self) -> dict[str, Any]:
+        """Key `noise` of summary.json."""
+        quantities = {MOTION: ("motion along x", "motion along y", "turning")}
+        out: dict[str, Any] = {}
+        for (robot, model), factors in sorted(self.measured.items()):
+            names = quantities.get(model, ("bearings", "ranges"))
+            entry: dict[str, Any] = {"measured": dict(zip(names, factors.tolist(), strict=True))}
+            noise = self.sightings.get((robot, model))
+            if noise is not None:
+                entry |= {"white": noise.white.tolist(), "shared": noise.shared.tolist()}
+            out[f"{robot} {model}"] = entry
+        for robot, config in self.odometry.items():
+            out[f"{robot} odometry"] = {name: getattr(config, name) for name in RATES}
+        return out
+
+    def kernel(self, given: RobustConfig) -> RobustConfig:
+        """The kernel as wide as the tails of white noise allow; as ``given`` for any other."""
+        if not (self.is_white and self.sightings):
+            return given
+        return replace(given, scale=min(noise.kernel_scale for noise in self.sightings.values()))
 
 
 def with_noise(steps: Sequence[Step], noise: LogNoise) -> tuple[Step, ...]:
-    """Steps whose sightings have the white noise of a log."""
-    sigmas = {
-        source: np.sqrt(n.white) for source, n in noise.sightings.items() if (n.white != 1).any()
-    }
+    """Steps whose sightings have the noise of a log.
 
-    def scaled(a: Association) -> Association:
-        sigma = sigmas.get((a.robot, a.model))
-        return a if sigma is None else a.with_measurement(a.z, a.cov * np.outer(sigma, sigma))
+    An error that n of them share counts n times in each: together they then tell no more than one.
+    """
+    count = Counter(
+        (a.robot, a.target, step.time_ns // SHARED_NS) for step in steps for a in step.associations
+    )
 
-    return tuple(replace(s, associations=tuple(map(scaled, s.associations))) for s in steps)
+    def widened(a: Association, span: int) -> Association:
+        own = noise.sightings.get((a.robot, a.model))
+        if own is None:
+            return a
+        sigma = np.sqrt(own.white + count[a.robot, a.target, span] * own.shared)
+        return a.with_measurement(a.z, a.cov * np.outer(sigma, sigma))
+
+    return tuple(
+        replace(
+            step,
+            associations=tuple(widened(a, step.time_ns // SHARED_NS) for a in step.associations),
+        )
+        for step in steps
+    )
 
 
 def estimate_noise(
@@ -156,14 +206,36 @@ def _estimated(
         change = _largest_change(noise, new)
         noise = new
         for name, track in tracks.items():
-            track.calibration = calibrations[name]
+            cov = graph.calibration_covariance(name, posterior)
+            track.calibration = replace(calibrations[name], cov=cov)
             change = max(change, _update_track(track, name, made, posterior, measured, stated, k))
         if change < CONVERGED_SHARE or not _is_white(noise):
             break
+    for track in tracks.values():
+        hold_insignificant_latency(track)
     for source, found in noise.items():
         measured[source] = found.white + found.shared
     final = {source: _cautious(found, config) for source, found in noise.items()}
     return LogNoise(final, {name: track.config for name, track in tracks.items()}, measured)
+
+
+def hold_insignificant_latency(track: Track) -> None:
+    """Take the clocks of sightings and odometry as one, unless the log is clearly likelier not so.
+
+    Where a robot drives evenly only noise tells of an offset, and its sigma is too small.
+    ``track`` has the calibration of a stretch of the log.
+    """
+    if not track.is_mounted or track.has_burst_stamps:
+        return
+    mean, cov = track.calibration.mean, track.calibration.cov
+    if mean[-1] ** 2 > LATENCY_SIGMAS**2 * cov[-1, -1]:
+        return
+    mean = np.append(mean[:-1], 0.0)
+    held = track.prior.cov.copy()
+    held[-1, :] = held[:, -1] = 0.0
+    held[-1, -1] = HELD_SIGMA**4
+    track.prior = replace(track.prior, cov=held)
+    track.calibration = replace(track.calibration, mean=mean, cov=held)
 
 
 def _is_white(noise: Mapping[Source, ObservationNoise]) -> bool:
@@ -198,13 +270,14 @@ def _sighting_noise(
 def _cautious(found: ObservationNoise, config: Config) -> ObservationNoise:
     """Noise that is not less than what is stated.
 
-    Of slow errors much is taken up by the robots' paths: where there are any, what is stated and
-    does not show in the residuals is taken for slow.
+    Of slow errors the robots' paths take up a part: where there are any, what is stated and does
+    not show in the residuals is taken for slow. Where bearings or ranges show none, it is open
+    whether they have such an error or have less noise than stated, and half of it is.
     """
     if not found.shared.any():
         return replace(found, white=np.maximum(found.white, 1.0))
-    shared = np.maximum(found.shared, 1.0 - found.white)
-    return ObservationNoise(found.white, shared, config.robust.scale)
+    hidden = np.where(found.shared > 0.0, 1.0, 0.5) * (1.0 - found.white)
+    return ObservationNoise(found.white, np.maximum(found.shared, hidden), config.robust.scale)
 
 
 def _largest_change(
@@ -230,17 +303,31 @@ def _update_track(
     if len(own) < MIN_MEASUREMENTS:
         track.config = without_floors(track.config)
         return 0.0
-    times = tuple(
-        np.array([getattr(m, end) for m in own], dtype=np.int64) for end in ("start_ns", "end_ns")
+    times = (
+        np.array([m.start_ns for m in own], dtype=np.int64),
+        np.array([m.end_ns for m in own], dtype=np.int64),
     )
-    variances = motion_variances(track, track.config, times)
-    deltas = track.motions(*times).delta
-    found = posterior.motions(robot, deltas, variances)
     if robot in stated:
-        left = found.redundancy
-        squared = np.square(found.normalised)
-        measured[robot, "motion"] = np.asarray((squared * left).sum(axis=0) / left.sum(axis=0))
+        of = spans(np.append(times[0][0], times[1]))
+        over = times[0][of[:, 0]], times[1][of[:, 1] - 1]
+        found = _residuals(track, robot, over, posterior, over_spans=True)
+        measured[robot, MOTION] = found.variance_factor()
         return 0.0
+    found = _residuals(track, robot, times, posterior)
     track.config = fit_noise(track, times, found.normalised, found.redundancy, relax=k > 0)
     after = motion_variances(track, track.config, times)
-    return float(np.abs(np.mean(after / variances, axis=0)[[0, 2]] - 1.0).max())
+    return float(np.abs(np.mean(after / found.variance, axis=0)[[0, 2]] - 1.0).max())
+
+
+def _residuals(
+    track: Track,
+    robot: str,
+    times_ns: tuple[IntArray, IntArray],
+    posterior: Posterior,
+    *,
+    over_spans: bool = False,
+) -> Residuals:
+    """Residuals of a robot's motions between times (n,), by its track's noise."""
+    variances = np.maximum(motion_variances(track, track.config, times_ns), MIN_SIGMA**2)
+    deltas = track.motions(*times_ns).delta
+    return posterior.motions(robot, deltas, variances, over_spans=over_spans)

@@ -29,7 +29,6 @@ from graphslam.slam.log_pass import PriorKnowledge, Progress, timed
 from graphslam.slam.pipeline import Pipeline
 from graphslam.slam.reoptimise_sightings import SightingGroup, group_sightings
 from graphslam.slam.sighting_batches import SightingBatch, sighting_batches
-from graphslam.slam.sighting_noise import LogNoise
 from graphslam.slam.synchronisation import ODOMETRY
 
 
@@ -61,7 +60,6 @@ class SightingPass(Pipeline):
         """Reads nothing yet."""
         super().__init__(log, config, known)
         self.all_named = True
-        self.noise = LogNoise()
 
     def run(self, progress: Progress) -> None:
         """Read the log and make the steps; see `Pipeline`."""

@@ -24,6 +24,7 @@ from graphslam.estimation.batch_calibration import calibrate, calibrate_roughly
 from graphslam.mapping.landmark_map import observed_from
 from graphslam.multi_robot.relative_frames import RobotEstimate
 from graphslam.odometry.preintegration import Track
+from graphslam.slam.motion_noise import scale_motion_noise
 from graphslam.slam.reoptimise_sightings import (
     SightingGroup,
     group_sightings,
@@ -94,17 +95,20 @@ def solve_finely(one: SightingPass, rough: Estimate) -> tuple[Estimate, tuple[St
         EstimationError: the estimate is indeterminate.
     """
     tracks, config = one.tracks, one.config
-    one.noise = estimate_noise(one.steps, one.sources, rough, tracks, config)
-    if one.noise.is_white:
+    noise = estimate_noise(one.steps, one.sources, rough, tracks, config)
+    one.noise = noise.to_summary()
+    if noise.is_white:
         begun_ns = {name: step.time_ns for step in one.steps for name in step.starts}
-        late_ns = {name: track.reported_late_ns(track.calibration) for name, track in tracks.items()}
+        late_ns = {name: t.reported_late_ns(t.calibration) for name, t in tracks.items()}
         steps = steps_at_sightings(one.steps, one.sources, late_ns, one.dropped)
         start = at_states(rough, steps, tracks)
-        solved = solve_at_sightings(steps, start, tracks, one.noise, config, begun_ns)
+        one.kernel = noise.kernel(config.robust)
+        solved = solve_at_sightings(steps, start, tracks, noise, config, begun_ns)
         for name, times in state_times(steps).items():
             one.runs[name].times = times.tolist()
+        one.counts["keyframes"] = sum(map(len, state_times(steps).values()))
         return solved
-    return solve_sighting_log(one.steps, rough, tracks, one.groups, config, 1, one.noise)
+    return solve_sighting_log(one.steps, rough, tracks, one.groups, config, 1, noise)
 
 
 def solve_at_sightings(
@@ -131,12 +135,12 @@ def solve_at_sightings(
     for name, track in tracks.items():
         track.config = noise.odometry.get(name, track.config)
     widened = with_noise(steps, noise)
-    kernels = noise.kernels()
 
     def rebuild(estimate: Estimate, _last: bool) -> tuple[Step, ...]:
-        return with_motions(widened, tracks, estimate, begun_ns)
+        made = with_motions(widened, tracks, estimate, begun_ns)
+        return scale_motion_noise(made, noise.motion_scales())
 
-    return calibrate(rebuild, start, tracks, config.robust, noise=kernels)
+    return calibrate(rebuild, start, tracks, noise.kernel(config.robust))
 
 
 def solve_robots_apart(one: SightingPass) -> Estimate:

@@ -14,9 +14,8 @@ from graphslam.core.geometry import Array, between, compose, exp, inverse, log, 
 from graphslam.core.observation_models import transport
 from graphslam.core.records import Association, Estimate, Motion, Sighting, Start, Step, Trajectory
 from graphslam.odometry.increment_sums import Motions
-from graphslam.odometry.interpolation import final_at
+from graphslam.odometry.interpolation import IntArray, final_at
 from graphslam.odometry.preintegration import LATENCY_STEP_NS, Track, preintegrate_batch
-from graphslam.odometry.readings import IntArray
 from graphslam.perception.sightings import sighting_observation
 
 #: ns: velocities are the motion from so long before to so long after
@@ -216,13 +215,15 @@ def _earlier(states: Trajectory, times_ns: IntArray) -> Array:
     The velocity at the very time would contain the noise of the odometry there, which is in the
     residual as well.
     """
-    before, after = (_interpolated(states, times_ns + dt) for dt in (-BASELINE_NS, BASELINE_NS))
-    step = -LATENCY_STEP_NS / (2 * BASELINE_NS) * log(between(before, after))
+    first, last = states.stamps_ns[0], states.stamps_ns[-1]
+    begin, end = (np.clip(times_ns + dt, first, last) for dt in (-BASELINE_NS, BASELINE_NS))
+    moved = log(between(_interpolated(states, begin), _interpolated(states, end)))
+    step = -LATENCY_STEP_NS / np.maximum(end - begin, 1)[:, None] * moved
     return compose(states.at(times_ns), exp(step))
 
 
 def _interpolated(states: Trajectory, times_ns: IntArray) -> Array:
-    """Poses (n, 3) on arcs between states; at the ends the robot stands."""
+    """Poses (n, 3) on arcs between states."""
     last = len(states.stamps_ns) - 1
     i = np.clip(states.stamps_ns.searchsorted(times_ns), 1, last)
     begin, end = states.stamps_ns[i - 1], states.stamps_ns[i]

@@ -86,8 +86,8 @@ def make_result(finished: FinishedPass, began: float) -> Result:
         estimate = transforms.estimate(finished.estimate)
         steps = tuple(map(transforms.step, pipeline.steps))
         if is_settled(pipeline.config):
-            estimate = settled(steps, estimate, pipeline.config.robust)
-        error, plain = graph_error(steps, estimate, pipeline.config.robust)
+            estimate = settled(steps, estimate, pipeline.kernel)
+        error, plain = graph_error(steps, estimate, pipeline.kernel)
         estimate = replace(estimate, error=error)
 
         def robot_result(name: str) -> RobotResult:

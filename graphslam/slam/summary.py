@@ -103,7 +103,9 @@ def summarise(
             "error": estimate.error,
             "error_without_kernels": plain_error,
             "dof": estimate.dof,
+            "kernel_scale": pipeline.kernel.scale,
         },
+        "noise": pipeline.noise,
         "calibration": {
             f"{robot}.{name}": {"value": value, "sigma": sigma, "observable": observable}
             for robot, run in runs.items()
@@ -134,6 +136,21 @@ def summarise(
             *(understated_noise(pipeline.steps, estimate) if is_relative(pipeline) else ()),
         ],
     }
+
+
+#: factor on a stated variance from which the log contradicts it
+CONTRADICTED = 2.0
+
+
+def noise_warnings(noise: Mapping[str, Any]) -> list[str]:
+    """Noise that the log contradicts, one line for each source."""
+    lines = []
+    for source, found in noise.items():
+        for name, factor in found.get("measured", {}).items():
+            if not 1 / CONTRADICTED < factor < CONTRADICTED:
+                more = f"{factor:.2g} times" if factor > 1 else f"1/{1 / factor:.2g} of"
+                lines.append(f"{source}: the variance of {name} is {more} what is stated")
+    return lines
 
 
 def has_invented_stamps(notes: Mapping[str, str]) -> bool:
@@ -180,6 +197,7 @@ def run_warnings(pipeline: LogPass) -> list[str]:
         for a, b in known.identities.items()
         if a < b
     ]
+    warnings += noise_warnings(pipeline.noise)
     warnings += span_warnings(
         {name: run.track for name, run in pipeline.runs.items()},
         unplaced=pipeline.dropped["sighting: no odometry near it"] > 0,

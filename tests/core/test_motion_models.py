@@ -31,9 +31,13 @@ NOISE = OdometryConfig()
 SECOND = 1_000_000_000
 
 
-def increments(source, rows, robot=ROBOT, config=NOISE):
+def increments(source, rows, robot=ROBOT, config=NOISE, seconds=0.0):
+    """Of rows without their column of seconds, if the source has one."""
     nominal = nominal_calibration(source, config, False).mean
-    return MOTION_SOURCES[source](np.asarray(rows, float), nominal, robot, config)
+    rows = np.asarray(rows, float)
+    if source != "given":
+        rows = np.column_stack([rows, np.full(len(rows), seconds)])
+    return MOTION_SOURCES[source](rows, nominal, robot, config)
 
 
 def drive(left, right, robot=EVEN, n=1):
@@ -123,9 +127,23 @@ def test_wheel_jacobian_equals_finite_differences(left, right):
 def test_model_error_grows_with_path_and_turning_as_printed():
     """4.14, each coefficient by itself, and unsigned when reversing."""
     config = OdometryConfig(k_x_m=1, k_x_rad=10, k_y_m=2, k_y_rad=20, k_phi_m=3, k_phi_rad=30)
-    expected = np.diag([2.0 + 10 * 0.5, 4.0 + 20 * 0.5, 6.0 + 30 * 0.5])
+    config = replace(config, k_x_s=0.1, k_y_s=0.2, k_phi_s=0.3)
+    expected = np.diag([2.0 + 10 * 0.5 + 0.1 * 7, 4.0 + 20 * 0.5 + 0.2 * 7, 6.0 + 15.0 + 0.3 * 7])
     for twist in ([2.0, 0.0, 0.5], [-2.0, 0.0, -0.5]):
-        np.testing.assert_allclose(model_error_cov(np.array([twist]), config)[0], expected)
+        found = model_error_cov(np.array([twist]), np.array([7.0]), config)[0]
+        np.testing.assert_allclose(found, expected)
+
+
+def test_noise_of_time_is_that_of_the_time_in_motion():
+    """Breaks if a robot that stands gathers noise, or if a reading cut in two has more of it."""
+    config = OdometryConfig(k_x_m=0, k_x_rad=0, k_x_s=0.01, floor_sigma_m=0.0)
+    track = odometry_track([0, 1, 2, 3], [[0, 0, 0], [1, 0, 0], [1, 0, 0], [2, 0, 0]], config)
+    times = np.array([[0, 3], [0, 1.25], [1, 2]]) * SECOND
+    found = track.motions(times[:, 0].astype(np.int64), times[:, 1].astype(np.int64))
+    calibrated = found.d_cal @ track.calibration.cov @ found.d_cal.mT
+    x = (found.cov - calibrated)[:, 0, 0]
+    # standing has the sigma of a robot that reports no motion, 1e-4 m
+    np.testing.assert_allclose(x, [0.02, 0.01, STANDING_SIGMA**2], atol=1e-12)
 
 
 @pytest.mark.parametrize("n", [2, 10, 300])
@@ -669,6 +687,8 @@ def test_a_robot_that_turns_drives_less_of_what_was_commanded():
     v, turn, d = 0.1, 0.08, 0.15
     twist = [np.hypot(v, d * turn), 0.0, turn]
     calibration = np.array([0.0, 0.0, 0.0, d**2 / 2])
-    found = MOTION_SOURCES["commands"](np.array([twist]), calibration, ROBOT, NOISE).delta[0]
+    found = MOTION_SOURCES["commands"](np.array([[*twist, 0.0]]), calibration, ROBOT, NOISE).delta[
+        0
+    ]
     np.testing.assert_allclose(found, exp(np.array([v, 0.0, turn])), atol=v * (d * turn / v) ** 4)
     assert found[0] < exp(np.array(twist))[0]

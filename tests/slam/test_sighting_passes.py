@@ -58,18 +58,35 @@ def difference_sigmas(a, b, which):
     return float(np.sqrt(np.mean(np.concatenate(found) ** 2)))
 
 
-def test_the_same_steps_as_while_reading_and_the_same_estimate(log, whole):
-    """A state or a sighting that is lost shows. What differs is where each stopped, and for causal
-    poses when it relinearised: final ones by 0.003 to 0.02 sigma, causal ones by 0.03 to 0.05, over
-    six draws of the log; twice the largest is allowed."""
+def test_nothing_is_lost_against_the_estimate_made_while_reading(log, whole):
+    """A sighting that is lost shows. Each is from a state at its own time, so the final poses are
+    other ones, but by less than their sigmas, and no worse. Causal poses differ by when the back
+    end relinearised: by 0.03 to 0.05 sigma over six draws of the log; twice that is allowed."""
     other = solved(log, *STARTS, backend="isam2")
-    assert whole.summary["counts"] == other.summary["counts"]
-    assert [(s.time_ns, set(s.motions), len(s.associations)) for s in whole.steps] == [
-        (s.time_ns, set(s.motions), len(s.associations)) for s in other.steps
-    ]
-    assert difference_sigmas(whole, other, "final") < 0.04
+    counts, others = ({**r.summary["counts"], "keyframes": 0} for r in (whole, other))
+    assert counts == others
+    seen, as_often = (
+        sorted((a.robot, a.source) for step in r.steps for a in step.associations)
+        for r in (whole, other)
+    )
+    assert seen == as_often
+    assert difference_sigmas(whole, other, "final") < 1.0
     assert difference_sigmas(whole, other, "causal") < 0.1
+    # 1.0 of it here: sightings twice a second need hardly be carried
+    assert error_m(whole) < 1.1 * error_m(other)
     assert error_m(whole) < 0.75 * error_m(whole, "causal")
+
+
+def test_states_are_where_something_was_seen(whole):
+    """By the robot or of it, at the times of these sightings and at no other but the start."""
+    for robot, states in whole.estimate.states.items():
+        times = {
+            step.time_ns
+            for step in whole.steps
+            for a in step.associations
+            if robot in (a.robot, a.target)
+        }
+        assert times <= set(states.stamps_ns.tolist()) <= times | {states.stamps_ns[0]}
 
 
 def test_what_is_causal_knows_nothing_of_the_rest_of_the_log(tmp_path, whole):
