@@ -23,7 +23,7 @@ from graphslam.odometry.preintegration import Track
 from graphslam.perception.sightings import sighting_observation
 
 #: an offset is applied if it is so many sigmas and at least so long, s
-SIGNIFICANT_SIGMAS, SIGNIFICANT_S = 3.0, 0.01
+SIGNIFICANT_SIGMAS, SIGNIFICANT_S = 4.0, 0.01
 #: s: with a larger sigma an offset is unobservable
 OBSERVABLE_S = 1.0
 #: ns: a velocity is the motion over this time

@@ -23,8 +23,8 @@ from graphslam.slam.initialisation import with_identities
 from graphslam.slam.log_pass import LogPass, PriorKnowledge, Progress, timed
 from graphslam.slam.pipeline import Pipeline
 from graphslam.slam.reoptimise_scans import reoptimise_scan_log
-from graphslam.slam.reoptimise_sightings import reoptimise_sighting_log
 from graphslam.slam.robot_state import Causal
+from graphslam.slam.unnamed_sightings import solve_unnamed
 
 #: how often a log is read again at most, with corrected clocks
 MAX_CLOCK_PASSES = 1
@@ -142,9 +142,7 @@ def reoptimise(pipeline: Pipeline, estimate: Estimate) -> Estimate:
     tracks = {name: run.track for name, run in pipeline.started.items()}
     config = pipeline.config
     if is_sighting_log(pipeline):
-        estimate, steps = reoptimise_sighting_log(
-            pipeline.steps, estimate, tracks, pipeline.sources, config
-        )
+        estimate, steps = solve_unnamed(pipeline, estimate)
     else:
         estimate, steps, counts = reoptimise_scan_log(
             pipeline.steps,

@@ -88,6 +88,10 @@ class Pipeline(StepRecorder):
             self.backend, self.runs, outlines(log, config), config, CLOCK_OFFSET_SIGMA_S
         )
         self.scan_buffer = ScanBuffer({}, {}, 0.0)
+        kinds = {topic.record for topic in log.topics}
+        # of one robot alone; several have their sightings collected in batches
+        self.of_sightings = len(log.robots) == 1 and config.keyframe.mode != "all"
+        self.of_sightings &= Sighting in kinds and not kinds & {Scan, RelativePose}
         self.removed_returns = self.robot_detector.counts
         self.unrelated_sightings: list[Sighting] = []
 
@@ -279,17 +283,21 @@ class Pipeline(StepRecorder):
         """Landmarks seen, in the base frame of the state (at the start of ``since``, if given)."""
         out = []
         for message in event:
+            source = None
             if isinstance(message, Scan):
                 found = self.front_end(message, self.config.front_end)
             elif isinstance(message, Sighting) and message.seen_robot is None:
                 found = (sighting_observation(message),)
+                if self.of_sightings:
+                    source = len(self.sources)
+                    self.sources.append(message)
             else:
                 continue
             for o in found:
                 z, cov = transport(o.z, o.cov, message.mount, np.zeros((3, 3)))
                 if since is not None:
                     z, cov = transport(z, cov, since.delta, since.cov)
-                out.append(Observation(o.kind, z, cov, o.extent, o.identity))
+                out.append(Observation(o.kind, z, cov, o.extent, o.identity, source))
         self.counts["observations"] += len(out)
         return out
 

@@ -36,33 +36,6 @@ CLIP_SIGMAS = 3.0
 MIN_VARIANCE_FACTOR = 1.0
 
 
-def reoptimise_sighting_log(
-    steps: Sequence[Step],
-    estimate: Estimate,
-    tracks: Mapping[str, Track],
-    sources: Sequence[Sighting],
-    config: Config,
-) -> tuple[Estimate, tuple[Step, ...]]:
-    """Solve a log of sightings again: with the noise that it shows, and the calibration unknown.
-
-    Args:
-        steps: as recorded.
-        estimate: of all their states and landmarks.
-        tracks: odometry of every robot; their calibration is set to what is found.
-        sources: recorded sightings; `Association.source` is an index into them.
-        config: settings.
-
-    Returns:
-        The estimate and the steps behind it.
-
-    Raises:
-        EstimationError: the estimate is indeterminate.
-    """
-    if not config.odometry.calibrate:
-        return estimate, tuple(steps)
-    return solve_sighting_log(steps, estimate, tracks, group_sightings(steps, sources), config)
-
-
 def solve_sighting_log(
     steps: Sequence[Step],
     estimate: Estimate,
@@ -72,9 +45,22 @@ def solve_sighting_log(
     rounds: int = ROUNDS,
     noise: LogNoise | None = None,
 ) -> tuple[Estimate, tuple[Step, ...]]:
-    """`reoptimise_sighting_log` by the groups of the sightings, in so many ``rounds``.
+    """Solve a log of sightings again: with the noise that it shows, and the calibration unknown.
 
-    With the ``noise`` of the log; if it is not known, with that of the residuals.
+    Args:
+        steps: as recorded.
+        estimate: of all their states and landmarks.
+        tracks: odometry of every robot; their calibration is set to what is found.
+        groups: the sightings of ``steps``.
+        config: settings.
+        rounds: how often.
+        noise: of the log; None takes it from the residuals of the last round but one.
+
+    Returns:
+        The estimate and the steps behind it.
+
+    Raises:
+        EstimationError: the estimate is indeterminate.
     """
     if noise is not None:
         groups = [with_shared_errors(group, noise) for group in groups]

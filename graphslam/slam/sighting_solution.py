@@ -103,6 +103,7 @@ def solve_finely(one: SightingPass, rough: Estimate) -> tuple[Estimate, tuple[St
         steps = steps_at_sightings(one.steps, one.sources, late_ns, one.dropped)
         start = at_states(rough, steps, tracks)
         one.kernel = noise.kernel(config.robust)
+        steps = with_noise(steps, noise)
         solved = solve_at_sightings(steps, start, tracks, noise, config, begun_ns)
         for name, times in state_times(steps).items():
             one.runs[name].times = times.tolist()
@@ -122,7 +123,7 @@ def solve_at_sightings(
     """The estimate with a state at every sighting, and the steps behind it.
 
     Args:
-        steps: see `steps_at_sightings`.
+        steps: see `steps_at_sightings`; with the ``noise`` of their sightings.
         start: an estimate of their states and landmarks.
         tracks: odometry of every robot; their calibration and noise are set to what is found.
         noise: of the log.
@@ -134,10 +135,9 @@ def solve_at_sightings(
     """
     for name, track in tracks.items():
         track.config = noise.odometry.get(name, track.config)
-    widened = with_noise(steps, noise)
 
     def rebuild(estimate: Estimate, _last: bool) -> tuple[Step, ...]:
-        made = with_motions(widened, tracks, estimate, begun_ns)
+        made = with_motions(steps, tracks, estimate, begun_ns)
         return scale_motion_noise(made, noise.motion_scales())
 
     return calibrate(rebuild, start, tracks, noise.kernel(config.robust))

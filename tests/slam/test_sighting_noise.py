@@ -58,7 +58,7 @@ def simulate(seed, *, late_s=0.0, shared=0.0, noise=1.0):
     return World(poses, noisy, seen, landmarks, START * rng.normal(size=3))
 
 
-def write(path, world, *, increments):
+def write(path, world, *, increments, named=True):
     stamps = T0 + np.arange(len(world.poses)) * round(PERIOD_S * S)
     with LogWriter(path) as log:
         pose, last = np.zeros(3), 0
@@ -74,7 +74,8 @@ def write(path, world, *, increments):
                 log.increment("robot", stamps[last], stamp, delta=delta, cov=cov)
             last = k
             while one is not None and one[0] == k:
-                log.sighting("robot", stamp, one[2], np.diag(SIGHTING**2), identity=f"p{one[1]}")
+                name = f"p{one[1]}" if named else None
+                log.sighting("robot", stamp, one[2], np.diag(SIGHTING**2), identity=name)
                 one = next(sightings, None)
     return path
 
@@ -142,6 +143,16 @@ def test_white_noise_is_used_as_well_as_by_the_plain_batch(tmp_path, increments,
     error, nees = np.mean(found, axis=0) / np.mean(best, axis=0)
     assert error < allowed
     assert 0.8 < nees < (1.25 if increments else 1.5)
+
+
+def test_without_names_every_point_is_in_the_map_once(tmp_path):
+    """While the log is read, points that are not recognised are added again: three times as many
+    as there are, at twice the error of a solution with names."""
+    world = simulate(1)
+    result = solved(tmp_path / "log.mcap", world, increments=True, named=False)
+    seen = {i for _, i, _ in world.seen}
+    assert abs(len(result.landmarks) - len(seen)) <= 1
+    assert judge(result, world)[0] < 1.3 * batch(world)[0]
 
 
 def test_unstated_noise_of_odometry_is_found(tmp_path):

@@ -59,12 +59,11 @@ def difference_sigmas(a, b, which):
 
 
 def test_nothing_is_lost_against_the_estimate_made_while_reading(log, whole):
-    """A sighting that is lost shows. Each is from a state at its own time, so the final poses are
-    other ones, but by less than their sigmas, and no worse. Causal poses differ by when the back
-    end relinearised: by 0.03 to 0.05 sigma over six draws of the log; twice that is allowed."""
+    """A sighting that is lost shows. Final poses differ by where the estimation of the noise began,
+    as the odometry has none here. Causal poses differ by when the back end relinearised: by 0.03
+    to 0.05 sigma over six draws of the log; twice that is allowed."""
     other = solved(log, *STARTS, backend="isam2")
-    counts, others = ({**r.summary["counts"], "keyframes": 0} for r in (whole, other))
-    assert counts == others
+    assert whole.summary["counts"] == other.summary["counts"]
     seen, as_often = (
         sorted((a.robot, a.source) for step in r.steps for a in step.associations)
         for r in (whole, other)
@@ -72,9 +71,8 @@ def test_nothing_is_lost_against_the_estimate_made_while_reading(log, whole):
     assert seen == as_often
     assert difference_sigmas(whole, other, "final") < 1.0
     assert difference_sigmas(whole, other, "causal") < 0.1
-    # 1.0 of it here: sightings twice a second need hardly be carried
-    assert error_m(whole) < 1.1 * error_m(other)
-    assert error_m(whole) < 0.75 * error_m(whole, "causal")
+    for result in (whole, other):
+        assert error_m(result) < 0.75 * error_m(result, "causal")
 
 
 def test_states_are_where_something_was_seen(whole):
