@@ -43,6 +43,8 @@ MAX_SIGHTINGS = 6000
 MAX_ROUNDS, CONVERGED_SHARE = 8, 0.1
 #: relative decrease of the error at which optimisation ends
 CONVERGED_ERROR = 1e-4
+#: smallest factor on a stated variance on the way, for logs without noise
+MIN_VARIANCE = 1e-4
 #: sightings or motions without which nothing is said about a source
 MIN_MEASUREMENTS = 100
 #: a latency of sightings is applied if it is so many of its sigmas
@@ -261,7 +263,8 @@ def _sighting_noise(
             continue
         found, shared = fit_distribution(residuals.normalised), posterior.shared(source)
         part = np.zeros(2) if shared is None else shared_variance(shared) * before.shared
-        new[source] = ObservationNoise(found.variance * before.white, part, found.kernel_scale)
+        white = np.maximum(found.variance * before.white, MIN_VARIANCE)
+        new[source] = ObservationNoise(white, part, found.kernel_scale)
     for source in noise.keys() - new.keys():
         new[source] = new[source[0], "point"]
     return new
