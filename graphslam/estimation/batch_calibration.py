@@ -37,12 +37,14 @@ def calibrate(
     rounds: int = ROUNDS,
     *,
     joint: bool = False,
+    rough: bool = False,
 ) -> tuple[Estimate, tuple[Step, ...]]:
     """Solve for states, landmarks and calibrations together, ``rounds`` times.
 
     ``rebuild`` computes the steps again in every round, the first by ``estimate``. The calibration
     of ``tracks`` is set to the one found. Returns the estimate, with ``joint`` and the root of its
-    information, and the steps behind it.
+    information, and the steps behind it. All rounds but the last converge roughly, with ``rough``
+    that one too.
 
     Raises:
         EstimationError: the estimate is indeterminate.
@@ -61,7 +63,7 @@ def calibrate(
             priors,
             initial,
             robust,
-            rough=not last,
+            rough=rough or not last,
             joint=joint and last,
         )
         estimate = solved.estimate

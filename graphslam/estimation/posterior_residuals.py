@@ -17,13 +17,10 @@ from graphslam.core.observation_models import MODELS
 from graphslam.estimation import factors
 from graphslam.estimation.recorded_graph import IntArray, RecordedGraph, Source
 from graphslam.estimation.selected_inverse import CovarianceBlocks
+from graphslam.odometry.noise_estimation import clipped
 
 #: share of its variance that a residual needs at least to tell about its noise
 MIN_REDUNDANCY = 0.02
-#: residuals are cut at so many of their own sigmas
-CLIP_SIGMAS = 3.0
-#: a median of absolute values, as the sigma of a normal variable
-SIGMA_OF_MEDIAN = 1.4826
 #: ns: errors of motions may be the same over as long as this
 SPAN_NS = 3_000_000_000
 
@@ -47,10 +44,8 @@ class Residuals:
 
     def variance_factor(self) -> Array:
         """Factors (k,) on the variances: residuals squared, each cut, over what is left of them."""
-        left, normalised = self.redundancy, self.normalised
-        cut = CLIP_SIGMAS * SIGMA_OF_MEDIAN * np.median(np.abs(normalised), axis=0)
-        squared = np.square(np.clip(normalised, -cut, cut))
-        return np.asarray((squared * left).sum(axis=0) / left.sum(axis=0))
+        left = self.redundancy
+        return np.asarray((clipped(self.normalised) ** 2 * left).sum(axis=0) / left.sum(axis=0))
 
     @property
     def normalised(self) -> Array:

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphslam.core.geometry import Array
-from graphslam.estimation.posterior_residuals import CLIP_SIGMAS, SIGMA_OF_MEDIAN, Residuals
+from graphslam.estimation.posterior_residuals import Residuals
+from graphslam.odometry.noise_estimation import CLIP_SIGMAS, SIGMA_OF_MEDIAN
 
 #: degrees of freedom that are tried; with the most of them a kernel hardly weights anything, but
 #: still bounds the influence of a gross error

@@ -68,14 +68,19 @@ def fit_noise(
     if not moved.any():
         return bare
     C, R, known, left = C[moved], R[moved], known[moved], redundancy[moved]
-    cut = CLIP_SIGMAS * SIGMA_OF_MEDIAN * np.median(np.abs(normalised[moved]), axis=0)
-    squared = np.clip(normalised[moved], -cut, cut) ** 2  # expected: true variance / R
+    squared = clipped(normalised[moved]) ** 2  # expected: true variance / R
     A = (C * (left / R)[:, :, None]).reshape(-1, len(RATES))
     x = _non_negative(A, ((squared - known / R) * left).ravel())
     if relax:
         before = np.maximum(np.mean(1.0 - known / R, axis=0), 1e-9)
         x *= np.repeat(np.clip(np.mean(C @ x / R, axis=0) / before, 0.5, 2.0) ** OVER_RELAXATION, 3)
     return with_rates(bare, x)
+
+
+def clipped(normalised: Array) -> Array:
+    """Residuals (n, k) cut at `CLIP_SIGMAS` of the sigmas that their medians show."""
+    cut = CLIP_SIGMAS * SIGMA_OF_MEDIAN * np.median(np.abs(normalised), axis=0)
+    return np.asarray(np.clip(normalised, -cut, cut))
 
 
 def with_rates(config: OdometryConfig, rates: Array) -> OdometryConfig:

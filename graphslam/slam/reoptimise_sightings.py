@@ -14,17 +14,17 @@ import numpy as np
 
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array
-from graphslam.core.observation_models import MODELS, transport
+from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Estimate, Motion, Sighting, Step
 from graphslam.estimation.batch_calibration import ROUNDS, calibrate
 from graphslam.estimation.recorded_graph import SHARED_NS
 from graphslam.odometry.increment_sums import Motions
 from graphslam.odometry.preintegration import Track, preintegrate_batch
 from graphslam.odometry.readings import IntArray
-from graphslam.perception.sightings import sighting_observation
 from graphslam.slam.motion_noise import noise_scales, scale_motion_noise
 from graphslam.slam.sighting_batches import transport_batch, transport_target
 from graphslam.slam.sighting_noise import LogNoise
+from graphslam.slam.sighting_states import measured_from_base
 
 #: ns: residuals of one target's sightings farther apart are taken as independent
 WINDOW_NS = 10_000_000_000
@@ -129,10 +129,7 @@ def group_sightings(steps: Sequence[Step], sources: Sequence[Sighting]) -> list[
             if a.source is None:
                 continue
             sighting = sources[a.source]
-            o = sighting_observation(sighting)
-            z, cov = o.z, o.cov
-            if sighting.mount.any():
-                z, cov = transport(z, cov, sighting.mount, np.zeros((3, 3)))
+            z, cov = measured_from_base(sighting)
             other, landmark = (a.target, -1) if isinstance(a.target, str) else (None, a.target)
             times = (a.time_ns, sighting.time_ns, step.time_ns)
             row = ((n, k), landmark, *times, z, cov, count[a.robot, a.target])

@@ -18,7 +18,7 @@ from graphslam.core.motion_models import HELD_SIGMA
 from graphslam.core.records import Association, Estimate, Sighting, Start, Step
 from graphslam.estimation.calibration_graph import CalibrationGraph
 from graphslam.estimation.posterior_residuals import Posterior, Residuals, spans
-from graphslam.estimation.recorded_graph import SHARED_NS, ObservationNoise, Source
+from graphslam.estimation.recorded_graph import ObservationNoise, Source
 from graphslam.estimation.residual_distribution import fit_distribution, shared_variance
 from graphslam.odometry.noise_estimation import (
     RATES,
@@ -79,7 +79,7 @@ class LogNoise:
     @property
     def is_white(self) -> bool:
         """Whether the errors of sightings are independent: then every one of them counts."""
-        return not any(noise.shared.any() for noise in self.sightings.values())
+        return _is_white(self.sightings)
 
     def to_summary(self) -> dict[str, Any]:
         """Key `noise` of summary.json."""
@@ -103,29 +103,17 @@ class LogNoise:
         return replace(given, scale=min(noise.kernel_scale for noise in self.sightings.values()))
 
 
-def with_noise(steps: Sequence[Step], noise: LogNoise) -> tuple[Step, ...]:
-    """Steps whose sightings have the noise of a log.
+def with_white_noise(steps: Sequence[Step], noise: LogNoise) -> tuple[Step, ...]:
+    """Steps whose sightings have the white noise of a log."""
 
-    An error that n of them share counts n times in each: together they then tell no more than one.
-    """
-    count = Counter(
-        (a.robot, a.target, step.time_ns // SHARED_NS) for step in steps for a in step.associations
-    )
-
-    def widened(a: Association, span: int) -> Association:
+    def widened(a: Association) -> Association:
         own = noise.sightings.get((a.robot, a.model))
         if own is None:
             return a
-        sigma = np.sqrt(own.white + count[a.robot, a.target, span] * own.shared)
+        sigma = np.sqrt(own.white)
         return a.with_measurement(a.z, a.cov * np.outer(sigma, sigma))
 
-    return tuple(
-        replace(
-            step,
-            associations=tuple(widened(a, step.time_ns // SHARED_NS) for a in step.associations),
-        )
-        for step in steps
-    )
+    return tuple(replace(s, associations=tuple(map(widened, s.associations))) for s in steps)
 
 
 def estimate_noise(

@@ -14,7 +14,6 @@ import numpy as np
 from graphslam.core.config import Config
 from graphslam.core.records import (
     Association,
-    Motion,
     RelativePose,
     Scan,
     Sighting,
@@ -29,6 +28,7 @@ from graphslam.slam.log_pass import PriorKnowledge, Progress, timed
 from graphslam.slam.pipeline import Pipeline
 from graphslam.slam.reoptimise_sightings import SightingGroup, group_sightings
 from graphslam.slam.sighting_batches import SightingBatch, sighting_batches
+from graphslam.slam.sighting_states import timed_motion
 from graphslam.slam.synchronisation import ODOMETRY
 
 
@@ -166,7 +166,7 @@ class SightingPass(Pipeline):
             if step_ns > run.state_ns and (
                 robot in mutual or self.keyframes.has_moved(run, run.state_ns, step_ns)
             ):
-                motions[robot] = _timed_motion(run.state_ns, step_ns)
+                motions[robot] = timed_motion(run.state_ns, step_ns)
                 run.times.append(step_ns)
                 self.counts["keyframes"] += 1
         associations = []
@@ -204,9 +204,3 @@ class SightingPass(Pipeline):
         return Association(
             robot, run.state_ns, entry.id, o.kind, o.z, o.cov, extent=o.extent, source=source
         )
-
-
-def _timed_motion(start_ns: int, end_ns: int) -> Motion:
-    """A motion of which only the times are known yet."""
-    unknown = np.full(3, np.nan)
-    return Motion(start_ns, end_ns, unknown, np.full((3, 3), np.nan), np.zeros((3, 0)), 0.0)

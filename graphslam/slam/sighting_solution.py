@@ -20,25 +20,19 @@ from graphslam.core.motion_models import Calibration
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Estimate, Step, Trajectory
 from graphslam.core.worker import parallel_map
-from graphslam.estimation.batch_calibration import calibrate, calibrate_roughly
+from graphslam.estimation.batch_calibration import calibrate_roughly
 from graphslam.mapping.landmark_map import observed_from
 from graphslam.multi_robot.relative_frames import RobotEstimate
 from graphslam.odometry.preintegration import Track
-from graphslam.slam.motion_noise import scale_motion_noise
 from graphslam.slam.reoptimise_sightings import (
     SightingGroup,
     group_sightings,
     recompute_steps,
     solve_sighting_log,
 )
-from graphslam.slam.sighting_noise import LogNoise, estimate_noise, with_noise
+from graphslam.slam.sighting_noise import estimate_noise
 from graphslam.slam.sighting_pass import SightingPass
-from graphslam.slam.sighting_states import (
-    at_states,
-    state_times,
-    steps_at_sightings,
-    with_motions,
-)
+from graphslam.slam.state_at_every_sighting import state_at_every_sighting
 
 #: how much wider the kernel is in the beginning
 WIDE = 10.0
@@ -94,53 +88,12 @@ def solve_finely(one: SightingPass, rough: Estimate) -> tuple[Estimate, tuple[St
     Raises:
         EstimationError: the estimate is indeterminate.
     """
-    tracks, config = one.tracks, one.config
-    noise = estimate_noise(one.steps, one.sources, rough, tracks, config)
+    noise = estimate_noise(one.steps, one.sources, rough, one.tracks, one.config)
     one.noise = noise.to_summary()
     if noise.is_white:
-        begun_ns = {name: step.time_ns for step in one.steps for name in step.starts}
-        late_ns = {name: t.reported_late_ns(t.calibration) for name, t in tracks.items()}
-        steps = steps_at_sightings(one.steps, one.sources, late_ns, one.dropped)
-        start = at_states(rough, steps, tracks)
-        one.kernel = noise.kernel(config.robust)
-        steps = with_noise(steps, noise)
-        solved = solve_at_sightings(steps, start, tracks, noise, config, begun_ns)
-        for name, times in state_times(steps).items():
-            one.runs[name].times = times.tolist()
-        one.counts["keyframes"] = sum(map(len, state_times(steps).values()))
-        return solved
-    return solve_sighting_log(one.steps, rough, tracks, one.groups, config, 1, noise)
-
-
-def solve_at_sightings(
-    steps: Sequence[Step],
-    start: Estimate,
-    tracks: Mapping[str, Track],
-    noise: LogNoise,
-    config: Config,
-    begun_ns: Mapping[str, int],
-) -> tuple[Estimate, tuple[Step, ...]]:
-    """The estimate with a state at every sighting, and the steps behind it.
-
-    Args:
-        steps: see `steps_at_sightings`; with the ``noise`` of their sightings.
-        start: an estimate of their states and landmarks.
-        tracks: odometry of every robot; their calibration and noise are set to what is found.
-        noise: of the log.
-        config: settings.
-        begun_ns: see `with_motions`.
-
-    Raises:
-        EstimationError: the estimate is indeterminate.
-    """
-    for name, track in tracks.items():
-        track.config = noise.odometry.get(name, track.config)
-
-    def rebuild(estimate: Estimate, _last: bool) -> tuple[Step, ...]:
-        made = with_motions(steps, tracks, estimate, begun_ns)
-        return scale_motion_noise(made, noise.motion_scales())
-
-    return calibrate(rebuild, start, tracks, noise.kernel(config.robust))
+        problem, start = state_at_every_sighting(one, rough, noise)
+        return problem.finish(one, problem.steps, start)
+    return solve_sighting_log(one.steps, rough, one.tracks, one.groups, one.config, 1, noise)
 
 
 def solve_robots_apart(one: SightingPass) -> Estimate:

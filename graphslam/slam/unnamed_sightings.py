@@ -8,19 +8,12 @@ is accurate enough to tell which landmarks are one, and which of them each sight
 from dataclasses import replace
 
 from graphslam.core.records import Estimate, Step
-from graphslam.estimation.calibration_graph import solve_calibrated
 from graphslam.mapping.duplicate_landmarks import merged
 from graphslam.mapping.point_reassociation import indistinguishable_points, reassociate_points
 from graphslam.slam.log_pass import LogPass
 from graphslam.slam.reoptimise_sightings import group_sightings, solve_sighting_log
-from graphslam.slam.sighting_noise import estimate_noise, with_noise
-from graphslam.slam.sighting_solution import solve_at_sightings
-from graphslam.slam.sighting_states import (
-    at_states,
-    state_times,
-    steps_at_sightings,
-    with_motions,
-)
+from graphslam.slam.sighting_noise import estimate_noise
+from graphslam.slam.state_at_every_sighting import state_at_every_sighting
 
 #: rounds of merging landmarks and associating again: a third moves one sighting in a thousand
 MAX_ROUNDS = 2
@@ -47,26 +40,12 @@ def solve_unnamed(one: LogPass, estimate: Estimate) -> tuple[Estimate, tuple[Ste
     if not noise.is_white:
         groups = group_sightings(one.steps, one.sources)
         return solve_sighting_log(one.steps, estimate, tracks, groups, config, noise=noise)
-    one.kernel = noise.kernel(config.robust)
-    for name, track in tracks.items():
-        track.config = noise.odometry.get(name, track.config)
-    begun_ns = {name: step.time_ns for step in one.steps for name in step.starts}
-    late_ns = {name: t.reported_late_ns(t.calibration) for name, t in tracks.items()}
-    plain = steps_at_sightings(one.steps, one.sources, late_ns, one.dropped)
-    estimate = at_states(estimate, plain, tracks)
-    steps = with_noise(plain, noise)
-    priors = {name: track.prior for name, track in tracks.items()}
+    problem, estimate = state_at_every_sighting(one, estimate, noise)
+    steps = problem.steps
     sightings = sum(len(step.associations) for step in steps)
     unnamed = any(entry.identity is None for entry in landmarks.entries.values())
     for _ in range(MAX_ROUNDS if unnamed else 0):
-        initial = {name: track.calibration for name, track in tracks.items()}
-        for track in tracks.values():
-            track.calibration = track.calibration.held()
-        made = with_motions(steps, tracks, estimate, begun_ns)
-        solution = solve_calibrated(made, estimate, priors, initial, one.kernel, rough=True)
-        estimate = solution.estimate
-        for name, track in tracks.items():
-            track.calibration = solution.calibrations[name]
+        estimate, _ = problem.solve(steps, estimate, rough=True)
         landmarks.update_from(steps, estimate)
         points = {
             i: found
@@ -81,9 +60,6 @@ def solve_unnamed(one: LogPass, estimate: Estimate) -> tuple[Estimate, tuple[Ste
         one.counts["observations_reassociated"] += moved
         if not into and moved <= SETTLED_SHARE * sightings:
             break
-    one.counts["keyframes"] = sum(map(len, state_times(steps).values()))
-    estimate, steps = solve_at_sightings(steps, estimate, tracks, noise, config, begun_ns)
-    landmarks.update_from(steps, estimate)
-    for name, times in state_times(steps).items():
-        one.runs[name].times = times.tolist()
-    return estimate, steps
+    estimate, solved = problem.finish(one, steps, estimate)
+    landmarks.update_from(solved, estimate)
+    return estimate, solved
