@@ -103,14 +103,14 @@ class LogNoise:
         return replace(given, scale=min(noise.kernel_scale for noise in self.sightings.values()))
 
 
-def with_white_noise(steps: Sequence[Step], noise: LogNoise) -> tuple[Step, ...]:
-    """Steps whose sightings have the white noise of a log."""
+def with_own_noise(steps: Sequence[Step], noise: LogNoise) -> tuple[Step, ...]:
+    """Steps whose sightings have the noise of a log that each has by itself, shared or not."""
 
     def widened(a: Association) -> Association:
         own = noise.sightings.get((a.robot, a.model))
         if own is None:
             return a
-        sigma = np.sqrt(own.white)
+        sigma = np.sqrt(own.white + own.shared)
         return a.with_measurement(a.z, a.cov * np.outer(sigma, sigma))
 
     return tuple(replace(s, associations=tuple(map(widened, s.associations))) for s in steps)

@@ -32,7 +32,7 @@ from graphslam.slam.reoptimise_sightings import (
 )
 from graphslam.slam.sighting_noise import estimate_noise
 from graphslam.slam.sighting_pass import SightingPass
-from graphslam.slam.state_at_every_sighting import state_at_every_sighting
+from graphslam.slam.state_per_step import sighting_problem
 
 #: how much wider the kernel is in the beginning
 WIDE = 10.0
@@ -90,10 +90,8 @@ def solve_finely(one: SightingPass, rough: Estimate) -> tuple[Estimate, tuple[St
     """
     noise = estimate_noise(one.steps, one.sources, rough, one.tracks, one.config)
     one.noise = noise.to_summary()
-    if noise.is_white:
-        problem, start = state_at_every_sighting(one, rough, noise)
-        return problem.finish(one, problem.steps, start)
-    return solve_sighting_log(one.steps, rough, one.tracks, one.groups, one.config, 1, noise)
+    problem, start = sighting_problem(one, rough, noise, one.groups)
+    return problem.finish(one, problem.steps, start)
 
 
 def solve_robots_apart(one: SightingPass) -> Estimate:

@@ -99,12 +99,16 @@ def state_times(steps: Sequence[Step]) -> dict[str, IntArray]:
 
 
 def at_states(estimate: Estimate, steps: Sequence[Step], tracks: Mapping[str, Track]) -> Estimate:
-    """An estimate with the states of other ``steps``, on the path between its own."""
+    """An estimate with the states of other ``steps``, on the path between its own.
+
+    Where covariances of its states are unknown, theirs are of the odometry in between alone.
+    """
     states = {}
     for robot, times in state_times(steps).items():
         known = estimate.states[robot]
-        zero = Trajectory(known.stamps_ns, known.poses, np.zeros((len(known.poses), 3, 3)))
-        states[robot] = final_at(zero, tracks[robot], times, times)
+        if np.isnan(known.covs).any():
+            known = replace(known, covs=np.zeros_like(known.covs))
+        states[robot] = final_at(known, tracks[robot], times, times)
     return replace(estimate, states=states)
 
 

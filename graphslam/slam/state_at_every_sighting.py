@@ -9,7 +9,7 @@ from graphslam.estimation.batch_calibration import ROUNDS, calibrate
 from graphslam.odometry.preintegration import Track
 from graphslam.slam.log_pass import LogPass
 from graphslam.slam.motion_noise import scale_motion_noise
-from graphslam.slam.sighting_noise import LogNoise, with_white_noise
+from graphslam.slam.sighting_noise import LogNoise, with_own_noise
 from graphslam.slam.sighting_states import (
     at_states,
     state_times,
@@ -50,6 +50,12 @@ class SightingProblem:
         rounds = 1 if rough else ROUNDS
         return calibrate(rebuild, start, self.tracks, self.kernel, rounds, rough=rough)
 
+    def at_sightings(
+        self, steps: tuple[Step, ...], estimate: Estimate
+    ) -> tuple[tuple[Step, ...], Estimate]:
+        """``steps`` and their estimate: there is a state wherever something was seen."""
+        return steps, estimate
+
     def finish(
         self, one: LogPass, steps: Sequence[Step], start: Estimate
     ) -> tuple[Estimate, tuple[Step, ...]]:
@@ -79,5 +85,5 @@ def state_at_every_sighting(
     for name, track in tracks.items():
         track.config = noise.odometry.get(name, track.config)
     one.kernel = noise.kernel(one.config.robust)
-    steps = with_white_noise(steps, noise)
+    steps = with_own_noise(steps, noise)
     return SightingProblem(steps, tracks, noise, one.kernel, begun_ns), start

@@ -1,22 +1,25 @@
 """A log of sightings without identities, solved again once it is associated.
 
 While the log is read, a filter associates: a landmark that it does not recognise is in the map
-twice. Solved as a whole, with a state at every sighting and the noise that the log shows, the map
-is accurate enough to tell which landmarks are one, and which of them each sighting is of.
+twice. Solved as a whole, with the noise that the log shows, the states are accurate enough to tell
+which landmarks are one, and which of them each sighting is of.
 """
 
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
-from graphslam.core.records import Estimate, Step
-from graphslam.mapping.duplicate_landmarks import merged
-from graphslam.mapping.point_reassociation import indistinguishable_points, reassociate_points
-from graphslam.slam.log_pass import LogPass
-from graphslam.slam.reoptimise_sightings import group_sightings, solve_sighting_log
-from graphslam.slam.sighting_noise import estimate_noise
-from graphslam.slam.state_at_every_sighting import state_at_every_sighting
+import numpy as np
 
-#: rounds of merging landmarks and associating again: a third moves one sighting in a thousand
-MAX_ROUNDS = 2
+from graphslam.core.records import Estimate, Step
+from graphslam.mapping.landmark_map import LandmarkMap, mean_landmarks
+from graphslam.mapping.point_reassociation import PointSightings, is_point, reassociated
+from graphslam.slam.log_pass import LogPass
+from graphslam.slam.sighting_noise import estimate_noise
+from graphslam.slam.state_at_every_sighting import SightingProblem
+from graphslam.slam.state_per_step import SteppedProblem, sighting_problem
+
+#: rounds of solving and associating again: the third moves one sighting in a hundred at most
+MAX_ROUNDS = 3
 #: share of the sightings that still move, below which another round is not worth it
 SETTLED_SHARE = 1e-3
 
@@ -37,29 +40,75 @@ def solve_unnamed(one: LogPass, estimate: Estimate) -> tuple[Estimate, tuple[Ste
         return estimate, tuple(one.steps)
     noise = estimate_noise(one.steps, one.sources, estimate, tracks, config)
     one.noise = noise.to_summary()
-    if not noise.is_white:
-        groups = group_sightings(one.steps, one.sources)
-        return solve_sighting_log(one.steps, estimate, tracks, groups, config, noise=noise)
-    problem, estimate = state_at_every_sighting(one, estimate, noise)
-    steps = problem.steps
-    sightings = sum(len(step.associations) for step in steps)
-    unnamed = any(entry.identity is None for entry in landmarks.entries.values())
-    for _ in range(MAX_ROUNDS if unnamed else 0):
+    problem, estimate = sighting_problem(one, estimate, noise)
+    steps, before = problem.steps, len(estimate.landmarks)
+    points = {
+        i
+        for i in estimate.landmarks
+        if landmarks.entries[i].identity is None and landmarks.entries[i].kind == "point"
+    }
+    for _ in range(MAX_ROUNDS if points else 0):
         estimate, _ = problem.solve(steps, estimate, rough=True)
-        landmarks.update_from(steps, estimate)
-        points = {
-            i: found
-            for i, found in estimate.landmarks.items()
-            if landmarks.entries[i].identity is None
-        }
-        into = indistinguishable_points(steps, replace(estimate, landmarks=points))
-        steps = merged(steps, into, landmarks)
-        left = {i: found for i, found in points.items() if i not in into}
-        steps, moved = reassociate_points(steps, replace(estimate, landmarks=left))
-        one.counts["landmarks_merged"] += len(into)
+        steps, estimate, moved, count = _associated_again(problem, steps, estimate, points)
         one.counts["observations_reassociated"] += moved
-        if not into and moved <= SETTLED_SHARE * sightings:
+        if moved <= SETTLED_SHARE * count:
             break
     estimate, solved = problem.finish(one, steps, estimate)
+    one.counts["landmarks_merged"] += before - len(estimate.landmarks)
     landmarks.update_from(solved, estimate)
+    _count_sightings(landmarks, solved, points)
     return estimate, solved
+
+
+def _associated_again(
+    problem: SightingProblem | SteppedProblem,
+    steps: tuple[Step, ...],
+    estimate: Estimate,
+    points: Collection[int],
+) -> tuple[tuple[Step, ...], Estimate, int, int]:
+    """Steps with every sighting of ``points`` at the one that it fits best; their estimate.
+
+    Also how many sightings have moved, and of how many.
+    """
+    fine, there = problem.at_sightings(steps, estimate)
+    points = points & estimate.landmarks.keys()
+    seen = PointSightings.of(fine, there, points)
+    if not len(seen.target):
+        return steps, estimate, 0, 0
+    found = reassociated(seen, {i: estimate.landmarks[i][0] for i in points})
+    sources = [a.source for step in fine for a in step.associations if is_point(a, points)]
+    targets = dict(zip(sources, found.tolist(), strict=True))
+    steps = _retargeted(steps, targets)
+    placed = mean_landmarks(_retargeted(fine, targets), there.states)
+    kept = {i: placed.get(i, found) for i, found in estimate.landmarks.items()}
+    kept = {i: found for i, found in kept.items() if i in placed or i not in points}
+    moved = int(np.count_nonzero(found != seen.target))
+    return steps, replace(estimate, landmarks=kept), moved, len(found)
+
+
+def _retargeted(steps: Sequence[Step], targets: Mapping[int | None, int]) -> tuple[Step, ...]:
+    """Steps whose sightings are of other landmarks; ``targets`` by `Association.source`."""
+    return tuple(
+        replace(
+            step,
+            associations=tuple(
+                replace(a, target=targets[a.source]) if a.source in targets else a
+                for a in step.associations
+            ),
+        )
+        for step in steps
+    )
+
+
+def _count_sightings(
+    landmarks: LandmarkMap, steps: Sequence[Step], points: Collection[int]
+) -> None:
+    """Set how often and when ``points`` of the map were seen."""
+    times: dict[int, list[int]] = {}
+    for step in steps:
+        for a in step.associations:
+            if is_point(a, points):
+                times.setdefault(int(a.target), []).append(a.time_ns)
+    for number, seen in times.items():
+        entry = landmarks.entries[number]
+        entry.sightings, entry.first_ns, entry.last_ns = len(seen), min(seen), max(seen)
