@@ -158,6 +158,7 @@ def smooth(
     """
     from graphslam.core.worker import Future
     from graphslam.results.folder import check_target, save
+    from graphslam.slam.log_reader import receive_log
 
     settled = _settle(recording, config, settings)
     if output is not None:
@@ -167,7 +168,7 @@ def smooth(
         # imported while the second process reads; what only that one needs is imported there
         from graphslam.slam.smooth import smooth
 
-        log = cast("LogSet", recording if ahead is None else ahead.receive())
+        log = cast("LogSet", recording) if ahead is None else receive_log(ahead, settled)
         if output is None:
             return smooth(log, settled, _count(log, progress), ahead=ahead)
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from graphslam.core.geometry import Array, compose, polar_points, rotate_cov
 from graphslam.core.observation_models import MODELS, transport
+from graphslam.core.record import Record
 from graphslam.core.records import Observation
 
 IntArray = NDArray[np.int64]
@@ -20,7 +21,7 @@ ROWS = np.array([MODELS[kind].rows for kind in KINDS])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ObservationArrays:
+class ObservationArrays(Record):
     """Observations (m) in the frames of the states or sensors from which they were made.
 
     ``kind`` (m,) code in `KINDS`; ``z`` (m, 3) and ``cov`` (m, 3, 3), padded with zeros for points,

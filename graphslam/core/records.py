@@ -17,6 +17,7 @@ import numpy as np
 
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array
+from graphslam.core.record import Record
 
 #: a time or times (...,), ns
 Stamps = int | Sequence[int] | np.ndarray[tuple[int, ...], np.dtype[np.int64]]
@@ -26,7 +27,7 @@ IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Message:
+class Message(Record):
     """Base of all messages of a log: the robot that recorded it and its two times."""
 
     robot: str
@@ -149,7 +150,7 @@ class Truth(Message):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Motion:
+class Motion(Record):
     """How a robot moved from ``start_ns`` to ``end_ns`` according to its own sensors.
 
     ``delta`` (3,) is the end pose in the frame of the start pose, ``cov`` (3, 3) along the start
@@ -169,7 +170,7 @@ class Motion:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Observation:
+class Observation(Record):
     """One observation of a landmark by a front end, in the frame of the sensor.
 
     ``kind`` says what ``z`` is: ``point`` (bearing, range); ``segment`` and ``line`` a pose on
@@ -189,7 +190,7 @@ class Observation:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Association:
+class Association(Record):
     """An observation made from a robot's state, with the target it belongs to.
 
     ``time_ns`` names the robot's state; ``target`` is a landmark's number or another robot's
@@ -217,7 +218,7 @@ class Association:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Start:
+class Start(Record):
     """Prior of a robot's first state: pose (3,), covariance (3, 3) along world axes."""
 
     pose: Array
@@ -225,7 +226,7 @@ class Start:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Closure:
+class Closure(Record):
     """Pose (3,) of state (robot, time) in the frame of state (other, other_time), with cov.
 
     ``verified``: its consistency with all other data was tested, so it gets no robust kernel.
@@ -248,7 +249,7 @@ class Closure:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Step:
+class Step(Record):
     """Everything that enters an estimator together, at one time.
 
     ``starts`` holds robots that appear for the first time, ``motions`` those that get a new
@@ -399,7 +400,7 @@ class RobotResult:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class KeyframeScan:
+class KeyframeScan(Record):
     """Points of a keyframe's scan: (n, 2) in the frame of its state, seen from ``sensor`` (3,)."""
 
     robot: str

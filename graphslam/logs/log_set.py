@@ -67,6 +67,7 @@ class LogSet:
     def __post_init__(self) -> None:
         self._opening_warnings = len(self.warnings)
         self._kept: dict[tuple[str, ...], list[Message | ReadReport]] = {}
+        self._ahead: dict[tuple[str, ...], Iterator[Message | ReadReport]] = {}
 
     def has_scans(self, robot: str) -> bool:
         """Whether the logs hold laser scans of ``robot``."""
@@ -95,19 +96,18 @@ class LogSet:
         works on each. ``keep``: a log without scans, if not longer than `KEPT_MESSAGES`, is held in
         memory from then on, so that it is decoded once however often it is read.
         """
-        topics = {topic.name: topic for topic in self.topics if topic.record not in exclude}
+        topics = self._topics_without(exclude)
         self.update(ReadReport())
-
-        def read() -> Iterator[Message | ReadReport]:
-            return self._read(topics, self._contexts)
-
-        count, kept = self.count(exclude), self._kept.get(tuple(topics))
+        names, count = tuple(topics), self.count(exclude)
+        kept, ahead = self._kept.get(names), self._ahead.pop(names, None)
         if kept is not None:
             items: Iterable[Message | ReadReport] = kept
+        elif ahead is not None:
+            items = ahead
         elif prefetch and count >= WORKER_MIN_MESSAGES:
-            items = Prefetch(read)
+            items = Prefetch(lambda: self.reading(exclude))
         else:
-            items = read()
+            items = self.reading(exclude)
         keep &= kept is None and count <= KEPT_MESSAGES
         keep &= not any(topic.record is records.Scan for topic in topics.values())
         taken: list[Message | ReadReport] = []
@@ -119,7 +119,20 @@ class LogSet:
             else:
                 yield item
         if keep:
-            self._kept[tuple(topics)] = taken
+            self._kept[names] = taken
+
+    def reading(self, exclude: tuple[type[Message], ...] = ()) -> Iterator["Message | ReadReport"]:
+        """What `messages` is made of: they, and last what was found out about them."""
+        return self._read(self._topics_without(exclude), self._contexts)
+
+    def expect(
+        self, reading: Iterator["Message | ReadReport"], exclude: tuple[type[Message], ...] = ()
+    ) -> None:
+        """Let the next `messages` with the same ``exclude`` take a `reading` that has begun."""
+        self._ahead[tuple(self._topics_without(exclude))] = reading
+
+    def _topics_without(self, exclude: tuple[type[Message], ...]) -> dict[str, Topic]:
+        return {topic.name: topic for topic in self.topics if topic.record not in exclude}
 
     def odometry(self, exclude: tuple[type[Message], ...] = ()) -> Iterator[Odometry]:
         """The odometry among `messages` with the same ``exclude``, at the same times.
@@ -127,7 +140,7 @@ class LogSet:
         Much faster, since the ranges of scans are not looked at. When they were taken has to be
         known: late stamps are repaired by the order in which all topics were recorded.
         """
-        topics = {topic.name: topic for topic in self.topics if topic.record not in exclude}
+        topics = self._topics_without(exclude)
         contexts = {
             name: replace(context, without_ranges=True) for name, context in self._contexts.items()
         }

@@ -24,8 +24,6 @@ from graphslam.core.records import (
     Scan,
     Sighting,
     Step,
-    TrueLandmark,
-    Truth,
 )
 from graphslam.logs import LogSet
 from graphslam.logs.clock import to_common_clock
@@ -46,6 +44,7 @@ from graphslam.perception.ordered_scan import scan_points
 from graphslam.perception.sightings import sighting_observation
 from graphslam.slam.keyframes import KeyframeSelector
 from graphslam.slam.log_pass import PriorKnowledge, Progress, counted, timed
+from graphslam.slam.log_reader import TRUE_RECORDS
 from graphslam.slam.recorded_closures import between_states
 from graphslam.slam.robot_settings import outlines
 from graphslam.slam.sighting_batches import (
@@ -126,7 +125,7 @@ class Pipeline(StepRecorder):
 
     def messages(self, progress: Progress) -> Iterator[Message]:
         """The messages of the log but truth, counted; for ``progress`` see `run`."""
-        read = self.log.messages((Truth, TrueLandmark), prefetch=True, keep=True)
+        read = self.log.messages(TRUE_RECORDS, prefetch=True, keep=True)
         return counted(read, self.counts, progress)
 
     def accepted(self, messages: Iterable[Message]) -> Iterator[Message]:

@@ -23,8 +23,6 @@ from graphslam.core.records import (
     Start,
     Step,
     TrueAssociations,
-    TrueLandmark,
-    Truth,
 )
 from graphslam.estimation.initial_estimate import initial_estimate
 from graphslam.estimation.isam2 import Reoptimiser
@@ -33,6 +31,7 @@ from graphslam.logs import LogSet
 from graphslam.odometry.given_increments import consecutive_motions
 from graphslam.slam.initialisation import estimate_start_poses
 from graphslam.slam.log_pass import PriorKnowledge, Progress, counted, timed
+from graphslam.slam.log_reader import TRUE_RECORDS
 from graphslam.slam.passes import Findings, FinishedPass, pass_findings
 from graphslam.slam.pipeline import Pipeline
 from graphslam.slam.recorded_closures import accept_closures, take_relative_poses
@@ -43,7 +42,7 @@ from graphslam.slam.start_priors import start_poses
 
 def is_pose_graph(log: LogSet, config: Config) -> bool:
     """Whether a log is only relative poses, and its solution is asked for, not a back end's way."""
-    kinds = {topic.record for topic in log.topics} - {Truth, TrueLandmark, TrueAssociations}
+    kinds = {topic.record for topic in log.topics} - {*TRUE_RECORDS, TrueAssociations}
     backend = config.backend
     at_once = backend.name == "batch" and backend.optimise_at_end and backend.reoptimise
     return at_once and kinds == {OdometryIncrement, RelativePose}
@@ -65,7 +64,7 @@ def solve_pose_graph(log: LogSet, config: Config, progress: Progress) -> Finishe
     counts: Counter[str] = Counter()
     with timed(seconds, "read"):
         tracks = make_tracks(log, config)
-        read = counted(log.messages((Truth, TrueLandmark), prefetch=True), counts, progress)
+        read = counted(log.messages(TRUE_RECORDS, prefetch=True), counts, progress)
         messages = take_relative_poses(read, tracks)
     with timed(seconds, "starts"):
         starts = start_poses(log, config)

@@ -17,7 +17,8 @@ from graphslam.core.config import Config
 from graphslam.core.geometry import Array, between, compose, inverse
 from graphslam.core.motion_models import Calibration
 from graphslam.core.observation_arrays import ObservationArrays
-from graphslam.core.records import Closure, Message, Motion, Scan, TrueLandmark, Truth
+from graphslam.core.record import Record
+from graphslam.core.records import Closure, Message, Motion, Scan
 from graphslam.logs import LogSet
 from graphslam.logs.log_set import ReadReport
 from graphslam.multi_robot.robot_detection import COMPARED_SCANS, without_returns
@@ -33,6 +34,7 @@ from graphslam.perception.front_ends import observe_block
 from graphslam.perception.ordered_scan import Sweep, make_sweep, scan_points
 from graphslam.perception.scan_matching import make_submap
 from graphslam.slam.keyframes import KeyframeSelector
+from graphslam.slam.log_reader import TRUE_RECORDS
 from graphslam.slam.progress import counted, timed
 from graphslam.slam.robot_settings import make_tracks, with_noted_keyframes
 from graphslam.slam.robot_state import RobotState
@@ -46,7 +48,7 @@ READ_AHEAD = 8000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ScanKeyframe:
+class ScanKeyframe(Record):
     """A scan that is used, and how the robot came there.
 
     ``motion`` is since the keyframe before; None if that has the same time. ``seen`` are
@@ -154,7 +156,7 @@ class _Reader:
         self._removed_returns: Counter[str] = Counter()
         self._seconds: dict[str, float] = defaultdict(float)
         self._span_ns = 1 << 63, 0
-        self._messages = _Messages(iter(log.messages((Truth, TrueLandmark))))
+        self._messages = _Messages(iter(log.messages(TRUE_RECORDS)))
 
     def read_ahead(self) -> None:
         """Read some of the messages that later blocks are made of."""
