@@ -104,13 +104,14 @@ class StateTable:
         Raises:
             EstimationError: there is none, or the robot has not started.
         """
-        self.latest(robot, time_ns)  # raises if it has not started
-        if (robot, time_ns) not in self._number:
+        number = self._number.get((robot, time_ns))
+        if number is None:
+            self.latest(robot, time_ns)  # raises if it has not started
             raise EstimationError(
                 f"robot {robot} has no state at {time_ns} ns: a step refers to a state that no "
                 "earlier step made"
             )
-        return self._number[robot, time_ns]
+        return number
 
     def latest(self, robot: str, at_ns: int | None = None) -> int:
         """Number of the robot's latest state; ``at_ns``, for the message, is when it is needed.

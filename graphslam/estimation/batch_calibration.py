@@ -7,11 +7,11 @@ uncertainty a part of every covariance.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from graphslam.core.config import RobustConfig
+from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Motion, Step
 from graphslam.estimation.calibration_graph import (
     CalibrationGraph,

@@ -7,7 +7,7 @@ is estimated jointly, and its uncertainty is in every covariance.
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import gtsam
@@ -16,11 +16,12 @@ import numpy as np
 from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array, adjoint, between, inverse, log, rotation3, wrap
 from graphslam.core.motion_models import HELD_SIGMA, Calibration
+from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Motion, Step
 from graphslam.estimation import factors
 from graphslam.estimation.backend import JointMarginal
 from graphslam.estimation.isam2 import NO_COVARIANCES, with_means
-from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH, marginals_of
+from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH, marginals_of, optimise
 from graphslam.estimation.posterior_residuals import Posterior, posterior_pairs
 from graphslam.estimation.recorded_graph import ObservationNoise, RecordedGraph, Source
 
@@ -156,12 +157,9 @@ class CalibrationGraph:
             EstimationError: the estimate is indeterminate.
         """
         builder, graph = self._builder, self._builder.graph
-        parameters = gtsam.LevenbergMarquardtParams()
-        parameters.setRelativeErrorTol(converged)
-        parameters.setMaxIterations(50)
         found = NO_COVARIANCES
         try:
-            values = gtsam.LevenbergMarquardtOptimizer(graph, self._values, parameters).optimize()
+            values = optimise(graph, self._values, builder.kernel, converged)
             if marginals:
                 found = marginals_of(graph, values, keep_rows=joint)
         except RuntimeError as error:

@@ -48,8 +48,8 @@ class ClosureGraph:
         """
         steps = list(steps)
         self._builder, self._values = BatchGraph.at_estimate(steps, start, kernel)
-        motions = (motion for step in steps for motion in step.motions.values())
-        self._use_qr = is_wide([*motions, *closures])
+        motions = [motion for step in steps for motion in step.motions.values()]
+        self._use_qr = is_wide(motions, closures)
         self._graph, self._size = self._builder.graph, self._builder.graph.size()
         self._kernel, self._rows = kernel, self._builder.rows
         groups = self._builder.closure_groups(replace(c, verified=True) for c in closures)

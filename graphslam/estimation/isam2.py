@@ -67,7 +67,7 @@ class BatchGraph(GraphBuilder):
             builder.insert(step, start, values)
         motions = [motion for step in steps for motion in step.motions.values()]
         closures = [closure for step in steps for closure in step.closures]
-        builder.is_wide = is_wide([*motions, *closures])
+        builder.is_wide = is_wide(motions, closures)
         return builder, values
 
     def expand(self, step: Step, current: Estimates) -> list[FactorGroup]:

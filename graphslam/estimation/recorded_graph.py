@@ -1,7 +1,8 @@
 """The graph of steps that are all recorded: what is many is made at once.
 
-`BatchGraph` makes the factors of a step one by one, as a log that is being read needs it. Here the
-observations of bearing and range, of which a log of sightings has tens of thousands, are arrays.
+`BatchGraph` makes the factors of a step one by one, as a log that is being read needs it. Here
+motions are arrays, and the observations of bearing and range, of which a log of sightings has tens
+of thousands.
 """
 
 from collections import defaultdict
@@ -14,10 +15,11 @@ import numpy as np
 
 from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array, are_positive
-from graphslam.core.records import Association, Estimate, Step
+from graphslam.core.observation_models import MODELS
+from graphslam.core.records import Association, Estimate, Motion, Step
 from graphslam.estimation import factors
 from graphslam.estimation.factor_graph import covariance_of
-from graphslam.estimation.input_checks import describe
+from graphslam.estimation.input_checks import describe, describe_motion
 from graphslam.estimation.isam2 import BatchGraph
 
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
@@ -87,19 +89,62 @@ class RecordedGraph(BatchGraph):
                 step refers to was never made.
         """
         polar: dict[Source, list[tuple[int, Association]]] = defaultdict(list)
+        motions: list[Motion] = []
         for step in steps:
-            for index, robot in enumerate(step.motions, self.graph.size() + len(step.starts)):
-                last = self.latest_key(robot, step.time_ns)
-                self.motions.append((index, robot, last, last + 1))
+            if step.starts:
+                self.insert(Step(step.time_ns, step.starts), start, values)
+            for robot, motion in step.motions.items():
+                self._insert_state(robot, step.time_ns, start, values)
+                motions.append(motion)
             others = []
             for seen in step.associations:
                 if seen.model in factors.BEARING_RANGE:
                     polar[seen.robot, seen.model].append((step.time_ns, seen))
+                elif seen.model == "line":
+                    self._insert_line(seen, start, values)
                 else:
                     others.append(seen)
-            self.insert(replace(step, associations=tuple(others)), start, values)
+            if others or step.closures:
+                rest = Step(step.time_ns, {}, {}, tuple(others), step.closures)
+                self.insert(rest, start, values)
+        self._make_motions(motions)
         for source, observed in sorted(polar.items(), key=lambda one: (one[0][1], one[0][0])):
             self._insert_polar(source, observed, start, values)
+
+    def _insert_state(
+        self, robot: str, time_ns: int, start: Estimate, values: gtsam.Values
+    ) -> None:
+        """Add a robot's next state, and a place in the graph for the motion to it."""
+        last = self.latest_key(robot, time_ns)
+        self.states.append(robot, time_ns)
+        factors.write(values, last + 1, self.value_in(start, last + 1))
+        self.motions.append((self.graph.size(), robot, last, last + 1))
+        self.graph.resize(self.graph.size() + 1)
+
+    def _make_motions(self, motions: Sequence[Motion]) -> None:
+        """Fill the places of `motions`."""
+        if not motions:
+            return
+        cov = np.array([motion.cov for motion in motions])
+        for bad in np.flatnonzero(~are_positive(cov)).tolist():
+            _, robot, _, key = self.motions[bad]
+            time_ns = self.states.times[robot][key - self.state_key(robot, 0)]
+            with covariance_of(describe_motion(robot, time_ns), cov[bad]):
+                factors.gaussian(cov[bad])
+        delta = np.array([motion.delta for motion in motions])
+        made = factors.motion_factors([ends[2:] for ends in self.motions], delta, cov)
+        for (index, *_), factor in zip(self.motions, made, strict=True):
+            self.graph.replace(index, factor)
+        self.rows += delta.size
+
+    def _insert_line(self, seen: Association, start: Estimate, values: gtsam.Values) -> None:
+        """Note an observation of a line; a new one gets its variable and its gauge."""
+        if seen.target not in self.landmark_dims:
+            self.insert(Step(seen.time_ns, {}, {}, (seen,)), start, values)
+            return
+        key = self.state_key(seen.robot, self.states.number(seen.robot, seen.time_ns))
+        self.rows += MODELS["line"].rows
+        self._lines.append((key, factors.landmark_key(int(seen.target)), seen))
 
     def _insert_polar(
         self,

@@ -34,7 +34,7 @@ def settled(steps: Sequence[Step], estimate: Estimate, kernel: RobustConfig) -> 
     _hold_lines(builder, values)
     motions = [motion for step in steps for motion in step.motions.values()]
     closures = [closure for step in steps for closure in step.closures]
-    use_qr = is_wide([*motions, *closures])
+    use_qr = is_wide(motions, closures)
     try:
         for _ in range(ROUNDS if kernel.kernel == "none" else ROUNDS_ROBUST):
             before = values

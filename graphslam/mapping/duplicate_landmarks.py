@@ -8,7 +8,7 @@ later merges must agree with earlier ones. What one image showed as two things i
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from graphslam.core.consistency import RIVAL_D2
 from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared, whiten
 from graphslam.core.geometry import Array, between, rotate_cov, wrap
+from graphslam.core.record import replace
 from graphslam.core.records import Association, Step
 from graphslam.estimation.backend import JointMarginal
 from graphslam.mapping.gating import BoolArray, IntArray

@@ -6,12 +6,13 @@ have changed, since reading them is a large part of an incremental smoother's co
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from graphslam.core.geometry import Array, between, compose, rotate_cov
 from graphslam.core.observation_models import MODELS
+from graphslam.core.record import replace
 from graphslam.core.records import Association, Estimate, Observation, Step, Trajectory
 from graphslam.estimation.backend import Backend
 from graphslam.mapping.gating import BoolArray, IntArray

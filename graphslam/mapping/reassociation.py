@@ -8,12 +8,13 @@ goes to the wall that it fits best; one that fits none is dropped.
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from graphslam.core.geometry import Array, compose, path_length, wrap
+from graphslam.core.record import replace
 from graphslam.core.records import Association, Estimate, Step
 from graphslam.mapping.gating import IntArray
 from graphslam.mapping.landmark_map import Entry, observed_from, retarget

@@ -6,11 +6,11 @@ identity in two frames are different landmarks. At the end all frames go back to
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 
 import numpy as np
 
 from graphslam.core.geometry import Array, compose
+from graphslam.core.record import replace
 from graphslam.core.records import Landmark, Message, RelativePose, Sighting, Start
 from graphslam.mapping.landmark_map import Entry
 from graphslam.multi_robot.frame_tree import FrameAssignment

@@ -1,7 +1,7 @@
 """Trajectories at any stamps, by odometry between states; results in other world frames."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from graphslam.core.geometry import (
     transform,
 )
 from graphslam.core.motion_models import Calibration
+from graphslam.core.record import replace
 from graphslam.core.records import Estimate, ScanTies, Start, Step, Trajectory
 from graphslam.odometry.preintegration import Track
 

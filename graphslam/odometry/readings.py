@@ -224,8 +224,12 @@ class Readings:
 
     def moved(self, start_ns: int, end_ns: int) -> tuple[float, float]:
         """Path (m) and net turning (rad, absolute) from ``start_ns`` to ``end_ns``; cheap."""
-        start, end = self._total(np.array([start_ns, end_ns]))
-        return float(end[_PATH] - start[_PATH]), abs(float(wrap(end[_HEADING] - start[_HEADING])))
+        start, end = self.driven(np.array([start_ns, end_ns]))
+        return float(end[0] - start[0]), abs(float(wrap(end[1] - start[1])))
+
+    def driven(self, times_ns: IntArray) -> Array:
+        """Accumulated path (m) and heading (rad, not wrapped) at times (n,): (n, 2)."""
+        return self._total(times_ns)[:, [_PATH, _HEADING]]
 
     def added_rows(self, start_ns: IntArray, end_ns: IntArray) -> Array:
         """Sums (n, k) of the rows between times (n,) and (n,), a share of those cut by a time."""

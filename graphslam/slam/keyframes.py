@@ -2,7 +2,10 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from graphslam.core.config import KeyframeConfig
+from graphslam.core.geometry import wrap
 from graphslam.core.records import Message, Scan, Sighting
 from graphslam.slam.robot_state import RobotState
 
@@ -26,6 +29,21 @@ class KeyframeSelector:
         used = self.has_moved(run, run.scanned_ns, first.time_ns, self._config.scan_angle_rad)
         if used:
             run.scanned_ns = first.time_ns
+        return used
+
+    def used_scans(self, scans: Sequence[Scan], run: RobotState) -> list[Scan]:
+        """Those of consecutive scans of a robot for which `is_used` holds, at once."""
+        if self._config.mode == "all" or not scans:
+            return list(scans)
+        since = scans[0].time_ns if run.scanned_ns is None else run.scanned_ns
+        times = np.array([since, *(scan.time_ns for scan in scans)], dtype=np.int64)
+        (path_m, heading), *driven = run.track.driven(times).tolist()
+        used, angle_rad = [], self._config.scan_angle_rad
+        for scan, (at_m, at_rad) in zip(scans, driven, strict=True):
+            turned = abs(float(wrap(at_rad - heading)))
+            if run.scanned_ns is None or self._is_far(at_m - path_m, turned, angle_rad):
+                run.scanned_ns, path_m, heading = scan.time_ns, at_m, at_rad
+                used.append(scan)
         return used
 
     def gets_state(self, event: Sequence[Message], run: RobotState) -> bool:
@@ -52,6 +70,8 @@ class KeyframeSelector:
         if since_ns is None:
             return True
         path_m, turned_rad = run.track.moved(since_ns, time_ns)
-        if angle_rad is None:
-            angle_rad = self._config.angle_rad
-        return path_m >= self._config.distance_m or turned_rad >= angle_rad
+        return self._is_far(path_m, turned_rad, angle_rad)
+
+    def _is_far(self, path_m: float, turned_rad: float, angle_rad: float | None) -> bool:
+        least_rad = self._config.angle_rad if angle_rad is None else angle_rad
+        return path_m >= self._config.distance_m or turned_rad >= least_rad

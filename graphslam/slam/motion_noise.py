@@ -5,11 +5,11 @@ axis. A few motions that are wrong (slip, jumps) do not move it; they are left t
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from graphslam.core.geometry import Array, between, wrap
+from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Step
 
 #: motions of a robot from which their noise is estimated at least

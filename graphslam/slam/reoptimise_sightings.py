@@ -7,7 +7,7 @@ the last round.
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ import numpy as np
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array
 from graphslam.core.observation_models import MODELS
+from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Motion, Sighting, Step
 from graphslam.estimation.batch_calibration import ROUNDS, calibrate
 from graphslam.estimation.recorded_graph import SHARED_NS

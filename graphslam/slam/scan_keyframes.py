@@ -201,7 +201,7 @@ class _Reader:
         scans = [message for message in block if isinstance(message, Scan)]
         run.scans += [(s.stamp_ns, s.time_ns, s.mount) for s in scans]
         self._counts["scans"] += len(scans)
-        used = [s for s in scans if self._keyframes.is_used((s,), run)]
+        used = self._keyframes.used_scans(scans, run)
         if not used:
             return []
         with timed(self._seconds, "motions"):

@@ -64,26 +64,24 @@ def recalibrate_path(path: TrackedPath, track: Track) -> None:
     noise = np.array([m.cov for m in path.motions])
     new = old.copy()
     new[used] = track.motions(ends[used, 0], ends[used, 1]).delta
-    anchor_at = np.array(path.anchors)
-    states = np.arange(len(path.times))
-    before = anchor_at[np.clip(np.searchsorted(anchor_at, states) - 1, 0, None)]
-    poses = [path.poses[0]]
-    by_old = by_new = np.zeros(3)
-    total = np.zeros((3, 3))
-    found = path.from_anchor[:1]
-    for k in range(1, len(states)):
-        if before[k] == k - 1:  # the first state after an anchor
-            by_old = by_new = np.zeros(3)
-            total = np.zeros((3, 3))
-        total = compose_cov(by_old, total, old[k - 1], noise[k - 1])
-        by_old, by_new = compose(by_old, old[k - 1]), compose(by_new, new[k - 1])
-        seen, cov = path.from_anchor[k]
-        change = by_new - by_old
-        change[2] = wrap(change[2])
-        seen = seen + cov @ np.linalg.solve(total, change)
-        found.append((seen, cov))
-        poses.append(compose(poses[before[k]], seen))
-    path.from_anchor, path.poses = found, poses
+    anchors = np.array(path.anchors)
+    begins, lasts = anchors[:-1], anchors[1:]
+    poses, seen = np.array(path.poses), np.array([pose for pose, _ in path.from_anchor])
+    covs = np.array([cov for _, cov in path.from_anchor])
+    by_old = np.zeros((len(begins), 3))
+    by_new, total = by_old.copy(), np.zeros((len(begins), 3, 3))
+    for k in range(1, int((lasts - begins).max(initial=0)) + 1):  # the k-th state after each
+        at = np.flatnonzero(begins + k <= lasts)
+        states = begins[at] + k
+        total[at] = compose_cov(by_old[at], total[at], old[states - 1], noise[states - 1])
+        by_old[at] = compose(by_old[at], old[states - 1])
+        by_new[at] = compose(by_new[at], new[states - 1])
+        change = by_new[at] - by_old[at]
+        change[:, 2] = wrap(change[:, 2])
+        seen[states] += (covs[states] @ np.linalg.solve(total[at], change[:, :, None]))[:, :, 0]
+    for begin, last in zip(begins.tolist(), lasts.tolist(), strict=True):
+        poses[begin + 1 : last + 1] = compose(poses[begin], seen[begin + 1 : last + 1])
+    path.poses, path.from_anchor = list(poses), list(zip(seen, covs, strict=True))
 
 
 class ScanLog(LogPass):

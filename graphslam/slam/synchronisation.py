@@ -44,26 +44,36 @@ def synchronise(
     max_gap_ns = round(max_gap_s * 1e9)
     now_ns = 0
 
-    def next_of_waiting(final: bool) -> Message | None:
-        """Takes out and returns the first waiting message, unless it has to wait longer."""
+    def has_to_wait(head: Message, needed: Sequence[Track | None]) -> bool:
+        if now_ns - head.time_ns > max_gap_ns:
+            return False
+        shown = [tracks[robot] for robot in watched] if isinstance(head, Scan) else ()
+        return not all(track and track.reaches(head.time_ns) for track in (*needed, *shown))
+
+    def ready(final: bool) -> Iterator[Message]:
+        """Takes out the messages in front that need not wait any longer."""
         while waiting:
             head = waiting[0]
+            needed: Sequence[Track | None] = ()
             if not isinstance(head, ODOMETRY):
                 needed = [tracks.get(robot) for robot in _robots(head)]
-                shown = [tracks[robot] for robot in watched] if isinstance(head, Scan) else []
-                covered = all(track and track.reaches(head.time_ns) for track in needed + shown)
-                if not covered and not final and now_ns - head.time_ns <= max_gap_ns:
-                    return None
-                if not all(track and track.covers(head.time_ns, max_gap_ns) for track in needed):
-                    waiting.popleft()
+                if not final and has_to_wait(head, needed):
+                    return
+            waiting.popleft()
+            for track in needed:
+                if not (track and track.covers(head.time_ns, max_gap_ns)):
                     dropped[f"{type(head).__name__.lower()}: no odometry near it"] += 1
-                    continue
-            return waiting.popleft()
-        return None
+                    break
+            else:
+                yield head
 
     for message in messages:
         if isinstance(message, ODOMETRY):
             tracks[message.robot].add(message)
+            if not waiting:  # nothing else is in front of it
+                now_ns = max(now_ns, message.time_ns)
+                yield message
+                continue
         elif isinstance(message, (Truth, TrueLandmark)):
             continue
         elif isinstance(message, Sighting) and message.seen_robot not in (None, *tracks):
@@ -71,7 +81,5 @@ def synchronise(
             continue
         now_ns = max(now_ns, message.time_ns)
         waiting.append(message)
-        while (ready := next_of_waiting(final=False)) is not None:
-            yield ready
-    while (ready := next_of_waiting(final=True)) is not None:
-        yield ready
+        yield from ready(final=False)
+    yield from ready(final=True)
