@@ -177,16 +177,21 @@ def smooth(
 
             return truth_of_logs(log, settled)
 
-        def render_report() -> str:
+        def render_report() -> tuple[str, list[str]]:
             from graphslam.results.report import render
 
-            return render(result, errors)
+            errors = _errors(result, known)
+            return render(result, errors), result.summary["warnings"]
+
+        def finish_report(result: Result) -> str:
+            page, result.summary["warnings"][:] = report.result()
+            return page
 
         truth = Future(read_truth)
         result = smooth(log, settled, _count(log, progress), ahead=ahead)
-        errors = _errors(result, truth.result())
+        known = truth.result()
         report = Future(render_report)
-        save(result, Path(output), force=force, report=lambda _: report.result())
+        save(result, Path(output), force=force, report=finish_report)
         return result
 
 

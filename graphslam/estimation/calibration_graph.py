@@ -21,7 +21,7 @@ from graphslam.core.records import Estimate, Motion, Step
 from graphslam.estimation import factors
 from graphslam.estimation.backend import JointMarginal
 from graphslam.estimation.isam2 import NO_COVARIANCES, with_means
-from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH, marginals_of, optimise
+from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH, marginals_of, reweighted
 from graphslam.estimation.posterior_residuals import Posterior, posterior_pairs
 from graphslam.estimation.recorded_graph import ObservationNoise, RecordedGraph, Source
 
@@ -157,9 +157,16 @@ class CalibrationGraph:
             EstimationError: the estimate is indeterminate.
         """
         builder, graph = self._builder, self._builder.graph
-        found = NO_COVARIANCES
+        parameters = gtsam.LevenbergMarquardtParams()
+        parameters.setRelativeErrorTol(converged)
+        parameters.setMaxIterations(50)
+        values, found, is_done = self._values, NO_COVARIANCES, False
         try:
-            values = optimise(graph, self._values, builder.kernel, converged)
+            # rough solutions begin far off
+            if builder.kernel.kernel != "none" and converged < CONVERGED_ERROR_ROUGH:
+                values, is_done = reweighted(graph, values, converged)
+            if not is_done:
+                values = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
             if marginals:
                 found = marginals_of(graph, values, keep_rows=joint)
         except RuntimeError as error:

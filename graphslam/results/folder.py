@@ -102,7 +102,8 @@ def save(
 ) -> None:
     """Write the result folder, see `write_folder`.
 
-    ``report`` renders report.html and is called last; without it there is no report.
+    ``report`` renders report.html, and may add to the summary; it is called when all else but that
+    is made. Without it there is no report.
 
     Raises:
         OutputError: the target exists and may not be replaced, a number is not finite, or the
@@ -131,7 +132,6 @@ def write_folder(directory: Path, files: Sequence[tuple[str, str | bytes]]) -> N
 def _files(result: Result, report: Callable[[Result], str] | None) -> list[tuple[str, str | bytes]]:
     """Names and contents of every file of the folder."""
     files: list[tuple[str, str | bytes]] = [
-        ("summary.json", to_json(result.summary, "summary.json")),
         ("config.toml", dump_config(result.config)),
         (
             "landmarks.json",
@@ -147,6 +147,7 @@ def _files(result: Result, report: Callable[[Result], str] | None) -> list[tuple
         files.append((JOINT_FILE, joint_bytes(joint)))
     if report is not None:
         files.append(("report.html", report(result)))
+    files.append(("summary.json", to_json(result.summary, "summary.json")))
     return files
 
 
