@@ -64,10 +64,11 @@ def recalibrate_path(path: TrackedPath, track: Track) -> None:
     noise = np.array([m.cov for m in path.motions])
     new = old.copy()
     new[used] = track.motions(ends[used, 0], ends[used, 1]).delta
-    anchors = np.array(path.anchors)
-    begins, lasts = anchors[:-1], anchors[1:]
+    begins = np.array(path.anchors)
+    lasts = np.append(begins[1:], len(path.times) - 1)
     poses, seen = np.array(path.poses), np.array([pose for pose, _ in path.from_anchor])
-    covs = np.array([cov for _, cov in path.from_anchor])
+    known = [cov for _, cov in path.from_anchor]
+    covs = np.array(known)
     by_old = np.zeros((len(begins), 3))
     by_new, total = by_old.copy(), np.zeros((len(begins), 3, 3))
     for k in range(1, int((lasts - begins).max(initial=0)) + 1):  # the k-th state after each
@@ -81,7 +82,7 @@ def recalibrate_path(path: TrackedPath, track: Track) -> None:
         seen[states] += (covs[states] @ np.linalg.solve(total[at], change[:, :, None]))[:, :, 0]
     for begin, last in zip(begins.tolist(), lasts.tolist(), strict=True):
         poses[begin + 1 : last + 1] = compose(poses[begin], seen[begin + 1 : last + 1])
-    path.poses, path.from_anchor = list(poses), list(zip(seen, covs, strict=True))
+    path.poses, path.from_anchor = list(poses), list(zip(seen, known, strict=True))
 
 
 class ScanLog(LogPass):
