@@ -65,13 +65,7 @@ __version__ = "0.1.0"
 _CLASSES = {
     "change_detection": ("Change", "ChangeResult"),
     "core.config": ("Config",),
-    "core.errors": (
-        "ConfigError",
-        "EstimationError",
-        "GraphSlamError",
-        "LogError",
-        "OutputError",
-    ),
+    "core.errors": ("ConfigError", "EstimationError", "GraphSlamError", "LogError", "OutputError"),
     "core.records": ("Estimate", "Landmark", "Result", "RobotResult", "Trajectory"),
     "logs": ("GroundTruth", "LogSet", "LogWriter"),
     "results.folder": ("SavedResult",),
