@@ -15,6 +15,7 @@ from graphslam.logs import time_order
 from graphslam.logs.decoders import TopicContext, decode_messages
 from graphslam.logs.future_stamps import Recorded, repair_future_stamps
 from graphslam.logs.mcap_file import McapFile, open_mcap, raw_messages
+from graphslam.logs.stated_noise import StatedNoise, stated_noise
 from graphslam.logs.topic_context import topic_contexts
 from graphslam.logs.topics import ODOMETRY_KINDS, Topic, choose_topics, find_topics
 
@@ -68,6 +69,7 @@ class LogSet:
         self._opening_warnings = len(self.warnings)
         self._kept: dict[tuple[str, ...], list[Message | ReadReport]] = {}
         self._ahead: dict[tuple[str, ...], Iterator[Message | ReadReport]] = {}
+        self._stated: dict[str, StatedNoise | None] = {}
 
     def has_scans(self, robot: str) -> bool:
         """Whether the logs hold laser scans of ``robot``."""
@@ -76,6 +78,14 @@ class LogSet:
     def no_return_m(self, topic: str) -> float:
         """Smallest range, m, that means no return in ``topic``; inf if none was detected."""
         return self._contexts[topic].no_return_m
+
+    def stated_noise(self, robot: str) -> StatedNoise | None:
+        """What the nav_msgs/Odometry of ``robot`` says about its noise; see `stated_noise`."""
+        if robot not in self._stated:
+            kind = records.OdometryPose
+            own = [t for t in self.topics if t.robot == robot and t.record is kind]
+            self._stated[robot] = stated_noise(self.opened, own[0]) if own else None
+        return self._stated[robot]
 
     def count(self, exclude: tuple[type[Message], ...] = ()) -> int:
         """Number of messages in all used topics except those of the records ``exclude``."""

@@ -185,7 +185,7 @@ def _after_frame(size: int) -> int:
 
 
 def odometry_table(data: Sequence[bytes]) -> Any:
-    """Rows (n,) of nav_msgs/Odometry with stamp, position ``xyz`` and ``rotation`` (x y z w).
+    """Rows (n,) of nav_msgs/Odometry: stamp, ``xyz``, ``rotation`` (x y z w), ``twist_covariance``.
 
     Raises:
         CdrError: the messages are cut short or differ in the lengths of their frames.
@@ -202,7 +202,8 @@ def _odometry_layout(order: str, frame_size: int, child_size: int) -> Layout:
     layout.string("child", child_size)
     layout.number("xyz", "d", 3)
     layout.number("rotation", "d", 4)
-    layout.skip(8 * (36 + 6 + 36))  # covariance of the pose, twist, covariance of the twist
+    layout.skip(8 * (36 + 6))  # covariance of the pose, twist
+    layout.number("twist_covariance", "d", 36)
     return layout
 
 

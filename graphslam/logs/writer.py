@@ -84,12 +84,21 @@ class LogWriter:
     # ------------------------------------------------------------ measurements
 
     def odometry(
-        self, robot: str, stamp_ns: int, pose: ArrayLike, *, log_time_ns: int | None = None
+        self,
+        robot: str,
+        stamp_ns: int,
+        pose: ArrayLike,
+        *,
+        twist_variances: tuple[float, float, float] | None = None,
+        log_time_ns: int | None = None,
     ) -> None:
-        """nav_msgs/Odometry on ``odom``: pose (3,) of the base in the odometry frame."""
+        """nav_msgs/Odometry on ``odom``: pose (3,) of the base in the odometry frame.
+
+        ``twist_variances``: of the velocity along x, y and of turning, if they are known.
+        """
         x, y, phi = np.asarray(pose, dtype=float).tolist()
         z, w = math.sin(phi / 2), math.cos(phi / 2)
-        data = _odometry_template(robot).filled(stamp_ns, x, y, z, w)
+        data = _odometry_template(robot, twist_variances).filled(stamp_ns, x, y, z, w)
         self._add(_topic(robot, "odom"), schemas.ODOMETRY, data, stamp_ns, log_time_ns)
 
     def wheel_angles(
@@ -347,8 +356,13 @@ class Event(NamedTuple):
 
 
 @cache
-def _odometry_template(robot: str) -> schemas.Template:
+def _odometry_template(
+    robot: str, twist_variances: tuple[float, float, float] | None = None
+) -> schemas.Template:
     """nav_msgs/Odometry with the numbers x, y and the quaternion's z, w."""
+    covariance = np.zeros((6, 6))
+    if twist_variances is not None:
+        covariance[[0, 1, 5], [0, 1, 5]] = twist_variances
     x, y, z, w = marks = (1.25, 2.25, 3.25, 4.25)
     rotation = _rotation(z, w)
     point = schemas.build("geometry_msgs/msg/Point", x=x, y=y, z=0.0)
@@ -359,8 +373,8 @@ def _odometry_template(robot: str) -> schemas.Template:
         schemas.ODOMETRY,
         header=schemas.header(0, frame(robot, "odom")),
         child_frame_id=frame(robot, "base_link"),
-        pose=_with_covariance("Pose", pose=pose),
-        twist=_with_covariance("Twist", twist=twist),
+        pose=_with_covariance("Pose", np.zeros(36), pose=pose),
+        twist=_with_covariance("Twist", covariance, twist=twist),
     )
     return schemas.Template(schemas.ODOMETRY, message, marks)
 
@@ -399,8 +413,8 @@ def _rotation(z: float, w: float) -> Any:
     return schemas.build("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=z, w=w)
 
 
-def _with_covariance(kind: str, **fields: Any) -> Any:
+def _with_covariance(kind: str, covariance: ArrayLike, **fields: Any) -> Any:
     """PoseWithCovariance or TwistWithCovariance; zeros mean unknown in ROS."""
     return schemas.build(
-        f"geometry_msgs/msg/{kind}WithCovariance", covariance=np.zeros(36), **fields
+        f"geometry_msgs/msg/{kind}WithCovariance", covariance=_flat(covariance), **fields
     )

@@ -77,6 +77,20 @@ def fit_noise(
     return with_rates(bare, x)
 
 
+def rates_of(twists: Array, seconds: Array, variances: Array) -> Array:
+    """The rates (9,), in the order of `RATES`, by which motions have given variances.
+
+    Args:
+        twists: (n, 3) m and rad, all of robots in motion.
+        seconds: (n,) that they take.
+        variances: (n, 3) along x, y and of turning.
+    """
+    A = np.column_stack([np.hypot(twists[:, 0], twists[:, 1]), np.abs(twists[:, 2]), seconds])
+    # relative errors count, so that each part of a log does
+    each = [_non_negative(A / v[:, None], np.ones(len(v))) for v in variances.T]
+    return np.concatenate(each)
+
+
 def clipped(normalised: Array) -> Array:
     """Residuals (n, k) cut at `CLIP_SIGMAS` of the sigmas that their medians show."""
     cut = CLIP_SIGMAS * SIGMA_OF_MEDIAN * np.median(np.abs(normalised), axis=0)

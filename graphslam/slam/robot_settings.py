@@ -11,6 +11,8 @@ from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam.core.records import RelativePose, Scan, Sighting
 from graphslam.logs import LogSet
+from graphslam.logs.stated_noise import StatedNoise
+from graphslam.odometry.noise_estimation import RATES, rates_of, with_rates
 from graphslam.odometry.preintegration import Track
 from graphslam.perception.robot_outlines import outline_of
 
@@ -43,7 +45,10 @@ def make_tracks(log: LogSet, config: Config) -> dict[str, Track]:
     return {
         name: Track(
             without_laser_calibration(
-                odometry_settings(config.odometry, log.notes), log.has_scans(name)
+                with_stated_noise(
+                    odometry_settings(config.odometry, log.notes), log.stated_noise(name)
+                ),
+                log.has_scans(name),
             ),
             robot_settings(name, config, log.notes),
             mounted=True,
@@ -51,6 +56,14 @@ def make_tracks(log: LogSet, config: Config) -> dict[str, Track]:
         )
         for name in log.robots
     }
+
+
+def with_stated_noise(config: OdometryConfig, stated: StatedNoise | None) -> OdometryConfig:
+    """Odometry settings with the rates that a log's messages state, unless others are set."""
+    default = OdometryConfig()
+    if stated is None or any(getattr(config, name) != getattr(default, name) for name in RATES):
+        return config
+    return with_rates(config, rates_of(stated.twists, stated.seconds, stated.variances))
 
 
 def without_laser_calibration(config: OdometryConfig, scans: bool) -> OdometryConfig:

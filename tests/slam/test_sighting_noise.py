@@ -58,7 +58,7 @@ def simulate(seed, *, late_s=0.0, shared=0.0, noise=1.0):
     return World(poses, noisy, seen, landmarks, START * rng.normal(size=3))
 
 
-def write(path, world, *, increments, named=True):
+def write(path, world, *, increments, named=True, stated=None):
     stamps = T0 + np.arange(len(world.poses)) * round(PERIOD_S * S)
     with LogWriter(path) as log:
         pose, last = np.zeros(3), 0
@@ -68,7 +68,7 @@ def write(path, world, *, increments, named=True):
             if k:
                 pose = compose(pose, exp(world.twists[k - 1]))
             if not increments:
-                log.odometry("robot", stamp, pose)
+                log.odometry("robot", stamp, pose, twist_variances=stated)
             elif k:
                 delta, cov = exp(world.twists[k - 1]), np.diag(ODOMETRY**2)
                 log.increment("robot", stamps[last], stamp, delta=delta, cov=cov)
@@ -166,6 +166,20 @@ def test_unstated_noise_of_odometry_is_found(tmp_path):
         each = [rates[f"k_{axis}_{unit}"] for unit in ("m", "rad", "s")]
         # 1200 motions, three quarters of whose noise the sightings leave open: 15 %
         assert each @ amounts / len(moved) == pytest.approx(true**2, rel=0.35)
+
+
+def test_noise_that_odometry_messages_state_is_used_and_checked(tmp_path):
+    """As that of increments. A tenth of the variance is named, and not believed."""
+    world, true = simulate(0), tuple(((ODOMETRY / PERIOD_S) ** 2).tolist())
+    result = solved(tmp_path / "true.mcap", world, increments=False, stated=true)
+    error, nees = np.array(judge(result, world)) / batch(world)
+    assert error < 1.1
+    assert 0.8 < nees < 1.25
+    assert not [w for w in result.summary["warnings"] if "robot motion" in w]
+    little = tuple(0.1 * variance for variance in true)
+    doubtful = solved(tmp_path / "little.mcap", world, increments=False, stated=little)
+    assert len([w for w in doubtful.summary["warnings"] if "robot motion" in w]) == 3
+    assert judge(doubtful, world)[1] < 2.0 * batch(world)[1]
 
 
 def test_a_late_sensor_costs_next_to_nothing(tmp_path):
