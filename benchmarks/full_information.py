@@ -11,8 +11,9 @@ poses    odometry as poses: its noise is unknown
 late     sightings stamped 50 ms late, increments; the batch knows by how much
 unnamed  identities left out, increments; landmarks beside
 sparse   one image per second
-bursty   0.9 of the variance of sightings is the same for a point for 10 s; the batch takes it for
-         white, so only the NEES of ours is judged
+segments sightings with a direction (3 deg): of poses, not of points
+bursty   0.9 of the variance of sightings is the same for a point for 10 s; the batch knows the
+         model, with a variable for each such error, which the log does not say
 three    three robots that see the points, and each other
 
 Run: python benchmarks/full_information.py [KIND ...] [--seeds N] [--seconds S]
@@ -38,6 +39,8 @@ PERIOD_S, T0, S = 0.1, 1_000_000_000, 1_000_000_000
 ODOMETRY = np.array([0.0066, 1e-4, 0.009])
 SIGHTING = np.array([np.deg2rad(1.5), 0.03])
 START = np.full(3, 0.01)
+#: rad: of the direction of a segment
+DIRECTION = np.deg2rad(3.0)
 LATE_S, SHARED, SPAN_S = 0.05, 0.9, 10.0
 POINTS, VISIBLE = 17, 5
 #: kind -> largest error against the batch, bounds of the NEES against the batch's
@@ -47,7 +50,8 @@ BARS = {
     "late": (1.1, (0.8, 1.25)),
     "unnamed": (1.3, (0.0, np.inf)),
     "sparse": (1.1, (0.75, 1.25)),
-    "bursty": (np.inf, (0.0, 1.0)),
+    "segments": (1.1, (0.75, 1.25)),
+    "bursty": (1.1, (0.75, 1.25)),
     "three": (1.1, (0.75, 1.25)),
 }
 
@@ -64,7 +68,10 @@ class Drive:
 
 @dataclass(frozen=True)
 class Log:
-    """Drives by robot, points, and sightings: robot, reading, what was seen, bearing and range."""
+    """Drives by robot, points (n, 2) or segments (n, 3), and sightings.
+
+    A sighting is robot, reading, what was seen, and bearing, range and, of a segment, direction.
+    """
 
     drives: dict[str, Drive]
     points: Array
@@ -100,6 +107,8 @@ def simulated(kind: str, seconds: float, seed: int) -> Log:
     drives = {
         name: drive(n, np.append(rng.uniform(-2, 2, 2), rng.uniform(-3, 3)), rng) for name in robots
     }
+    if kind == "segments":
+        points = np.column_stack([points, rng.uniform(-np.pi, np.pi, POINTS)])
     bias = np.sqrt(SHARED) * SIGHTING * rng.normal(size=(POINTS, round(seconds / SPAN_S) + 1, 2))
     seen = []
     for k in range(1, n + 1):
@@ -108,7 +117,7 @@ def simulated(kind: str, seconds: float, seed: int) -> Log:
         for robot, own in drives.items():
             x = (own.before if kind == "late" else own.poses)[k]
             others = {name: other.poses[k, :2] for name, other in drives.items() if name != robot}
-            targets = {f"p{i}": point for i, point in enumerate(points)} | others
+            targets = {f"p{i}": point[:2] for i, point in enumerate(points)} | others
             apart = np.array(list(targets.values())) - x[:2]
             z = np.column_stack([np.arctan2(*apart.T[::-1]) - x[2], np.hypot(*apart.T)])
             z[:, 0] = wrap(z[:, 0])
@@ -117,8 +126,10 @@ def simulated(kind: str, seconds: float, seed: int) -> Log:
                 e = SIGHTING * rng.normal(size=2)
                 if kind == "bursty":
                     e = np.sqrt(1 - SHARED) * e + bias[i, int(k * PERIOD_S // SPAN_S)]
-                name = list(targets)[i]
-                seen.append((robot, k, name, np.array([wrap(z[i, 0] + e[0]), z[i, 1] + e[1]])))
+                measured = [wrap(z[i, 0] + e[0]), z[i, 1] + e[1]]
+                if kind == "segments":
+                    measured.append(wrap(points[i, 2] - x[2] + DIRECTION * rng.normal()))
+                seen.append((robot, k, list(targets)[i], np.array(measured)))
     return Log(drives, points, seen)
 
 
@@ -143,7 +154,7 @@ def write(path: Path, log: Log, kind: str) -> None:
                 robot, _, name, z = one
                 other = name if name in log.drives else None
                 identity = None if other or kind == "unnamed" else name
-                cov = np.diag(SIGHTING**2)
+                cov = np.diag(np.append(SIGHTING, DIRECTION)[: len(z)] ** 2)
                 out.sighting(robot, stamp, z, cov, identity=identity, seen_robot=other)
                 one = next(sightings)
 
@@ -174,13 +185,25 @@ def batch(log: Log, kind: str) -> tuple[float, float]:
                 graph.add(gtsam.BetweenFactorPose2(one, other, moved, motion))
     for robot, k, name, z in log.seen:
         at = key(robot, k, half=late)
+        bearing, polar = gtsam.Rot2(z[0]), gtsam.BearingRangeFactor2D
         if name in log.drives:
-            factor, target = gtsam.BearingRangeFactorPose2, key(name, k)
+            graph.add(gtsam.BearingRangeFactorPose2(at, key(name, k), bearing, z[1], sight))
+            continue
+        number = int(name[1:])
+        target, place = int(gtsam.symbol("l", number)), log.points[number]
+        if not values.exists(target):
+            values.insert(target, gtsam.Pose2(*place) if len(place) == 3 else place)
+        if len(place) == 3:
+            graph.add(gtsam.BetweenFactorPose2(at, target, *relative_pose(z)))
+        elif kind == "bursty":
+            error = int(gtsam.symbol("b", 1000 * number + int(k * PERIOD_S // SPAN_S)))
+            if not values.exists(error):
+                values.insert(error, np.zeros(2))
+                shared = diagonal(np.sqrt(SHARED) * SIGHTING)
+                graph.add(gtsam.PriorFactorVector(error, np.zeros(2), shared))
+            graph.add(with_shared_error((at, target, error), z))
         else:
-            factor, target = gtsam.BearingRangeFactor2D, int(gtsam.symbol("l", int(name[1:])))
-            if not values.exists(target):
-                values.insert(target, log.points[int(name[1:])])
-        graph.add(factor(at, target, gtsam.Rot2(z[0]), z[1], sight))
+            graph.add(polar(at, target, bearing, z[1], sight))
     found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     marginals = gtsam.Marginals(graph, found)
 
@@ -194,6 +217,35 @@ def batch(log: Log, kind: str) -> tuple[float, float]:
     return judged(
         log, {robot: tuple(map(np.array, zip(*states(robot), strict=True))) for robot in log.drives}
     )
+
+
+def relative_pose(z: Array) -> tuple[gtsam.Pose2, gtsam.noiseModel.Base]:
+    """A sighting of a segment (3,) as a relative pose, and its noise along the segment's axes."""
+    c, s, r = np.cos(z[0]), np.sin(z[0]), z[1]
+    J = np.array([[-r * s, c, 0.0], [r * c, s, 0.0], [0.0, 0.0, 1.0]])
+    J = rotation3(-z[2]) @ J
+    cov = J @ np.diag(np.append(SIGHTING, DIRECTION) ** 2) @ J.T
+    return gtsam.Pose2(r * c, r * s, z[2]), gtsam.noiseModel.Gaussian.Covariance(cov)
+
+
+def with_shared_error(keys: tuple[int, int, int], z: Array) -> gtsam.CustomFactor:
+    """Bearing and range (2,) of a point with an error that others share: state, point, error."""
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, H: list[Array] | None) -> Array:
+        x, t, e = values.atPose2(keys[0]), values.atPoint2(keys[1]), values.atVector(keys[2])
+        c, s = np.cos(x.theta()), np.sin(x.theta())
+        dx, dy = t[0] - x.x(), t[1] - x.y()
+        u, v = c * dx + s * dy, c * dy - s * dx
+        r = np.hypot(u, v)
+        if H is not None:
+            polar = np.array([[-v / r**2, u / r**2], [u / r, v / r]])
+            H[0] = polar @ np.array([[-1.0, 0.0, v], [0.0, -1.0, -u]])
+            H[1] = polar @ np.array([[c, s], [-s, c]])
+            H[2] = np.eye(2)
+        return np.array([wrap(np.arctan2(v, u) + e[0] - z[0]), r + e[1] - z[1]])
+
+    white = gtsam.noiseModel.Diagonal.Sigmas(np.sqrt(1 - SHARED) * SIGHTING)
+    return gtsam.CustomFactor(white, list(keys), error)
 
 
 def judged(log: Log, found: dict[str, tuple[Array, Array]]) -> tuple[float, float]:
