@@ -133,6 +133,9 @@ class Pipeline(StepRecorder):
         ignore = self.config.association.robot_sightings == "ignore"
         for recorded in messages:
             message = recorded
+            if not isinstance(message, (Sighting, RelativePose)):  # most are: of one robot alone
+                yield message
+                continue
             if self.known.identities and isinstance(message, Sighting):
                 message = rename_identities(message, self.known.identities, self.log.robots)
             if isinstance(message, Sighting) and message.seen_robot == message.robot:

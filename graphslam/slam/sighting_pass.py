@@ -82,8 +82,9 @@ class SightingPass(Pipeline):
 
     def _read(self, progress: Progress) -> list[Sighting]:
         """All sightings that may be used; odometry goes into the tracks."""
-        sightings = []
+        sightings: list[Sighting] = []
         read = self.messages(progress)
+        first_ns = last_ns = None
         for message in self.accepted(to_common_clock(read, self.known.clocks)):
             if isinstance(message, ODOMETRY):
                 self.runs[message.robot].track.add(message)
@@ -91,7 +92,11 @@ class SightingPass(Pipeline):
                 sightings.append(message)
             else:
                 continue
-            self.record_time(message.time_ns)
+            last_ns = message.time_ns
+            first_ns = last_ns if first_ns is None else first_ns
+        if first_ns is not None and last_ns is not None:
+            self.record_time(first_ns)
+            self.record_time(last_ns)
         return sightings
 
     def _covered(self, sightings: Sequence[Sighting]) -> list[Sighting]:
@@ -105,10 +110,10 @@ class SightingPass(Pipeline):
         }
         covered = []
         for n, s in enumerate(sightings):
-            robots = (s.robot,) if s.seen_robot is None else (s.robot, s.seen_robot)
-            if s.seen_robot is not None and s.seen_robot not in reached:
-                self.dropped[f"sighting: robot {s.seen_robot} is not in the log"] += 1
-            elif all(robot in reached and reached[robot][n] for robot in robots):
+            own, other = s.robot, s.seen_robot
+            if other is not None and other not in reached:
+                self.dropped[f"sighting: robot {other} is not in the log"] += 1
+            elif own in reached and reached[own][n] and (other is None or reached[other][n]):
                 covered.append(s)
             else:
                 self.dropped["sighting: no odometry near it"] += 1
