@@ -63,12 +63,14 @@ def optimise(
     converged: float | None = None,
     *,
     use_qr: bool = False,
+    soften: bool = True,
 ) -> gtsam.Values:
     """Optimise from ``values`` until the relative decrease of the error is small.
 
     By Levenberg-Marquardt; with a kernel first by `reweighted` Gauss-Newton as far as that goes.
     ``converged`` is that limit: by default `CONVERGED_ERROR`, whose 1e-10 costs nothing where
-    convergence is quadratic, or `CONVERGED_ERROR_ROBUST` with a kernel. ``use_qr``: see the module.
+    convergence is quadratic, or `CONVERGED_ERROR_ROBUST` with a kernel. ``use_qr``: see the module;
+    ``soften``: see `FAR`.
 
     Raises:
         RuntimeError: the graph is indeterminate.
@@ -84,17 +86,17 @@ def optimise(
     parameters.setAbsoluteErrorTol(CONVERGED_ABSOLUTE)
     parameters.setMaxIterations(MAX_ITERATIONS)
     if use_qr:
-        if graph.error(values) > FAR * graph.size():
+        if soften and graph.error(values) > FAR * graph.size():
             for sigma in SOFT_SIGMAS:
                 soft = softened(graph, sigma)
-                values = optimise(soft, values, kernel, CONVERGED_ERROR_ROUGH)
+                values = optimise(soft, values, kernel, CONVERGED_ERROR_ROUGH, soften=False)
         parameters.setLinearSolverType("MULTIFRONTAL_QR")
         parameters.setlambdaUpperBound(MAX_DAMPING_QR)
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
     values = optimizer.optimize()
     # it gives up where no damping helps: at a minimum, or because Cholesky fails
     if not use_qr and optimizer.lambda_() >= MAX_DAMPING and _can_fall(graph, values, converged):
-        return optimise(graph, values, kernel, converged, use_qr=True)
+        return optimise(graph, values, kernel, converged, use_qr=True, soften=soften)
     return values
 
 
