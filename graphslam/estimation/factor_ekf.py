@@ -135,6 +135,11 @@ class FactorEkfBackend(GraphBackend):
         self._causal: dict[int, tuple[Array, Array]] = {}  # states after their own step
         self._error = 0.0
 
+    @property
+    def causal_states(self) -> dict[int, tuple[Array, Array]]:
+        """Key of every state -> its pose (3,) and covariance (3, 3) after its own step."""
+        return self._causal
+
     def value(self, key: int, dim: int) -> Array:
         """See `GraphBackend`."""
         return self._values[key]
@@ -282,12 +287,16 @@ def linear(
     factor: gtsam.NonlinearFactor, values: Mapping[int, Array], z: Callable[[int], Array]
 ) -> Rows:
     """``factor`` at the estimate, in terms of z (d,): A (z - z_now) = b is A z = b + A z_now."""
-    here = gtsam.Values()
-    for key in factor.keys():  # noqa: SIM118 (GTSAM's factors are no mappings)
-        factors.write(here, key, values[key])
-    made = factor.linearize(here)
-    A, b = made.jacobian()
-    keys = made.keys()
+    keys = factor.keys()
+    if isinstance(factor, gtsam.BetweenFactorPose2) and factors.turns_little(factor, values):
+        A, b = factors.linearised(factor, values)
+    else:
+        here = gtsam.Values()
+        for key in keys:
+            factors.write(here, key, values[key])
+        made = factor.linearize(here)
+        A, b = made.jacobian()
+        keys = made.keys()
     now = np.concatenate([z(key) for key in keys])
     return Rows({key: len(values[key]) for key in keys}, A, b + A @ now)
 

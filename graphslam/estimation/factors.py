@@ -15,8 +15,17 @@ import numpy as np
 
 from graphslam.core.config import RobustConfig
 from graphslam.core.errors import EstimationError
-from graphslam.core.geometry import Array, between, compose, exp, is_positive, rotate_cov, wrap
-from graphslam.core.observation_models import LineModel
+from graphslam.core.geometry import (
+    Array,
+    between,
+    compose,
+    exp,
+    is_positive,
+    rotate_cov,
+    rotation3,
+    wrap,
+)
+from graphslam.core.observation_models import MODELS, LineModel
 from graphslam.core.records import Association, Closure, Motion, Start
 
 #: m: sigma of a line landmark's origin along the line, relative to the state that first saw it. A
@@ -30,6 +39,8 @@ FILTER_GAUGE_SIGMA_M = 1e-3
 #: if the noise of its observations follows; where that is kept, a wide gauge would be pulled along
 LINE_HELD_SIGMA_M = 1e-4
 NO_KERNEL = RobustConfig("none")
+#: rad: see `turns_little`
+LITTLE_TURN_RAD = 3e-3
 
 #: a symbol's letter is in its highest byte, its number in the others
 FIRST_STATE, FIRST_LANDMARK = (int(gtsam.symbol(letter, 0)) for letter in "xl")
@@ -344,6 +355,34 @@ def line_held_factor(key: int, target: int, x: Array, t: Array) -> gtsam.Nonline
     """
     R = np.diag([1.0 / LINE_HELD_SIGMA_M, 0.0, 0.0])
     return _line_factor(key, target, between(x, t), R, NO_KERNEL)
+
+
+def turns_little(factor: gtsam.BetweenFactorPose2, values: Mapping[int, Array]) -> bool:
+    """Whether a factor's residual turns so little that GTSAM's Jacobian has lost digits.
+
+    Pose2::LogmapDerivative has sin α / (1 - cos α) - 2 / α for |α| > 1e-5 rad, whose rounding grows
+    as α⁻³: one digit is left at 1e-5, six at 1e-4, nine at 1e-3.
+    """
+    key, target = factor.keys()
+    turn = values[target][2] - values[key][2] - factor.measured().theta()
+    return 1e-10 < abs(math.remainder(turn, math.tau)) < LITTLE_TURN_RAD
+
+
+def linearised(
+    factor: gtsam.BetweenFactorPose2, values: Mapping[int, Array]
+) -> tuple[Array, Array]:
+    """``factor.linearize`` with all digits, by the row of `MODELS`: A (k, 6) and b (k,).
+
+    Its noise is Gaussian, without a kernel.
+    """
+    x, t = (values[key] for key in factor.keys())  # noqa: SIM118 (it is no mapping)
+    z, model = array3(factor.measured()), MODELS["segment"]
+    H_x, H_t = model.jacobians(z, x, t)
+    noise = factor.noiseModel()
+    assert isinstance(noise, gtsam.noiseModel.Gaussian)
+    R = noise.R()
+    A = R @ np.hstack([H_x @ rotation3(x[2]), H_t @ rotation3(t[2])])
+    return A, -R @ model.residual(z, x, t)
 
 
 def jacobian_factor(A: Array, b: Array, dims: Mapping[int, int]) -> gtsam.JacobianFactor:

@@ -1,5 +1,6 @@
 """Robust kernels as formulas: what an M-estimator's cost is, and the weight that it gives."""
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -21,9 +22,10 @@ LOSSES: dict[str, Callable[[Array, float], Array]] = {
     "cauchy": lambda d, k: 0.5 * k * k * np.log1p(np.square(d / k)),
     "geman-mcclure": lambda d, k: 0.5 * np.square(k * d) / (k * k + d * d),
 }
-#: relative change of a weight at which reweighting ends, and its largest number of rounds
-#: (convergence is linear)
-CONVERGED, MAX_ROUNDS = 1e-4, 100
+#: relative change of a weight at which reweighting ends, and its largest number of rounds:
+#: convergence is linear, and what is left of it must be rounding, or two filters that are the same
+#: but for rounding would stop a round apart
+CONVERGED, MAX_ROUNDS = 1e-12, 500
 
 
 def robust_weight(innovation: Array, HPHt: Array, R: Array, robust: RobustConfig) -> float:
@@ -43,9 +45,11 @@ def robust_weight(innovation: Array, HPHt: Array, R: Array, robust: RobustConfig
     L = np.linalg.cholesky(R)
     a, U = np.linalg.eigh(np.linalg.solve(L, np.linalg.solve(L, HPHt).T))
     u = U.T @ np.linalg.solve(L, innovation)
-    weight, w = WEIGHTS[robust.kernel], 1.0
+    weight, scale, w = WEIGHTS[robust.kernel], robust.scale, 1.0
+    axes = list(zip(u.tolist(), np.maximum(a, 0.0).tolist(), strict=True))
     for _ in range(MAX_ROUNDS):
-        before, w = w, weight(float(np.linalg.norm(u / (1 + w * np.maximum(a, 0.0)))), robust.scale)
+        left = math.hypot(*(own / (1.0 + w * spread) for own, spread in axes))
+        before, w = w, weight(left, scale)
         if before - w <= CONVERGED * before:
             break
     return w
