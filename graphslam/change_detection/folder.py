@@ -5,7 +5,7 @@ from pathlib import Path
 
 from graphslam.change_detection.detect import ChangeResult, detect_changes, identity_registration
 from graphslam.change_detection.export import overlay_map, pgm, write_mcap
-from graphslam.change_detection.visit import load_visit, select_time_span
+from graphslam.change_detection.visit import Visit, load_visit, select_time_span
 from graphslam.core.config import ChangesConfig
 from graphslam.core.errors import OutputError
 from graphslam.core.output_folder import atomic_folder
@@ -31,6 +31,24 @@ def changes_between(
             in common.
         LogError: a log is missing or has changed.
     """
+    a, b, same = load_visits(reference, later, config, reference_span_s, later_span_s)
+    return detect_changes(a, b, config, identity_registration(a) if same else None)
+
+
+def load_visits(
+    reference: Path,
+    later: Path,
+    config: ChangesConfig,
+    reference_span_s: Span | None,
+    later_span_s: Span | None,
+) -> tuple[Visit, Visit, bool]:
+    """Both visits, and whether they are of one run, which has one frame.
+
+    Raises:
+        OutputError: a folder is not a result, has no scans or covariances in the span, or one
+            folder is given twice without spans.
+        LogError: a log is missing or has changed.
+    """
     same = reference.resolve() == later.resolve()
     if same and (reference_span_s is None or later_span_s is None):
         raise OutputError(
@@ -38,12 +56,11 @@ def changes_between(
         )
     a = load_visit(load(reference), reference, config)
     b = a if same else load_visit(load(later), later, config)
-    registration = identity_registration(a) if same else None
     if reference_span_s is not None:
         a = select_time_span(a, reference_span_s, "--reference-span")
     if later_span_s is not None:
         b = select_time_span(b, later_span_s, "--later-span")
-    return detect_changes(a, b, config, registration)
+    return a, b, same
 
 
 def check_changes_target(directory: Path, *, force: bool) -> None:

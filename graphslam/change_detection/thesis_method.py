@@ -4,6 +4,7 @@ Corrections of the printed equations are stated where they are made; docs/change
 the method's detection and false-alarm rates. Applications use `detect_changes`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -177,11 +178,85 @@ def occlusion_map(grid: Grid, pose: Array, angles: Array, ranges: Array, margin_
     """
     centers = grid.centers(np.arange(grid.shape[0] * grid.shape[1]))
     away = centers - pose[:2]
-    bearing = wrap(np.arctan2(away[:, 1], away[:, 0]) - pose[2] - angles[0])
-    beam = np.round(bearing / (angles[1] - angles[0])).astype(int)
-    inside = (beam >= 0) & (beam < len(angles))
-    seen = ranges[np.clip(beam, 0, len(angles) - 1)] + margin_m
+    # bearings relative to the middle of the fan: relative to its first beam they would have to go
+    # from 0 to the field of view, of which an angle that is wrapped to (-pi, pi] has the first half
+    step, middle = angles[1] - angles[0], (angles[0] + angles[-1]) / 2
+    bearing = wrap(np.arctan2(away[:, 1], away[:, 0]) - pose[2] - middle)
+    beam = np.floor((bearing + middle - angles[0]) / step + 0.5).astype(int)
+    n = len(angles)
+    if n * step > 2 * np.pi - 0.5 * step:  # the circle is closed: behind the last comes the first
+        beam %= n
+    inside = (beam >= 0) & (beam < n)
+    seen = ranges[np.clip(beam, 0, n - 1)] + margin_m
     return np.asarray(inside & (np.hypot(*away.T) <= np.nan_to_num(seen, nan=-1.0)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison:
+    """Beams (n,) against what is expected of them.
+
+    Attributes:
+        ranges: expected, m; NaN where there is no dent.
+        sigmas: standard deviation of that, m.
+        d2: squared distance of measured and expected point (5.14); NaN where not compared.
+        dismissed: nearer than expected, where the reference was occluded (5.4).
+    """
+
+    ranges: Array
+    sigmas: Array
+    d2: Array
+    dismissed: Bools
+
+    @property
+    def compared(self) -> Bools:
+        """(n,) beams that have both a return and an expected one."""
+        return np.isfinite(self.d2)
+
+    def differs(self, gate: float) -> Bools:
+        """(n,) beams whose squared distance exceeds a gate, and that are not dismissed."""
+        return np.asarray((np.nan_to_num(self.d2) > gate) & ~self.dismissed)
+
+    @classmethod
+    def joined(cls, parts: "Sequence[Comparison]") -> "Comparison":
+        """Several scans one after another."""
+        return cls(
+            np.concatenate([part.ranges for part in parts]),
+            np.concatenate([part.sigmas for part in parts]),
+            np.concatenate([part.d2 for part in parts]),
+            np.concatenate([part.dismissed for part in parts]),
+        )
+
+
+def compare_scan(
+    dents: DentMap,
+    visible: Bools,
+    pose: Array,
+    cov: Array,
+    angles: Array,
+    ranges: Array,
+    noise: LaserNoise,
+) -> Comparison:
+    """One scan against the reference map (5.13, 5.14) and the occlusion map (5.4).
+
+    Args:
+        dents: reference map.
+        visible: (cells,) see `occlusion_map`.
+        pose: (3,) of the laser.
+        cov: (3, 3) of it.
+        angles: (n,) rad.
+        ranges: (n,) m, NaN without a return.
+        noise: of a beam.
+    """
+    reach = float(np.nanmax(ranges, initial=0.0)) + 1.0
+    expected, expected_covs = expected_measurements(dents, pose, angles, reach)
+    points = scan_points(pose, angles, ranges)
+    covs = point_covariances(pose, cov, angles, np.nan_to_num(ranges, nan=1.0), noise)
+    d2 = squared_mahalanobis(points, covs, scan_points(pose, angles, expected), expected_covs)
+    cell = dents.grid.cells(points)
+    hidden = (cell < 0) | ~visible[cell]
+    # what stands where the reference was occluded may have been there all along
+    dismissed = hidden & (ranges < np.nan_to_num(expected))
+    return Comparison(expected, np.sqrt(expected_covs[:, 0, 0]), d2, np.asarray(dismissed))
 
 
 def changed_beams(
@@ -197,29 +272,12 @@ def changed_beams(
 ) -> tuple[Bools, Bools]:
     """The thesis' detector for one scan: which beams (n,) are compared, and which show a change.
 
-    Args:
-        dents: reference map.
-        visible: (cells,) see `occlusion_map`.
-        pose: (3,) of the laser.
-        cov: (3, 3) of it.
-        angles: (n,) rad.
-        ranges: (n,) m, NaN without a return.
-        noise: of a beam.
-        gate: on the squared distance of 5.14.
-        consecutive: least number of flagged neighbours in a row; 1 = the rule is off.
+    ``gate`` is on the squared distance of 5.14; ``consecutive`` the least number of flagged
+    neighbours in a row, 1 = the rule is off. The others: see `compare_scan`.
     """
-    reach = float(np.nanmax(ranges)) + 1.0
-    expected, expected_covs = expected_measurements(dents, pose, angles, reach)
-    points = scan_points(pose, angles, ranges)
-    covs = point_covariances(pose, cov, angles, np.nan_to_num(ranges, nan=1.0), noise)
-    d2 = squared_mahalanobis(points, covs, scan_points(pose, angles, expected), expected_covs)
-    compared = np.isfinite(d2)
-    cell = dents.grid.cells(points)
-    hidden = (cell < 0) | ~visible[cell]
-    # what stands where the reference was occluded may have been there all along
-    dismissed = hidden & (ranges < np.nan_to_num(expected))
-    marked = compared & (np.nan_to_num(d2) > gate) & ~dismissed
-    return compared, marked & consecutive_runs(marked, consecutive)
+    found = compare_scan(dents, visible, pose, cov, angles, ranges, noise)
+    marked = found.differs(gate)
+    return found.compared, marked & consecutive_runs(marked, consecutive)
 
 
 def consecutive_runs(marked: Bools, least: int) -> Bools:

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from graphslam.change_detection.grid import Grid
+from graphslam.change_detection.thesis_changes import nearest_scans, thesis_changes
+from graphslam.change_detection.thesis_folder import write_folder
 from graphslam.change_detection.thesis_method import (
     VOLUME,
     LaserNoise,
@@ -17,7 +19,11 @@ from graphslam.change_detection.thesis_method import (
     squared_mahalanobis,
     stable_points,
 )
-from graphslam.core.geometry import rotation
+from graphslam.change_detection.visit import visit_from_scans
+from graphslam.core.config import ChangesConfig
+from graphslam.core.geometry import rotation, wrap
+from graphslam.simulation.raycast import BeamFan, cast_beams
+from graphslam.simulation.world import Outline, make_world
 
 GRID = Grid((-1.0, -5.0), 0.025, (400, 400))
 ANGLES = np.radians(np.arange(-90, 90.1, 0.5))
@@ -99,6 +105,49 @@ def test_behind_what_was_hit_is_occluded():
         assert visible[GRID.cells(np.array([point]))[0]] == seen, point
 
 
+#: a room with two boxes, and a laser that is not in its middle, as (start, end) of walls
+OCCLUDERS = [((-2, -2), (3, -2)), ((3, -2), (3, 2.5)), ((3, 2.5), (-2, 2.5)), ((-2, 2.5), (-2, -2)),
+             ((0.9, 0.4), (1.5, 0.4)), ((1.5, 0.4), (1.5, 1.1)), ((1.5, 1.1), (0.9, 1.1)),
+             ((0.9, 1.1), (0.9, 0.4)), ((-1.2, -1.0), (-0.7, -1.5))]  # fmt: skip
+FINE = Grid((-2.5, -2.5), 0.025, (240, 240))
+
+
+def free_sight(start, ends):
+    """Which of ``ends`` (n, 2) are seen from ``start``: no wall crosses the way there."""
+    seen = np.ones(len(ends), dtype=bool)
+    way = ends - start
+    for a, b in np.array(OCCLUDERS, float):
+        along, across = b - a, start - a
+        bend = way[:, 0] * along[1] - way[:, 1] * along[0]
+        t = (along[0] * across[1] - along[1] * across[0]) / bend
+        s = (way[:, 0] * across[1] - way[:, 1] * across[0]) / bend
+        seen &= ~((t > 0) & (t < 1) & (s >= 0) & (s <= 1))
+    return seen
+
+
+@pytest.mark.parametrize("field_deg", [100, 180, 270, 359.5, 360])
+@pytest.mark.parametrize("heading_deg", [0, 120, -100])
+def test_what_is_occluded_is_so_by_casting_rays(field_deg, heading_deg):
+    """To 1 % of the cells, whatever the field of view: breaks if bearings relative to the first
+    beam are wrapped (34 % of the visible cells are lost at 270 deg) or taken modulo a turn (what is
+    just before the first beam). 360: the last beam is the first one again."""
+    pose = np.array([0.2037, 0.1041, np.radians(heading_deg)])  # in line with no cell
+    step = 0.25
+    angles = np.radians(np.arange(-field_deg / 2, field_deg / 2 + 1e-9, step))
+    walls = make_world([Outline(f"wall {n}", np.array(ends, float)) for n, ends in
+                        enumerate(OCCLUDERS)])  # fmt: skip
+    fan = BeamFan(angles[0], np.radians(step), len(angles))
+    ranges = cast_beams(pose[None], fan, walls.shapes, 50.0).ranges[0]
+    found = occlusion_map(FINE, pose, angles, ranges, 0.0)
+    cells = np.arange(FINE.shape[0] * FINE.shape[1])
+    centers = FINE.centers(cells)
+    away = centers - pose[:2]
+    off_axis = np.abs(wrap(np.arctan2(away[:, 1], away[:, 0]) - pose[2]))
+    seen = free_sight(pose[:2], centers) & (off_axis <= np.radians(field_deg / 2))
+    assert seen.sum() > 3000
+    assert np.mean(found[seen]) > 0.99 and np.mean(found[~seen]) < 0.01
+
+
 def test_a_wall_that_came_nearer_is_flagged_and_the_rest_is_not():
     dents, visible = reference(wall())
     compared, marked = changed_beams(
@@ -140,3 +189,53 @@ def test_points_that_are_stable_over_time():
     others = [np.array([[1.01, 0], [5.0, 0]]), np.array([[0.99, 0], [np.nan, 0]]),
               np.array([[2.01, 0.0]])]  # fmt: skip
     assert list(stable_points(points, others, 0.05, 2)) == [True, False, False]
+
+
+# ------------------------------------------------------------ two visits
+
+
+def two_visits(shift):
+    """Three scans each of a wall, of which a part moved by ``shift`` before the later visit."""
+    rng = np.random.default_rng(4)
+
+    def visit(ranges, first_ns):
+        poses = np.array([HERE, [0.02, 0.01, 0.01], [0.0, -0.02, -0.01]])
+        sweeps = [(ANGLES, ranges + 0.005 * rng.normal(size=len(ANGLES))) for _ in poses]
+        covs = np.broadcast_to(KNOWN, (3, 3, 3)).copy()
+        return visit_from_scans(first_ns + np.arange(3, dtype=np.int64), poses, covs, sweeps)
+
+    return visit(wall(), 0), visit(wall(shift=shift), 100)
+
+
+def test_the_whole_method_finds_what_moved_and_where():
+    """Chapter 5 top to bottom: one region where the part of the wall stands now."""
+    config = ChangesConfig(consecutive_beams=3)
+    found = thesis_changes(*two_visits(0.4), config, same_frame=True)
+    largest = found.regions[0]
+    assert largest.kind == "appeared" and largest.first_seen_ns == 100
+    np.testing.assert_allclose(largest.polygon.mean(axis=0), [3.6, 0.0], atol=0.1)
+    told = found.to_dict()
+    assert told["method"] == "thesis" and told["beams_flagged"] == found.marked.sum() > 0
+    assert told["changes"][0]["probability"] is None  # the thesis states none
+
+
+def test_every_later_scan_is_compared_with_the_nearest_one():
+    a, b = two_visits(0.0)
+    assert list(nearest_scans(a, b)) == [0, 1, 2]
+    turned = b.transformed(np.array([0.0, 0.0, 2 * np.pi]), np.zeros((3, 3)))
+    assert list(nearest_scans(a, turned)) == [0, 1, 2]
+
+
+def test_the_folder_has_the_maps_and_a_line_per_compared_beam(tmp_path):
+    found = thesis_changes(*two_visits(0.4), ChangesConfig(), same_frame=True)
+    write_folder(found, ChangesConfig(), tmp_path / "out", ("before", "after"))
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    maps = {f"{name}.{end}" for name in ("reference_map", "occlusion_map", "changes")
+            for end in ("pgm", "yaml")}  # fmt: skip
+    assert names == {"changes.json", "decision.csv", "report.html"} | maps
+    rows = (tmp_path / "out/decision.csv").read_text(encoding="utf-8").splitlines()
+    assert len(rows) - 1 == found.expected.compared.sum()
+    assert sum(row.endswith(",1") for row in rows[1:]) == found.marked.sum()
+    page = (tmp_path / "out/report.html").read_text(encoding="utf-8")
+    for picture in ("Reference map", "Expected scan", "Occlusion map", "Decision"):
+        assert picture in page
