@@ -11,6 +11,7 @@ from graphslam.core.errors import ConfigError, EstimationError, GraphSlamError, 
 from graphslam.core.geometry import Array, transform, wrap
 from graphslam.core.records import Step, Trajectory
 from graphslam.evaluation.compare_variants import NAMES, Variant
+from graphslam.evaluation.equal_backends import equal_pairs
 from graphslam.evaluation.error_statistics import nees
 from graphslam.evaluation.metrics import evaluate
 from graphslam.evaluation.recorded_steps import RecordedSteps, record_steps
@@ -121,6 +122,7 @@ def compare(
         "start_given": given,
         "reference": reference.variant.spec,
         "rows": [run.row for run in runs],
+        "equal": equal_pairs([(one.variant, one.finished()) for one in done]),
         "warnings": list(dict.fromkeys([*log.warnings, *warnings])),
     }
     lanes = [one.curves(known, reference) for one in done]
@@ -167,6 +169,9 @@ class _BackendRun:
             self.row["label"] += f", {timed.error_frame}-frame errors"
         self.row |= {
             "error_frame": timed.error_frame,
+            "lines": variant.config.ekf.lines if name == "ekf" else "model",
+            "kernel": variant.config.robust.kernel,
+            "past_states": _past_states(variant.config, is_filter=is_filter),
             "final_is_causal": is_filter,
             "steps": len(recording.steps),
             "states": sum(map(len, done.causal.values())),
@@ -211,6 +216,11 @@ class _BackendRun:
             for kind in ("final", "causal")
         }
 
+    def finished(self) -> SavedResult:
+        """The result of a run that succeeded."""
+        assert self.result is not None  # see `evaluate_against`
+        return self.result
+
     def final(self) -> dict[str, Trajectory]:
         """The final trajectory of each robot."""
         assert self.result is not None  # see `evaluate_against`
@@ -248,6 +258,16 @@ class _BackendRun:
             self.row["spec"], self.row["label"], self.row["final_is_causal"], paths, curves,
             self.step_ms, self.landmarks, self.path_m,
         )  # fmt: skip
+
+
+def _past_states(config: Config, *, is_filter: bool) -> int | str:
+    """How many past poses of a robot a back end can still use."""
+    if config.backend.name == "dead-reckoning":
+        return 0
+    if is_filter:
+        return config.ekf.past_states
+    finite = np.isfinite(config.backend.horizon_s)
+    return f"{config.backend.horizon_s:g} s" if finite else "all"
 
 
 def _difference(pairs: Sequence[PosePairs]) -> dict[str, float] | None:

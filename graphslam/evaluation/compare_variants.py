@@ -5,8 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from graphslam.core.config import Config
-from graphslam.core.config_io import parse_setting, with_settings
+from graphslam.core.config_io import parse_setting, with_preset, with_settings
 from graphslam.core.errors import ConfigError
+from graphslam.core.presets import PRESETS
 from graphslam.estimation.backends import BACKENDS
 
 #: names of back ends in tables; the others have the name in `BACKENDS`
@@ -51,8 +52,13 @@ def parse_variants(specs: Sequence[str], config: Config | None = None) -> tuple[
 def _variant(spec: str, config: Config) -> Variant:
     head, *settings = spec.split("+")
     name, colon, horizon = head.partition(":")
+    label = NAMES.get(name, name)
+    if name in PRESETS:
+        config = with_preset(config, name)
+        name, label = config.backend.name, f"{name}: {NAMES.get(config.backend.name, name)}"
     if name not in BACKENDS:
-        raise ConfigError(f"--backends: {spec!r} is not one of {', '.join(sorted(BACKENDS))}")
+        known = ", ".join(sorted([*BACKENDS, *PRESETS]))
+        raise ConfigError(f"--backends: {spec!r} is not one of {known}")
     if colon and name != "isam2":
         raise ConfigError(f"--backends {spec}: only isam2 has a horizon")
     if colon:
@@ -61,7 +67,6 @@ def _variant(spec: str, config: Config) -> Variant:
         config = with_settings(config, {"backend": name} | dict(map(parse_setting, settings)))
     except ConfigError as error:
         raise ConfigError(f"--backends {spec}: {error}") from error
-    label = NAMES.get(name, name)
     if name == "isam2" and math.isfinite(config.backend.horizon_s):
         label += f", horizon {config.backend.horizon_s:g} s"
     # the horizon is in the label, the error frame is added to that of a filter

@@ -83,6 +83,12 @@ def _relations(*at: str) -> tuple[Column, ...]:
 
 #: title -> columns of a table; a table without any number is left out
 COLUMNS: dict[str, tuple[Column, ...]] = {
+    "What each row takes as Gaussian": (
+        Column("errors of poses", value_at("error_frame"), None),
+        Column("lines", value_at("lines"), None),
+        Column("kernel", value_at("kernel"), None),
+        Column("past states", value_at("past_states"), None),
+    ),
     "Final trajectory, from all data": trajectory_columns("joint", "final"),
     "Causal trajectory, from data up to each pose": trajectory_columns("joint", "causal"),
     "Landmarks": landmark_columns("landmarks"),
@@ -218,6 +224,17 @@ def headline(summary: Mapping[str, Any]) -> str:
     )
 
 
+def equality_notes(summary: Mapping[str, Any]) -> list[str]:
+    """The equalities of a comparison as sentences."""
+    labels = {row["spec"]: row["label"] for row in summary["rows"]}
+    what = {"causal": "are one filter; their causal", "final": "end at one optimum; their final"}
+    return [
+        f"{' and '.join(labels[spec] for spec in pair['specs'])} {what[pair['what']]} poses differ "
+        f"by {pair['sigmas']:.1e} sigma at most."
+        for pair in summary.get("equal", ())
+    ]
+
+
 def reading_notes(summary: Mapping[str, Any]) -> list[str]:
     """What is needed to read the tables."""
     done = [row for row in summary["rows"] if row["error"] is None]
@@ -228,6 +245,7 @@ def reading_notes(summary: Mapping[str, Any]) -> list[str]:
     rivals = any(spec != "dead-reckoning" for spec in filters) and len(filters) < len(done)
     if rivals and not filter_wins(summary):
         texts.append("No filter is ahead of every smoother in any number.")
+    texts += equality_notes(summary)
     late = max(row["late"] for row in done)
     if late:
         texts.append(
