@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 from graphslam.core.config import Config
 from graphslam.core.config_io import RENAMED_KEYS, settings_of
+from graphslam.core.presets import PRESETS, preset_purpose, preset_settings
 
 PAGE = Path(__file__).with_suffix(".md")
 
@@ -22,8 +23,8 @@ HEAD = """\
 
 Made from `graphslam/core/config.py` and `sensor_config.py` by `make docs`; change it there.
 
-One tree of settings. `graphslam smooth` takes the defaults, then `--config FILE.toml`, then its
-own options (`--backend isam2` is `backend.name`, `--front-end` is `front_end.name`, `--start` is
+One tree of settings; `graphslam config` prints it as TOML, with units. `graphslam smooth` takes the
+defaults, then `--preset NAME`, then `--config FILE.toml`, then its own options (`--backend isam2` is `backend.name`, `--front-end` is `front_end.name`, `--start` is
 `start.from_truth` or `start.poses.ROBOT`), then every `--set KEY=VALUE`; what comes later wins.
 Keys carry their unit. An unknown key, a wrong type or a value out of range is an error that names
 the key. `config.toml` in a result folder is the whole tree as used; `--config` takes it back.
@@ -32,6 +33,15 @@ the key. `config.toml` in a result folder is the whole tree as used; `--config` 
 graphslam smooth LOG.mcap -o DIR --set keyframe.mode=all --set robust.kernel=none
 ```
 """
+
+PRESET_HEAD = """\
+## Presets
+
+Small differences from the defaults (`--preset NAME`, `preset="NAME"` in Python); `graphslam config
+--preset NAME` prints one as a file, with the reason of each setting.
+
+| preset | for | settings |
+|---|---|---|"""
 
 RENAMED = """\
 ## Renamed keys
@@ -50,9 +60,20 @@ def page() -> str:
             parts.append(section(f"[{name}.NAME]", typing.get_args(kind)[1]))
         else:
             parts.append(section(f"[{name}]", kind))
+    parts += [PRESET_HEAD, *(preset_row(name) for name in PRESETS), ""]
     return "\n".join(
         [*parts, RENAMED, *(f"| `{a}` | `{b}` |" for a, b in RENAMED_KEYS.items()), ""]
     )
+
+
+def preset_row(name: str) -> str:
+    """One line on a preset."""
+    settings = [
+        f"`{table}.{key}`"
+        for table, own in preset_settings(name).items()
+        for key in (own if table != "robots" else [f"{robot}.outline" for robot in own])
+    ]
+    return f"| `{name}` | {preset_purpose(name)} | {', '.join(settings)} |"
 
 
 def section(title: str, kind: Any) -> str:

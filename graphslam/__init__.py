@@ -2,8 +2,6 @@
 
 This module is the public Python interface; what its names do is what the commands do::
 
-    import graphslam
-
     result = graphslam.smooth("drive.mcap", keyframe={"distance_m": 0.5}, output="result")
     errors = graphslam.evaluate(result)  # against the truth in the log
 
@@ -11,8 +9,9 @@ Everything else in the package is internal and may change with every version.
 
 Settings are keywords with the names, checks and defaults of docs/configuration.md: a table as a
 mapping (``keyframe={"mode": "all"}``), a dotted key (``**{"keyframe.mode": "all"}``), or for the
-tables that have a ``name`` just that (``backend="ekf"``). They go over ``config``, which is a
-`Config` or the path of a TOML file. A wrong setting is a `ConfigError` that names its key.
+tables that have a ``name`` just that (``backend="ekf"``); ``preset="thesis"`` stands for those of a
+preset, under all others. They go over ``config``, which is a `Config` or the path of a TOML file.
+A wrong setting is a `ConfigError` that names its key.
 
 Paths are strings or path objects. A ``recording`` is an MCAP file, several that belong together,
 or what `open_logs` returned, whose settings are then the default. With ``output`` a function also
@@ -20,7 +19,7 @@ writes the folder that its command writes, and replaces an existing one only wit
 cannot be written is an `OutputError`. ``progress`` is called with the number of messages read so
 far and of all.
 
-What a name needs is imported when it is used, so ``import graphslam`` costs nothing.
+What a name needs is imported when it is used.
 
 Matrices are small, and a linear algebra library that uses a thread per core for them takes up to
 half as much time again. The commands tell it to use one; a script must do so itself, in the
@@ -98,8 +97,10 @@ def __dir__() -> list[str]:
 # ---------------------------------------------------------------- functions
 
 
-def load_config(config: Config | PathLike | None = None, **settings: Any) -> Config:
-    """The defaults, over them a TOML file or another configuration, over that ``settings``.
+def load_config(
+    config: Config | PathLike | None = None, *, preset: str | None = None, **settings: Any
+) -> Config:
+    """The defaults, over them preset, TOML file, ``settings``; over a `Config` the other two.
 
     Raises:
         ConfigError: the file cannot be read, or a setting is wrong.
@@ -108,7 +109,9 @@ def load_config(config: Config | PathLike | None = None, **settings: Any) -> Con
     from graphslam.core.config import Config
 
     if not isinstance(config, Config):
-        config = config_io.load_config(None if config is None else Path(config))
+        config = config_io.load_config(Path(config) if config else None, (), preset)
+    elif preset:
+        config = config_io.with_preset(config, preset)
     return config_io.with_settings(config, settings) if settings else config
 
 
@@ -237,7 +240,7 @@ def evaluate(
 def compare(
     recording: Recording,
     /,
-    backends: str | Sequence[str] = ("ekf", "isam2:0", "isam2", "batch"),
+    backends: str | Sequence[str] = ("ekf", "ekf+ekf.error=body", "isam2:0", "isam2", "batch"),
     *,
     mode: str = "replay",
     truth: Truth | None = None,

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from graphslam.core.config import BackendConfig, FrontEndConfig
+from graphslam.core.presets import PRESETS
 from graphslam.logs import IMPORTERS
 from graphslam.simulation import SCENARIOS
 
@@ -193,8 +194,8 @@ Backends = Annotated[
     typer.Option(
         "--backends",
         metavar="SPEC,...",
-        help="NAME[:HORIZON][+key=value...], NAME one of "
-        f"{', '.join(BACKENDS)}: ekf, isam2:20, ekf+ekf.error=body.",
+        help="NAME[:HORIZON][+key=value...], NAME a preset or one of "
+        f"{', '.join(BACKENDS)}: ekf, isam2:20, ekf+ekf.error=body, thesis.",
     ),
 ]
 ComparisonMode = Annotated[
@@ -203,6 +204,20 @@ ComparisonMode = Annotated[
         MODES,
         "The same recorded steps for all, or each back end does its own association.",
         "--mode",
+    ),
+]
+Preset = Annotated[
+    str | None,
+    _choice(
+        list(PRESETS), "Settings for a purpose, under --config and --set; see graphslam config."
+    ),
+]
+ChangeMethod = Annotated[
+    str,
+    _choice(
+        ["evidence", "thesis"],
+        "Beams of all scans as evidence on surfaces, or chapter 5 of the thesis as printed.",
+        "--method",
     ),
 ]
 ConfigFile = Annotated[Path | None, typer.Option("--config", metavar="FILE.toml", help="Settings.")]

@@ -17,6 +17,7 @@ from graphslam.cli.arguments import (
     Backend,
     Backends,
     Causal,
+    ChangeMethod,
     ComparisonMode,
     ConfigFile,
     Debug,
@@ -35,6 +36,7 @@ from graphslam.cli.arguments import (
     OutputFolder,
     OutputLog,
     OutputLogOrFolder,
+    Preset,
     ReferenceFolder,
     Relations,
     ResultFolder,
@@ -168,6 +170,7 @@ def smooth(
     front_end: FrontEnd = None,
     start: Starts = None,
     causal: Causal = False,
+    preset: Preset = None,
     config: ConfigFile = None,
     settings: Settings = None,
     force: Force = False,
@@ -178,7 +181,7 @@ def smooth(
     """
     from graphslam.cli import show
 
-    named = backend or named_backend(config, settings or ())
+    named = backend or named_backend(config, settings or (), preset)
     if horizon is not None and named not in (None, "isam2"):
         raise ConfigError(f"only isam2 supports --horizon, not {named}; omit it")
     if horizon is not None:
@@ -188,7 +191,7 @@ def smooth(
         options.append("backend.causal=true")
     options += [] if horizon is None else [f"backend.horizon_s={horizon}"]
     options += [f"front_end.name={front_end}"] if front_end else []
-    tree = load_config(config, [*options, *(start or ()), *(settings or ())])
+    tree = load_config(config, [*options, *(start or ()), *(settings or ())], preset)
     with progress_bar("smoothing") as progress:
         result = graphslam.smooth(logs, config=tree, output=output, force=force, progress=progress)
     return Output(result.summary, lambda: show.smoothed(result, output))
@@ -212,12 +215,13 @@ def evaluate(
 def compare(
     logs: Logs,
     output: OutputFolder,
-    backends: Backends = "ekf,isam2:0,isam2,batch",
+    backends: Backends = "ekf,ekf+ekf.error=body,isam2:0,isam2,batch",
     mode: ComparisonMode = "replay",
     truth: TruthFiles = None,
     relations: Relations = None,
     front_end: FrontEnd = None,
     start: Starts = None,
+    preset: Preset = None,
     config: ConfigFile = None,
     settings: Settings = None,
     force: Force = False,
@@ -229,7 +233,7 @@ def compare(
     from graphslam.cli import show
 
     options = [f"front_end.name={front_end}"] if front_end else []
-    tree = load_config(config, [*options, *(start or ()), *(settings or ())])
+    tree = load_config(config, [*options, *(start or ()), *(settings or ())], preset)
     with progress_bar("associating") as progress:
         comparison = graphslam.compare(
             logs, [spec for spec in backends.split(",") if spec], mode=mode, truth=truth or None,
@@ -247,6 +251,7 @@ def changes(
     reference: ReferenceFolder,
     later: LaterFolder,
     output: OutputFolder,
+    method: ChangeMethod = "evidence",
     reference_span: Span = None,
     later_span: Span = None,
     config: ConfigFile = None,
@@ -255,16 +260,26 @@ def changes(
 ) -> Output:
     """Find what is different since the last visit, and with what probability.
 
-    Writes changes.json, report.html, a map and an MCAP file of them. REFERENCE and LATER may be
-    one folder with two spans.
+    Writes changes.json, report.html, a map and an MCAP file of them; with --method thesis the maps
+    of chapter 5 and its decisions. REFERENCE and LATER may be one folder with two spans.
     """
     from graphslam.cli import show
 
-    found = graphslam.changes_between(
-        reference, later, reference_span_s=span_of(reference_span),
-        later_span_s=span_of(later_span), config=load_config(config, settings or ()),
-        output=output, force=force,
-    ).to_dict()  # fmt: skip
+    tree, spans = (
+        load_config(config, settings or ()),
+        (span_of(reference_span), span_of(later_span)),
+    )
+    if method == "thesis":
+        from graphslam.change_detection import write_thesis_changes
+
+        found = write_thesis_changes(
+            reference, later, tree.changes, *spans, directory=output, force=force
+        ).to_dict()
+    else:
+        found = graphslam.changes_between(
+            reference, later, reference_span_s=spans[0], later_span_s=spans[1], config=tree,
+            output=output, force=force,
+        ).to_dict()  # fmt: skip
     return Output(found, lambda: show.changes(found, output))
 
 
@@ -297,3 +312,17 @@ def experiment(
     summary = summarise(definition, rows)
     save_summary(summary, output)
     return Output(summary, lambda: show.experiment(summary, output))
+
+
+@command("config")
+def config_command(preset: Preset = None) -> Output:
+    """Print all settings with their defaults, units and meaning, as TOML, and the presets.
+
+    With --preset only what that preset changes. Either can be saved and given to --config.
+    """
+    from graphslam.core.config_text import documented_settings, settings_tree
+    from graphslam.core.presets import preset_settings, preset_text
+
+    text = documented_settings() if preset is None else preset_text(preset)
+    content = settings_tree() if preset is None else preset_settings(preset)
+    return Output(content, lambda: typer.echo(text, nl=False))

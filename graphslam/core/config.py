@@ -46,23 +46,28 @@ class AssociationConfig:
 
     method: `greedy` is the thesis' variant of the NNSF, `optimal` minimises the sum of distances.
     identities: `use` or `ignore` those in the log. robot_sightings: `use` or `ignore` sightings of
-    other robots. max_distance_m: eq. 3.23. directed: a line has two sides; false compares
-    directions modulo pi (3.24). gate_probability: of the chi-square gate (3.25).
-    floor_m, floor_rad: added to the innovations' sigmas before gating, for model errors; they never
-    enter the estimate. new_landmark_probability: an observation is a new landmark only if its
-    distance to every landmark exceeds this second, higher quantile. overlap_gap_m: largest gap
-    along the line between an observed segment and the landmark's extent. sightings_to_promote: a
-    tentative landmark enters the graph at this many sightings. tentative_s, tentative_m: one not
-    observed again within this time and path is deleted. reacquire_m: a landmark not observed for
-    this much path counts as old; old lines are matched again only if reacquire_min of them, not all
-    parallel, agree. reassociation_gate_m (across), reassociation_gate_rad: largest residual of an
-    observation when the solved log is associated again, and distance of one landmark's visits.
+    other robots. max_distance_m: eq. 3.23. nearness: what that is for walls: `across` = the
+    distance across the line, with overlap along it, segments of other lengths being compared as
+    lines; `middle` = that of the middles, as printed, and nothing else. directed: a line has two
+    sides; false compares directions modulo pi (3.24). gate_probability: of the chi-square gate
+    (3.25). floor_m, floor_rad: added to the innovations' sigmas before gating, for model errors;
+    they never enter the estimate. new_landmark_probability: an observation is a new landmark only
+    if its distance to every landmark exceeds this second, higher quantile. overlap_gap_m: largest
+    gap along the line between an observed segment and the landmark's extent. sightings_to_promote:
+    a tentative landmark enters the graph at this many sightings. tentative_s, tentative_m: one not
+    observed again within this time and path is deleted. delete_s: one in the graph that is not
+    observed for this long is not associated again, and a filter deletes it (section 4.6).
+    reacquire_m: a landmark not observed for this much path counts as old; old lines are matched
+    again only if reacquire_min of them, not all parallel, agree. reassociation_gate_m (across),
+    reassociation_gate_rad: largest residual of an observation when the solved log is associated
+    again, and distance of one landmark's visits.
     """
 
     method: Literal["optimal", "greedy"] = "optimal"
     identities: Literal["use", "ignore"] = "use"
     robot_sightings: Literal["use", "ignore"] = "use"
     max_distance_m: float = 1.5
+    nearness: Literal["across", "middle"] = "across"
     directed: bool = True
     gate_probability: float = 0.99
     floor_m: float = 0.05
@@ -72,6 +77,7 @@ class AssociationConfig:
     sightings_to_promote: int = 3
     tentative_s: float = 20.0
     tentative_m: float = 5.0
+    delete_s: float = math.inf
     reacquire_m: float = 10.0
     reacquire_min: int = 3
     reassociation_gate_m: float = 0.3
@@ -238,7 +244,8 @@ class ChangesConfig:
     distance of a surface are compared with it; beams that end farther behind it passed through it.
     nonrigid_gate_m: gate_m, at least, where the maps are bent against each other. min_length_m:
     smallest change that is reported. min_beams: fewest beams that support one.
-    max_displacement_m: what moved farther is reported as vanished and appeared.
+    max_displacement_m: what moved farther is reported as vanished and appeared. consecutive_beams:
+    of the thesis' method: so many neighbouring beams must differ (section 5.3); 1 = one is enough.
     """
 
     false_alarm_rate: float = 0.01
@@ -260,6 +267,7 @@ class ChangesConfig:
     min_length_m: float = 0.1
     min_beams: int = 5
     max_displacement_m: float = 5.0
+    consecutive_beams: int = 1
 
 
 @dataclass(frozen=True)

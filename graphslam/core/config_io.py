@@ -18,6 +18,7 @@ from typing import Any, Literal
 
 from graphslam.core.config import Config
 from graphslam.core.errors import ConfigError
+from graphslam.core.presets import over, preset_settings
 
 #: old name -> new name of keys that were renamed; an old name is accepted with a warning
 RENAMED_KEYS = {
@@ -33,27 +34,44 @@ RENAMED_KEYS = {
 }
 
 
-def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Config:
-    """Default settings, then the TOML file, then ``key=value`` overrides (dotted keys).
+def load_config(
+    path: Path | None = None, overrides: Sequence[str] = (), preset: str | None = None
+) -> Config:
+    """Defaults, then the preset, then the TOML file, then ``key=value`` overrides (dotted keys).
 
     A key of `RENAMED_KEYS` is accepted by its old name; `Config.warnings` then has a line on it.
 
     Raises:
-        ConfigError: the file cannot be read, a key is unknown, a value has the wrong type, or the
-            file or the overrides give one setting by its old and its new name.
+        ConfigError: there is no such preset, the file cannot be read, a key is unknown, a value has
+            the wrong type, or the file or the overrides give one setting by its old and its new
+            name.
     """
     tree = _read(path)
+    if preset is not None:
+        tree = over(preset_settings(preset), tree)
     settings = map(parse_setting, overrides)
     return _override(tree, [(_split_key(key), value) for key, value in settings])
 
 
-def named_backend(path: Path | None, overrides: Sequence[str] = ()) -> str | None:
-    """The back end that a file and overrides, see `load_config`, ask for; None if neither does.
+def with_preset(config: Config, name: str) -> Config:
+    """The configuration with the settings of a preset over it.
+
+    Raises:
+        ConfigError: there is no such preset.
+    """
+    return with_settings(config, preset_settings(name))
+
+
+def named_backend(
+    path: Path | None, overrides: Sequence[str] = (), preset: str | None = None
+) -> str | None:
+    """The back end that preset, file and overrides, see `load_config`, ask for; None if none does.
 
     Raises:
         ConfigError: the file cannot be read, or an override has another form.
     """
-    table = _read(path).get("backend", {})
+    named = {} if preset is None else preset_settings(preset)
+    table = over(named, _read(path)).get("backend", {})
     name = table.get("name") if isinstance(table, dict) else None
     for key, value in map(parse_setting, overrides):
         name = value if key == "backend.name" else name
@@ -273,7 +291,7 @@ def _check_range(key: str, value: float) -> None:
 
 
 #: settings that may be infinite
-_INFINITE = {"backend.horizon_s"}
+_INFINITE = {"association.delete_s", "backend.horizon_s"}
 
 #: settings that would be a divisor of 0, or make a covariance singular
 _NOT_ZERO = {
@@ -336,7 +354,7 @@ def _dump(node: Any, path: tuple[str, ...], lines: list[str]) -> None:
     plain = [(n, v) for n, v in items if not dataclasses.is_dataclass(v) and not _is_table(v)]
     if path and (plain or not items):
         lines += ["", f"[{'.'.join(map(_key, path))}]"]
-    lines += [f"{_key(name)} = {_value(value)}" for name, value in plain]
+    lines += [f"{_key(name)} = {toml_value(value)}" for name, value in plain]
     for name, value in items:
         if dataclasses.is_dataclass(value) or _is_table(value):
             _dump(value, (*path, name), lines)
@@ -356,9 +374,10 @@ def _quote(text: str) -> str:
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-def _value(value: Any) -> str:
+def toml_value(value: Any) -> str:
+    """A setting as TOML: a truth value, a number, a text, or a list of these."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple):
-        return f"[{', '.join(map(_value, value))}]"
+        return f"[{', '.join(map(toml_value, value))}]"
     return _quote(value) if isinstance(value, str) else repr(value)

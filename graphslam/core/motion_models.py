@@ -136,6 +136,23 @@ def command_increments(
     return Increments(exp(twists), cov, exp_jacobian(twists) @ d_twist)
 
 
+def parameter_cov(source: str, rows: Array, robot: RobotConfig, config: OdometryConfig) -> Array:
+    """Covariance (n, 3, 3) of w_p, eq. 4.9-4.13 as printed: parameters drawn anew in each row.
+
+    It grows with the square of the rotations of a row, so it depends on how often the odometry is
+    read. Of a source that reports poses, the rotations are those of the robot's nominal wheels.
+    """
+    wheels = source == "wheels"
+    angles = (rows if wheels else rows_of_twists("wheels", rows[:, :3], robot))[:, :2]
+    moved = np.any(angles != 0, axis=1)
+    variances = np.zeros((len(angles), 5))
+    variances[:, :2], variances[:, 4] = config.wheel_radius_sigma_m**2, config.axle_sigma_m**2
+    if not wheels:  # `wheel_increments` has that of the counts
+        variances[:, 2:4] = config.count_sigma_rad**2 * moved[:, None]
+    J = exp_jacobian(wheel_twist(angles, robot)) @ wheel_jacobian(angles, robot)
+    return np.asarray((J * variances[:, None, :]) @ J.mT)
+
+
 def given_increments(
     rows: Array, _calibration: Array, _robot: RobotConfig, _config: OdometryConfig
 ) -> Increments:
@@ -217,7 +234,10 @@ def nominal_calibration(source: str, config: OdometryConfig, mounted: bool) -> C
             "laser_yaw_rad": config.laser_sigma_rad,
             "laser_latency_s": config.laser_latency_sigma_s,
         }
-    known = [0.0 if name in config.fixed_calibration else sigma for name, sigma in sigmas.items()]
+    held: set[str] = set(config.fixed_calibration)
+    if config.parameter_noise == "white":  # then their errors are in every increment
+        held |= {name for name in sigmas if not name.startswith("laser_")}
+    known = [0.0 if name in held else sigma for name, sigma in sigmas.items()]
     # a parameter whose sigma is 0 is held, without making the covariance singular
     values = np.maximum(np.array(known, dtype=float), 1e-9)
     return Calibration(tuple(sigmas), np.zeros(len(values)), np.diag(values**2))

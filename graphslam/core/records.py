@@ -253,7 +253,8 @@ class Step(Record):
     """Everything that enters an estimator together, at one time.
 
     ``starts`` holds robots that appear for the first time, ``motions`` those that get a new
-    state at ``time_ns``. Steps are recorded and can be replayed into another back end.
+    state at ``time_ns``; ``deleted`` are landmarks that no later step observes, and that a filter
+    may drop. Steps are recorded and can be replayed into another back end.
     """
 
     time_ns: int
@@ -261,6 +262,7 @@ class Step(Record):
     motions: Mapping[str, Motion] = field(default_factory=dict)
     associations: tuple[Association, ...] = ()
     closures: tuple[Closure, ...] = ()
+    deleted: tuple[int, ...] = ()
 
 
 # ---------------------------------------------------------------- estimates and results

@@ -87,6 +87,9 @@ class OdometryConfig:
     commanded_velocities: the odometry poses integrate commanded, not measured, velocities;
     turning_lever_sigma_m: distance between the middle of the axle and the point whose speed was
     commanded.
+    parameter_noise: `constant` = a calibration error is the same in every reading; `white` = radii,
+    axle and counts are drawn anew in each, as thesis 4.9-4.13 prints it (of odometry that reports
+    poses by the wheels of [robots.*]), and no parameter of the odometry is estimated.
     floor_sigma_m and floor_sigma_rad are added once per interval in which the robot moved.
     calibrate: estimate the calibration errors online, and at the end jointly with the trajectory.
     fixed_calibration: parameters held at what the log and [robots.*] say.
@@ -120,6 +123,7 @@ class OdometryConfig:
     laser_latency_sigma_s: float = 0.05
     sighting_latency_sigma_s: float = 0.2
     commanded_velocities: bool = False
+    parameter_noise: Literal["constant", "white"] = "constant"
     turning_lever_sigma_m: float = 0.2
     floor_sigma_m: float = 0.005
     floor_sigma_rad: float = 0.005
@@ -158,17 +162,20 @@ class FrontEndConfig:
     name: which front end; `both` extracts segments first, then Hough lines from the other returns.
     max_range_m: farther returns are not used for lines. gap_m: neighbouring returns farther apart
     than gap_m + gap_ratio * range start a new chain. split_m: largest orthogonal deviation inside
-    one segment. min_points, min_length_m: smaller segments are dropped. range_sigma_m: white range
-    noise. floor_normal_m, floor_angle_rad: error of a line that does not shrink with the number of
-    points (material, flatness, bias of the laser). end_sigma_m: error of a segment's end where the
-    wall ends. covariance: `incidence` weights each point by its noise along the normal, `thesis`
-    uses eq. 4.32 as printed. Hough lines (4.7.1-4.7.3): hough_delta_d_m is the distance step Δd,
-    equal to the stripe width 2a; hough_gamma_steps the number of angles γ in a full turn;
-    hough_d_max_m the largest distance d of a line. hough_threshold_m is the threshold of C with
-    g = r times the angle between beams: metres of wall at normal incidence. cylinders: whether to
-    extract them; cylinder_min_radius_m, cylinder_max_radius_m: their radii; cylinder_points: fewest
-    returns. dynamic_objects: `drop` removes free-standing objects in space that an earlier scan saw
-    as free; `keep` leaves them in.
+    one segment. split_rule: `deviation` splits a chain by that; `variance` a whole scan until the
+    mean square deviation is below (split_m / 2)², as thesis 4.7.6 prints it. hidden_ends: a segment
+    of which an end may be hidden is kept as a `line`, or `reject`ed as in thesis 4.7.8. min_points,
+    min_length_m: smaller segments are dropped. range_sigma_m: white range noise. floor_normal_m,
+    floor_angle_rad: error of a line that does not shrink with the number of points (material,
+    flatness, bias of the laser). end_sigma_m: error of a segment's end where the wall ends.
+    covariance: `incidence` weights each point by its noise along the normal, `thesis` uses eq. 4.32
+    as printed. Hough lines (4.7.1-4.7.3): hough_delta_d_m is the distance step Δd, equal to the
+    stripe width 2a; hough_gamma_steps the number of angles γ in a full turn; hough_d_max_m the
+    largest distance d of a line. hough_threshold_m is the threshold of C with g = r times the angle
+    between beams: metres of wall at normal incidence. cylinders: whether to extract them;
+    cylinder_min_radius_m, cylinder_max_radius_m: their radii; cylinder_points: fewest returns.
+    dynamic_objects: `drop` removes free-standing objects in space that an earlier scan saw as free;
+    `keep` leaves them in.
     """
 
     name: Literal["segments", "hough", "both", "none"] = "segments"
@@ -176,6 +183,8 @@ class FrontEndConfig:
     gap_m: float = 0.3
     gap_ratio: float = 0.05
     split_m: float = 0.05
+    split_rule: Literal["deviation", "variance"] = "deviation"
+    hidden_ends: Literal["line", "reject"] = "line"
     min_points: int = 6
     min_length_m: float = 0.4
     range_sigma_m: float = 0.02

@@ -57,9 +57,14 @@ class FilterBackend(ABC):
             self._states.append(robot, step.time_ns)
             self._move(robot, motion)
         self._observe_step(step)
+        for landmark in step.deleted:
+            self.remove(landmark)
         for robot in {**step.starts, **step.motions}:
             joint = self.joint(robot, ())
             self._track.append(robot, step.time_ns, joint.pose, joint.cov)
+
+    def remove(self, landmark: int) -> None:  # noqa: B027 (a filter need not: nothing else changes)
+        """Drop a landmark that no later step observes; here it stays."""
 
     @abstractmethod
     def _start(self, robot: str, start: Start) -> None:

@@ -5,6 +5,7 @@ graph that was seen recently; landmarks not seen for long, only if enough of the
 compatible (a loop closure); a tentative landmark; a new one. Else it is rejected, with the reason.
 """
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -103,6 +104,7 @@ class Associator:
         self._config, self._backend = config, backend
         self._images = 0
         self._unsettled: set[int] = set()  # admitted, but not yet in the back end
+        self._deleted: list[int] = []  # of the graph, see `take_deleted`
         m2, rad2 = config.floor_m**2, config.floor_rad**2
         self._floor = {
             "line": np.diag([m2, rad2]),
@@ -122,6 +124,8 @@ class Associator:
         self._images += 1
         age_ns = round(config.tentative_s * 1e9)
         self.map.expire(image.time_ns, image.robot, image.path_m, age_ns, config.tentative_m)
+        if math.isfinite(config.delete_s):
+            self._deleted += self.map.expire_unseen(image.time_ns, 1e9 * config.delete_s)
         if image.gathering and all(map(self._has_identity, image.seen)):
             return self._associate_identified(image)
         candidates = self._candidates(image)
@@ -142,6 +146,11 @@ class Associator:
                 continue
             out += self._record(image, entry, o.kind, o, True)
         return tuple(out)
+
+    def take_deleted(self) -> tuple[int, ...]:
+        """The landmarks of the graph that were deleted since the last call."""
+        deleted, self._deleted = tuple(self._deleted), []
+        return deleted
 
     def settle(self) -> None:
         """Record that the back end has taken the step of all associations so far."""
@@ -236,7 +245,7 @@ class Associator:
         gate = gate_distance(config.gate_probability, np.maximum(compared.dof, 1))
 
         def best(which: BoolArray) -> dict[int, int]:
-            return _assign_pairs(pairs, compared, gate, which, len(image.seen), config.method)
+            return _assign_pairs(pairs, compared, gate, which, len(image.seen), config)
 
         # observations of one image exclude each other: landmarks with an identity are taken
         free = ~known & ~np.isin(pairs.landmark, pairs.landmark[known])
@@ -337,7 +346,12 @@ def _worth_comparing(
 
 
 def _assign_pairs(
-    pairs: Pairs, compared: PairDistances, gate: Array, which: BoolArray, n: int, method: str
+    pairs: Pairs,
+    compared: PairDistances,
+    gate: Array,
+    which: BoolArray,
+    n: int,
+    config: AssociationConfig,
 ) -> dict[int, int]:
     """Observation -> pair among the pairs ``which``.
 
@@ -354,7 +368,9 @@ def _assign_pairs(
     for k in use:
         cell = int(pairs.observation[k]), columns[int(pairs.landmark[k])]
         cost[cell], limit[cell], number[cell] = compared.d2[k], gate[k], k
-    chosen = {i: int(number[i, c]) for i, c in assign(cost, limit, method)}
+    chosen = {i: int(number[i, c]) for i, c in assign(cost, limit, config.method)}
+    if config.nearness == "middle":
+        return chosen  # what shares no middle is no part of it
     for k in use[np.argsort(compared.d2[use], kind="stable")]:
         i = int(pairs.observation[k])
         if i not in chosen and pairs.model[k] == "line":

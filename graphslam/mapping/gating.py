@@ -140,12 +140,15 @@ def candidate_pairs(
     end = middle[..., 0] + np.cos(middle[..., 2]) * ends[:, None, 1]
     begin, end = np.minimum(begin, end), np.maximum(begin, end)
     gap = np.maximum(begin - extents[None, :, 1], extents[None, :, 0] - end)
-    line_ok = (
-        (np.abs(middle[..., 1]) < config.max_distance_m)
-        & (np.abs(turned) < MAX_ANGLE_RAD)
-        & (gap < config.overlap_gap_m)
-    )
     near = np.hypot(middle[..., 0], middle[..., 1]) < config.max_distance_m
+    as_printed = config.nearness == "middle"
+    line_ok = near & (np.abs(turned) < np.pi / 2)
+    if not as_printed:
+        line_ok = (
+            (np.abs(middle[..., 1]) < config.max_distance_m)
+            & (np.abs(turned) < MAX_ANGLE_RAD)
+            & (gap < config.overlap_gap_m)
+        )
     i, j = np.nonzero((both_points & near) | (both_lines & line_ok))
     length = ends[:, 1] - ends[:, 0]
     known = extents[:, 1] - extents[:, 0]
@@ -153,7 +156,9 @@ def candidate_pairs(
         "point"
         if points[a]
         else "segment"
-        if seen[a].kind == "segment" and whole[b] and abs(length[a] - known[b]) < LENGTH_TOLERANCE_M
+        if seen[a].kind == "segment"
+        and whole[b]
+        and (as_printed or abs(length[a] - known[b]) < LENGTH_TOLERANCE_M)
         else "line"
         for a, b in zip(i.tolist(), j.tolist(), strict=True)
     )

@@ -67,7 +67,7 @@ class LandmarkMap:
     def __init__(self) -> None:
         self.entries: dict[int, Entry] = {}
         self.by_identity: dict[str, int] = {}
-        self.deleted = 0
+        self.deleted = self.forgotten = 0  # tentative ones, and landmarks of the graph
         self._next = 0
 
     def __len__(self) -> int:
@@ -168,9 +168,21 @@ class LandmarkMap:
             and time_ns - e.last_ns > age_ns
             and path_m - e.path_m[robot] > age_m
         ]
-        for i in gone:
-            del self.entries[i]
+        self._delete(gone)
         self.deleted += len(gone)
+
+    def expire_unseen(self, time_ns: int, age_ns: float) -> list[int]:
+        """Delete landmarks of the graph that no robot has seen for long; returns their numbers."""
+        gone = [i for i, e in self.entries.items() if e.in_graph and time_ns - e.last_ns > age_ns]
+        self._delete(gone)
+        self.forgotten += len(gone)
+        return gone
+
+    def _delete(self, gone: Sequence[int]) -> None:
+        for i in gone:
+            identity = self.entries.pop(i).identity
+            if identity is not None and self.by_identity.get(identity) == i:
+                del self.by_identity[identity]
 
 
 def retarget(a: Association, target: int, kind: str) -> Association:

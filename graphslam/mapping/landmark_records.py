@@ -35,8 +35,9 @@ def make_landmark(entry: Entry, mean: Array, cov: Array) -> Landmark:
 
 
 def make_landmarks(landmarks: LandmarkMap, estimate: Estimate) -> tuple[Landmark, ...]:
-    """The final map: every landmark that the back end estimated; both in the same world frame."""
+    """The final map: every landmark that was estimated and not deleted; in one world frame."""
     return tuple(
         make_landmark(landmarks.entries[number], mean, cov)
         for number, (mean, cov) in sorted(estimate.landmarks.items())
+        if number in landmarks.entries
     )

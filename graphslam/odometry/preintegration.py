@@ -29,6 +29,7 @@ from graphslam.core.motion_models import (
     compound,
     mounted_motion,
     nominal_calibration,
+    parameter_cov,
     rows_of_twists,
 )
 from graphslam.core.records import Motion
@@ -134,7 +135,11 @@ class Track(Readings):
 
     def increments(self, rows: Array, calibration: Array) -> Increments:
         """Increments (n) of rows (n, k), by calibration parameters (p,) or (n, p)."""
-        return MOTION_SOURCES[self.source](rows, calibration, self._robot, self.config)
+        made = MOTION_SOURCES[self.source](rows, calibration, self._robot, self.config)
+        if self.config.parameter_noise == "white" and self.source != "given":
+            noise = parameter_cov(self.source, rows, self._robot, self.config)
+            made = replace(made, cov=made.cov + noise)
+        return made
 
     def derivative(self, twists: Array) -> Array:
         """Derivative (n, 3, p) of motions on arcs, by their twists (n, 3), by the calibration."""

@@ -20,6 +20,7 @@ from graphslam.perception.line_fit import LineFits, fit_lines, observations
 from graphslam.perception.line_moments import fitted_lines, mean_square
 from graphslam.perception.ordered_scan import Indices, Mask, Sweep
 from graphslam.perception.segment_ends import fully_visible
+from graphslam.perception.variance_split import first_and_last, split_by_variance
 
 MISSING_BEAMS = 3
 """Missing returns that a chain may bridge; the distance of the returns is another test."""
@@ -73,7 +74,7 @@ def segments(sweep: Sweep, config: FrontEndConfig) -> tuple[Observation, ...]:
 
 def find_segments(sweep: Sweep, config: FrontEndConfig) -> Segments:
     """The segments of one scan with their returns."""
-    pieces = _split(sweep, config)
+    pieces = (_split_scans if config.split_rule == "variance" else _split)(sweep, config)
     # Twice: an object in front of a wall keeps the parts of the wall from being neighbours, and can
     # be distinguished from small pieces of the wall only after those have been merged.
     pieces = _merge(pieces, sweep, config)
@@ -84,7 +85,10 @@ def find_segments(sweep: Sweep, config: FrontEndConfig) -> Segments:
     fits = fit_lines(sweep.points[rows], starts, config)
     last = starts + counts - 1
     whole = fully_visible(sweep, sweep.beam[rows[starts]], sweep.beam[rows[last]], fits, config)
-    return Segments(rows, starts, fits, whole, valid_lines(fits, config))
+    valid = valid_lines(fits, config)
+    if config.hidden_ends == "reject":
+        valid &= whole
+    return Segments(rows, starts, fits, whole, valid)
 
 
 def valid_lines(fits: LineFits, config: FrontEndConfig) -> Mask:
@@ -176,9 +180,26 @@ def _split(sweep: Sweep, config: FrontEndConfig) -> Pieces:
     wanted = np.searchsorted(values, vertex_key) * len(key) + starts[own][chain]
     vertex = order[np.searchsorted(place, wanted)]
     same = chain[1:] == chain[:-1]
-    first, last = vertex[:-1][same], vertex[1:][same]
+    return _pieces(vertex[:-1][same], vertex[1:][same], sweep)
+
+
+def _pieces(first: Indices, last: Indices, sweep: Sweep) -> Pieces:
     sums = np.cumsum(sweep.moments, axis=1)
     return Pieces(first, last, sums[:, last] - sums[:, first] + sweep.moments[:, first])
+
+
+def _split_scans(sweep: Sweep, config: FrontEndConfig) -> Pieces:
+    """Pieces by the variance of the deviations, beginning with whole scans: 4.7.6 as printed."""
+    starts = np.flatnonzero(np.diff(sweep.scan, prepend=-1))
+    ends = np.append(starts[1:], len(sweep.scan)) - 1
+    runs = [
+        run
+        for i, j in zip(starts.tolist(), ends.tolist(), strict=True)
+        for run in split_by_variance(
+            sweep.points, i, j, allowed_rms(config) ** 2, fewest_points(config)
+        )
+    ]
+    return _pieces(*first_and_last(runs), sweep)
 
 
 def _merge(pieces: Pieces, sweep: Sweep, config: FrontEndConfig) -> Pieces:

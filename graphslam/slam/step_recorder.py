@@ -1,6 +1,7 @@
 """Steps into the back end, and what is recorded of them: states, calibration, covariances."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array, rotation3
@@ -66,6 +67,7 @@ class StepRecorder(LogPass):
         """Give a step to the back end and learn from it; ``known`` landmarks were there before."""
         if not (step.motions or step.associations or step.closures):
             return
+        step = replace(step, deleted=self.associator.take_deleted())
         with timed(self.seconds, "back end"):
             self.backend.add(step)
             self.associator.settle()

@@ -57,6 +57,10 @@ def summarise(
     all_dropped = Counter(log.dropped) + pipeline.dropped + pipeline.removed_returns
     if pipeline.landmarks.deleted:
         all_dropped["tentative landmark: not seen often enough"] += pipeline.landmarks.deleted
+    if pipeline.landmarks.forgotten:
+        all_dropped["landmark: not seen again for association.delete_s"] += (
+            pipeline.landmarks.forgotten
+        )
     return {
         "format": FORMAT,
         "versions": {

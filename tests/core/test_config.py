@@ -339,7 +339,7 @@ def test_defaults_are_of_their_own_types_and_finite(table):
         if hints[field.name] in (int, float, bool, str):
             assert type(value) is hints[field.name]
         assert not isinstance(value, float) or (
-            (math.isfinite(value) or field.name == "horizon_s") and value >= 0
+            (math.isfinite(value) or field.name in ("horizon_s", "delete_s")) and value >= 0
         )
 
 

@@ -692,3 +692,50 @@ def test_a_robot_that_turns_drives_less_of_what_was_commanded():
     ]
     np.testing.assert_allclose(found, exp(np.array([v, 0.0, turn])), atol=v * (d * turn / v) ** 4)
     assert found[0] < exp(np.array(twist))[0]
+
+
+@pytest.mark.parametrize("source", ["wheels", "odometry"])
+def test_parameters_drawn_anew_in_every_reading_are_the_printed_noise(source):
+    """4.9-4.13 against sampled radii, counts and axles; and nothing of the odometry is calibrated.
+
+    Of odometry that reports poses the wheels are the robot's: the same motion, the same noise."""
+    config = replace(
+        NOISE, parameter_noise="white", wheel_radius_sigma_m=0.002, axle_sigma_m=0.01,
+        count_sigma_rad=0.05, k_x_m=0, k_x_rad=0, k_y_m=0, k_y_rad=0, k_phi_m=0, k_phi_rad=0,
+    )  # fmt: skip
+    turns = np.array([2.0, 2.6])
+    rows = turns[None] if source == "wheels" else wheel_twist(turns[None], ROBOT)
+    track = Track(config, ROBOT)
+    track._begin(source, 0)
+    rows = np.column_stack([rows, np.zeros(1)])
+    found = track.increments(rows, track.calibration.mean)
+    rng = np.random.default_rng(3)
+    sigmas = np.array([0.002, 0.002, 0.05, 0.05, 0.01])
+    nominal = np.array([0.11, 0.1, *turns, 0.6])
+    drawn = nominal + sigmas * rng.normal(size=(200_000, 5))
+    path = (drawn[:, 0] * drawn[:, 2] + drawn[:, 1] * drawn[:, 3]) / 2
+    turning = (drawn[:, 1] * drawn[:, 3] - drawn[:, 0] * drawn[:, 2]) / drawn[:, 4]
+    moved = exp(np.column_stack([path, np.zeros(len(path)), turning]))
+    np.testing.assert_allclose(found.cov[0], np.cov(moved.T), rtol=0.02, atol=2e-6)
+    assert track.calibration.cov.max() <= 1e-18
+    plain = Track(NOISE, ROBOT)
+    plain._begin(source, 0)
+    assert plain.calibration.cov.max() > 1e-8
+
+
+def test_white_parameter_noise_averages_out_and_a_constant_error_does_not():
+    """Why the thesis' heading is too certain after a straight drive: sigma grows with the root of
+    the path there, in proportion to it here."""
+    sigma = {}
+    for kind in ("white", "constant"):
+        config = replace(NOISE, parameter_noise=kind, k_phi_m=0.0, k_phi_rad=0.0, count_sigma_rad=0)
+        for metres in (10, 40):
+            track = Track(config, EVEN)
+            turns = np.linspace(0.0, metres / 0.1, 10 * metres + 1)
+            for n, turn in enumerate(turns):
+                stamp = n * SECOND // 10
+                track.add(WheelAngles("r", stamp, stamp, turn, turn))
+            moved = track.motion(0, 10 * metres * SECOND // 10)
+            sigma[kind, metres] = np.sqrt(moved.cov[2, 2])
+    assert sigma["white", 40] / sigma["white", 10] == pytest.approx(2.0, rel=0.05)
+    assert sigma["constant", 40] / sigma["constant", 10] == pytest.approx(4.0, rel=0.05)

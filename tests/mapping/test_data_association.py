@@ -178,6 +178,24 @@ def test_landmarks_of_the_graph_are_never_deleted():
     assert run.map.graph_ids() == [0] and run.map.deleted == 0
 
 
+def test_a_landmark_of_the_graph_that_is_not_seen_again_is_deleted():
+    """Section 4.6, where asked for: in time alone, and no step observes it afterwards."""
+    run = Run(replace(EXACT, delete_s=60.0))
+    run.learn(point(4.0, 1.0))
+    run.look(after_s=59)
+    assert run.map.graph_ids() == [0] and run.associator.take_deleted() == ()
+    run.look(after_s=2)
+    assert run.map.graph_ids() == [] and run.associator.take_deleted() == (0,)
+    assert (run.map.forgotten, run.map.deleted) == (1, 0)
+    assert run.associator.take_deleted() == ()  # once
+
+
+def test_a_landmark_is_new_at_once_where_the_thesis_says_so():
+    run = Run(replace(EXACT, sightings_to_promote=1))
+    (only,) = run.look(point(4.0, 1.0))
+    assert not only.late and run.map.graph_ids() == [only.target]
+
+
 def test_another_robots_waiting_deletes_nothing():
     """Path is that of the robot that saw it."""
     run = Run()

@@ -429,3 +429,19 @@ def test_where_the_walls_are_seen_does_not_matter_for_fixing_the_pose():
         a, b = (compose(np.array(w), np.array([along, 0, 0])) for w in ([6, 3, 0.2], [9, 0, 1.77]))
         seen = [see_line(a, [-1, 1]), see_line(b, [-1, 1])]
         assert gating.fixes_pose(compared(seen, ["line"] * 2, [[6, 3, 0.2], [9, 0, 1.77]]), [0, 1])
+
+
+def test_as_printed_two_walls_are_near_if_their_middles_are():
+    """3.23 with ``nearness = middle``: no distance across, no overlap, no test of the length; so a
+    long wall seen in part is another one, and a segment of another length is the same."""
+    printed = AssociationConfig(nearness="middle", directed=False, max_distance_m=1.5)
+    landmark, extent = (5.0, 2.0, 0.3), (-3.0, 3.0)
+    along = compose(np.array(landmark), np.array([2.0, 0.0, 0.0]))
+    seen = [see_line(along, (-0.5, 0.5), kind="segment")]
+    assert candidates(seen, [landmark], [extent], whole=[True], config=printed) == {}
+    assert candidates(seen, [landmark], [extent], whole=[True]) == {(0, 0): ("line", False)}
+    beside = compose(np.array(landmark), np.array([1.0, 0.5, 0.9]))  # turned by 0.9 rad
+    seen = [see_line(beside, (-0.5, 0.5), kind="segment")]
+    found = candidates(seen, [landmark], [extent], whole=[True], config=printed)
+    assert found == {(0, 0): ("segment", False)}
+    assert candidates(seen, [landmark], [extent], whole=[True]) == {}

@@ -1,5 +1,7 @@
 """Front ends: lines from scans of scenes whose walls are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,6 +16,7 @@ from graphslam.core.geometry import compose, rotate_cov, rotation, wrap
 from graphslam.perception.front_ends import FRONT_ENDS
 from graphslam.perception.line_fit import fit_lines, observations
 from graphslam.perception.ordered_scan import scan_points
+from graphslam.perception.variance_split import split_by_variance
 
 segments = FRONT_ENDS["segments"]
 CONFIG = FrontEndConfig()
@@ -353,3 +356,44 @@ def test_points_that_coincide_are_an_error_of_ours():
 def test_scan_points_go_through_the_mount_and_leave_out_missing_returns():
     scan = make_scan([1.0, np.nan, 2.0, 50.0, np.inf], 0.0, np.pi / 2, (0.5, 0.1, np.pi / 2))
     np.testing.assert_allclose(scan_points(scan, 30.0), [[0.5, 1.1], [0.5, -1.9]], atol=1e-12)
+
+
+# ---------------------------------------------------------------- as the thesis prints it
+
+
+def split(points, allowed_m, fewest=3):
+    points = np.asarray(points, float)
+    return split_by_variance(points, 0, len(points) - 1, allowed_m**2, fewest)
+
+
+def test_a_scan_is_split_at_the_farthest_return_until_the_variance_is_small():
+    """4.7.6: corners of a polyline, and no split where the mean square deviation is allowed even
+    though one return is farther (which a split by the largest deviation would cut)."""
+    corner = [(x, 0.0) for x in np.linspace(0, 2, 11)] + [(2.0, y) for y in np.linspace(0.2, 2, 10)]
+    assert split(corner, 0.01) == [(0, 10), (10, 20)]
+    bump = [(x, 0.0) for x in np.linspace(0, 2, 41)]
+    bump[20] = (1.0, 0.06)
+    assert split(bump, 0.05 / 2) == [(0, 40)]
+    assert len(split(bump, 0.005)) > 1
+    assert split(corner[:12], 0.01, fewest=4) == [(0, 10)]  # the rest has too few returns
+
+
+def test_segments_of_which_an_end_may_be_hidden_are_rejected_where_asked_for():
+    """4.7.8: a wall behind a box is cut by its edges; only the box remains."""
+    box = [[[2.0, -0.5], [2.0, 0.5]]]
+    scan = scan_of([*box, BACK_WALL], sigma=0.0)
+    kept = segments(scan, CONFIG)
+    rejected = segments(scan, replace(CONFIG, hidden_ends="reject"))
+    assert {o.kind for o in kept} == {"segment", "line"}
+    assert [o.kind for o in rejected] == ["segment"]
+    np.testing.assert_allclose(rejected[0].z[:2], [2.0, 0.0], atol=0.02)
+
+
+def test_both_splits_find_the_walls_of_a_room():
+    """Within the noise, from scans of four walls."""
+    scan = scan_of(ROOM, sigma=0.005)
+    by_variance = segments(scan, replace(CONFIG, split_rule="variance"))
+    by_deviation = segments(scan, CONFIG)
+    assert len(by_variance) == len(by_deviation)
+    for a, b in zip(by_variance, by_deviation, strict=True):
+        assert abs(wrap(a.z[2] - b.z[2])) < 0.01
