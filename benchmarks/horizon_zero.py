@@ -6,9 +6,9 @@ pose of every robot that moved, and at the end all landmarks: the largest differ
 the standard deviation of that coordinate, and the largest relative difference of a standard
 deviation. Then the CPU time of a whole replay, the better of three each, in turn.
 
-With --isam2 instead the same filter inside `gtsam.ISAM2`: every factor is linearised at the estimate
-of its own time, enters as a LinearContainerFactor, and nothing is linearised again. It has no
-robust kernel, which would need marginals between factors, so horizon 0 has none here either.
+With --isam2 instead the same filter inside `gtsam.ISAM2`: every factor is linearised at the
+estimate of its own time, enters as a LinearContainerFactor, and nothing is linearised again. It has
+no robust kernel, which would need marginals between factors, so horizon 0 has none here either.
 
 Run: python benchmarks/horizon_zero.py [lab corridor two-robots forest intel] [--seconds 600]
      [--isam2]

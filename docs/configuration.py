@@ -24,7 +24,8 @@ HEAD = """\
 Made from `graphslam/core/config.py` and `sensor_config.py` by `make docs`; change it there.
 
 One tree of settings; `graphslam config` prints it as TOML, with units. `graphslam smooth` takes the
-defaults, then `--preset NAME`, then `--config FILE.toml`, then its own options (`--backend isam2` is `backend.name`, `--front-end` is `front_end.name`, `--start` is
+defaults, then `--preset NAME`, then `--config FILE.toml`, then its own options (`--backend isam2`
+is `backend.name`, `--front-end` is `front_end.name`, `--start` is
 `start.from_truth` or `start.poses.ROBOT`), then every `--set KEY=VALUE`; what comes later wins.
 Keys carry their unit. An unknown key, a wrong type or a value out of range is an error that names
 the key. `config.toml` in a result folder is the whole tree as used; `--config` takes it back.
