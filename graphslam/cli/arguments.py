@@ -124,7 +124,8 @@ Experiment = Annotated[
     str,
     typer.Argument(
         metavar="NAME|FILE.toml",
-        help="An experiment file, or ekf-versus-smoothing, filters, thesis or consistency.",
+        help="An experiment file, or ekf-versus-smoothing, filters, thesis, three-filters or "
+        "consistency.",
     ),
 ]
 EvaluatedFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Result folder of smooth.")]

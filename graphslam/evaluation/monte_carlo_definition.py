@@ -18,11 +18,12 @@ from graphslam.simulation.scenario import NOT_NEGATIVE, POSITIVE, Point, Scenari
 from graphslam.simulation.scenario_parser import build
 
 _FOLDER = Path(__file__).parent / "experiments"
+_PRESET = "preset="
 
 #: name -> file of an experiment of the package
 EXPERIMENTS: dict[str, Path] = {
     name: _FOLDER / f"{name}.toml"
-    for name in ("ekf-versus-smoothing", "filters", "thesis", "consistency")
+    for name in ("ekf-versus-smoothing", "filters", "thesis", "consistency", "three-filters")
 }
 
 
@@ -103,7 +104,8 @@ class Logs:
 class Definition:
     """An experiment: every variant at every noise scale, ``runs`` seeds each.
 
-    variants: name -> settings as for ``--set``, over the common ``settings``. Exactly one of
+    variants: name -> settings as for ``--set``, over the common ``settings``; ``preset=NAME`` among
+    them is as ``--preset``, under all of them. Exactly one of
     ``bench`` (steps drawn directly, true associations) and ``logs`` (simulate, smooth, evaluate).
     name: the file's; it is not a key.
     """
@@ -122,9 +124,12 @@ class Definition:
         """The configuration of a variant, with ``more`` settings over its own.
 
         Raises:
-            ConfigError: a setting is wrong.
+            ConfigError: a setting is wrong, or there is no such preset.
         """
-        return load_config(None, [*self.settings, *self.variants[variant], *more])
+        given = [*self.settings, *self.variants[variant], *more]
+        presets = [text for text in given if text.startswith(_PRESET)]
+        preset = presets[-1].removeprefix(_PRESET) if presets else None
+        return load_config(None, [text for text in given if text not in presets], preset)
 
 
 def load_definition(name: str | Path) -> Definition:

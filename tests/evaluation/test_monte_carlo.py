@@ -71,6 +71,14 @@ def small(tmp_path):
 # ------------------------------------------------------------ definitions
 
 
+def test_a_variant_may_be_a_preset():
+    """Under all its settings, whatever their order."""
+    made = load_definition("three-filters")
+    assert made.config("thesis") == load_config(preset="thesis")
+    assert made.config("thesis", "ekf.past_states=4").ekf.past_states == 4
+    assert made.config("batch") == load_config()
+
+
 @pytest.mark.parametrize("name", sorted(EXPERIMENTS))
 def test_every_experiment_that_comes_along_can_be_read(name):
     definition = load_definition(name)
