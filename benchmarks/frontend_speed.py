@@ -18,7 +18,7 @@ from common import FREIBURG, best_cpu_s, parser
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.records import Scan
 from graphslam.perception.front_ends import FRONT_ENDS
-from graphslam.perception.hough import Votes
+from graphslam.perception.hough_votes import ThesisVotes
 from graphslam.perception.ordered_scan import Sweep, make_sweep
 
 
@@ -79,9 +79,9 @@ def accumulators(scans: Sequence[Scan], config: FrontEndConfig) -> None:
     d_max, cell = config.hough_d_max_m, config.hough_delta_d_m
     side = round(2 * d_max / cell)
 
-    def table(sweep: Sweep) -> Votes:
+    def table(sweep: Sweep) -> ThesisVotes:
         weights = sweep.ranges[sweep.beam] * sweep.step_rad
-        return Votes(sweep.points, weights, np.ones(len(sweep.beam), dtype=np.bool_), config)
+        return ThesisVotes(sweep.points, weights, np.ones(len(sweep.beam), dtype=np.bool_), config)
 
     def first(sweep: Sweep) -> object:
         return table(sweep).peak()

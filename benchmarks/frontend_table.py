@@ -8,9 +8,14 @@ range); 1 is honest, less is cautious. Mean and spread over seeds.
 
 The time is CPU time per scan on one core; on a real log too, if there is one.
 
-A second table is of whole runs: mean error of the final positions and of the causal ones over
-seeds, on a real log the mean over its reference relations (all, and loops) of the final ones, the
-landmarks in the map, and CPU time of the front end per scan.
+A second table is of whole runs, median and worst over seeds: error of the final positions, end pose
+and walls at the start laid on themselves (see `thesis_experiments.py`); on a real log the mean over
+its reference relations (all, and loops) of the final ones; the landmarks in the map, and CPU time
+of the front end per scan. The last line is the error of each front end relative to `segments`,
+mean over seeds and logs.
+
+`hough, thesis` counts votes with `front_end.hough_votes = "thesis"`. `hough, raster` is OpenCV's
+transform of a raster with the weights as pixels, which is in no release: it is here to be compared.
 
 Run: python benchmarks/frontend_table.py [--no-scans] [--no-runs] [LOG.mcap=RELATIONS ...]
 """
@@ -22,41 +27,69 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import thesis_runs
 from common import best_cpu_s, parser, simulated_log
 from numpy.typing import NDArray
 
-from graphslam.core.config import BackendConfig, Config, FrontEndConfig, StartConfig
+from graphslam.core.config import Config, FrontEndConfig
 from graphslam.core.geometry import Array, between, rotate_cov, transform, wrap
-from graphslam.core.records import Observation, Result, Scan
-from graphslam.evaluation.ground_truth import truth_of_logs
+from graphslam.core.records import Observation, Scan
 from graphslam.evaluation.metrics import evaluate
 from graphslam.evaluation.relation_metrics import read_relations
 from graphslam.logs import open_logs
 from graphslam.perception.front_ends import FRONT_ENDS
+from graphslam.perception.hough_votes import HOUGH_VOTES, PROPOSALS, OpenCvVotes
 from graphslam.simulation import load_scenario, simulate
 from graphslam.simulation.scene import prepare_visits
 from graphslam.slam.smooth import smooth
 
-SEEDS = (0, 1, 2, 3)
-SCANS = 120
+SEEDS = range(20)
+SCANS = 30
 """Of each recording, evenly taken."""
 
 NEAR_M, NEAR_RAD = 0.1, 0.1
 """Farther from every face an observation is false. Many sigmas: it must not trim the NIS."""
 
-RUNS = ("lab", "office-loop", "corridor")
-RUN_SEEDS = (0, 1)
-CAUSAL = BackendConfig(causal=True)
-
+RUNS = ("lab", "corridor")
 SCENARIOS = ("lab", "office-loop", "corridor", "forest", "fleet")
+WHOLE = {
+    "segments": FrontEndConfig(),
+    "hough": FrontEndConfig(name="hough"),
+    "hough, thesis": FrontEndConfig(name="hough", hough_votes="thesis"),
+    "both": FrontEndConfig(name="both"),
+}
 FRONT = {
-    "segments": FrontEndConfig(cylinders=False),
-    "hough": FrontEndConfig(name="hough", cylinders=False),
-    "both": FrontEndConfig(name="both", cylinders=False),
+    **WHOLE,
+    # not one of the votes that a user may choose, so the type does not have it
+    "hough, raster": FrontEndConfig(name="hough", hough_votes="raster"),  # type: ignore[arg-type]
     "both + cylinders": FrontEndConfig(name="both", cylinders=True),
 }
 
-WHOLE = {label: front for label, front in FRONT.items() if not front.cylinders}
+
+class RasterVotes(OpenCvVotes):
+    """Lines proposed by `cv2.HoughLines` of a cropped raster whose pixels are the weights."""
+
+    def _proposals(self) -> tuple[Array, Array]:
+        points, cell = self._points[self._voting], self._config.hough_delta_d_m
+        if not len(points):
+            return np.zeros(0), np.zeros(0)
+        weights = self._weights[self._voting]
+        low = points.min(axis=0)
+        x, y = np.rint((points - low) / cell).astype(np.intp).T
+        image = np.zeros((y.max() + 1, x.max() + 1))
+        np.add.at(image, (y, x), weights)
+        pixels = np.minimum(np.ceil(255 * image / weights.max()), 255).astype(np.uint8)
+        step = 2 * np.pi / self._config.hough_gamma_steps
+        found = cv2.HoughLines(pixels, 1, step, 1, use_edgeval=True)
+        if found is None:
+            return np.zeros(0), np.zeros(0)
+        rho, gamma = found.reshape(-1, 2)[:PROPOSALS].T.astype(np.float64)
+        d = rho * cell + low[0] * np.cos(gamma) + low[1] * np.sin(gamma)
+        near = np.abs(d) <= self._config.hough_d_max_m
+        return d[near], gamma[near]
+
+
+HOUGH_VOTES["raster"] = RasterVotes
 
 
 @dataclass(frozen=True)
@@ -204,7 +237,7 @@ def ms_per_scan(config: FrontEndConfig, scans: Sequence[Scan]) -> float:
 
 
 def spread(values: Sequence[float]) -> str:
-    return f"{np.mean(values):6.3f} ±{np.std(values):5.3f}"
+    return f"{np.mean(values):.3f} ±{np.std(values):.3f}"
 
 
 def row(label: str, kind: str, scores: Sequence[Score], scans: int, ms: float | None) -> None:
@@ -215,56 +248,67 @@ def row(label: str, kind: str, scores: Sequence[Score], scans: int, ms: float | 
         return
     per_scan = sum(s.found for s in scores) / scans
     again = sum(s.repeated for s in scores) / max(sum(s.found for s in scores), 1)
+    shown = [spread(values) if values else "-" for values in (precision, recall, nis)]
+    time = f"{ms:.2f}" if ms is not None else "-"
     print(
-        f"{label:30} {kind:6} {spread(precision) if precision else '-':>14}"
-        f" {spread(recall) if recall else '-':>14} {spread(nis) if nis else '-':>14}"
-        f" {again:7.3f} {per_scan:9.2f}" + (f" {ms:8.3f}" if ms is not None else "")
+        f"| {label} | {kind} | {' | '.join(shown)} | {again:.3f} | {per_scan:.2f} | {time} |",
+        flush=True,
     )
 
 
-def run_row(label: str, errors: str, result: Result, ms: float) -> None:
-    landmarks = result.summary["counts"]["landmarks"]
-    print(f"{label:34} {errors} {landmarks:10d} {ms:9.3f}", flush=True)
+def worst(values: Sequence[float]) -> str:
+    return f"{np.median(values):.4f}, {max(values):.4f}"
 
 
-def simulated_runs(folder: Path) -> None:
-    """Position errors (RMSE) in simulation over seeds; the landmarks are those of the last."""
+def simulated_runs(folder: Path) -> dict[str, list[float]]:
+    """Errors of whole runs in simulation over seeds; front end -> those relative to segments."""
+    relative: dict[str, list[float]] = {label: [] for label in WHOLE}
     for name in RUNS:
+        errors: dict[str, list[float]] = {}
         for label, front in WHOLE.items():
-            config = replace(
-                Config(), front_end=front, start=StartConfig(from_truth=True), backend=CAUSAL
-            )
-            final, causal = [], []
-            for seed in RUN_SEEDS:
-                log = open_logs([simulated_log(name, seed, folder)], config)
-                result = smooth(log, config)
-                found = evaluate(result, truth_of_logs(log, config).trajectories)["joint"]
-                final.append(found["final"]["ate_rmse_m"])
-                causal.append(found["causal"]["ate_rmse_m"])
-            scans = [m for m in log.messages() if isinstance(m, Scan)][::10]
-            errors = f"{spread(final)} {spread(causal)}"
-            run_row(f"{name}: {label}", errors, result, ms_per_scan(front, scans))
+            config = replace(Config(), front_end=front)
+            rows = []
+            for seed in SEEDS:
+                done = thesis_runs.run(simulated_log(name, seed, folder), config)
+                own = done.aligned("vehicle", thesis_runs.WITH)
+                moved = transform(own, done.laser("vehicle", thesis_runs.WITH)[:, :2])
+                off = moved - done.laser("vehicle", thesis_runs.TRUE)[:, :2]
+                row = [float(np.sqrt(np.mean(np.sum(off**2, axis=1))))]
+                if name == "corridor":
+                    row.append(thesis_runs.end_error(done, thesis_runs.WITH))
+                    row.append(thesis_runs.wall_overlay(done, thesis_runs.WITH))
+                rows.append((*row, float(done.result.summary["counts"]["landmarks"])))
+            *found, landmarks = map(list, zip(*rows, strict=True))
+            ms = ms_per_scan(front, done.scans["vehicle"][::5])
+            columns = [worst(values) for values in found]
+            columns += ["-"] * (3 - len(columns))
+            shown = " | ".join([*columns, f"{np.median(landmarks):.0f}", f"{ms:.2f}"])
+            print(f"| {name}, {label} | {shown} |", flush=True)
+            errors[label] = found[0]
+        for label, own_errors in errors.items():
+            relative[label].append(float(np.mean(own_errors) / np.mean(errors["segments"])))
+    return relative
 
 
-def real_runs(path: Path, relations: Path) -> None:
-    """Errors over relations of one real log."""
+def real_runs(path: Path, relations: Path) -> dict[str, float]:
+    """Errors over relations of one real log; front end -> the error relative to segments."""
+    errors = {}
     for label, front in WHOLE.items():
         config = replace(Config(), front_end=front)
         log = open_logs([path], config)
         result = smooth(log, config)
         found = evaluate(result, relations=read_relations(relations))["relations"]
         scans = [m for m in log.messages() if isinstance(m, Scan)][::20]
-        both = (found[group]["trans_mean_m"] for group in ("all", "loops"))
-        errors = " ".join(f"{value:13.4f}" for value in both)
-        run_row(f"{path.stem}: {label}", errors, result, ms_per_scan(front, scans))
+        both = " | ".join(f"{found[group]['trans_mean_m']:.4f}" for group in ("all", "loops"))
+        landmarks, ms = result.summary["counts"]["landmarks"], ms_per_scan(front, scans)
+        print(f"| {path.stem}, {label} | {both} | - | {landmarks} | {ms:.2f} |", flush=True)
+        errors[label] = found["all"]["trans_mean_m"]
+    return {label: error / errors["segments"] for label, error in errors.items()}
 
 
 def scan_table(folder: Path) -> None:
     """Precision, recall, NIS and time of every front end on every scenario."""
-    print(
-        f"{'':30} {'':6} {'precision':>14} {'recall':>14} {'NIS / dof':>14} {'again':>7}"
-        f" {'per scan':>9} {'ms/scan':>8}"
-    )
+    print("| | what | precision | recall | NIS / dof | again | per scan | ms per scan |")
     for name in SCENARIOS:
         truths = [list(true_scans(name, seed, folder)) for seed in SEEDS]
         scans = [t.scan for t in truths[0]]
@@ -272,9 +316,9 @@ def scan_table(folder: Path) -> None:
         for label, config in FRONT.items():
             pairs = [score(name, config, t) for t in truths]
             ms = ms_per_scan(config, scans)
-            row(f"{name}: {label}", "lines", [a for a, _ in pairs], count, ms)
+            row(f"{name}, {label}", "lines", [a for a, _ in pairs], count, ms)
             if config.cylinders:
-                row(f"{name}: {label}", "points", [b for _, b in pairs], count, None)
+                row(f"{name}, {label}", "points", [b for _, b in pairs], count, None)
 
 
 def main() -> None:
@@ -287,15 +331,16 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         if not arguments.no_scans:
             scan_table(Path(folder))
-        print(
-            f"{'':34} {'final, all':>13} {'causal, loops':>13} {'landmarks':>10} {'ms/scan':>9}",
-            flush=True,
-        )
+        print("| | error (real: all) | end pose (real: loops) | walls | landmarks | ms per scan |")
+        relative: dict[str, list[float]] = {label: [] for label in WHOLE}
         if not arguments.no_runs:
-            simulated_runs(Path(folder))
+            relative = simulated_runs(Path(folder))
         for pair in arguments.logs:
             log, _, relations = pair.partition("=")
-            real_runs(Path(log), Path(relations))
+            for label, share in real_runs(Path(log), Path(relations)).items():
+                relative[label].append(share)
+        shares = [f"{label} {np.mean(v):.3f}" for label, v in relative.items() if v]
+        print("error relative to segments, mean over logs:", ", ".join(shares))
 
 
 if __name__ == "__main__":

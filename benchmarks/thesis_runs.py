@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from graphslam.core.config import Config
 from graphslam.core.config_io import load_config
 from graphslam.core.geometry import between, compose, transform
 from graphslam.core.records import Result, Scan, TrueLandmark
@@ -73,9 +74,8 @@ class Run:
         return align(self.laser(robot, source)[:, :2], self.laser(robot, TRUE)[:, :2])
 
 
-def run(log: Path, known_starts: bool = False) -> Run:
+def run(log: Path, config: Config = DEFAULTS) -> Run:
     """Smooth a simulated log and read its truth."""
-    config = STARTS_KNOWN if known_starts else DEFAULTS
     result = smooth(open_logs([log], config), config)
     known = read_truth([log], config)
     scans: dict[str, list[Scan]] = {}
@@ -99,11 +99,11 @@ def run(log: Path, known_starts: bool = False) -> Run:
     return Run(result, truth, kept, scans, faces, met)
 
 
-def simulated(scenario: Scenario, seed: int, folder: Path, known_starts: bool = False) -> Run:
+def simulated(scenario: Scenario, seed: int, folder: Path, config: Config = DEFAULTS) -> Run:
     """A scenario of one visit, simulated in ``folder`` and smoothed."""
     log = folder / f"{seed}.mcap"
     simulate(scenario, log, seed=seed)
-    return run(log, known_starts)
+    return run(log, config)
 
 
 # ------------------------------------------------------------ lab
@@ -226,9 +226,9 @@ def pioneer_errors(done: Run) -> tuple[float, float]:
 def two_robots(seed: int, folder: Path) -> dict[str, float]:
     """Experiment 3, thesis 6.1.3."""
     scenario = load_scenario("two-robots")
-    both = simulated(scenario, seed, folder, known_starts=True)
+    both = simulated(scenario, seed, folder, STARTS_KNOWN)
     (folder / f"{seed}.mcap").unlink()
-    single = simulated(alone(scenario), seed, folder, known_starts=True)
+    single = simulated(alone(scenario), seed, folder, STARTS_KNOWN)
     (error, sigma), (error_alone, sigma_alone) = pioneer_errors(both), pioneer_errors(single)
     return {
         "error with": error,

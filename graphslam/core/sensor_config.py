@@ -169,8 +169,9 @@ class FrontEndConfig:
     floor_angle_rad: error of a line that does not shrink with the number of points (material,
     flatness, bias of the laser). end_sigma_m: error of a segment's end where the wall ends.
     covariance: `incidence` weights each point by its noise along the normal, `thesis` uses eq. 4.32
-    as printed. Hough lines (4.7.1-4.7.3): hough_delta_d_m is the distance step Δd, equal to the
-    stripe width 2a; hough_gamma_steps the number of angles γ in a full turn; hough_d_max_m the
+    as printed. Hough lines (4.7.1-4.7.3): hough_votes says what counts votes, `opencv`'s transform
+    with the thesis' weights to rank and refine its lines, or the weighted accumulator of the
+    `thesis`; hough_delta_d_m is the distance step Δd, equal to the stripe width 2a; hough_gamma_steps the number of angles γ in a full turn; hough_d_max_m the
     largest distance d of a line. hough_threshold_m is the threshold of C with g = r times the angle
     between beams: metres of wall at normal incidence. cylinders: whether to extract them;
     cylinder_min_radius_m, cylinder_max_radius_m: their radii; cylinder_points: fewest returns.
@@ -192,6 +193,7 @@ class FrontEndConfig:
     floor_angle_rad: float = 0.005
     end_sigma_m: float = 0.05
     covariance: Literal["incidence", "thesis"] = "incidence"
+    hough_votes: Literal["opencv", "thesis"] = "opencv"
     hough_delta_d_m: float = 0.025
     hough_gamma_steps: int = 120
     hough_d_max_m: float = 20.0

@@ -10,7 +10,6 @@ each run must fit the line: the front of a cupboard does not become a part of th
 """
 
 import math
-from functools import lru_cache
 
 import numpy as np
 
@@ -18,13 +17,11 @@ from graphslam.core.config import FrontEndConfig
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.records import Observation
+from graphslam.perception.hough_votes import HOUGH_VOTES, SEED_POINTS
 from graphslam.perception.line_fit import fit_lines, observations
 from graphslam.perception.line_moments import fitted_line, fitted_lines, mean_square
 from graphslam.perception.ordered_scan import Indices, Mask, Sweep
 from graphslam.perception.segments import MISSING_BEAMS, allowed_rms, fewest_points, valid_lines
-
-SEED_POINTS = 3
-"""Fewest returns of a peak: any two lie on a line, and far ones have large weights."""
 
 RUN_POINTS = 3
 """Fewest returns of a run: one or two are where another wall crosses the line."""
@@ -77,7 +74,8 @@ def find_lines(sweep: Sweep, free: Mask, config: FrontEndConfig) -> tuple[Indice
     free = free.copy()
     lines: list[Indices] = []
     if np.count_nonzero(free) >= fewest_points(config):
-        votes = Votes(sweep.points, sweep.ranges[sweep.beam] * sweep.step_rad, free, config)
+        g = sweep.ranges[sweep.beam] * sweep.step_rad
+        votes = HOUGH_VOTES[config.hough_votes](sweep.points, g, free, config)
         while len(seed := votes.peak()):
             rows = _grow(seed, sweep, free, config)
             # the returns of a rejected peak stop voting too, but may be added to another line
@@ -87,61 +85,6 @@ def find_lines(sweep: Sweep, free: Mask, config: FrontEndConfig) -> tuple[Indice
                 free[rows] = False
     sizes = np.array([len(rows) for rows in lines], dtype=np.intp)
     return np.concatenate((np.zeros(0, dtype=np.intp), *lines)), np.cumsum(sizes) - sizes
-
-
-class Votes:
-    """Accumulator C(d, γ) of eq. 4.29-4.31 for the returns that still vote.
-
-    ``points`` (k, 2) m, laser frame, with ``weights`` (k,) g; ``voting`` (k,): which of them vote.
-    A line at (d, γ + π) is the one at (-d, γ): angles cover half a turn, distances both signs.
-    Stripes touch (Δd = 2a), so at each angle a return is in one stripe.
-    """
-
-    def __init__(self, points: Array, weights: Array, voting: Mask, config: FrontEndConfig) -> None:
-        normals = _normals(config.hough_gamma_steps)
-        reach = min(config.hough_d_max_m, float(np.abs(points).sum(axis=1).max()))
-        half = round(reach / config.hough_delta_d_m)
-        self._width = 2 * half + 1
-        size = self._width * normals.shape[1]
-        stripe = np.rint(points @ normals / config.hough_delta_d_m).astype(np.intp)
-        outside = np.abs(stripe) > half
-        stripe += half + self._width * np.arange(normals.shape[1])
-        stripe[outside] = size  # one extra cell, which is ignored
-        self._stripe, self._weights, self._voting = stripe, weights, voting.copy()
-        self._threshold = config.hough_threshold_m
-        cells = stripe[voting]
-        each = np.repeat(weights[voting], stripe.shape[1])
-        self.C = np.bincount(cells.ravel(), each, minlength=size + 1)[:-1]
-        self.C[np.bincount(cells.ravel(), minlength=size + 1)[:-1] < SEED_POINTS] = 0.0
-
-    def peak(self) -> Indices:
-        """Rows of the returns in the stripe with most votes; none if it is below the threshold."""
-        while True:
-            cell = int(np.argmax(self.C))
-            if self.C[cell] <= self._threshold:
-                return np.zeros(0, dtype=np.intp)
-            inside = self._stripe[:, cell // self._width] == cell
-            rows = np.flatnonzero(inside & self._voting)
-            if len(rows) >= SEED_POINTS:
-                return rows
-            self.C[cell] = 0.0
-
-    def remove(self, rows: Indices) -> None:
-        """These returns stop voting."""
-        rows = rows[self._voting[rows]]
-        self._voting[rows] = False
-        cells = self._stripe[rows]
-        each = np.repeat(self._weights[rows], cells.shape[1])
-        inside = cells.ravel() < len(self.C)
-        np.subtract.at(self.C, cells.ravel()[inside], each[inside])
-
-
-@lru_cache(maxsize=8)
-def _normals(gamma_steps: int) -> Array:
-    """Unit normals (2, t) of half a turn of γ; an odd number of steps is rounded up."""
-    t = (gamma_steps + 1) // 2
-    gamma = np.pi / t * np.arange(t)
-    return np.array((np.cos(gamma), np.sin(gamma)))
 
 
 def _grow(seed: Indices, sweep: Sweep, free: Mask, config: FrontEndConfig) -> Indices:

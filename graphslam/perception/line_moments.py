@@ -23,7 +23,16 @@ def fitted_lines(moments: Array) -> Array:
     x, y, xx, xy, yy = moments[1:] / moments[0]
     direction = 0.5 * np.arctan2(2 * (xy - x * y), xx - x * x - yy + y * y)
     a, b = -np.sin(direction), np.cos(direction)
-    d = a * x + b * y
+    return _lines(a, b, a * x + b * y)
+
+
+def offset_lines(d: Array, gamma: Array) -> Array:
+    """The lines q (6, p) at distances d (p,) m, with normals in the directions gamma (p,) rad."""
+    return _lines(np.cos(gamma), np.sin(gamma), d)
+
+
+def _lines(a: Array, b: Array, d: Array) -> Array:
+    """The lines a x + b y = d as q (6, p); a² + b² = 1."""
     return np.array((d * d, -2 * d * a, -2 * d * b, a * a, 2 * a * b, b * b))
 
 

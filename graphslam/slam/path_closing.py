@@ -45,29 +45,41 @@ class ClosedPaths:
 
     def uncertainty(self, steps: Sequence[Step]) -> "LandmarkUncertainty":
         """How well the relative position of landmarks is known that ``steps`` have."""
-        first: dict[int, int] = {}
+        seen: dict[int, dict[int, None]] = {}
         for step in steps:
             for a in step.associations:
-                if isinstance(a.target, int) and a.target not in first:
-                    first[a.target] = self.node(a.robot, a.time_ns)
-        return LandmarkUncertainty(self.graph, first)
+                if isinstance(a.target, int):
+                    seen.setdefault(a.target, {})[self.node(a.robot, a.time_ns)] = None
+        nodes = {number: np.array(list(found)) for number, found in seen.items()}
+        return LandmarkUncertainty(self.graph, nodes)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkUncertainty:
     """What the graph of submaps says about the relative position of landmarks.
 
-    ``node``: landmark -> the submap where it was seen first. Called as `PairUncertainty`.
+    ``nodes``: landmark -> the submaps where it was seen. Called as `PairUncertainty`. A wall may be
+    as long as the path: where it is at a place is known by the submap nearest to that place, not
+    by the one, far away, where it was seen first.
     """
 
     graph: SubmapGraph
-    node: Mapping[int, int]
+    nodes: Mapping[int, IntArray]
+
+    def _nearest(self, landmarks: IntArray, at: Array) -> IntArray:
+        """Of the submaps where each landmark (m,) was seen, the nearest to a place (m, 2)."""
+        out = np.empty(len(landmarks), dtype=np.int64)
+        for k, number in enumerate(landmarks.tolist()):
+            nodes = self.nodes[number]
+            d = self.graph.poses[nodes, :2] - at[k]
+            out[k] = nodes[np.argmin(d[:, 0] ** 2 + d[:, 1] ** 2)]
+        return out
 
     def __call__(self, a: IntArray, b: IntArray, at: Array, normals: Array) -> Array:
         """Sigmas (m, 2): across at a place (m, 2) with normals (m, 2), and of the direction."""
         if not len(a):
             return np.zeros((0, 2))
-        i, j = (np.array([self.node[n] for n in numbers.tolist()]) for numbers in (a, b))
+        i, j = self._nearest(a, at), self._nearest(b, at)
         h, cov = self.graph.relative(i, j)
         cov = CHAIN_INFLATION * cov
         base = self.graph.poses[j]

@@ -6,7 +6,7 @@ import numpy as np
 from graphslam.core.geometry import between, compose, rotate_cov
 from graphslam.estimation import factors
 from graphslam.mapping.submap_graph import RelativePoses, SubmapGraph
-from graphslam.slam.path_closing import follow
+from graphslam.slam.path_closing import LandmarkUncertainty, follow
 
 START = 1e-8 * np.eye(3)[None]
 COV = np.diag([0.05, 0.03, 0.02]) ** 2
@@ -162,3 +162,30 @@ def test_a_path_whose_start_is_uncertain_is_placed_by_its_closures():
     graph.solve(same)
     np.testing.assert_allclose(graph.poses[:4], poses, atol=0.03)
     np.testing.assert_allclose(graph.poses[4:, :2], graph.poses[:4, :2], atol=0.08)
+
+
+def test_two_visits_of_a_long_wall_are_compared_where_both_were_near():
+    """Out along a corridor of 60 m and back, a closure at the start: the wall is known as well as
+    the closure says there, though it was first seen at one end on the way out, at the other on the
+    way back. From those two submaps, 58 m apart, its relative position is not known to 10 cm."""
+    x = np.array([*np.arange(0.0, 60.0, 2.0), *np.arange(58.0, -2.0, -2.0)])
+    poses = np.zeros((len(x), 3))
+    poses[:, 0], poses[len(x) // 2 :, 2] = x, np.pi
+    n = np.arange(len(x) - 1)
+    cov = np.tile(np.diag([0.02, 0.005, 0.002]) ** 2, (len(n), 1, 1))
+    graph = SubmapGraph(
+        poses, RelativePoses(n, n + 1, between(poses[:-1], poses[1:]), cov), [0], START
+    )
+    graph.solve(
+        RelativePoses(
+            np.array([0]), np.array([len(x) - 1]), between(poses[0], poses[-1])[None],
+            np.diag([0.01, 0.01, 0.002])[None] ** 2,
+        )
+    )  # fmt: skip
+    out, back, at = np.array([0]), np.array([1]), np.array([[1.0, 1.2]])
+    normal = np.array([[0.0, 1.0]])
+    way_out, way_back = np.arange(30), np.arange(30, 60)
+    ends = LandmarkUncertainty(graph, {0: way_out[:1], 1: way_back[:1]})
+    everywhere = LandmarkUncertainty(graph, {0: way_out, 1: way_back})
+    assert ends(out, back, at, normal)[0, 0] > 0.1
+    assert everywhere(out, back, at, normal)[0, 0] < 0.04
