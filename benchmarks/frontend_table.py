@@ -27,13 +27,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import thesis_runs
 from common import best_cpu_s, parser, simulated_log
 from numpy.typing import NDArray
 
 from graphslam.core.config import Config, FrontEndConfig
 from graphslam.core.geometry import Array, between, rotate_cov, transform, wrap
 from graphslam.core.records import Observation, Scan
+from graphslam.evaluation import thesis_experiments
 from graphslam.evaluation.metrics import evaluate
 from graphslam.evaluation.relation_metrics import read_relations
 from graphslam.logs import open_logs
@@ -269,14 +269,14 @@ def simulated_runs(folder: Path) -> dict[str, list[float]]:
             config = replace(Config(), front_end=front)
             rows = []
             for seed in SEEDS:
-                done = thesis_runs.run(simulated_log(name, seed, folder), config)
-                own = done.aligned("vehicle", thesis_runs.WITH)
-                moved = transform(own, done.laser("vehicle", thesis_runs.WITH)[:, :2])
-                off = moved - done.laser("vehicle", thesis_runs.TRUE)[:, :2]
+                done = thesis_experiments.run(simulated_log(name, seed, folder), config)
+                own = done.aligned("vehicle", thesis_experiments.WITH)
+                moved = transform(own, done.laser("vehicle", thesis_experiments.WITH)[:, :2])
+                off = moved - done.laser("vehicle", thesis_experiments.TRUE)[:, :2]
                 row = [float(np.sqrt(np.mean(np.sum(off**2, axis=1))))]
                 if name == "corridor":
-                    row.append(thesis_runs.end_error(done, thesis_runs.WITH))
-                    row.append(thesis_runs.wall_overlay(done, thesis_runs.WITH))
+                    row.append(thesis_experiments.end_error(done, thesis_experiments.WITH))
+                    row.append(thesis_experiments.wall_overlay(done, thesis_experiments.WITH))
                 rows.append((*row, float(done.result.summary["counts"]["landmarks"])))
             *found, landmarks = map(list, zip(*rows, strict=True))
             ms = ms_per_scan(front, done.scans["vehicle"][::5])

@@ -12,8 +12,11 @@ import numpy as np
 from figure_style import BLUE, GREY, MARK, RED, WALL, legend, panels, path, scatter, window
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from thesis_runs import (
+
+from graphslam.core.geometry import transform
+from graphslam.evaluation.thesis_experiments import (
     CORNER_M,
+    DEFAULTS,
     TRUE,
     WITH,
     WITHOUT,
@@ -24,9 +27,8 @@ from thesis_runs import (
     run,
     simulated,
     visits_of_the_start,
+    with_known_starts,
 )
-
-from graphslam.core.geometry import transform
 from graphslam.simulation import load_scenario, simulate
 
 SEED = 0
@@ -110,9 +112,9 @@ def corridor(folder: Path) -> dict[str, Figure]:
 def two_robots(folder: Path) -> dict[str, Figure]:
     """Thesis figures 6-10 to 6-13."""
     scenario = load_scenario("two-robots")
-    both = simulated(scenario, SEED, folder, known_starts=True)
+    both = simulated(scenario, SEED, folder, with_known_starts(DEFAULTS))
     (folder / f"{SEED}.mcap").unlink()
-    single = simulated(alone(scenario), SEED, folder, known_starts=True)
+    single = simulated(alone(scenario), SEED, folder, with_known_starts(DEFAULTS))
     scans, axes = panels(2, (10, 4.6))
     close, details = panels(2, (10, 4.4))
     pole = both.faces["pole 6"].pose[:2]

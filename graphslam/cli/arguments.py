@@ -124,7 +124,7 @@ Experiment = Annotated[
     str,
     typer.Argument(
         metavar="NAME|FILE.toml",
-        help="An experiment file, or ekf-versus-smoothing, filters, thesis, three-filters or "
+        help="An experiment file, or ekf-versus-smoothing, filters, thesis, rooms, three-filters or "
         "consistency.",
     ),
 ]

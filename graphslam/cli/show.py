@@ -241,6 +241,10 @@ def experiment(found: Mapping[str, Any], directory: Path) -> None:
     from graphslam.results.report_experiment import coverage
 
     console = _console()
+    if found["kind"] == "chapter":
+        _chapter(console, found)
+        console.print(f"report: {directory / 'report.html'}")
+        return
     rows = []
     for row in found["table"]:
         name = " ".join(str(row[key]) for key in ("scenario", "front_end", "variant") if key in row)
@@ -267,6 +271,18 @@ def experiment(found: Mapping[str, Any], directory: Path) -> None:
     for warning in found["warnings"]:
         console.print(f"warning: {warning}")
     console.print(f"report: {directory / 'report.html'}")
+
+
+def _chapter(console: Console, found: Mapping[str, Any]) -> None:
+    """The thesis' experiments: a table each, and what failed."""
+    from graphslam.evaluation.thesis_chapter import table_rows
+
+    for experiment in found["chapter"].values():
+        head, lines = table_rows(experiment)
+        console.print(experiment["title"])
+        console.print(_table(head, lines))
+    for warning in found["warnings"]:
+        console.print(f"warning: {warning}")
 
 
 def _console() -> Console:

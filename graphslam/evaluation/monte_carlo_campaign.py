@@ -18,6 +18,7 @@ from dataclasses import asdict, dataclass
 from functools import cache
 from multiprocessing import get_context, resource_tracker
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from graphslam.evaluation.monte_carlo_bench import draw_run, run_seed
 from graphslam.evaluation.monte_carlo_bench_run import run_bench
 from graphslam.evaluation.monte_carlo_definition import Definition
 from graphslam.evaluation.monte_carlo_log_run import run_log
+from graphslam.evaluation.thesis_experiments import EXPERIMENTS
 
 Row = dict[str, Any]
 
@@ -47,7 +49,10 @@ class Job:
 
 def list_jobs(definition: Definition) -> list[Job]:
     """Every run of an experiment; all variants of a run are neighbours."""
-    if definition.logs is None:
+    if definition.chapter is not None:
+        chapter = definition.chapter
+        sources = [(name, f) for name in chapter.experiments for f in chapter.front_ends]
+    elif definition.logs is None:
         sources = [("", "")]
     else:
         sources = [(s, f) for s in definition.logs.scenarios for f in definition.logs.front_ends]
@@ -72,6 +77,10 @@ def run_job(definition: Definition, job: Job) -> Row:
         run = draw_run(definition.bench, job.scale, rng)
         return run_bench(run, definition.config(job.variant))
     config = definition.config(job.variant, f"front_end.name={job.front_end}")
+    if definition.chapter is not None:
+        with TemporaryDirectory(prefix="graphslam-") as folder:
+            experiment = EXPERIMENTS[job.scenario]
+            return {"values": experiment(definition.seed + job.run, Path(folder), config)}
     drawn = definition.logs is not None and definition.logs.draw_starts
     seed = int(sequence.generate_state(1)[0])
     return run_log(job.scenario, job.scale, seed, config, draw_starts=drawn)

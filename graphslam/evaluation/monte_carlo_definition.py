@@ -13,6 +13,7 @@ from typing import Any
 from graphslam.core.config import Config
 from graphslam.core.config_io import load_config
 from graphslam.core.errors import ConfigError
+from graphslam.evaluation.thesis_experiments import EXPERIMENTS as THESIS_EXPERIMENTS
 from graphslam.simulation import load_scenario
 from graphslam.simulation.scenario import NOT_NEGATIVE, POSITIVE, Point, ScenarioError
 from graphslam.simulation.scenario_parser import build
@@ -23,7 +24,9 @@ _PRESET = "preset="
 #: name -> file of an experiment of the package
 EXPERIMENTS: dict[str, Path] = {
     name: _FOLDER / f"{name}.toml"
-    for name in ("ekf-versus-smoothing", "filters", "thesis", "consistency", "three-filters")
+    for name in (
+        "ekf-versus-smoothing", "filters", "thesis", "rooms", "consistency", "three-filters",
+    )
 }
 
 
@@ -101,12 +104,24 @@ class Logs:
 
 
 @dataclass(frozen=True)
+class Chapter:
+    """The experiments of the thesis' chapter 6, by their names, with front ends.
+
+    Every seed is the sum of the definition's and the number of the run.
+    """
+
+    experiments: tuple[str, ...] = tuple(THESIS_EXPERIMENTS)
+    front_ends: tuple[str, ...] = ("segments", "hough")
+
+
+@dataclass(frozen=True)
 class Definition:
     """An experiment: every variant at every noise scale, ``runs`` seeds each.
 
     variants: name -> settings as for ``--set``, over the common ``settings``; ``preset=NAME`` among
-    them is as ``--preset``, under all of them. Exactly one of
-    ``bench`` (steps drawn directly, true associations) and ``logs`` (simulate, smooth, evaluate).
+    them is as ``--preset``, under all of them. Exactly one of ``bench`` (steps drawn directly, true
+    associations), ``logs`` (simulate, smooth, evaluate) and ``chapter`` (the thesis' own
+    experiments).
     name: the file's; it is not a key.
     """
 
@@ -118,6 +133,7 @@ class Definition:
     settings: tuple[str, ...] = ()
     bench: Bench | None = None
     logs: Logs | None = None
+    chapter: Chapter | None = None
     name: str = field(default="", metadata={"hidden": True})
 
     def config(self, variant: str, *more: str) -> Config:
@@ -181,8 +197,10 @@ def _problem(found: Definition) -> str:
     """What is wrong with the combination of keys; empty if nothing."""
     if not found.variants:
         return "variants: is empty; give at least one, for example isam2 = []"
-    if (found.bench is None) == (found.logs is None):
-        return "give exactly one of the tables bench and logs"
+    if sum(table is not None for table in (found.bench, found.logs, found.chapter)) != 1:
+        return "give exactly one of the tables bench, logs and chapter"
+    if found.chapter is not None:
+        return _chapter_problem(found.chapter, found.noise_scales)
     if not found.noise_scales or len(set(found.noise_scales)) < len(found.noise_scales):
         return "noise_scales: give at least one, each once"
     if found.bench is not None:
@@ -190,3 +208,9 @@ def _problem(found: Definition) -> str:
         if len(lengths) != 1 or lengths == {0}:
             return "bench.robots: all paths must have the same number of steps, at least one"
     return ""
+
+
+def _chapter_problem(chapter: Chapter, noise_scales: tuple[float, ...]) -> str:
+    if set(chapter.experiments) - set(THESIS_EXPERIMENTS) or not chapter.experiments:
+        return f"chapter.experiments: give some of {', '.join(THESIS_EXPERIMENTS)}"
+    return "" if noise_scales == (1.0,) else "noise_scales: the thesis' experiments have none"

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from graphslam.core.errors import OutputError
+from graphslam.evaluation.thesis_chapter import markdown_page, table_rows
 from graphslam.results.file_formats import to_json
 from graphslam.results.report_experiment import experiment_figures, experiment_page
 
@@ -12,10 +13,14 @@ from graphslam.results.report_experiment import experiment_figures, experiment_p
 def save_summary(summary: Mapping[str, Any], directory: Path) -> None:
     """Write summary.json, report.html and figures/*.svg, each atomically.
 
+    Of the thesis' chapter 6 also chapter.md: its tables.
+
     Raises:
         OutputError: nothing can be written there.
     """
-    files = {"summary.json": to_json(summary, "summary"), "report.html": experiment_page(summary)}
+    files = {"summary.json": to_json(summary, "summary"), "report.html": _page(summary)}
+    if summary["kind"] == "chapter":
+        files["chapter.md"] = markdown_page(summary)
     figures = experiment_figures(summary)
     files |= {f"figures/{name}.svg": text for name, text in figures.items()}
     try:
@@ -27,3 +32,11 @@ def save_summary(summary: Mapping[str, Any], directory: Path) -> None:
             part.replace(path)
     except OSError as error:
         raise OutputError(f"{directory}: cannot be written: {error.strerror}") from error
+
+
+def _page(summary: Mapping[str, Any]) -> str:
+    tables = {
+        experiment["title"]: table_rows(experiment)
+        for experiment in summary.get("chapter", {}).values()
+    }
+    return experiment_page(summary, tables)

@@ -11,6 +11,7 @@ from scipy.stats import chi2, norm
 from graphslam.core.geometry import Array
 from graphslam.evaluation.cramer_rao_bound import Bound, cramer_rao_bound
 from graphslam.evaluation.monte_carlo_definition import Definition
+from graphslam.evaluation.thesis_chapter import summarise_chapter
 
 Row = Mapping[str, Any]
 
@@ -50,7 +51,7 @@ def summarise(definition: Definition, rows: Sequence[Row]) -> dict[str, Any]:
     found: dict[str, Any] = {
         "name": definition.name,
         "description": definition.description,
-        "kind": "bench" if bench else "logs",
+        "kind": "bench" if bench else "chapter" if definition.chapter else "logs",
         "runs": definition.runs,
         "seed": definition.seed,
         "noise_scales": list(definition.noise_scales),
@@ -65,11 +66,15 @@ def summarise(definition: Definition, rows: Sequence[Row]) -> dict[str, Any]:
     }
     if bench:
         return {**found, **_bench(definition, groups)}
+    if definition.chapter:
+        return {**found, "chapter": summarise_chapter(rows)}
     limit = definition.logs.diverged_m if definition.logs else 0.0
     return {**found, "table": [_log_row(key, group, limit) for key, group in groups.items()]}
 
 
 def _diverged_if(definition: Definition) -> str:
+    if definition.chapter:
+        return "not judged"
     if definition.logs:
         return f"the final trajectory is more than {definition.logs.diverged_m:g} m off somewhere"
     return (

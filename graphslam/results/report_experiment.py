@@ -5,7 +5,7 @@ Everything is drawn from the summary of `graphslam.evaluation.monte_carlo_summar
 `FIGURES` lists the figures of an experiment on the bench.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from typing import Any
 
@@ -19,8 +19,15 @@ from graphslam.results.report_figure import Drawing, panels, positive, svg
 Summary = Mapping[str, Any]
 
 
-def experiment_page(summary: Summary) -> str:
-    """The report of an experiment as one self-contained HTML document."""
+#: title -> head and lines of a table
+Tables = Mapping[str, tuple[Sequence[str], Sequence[Sequence[str]]]]
+
+
+def experiment_page(summary: Summary, tables: Tables | None = None) -> str:
+    """The report of an experiment as one self-contained HTML document.
+
+    ``tables`` are those of an experiment that brings its own, instead of errors over logs.
+    """
     sections = [_header(summary), _warnings(summary)]
     if summary["kind"] == "bench":
         drawings = [html.figure(draw(summary), *text) for draw, *text in FIGURES.values()]
@@ -28,6 +35,10 @@ def experiment_page(summary: Summary) -> str:
             html.section("Consistency", _consistency(summary)),
             html.section("Errors against the Cramér-Rao bound", _errors(summary)),
             html.section("Figures", html.figure_grid(drawings)),
+        ]
+    elif tables:
+        sections += [
+            html.section(title, html.table(head, lines)) for title, (head, lines) in tables.items()
         ]
     else:
         sections.append(html.section("Errors over logs", _logs(summary)))
@@ -62,8 +73,8 @@ def _header(summary: Summary) -> str:
         ("runs", summary["rows"]),
         ("variants", len(summary["variants"])),
         ("noise scales", len(summary["noise_scales"])),
-        ("failed", sum(row["failed"] for row in summary["table"])),
-        ("diverged", sum(row.get("diverged", 0) for row in summary["table"])),
+        ("failed", sum(summary["errors"].values())),
+        ("diverged", sum(row.get("diverged", 0) for row in summary.get("table", ()))),
         ("run time, s", summary["seconds"]),
     )
     note = (

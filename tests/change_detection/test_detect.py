@@ -206,6 +206,21 @@ def test_what_appeared_is_found_and_outlined():
     assert x @ np.roll(y, -1) - y @ np.roll(x, -1) > 0  # counter-clockwise
 
 
+def test_a_change_needs_as_many_beams_as_the_setting_says():
+    """`min_beams`, for a region as a whole; a piece with fewer beams is not tested at all."""
+    rng = np.random.default_rng(4)
+    before, after = visit([], drive(50), rng), visit([box(5, 4)], drive(50, 0.1), rng)
+    (change,) = same(before, after).changes
+    few = same(before, after, min_beams=10 * change.beams)
+    assert not few.changes and not few.compared.any()
+    grid = grid_over(after.ends[after.surface], 0.025, 10**6)
+    surface = fit_surfaces(after, grid, SIGMA, CONFIG)
+    usual, strict = (
+        beams_past_surfaces(surface, before, SIGMA, replace(CONFIG, min_beams=n)) for n in (5, 50)
+    )
+    assert usual.tested.sum() > strict.tested.sum() > 0
+
+
 def test_what_vanished_is_found():
     rng = np.random.default_rng(5)
     found = same(visit([box(5, 4)], drive(50), rng), visit([], drive(50, 0.1), rng))

@@ -124,6 +124,28 @@ def test_wheel_jacobian_equals_finite_differences(left, right):
     )
 
 
+@pytest.mark.parametrize("row", [(3.0, 5.0), (-4.0, 4.5), (2.0, 2.0)])
+def test_counting_noise_enters_position_and_heading_of_an_increment(row):
+    """4.13: J Var(δθ) Jᵀ with J the derivative of the increment, heading included, by both wheel
+    angles, here by finite differences; each wheel has the same sigma. The rest of 4.13, radii and
+    axle, is the calibration's."""
+    config = replace(NOISE, count_sigma_rad=0.02)
+    found = increments("wheels", [row], config=config)
+    without = increments("wheels", [row], config=replace(config, count_sigma_rad=0.0))
+
+    def pose(angles):
+        return exp(wheel_twist(np.atleast_2d(angles), ROBOT))[0]
+
+    J = jacobian(pose, np.array(row))
+    counting = found.cov[0] - without.cov[0]
+    np.testing.assert_allclose(counting, 0.02**2 * J @ J.T, rtol=1e-6, atol=1e-12)
+    # the heading's part: both radii over the axle
+    np.testing.assert_allclose(counting[2, 2], 0.02**2 * (0.11**2 + 0.1**2) / 0.6**2, rtol=1e-9)
+    still = increments("wheels", [(0.0, 0.0)], config=config)
+    before = increments("wheels", [(0.0, 0.0)], config=replace(config, count_sigma_rad=0.0))
+    np.testing.assert_array_equal(still.cov, before.cov)  # a wheel that stands is not miscounted
+
+
 def test_model_error_grows_with_path_and_turning_as_printed():
     """4.14, each coefficient by itself, and unsigned when reversing."""
     config = OdometryConfig(k_x_m=1, k_x_rad=10, k_y_m=2, k_y_rad=20, k_phi_m=3, k_phi_rad=30)

@@ -504,7 +504,7 @@ def test_a_noise_scale_multiplies_every_error_of_the_sensors_and_nothing_else():
 
 def test_a_run_over_a_log_is_evaluated(tmp_path):
     """The thesis' two robots with a tenth of the noise: found within 5 cm of the truth."""
-    definition = replace(load_definition("thesis"), noise_scales=(0.1,))
+    definition = replace(load_definition("rooms"), noise_scales=(0.1,))
     row = run_job(definition, Job("two-robots", "segments", 0.1, "isam2", 0))
     assert row["joint"]["final"]["ate_rmse_m"] < 0.05
     assert set(row["robots"]) == {"pioneer", "vehicle"}

@@ -1,5 +1,7 @@
 """Cylinders: what is one, what is none, and whether its covariance is honest."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from walls import cast, make_scan
@@ -79,6 +81,23 @@ def test_the_covariance_of_the_centre_is_honest():
             nis.append(e @ np.linalg.solve(found.cov, e) / 2)
     assert len(nis) > 330
     assert 0.3 < np.mean(nis) < 1.15
+
+
+@pytest.mark.parametrize("fewest, found", [(4, 1), (5, 1), (6, 0)])
+def test_a_cylinder_needs_as_many_returns_as_the_setting_says(fewest, found):
+    """`cylinder_points`; this pole is met by five beams."""
+    scan = see([(4.0, 0.0, 0.08)])
+    assert np.count_nonzero(scan.ranges < 5) == 5
+    assert len(points(scan, replace(CONFIG, cylinder_points=fewest))) == found
+
+
+def test_a_cylinder_needs_more_space_beside_it_than_the_gap():
+    """`gap_m`, 30 cm: 15 cm before a wall a pole is a part of it, 45 cm before it is not."""
+    for behind_m, found in ((0.15, 0), (0.45, 1)):
+        wall = [[[3.0 + behind_m, -9.0], [3.0 + behind_m, 9.0]]]
+        assert len(points(see([(3.0, 0.0, 0.1)], wall))) == found
+    near = [[[3.15, -9.0], [3.15, 9.0]]]
+    assert len(points(see([(3.0, 0.0, 0.1)], near), replace(CONFIG, gap_m=0.1))) == 1
 
 
 def test_a_pillar_at_a_wall_and_one_half_hidden_are_not_free_standing():

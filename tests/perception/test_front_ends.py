@@ -14,8 +14,11 @@ from graphslam.core.config import FrontEndConfig
 from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import compose, rotate_cov, rotation, wrap
 from graphslam.perception.front_ends import FRONT_ENDS
+from graphslam.perception.hough import _borders as run_borders
 from graphslam.perception.line_fit import fit_lines, observations
-from graphslam.perception.ordered_scan import scan_points
+from graphslam.perception.ordered_scan import make_sweep, scan_points
+from graphslam.perception.segments import _chain_starts as chain_starts
+from graphslam.perception.segments import find_segments
 from graphslam.perception.variance_split import split_by_variance
 
 segments = FRONT_ENDS["segments"]
@@ -237,6 +240,63 @@ def test_noise_does_not_split_a_wall():
 def test_a_recess_in_a_wall_is_its_own_segment(offset_m, parts):
     walls = [[[3.0, -2.0], [3.0, 0.0]], [[3 + offset_m, 0.0], [3 + offset_m, 1.5]]]
     assert len(segments(scan_of(walls, sigma=0.01), CONFIG)) == parts
+
+
+@pytest.mark.parametrize("bend_m, parts", [(0.05, 1), (0.06, 2)])
+def test_a_wall_is_split_where_it_bends_by_more_than_the_setting_says(bend_m, parts):
+    """`split_m`, 5 cm: the largest deviation from the chord inside one segment."""
+    wall = [[[3, -1.5], [3 - bend_m, 0]], [[3 - bend_m, 0], [3, 1.5]]]
+    assert len(segments(scan_of(wall), CONFIG)) == parts
+
+
+@pytest.mark.parametrize("step_m, parts", [(0.09, 1), (0.11, 2)])
+def test_two_walls_are_two_if_their_step_exceeds_twice_the_deviation(step_m, parts):
+    """One line between them deviates by half the step from either."""
+    walls = [[[3, -1.5], [3, 0]], [[3 - step_m, 0], [3 - step_m, 1.5]]]
+    assert len(segments(scan_of(walls), CONFIG)) == parts
+
+
+def test_a_return_farther_than_the_deviation_from_its_segment_is_left_out():
+    """A strip 4 cm proud of the wall is a part of the wall, one of 6 cm is not."""
+    kept = []
+    for proud_m in (0.04, 0.06):
+        strip = [[3 - proud_m, 0.2], [3 - proud_m, 0.3]]
+        sweep = make_sweep(scan_of([[[3, -1.5], [3, 1.5]], strip], step_deg=1.0), 30.0)
+        found = find_segments(sweep, CONFIG)
+        kept.append(np.count_nonzero(sweep.points[found.rows, 0] < 2.99))
+    assert kept[0] >= 2 and kept[1] == 0
+
+
+@pytest.mark.parametrize("step_m, chains", [(0.49, 1), (0.51, 2)])
+def test_neighbouring_returns_are_one_chain_up_to_a_gap_that_grows_with_range(step_m, chains):
+    """`gap_m` + `gap_ratio` times the range: 0.3 + 0.05 * 4 m."""
+    walls = [[[4, -1], [4, 0]], [[4 + step_m, 0], [4 + step_m, 1]]]
+    assert len(chain_starts(make_sweep(scan_of(walls), 30.0), CONFIG)) == chains
+
+
+@pytest.mark.parametrize("setting", [{"gap_m": 0.15}, {"gap_ratio": 0.0125}])
+def test_a_smaller_gap_cuts_chains_and_lines_of_the_hough_transform(setting):
+    """Two collinear boards 40 cm apart, 4 m away, with a thing between them: the gap between runs
+    is 0.5 m by default, and smaller with either setting smaller."""
+    walls = [[[4, -1.4], [4, -0.2]], [[4, 0.2], [4, 1.4]], [[3, -0.15], [3, 0.15]]]
+    sweep = make_sweep(scan_of(walls), 30.0)
+    on = np.flatnonzero(np.abs(sweep.points[:, 0] - 4) < 1e-6)
+    assert len(run_borders(on, np.pi / 2, sweep, CONFIG)) == 2  # begin and end of one run
+    assert len(run_borders(on, np.pi / 2, sweep, replace(CONFIG, **setting))) == 3
+    step = [[[4, -1], [4, 0]], [[4.45, 0], [4.45, 1]]]
+    behind = make_sweep(scan_of(step), 30.0)
+    assert len(chain_starts(behind, CONFIG)) == 1
+    assert len(chain_starts(behind, replace(CONFIG, **setting))) == 2
+
+
+@pytest.mark.parametrize("points, kept", [(12, True), (13, False)])
+def test_a_line_needs_as_many_returns_as_the_setting_says(points, kept):
+    """`min_points`; the two end returns of a chain count."""
+    wall = [[3.0, -0.3], [3.0, 0.3]]
+    seen = np.count_nonzero(np.isfinite(scan_of([wall], step_deg=1.0).ranges))
+    assert seen == 11 or seen == 12
+    config = replace(CONFIG, min_points=points - 12 + seen)
+    assert bool(segments(scan_of([wall], step_deg=1.0), config)) == kept
 
 
 def test_a_grazing_corridor_wall_is_followed_although_its_returns_are_far_apart():

@@ -1,30 +1,40 @@
 """The thesis' experiments (chapter 6), one seed each: simulated, smoothed, held against the truth.
 
-Smoothed with default settings; where the thesis knows where its robots start relative to each
-other, `start.from_truth` is set and nothing else. `thesis_experiments.py` runs them over seeds,
-`thesis_figures.py` draws them.
+Where the thesis knows where its robots start relative to each other, `start.from_truth` is set.
+`thesis_chapter` makes tables of many seeds, the benchmark `thesis_figures.py` draws one.
 """
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from graphslam.change_detection import detect_changes, load_visit
 from graphslam.core.config import Config
 from graphslam.core.config_io import load_config
 from graphslam.core.geometry import between, compose, transform
 from graphslam.core.records import Result, Scan, TrueLandmark
 from graphslam.evaluation.trajectory_metrics import align, pair_poses
 from graphslam.logs import open_logs, read_true_associations, read_truth
+from graphslam.results.folder import load, save
 from graphslam.simulation import Scenario, load_scenario, simulate
+from graphslam.simulation.recording import NoiseFreeScans
 from graphslam.slam.smooth import smooth
 
 DEFAULTS = load_config()
-STARTS_KNOWN = load_config(overrides=["start.from_truth=true"])
+
+
+def with_known_starts(config: Config) -> Config:
+    """The same settings with every robot's start known."""
+    return replace(config, start=replace(config.start, from_truth=True))
+
 
 Array = NDArray[np.float64]
+IntArray = NDArray[np.intp]
 
 #: where a robot's poses are taken from
 WITH, WITHOUT, TRUE = "with landmarks", "dead reckoning", "true poses"
@@ -132,9 +142,9 @@ def corner_scatter(lab: Run, source: str) -> float:
     return float(np.sqrt(np.mean(distance_to_faces(near, lab.faces) ** 2)))
 
 
-def lab(seed: int, folder: Path) -> dict[str, float]:
+def lab(seed: int, folder: Path, config: Config = DEFAULTS) -> dict[str, float]:
     """Experiment 1, thesis 6.1.1."""
-    done = simulated(load_scenario("lab"), seed, folder)
+    done = simulated(load_scenario("lab"), seed, folder, config)
     return {source: corner_scatter(done, source) for source in (WITH, WITHOUT, TRUE)}
 
 
@@ -188,12 +198,12 @@ def end_error(corridor: Run, source: str) -> float:
     return float(np.hypot(*(between(estimate[0], estimate[-1]) - between(true[0], true[-1]))[:2]))
 
 
-def corridor(seed: int, folder: Path) -> dict[str, float]:
+def corridor(seed: int, folder: Path, config: Config = DEFAULTS) -> dict[str, float]:
     """Experiment 2, thesis 6.1.2."""
     scenario = load_scenario("corridor")
-    done = simulated(scenario, seed, folder)
+    done = simulated(scenario, seed, folder, config)
     encoders = scenario.robots["vehicle"].encoders
-    drift = done.result.summary["calibration"]["vehicle.drift_rad_per_m"]["value"]
+    drift = done.result.summary["calibration"].get("vehicle.drift_rad_per_m", {}).get("value", 0.0)
     return {
         "wheel": abs(drift * encoders.axle_m - encoders.radius_error_right),
         f"end {WITH}": end_error(done, WITH),
@@ -223,12 +233,12 @@ def pioneer_errors(done: Run) -> tuple[float, float]:
     return error, float(np.sqrt(np.mean(covs[:, 0, 0] + covs[:, 1, 1])))
 
 
-def two_robots(seed: int, folder: Path) -> dict[str, float]:
+def two_robots(seed: int, folder: Path, config: Config = DEFAULTS) -> dict[str, float]:
     """Experiment 3, thesis 6.1.3."""
-    scenario = load_scenario("two-robots")
-    both = simulated(scenario, seed, folder, STARTS_KNOWN)
+    scenario, config = load_scenario("two-robots"), with_known_starts(config)
+    both = simulated(scenario, seed, folder, config)
     (folder / f"{seed}.mcap").unlink()
-    single = simulated(alone(scenario), seed, folder, STARTS_KNOWN)
+    single = simulated(alone(scenario), seed, folder, config)
     (error, sigma), (error_alone, sigma_alone) = pioneer_errors(both), pioneer_errors(single)
     return {
         "error with": error,
@@ -241,19 +251,74 @@ def two_robots(seed: int, folder: Path) -> dict[str, float]:
 # ------------------------------------------------------------ change
 
 
-def change(seed: int, folder: Path) -> dict[str, float]:
-    """Experiment 4, thesis 6.2: what the two visits are worth before changes are looked for."""
-    simulate(load_scenario("change"), folder / str(seed), seed=seed)
-    out = {}
+#: m: edges of the displacements for which the share of beams found is counted
+DISPLACEMENTS_M = np.arange(0.0, 0.6001, 0.02)
+#: share of the beams on a part of the table that must be found
+MOST = 0.5
+
+
+def table_beams(truth: Mapping[str, Any], scans: NoiseFreeScans) -> tuple[Array, IntArray]:
+    """Displacements (k,) m of the turned table where beams met it, and numbers (k,) of the beams.
+
+    The displacement is that of the surface, across it: what a range can show.
+    """
+    (move,) = truth["changes"]
+    after, before = np.array(move["after"]), np.array(move["before"])
+    ranges, laser = scans.hits.ranges, scans.laser
+    beams = ranges.shape[1]
+    heading = scans.poses[:, 2, None] + np.radians(laser.step_deg) * (
+        np.arange(beams) - (beams - 1) / 2
+    )
+    ends = scans.poses[:, None, :2] + ranges[..., None] * np.stack(
+        [np.cos(heading), np.sin(heading)], axis=-1
+    )
+    ends = np.where(np.isfinite(ends), ends, 1e6)
+    along, earlier = after[1] - after[0], before[1] - before[0]
+    length = float(np.hypot(*along))
+    t = (ends - after[0]) @ along / length
+    aside = np.abs((ends - after[0]) @ np.array([-along[1], along[0]])) / length
+    scan, beam = np.nonzero((aside < 1e-6) & (t > 0.02) & (t < length - 0.02))
+    turn = np.arctan2(*along[::-1]) - np.arctan2(*earlier[::-1])
+    return t[scan, beam] * np.sin(abs(turn)), scan * beams + beam
+
+
+def found_from(moved: Array, flagged: NDArray[np.bool_]) -> float:
+    """Displacement, m, from which on most beams are found; the largest if they never are.
+
+    ``moved`` (k,) m and ``flagged`` (k,) are of the beams that met the moved surface.
+    """
+    bins = np.digitize(moved, DISPLACEMENTS_M)
+    for k in range(len(DISPLACEMENTS_M), 0, -1):
+        here = flagged[bins == k]
+        if len(here) and here.mean() < MOST:
+            return float(DISPLACEMENTS_M[min(k, len(DISPLACEMENTS_M) - 1)])
+    return 0.0
+
+
+def change(seed: int, folder: Path, config: Config = DEFAULTS) -> dict[str, float]:
+    """Experiment 4, thesis 6.2: what the two visits are worth, and which changes are found."""
+    recordings = simulate(load_scenario("change"), folder / str(seed), seed=seed).recordings
+    out, visits = {}, []
     for name in ("reference", "later"):
-        done = run(folder / str(seed) / f"{name}.mcap")
+        done = run(folder / str(seed) / f"{name}.mcap", config)
         moved = transform(done.aligned("vehicle", WITH), done.laser("vehicle", WITH)[:, :2])
         errors = moved - done.laser("vehicle", TRUE)[:, :2]
         out[name] = float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
+        save(done.result, folder / name, force=True)
+        visits.append(load_visit(load(folder / name), folder / name))
+    found = detect_changes(visits[0], visits[1], config.changes)
+    truth = json.loads((folder / str(seed) / "truth.json").read_text(encoding="utf-8"))
+    displaced, beams = table_beams(truth, recordings[1].scans["vehicle"])
+    usable = found.compared[beams]
+    out["found from"] = found_from(displaced[usable], found.flagged[beams[usable]])
+    out["false alarms"] = float(np.mean(np.delete(found.flagged, beams)))
     return out
 
 
-EXPERIMENTS: dict[str, Callable[[int, Path], dict[str, float]]] = {
+#: seed, empty folder, settings -> values
+Experiment = Callable[[int, Path, Config], dict[str, float]]
+
+EXPERIMENTS: dict[str, Experiment] = {
     "lab": lab,
     "corridor": corridor,
     "two-robots": two_robots,
