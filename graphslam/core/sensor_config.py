@@ -171,7 +171,8 @@ class FrontEndConfig:
     covariance: `incidence` weights each point by its noise along the normal, `thesis` uses eq. 4.32
     as printed. Hough lines (4.7.1-4.7.3): hough_votes says what counts votes, `opencv`'s transform
     with the thesis' weights to rank and refine its lines, or the weighted accumulator of the
-    `thesis`; hough_delta_d_m is the distance step Δd, equal to the stripe width 2a; hough_gamma_steps the number of angles γ in a full turn; hough_d_max_m the
+    `thesis`; hough_delta_d_m is the distance step Δd, equal to the stripe width 2a;
+    hough_gamma_steps the number of angles γ in a full turn; hough_d_max_m the
     largest distance d of a line. hough_threshold_m is the threshold of C with g = r times the angle
     between beams: metres of wall at normal incidence. cylinders: whether to extract them;
     cylinder_min_radius_m, cylinder_max_radius_m: their radii; cylinder_points: fewest returns.
