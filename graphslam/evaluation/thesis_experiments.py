@@ -1,7 +1,7 @@
 """The thesis' experiments (chapter 6), one seed each: simulated, smoothed, held against the truth.
 
 Where the thesis knows where its robots start relative to each other, `start.from_truth` is set.
-`thesis_chapter` makes tables of many seeds, the benchmark `thesis_figures.py` draws one.
+`thesis_chapter` makes tables of many seeds.
 """
 
 import json
