@@ -25,7 +25,12 @@ _PRESET = "preset="
 EXPERIMENTS: dict[str, Path] = {
     name: _FOLDER / f"{name}.toml"
     for name in (
-        "ekf-versus-smoothing", "filters", "thesis", "rooms", "consistency", "three-filters",
+        "ekf-versus-smoothing",
+        "filters",
+        "thesis",
+        "rooms",
+        "consistency",
+        "three-filters",
     )
 }
 
