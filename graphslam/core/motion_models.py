@@ -7,7 +7,7 @@ longer than an interval between two states, so within an interval its *effect* a
 treats it as white (see docs/thesis.md for why that misstates it).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -93,6 +93,14 @@ class Calibration:
         The variance is 1e-18, not 0, so that covariances stay invertible.
         """
         return Calibration(self.names, self.mean, 1e-18 * np.eye(len(self.mean)))
+
+    def at_zero(self, parameters: Sequence[int]) -> "Calibration":
+        """The same with some parameters zero and held."""
+        mean, cov = self.mean.copy(), self.cov.copy()
+        mean[parameters] = 0.0
+        cov[parameters, :] = cov[:, parameters] = 0.0
+        cov[parameters, parameters] = HELD_SIGMA**4
+        return Calibration(self.names, mean, cov)
 
 
 def odometry_increments(

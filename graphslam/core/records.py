@@ -316,6 +316,18 @@ class InformationRoot:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class MountCovariance:
+    """Covariance (3, 3) of a robot's mount (x, y, yaw; base axes), and of an estimate with it.
+
+    ``states`` (n, 3, 3): rows of its states; ``landmarks``: (d, 3) by number. World axes.
+    """
+
+    mount: Array
+    states: Array
+    landmarks: Mapping[int, Array]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
     """The result of a back end: every state and every landmark, world frame.
 
@@ -323,6 +335,7 @@ class Estimate:
     and (2, 2) for points, (3,) and (3, 3) for lines and segments, additive world-axis errors.
     ``error`` is half the weighted squared residual (robust weights applied), ``dof`` rows minus
     unknowns. ``root`` has the covariance between any states; None where a back end has none.
+    ``mounts``: of robots whose mount is estimated with the states.
     """
 
     states: Mapping[str, Trajectory]
@@ -330,6 +343,7 @@ class Estimate:
     error: float
     dof: int
     root: InformationRoot | None = None
+    mounts: Mapping[str, MountCovariance] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,16 +17,20 @@ from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array, adjoint, between, inverse, log, rotation3, wrap
 from graphslam.core.motion_models import HELD_SIGMA, Calibration
 from graphslam.core.record import replace
-from graphslam.core.records import Estimate, Motion, Step
+from graphslam.core.records import Estimate, Motion, MountCovariance, Step
 from graphslam.estimation import factors
 from graphslam.estimation.backend import JointMarginal
+from graphslam.estimation.covariance_columns import covariance_columns
 from graphslam.estimation.isam2 import NO_COVARIANCES, with_means
 from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH, marginals_of, reweighted
 from graphslam.estimation.posterior_residuals import Posterior, posterior_pairs
 from graphslam.estimation.recorded_graph import ObservationNoise, RecordedGraph, Source
+from graphslam.estimation.selected_inverse import CliqueRows
 
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
+#: parameters of a calibration that are the mount of the sensor
+MOUNT_NAMES = ("laser_x_m", "laser_y_m", "laser_yaw_rad")
 #: relative decrease of the error at which optimisation ends
 CONVERGED_ERROR = 1e-5
 
@@ -175,6 +179,8 @@ class CalibrationGraph:
         covs = found.marginals
         means = with_means(values, builder.dims(), covs)
         estimate = builder.estimate(means, float(graph.error(values)), found.rows)
+        if found.rows is not None:
+            estimate = replace(estimate, mounts=self._mounts(found.rows, values))
         calibrations = {}
         for robot, prior in self._priors.items():
             mean, cov, use = prior.mean.copy(), prior.cov.copy(), self._free[robot]
@@ -184,6 +190,35 @@ class CalibrationGraph:
                 cov[np.ix_(use, use)] = covs.get(key, np.nan)
             calibrations[robot] = Calibration(prior.names, mean, cov)
         return estimate, calibrations
+
+    def _mounts(
+        self, cliques: Sequence[CliqueRows], values: gtsam.Values
+    ) -> dict[str, MountCovariance]:
+        """Covariances of the mounts of robots, and of states and landmarks with them."""
+        builder, mounts = self._builder, {}
+        for robot, prior in self._priors.items():
+            place = [prior.names.index(name) for name in MOUNT_NAMES if name in prior.names]
+            use = self._free[robot]
+            if not np.isin(place, use).any():
+                continue
+            columns = covariance_columns(cliques, self._keys[robot])
+            spread = np.zeros((len(prior.names), len(use)))
+            spread[use] = np.eye(len(use))
+            pick = spread[place].T  # parameters that are not held -> mount
+
+            states = builder.state_keys(robot)
+            turns = rotation3([factors.read(values, key, 3)[2] for key in states])
+            landmarks = {}
+            for i, dim in builder.landmark_dims.items():
+                key = factors.landmark_key(i)
+                turn = rotation3(factors.read(values, key, dim)[2]) if dim == 3 else np.eye(dim)
+                landmarks[i] = turn @ columns[key] @ pick
+            mounts[robot] = MountCovariance(
+                pick.T @ columns[self._keys[robot]] @ pick,
+                turns @ np.array([columns[key] for key in states]) @ pick,
+                landmarks,
+            )
+        return mounts
 
     def posterior(self) -> Posterior:
         """The last solution with the covariances that its residuals need.

@@ -67,6 +67,15 @@ def alignment_of_poses(pairs: Sequence[PosePairs]) -> Alignment:
     return Alignment(align(true, own), "poses")
 
 
+def displacement_of_poses(pairs: Sequence[PosePairs]) -> Alignment:
+    """By positions and headings of all poses: also that of robots that hardly moved."""
+    true, own = (np.concatenate([getattr(p, name) for p in pairs]) for name in _SIDES)
+    turn = np.exp(1j * (own[:, 2] - true[:, 2])).mean()
+    pose = np.array([0.0, 0.0, np.angle(turn)])
+    pose[:2] = np.mean(own[:, :2] - transform(pose, true[:, :2]), axis=0)
+    return Alignment(pose, "poses")
+
+
 _SIDES = ("truth", "estimate")
 
 

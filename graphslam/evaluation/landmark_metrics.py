@@ -18,12 +18,18 @@ MATCH_DISTANCE_M, MATCH_ANGLE_RAD = 1.0, 0.35
 EXCHANGE_RATIO = 3.0
 
 
-def landmark_metrics(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]) -> dict[str, Any]:
+def landmark_metrics(
+    estimated: Sequence[Landmark],
+    true: Sequence[TrueLandmark],
+    aligned: Sequence[TrueLandmark] | None = None,
+) -> dict[str, Any]:
     """``rmse_m``, ``nees_per_dof``, ``coverage``, ``worst``, ``matched``, ``missed``, ``extra``.
 
     Landmarks match by identity where both have one. Other points match by the assignment with the
     smallest sum of distances among pairs within 1 m. Other lines and segments each match the
     nearest true one within 1 m and 0.35 rad modulo pi, since a wall may be seen in several pieces.
+    Its distance is that of the middle from the true line and, where nothing of it was seen, the
+    gap to what was seen.
 
     The error of a point is its distance. The error of a line or segment is the distance of the
     middle of its extent from the true line; its NEES has two degrees of freedom (direction and
@@ -35,8 +41,12 @@ def landmark_metrics(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]
     association can dominate the mean. ``exchanged`` lists pairs of identities of points that
     each lie at the other's true place: their names are wrong, not their positions, and they are
     matched by position.
+
+    ``aligned`` are the true ones, in their order, laid on the estimate as a whole, if it is there
+    that they match.
     """
-    pairs, exchanged = _undo_exchanges(_match(estimated, true), estimated, true)
+    there = true if aligned is None else aligned
+    pairs, exchanged = _undo_exchanges(_match(estimated, there), estimated, there)
     errors, values, dofs = [], [], []
     for i, j in pairs:
         error, difference, cov = _landmark_error(estimated[i], true[j])
@@ -128,7 +138,7 @@ def _match_distances(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]
     poses = np.array([t.pose for t in true])
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     position = np.array([e.position for e in estimated])
-    middle = np.array([e.extent.mean(axis=0) for e in estimated])
+    extent = np.array([e.extent for e in estimated])
     points = np.array([e.kind == "point" for e in estimated], dtype=bool)
     true_points = np.array([t.kind == "point" for t in true], dtype=bool)
     # where each true wall begins and ends along its own x axis
@@ -138,9 +148,12 @@ def _match_distances(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]
             along = (one.extent - one.pose[:2]) @ np.array([c[k], s[k]])
             ends[k] = along.min(), along.max()
     apart = np.hypot(*(position[:, None, :2] - poses[:, :2]).transpose(2, 0, 1))
-    off = middle[:, None] - poses[:, :2]
+    off = extent[:, :, None] - poses[:, :2]
     x, y = c * off[..., 0] + s * off[..., 1], c * off[..., 1] - s * off[..., 0]
-    beyond = x - np.clip(x, ends[:, 0], ends[:, 1])
+    y = y.mean(axis=1)
+    # a gap between what was seen and the wall: what was seen may span several walls of one line
+    beyond = np.maximum(x.min(axis=1) - ends[:, 1], ends[:, 0] - x.max(axis=1))
+    beyond = np.maximum(beyond, 0.0)
     turn = wrap(2 * (position[:, None, 2] - poses[:, 2])) / 2  # modulo pi
     with np.errstate(invalid="ignore"):  # points have no direction
         walls = np.where(np.abs(turn) <= MATCH_ANGLE_RAD, np.hypot(beyond, y), np.inf)

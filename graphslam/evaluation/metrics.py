@@ -15,6 +15,7 @@ from graphslam.evaluation.common_frame import (
     alignment_of_landmarks,
     alignment_of_poses,
     changes_matches,
+    displacement_of_poses,
     is_common_frame,
     is_start_given,
     moved_landmarks,
@@ -69,7 +70,9 @@ def evaluate(
             result.config, in_world, result.summary.get("world")
         )
         found["common_frame"] = common
-        alignment = None if common else alignment_of_poses(list(in_world.values()))
+        robots = list(in_world.values())
+        if robots:
+            alignment = (displacement_of_poses if common else alignment_of_poses)(robots)
         found |= _compare_trajectories(pairs, own_frame if common else set(pairs), set(in_world))
     if true_landmarks:
         placed = [landmark for landmark in result.landmarks if landmark.frame is None]
@@ -96,10 +99,13 @@ def _compare_landmarks(
 ) -> dict[str, Any]:
     """``landmarks`` of `evaluate`; covariances are of places in the world, not of aligned ones.
 
-    Where the frames are not the same and no alignment is known, no landmark can be matched.
+    Where the frames are not the same and no alignment is known, no landmark can be matched. In a
+    common frame the alignment only tells which match: a start that is a little off turns the far
+    end of a map by more than two walls are apart.
     """
     if common:
-        return {**landmark_metrics(estimated, true), "aligned_by": None}
+        there = moved_landmarks(alignment, true) if alignment else true
+        return {**landmark_metrics(estimated, true, there), "aligned_by": None}
     if alignment is None:
         return {**dict.fromkeys(landmark_metrics((), ())), "exchanged": [], "aligned_by": None}
     metrics = landmark_metrics(estimated, moved_landmarks(alignment, true))

@@ -96,8 +96,14 @@ class Candidates:
 class Associator:
     """Keeps the landmark map and decides where each observation belongs."""
 
-    def __init__(self, config: AssociationConfig, backend: Backend) -> None:
-        self.map = LandmarkMap()
+    def __init__(
+        self,
+        config: AssociationConfig,
+        backend: Backend,
+        landmarks: LandmarkMap | None = None,
+    ) -> None:
+        """``landmarks``: the map, empty; another one by default."""
+        self.map = LandmarkMap() if landmarks is None else landmarks
         self.rejected: Counter[str] = Counter()
         self.closures = 0
         self.innovations: dict[str, list[tuple[int, float]]] = {}

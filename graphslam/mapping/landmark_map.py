@@ -62,9 +62,15 @@ class Entry:
 
 
 class LandmarkMap:
-    """All landmarks by number, with arrays over them for the vectorised gates."""
+    """All landmarks by number, with arrays over them for the vectorised gates.
 
-    def __init__(self) -> None:
+    ``bias_m``: sigma of an error of walls along their normals that all observations of one share.
+    A laser's error on a surface (material, flatness) is the same in every scan: no number of scans
+    averages it, and no residual shows it.
+    """
+
+    def __init__(self, bias_m: float = 0.0) -> None:
+        self.bias_m = bias_m
         self.entries: dict[int, Entry] = {}
         self.by_identity: dict[str, int] = {}
         self.deleted = self.forgotten = 0  # tentative ones, and landmarks of the graph
@@ -153,7 +159,7 @@ class LandmarkMap:
 
     def transformed(self, worlds: Mapping[int, Array]) -> "LandmarkMap":
         """The same map after the frame of each landmark was put at ``worlds[id]`` (3,)."""
-        moved = LandmarkMap()
+        moved = LandmarkMap(self.bias_m)
         for i, entry in self.entries.items():
             moved.entries[i] = replace(entry, mean=compose(worlds[i], entry.mean))
         return moved

@@ -21,12 +21,17 @@ def line_parameters(pose: Array, cov: Array) -> tuple[float, float, Array]:
     return normal, float(n @ pose[:2]), J @ cov @ J.T
 
 
-def make_landmark(entry: Entry, mean: Array, cov: Array) -> Landmark:
-    """Bookkeeping and estimate (``mean`` (2,) or (3,), ``cov``; world axes) as one record."""
+def make_landmark(entry: Entry, mean: Array, cov: Array, bias_m: float = 0.0) -> Landmark:
+    """Bookkeeping and estimate (``mean`` (2,) or (3,), ``cov``; world axes) as one record.
+
+    ``bias_m``: see `LandmarkMap`.
+    """
     if entry.kind == "point":
         position, line = np.array([mean[0], mean[1], np.nan]), None
         extent = np.array([mean, mean])
     else:
+        n = np.append(unit_vectors(float(mean[2] + np.pi / 2)), 0.0)
+        cov = cov + bias_m**2 * np.outer(n, n)
         position, line = mean, line_parameters(mean, cov)
         low, high = entry.extent_at(mean)
         extent = transform(mean, np.array([[low, 0.0], [high, 0.0]]))
@@ -37,7 +42,7 @@ def make_landmark(entry: Entry, mean: Array, cov: Array) -> Landmark:
 def make_landmarks(landmarks: LandmarkMap, estimate: Estimate) -> tuple[Landmark, ...]:
     """The final map: every landmark that was estimated and not deleted; in one world frame."""
     return tuple(
-        make_landmark(landmarks.entries[number], mean, cov)
+        make_landmark(landmarks.entries[number], mean, cov, landmarks.bias_m)
         for number, (mean, cov) in sorted(estimate.landmarks.items())
         if number in landmarks.entries
     )

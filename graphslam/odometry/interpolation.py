@@ -22,7 +22,7 @@ from graphslam.core.geometry import (
 )
 from graphslam.core.motion_models import Calibration
 from graphslam.core.record import replace
-from graphslam.core.records import Estimate, ScanTies, Start, Step, Trajectory
+from graphslam.core.records import Estimate, MountCovariance, ScanTies, Start, Step, Trajectory
 from graphslam.odometry.preintegration import Track
 
 IntArray = np.ndarray[tuple[int], np.dtype[np.int64]]
@@ -181,7 +181,11 @@ class FrameTransforms:
             M = rotation3(world[2])[: len(mean), : len(mean)]
             moved = compose(world, mean) if len(mean) == 3 else transform(world, mean)
             landmarks[number] = (moved, M @ cov @ M.T)
-        return replace(estimate, states=states, landmarks=landmarks)
+        mounts = {
+            robot: rotated(known, float(self.robots[robot][2]))
+            for robot, known in estimate.mounts.items()
+        }
+        return replace(estimate, states=states, landmarks=landmarks, mounts=mounts)
 
     def step(self, step: Step) -> Step:
         """The step with its starts in the new frame."""
@@ -190,6 +194,16 @@ class FrameTransforms:
             world = self.robots[robot]
             starts[robot] = Start(compose(world, start.pose), rotate_cov(start.cov, world[2]))
         return replace(step, starts=starts)
+
+
+def rotated(known: MountCovariance, angle: float) -> MountCovariance:
+    """The same in a world that is turned by so much, rad."""
+    turn = rotation3(np.asarray(angle))
+    return MountCovariance(
+        known.mount,
+        turn @ known.states,
+        {i: turn[: len(cross), : len(cross)] @ cross for i, cross in known.landmarks.items()},
+    )
 
 
 def origin_shift(start: Array, mounts: Array) -> Array:

@@ -49,3 +49,10 @@ def fitted_line(moments: Array) -> tuple[Array, float]:
 def mean_square(lines: Array, moments: Array) -> Array:
     """Mean square deviation (p,), m², of returns with ``moments`` (6, p) from ``lines`` (6, p)."""
     return np.asarray((lines * moments).sum(axis=0) / moments[0])
+
+
+def least_squares(moments: Array) -> Array:
+    """Sums (p,), m², of squared deviations of returns with ``moments`` (6, p) from their lines."""
+    n, x, y, xx, xy, yy = moments
+    xx, xy, yy = xx - x * x / n, xy - x * y / n, yy - y * y / n
+    return np.asarray(np.maximum(0.5 * (xx + yy - np.hypot(xx - yy, 2 * xy)), 0.0))

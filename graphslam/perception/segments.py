@@ -16,6 +16,7 @@ from graphslam.core.config import FrontEndConfig
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.records import Observation
+from graphslam.perception.breaks import Returns, moved_breaks, without_breaks
 from graphslam.perception.line_fit import LineFits, fit_lines, observations
 from graphslam.perception.line_moments import fitted_lines, mean_square
 from graphslam.perception.ordered_scan import Indices, Mask, Sweep
@@ -27,6 +28,9 @@ MISSING_BEAMS = 3
 
 STEP_GROWTH = 4.0
 """Largest growth of the distance from one return to the next on a wall at grazing incidence."""
+
+BENDS = 3.0
+"""Returns so many times split_m off a line may be of a wall that bends."""
 
 MERGE_GATE = chi2_quantile(0.999, 2)
 """Two degrees of freedom: pieces of one wall differ by no more."""
@@ -74,17 +78,20 @@ def segments(sweep: Sweep, config: FrontEndConfig) -> tuple[Observation, ...]:
 
 def find_segments(sweep: Sweep, config: FrontEndConfig) -> Segments:
     """The segments of one scan with their returns."""
-    pieces = (_split_scans if config.split_rule == "variance" else _split)(sweep, config)
+    returns = Returns(sweep.moments)
+    split = _split_scans if config.split_rule == "variance" else _split
+    pieces = split(sweep, returns, config)
     # Twice: an object in front of a wall keeps the parts of the wall from being neighbours, and can
     # be distinguished from small pieces of the wall only after those have been merged.
     pieces = _merge(pieces, sweep, config)
     pieces = pieces[pieces.moments[0] >= fewest_points(config)]
     pieces = _merge(pieces, sweep, config)
-    rows, counts = _members(pieces, sweep, config)
+    rows, counts, unbroken = _members(pieces, sweep, config)
     starts = np.cumsum(counts) - counts
     fits = fit_lines(sweep.points[rows], starts, config)
     last = starts + counts - 1
     whole = fully_visible(sweep, sweep.beam[rows[starts]], sweep.beam[rows[last]], fits, config)
+    whole &= unbroken
     valid = valid_lines(fits, config)
     if config.hidden_ends == "reject":
         valid &= whole
@@ -151,7 +158,11 @@ def _chain_starts(sweep: Sweep, config: FrontEndConfig) -> Indices:
     return np.concatenate(([0], np.flatnonzero(cut) + 1))
 
 
-def _split(sweep: Sweep, config: FrontEndConfig) -> Pieces:
+def _pieces(returns: Returns, first: Indices, last: Indices) -> Pieces:
+    return Pieces(first, last, returns.of(first, last))
+
+
+def _split(sweep: Sweep, returns: Returns, config: FrontEndConfig) -> Pieces:
     """Pieces within split_m of the chord between their ends: thesis 4.7.6, steps 0 to 3.
 
     The thesis splits by the recursion of Douglas and Peucker. So does OpenCV, which then drops
@@ -180,15 +191,10 @@ def _split(sweep: Sweep, config: FrontEndConfig) -> Pieces:
     wanted = np.searchsorted(values, vertex_key) * len(key) + starts[own][chain]
     vertex = order[np.searchsorted(place, wanted)]
     same = chain[1:] == chain[:-1]
-    return _pieces(vertex[:-1][same], vertex[1:][same], sweep)
+    return _pieces(returns, *moved_breaks(returns, vertex[:-1][same], vertex[1:][same]))
 
 
-def _pieces(first: Indices, last: Indices, sweep: Sweep) -> Pieces:
-    sums = np.cumsum(sweep.moments, axis=1)
-    return Pieces(first, last, sums[:, last] - sums[:, first] + sweep.moments[:, first])
-
-
-def _split_scans(sweep: Sweep, config: FrontEndConfig) -> Pieces:
+def _split_scans(sweep: Sweep, returns: Returns, config: FrontEndConfig) -> Pieces:
     """Pieces by the variance of the deviations, beginning with whole scans: 4.7.6 as printed."""
     starts = np.flatnonzero(np.diff(sweep.scan, prepend=-1))
     ends = np.append(starts[1:], len(sweep.scan)) - 1
@@ -199,7 +205,7 @@ def _split_scans(sweep: Sweep, config: FrontEndConfig) -> Pieces:
             sweep.points, i, j, allowed_rms(config) ** 2, fewest_points(config)
         )
     ]
-    return _pieces(*first_and_last(runs), sweep)
+    return _pieces(returns, *first_and_last(runs))
 
 
 def _merge(pieces: Pieces, sweep: Sweep, config: FrontEndConfig) -> Pieces:
@@ -247,22 +253,49 @@ def _bridged(pieces: Pieces, i: int, sweep: Sweep, config: FrontEndConfig) -> bo
     return not np.any(left < -2 * config.split_m)  # missing returns, NaN, compare False
 
 
-def _members(pieces: Pieces, sweep: Sweep, config: FrontEndConfig) -> tuple[Indices, Indices]:
+def _members(pieces: Pieces, sweep: Sweep, config: FrontEndConfig) -> tuple[Indices, Indices, Mask]:
     """Rows of the returns of each segment, one after the other, and how many each has (m,).
 
-    Returns farther than split_m from the segment's line are left out: a pole in front of the wall,
-    mixed pixels. The line is fitted without the end points, which are the doubtful ones; a return
-    that two pieces share goes to the closer line. Segments with too few returns are dropped.
+    Also which segments (m,) end where their pieces do.
+
+    A piece that bends within split_m is several segments. Returns farther than split_m from the
+    segment's line are left out: a pole in front of the wall, mixed pixels. The line is fitted
+    without the end points, which are the doubtful ones; a return that two pieces share goes to the
+    closer line. Segments with too few returns are dropped.
     """
     moments = sweep.moments
-    line = fitted_lines(pieces.moments - moments[:, pieces.first] - moments[:, pieces.last])
     counts = pieces.last - pieces.first + 1
+    rows = np.arange(counts.sum()) + np.repeat(pieces.first + counts - np.cumsum(counts), counts)
+    own = pieces.moments - moments[:, pieces.first] - moments[:, pieces.last]
+    # what lies in front of a wall or behind it breaks no line; what bends it is not left out yet
+    rows, counts = _near(rows, counts, own, BENDS * config.split_m, moments)
+    returns = Returns(moments[:, rows])
+    last = np.cumsum(counts) - 1
+    noise = config.range_sigma_m, config.floor_normal_m
+    begin, end = last - counts + 1, last
+    first = begin
+    if config.split_rule != "variance":  # that one is used as the thesis prints it
+        first, last = without_breaks(returns, begin, end, *noise)
+    unbroken = np.isin(first, begin) & np.isin(last, end)
+    size = last - first + 1
+    enough = size >= fewest_points(config)
+    rows, counts = rows[np.repeat(enough, size)], size[enough]
+    first, last, unbroken = first[enough], last[enough], unbroken[enough]
+    rows, counts = _near(rows, counts, returns.of(first + 1, last - 1), config.split_m, moments)
+    enough = counts >= fewest_points(config)
+    return rows[np.repeat(enough, counts)], counts[enough], unbroken[enough]
+
+
+def _near(
+    rows: Indices, counts: Indices, fitted: Array, reach_m: float, moments: Array
+) -> tuple[Indices, Indices]:
+    """Of runs of ``rows``, ``counts`` (m,) each, those near the lines that ``fitted`` (6, m) have.
+
+    A row in two neighbouring runs stays in that with the closer line.
+    """
     owner = np.repeat(np.arange(len(counts)), counts)
-    rows = np.arange(len(owner)) + (pieces.first + counts - np.cumsum(counts))[owner]
-    square = (line[:, owner] * moments[:, rows]).sum(axis=0)
-    near = square <= config.split_m**2
+    square = (fitted_lines(fitted)[:, owner] * moments[:, rows]).sum(axis=0)
+    near = square <= reach_m**2
     shared = np.flatnonzero(rows[1:] == rows[:-1])
     near[np.where(square[shared] <= square[shared + 1], shared + 1, shared)] = False
-    size = np.bincount(owner[near], minlength=len(counts))
-    enough = size >= fewest_points(config)
-    return rows[near & enough[owner]], size[enough]
+    return rows[near], np.bincount(owner[near], minlength=len(counts))

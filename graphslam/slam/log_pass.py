@@ -61,7 +61,8 @@ class LogPass:
         self.noise: dict[str, Any] = {}  # of summary.json
         self.starts = known.frame_assignment.starts
         self.frames = RobotFrames(known.frame_assignment)
-        self.landmarks = LandmarkMap()
+        scans = any(map(log.has_scans, log.robots))
+        self.landmarks = LandmarkMap(config.front_end.floor_normal_m if scans else 0.0)
         self.steps: list[Step] = []
         self.sources: list[Sighting] = []
         self.robot_sightings: list[Sighting] = []

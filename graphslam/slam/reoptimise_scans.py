@@ -46,6 +46,8 @@ from graphslam.slam.motion_noise import noise_scales, scale_motion_noise
 GATE_FACTORS = ((1.0, 1.0), (1 / 2, 2 / 3), (1 / 2, 2 / 3))
 #: times that the noise of motions is estimated, at most; it is settled when it grows by less than
 MAX_NOISE_ROUNDS, NOISE_GROWTH = 4, 1.1
+#: a mount of one of several robots is corrected if it is off by so many of its sigmas
+MOUNT_SIGMAS = 4.0
 #: rounds of loop closing, at most
 MAX_CLOSING_ROUNDS = 8
 #: solutions from inflated to stated covariances of closures, at most; residuals that stay above
@@ -123,6 +125,12 @@ def reoptimise_scan_log(
             made = recompute_motions(closed, tracks)
             return scale_motion_noise(made, noise_scales(made, estimate))
 
+        if len(tracks) > 1:
+            # the world lies where the mount of the first robot puts it: a mount that this drive
+            # does not tell would move the others away from where they started
+            estimate, _ = calibrate(rebuild, estimate, tracks, config.robust, rounds=1)
+            for track in tracks.values():
+                track.hold_mount_unless(MOUNT_SIGMAS)
         estimate, steps = calibrate(rebuild, estimate, tracks, config.robust, joint=True)
     else:
         estimate = solve(steps, estimate, closures, rough=False, joint=True)

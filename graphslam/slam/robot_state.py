@@ -7,7 +7,7 @@ import numpy as np
 
 from graphslam.core.geometry import Array, between, compose, inverse
 from graphslam.core.motion_models import Calibration
-from graphslam.core.records import Motion, RobotResult, Trajectory
+from graphslam.core.records import Motion, MountCovariance, RobotResult, Trajectory
 from graphslam.logs.clock import Clock
 from graphslam.odometry.interpolation import (
     IntArray,
@@ -18,6 +18,7 @@ from graphslam.odometry.interpolation import (
     trajectory_of_mount,
     transform_trajectory,
 )
+from graphslam.odometry.mount_covariance import base_trajectory
 from graphslam.odometry.online_calibration import Calibrator, to_summary
 from graphslam.odometry.preintegration import Track
 from graphslam.odometry.readings import EDGE_NS
@@ -119,13 +120,19 @@ class RobotState:
         return Causal(trajectory_of_mount(causal, inverse(mount)), scan)
 
     def result(
-        self, states: Trajectory, causal: "Causal | None", *, causal_only: bool = False
+        self,
+        states: Trajectory,
+        causal: "Causal | None",
+        mount: MountCovariance | None = None,
+        *,
+        causal_only: bool = False,
     ) -> RobotResult:
         """Trajectories of the robot at the stamps that it is reported at.
 
         Args:
             states: the final states, world frame.
             causal: the causal trajectories; None if they are not asked for.
+            mount: covariances of the states with the mount, where it is estimated with them.
             causal_only: final poses are the causal ones, also between the states, as a back end
                 that revises no state does not revise the motion between states either.
         """
@@ -138,7 +145,8 @@ class RobotState:
             late_ns = self.track.reported_late_ns(self.track.calibration)
             times = times + late_ns
             final = final_at(states, self.track, times, stamps)
-        base = trajectory_of_mount(final, inverse(self.track.mount))
+        before = states.index_before(times)
+        base = base_trajectory(final, self.track.mount, mount, states, before)
         at_start = compose(states.poses[0], inverse(self.track.mount))
         odometry = between(
             self.track.pose(self.times[0] - late_ns), self.track.pose(times - late_ns)

@@ -14,7 +14,6 @@ import numpy as np
 
 from graphslam.core.config import Config, OdometryConfig, RobustConfig
 from graphslam.core.geometry import Array
-from graphslam.core.motion_models import HELD_SIGMA
 from graphslam.core.records import Association, Estimate, Sighting, Start, Step
 from graphslam.estimation.calibration_graph import CalibrationGraph
 from graphslam.estimation.posterior_residuals import Posterior, Residuals, spans
@@ -220,12 +219,9 @@ def hold_insignificant_latency(track: Track) -> None:
     mean, cov = track.calibration.mean, track.calibration.cov
     if mean[-1] ** 2 > LATENCY_SIGMAS**2 * cov[-1, -1]:
         return
-    mean = np.append(mean[:-1], 0.0)
-    held = track.prior.cov.copy()
-    held[-1, :] = held[:, -1] = 0.0
-    held[-1, -1] = HELD_SIGMA**4
-    track.prior = replace(track.prior, cov=held)
-    track.calibration = replace(track.calibration, mean=mean, cov=held)
+    last = [len(mean) - 1]
+    track.prior = track.prior.at_zero(last)
+    track.calibration = replace(track.prior, mean=np.append(mean[:-1], 0.0))
 
 
 def _is_white(noise: Mapping[Source, ObservationNoise]) -> bool:

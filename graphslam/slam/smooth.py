@@ -13,6 +13,7 @@ from graphslam.estimation.settled import settled
 from graphslam.logs import LogSet
 from graphslam.mapping.landmark_records import make_landmarks
 from graphslam.mapping.loop_closure import Tamper
+from graphslam.odometry.mount_covariance import with_mount_errors
 from graphslam.slam.initialisation import initialise
 from graphslam.slam.log_pass import Progress, timed
 from graphslam.slam.log_reader import Reading, is_scan_log
@@ -89,11 +90,17 @@ def make_result(finished: FinishedPass, began: float) -> Result:
             estimate = settled(steps, estimate, pipeline.kernel)
         error, plain = graph_error(steps, estimate, pipeline.kernel)
         estimate = replace(estimate, error=error)
+        if len(runs) == 1:
+            (name, run), world = next(iter(runs.items())), pipeline.frames.world
+            if name in estimate.mounts and name == world:
+                start = pipeline.starts[world].pose
+                estimate = with_mount_errors(estimate, name, start, run.track.mount)
+        else:
+            estimate = replace(estimate, mounts={})
 
         def robot_result(name: str) -> RobotResult:
-            return runs[name].result(
-                estimate.states[name], causal.get(name), causal_only=causal_only
-            )
+            states, mount = estimate.states[name], estimate.mounts.get(name)
+            return runs[name].result(states, causal.get(name), mount, causal_only=causal_only)
 
         robots = dict(zip(runs, parallel_map(robot_result, list(runs)), strict=True))
     moved = pipeline.landmarks.transformed(transforms.landmarks)

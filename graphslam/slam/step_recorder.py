@@ -20,8 +20,7 @@ class StepRecorder(LogPass):
         """Without states, see `LogPass`."""
         super().__init__(log, config, known)
         self.backend = BACKENDS[self.config.backend.name](self.config)
-        self.associator = Associator(self.config.association, self.backend)
-        self.landmarks = self.associator.map
+        self.associator = Associator(self.config.association, self.backend, self.landmarks)
         self.rejected = self.associator.rejected
         self.innovations = self.associator.innovations
 
