@@ -285,6 +285,39 @@ def test_the_landmark_that_makes_the_mean_is_named():
     assert landmark_metrics([], true)["worst"] is None
 
 
+def true_line(pose, extent):
+    return TrueLandmark("", 0, 0, "", "line", np.array(pose), np.array(extent))
+
+
+def test_a_wall_seen_beside_a_door_matches_the_wall_not_the_door_in_its_middle():
+    wall = [true_line([x, 0.0, 0.0], [[x, 0.0], [x + 4, 0.0]]) for x in (0.0, 5.0)]
+    door = true_line([4.0, 0.1, 0.0], [[4.0, 0.1], [5.0, 0.1]])
+    cov = np.diag([1.0, 1e-4, 1e-4])
+    line = (np.pi / 2, 0.0, np.diag([1e-4, 1e-4]))
+    seen = landmark(0, "line", [4.5, 0.0, 0.0], cov, [[1.0, 0.0], [8.0, 0.0]], line)
+    found = landmark_metrics([seen], [door, *wall])
+    assert found["rmse_m"] < 1e-9
+    assert found["missed"] == 2
+
+
+def test_a_start_that_is_off_does_not_change_which_wall_a_landmark_is():
+    """Two walls 0.3 m apart, 40 m from a start that is off by 0.02 rad: 0.8 m there."""
+    start = np.array([0.0, 0.0, 0.02])
+    true = [true_line([40.0, y, 0.0], [[39.0, y], [41.0, y]]) for y in (0.0, 0.3)]
+    there = [true_line(compose(start, t.pose), transform(start, t.extent)) for t in true]
+    cov = np.diag([1.0, 1e-4, 1e-4])
+    seen = []
+    for k, t in enumerate(there):
+        normal = t.pose[2] + np.pi / 2
+        offset = float(np.array([np.cos(normal), np.sin(normal)]) @ t.pose[:2])
+        line = (normal, offset, np.diag([1e-4, 1e-4]))
+        seen.append(landmark(k, "line", t.pose, cov, t.extent, line))
+    found = landmark_metrics(seen, true, there)
+    assert found["missed"] == 0
+    assert found["rmse_m"] == pytest.approx(0.8, abs=0.01)
+    assert landmark_metrics(seen, true)["missed"] == 1
+
+
 def test_pieces_of_a_wall_all_match_it():
     """Furniture cuts a wall into pieces. One to one, all but one would be judged by other walls."""
     walls = [

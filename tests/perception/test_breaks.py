@@ -1,0 +1,74 @@
+"""Walls that look straight to within split_m, but are two."""
+
+import numpy as np
+import pytest
+from line_checks import near
+from test_front_ends import CONFIG, scan_of, segments
+
+from graphslam.core.geometry import wrap
+from graphslam.perception.breaks import Returns, moved_breaks, without_breaks
+from graphslam.perception.line_moments import point_moments
+
+
+def noisy(points, sigma, seed=0):
+    return np.asarray(points) + [0.0, sigma] * np.random.default_rng(seed).normal(
+        size=(len(points), 2)
+    )
+
+
+def whole(points):
+    return Returns(point_moments(points)), np.array([0]), np.array([len(points) - 1])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_door_in_its_niche_is_not_one_line_with_its_wall(seed):
+    """A line through both turns by 50 mrad: ten of the sigmas that its returns would say."""
+    wall, door = [[3.0, -1.5], [3.0, 0.0]], [[3.08, 0.0], [3.08, 0.9]]
+    found = near(segments(scan_of([wall, door], sigma=0.015, seed=seed), CONFIG), wall, 0.2)
+    assert found
+    for o in found:
+        off = wrap(o.z[2] - np.pi / 2)
+        off = off - np.pi * np.round(off / np.pi)
+        assert abs(off) < 4 * np.sqrt(o.cov[2, 2])
+
+
+def test_a_straight_run_is_not_broken_by_noise():
+    # 1e-3 for each run at most: 500 runs break 0.5 times on average, 4 times with 1e-3 chance
+    x = np.linspace(0.0, 4.0, 120)
+    broken = 0
+    for seed in range(500):
+        points = noisy(np.column_stack([x, np.full_like(x, 2.0)]), 0.02, seed)
+        first, _ = without_breaks(*whole(points), 0.02, 0.02)
+        broken += len(first) > 1
+    assert broken <= 4
+
+
+@pytest.mark.parametrize("step_m", [0.06, 0.1])
+def test_a_step_is_found_where_it_is(step_m):
+    x = np.linspace(0.0, 3.0, 100)
+    points = noisy(np.column_stack([x, 2.0 + step_m * (x > 1.0)]), 0.01)
+    first, last = without_breaks(*whole(points), 0.02, 0.01)
+    assert len(first) == 2
+    assert abs(x[first[1]] - 1.0) < 0.05  # two returns
+    assert last[0] + 1 == first[1]
+
+
+def test_breaks_move_to_the_corner():
+    corner = np.concatenate(
+        [
+            np.column_stack([np.linspace(0, 1, 30), np.zeros(30)]),
+            np.column_stack([np.ones(30), np.linspace(0.03, 1, 30)]),
+        ]
+    )
+    returns = Returns(point_moments(corner))
+    for wrong in (25, 34):
+        first, last = moved_breaks(returns, np.array([0, wrong]), np.array([wrong, 59]))
+        assert last[0] == first[1]
+        assert abs(int(first[1]) - 29) <= 1
+
+
+def test_beams_that_graze_a_wall_have_less_noise_across_it():
+    x = np.linspace(4.0, 6.0, 20)
+    grazing, _, _ = whole(np.column_stack([x, np.full_like(x, 0.5)]))
+    ends = np.array([0]), np.array([19])
+    assert grazing.square_incidence(*ends) == pytest.approx(np.mean(0.25 / (x**2 + 0.25)))
