@@ -70,7 +70,7 @@ class AssociationConfig:
     nearness: Literal["across", "middle"] = "across"
     directed: bool = True
     gate_probability: float = 0.99
-    floor_m: float = 0.02
+    floor_m: float = 0.03
     floor_rad: float = 0.03
     new_landmark_probability: float = 0.9999
     overlap_gap_m: float = 0.3

@@ -103,14 +103,8 @@ class Track(Readings):
         return slice(self.increment_parameters, self.increment_parameters + 3)
 
     def hold_mount_unless(self, sigmas: float) -> None:
-        """Take the sensor to be where the log says, unless the calibration is so many sigmas off.
-
-        Where a drive tells little of the mount, what it seems to tell is noise.
-        """
-        if not self.is_mounted:
-            return
-        off = self.mount
-        if off @ np.linalg.solve(self.mount_cov, off) <= sigmas**2:
+        """Take the sensor to be where the log says, unless that is so many sigmas off."""
+        if self.is_mounted and self.mount @ np.linalg.inv(self.mount_cov) @ self.mount <= sigmas**2:
             mount = range(*self._mount_slice.indices(len(self.calibration.mean)))
             self.prior = self.prior.at_zero(mount)
             self.calibration = self.calibration.at_zero(mount)

@@ -223,7 +223,7 @@ def test_the_rule_of_two_thresholds(off_sigma):
 
 
 def test_the_floor_widens_both_thresholds_and_not_the_measurement():
-    run = Run(AssociationConfig())  # floor_m 0.05
+    run = Run(AssociationConfig(floor_m=0.05))
     run.learn(point(4.0, 0.0))
     (found,) = run.look(point(4.08, 0.0))
     assert found.target == 0

@@ -140,9 +140,9 @@ def test_what_is_neither_a_match_nor_new_is_rejected_and_counted():
             found.move(motion([0.0, 0.0, 0.0], k, 0.0))
         found.track(k * S, lines(np.zeros(3), WALLS[:1]))
     found.move(motion([0.0, 0.0, 0.0], 4, 0.0))
-    # between the quantiles of 0.99 and 0.9999, with the floor of 5 cm
+    # between the quantiles of 0.99 and 0.9999, with the floor of 3 cm
     associations, _, _ = found.track(
-        4 * S, lines(np.zeros(3), WALLS[:1] + np.array([0.0, 0.19, 0.0]))
+        4 * S, lines(np.zeros(3), WALLS[:1] + np.array([0.0, 0.12, 0.0]))
     )
     assert associations == ()
     assert found.rejected["between the thresholds: neither a match nor new"] == 1

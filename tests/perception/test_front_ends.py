@@ -242,6 +242,15 @@ def test_a_recess_in_a_wall_is_its_own_segment(offset_m, parts):
     assert len(segments(scan_of(walls, sigma=0.01), CONFIG)) == parts
 
 
+@pytest.fixture
+def split_alone(monkeypatch):
+    """Without the test of all returns of a segment (test_breaks.py), which sees less than that."""
+    monkeypatch.setattr(
+        "graphslam.perception.segments.without_breaks", lambda _, first, last, *noise: (first, last)
+    )
+
+
+@pytest.mark.usefixtures("split_alone")
 @pytest.mark.parametrize("bend_m, parts", [(0.05, 1), (0.06, 2)])
 def test_a_wall_is_split_where_it_bends_by_more_than_the_setting_says(bend_m, parts):
     """`split_m`, 5 cm: the largest deviation from the chord inside one segment."""
@@ -249,6 +258,7 @@ def test_a_wall_is_split_where_it_bends_by_more_than_the_setting_says(bend_m, pa
     assert len(segments(scan_of(wall), CONFIG)) == parts
 
 
+@pytest.mark.usefixtures("split_alone")
 @pytest.mark.parametrize("step_m, parts", [(0.09, 1), (0.11, 2)])
 def test_two_walls_are_two_if_their_step_exceeds_twice_the_deviation(step_m, parts):
     """One line between them deviates by half the step from either."""
