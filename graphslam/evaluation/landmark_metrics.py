@@ -28,8 +28,8 @@ def landmark_metrics(
     Landmarks match by identity where both have one. Other points match by the assignment with the
     smallest sum of distances among pairs within 1 m. Other lines and segments each match the
     nearest true one within 1 m and 0.35 rad modulo pi, since a wall may be seen in several pieces.
-    Its distance is that of the middle from the true line and, where nothing of it was seen, the
-    gap to what was seen.
+    That is of the middle of what was seen; of several the one is taken whose line is nearest to
+    it, and on which something was seen.
 
     The error of a point is its distance. The error of a line or segment is the distance of the
     middle of its extent from the true line; its NEES has two degrees of freedom (direction and
@@ -152,11 +152,13 @@ def _match_distances(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]
     x, y = c * off[..., 0] + s * off[..., 1], c * off[..., 1] - s * off[..., 0]
     y = y.mean(axis=1)
     # a gap between what was seen and the wall: what was seen may span several walls of one line
-    beyond = np.maximum(x.min(axis=1) - ends[:, 1], ends[:, 0] - x.max(axis=1))
-    beyond = np.maximum(beyond, 0.0)
+    gap = np.maximum(x.min(axis=1) - ends[:, 1], ends[:, 0] - x.max(axis=1))
+    gap = np.maximum(gap, 0.0)
+    middle = x.mean(axis=1)
+    near = np.hypot(middle - np.clip(middle, ends[:, 0], ends[:, 1]), y) <= MATCH_DISTANCE_M
     turn = wrap(2 * (position[:, None, 2] - poses[:, 2])) / 2  # modulo pi
     with np.errstate(invalid="ignore"):  # points have no direction
-        walls = np.where(np.abs(turn) <= MATCH_ANGLE_RAD, np.hypot(beyond, y), np.inf)
+        walls = np.where(near & (np.abs(turn) <= MATCH_ANGLE_RAD), np.hypot(gap, y), np.inf)
     distance = np.where(points[:, None], apart, walls)
     distance[points[:, None] != true_points] = np.inf
     return np.where(distance <= MATCH_DISTANCE_M, distance, np.inf)
