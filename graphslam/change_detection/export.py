@@ -1,20 +1,20 @@
 """Changes for other tools: a map to overlay on the reference's, and an MCAP file for viewers."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from graphslam.change_detection.detect import ChangeResult
+from graphslam.change_detection.grid import Grid
 from graphslam.change_detection.objects import Change
 from graphslam.core.geometry import Array
 from graphslam.logs import schemas
 from graphslam.logs.writer import LogWriter
+from graphslam.results.grid_map import FREE, OCCUPIED, UNKNOWN, write_grid_map
 
-#: grey values of nav2's map_server in mode trinary
-_OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
 _FRAME = "map"
 #: red, green, blue of the kinds
 _RGB = {"appeared": (0.16, 0.63, 0.17), "vanished": (0.89, 0.34, 0.1), "moved": (0.58, 0.2, 0.75)}
@@ -22,33 +22,22 @@ _MAX_POINTS = 200_000
 _LINE_STRIP, _TEXT, _POINT_FLOAT32 = 4, 9, 7
 
 
-def overlay_map(found: ChangeResult) -> tuple[NDArray[np.uint8], str]:
-    """The changes as an image (rows, columns), north up, and its YAML for nav2's map_server.
+def write_overlay_map(folder: Path, grid: Grid, old: Iterable[Array], new: Iterable[Array]) -> None:
+    """The changes as a map ``changes`` for nav2's map_server.
 
-    Occupied where something is now, free where something was before, unknown elsewhere: overlaid on
-    the reference's map it gives the current map.
+    Occupied within the polygons (m, 2) of ``new``: something is there now; free within those of
+    ``old``: something was there before; unknown elsewhere. Overlaid on the reference's map it gives
+    the current map.
     """
-    grid = found.surfaces[0].nearest.grid
-    image = np.full(grid.shape[::-1], _UNKNOWN, dtype=np.uint8)
-    old = [c.polygon if c.kind == "vanished" else c.before for c in found.changes]
-    new = [c.polygon for c in found.changes if c.kind != "vanished"]
-    for polygons, value in ((old, _FREE), (new, _OCCUPIED)):  # the new are drawn over the old
+    image = np.full(grid.shape[::-1], UNKNOWN, dtype=np.uint8)
+    for polygons, value in ((old, FREE), (new, OCCUPIED)):  # the new are drawn over the old
         for polygon in polygons:
-            if polygon is not None:
-                cells = (polygon - np.array(grid.origin_m)) / grid.cell_m - 0.5
-                cv2.fillPoly(image, [np.round(cells).astype(np.int32)], value)
-    x, y = grid.origin_m
-    return np.ascontiguousarray(image[::-1]), (
-        "# changes: occupied = appeared or moved here, free = vanished or moved away\n"
-        f"image: changes.pgm\nmode: trinary\nresolution: {grid.cell_m:.6g}\n"
-        f"origin: [{x:.6f}, {y:.6f}, 0.0]\nnegate: 0\n"
-        "occupied_thresh: 0.65\nfree_thresh: 0.196\n"
-    )
-
-
-def pgm(image: NDArray[np.uint8]) -> bytes:
-    """A grey image (rows, columns) as binary PGM."""
-    return f"P5\n{image.shape[1]} {image.shape[0]}\n255\n".encode() + image.tobytes()
+            cells = (polygon - np.array(grid.origin_m)) / grid.cell_m - 0.5
+            cv2.fillPoly(image, [np.round(cells).astype(np.int32)], value)
+    write_grid_map(
+        folder, "changes", image, cell_m=grid.cell_m, origin_m=grid.origin_m,
+        meaning="changes: occupied = appeared or moved here, free = vanished or moved away",
+    )  # fmt: skip
 
 
 def write_mcap(found: ChangeResult, path: Path) -> None:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from graphslam.change_detection.detect import ChangeResult, detect_changes, identity_registration
-from graphslam.change_detection.export import overlay_map, pgm, write_mcap
+from graphslam.change_detection.export import write_mcap, write_overlay_map
 from graphslam.change_detection.visit import Visit, load_visit, select_time_span
 from graphslam.core.config import ChangesConfig
 from graphslam.core.errors import OutputError
@@ -90,9 +90,12 @@ def save_changes(
     texts = {"changes.json": to_json(found.to_dict(), "changes.json")}
     if report is not None:
         texts["report.html"] = report(found)
-    image, texts["changes.yaml"] = overlay_map(found)
+    old = [c.polygon if c.kind == "vanished" else c.before for c in found.changes]
+    new = [c.polygon for c in found.changes if c.kind != "vanished"]
     with atomic_folder(directory) as part:
-        (part / "changes.pgm").write_bytes(pgm(image))
+        write_overlay_map(
+            part, found.surfaces[0].nearest.grid, [p for p in old if p is not None], new
+        )
         write_mcap(found, part / "changes.mcap")
         for name, text in texts.items():
             (part / name).write_text(text, encoding="utf-8")

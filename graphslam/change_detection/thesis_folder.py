@@ -5,12 +5,11 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from graphslam.change_detection.export import pgm
-from graphslam.change_detection.folder import check_changes_target, load_visits
+from graphslam.change_detection.export import write_overlay_map
+from graphslam.change_detection.folder import Span, check_changes_target, load_visits
 from graphslam.change_detection.grid import Grid
 from graphslam.change_detection.thesis_changes import ThesisChanges, reference_maps, thesis_changes
 from graphslam.change_detection.visit import Bools
@@ -20,12 +19,9 @@ from graphslam.core.output_folder import atomic_folder
 from graphslam.results import report_html as html
 from graphslam.results.drawing_elements import INK, PALETTE, Shade, Style, opacity_levels
 from graphslam.results.file_formats import to_json
+from graphslam.results.grid_map import FREE, OCCUPIED, write_grid_map
 from graphslam.results.report_figure import WIDTH_IN, Drawing, density, map_axes, svg
 
-Span = tuple[float, float]
-
-#: grey values of nav2's map_server in mode scale and trinary
-_OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
 _REFERENCE, _LATER, _CHANGED = "#7d8590", PALETTE[0], PALETTE[1]
 #: cells of the longer side of a picture
 _PIXELS = 900
@@ -78,15 +74,17 @@ def write_folder(
 ) -> None:
     """The folder, which may replace another one; ``names`` of the two visits."""
     grid, shown = found.grid, Shown.of(found, config)
-    deep = np.where(shown.depth > 0, 200 - 200 * shown.depth, _FREE).astype(np.uint8)
-    seen = np.where(shown.visible, _FREE, _OCCUPIED).astype(np.uint8)
+    deep = np.where(shown.depth > 0, 200 - 200 * shown.depth, FREE).astype(np.uint8)
+    seen = np.where(shown.visible, FREE, OCCUPIED).astype(np.uint8)
+    old = [r.polygon for r in found.regions if r.kind == "vanished"]
+    new = [r.polygon for r in found.regions if r.kind == "appeared"]
     with atomic_folder(directory) as part:
         (part / "changes.json").write_text(
             to_json(found.to_dict(), "changes.json"), encoding="utf-8"
         )
         _save_map(part, "reference_map", grid, deep, "the darker, the deeper the dent")
         _save_map(part, "occlusion_map", grid, seen, "free = seen by the reference, else occluded")
-        _save_map(part, "changes", grid, _overlay(found), "occupied = appeared, free = vanished")
+        write_overlay_map(part, grid, old, new)
         (part / "decision.csv").write_text(decision_table(found), encoding="utf-8")
         (part / "report.html").write_text(thesis_page(found, shown, names), encoding="utf-8")
 
@@ -116,27 +114,9 @@ class Shown:
 
 
 def _save_map(folder: Path, name: str, grid: Grid, values: NDArray[np.uint8], meaning: str) -> None:
-    """Values (cells,) as an image, north up, with its YAML for nav2's map_server."""
-    image = np.ascontiguousarray(values.reshape(grid.shape).T[::-1])
-    (folder / f"{name}.pgm").write_bytes(pgm(image))
-    x, y = grid.origin_m
-    (folder / f"{name}.yaml").write_text(
-        f"# {meaning}\nimage: {name}.pgm\nmode: trinary\nresolution: {grid.cell_m:.6g}\n"
-        f"origin: [{x:.6f}, {y:.6f}, 0.0]\nnegate: 0\n"
-        "occupied_thresh: 0.65\nfree_thresh: 0.196\n",
-        encoding="utf-8",
-    )
-
-
-def _overlay(found: ThesisChanges) -> NDArray[np.uint8]:
-    """The marked regions (cells,): occupied where something appeared, free where it vanished."""
-    grid = found.grid
-    image = np.full(grid.shape[::-1], _UNKNOWN, dtype=np.uint8)
-    for region in found.regions:
-        cells = (region.polygon - np.array(grid.origin_m)) / grid.cell_m - 0.5
-        value = _OCCUPIED if region.kind == "appeared" else _FREE
-        cv2.fillPoly(image, [np.round(cells).astype(np.int32)], value)
-    return np.asarray(image.T.reshape(-1))
+    """Values (cells,) as a map for nav2's map_server."""
+    image = values.reshape(grid.shape).T
+    write_grid_map(folder, name, image, cell_m=grid.cell_m, origin_m=grid.origin_m, meaning=meaning)
 
 
 def decision_table(found: ThesisChanges) -> str:

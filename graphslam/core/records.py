@@ -335,7 +335,7 @@ class Estimate:
     and (2, 2) for points, (3,) and (3, 3) for lines and segments, additive world-axis errors.
     ``error`` is half the weighted squared residual (robust weights applied), ``dof`` rows minus
     unknowns. ``root`` has the covariance between any states; None where a back end has none.
-    ``mounts``: of robots whose mount is estimated with the states.
+    ``mount``: of a single robot whose mount is estimated with its states; else None.
     """
 
     states: Mapping[str, Trajectory]
@@ -343,7 +343,7 @@ class Estimate:
     error: float
     dof: int
     root: InformationRoot | None = None
-    mounts: Mapping[str, MountCovariance] = field(default_factory=dict)
+    mount: MountCovariance | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -179,8 +179,8 @@ class CalibrationGraph:
         covs = found.marginals
         means = with_means(values, builder.dims(), covs)
         estimate = builder.estimate(means, float(graph.error(values)), found.rows)
-        if found.rows is not None:
-            estimate = replace(estimate, mounts=self._mounts(found.rows, values))
+        if found.rows is not None and len(self._priors) == 1:
+            estimate = replace(estimate, mount=self._mount(found.rows, values))
         calibrations = {}
         for robot, prior in self._priors.items():
             mean, cov, use = prior.mean.copy(), prior.cov.copy(), self._free[robot]
@@ -191,34 +191,26 @@ class CalibrationGraph:
             calibrations[robot] = Calibration(prior.names, mean, cov)
         return estimate, calibrations
 
-    def _mounts(
-        self, cliques: Sequence[CliqueRows], values: gtsam.Values
-    ) -> dict[str, MountCovariance]:
-        """Covariances of the mounts of robots, and of states and landmarks with them."""
-        builder, mounts = self._builder, {}
-        for robot, prior in self._priors.items():
-            place = [prior.names.index(name) for name in MOUNT_NAMES if name in prior.names]
-            use = self._free[robot]
-            if not np.isin(place, use).any():
-                continue
-            columns = covariance_columns(cliques, self._keys[robot])
-            spread = np.zeros((len(prior.names), len(use)))
-            spread[use] = np.eye(len(use))
-            pick = spread[place].T  # parameters that are not held -> mount
-
-            states = builder.state_keys(robot)
-            turns = rotation3([factors.read(values, key, 3)[2] for key in states])
-            landmarks = {}
-            for i, dim in builder.landmark_dims.items():
-                key = factors.landmark_key(i)
-                turn = rotation3(factors.read(values, key, dim)[2]) if dim == 3 else np.eye(dim)
-                landmarks[i] = turn @ columns[key] @ pick
-            mounts[robot] = MountCovariance(
-                pick.T @ columns[self._keys[robot]] @ pick,
-                turns @ np.array([columns[key] for key in states]) @ pick,
-                landmarks,
-            )
-        return mounts
+    def _mount(self, cliques: Sequence[CliqueRows], values: gtsam.Values) -> MountCovariance | None:
+        """Covariance of the mount, and of states and landmarks with it; None if it is held."""
+        builder, ((robot, prior),) = self._builder, self._priors.items()
+        names = np.array(prior.names)[self._free[robot]]
+        pick = (names[:, None] == np.array(MOUNT_NAMES)).astype(float)  # parameters -> mount
+        if not pick.any():
+            return None
+        columns = covariance_columns(cliques, self._keys[robot])
+        states = builder.state_keys(robot)
+        turns = rotation3([factors.read(values, key, 3)[2] for key in states])
+        landmarks = {}
+        for i, dim in builder.landmark_dims.items():
+            key = factors.landmark_key(i)
+            turn = rotation3(factors.read(values, key, dim)[2]) if dim == 3 else np.eye(dim)
+            landmarks[i] = turn @ columns[key] @ pick
+        return MountCovariance(
+            pick.T @ columns[self._keys[robot]] @ pick,
+            turns @ np.array([columns[key] for key in states]) @ pick,
+            landmarks,
+        )
 
     def posterior(self) -> Posterior:
         """The last solution with the covariances that its residuals need.

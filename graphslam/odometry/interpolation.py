@@ -181,11 +181,11 @@ class FrameTransforms:
             M = rotation3(world[2])[: len(mean), : len(mean)]
             moved = compose(world, mean) if len(mean) == 3 else transform(world, mean)
             landmarks[number] = (moved, M @ cov @ M.T)
-        mounts = {
-            robot: rotated(known, float(self.robots[robot][2]))
-            for robot, known in estimate.mounts.items()
-        }
-        return replace(estimate, states=states, landmarks=landmarks, mounts=mounts)
+        mount = estimate.mount
+        if mount is not None:
+            (robot,) = estimate.states  # there is a mount of a single robot only
+            mount = turned(mount, float(self.robots[robot][2]))
+        return replace(estimate, states=states, landmarks=landmarks, mount=mount)
 
     def step(self, step: Step) -> Step:
         """The step with its starts in the new frame."""
@@ -196,9 +196,9 @@ class FrameTransforms:
         return replace(step, starts=starts)
 
 
-def rotated(known: MountCovariance, angle: float) -> MountCovariance:
-    """The same in a world that is turned by so much, rad."""
-    turn = rotation3(np.asarray(angle))
+def turned(known: MountCovariance, angle_rad: float) -> MountCovariance:
+    """The same along the axes of the frame in which its world frame is turned by an angle."""
+    turn = rotation3(angle_rad)
     return MountCovariance(
         known.mount,
         turn @ known.states,

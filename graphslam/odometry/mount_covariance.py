@@ -6,71 +6,64 @@ sensor. The drive that tells of the mount is that of the states, so both are tak
 the mount would make up most of what it adds, and its correlation takes it away again.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
 from graphslam.core.geometry import Array, between, compose, compose_jacobians, inverse
+from graphslam.core.record import replace
 from graphslam.core.records import Estimate, MountCovariance, Trajectory
-from graphslam.odometry.interpolation import IntArray
+from graphslam.odometry.interpolation import IntArray, trajectory_of_mount
 
 
-def with_mount_errors(estimate: Estimate, robot: str, start: Array, mount: Array) -> Estimate:
-    """An estimate whose covariances have the error of the world that the mount of a robot is.
+def with_mount_errors(estimate: Estimate, start: Array, mount: Array) -> Estimate:
+    """The estimate of a single robot, whose covariances have that of the world by its mount.
 
     Args:
-        estimate: in the world where the robot's base is at its ``start`` in the beginning; its
-            covariances and those with the mount are as if that world were known.
-        robot: the one to whose start the world is fixed.
-        start: (3,) pose of its base.
+        estimate: with `Estimate.mount`, in the world in which the base begins at its ``start``; its
+            covariances are as if the mount by which that world is found were known.
+        start: (3,) pose of the base.
         mount: (3,) as estimated.
     """
-    known = estimate.mounts[robot]
-    states = estimate.states[robot]
-    J = _of_world(start, mount, states.poses)
-    own, cross = _added(states.covs, known.states, J, known.mount)
+    known = estimate.mount
+    assert known is not None
+    ((robot, states),) = estimate.states.items()
+    covs, cross = _added(
+        states.covs, known.states, _of_world(start, mount, states.poses), known.mount
+    )
     landmarks, crosses = {}, {}
     for i, (mean, cov) in estimate.landmarks.items():
-        d = len(mean)
-        pose = np.append(mean, 0.0)[:3]
-        J_i = _of_world(start, mount, pose)[:d]
-        added, crosses[i] = _added(cov, known.landmarks[i], J_i, known.mount)
+        J = _of_world(start, mount, np.append(mean, 0.0)[:3])[: len(mean)]
+        added, crosses[i] = _added(cov, known.landmarks[i], J, known.mount)
         landmarks[i] = mean, added
     return replace(
         estimate,
-        states={**estimate.states, robot: replace(states, covs=own)},
+        states={robot: replace(states, covs=covs)},
         landmarks=landmarks,
-        mounts={**estimate.mounts, robot: MountCovariance(known.mount, cross, crosses)},
+        mount=MountCovariance(known.mount, cross, crosses),
     )
 
 
 def base_trajectory(
-    sensor: Trajectory,
-    mount: Array,
-    known: MountCovariance | None = None,
-    states: Trajectory | None = None,
-    before: IntArray | None = None,
+    sensor: Trajectory, mount: Array, known: MountCovariance, states: Trajectory, before: IntArray
 ) -> Trajectory:
-    """Trajectory of a base whose sensor sits at ``mount`` (3,) in it.
+    """Trajectory of a base whose sensor sits at ``mount`` (3,) in it, which is not exactly known.
 
     Args:
         sensor: its trajectory.
         mount: as estimated.
-        known: covariances of the mount, and with ``states``; the mount is taken as exact without.
+        known: covariances of the mount, and of ``states`` with it.
         states: of the sensor.
-        before: (n,) the last of them before each pose.
+        before: (n,) index of the last state before each pose of ``sensor``.
     """
     back = inverse(mount)
+    base = trajectory_of_mount(sensor, back)
+    at = states.poses[before]
+    carried, _ = compose_jacobians(at, between(at, sensor.poses))
     F, G = compose_jacobians(sensor.poses, back)
-    covs = F @ sensor.covs @ F.mT
-    if known is not None and states is not None and before is not None:
-        at = states.poses[before]
-        carried, _ = compose_jacobians(at, between(at, sensor.poses))
-        c, s = np.cos(mount[2]), np.sin(mount[2])
-        x, y = mount[:2]
-        of_inverse = np.array([[-c, -s, s * x - c * y], [s, -c, c * x + s * y], [0.0, 0.0, -1.0]])
-        covs, _ = _added(covs, F @ carried @ known.states[before], G @ of_inverse, known.mount)
-    return Trajectory(sensor.stamps_ns, compose(sensor.poses, back), covs)
+    c, s = np.cos(mount[2]), np.sin(mount[2])
+    x, y = mount[:2]
+    of_inverse = np.array([[-c, -s, s * x - c * y], [s, -c, c * x + s * y], [0.0, 0.0, -1.0]])
+    cross = F @ carried @ known.states[before]
+    return replace(base, covs=_added(base.covs, cross, G @ of_inverse, known.mount)[0])
 
 
 def _of_world(start: Array, mount: Array, poses: Array) -> Array:

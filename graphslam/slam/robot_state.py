@@ -145,8 +145,11 @@ class RobotState:
             late_ns = self.track.reported_late_ns(self.track.calibration)
             times = times + late_ns
             final = final_at(states, self.track, times, stamps)
-        before = states.index_before(times)
-        base = base_trajectory(final, self.track.mount, mount, states, before)
+        if mount is None:
+            base = trajectory_of_mount(final, inverse(self.track.mount))
+        else:
+            before = states.index_before(times)
+            base = base_trajectory(final, self.track.mount, mount, states, before)
         at_start = compose(states.poses[0], inverse(self.track.mount))
         odometry = between(
             self.track.pose(self.times[0] - late_ns), self.track.pose(times - late_ns)

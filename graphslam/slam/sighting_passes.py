@@ -62,8 +62,8 @@ def run_sighting_passes(
                     known = with_identities(known, log, config, swapped)
                     continue
             if rough.error > rough.dof and len(one.tracks) == 1:
-                # odometry drifted too far for a start of the whole at once: grown step by step, the
-                # estimate keeps near its minimum
+                # or odometry drifts too far for a start of the whole at once: grown step by step,
+                # the estimate keeps near its minimum
                 replayed.cancel()
                 return None
             # before anything finer, as all of it depends on the clocks; paths need the calibration

@@ -90,16 +90,13 @@ def make_result(finished: FinishedPass, began: float) -> Result:
             estimate = settled(steps, estimate, pipeline.kernel)
         error, plain = graph_error(steps, estimate, pipeline.kernel)
         estimate = replace(estimate, error=error)
-        if len(runs) == 1:
-            (name, run), world = next(iter(runs.items())), pipeline.frames.world
-            if name in estimate.mounts and name == world:
-                start = pipeline.starts[world].pose
-                estimate = with_mount_errors(estimate, name, start, run.track.mount)
-        else:
-            estimate = replace(estimate, mounts={})
+        if estimate.mount is not None:
+            ((name, run),) = runs.items()
+            start = pipeline.starts[name].pose
+            estimate = with_mount_errors(estimate, start, run.track.mount)
 
         def robot_result(name: str) -> RobotResult:
-            states, mount = estimate.states[name], estimate.mounts.get(name)
+            states, mount = estimate.states[name], estimate.mount
             return runs[name].result(states, causal.get(name), mount, causal_only=causal_only)
 
         robots = dict(zip(runs, parallel_map(robot_result, list(runs)), strict=True))

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
@@ -16,7 +17,7 @@ from graphslam.change_detection.alignment import laser_warnings
 from graphslam.change_detection.beam_evidence import beams_past_surfaces
 from graphslam.change_detection.detect import identity_registration
 from graphslam.change_detection.elastic_path import fit_elastic_path
-from graphslam.change_detection.export import overlay_map
+from graphslam.change_detection.folder import save_changes
 from graphslam.change_detection.grid import Grid, distance_map, grid_over, sorted_unique
 from graphslam.change_detection.nonrigid_registration import correlate_maps
 from graphslam.change_detection.path_refinement import refine_path
@@ -369,12 +370,14 @@ def test_moving_a_visit_moves_its_ends():
 # ------------------------------------------------------------ files and the command
 
 
-def test_the_overlay_is_occupied_where_something_is_now_and_free_where_it_was():
+def test_the_overlay_is_occupied_where_something_is_now_and_free_where_it_was(tmp_path):
     rng = np.random.default_rng(16)
     a, b = visit([box(5, 4)], drive(50), rng), visit([box(4, 4.6)], drive(50, 0.1), rng)
     found = same(a, b)
-    image, text = overlay_map(found)
+    save_changes(found, tmp_path / "out", force=False)
+    text = (tmp_path / "out" / "changes.yaml").read_text()
     lines = dict(line.split(": ", 1) for line in text.splitlines() if ": " in line[:30])
+    image = cv2.imread(str(tmp_path / "out" / lines["image"]), cv2.IMREAD_UNCHANGED)
     x, y, _ = json.loads(lines["origin"])
     cell = float(lines["resolution"])
 

@@ -47,10 +47,10 @@ def test_covariances_are_those_of_samples():
         {},
         0.0,
         0,
-        mounts={"r": MountCovariance(SIGMA @ SIGMA, R @ cross, {})},
+        mount=MountCovariance(SIGMA @ SIGMA, R @ cross, {}),
     )
-    found = with_mount_errors(estimate, "r", START, MOUNT)
-    base = base_trajectory(found.states["r"], MOUNT, found.mounts["r"], found.states["r"], stamps)
+    found = with_mount_errors(estimate, START, MOUNT)
+    base = base_trajectory(found.states["r"], MOUNT, found.mount, found.states["r"], stamps)
     sensors = compose(world_of(MOUNT + off)[:, None], poses + errors)
     bases = compose(sensors, inverse(MOUNT + off)[:, None])
     for seen, covs_of in ((sensors, found.states["r"].covs), (bases, base.covs)):
@@ -68,11 +68,10 @@ def test_the_base_begins_where_the_start_is_known_to_be():
     sensor = compose(world_of(MOUNT), START)[None]
     trajectory = Trajectory(np.array([0]), sensor, prior[None])
     known = MountCovariance(P, np.zeros((1, 3, 3)), {})
-    estimate = Estimate({"r": trajectory}, {}, 0.0, 0, mounts={"r": known})
-    found = with_mount_errors(estimate, "r", START, MOUNT)
-    base = base_trajectory(
-        found.states["r"], MOUNT, found.mounts["r"], found.states["r"], np.array([0])
-    )
-    # the prior is on the state, 0.3 m ahead: its direction moves the base about it by 6 mm
+    estimate = Estimate({"r": trajectory}, {}, 0.0, 0, mount=known)
+    found = with_mount_errors(estimate, START, MOUNT)
+    base = base_trajectory(found.states["r"], MOUNT, found.mount, found.states["r"], np.array([0]))
+    # the prior is on the state, 0.3 m ahead: its direction of 0.02 rad moves the base about it by
+    # 6 mm, beside 10 mm: 1.7 mm more in all
     assert np.sqrt(np.diag(base.covs[0])) == pytest.approx([0.01, 0.01, 0.02], abs=2e-3)
     assert np.sqrt(found.states["r"].covs[0, 0, 0]) > 0.015
