@@ -124,8 +124,8 @@ Experiment = Annotated[
     str,
     typer.Argument(
         metavar="NAME|FILE.toml",
-        help="An experiment file, or ekf-versus-smoothing, filters, thesis, rooms, three-filters "
-        "or consistency.",
+        help="An experiment file, or ekf-versus-smoothing, filters, slip, thesis, rooms, "
+        "three-filters or consistency.",
     ),
 ]
 EvaluatedFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Result folder of smooth.")]

@@ -27,6 +27,7 @@ __all__ = [
     "Config",
     "EkfConfig",
     "FrontEndConfig",
+    "ImmConfig",
     "KeyframeConfig",
     "LogsConfig",
     "LoopClosureConfig",
@@ -89,10 +90,13 @@ class RobustConfig:
     """How observation factors treat outliers.
 
     kernel: the M-estimator. scale: its parameter, in sigmas (Cauchy: 95 % efficient at 2.385).
+    motions: the same of motions, for wheels that slip: of `isam2`, `batch` and `decentralised`. The
+    last solution of `smooth`, in which the odometry's calibration is unknown too, does without.
     """
 
     kernel: Literal["none", "huber", "cauchy", "geman-mcclure"] = "cauchy"
     scale: float = 2.0
+    motions: Literal["none", "huber", "cauchy", "geman-mcclure"] = "none"
 
 
 @dataclass(frozen=True)
@@ -115,7 +119,14 @@ class BackendConfig:
     """
 
     name: Literal[
-        "isam2", "batch", "ekf", "invariant-ekf", "rbpf", "dead-reckoning", "decentralised"
+        "isam2",
+        "batch",
+        "ekf",
+        "invariant-ekf",
+        "imm",
+        "rbpf",
+        "dead-reckoning",
+        "decentralised",
     ] = "batch"
     causal: bool = False
     horizon_s: float = math.inf
@@ -170,6 +181,19 @@ class EkfConfig:
     along_sigma_m: float = 10.0
     iterations: int = 1
     past_states: int = 20
+
+
+@dataclass(frozen=True)
+class ImmConfig:
+    """The filter with interacting multiple models, `imm`: motions are normal, or slip.
+
+    slip_probability: that a motion slips after one that did not. grip_probability: that it does not
+    after one that did. slip_scale: sigmas of a motion that slips, in those that odometry states.
+    """
+
+    slip_probability: float = 0.1
+    grip_probability: float = 0.9
+    slip_scale: float = 10.0
 
 
 @dataclass(frozen=True)
@@ -288,6 +312,7 @@ class Config:
     backend: BackendConfig = field(default_factory=BackendConfig)
     loop_closure: LoopClosureConfig = field(default_factory=LoopClosureConfig)
     ekf: EkfConfig = field(default_factory=EkfConfig)
+    imm: ImmConfig = field(default_factory=ImmConfig)
     rbpf: RbpfConfig = field(default_factory=RbpfConfig)
     start: StartConfig = field(default_factory=StartConfig)
     multi_robot: MultiRobotConfig = field(default_factory=MultiRobotConfig)

@@ -136,6 +136,13 @@ class JointGaussian(Generic[Name]):
         }
         return made
 
+    def copied(self) -> "JointGaussian[Name]":
+        """Another one with the same members, mean and covariance."""
+        made = type(self)(room=0)
+        made._x, made._P, made._slots = self._x.copy(), self._P.copy(), self._slots.copy()
+        made._blocks, made._size = self._blocks.copy(), self._size
+        return made
+
     def __len__(self) -> int:
         """Size n of the state."""
         return self._size

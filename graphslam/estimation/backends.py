@@ -11,6 +11,7 @@ from graphslam.estimation.decentralised import DecentralisedBackend
 from graphslam.estimation.ekf import EkfBackend
 from graphslam.estimation.factor_ekf import FactorEkfBackend
 from graphslam.estimation.fixed_lag import FixedLagBackend
+from graphslam.estimation.imm import ImmBackend
 from graphslam.estimation.invariant_ekf import InvariantEkfBackend
 from graphslam.estimation.rbpf import RbpfBackend
 
@@ -34,6 +35,7 @@ BACKENDS: dict[str, Callable[[Config], Backend]] = {
     "dead-reckoning": DeadReckoningBackend,
     "decentralised": DecentralisedBackend,
     "ekf": EkfBackend,
+    "imm": ImmBackend,
     "invariant-ekf": InvariantEkfBackend,
     "isam2": isam2_with_horizon,
     "rbpf": RbpfBackend,

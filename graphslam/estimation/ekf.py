@@ -198,8 +198,12 @@ class EkfBackend(FilterBackend):
             raise indeterminate(what)
         gaussian.condition(B)
         self._apply_correction(d)
+        self._use(d2, HPHt + R)
+
+    def _use(self, d2: float, S: Array) -> None:
+        """Count an innovation: its square d2, normalised by its covariance S (k, k)."""
         self._twice_error += d2
-        self._dof += model.rows
+        self._dof += len(S)
 
     def _mean(self, name: Member) -> Array:
         """Mean of one member, a view of it."""

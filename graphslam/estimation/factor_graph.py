@@ -148,7 +148,7 @@ class GraphBuilder:
             key = self.state_key(robot, self.states.append(robot, step.time_ns))
             what = describe_motion(robot, step.time_ns)
             with covariance_of(what, motion.cov):
-                factor = factors.motion_factor(last, key, motion)
+                factor = factors.motion_factor(last, key, motion, self.kernel)
             self.rows += 3
             new = key, compose(estimate(last, 3), motion.delta)
             yield FactorGroup((factor,), what, new, last)

@@ -164,9 +164,12 @@ def start_factor(key: int, start: Start) -> gtsam.NonlinearFactor:
     return gtsam.PriorFactorPose2(key, pose2(start.pose), gaussian(cov))
 
 
-def motion_factor(key: int, next_key: int, motion: Motion) -> gtsam.NonlinearFactor:
-    """Odometry between two states of one robot."""
-    return relative_pose_factor(key, next_key, motion.delta, motion.cov, NO_KERNEL)
+def motion_factor(
+    key: int, next_key: int, motion: Motion, kernel: RobustConfig = NO_KERNEL
+) -> gtsam.NonlinearFactor:
+    """Odometry between two states of one robot, under the kernel of motions."""
+    own = replace(kernel, kernel=kernel.motions)
+    return relative_pose_factor(key, next_key, motion.delta, motion.cov, own)
 
 
 def motion_factors(

@@ -51,17 +51,25 @@ class FilterBackend(ABC):
             check_finite(describe_start(robot, step.time_ns), start.pose, start.cov)
             self._states.append(robot, step.time_ns)
             self._start(robot, start)
-        for robot, motion in step.motions.items():
-            self._states.latest(robot, step.time_ns)  # raises if it has not started
-            check_finite(describe_motion(robot, step.time_ns), motion.delta, motion.cov)
-            self._states.append(robot, step.time_ns)
-            self._move(robot, motion)
-        self._observe_step(step)
+        self._advance(step)
         for landmark in step.deleted:
             self.remove(landmark)
         for robot in {**step.starts, **step.motions}:
             joint = self.joint(robot, ())
             self._track.append(robot, step.time_ns, joint.pose, joint.cov)
+
+    def _advance(self, step: Step) -> None:
+        """Use the step's motions, then its associations and closures."""
+        for robot, motion in step.motions.items():
+            self._move_to(robot, step.time_ns, motion)
+        self._observe_step(step)
+
+    def _move_to(self, robot: str, time_ns: int, motion: Motion) -> None:
+        """Make the robot's next state, at ``time_ns``."""
+        self._states.latest(robot, time_ns)  # raises if it has not started
+        check_finite(describe_motion(robot, time_ns), motion.delta, motion.cov)
+        self._states.append(robot, time_ns)
+        self._move(robot, motion)
 
     def remove(self, landmark: int) -> None:  # noqa: B027 (a filter need not: nothing else changes)
         """Drop a landmark that no later step observes; here it stays."""

@@ -16,6 +16,7 @@ NAMES = {
     "dead-reckoning": "Dead reckoning",
     "decentralised": "Decentralised",
     "ekf": "EKF",
+    "imm": "IMM",
     "isam2": "iSAM2",
 }
 

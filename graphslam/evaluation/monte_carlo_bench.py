@@ -78,8 +78,10 @@ def run_seed(seed: int, scale: float, run: int) -> np.random.SeedSequence:
     return np.random.SeedSequence(seed, spawn_key=(round(1e6 * scale), run))
 
 
-def draw_run(bench: Bench, scale: float, rng: np.random.Generator | None) -> BenchRun:
-    """Draw a run; without ``rng`` all errors are zero.
+def draw_run(
+    bench: Bench, scale: float, rng: np.random.Generator | None, *, told: bool = False
+) -> BenchRun:
+    """Draw a run; without ``rng`` all errors are zero. ``told``: slipping motions state that.
 
     Errors of starts, motions and sightings of points are additive; those of the pose of a line or a
     robot are along its own axes, as its covariance is given.
@@ -103,11 +105,13 @@ def draw_run(bench: Bench, scale: float, rng: np.random.Generator | None) -> Ben
         now = k * STEP_NS
         motions, seen = {}, []
         for name in names:
-            delta = between(truth[name][k - 1], truth[name][k]) + error(noise.motion)
+            cov = noise.motion
+            if bench.slip and rng is not None and rng.random() < bench.slip.share:
+                cov = bench.slip.scale**2 * cov
+            delta = between(truth[name][k - 1], truth[name][k]) + error(cov)
             length = float(np.hypot(delta[0], delta[1]))
-            motions[name] = Motion(
-                now - STEP_NS, now, delta, noise.motion, np.zeros((3, 0)), length
-            )
+            stated = cov if told else noise.motion
+            motions[name] = Motion(now - STEP_NS, now, delta, stated, np.zeros((3, 0)), length)
             x = truth[name][k]
             for i, point in enumerate(bench.points_m):
                 if np.hypot(*(np.array(point) - x[:2])) <= bench.point_reach_m:

@@ -74,7 +74,9 @@ def run_job(definition: Definition, job: Job) -> Row:
     sequence = run_seed(definition.seed, job.scale, job.run)
     if definition.bench is not None:
         rng = np.random.default_rng(sequence)
-        run = draw_run(definition.bench, job.scale, rng)
+        slip = definition.bench.slip
+        told = slip is not None and job.variant in slip.told
+        run = draw_run(definition.bench, job.scale, rng, told=told)
         return run_bench(run, definition.config(job.variant))
     config = definition.config(job.variant, f"front_end.name={job.front_end}")
     if definition.chapter is not None:

@@ -15,7 +15,7 @@ from graphslam.core.config_io import load_config
 from graphslam.core.errors import ConfigError
 from graphslam.evaluation.thesis_experiments import EXPERIMENTS as THESIS_EXPERIMENTS
 from graphslam.simulation import load_scenario
-from graphslam.simulation.scenario import NOT_NEGATIVE, POSITIVE, Point, ScenarioError
+from graphslam.simulation.scenario import NOT_NEGATIVE, POSITIVE, SHARE, Point, ScenarioError
 from graphslam.simulation.scenario_parser import build
 
 _FOLDER = Path(__file__).parent / "experiments"
@@ -27,6 +27,7 @@ EXPERIMENTS: dict[str, Path] = {
     for name in (
         "ekf-versus-smoothing",
         "filters",
+        "slip",
         "thesis",
         "rooms",
         "consistency",
@@ -76,12 +77,26 @@ class Sigmas:
 
 
 @dataclass(frozen=True)
+class Slip:
+    """Motions whose error is larger than stated.
+
+    share: of each robot's motions, drawn one by one. scale: of the sigmas of their errors. told:
+    variants whose motions state that, which no odometry does: what could be reached at best.
+    """
+
+    share: float = field(metadata=SHARE)
+    scale: float = field(metadata=POSITIVE)
+    told: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Bench:
     """A room, robots and noise, from which steps are drawn without a log.
 
     point_reach_m, line_reach_m: ranges at which points and lines are observed; which are observed
     follows from the planned path, so every run has the same graph. meet_every: the alphabetically
-    first robot observes the others every so many steps; 0 = never.
+    first robot observes the others every so many steps; 0 = never. slip: motions that slip; by
+    default none.
     """
 
     robots: Mapping[str, BenchRobot]
@@ -91,6 +106,7 @@ class Bench:
     point_reach_m: float = field(default=5.0, metadata=POSITIVE)
     line_reach_m: float = field(default=5.0, metadata=POSITIVE)
     meet_every: int = field(default=0, metadata=NOT_NEGATIVE)
+    slip: Slip | None = None
 
 
 @dataclass(frozen=True)
@@ -181,6 +197,8 @@ def load_definition(name: str | Path) -> Definition:
             load_scenario(scenario)
         except ScenarioError as error:
             raise ConfigError(f"{path.name}: logs.scenarios: {error}") from error
+    if found.bench and found.bench.slip and set(found.bench.slip.told) - set(found.variants):
+        raise ConfigError(f"{path.name}: bench.slip.told: give names of variants")
     for variant in found.variants:
         try:
             found.config(variant)

@@ -159,6 +159,30 @@ def test_what_is_drawn_has_the_covariance_that_is_stated():
         assert low < np.mean(squares[name]) / dof < high, name
 
 
+def test_motions_slip_in_the_share_given_and_state_it_only_where_told():
+    """200 runs of 40 motions: errors of slipping ones are ten times as large, a tenth of them slip,
+    and what is told has NEES of one. The draws are the same whether it is told or not."""
+    bench, share, squares, stated = load_definition("slip").bench, [], [], []
+    for run in range(200):
+        drawn, known = (
+            draw_run(bench, 1.0, np.random.default_rng(run_seed(1, 1.0, run)), told=told)
+            for told in (False, True)
+        )
+        cov = Noise.of(bench, 1.0).motion
+        for k, (step, twin) in enumerate(zip(drawn.steps[1:], known.steps[1:], strict=True), 1):
+            for name, motion in twin.motions.items():
+                e = motion.delta - between(drawn.truth[name][k - 1], drawn.truth[name][k])
+                np.testing.assert_array_equal(motion.delta, step.motions[name].delta)
+                np.testing.assert_array_equal(step.motions[name].cov, cov)
+                share.append(motion.cov[0, 0] / cov[0, 0])
+                squares.append(e @ np.linalg.solve(motion.cov, e))
+                stated.append(e @ np.linalg.solve(cov, e))
+    assert set(np.round(share, 9)) == {1.0, 100.0}
+    assert np.mean(np.array(share) > 1) == pytest.approx(0.1, abs=0.015)
+    assert np.mean(squares) / 3 == pytest.approx(1.0, abs=0.05)
+    assert np.mean(stated) / 3 == pytest.approx(0.9 + 10, rel=0.2)
+
+
 def test_a_seed_is_of_run_and_scale_alone():
     """And differs between them: else runs would repeat each other."""
     states = {
