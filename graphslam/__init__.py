@@ -13,11 +13,11 @@ tables that have a ``name`` just that (``backend="ekf"``); ``preset="thesis"`` s
 preset, under all others. They go over ``config``, which is a `Config` or the path of a TOML file.
 A wrong setting is a `ConfigError` that names its key.
 
-Paths are strings or path objects. A ``recording`` is an MCAP file, several that belong together,
-or what `open_logs` returned, whose settings are then the default. With ``output`` a function also
-writes the folder that its command writes, and replaces an existing one only with ``force``; what
-cannot be written is an `OutputError`. ``progress`` is called with the number of messages read so
-far and of all.
+Paths are strings or path objects. A ``recording`` is an MCAP file, a folder of rosbag2, a ``.db3``
+or a ROS 1 bag, several of these that belong together, or what `open_logs` returned, whose settings
+are then the default. With ``output`` a function also writes the folder that its command writes, and
+replaces an existing one only with ``force``; what cannot be written is an `OutputError`.
+``progress`` is called with the number of messages read so far and of all.
 
 What a name needs is imported when it is used.
 
@@ -122,10 +122,10 @@ def open_logs(
     config: Config | PathLike | None = None,
     **settings: Any,
 ) -> LogSet:
-    """Open MCAP files as one recording and find out what is in it.
+    """Open files or folders as one recording and find out what is in it.
 
     Raises:
-        LogError: a file is missing, not MCAP or empty, or holds nothing usable.
+        LogError: a file is missing, empty or of no known container, or holds nothing usable.
     """
     from graphslam.logs import open_logs
 

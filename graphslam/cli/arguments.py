@@ -103,7 +103,11 @@ def _output(metavar: str, text: str) -> Any:
 # ---------------------------------------------------------------- what goes in
 
 Logs = Annotated[
-    list[Path], typer.Argument(metavar="LOG", help="MCAP files; several are one recording.")
+    list[Path],
+    typer.Argument(
+        metavar="LOG",
+        help="MCAP, rosbag2 (folder or .db3), ROS 1 .bag; several are one recording.",
+    ),
 ]
 Format = Annotated[
     str,

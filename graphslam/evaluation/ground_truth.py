@@ -6,7 +6,7 @@ from pathlib import Path
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError, OutputError
 from graphslam.core.records import Result, Trajectory, TrueLandmark, Truth
-from graphslam.logs import GroundTruth, LogSet, read_truth, truth_from_mcap
+from graphslam.logs import GroundTruth, LogSet, is_recording, read_truth, truth_from_recordings
 from graphslam.results.file_formats import read_trajectory
 from graphslam.results.folder import SavedResult
 
@@ -17,7 +17,7 @@ def truth_of_logs(log: LogSet, config: Config) -> GroundTruth:
     """The truth in opened logs; empty if there is none."""
     if not any(topic.record in (Truth, TrueLandmark) for topic in log.topics):
         return GroundTruth({}, ())  # without reading the logs again
-    return truth_from_mcap(log.opened, config)
+    return truth_from_recordings(log.opened, config)
 
 
 def truth_of_run(result: Result | SavedResult) -> GroundTruth:
@@ -37,7 +37,7 @@ def truth_of_run(result: Result | SavedResult) -> GroundTruth:
 
 
 def truth_of_files(sources: Sequence[str], robots: Sequence[str]) -> GroundTruth:
-    """Truth from logs (``LOG.mcap``) and TUM files (``FILE.tum``, ``ROBOT=FILE.tum``).
+    """Truth from recordings and TUM files (``FILE.tum``, ``ROBOT=FILE.tum``).
 
     Args:
         sources: files as given on the command line; what they hold is combined.
@@ -50,7 +50,7 @@ def truth_of_files(sources: Sequence[str], robots: Sequence[str]) -> GroundTruth
     trajectories: dict[str, Trajectory] = {}
     landmarks: list[TrueLandmark] = []
     for source in sources:
-        if source.endswith(".mcap"):
+        if source.endswith(".mcap") or is_recording(Path(source)):
             found = read_truth([Path(source)], Config())
             if not found:
                 raise LogError(f"{source}: {_NO_TRUTH}")

@@ -1,4 +1,4 @@
-"""Logs in and out: MCAP files to time-ordered records, other formats to MCAP.
+"""Logs in and out: recordings to time-ordered records, other formats to MCAP.
 
 No other package imports `mcap` or `rosbags`. See docs/logs.md.
 """
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from graphslam.core.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
+    from graphslam.logs.containers import is_recording
     from graphslam.logs.import_pose_graph import pose_stamp_ns
     from graphslam.logs.import_summary import ImportSummary
     from graphslam.logs.importers import IMPORTERS
@@ -17,18 +18,19 @@ if TYPE_CHECKING:
         GroundTruth,
         read_true_associations,
         read_truth,
-        truth_from_mcap,
+        truth_from_recordings,
     )
     from graphslam.logs.writer import LogWriter
 
 #: module -> the names that it defines
 _NAMES = {
+    "containers": ("is_recording",),
     "import_pose_graph": ("pose_stamp_ns",),
     "import_summary": ("ImportSummary",),
     "importers": ("IMPORTERS",),
     "log_info": ("LogInfo", "RobotInfo", "TopicInfo", "inspect_logs"),
     "log_set": ("LogFile", "LogSet", "open_logs"),
-    "truth": ("GroundTruth", "read_true_associations", "read_truth", "truth_from_mcap"),
+    "truth": ("GroundTruth", "read_true_associations", "read_truth", "truth_from_recordings"),
     "writer": ("LogWriter",),
 }
 
@@ -43,11 +45,12 @@ __all__ = [
     "RobotInfo",
     "TopicInfo",
     "inspect_logs",
+    "is_recording",
     "open_logs",
     "pose_stamp_ns",
     "read_true_associations",
     "read_truth",
-    "truth_from_mcap",
+    "truth_from_recordings",
 ]
 
 if not TYPE_CHECKING:  # a type checker would take every name for defined

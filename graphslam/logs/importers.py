@@ -29,6 +29,12 @@ def _mrclam(source: Path, target: Path) -> ImportSummary:
     return import_mrclam(source, target)
 
 
+def _rosbag(source: Path, target: Path) -> ImportSummary:
+    from graphslam.logs.import_rosbag import import_rosbag
+
+    return import_rosbag(source, target)
+
+
 def _tinyslam(source: Path, target: Path) -> ImportSummary:
     from graphslam.logs.import_tinyslam import import_tinyslam
 
@@ -41,5 +47,6 @@ IMPORTERS: dict[str, Callable[[Path, Path], ImportSummary]] = {
     "g2o": _pose_graph,
     "isam": _pose_graph,
     "mrclam": _mrclam,
+    "rosbag": _rosbag,
     "tinyslam": _tinyslam,
 }

@@ -14,10 +14,11 @@ from graphslam.core.config import Config, RobotConfig
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import Array, between
 from graphslam.logs import time_order
+from graphslam.logs.containers import open_recording
 from graphslam.logs.decoders import TopicContext
 from graphslam.logs.future_stamps import Recorded
 from graphslam.logs.log_set import FileReader, LogFile, damage, merged_notes
-from graphslam.logs.mcap_file import McapFile, open_mcap
+from graphslam.logs.recording import Recording
 from graphslam.logs.schemas import SIGHTING
 from graphslam.logs.topic_context import ScanShape, scan_shape, topic_contexts
 from graphslam.logs.topics import (
@@ -116,9 +117,9 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
     A reason why the logs cannot be smoothed is reported in ``problem``, not raised.
 
     Raises:
-        LogError: a file is missing, not MCAP or without a message.
+        LogError: a file is missing, of no known container or without a message.
     """
-    files = [open_mcap(Path(path)) for path in paths]
+    files = [open_recording(Path(path)) for path in paths]
     warnings = [*config.warnings, *damage(files)]
     topics: list[Topic] = []
     chosen: list[Topic] = []
@@ -192,7 +193,7 @@ class _Reading:
 
 
 def _read_topic(
-    files: Sequence[McapFile],
+    files: Sequence[Recording],
     topic: Topic,
     contexts: Mapping[str, TopicContext],
     config: Config,
@@ -210,7 +211,7 @@ def _read_topic(
 
 
 def _topic_info(
-    files: Sequence[McapFile],
+    files: Sequence[Recording],
     topic: Topic,
     used: bool,
     reading: _Reading | None,
@@ -256,7 +257,7 @@ def _gaps(times_ns: NDArray[np.int64], period_s: float) -> tuple[Gap, ...]:
     return tuple(Gap(int(times_ns[i]), float(steps_s[i])) for i in found)
 
 
-def _other_topics(files: Sequence[McapFile], known: set[str]) -> list[TopicInfo]:
+def _other_topics(files: Sequence[Recording], known: set[str]) -> list[TopicInfo]:
     counts: Counter[tuple[str, str]] = Counter()
     for raw in (raw for file in files for raw in file.topics if raw.name not in known):
         counts[raw.name, raw.schema] += raw.count

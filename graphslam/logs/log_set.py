@@ -12,9 +12,10 @@ from graphslam.core.errors import LogError
 from graphslam.core.records import Message
 from graphslam.core.worker import Prefetch
 from graphslam.logs import time_order
+from graphslam.logs.containers import open_recording
 from graphslam.logs.decoders import TopicContext, decode_messages
 from graphslam.logs.future_stamps import Recorded, repair_future_stamps
-from graphslam.logs.mcap_file import McapFile, open_mcap, raw_messages
+from graphslam.logs.recording import Recording, raw_messages
 from graphslam.logs.stated_noise import StatedNoise, stated_noise
 from graphslam.logs.topic_context import topic_contexts
 from graphslam.logs.topics import ODOMETRY_KINDS, Topic, choose_topics, find_topics
@@ -50,7 +51,7 @@ class LogSet:
         dropped: number of dropped messages (of dropped beams, where the reason begins with
             ``range:``) by reason; filled when `messages` is exhausted.
         repaired: the same for messages that are used in spite of a defect.
-        opened: the indexed MCAP files, in the order of ``files``.
+        opened: the indexed recordings, in the order of ``files``.
         config: the settings that the logs were opened with.
     """
 
@@ -61,7 +62,7 @@ class LogSet:
     warnings: list[str]
     dropped: Counter[str]
     repaired: Counter[str]
-    opened: Sequence[McapFile] = field(repr=False)
+    opened: Sequence[Recording] = field(repr=False)
     _contexts: Mapping[str, TopicContext] = field(repr=False)
     config: Config = field(repr=False)
 
@@ -197,15 +198,15 @@ class ReadReport:
 
 
 def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
-    """Open ``paths`` (MCAP files) as one log and determine its robots and topics.
+    """Open ``paths`` (see `open_recording`) as one log and determine its robots and topics.
 
     Raises:
-        LogError: a file is missing, not MCAP or empty; no topic is usable; all usable topics are
-            empty; a robot has scans but no odometry. The message names file and topic.
+        LogError: a file is missing, of no known container or empty; no topic is usable; all usable
+            topics are empty; a robot has scans but no odometry. The message names file and topic.
     """
     if not paths:
-        raise LogError("no log given; name at least one .mcap file")
-    files = [open_mcap(Path(path)) for path in paths]
+        raise LogError("no log given; name at least one file or folder")
+    files = [open_recording(Path(path)) for path in paths]
     for n, file in enumerate(files):
         if file.sha256 in {other.sha256 for other in files[:n]}:
             raise LogError(f"{file.path}: is given twice; name each log once")
@@ -225,12 +226,12 @@ def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
     )
 
 
-def merged_notes(files: Iterable[McapFile]) -> dict[str, str]:
+def merged_notes(files: Iterable[Recording]) -> dict[str, str]:
     """The notes of all files; of notes with the same key that of the last file."""
     return {key: note for file in files for key, note in file.notes.items()}
 
 
-def damage(files: Iterable[McapFile]) -> list[str]:
+def damage(files: Iterable[Recording]) -> list[str]:
     """One line about the losses in each damaged file."""
     return [
         f"{f.path}: damaged, {'an unknown number of' if f.lost is None else f.lost} messages are "
@@ -250,7 +251,7 @@ class FileReader:
     ``dropped`` and the counts of ``sorter`` are those of the messages read so far.
     """
 
-    def __init__(self, file: McapFile, config: Config) -> None:
+    def __init__(self, file: Recording, config: Config) -> None:
         """Prepare to read ``file`` with the window of ``config.logs``."""
         self.file = file
         self.sorter = time_order.MessageSorter(round(config.logs.reorder_s * 1e9))
@@ -293,7 +294,7 @@ _STAMP_DEFECTS = {
 }
 
 
-def _stamp_warnings(file: McapFile, topic: str, counts: Counter[str]) -> list[str]:
+def _stamp_warnings(file: Recording, topic: str, counts: Counter[str]) -> list[str]:
     """One line per kind of defect among the stamps of a topic."""
     return [
         f"{file.path}: {topic}: {counts[kind]} {text}"

@@ -152,6 +152,8 @@ geometry_msgs/Quaternion rotation
 }
 
 _DECODER = Decoder(_ROS_DEFINITIONS | DEFINITIONS)
+#: schemas that `decode` reads
+KNOWN = frozenset(name for name in (*_ROS_DEFINITIONS, *DEFINITIONS) if "/msg/" in name)
 
 
 @cache
@@ -162,6 +164,20 @@ def _typestore() -> Any:
     for name, text in DEFINITIONS.items():
         store.register(get_types_from_msg(text, name))
     return store
+
+
+def ros1_to_cdr(schema: str, data: bytes) -> bytes:
+    """The ROS 1 message in ``data``, of the type that ROS 2 calls ``schema``, in CDR.
+
+    Raises:
+        CdrError: the bytes are cut short or are not such a message.
+    """
+    from rosbags.serde import SerdeError  # noqa: PLC0415
+
+    try:
+        return bytes(_typestore().ros1_to_cdr(data, schema))
+    except (SerdeError, struct.error, ValueError, IndexError, TypeError, AssertionError) as error:
+        raise CdrError(str(error)) from error
 
 
 def decode(schema: str, data: bytes) -> Any:

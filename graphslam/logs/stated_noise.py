@@ -14,7 +14,7 @@ from graphslam.core.geometry import Array, between, log
 from graphslam.logs import schemas
 from graphslam.logs.cdr import CdrError
 from graphslam.logs.decoders import TopicContext, odometry
-from graphslam.logs.mcap_file import McapFile, sample_messages
+from graphslam.logs.recording import Recording, sample_messages
 from graphslam.logs.topics import Topic
 
 #: rows of x, y and heading in the covariance of a velocity in space
@@ -42,7 +42,7 @@ class StatedNoise:
     variances: Array
 
 
-def stated_noise(files: Sequence[McapFile], topic: Topic) -> StatedNoise | None:
+def stated_noise(files: Sequence[Recording], topic: Topic) -> StatedNoise | None:
     """The noise that ``topic``, of `OdometryPose`, states; None if it is not filled in sensibly.
 
     It is if the covariances of most velocities in motion are positive definite along x, y and
@@ -66,7 +66,7 @@ def stated_noise(files: Sequence[McapFile], topic: Topic) -> StatedNoise | None:
     return StatedNoise(twists[sensible], dt, variances[sensible] * dt[:, None] ** 2)
 
 
-def _sampled(file: McapFile, topic: Topic) -> list[tuple[Array, Array, Array]]:
+def _sampled(file: Recording, topic: Topic) -> list[tuple[Array, Array, Array]]:
     """Motions (n, 3) between readings in a row, seconds (n,), covariances (n, 3, 3) of velocity.
 
     Empty if the first message states none, as most do not: then no more is read.

@@ -11,9 +11,9 @@ from graphslam.core.config import Config
 from graphslam.core.geometry import Array
 from graphslam.logs import schemas
 from graphslam.logs.decoders import TopicContext, frame_of
-from graphslam.logs.mcap_file import McapFile, raw_messages, sample_messages
 from graphslam.logs.mounts import TransformTree, find_mount, is_level, transform_tree
 from graphslam.logs.no_return import find_no_return
+from graphslam.logs.recording import Recording, raw_messages, sample_messages
 from graphslam.logs.schemas import DEFAULT_ROBOT
 from graphslam.logs.topics import ODOMETRY_KINDS, Topic, robot_of, static_transform_topics
 
@@ -31,7 +31,7 @@ class ScanShape:
     range_max_m: float | None
 
 
-def scan_shape(files: Sequence[McapFile], topic: Topic) -> ScanShape | None:
+def scan_shape(files: Sequence[Recording], topic: Topic) -> ScanShape | None:
     """Shape of the first scan of ``topic`` that can be decoded; None if there is none."""
     for message in sample_decoded(files, topic):
         beams = len(message.ranges)
@@ -42,7 +42,7 @@ def scan_shape(files: Sequence[McapFile], topic: Topic) -> ScanShape | None:
 
 
 def topic_contexts(
-    files: Sequence[McapFile], topics: Sequence[Topic], config: Config
+    files: Sequence[Recording], topics: Sequence[Topic], config: Config
 ) -> tuple[dict[str, TopicContext], list[str]]:
     """Decoding context of each topic, and warnings about assumptions that were made."""
     warnings: list[str] = []
@@ -74,7 +74,7 @@ def topic_contexts(
     return contexts, warnings
 
 
-def sample_decoded(files: Sequence[McapFile], topic: Topic) -> Iterator[Any]:
+def sample_decoded(files: Sequence[Recording], topic: Topic) -> Iterator[Any]:
     """Decoded messages of ``topic``, sampled evenly over the log."""
     for file in files:
         data = sample_messages(file, topic.name, _SAMPLE_BLOCKS, _SAMPLE_PER_BLOCK)
@@ -82,7 +82,7 @@ def sample_decoded(files: Sequence[McapFile], topic: Topic) -> Iterator[Any]:
         yield from schemas.decode_all(topic.schema, data)
 
 
-def _base_frame(files: Sequence[McapFile], topic: Topic) -> str:
+def _base_frame(files: Sequence[Recording], topic: Topic) -> str:
     """Frame whose motion an odometry topic describes."""
     if topic.record is records.WheelAngles:
         return "base_link"  # JointState has no such frame; this is ROS' convention
@@ -92,7 +92,7 @@ def _base_frame(files: Sequence[McapFile], topic: Topic) -> str:
     return "base_link"
 
 
-def _transforms(files: Sequence[McapFile], robot: str) -> TransformTree:
+def _transforms(files: Sequence[Recording], robot: str) -> TransformTree:
     """Static transforms for ``robot``: global ones and those of its namespace."""
     tree: dict[str, tuple[str, Array]] = {}
     for file in files:

@@ -7,7 +7,7 @@ from graphslam.core import records
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError
 from graphslam.logs.decoders import DECODERS
-from graphslam.logs.mcap_file import McapFile
+from graphslam.logs.recording import Recording
 from graphslam.logs.schemas import DEFAULT_ROBOT, TF_MESSAGE
 
 # Sources of odometry in order of preference: an increment has its covariance, wheel angles need
@@ -30,7 +30,7 @@ class Topic:
     count: int
 
 
-def find_topics(files: Sequence[McapFile], config: Config) -> list[Topic]:
+def find_topics(files: Sequence[Recording], config: Config) -> list[Topic]:
     """All topics whose schema has a decoder, sorted by name.
 
     The robot is the first part of the topic's name, ``robot`` where there is only one part.
@@ -73,7 +73,7 @@ def robot_of(topic: str) -> str:
     return first if separator else DEFAULT_ROBOT
 
 
-def static_transform_topics(file: McapFile) -> list[str]:
+def static_transform_topics(file: Recording) -> list[str]:
     """Topics of ``file`` with static transforms."""
     return [
         topic.name
@@ -83,7 +83,7 @@ def static_transform_topics(file: McapFile) -> list[str]:
 
 
 def choose_topics(
-    files: Sequence[McapFile], topics: Sequence[Topic]
+    files: Sequence[Recording], topics: Sequence[Topic]
 ) -> tuple[list[Topic], list[str]]:
     """One odometry source and one laser per robot, all other topics, and warnings.
 

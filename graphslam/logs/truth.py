@@ -10,8 +10,9 @@ import numpy as np
 from graphslam.core.config import Config
 from graphslam.core.records import Trajectory, TrueAssociations, TrueLandmark, Truth
 from graphslam.logs import schemas
+from graphslam.logs.containers import open_recording
 from graphslam.logs.decoders import TopicContext, decode_messages
-from graphslam.logs.mcap_file import McapFile, open_mcap, raw_messages
+from graphslam.logs.recording import Recording, raw_messages
 from graphslam.logs.topics import find_topics
 
 
@@ -38,12 +39,13 @@ def read_truth(paths: Sequence[Path], config: Config) -> GroundTruth:
     taken once, by its identity.
 
     Raises:
-        LogError: a file is missing, not MCAP, empty, or without any topic that can be decoded.
+        LogError: a file is missing, of no known container, empty, or without any topic that can be
+            decoded.
     """
-    return truth_from_mcap([open_mcap(path) for path in paths], config)
+    return truth_from_recordings([open_recording(path) for path in paths], config)
 
 
-def truth_from_mcap(files: Sequence[McapFile], config: Config) -> GroundTruth:
+def truth_from_recordings(files: Sequence[Recording], config: Config) -> GroundTruth:
     """`read_truth` of files that are already open."""
     topics = {t.name: t for t in find_topics(files, config) if t.record in (Truth, TrueLandmark)}
     poses: dict[str, list[bytes]] = {}
@@ -73,9 +75,10 @@ def read_true_associations(
     """True associations of scans and sightings: topic -> messages in the order of recording.
 
     Raises:
-        LogError: a file is missing, not MCAP, empty, or without any topic that can be decoded.
+        LogError: a file is missing, of no known container, empty, or without any topic that can be
+            decoded.
     """
-    files = [open_mcap(path) for path in paths]
+    files = [open_recording(path) for path in paths]
     topics = {t.name: t for t in find_topics(files, config) if t.record is TrueAssociations}
     found: dict[str, list[TrueAssociations]] = {name: [] for name in topics}
     unusable: Counter[str] = Counter()

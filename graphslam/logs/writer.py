@@ -307,6 +307,10 @@ class LogWriter:
         """Any ROS 2 message, made by `schemas.build`, on ``topic`` (with its leading slash)."""
         self._add(topic, schema, message, stamp_ns, None)
 
+    def encoded(self, topic: str, schema: str, data: bytes, log_time_ns: int) -> None:
+        """A message of a known schema in CDR, recorded at ``log_time_ns``, as it is."""
+        self._add(topic, schema, data, log_time_ns, None)
+
     # ------------------------------------------------------------ internals
 
     def _build(

@@ -20,8 +20,9 @@ from graphslam.core.config import Config, LogsConfig, RobotConfig
 from graphslam.core.errors import LogError, OutputError
 from graphslam.logs import LogSet, LogWriter, decoders, inspect_logs, open_logs, schemas
 from graphslam.logs.cdr import CdrError
+from graphslam.logs.containers import open_recording
 from graphslam.logs.decoders import DECODERS, TopicContext, decode_messages
-from graphslam.logs.mcap_file import open_mcap, raw_messages
+from graphslam.logs.recording import raw_messages
 from graphslam.logs.time_order import TOO_LATE, MessageSorter
 
 S = 1_000_000_000
@@ -455,8 +456,8 @@ def foreign_log(path: Path, schema: str, encoding: str = "cdr", count: int = 1) 
 def test_logs_without_anything_usable_say_what_there_is(tmp_path):
     path = tmp_path / "log.mcap"
     assert "/topic (std_msgs/msg/String, cdr)" in error_of(foreign_log(path, "std_msgs/msg/String"))
-    assert "(sensor_msgs/msg/LaserScan, ros1)" in error_of(
-        foreign_log(path, schemas.LASER_SCAN, "ros1")
+    assert "(sensor_msgs/msg/LaserScan, cbor)" in error_of(
+        foreign_log(path, schemas.LASER_SCAN, "cbor")
     )
     with LogWriter(path) as log:
         log.truth("robot", S, (0, 0, 0))
@@ -568,7 +569,7 @@ def test_files_without_summary_chunks_or_statistics_are_read_all_the_same(tmp_pa
             for k in range(2500):
                 writer.add_message(channel, 2500 - k, struct.pack("<I", k), k)
             writer.finish()
-        file = open_mcap(path)
+        file = open_recording(path)
         assert file.messages == 2500 and file.lost == 0 and not file.damage and not file.in_order
         numbers = [struct.unpack("<I", m.data)[0] for m in raw_messages(file, {"/truth"})]
         assert numbers == list(range(2500))[::-1]

@@ -1,0 +1,129 @@
+"""Recordings by their files: one row of `CONTAINERS` per container, found by its first bytes."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+from graphslam.core.errors import LogError
+from graphslam.logs import bag_file, mcap_file, sqlite_file
+from graphslam.logs.container_files import is_compressed, open_file
+from graphslam.logs.recording import Piece, Recording
+from graphslam.logs.rosbag2_metadata import METADATA, Metadata, read_metadata
+
+
+class Container(NamedTuple):
+    """A row of `CONTAINERS`: the bytes that a file begins with, and what indexes it."""
+
+    magic: bytes
+    make_index: Callable[[Path], Piece]
+
+
+CONTAINERS: dict[str, Container] = {
+    "MCAP": Container(mcap_file.MAGIC, mcap_file.index_mcap),
+    "rosbag2 SQLite": Container(sqlite_file.MAGIC, sqlite_file.index_sqlite),
+    "ROS 1 bag": Container(bag_file.MAGIC, bag_file.index_bag),
+}
+
+_LONGEST = max(len(container.magic) for container in CONTAINERS.values())
+#: what is beside recordings in folders, and is not looked at
+_PACKED = {b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zXZ": "xz", b"PK\x03\x04": "zip"}
+
+
+def open_recording(path: Path) -> Recording:
+    """Read through ``path`` once and index it.
+
+    It is a file of any row of `CONTAINERS`, also compressed with zstd, or a folder of such files,
+    which are the pieces of one recording.
+
+    Raises:
+        LogError: no such file, unreadable, of no known container, or without any message.
+    """
+    try:
+        recording = _open_folder(path) if path.is_dir() else Recording(path, (_indexed(path),))
+    except FileNotFoundError as error:
+        raise LogError(f"{path}: no such file; check the path") from error
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror}; check the file") from error
+    if not recording.messages:
+        damage = recording.damage
+        why = f"no message can be read: {damage}" if damage else "is an empty log"
+        raise LogError(f"{path}: {why}; record it again or name another file")
+    return recording
+
+
+def is_recording(path: Path) -> bool:
+    """Whether ``path`` is a file of any row of `CONTAINERS`, or a folder."""
+    return path.is_dir() or (path.is_file() and _container_of(path) is not None)
+
+
+def _indexed(path: Path) -> Piece:
+    container = _container_of(path)
+    if container is None:
+        raise LogError(f"{path}: {_what_it_is(path)}")
+    return container.make_index(path)
+
+
+def _container_of(path: Path) -> Container | None:
+    with open_file(path) as stream:
+        begin = stream.read(_LONGEST)
+    rows = CONTAINERS.values()
+    return next((row for row in rows if begin.startswith(row.magic)), None)
+
+
+def _what_it_is(path: Path) -> str:
+    """What a file of no known container is, and what to do."""
+    with open_file(path) as stream:
+        begin = stream.read(_LONGEST)
+    if not begin and is_compressed(path):
+        return "is compressed with zstd and damaged at its beginning; copy it again"
+    if not begin:
+        return "is an empty file, not an MCAP file or another recording; is it the right one?"
+    if begin.startswith(bag_file.ANY_VERSION):
+        return "is a bag of an old version; `rosbag fix` makes one of version 2.0 of it"
+    for magic, name in _PACKED.items():
+        if begin.startswith(magic):
+            return f"is packed with {name}; unpack it, or `graphslam import` it"
+    if path.name == METADATA:
+        return "is the description of a recording; name the folder that it is in"
+    return (
+        f"is not an MCAP file, nor another recording ({', '.join(CONTAINERS)}); "
+        "`graphslam import` turns other formats into MCAP"
+    )
+
+
+# ---------------------------------------------------------------- folders
+
+
+def _open_folder(folder: Path) -> Recording:
+    """The files of recordings in ``folder`` as the pieces of one, in the order of time."""
+    metadata = read_metadata(folder / METADATA)
+    paths = [path for path in sorted(folder.iterdir()) if path.is_file()]
+    if metadata.files:
+        # other files, for example copies, are not part of the recording
+        paths = [path for path in paths if metadata.listed(path.name)]
+    found = [path for path in paths if path.stat().st_size and _container_of(path)]
+    if not found:
+        raise LogError(f"{folder}: {_without_recording(folder)}")
+    pieces = [_counted(_indexed(path), metadata) for path in found]
+    pieces = [piece for piece in pieces if piece.messages or piece.damage]
+    pieces.sort(key=lambda piece: piece.start_ns)
+    missing = metadata.missing([path.name for path in found])
+    lost = f"{', '.join(missing)} of {METADATA} is not there" if missing else ""
+    return Recording(folder, tuple(pieces), lost)
+
+
+def _counted(piece: Piece, metadata: Metadata) -> Piece:
+    """The piece with its lost messages, if the metadata has their number."""
+    stated = metadata.messages_of(piece.path.name)
+    if stated is None or not piece.damage or piece.lost is not None:
+        return piece
+    return replace(piece, lost=max(0, stated - piece.messages))
+
+
+def _without_recording(folder: Path) -> str:
+    """What to say about a folder in which there is none."""
+    inside = sorted(path.name for path in folder.iterdir() if path.is_dir())
+    if inside:
+        return f"is a directory without a recording; name a folder in it, such as {inside[0]}"
+    return f"is a directory without a recording ({', '.join(CONTAINERS)}); name another one"

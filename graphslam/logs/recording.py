@@ -1,0 +1,280 @@
+"""A recording of any container: its topics, and their raw messages in the order of recording.
+
+A container's module makes one pass over a file and lists the blocks of messages that can be read
+(`Piece`), and reads a block again when its messages are wanted. A recording has one piece, or
+several that follow each other (split bags). What a message is made of is known to `translations`.
+"""
+
+import hashlib
+import heapq
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+from graphslam.logs.translations import Translate, translation
+
+_T = TypeVar("_T")
+
+#: files that are open at once while blocks that overlap in time are merged
+_MAX_OPEN = 16
+#: most messages of a block that is not given by the file itself, so that a block is never large
+MAX_BLOCK = 1000
+
+
+class RawMessage(NamedTuple):
+    """One message: topic, time of recording and encoded bytes, see `RawTopic`."""
+
+    topic: str
+    log_time_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class RawTopic:
+    """A topic of a recording: schema name, encoding and number of readable messages.
+
+    What can be decoded is ``cdr`` with the name of a ROS 2 schema, however it was recorded.
+    """
+
+    name: str
+    schema: str
+    encoding: str
+    count: int
+
+
+class Channel(NamedTuple):
+    """A source of messages in a file: topic, schema and encoding as recorded."""
+
+    topic: str
+    schema: str
+    encoding: str
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Messages that are read together: a chunk, or messages in a row.
+
+    ``offset`` and ``end`` are bytes or row numbers, as the container counts. ``counts``: number of
+    messages by channel.
+    """
+
+    offset: int
+    end: int
+    start_ns: int
+    end_ns: int
+    counts: Mapping[int, int]
+
+
+#: channel, log time ns and data of the messages of the wanted channels in a block
+ReadBlock = Callable[[Block, Collection[int]], Iterator[tuple[int, int, bytes]]]
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """Index of one file from one pass over it.
+
+    ``lost`` is the number of messages that cannot be read, None if the file is damaged and does not
+    say how many there were. ``damage`` describes the damage in one line, empty if there is none.
+    ``in_order``: log times never decrease in file order. ``open`` opens the file to read blocks.
+    """
+
+    path: Path
+    sha256: str
+    channels: Mapping[int, Channel] = field(repr=False)
+    blocks: tuple[Block, ...] = field(repr=False)
+    in_order: bool
+    lost: int | None
+    damage: str
+    open: Callable[["Piece"], AbstractContextManager[ReadBlock]] = field(repr=False)
+    notes: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def messages(self) -> int:
+        """Number of readable messages."""
+        return sum(sum(block.counts.values()) for block in self.blocks)
+
+    @property
+    def start_ns(self) -> int:
+        """Earliest log time; 0 without messages."""
+        return min((block.start_ns for block in self.blocks), default=0)
+
+    @property
+    def end_ns(self) -> int:
+        """Latest log time; 0 without messages."""
+        return max((block.end_ns for block in self.blocks), default=0)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Pieces in the order of time; ``path`` is the file or the folder that holds them.
+
+    ``damage`` of the whole is in one line; ``pieces_lost`` says which pieces are missing.
+    """
+
+    path: Path
+    pieces: tuple[Piece, ...]
+    pieces_lost: str = ""
+
+    @cached_property
+    def sha256(self) -> str:
+        """Of the file; of several, that of their digests one after the other."""
+        if len(self.pieces) == 1:
+            return self.pieces[0].sha256
+        return hashlib.sha256("".join(p.sha256 for p in self.pieces).encode()).hexdigest()
+
+    @cached_property
+    def messages(self) -> int:
+        """Number of readable messages."""
+        return sum(piece.messages for piece in self.pieces)
+
+    @property
+    def lost(self) -> int | None:
+        """Number of lost messages, None if it is not known."""
+        if self.pieces_lost:
+            return None
+        known = [piece.lost for piece in self.pieces if piece.lost is not None]
+        return sum(known) if len(known) == len(self.pieces) else None
+
+    @property
+    def damage(self) -> str:
+        """What is damaged, in one line; empty if nothing is."""
+        several = len(self.pieces) > 1
+        told = [f"{p.path.name}: " * several + p.damage for p in self.pieces if p.damage]
+        return "; ".join([*([self.pieces_lost] if self.pieces_lost else []), *told])
+
+    @property
+    def notes(self) -> Mapping[str, str]:
+        """Notes in the files; of notes with the same key that of the last file."""
+        return {key: note for piece in self.pieces for key, note in piece.notes.items()}
+
+    @property
+    def in_order(self) -> bool:
+        """Whether log times never decrease from message to message."""
+        follow = all(a.end_ns <= b.start_ns for a, b in pairwise(self.pieces))
+        return follow and all(piece.in_order for piece in self.pieces)
+
+    @cached_property
+    def topics(self) -> tuple[RawTopic, ...]:
+        """All topics, sorted by name, translated where that is possible."""
+        counts: Counter[str] = Counter()
+        kinds: dict[str, tuple[str, str]] = {}
+        for piece in self.pieces:
+            read = Counter[int]()
+            for block in piece.blocks:
+                read.update(block.counts)
+            for number, (topic, schema, encoding) in piece.channels.items():
+                counts[topic] += read[number]
+                found = translation(schema, encoding)
+                kinds.setdefault(topic, (found.schema, "cdr") if found else (schema, encoding))
+        return tuple(RawTopic(name, *kinds[name], counts[name]) for name in sorted(kinds))
+
+
+class BlockList:
+    """Blocks of a file as they are found, in its order."""
+
+    def __init__(self) -> None:
+        self.blocks: list[Block] = []
+        self.in_order, self._latest_ns = True, -1
+
+    def add(self, offset: int, end: int, messages: Sequence[tuple[int, int]]) -> None:
+        """Add a block of messages, given by channel and log time; none is no block."""
+        if not messages:
+            return
+        channels, times = zip(*messages, strict=True)
+        self.in_order &= all(a <= b for a, b in pairwise((self._latest_ns, *times)))
+        self._latest_ns = max(self._latest_ns, *times)
+        self.blocks.append(Block(offset, end, min(times), max(times), dict(Counter(channels))))
+
+
+def raw_messages(recording: Recording, topics: Collection[str]) -> Iterator[RawMessage]:
+    """Messages of ``topics`` in the order of recording.
+
+    This is the order of the file if its log times never decrease, else that of the log times.
+    Memory holds the blocks that overlap in log time, a single one if the file is in order.
+    """
+    blocks = [(p, b) for p in recording.pieces for b in p.blocks]
+    with _Reader(topics) as reader:
+        blocks = [(piece, block) for piece, block in blocks if reader.has_any(piece, block)]
+        if recording.in_order:
+            for piece, block in blocks:
+                yield from reader.read(piece, block)
+        else:
+            yield from _by_log_time(reader, blocks)
+
+
+def sample_messages(
+    recording: Recording, topic: str, blocks: int, per_block: int
+) -> Iterator[bytes]:
+    """Data of about ``blocks * per_block`` messages of ``topic``, spread evenly over the file."""
+    with _Reader((topic,)) as reader:
+        holding = [(p, b) for p in recording.pieces for b in p.blocks if reader.has_any(p, b)]
+        for piece, block in _spread(holding, blocks):
+            yield from _spread([raw.data for raw in reader.read(piece, block)], per_block)
+
+
+def _spread(items: Sequence[_T], n: int) -> Sequence[_T]:
+    """At most ``n`` of the items, evenly spaced."""
+    return items[:: max(1, -(-len(items) // n))]
+
+
+class _Reader:
+    """Reads blocks of several files, of which the latest stay open; a context manager."""
+
+    def __init__(self, topics: Collection[str]) -> None:
+        self._topics = topics
+        self._wanted: dict[Path, dict[int, tuple[str, Translate | None]]] = {}
+        self._open: dict[Path, tuple[ReadBlock, ExitStack]] = {}
+
+    def __enter__(self) -> "_Reader":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for _, stack in self._open.values():
+            stack.close()
+
+    def has_any(self, piece: Piece, block: Block) -> bool:
+        """Whether there are messages of the topics in ``block``."""
+        if piece.path not in self._wanted:
+            self._wanted[piece.path] = {
+                number: (channel.topic, found.translate if found else None)
+                for number, channel in piece.channels.items()
+                if channel.topic in self._topics
+                for found in (translation(channel.schema, channel.encoding),)
+            }
+        return not self._wanted[piece.path].keys().isdisjoint(block.counts)
+
+    def read(self, piece: Piece, block: Block) -> Iterator[RawMessage]:
+        """The messages of the topics in ``block``, translated."""
+        wanted = self._wanted[piece.path]
+        if piece.path not in self._open:
+            while len(self._open) >= _MAX_OPEN:
+                self._open.pop(next(iter(self._open)))[1].close()
+            stack = ExitStack()
+            read: ReadBlock = stack.enter_context(piece.open(piece))
+            self._open[piece.path] = read, stack
+        for channel, log_time_ns, data in self._open[piece.path][0](block, wanted.keys()):
+            topic, translate = wanted[channel]
+            yield RawMessage(topic, log_time_ns, translate(data) if translate else data)
+
+
+def _by_log_time(reader: _Reader, blocks: list[tuple[Piece, Block]]) -> Iterator[RawMessage]:
+    """Merge blocks that overlap in log time; equal times keep the order of the file."""
+    heap: list[tuple[int, int, int, RawMessage]] = []
+    # a stable sort: equal times keep the order of pieces and blocks
+    for number, (piece, block) in enumerate(sorted(blocks, key=lambda b: b[1].start_ns)):
+        while heap and heap[0][0] < block.start_ns:
+            yield heapq.heappop(heap)[3]
+        for position, raw in enumerate(reader.read(piece, block)):
+            heapq.heappush(heap, (raw.log_time_ns, number, position, raw))
+    while heap:
+        yield heapq.heappop(heap)[3]
+
+
+def one_line(error: Exception) -> str:
+    """Text of an error in one line; its type if it has no text."""
+    return " ".join(str(error).split()) or type(error).__name__
