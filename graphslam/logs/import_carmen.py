@@ -1,13 +1,16 @@
 """CARMEN logs (the format of the Radish and Freiburg data sets) to MCAP.
 
-FLASER lines become LaserScan, ODOM lines Odometry, PARAM robot_frontlaser_offset the laser's
-mount. The stamp is exactly the ipc time (third field from the end), because the published
-relations refer to it.
+Lines of lasers become LaserScan, ODOM lines Odometry; where there are none, the robot's pose in the
+lines of lasers does. The stamp is exactly the ipc time (third field from the end), because the
+published relations refer to it.
+
+Source: https://carmen.sourceforge.net/logger_playback.html
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from decimal import Decimal, DecimalException
+from functools import partial
 from itertools import accumulate
 from pathlib import Path
 from typing import NamedTuple
@@ -16,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphslam.core.errors import LogError
+from graphslam.core.geometry import between
 from graphslam.logs.decoders import MAX_RANGE_M
 from graphslam.logs.import_summary import ImportSummary
 from graphslam.logs.no_return import find_no_return
@@ -24,20 +28,49 @@ from graphslam.logs.source_files import text_lines
 from graphslam.logs.writer import LogWriter
 
 Ranges = NDArray[np.float32]
+_Pose = tuple[float, float, float]
 
 _TRAILER = 3  # fields at the end: ipc time, host, logger time
-_SCAN_TAIL = 6  # fields after the ranges: laser pose and odometry pose
 _SAMPLE_EVERY = 20  # every 20th scan is searched for the no-return value
+#: m and rad within which the pose of a laser on the robot must stay to be its mount
+_MOUNT_SPREAD = 1e-3
+#: lasers by the number in the names of their lines: frame, usual heading on the robot
+_LASERS = {1: ("laser", 0.0), 2: ("rear_laser", np.pi), 3: ("laser3", 0.0), 4: ("laser4", 0.0)}
 
 
 class _Odometry(NamedTuple):
     stamp_ns: int
-    pose: tuple[float, float, float]
+    pose: _Pose
+
+
+class _Truth(NamedTuple):
+    stamp_ns: int
+    pose: _Pose
 
 
 class _Scan(NamedTuple):
+    """A scan; ``angles``: first angle and step, rad.
+
+    Poses of the laser and the robot are in the frame of the odometry, None if the line has none.
+    """
+
     stamp_ns: int
+    tag: str
+    laser: int
     ranges: Ranges
+    angles: tuple[float, float]
+    laser_pose: _Pose | None = None
+    robot_pose: _Pose | None = None
+
+
+class _Offset(NamedTuple):
+    """Distance of a laser ahead of the base, m."""
+
+    laser: int
+    ahead_m: float
+
+
+_Entry = _Odometry | _Truth | _Scan | _Offset
 
 
 def import_carmen(source: Path, target: Path) -> ImportSummary:
@@ -54,36 +87,97 @@ def import_carmen(source: Path, target: Path) -> ImportSummary:
     malformed: Counter[str] = Counter()
     # all in memory, about 4 bytes per beam: the log times are computed from the end
     entries = list(_entries(source, malformed))
-    offsets = [entry for entry in entries if isinstance(entry, float)]
-    stamped = [entry for entry in entries if not isinstance(entry, float)]
+    offsets = {entry.laser: entry.ahead_m for entry in entries if isinstance(entry, _Offset)}
+    stamped = [entry for entry in entries if not isinstance(entry, _Offset)]
     if not stamped:
-        raise LogError(f"{source}: has no readable FLASER or ODOM line; is it CARMEN? Name the log")
+        raise LogError(
+            f"{source}: has no readable line of a laser (FLASER, ROBOTLASER1) or ODOM line; is it "
+            "CARMEN? Name the log"
+        )
+    stamped, notes = _once(stamped)
     # log times that never decrease, so that readers keep the order of the file: a line was written
     # before all lines after it, hence not later than the earliest of their stamps
     log_times = list(accumulate((entry.stamp_ns for entry in reversed(stamped)), min))[::-1]
-    scans = [entry.ranges for entry in stamped if isinstance(entry, _Scan)]
-    no_return = find_no_return(scans[::_SAMPLE_EVERY])
-    # without a no-return value the limit for any laser
-    range_max = MAX_RANGE_M if no_return is None else float(np.nextafter(np.float32(no_return), 0))
-    notes = {"format": "carmen", "source": source.name, "stamps": "ipc time, exact"}
-    with LogWriter(target, notes) as log:
-        log.mount(DEFAULT_ROBOT, log_times[0], (offsets[-1] if offsets else 0.0, 0.0, 0.0))
+    scans = [entry for entry in stamped if isinstance(entry, _Scan)]
+    in_scans = not any(isinstance(entry, _Odometry) for entry in stamped)
+    if in_scans and any(scan.robot_pose for scan in scans):
+        notes.append("has no ODOM lines; the odometry is that in the lines of the laser")
+    lasers = sorted({scan.laser for scan in scans})
+    own = {laser: [scan for scan in scans if scan.laser == laser] for laser in lasers}
+    limits = {laser: _range_max(own[laser]) for laser in lasers}
+    told = {"format": "carmen", "source": source.name, "stamps": "ipc time, exact"}
+    with LogWriter(target, told) as log:
+        for laser in lasers or [1]:
+            mount = _mount(laser, offsets.get(laser), own.get(laser, []))
+            log.mount(DEFAULT_ROBOT, log_times[0], mount, _LASERS[laser][0])
+        latest_ns = -1
         for entry, log_time_ns in zip(stamped, log_times, strict=True):
+            stamp_ns = entry.stamp_ns
             if isinstance(entry, _Odometry):
-                log.odometry(DEFAULT_ROBOT, entry.stamp_ns, entry.pose, log_time_ns=log_time_ns)
+                log.odometry(DEFAULT_ROBOT, stamp_ns, entry.pose, log_time_ns=log_time_ns)
+            elif isinstance(entry, _Truth):
+                log.truth(DEFAULT_ROBOT, stamp_ns, entry.pose, log_time_ns=log_time_ns)
             else:
-                start, step = _beam_angles(len(entry.ranges))
+                if in_scans and entry.robot_pose and stamp_ns != latest_ns:
+                    latest_ns = stamp_ns  # two lasers may have one stamp
+                    log.odometry(DEFAULT_ROBOT, stamp_ns, entry.robot_pose, log_time_ns=log_time_ns)
                 log.scan(
                     DEFAULT_ROBOT,
-                    entry.stamp_ns,
+                    stamp_ns,
                     entry.ranges,
-                    angle_min_rad=start,
-                    angle_step_rad=step,
-                    range_max_m=range_max,
+                    angle_min_rad=entry.angles[0],
+                    angle_step_rad=entry.angles[1],
+                    range_max_m=limits[entry.laser],
+                    sensor=_LASERS[entry.laser][0],
                     log_time_ns=log_time_ns,
                 )
-    warnings = [f"{source}: {n} {tag} lines cannot be read" for tag, n in sorted(malformed.items())]
-    return ImportSummary(source, target, log.counts, tuple(warnings))
+    notes += [f"{n} {tag} lines cannot be read" for tag, n in sorted(malformed.items())]
+    return ImportSummary(source, target, log.counts, tuple(f"{source}: {note}" for note in notes))
+
+
+def _once(
+    entries: Sequence[_Odometry | _Truth | _Scan],
+) -> tuple[list[_Odometry | _Truth | _Scan], list[str]]:
+    """The entries with every laser once, and notes on what was left out.
+
+    CARMEN logs the scans of a laser by up to three names: with the robot's pose, as they came from
+    the laser, and with remissions. The first of `_SCANS` that is there is used.
+    """
+    counts = Counter((e.laser, e.tag) for e in entries if isinstance(e, _Scan))
+    order = list(_SCANS)
+    used: dict[int, str] = {}
+    for laser, tag in sorted(counts, key=lambda kind: order.index(kind[1])):
+        used.setdefault(laser, tag)
+    notes = [
+        f"{count} {tag} lines are not used: {used[laser]} has this laser"
+        for (laser, tag), count in sorted(counts.items())
+        if used[laser] != tag
+    ]
+    kept = [e for e in entries if not isinstance(e, _Scan) or used[e.laser] == e.tag]
+    return kept, notes
+
+
+def _range_max(scans: Sequence[_Scan]) -> float:
+    """Just below the no-return value, m; without one the limit for any laser."""
+    no_return = find_no_return([scan.ranges for scan in scans][::_SAMPLE_EVERY])
+    return MAX_RANGE_M if no_return is None else float(np.nextafter(np.float32(no_return), 0))
+
+
+def _mount(laser: int, ahead_m: float | None, scans: Sequence[_Scan]) -> _Pose:
+    """Pose of a laser on the robot: as a PARAM says, else as the poses in its lines say."""
+    heading = _LASERS[laser][1]
+    if ahead_m is not None:
+        return ahead_m, 0.0, heading
+    poses = [(scan.robot_pose, scan.laser_pose) for scan in scans if scan.robot_pose]
+    if poses:
+        robot, own = np.array(poses).transpose(1, 0, 2)
+        relative = between(robot, own)
+        middle = np.median(relative, axis=0)
+        # poses of the laser that were corrected by a SLAM program do not stay on the robot
+        if (np.abs(between(middle, relative)) <= _MOUNT_SPREAD).all():
+            x, y, phi = (float(value) + 0.0 for value in middle.round(6))
+            return x, y, phi
+    return 0.0, 0.0, heading
 
 
 def parse_stamp_ns(text: str) -> int:
@@ -110,11 +204,8 @@ def _beam_angles(beams: int) -> tuple[float, float]:
     return -np.pi / 2, np.pi / (beams - beams % 2) if beams > 1 else np.pi
 
 
-def _entries(source: Path, malformed: Counter[str]) -> Iterator[_Odometry | _Scan | float]:
-    """The parsed lines of a log in the order of the file; malformed lines are counted by tag.
-
-    A number is the distance, m, of the laser ahead of the base.
-    """
+def _entries(source: Path, malformed: Counter[str]) -> Iterator[_Entry]:
+    """The parsed lines of a log in the order of the file; malformed lines are counted by tag."""
     for line in text_lines(source):
         fields = line.split()
         if not fields or fields[0] not in _PARSERS:
@@ -128,30 +219,90 @@ def _entries(source: Path, malformed: Counter[str]) -> Iterator[_Odometry | _Sca
             yield entry
 
 
+def _pose(fields: Sequence[str]) -> _Pose:
+    x, y, theta = map(float, fields)
+    return x, y, theta
+
+
+def _ranges(fields: Sequence[str]) -> Ranges:
+    return np.array([float(field) for field in fields], dtype=np.float32)
+
+
 def _odometry(fields: list[str]) -> _Odometry:
     """ODOM x y theta tv rv accel ipc_timestamp ipc_hostname logger_timestamp."""
     if len(fields) < 4 + _TRAILER:
         raise ValueError("too few fields")
-    x, y, theta = map(float, fields[1:4])
-    return _Odometry(parse_stamp_ns(fields[-_TRAILER]), (x, y, theta))
+    return _Odometry(parse_stamp_ns(fields[-_TRAILER]), _pose(fields[1:4]))
 
 
-def _scan(fields: list[str]) -> _Scan:
+def _truth(fields: list[str]) -> _Truth:
+    """TRUEPOS true_x true_y true_theta odom_x odom_y odom_theta, and the end of all lines."""
+    if len(fields) < 7 + _TRAILER:
+        raise ValueError("too few fields")
+    return _Truth(parse_stamp_ns(fields[-_TRAILER]), _pose(fields[1:4]))
+
+
+def _scan(laser: int, fields: list[str]) -> _Scan:
     """FLASER n r1..rn x y theta odom_x odom_y odom_theta ipc_timestamp host logger_timestamp."""
     beams = int(fields[1])
-    if len(fields) != 2 + beams + _SCAN_TAIL + _TRAILER:
+    after = fields[2 + beams : -_TRAILER]
+    if len(after) != 6 or beams < 0:
         raise ValueError("the number of ranges differs from the count in the line")
-    ranges = np.array([float(field) for field in fields[2 : 2 + beams]], dtype=np.float32)
-    return _Scan(parse_stamp_ns(fields[-_TRAILER]), ranges)
+    ranges = _ranges(fields[2 : 2 + beams])
+    stamp_ns, angles = parse_stamp_ns(fields[-_TRAILER]), _beam_angles(beams)
+    poses = _pose(after[:3]), _pose(after[3:])
+    return _Scan(stamp_ns, fields[0], laser, ranges, angles, *poses)
 
 
-def _parameter(fields: list[str]) -> float | None:
+def _with_remissions(laser: int, fields: list[str]) -> _Scan:
+    """REMISSIONFLASER n r1 remission1 .. rn remissionn, and the end of all lines."""
+    beams = int(fields[1])
+    if len(fields) != 2 + 2 * beams + _TRAILER or beams < 0:
+        raise ValueError("the number of ranges differs from the count in the line")
+    ranges = _ranges(fields[2 : 2 + 2 * beams : 2])
+    stamp_ns = parse_stamp_ns(fields[-_TRAILER])
+    return _Scan(stamp_ns, fields[0], laser, ranges, _beam_angles(beams))
+
+
+def _new_scan(laser: int, fields: list[str]) -> _Scan:
+    """ROBOTLASER1 and RAWLASER1.
+
+    laser_type start_angle field_of_view angular_resolution maximum_range accuracy remission_mode
+    n r1..rn m remission1..remissionm; ROBOTLASER1 goes on with the poses of laser and robot (3 + 3)
+    and four or five numbers. Old logs have no m.
+    """
+    start, step, beams = float(fields[2]), float(fields[4]), int(fields[8])
+    ranges, rest = fields[9 : 9 + beams], fields[9 + beams : -_TRAILER]
+    if len(ranges) != beams:
+        raise ValueError("the number of ranges differs from the count in the line")
+    lengths = (10, 11) if fields[0].startswith("ROBOT") else (0,)
+    if rest and rest[0].isdigit() and len(rest) - 1 - int(rest[0]) in lengths:
+        rest = rest[1 + int(rest[0]) :]
+    if len(rest) not in lengths:
+        raise ValueError("the number of remissions differs from the count in the line")
+    poses = (_pose(rest[:3]), _pose(rest[3:6])) if rest else (None, None)
+    stamp_ns, own = parse_stamp_ns(fields[-_TRAILER]), _ranges(ranges)
+    return _Scan(stamp_ns, fields[0], laser, own, (start, step), *poses)
+
+
+def _parameter(fields: list[str]) -> _Offset | None:
     """PARAM name value ipc_timestamp host logger_timestamp."""
-    return float(fields[2]) if fields[1] == "robot_frontlaser_offset" else None
+    laser = {"robot_frontlaser_offset": 1, "robot_rearlaser_offset": 2}.get(fields[1])
+    return None if laser is None else _Offset(laser, float(fields[2]))
 
 
-_PARSERS: dict[str, Callable[[list[str]], _Odometry | _Scan | float | None]] = {
+#: lines of lasers; of several for one laser the first is used: those that have the robot's pose
+_SCANS: dict[str, Callable[[list[str]], _Scan]] = {
+    **{f"ROBOTLASER{n}": partial(_new_scan, n) for n in _LASERS},
+    "FLASER": partial(_scan, 1),
+    "RLASER": partial(_scan, 2),
+    **{f"RAWLASER{n}": partial(_new_scan, n) for n in _LASERS},
+    "REMISSIONFLASER": partial(_with_remissions, 1),
+    "REMISSIONRLASER": partial(_with_remissions, 2),
+}
+_PARSERS: dict[str, Callable[[list[str]], _Entry | None]] = {
     "ODOM": _odometry,
-    "FLASER": _scan,
+    "TRUEPOS": _truth,
     "PARAM": _parameter,
+    **_SCANS,
 }

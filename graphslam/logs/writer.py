@@ -155,16 +155,21 @@ class LogWriter:
         angle_step_rad: float,
         range_max_m: float,
         range_min_m: float = 0.0,
+        sensor: str = "laser",
         log_time_ns: int | None = None,
     ) -> None:
         """sensor_msgs/LaserScan on ``scan``: ranges (n,) m in the laser frame, kept as float32.
 
-        A beam without a return is written as inf or as a value above ``range_max_m``.
+        Of another ``sensor`` than ``laser`` it is on ``scan_SENSOR``, in that frame. A beam without
+        a return is written as inf or as a value above ``range_max_m``.
         """
         values = np.asarray(ranges, dtype=np.float32)
         self._build(
             schemas.LASER_SCAN,
-            (_topic(robot, "scan"), frame(robot, "laser")),
+            (
+                _topic(robot, "scan" if sensor == "laser" else f"scan_{sensor}"),
+                frame(robot, sensor),
+            ),
             (stamp_ns, log_time_ns),
             angle_min=angle_min_rad,
             angle_max=angle_min_rad + angle_step_rad * (len(values) - 1),

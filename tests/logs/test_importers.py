@@ -294,6 +294,124 @@ def test_beams_are_spread_over_half_a_turn_from_the_right(beams, step_deg, tmp_p
     assert np.rad2deg(scan.angle_min_rad) == pytest.approx(-90, rel=1e-6)
 
 
+# -------------------------------------------------------------- dialects of CARMEN
+
+_MOUNT = np.array([0.3, -0.1, 0.2])
+_END = "{stamp:.6f} host {stamp:.6f}"
+
+
+def _carmen_drive() -> list[tuple[float, np.ndarray, np.ndarray]]:
+    """Stamp, pose of the robot and ranges of 90 scans on a circle."""
+    rng = np.random.default_rng(5)
+    return [
+        (100 + 0.1 * k, np.array([np.cos(k / 30), np.sin(k / 30), k / 30]), 1 + rng.random(5))
+        for k in range(90)
+    ]
+
+
+def _text(*numbers: object) -> str:
+    return " ".join(f"{n:.9f}" if isinstance(n, float) else str(n) for n in numbers)
+
+
+def _line(dialect: str, stamp: float, pose: np.ndarray, ranges: np.ndarray) -> str:
+    laser = geometry.compose(pose, _MOUNT)
+    beams, poses = [len(ranges), *ranges.tolist()], [*laser.tolist(), *pose.tolist()]
+    shape = [0, -np.pi / 2, np.pi, np.pi / 4, 80.0, 0.01, 0]
+    tail = [0.1, 0.0, 0.5, 0.5]
+    middle = {
+        "FLASER": [*beams, *poses],
+        "RLASER": [*beams, *poses],
+        "ROBOTLASER1": [*shape, *beams, 0, *poses, *tail, 0.0],
+        "ROBOTLASER1 with remissions": [*shape, *beams, 5, *ranges.tolist(), *poses, *tail, 0.0],
+        "ROBOTLASER1 of old logs": [*shape, *beams, *poses, *tail],
+        "RAWLASER1": [*shape, *beams, 0],
+        "REMISSIONFLASER": [len(ranges), *(v for r in ranges.tolist() for v in (r, 99.0))],
+    }[dialect]
+    return f"{dialect.split(maxsplit=1)[0]} {_text(*middle)} {_END.format(stamp=stamp)}"
+
+
+DIALECTS = [
+    "FLASER", "RLASER", "ROBOTLASER1", "ROBOTLASER1 with remissions", "ROBOTLASER1 of old logs",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_without_odom_lines_the_odometry_and_the_mount_are_those_of_the_laser_lines(
+    dialect, tmp_path
+):
+    """Many public logs are like that. Breaks if a field is counted wrongly."""
+    source = tmp_path / "log.clf"
+    drive = _carmen_drive()
+    source.write_text("\n".join(_line(dialect, *one) for one in drive))
+    summary = IMPORTERS["carmen"](source, tmp_path / "log.mcap")
+    assert summary.warnings == (
+        f"{source}: has no ODOM lines; the odometry is that in the lines of the laser",
+    )
+    messages = list(open_logs([tmp_path / "log.mcap"], Config()).messages())
+    poses = [m.pose for m in messages if isinstance(m, records.OdometryPose)]
+    scans = [m for m in messages if isinstance(m, records.Scan)]
+    expected = np.array([pose for _, pose, _ in drive])
+    np.testing.assert_allclose(geometry.between(expected, np.array(poses)), 0, atol=1e-8)
+    assert len(scans) == len(drive)
+    for scan, (stamp, _, ranges) in zip(scans, drive, strict=True):
+        assert scan.stamp_ns == round(stamp * 1e6) * 1000
+        np.testing.assert_allclose(scan.ranges, ranges, rtol=1e-6)
+        np.testing.assert_allclose(scan.mount, _MOUNT, atol=2e-6)
+        np.testing.assert_allclose(scan.angles, np.radians([-90, -45, 0, 45, 90]), atol=1e-6)
+
+
+@pytest.mark.parametrize("dialect", ["RAWLASER1", "REMISSIONFLASER", "FLASER"])
+def test_odom_lines_are_preferred_to_poses_in_other_lines(dialect, tmp_path):
+    source = tmp_path / "log.clf"
+    lines = []
+    for k, one in enumerate(_carmen_drive()):
+        if k % 10 == 0:
+            lines.append(f"ODOM {_text(0.1 * k, 0.0, 0.0, 0, 0, 0)} {one[0]} host 1")
+        lines.append(_line(dialect, *one))
+    source.write_text("\n".join(lines))
+    messages = run("carmen", source, tmp_path / "log.mcap")
+    poses = [m.pose[0] for m in messages if isinstance(m, records.OdometryPose)]
+    np.testing.assert_allclose(poses, range(9))
+    assert sum(isinstance(m, records.Scan) for m in messages) == 90
+
+
+def test_a_laser_that_is_logged_under_two_names_is_taken_once(tmp_path):
+    source = tmp_path / "log.clf"
+    drive = _carmen_drive()
+    names = ("RAWLASER1", "ROBOTLASER1")
+    source.write_text("\n".join(_line(name, *one) for one in drive for name in names))
+    summary = IMPORTERS["carmen"](source, tmp_path / "log.mcap")
+    assert summary.counts["/scan"] == len(drive)
+    assert summary.warnings[0].endswith(
+        "90 RAWLASER1 lines are not used: ROBOTLASER1 has this laser"
+    )
+
+
+def test_poses_of_the_laser_that_were_corrected_are_no_mount(tmp_path):
+    """In corrected logs the first pose of FLASER is that of a SLAM program, not the odometry's."""
+    source = tmp_path / "log.clf"
+    lines = []
+    for k, (stamp, pose, ranges) in enumerate(_carmen_drive()):
+        laser = geometry.compose(pose, np.array([0.01 * k, 0.0, 0.0]))
+        numbers = [len(ranges), *ranges.tolist(), *laser.tolist(), *pose.tolist()]
+        lines.append(f"FLASER {_text(*numbers)} {_END.format(stamp=stamp)}")
+    source.write_text("\n".join(lines))
+    messages = run("carmen", source, tmp_path / "log.mcap")
+    (mount,) = {m.mount.tobytes() for m in messages if isinstance(m, records.Scan)}
+    assert not np.frombuffer(mount).any()
+
+
+def test_true_positions_are_the_truth(tmp_path):
+    source = tmp_path / "log.clf"
+    lines = [f"ODOM 0 0 0 0 0 0 {k} host {k}" for k in range(3)]
+    lines += [f"TRUEPOS {k} 2 0.5 0 0 0 {k} host {k}" for k in range(3)]
+    source.write_text("\n".join(lines))
+    truth = [
+        m for m in run("carmen", source, tmp_path / "log.mcap") if isinstance(m, records.Truth)
+    ]
+    assert [m.pose.tolist() for m in truth] == [[k, 2, 0.5] for k in range(3)]
+
+
 def test_intel_is_read_whole_with_its_stamps_and_in_the_order_of_the_recording(tmp_path):
     """With its late stamps the path of dead reckoning is 675 m; in the order of recording 509 m."""
     source, relations = real_data("freiburg/intel.clf.bz2"), real_data("freiburg/intel.relations")
