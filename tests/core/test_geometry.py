@@ -1,7 +1,7 @@
 """Planar geometry: group laws, exactness near zero, derivatives."""
 
 from fractions import Fraction
-from math import factorial
+from math import comb, factorial
 
 import numpy as np
 import pytest
@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 
 from graphslam.core import geometry
 from graphslam.core.geometry import (
+    adjoint,
+    are_positive,
     between,
     compose,
     compose_cov,
@@ -19,11 +21,15 @@ from graphslam.core.geometry import (
     exp_jacobian,
     interpolate,
     inverse,
+    inverse_cov,
     is_positive,
     log,
     log_jacobian,
+    path_length,
+    polar_points,
     rotate_cov,
     transform,
+    transform_each,
     wrap,
 )
 
@@ -111,17 +117,46 @@ def test_transform_moves_points_as_compose_moves_positions(a, b):
     np.testing.assert_allclose(transform(a, b[None, :2])[0], compose(a, b)[:2], atol=CHAIN)
 
 
+@pytest.mark.parametrize("shapes", [((4, 1, 3), (5, 3)), ((4, 3), (4, 3)), ((3, 3), (3,))])
 @pytest.mark.parametrize("name", ["compose", "between", "inverse", "exp", "log"])
-def test_leading_axes_broadcast(name):
-    """A stack gives what its members give one by one."""
+def test_leading_axes_broadcast(name, shapes):
+    """A stack gives what its members give one by one, also of three, which is as wide as long."""
     rng = np.random.default_rng(3)
-    a, b = rng.normal(size=(4, 1, 3)), rng.normal(size=(5, 3))
+    a, b = (rng.normal(size=shape) for shape in shapes)
     function = getattr(geometry, name)
     arguments = (a, b) if name in ("compose", "between") else (a,)
     together = function(*arguments)
     for index in np.ndindex(together.shape[:-1]):
         parts = [np.broadcast_to(p, together.shape)[index] for p in arguments]
         np.testing.assert_array_equal(together[index], function(*parts))
+
+
+def test_points_are_moved_each_by_its_own_pose():
+    rng = np.random.default_rng(5)
+    poses, points = rng.normal(size=(6, 3)), rng.normal(size=(6, 2))
+    expected = [transform(pose, point[None])[0] for pose, point in zip(poses, points, strict=True)]
+    np.testing.assert_allclose(transform_each(poses, points), expected, atol=1e-15)
+
+
+def test_ranges_and_bearings_are_points_counter_clockwise_from_ahead():
+    found = polar_points(np.array([2.0, 3.0, 1.0]), np.radians([0.0, 90.0, -135.0]))
+    expected = [[2.0, 0.0], [0.0, 3.0], [-np.sqrt(0.5), -np.sqrt(0.5)]]
+    np.testing.assert_allclose(found, expected, atol=1e-15)
+
+
+def test_the_length_of_a_path_is_summed_up_to_each_pose():
+    """Of poses the heading is no length."""
+    path = np.array([[0.0, 0, 0], [3, 4, 2], [3, 4, -1], [3, 2, 0]])
+    for columns in (2, 3):
+        np.testing.assert_allclose(path_length(path[:, :columns]), [0, 5, 5, 7], atol=1e-15)
+
+
+@pytest.mark.parametrize("function", [exp, log])
+@pytest.mark.parametrize("turn", [np.nan, np.inf, -np.inf])
+def test_a_turn_that_is_not_finite_comes_out_as_nan(function, turn):
+    """As for stacks, and not as an exception of `math`: an optimiser that diverged is told apart
+    by its values."""
+    assert np.isnan(function(np.array([1.0, 2.0, turn]))).all()
 
 
 # ------------------------------------------------------------ exponential and logarithm
@@ -166,6 +201,38 @@ def test_exp_jacobian_is_exact_near_zero_and_on_both_sides_of_its_switch(omega):
     # the closed form divides a difference of terms of size w² by w²: 1e-16 / 0.3² at the switch
     np.testing.assert_allclose(
         exp_jacobian(np.array([2.0, 3.0, omega])), expected, rtol=1e-13, atol=1e-14
+    )
+
+
+@pytest.mark.parametrize("omega", [0.05, 0.15, 0.25, 0.2999, -0.2999])
+def test_the_series_of_exp_jacobian_are_exact_to_the_last_digits(omega):
+    """Each by itself, in which a coefficient that is a hundredth off shows."""
+    _, _, da, db = exact_terms(omega)
+    found = exp_jacobian(np.array([1.0, 0.0, omega]))[:2, 2]
+    np.testing.assert_allclose(found, [da, db], rtol=5e-16)
+
+
+def bernoulli(n):
+    """The Bernoulli number B_n."""
+    known = [Fraction(1)]
+    for m in range(1, n + 1):
+        known.append(-sum(comb(m + 1, k) * known[k] for k in range(m)) / (m + 1))
+    return known[n]
+
+
+@pytest.mark.parametrize("phi", [0.01, 0.05, 0.0999, 0.1001, 0.2, 0.29, 0.5, 1.0])
+def test_log_jacobian_is_exact_on_both_sides_of_its_switch(phi):
+    """(phi/2) cot(phi/2) and its derivative: sums over Bernoulli numbers, 20 terms for 1 rad."""
+    w = Fraction(phi)
+    even = [(k, (-1) ** k * bernoulli(2 * k) / factorial(2 * k)) for k in range(20)]
+    c = float(sum(b * w ** (2 * k) for k, b in even))
+    dc = float(sum(b * 2 * k * w ** (2 * k - 1) for k, b in even if k))
+    found = log_jacobian(np.array([1.0, 0.0, phi]))
+    expected = [[c, phi / 2, dc], [-phi / 2, c, -0.5], [0, 0, 1]]
+    # the closed form is a difference of numbers of size 1/phi, below that the term left out
+    np.testing.assert_allclose(found, expected, rtol=2e-13)
+    np.testing.assert_allclose(
+        log_jacobian(np.array([0.0, 1.0, phi]))[:2, 2], [0.5, dc], rtol=2e-13
     )
 
 
@@ -224,6 +291,27 @@ def test_compose_cov_equals_monte_carlo():
     assert np.all(np.abs(np.cov(ends.T) - cov) < 5 * sampling)
 
 
+@given(near_poses)
+def test_inverse_cov_is_that_of_the_inverse(a):
+    """Against finite differences; along the axes of a, not of its parent."""
+    root = np.array([[0.3, 0.0, 0.0], [0.1, 0.2, 0.0], [-0.1, 0.3, 0.1]])
+
+    def unwrapped(pose):
+        moved = inverse(pose)
+        return np.array([moved[0], moved[1], -pose[2]])
+
+    J = jacobian(unwrapped, a)
+    np.testing.assert_allclose(
+        inverse_cov(a, root @ root.T), J @ root @ root.T @ J.T, atol=100 * DIFFERENCES
+    )
+
+
+@given(near_poses, near_poses)
+def test_adjoint_takes_a_twist_from_the_body_to_the_origin(a, twist):
+    """exp(Ad(a) xi) a = a exp(xi): one motion, told in two frames."""
+    same(compose(exp(adjoint(a) @ twist), a), compose(a, exp(twist)))
+
+
 @given(st.floats(-7, 7), st.integers(0, 1000))
 def test_rotate_cov_turns_back_and_keeps_eigenvalues(angle, seed):
     root = np.random.default_rng(seed).normal(size=(3, 3))
@@ -257,3 +345,14 @@ def test_positive_definite_is_what_eigenvalues_say(size):
         cov = (q * values) @ q.T
         assert is_positive((cov + cov.T) / 2) == (values.min() > 0)
     assert not is_positive(np.full((size, size), np.nan))
+
+
+def test_many_covariances_are_tested_as_each_is():
+    rng = np.random.default_rng(7)
+    roots = rng.normal(size=(200, 2, 2))
+    covs = roots @ roots.mT - 0.5 * rng.uniform(size=(200, 1, 1)) * np.eye(2)
+    covs[:4] = [np.diag([np.inf, 1.0]), np.diag([1.0, np.nan]), np.zeros((2, 2)), np.diag([1.0, 0])]
+    found = are_positive(covs)
+    assert 20 < found.sum() < 190
+    assert found[4:].tolist() == [is_positive(cov) for cov in covs[4:]]
+    assert not found[:4].any() and not is_positive(covs[2]) and not is_positive(covs[3])

@@ -131,6 +131,84 @@ def test_line_gauge_ties_only_along_the_line():
         np.testing.assert_allclose(squared_norm(factor, at(x, moved)), expected, atol=EXACT)
 
 
+@pytest.mark.parametrize("wide", [True, False])
+def test_a_filters_gauge_is_the_narrow_one(wide):
+    """`LINE_GAUGE_SIGMA_M` is for what relinearises; exchanged, filters become inconsistent."""
+    x, z = np.array([1.0, 2.0, 0.5]), np.array([3.0, 1.0, 0.2])
+    seen = Association("r", 0, 0, "line", z, np.eye(3))
+    factor = factors.line_gauge_factor(X, T, seen, wide=wide)
+    moved = compose(compose(x, z), np.array([0.01, 0, 0]))
+    sigma = factors.LINE_GAUGE_SIGMA_M if wide else factors.FILTER_GAUGE_SIGMA_M
+    np.testing.assert_allclose(squared_norm(factor, at(x, moved)), (0.01 / sigma) ** 2, rtol=1e-9)
+    assert factors.LINE_GAUGE_SIGMA_M > 100 * factors.FILTER_GAUGE_SIGMA_M
+
+
+def test_a_held_line_is_held_along_itself_alone():
+    x, t = np.array([1.0, 2.0, 0.5]), np.array([3.0, 1.0, 2.2])
+    factor = factors.line_held_factor(X, T, x, t)
+    for shift, expected in (
+        ([0, 0, 0], 0.0), ([0, 5.0, 0], 0.0), ([2.0, 0, 0], 4 / factors.LINE_HELD_SIGMA_M**2),
+    ):  # fmt: skip
+        found = squared_norm(factor, at(x, compose(t, np.array(shift, float))))
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_sliding_line_does_not_feel_where_its_origin_is(seed):
+    """With a residual in the direction GTSAM's normal part changes as the origin slides; that of
+    `line_rows` does not, to rounding, and is the normal part itself where the measurement faces the
+    origin. A slope of the other sign, or of the other row, breaks one of both."""
+    seen, x, t = random_case("line", seed)
+    arrays = (np.array([part]) for part in (seen.z, seen.cov, x, t))
+    z, cov, xs, ts = arrays
+    (plain,) = factors.line_factors([X], [T], z, cov, xs, ts, PLAIN)
+    (sliding,) = factors.line_factors([X], [T], z, cov, xs, ts, PLAIN, sliding=True)
+    here = squared_norm(sliding, at(x, t))
+    np.testing.assert_allclose(here, squared_norm(plain, at(x, t)), rtol=1e-9)
+    for along in (-3.0, 0.5, 20.0):
+        slid = compose(t, np.array([along, 0.0, 0.0]))
+        np.testing.assert_allclose(squared_norm(sliding, at(x, slid)), here, rtol=1e-8)
+        assert abs(squared_norm(plain, at(x, slid)) - here) > 1e-3 * here
+
+
+# ------------------------------------------------------------ many at once
+
+
+def other_values(x, t):
+    """Values at which no residual is zero."""
+    return at(compose(x, np.array([0.3, -0.2, 0.1])), t + np.array([0.1, 0.4, -0.2])[: len(t)])
+
+
+@pytest.mark.parametrize("kernel", [PLAIN, RobustConfig("cauchy", 1.5)], ids=["none", "cauchy"])
+@pytest.mark.parametrize("name", ["line", *factors.BEARING_RANGE])
+def test_factors_made_together_are_those_made_alone(name, kernel):
+    """Breaks with the row of another, or with a noise model that lost its kernel."""
+    cases = [random_case(name, seed) for seed in range(4)]
+    z, cov = (np.array([getattr(seen, what) for seen, _, _ in cases]) for what in ("z", "cov"))
+    x, t = (np.array(part) for part in zip(*((x, t) for _, x, t in cases), strict=True))
+    keys, targets = [X] * 4, [T] * 4
+    if name == "line":
+        many = factors.line_factors(keys, targets, z, cov, x, t, kernel)
+    else:
+        many = factors.bearing_range_factors(name, keys, targets, z, cov, kernel)
+    for n, (seen, _, _) in enumerate(cases):
+        one = factors.observation_factor(X, T, seen, kernel, x[n], t[n])
+        values = other_values(x[n], t[n])
+        assert many[n].error(values) == pytest.approx(one.error(values), rel=1e-9)
+        assert list(many[n].keys()) == [X, T]
+
+
+def test_motions_made_together_are_those_made_alone():
+    rng = np.random.default_rng(2)
+    delta, roots = rng.normal(size=(3, 3)), 0.3 * rng.normal(size=(3, 3, 3))
+    cov = roots @ roots.mT + 0.01 * np.eye(3)
+    values = at(np.array([1.0, 2.0, 0.5]), np.array([-1.0, 0.5, 2.0]))
+    for n, many in enumerate(factors.motion_factors([(X, T)] * 3, delta, cov)):
+        one = factors.motion_factor(X, T, Motion(0, 1, delta[n], cov[n], np.zeros((3, 0)), 1.0))
+        assert many.error(values) == pytest.approx(one.error(values), rel=1e-9)
+        assert list(many.keys()) == [X, T]
+
+
 # ------------------------------------------------------------ motion, closure, start
 
 
@@ -179,6 +257,15 @@ def test_a_closure_of_n_images_costs_what_n_of_one_do(images):
         np.testing.assert_allclose(many, images * one, rtol=1e-12)
 
 
+@pytest.mark.parametrize("verified", [True, False])
+def test_a_closure_gives_way_unless_it_was_verified(verified):
+    """100 sigma off: a verified one costs all of it, another a hundredth."""
+    closure = Closure("a", 5, "b", 0, np.zeros(3), 1e-4 * np.eye(3), verified=verified)
+    factor = factors.closure_factor(X, T, closure, RobustConfig("cauchy", 2.0))
+    cost = squared_norm(factor, at(np.array([1.0, 0, 0]), np.zeros(3)))
+    assert cost == pytest.approx(1e4) if verified else cost < 100
+
+
 def test_start_factor_takes_its_covariance_along_world_axes():
     """A robot that starts facing north with x known to 1 cm and y to 1 m."""
     start = Start(np.array([2.0, 3.0, np.pi / 2]), np.diag([1e-4, 1.0, 1e-2]))
@@ -225,6 +312,58 @@ def test_keys_of_robots_states_and_landmarks_never_meet():
     keys = [factors.state_key(r, n) for r in (0, 1, 2**16 - 1) for n in (0, 1, 2**40 - 1)]
     keys += [factors.landmark_key(n) for n in (0, 1, 2**40)]
     assert len(set(keys)) == len(keys)
+
+
+def test_keys_say_what_they_are_of():
+    for n in (0, 5, 2**40 - 1):
+        for robot in (0, 3, 2**16 - 1):
+            key = factors.state_key(robot, n)
+            assert factors.is_state(key) and factors.number_of(key) == (robot, n)
+        key = factors.landmark_key(n)
+        assert not factors.is_state(key) and factors.number_of(key) == (None, n)
+
+
+def test_values_come_back_as_they_were_written():
+    """Poses and points; `retracted` is GTSAM's own correction of either."""
+    pose, point, L = np.array([1.0, -2.0, 0.7]), np.array([3.0, 4.0]), factors.landmark_key(0)
+    values = gtsam.Values()
+    for key, value in ((X, pose), (L, point)):
+        factors.write(values, key, value)
+        np.testing.assert_allclose(factors.read(values, key, len(value)), value, atol=1e-15)
+        factors.overwrite(values, key, 2 * value)
+        np.testing.assert_allclose(factors.read(values, key, len(value)), 2 * value, atol=1e-15)
+    delta, z = gtsam.VectorValues(), np.array([0.1, -0.3, 0.4])
+    delta.insert(X, z)
+    delta.insert(L, z[:2])
+    moved = values.retract(delta)
+    for key, value in ((X, 2 * pose), (L, 2 * point)):
+        n = len(value)
+        expected = factors.retracted(value, z[:n])
+        np.testing.assert_allclose(factors.read(moved, key, n), expected, atol=1e-14)
+
+
+def test_a_noise_model_keeps_ten_decades():
+    """Wall-like covariances, turned: whitened by it, the covariance is the unit matrix."""
+    rng = np.random.default_rng(6)
+    for spread in (1.0, 1e-4):
+        for _ in range(5):
+            q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+            cov = (q * [1.0, spread, spread**2]) @ q.T
+            cov = (cov + cov.T) / 2
+            R = factors.gaussian(cov).R()
+            np.testing.assert_array_equal(np.tril(R, -1), 0.0)
+            np.testing.assert_allclose(R @ cov @ R.T, np.eye(3), atol=1e-15 / spread**2)
+
+
+@pytest.mark.parametrize("two", [False, True])
+def test_rows_of_one_or_two_variables_stay_in_their_order(two):
+    rng = np.random.default_rng(1)
+    A, b = rng.normal(size=(2, 5 if two else 3)), rng.normal(size=2)
+    factor = factors.jacobian_factor(A, b, {T: 3, X: 2} if two else {T: 3})
+    found, right = factor.jacobian()
+    np.testing.assert_array_equal(found, A)
+    np.testing.assert_array_equal(right, b)
+    assert list(factor.keys()) == ([T, X] if two else [T])
 
 
 # ------------------------------------------------------------ the 30 m corridor
@@ -359,6 +498,11 @@ def test_a_filter_linearises_small_turns_with_all_digits(turn):
     factor = factors.relative_pose_factor(1, 2, z, cov, PLAIN)
     values = {1: x, 2: t}
     assert factors.turns_little(factor, values)
+    assert factors.turns_little(factor, {1: x, 2: t + np.array([0, 0, 2 * np.pi])})
+    assert not factors.turns_little(factor, {1: x, 2: t + np.array([0, 0, 4e-3])})
+    assert not factors.turns_little(
+        factor, {1: x, 2: t - np.array([0, 0, turn])}
+    )  # GTSAM's own case
     A, b = factors.linearised(factor, values)
     here = gtsam.Values()
     for key, value in values.items():

@@ -4,15 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from finite_differences import jacobian
 from pose_checks import assert_same_pose
 from scipy.linalg import eigh
 
 from graphslam.core.config import OdometryConfig, RobotConfig
-from graphslam.core.geometry import between, compose, compose_cov, exp, inverse
-from graphslam.core.records import OdometryPose, Trajectory
+from graphslam.core.geometry import between, compose, compose_cov, exp, inverse, log, rotate_cov
+from graphslam.core.records import Estimate, OdometryPose, Start, Step, Trajectory
 from graphslam.odometry.interpolation import (
+    FrameTransforms,
     causal_at,
     final_at,
+    final_scans,
     origin_shift,
     trajectory_of_mount,
     transform_trajectory,
@@ -226,6 +229,38 @@ def test_final_covariance_is_that_of_a_bridge_by_hand():
     np.testing.assert_allclose(final, 0.5 * covs[0] + 0.5 * covs[1] + 0.25 * Q, atol=1e-15)
 
 
+def test_between_two_states_a_scan_is_as_uncertain_as_the_odometry_bridge():
+    """What is left of odometry's error with both ends known, s (1 - s) of the whole interval's, as
+    an error of the sensor's pose in its own frame: turned to the robot's axes there, and with the
+    lever arm to the sensor, here by finite differences. Not more than a quarter, nothing at the
+    states."""
+    times, rng = [3.0, 5.0, 6.2, 7.0], np.random.default_rng(2)
+    mounts = rng.normal(0, 0.5, size=(4, 3))
+    final, ties = final_scans(STATES, TRACK, ns(times), ns(times), mounts)
+    assert_same_pose(final.poses, at(times, causal=False).poses, atol=0)
+    assert ties.state.tolist() == [1, 2, 2, 3]
+    np.testing.assert_allclose(ties.share, [0.0, 1 / 3, 2.2 / 3, 0.0], atol=1e-9)
+    for k in (1, 2):
+        s, start = ties.share[k], STATES.poses[ties.state[k]]
+        _, Q = coarse(4.0, 7.0)
+        own = rotate_cov(s * (1 - s) * Q, start[2] - final.poses[k, 2])
+
+        def of_sensor(e, mount=mounts[k]):
+            return log(compose(compose(inverse(mount), exp(e)), mount))
+
+        J = jacobian(of_sensor, np.zeros(3))
+        np.testing.assert_allclose(ties.covs[k], J @ own @ J.T, rtol=1e-6, atol=1e-12)
+    np.testing.assert_array_equal(ties.covs[[0]], 0.0)
+
+
+def test_after_the_last_state_a_scan_is_as_uncertain_as_the_odometry_since():
+    final, ties = final_scans(STATES, TRACK, ns([11.8]), ns([11.8]), np.zeros((1, 3)))
+    _, Q = coarse(11.0, 11.8)
+    own = rotate_cov(Q, STATES.poses[-1, 2] - final.poses[0, 2])
+    np.testing.assert_allclose(ties.covs[0], own, rtol=1e-9, atol=1e-15)
+    assert ties.share[0] == 0.0
+
+
 def test_after_the_last_state_final_and_causal_are_one_thing():
     """Nothing is known that would tell them apart; covariances grow on from the last state's."""
     times = [11.2, 11.6, 12.0]
@@ -312,3 +347,31 @@ def test_origin_shift_brings_the_base_to_the_start():
         assert_same_pose(base, start, atol=1e-14)
     assert_same_pose(world[1], np.zeros(3), atol=1e-15)
     assert_same_pose(origin_shift(start, mounts[0]), world[0], atol=0)
+
+
+def test_a_new_world_frame_moves_states_landmarks_and_starts_alike():
+    """Each robot's and each landmark's by its own frame: as poses composed from the left, points as
+    poses without a heading, covariances turned with the axes. A landmark taken for the other kind,
+    or the frame of another, breaks it."""
+    rng = np.random.default_rng(5)
+    worlds = rng.normal(0, 2.0, size=(4, 3))
+    frames = FrameTransforms({"a": worlds[0], "b": worlds[1]}, {7: worlds[2], 9: worlds[3]})
+    point, line = rng.normal(size=2), rng.normal(size=3)
+    cov = 0.1 * np.eye(3) + 0.05
+    before = Estimate({"a": STATES, "b": STATES}, {7: (point, cov[:2, :2]), 9: (line, cov)}, 0.0, 0)
+    found = frames.estimate(before)
+    for robot, world in (("a", worlds[0]), ("b", worlds[1])):
+        expected = transform_trajectory(STATES, world)
+        np.testing.assert_array_equal(found.states[robot].poses, expected.poses)
+        np.testing.assert_array_equal(found.states[robot].covs, expected.covs)
+    moved, moved_cov = found.landmarks[7]
+    np.testing.assert_allclose(moved, compose(worlds[2], np.append(point, 0.0))[:2], atol=1e-14)
+    np.testing.assert_allclose(moved_cov, rotate_cov(cov, worlds[2][2])[:2, :2], atol=1e-15)
+    moved, moved_cov = found.landmarks[9]
+    assert_same_pose(moved, compose(worlds[3], line))
+    np.testing.assert_allclose(moved_cov, rotate_cov(cov, worlds[3][2]), atol=1e-15)
+
+    step = frames.step(Step(5, starts={"b": Start(line, cov)}))
+    assert_same_pose(step.starts["b"].pose, compose(worlds[1], line))
+    np.testing.assert_allclose(step.starts["b"].cov, rotate_cov(cov, worlds[1][2]), atol=1e-15)
+    assert step.time_ns == 5
