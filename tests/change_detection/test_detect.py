@@ -21,7 +21,7 @@ from graphslam.change_detection.folder import save_changes
 from graphslam.change_detection.grid import Grid, distance_map, grid_over, sorted_unique
 from graphslam.change_detection.nonrigid_registration import correlate_maps
 from graphslam.change_detection.path_refinement import refine_path
-from graphslam.change_detection.regions import counter_clockwise, outline
+from graphslam.change_detection.regions import counter_clockwise, find_regions, outline
 from graphslam.change_detection.report import render_changes
 from graphslam.change_detection.rigid_registration import register
 from graphslam.change_detection.scan_to_map import align_scans
@@ -220,6 +220,20 @@ def test_a_change_needs_as_many_beams_as_the_setting_says():
         beams_past_surfaces(surface, before, SIGMA, replace(CONFIG, min_beams=n)) for n in (5, 50)
     )
     assert usual.tested.sum() > strict.tested.sum() > 0
+    # of these beams the fewest, and one less
+    past = beams_past_surfaces(surface, before, SIGMA, CONFIG)
+    fewest = int(past.count[surface.good & (past.count > 5)].min())
+    exact = beams_past_surfaces(surface, before, SIGMA, replace(CONFIG, min_beams=fewest)).tested
+    assert exact[surface.good & (past.count == fewest)].all()
+    assert not exact[past.count < fewest].any()
+
+    # a region whose pieces were all tested
+    def regions(least):
+        config = replace(CONFIG, min_beams=least)
+        return find_regions(surface, past, past.beams, past.rows, past.first_ns, SIGMA, config)
+
+    most = max(region.beams for region in regions(1))
+    assert [region.beams for region in regions(most)] == [most] and not regions(most + 1)
 
 
 def test_what_vanished_is_found():

@@ -131,6 +131,16 @@ def test_a_gap_without_returns_is_bridged_if_it_is_shorter_than_the_shorter_piec
     assert wall_with_gap(-0.7, (0.0, 0.8), 3.0) == 2
 
 
+@pytest.mark.parametrize("gap_m, low_m", [(0.25, -0.2), (0.35, 0.35)])
+def test_a_gap_as_in_a_chain_is_bridged_whatever_the_pieces(gap_m, low_m):
+    """Up to `gap_m`, 0.3 m: then a piece of 0.2 m is a part of the wall."""
+    scan = scan_of([[[3.0, -0.2], [3.0, 2.0]]], step_deg=0.25)
+    y = scan.ranges * np.sin(scan.angles)
+    scan.ranges[(y > 0) & (y < gap_m)] = np.nan
+    (found,) = segments(scan, CONFIG)
+    assert 2.0 - np.diff(found.extent)[0] == pytest.approx(low_m, abs=0.03)
+
+
 @pytest.mark.parametrize("behind_m, pieces", [(0.08, 1), (0.12, 2), (3.0, 2), (-0.5, 1)])
 def test_a_beam_through_a_gap_shows_that_it_is_open(behind_m, pieces):
     """Twice `split_m` beyond the wall, 10 cm; what is before it may hide the wall."""
@@ -182,7 +192,7 @@ def test_a_wall_goes_on_up_to_twice_the_deviation_beside_its_line(turn, beyond_m
     assert found.kind == kind
 
 
-@pytest.mark.parametrize("nearer_m, kind", [(0.10, "segment"), (0.20, "line")])
+@pytest.mark.parametrize("nearer_m, kind", [(0.14, "segment"), (0.17, "line")])
 @pytest.mark.parametrize("side", [1, -1])
 def test_an_end_is_hidden_by_what_is_nearer_than_a_corner_would_be(nearer_m, kind, side):
     """`_corner_m` at 3 m and half a degree: twice 5 cm and 2.6 cm. On either side of the wall, on
@@ -274,6 +284,15 @@ def test_a_circle_is_full_if_half_a_beam_or_less_is_missing():
             np.testing.assert_array_equal(np.flatnonzero(np.isnan(sweep.ranges)), [start + 150])
 
 
+@pytest.mark.parametrize("missing", [np.nan, np.inf, -np.inf])
+def test_a_missing_return_is_a_jump_to_the_laser(missing):
+    """5 m to nothing is more than 5 m to a thing 6 cm before the laser."""
+    r = np.full(360, 5.0)
+    r[150], r[20:40] = missing, 0.06
+    sweep = make_sweep(make_scan(r, -np.pi, np.radians(1.0)), 30.0)
+    assert np.isnan(sweep.ranges[0]) or np.isnan(sweep.ranges[-1])
+
+
 def test_returns_at_zero_below_and_at_the_maximum_are_none():
     """A laser says 0 or its maximum for "nothing"; ranges beyond the maximum still tell what is
     free, but no line is fitted to them."""
@@ -313,6 +332,16 @@ def test_a_line_is_valid_up_to_its_limits():
     assert allowed_rms(CONFIG) == 0.025
     assert allowed_rms(replace(CONFIG, split_m=0.0)) == 5e-5
     assert [fewest_points(replace(CONFIG, min_points=n)) for n in (1, 4, 9)] == [4, 4, 9]
+
+
+@pytest.mark.parametrize("covariance", ["incidence", "thesis"])
+def test_a_line_is_where_the_middle_of_what_was_seen_is(covariance):
+    """Not where most of its returns are, nor the more certain ones."""
+    y = np.array([-0.5, -0.4, -0.3, -0.2, -0.1, 0.6, 2.1])
+    config = replace(CONFIG, covariance=covariance)
+    lines = fit_lines(np.column_stack([np.full(7, 2.0), y]), np.zeros(1, dtype=np.intp), config)
+    np.testing.assert_allclose(lines.z[0], [2.0, 0.8, np.pi / 2], atol=1e-12)
+    np.testing.assert_allclose(lines.length, 2.6, atol=1e-12)
 
 
 def test_along_a_line_of_unknown_ends_the_variance_is_that_of_its_length():

@@ -322,6 +322,15 @@ def test_a_run_wider_than_the_largest_cylinder_is_none(radius, is_wide):
     assert runs(r, config) == ([] if is_wide else [(60, 65)])
 
 
+@pytest.mark.parametrize("gap_m", [0.0, 0.05, 0.3])
+def test_a_run_at_the_border_of_a_scan_is_not_free_whatever_the_gap(gap_m):
+    """What is beyond is not known."""
+    r = np.full(181, np.nan)
+    r[:6] = 1.0
+    assert runs(r, replace(CONFIG, gap_m=gap_m)) == []
+    assert runs(r[::-1], replace(CONFIG, gap_m=gap_m)) == []
+
+
 def test_no_run_is_free_in_a_scan_of_too_few_returns():
     r = np.full(181, np.nan)
     r[60:63] = 2.0

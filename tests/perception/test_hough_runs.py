@@ -138,16 +138,19 @@ def test_parts_fit_a_line_by_their_excess_over_their_own_line():
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_a_long_run_must_fit_as_a_whole_where_each_of_its_blocks_does(order):
-    """12 mm off: 64 returns show it, 16 do not. The other run stays, first or last."""
-    parts = [column(-3, -1, 30), [[2.0, 0.0]], column(1, 3, 64, 4.012)]
-    if order < 0:
-        parts = [np.asarray(p) * [1, -1] for p in parts][::-1]
-        parts = [np.asarray(p)[::-1] for p in parts]
-    assert fitting(*parts) == [30, 0, 0][::order]
-    few = [parts[0], parts[1], parts[2]]
-    few[2 if order > 0 else 0] = few[2 if order > 0 else 0][::4]
-    assert fitting(*few) == [30, 0, 16][::order]
+@pytest.mark.parametrize("count", [30, 400])
+def test_a_long_run_must_fit_as_a_whole_where_each_of_its_blocks_does(order, count):
+    """12 mm off: 64 returns show it, 16 do not. The other run stays, first or last; many returns on
+    the line do not make up for a run that is not."""
+    wall, post, off = column(-3, -1, count), np.array([[2.0, 0.0]]), column(1, 3, 64, 4.012)
+
+    def kept(*parts):
+        if order > 0:
+            return fitting(*parts)
+        return fitting(*((part * [1, -1])[::-1] for part in parts[::-1]))[::-1]
+
+    assert kept(wall, post, off) == [count, 0, 0]
+    assert kept(wall, post, off[::4]) == [count, 0, 16]
 
 
 def test_of_a_run_of_two_things_the_one_off_the_line_is_left_out():
@@ -188,6 +191,16 @@ def test_lines_are_where_they_begin_in_the_rows(votes):
     assert len(seen) == 1 and 0 < len(used) < len(rows)
     none, starts = find_lines(sweep, np.zeros(len(sweep.beam), bool), config)
     assert len(none) == len(starts) == 0
+
+
+@pytest.mark.parametrize("off_m, is_kept", [(0.045, True), (0.055, False)])
+def test_a_return_belongs_to_a_line_up_to_split_m(off_m, is_kept):
+    """One of a wall's fifty: what is farther is a thing in front of it."""
+    sweep = make_sweep(scan_of([[[4.0, -2.0], [4.0, 2.0]]]), 30.0)
+    one = len(sweep.beam) // 2
+    sweep.points[one] *= 1 - off_m / sweep.points[one, 0]
+    rows, starts = find_lines(sweep, np.ones(len(sweep.beam), bool), CONFIG)
+    assert len(starts) == 1 and (one in rows) is is_kept
 
 
 @pytest.mark.parametrize("points, is_found", [(6, True), (5, False)])

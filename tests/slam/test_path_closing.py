@@ -9,12 +9,14 @@ from graphslam.slam.smooth import smooth
 
 
 @pytest.mark.parametrize("is_closed", [True, False])
-def test_loops_are_closed_by_scans_only_if_the_setting_says_so(tmp_path, is_closed):
-    """`backend.close_loops`: once round a box. Without, no pair of places is compared."""
+@pytest.mark.parametrize("backend", ["batch", "isam2"])
+def test_loops_are_closed_by_scans_only_if_the_setting_says_so(tmp_path, backend, is_closed):
+    """`backend.close_loops`: once round a box. Without, no pair of places is compared, neither in a
+    batch nor after a pass step by step."""
     drive(tmp_path / "room.mcap")
-    config = load_config(
-        overrides=[f"backend.close_loops={str(is_closed).lower()}", "loop_closure.revisit_path_m=8"]
-    )
+    overrides = ["loop_closure.revisit_path_m=8", f"backend.name={backend}"]
+    overrides.append(f"backend.close_loops={str(is_closed).lower()}")
+    config = load_config(overrides=overrides)
     asked = []
 
     def look(closures, submaps):
