@@ -227,12 +227,14 @@ def test_the_threshold_is_metres_of_wall():
 # ---------------------------------------------------------------- votes
 
 
+@pytest.mark.parametrize("threshold_m", [0.0, 0.4])
 @pytest.mark.parametrize("votes", [OpenCvVotes, ThesisVotes])
-def test_votes_that_were_removed_do_not_come_back(votes):
-    """Removed twice or once, in a stripe or outside of the table: the rest votes as if alone."""
+def test_votes_that_were_removed_do_not_come_back(votes, threshold_m):
+    """Removed twice or once, in a stripe or outside of the table: the rest votes as if alone, and
+    without a threshold too there is an end."""
     far = np.column_stack([np.full(20, 30.0), np.linspace(-5, 5, 20)])
     points = np.concatenate([column(-1, 1, 40), column(-1, 1, 30, 6.0), far])
-    config = FrontEndConfig(hough_d_max_m=10.0)
+    config = FrontEndConfig(hough_d_max_m=10.0, hough_threshold_m=threshold_m)
     found = votes(points, np.ones(90), np.ones(90, bool), config)
     assert set(found.peak()) == set(range(40))
     found.remove(np.arange(40))
