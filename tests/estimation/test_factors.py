@@ -126,7 +126,9 @@ def test_line_gauge_ties_only_along_the_line():
     seen = Association("r", 0, 0, "line", z, np.eye(3))
     factor = factors.line_gauge_factor(X, T, seen)
     t = compose(x, z)
-    for shift, expected in (([0, 5.0, 0], 0.0), ([2.0, 0, 0], 4 / factors.LINE_GAUGE_SIGMA_M**2)):
+    for shift, expected in (
+        ([0, 5.0, 0], 0.0), ([0, 0, 0.5], 0.0), ([2.0, 0, 0], 4 / factors.LINE_GAUGE_SIGMA_M**2),
+    ):  # fmt: skip
         moved = compose(t, np.array(shift, float))
         np.testing.assert_allclose(squared_norm(factor, at(x, moved)), expected, atol=EXACT)
 
@@ -147,7 +149,8 @@ def test_a_held_line_is_held_along_itself_alone():
     x, t = np.array([1.0, 2.0, 0.5]), np.array([3.0, 1.0, 2.2])
     factor = factors.line_held_factor(X, T, x, t)
     for shift, expected in (
-        ([0, 0, 0], 0.0), ([0, 5.0, 0], 0.0), ([2.0, 0, 0], 4 / factors.LINE_HELD_SIGMA_M**2),
+        ([0, 0, 0], 0.0), ([0, 5.0, 0], 0.0), ([0, 0, 0.5], 0.0),
+        ([2.0, 0, 0], 4 / factors.LINE_HELD_SIGMA_M**2),
     ):  # fmt: skip
         found = squared_norm(factor, at(x, compose(t, np.array(shift, float))))
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-8)
