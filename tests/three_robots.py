@@ -18,12 +18,20 @@ def pose(robot, seconds):
 
 
 def write(
-    path, seed=1, marks=LANDMARKS, meets=lambda a, b: True, names=None, spoil=None, seconds=60.0
+    path,
+    seed=1,
+    marks=LANDMARKS,
+    meets=lambda a, b: True,
+    names=None,
+    spoil=None,
+    seconds=60.0,
+    say=None,
 ):
     """Three robots on circles, their odometry 2 % off in turns, see landmarks and each other.
 
     ``meets(observer, seen)`` says who sees whom or what; ``names`` are exchanged; ``spoil(z, rng,
-    observer, seen, seconds)`` may return something else than what was measured.
+    observer, seen, seconds)`` may return something else than what was measured; ``say(observer,
+    seen, seconds)`` what the log says that it is of, as keywords of `LogWriter.sighting`.
     """
     rng = np.random.default_rng(seed)
     names = names or {}
@@ -46,4 +54,5 @@ def write(
                     z = z + SIGMAS * rng.normal(size=2)
                     z = spoil(z, rng, robot, name, k / 10) if spoil else z
                     subject = {"seen_robot" if called in STARTS else "identity": called}
+                    subject = say(robot, name, k / 10) if say else subject
                     log.sighting(robot, stamp, z, np.diag(SIGMAS**2), **subject)

@@ -88,8 +88,9 @@ class Sighting(Message):
 
     ``z`` is (bearing rad, range m) or (bearing, range, direction rad) in the sensor's frame, the
     direction being the heading of the target relative to the sensor. ``cov`` is (2, 2) or
-    (3, 3). ``identity`` is None when unknown. ``seen_robot`` names a robot, None for a landmark.
-    Sightings of one robot at one stamp form one image: they exclude each other.
+    (3, 3). ``identity`` is None when unknown. ``seen_robot`` names a robot; where it is None,
+    ``may_be`` says what is seen: a ``landmark``, some ``robot``, or ``either``. Sightings of one
+    robot at one stamp form one image: they exclude each other.
     """
 
     z: Array
@@ -97,6 +98,7 @@ class Sighting(Message):
     identity: str | None
     seen_robot: str | None
     mount: Array
+    may_be: str = "landmark"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -178,7 +180,7 @@ class Observation(Record):
     for a ``line`` its first row and column mean nothing (no information along the line).
     ``extent`` (2,) is where the observed part begins and ends along the line, measured from z,
     m; None for points. ``source`` is the number of the recorded sighting that it was made from,
-    where that is kept.
+    where that is kept. ``robots``: those that it may be of; ``is_landmark``: or a landmark.
     """
 
     kind: str
@@ -187,6 +189,8 @@ class Observation(Record):
     extent: Array | None = None
     identity: str | None = None
     source: int | None = None
+    robots: tuple[str, ...] = ()
+    is_landmark: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -161,6 +161,9 @@ def sighting(message: Any, topic: TopicContext) -> records.Sighting:
     if z[1] <= 0:
         raise UnusableMessageError("sighting: range is not positive")
     mount = topic.mounts.get(frame_of(message), _NO_MOUNT)
+    may_be = _UNNAMED.get(message.robot)
+    if may_be is not None:
+        return records.Sighting(*_source(message, topic), z, cov, None, None, mount, may_be)
     identity, seen = message.identity or None, message.robot or None
     return records.Sighting(*_source(message, topic), z, cov, identity, seen, mount)
 
@@ -223,6 +226,7 @@ DECODERS: dict[str, Decoder] = {
     schemas.TRUE_ASSOCIATIONS: Decoder(records.TrueAssociations, true_associations),
 }
 
+_UNNAMED = {schemas.SOME_ROBOT: "robot", schemas.ANYTHING: "either"}
 _NO_MOUNT = np.zeros(3)
 _NO_RANGES = np.empty(0)
 

@@ -33,6 +33,9 @@ TRUE_POSE = "graphslam_msgs/msg/TruePose"
 TRUE_LANDMARK = "graphslam_msgs/msg/TrueLandmark"
 TRUE_ASSOCIATIONS = "graphslam_msgs/msg/TrueAssociations"
 
+#: what a Sighting says instead of a robot's name (no name: those are parts of topics)
+SOME_ROBOT, ANYTHING = "?", "*"
+
 #: fields that OdometryIncrement and RelativePose begin with
 _START_AND_POSE = """\
 std_msgs/Header header
@@ -56,7 +59,8 @@ float64 direction
 float64[9] covariance
 # Which landmark it is; empty = unknown.
 string identity
-# Name of the robot seen; empty = a landmark was seen.
+# Name of the robot seen; empty = a landmark was seen; ? = a robot, it is not known which;
+# * = a robot or a landmark, it is not known which of the two.
 string robot
 """,
     ODOMETRY_INCREMENT: f"""\

@@ -211,7 +211,8 @@ class LogWriter:
     ) -> None:
         """Sighting on ``sightings``: ``z`` (2,) or (3,), ``cov`` (2, 2) or (3, 3).
 
-        ``z`` is (bearing rad, range m[, direction rad]) in the frame of ``sensor``.
+        ``z`` is (bearing rad, range m[, direction rad]) in the frame of ``sensor``. ``seen_robot``
+        is the name of a robot, `schemas.SOME_ROBOT` or `schemas.ANYTHING`; None for a landmark.
         """
         bearing, distance, *direction = np.asarray(z, dtype=float).tolist()
         full = np.zeros((3, 3))

@@ -1,8 +1,9 @@
 """Data association of one image (scan or set of sightings) at a time, and landmark life cycle.
 
-An observation is associated with, in this order: the landmark of its identity; a landmark of the
-graph that was seen recently; landmarks not seen for long, only if enough of them are jointly
-compatible (a loop closure); a tentative landmark; a new one. Else it is rejected, with the reason.
+An observation is associated with, in this order: the landmark of its identity; another robot or a
+landmark of the graph that was seen recently, whichever is nearest; landmarks not seen for long,
+only if enough of them are jointly compatible (a loop closure); a tentative landmark; a new one.
+Else it is rejected, with the reason.
 """
 
 import math
@@ -14,8 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from graphslam.core.config import AssociationConfig
-from graphslam.core.gaussian import move_block
-from graphslam.core.geometry import Array, compose, compose_jacobians, rotate_cov
+from graphslam.core.geometry import Array, compose, rotate_cov
 from graphslam.core.records import Association, Motion, Observation
 from graphslam.estimation.backend import Backend, JointMarginal
 from graphslam.mapping.gating import (
@@ -28,9 +28,16 @@ from graphslam.mapping.gating import (
     fixes_pose,
     flip,
     gate_distance,
+    gate_floor,
     jointly_compatible,
 )
 from graphslam.mapping.landmark_map import Entry, LandmarkMap
+from graphslam.mapping.robot_candidates import (
+    NOT_THERE,
+    RobotTarget,
+    predicted_joint,
+    robot_distances,
+)
 from graphslam.odometry.preintegration import Track
 
 #: images between two refreshes of all landmark estimates; those compared are always current
@@ -38,16 +45,6 @@ REFRESH_EVERY = 50
 #: landmarks per observation whose joint marginal is read, the nearest by crude distance: recently
 #: seen ones, and old ones (more, as the pose may have drifted)
 NEAREST_RECENT, NEAREST_OLD = 3, 4
-
-
-def predicted_joint(joint: JointMarginal, motion: Motion | None) -> JointMarginal:
-    """The joint after the robot moved on: system update of the pose block, thesis 4.4-4.7."""
-    if motion is None:
-        return joint
-    F, W = compose_jacobians(joint.pose, motion.delta)
-    P = joint.cov.copy()
-    move_block(P, slice(0, 3), F, W @ motion.cov @ W.T)
-    return replace(joint, pose=compose(joint.pose, motion.delta), cov=P)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +55,8 @@ class Image:
     back end, and ``motion`` leads from there to this one; None if it is it. ``path_m`` is how far
     the robot has driven. ``gathering``: more images follow before the back end takes the step (and
     `Associator.settle` is called). Innovations of sightings with an identity, which need the
-    expensive joint marginal, are not recorded then.
+    expensive joint marginal, are not recorded then. ``robots``: those that `Observation.robots`
+    names and that have a state.
     """
 
     robot: str
@@ -69,6 +67,21 @@ class Image:
     track: Track
     path_m: float
     gathering: bool = False
+    robots: Sequence[RobotTarget] = ()
+
+    @property
+    def parts(self) -> list["Image"]:
+        """What can be associated one after the other: landmarks, and robots.
+
+        If something may be of either, the two exclude each other and are one part.
+        """
+        robots = [o for o in self.seen if not o.is_landmark]
+        either = any(o.is_landmark and o.robots for o in self.seen)
+        if either or not robots:
+            return [self]
+        landmarks = [o for o in self.seen if o.is_landmark]
+        parts = [replace(self, seen=robots)]
+        return [replace(self, seen=landmarks, robots=()), *parts] if landmarks else parts
 
     @cached_property
     def predicted(self) -> Array:
@@ -81,8 +94,9 @@ class Candidates:
     """Candidate pairs of an image's observations with landmarks.
 
     ``entries`` (k) is the landmark of each pair, ``recent`` (k,) whether this robot saw it lately;
-    ``joint`` is over the predicted pose and the graph's landmarks among them, ``where[id]`` their
-    place in it.
+    ``joint`` is over the predicted pose, the graph's landmarks among them, ``where[id]`` their
+    place in it, and the image's robots. ``robot_pairs`` are with these, ``robots_compared`` their
+    distances.
     """
 
     joint: JointMarginal
@@ -91,6 +105,8 @@ class Candidates:
     compared: PairDistances
     recent: BoolArray
     entries: tuple[Entry, ...]
+    robot_pairs: Pairs
+    robots_compared: PairDistances
 
 
 class Associator:
@@ -111,17 +127,13 @@ class Associator:
         self._images = 0
         self._unsettled: set[int] = set()  # admitted, but not yet in the back end
         self._deleted: list[int] = []  # of the graph, see `take_deleted`
-        m2, rad2 = config.floor_m**2, config.floor_rad**2
-        self._floor = {
-            "line": np.diag([m2, rad2]),
-            "point": np.diag([rad2, m2]),
-            "segment": np.diag([m2, m2, rad2]),
-        }
+        self._floor = gate_floor(config)
 
     def associate(self, image: Image) -> tuple[Association, ...]:
         """What is to enter the graph of an image.
 
-        It includes earlier sightings of landmarks that this image promotes (marked late).
+        It includes earlier sightings of landmarks that this image promotes (marked late). Other
+        robots come behind landmarks where the two are told apart.
         """
         config = self._config
         if self._images % REFRESH_EVERY == 0:
@@ -132,10 +144,13 @@ class Associator:
         self.map.expire(image.time_ns, image.robot, image.path_m, age_ns, config.tentative_m)
         if math.isfinite(config.delete_s):
             self._deleted += self.map.expire_unseen(image.time_ns, 1e9 * config.delete_s)
-        if image.gathering and all(map(self._has_identity, image.seen)):
-            return self._associate_identified(image)
-        candidates = self._candidates(image)
-        associations = self._apply(image, candidates, self._choose(image, candidates))
+        associations: tuple[Association, ...] = ()
+        for part in image.parts:
+            if part.gathering and all(map(self._has_identity, part.seen)):
+                associations += self._associate_identified(part)
+                continue
+            candidates = self._candidates(part)
+            associations += self._apply(part, candidates, *self._choose(part, candidates))
         if not image.gathering:
             self.settle()
         return associations
@@ -166,7 +181,7 @@ class Associator:
         """Candidate pairs of an image and their distances."""
         seen = image.seen
         ids, means, extents, is_point, whole = self.map.arrays()
-        free = [n for n, o in enumerate(seen) if not self._has_identity(o)]
+        free = [n for n, o in enumerate(seen) if o.is_landmark and not self._has_identity(o)]
         pairs = candidate_pairs(
             [seen[n] for n in free], image.predicted, means, extents, is_point, whole, self._config
         )
@@ -194,9 +209,14 @@ class Associator:
         wanted = entries[: len(entries) - len(known)] if image.gathering else entries
         graph_ids = sorted({e.id for e in wanted if e.in_graph and e.id not in self._unsettled})
         where = {landmark: n for n, landmark in enumerate(graph_ids)}
-        joint = predicted_joint(self._backend.joint(image.robot, graph_ids), image.motion)
+        joint = predicted_joint(
+            self._backend.joint(image.robot, graph_ids, [robot.name for robot in image.robots]),
+            image.motion,
+            image.robots,
+        )
         compared = self._compare(image, pairs, entries, joint, where)
-        return Candidates(joint, where, pairs, compared, recent, tuple(entries))
+        of_robots = robot_distances(seen, image.robots, joint, self._floor)
+        return Candidates(joint, where, pairs, compared, recent, tuple(entries), *of_robots)
 
     def _has_identity(self, o: Observation) -> bool:
         return o.identity is not None and self._config.identities == "use"
@@ -242,20 +262,29 @@ class Associator:
                 states[n], P_xx[n], P_tt[n] = entry.mean, since[entry.last_ns], entry.cov
         return compare(image.seen, pairs, joint.pose, states, P_xx, P_xt, P_tt, self._floor)
 
-    def _choose(self, image: Image, candidates: Candidates) -> dict[int, int]:
-        """Observation -> pair."""
+    def _choose(
+        self, image: Image, candidates: Candidates
+    ) -> tuple[dict[int, int], dict[int, int]]:
+        """Observation -> pair with a landmark, and observation -> pair with a robot."""
         config, pairs, compared = self._config, candidates.pairs, candidates.compared
         entries = candidates.entries
         known = np.array([self._has_identity(image.seen[i]) for i in pairs.observation], dtype=bool)
         in_graph = np.array([e.in_graph for e in entries], dtype=bool)
-        gate = gate_distance(config.gate_probability, np.maximum(compared.dof, 1))
+        every = pairs.joined(candidates.robot_pairs)
+        d2 = np.append(compared.d2, candidates.robots_compared.d2)
+        dof = np.append(compared.dof, candidates.robots_compared.dof)
+        gate = gate_distance(config.gate_probability, np.maximum(dof, 1))
 
-        def best(which: BoolArray) -> dict[int, int]:
-            return _assign_pairs(pairs, compared, gate, which, len(image.seen), config)
+        def best(which: BoolArray, *, robots: bool = False) -> dict[int, int]:
+            use = np.append(which, np.full(len(d2) - len(which), robots))
+            return _assign_pairs(every, d2, gate, use, len(image.seen), config)
 
         # observations of one image exclude each other: landmarks with an identity are taken
         free = ~known & ~np.isin(pairs.landmark, pairs.landmark[known])
-        chosen = best(free & in_graph & candidates.recent)
+        nearest = best(free & in_graph & candidates.recent, robots=True)
+        chosen = {n: k for n, k in nearest.items() if k < len(pairs.observation)}
+        robots = {n: k - len(pairs.observation) for n, k in nearest.items() if n not in chosen}
+        free &= ~np.isin(pairs.observation, list(robots))
         # a landmark that the back end does not have yet closes no loop
         settled = np.array([e.id in candidates.where for e in entries], dtype=bool)
         old = best(free & in_graph & ~candidates.recent & settled)
@@ -264,7 +293,8 @@ class Associator:
             self.closures += 1
         taken = np.array([int(i) in chosen for i in pairs.observation], dtype=bool)
         chosen |= best(free & ~in_graph & ~taken)
-        return chosen | {int(pairs.observation[k]): int(k) for k in np.flatnonzero(known)}
+        chosen |= {int(pairs.observation[k]): int(k) for k in np.flatnonzero(known)}
+        return chosen, robots
 
     def _closes_loop(self, candidates: Candidates, picks: list[int]) -> bool:
         """Whether pairs with landmarks not seen for long are accepted: enough, and together."""
@@ -277,24 +307,47 @@ class Associator:
         )
 
     def _apply(
-        self, image: Image, candidates: Candidates, chosen: dict[int, int]
+        self,
+        image: Image,
+        candidates: Candidates,
+        chosen: dict[int, int],
+        robots: dict[int, int],
     ) -> tuple[Association, ...]:
-        """Associations of the chosen pairs; other observations make landmarks or are rejected."""
-        pairs, compared = candidates.pairs, candidates.compared
-        new_gate = gate_distance(self._config.new_landmark_probability, np.maximum(compared.dof, 1))
+        """Associations of the chosen pairs; other observations make landmarks or are rejected.
+
+        ``chosen`` and ``robots``: see `_choose`.
+        """
+        config, pairs, compared = self._config, candidates.pairs, candidates.compared
+        new_gate = gate_distance(config.new_landmark_probability, np.maximum(compared.dof, 1))
         close = candidates.recent & (compared.d2 < new_gate)
+        of_robots, distances = candidates.robot_pairs, candidates.robots_compared
+        new_gate = gate_distance(config.new_landmark_probability, np.maximum(distances.dof, 1))
+        near_robots = set(of_robots.observation[distances.d2 < new_gate].tolist())
         out: list[Association] = []
         for n, seen in enumerate(image.seen):
             o = seen
+            if n in robots:
+                k = robots[n]
+                name, model = image.robots[-1 - of_robots.landmark[k]].name, of_robots.model[k]
+                self._record_innovation(image, model, distances, k)
+                out.append(
+                    Association(
+                        image.robot, image.time_ns, name, model, o.z, o.cov, source=o.source
+                    )
+                )
+                continue
+            if not o.is_landmark:
+                self.rejected[NOT_THERE] += 1
+                continue
             if n in chosen:
                 k = chosen[n]
                 entry, model = candidates.entries[k], pairs.model[k]
                 o = flip(o) if pairs.flipped[k] else o
                 if entry.id in candidates.where or not entry.in_graph:
-                    self.innovations.setdefault(model, []).append(
-                        (image.time_ns, float(compared.d2[k] / compared.dof[k]))
-                    )
-            elif not self._has_identity(o) and np.any(close & (pairs.observation == n)):
+                    self._record_innovation(image, model, compared, k)
+            elif not self._has_identity(o) and (
+                n in near_robots or np.any(close & (pairs.observation == n))
+            ):
                 self.rejected["between the thresholds: neither a match nor new"] += 1
                 continue
             elif self._named(o) is not None:
@@ -305,6 +358,12 @@ class Associator:
                 entry, model = self.map.add(o, image.predicted, image.time_ns), o.kind
             out += self._record(image, entry, model, o, self._has_identity(o))
         return tuple(out)
+
+    def _record_innovation(self, image: Image, model: str, compared: PairDistances, k: int) -> None:
+        """Record the squared distance of a pair, per degree of freedom."""
+        self.innovations.setdefault(model, []).append(
+            (image.time_ns, float(compared.d2[k] / compared.dof[k]))
+        )
 
     def _record(
         self, image: Image, entry: Entry, model: str, o: Observation, certain: bool
@@ -353,7 +412,7 @@ def _worth_comparing(
 
 def _assign_pairs(
     pairs: Pairs,
-    compared: PairDistances,
+    d2: Array,
     gate: Array,
     which: BoolArray,
     n: int,
@@ -364,7 +423,7 @@ def _assign_pairs(
     One-to-one first. A line may be seen in several parts (a pillar hides its middle), so a line
     observation left over joins its nearest landmark even if that has an observation already.
     """
-    use = np.flatnonzero(which & (compared.d2 < gate))
+    use = np.flatnonzero(which & (d2 < gate))
     if not len(use):
         return {}
     columns = {int(j): c for c, j in enumerate(np.unique(pairs.landmark[use]))}
@@ -373,11 +432,11 @@ def _assign_pairs(
     number = np.full(cost.shape, -1, dtype=np.int64)
     for k in use:
         cell = int(pairs.observation[k]), columns[int(pairs.landmark[k])]
-        cost[cell], limit[cell], number[cell] = compared.d2[k], gate[k], k
+        cost[cell], limit[cell], number[cell] = d2[k], gate[k], k
     chosen = {i: int(number[i, c]) for i, c in assign(cost, limit, config.method)}
     if config.nearness == "middle":
         return chosen  # what shares no middle is no part of it
-    for k in use[np.argsort(compared.d2[use], kind="stable")]:
+    for k in use[np.argsort(d2[use], kind="stable")]:
         i = int(pairs.observation[k])
         if i not in chosen and pairs.model[k] == "line":
             chosen[i] = int(k)

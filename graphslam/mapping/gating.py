@@ -16,6 +16,7 @@ from graphslam.core.config import AssociationConfig
 from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared
 from graphslam.core.geometry import Array, between, compose, wrap
 from graphslam.core.observation_models import MODELS
+from graphslam.core.record import replace
 from graphslam.core.records import Observation
 
 IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
@@ -45,6 +46,16 @@ class Pairs:
     model: tuple[str, ...]
     flipped: BoolArray
     rough_distance: Array
+
+    def joined(self, more: "Pairs") -> "Pairs":
+        """These pairs and then ``more``."""
+        return Pairs(
+            np.append(self.observation, more.observation),
+            np.append(self.landmark, more.landmark),
+            self.model + more.model,
+            np.append(self.flipped, more.flipped),
+            np.append(self.rough_distance, more.rough_distance),
+        )
 
     def only(self, keep: BoolArray) -> "Pairs":
         """The pairs for which ``keep`` (k,) holds."""
@@ -78,6 +89,19 @@ def gate_distance(probability: float, dof: IntArray | int) -> Array:
     return np.asarray(_quantiles(probability)[np.asarray(dof) - 1])
 
 
+def gate_floor(config: AssociationConfig) -> dict[str, Array]:
+    """Model -> covariance (rows, rows) added to innovations before they are gated."""
+    m2, rad2 = config.floor_m**2, config.floor_rad**2
+    polar, pose = np.diag([rad2, m2]), np.diag([m2, m2, rad2])
+    return {
+        "line": np.diag([m2, rad2]),
+        "point": polar,
+        "segment": pose,
+        "robot-point": polar,
+        "robot-pose": pose,
+    }
+
+
 @functools.cache
 def _quantiles(probability: float) -> Array:
     """Chi-square quantiles (9,) of 1 to 9 degrees of freedom."""
@@ -88,7 +112,7 @@ def flip(seen: Observation) -> Observation:
     """The same line described in the opposite direction."""
     assert seen.extent is not None
     z = np.array([seen.z[0], seen.z[1], wrap(seen.z[2] + np.pi)])
-    return Observation(seen.kind, z, seen.cov, -seen.extent[::-1], seen.identity, seen.source)
+    return replace(seen, z=z, extent=-seen.extent[::-1])
 
 
 def candidate_pairs(

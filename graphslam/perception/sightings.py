@@ -15,3 +15,18 @@ def sighting_observation(message: Sighting) -> Observation:
     J = np.eye(3)
     _, J[:2, :2] = MODELS["point"].invert_jacobians(sighted, origin)
     return Observation("segment", z, J @ message.cov @ J.T, np.zeros(2), message.identity)
+
+
+def is_unnamed_robot(message: Sighting) -> bool:
+    """Whether it may be of any robot."""
+    return message.seen_robot is None and message.may_be != "landmark"
+
+
+def may_be_robot(message: Sighting) -> bool:
+    """Whether it may be of a robot, named or not."""
+    return message.seen_robot is not None or message.may_be != "landmark"
+
+
+def may_be_landmark(message: Sighting) -> bool:
+    """Whether it may be of a landmark, named or not."""
+    return message.seen_robot is None and message.may_be != "robot"

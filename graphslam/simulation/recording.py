@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from graphslam.core.geometry import Array, compose
+from graphslam.logs.schemas import ANYTHING, SOME_ROBOT
 from graphslam.logs.writer import Event, LogWriter
 from graphslam.simulation.encoders import odometry, wheel_angles
 from graphslam.simulation.laser import beam_fan, laser_mount, noise_free_scans, noisy_ranges
@@ -16,7 +17,12 @@ from graphslam.simulation.raycast import NO_SURFACE, Hits
 from graphslam.simulation.scenario import Body, Encoders, Laser, Scenario, SightingSensor
 from graphslam.simulation.scene import SimulatedRobot, SimulatedVisit
 from graphslam.simulation.sensor_clock import sample_times, stamps
-from graphslam.simulation.sightings import LANDMARKS, sighting_targets, simulate_sightings
+from graphslam.simulation.sightings import (
+    LANDMARKS,
+    sighting_targets,
+    simulate_sightings,
+    with_faults,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +82,7 @@ def record_visit(scenario: Scenario, visit: SimulatedVisit, path: Path, seed: in
             events += _beam_associations(this, ideal, scans)
             ideal_scans[name] = ideal
         events += _sighting_associations(this, seen)
-        sighted |= {target for _, target in seen}
+        sighted |= {target for _, target in seen if target}
         robots[name] = RobotSummary(
             actor.drive.path_m, visit.duration_s, len(scans), len(seen), end_m
         )
@@ -196,22 +202,27 @@ def _biases(this: _Recorder, laser: Laser) -> Array:
 
 
 def _sightings(this: _Recorder) -> Iterator[tuple[Event, str]]:
-    """The sightings' messages, each with the name of the target."""
+    """The sightings' messages, each with the name of the target, empty where there is none."""
     for number, sensor in enumerate(this.actor.robot.sightings):
         times, at = this.times(sensor)
         poses = this.actor.drive.at(times).poses
         targets = list(sighting_targets(sensor, this.visit.world, this.others(times), len(times)))
         rng = this.rng(f"sightings {number}")
         landmark = sensor.of == LANDMARKS
-        for seen in simulate_sightings(poses, sensor, targets, rng):
+        unnamed = (None if landmark else SOME_ROBOT) if sensor.told_apart else ANYTHING
+        names = [target.name for target in targets]
+        names = [name for name in names if name in sensor.names or not sensor.names]
+        true = simulate_sightings(poses, sensor, targets, rng)
+        for seen in with_faults(true, sensor, names, this.rng(f"faults {number}")):
+            named = (None if landmark else seen.said) if sensor.identified else unnamed
             event = Event.of(
                 LogWriter.sighting,
                 this.name,
                 at[seen.sample],
                 z=seen.z,
                 cov=seen.cov,
-                identity=seen.name if landmark and sensor.identified else None,
-                seen_robot=None if landmark else seen.name,
+                identity=seen.said if landmark and sensor.identified else None,
+                seen_robot=named,
             )
             yield event, seen.name
 
@@ -246,7 +257,9 @@ def _sighting_associations(this: _Recorder, seen: list[tuple[Event, str]]) -> It
     for event, target in seen:
         images.setdefault(event.stamp_ns, []).append(target)
     for stamp_ns, names in images.items():
-        truth = {"names": names, "targets": np.arange(len(names))}
+        known = [name for name in names if name]
+        there = np.array([bool(name) for name in names])
+        truth = {"names": known, "targets": np.where(there, np.cumsum(there) - 1, -1)}
         yield Event.of(LogWriter.true_associations, this.name, stamp_ns, of="sightings", **truth)
 
 

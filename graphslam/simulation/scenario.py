@@ -211,7 +211,10 @@ class SightingSensor(Sensor):
 
     of: `landmarks` or `robots`. names: its targets; empty = all of the scenario.
     direction_sigma_deg: 0 = the direction is not measured (cylinders have none). identified:
-    whether the identity is in the message.
+    whether the identity, of a robot its name, is in the message. told_apart: without it, whether
+    the message says that it is a robot, or a landmark. exchanged_share: share of the sightings
+    under the name of another target. false_share: sightings of nothing, anywhere in the field of
+    view and under any name, for each true one.
     """
 
     of: str
@@ -223,6 +226,9 @@ class SightingSensor(Sensor):
     bearing_sigma_deg: float = field(default=0.5, metadata=POSITIVE)
     direction_sigma_deg: float = field(default=0.0, metadata=NOT_NEGATIVE)
     identified: bool = True
+    told_apart: bool = True
+    exchanged_share: float = field(default=0.0, metadata=SHARE)
+    false_share: float = field(default=0.0, metadata=SHARE)
 
 
 @dataclass(frozen=True)

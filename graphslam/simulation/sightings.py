@@ -1,7 +1,7 @@
 """Simulated sightings of cylinders and other robots: bearing, range, optionally direction."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,12 +33,14 @@ class SimulatedSighting:
     """One sighting: sample index, name of the target, ``z`` (2,) or (3,) and its covariance.
 
     ``z`` is bearing rad, range m and optionally direction rad, in the observer's base frame.
+    ``said``: the target's name in the message; ``name`` is empty where nothing is there.
     """
 
     sample: int
     name: str
     z: Array
     cov: Array
+    said: str
 
 
 def sighting_targets(
@@ -87,8 +89,27 @@ def simulate_sightings(
         visible &= _line_of_sight(poses, bearing, distance, target)
         cov = np.diag(sigma**2)
         samples = np.flatnonzero(visible).tolist()
-        found += [SimulatedSighting(i, target.name, z[i], cov) for i in samples]
+        found += [SimulatedSighting(i, target.name, z[i], cov, target.name) for i in samples]
     return sorted(found, key=lambda seen: seen.sample)
+
+
+def with_faults(
+    sightings: Iterable[SimulatedSighting],
+    sensor: SightingSensor,
+    names: Sequence[str],
+    rng: np.random.Generator,
+) -> Iterator[SimulatedSighting]:
+    """Sightings, some under another one of the ``names``, and false ones behind true ones."""
+    for seen in sightings:
+        others = [name for name in names if name != seen.name]
+        exchanged = others and rng.random() < sensor.exchanged_share
+        yield replace(seen, said=str(rng.choice(others))) if exchanged else seen
+        if rng.random() < sensor.false_share:
+            half = np.radians(sensor.field_deg) / 2
+            z = np.array([*rng.uniform([-half, 0.0], [half, sensor.range_max_m]), 0.0])
+            z[2] = rng.uniform(-np.pi, np.pi)
+            z = z[: len(seen.z)]
+            yield SimulatedSighting(seen.sample, "", z, seen.cov, str(rng.choice(list(names))))
 
 
 def _line_of_sight(poses: Array, bearing: Array, distance: Array, target: Target) -> Flags:

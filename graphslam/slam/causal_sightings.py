@@ -5,18 +5,29 @@ way, and applied to the motions and sightings of the next `BLOCK` steps, which a
 """
 
 import time
+from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graphslam.core.config import AssociationConfig
 from graphslam.core.geometry import Array, between, compose, rotation3
 from graphslam.core.motion_models import Calibration
-from graphslam.core.records import Estimate, Step, Trajectory
+from graphslam.core.records import Association, Estimate, Step, Trajectory
 from graphslam.estimation.compressed_filter import CompressedBackend
+from graphslam.mapping.gating import gate_distance, gate_floor
+from graphslam.mapping.robot_candidates import (
+    RobotTarget,
+    as_observation,
+    predicted_joint,
+    robot_distances,
+    robots_in,
+)
 from graphslam.odometry.online_calibration import observed_information
 from graphslam.odometry.preintegration import Track
 from graphslam.slam.reoptimise_sightings import SightingGroup, recompute_steps
+from graphslam.slam.robot_sightings import RobotCandidates
 from graphslam.slam.robot_state import Causal, RobotState
 from graphslam.slam.sighting_pass import SightingPass
 
@@ -59,13 +70,15 @@ def _replay(one: SightingPass, tracks: Mapping[str, Track]) -> CausalReplay:
     settings = replace(settings, relinearize_every=INTERVAL * settings.relinearize_every)
     backend = CompressedBackend(replace(one.config, backend=settings))
     runs = {name: RobotState(track, clock=one.runs[name].clock) for name, track in tracks.items()}
+    candidates = RobotCandidates(runs, one.frames.of, one.config, one.clock_sigma_s)
     known: set[int | str] = set()
     step_ms: list[float] = []
     for first in range(0, len(one.steps), BLOCK):
         block = range(first, min(first + BLOCK, len(one.steps)))
         used = {name: run.track.calibration for name, run in runs.items()}
-        for step in _computed(one.steps[first : block.stop], one.groups, block, runs):
+        for recorded in _computed(one.steps[first : block.stop], one.groups, block, runs):
             began = time.perf_counter()
+            step = _gated(recorded, backend, candidates, one.config.association)
             backend.add(step)
             poses = {name: backend.state_mean(name) for name in (*step.starts, *step.motions)}
             if one.config.odometry.calibrate and step.motions:
@@ -107,6 +120,36 @@ def _computed(
     tracks = {name: runs[name].track for name in states}
     own = [part for group in groups if len((part := group.of_steps(numbers)).where)]
     return recompute_steps(steps, Estimate(states, {}, 0.0, 0), tracks, own)
+
+
+def _gated(
+    step: Step,
+    backend: CompressedBackend,
+    candidates: RobotCandidates,
+    config: AssociationConfig,
+) -> Step:
+    """A step without sightings of robots that are not where the back end expects these."""
+    of_robots: dict[str, list[Association]] = defaultdict(list)
+    for a in step.associations:
+        if isinstance(a.target, str):
+            of_robots[a.robot].append(a)
+    if not of_robots:
+        return step
+    false: set[int | None] = set()
+    floor = gate_floor(config)
+    for robot, own in of_robots.items():
+        seen = [as_observation(a) for a in own]
+        others = [
+            RobotTarget(name, step.motions.get(name), candidates.clock_shift(name, step.time_ns))
+            for name in robots_in(seen)
+        ]
+        joint = backend.joint(robot, [], [other.name for other in others])
+        joint = predicted_joint(joint, step.motions.get(robot), others)
+        _, found = robot_distances(seen, others, joint, floor)
+        gate = gate_distance(config.gate_probability, found.dof)
+        false |= {a.source for a, far in zip(own, found.d2 >= gate, strict=True) if far}
+    kept = tuple(a for a in step.associations if a.source not in false)
+    return replace(step, associations=kept)
 
 
 def _learn(

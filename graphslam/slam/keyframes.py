@@ -7,6 +7,7 @@ import numpy as np
 from graphslam.core.config import KeyframeConfig
 from graphslam.core.geometry import wrap
 from graphslam.core.records import Message, Scan, Sighting
+from graphslam.perception.sightings import may_be_robot
 from graphslam.slam.robot_state import RobotState
 
 
@@ -52,7 +53,7 @@ class KeyframeSelector:
         return (
             self._config.mode == "all"
             or isinstance(first, Scan)
-            or any(isinstance(m, Sighting) and m.seen_robot for m in event)
+            or any(isinstance(m, Sighting) and may_be_robot(m) for m in event)
             or self.has_moved(run, run.state_ns, first.time_ns)
         )
 

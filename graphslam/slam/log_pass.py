@@ -8,7 +8,7 @@ from typing import Any
 from graphslam.core.config import Config
 from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import rotate_cov
-from graphslam.core.records import KeyframeScan, Sighting, Start, Step
+from graphslam.core.records import Association, KeyframeScan, Sighting, Start, Step
 from graphslam.logs import LogSet
 from graphslam.logs.clock import Clock
 from graphslam.mapping.landmark_map import LandmarkMap
@@ -43,7 +43,8 @@ class LogPass:
     """The robots, landmarks and steps of one pass over a log, and its counts and times.
 
     ``sources`` are the sightings that `Association.source` numbers (steps of several images only);
-    ``robot_sightings`` those of robots that entered at their own time. ``rejected`` counts
+    ``robot_sightings`` those of robots at their own time, which it numbers otherwise; ``offers``:
+    number of a step -> what its sightings of robots could be, used or not. ``rejected`` counts
     observations and ``removed_returns`` returns that were not used, by reason; ``innovations``:
     model -> (time, squared distance per degree of freedom) of accepted observations.
     """
@@ -66,6 +67,7 @@ class LogPass:
         self.steps: list[Step] = []
         self.sources: list[Sighting] = []
         self.robot_sightings: list[Sighting] = []
+        self.offers: dict[int, tuple[Association, ...]] = {}
         self.keyframe_scans: list[KeyframeScan] = []
         self.counts: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()

@@ -17,12 +17,14 @@ from graphslam.estimation.clock_calibration import ClockEstimate, estimate_clock
 from graphslam.estimation.isam2 import Isam2Backend
 from graphslam.logs import LogSet
 from graphslam.mapping.loop_closure import Tamper
+from graphslam.mapping.robot_candidates import NOT_THERE
 from graphslam.multi_robot.identity_swaps import find_swapped_identities
 from graphslam.slam.causal import causal_of
 from graphslam.slam.initialisation import with_identities
 from graphslam.slam.log_pass import LogPass, PriorKnowledge, Progress, timed
 from graphslam.slam.pipeline import Pipeline
 from graphslam.slam.reoptimise_scans import reoptimise_scan_log
+from graphslam.slam.robot_gating import RobotOffers
 from graphslam.slam.robot_state import Causal
 from graphslam.slam.unnamed_sightings import solve_unnamed
 
@@ -141,6 +143,9 @@ def reoptimise(pipeline: Pipeline, estimate: Estimate) -> Estimate:
     """The whole log solved again from a rough estimate; the pipeline's steps follow the result."""
     tracks = {name: run.track for name, run in pipeline.started.items()}
     config = pipeline.config
+    robots = RobotOffers(pipeline.offers, pipeline.sources or pipeline.robot_sightings)
+    unused = robots.unused(pipeline.steps)
+    pipeline.steps = list(robots.associated_again(pipeline.steps, estimate, config.robust, config))
     if is_sighting_log(pipeline):
         estimate, steps = solve_unnamed(pipeline, estimate)
     else:
@@ -152,9 +157,12 @@ def reoptimise(pipeline: Pipeline, estimate: Estimate) -> Estimate:
             pipeline.keyframe_scans,
             config,
             pipeline.tamper,
+            robots,
         )
         pipeline.counts.update(counts)
     pipeline.steps = list(steps)
+    if change := robots.unused(steps) - unused:
+        pipeline.rejected[NOT_THERE] += change
     for name in tracks:
         pipeline.runs[name].is_calibrated = config.odometry.calibrate
     return estimate

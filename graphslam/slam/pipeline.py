@@ -13,6 +13,7 @@ import numpy as np
 
 from graphslam.core.config import Config
 from graphslam.core.observation_models import transport
+from graphslam.core.record import replace
 from graphslam.core.records import (
     Association,
     Closure,
@@ -29,6 +30,7 @@ from graphslam.logs import LogSet
 from graphslam.logs.clock import to_common_clock
 from graphslam.mapping.data_association import Image
 from graphslam.mapping.loop_closure import Tamper
+from graphslam.mapping.robot_candidates import robot_associations, robots_in
 from graphslam.multi_robot.identity_swaps import rename_identities
 from graphslam.multi_robot.mutual_detection import ScanBuffer
 from graphslam.multi_robot.robot_detection import RobotDetector
@@ -41,12 +43,17 @@ from graphslam.odometry.scan_odometry import (
 )
 from graphslam.perception.front_ends import FRONT_ENDS
 from graphslam.perception.ordered_scan import scan_points
-from graphslam.perception.sightings import sighting_observation
+from graphslam.perception.sightings import (
+    may_be_landmark,
+    may_be_robot,
+    sighting_observation,
+)
 from graphslam.slam.keyframes import KeyframeSelector
 from graphslam.slam.log_pass import PriorKnowledge, Progress, counted, timed
 from graphslam.slam.log_reader import TRUE_RECORDS
 from graphslam.slam.recorded_closures import between_states
 from graphslam.slam.robot_settings import outlines
+from graphslam.slam.robot_sightings import RobotCandidates, with_named_robots
 from graphslam.slam.sighting_batches import (
     SightingBatch,
     batch_motions,
@@ -85,6 +92,11 @@ class Pipeline(StepRecorder):
         self.keyframes = KeyframeSelector(self.config.keyframe)
         self.robot_detector = RobotDetector(
             self.backend, self.runs, outlines(log, config), config, CLOCK_OFFSET_SIGMA_S
+        )
+        # once an earlier pass has found the clocks they are known
+        self.clock_sigma_s = 0.0 if known.clocks else CLOCK_OFFSET_SIGMA_S
+        self.candidates = RobotCandidates(
+            self.runs, self.frames.of, config, self.clock_sigma_s, self.has_started
         )
         self.scan_buffer = ScanBuffer({}, {}, 0.0)
         kinds = {topic.record for topic in log.topics}
@@ -140,8 +152,10 @@ class Pipeline(StepRecorder):
                 message = rename_identities(message, self.known.identities, self.log.robots)
             if isinstance(message, Sighting) and message.seen_robot == message.robot:
                 self.dropped["sighting: a robot does not see itself"] += 1
-            elif ignore and isinstance(message, Sighting) and message.seen_robot is not None:
+            elif ignore and isinstance(message, Sighting) and not may_be_landmark(message):
                 self.dropped["sighting: of a robot, ignored by association.robot_sightings"] += 1
+            elif ignore and isinstance(message, Sighting):
+                yield self.frames.with_frame_identity(replace(message, may_be="landmark"))
             elif self.frames.crosses_frames(message):
                 kind = type(message).__name__.lower()
                 self.dropped[f"{kind}: between robots in separate frames"] += 1
@@ -159,22 +173,31 @@ class Pipeline(StepRecorder):
         step_ns = batch.time_ns
         self.record_time(batch.first_ns)
         self.record_time(step_ns)
-        mutual: set[str] = set()  # robots that saw a robot or were seen
         for image in batch.images:
             self.start_if_needed(image[0].robot, image[0].time_ns)
-            mutual |= {robot for s in image if s.seen_robot for robot in (s.robot, s.seen_robot)}
+        sightings = [sighting for image in batch.images for sighting in image]
+        possible = [self.candidates.possible(sighting) for sighting in sightings]
+        named, behind = with_named_robots(batch, possible)
+        # robots that saw a robot or were seen
+        mutual = {
+            robot
+            for image in named.images
+            for s in image
+            if s.seen_robot
+            for robot in (s.robot, s.seen_robot)
+        }
         for robot in sorted(mutual):  # states in an order that no hash decides
             self.start_if_needed(robot, step_ns)
-        integrate_pending(self.runs[robot].track for robot in batch.robots)
+        integrate_pending(self.runs[robot].track for robot in named.robots)
         last_ns = {
             robot: run.state_ns
-            for robot, run in ((robot, self.runs[robot]) for robot in batch.robots)
+            for robot, run in ((robot, self.runs[robot]) for robot in named.robots)
             if step_ns > run.state_ns
             and (robot in mutual or self.keyframes.has_moved(run, run.state_ns, step_ns))
         }
-        state_ns = {r: step_ns if r in last_ns else self.runs[r].state_ns for r in batch.robots}
+        state_ns = {r: step_ns if r in last_ns else self.runs[r].state_ns for r in named.robots}
         to_image, motions = batch_motions(
-            batch, state_ns, last_ns, {robot: self.runs[robot].track for robot in state_ns}
+            named, state_ns, last_ns, {robot: self.runs[robot].track for robot in state_ns}
         )
         motions = {robot: motions[robot] for robot in last_ns}
         for robot, motion in motions.items():
@@ -182,7 +205,6 @@ class Pipeline(StepRecorder):
         with timed(self.seconds, "association"):
             known = set(self.associator.map.graph_ids())
             associations: tuple[Association, ...] = ()
-            sightings = [sighting for image in batch.images for sighting in image]
             seen = to_state_frame(
                 sightings, [to_image[s.robot, s.time_ns] for s in sightings], len(self.sources)
             )
@@ -192,15 +214,38 @@ class Pipeline(StepRecorder):
                 + (motions[name].delta[2] if name in motions else 0.0)
                 for name in state_ns
             }
-            of_robots = robot_observations(sightings, seen, state_ns, to_image, heading)
-            observations, robots = iter(seen), iter(of_robots)
+            offers = robot_observations(
+                [s for image in named.images for s in image],
+                [seen[k] for k in behind],
+                state_ns,
+                to_image,
+                heading,
+            )
+            observations = iter(
+                replace(o, robots=names, is_landmark=may_be_landmark(s))
+                for o, s, names in zip(seen, sightings, possible, strict=True)
+            )
             for image in batch.images:
                 own = list(itertools.islice(observations, len(image)))
                 associations += self.associate_image(image, own, state_ns[image[0].robot], motions)
-                count = sum(s.seen_robot is not None for s in image)
-                associations += tuple(itertools.islice(robots, count))
             self.record_covariances()
-        self.add_step(Step(step_ns, {}, motions, inflate_repeated(associations)), known)
+        associations = self.moved_to_states(associations, offers)
+        self.add_step(Step(step_ns, {}, motions, inflate_repeated(associations)), known, offers)
+
+    def moved_to_states(
+        self, associations: Sequence[Association], offers: Sequence[Association]
+    ) -> tuple[Association, ...]:
+        """Associations, those of robots as between states, as they are among ``offers``.
+
+        The sightings behind them get the robots' names.
+        """
+        of_robots = {(a.source, a.target): a for a in offers}
+        moved = []
+        for a in associations:
+            moved.append(of_robots[a.source, a.target] if isinstance(a.target, str) else a)
+            if isinstance(a.target, str) and a.source is not None:
+                self.sources[a.source] = replace(self.sources[a.source], seen_robot=a.target)
+        return tuple(moved)
 
     def associate_image(
         self,
@@ -209,7 +254,7 @@ class Pipeline(StepRecorder):
         state_ns: int,
         motions: Mapping[str, Motion],
     ) -> tuple[Association, ...]:
-        """Associations of the landmarks in one image of a step of several.
+        """Associations of one image in a step of several, with robots as seen at its time.
 
         Args:
             image: sightings of one robot at one time.
@@ -219,13 +264,11 @@ class Pipeline(StepRecorder):
         """
         robot = image[0].robot
         run = self.runs[robot]
-        landmarks = [o for o, s in zip(seen, image, strict=True) if s.seen_robot is None]
         self.counts["observations"] += len(seen)
-        if not landmarks:
-            return ()
         pose, motion = run.causal_poses[-1], motions.get(robot)
+        others = self.candidates.targets(robots_in(seen), image[0].time_ns)
         return self.associator.associate(
-            Image(robot, state_ns, landmarks, pose, motion, run.track, run.path_m, gathering=True)
+            Image(robot, state_ns, seen, pose, motion, run.track, run.path_m, True, others)
         )
 
     def add_event(self, event: Sequence[Message]) -> None:
@@ -282,24 +325,31 @@ class Pipeline(StepRecorder):
         return motion, match_off_lines(motion, last[1], scan.robot, free)
 
     def observations(self, event: Sequence[Message], since: Motion | None) -> list[Observation]:
-        """Landmarks seen, in the base frame of the state (at the start of ``since``, if given)."""
+        """What was seen, in the base frame of the state (at the start of ``since``, if given)."""
         out = []
         for message in event:
-            source = None
+            source, is_landmark = None, True
+            robots: tuple[str, ...] = ()
             if isinstance(message, Scan):
                 found = self.front_end(message, self.config.front_end)
-            elif isinstance(message, Sighting) and message.seen_robot is None:
+            elif isinstance(message, Sighting):
                 found = (sighting_observation(message),)
-                if self.of_sightings:
-                    source = len(self.sources)
-                    self.sources.append(message)
+                if message.seen_robot is not None:
+                    self.start_if_needed(message.seen_robot, message.time_ns)
+                robots, is_landmark = self.candidates.possible(message), may_be_landmark(message)
+                kept = self.sources if self.of_sightings else self.robot_sightings
+                if self.of_sightings or may_be_robot(message):
+                    source = len(kept)
+                    kept.append(message)
             else:
                 continue
             for o in found:
                 z, cov = transport(o.z, o.cov, message.mount, np.zeros((3, 3)))
                 if since is not None:
                     z, cov = transport(z, cov, since.delta, since.cov)
-                out.append(Observation(o.kind, z, cov, o.extent, o.identity, source))
+                out.append(
+                    Observation(o.kind, z, cov, o.extent, o.identity, source, robots, is_landmark)
+                )
         self.counts["observations"] += len(out)
         return out
 
@@ -321,20 +371,26 @@ class Pipeline(StepRecorder):
         with timed(self.seconds, "association"):
             known = set(self.associator.map.graph_ids())
             associations: tuple[Association, ...] = ()
+            offers = robot_associations(robot, state_ns, seen)
             if seen:
-                pose = run.causal_poses[-1]
+                pose, others = run.causal_poses[-1], robots_in(seen)
+                targets = self.candidates.targets(others, state_ns)
                 associations = self.associator.associate(
-                    Image(robot, state_ns, seen, pose, motion, run.track, run.path_m)
+                    Image(
+                        robot, state_ns, seen, pose, motion, run.track, run.path_m, robots=targets
+                    )
                 )
-            for message in event:
-                if isinstance(message, Sighting) and message.seen_robot is not None:
-                    associations += (self.robot_sighting(message, state_ns, motions),)
+                self.name_robots(associations)
+                for target in targets:
+                    if target.motion is not None:
+                        motions[target.name] = target.motion
+                        self.runs[target.name].path_m += target.motion.length_m
             given = [self.closure(m, state_ns) for m in event if isinstance(m, RelativePose)]
             closures = tuple(c for c in (second, *given) if c)
             self.record_covariances()
         if not (motions or associations or closures):
             return
-        self.add_step(Step(time_ns, {}, motions, associations, closures), known)
+        self.add_step(Step(time_ns, {}, motions, associations, closures), known, offers)
         for message in event:
             if isinstance(message, Scan):
                 points = scan_points(message, self.config.front_end.max_range_m)
@@ -342,26 +398,12 @@ class Pipeline(StepRecorder):
                     KeyframeScan(robot, state_ns, points.astype(np.float32), message.mount)
                 )
 
-    def robot_sighting(
-        self, message: Sighting, state_ns: int, motions: dict[str, Motion]
-    ) -> Association:
-        """A sighting of another robot, whose motion to the same time is added to ``motions``."""
-        other = message.seen_robot
-        assert other is not None
-        self.robot_sightings.append(message)
-        self.start_if_needed(other, state_ns)
-        moved = self.motion_since_state(other, state_ns)
-        if moved is not None and other not in motions:
-            motions[other] = moved
-            self.runs[other].path_m += moved.length_m
-        z, cov = message.z, message.cov
-        model = "robot-point"
-        if len(z) == 3:
-            o = sighting_observation(message)
-            z, cov, model = o.z, o.cov, "robot-pose"
-        z, cov = transport(z, cov, message.mount, np.zeros((3, 3)))
-        self.counts["observations"] += 1
-        return Association(message.robot, state_ns, other, model, z, cov)
+    def name_robots(self, associations: Sequence[Association]) -> None:
+        """Give sightings of robots that entered at their own time the names of these."""
+        for a in associations:
+            if isinstance(a.target, str) and a.source is not None:
+                named = replace(self.robot_sightings[a.source], seen_robot=a.target)
+                self.robot_sightings[a.source] = named
 
     def closure(self, message: RelativePose, state_ns: int) -> Closure | None:
         """A recorded relative pose between the states nearest before its ends; None if dropped."""

@@ -41,6 +41,7 @@ from graphslam.mapping.submaps import build_submaps, with_poses_from
 from graphslam.mapping.visits import rejoin_visits, split_by_visit
 from graphslam.odometry.preintegration import Track
 from graphslam.slam.motion_noise import noise_scales, scale_motion_noise
+from graphslam.slam.robot_gating import RobotOffers
 
 #: factors on the gates of re-association (across, direction), round by round
 GATE_FACTORS = ((1.0, 1.0), (1 / 2, 2 / 3), (1 / 2, 2 / 3))
@@ -63,6 +64,7 @@ def reoptimise_scan_log(
     keyframe_scans: Iterable[KeyframeScan],
     config: Config,
     tamper: Tamper | None = None,
+    robots: RobotOffers | None = None,
 ) -> tuple[Estimate, tuple[Step, ...], Counter[str]]:
     """Solve a log of scans again: motion noise, loop closure, duplicates, calibration.
 
@@ -74,6 +76,7 @@ def reoptimise_scan_log(
         keyframe_scans: scan points seen from the states.
         config: settings.
         tamper: for tests, see `Tamper`.
+        robots: what sightings of robots could be, used or not.
 
     Returns:
         The estimate, the steps behind it, and counts of what was changed, by name.
@@ -117,6 +120,8 @@ def reoptimise_scan_log(
         missed = violated(closures, estimate.states, ALREADY_CLOSED)
         closures = [c for c, off in zip(closures, missed, strict=True) if off]
         counts["closures_kept"] = len(closures)
+    if robots is not None:
+        steps = robots.associated_again(steps, estimate, config.robust, config)
     if config.odometry.calibrate:
         estimate = solve(steps, estimate, closures)
         closed = with_closures(steps, closures)

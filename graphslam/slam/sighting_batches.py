@@ -17,7 +17,7 @@ from graphslam.core.observation_models import MODELS, transport
 from graphslam.core.records import Association, Message, Motion, Observation, Sighting
 from graphslam.odometry.preintegration import Track, preintegrate_batch
 from graphslam.odometry.readings import IntArray
-from graphslam.perception.sightings import sighting_observation
+from graphslam.perception.sightings import is_unnamed_robot, sighting_observation
 from graphslam.slam.synchronisation import ODOMETRY
 
 #: rad: sigma of the relative heading of two robots, used to rotate a short motion
@@ -66,7 +66,9 @@ def batch_sightings(
 
     def covered(one: SightingBatch, now_ns: int) -> bool:
         late = now_ns - one.time_ns > max_gap_ns
-        return late or all(tracks[robot].reaches(one.time_ns) for robot in one.robots)
+        unnamed = any(is_unnamed_robot(s) for image in one.images for s in image)
+        robots = tracks if unnamed else one.robots
+        return late or all(tracks[robot].reaches(one.time_ns) for robot in robots)
 
     for event in events:
         first = event[0]

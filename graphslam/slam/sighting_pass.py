@@ -152,6 +152,11 @@ class SightingPass(Pipeline):
         """The sightings of the steps as arrays."""
         return group_sightings(self.steps, self.sources)
 
+    def keep_steps(self, steps: Iterable[Step]) -> None:
+        """Replace the steps by others with the same states."""
+        self.steps = list(steps)
+        self.__dict__.pop("groups", None)
+
     def _step(self, batch: SightingBatch) -> Step:
         """The step of a batch: who gets a state there, and what was seen from which state.
 

@@ -8,20 +8,21 @@ their calibration until then.
 """
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 
 import numpy as np
 
-from graphslam.core.config import Config
+from graphslam.core.config import Config, RobustConfig
 from graphslam.core.geometry import Array, between, compose
 from graphslam.core.motion_models import Calibration
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Estimate, Step, Trajectory
 from graphslam.core.worker import parallel_map
-from graphslam.estimation.batch_calibration import calibrate_roughly
+from graphslam.estimation.batch_calibration import calibrate, calibrate_roughly
 from graphslam.mapping.landmark_map import observed_from
+from graphslam.mapping.robot_candidates import NOT_THERE
 from graphslam.multi_robot.relative_frames import RobotEstimate
 from graphslam.odometry.preintegration import Track
 from graphslam.slam.reoptimise_sightings import (
@@ -30,12 +31,16 @@ from graphslam.slam.reoptimise_sightings import (
     recompute_steps,
     solve_sighting_log,
 )
+from graphslam.slam.robot_gating import RobotOffers
 from graphslam.slam.sighting_noise import estimate_noise
 from graphslam.slam.sighting_pass import SightingPass
 from graphslam.slam.state_per_step import sighting_problem
 
 #: how much wider the kernel is in the beginning
 WIDE = 10.0
+#: rounds of deciding which sightings of robots are used, and share of them that may still change:
+#: the solution that follows is hardly moved by it
+GATING_ROUNDS, FEW = 3, 0.01
 #: rounds of the rough solution, after which the latency of odometry no longer changes much
 ROUNDS = 3
 #: the same from estimates of robots by themselves
@@ -88,10 +93,59 @@ def solve_finely(one: SightingPass, rough: Estimate) -> tuple[Estimate, tuple[St
     Raises:
         EstimationError: the estimate is indeterminate.
     """
+    rough = _with_gated_robots(one, rough)
     noise = estimate_noise(one.steps, one.sources, rough, one.tracks, one.config)
     one.noise = noise.to_summary()
     problem, start = sighting_problem(one, rough, noise, one.groups)
     return problem.finish(one, problem.steps, start)
+
+
+def _with_gated_robots(one: SightingPass, rough: Estimate) -> Estimate:
+    """An estimate without sightings of robots that contradict all else; their steps lose them."""
+    recorded, groups, kernel = one.steps, one.groups, _wide(one.config.robust)
+    kept = every = _sources(recorded)
+    made: tuple[Step, ...] = ()
+
+    def rebuild(estimate: Estimate, _last: bool) -> tuple[Step, ...]:
+        nonlocal made
+        made = recompute_steps(recorded, estimate, one.tracks, groups)
+        return _only(made, kept)
+
+    calibrations = {name: track.calibration for name, track in one.tracks.items()}
+    for track in one.tracks.values():
+        track.calibration = track.calibration.held()
+    used = rebuild(rough, False)
+    for name, track in one.tracks.items():
+        track.calibration = calibrations[name]
+    for _ in range(GATING_ROUNDS):
+        robots = RobotOffers.of(made, one.sources)
+        before, kept = kept, _sources(robots.associated_again(used, rough, kernel, one.config))
+        if len(kept ^ before) <= FEW * robots.count:
+            break
+        kernel = one.config.robust
+        rough, used = calibrate(rebuild, rough, one.tracks, kernel, 1, rough=True)
+    if len(kept) < len(every):
+        one.keep_steps(_only(recorded, kept))
+        one.rejected[NOT_THERE] = robots.unused(one.steps)
+    return rough
+
+
+def _wide(kernel: RobustConfig) -> RobustConfig:
+    """The kernel of the rough solution."""
+    return replace(kernel, scale=WIDE * kernel.scale)
+
+
+def _sources(steps: Sequence[Step]) -> set[int | None]:
+    """Numbers of the sightings behind the associations of steps."""
+    return {a.source for step in steps for a in step.associations}
+
+
+def _only(steps: Sequence[Step], sources: Collection[int | None]) -> tuple[Step, ...]:
+    """Steps with the associations of some sightings."""
+    return tuple(
+        replace(step, associations=tuple(a for a in step.associations if a.source in sources))
+        for step in steps
+    )
 
 
 def solve_robots_apart(one: SightingPass) -> Estimate:
@@ -188,5 +242,4 @@ def _rough(
 ) -> Estimate:
     """A rough estimate from initial ``states``."""
     start, made = _with_landmarks(states, steps, tracks, groups)
-    wide = replace(config.robust, scale=WIDE * config.robust.scale)
-    return calibrate_roughly(made, start, tracks, wide, rounds)
+    return calibrate_roughly(made, start, tracks, _wide(config.robust), rounds)

@@ -1,11 +1,11 @@
 """Steps into the back end, and what is recorded of them: states, calibration, covariances."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array, rotation3
-from graphslam.core.records import Motion, Step
+from graphslam.core.records import Association, Motion, Step
 from graphslam.estimation.backends import BACKENDS
 from graphslam.logs import LogSet
 from graphslam.mapping.data_association import Associator
@@ -62,14 +62,22 @@ class StepRecorder(LogPass):
             return None
         return run.track.motion(run.state_ns, time_ns)
 
-    def add_step(self, step: Step, known: set[int]) -> None:
-        """Give a step to the back end and learn from it; ``known`` landmarks were there before."""
+    def add_step(self, step: Step, known: set[int], offers: Sequence[Association] = ()) -> None:
+        """Give a step to the back end and learn from it.
+
+        Args:
+            step: what enters.
+            known: landmarks that were there before it.
+            offers: what the sightings of robots in it could be, see `LogPass`.
+        """
         if not (step.motions or step.associations or step.closures):
             return
         step = replace(step, deleted=self.associator.take_deleted())
         with timed(self.seconds, "back end"):
             self.backend.add(step)
             self.associator.settle()
+            if offers:
+                self.offers[len(self.steps)] = tuple(offers)
             self.steps.append(step)
             poses = {name: self.backend.state_mean(name) for name in step.motions}
             if self.config.odometry.calibrate:

@@ -14,6 +14,7 @@ from graphslam.core.records import (
     WheelAngles,
 )
 from graphslam.odometry.preintegration import Track
+from graphslam.perception.sightings import is_unnamed_robot
 
 ODOMETRY = (OdometryPose, OdometryIncrement, WheelAngles)
 
@@ -38,7 +39,8 @@ def synchronise(
     all robots, so one robot without odometry may delay the others, by ``max_gap_s`` at most.
     Messages farther than that from any odometry of their robot are dropped and counted, and so are
     sightings of robots without a track. At the end of the log robots are taken to stand still after
-    their last reading. Scans may show the robots ``watched``, so they wait for their odometry too.
+    their last reading. Scans may show the robots ``watched``, so they wait for their odometry too,
+    and so do sightings of robots without a name for that of all robots.
     """
     waiting: deque[Message] = deque()
     max_gap_ns = round(max_gap_s * 1e9)
@@ -47,7 +49,11 @@ def synchronise(
     def has_to_wait(head: Message, needed: Sequence[Track | None]) -> bool:
         if now_ns - head.time_ns > max_gap_ns:
             return False
-        shown = [tracks[robot] for robot in watched] if isinstance(head, Scan) else ()
+        shown: Sequence[Track] = ()
+        if isinstance(head, Scan):
+            shown = [tracks[robot] for robot in watched]
+        elif isinstance(head, Sighting) and is_unnamed_robot(head):
+            shown = [*tracks.values()]
         return not all(track and track.reaches(head.time_ns) for track in (*needed, *shown))
 
     def ready(final: bool) -> Iterator[Message]:

@@ -23,6 +23,7 @@ from graphslam.logs.cdr import CdrError
 from graphslam.logs.containers import open_recording
 from graphslam.logs.decoders import DECODERS, TopicContext, decode_messages
 from graphslam.logs.recording import raw_messages
+from graphslam.logs.schemas import ANYTHING, SOME_ROBOT
 from graphslam.logs.time_order import TOO_LATE, MessageSorter
 
 S = 1_000_000_000
@@ -65,6 +66,8 @@ def test_every_kind_of_record_comes_back_as_it_was_written(tmp_path):
         log.scan("robot1", 2 * S + 2, [1.0, np.inf, 3.0], **SCAN)
         log.sighting("robot1", 3 * S, (0.1, 2.0), COV2, identity="7")
         log.sighting("robot1", 3 * S, (0.1, 2.0, -1.0), COV3, seen_robot="robot2")
+        log.sighting("robot1", 3 * S, (0.1, 2.0), COV2, seen_robot=SOME_ROBOT)
+        log.sighting("robot1", 3 * S, (0.1, 2.0), COV2, seen_robot=ANYTHING)
         log.relative_pose("robot1", S, 3 * S + 1, delta=(1, 2, 0.5), cov=COV3, other="robot2")
         log.truth("robot1", 3 * S + 2, (4, 5, 6))
         log.true_landmark(3 * S + 3, "wall", "segment", (1, 2, 0.1), extent=extent)
@@ -76,7 +79,7 @@ def test_every_kind_of_record_comes_back_as_it_was_written(tmp_path):
     assert not logs.warnings and not logs.repaired
     assert logs.dropped == {"range: infinite": 1}
     assert logs.has_scans("robot1") and not logs.has_scans("robot2")
-    odometry, scan, first, second, relative, truth, landmark, increment, wheels = messages
+    odometry, scan, first, second, *unnamed, relative, truth, landmark, increment, wheels = messages
     assert isinstance(odometry, records.OdometryPose) and odometry.stamp_ns == 2 * S + 1
     np.testing.assert_allclose(odometry.pose, (1, 2, 3), atol=1e-15)
     assert isinstance(scan, records.Scan) and scan.robot == "robot1"
@@ -92,6 +95,12 @@ def test_every_kind_of_record_comes_back_as_it_was_written(tmp_path):
         "robot2",
     )
     np.testing.assert_array_equal(second.cov, COV3)
+    assert [(m.identity, m.seen_robot, m.may_be) for m in (first, second, *unnamed)] == [
+        ("7", None, "landmark"),
+        (None, "robot2", "landmark"),
+        (None, None, "robot"),
+        (None, None, "either"),
+    ]
     assert isinstance(relative, records.RelativePose) and (relative.other, relative.start_ns) == (
         "robot2",
         S,

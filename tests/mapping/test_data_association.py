@@ -17,10 +17,15 @@ from graphslam.mapping.data_association import (
     Associator,
     Image,
     _worth_comparing,
-    predicted_joint,
 )
 from graphslam.mapping.gating import Pairs
 from graphslam.mapping.landmark_map import Entry
+from graphslam.mapping.robot_candidates import (
+    NOT_THERE,
+    RobotTarget,
+    predicted_joint,
+    robots_in,
+)
 from graphslam.odometry.preintegration import Track
 
 SECOND = 1_000_000_000
@@ -38,14 +43,15 @@ class KnownPoses:
 
     def __init__(self, pose_cov):
         self.pose, self.pose_cov = ORIGIN, pose_cov
-        self.landmarks = {}
+        self.landmarks, self.robots = {}, {}
 
-    def joint(self, robot, landmarks):
+    def joint(self, robot, landmarks, others=()):
         means = tuple(self.landmarks[i] for i in landmarks)
-        slices = block_slices([len(mean) for mean in means])
-        cov = np.zeros((3 + sum(map(len, means)),) * 2)
+        there = tuple(self.robots[name] for name in others)
+        slices = block_slices([len(mean) for mean in (*means, *there)])
+        cov = np.zeros((3 + sum(map(len, (*means, *there))),) * 2)
         cov[:3, :3] = self.pose_cov
-        return JointMarginal(self.pose, means, cov, slices)
+        return JointMarginal(self.pose, means, cov, slices, there)
 
     def landmark_means(self, landmarks):
         return [self.landmarks[i] for i in landmarks]
@@ -72,10 +78,11 @@ class Run:
         track.add(OdometryPose(robot, self.now_ns, self.now_ns, pose))
         self.paths[robot] = self.paths.get(robot, 0.0) + path_m
         self.poses[self.now_ns] = self.backend.pose = pose
-        image = Image(robot, self.now_ns, seen, pose, None, track, self.paths[robot])
+        others = [RobotTarget(name, None, np.zeros(2)) for name in robots_in(seen)]
+        image = Image(robot, self.now_ns, seen, pose, None, track, self.paths[robot], robots=others)
         found = self.associator.associate(image)
         for a in found:
-            if a.target not in self.backend.landmarks:
+            if a.target not in (*self.backend.landmarks, *self.backend.robots):
                 place = MODELS[a.model].invert(a.z, self.poses[a.time_ns])
                 self.backend.landmarks[a.target] = place
         return found
@@ -503,6 +510,78 @@ def test_prediction_moves_the_pose_block_and_its_correlations():
     np.testing.assert_allclose(moved.cov, moved.cov.T, atol=1e-13)
     np.testing.assert_array_equal(moved.cov[3:, 3:], P[3:, 3:])
     assert predicted_joint(joint, None) is joint
+
+
+def test_other_robots_move_in_the_prediction_like_the_robot_itself():
+    """Only their own blocks get noise; their clocks widen them along their paths alone."""
+    rng = np.random.default_rng(5)
+    root = rng.normal(size=(11, 11))
+    poses = np.array([[1.0, 2.0, 0.5], [4.0, 1.0, np.pi / 2], [0.0, 3.0, -1.0]])
+    joint = JointMarginal(
+        poses[0], (np.ones(2),), root @ root.T, block_slices([2, 3, 3]), tuple(poses[1:])
+    )
+    motion = Motion(0, 1, np.array([0.5, 0.1, 0.3]), 0.01 * np.eye(3), np.zeros((3, 0)), 0.5)
+    others = [RobotTarget("b", motion, np.array([0.2, 0.0])), RobotTarget("c", None, np.zeros(2))]
+    moved = predicted_joint(joint, None, others)
+    F, _ = compose_jacobians(poses[1], motion.delta)
+    expected = compose_cov(poses[1], joint.cov[5:8, 5:8], motion.delta, motion.cov)
+    ahead = 0.2 * np.array([np.cos(np.pi / 2 + 0.3), np.sin(np.pi / 2 + 0.3)])
+    expected[:2, :2] += np.outer(ahead, ahead)
+    np.testing.assert_allclose(moved.others[0], compose(poses[1], motion.delta))
+    np.testing.assert_allclose(moved.cov[5:8, 5:8], expected, atol=1e-12)
+    np.testing.assert_allclose(moved.cov[:3, 5:8], joint.cov[:3, 5:8] @ F.T, atol=1e-12)
+    np.testing.assert_array_equal(moved.others[1], poses[2])
+    for same in (slice(0, 5), slice(8, 11)):
+        np.testing.assert_array_equal(moved.cov[same, same], joint.cov[same, same])
+
+
+# ------------------------------------------------------------ other robots
+
+
+def robot_at(x, y, *names, is_landmark=False):
+    """A sighting at (x, y) that may be of robots."""
+    return replace(point(x, y), robots=names, is_landmark=is_landmark)
+
+
+def run_with_robots(**robots):
+    run = Run()
+    run.backend.robots = {name: np.array([*at, 0.0]) for name, at in robots.items()}
+    return run
+
+
+def test_a_robot_is_where_its_name_says_or_the_sighting_is_rejected():
+    """Within the gate of two degrees of freedom at 1 cm; breaks if names are trusted ungated."""
+    run = run_with_robots(b=(4.0, 0.0), c=(0.0, 3.0))
+    (found,) = run.look(robot_at(4.02, 0.0, "b"))
+    assert (found.target, found.model) == ("b", "robot-point")
+    assert run.look(robot_at(4.02, 0.0, "c")) == ()
+    assert run.look(robot_at(4.04, 0.0, "b")) == ()
+    assert run.rejected == {NOT_THERE: 2}
+    assert not run.map.entries, "a sighting of a robot makes no landmark"
+
+
+def test_unnamed_robots_are_assigned_together():
+    """b and c 4 cm apart, seen 1.5 cm and -2.2 cm from b: alone the first would be b's, and the
+    second too. A robot takes one sighting of an image."""
+    run = run_with_robots(b=(4.0, 0.0), c=(4.03, 0.0))
+    found = run.look(robot_at(4.014, 0.0, "b", "c"), robot_at(3.99, 0.0, "b", "c"))
+    assert targets(found) == ["c", "b"]
+    assert targets(run.look(robot_at(4.0, 0.0, "b"), robot_at(4.001, 0.0, "b"))) == ["b"]
+
+
+def test_robots_and_landmarks_compete_for_what_may_be_either():
+    """A landmark 3 cm from a robot: each sighting goes to what is nearest, and one that lies
+    between the two thresholds of a robot is neither its nor a new landmark."""
+    run = run_with_robots(b=(4.0, 0.0))
+    run.learn(point(4.03, 0.0))
+    either = [robot_at(x, 0.0, "b", is_landmark=True) for x in (4.028, 4.004)]
+    assert targets(run.look(*either)) == [0, "b"]
+    assert targets(run.look(*either[::-1])) == ["b", 0]
+    before = len(run.map.entries)
+    assert run.look(robot_at(3.964, 0.0, "b", is_landmark=True)) == ()
+    assert run.rejected == {BETWEEN: 1} and len(run.map.entries) == before
+    run.look(robot_at(3.0, 0.0, "b", is_landmark=True))
+    assert len(run.map.entries) == before + 1, "far from every robot it is a landmark"
 
 
 def test_the_map_follows_the_estimate():

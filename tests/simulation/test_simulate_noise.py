@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from graphslam.core.config_io import load_config
 from graphslam.core.geometry import between, compose, wrap
 from graphslam.core.records import OdometryPose, Scan, Sighting, WheelAngles
-from graphslam.logs import open_logs, read_truth
+from graphslam.logs import open_logs, read_true_associations, read_truth
 from graphslam.simulation import simulate
 from graphslam.simulation.scenario import (
     Body,
@@ -338,6 +338,39 @@ def test_sightings_have_the_noise_that_they_state(tmp_path):
         if name in places:
             assert np.abs(expected[:, 0]).max() <= np.radians(100)
         assert not crosses(at[:, :2], np.broadcast_to(target, at.shape)[:, :2], screen).any()
+
+
+def test_sensors_take_names_for_one_another_and_see_what_is_not_there(tmp_path):
+    """In the shares asked for, under the names of others; the truth says so, and what the sensor
+    measures besides stays the same number for number. Without names the message says what it may
+    be of."""
+    drive = {f"r{k}": robot(start=(2.0 + k, 2.0), drive=(Leg(wait_s=40.0),)) for k in range(3)}
+
+    def log(folder, **settings):
+        (tmp_path / folder).mkdir()
+        seers = (SightingSensor("robots", period_s=0.05, field_deg=200.0, **settings),)
+        own = {"robot": robot(drive=(Leg(wait_s=40.0),), sightings=seers)}
+        return Log(tmp_path / folder, {**own, **drive}, StaticObjects(walls=(ROOM,)))
+
+    right, wrong = log("right"), log("wrong", exchanged_share=0.2, false_share=0.1)
+    topics = read_true_associations([tmp_path / "wrong/log.mcap"], load_config())
+    images = topics["/true_associations/sightings"]
+    true = [m.names[t] if t >= 0 else "" for m in images for t in m.targets]
+    seen = wrong.of(Sighting)
+    assert len(true) == len(seen)
+    there = [m for m, name in zip(seen, true, strict=True) if name]
+    for a, b in zip(right.of(Sighting), there, strict=True):
+        np.testing.assert_array_equal(a.z, b.z)
+    n = len(there)
+    exchanged = sum(m.seen_robot != name for m, name in zip(seen, true, strict=True) if name)
+    for count, share in ((exchanged, 0.2), (len(seen) - n, 0.1)):
+        assert abs(count - share * n) < 4 * np.sqrt(share * (1 - share) * n)
+    assert {m.seen_robot for m in seen} == set(drive)
+    assert all(0 < m.z[1] <= 8.0 and abs(m.z[0]) <= np.radians(100.0) for m in seen)
+    for settings, may_be in (({}, "robot"), ({"told_apart": False}, "either")):
+        unnamed = log(f"unnamed {may_be}", identified=False, **settings).of(Sighting)
+        assert {(m.seen_robot, m.identity, m.may_be) for m in unnamed} == {(None, None, may_be)}
+        assert len(unnamed) == n
 
 
 def crosses(a, b, wall):

@@ -1,0 +1,104 @@
+"""Sightings of robots: gated by name, and associated without one."""
+
+import zlib
+
+import numpy as np
+import pytest
+from three_robots import STARTS, T0, pose, write
+
+from graphslam.core.config_io import load_config
+from graphslam.logs import open_logs
+from graphslam.logs.schemas import ANYTHING, SOME_ROBOT
+from graphslam.mapping.robot_candidates import NOT_THERE
+from graphslam.slam.smooth import smooth
+
+#: the posts stand apart from the robots' circles
+POSTS = {"6": (3.0, 2.0), "7": (-1.0, 4.0), "8": (6.0, 5.0)}
+
+
+def named(observer, seen, seconds):
+    return {"seen_robot" if seen in STARTS else "identity": seen}
+
+
+def is_exchanged(observer, seen, seconds):
+    """A tenth of the sightings of robots."""
+    if seen not in STARTS:
+        return False
+    return zlib.crc32(f"{observer} {seen} {seconds}".encode()) % 10 == 0
+
+
+def exchanged(observer, seen, seconds):
+    if is_exchanged(observer, seen, seconds):
+        (seen,) = set(STARTS) - {observer, seen}
+    return named(observer, seen, seconds)
+
+
+def unnamed(observer, seen, seconds):
+    return {"seen_robot": SOME_ROBOT} if seen in STARTS else {"identity": seen}
+
+
+def anything(observer, seen, seconds):
+    return {"seen_robot": ANYTHING}
+
+
+def run(tmp_path, say, backend):
+    """The result, its error (m, root mean square) and the sightings that name the wrong robot."""
+    wrong = []
+
+    def spoken(observer, seen, seconds):
+        wrong.extend([(observer, seen)] * is_exchanged(observer, seen, seconds))
+        return say(observer, seen, seconds)
+
+    write(tmp_path / "log.mcap", marks=POSTS, seed=4, say=spoken, seconds=40.0)
+    starts = [f"start.poses.{r}=[{x}, {y}, {phi}]" for r, (x, y, phi) in STARTS.items()]
+    config = load_config(overrides=[*starts, f"backend.name={backend}"])
+    result = smooth(open_logs([tmp_path / "log.mcap"], config), config)
+    off = []
+    for name, robot in result.robots.items():
+        true = np.array([pose(name, t) for t in (robot.final.stamps_ns - T0) * 1e-9])
+        off.append((robot.final.poses - true)[:, :2])
+    error = float(np.sqrt(np.mean(np.sum(np.concatenate(off) ** 2, axis=1))))
+    return result, error, wrong
+
+
+def robots_used(result):
+    return sum(isinstance(a.target, str) for step in result.steps for a in step.associations)
+
+
+@pytest.mark.parametrize("backend", ["batch", "isam2", "ekf"])
+def test_exchanged_names_are_rejected_and_hardly_anything_else(tmp_path, backend):
+    """The robots are metres apart, so every false name shows; breaks if names are trusted, or if
+    the gates are too narrow for true ones."""
+    right, error, wrong = run(tmp_path, named, backend)
+    total = robots_used(right)
+    assert right.summary["rejected"].get(NOT_THERE, 0) <= 0.02 * total
+    result, after, _ = run(tmp_path, exchanged, backend)
+    assert len(wrong) > 0.07 * total
+    rejected = result.summary["rejected"][NOT_THERE]
+    assert len(wrong) <= rejected <= len(wrong) + 0.02 * total
+    assert after < 1.15 * error + 0.005
+
+
+@pytest.mark.parametrize("backend", ["batch", "ekf"])
+@pytest.mark.parametrize("say", [unnamed, anything])
+def test_robots_without_names_are_recognised(tmp_path, backend, say):
+    """As many sightings of robots are used as with names, and the paths are as good; breaks if a
+    robot is taken for another, or for a landmark, or if landmarks come of robots."""
+    right, error, _ = run(tmp_path, named, backend)
+    result, after, _ = run(tmp_path, say, backend)
+    assert robots_used(result) > 0.97 * robots_used(right)
+    # without landmarks' names the filter's map is poorer, whatever becomes of the robots
+    assert after < (1.15 if say is unnamed else 1.6) * error + 0.005
+    if backend == "batch":
+        assert len(result.landmarks) == len(POSTS)
+
+
+def test_ignored_sightings_of_robots_are_no_landmarks(tmp_path):
+    write(tmp_path / "log.mcap", marks=POSTS, say=unnamed, seconds=10.0)
+    starts = [f"start.poses.{r}=[{x}, {y}, {phi}]" for r, (x, y, phi) in STARTS.items()]
+    config = load_config(overrides=[*starts, "association.robot_sightings=ignore"])
+    result = smooth(open_logs([tmp_path / "log.mcap"], config), config)
+    assert not robots_used(result)
+    assert {mark.identity for mark in result.landmarks} == set(POSTS)
+    ignored = "sighting: of a robot, ignored by association.robot_sightings"
+    assert result.summary["dropped"][ignored] == 20 * 6
