@@ -19,14 +19,15 @@ from graphslam.logs.decoders import TopicContext
 from graphslam.logs.future_stamps import Recorded
 from graphslam.logs.log_set import FileReader, LogFile, damage, merged_notes
 from graphslam.logs.recording import Recording
+from graphslam.logs.robots import robots_and_topics
 from graphslam.logs.schemas import SIGHTING
+from graphslam.logs.tf_tree import static_topics
 from graphslam.logs.topic_context import ScanShape, scan_shape, topic_contexts
 from graphslam.logs.topics import (
     ODOMETRY_KINDS,
     Topic,
     choose_topics,
     find_topics,
-    static_transform_topics,
 )
 
 _GAP_PERIODS, _GAP_S = 10, 1.0  # a gap is longer than both: 10 periods of the topic and 1 s
@@ -126,6 +127,8 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
     problem = ""
     try:
         topics = find_topics(files, config)
+        files, topics, derived = robots_and_topics(files, config)
+        warnings += derived
         chosen, choices = choose_topics(files, topics)
         warnings += choices
     except LogError as error:
@@ -261,10 +264,9 @@ def _other_topics(files: Sequence[Recording], known: set[str]) -> list[TopicInfo
     counts: Counter[tuple[str, str]] = Counter()
     for raw in (raw for file in files for raw in file.topics if raw.name not in known):
         counts[raw.name, raw.schema] += raw.count
-    static = {name for file in files for name in static_transform_topics(file)}
-    return [
-        TopicInfo(name, schema, None, name in static, n) for (name, schema), n in counts.items()
-    ]
+    used = {name for file in files for name in static_topics(file)}
+    used |= {derived.source for file in files for derived in file.derived}
+    return [TopicInfo(name, schema, None, name in used, n) for (name, schema), n in counts.items()]
 
 
 # ---------------------------------------------------------------- one robot

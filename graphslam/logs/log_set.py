@@ -16,9 +16,10 @@ from graphslam.logs.containers import open_recording
 from graphslam.logs.decoders import TopicContext, decode_messages
 from graphslam.logs.future_stamps import Recorded, repair_future_stamps
 from graphslam.logs.recording import Recording, raw_messages
+from graphslam.logs.robots import robots_and_topics
 from graphslam.logs.stated_noise import StatedNoise, stated_noise
 from graphslam.logs.topic_context import topic_contexts
-from graphslam.logs.topics import ODOMETRY_KINDS, Topic, choose_topics, find_topics
+from graphslam.logs.topics import ODOMETRY_KINDS, Topic, choose_topics
 
 Odometry = records.OdometryIncrement | records.OdometryPose | records.WheelAngles
 
@@ -210,14 +211,15 @@ def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
     for n, file in enumerate(files):
         if file.sha256 in {other.sha256 for other in files[:n]}:
             raise LogError(f"{file.path}: is given twice; name each log once")
-    topics, warnings = choose_topics(files, find_topics(files, config))
+    files, topics, derived = robots_and_topics(files, config)
+    topics, warnings = choose_topics(files, topics)
     contexts, assumed = topic_contexts(files, topics, config)
     return LogSet(
         robots=tuple(sorted({t.robot for t in topics if t.record in ODOMETRY_KINDS})),
         files=tuple(LogFile(f.path, f.sha256, f.messages, f.lost) for f in files),
         topics=tuple(topics),
         notes=merged_notes(files),
-        warnings=[*config.warnings, *damage(files), *warnings, *assumed],
+        warnings=[*config.warnings, *damage(files), *derived, *warnings, *assumed],
         dropped=Counter(),
         repaired=Counter(),
         opened=files,

@@ -10,11 +10,11 @@ import heapq
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from graphslam.logs.translations import Translate, translation
 
@@ -109,16 +109,34 @@ class Piece:
         return max((block.end_ns for block in self.blocks), default=0)
 
 
+@dataclass(frozen=True, slots=True)
+class Derived:
+    """A topic made of another one, ``source``.
+
+    ``make(*arguments)`` begins a reading: it gives what turns each message of the source, in their
+    order, into messages of this topic.
+    """
+
+    name: str
+    schema: str
+    source: str
+    count: int
+    make: Callable[..., Callable[[bytes], Sequence[bytes]]]
+    arguments: tuple[Any, ...]
+
+
 @dataclass(frozen=True)
 class Recording:
     """Pieces in the order of time; ``path`` is the file or the folder that holds them.
 
     ``damage`` of the whole is in one line; ``pieces_lost`` says which pieces are missing.
+    ``derived``: topics that are made of others.
     """
 
     path: Path
     pieces: tuple[Piece, ...]
     pieces_lost: str = ""
+    derived: tuple[Derived, ...] = ()
 
     @cached_property
     def sha256(self) -> str:
@@ -171,7 +189,13 @@ class Recording:
                 counts[topic] += read[number]
                 found = translation(schema, encoding)
                 kinds.setdefault(topic, (found.schema, "cdr") if found else (schema, encoding))
-        return tuple(RawTopic(name, *kinds[name], counts[name]) for name in sorted(kinds))
+        topics = [RawTopic(name, *kinds[name], counts[name]) for name in kinds]
+        topics += [RawTopic(d.name, d.schema, "cdr", d.count) for d in self.derived]
+        return tuple(sorted(topics))
+
+    def with_derived(self, derived: Derived) -> "Recording":
+        """The recording with one more topic."""
+        return replace(self, derived=(*self.derived, derived))
 
 
 class BlockList:
@@ -197,6 +221,22 @@ def raw_messages(recording: Recording, topics: Collection[str]) -> Iterator[RawM
     This is the order of the file if its log times never decrease, else that of the log times.
     Memory holds the blocks that overlap in log time, a single one if the file is in order.
     """
+    derived = [one for one in recording.derived if one.name in topics]
+    if not derived:
+        yield from _recorded(recording, topics)
+        return
+    wanted = {*topics} | {one.source for one in derived}
+    makers = [(one, one.make(*one.arguments)) for one in derived]
+    for raw in _recorded(recording, wanted):
+        for one, make in makers:
+            if one.source == raw.topic:
+                for data in make(raw.data):
+                    yield RawMessage(one.name, raw.log_time_ns, data)
+        if raw.topic in topics:
+            yield raw
+
+
+def _recorded(recording: Recording, topics: Collection[str]) -> Iterator[RawMessage]:
     blocks = [(p, b) for p in recording.pieces for b in p.blocks]
     with _Reader(topics) as reader:
         blocks = [(piece, block) for piece, block in blocks if reader.has_any(piece, block)]
@@ -211,6 +251,12 @@ def sample_messages(
     recording: Recording, topic: str, blocks: int, per_block: int
 ) -> Iterator[bytes]:
     """Data of about ``blocks * per_block`` messages of ``topic``, spread evenly over the file."""
+    for derived in recording.derived:
+        if derived.name == topic:
+            make = derived.make(*derived.arguments)
+            for data in sample_messages(recording, derived.source, blocks, per_block):
+                yield from make(data)
+            return
     with _Reader((topic,)) as reader:
         holding = [(p, b) for p in recording.pieces for b in p.blocks if reader.has_any(p, b)]
         for piece, block in _spread(holding, blocks):

@@ -11,11 +11,11 @@ from graphslam.core.config import Config
 from graphslam.core.geometry import Array
 from graphslam.logs import schemas
 from graphslam.logs.decoders import TopicContext, frame_of
-from graphslam.logs.mounts import TransformTree, find_mount, is_level, transform_tree
+from graphslam.logs.mounts import TransformTree, find_mount, is_level
 from graphslam.logs.no_return import find_no_return
-from graphslam.logs.recording import Recording, raw_messages, sample_messages
-from graphslam.logs.schemas import DEFAULT_ROBOT
-from graphslam.logs.topics import ODOMETRY_KINDS, Topic, robot_of, static_transform_topics
+from graphslam.logs.recording import Recording, sample_messages
+from graphslam.logs.tf_tree import sampled_edges, static_tree
+from graphslam.logs.topics import ODOMETRY_KINDS, Topic
 
 # 16 x 16 messages over the whole log: enough to find a frequent value, quick to read
 _SAMPLE_BLOCKS, _SAMPLE_PER_BLOCK = 16, 16
@@ -47,8 +47,9 @@ def topic_contexts(
     """Decoding context of each topic, and warnings about assumptions that were made."""
     warnings: list[str] = []
     odometry = [t for kind in ODOMETRY_KINDS[::-1] for t in topics if t.record is kind]
-    bases = {t.robot: _base_frame(files, t) for t in odometry}  # the preferred kind comes last
+    bases = {t.robot: base_frame(files, t) for t in odometry}  # the preferred kind comes last
     contexts = {}
+    trees: dict[str, TransformTree] = {}
     for topic in topics:
         settings = config.robot(topic.robot)
         mounts: dict[str, Array] = {}
@@ -56,7 +57,10 @@ def topic_contexts(
         no_return = None
         if topic.record in (records.Scan, records.Sighting):
             messages = list(sample_decoded(files, topic))
-            tree, base = _transforms(files, topic.robot), bases.get(topic.robot, "base_link")
+            if topic.robot not in trees:
+                edges = sampled_edges(files, topic.robot)
+                trees[topic.robot] = static_tree(files, topic.robot, edges)
+            tree, base = trees[topic.robot], bases.get(topic.robot, "base_link")
             for frame in sorted({frame_of(message) for message in messages}):
                 mounts[frame], upside_down, notes = _mount(topic, tree, base, frame, settings.laser)
                 inverted |= {frame} if upside_down else set()
@@ -82,7 +86,7 @@ def sample_decoded(files: Sequence[Recording], topic: Topic) -> Iterator[Any]:
         yield from schemas.decode_all(topic.schema, data)
 
 
-def _base_frame(files: Sequence[Recording], topic: Topic) -> str:
+def base_frame(files: Sequence[Recording], topic: Topic) -> str:
     """Frame whose motion an odometry topic describes."""
     if topic.record is records.WheelAngles:
         return "base_link"  # JointState has no such frame; this is ROS' convention
@@ -90,17 +94,6 @@ def _base_frame(files: Sequence[Recording], topic: Topic) -> str:
         name = message.child_frame_id if topic.record is records.OdometryPose else frame_of(message)
         return str(name).lstrip("/") or "base_link"
     return "base_link"
-
-
-def _transforms(files: Sequence[Recording], robot: str) -> TransformTree:
-    """Static transforms for ``robot``: global ones and those of its namespace."""
-    tree: dict[str, tuple[str, Array]] = {}
-    for file in files:
-        own = [n for n in static_transform_topics(file) if robot_of(n) in (DEFAULT_ROBOT, robot)]
-        data = (raw.data for raw in raw_messages(file, own))
-        # a mount that is missing because its message is damaged causes a warning
-        tree |= transform_tree(schemas.decode_all(schemas.TF_MESSAGE, data))
-    return tree
 
 
 def _mount(

@@ -8,7 +8,7 @@ from graphslam.core.config import Config
 from graphslam.core.errors import LogError
 from graphslam.logs.decoders import DECODERS
 from graphslam.logs.recording import Recording
-from graphslam.logs.schemas import DEFAULT_ROBOT, TF_MESSAGE
+from graphslam.logs.tf_tree import namespace_of
 
 # Sources of odometry in order of preference: an increment has its covariance, wheel angles need
 # the wheel geometry from the configuration.
@@ -33,7 +33,7 @@ class Topic:
 def find_topics(files: Sequence[Recording], config: Config) -> list[Topic]:
     """All topics whose schema has a decoder, sorted by name.
 
-    The robot is the first part of the topic's name, ``robot`` where there is only one part.
+    The robot is the namespace; see `robots_and_topics` for whose it really is.
     ``config.logs.topics``, where not empty, restricts the topics and names the robots.
 
     Raises:
@@ -47,7 +47,7 @@ def find_topics(files: Sequence[Recording], config: Config) -> list[Topic]:
                 others.add(f"{raw.name} ({raw.schema}, {raw.encoding})")
                 continue
             before = found[raw.name].count if raw.name in found else 0
-            robot = config.logs.topics.get(raw.name, robot_of(raw.name))
+            robot = config.logs.topics.get(raw.name, namespace_of(raw.name))
             record = DECODERS[raw.schema].record
             found[raw.name] = Topic(raw.name, raw.schema, robot, record, before + raw.count)
     names = ", ".join(str(file.path) for file in files)
@@ -65,21 +65,6 @@ def find_topics(files: Sequence[Recording], config: Config) -> list[Topic]:
             f"there are {', '.join(sorted(found))}"
         )
     return [found[name] for name in sorted(found) if not wanted or name in wanted]
-
-
-def robot_of(topic: str) -> str:
-    """Robot of a topic by its namespace: robot1 for ``/robot1/scan``, robot for ``/scan``."""
-    first, separator, _ = topic.strip("/").partition("/")
-    return first if separator else DEFAULT_ROBOT
-
-
-def static_transform_topics(file: Recording) -> list[str]:
-    """Topics of ``file`` with static transforms."""
-    return [
-        topic.name
-        for topic in file.topics
-        if topic.schema == TF_MESSAGE and topic.name.endswith("tf_static")
-    ]
 
 
 def choose_topics(

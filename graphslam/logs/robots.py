@@ -1,0 +1,264 @@
+"""Who is whose: the robots of a log, and which topics belong to each.
+
+One robot is the normal case, and its topics may have any names: ``/front/scan`` and
+``/diff_drive_controller/odom`` are one robot's. A namespace is a robot of its own if it has both a
+sensor and odometry. What else belongs to it is told by frames, or by there being only one robot.
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from graphslam.core import records
+from graphslam.core.config import Config
+from graphslam.core.errors import LogError
+from graphslam.core.geometry import Array
+from graphslam.logs.decoders import frame_of
+from graphslam.logs.recording import Recording
+from graphslam.logs.schemas import DEFAULT_ROBOT, ODOMETRY
+from graphslam.logs.tf_odometry import Chain, find_chain, with_odometry
+from graphslam.logs.tf_tree import Edge, moving_topics, sampled_edges, static_tree
+from graphslam.logs.topic_context import sample_decoded
+from graphslam.logs.topics import ODOMETRY_KINDS, Topic, find_topics
+
+_NOBODY = ""
+_SENSORS = (records.Scan, records.Sighting)
+
+
+@dataclass(slots=True)
+class _Space:
+    """A namespace: its topics, and the frames of what it senses and of its odometry."""
+
+    name: str
+    topics: list[Topic]
+    sensed: set[str] = field(default_factory=set)
+    moved: set[str] = field(default_factory=set)
+
+    @property
+    def senses(self) -> bool:
+        return any(topic.record in _SENSORS for topic in self.topics)
+
+    @property
+    def moves(self) -> bool:
+        return any(topic.record in ODOMETRY_KINDS for topic in self.topics)
+
+    @property
+    def has_joints_only(self) -> bool:
+        """Whether all its odometry are joints."""
+        kinds = {topic.record for topic in self.topics if topic.record in ODOMETRY_KINDS}
+        return kinds == {records.WheelAngles}
+
+    @property
+    def prefixes(self) -> set[str]:
+        """Names of robots in frames such as ``robot1/base_link``."""
+        return {f.partition("/")[0] for f in self.sensed | self.moved if "/" in f}
+
+
+@dataclass(slots=True)
+class _Frames:
+    """What tf says, read when it is asked for."""
+
+    files: Sequence[Recording]
+    _trees: dict[str, tuple[dict[str, Edge], dict[str, tuple[str, Array]]]] = field(
+        default_factory=dict
+    )
+
+    def tree(self, space: str) -> tuple[dict[str, Edge], dict[str, tuple[str, Array]]]:
+        """Edges on /tf, and static transforms, of a namespace."""
+        if space not in self._trees:
+            edges = sampled_edges(self.files, space)
+            self._trees[space] = edges, static_tree(self.files, space, edges)
+        return self._trees[space]
+
+    def above(self, frame: str, space: str) -> list[str]:
+        """``frame`` and those above it, up to the root."""
+        edges, static = self.tree(space)
+        found = [frame]
+        while frame in edges or frame in static:
+            frame = edges[frame].parent if frame in edges else static[frame][0]
+            if frame in found:
+                break
+            found.append(frame)
+        return found
+
+    def chain(self, frame: str, space: str) -> Chain | None:
+        """The odometry above ``frame`` in tf."""
+        return find_chain(frame, *self.tree(space))
+
+
+def robots_and_topics(
+    files: Sequence[Recording], config: Config
+) -> tuple[list[Recording], list[Topic], list[str]]:
+    """The usable topics with their robots, the files with topics that were derived, warnings.
+
+    Raises:
+        LogError: see `find_topics`; or it cannot be told whose a sensor is.
+    """
+    topics = find_topics(files, config)
+    frames = _Frames(files)
+    if config.logs.topics:
+        robots: Mapping[str, str] = {}
+    else:
+        robots = assign_robots(files, topics, frames)
+    named, unused = [], []
+    for topic in topics:
+        robot = robots.get(topic.robot, topic.robot)
+        if robot == _NOBODY and topic.record in ODOMETRY_KINDS:
+            unused.append(f"{topic.name}: is not used: whose it is cannot be told")
+        else:
+            named.append(replace(topic, robot=robot or topic.robot))
+    opened, found, warnings = _with_tf_odometry(files, named, frames)
+    return opened, found, unused + warnings
+
+
+def assign_robots(
+    files: Sequence[Recording], topics: Sequence[Topic], frames: _Frames
+) -> Mapping[str, str]:
+    """Robot of each namespace that has a sensor or odometry, by its name; empty: of none.
+
+    Raises:
+        LogError: it cannot be told whose a sensor is.
+    """
+    spaces = [
+        _Space(name, [t for t in topics if t.robot == name and t.count])
+        for name in sorted({t.robot for t in topics if t.count})
+    ]
+    spaces = [space for space in spaces if space.senses or space.moves]
+    # joints may be those of an arm: they say who moves only where nothing else does
+    by_joints = not any(space.moves and not space.has_joints_only for space in spaces)
+    movers = [s for s in spaces if s.moves and (by_joints or not s.has_joints_only)]
+    whole = [space for space in movers if space.senses]
+    if len(whole) == len(spaces):
+        return {space.name: space.name for space in spaces}
+    for space in spaces:
+        _add_frames(space, files)
+    owners = {space.name: space.name for space in spaces}
+    on_tf: dict[Chain, str] = {}
+    for space in spaces:
+        if space.senses and space not in whole:
+            owner, chain = _owner_of_sensor(space, movers, frames)
+            # sensors above which the same frames move are on one robot
+            owners[space.name] = on_tf.setdefault(chain, space.name) if chain else owner
+    sensing = {owners[space.name] for space in spaces if space.senses}
+    for space in spaces:
+        # more odometry of a robot that has some, such as /odometry/filtered beside /odom
+        if owners[space.name] == space.name and space.name not in sensing:
+            others = [s for s in movers if s.name in sensing]
+            same = [s for s in others if _same_base(space, s, frames)]
+            owners[space.name] = same[0].name if same else space.name
+            if sensing and space.has_joints_only and space.name == DEFAULT_ROBOT:
+                # /joint_states of the only robot, or of one that cannot be told
+                owners[space.name] = next(iter(sensing)) if len(sensing) == 1 else _NOBODY
+    return _named(owners, {space.name for space in whole})
+
+
+def _add_frames(space: _Space, files: Sequence[Recording]) -> None:
+    for topic in space.topics:
+        for message in sample_decoded(files, topic):
+            if topic.record in _SENSORS:
+                space.sensed.add(frame_of(message))
+            elif topic.record is records.OdometryPose:
+                space.moved |= {str(message.child_frame_id).lstrip("/"), frame_of(message)}
+            elif topic.record is records.OdometryIncrement:
+                space.moved.add(frame_of(message))
+            break
+    space.sensed.discard("")
+    space.moved.discard("")
+
+
+def _owner_of_sensor(
+    space: _Space, movers: Sequence[_Space], frames: _Frames
+) -> tuple[str, Chain | None]:
+    """The namespace with the odometry of a sensor; its own, if that is on /tf or nowhere.
+
+    Raises:
+        LogError: there are several that may be.
+    """
+    above = {frame for sensed in space.sensed for frame in frames.above(sensed, space.name)}
+    by_frames = [mover for mover in movers if mover.moved & above]
+    if len(by_frames) == 1:
+        return by_frames[0].name, None
+    for sensed in sorted(space.sensed):
+        if chain := frames.chain(sensed, space.name):
+            return space.name, chain
+    possible = [mover for mover in by_frames or movers if not _contradict(space, mover)]
+    if len(possible) > 1:
+        sensor = next(topic for topic in space.topics if topic.record in _SENSORS)
+        names = [mover.name for mover in possible]
+        of_movers = [topic for mover in movers for topic in mover.topics]
+        line = ", ".join(f'"{t.name}" = "{t.robot}"' for t in of_movers)
+        raise LogError(
+            f"{', '.join(str(file.path) for file in frames.files)}: whose is {sensor.name}? its "
+            f"frame {', '.join(sorted(space.sensed)) or '(none)'} belongs to none of "
+            f"{', '.join(names)}; say it with "
+            f'--set \'logs.topics={{{line}, "{sensor.name}" = "{names[0]}"}}\''
+        )
+    return (possible[0].name if possible else space.name), None
+
+
+def _contradict(space: _Space, other: _Space) -> bool:
+    """Whether the names of robots in their frames differ."""
+    return bool(space.prefixes and other.prefixes and not space.prefixes & other.prefixes)
+
+
+def _same_base(space: _Space, other: _Space, frames: _Frames) -> bool:
+    """Whether two odometries are of one body: the frames are tied, and no tf is of one only."""
+    if any(
+        topic.startswith(f"/{name}/")
+        for file in frames.files
+        for topic in moving_topics(file)
+        for name in (space.name, other.name)
+    ):
+        return False  # frames of the same name in different trees
+    above = {frame for moved in other.moved for frame in frames.above(moved, other.name)}
+    mine = {frame for moved in space.moved for frame in frames.above(moved, space.name)}
+    bases = {frame for frame in space.moved & other.moved if "odom" not in frame}
+    tied = (space.moved & above) | (other.moved & mine)
+    return bool(bases or {frame for frame in tied if frame not in ("map", "world")})
+
+
+def _named(owners: Mapping[str, str], whole: Collection[str]) -> dict[str, str]:
+    """Names of the robots: the namespace.
+
+    One that has its topics in several, of which none has all kinds, is `DEFAULT_ROBOT` if it is the
+    only one.
+    """
+    alone = len(set(owners.values())) == 1 < len(owners)
+    return {
+        space: DEFAULT_ROBOT if alone and owner not in whole else owner
+        for space, owner in owners.items()
+    }
+
+
+# ---------------------------------------------------------------- odometry on /tf
+
+
+def _with_tf_odometry(
+    files: Sequence[Recording], topics: Sequence[Topic], frames: _Frames
+) -> tuple[list[Recording], list[Topic], list[str]]:
+    """The files and topics with the odometry on /tf of robots that have no better one."""
+    opened, found, warnings = list(files), list(topics), []
+    good = (records.OdometryIncrement, records.OdometryPose)
+    moving = any(moving_topics(file) for file in files)
+    for robot in sorted({t.robot for t in topics if t.count and t.record in _SENSORS}):
+        own = [t for t in topics if t.robot == robot and t.count]
+        if not moving or any(t.record in good for t in own):
+            continue
+        sensor = next(t for t in own if t.record in _SENSORS)
+        sensed = {frame_of(message) for message in sample_decoded(files, sensor)}
+        chains = (frames.chain(frame, robot) for frame in sorted(sensed))
+        chain = next(filter(None, chains), None)
+        if chain is None:
+            continue
+        name, count = "", 0
+        for k, file in enumerate(opened):
+            opened[k], derived = with_odometry(file, chain)
+            if derived:
+                name, count = derived.name, count + derived.count
+        found.append(Topic(name, ODOMETRY, robot, records.OdometryPose, count))
+        warnings.append(
+            f"robot {robot}: has no topic with odometry; it is taken from {chain.topic}: "
+            f"{chain.base} in {chain.odometry}"
+        )
+        if "odom" not in chain.odometry:
+            warnings[-1] += ", which is not called odom: if it is a map, the pose may jump"
+    return opened, sorted(found, key=lambda topic: topic.name), warnings

@@ -1,0 +1,154 @@
+"""Odometry from tf: the pose of a robot's base in its odometry frame, where no topic has it.
+
+Between the two frames there may be several transforms, static and moving ones.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache, reduce
+
+import numpy as np
+
+from graphslam.core.geometry import Array
+from graphslam.logs import schemas
+from graphslam.logs.cdr import CdrError
+from graphslam.logs.recording import Derived, Recording, raw_messages
+from graphslam.logs.tf_tree import Edge, matrix_of, moving_topics, transforms_of
+
+#: numbers in a message that are replaced
+_MARKS = (1.25, 2.25, 3.25, 4.25, 5.25, 6.25, 7.25)
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """Frames from the base up to the odometry frame; ``edges`` has each transform on the way.
+
+    ``topic``: on which the moving transforms are. A static transform (4, 4) is parent from child;
+    None is one that moves.
+    """
+
+    topic: str
+    frames: tuple[str, ...]
+    static: tuple[Array | None, ...] = field(repr=False, compare=False)
+
+    @property
+    def base(self) -> str:
+        """Frame whose motion it is."""
+        return self.frames[0]
+
+    @property
+    def odometry(self) -> str:
+        """Frame in which it moves."""
+        return self.frames[-1]
+
+
+def find_chain(
+    sensor: str, edges: Mapping[str, Edge], static: Mapping[str, tuple[str, Array]]
+) -> Chain | None:
+    """The odometry of the robot that carries the frame ``sensor``; None if nothing above moves.
+
+    ``edges`` and ``static`` transforms (4, 4) are by their child, see `sampled_edges` and
+    `static_tree`.
+
+    The base is the frame below the lowest transform that moves. The odometry frame is the next
+    above it that is called ``odom`` (REP 105), or else the one right above the base: what is above
+    may be a map, in which a robot jumps.
+    """
+    frames = [sensor]
+    while (parent := _parent(frames[-1], edges, static)) and parent not in frames:
+        frames.append(parent)
+    moving = [k for k, frame in enumerate(frames[:-1]) if frame in edges and edges[frame].moves]
+    if not moving:
+        return None
+    first = moving[0]
+    named = [k for k in range(first + 1, len(frames)) if "odom" in frames[k].rsplit("/", 1)[-1]]
+    last = named[0] if named else first + 1
+    topics = {edges[frames[k]].topic for k in moving if k < last}
+    if len(topics) > 1:
+        return None
+    own = tuple(frames[first : last + 1])
+    steps = tuple(
+        None if k in moving else matrix_of(edges[frames[k]].first) if frames[k] in edges
+        else static[frames[k]][1]
+        for k in range(first, last)
+    )  # fmt: skip
+    return Chain(topics.pop(), own, steps)
+
+
+def _parent(
+    frame: str, edges: Mapping[str, Edge], static: Mapping[str, tuple[str, Array]]
+) -> str | None:
+    if frame in edges:
+        return edges[frame].parent
+    return static[frame][0] if frame in static else None
+
+
+class TfOdometry:
+    """Turns messages of /tf into nav_msgs/Odometry, as they come.
+
+    A message is made when the lowest transform that moves has come; of others that move, the
+    latest is taken.
+    """
+
+    def __init__(self, chain: Chain) -> None:
+        """``chain``: of the robot."""
+        self._children = chain.frames[:-1]
+        self._links = set(zip(chain.frames[1:], chain.frames, strict=False))
+        self._steps = dict(zip(self._children, chain.static, strict=True))
+        self._frames = (chain.odometry, chain.base)
+
+    def __call__(self, data: bytes) -> list[bytes]:
+        """The odometry in a message of /tf, none to several."""
+        try:
+            found = [t for t in transforms_of(data) if (t.parent, t.child) in self._links]
+        except CdrError:
+            return []
+        if len(self._children) == 1:  # as they are, to the bit
+            return [_template(*self._frames).filled(t.stamp_ns, *t.values) for t in found]
+        # all of a message first: which of them comes first means nothing
+        self._steps |= {t.child: matrix_of(t.values) for t in found}
+        stamps = [t.stamp_ns for t in found if t.child == self._children[0]]
+        steps = [step for step in map(self._steps.get, self._children[::-1]) if step is not None]
+        if not stamps or len(steps) < len(self._children):
+            return []
+        return [_template(*self._frames).filled(stamps[-1], *_pose(steps))]
+
+
+def _pose(steps: Sequence[Array]) -> list[float]:
+    """Position and quaternion of the product of transforms (4, 4)."""
+    matrix = reduce(np.matmul, steps)
+    # only the heading is of interest: a quaternion about z that has it
+    heading = np.arctan2(matrix[1, 0], matrix[0, 0])
+    turn = [0.0, 0.0, float(np.sin(heading / 2)), float(np.cos(heading / 2))]
+    return [*matrix[:3, 3].tolist(), *turn]
+
+
+@cache
+def _template(frame: str, child: str) -> schemas.Template:
+    """nav_msgs/Odometry with the numbers of a transform."""
+    x, y, z, a, b, c, d = _MARKS
+    point = schemas.build("geometry_msgs/msg/Point", x=x, y=y, z=z)
+    rotation = schemas.build("geometry_msgs/msg/Quaternion", x=a, y=b, z=c, w=d)
+    zero = schemas.build("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+    pose = schemas.build("geometry_msgs/msg/Pose", position=point, orientation=rotation)
+    twist = schemas.build("geometry_msgs/msg/Twist", linear=zero, angular=zero)
+    kinds = "geometry_msgs/msg/PoseWithCovariance", "geometry_msgs/msg/TwistWithCovariance"
+    message = schemas.build(
+        schemas.ODOMETRY,
+        header=schemas.header(0, frame),
+        child_frame_id=child,
+        pose=schemas.build(kinds[0], pose=pose, covariance=np.zeros(36)),
+        twist=schemas.build(kinds[1], twist=twist, covariance=np.zeros(36)),
+    )
+    return schemas.Template(schemas.ODOMETRY, message, _MARKS)
+
+
+def with_odometry(recording: Recording, chain: Chain) -> tuple[Recording, Derived | None]:
+    """The recording with the odometry of ``chain`` as a topic; None if it has none of it."""
+    if chain.topic not in moving_topics(recording):
+        return recording, None
+    make: Callable[[bytes], Sequence[bytes]] = TfOdometry(chain)
+    count = sum(len(make(raw.data)) for raw in raw_messages(recording, {chain.topic}))
+    name = f"{chain.topic} ({chain.odometry} to {chain.base})"
+    derived = Derived(name, schemas.ODOMETRY, chain.topic, count, TfOdometry, (chain,))
+    return recording.with_derived(derived), derived

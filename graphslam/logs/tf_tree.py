@@ -1,0 +1,164 @@
+"""The tree of frames of tf: static transforms, and those that are repeated or that move.
+
+Transforms on ``/tf_static`` are static. On ``/tf`` there are those that move (odometry) and, from
+old publishers of static ones, some that never do.
+"""
+
+import struct
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from graphslam.core.geometry import Array
+from graphslam.logs import schemas
+from graphslam.logs.cdr import HEADER, CdrError, byte_order
+from graphslam.logs.mounts import transform_tree
+from graphslam.logs.recording import Recording, raw_messages, sample_messages
+from graphslam.logs.schemas import DEFAULT_ROBOT, TF_MESSAGE
+
+#: messages of /tf that are looked at: enough for every edge to be seen, and to be seen to move
+_BLOCKS, _PER_BLOCK = 64, 32
+#: m, or a number of a quaternion: a transform that changes by less is static
+_AT_REST = 1e-6
+
+
+class Transform(NamedTuple):
+    """A transform of a TFMessage: stamp ns, frames, and x y z, then the quaternion x y z w."""
+
+    stamp_ns: int
+    parent: str
+    child: str
+    values: tuple[float, ...]
+
+
+@dataclass(slots=True)
+class Edge:
+    """A transform from ``parent`` to ``child`` as seen in several messages of a topic.
+
+    ``first``: its values in the first of them. ``moves``: they differ.
+    """
+
+    topic: str
+    parent: str
+    child: str
+    first: tuple[float, ...]
+    moves: bool = False
+
+
+def transforms_of(data: bytes) -> list[Transform]:
+    """The transforms of a TFMessage in CDR; much faster than `schemas.decode`.
+
+    Raises:
+        CdrError: the bytes are cut short or are not such a message.
+    """
+    order = byte_order(data)
+    pair, one = struct.Struct(order + "iI"), struct.Struct(order + "I")
+    seven = struct.Struct(order + "7d")
+    found = []
+    try:
+        (count,) = one.unpack_from(data, HEADER)
+        at = HEADER + 4
+        for _ in range(count):
+            at += -(at - HEADER) % 4
+            sec, nanosec = pair.unpack_from(data, at)
+            names = []
+            at += 8
+            for _ in range(2):
+                at += -(at - HEADER) % 4
+                (size,) = one.unpack_from(data, at)
+                names.append(data[at + 4 : at + 3 + size].decode().lstrip("/"))
+                at += 4 + size
+            at += -(at - HEADER) % 8
+            values = seven.unpack_from(data, at)
+            at += 56
+            found.append(Transform(sec * 1_000_000_000 + nanosec, names[0], names[1], values))
+    except (struct.error, UnicodeDecodeError, OverflowError) as error:
+        raise CdrError(str(error)) from error
+    return found
+
+
+def moving_topics(recording: Recording) -> list[str]:
+    """Topics with transforms that are not static, or not all."""
+    return [
+        topic.name
+        for topic in recording.topics
+        if topic.schema == TF_MESSAGE and not topic.name.endswith("tf_static") and topic.count
+    ]
+
+
+def static_topics(recording: Recording) -> list[str]:
+    """Topics with static transforms."""
+    return [
+        topic.name
+        for topic in recording.topics
+        if topic.schema == TF_MESSAGE and topic.name.endswith("tf_static")
+    ]
+
+
+def sampled_edges(files: Sequence[Recording], space: str) -> dict[str, Edge]:
+    """The edges on the topics ``/tf`` of a namespace (and on those of all), by their child."""
+    found: dict[str, Edge] = {}
+    for file in files:
+        for topic in moving_topics(file):
+            if namespace_of(topic) in (DEFAULT_ROBOT, space):
+                messages = sample_messages(file, topic, _BLOCKS, _PER_BLOCK)
+                _add_edges(found, topic, decoded(messages))
+    return found
+
+
+def _add_edges(found: dict[str, Edge], topic: str, messages: Iterable[list[Transform]]) -> None:
+    for _, parent, child, values in (one for message in messages for one in message):
+        edge = found.setdefault(child, Edge(topic, parent, child, values))
+        if not edge.moves:
+            pairs = zip(edge.first, values, strict=True)
+            edge.moves = any(abs(a - b) > _AT_REST for a, b in pairs)
+
+
+def decoded(messages: Iterable[bytes]) -> Iterator[list[Transform]]:
+    """The transforms of each message that can be decoded."""
+    for data in messages:
+        with suppress(CdrError):
+            yield transforms_of(data)
+
+
+def static_tree(
+    files: Sequence[Recording], space: str, edges: dict[str, Edge]
+) -> dict[str, tuple[str, Array]]:
+    """Static transforms of a namespace, and those of ``edges`` that do not move.
+
+    Child -> (parent, parent_from_child (4, 4)).
+    """
+    tree: dict[str, tuple[str, Array]] = {}
+    for child, edge in edges.items():
+        matrix = matrix_of(edge.first)
+        if not edge.moves and np.isfinite(matrix).all():
+            tree[child] = (edge.parent, matrix)
+    for file in files:
+        own = [n for n in static_topics(file) if namespace_of(n) in (DEFAULT_ROBOT, space)]
+        data = (raw.data for raw in raw_messages(file, own))
+        # a mount that is missing because its message is damaged causes a warning
+        tree |= transform_tree(schemas.decode_all(TF_MESSAGE, data))
+    return tree
+
+
+def namespace_of(topic: str) -> str:
+    """First part of a topic's name: robot1 for ``/robot1/scan``; robot for ``/scan``."""
+    first, separator, _ = topic.strip("/").partition("/")
+    return first if separator else DEFAULT_ROBOT
+
+
+def matrix_of(values: Sequence[float]) -> Array:
+    """The transform (4, 4) of x y z and a quaternion x y z w; NaN if that is zero."""
+    t, (x, y, z, w) = values[:3], values[3:]
+    norm = np.sqrt(x * x + y * y + z * z + w * w)
+    if not norm > 0:
+        return np.full((4, 4), np.nan)
+    x, y, z, w = x / norm, y / norm, z / norm, w / norm
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])  # times v: (x, y, z) x v
+    matrix = np.eye(4)
+    matrix[:3, :3] += 2 * (w * cross + cross @ cross)
+    matrix[:3, 3] = t
+    return matrix
