@@ -66,6 +66,22 @@ def bag(log: Path, target: Path, compression: str = "") -> Path:
     return target
 
 
+def ros1_mcap(log: Path, target: Path) -> Path:
+    """An MCAP file with the encoding and the names of ROS 1, as `mcap convert` makes it of a bag."""
+    plain, made = typestore(Stores.ROS2_HUMBLE), {}
+    with target.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros1")
+        for topic, schema, log_time, data in messages_of(log):
+            if topic not in made:
+                kind = writer.register_schema(schema.replace("/msg/", "/"), "ros1msg", b"")
+                made[topic] = writer.register_channel(topic, "ros1", kind)
+            own = bytes(plain.cdr_to_ros1(data, schema))
+            writer.add_message(made[topic], log_time, own, log_time)
+        writer.finish()
+    return target
+
+
 def bare_db3(log: Path, target: Path) -> Path:
     """A database without its folder and metadata.yaml."""
     folder = rosbag2(log, target.parent / "bare", StoragePlugin.SQLITE3, CompressionMode.NONE)
@@ -148,4 +164,5 @@ CONTAINERS: dict[str, tuple[str, Callable[[Path, Path], Path]]] = {
     "ROS 1 bag, lz4": ("k.bag", partial(bag, compression="lz4")),
     ".mcap.zstd": ("l.mcap.zstd", compressed),
     "folder of MCAP files": ("m", split_mcap),
+    "MCAP, ROS 1 encoding": ("n.mcap", ros1_mcap),
 }  # fmt: skip

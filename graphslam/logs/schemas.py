@@ -329,7 +329,7 @@ class Template:
         """The bytes with this stamp and these numbers, in the order of the marks."""
         data = bytearray(self._data)
         # after CDR's own header of four bytes the message begins with its std_msgs/Header
-        struct.pack_into("<iI", data, 4, *_seconds(stamp_ns))
+        struct.pack_into("<iI", data, 4, *seconds_and_rest(stamp_ns))
         for place, number in zip(self._places, numbers, strict=True):
             struct.pack_into("<d", data, place, number)
         return bytes(data)
@@ -353,11 +353,16 @@ def time(stamp_ns: int) -> Any:
     Raises:
         LogError: the stamp does not fit the signed 32-bit seconds of ROS 2.
     """
-    seconds, nanoseconds = _seconds(stamp_ns)
+    seconds, nanoseconds = seconds_and_rest(stamp_ns)
     return build("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
 
 
-def _seconds(stamp_ns: int) -> tuple[int, int]:
+def seconds_and_rest(stamp_ns: int) -> tuple[int, int]:
+    """Seconds and nanoseconds of integer nanoseconds.
+
+    Raises:
+        LogError: the stamp does not fit the signed 32-bit seconds of ROS 2.
+    """
     seconds, nanoseconds = divmod(int(stamp_ns), 1_000_000_000)
     if not -(2**31) <= seconds < 2**31:
         raise LogError(f"stamp {stamp_ns} ns cannot be written: ROS 2 has 32 bits for seconds")

@@ -5,18 +5,16 @@ Between the two frames there may be several transforms, static and moving ones.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache, reduce
+from functools import reduce
 
 import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam.logs import schemas
 from graphslam.logs.cdr import CdrError
+from graphslam.logs.cdr_writing import odometry_bytes
 from graphslam.logs.recording import Derived, Recording, raw_messages
 from graphslam.logs.tf_tree import Edge, matrix_of, moving_topics, transforms_of
-
-#: numbers in a message that are replaced
-_MARKS = (1.25, 2.25, 3.25, 4.25, 5.25, 6.25, 7.25)
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,14 +102,18 @@ class TfOdometry:
         except CdrError:
             return []
         if len(self._children) == 1:  # as they are, to the bit
-            return [_template(*self._frames).filled(t.stamp_ns, *t.values) for t in found]
+            return [self._message(t.stamp_ns, t.values) for t in found]
         # all of a message first: which of them comes first means nothing
         self._steps |= {t.child: matrix_of(t.values) for t in found}
         stamps = [t.stamp_ns for t in found if t.child == self._children[0]]
         steps = [step for step in map(self._steps.get, self._children[::-1]) if step is not None]
         if not stamps or len(steps) < len(self._children):
             return []
-        return [_template(*self._frames).filled(stamps[-1], *_pose(steps))]
+        return [self._message(stamps[-1], _pose(steps))]
+
+    def _message(self, stamp_ns: int, values: Sequence[float]) -> bytes:
+        frame, child = self._frames
+        return odometry_bytes(stamp_ns, frame, values[:3], values[3:], child)
 
 
 def _pose(steps: Sequence[Array]) -> list[float]:
@@ -121,26 +123,6 @@ def _pose(steps: Sequence[Array]) -> list[float]:
     heading = np.arctan2(matrix[1, 0], matrix[0, 0])
     turn = [0.0, 0.0, float(np.sin(heading / 2)), float(np.cos(heading / 2))]
     return [*matrix[:3, 3].tolist(), *turn]
-
-
-@cache
-def _template(frame: str, child: str) -> schemas.Template:
-    """nav_msgs/Odometry with the numbers of a transform."""
-    x, y, z, a, b, c, d = _MARKS
-    point = schemas.build("geometry_msgs/msg/Point", x=x, y=y, z=z)
-    rotation = schemas.build("geometry_msgs/msg/Quaternion", x=a, y=b, z=c, w=d)
-    zero = schemas.build("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
-    pose = schemas.build("geometry_msgs/msg/Pose", position=point, orientation=rotation)
-    twist = schemas.build("geometry_msgs/msg/Twist", linear=zero, angular=zero)
-    kinds = "geometry_msgs/msg/PoseWithCovariance", "geometry_msgs/msg/TwistWithCovariance"
-    message = schemas.build(
-        schemas.ODOMETRY,
-        header=schemas.header(0, frame),
-        child_frame_id=child,
-        pose=schemas.build(kinds[0], pose=pose, covariance=np.zeros(36)),
-        twist=schemas.build(kinds[1], twist=twist, covariance=np.zeros(36)),
-    )
-    return schemas.Template(schemas.ODOMETRY, message, _MARKS)
 
 
 def with_odometry(recording: Recording, chain: Chain) -> tuple[Recording, Derived | None]:

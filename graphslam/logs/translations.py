@@ -10,9 +10,12 @@ from typing import NamedTuple
 
 import zstandard
 
-from graphslam.logs import schemas
+from graphslam.core.errors import LogError
+from graphslam.logs import foxglove, schemas
 from graphslam.logs.cdr import CdrError
 from graphslam.logs.container_files import ZSTD_MAGIC
+from graphslam.logs.multi_echo import MULTI_ECHO, first_echoes
+from graphslam.logs.wire import WireError
 
 #: from the bytes as recorded to CDR
 Translate = Callable[[bytes], bytes]
@@ -26,8 +29,17 @@ class Translation(NamedTuple):
 
 
 def _from_cdr(schema: str) -> Translation | None:
+    if schema == MULTI_ECHO:
+        return Translation(schemas.LASER_SCAN, _first_echoes)
     # rosbag2 may compress every message by itself
     return Translation(schema, _uncompressed)
+
+
+def _first_echoes(data: bytes) -> bytes:
+    try:
+        return first_echoes(_uncompressed(data))
+    except (CdrError, LogError):  # LogError: a stamp that ROS 2 does not have
+        return b""
 
 
 def _uncompressed(data: bytes) -> bytes:
@@ -47,9 +59,11 @@ _RENAMED = {"tf/tfMessage": schemas.TF_MESSAGE}
 def _from_ros1(schema: str) -> Translation | None:
     package, _, name = schema.partition("/")
     ros2 = _RENAMED.get(schema, f"{package}/msg/{name.removeprefix('msg/')}")
-    if ros2 not in schemas.KNOWN:
-        return None
-    return Translation(ros2, partial(_ros1_message, ros2))
+    if ros2 == MULTI_ECHO:
+        return Translation(
+            schemas.LASER_SCAN, lambda data: _first_echoes(_ros1_message(ros2, data))
+        )
+    return Translation(ros2, partial(_ros1_message, ros2)) if ros2 in schemas.KNOWN else None
 
 
 def _ros1_message(schema: str, data: bytes) -> bytes:
@@ -59,8 +73,24 @@ def _ros1_message(schema: str, data: bytes) -> bytes:
         return b""
 
 
+def _from_foxglove(encoding: str, schema: str) -> Translation | None:
+    package, _, name = schema.partition(".")
+    if package != "foxglove" or name not in foxglove.KINDS:
+        return None
+    return Translation(foxglove.KINDS[name].schema, partial(_foxglove_message, name, encoding))
+
+
+def _foxglove_message(name: str, encoding: str, data: bytes) -> bytes:
+    try:
+        return foxglove.to_cdr(name, encoding, data)
+    except WireError:
+        return b""
+
+
 TRANSLATIONS: dict[str, Callable[[str], Translation | None]] = {
     "cdr": _from_cdr,
+    "json": partial(_from_foxglove, "json"),
+    "protobuf": partial(_from_foxglove, "protobuf"),
     "ros1": _from_ros1,
 }
 
