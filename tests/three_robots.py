@@ -31,7 +31,8 @@ def write(
 
     ``meets(observer, seen)`` says who sees whom or what; ``names`` are exchanged; ``spoil(z, rng,
     observer, seen, seconds)`` may return something else than what was measured; ``say(observer,
-    seen, seconds)`` what the log says that it is of, as keywords of `LogWriter.sighting`.
+    seen, seconds)`` what the log says that it is of, as keywords of `LogWriter.sighting`, or None
+    if it is not in the log.
     """
     rng = np.random.default_rng(seed)
     names = names or {}
@@ -55,4 +56,5 @@ def write(
                     z = spoil(z, rng, robot, name, k / 10) if spoil else z
                     subject = {"seen_robot" if called in STARTS else "identity": called}
                     subject = say(robot, name, k / 10) if say else subject
-                    log.sighting(robot, stamp, z, np.diag(SIGMAS**2), **subject)
+                    if subject is not None:
+                        log.sighting(robot, stamp, z, np.diag(SIGMAS**2), **subject)

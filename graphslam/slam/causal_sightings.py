@@ -5,7 +5,7 @@ way, and applied to the motions and sightings of the next `BLOCK` steps, which a
 """
 
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -148,8 +148,16 @@ def _gated(
         _, found = robot_distances(seen, others, joint, floor)
         gate = gate_distance(config.gate_probability, found.dof)
         false |= {a.source for a, far in zip(own, found.d2 >= gate, strict=True) if far}
-    kept = tuple(a for a in step.associations if a.source not in false)
-    return replace(step, associations=kept)
+    if not false:
+        return step
+    kept = [a for a in step.associations if a.source not in false]
+    # n sightings of one target count as one, see `inflate_repeated`: n is smaller now
+    before, left = (
+        Counter((a.robot, a.target) for a in some) for some in (step.associations, kept)
+    )
+    share = {pair: n / before[pair] for pair, n in left.items()}
+    weighed = (a.with_measurement(a.z, a.cov * share[a.robot, a.target]) for a in kept)
+    return replace(step, associations=tuple(weighed))
 
 
 def _learn(

@@ -93,6 +93,34 @@ def test_robots_without_names_are_recognised(tmp_path, backend, say):
         assert len(result.landmarks) == len(POSTS)
 
 
+@pytest.mark.parametrize("backend", ["batch", "ekf"])
+def test_what_is_rejected_changes_nothing(tmp_path, backend):
+    """A tenth of the sightings of robots are 2 m too far: every trajectory is that of a log without
+    these, the causal ones to rounding, the final ones as far as they have converged. Breaks if one
+    of the ways to an estimate takes in what another one rejects."""
+
+    def spoil(z, rng, observer, seen, seconds):
+        return z + np.array([0.0, 2.0 * is_exchanged(observer, seen, seconds)])
+
+    def left_out(observer, seen, seconds):
+        return None if is_exchanged(observer, seen, seconds) else named(observer, seen, seconds)
+
+    starts = [f"start.poses.{r}=[{x}, {y}, {phi}]" for r, (x, y, phi) in STARTS.items()]
+    config = load_config(overrides=[*starts, f"backend.name={backend}"])
+    results = []
+    for name, say in (("false", named), ("absent", left_out)):
+        path = tmp_path / f"{name}.mcap"
+        write(path, marks=POSTS, seed=4, spoil=spoil, say=say, seconds=30.0)
+        results.append(smooth(open_logs([path], config), config))
+    false, absent = results
+    assert false.summary["rejected"][NOT_THERE] > 20
+    for robot, right in absent.robots.items():
+        found = false.robots[robot]
+        for a, b, atol in ((found.causal, right.causal, 1e-7), (found.final, right.final, 2e-4)):
+            np.testing.assert_array_equal(a.stamps_ns, b.stamps_ns)
+            np.testing.assert_allclose(a.poses, b.poses, atol=atol)
+
+
 def test_ignored_sightings_of_robots_are_no_landmarks(tmp_path):
     write(tmp_path / "log.mcap", marks=POSTS, say=unnamed, seconds=10.0)
     starts = [f"start.poses.{r}=[{x}, {y}, {phi}]" for r, (x, y, phi) in STARTS.items()]
