@@ -5,10 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from backend_cases import PLAIN, run, see, two_robots
+from three_robots import STARTS, write
 
-from graphslam.core.config import OdometryConfig, RobotConfig
+from graphslam.core.config import KeyframeConfig, OdometryConfig, RobotConfig
+from graphslam.core.config_io import load_config
 from graphslam.core.records import OdometryPose, Sighting
+from graphslam.logs import open_logs
+from graphslam.mapping.landmark_map import LandmarkMap
+from graphslam.mapping.robot_candidates import NOT_THERE
 from graphslam.odometry.preintegration import Track
+from graphslam.slam.initialisation import initialise
+from graphslam.slam.keyframes import KeyframeSelector
+from graphslam.slam.pipeline import Pipeline
+from graphslam.slam.reoptimise_scans import reoptimise_scan_log
 from graphslam.slam.robot_gating import RobotOffers
 from graphslam.slam.robot_sightings import RobotCandidates
 from graphslam.slam.robot_state import RobotState
@@ -97,6 +106,40 @@ def test_a_sighting_that_is_of_a_landmark_is_of_no_robot():
     assert used(made) == {0}
 
 
+@pytest.mark.parametrize("may_be", ["robot", "either", "landmark"])
+def test_what_may_be_a_robot_has_a_state_of_its_own(may_be):
+    """A robot is moved to the time at which it was seen, so its observer has to be there, too."""
+    track = Track(OdometryConfig(), RobotConfig())
+    track.add(OdometryPose("a", 0, 0, np.zeros(3)))
+    track.add(OdometryPose("a", S, S, np.zeros(3)))
+    standing = RobotState(track)
+    standing.append(0, np.zeros(3))
+    selector = KeyframeSelector(KeyframeConfig())
+    assert selector.gets_state([sighting(S, may_be=may_be)], standing) == (may_be != "landmark")
+    assert selector.gets_state([sighting(S, "b", "landmark")], standing)
+
+
+@pytest.mark.parametrize("mode", ["motion", "all"])
+def test_a_pass_keeps_what_it_rejected(tmp_path, mode):
+    """Every sighting of a robot, used or not, by its step, between states that exist, so that it
+    can be decided again; in batches and at their own times."""
+    write(tmp_path / "log.mcap", seconds=6.0, spoil=lambda z, *_: z + np.array([0.0, 2.0]))
+    starts = [f"start.poses.{r}=[{x}, {y}, {phi}]" for r, (x, y, phi) in STARTS.items()]
+    config = load_config(overrides=[*starts, "backend.name=ekf", f"keyframe.mode={mode}"])
+    log = open_logs([tmp_path / "log.mcap"], config)
+    one = Pipeline(log, config, initialise(log, config))
+    one.run(lambda _count: None)
+    offers = [a for own in one.offers.values() for a in own]
+    robots = RobotOffers(one.offers, one.sources or one.robot_sightings)
+    assert len({a.source for a in offers}) == len(offers) == robots.count == 6 * 12
+    assert robots.unused(one.steps) == one.rejected[NOT_THERE] > 60
+    for n, own in one.offers.items():
+        for a in own:
+            assert robots.sightings[a.source].seen_robot == a.target
+            assert one.steps[n].time_ns in one.runs[a.target].times
+            assert a.time_ns in one.runs[a.robot].times
+
+
 def test_an_unknown_clock_is_an_unknown_place_along_the_path():
     """At 0.4 m/s and half a second 0.2 m ahead; nothing once clocks are known."""
     track = Track(OdometryConfig(), RobotConfig())
@@ -107,3 +150,24 @@ def test_an_unknown_clock_is_an_unknown_place_along_the_path():
     for sigma_s, ahead in ((0.5, 0.2), (0.0, 0.0)):
         candidates = RobotCandidates(runs, {"b": "b"}, PLAIN, sigma_s)
         np.testing.assert_allclose(candidates.clock_shift("b", S), [ahead, 0.0], atol=1e-9)
+
+
+def test_logs_of_scans_decide_again_too():
+    """Before the last solution: what was rejected while the log was read is in it."""
+    steps, offers = offered(two_robots(np.random.default_rng(1))[0], (0,))
+    of_robots = [
+        replace(
+            step,
+            associations=tuple(a for a in step.associations if isinstance(a.target, str)),
+            closures=(),
+        )
+        for step in steps
+    ]
+    config = replace(PLAIN, odometry=replace(PLAIN.odometry, calibrate=False))
+    estimate = run("batch", of_robots, config).finish()
+    robots = RobotOffers(offers, [sighting(2, "b"), sighting(5, "b")])
+    for known, expected in ((robots, {0, 1}), (None, {0})):
+        _, made, _ = reoptimise_scan_log(
+            of_robots, estimate, {}, LandmarkMap(), (), config, None, known
+        )
+        assert used(made) == expected

@@ -3,12 +3,15 @@
 from collections import Counter
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from graphslam.core.config import OdometryConfig, RobotConfig
+from graphslam.core.record import replace
 from graphslam.core.records import OdometryPose, Scan, Sighting, TrueLandmark, Truth
 from graphslam.odometry.preintegration import Track
+from graphslam.slam.sighting_batches import SightingBatch, batch_sightings
 from graphslam.slam.synchronisation import synchronise
 
 SECOND = 1_000_000_000
@@ -66,6 +69,32 @@ def test_scan_waits_for_the_odometry_reading_after_it():
     ]  # fmt: skip
     assert all(run.covered)
     assert run.read_at_release[1] == 1 * SECOND  # not before the reading that covers it
+
+
+@pytest.mark.parametrize("may_be", ["robot", "either", "landmark"])
+def test_what_may_be_any_robot_waits_for_all_of_them(may_be):
+    """Robot c is the last to be read: what may be c needs to know where it was; a landmark does
+    not. The same holds for batches."""
+    seen = replace(sighting("a", 0.5), may_be=may_be)
+    later = [odometry("a", 1), odometry("b", 1.1), odometry("b", 1.2), odometry("c", 1.3)]
+    first = [odometry(robot, 0.1 * k) for k, robot in enumerate("abc")]
+    run = Run([*first, seen, *later, odometry("a", 2)], "abc")
+    released = [t for m, t in zip(run.released, run.read_at_release, strict=True) if m is seen]
+    until = 1.0 if may_be == "landmark" else 1.3
+    assert released == [round(until * SECOND)]
+    tracks = {r: Track(OdometryConfig(), RobotConfig()) for r in "abc"}
+
+    def messages():
+        for message in [*first, seen, replace(seen, time_ns=2 * seen.time_ns), *later]:
+            if isinstance(message, OdometryPose):
+                tracks[message.robot].add(message)
+            read.append(message.time_ns)
+            yield [message]
+
+    read = []
+    made = batch_sightings(messages(), tracks, SECOND // 10, round(GAP_S * SECOND))
+    batch = next(event for event in made if isinstance(event, SightingBatch))
+    assert batch.images == [[seen]] and read[-1] == round(until * SECOND)
 
 
 def test_scan_at_the_stamp_of_a_reading_needs_no_later_one():
