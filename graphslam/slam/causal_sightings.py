@@ -14,7 +14,7 @@ import numpy as np
 from graphslam.core.config import AssociationConfig
 from graphslam.core.geometry import Array, between, compose, rotation3
 from graphslam.core.motion_models import Calibration
-from graphslam.core.records import Association, Estimate, Step, Trajectory
+from graphslam.core.records import Association, Estimate, Motion, Step, Trajectory
 from graphslam.estimation.compressed_filter import CompressedBackend
 from graphslam.mapping.gating import gate_distance, gate_floor
 from graphslam.mapping.robot_candidates import (
@@ -27,7 +27,6 @@ from graphslam.mapping.robot_candidates import (
 from graphslam.odometry.online_calibration import observed_information
 from graphslam.odometry.preintegration import Track
 from graphslam.slam.reoptimise_sightings import SightingGroup, recompute_steps
-from graphslam.slam.robot_sightings import RobotCandidates
 from graphslam.slam.robot_state import Causal, RobotState
 from graphslam.slam.sighting_pass import SightingPass
 
@@ -70,7 +69,6 @@ def _replay(one: SightingPass, tracks: Mapping[str, Track]) -> CausalReplay:
     settings = replace(settings, relinearize_every=INTERVAL * settings.relinearize_every)
     backend = CompressedBackend(replace(one.config, backend=settings))
     runs = {name: RobotState(track, clock=one.runs[name].clock) for name, track in tracks.items()}
-    candidates = RobotCandidates(runs, one.frames.of, one.config, one.clock_sigma_s)
     known: set[int | str] = set()
     step_ms: list[float] = []
     for first in range(0, len(one.steps), BLOCK):
@@ -78,7 +76,7 @@ def _replay(one: SightingPass, tracks: Mapping[str, Track]) -> CausalReplay:
         used = {name: run.track.calibration for name, run in runs.items()}
         for recorded in _computed(one.steps[first : block.stop], one.groups, block, runs):
             began = time.perf_counter()
-            step = _gated(recorded, backend, candidates, one.config.association)
+            step = _gated(recorded, backend, one.clock_sigma_s, one.config.association)
             backend.add(step)
             poses = {name: backend.state_mean(name) for name in (*step.starts, *step.motions)}
             if one.config.odometry.calibrate and step.motions:
@@ -125,7 +123,7 @@ def _computed(
 def _gated(
     step: Step,
     backend: CompressedBackend,
-    candidates: RobotCandidates,
+    clock_sigma_s: float,
     config: AssociationConfig,
 ) -> Step:
     """A step without sightings of robots that are not where the back end expects these."""
@@ -140,8 +138,9 @@ def _gated(
     for robot, own in of_robots.items():
         seen = [as_observation(a) for a in own]
         others = [
-            RobotTarget(name, step.motions.get(name), candidates.clock_shift(name, step.time_ns))
+            RobotTarget(name, motion, _clock_shift(motion, clock_sigma_s))
             for name in robots_in(seen)
+            for motion in [step.motions.get(name)]
         ]
         joint = backend.joint(robot, [], [other.name for other in others])
         joint = predicted_joint(joint, step.motions.get(robot), others)
@@ -158,6 +157,13 @@ def _gated(
     share = {pair: n / before[pair] for pair, n in left.items()}
     weighed = (a.with_measurement(a.z, a.cov * share[a.robot, a.target]) for a in kept)
     return replace(step, associations=tuple(weighed))
+
+
+def _clock_shift(motion: Motion | None, clock_sigma_s: float) -> Array:
+    """`RobotTarget.clock_shift` by the robot's last motion; none for one that stands."""
+    if motion is None or not clock_sigma_s:
+        return np.zeros(2)
+    return np.asarray(motion.delta[:2] * (1e9 * clock_sigma_s / (motion.end_ns - motion.start_ns)))
 
 
 def _learn(

@@ -33,7 +33,7 @@ class RobotCandidates:
         frames: Mapping[str, str],
         config: Config,
         clock_sigma_s: float,
-        start: Callable[[str, int], bool] = lambda _robot, _time_ns: False,
+        start: Callable[[str, int], bool],
     ) -> None:
         """Made before the pass.
 
@@ -43,7 +43,7 @@ class RobotCandidates:
             config: settings.
             clock_sigma_s: sigma of the difference of two robots' clocks.
             start: gives a robot its first state if it can have one at a time, ns, and returns
-                whether it has one; needed for sightings without a name.
+                whether it has one.
         """
         self._runs, self._frames, self._start = runs, frames, start
         self._max_distance_m = config.association.max_distance_m

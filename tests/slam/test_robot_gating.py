@@ -148,7 +148,7 @@ def test_an_unknown_clock_is_an_unknown_place_along_the_path():
         track.add(OdometryPose("b", k * S // 10, k * S // 10, pose))
     runs = {"b": RobotState(track)}
     for sigma_s, ahead in ((0.5, 0.2), (0.0, 0.0)):
-        candidates = RobotCandidates(runs, {"b": "b"}, PLAIN, sigma_s)
+        candidates = RobotCandidates(runs, {"b": "b"}, PLAIN, sigma_s, lambda *_: True)
         np.testing.assert_allclose(candidates.clock_shift("b", S), [ahead, 0.0], atol=1e-9)
 
 
