@@ -67,7 +67,7 @@ def bag(log: Path, target: Path, compression: str = "") -> Path:
 
 
 def ros1_mcap(log: Path, target: Path) -> Path:
-    """An MCAP file with the encoding and the names of ROS 1, as `mcap convert` makes it of a bag."""
+    """An MCAP file with the encoding and the names of ROS 1, as of a converted bag."""
     plain, made = typestore(Stores.ROS2_HUMBLE), {}
     with target.open("wb") as stream:
         writer = Writer(stream)

@@ -17,6 +17,12 @@ def _carmen(source: Path, target: Path) -> ImportSummary:
     return import_carmen(source, target)
 
 
+def _csv(source: Path, target: Path) -> ImportSummary:
+    from graphslam.logs.import_csv import import_csv
+
+    return import_csv(source, target)
+
+
 def _pose_graph(source: Path, target: Path) -> ImportSummary:
     from graphslam.logs.import_pose_graph import import_pose_graph
 
@@ -44,6 +50,7 @@ def _tinyslam(source: Path, target: Path) -> ImportSummary:
 #: from the source's path and the MCAP file to be written
 IMPORTERS: dict[str, Callable[[Path, Path], ImportSummary]] = {
     "carmen": _carmen,
+    "csv": _csv,
     "g2o": _pose_graph,
     "isam": _pose_graph,
     "mrclam": _mrclam,

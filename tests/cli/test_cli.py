@@ -338,7 +338,7 @@ USAGE = {
     "front end": (("smooth", "l", "-o", "o", "--front-end", "x"), "segments, hough, both, none"),
     "horizon": (("smooth", "l", "-o", "o", "--horizon", "-1"), "seconds from 0 to inf"),
     "no horizon": (("smooth", "l", "-o", "o", "--horizon", "nan"), "seconds from 0 to inf"),
-    "format": (("import", "csv", "a", "-o", "b"), ", ".join(sorted(IMPORTERS))),
+    "format": (("import", "lcm", "a", "-o", "b"), ", ".join(sorted(IMPORTERS))),
 }
 
 

@@ -44,7 +44,8 @@ def test_bad_sources_get_one_line_and_leave_no_file(name, tmp_path):
     empty.write_text("")
     noise.write_bytes(b"no gzip at all")
     # an MRCLAM set may be a folder; this one holds none of its files
-    folder = "has no RobotN_Odometry.dat" if name == "mrclam" else "is a directory"
+    lacking = {"mrclam": "has no RobotN_Odometry.dat", "csv": "has no odometry.csv"}
+    folder = lacking.get(name, "is a directory")
     # no log of ROS is packed with gzip
     no_gzip = "is not an MCAP file" if name == "rosbag" else "cannot be read to its end"
     for source, why in (

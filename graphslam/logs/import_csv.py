@@ -1,0 +1,138 @@
+"""Tables of numbers to MCAP: odometry as CSV or TUM, scans as CSV.
+
+A folder or archive with, per robot:
+
+- ``odometry.csv``: stamp s, x m, y m, heading rad; or ``odometry.tum``: stamp s, x y z m, and the
+  quaternion x y z w.
+- ``scans.csv``: stamp s, first angle rad, step rad, then the ranges m; a range that is empty, nan,
+  inf or not positive is no return.
+- ``laser.csv``: x m, y m, heading rad of the laser on the base; without it the base itself.
+- ``truth.csv`` or ``truth.tum``: true poses, as odometry.
+
+Files of several robots are called ``NAME.odometry.csv``. Columns are separated by commas or blanks;
+lines that begin with ``#`` and a first line of names are left out.
+"""
+
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from graphslam.core.errors import LogError
+from graphslam.logs.decoders import MAX_RANGE_M
+from graphslam.logs.import_carmen import parse_stamp_ns
+from graphslam.logs.import_summary import ImportSummary
+from graphslam.logs.schemas import DEFAULT_ROBOT
+from graphslam.logs.source_files import text_files
+from graphslam.logs.writer import Event, LogWriter
+
+_FILES = re.compile(r"(?:(?P<robot>.+)\.)?(?P<what>odometry|scans|laser|truth)\.(?P<kind>csv|tum)")
+_SEPARATOR = re.compile(r"[,;\s]\s*")
+
+Pose = tuple[float, float, float]
+_T = TypeVar("_T")
+
+
+def import_csv(source: Path, target: Path) -> ImportSummary:
+    """Convert the tables in ``source`` (a folder, .zip or .tar) to the MCAP file ``target``.
+
+    Raises:
+        LogError: ``source`` cannot be read, has none of the files, or a file has no usable line.
+        OutputError: ``target`` cannot be written.
+    """
+    texts = text_files(source, _FILES)
+    if not any("odometry" in name for name in texts):
+        raise LogError(
+            f"{source}: has no odometry.csv (stamp s, x m, y m, heading rad) or odometry.tum; "
+            "is it a folder of tables?"
+        )
+    events: list[Event] = []
+    mounts: dict[str, Pose] = {}
+    warnings = []
+    for name, text in sorted(texts.items()):
+        found = _FILES.fullmatch(name)
+        assert found is not None  # `text_files` gives no others
+        robot = found["robot"] or DEFAULT_ROBOT
+        malformed: Counter[str] = Counter()
+        if found["what"] == "laser":
+            mounts[robot] = next(_parsed(text, _numbers, malformed), (0.0, 0.0, 0.0))
+        else:
+            parse = _event(found["what"], found["kind"], robot)
+            own = list(_parsed(text, parse, malformed))
+            if not own:
+                raise LogError(
+                    f"{source}: {name} has no usable line; stamps are seconds, all numbers decimal"
+                )
+            events += own
+        warnings += [
+            f"{source}: {n} lines of {name} cannot be read" for n in malformed.values() if n
+        ]
+    events.sort(key=lambda event: event.stamp_ns)
+    with LogWriter(target, {"format": "csv", "source": source.name}) as log:
+        for robot, mount in mounts.items():
+            log.mount(robot, events[0].stamp_ns, mount)
+        for event in events:
+            event.write(log)
+    return ImportSummary(source, target, log.counts, tuple(warnings))
+
+
+def _parsed(text: str, parse: Callable[[list[str]], _T], malformed: Counter[str]) -> Iterator[_T]:
+    """What ``parse`` makes of each line; a first line of names is no malformed one."""
+    for number, line in enumerate(text.splitlines()):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        fields = _SEPARATOR.split(line.strip())
+        try:
+            yield parse(fields)
+        except (ValueError, IndexError):
+            malformed["lines"] += number > 0
+
+
+def _event(what: str, kind: str, robot: str) -> Callable[[list[str]], Event]:
+    """What makes an event of the fields of a line."""
+    if what == "scans":
+        return partial(_scan, robot)
+    method = LogWriter.truth if what == "truth" else LogWriter.odometry
+    return partial(_pose_event, method, robot, _tum_pose if kind == "tum" else _numbers)
+
+
+def _pose_event(
+    method: Callable[..., None],
+    robot: str,
+    pose_of: Callable[[list[str]], Pose],
+    fields: list[str],
+) -> Event:
+    stamp_ns = parse_stamp_ns(fields[0])
+    return Event.of(method, robot, stamp_ns, pose=pose_of(fields[1:]))
+
+
+def _numbers(fields: list[str]) -> Pose:
+    """X m, y m, heading rad; more columns are left out."""
+    x, y, phi = map(float, fields[:3])
+    return x, y, phi
+
+
+def _tum_pose(fields: list[str]) -> Pose:
+    """The planar part of x y z m and the quaternion x y z w."""
+    x, y, _, qx, qy, qz, qw = map(float, fields[:7])
+    phi = math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
+    return x, y, phi
+
+
+def _scan(robot: str, fields: list[str]) -> Event:
+    start, step = float(fields[1]), float(fields[2])
+    ranges = [float(field) if field else math.inf for field in fields[3:]]
+    return Event.of(
+        LogWriter.scan,
+        robot,
+        parse_stamp_ns(fields[0]),
+        ranges=np.array(ranges, dtype=np.float32),
+        angle_min_rad=start,
+        angle_step_rad=step,
+        range_max_m=MAX_RANGE_M,
+    )

@@ -1,0 +1,82 @@
+"""Tables: the same drive as CSV and TUM gives the same records, and odd lines are counted."""
+
+import numpy as np
+import pytest
+from room_log import MOUNT, drive
+
+import graphslam
+from graphslam.core import records
+from graphslam.core.config import Config
+from graphslam.core.errors import LogError
+from graphslam.logs import IMPORTERS, open_logs, read_truth
+
+
+def seconds(ns: int) -> str:
+    return f"{ns // 10**9}.{ns % 10**9:09d}"
+
+
+def numbers(values) -> str:
+    return ",".join("" if np.isnan(v) else repr(float(v)) for v in values)
+
+
+def tables(log, folder, kind: str, prefix: str = ""):
+    """The messages of a log as tables."""
+    folder.mkdir(exist_ok=True)
+    lines = {"odometry": [], "scans": ["stamp,first,step,ranges"], "truth": ["# true poses"]}
+    for message in open_logs([log], Config()).messages():
+        stamp = seconds(message.stamp_ns)
+        if isinstance(message, records.Scan):
+            shape = (message.angle_min_rad, message.angle_step_rad)
+            lines["scans"].append(f"{stamp},{numbers(shape)},{numbers(message.ranges)}")
+            continue
+        name = "truth" if isinstance(message, records.Truth) else "odometry"
+        x, y, phi = message.pose
+        text = f"{stamp},{numbers((x, y, phi))}"
+        if kind == "tum":
+            values = (x, y, 0.5, 0.0, 0.0, np.sin(phi / 2), np.cos(phi / 2))
+            text = f"{stamp} {numbers(values).replace(',', ' ')}"
+        lines[name].append(text)
+    for name, own in lines.items():
+        suffix = "csv" if name == "scans" else kind
+        (folder / f"{prefix}{name}.{suffix}").write_text("\n".join(own))
+    (folder / f"{prefix}laser.csv").write_text("x,y,heading\n" + numbers(MOUNT))
+    (folder / "notes.txt").write_text("not looked at")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    return drive(tmp_path_factory.mktemp("drive") / "drive.mcap")
+
+
+@pytest.mark.parametrize("kind", ["csv", "tum"])
+def test_tables_give_the_same_trajectory_and_truth(kind, log, tmp_path):
+    source = tables(log, tmp_path / "tables", kind)
+    target = tmp_path / "log.mcap"
+    assert not IMPORTERS["csv"](source, target).warnings
+    found, expected = (list(open_logs([p], Config()).messages()) for p in (target, log))
+    assert [(type(m), m.stamp_ns) for m in found] == [(type(m), m.stamp_ns) for m in expected]
+    mine, theirs = (graphslam.smooth(p).robots["robot"].final for p in (target, log))
+    # headings by quaternions differ in the last digit, and the solver stops where it is converged
+    np.testing.assert_allclose(mine.poses, theirs.poses, atol=1e-9 if kind == "csv" else 1e-7)
+    mine, theirs = (read_truth([p], Config()).trajectories["robot"] for p in (target, log))
+    np.testing.assert_allclose(mine.poses, theirs.poses, atol=1e-12)
+
+
+def test_robots_are_named_by_the_files(log, tmp_path):
+    for name in ("a", "b"):
+        source = tables(log, tmp_path / "tables", "csv", f"{name}.")
+    IMPORTERS["csv"](source, tmp_path / "log.mcap")
+    assert open_logs([tmp_path / "log.mcap"], Config()).robots == ("a", "b")
+
+
+def test_lines_that_cannot_be_read_are_counted_and_a_file_of_them_is_refused(log, tmp_path):
+    source = tables(log, tmp_path / "tables", "csv")
+    path = source / "odometry.csv"
+    path.write_text(path.read_text() + "\n1.0,2\nnonsense\n")
+    (warning,) = IMPORTERS["csv"](source, tmp_path / "log.mcap").warnings
+    assert "2 lines of odometry.csv cannot be read" in warning
+    # stamps in nanoseconds, which others write too
+    path.write_text("1700000000123456789,0,0,0\n1700000000223456789,0,0,0\n")
+    with pytest.raises(LogError, match="stamps are seconds"):
+        IMPORTERS["csv"](source, tmp_path / "log.mcap")
