@@ -163,6 +163,24 @@ def test_each_motion_of_several_is_corrected_by_its_own_scans():
         assert found[k].from_scans and np.hypot(*error[:2]) < 0.02 and abs(error[2]) < 0.01
 
 
+@pytest.mark.parametrize(
+    "here, there, is_used",
+    [(0.55, 0.59, False), (0.55, 0.61, True), (0.3, 0.49, False), (0.3, 0.51, True)],
+)
+def test_another_motion_must_put_more_points_on_others(monkeypatch, here, there, is_used):
+    """Half of them, and a twentieth more than where odometry has them: in a corridor of equal doors
+    the next door is as good as the right one."""
+    name = "graphslam.odometry.scan_odometry."
+    pose, cov = STEP + np.array([0.9, 0.0, 0.0]), SURE[None]
+    monkeypatch.setattr(name + "fits", lambda *_: (np.array([here]), np.zeros((1, 3)), cov))
+    monkeypatch.setattr(name + "align_pairs", lambda *_: (pose[None], cov, None))
+    monkeypatch.setattr(name + "shares_on_others", lambda ends, *_: np.full(len(ends), there))
+    monkeypatch.setattr(name + "match_pairs", lambda ends, *_: [[]] * len(ends))
+    scan = scan_submap(cloud(np.zeros(3), L_ROOM))
+    (found,) = check_motions([said(STEP)], [scan], [scan])
+    assert found.from_scans is is_used
+
+
 @pytest.mark.parametrize("reach, is_found", [(0.95, True), (3.0, False)])
 def test_a_motion_is_searched_for_within_the_window_beyond_twice_the_motion(reach, is_found):
     """`search_m`, 0.5 m, plus twice 0.6 m: an unsigned counter reports the reverse. What is farther

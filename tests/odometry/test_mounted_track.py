@@ -151,8 +151,8 @@ def test_the_mount_is_that_of_the_calibration_and_none_without_one():
     np.testing.assert_array_equal(track.mount_cov, track.calibration.cov[3:6, 3:6])
     assert track.increment_parameters == 3
     plain = track_of([0, 1], curve([0, 1]))
-    np.testing.assert_array_equal(plain.mount, 0.0)
-    np.testing.assert_array_equal(plain.mount_cov, 0.0)
+    np.testing.assert_array_equal(plain.mount, np.zeros(3))
+    np.testing.assert_array_equal(plain.mount_cov, np.zeros((3, 3)))
     assert plain.increment_parameters == 3 and not plain.is_mounted
 
 

@@ -9,12 +9,15 @@ from walls import cast, make_scan, scan_of
 
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import rotate_cov, rotation
+from graphslam.perception.breaks import Returns
 from graphslam.perception.front_ends import FRONT_ENDS
 from graphslam.perception.line_fit import LineFits, fit_lines, observations
 from graphslam.perception.ordered_scan import Sweep, join_sweeps, make_sweep
 from graphslam.perception.segments import (
     STEP_GROWTH,
+    Pieces,
     _chain_starts,
+    _merge,
     allowed_rms,
     fewest_points,
     find_segments,
@@ -147,6 +150,31 @@ def test_a_beam_through_a_gap_shows_that_it_is_open(behind_m, pieces):
     assert wall_with_gap(-2.0, (-0.35, 0.35), 2.0, behind_m) == pieces
 
 
+@pytest.mark.parametrize("returns, kept", [(3, 3), (2, 0)])
+def test_three_returns_behind_a_gap_are_a_part_of_the_wall(returns, kept):
+    """The end of a wall beside a post; two returns are no piece."""
+    scan = scan_of([[[3.0, -1.5], [3.0, 1.5]]], step_deg=0.25)
+    last = np.flatnonzero(np.isfinite(scan.ranges))[-1]
+    scan.ranges[last - returns - 7 : last - returns + 1] = np.nan
+    sweep = make_sweep(scan, 30.0)
+    found = find_segments(sweep, CONFIG)
+    assert len(found.starts) == 1
+    assert np.count_nonzero(sweep.beam[found.rows] > last - returns) == kept
+
+
+@pytest.mark.parametrize("off_m, pieces", [(0.032, 1), (0.034, 2)])
+def test_few_returns_may_scatter_more_than_a_segment(off_m, pieces):
+    """Sixteen: two sigmas of their own mean square, 1.7 times the allowed one. They zigzag, so that
+    neither a bend nor a step keeps the two pieces apart."""
+    rows = np.arange(16)
+    sign = np.array([1, -1, -1, 1] * 4)
+    points = np.column_stack([3.0 + off_m * sign, 0.06 * (rows - 7.5)])
+    sweep = sweep_of(points)
+    halves = Returns(sweep.moments).of(np.array([0, 8]), np.array([7, 15]))
+    joined = _merge(Pieces(np.array([0, 8]), np.array([7, 15]), halves), sweep, CONFIG)
+    assert len(joined.first) == pieces
+
+
 @pytest.mark.parametrize("turn", TURNS)
 def test_a_door_is_open_in_every_direction(turn):
     """The same beyond a wall that is not seen face on."""
@@ -249,6 +277,11 @@ def test_two_walls_that_meet_at_a_shallow_angle_have_no_corner(bend_deg, kinds, 
     found = segments(scan_of([*walls, BEHIND], step_deg=0.25), CONFIG)
     on = [o for o in found if o.z[0] < 5]
     assert len(on) == 2 and {o.kind for o in on} == kinds
+    # in each scan of a block as in the first
+    scan = scan_of([*walls, BEHIND], step_deg=0.25)
+    seen = find_segments(join_sweeps([make_sweep(scan, 30.0)] * 3), CONFIG)
+    near_by = seen.fits.z[:, 0] < 5
+    assert near_by.sum() == 6 and set(seen.whole[near_by].tolist()) == {kinds == {"segment"}}
 
 
 def test_walls_at_a_shallow_angle_that_do_not_meet_have_their_ends():

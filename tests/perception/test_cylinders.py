@@ -240,6 +240,15 @@ def test_the_fit_has_as_many_degrees_of_freedom_as_ranges_and_edges_leave():
     assert circles.chi2[i] == pytest.approx(ranges + ((edges / STEP) ** 2).sum(), rel=1e-6)
 
 
+def test_the_fit_of_a_single_beam_has_one_degree_of_freedom():
+    """One range and two edges, for three unknowns: never less than one, a divisor of chi-square."""
+    sweep = make_sweep(see([(3.0, 0.0, 0.2)]), 30.0)
+    (middle,) = np.flatnonzero(sweep.beam == 180)
+    for n, dof in ((0, 1), (1, 2)):
+        fit = fit_circles(sweep, np.array([middle - n]), np.array([middle + n]), CONFIG)
+        assert fit.dof.tolist() == [dof]
+
+
 def test_a_line_through_the_same_returns_is_compared_by_the_same_noise():
     """Least squares of each run alone, the first run of a scan and one behind others."""
     scan = see([(3.0, -1.5, 0.3), (4.0, 1.0, 0.4)], sigma=0.01)
