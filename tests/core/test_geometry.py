@@ -142,6 +142,9 @@ def test_ranges_and_bearings_are_points_counter_clockwise_from_ahead():
     found = polar_points(np.array([2.0, 3.0, 1.0]), np.radians([0.0, 90.0, -135.0]))
     expected = [[2.0, 0.0], [0.0, 3.0], [-np.sqrt(0.5), -np.sqrt(0.5)]]
     np.testing.assert_allclose(found, expected, atol=1e-15)
+    bearings = np.arange(6.0).reshape(2, 3)
+    stack = polar_points(np.ones((2, 3)), bearings)
+    np.testing.assert_array_equal(stack, np.dstack([np.cos(bearings), np.sin(bearings)]))
 
 
 def test_the_length_of_a_path_is_summed_up_to_each_pose():

@@ -141,8 +141,9 @@ def test_counting_noise_enters_position_and_heading_of_an_increment(row):
     np.testing.assert_allclose(counting, 0.02**2 * J @ J.T, rtol=1e-6, atol=1e-12)
     # the heading's part: both radii over the axle
     np.testing.assert_allclose(counting[2, 2], 0.02**2 * (0.11**2 + 0.1**2) / 0.6**2, rtol=1e-9)
-    still = increments("wheels", [(0.0, 0.0)], config=config)
-    before = increments("wheels", [(0.0, 0.0)], config=replace(config, count_sigma_rad=0.0))
+    still = increments("wheels", [(0.0, 0.0)], config=config, seconds=0.1)
+    certain = replace(config, count_sigma_rad=0.0)
+    before = increments("wheels", [(0.0, 0.0)], config=certain, seconds=0.1)
     np.testing.assert_array_equal(still.cov, before.cov)  # a wheel that stands is not miscounted
 
 
