@@ -12,7 +12,7 @@ A second table is of whole runs, median and worst over seeds: error of the final
 and walls at the start laid on themselves (see `thesis_experiments.py`); on a real log the mean over
 its reference relations (all, and loops) of the final ones; the landmarks in the map, and CPU time
 of the front end per scan. The last line is the error of each front end relative to `segments`,
-mean over seeds and logs.
+mean over seeds and logs. Real logs are those given, else Intel and ACES if they are there.
 
 `hough, thesis` counts votes with `front_end.hough_votes = "thesis"`. `hough, raster` is OpenCV's
 transform of a raster with the weights as pixels, which is in no release: it is here to be compared.
@@ -27,7 +27,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from common import best_cpu_s, parser, simulated_log
+from common import (
+    FREIBURG,
+    FREIBURG_LOGS,
+    best_cpu_s,
+    import_freiburg,
+    parser,
+    simulated_log,
+)
 from numpy.typing import NDArray
 
 from graphslam.core.config import Config, FrontEndConfig
@@ -321,6 +328,18 @@ def scan_table(folder: Path) -> None:
                 row(f"{name}, {label}", "points", [b for _, b in pairs], count, None)
 
 
+def real_logs(given: Sequence[str], folder: Path) -> list[tuple[Path, Path]]:
+    """Logs with their relations."""
+    if given:
+        pairs = [pair.partition("=") for pair in given]
+        return [(Path(log), Path(relations)) for log, _, relations in pairs]
+    return [
+        (import_freiburg(name, folder), FREIBURG / f"{name}.relations")
+        for name in FREIBURG_LOGS
+        if (FREIBURG / f"{name}.relations").exists()
+    ]
+
+
 def main() -> None:
     options = parser(__doc__)
     options.add_argument("logs", nargs="*", metavar="LOG.mcap=RELATIONS")
@@ -335,9 +354,8 @@ def main() -> None:
         relative: dict[str, list[float]] = {label: [] for label in WHOLE}
         if not arguments.no_runs:
             relative = simulated_runs(Path(folder))
-        for pair in arguments.logs:
-            log, _, relations = pair.partition("=")
-            for label, share in real_runs(Path(log), Path(relations)).items():
+        for log, relations in real_logs(arguments.logs, Path(folder)):
+            for label, share in real_runs(log, relations).items():
                 relative[label].append(share)
         shares = [f"{label} {np.mean(v):.3f}" for label, v in relative.items() if v]
         print("error relative to segments, mean over logs:", ", ".join(shares))

@@ -181,6 +181,22 @@ def test_another_motion_must_put_more_points_on_others(monkeypatch, here, there,
     assert found.from_scans is is_used
 
 
+def test_a_lost_motion_is_searched_for_within_twice_itself_and_the_settings(monkeypatch):
+    """Half a window in each component, either way round: an unsigned counter reports the reverse."""
+    windows = []
+
+    def nothing(ends, _starts, _near, asked):
+        windows.extend(asked)
+        return [[]] * len(ends)
+
+    monkeypatch.setattr("graphslam.odometry.scan_odometry.match_pairs", nothing)
+    before = scan_submap(cloud(np.zeros(3), L_ROOM))
+    now = scan_submap(cloud(np.array([20.0, 0.0, 1.0]), CORRIDOR))
+    check_motions([said([0.6, -0.1, -0.3])], [before], [now])
+    expected = np.array([CONFIG.search_m + 1.2, CONFIG.search_m + 0.2, CONFIG.search_rad + 0.6])
+    np.testing.assert_allclose(windows, [expected])
+
+
 @pytest.mark.parametrize("reach, is_found", [(0.95, True), (3.0, False)])
 def test_a_motion_is_searched_for_within_the_window_beyond_twice_the_motion(reach, is_found):
     """`search_m`, 0.5 m, plus twice 0.6 m: an unsigned counter reports the reverse. What is farther

@@ -56,11 +56,12 @@ def drive():
     return [*scans, scans[-1]], np.array([*poses, poses[-1]])
 
 
-def test_segments_of_a_block_are_those_of_each_scan(drive):
+@pytest.mark.parametrize("rule", ["deviation", "variance"])
+def test_segments_of_a_block_are_those_of_each_scan(drive, rule):
     """To the digit: breaks when a wall is joined across the border of two scans, or the point of
     another scan is taken for its own."""
     scans, _ = drive
-    config = FrontEndConfig()
+    config = FrontEndConfig(split_rule=rule)
     sweeps = [make_sweep(scan, config.max_range_m) for scan in scans]
     found = observe_block(scans, sweeps, config)
     assert len(found) == len(scans) and sum(map(len, found)) > 3 * len(scans)
