@@ -182,7 +182,7 @@ def test_another_motion_must_put_more_points_on_others(monkeypatch, here, there,
 
 
 def test_a_lost_motion_is_searched_for_within_twice_itself_and_the_settings(monkeypatch):
-    """Half a window in each component, either way round: an unsigned counter reports the reverse."""
+    """Half a window in each component: an unsigned counter reports the reverse of a motion."""
     windows = []
 
     def nothing(ends, _starts, _near, asked):
