@@ -32,6 +32,7 @@ __all__ = [
     "LogsConfig",
     "LoopClosureConfig",
     "MultiRobotConfig",
+    "NetworkConfig",
     "OdometryConfig",
     "RbpfConfig",
     "RobotConfig",
@@ -197,6 +198,19 @@ class ImmConfig:
 
 
 @dataclass(frozen=True)
+class NetworkConfig:
+    """The network between robots of `decentralised`, simulated.
+
+    loss_ratio: share of messages that a robot does not receive; each receiver by itself. delay_s:
+    messages come late by up to this, uniformly distributed. seed: of the random numbers.
+    """
+
+    loss_ratio: float = 0.0
+    delay_s: float = 0.0
+    seed: int = 0
+
+
+@dataclass(frozen=True)
 class RbpfConfig:
     """The Rao-Blackwellised particle filter; it has no robust kernel.
 
@@ -313,6 +327,7 @@ class Config:
     loop_closure: LoopClosureConfig = field(default_factory=LoopClosureConfig)
     ekf: EkfConfig = field(default_factory=EkfConfig)
     imm: ImmConfig = field(default_factory=ImmConfig)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
     rbpf: RbpfConfig = field(default_factory=RbpfConfig)
     start: StartConfig = field(default_factory=StartConfig)
     multi_robot: MultiRobotConfig = field(default_factory=MultiRobotConfig)

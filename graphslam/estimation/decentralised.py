@@ -14,7 +14,10 @@ interval, never of messages. All messages and the receiver's own measurements ar
 of one graph, whose sum is the centralised one, with two losses: condensed factors keep their
 linearisation point and robust weights, and between messages the others are unknown.
 
-There is no network model: every message reaches every robot, and landmark identities are shared.
+The network may lose messages or deliver them late, see `message_link`. At the end the robots meet:
+each gives the others what they still lack. It is assumed that a robot that is seen by another one
+learns so at once, since the state at which that was must not be eliminated, and that landmark
+identities are shared.
 """
 
 from collections import defaultdict
@@ -31,6 +34,7 @@ from graphslam.core.records import Estimate, Step
 from graphslam.estimation import factors
 from graphslam.estimation.factor_graph import FactorGroup, GraphBackend, GraphBuilder
 from graphslam.estimation.isam2 import isam2_parameters, isam2_tree
+from graphslam.estimation.message_link import Inbox, Network, Outbox, Packet
 from graphslam.estimation.optimisation import optimise
 
 #: bytes of a number, and of a variable's key
@@ -52,10 +56,15 @@ class Measurement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Message:
-    """What a robot sends to the others: factors, and values of their variables."""
+    """What a robot sends to the others: factors, and values of their variables.
+
+    ``sightings`` are factors between its states and those of others, ``size`` all of it in bytes.
+    """
 
     factors: Sequence[gtsam.NonlinearFactor]
     values: Mapping[int, Array]
+    sightings: Sequence[gtsam.NonlinearFactor]
+    size: int
 
 
 @dataclass(slots=True, eq=False)
@@ -64,8 +73,9 @@ class LocalSmoother:
 
     ``dims`` are its variables. ``new_factors`` and ``new_values`` wait for the next update.
     ``unsent`` are its measurements since its last message, which ended at state number
-    ``last_sent``. ``sent`` and ``measured`` count the bytes of its messages and of its measurements
-    as they are.
+    ``last_sent``, ``sightings`` those of other robots. ``waiting`` are received sightings of which
+    a state is not known yet. ``sent`` and ``measured`` count the bytes of its messages and of its
+    measurements as they are.
     """
 
     name: str
@@ -75,6 +85,10 @@ class LocalSmoother:
     new_factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     new_values: dict[int, Array] = field(default_factory=dict)
     unsent: list[Measurement] = field(default_factory=list)
+    sightings: list[Measurement] = field(default_factory=list)
+    waiting: list[gtsam.NonlinearFactor] = field(default_factory=list)
+    outbox: Outbox[Message] = field(default_factory=Outbox)
+    inboxes: defaultdict[str, Inbox[Message]] = field(default_factory=lambda: defaultdict(Inbox))
     last_sent: int = 0
     sent: int = 0
     measured: int = 0
@@ -87,6 +101,15 @@ class LocalSmoother:
             if key not in self.dims:
                 self.dims[key] = len(value)
                 self.new_values[key] = value
+
+    def receive(self, messages: Iterable[Message]) -> None:
+        """Add messages; sightings wait until both of their states are known."""
+        for message in messages:
+            self.add(message.factors, message.values)
+            self.waiting += message.sightings
+        ready = [f for f in self.waiting if all(key in self.dims for key in f.keys())]  # noqa: SIM118
+        self.waiting = [f for f in self.waiting if any(key not in self.dims for key in f.keys())]  # noqa: SIM118
+        self.add(ready, {})
 
     def update(self) -> None:
         """Update the tree."""
@@ -113,20 +136,23 @@ class LocalSmoother:
         These need no prior: the chain of states ties them to shared ones.
         """
         unsent, self.unsent = self.unsent, []
+        sightings, self.sightings = self.sightings, []
         estimate = self.isam.calculateBestEstimate()
         content: list[gtsam.NonlinearFactor] = []
+        size = sum(sighting.size for sighting in sightings)
         for section, inner in _sections(unsent, shared):
             as_measured = sum(measurement.size for measurement in section)
             if inner:
                 made, smaller = _condensed(section, inner, estimate, self.dims)
                 if smaller < as_measured:
                     content += made
-                    self.sent += smaller
+                    size += smaller
                     continue
             content += [factor for measurement in section for factor in measurement.factors]
-            self.sent += as_measured
+            size += as_measured
         keys = {key for factor in content for key in factor.keys()}  # noqa: SIM118
-        return Message(content, {key: factors.read(estimate, key, self.dims[key]) for key in keys})
+        values = {key: factors.read(estimate, key, self.dims[key]) for key in keys}
+        return Message(content, values, [f for one in sightings for f in one.factors], size)
 
 
 def _sections(
@@ -191,7 +217,8 @@ class DecentralisedBackend(GraphBackend):
         self._next_ns: int | None = None
         self._robots: list[LocalSmoother] = []
         self._queried: LocalSmoother | None = None  # the robot whose state was queried last
-        self._between_robots: list[FactorGroup] = []  # since the last exchange
+        self._network: Network[Message] = Network(config.network)
+        self._now_ns = 0
         self.messages = 0
 
     @property
@@ -207,12 +234,14 @@ class DecentralisedBackend(GraphBackend):
     def add(self, step: Step) -> None:
         """See `Backend`; an exchange comes before the first step after its time."""
         self._joints.clear()
+        self._now_ns = step.time_ns
         if self._next_ns is None:
             self._next_ns = step.time_ns + self._period_ns
         if step.time_ns >= self._next_ns:
             self.exchange()
             elapsed = (step.time_ns - self._next_ns) // self._period_ns
             self._next_ns += self._period_ns * (1 + elapsed)
+        self._receive()
         for group in self.builder.factor_groups(step, self.value):
             self._add(group)
         self._update()
@@ -230,7 +259,8 @@ class DecentralisedBackend(GraphBackend):
             if late:
                 self.builder.skipped[NOT_SENT] += 1
             else:
-                self._between_robots.append(group)
+                robot.sightings.append(Measurement(group.factors, size))
+                robot.waiting += group.factors
             return
         new = dict([group.new] if group.new else [])
         if group.observed and group.observed[1] not in {*robot.dims, *new}:
@@ -248,23 +278,41 @@ class DecentralisedBackend(GraphBackend):
     def exchange(self) -> None:
         """Every robot sends its measurements since its last message to all others."""
         self._joints.clear()
-        between, self._between_robots = self._between_robots, []
-        shared = {key for group in between for f in group.factors for key in f.keys()}  # noqa: SIM118
-        messages = []
+        shared = {key for robot in self._robots for one in robot.sightings for key in one.keys()}  # noqa: SIM118
         for n, robot in enumerate(self._robots):
             last = len(self.builder.states.times[robot.name]) - 1
             ends = {factors.state_key(n, number) for number in (robot.last_sent, last)}
-            messages.append(robot.message(shared | ends))
+            message = robot.message(shared | ends)
             robot.last_sent = last
             self.messages += 1
-        for robot in self._robots:
-            for message, sender in zip(messages, self._robots, strict=True):
-                if sender is not robot:
-                    robot.add(message.factors, message.values)
-            for group in between:
-                robot.add(group.factors, {})
-        for group in between:
-            self._robot_of(group.factors[0].keys()[0]).sent += _measured_bytes(group)
+            sent = robot.outbox.send(message, self._now_ns)
+            lacking = {name: inbox.lacking() for name, inbox in robot.inboxes.items()}
+            numbers = len(sent) + sum(map(len, lacking.values()))
+            robot.sent += sum(one.size for _, one in sent) + NUMBER_BYTES * numbers
+            others = (other.name for other in self._robots if other is not robot)
+            self._network.send(Packet(robot.name, self._now_ns, sent, lacking), others)
+        self._receive()
+        self._update()
+
+    def _receive(self) -> None:
+        """Let robots take in what has arrived."""
+        by_name = {robot.name: robot for robot in self._robots}
+        for name, packet in self._network.arrived(self._now_ns):
+            robot = by_name[name]
+            robot.outbox.ask(packet.lacking.get(name, ()), packet.sent_ns)
+            robot.receive(robot.inboxes[packet.sender].accept(packet.messages))
+
+    def _meet(self) -> None:
+        """Let every robot give the others what they lack."""
+        for sender in self._robots:
+            contents = sender.outbox.contents
+            lacked: set[int] = set()
+            for robot in self._robots:
+                if robot is not sender:
+                    inbox = robot.inboxes[sender.name]
+                    lacked |= set(range(inbox.following, len(contents))) - inbox.early.keys()
+                    robot.receive(inbox.accept(enumerate(contents)))
+            sender.sent += sum(contents[number].size + NUMBER_BYTES for number in lacked)
         self._update()
 
     def _update(self) -> None:
@@ -322,11 +370,12 @@ class DecentralisedBackend(GraphBackend):
         return self.builder.covariance(robot.isam, robot.graph, keys)
 
     def finish(self) -> Estimate:
-        """See `Backend`: after a last exchange each robot optimises its graph to convergence.
+        """See `Backend`: once all has been exchanged each robot optimises its graph to convergence.
 
         States are by their own robots, landmarks by the first robot, as is the error.
         """
         self.exchange()
+        self._meet()
         marginals: dict[int, tuple[Array, Array]] = {}
         half_error = 0.0
         for n, robot in enumerate(self._robots):

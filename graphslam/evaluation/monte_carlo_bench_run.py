@@ -9,6 +9,7 @@ from graphslam.core.geometry import Array, wrap
 from graphslam.core.records import Estimate
 from graphslam.estimation.backend import Backend
 from graphslam.estimation.backends import BACKENDS
+from graphslam.estimation.decentralised import exchanged_bytes
 from graphslam.evaluation.monte_carlo_bench import BenchRun
 from graphslam.evaluation.monte_carlo_consistency import (
     joint_errors,
@@ -24,7 +25,8 @@ def run_bench(run: BenchRun, config: Config) -> dict[str, Any]:
     all landmarks, at the final estimate. ``final`` and ``causal``: mean over the robots of squared
     errors at each step (K+1,), position m² and heading rad²; ``causal.nees`` of the robots' latest
     poses together, 3 degrees of freedom each. ``landmarks``: mean squares of the final map.
-    ``end``: final poses at the last step. ``error_frame``: the frame of the errors.
+    ``end``: final poses at the last step. ``error_frame``: the frame of the errors. ``exchanged``,
+    of robots that send messages: bytes per robot, ``sent`` and as ``measured``.
 
     Raises:
         EstimationError: the estimate is indeterminate.
@@ -50,7 +52,17 @@ def run_bench(run: BenchRun, config: Config) -> dict[str, Any]:
         "causal": causal,
         "landmarks": landmark_squares(estimate.landmarks, run.landmarks),
         "end": poses[:, -1].tolist(),
+        **_exchanged(backend),
     }
+
+
+def _exchanged(backend: Backend) -> dict[str, Any]:
+    """Bytes per robot, see `run_bench`; empty where nothing is sent."""
+    found = exchanged_bytes(backend)
+    if found is None:
+        return {}
+    sent, measured = (sum(one.values()) / len(one) for one in found)
+    return {"exchanged": {"sent": sent, "measured": measured}}
 
 
 def _append_squares(curves: dict[str, Any], errors: Array) -> None:

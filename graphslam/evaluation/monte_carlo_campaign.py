@@ -77,7 +77,8 @@ def run_job(definition: Definition, job: Job) -> Row:
         slip = definition.bench.slip
         told = slip is not None and job.variant in slip.told
         run = draw_run(definition.bench, job.scale, rng, told=told)
-        return run_bench(run, definition.config(job.variant))
+        # other messages are lost in every run
+        return run_bench(run, definition.config(job.variant, f"network.seed={job.run}"))
     config = definition.config(job.variant, f"front_end.name={job.front_end}")
     if definition.chapter is not None:
         with TemporaryDirectory(prefix="graphslam-") as folder:

@@ -28,6 +28,7 @@ EXPERIMENTS: dict[str, Path] = {
         "ekf-versus-smoothing",
         "filters",
         "slip",
+        "network",
         "thesis",
         "rooms",
         "consistency",

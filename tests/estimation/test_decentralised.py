@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from backend_cases import MOTION_COV, PLAIN, assert_covariance, motion, see, two_robots
 
+from graphslam.core.config import NetworkConfig
 from graphslam.core.config_io import load_config
 from graphslam.core.geometry import compose
 from graphslam.core.records import Association, Start, Step
 from graphslam.estimation.backends import BACKENDS
+from graphslam.estimation.message_link import Inbox, Network, Outbox, Packet
 from graphslam.estimation.replay import replay
 from graphslam.evaluation.compare_backends import compare
 from graphslam.evaluation.compare_variants import parse_variants
@@ -79,7 +81,8 @@ def test_without_noise_the_exchange_loses_and_adds_nothing(exchange_s):
     backend = run("decentralised", steps, exchange_s)
     found = all_of(backend.finish())
     # else nothing was condensed, and there is nothing to see here
-    assert sum(backend.sent.values()) < 0.9 * sum(backend.measured.values())
+    numbers = 8 * backend.messages
+    assert sum(backend.sent.values()) - numbers < 0.9 * sum(backend.measured.values())
     np.testing.assert_allclose(found[0], expected[0], atol=1e-6)
     np.testing.assert_allclose(found[1], expected[1], rtol=1e-4)
 
@@ -166,10 +169,11 @@ def test_bytes_of_a_tiny_example():
     prior, moved, sighting = 8 + 8 * 9, 16 + 8 * 9, 16 + 8 * 5
     assert backend.measured == {"a": prior + 10 * moved + 3 * sighting, "b": prior + moved}
     ends_and_point = 8 * 8 + 3 * 8 + 8 * (8 * 9 // 2 + 8)
-    # what nothing is eliminated from goes as it is: the prior, the last look at point and robot
+    # what nothing is eliminated from goes as it is: the prior, the last look at point and robot;
+    # and the number of the message
     assert backend.sent == {
-        "a": prior + ends_and_point + 2 * sighting,
-        "b": prior + moved,
+        "a": 8 + prior + ends_and_point + 2 * sighting,
+        "b": 8 + prior + moved,
     }
 
 
@@ -198,6 +202,158 @@ def test_a_meeting_helps_the_one_that_was_seen():
     np.testing.assert_allclose(before, lost.cov, rtol=1e-6)
     backend.add(Step(2 * S, {}, {"b": motion(0, 2 * S, [0.0, 0.0, 0.0], MOTION_COV)}))
     assert np.trace(backend.joint("b", []).cov[:2, :2]) < 0.1 * np.trace(before[:2, :2])
+
+
+# ------------------------------------------------------------ messages lost and late
+
+
+def lossy(loss=0.0, delay_s=0.0, exchange_s=3.0, seed=0):
+    return replace(config(exchange_s), network=NetworkConfig(loss, delay_s, seed))
+
+
+@pytest.mark.parametrize(("loss", "delay_s"), [(0.0, 7.0), (0.4, 0.0), (0.4, 7.0)])
+def test_when_all_have_met_it_does_not_matter_what_was_lost_or_late(loss, delay_s):
+    """Without noise messages are exact, so means and covariances are those of one graph: nothing
+    lost is missing, nothing repeated is counted twice, and sightings of others that came before the
+    state in which the other was have been kept."""
+    steps = wandering(states=26)
+    expected = all_of(run("batch", steps).finish())
+    backend = BACKENDS["decentralised"](lossy(loss, delay_s, 3.0, 5))
+    for step in steps:
+        backend.add(step)
+    found = all_of(backend.finish())
+    np.testing.assert_allclose(found[0], expected[0], atol=1e-6)
+    np.testing.assert_allclose(found[1], expected[1], rtol=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_with_messages_lost_and_late_nobody_claims_to_know_more_than_all_together(seed):
+    """At any time, as above; a repeated message that came after all must not count twice."""
+    steps = wandering(0.2, seed, states=26)
+    central = BACKENDS["batch"](config(3.0))
+    own = BACKENDS["decentralised"](lossy(0.4, 5.0, 2.0, seed))
+    for step in steps:
+        central.add(step)
+        own.add(step)
+        for robot in "ab":
+            all_, mine = (backend.joint(robot, []).cov for backend in (central, own))
+            assert_covariance(mine)
+            sigma = np.sqrt(np.diag(all_))
+            assert np.linalg.eigvalsh((mine - all_) / np.outer(sigma, sigma)).min() > -0.02
+
+
+def led(states):
+    """Robot `a` sees a point from all states, and `b` from every second; b itself sees nothing."""
+    start = {"a": np.zeros(3), "b": np.array([3.0, 1.0, 0.0])}
+    where, point = dict(start), np.array([4.0, 2.0])
+    steps = [Step(0, {r: Start(x, 1e-4 * np.eye(3)) for r, x in start.items()})]
+    for k in range(1, states):
+        motions = {}
+        for robot in where:
+            where[robot] = compose(where[robot], np.array([0.1, 0.0, 0.05]))
+            motions[robot] = motion((k - 1) * S, k * S, [0.1, 0.0, 0.05], MOTION_COV)
+        seen = [see("a", k * S, 0, "point", where["a"], point)]
+        if k % 2 == 0:
+            seen.append(see("a", k * S, "b", "robot-pose", where["a"], where["b"]))
+        steps.append(Step(k * S, {}, motions, tuple(seen)))
+    return steps
+
+
+def uncertainty(loss=0.0, delay_s=0.0, exchange_s=4.0):
+    """Area of b's position's covariance by its own estimator at each of 40 states, m⁴."""
+    backend, areas = BACKENDS["decentralised"](lossy(loss, delay_s, exchange_s, 1)), []
+    for step in led(40):
+        backend.add(step)
+        areas.append(np.linalg.det(backend.joint("b", []).cov[:2, :2]))
+    return np.array(areas), backend
+
+
+def test_lost_messages_are_repeated_while_robots_are_under_way():
+    """A third of the messages are lost. b is less sure of where it is than with all of them, and yet
+    much surer than alone, as most of them are used by the end: without repetition the first one
+    that is lost, here before the sixth, would stop all that come after it."""
+    all_, none = uncertainty(exchange_s=1.0)[0], uncertainty(exchange_s=1e9)[0]
+    some, backend = uncertainty(loss=0.33, exchange_s=1.0)
+    a, b = backend._robots
+    assert min(a.outbox.repeated) < 6
+    assert b.inboxes["a"].following > 0.8 * len(a.outbox.contents)
+    assert np.all(some >= all_ * (1 - 1e-6))
+    assert 1.2 * all_.mean() < some.mean() < 0.3 * none.mean()
+
+
+def test_late_messages_are_taken_in_when_they_come():
+    """Up to 6 s late: the areas are between those with messages in time and those without any."""
+    in_time, late, none = (
+        uncertainty(delay_s=delay_s, exchange_s=exchange_s)[0][8:]
+        for delay_s, exchange_s in ((0.0, 4.0), (6.0, 4.0), (0.0, 1e9))
+    )
+    assert np.all(in_time <= late * (1 + 1e-6))
+    assert np.all(late <= none * (1 + 1e-6))
+    assert 1.2 * in_time.mean() < late.mean() < 0.8 * none.mean()
+    # messages are sent at multiples of 10 s, and come at other times
+    falls = np.flatnonzero(np.diff(uncertainty(delay_s=6.0, exchange_s=10.0)[0]) < 0) + 1
+    assert len(falls) and np.any(falls % 10 != 0)
+
+
+def test_what_the_robots_tell_each_other_when_they_meet_is_paid_for():
+    """All is lost on the way, so all is sent again at the end."""
+    sent = []
+    for loss in (0.0, 1.0):
+        backend = BACKENDS["decentralised"](lossy(loss))
+        for step in wandering():
+            backend.add(step)
+        backend.finish()
+        sent.append(backend.sent)
+    assert sent[1] == {robot: 2 * size for robot, size in sent[0].items()}
+
+
+def test_messages_of_a_link_come_in_order_and_once():
+    inbox = Inbox()
+    assert inbox.accept([(1, "b")]) == []
+    assert inbox.lacking() == {0}
+    assert inbox.accept([(3, "d"), (1, "again")]) == []
+    assert inbox.lacking() == {0, 2}
+    assert inbox.accept([(0, "a")]) == ["a", "b"]
+    assert inbox.accept([(0, "a"), (1, "b")]) == []
+    assert inbox.lacking() == {2}
+    assert inbox.accept([(2, "c")]) == ["c", "d"]
+    assert inbox.lacking() == set()
+
+
+def test_a_message_is_repeated_once_for_every_time_it_was_missed():
+    """Two receivers ask for the same one: one repetition. Who asks before that has been sent may
+    have it by now, so it is not sent again; who asks after it is."""
+    outbox = Outbox()
+    assert outbox.send("a", 0) == [(0, "a")]
+    assert outbox.send("b", 10) == [(1, "b")]
+    outbox.ask({0}, 12)
+    outbox.ask({0}, 13)
+    assert outbox.send("c", 20) == [(0, "a"), (2, "c")]
+    outbox.ask({0}, 15)
+    assert outbox.send("d", 30) == [(3, "d")]
+    outbox.ask({0}, 25)
+    assert outbox.send("e", 40) == [(0, "a"), (4, "e")]
+
+
+def test_the_network_loses_and_delays_as_it_is_told():
+    """Each receiver by itself: 4000 packets to two, a quarter lost within four sigmas of 0.7 %,
+    delays uniform up to 2 s."""
+    network, delays, got = Network(NetworkConfig(0.25, 2.0)), [], []
+    for k in range(4000):
+        network.send(Packet("a", k * 10 * S, [(k, None)], {}), ["b", "c"])
+        for now in range(k * 10 * S, (k * 10 + 3) * S, S // 100):
+            here = [(name, packet.messages[0][0]) for name, packet in network.arrived(now)]
+            got += here
+            delays += [now - k * 10 * S for _ in here]
+            if len(here) == 2:
+                break
+    assert len(got) == len(set(got))
+    for name in "bc":
+        assert sum(who == name for who, _ in got) / 4000 == pytest.approx(0.75, abs=0.028)
+    both = len({k for who, k in got if who == "b"} & {k for who, k in got if who == "c"})
+    assert both / 4000 == pytest.approx(0.75**2, abs=0.032)
+    assert np.mean(delays) / S == pytest.approx(1.0, abs=0.05)
+    assert max(delays) <= 2.01 * S
 
 
 def test_it_is_a_row_of_a_comparison(tmp_path):
