@@ -203,11 +203,15 @@ class NetworkConfig:
 
     loss_ratio: share of messages that a robot does not receive; each receiver by itself. delay_s:
     messages come late by up to this, uniformly distributed. seed: of the random numbers.
+    landmarks: whether all robots have the same names for landmarks (`common`), as on barcodes, or
+    each its `own`, so that who receives a message finds out which are the same by the gates of
+    [association].
     """
 
     loss_ratio: float = 0.0
     delay_s: float = 0.0
     seed: int = 0
+    landmarks: Literal["common", "own"] = "common"
 
 
 @dataclass(frozen=True)

@@ -16,13 +16,13 @@ linearisation point and robust weights, and between messages the others are unkn
 
 The network may lose messages or deliver them late, see `message_link`. At the end the robots meet:
 each gives the others what they still lack. It is assumed that a robot that is seen by another one
-learns so at once, since the state at which that was must not be eliminated, and that landmark
-identities are shared.
+learns so at once, since the state at which that was must not be eliminated. Landmarks have common
+names, or each robot has its own (`network.landmarks`): then what it receives is compared with what
+it has, see `landmark_ties`. Which of its own observations are of one landmark is as recorded.
 """
 
-from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Iterable, Sequence
 
 import gtsam
 import numpy as np
@@ -34,202 +34,50 @@ from graphslam.core.records import Estimate, Step
 from graphslam.estimation import factors
 from graphslam.estimation.factor_graph import FactorGroup, GraphBackend, GraphBuilder
 from graphslam.estimation.isam2 import isam2_parameters, isam2_tree
-from graphslam.estimation.message_link import Inbox, Network, Outbox, Packet
+from graphslam.estimation.landmark_ties import tied
+from graphslam.estimation.local_smoother import (
+    KEY_BYTES,
+    NUMBER_BYTES,
+    LocalSmoother,
+    Measurement,
+    Message,
+    number_in,
+    owner_of,
+    prefix_of,
+)
+from graphslam.estimation.message_link import Network, Packet
 from graphslam.estimation.optimisation import optimise
 
-#: bytes of a number, and of a variable's key
-NUMBER_BYTES, KEY_BYTES = 8, 8
 NOT_SENT = "evidence about a state before the last message: kept locally, not sent"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Measurement:
-    """Factors of one measurement, and its bytes if sent as it is."""
-
-    factors: tuple[gtsam.NonlinearFactor, ...]
-    size: int
-
-    def keys(self) -> set[int]:
-        """Its variables."""
-        return {key for factor in self.factors for key in factor.keys()}  # noqa: SIM118
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Message:
-    """What a robot sends to the others: factors, and values of their variables.
-
-    ``sightings`` are factors between its states and those of others, ``size`` all of it in bytes.
-    """
-
-    factors: Sequence[gtsam.NonlinearFactor]
-    values: Mapping[int, Array]
-    sightings: Sequence[gtsam.NonlinearFactor]
-    size: int
-
-
-@dataclass(slots=True, eq=False)
-class LocalSmoother:
-    """One robot's own estimator, of its measurements and the messages it received.
-
-    ``dims`` are its variables. ``new_factors`` and ``new_values`` wait for the next update.
-    ``unsent`` are its measurements since its last message, which ended at state number
-    ``last_sent``, ``sightings`` those of other robots. ``waiting`` are received sightings of which
-    a state is not known yet. ``sent`` and ``measured`` count the bytes of its messages and of its
-    measurements as they are.
-    """
-
-    name: str
-    isam: gtsam.ISAM2
-    graph: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
-    dims: dict[int, int] = field(default_factory=dict)
-    new_factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
-    new_values: dict[int, Array] = field(default_factory=dict)
-    unsent: list[Measurement] = field(default_factory=list)
-    sightings: list[Measurement] = field(default_factory=list)
-    waiting: list[gtsam.NonlinearFactor] = field(default_factory=list)
-    outbox: Outbox[Message] = field(default_factory=Outbox)
-    inboxes: defaultdict[str, Inbox[Message]] = field(default_factory=lambda: defaultdict(Inbox))
-    last_sent: int = 0
-    sent: int = 0
-    measured: int = 0
-
-    def add(self, made: Iterable[gtsam.NonlinearFactor], values: Mapping[int, Array]) -> None:
-        """Add factors for the next update, with initial values for variables that are missing."""
-        for factor in made:
-            self.new_factors.add(factor)
-        for key, value in values.items():
-            if key not in self.dims:
-                self.dims[key] = len(value)
-                self.new_values[key] = value
-
-    def receive(self, messages: Iterable[Message]) -> None:
-        """Add messages; sightings wait until both of their states are known."""
-        for message in messages:
-            self.add(message.factors, message.values)
-            self.waiting += message.sightings
-        ready = [f for f in self.waiting if all(key in self.dims for key in f.keys())]  # noqa: SIM118
-        self.waiting = [f for f in self.waiting if any(key not in self.dims for key in f.keys())]  # noqa: SIM118
-        self.add(ready, {})
-
-    def update(self) -> None:
-        """Update the tree."""
-        if not self.new_factors.size():
-            return
-        values = gtsam.Values()
-        for key, value in self.new_values.items():
-            factors.write(values, key, value)
-        self.graph.push_back(self.new_factors)
-        self.isam.update(self.new_factors, values)
-        self.new_factors, self.new_values = gtsam.NonlinearFactorGraph(), {}
-
-    def value(self, key: int) -> Array:
-        """Current estimate (2,) or (3,) of one of its variables."""
-        if key in self.new_values:
-            return self.new_values[key]
-        if self.dims[key] == 3:
-            return factors.array3(self.isam.calculateEstimatePose2(key))
-        return np.asarray(self.isam.calculateEstimatePoint2(key))
-
-    def message(self, shared: set[int]) -> Message:
-        """Its own measurements since the last message, states that are not ``shared`` eliminated.
-
-        These need no prior: the chain of states ties them to shared ones.
-        """
-        unsent, self.unsent = self.unsent, []
-        sightings, self.sightings = self.sightings, []
-        estimate = self.isam.calculateBestEstimate()
-        content: list[gtsam.NonlinearFactor] = []
-        size = sum(sighting.size for sighting in sightings)
-        for section, inner in _sections(unsent, shared):
-            as_measured = sum(measurement.size for measurement in section)
-            if inner:
-                made, smaller = _condensed(section, inner, estimate, self.dims)
-                if smaller < as_measured:
-                    content += made
-                    size += smaller
-                    continue
-            content += [factor for measurement in section for factor in measurement.factors]
-            size += as_measured
-        keys = {key for factor in content for key in factor.keys()}  # noqa: SIM118
-        values = {key: factors.read(estimate, key, self.dims[key]) for key in keys}
-        return Message(content, values, [f for one in sightings for f in one.factors], size)
-
-
-def _sections(
-    unsent: Sequence[Measurement], shared: set[int]
-) -> Iterator[tuple[list[Measurement], list[int]]]:
-    """Measurements connected by states that are not ``shared``, and those states.
-
-    Measurements without any such state form one section.
-    """
-    inner = [[k for k in m.keys() if factors.is_state(k) and k not in shared] for m in unsent]  # noqa: SIM118
-    from scipy.cluster.hierarchy import DisjointSet  # noqa: PLC0415 (slow to import)
-
-    connected = DisjointSet({key for keys in inner for key in keys})
-    for keys in inner:
-        for key in keys[1:]:
-            connected.merge(keys[0], key)
-    sections: dict[int | None, list[Measurement]] = defaultdict(list)
-    states: dict[int | None, set[int]] = defaultdict(set)
-    for measurement, keys in zip(unsent, inner, strict=True):
-        label = connected[keys[0]] if keys else None
-        sections[label].append(measurement)
-        states[label].update(keys)
-    for label, section in sections.items():
-        yield section, sorted(states[label])
-
-
-def _condensed(
-    section: Sequence[Measurement],
-    inner: Sequence[int],
-    estimate: gtsam.Values,
-    dims: Mapping[int, int],
-) -> tuple[list[gtsam.NonlinearFactor], int]:
-    """Factors that remain of measurements when states are eliminated, and their bytes.
-
-    Per factor the keys of its variables, information (upper triangle) and vector; once per variable
-    its linearisation point.
-    """
-    graph = gtsam.NonlinearFactorGraph()
-    for measurement in section:
-        for factor in measurement.factors:
-            graph.add(factor)
-    order = gtsam.Ordering(list(inner))
-    rest = graph.linearize(estimate).eliminatePartialSequential(order, gtsam.EliminateQR)[1]
-    made = gtsam.LinearContainerFactor.ConvertLinearGraph(rest, estimate)
-    condensed = [made.at(n) for n in range(made.size())]
-    unique = {key for factor in condensed for key in factor.keys()}  # noqa: SIM118
-    size = sum(NUMBER_BYTES * dims[key] for key in unique)
-    for factor in condensed:
-        keys = factor.keys()
-        dim = sum(dims[key] for key in keys)
-        size += KEY_BYTES * len(keys) + NUMBER_BYTES * (dim * (dim + 1) // 2 + dim)
-    return condensed, size
-
-
 class DecentralisedBackend(GraphBackend):
-    """See the module's docstring; queries about a robot are answered by its own estimator."""
+    """See the module's docstring; queries about a robot are answered by its own estimator.
+
+    ``own_names``: whether robots have landmarks' names of their own.
+    """
 
     def __init__(self, config: Config) -> None:
         super().__init__(GraphBuilder(config.robust))
         self._config = config
         self._period_ns = round(1e9 * config.backend.exchange_s)
         self._next_ns: int | None = None
-        self._robots: list[LocalSmoother] = []
+        self.robots: list[LocalSmoother] = []
         self._queried: LocalSmoother | None = None  # the robot whose state was queried last
         self._network: Network[Message] = Network(config.network)
+        self.own_names = config.network.landmarks == "own"
         self._now_ns = 0
         self.messages = 0
 
     @property
     def sent(self) -> dict[str, int]:
         """Robot -> bytes of its messages, each counted once, whatever the number of receivers."""
-        return {robot.name: robot.sent for robot in self._robots}
+        return {robot.name: robot.sent for robot in self.robots}
 
     @property
     def measured(self) -> dict[str, int]:
         """Robot -> bytes of its measurements as they are: what a centralised estimate needs."""
-        return {robot.name: robot.measured for robot in self._robots}
+        return {robot.name: robot.measured for robot in self.robots}
 
     def add(self, step: Step) -> None:
         """See `Backend`; an exchange comes before the first step after its time."""
@@ -262,24 +110,28 @@ class DecentralisedBackend(GraphBackend):
                 robot.sightings.append(Measurement(group.factors, size))
                 robot.waiting += group.factors
             return
-        new = dict([group.new] if group.new else [])
+        new, made = dict([group.new] if group.new else []), group.factors
         if group.observed and group.observed[1] not in {*robot.dims, *new}:
             # a landmark of other robots, of which this one has no message yet
             _, target, seen = group.observed
             new[target] = MODELS[seen.model].invert(seen.z, self.value(key, 3))
             if seen.model == "line":  # until then its gauge must be fixed here
-                robot.add([factors.line_gauge_factor(key, target, seen)], {})
-        robot.add(group.factors, new)
+                gauge = factors.line_gauge_factor(key, target, seen)
+                if self.own_names:
+                    made = (gauge, *made)
+                else:
+                    robot.add([gauge], {})
+        robot.add(made, new)
         if late:
             self.builder.skipped[NOT_SENT] += 1
         else:
-            robot.unsent.append(Measurement(group.factors, size))
+            robot.unsent.append(Measurement(made, size))
 
     def exchange(self) -> None:
         """Every robot sends its measurements since its last message to all others."""
         self._joints.clear()
-        shared = {key for robot in self._robots for one in robot.sightings for key in one.keys()}  # noqa: SIM118
-        for n, robot in enumerate(self._robots):
+        shared = {key for robot in self.robots for one in robot.sightings for key in one.keys()}  # noqa: SIM118
+        for n, robot in enumerate(self.robots):
             last = len(self.builder.states.times[robot.name]) - 1
             ends = {factors.state_key(n, number) for number in (robot.last_sent, last)}
             message = robot.message(shared | ends)
@@ -289,34 +141,43 @@ class DecentralisedBackend(GraphBackend):
             lacking = {name: inbox.lacking() for name, inbox in robot.inboxes.items()}
             numbers = len(sent) + sum(map(len, lacking.values()))
             robot.sent += sum(one.size for _, one in sent) + NUMBER_BYTES * numbers
-            others = (other.name for other in self._robots if other is not robot)
+            others = (other.name for other in self.robots if other is not robot)
             self._network.send(Packet(robot.name, self._now_ns, sent, lacking), others)
         self._receive()
         self._update()
 
     def _receive(self) -> None:
         """Let robots take in what has arrived."""
-        by_name = {robot.name: robot for robot in self._robots}
+        by_name = {robot.name: robot for robot in self.robots}
         for name, packet in self._network.arrived(self._now_ns):
             robot = by_name[name]
             robot.outbox.ask(packet.lacking.get(name, ()), packet.sent_ns)
-            robot.receive(robot.inboxes[packet.sender].accept(packet.messages))
+            self._take(robot, by_name[packet.sender], packet.messages)
+
+    def _take(
+        self, robot: LocalSmoother, sender: LocalSmoother, messages: Iterable[tuple[int, Message]]
+    ) -> None:
+        """Let a robot use the messages of another one that are next."""
+        accepted = robot.inboxes[sender.name].accept(messages)
+        robot.receive(accepted)
+        if self.own_names and accepted:
+            robot.tie_landmarks(self._config.association)
 
     def _meet(self) -> None:
         """Let every robot give the others what they lack."""
-        for sender in self._robots:
+        for sender in self.robots:
             contents = sender.outbox.contents
             lacked: set[int] = set()
-            for robot in self._robots:
+            for robot in self.robots:
                 if robot is not sender:
                     inbox = robot.inboxes[sender.name]
                     lacked |= set(range(inbox.following, len(contents))) - inbox.early.keys()
-                    robot.receive(inbox.accept(enumerate(contents)))
+                    self._take(robot, sender, enumerate(contents))
             sender.sent += sum(contents[number].size + NUMBER_BYTES for number in lacked)
         self._update()
 
     def _update(self) -> None:
-        for robot in self._robots:
+        for robot in self.robots:
             try:
                 robot.update()
             except RuntimeError as error:
@@ -326,11 +187,12 @@ class DecentralisedBackend(GraphBackend):
         """The robot whose state ``key`` is."""
         index, _ = factors.number_of(key)
         assert index is not None  # a landmark belongs to no robot
-        while len(self._robots) <= index:
-            name = self.builder.robots[len(self._robots)]
+        while len(self.robots) <= index:
+            name = self.builder.robots[len(self.robots)]
             tree = gtsam.ISAM2(isam2_parameters(self._config, "QR"))
-            self._robots.append(LocalSmoother(name, tree))
-        return self._robots[index]
+            prefix = prefix_of(len(self.robots)) if self.own_names else 0
+            self.robots.append(LocalSmoother(name, tree, prefix=prefix))
+        return self.robots[index]
 
     def value(self, key: int, dim: int) -> Array:
         """See `GraphBackend`: of a state by its robot, of a landmark by `_robot_with` it."""
@@ -342,7 +204,7 @@ class DecentralisedBackend(GraphBackend):
     def _robot_with(self, key: int) -> LocalSmoother:
         """The robot queried last if it has the variable, else the first one that has."""
         first = [self._queried] if self._queried is not None else []
-        return next(robot for robot in (*first, *self._robots) if key in robot.dims)
+        return next(robot for robot in (*first, *self.robots) if key in robot.dims)
 
     def landmark_means(self, landmarks: Sequence[int]) -> list[Array]:
         """See `Backend`: each by the first robot that has it."""
@@ -378,7 +240,7 @@ class DecentralisedBackend(GraphBackend):
         self._meet()
         marginals: dict[int, tuple[Array, Array]] = {}
         half_error = 0.0
-        for n, robot in enumerate(self._robots):
+        for n, robot in enumerate(self.robots):
             try:
                 start = robot.isam.calculateBestEstimate()
                 values = optimise(robot.graph, start, self._config.robust)
@@ -387,6 +249,8 @@ class DecentralisedBackend(GraphBackend):
                 raise self.builder.explain(error) from error
             for key, dim in robot.dims.items():
                 index, _ = factors.number_of(key)
+                if index is None and owner_of(key):
+                    continue  # a name that another robot gave
                 if index == n or (index is None and key not in marginals):
                     marginals[key] = factors.read(values, key, dim), self._marginal(robot, [key])
             half_error = half_error if n else float(robot.graph.error(values))
@@ -405,3 +269,22 @@ def exchanged_bytes(backend: object) -> tuple[dict[str, int], dict[str, int]] | 
     if isinstance(backend, DecentralisedBackend):
         return backend.sent, backend.measured
     return None
+
+
+def landmark_ties(backend: object) -> dict[str, int] | None:
+    """How robots with names of their own have associated landmarks; None for other back ends.
+
+    All robots together, judged by the recorded numbers: pairs that are ``right`` and ``wrong``, and
+    those ``missed``: landmarks that a robot knows by two names and has not tied.
+    """
+    if not isinstance(backend, DecentralisedBackend) or not backend.own_names:
+        return None
+    found = Counter(right=0, wrong=0, missed=0)
+    for robot in backend.robots:
+        keys = [key for key in robot.dims if not factors.is_state(key)]
+        for pair in robot.ties:
+            a, b = (number_in(key) for key in pair)
+            found["right" if a == b else "wrong"] += 1
+        groups = tied({key: owner_of(key) for key in keys}, robot.ties)
+        found["missed"] += len(groups) - len({number_in(key) for key in groups})
+    return dict(found)

@@ -1,9 +1,9 @@
 """Messages between robots over a network that loses some and delivers others late.
 
 A robot's messages have numbers. Each begins at the state at which the one before ends, so they are
-used in this order, each once: what comes too early waits, what comes twice is ignored. A number that
-is missing before one that came has been lost, or is late; with its next message the receiver says
-which it lacks, and the sender repeats those as they were. One sum of several messages would be
+used in this order, each once: what comes too early waits, what comes twice is ignored. A number
+that is missing before one that came has been lost, or is late; with its next message the receiver
+says which it lacks, and the sender repeats those as they were. One sum of several messages would be
 smaller, but who has received a part of it after all could not take the rest from it.
 """
 
@@ -34,7 +34,7 @@ class Packet(Generic[Content]):
 
 @dataclass(slots=True, eq=False)
 class Inbox(Generic[Content]):
-    """Messages of one sender: ``following`` is the number to be used next, ``early`` those that wait."""
+    """Messages of one sender: ``following`` is the number used next, ``early`` are waiting."""
 
     following: int = 0
     early: dict[int, Content] = field(default_factory=dict)
@@ -57,7 +57,7 @@ class Inbox(Generic[Content]):
 
 @dataclass(slots=True, eq=False)
 class Outbox(Generic[Content]):
-    """All messages of a robot: ``contents`` by number; ``asked`` for, and ``repeated``, when, ns."""
+    """All messages of a robot, ``contents``; when they were ``asked`` for and ``repeated``, ns."""
 
     contents: list[Content] = field(default_factory=list)
     asked: dict[int, int] = field(default_factory=dict)

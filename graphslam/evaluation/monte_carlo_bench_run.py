@@ -9,7 +9,7 @@ from graphslam.core.geometry import Array, wrap
 from graphslam.core.records import Estimate
 from graphslam.estimation.backend import Backend
 from graphslam.estimation.backends import BACKENDS
-from graphslam.estimation.decentralised import exchanged_bytes
+from graphslam.estimation.decentralised import exchanged_bytes, landmark_ties
 from graphslam.evaluation.monte_carlo_bench import BenchRun
 from graphslam.evaluation.monte_carlo_consistency import (
     joint_errors,
@@ -26,7 +26,8 @@ def run_bench(run: BenchRun, config: Config) -> dict[str, Any]:
     errors at each step (K+1,), position m² and heading rad²; ``causal.nees`` of the robots' latest
     poses together, 3 degrees of freedom each. ``landmarks``: mean squares of the final map.
     ``end``: final poses at the last step. ``error_frame``: the frame of the errors. ``exchanged``,
-    of robots that send messages: bytes per robot, ``sent`` and as ``measured``.
+    of robots that send messages: bytes per robot, ``sent`` and as ``measured``; ``ties``: how they
+    associated landmarks, if each has names of its own.
 
     Raises:
         EstimationError: the estimate is indeterminate.
@@ -57,12 +58,13 @@ def run_bench(run: BenchRun, config: Config) -> dict[str, Any]:
 
 
 def _exchanged(backend: Backend) -> dict[str, Any]:
-    """Bytes per robot, see `run_bench`; empty where nothing is sent."""
-    found = exchanged_bytes(backend)
+    """Bytes per robot and ties of landmarks, see `run_bench`; empty where nothing is sent."""
+    found, ties = exchanged_bytes(backend), landmark_ties(backend)
     if found is None:
         return {}
     sent, measured = (sum(one.values()) / len(one) for one in found)
-    return {"exchanged": {"sent": sent, "measured": measured}}
+    exchanged = {"exchanged": {"sent": sent, "measured": measured}}
+    return exchanged if ties is None else {**exchanged, "ties": ties}
 
 
 def _append_squares(curves: dict[str, Any], errors: Array) -> None:

@@ -125,12 +125,13 @@ def _bench_row(rows: Sequence[Row], bound: Bound, scales: int) -> dict[str, Any]
     limit = DIVERGED_RATIO**2 * float(bound.final.position_m2.mean())
     lost = ~(nees <= chi2.isf(DIVERGED_TAIL, dof)) | ~(position <= limit)
     verdict = None if mean is None else _verdict(mean, low, high)
-    exchanged = {
-        name: float(_array(rows, _at("exchanged", name)).mean())
-        for name in rows[0].get("exchanged", ())
+    messages = {
+        kind: {name: float(_array(rows, _at(kind, name)).mean()) for name in rows[0][kind]}
+        for kind in ("exchanged", "ties")
+        if kind in rows[0]
     }
     return {
-        **({"exchanged_bytes": exchanged} if exchanged else {}),
+        **messages,
         "error_frame": rows[0]["error_frame"],
         "dof": dof,
         "nees_per_dof": mean,

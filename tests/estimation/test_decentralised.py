@@ -249,8 +249,8 @@ def led(states):
     steps = [Step(0, {r: Start(x, 1e-4 * np.eye(3)) for r, x in start.items()})]
     for k in range(1, states):
         motions = {}
-        for robot in where:
-            where[robot] = compose(where[robot], np.array([0.1, 0.0, 0.05]))
+        for robot, x in list(where.items()):
+            where[robot] = compose(x, np.array([0.1, 0.0, 0.05]))
             motions[robot] = motion((k - 1) * S, k * S, [0.1, 0.0, 0.05], MOTION_COV)
         seen = [see("a", k * S, 0, "point", where["a"], point)]
         if k % 2 == 0:
@@ -269,12 +269,12 @@ def uncertainty(loss=0.0, delay_s=0.0, exchange_s=4.0):
 
 
 def test_lost_messages_are_repeated_while_robots_are_under_way():
-    """A third of the messages are lost. b is less sure of where it is than with all of them, and yet
+    """A third of the messages are lost. b is less sure of where it is than with all of them, yet
     much surer than alone, as most of them are used by the end: without repetition the first one
     that is lost, here before the sixth, would stop all that come after it."""
     all_, none = uncertainty(exchange_s=1.0)[0], uncertainty(exchange_s=1e9)[0]
     some, backend = uncertainty(loss=0.33, exchange_s=1.0)
-    a, b = backend._robots
+    a, b = backend.robots
     assert min(a.outbox.repeated) < 6
     assert b.inboxes["a"].following > 0.8 * len(a.outbox.contents)
     assert np.all(some >= all_ * (1 - 1e-6))
