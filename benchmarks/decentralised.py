@@ -1,7 +1,7 @@
 """What a graph per robot with condensed messages costs, compared with one graph of all robots.
 
 The same recorded steps are replayed into both by `graphslam compare`, for several intervals between
-messages:
+messages, with messages that are lost and late, and with names of landmarks of each robot's own:
 MRCLAM set 6, from the true start poses, and the thesis' two robots with lasers (simulated). Errors
 are root mean squares over all robots, from the centralised estimate ("loss") and from the truth, m;
 kB are what each robot sends on average, and what it measured; s is the time of the replay.
@@ -19,6 +19,13 @@ LOGS = {
     "two-robots": ["simulate", "two-robots", "--seed", "0"],
 }
 PERIODS_S = ("10", "30", "120")
+#: with messages every 10 s
+NETWORKS = (
+    "network.loss_ratio=0.3",
+    "network.delay_s=60",
+    "network.loss_ratio=0.3+network.delay_s=60",
+    "network.landmarks=own",
+)
 
 
 def show(row: dict) -> None:
@@ -49,6 +56,8 @@ def main() -> None:
     names = [name for name in given if name in LOGS] or list(LOGS)
     periods_s = [name for name in given if name not in LOGS] or list(PERIODS_S)
     specs = ["batch", *(f"decentralised+backend.exchange_s={t}" for t in periods_s)]
+    if len(periods_s) == len(PERIODS_S):
+        specs += [f"decentralised+backend.exchange_s=10+{network}" for network in NETWORKS]
     with tempfile.TemporaryDirectory() as scratch:
         for name in names:
             log = Path(scratch) / f"{name}.mcap"

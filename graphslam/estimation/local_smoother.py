@@ -148,11 +148,11 @@ class LocalSmoother:
 
         These need no prior: the chain of states ties them to shared ones.
         """
+        used = {key for one in self.unsent for key in one.keys()}  # noqa: SIM118
         unsent, self.unsent = [self._named(one) for one in self.unsent], []
         sightings, self.sightings = self.sightings, []
         now = self.isam.calculateBestEstimate()
-        points = {key: factors.read(now, key, dim) for key, dim in self.dims.items()}
-        points = {self._name(key): point for key, point in points.items() if not owner_of(key)}
+        points = {self._name(key): factors.read(now, key, self.dims[key]) for key in used}
         estimate = gtsam.Values()
         for key, point in points.items():
             factors.write(estimate, key, point)

@@ -74,11 +74,13 @@ def test_points_are_no_walls_and_walls_are_compared_across():
 
 
 def test_a_walls_direction_makes_its_place_far_along_uncertain():
-    """0.4 m off at 4 m along, where a direction of 0.1 rad leaves 0.4 m; not at 0.2 m along."""
-    wall = np.array([0.0, 0.0, 0.0])
-    cov = np.diag(np.square([1.0, 0.05, 0.1, 1.0, 0.05, 0.1]))
+    """0.4 m off at 4 m along, where a direction of 0.1 rad leaves 0.4 m; not at 0.2 m along. The
+    wall is not along the world's axes, and nothing is known along it."""
+    wall = np.array([1.0, 2.0, 0.8])
+    cov = np.diag(np.square([5.0, 0.05, 0.1, 5.0, 0.05, 0.1]))
     for along, same in ((4.0, True), (0.2, False)):
-        found = named((A, wall, 1.0), (B, (along, 0.4, 0.0), 1.0), cov=cov)
+        other = compose(wall, np.array([along, 0.4, 0.0]))
+        found = named((A, wall, 1.0), (B, other, 1.0), cov=cov)
         assert (surest_tie(found, SETTINGS) is not None) == same
 
 
@@ -139,7 +141,8 @@ def test_robots_that_find_out_for_themselves_end_where_common_names_do(loss):
 
 
 def test_walls_are_tied_too():
-    """Points, lines and segments: each robot ties what both have seen, and ends near the truth."""
+    """Points, lines and segments: each robot ties what both have seen, and ends near the truth. The
+    place of every origin along its line is fixed by who saw it first, in its messages too."""
     steps, where = two_robots(np.random.default_rng(4))
     backend, estimate = smoothed(steps, own_names(2e-9))
     assert landmark_ties(backend) == {"right": 6, "wrong": 0, "missed": 0}
@@ -147,6 +150,11 @@ def test_walls_are_tied_too():
         states = estimate.states[robot]
         miss = states.poses[-1] - truth
         assert np.all(np.abs(miss) < 5 * np.sqrt(np.diag(states.covs[-1])))
+    for one in backend.robots:
+        for key, dim in one.dims.items():
+            cov = one.isam.marginalCovariance(key)
+            assert cov.shape == (dim, dim)
+            assert np.isfinite(cov).all() and np.all(np.diag(cov) < 5.0)
 
 
 def test_robots_that_do_not_know_where_the_other_is_wait():
