@@ -128,7 +128,7 @@ Experiment = Annotated[
     str,
     typer.Argument(
         metavar="NAME|FILE.toml",
-        help="An experiment file, or ekf-versus-smoothing, filters, slip, thesis, rooms, "
+        help="An experiment file, or ekf-versus-smoothing, filters, slip, network, thesis, rooms, "
         "three-filters or consistency.",
     ),
 ]
