@@ -92,8 +92,8 @@ def choose_topics(
         if sensors and not odometry:
             raise LogError(
                 f"{names}: a {'scan' if lasers else 'sighting'} without odometry: robot {robot} "
-                f"has {sensors[0].name} but no odometry; record it, or assign topics to robots in "
-                "logs.topics"
+                f"has {sensors[0].name} but no odometry; record nav_msgs/Odometry, or odom to base "
+                "on /tf, or assign topics to robots in logs.topics"
             )
         # true associations are read by `logs.truth` only
         others = (*ODOMETRY_KINDS, records.Scan, records.TrueAssociations)
@@ -103,7 +103,8 @@ def choose_topics(
     if not any(topic.record in ODOMETRY_KINDS for topic in chosen):
         raise LogError(
             f"{names}: no odometry; the log has only {', '.join(t.name for t in filled)}; "
-            "smoothing needs nav_msgs/Odometry, JointState or OdometryIncrement"
+            "smoothing needs nav_msgs/Odometry, odom to base on /tf, JointState or "
+            "OdometryIncrement"
         )
     return chosen, warnings
 
