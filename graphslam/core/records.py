@@ -64,22 +64,24 @@ class WheelAngles(Message):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan(Message):
-    """One sweep of a planar laser.
+    """One sweep of a planar laser, its pose in the base frame being ``mount`` (3,).
 
-    ``ranges`` (n,) m, NaN where the beam gave no usable range; beam i points along
-    ``angle_min_rad + i * angle_step_rad`` in the laser frame; ``mount`` (3,) is the pose of the
-    laser in the base frame.
+    ``ranges`` (n,) m, NaN without one; beam i is along ``angle_min_rad + i angle_step_rad``, or its
+    ``bearings``, ``beam_period_s`` after the one before (negative: before it), see `sweep_motion`.
     """
 
     ranges: Array
     angle_min_rad: float
     angle_step_rad: float
     mount: Array
+    beam_period_s: float = 0.0
+    bearings: Array | None = None
 
     @property
     def angles(self) -> Array:
         """Beam directions (n,), rad, in the laser frame."""
-        return self.angle_min_rad + self.angle_step_rad * np.arange(len(self.ranges), dtype=float)
+        evenly = self.angle_min_rad + self.angle_step_rad * np.arange(len(self.ranges), dtype=float)
+        return evenly if self.bearings is None else self.bearings
 
 
 @dataclass(frozen=True, slots=True, eq=False)

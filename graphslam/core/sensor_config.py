@@ -28,12 +28,15 @@ class LogsConfig:
 
     reorder_s: how much out of order, by their stamps, messages may arrive and still be sorted.
     max_clock_offset_s: largest offset between the clocks of two robots that is searched for.
+    undistort: take the motion of the robot during a sweep out of scans whose messages state the
+        time between two beams (`time_increment`).
     topics: topics to use, name -> robot; empty = every topic whose schema is known, with the
         topic's namespace as robot.
     """
 
     reorder_s: float = 2.0
     max_clock_offset_s: float = 5.0
+    undistort: bool = True
     topics: Mapping[str, str] = field(default_factory=dict)
 
 

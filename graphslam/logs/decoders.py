@@ -20,6 +20,8 @@ from graphslam.logs.cdr import CdrError
 
 # No planar laser measures farther; some drivers write 1e6 or 65535 for an error.
 MAX_RANGE_M = 1000.0
+#: no planar laser takes longer for a sweep; it may take so much more of the time that is stated
+MAX_SWEEP_S, SWEEP_SLACK = 1.0, 1.05
 
 
 class UnusableMessageError(Exception):
@@ -32,14 +34,16 @@ class TopicContext:
 
     ``mounts`` gives the pose (3,) of each sensor frame in the base frame; ``inverted`` names the
     frames of sensors that are mounted upside down. Ranges of ``no_return_m`` or more mean no
-    return. ``beams`` counts dropped beams of scans that are kept, by reason. With
-    ``without_ranges`` scans get no ranges: only when they were taken is of interest.
+    return. With ``at_once`` all beams of a scan count as measured at its stamp. ``beams`` counts
+    dropped beams of scans that are kept, by reason. With ``without_ranges`` scans get no ranges:
+    only when they were taken is of interest.
     """
 
     robot: str
     mounts: Mapping[str, Array] = field(default_factory=dict)
     inverted: frozenset[str] = frozenset()
     no_return_m: float = np.inf
+    at_once: bool = False
     left_joint: str = ""
     right_joint: str = ""
     beams: Counter[str] = field(default_factory=Counter)
@@ -69,9 +73,10 @@ def scans(rows: Any, topic: TopicContext) -> list[records.Scan | str]:
     frame = rows["frame"][0].decode().lstrip("/")
     mount, inverted = topic.mounts.get(frame, _NO_MOUNT), frame in topic.inverted
     starts, steps = (rows[n].astype(float).tolist() for n in ("angle_min", "angle_increment"))
+    periods = len(rows) * [0.0] if topic.at_once else _beam_periods(rows, beams)
     found: list[records.Scan | str] = []
     for i, stamp in enumerate(schemas.stamps_ns(rows).tolist()):
-        start, step = starts[i], steps[i]
+        start, step, period = starts[i], steps[i], periods[i]
         if not beams:
             found.append("scan: no beams")
             continue
@@ -88,9 +93,23 @@ def scans(rows: Any, topic: TopicContext) -> list[records.Scan | str]:
             # seen from above, an upside-down laser scans clockwise
             start, step = -start, -step
         if step < 0:
-            start, step = start + step * (beams - 1), -step
+            start, step, period = start + step * (beams - 1), -step, -period
             own = own[::-1].copy()
-        found.append(records.Scan(topic.robot, stamp, stamp, own, start, step, mount))
+        found.append(records.Scan(topic.robot, stamp, stamp, own, start, step, mount, period))
+    return found
+
+
+def _beam_periods(rows: Any, beams: int) -> list[float]:
+    """Time between two beams of each scan, s: ``time_increment`` where it can be true, else 0.
+
+    Some drivers write nonsense: a sweep is neither longer than ``scan_time``, if that is given, nor
+    than `MAX_SWEEP_S`.
+    """
+    between, whole = (rows[name].astype(float) for name in ("time_increment", "scan_time"))
+    most = np.where((whole > 0) & (whole < MAX_SWEEP_S), whole, MAX_SWEEP_S)
+    with np.errstate(invalid="ignore"):
+        true = (between > 0) & (between * (beams - 1) <= SWEEP_SLACK * most)
+    found: list[float] = np.where(true, between, 0.0).tolist()
     return found
 
 

@@ -79,7 +79,8 @@ class RobotInfo:
 
     ``speed_m_s`` is the mean over the log, ``top_speed_m_s`` the largest mean over one second,
     because odometry in bursts has no speed between two messages. ``reverses``: whether odometry
-    ever goes backwards.
+    ever goes backwards. ``odometry`` is a topic, or says that scans are matched: then nothing more
+    is known.
     """
 
     name: str
@@ -279,9 +280,13 @@ def _robot_info(
     readings: Mapping[str, _Reading],
     settings: RobotConfig,
 ) -> RobotInfo:
-    own = [t for t in topics if t.robot == name and t.count and t.record in ODOMETRY_KINDS]
+    filled = [t for t in topics if t.robot == name and t.count]
+    own = [t for t in filled if t.record in ODOMETRY_KINDS]
     own.sort(key=lambda t: (t not in chosen, ODOMETRY_KINDS.index(t.record), -t.count))
     if not own:
+        lasers = [t.name for t in filled if t.record is records.Scan and t in chosen]
+        if lasers:
+            return RobotInfo(name, "", f"scan matching of {lasers[0]}")
         return RobotInfo(name, "has no odometry")
     reading = readings[own[0].name]
     if len(reading.motion) < 2:

@@ -19,7 +19,7 @@ from graphslam.logs.recording import Recording, raw_messages
 from graphslam.logs.robots import robots_and_topics
 from graphslam.logs.stated_noise import StatedNoise, stated_noise
 from graphslam.logs.topic_context import topic_contexts
-from graphslam.logs.topics import ODOMETRY_KINDS, Topic, choose_topics
+from graphslam.logs.topics import MOTION_KINDS, ODOMETRY_KINDS, Topic, choose_topics
 
 Odometry = records.OdometryIncrement | records.OdometryPose | records.WheelAngles
 
@@ -44,7 +44,7 @@ class LogSet:
     """Logs that belong together.
 
     Attributes:
-        robots: names of the robots with odometry, sorted.
+        robots: names of the robots with odometry or scans, sorted.
         files: the files and their message counts.
         topics: the topics that are used.
         notes: the metadata record `graphslam` of the files, for example that stamps are invented.
@@ -76,6 +76,12 @@ class LogSet:
     def has_scans(self, robot: str) -> bool:
         """Whether the logs hold laser scans of ``robot``."""
         return any(t.robot == robot and t.record is records.Scan for t in self.topics)
+
+    @property
+    def without_odometry(self) -> tuple[str, ...]:
+        """Robots with scans and no odometry, which is made of the scans."""
+        having = {t.robot for t in self.topics if t.record in ODOMETRY_KINDS}
+        return tuple(robot for robot in self.robots if robot not in having)
 
     def no_return_m(self, topic: str) -> float:
         """Smallest range, m, that means no return in ``topic``; inf if none was detected."""
@@ -203,7 +209,8 @@ def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
 
     Raises:
         LogError: a file is missing, of no known container or empty; no topic is usable; all usable
-            topics are empty; a robot has scans but no odometry. The message names file and topic.
+            topics are empty; a robot has sightings but neither odometry nor scans. The message
+            names file and topic.
     """
     if not paths:
         raise LogError("no log given; name at least one file or folder")
@@ -215,7 +222,7 @@ def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
     topics, warnings = choose_topics(files, topics)
     contexts, assumed = topic_contexts(files, topics, config)
     return LogSet(
-        robots=tuple(sorted({t.robot for t in topics if t.record in ODOMETRY_KINDS})),
+        robots=tuple(sorted({t.robot for t in topics if t.record in MOTION_KINDS})),
         files=tuple(LogFile(f.path, f.sha256, f.messages, f.lost) for f in files),
         topics=tuple(topics),
         notes=merged_notes(files),

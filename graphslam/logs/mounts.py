@@ -53,6 +53,15 @@ def find_mount(tree: TransformTree, base: str, sensor: str) -> Mount | None:
     return planar_mount(np.asarray(np.linalg.solve(of_base[common], of_sensor[common])))
 
 
+def base_above(tree: TransformTree, sensor: str) -> str:
+    """The frame that moves with the robot, where no odometry names it: the base of a sensor.
+
+    By ROS' convention its name begins with "base", after a namespace; else it is the root.
+    """
+    frames = list(_ancestors(tree, sensor))
+    return next((f for f in frames if f.rpartition("/")[2].startswith("base")), frames[-1])
+
+
 def planar_mount(base_from_sensor: Array) -> Mount:
     """The planar part of a transform (4, 4); the heading is that of the sensor's x axis."""
     R = base_from_sensor[:3, :3]

@@ -11,7 +11,7 @@ from graphslam.core.config import Config
 from graphslam.core.geometry import Array
 from graphslam.logs import schemas
 from graphslam.logs.decoders import TopicContext, frame_of
-from graphslam.logs.mounts import TransformTree, find_mount, is_level
+from graphslam.logs.mounts import TransformTree, base_above, find_mount, is_level
 from graphslam.logs.no_return import find_no_return
 from graphslam.logs.recording import Recording, sample_messages
 from graphslam.logs.tf_tree import sampled_edges, static_tree
@@ -60,8 +60,9 @@ def topic_contexts(
             if topic.robot not in trees:
                 edges = sampled_edges(files, topic.robot)
                 trees[topic.robot] = static_tree(files, topic.robot, edges)
-            tree, base = trees[topic.robot], bases.get(topic.robot, "base_link")
+            tree = trees[topic.robot]
             for frame in sorted({frame_of(message) for message in messages}):
+                base = bases[topic.robot] if topic.robot in bases else base_above(tree, frame)
                 mounts[frame], upside_down, notes = _mount(topic, tree, base, frame, settings.laser)
                 inverted |= {frame} if upside_down else set()
                 warnings += notes
@@ -72,6 +73,7 @@ def topic_contexts(
             mounts=mounts,
             inverted=frozenset(inverted),
             no_return_m=np.inf if no_return is None else no_return,
+            at_once=not config.logs.undistort,
             left_joint=settings.left_joint,
             right_joint=settings.right_joint,
         )

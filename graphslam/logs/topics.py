@@ -17,6 +17,8 @@ ODOMETRY_KINDS: tuple[type[records.Message], ...] = (
     records.OdometryPose,
     records.WheelAngles,
 )
+# What tells how a robot moved: without odometry its scans, compared with each other.
+MOTION_KINDS = (*ODOMETRY_KINDS, records.Scan)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +75,8 @@ def choose_topics(
     """One odometry source and one laser per robot, all other topics, and warnings.
 
     Raises:
-        LogError: all topics are empty, or a robot has scans or sightings but no odometry.
+        LogError: all topics are empty; a robot has sightings but neither odometry nor scans, or
+            scans but no odometry, which another robot without sensors has.
     """
     names = ", ".join(str(file.path) for file in files)
     filled = [topic for topic in topics if topic.count]
@@ -90,23 +93,33 @@ def choose_topics(
         lasers = [t for t in own if t.record is records.Scan]
         sensors = lasers + [t for t in own if t.record is records.Sighting]
         if sensors and not odometry:
-            raise LogError(
-                f"{names}: a {'scan' if lasers else 'sighting'} without odometry: robot {robot} "
-                f"has {sensors[0].name} but no odometry; record nav_msgs/Odometry, or odom to base "
-                "on /tf, or assign topics to robots in logs.topics"
+            if not lasers or _odometry_alone(filled):
+                raise LogError(
+                    f"{names}: a {'scan' if lasers else 'sighting'} without odometry: robot "
+                    f"{robot} has {sensors[0].name} but no odometry; record nav_msgs/Odometry, "
+                    "or odom to base on /tf, or assign topics to robots in logs.topics"
+                )
+            warnings.append(
+                f"robot {robot}: no odometry: scan matching of {lasers[0].name} is used"
             )
         # true associations are read by `logs.truth` only
         others = (*ODOMETRY_KINDS, records.Scan, records.TrueAssociations)
         rest = [t for t in filled if t.robot == robot and t.record not in others]
         chosen += odometry[:1] + lasers[:1] + rest
         warnings += _unused("odometry", robot, odometry) + _unused("laser", robot, lasers)
-    if not any(topic.record in ODOMETRY_KINDS for topic in chosen):
+    if not any(topic.record in MOTION_KINDS for topic in chosen):
         raise LogError(
             f"{names}: no odometry; the log has only {', '.join(t.name for t in filled)}; "
-            "smoothing needs nav_msgs/Odometry, odom to base on /tf, JointState or "
+            "smoothing needs LaserScan, nav_msgs/Odometry, odom to base on /tf, JointState or "
             "OdometryIncrement"
         )
     return chosen, warnings
+
+
+def _odometry_alone(topics: Sequence[Topic]) -> bool:
+    """Whether some robot has odometry and no sensor: it may be that of a robot with scans only."""
+    sensing = {t.robot for t in topics if t.record in (records.Scan, records.Sighting)}
+    return any(t.record in ODOMETRY_KINDS and t.robot not in sensing for t in topics)
 
 
 def _unused(what: str, robot: str, topics: Sequence[Topic]) -> list[str]:

@@ -155,13 +155,15 @@ class LogWriter:
         angle_step_rad: float,
         range_max_m: float,
         range_min_m: float = 0.0,
+        beam_period_s: float = 0.0,
         sensor: str = "laser",
         log_time_ns: int | None = None,
     ) -> None:
         """sensor_msgs/LaserScan on ``scan``: ranges (n,) m in the laser frame, kept as float32.
 
         Of another ``sensor`` than ``laser`` it is on ``scan_SENSOR``, in that frame. A beam without
-        a return is written as inf or as a value above ``range_max_m``.
+        a return is written as inf or as a value above ``range_max_m``. ``stamp_ns`` is that of the
+        first beam, and each comes ``beam_period_s`` after the one before.
         """
         values = np.asarray(ranges, dtype=np.float32)
         self._build(
@@ -174,8 +176,8 @@ class LogWriter:
             angle_min=angle_min_rad,
             angle_max=angle_min_rad + angle_step_rad * (len(values) - 1),
             angle_increment=angle_step_rad,
-            time_increment=0.0,
-            scan_time=0.0,
+            time_increment=beam_period_s,
+            scan_time=beam_period_s * len(values),
             range_min=range_min_m,
             range_max=range_max_m,
             ranges=values,

@@ -19,6 +19,9 @@ from graphslam.perception.ordered_scan import Sweep, join_sweeps, make_sweep
 from graphslam.perception.segments import find_segments, segments
 from graphslam.perception.segments_and_hough import segments_and_hough
 
+#: angles between beams that differ by no more than this factor count as one
+ALIKE_STEPS = 1.2
+
 FrontEnd = Callable[[Scan, FrontEndConfig], tuple[Observation, ...]]
 
 
@@ -48,10 +51,11 @@ def observe_block(
 ) -> list[ObservationArrays]:
     """What the configured front end finds in each of many scans, in the frame of the laser.
 
-    Segments are extracted from all scans at once. ``sweeps`` are those of ``scans``.
+    Segments are extracted from all scans at once, unless their angles between beams differ by more
+    than the turning of a robot during a sweep changes them. ``sweeps`` are those of ``scans``.
     """
-    steps = {sweep.step_rad for sweep in sweeps}
-    if config.name != "segments" or config.cylinders or len(steps) != 1:
+    steps = [sweep.step_rad for sweep in sweeps]
+    if config.name != "segments" or config.cylinders or max(steps) > ALIKE_STEPS * min(steps):
         front_end = FRONT_ENDS[config.name]
         return [ObservationArrays.of(front_end(scan, config)) for scan in scans]
     joined = join_sweeps(sweeps)

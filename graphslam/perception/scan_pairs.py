@@ -92,17 +92,24 @@ def fit_pairs(
     )
 
 
-def surface_information(points: Array, scan: IntArray, config: ScanMatchingConfig) -> Array:
+def surface_information(
+    points: Array,
+    scan: IntArray,
+    config: ScanMatchingConfig,
+    beside: int = BESIDE,
+    cells: float = NEIGHBOURHOOD_CELLS,
+) -> Array:
     """Information (n, 2, 2) of points (n, 2) across the surface that neighbouring returns show.
 
     ``scan`` (n,) is the scan of each point, whose points follow each other in the order of the
-    beams. See `Submap.information`.
+    beams. Neighbours are ``beside`` of them on either side that are nearer than ``cells``. See
+    `Submap.information`.
     """
     n = len(points)
     sums = np.zeros((6, n))
     sums[0] = 1.0
-    limit = (NEIGHBOURHOOD_CELLS * config.cell_m) ** 2
-    for k in range(1, BESIDE + 1):
+    limit = (cells * config.cell_m) ** 2
+    for k in range(1, beside + 1):
         d = points[k:] - points[:-k]
         near = (scan[k:] == scan[:-k]) & ((d**2).sum(axis=1) <= limit)
         d = d * near[:, None]

@@ -1,6 +1,6 @@
 """Laser scans: exact ranges, then noise and errors of a real laser."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -27,14 +27,19 @@ def laser_mount(laser: Laser) -> Array:
 
 
 def noise_free_scans(
-    poses: Array, laser: Laser, world: World, others: Mapping[str, tuple[Body, Array]]
+    poses: Array,
+    laser: Laser,
+    world: World,
+    others: Mapping[str, tuple[Body, Array]],
+    fan: BeamFan | None = None,
 ) -> Hits:
     """Ranges and surfaces of noise-free beams for bases at ``poses`` (n, 3).
 
     ``others``: the other robots with their poses (n, 3) at the same times. Surfaces are numbered as
-    in ``world``; the whole outline of robot i is surface ``len(world.names) + i``.
+    in ``world``; the whole outline of robot i is surface ``len(world.names) + i``. ``fan``: some of
+    the beams instead of all.
     """
-    at, fan = compose(poses, laser_mount(laser)), beam_fan(laser)
+    at, fan = compose(poses, laser_mount(laser)), fan or beam_fan(laser)
     reach = laser.range_max_m + _MARGIN_M
     hits = cast_beams(at, fan, world.shapes, reach)
     for number, (body, where) in enumerate(others.values()):
@@ -42,6 +47,27 @@ def noise_free_scans(
         robot = np.where(seen.surfaces == NO_SURFACE, NO_SURFACE, 0)
         hits = nearest_hits(hits, Hits(seen.ranges, robot), len(world.names) + number)
     return hits
+
+
+def swept_scans(
+    times: Array,
+    laser: Laser,
+    world: World,
+    poses_at: Callable[[Array], Array],
+    others_at: Callable[[Array], Mapping[str, tuple[Body, Array]]],
+) -> Hits:
+    """`noise_free_scans` whose beams are measured one after the other, the first at times (n,) s.
+
+    ``poses_at`` and ``others_at`` give the base and the other robots at times.
+    """
+    fan = beam_fan(laser)
+    columns = []
+    for beam, angle in enumerate(fan.angles.tolist()):
+        now = times + beam * laser.beam_period_s
+        one = BeamFan(angle, fan.step_rad, 1)
+        columns.append(noise_free_scans(poses_at(now), laser, world, others_at(now), one))
+    ranges, surfaces = ([getattr(c, name) for c in columns] for name in ("ranges", "surfaces"))
+    return Hits(np.concatenate(ranges, axis=1), np.concatenate(surfaces, axis=1))
 
 
 def noisy_ranges(hits: Hits, biases: Array, laser: Laser, rng: np.random.Generator) -> Array:

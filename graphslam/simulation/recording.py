@@ -12,7 +12,13 @@ from graphslam.core.geometry import Array, compose
 from graphslam.logs.schemas import ANYTHING, SOME_ROBOT
 from graphslam.logs.writer import Event, LogWriter
 from graphslam.simulation.encoders import odometry, wheel_angles
-from graphslam.simulation.laser import beam_fan, laser_mount, noise_free_scans, noisy_ranges
+from graphslam.simulation.laser import (
+    beam_fan,
+    laser_mount,
+    noise_free_scans,
+    noisy_ranges,
+    swept_scans,
+)
 from graphslam.simulation.raycast import NO_SURFACE, Hits
 from graphslam.simulation.scenario import Body, Encoders, Laser, Scenario, SightingSensor
 from graphslam.simulation.scene import SimulatedRobot, SimulatedVisit
@@ -166,7 +172,13 @@ def _scans(this: _Recorder) -> tuple[list[Event], NoiseFreeScans | None]:
         return [], None
     times, at = this.times(laser)
     poses = this.actor.drive.at(times).poses
-    hits = noise_free_scans(poses, laser, this.visit.world, this.others(times))
+    world = this.visit.world
+    if laser.sweep_s:
+        hits = swept_scans(
+            times, laser, world, lambda now: this.actor.drive.at(now).poses, this.others
+        )
+    else:
+        hits = noise_free_scans(poses, laser, world, this.others(times))
     ranges = noisy_ranges(hits, _biases(this, laser), laser, this.rng("laser"))
     fan = beam_fan(laser)
     events = [
@@ -179,6 +191,7 @@ def _scans(this: _Recorder) -> tuple[list[Event], NoiseFreeScans | None]:
             angle_step_rad=fan.step_rad,
             range_min_m=laser.range_min_m,
             range_max_m=laser.range_max_m,
+            beam_period_s=laser.beam_period_s,
         )
         for t, row in zip(at, ranges, strict=True)
     ]

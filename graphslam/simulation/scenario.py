@@ -181,7 +181,8 @@ class Laser(Sensor):
     of the constant range bias of a material. dropout_share: share of beams without a return;
     spurious_share: with a return from a random range in front of the surface. mixed_share: share of
     the beams at a range discontinuity above mixed_gap_m that return a range between its two sides.
-    resolution_m: ranges are rounded to multiples of it; 0 = not rounded.
+    resolution_m: ranges are rounded to multiples of it; 0 = not rounded. sweep_s: time from the
+    first beam to the last, which are measured one after the other; 0 = all at once.
     """
 
     period_s: float = field(default=0.3, metadata=POSITIVE)
@@ -198,6 +199,12 @@ class Laser(Sensor):
     mixed_share: float = field(default=0.0, metadata=SHARE)
     mixed_gap_m: float = field(default=0.1, metadata=NOT_NEGATIVE)
     resolution_m: float = field(default=0.001, metadata=NOT_NEGATIVE)
+    sweep_s: float = field(default=0.0, metadata=NOT_NEGATIVE)
+
+    @property
+    def beam_period_s(self) -> float:
+        """Time between two beams."""
+        return self.sweep_s / max(self.beams - 1, 1)
 
     @property
     def beams(self) -> int:

@@ -34,6 +34,7 @@ from graphslam.mapping.robot_candidates import robot_associations, robots_in
 from graphslam.multi_robot.identity_swaps import rename_identities
 from graphslam.multi_robot.mutual_detection import ScanBuffer
 from graphslam.multi_robot.robot_detection import RobotDetector
+from graphslam.odometry.laser_odometry import with_laser_odometry
 from graphslam.odometry.readings import integrate_pending
 from graphslam.odometry.scan_odometry import (
     checked_against_scans,
@@ -41,6 +42,7 @@ from graphslam.odometry.scan_odometry import (
     points_off_lines,
     scan_submap,
 )
+from graphslam.odometry.sweep_motion import undistorted_by_track
 from graphslam.perception.front_ends import FRONT_ENDS
 from graphslam.perception.ordered_scan import scan_points
 from graphslam.perception.sightings import (
@@ -109,8 +111,9 @@ class Pipeline(StepRecorder):
     def run(self, progress: Progress) -> None:
         """Take in every message of the log; ``progress`` gets the number of messages read."""
         tracks = {name: run.track for name, run in self.runs.items()}
+        read = self.accepted(to_common_clock(self.messages(progress), self.known.clocks))
         messages = synchronise(
-            self.accepted(to_common_clock(self.messages(progress), self.known.clocks)),
+            with_laser_odometry(read, self.log.without_odometry, self.config),
             tracks,
             self.config.odometry.max_gap_s,
             self.dropped,
@@ -279,6 +282,9 @@ class Pipeline(StepRecorder):
         self.start_if_needed(first.robot, time_ns)
         if isinstance(first, ODOMETRY) and self.config.keyframe.mode != "all":
             return  # most of a log; the track has it already
+        if isinstance(first, Scan):  # an event of its own
+            event = undistorted_by_track([first], run.track)
+            first = event[0]
         run.scans += [(m.stamp_ns, m.time_ns, m.mount) for m in event if isinstance(m, Scan)]
         self.counts["scans"] += isinstance(first, Scan)
         used = self.keyframes.is_used(event, run)

@@ -22,6 +22,7 @@ from graphslam.core.records import Closure, Message, Motion, Scan
 from graphslam.logs import LogSet
 from graphslam.logs.log_set import ReadReport
 from graphslam.multi_robot.robot_detection import COMPARED_SCANS, without_returns
+from graphslam.odometry.laser_odometry import with_laser_odometry
 from graphslam.odometry.scan_odometry import (
     MIN_POINTS,
     check_motions,
@@ -29,6 +30,7 @@ from graphslam.odometry.scan_odometry import (
     points_off_lines,
     suspect_motions,
 )
+from graphslam.odometry.sweep_motion import undistorted_by_track
 from graphslam.perception.dynamic_objects import dynamic_returns_of_all
 from graphslam.perception.front_ends import observe_block
 from graphslam.perception.ordered_scan import Sweep, make_sweep, scan_points
@@ -175,6 +177,7 @@ class _Reader:
         track = self.run.track
         read = counted(self._messages, self._counts, lambda _count: None)
         max_gap_s = self._config.odometry.max_gap_s
+        read = with_laser_odometry(read, self._log.without_odometry, self._config)
         messages = synchronise(read, {self._robot: track}, max_gap_s, self._dropped)
         first_ns, size = 0, FIRST_BLOCK
         while True:
@@ -201,7 +204,7 @@ class _Reader:
         scans = [message for message in block if isinstance(message, Scan)]
         run.scans += [(s.stamp_ns, s.time_ns, s.mount) for s in scans]
         self._counts["scans"] += len(scans)
-        used = self._keyframes.used_scans(scans, run)
+        used = undistorted_by_track(self._keyframes.used_scans(scans, run), run.track)
         if not used:
             return []
         with timed(self._seconds, "motions"):

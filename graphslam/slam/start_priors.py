@@ -47,15 +47,18 @@ def _cov(sigma_m: float, sigma_rad: float) -> Array:
 
 
 def first_truth(log: LogSet) -> dict[str, Array]:
-    """The true pose (3,) of each robot when its odometry begins: one sample each.
+    """The true pose (3,) of each robot when its odometry or, without one, its scans begin.
 
     Raises:
         EstimationError: a robot has no truth within `MAX_TRUTH_LAG_NS` of its first odometry.
     """
     begins: dict[str, int] = {}
     nearest: dict[str, Truth] = {}
-    for message in log.messages((Scan, Sighting)):
-        if isinstance(message, ODOMETRY):
+    by_scans = log.without_odometry
+    for message in log.messages((Sighting,) if by_scans else (Scan, Sighting)):
+        if isinstance(message, ODOMETRY) or (
+            isinstance(message, Scan) and message.robot in by_scans
+        ):
             begins.setdefault(message.robot, message.time_ns)
         elif isinstance(message, Truth):
             known = nearest.get(message.robot)

@@ -117,6 +117,7 @@ def summarise(
         },
         "odometry": {
             robot: {
+                "source": "scans" if robot in log.without_odometry else run.track.source,
                 "motions": run.motions,
                 "contradicted": run.contradicted,
                 "resets": run.track.resets,
@@ -187,7 +188,7 @@ def run_warnings(pipeline: LogPass) -> list[str]:
         f"{name}: scans contradict its odometry in {run.contradicted} of {run.motions} motions; "
         "these were taken from the scans"
         for name, run in pipeline.runs.items()
-        if run.contradicted
+        if run.contradicted and name not in pipeline.log.without_odometry
     ]
     warnings += [
         f"{name}: its wheel radii and axle are not set; the defaults of robots.{name}.* were used"

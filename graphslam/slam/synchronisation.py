@@ -14,6 +14,7 @@ from graphslam.core.records import (
     WheelAngles,
 )
 from graphslam.odometry.preintegration import Track
+from graphslam.odometry.sweep_motion import sweep_end_ns
 from graphslam.perception.sightings import is_unnamed_robot
 
 ODOMETRY = (OdometryPose, OdometryIncrement, WheelAngles)
@@ -54,7 +55,9 @@ def synchronise(
             shown = [tracks[robot] for robot in watched]
         elif isinstance(head, Sighting) and is_unnamed_robot(head):
             shown = [*tracks.values()]
-        return not all(track and track.reaches(head.time_ns) for track in (*needed, *shown))
+        # a scan is put together from where its first beam and its last one were measured
+        last_ns = sweep_end_ns(head) if isinstance(head, Scan) else head.time_ns
+        return not all(track and track.reaches(last_ns) for track in (*needed, *shown))
 
     def ready(final: bool) -> Iterator[Message]:
         """Takes out the messages in front that need not wait any longer."""

@@ -480,6 +480,25 @@ def test_logs_without_anything_usable_say_what_there_is(tmp_path):
     assert "/nothing" in text and "/alice/odom" in text
 
 
+def test_a_robot_without_odometry_is_moved_by_its_scans(tmp_path):
+    """Said by `info` and by the log; the base is the frame of tf whose name says so, else the
+    laser itself, without a warning that there is no mount."""
+    path = tmp_path / "log.mcap"
+    with LogWriter(path) as log:
+        log.mount("bob", S, (0.2, 0.0, 0.1))
+        log.scan("bob", S, [1, 2], **SCAN)
+    opened = open_logs([path], Config())
+    assert opened.robots == opened.without_odometry == ("bob",)
+    line = "robot bob: no odometry: scan matching of /bob/scan is used"
+    assert opened.warnings == [line]
+    (scan,) = opened.messages()
+    assert scan.mount == pytest.approx([0.2, 0.0, 0.1])
+    info = inspect_logs([path], Config())
+    (robot,) = info.robots
+    assert not info.problem and line in info.warnings
+    assert not robot.problem and robot.odometry == "scan matching of /bob/scan"
+
+
 def test_usable_topics_without_messages_are_named(tmp_path):
     path = tmp_path / "log.mcap"
     foreign_log(path, schemas.ODOMETRY, count=0)
@@ -615,6 +634,7 @@ def test_info_reports_what_keeps_a_log_from_being_smoothed(tmp_path):
     path = tmp_path / "log.mcap"
     with LogWriter(path) as log:
         log.scan("bob", S, [1, 2], **SCAN)
+        log.odometry("alice", S, (0, 0, 0))
     info = inspect_logs([path], Config())
     assert "scan without odometry" in info.problem and info.topics[0].count == 1
     info = inspect_logs([foreign_log(path, "std_msgs/msg/String")], Config())

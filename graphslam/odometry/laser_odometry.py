@@ -1,0 +1,188 @@
+"""Odometry of a robot that reports none: each scan aligned with those just before it.
+
+A scan is aligned with a map of a few earlier scans, from a pose that is predicted at constant
+velocity. The origin of the map is the *reference*, the latest of them; after some motion the scan
+itself becomes the reference. So errors add up per reference, not per scan, and a robot that stands
+does not drift.
+
+What comes out are increments with covariances, as a robot could have reported them itself, so
+nothing that follows has to know. The covariance of an alignment is that of the whole way from its
+reference, of which each increment gets an equal share. In directions that the scans do not
+determine it is that of a robot that drives anywhere (`OPEN_SIGMA_M`).
+"""
+
+from collections import deque
+from collections.abc import Collection, Iterable, Iterator
+
+import numpy as np
+
+from graphslam.core.config import Config
+from graphslam.core.geometry import Array, between, compose, exp, inverse, log, rotate_cov, rotation
+from graphslam.core.records import Message, OdometryIncrement, Scan
+from graphslam.odometry.sweep_motion import undistorted
+from graphslam.perception.ordered_scan import scan_points
+from graphslam.perception.scan_alignment import (
+    align_scan,
+    moved_scan,
+    scan_information,
+    scan_map,
+)
+
+#: a scan becomes the reference when the robot has moved or turned by this much since the last one,
+#: or after so many scans: they are held in memory until then
+REFERENCE_M, REFERENCE_RAD, REFERENCE_SCANS = 0.3, 0.25, 64
+#: references in the map
+MAP_SCANS = 16
+#: sigmas of a prediction, m and rad per root of a second
+PREDICTED_SIGMA_M, PREDICTED_SIGMA_RAD = 0.15, 0.3
+#: sigmas where scans tell nothing, m and rad per root of a second: larger than of predictions, as
+#: the error of a velocity goes on for many scans, but increments count as independent
+OPEN_SIGMA_M, OPEN_SIGMA_RAD = 0.5, 1.0
+#: s: the velocity is that of the last interval so long, at least, as stamps jitter; a prediction
+#: goes no farther than the second
+VELOCITY_S, PREDICTED_S = 0.3, 1.0
+#: s: no time between two scans is shorter: stamps of a burst
+SHORTEST_S = 1e-3
+#: m/s and rad/s: half of the window in which a scan that fits nowhere is searched for, besides that
+#: of `ScanMatchingConfig`, grows with the time since the one before; m: no farther than this
+SEARCH_M_S, SEARCH_RAD_S, MOST_SEARCH_M = 1.0, 1.0, 3.0
+
+
+class LaserOdometry:
+    """The odometry of one robot by its scans."""
+
+    def __init__(self, config: Config) -> None:
+        """No scan yet."""
+        self._config = config.scan_matching
+        self._max_range_m = config.front_end.max_range_m
+        self._scans: list[tuple[Array, Array]] = []  # of the map, the reference last
+        self._last: Scan | None = None
+        # of the last scan in the map: its pose, with errors as predicted and as stated
+        self._pose, self._cov, self._stated = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
+        self._ways: list[tuple[Scan, Scan, Array]] = []  # since the reference: from, to, increment
+        self._recent: deque[tuple[float, Array]] = deque()  # s and increment: of `VELOCITY_S`
+
+    def add(self, scan: Scan) -> list[OdometryIncrement]:
+        """Take in the next scan.
+
+        Returns:
+            Increments to all scans up to this one that had none; none until the next reference.
+        """
+        velocity = self._velocity()
+        points = scan_points(undistorted(scan, _of_laser(velocity, scan.mount)), self._max_range_m)
+        last, self._last = self._last, scan
+        if last is None:
+            self._refer_to(points)
+            return []
+        seconds = max(1e-9 * (scan.time_ns - last.time_ns), SHORTEST_S)
+        moved = exp(min(seconds, PREDICTED_S) * velocity)
+        before, guess = self._pose, compose(self._pose, moved)
+        window = np.array([SEARCH_M_S, SEARCH_M_S, SEARCH_RAD_S]) * seconds
+        window = np.minimum(window, [MOST_SEARCH_M, MOST_SEARCH_M, np.pi / 2])
+        config = self._config
+        window += [config.search_m, config.search_m, config.search_rad]
+        cov = self._cov + _variances(PREDICTED_SIGMA_M, PREDICTED_SIGMA_RAD) * seconds
+        found = align_scan(points, self._map, guess, cov, before, window)
+        self._pose, self._cov = found.pose, _updated(cov, found.information)
+        stated = self._stated + _variances(OPEN_SIGMA_M, OPEN_SIGMA_RAD) * seconds
+        self._stated = _updated(stated, found.information)
+        increment = between(before, found.pose)
+        self._ways.append((last, scan, increment))
+        self._recent.append((seconds, increment))
+        while sum(s for s, _ in self._recent) - self._recent[0][0] >= VELOCITY_S:
+            self._recent.popleft()
+        x, y, turned = found.pose
+        near = np.hypot(x, y) < REFERENCE_M and abs(turned) < REFERENCE_RAD
+        if near and found.share > 0.0 and len(self._ways) < REFERENCE_SCANS:
+            return []
+        made = self.finish()
+        self._refer_to(points)
+        return made
+
+    def finish(self) -> list[OdometryIncrement]:
+        """Increments to all scans that had none."""
+        shared = self._stated + _variances(self._config.floor_m, self._config.floor_rad)
+        shared = shared / max(len(self._ways), 1)
+        heading, made = 0.0, []
+        for start, end, increment in self._ways:
+            cov = rotate_cov(shared, -heading)
+            made.append(
+                OdometryIncrement(
+                    end.robot, end.stamp_ns, end.time_ns, start.time_ns, increment, cov
+                )
+            )
+            heading += float(increment[2])
+        self._ways.clear()
+        return made
+
+    def _velocity(self) -> Array:
+        """Twist (3,) per second of the last scans."""
+        moved, seconds = np.zeros(3), 0.0
+        for span, increment in self._recent:
+            moved, seconds = compose(moved, increment), seconds + span
+        return np.asarray(log(moved) / max(seconds, VELOCITY_S))
+
+    def _refer_to(self, points: Array) -> None:
+        """Make the last scan, of points (n, 2), the reference."""
+        back = inverse(self._pose)
+        kept = self._scans[1 - MAP_SCANS :]
+        self._scans = [moved_scan(scan, back) for scan in kept]
+        self._scans.append((points, scan_information(points, self._config)))
+        self._map = scan_map(self._scans, self._config)
+        self._pose, self._cov, self._stated = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
+
+
+def _variances(sigma_m: float, sigma_rad: float) -> Array:
+    return np.diag([sigma_m**2, sigma_m**2, sigma_rad**2])
+
+
+def _of_laser(velocity: Array, mount: Array) -> Array:
+    """Twist (3,) of a laser at ``mount`` (3,), by that of the base."""
+    x, y, turning = velocity
+    at_laser = rotation(-float(mount[2])) @ [x - turning * mount[1], y + turning * mount[0]]
+    return np.append(at_laser, turning)
+
+
+def _updated(cov: Array, information: Array) -> Array:
+    """A covariance (3, 3) after a measurement with such information (3, 3)."""
+    return np.asarray(np.linalg.inv(np.linalg.inv(cov) + information), dtype=float)
+
+
+def with_laser_odometry(
+    messages: Iterable[Message], robots: Collection[str], config: Config
+) -> Iterator[Message]:
+    """Messages in time order; in front of each scan the odometry increment that leads to it.
+
+    Args:
+        messages: in time order.
+        robots: those that have scans and no odometry.
+        config: settings.
+    """
+    if not robots:
+        yield from messages
+        return
+    odometers = {robot: LaserOdometry(config) for robot in robots}
+    waiting: deque[Message] = deque()
+    ready: dict[str, deque[OdometryIncrement]] = {robot: deque() for robot in robots}
+    begun: set[str] = set()
+
+    def released() -> Iterator[Message]:
+        """What is in front and has all that it needs."""
+        while waiting:
+            head = waiting[0]
+            if isinstance(head, Scan) and head.robot in odometers:
+                if head.robot in begun:
+                    if not ready[head.robot]:
+                        return
+                    yield ready[head.robot].popleft()
+                begun.add(head.robot)
+            yield waiting.popleft()
+
+    for message in messages:
+        waiting.append(message)
+        if isinstance(message, Scan) and message.robot in odometers:
+            ready[message.robot] += odometers[message.robot].add(message)
+        yield from released()
+    for robot, odometer in odometers.items():
+        ready[robot] += odometer.finish()
+    yield from released()
