@@ -6,14 +6,16 @@ way, and applied to the motions and sightings of the next `BLOCK` steps, which a
 
 import time
 from collections import Counter, defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from graphslam.core.config import AssociationConfig
+from graphslam.core.gaussian import mahalanobis_squared
 from graphslam.core.geometry import Array, between, compose, rotation3
 from graphslam.core.motion_models import Calibration
+from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Estimate, Motion, Step, Trajectory
 from graphslam.estimation.compressed_filter import CompressedBackend
 from graphslam.mapping.gating import gate_distance, gate_floor
@@ -128,13 +130,10 @@ def _gated(
 ) -> Step:
     """A step without sightings of robots that are not where the back end expects these."""
     of_robots: dict[str, list[Association]] = defaultdict(list)
-    for a in step.associations:
-        if isinstance(a.target, str):
-            of_robots[a.robot].append(a)
-    if not of_robots:
-        return step
-    false: set[int | None] = set()
     floor = gate_floor(config)
+    for a in _doubtful(step, backend, floor, config):
+        of_robots[a.robot].append(a)
+    false: set[int | None] = set()
     for robot, own in of_robots.items():
         seen = [as_observation(a) for a in own]
         others = [
@@ -157,6 +156,30 @@ def _gated(
     share = {pair: n / before[pair] for pair, n in left.items()}
     weighed = (a.with_measurement(a.z, a.cov * share[a.robot, a.target]) for a in kept)
     return replace(step, associations=tuple(weighed))
+
+
+def _doubtful(
+    step: Step, backend: CompressedBackend, floor: Mapping[str, Array], config: AssociationConfig
+) -> Iterator[Association]:
+    """Sightings of robots that are not in the gate by their own noise alone.
+
+    The covariance of the estimate makes the gate wider: the others need none, which is expensive.
+    """
+    by_model: dict[str, list[Association]] = defaultdict(list)
+    for a in step.associations:
+        if isinstance(a.target, str):
+            by_model[a.model].append(a)
+    poses: dict[str, Array] = {}
+    for robot in {str(r) for own in by_model.values() for a in own for r in (a.robot, a.target)}:
+        pose, motion = backend.state_mean(robot), step.motions.get(robot)
+        poses[robot] = pose if motion is None else compose(pose, motion.delta)
+    for name, own in by_model.items():
+        model = MODELS[name]
+        x, t = np.array([[poses[a.robot], poses[str(a.target)]] for a in own]).transpose(1, 0, 2)
+        z, cov = np.array([a.z for a in own]), np.array([a.cov for a in own])
+        r, R = model.residual(z, x, t), model.noise(z, cov, x, t) + floor[name]
+        inside = mahalanobis_squared(r, R) < gate_distance(config.gate_probability, model.rows)
+        yield from (a for a, is_in in zip(own, inside, strict=True) if not is_in)
 
 
 def _clock_shift(motion: Motion | None, clock_sigma_s: float) -> Array:
