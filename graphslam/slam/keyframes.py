@@ -12,10 +12,14 @@ from graphslam.slam.robot_state import RobotState
 
 
 class KeyframeSelector:
-    """Decides by motion since the last keyframe; mode ``all`` makes a state of everything."""
+    """Decides by motion since the last keyframe; mode ``all`` makes a state of everything.
 
-    def __init__(self, config: KeyframeConfig) -> None:
-        self._config = config
+    ``at_sightings``: sightings get a state at their own time wherever the robot has moved. What
+    moves several of them to another time is an error that they share.
+    """
+
+    def __init__(self, config: KeyframeConfig, *, at_sightings: bool = False) -> None:
+        self._config, self._at_sightings = config, at_sightings
 
     def is_used(self, event: Sequence[Message], run: RobotState) -> bool:
         """Whether an event becomes observations; else only its pose is reported.
@@ -55,6 +59,7 @@ class KeyframeSelector:
             or isinstance(first, Scan)
             or any(isinstance(m, Sighting) and may_be_robot(m) for m in event)
             or self.has_moved(run, run.state_ns, first.time_ns)
+            or (self._at_sightings and any(run.track.moved(run.state_ns, first.time_ns)))
         )
 
     def has_moved(

@@ -91,7 +91,6 @@ class Pipeline(StepRecorder):
         self.matches_scans = config.odometry.scan_matching != "off" and (
             config.backend.name != "dead-reckoning" and config.front_end.name != "none"
         )
-        self.keyframes = KeyframeSelector(self.config.keyframe)
         self.robot_detector = RobotDetector(
             self.backend, self.runs, outlines(log, config), config, CLOCK_OFFSET_SIGMA_S
         )
@@ -105,6 +104,8 @@ class Pipeline(StepRecorder):
         # of one robot alone; several have their sightings collected in batches
         self.of_sightings = len(log.robots) == 1 and config.keyframe.mode != "all"
         self.of_sightings &= Sighting in kinds and not kinds & {Scan, RelativePose}
+        # sightings alone are solved again with states at their times
+        self.keyframes = KeyframeSelector(self.config.keyframe, at_sightings=Scan in kinds)
         self.removed_returns = self.robot_detector.counts
         self.unrelated_sightings: list[Sighting] = []
 
