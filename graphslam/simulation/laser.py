@@ -95,13 +95,19 @@ def _mixed_pixels(ranges: Array, hits: Hits, laser: Laser, rng: np.random.Genera
     """Ranges with mixed pixels: some beams at a range discontinuity return a range in between.
 
     A beam has a width: at an edge it hits the near and the far surface, and a time-of-flight laser
-    reports a range between them.
+    reports a range between them. It is as wide to either side: of the two beams at an edge each is
+    mixed in half of the cases. A beam along a wall hits the wall alone, however far its neighbours
+    hit it.
     """
     share, chosen = rng.random(hits.ranges.shape), rng.random(hits.ranges.shape)
-    following = np.roll(hits.ranges, -1, axis=1)
-    with np.errstate(invalid="ignore"):  # two beams without a hit
-        jump = following - hits.ranges
-    edge = (np.abs(jump) > laser.mixed_gap_m) & np.isfinite(jump)
-    edge[:, -1] = False  # the last beam has no neighbour
-    mixed = edge & (chosen < laser.mixed_share)
-    return np.where(mixed, ranges + share * np.where(mixed, jump, 0.0), ranges)
+    mixed = ranges
+    for step in (1, -1):
+        with np.errstate(invalid="ignore"):  # two beams without a hit
+            jump = np.roll(hits.ranges, -step, axis=1) - hits.ranges
+        edge = (np.abs(jump) > laser.mixed_gap_m) & np.isfinite(jump)
+        edge &= np.roll(hits.surfaces, -step, axis=1) != hits.surfaces
+        edge[:, -1 if step == 1 else 0] = False  # has no neighbour there
+        least = 0.0 if step == 1 else laser.mixed_share / 2
+        this = edge & (chosen >= least) & (chosen < least + laser.mixed_share / 2)
+        mixed = np.where(this, ranges + share * np.where(this, jump, 0.0), mixed)
+    return mixed
