@@ -21,6 +21,9 @@ HELD_SIGMA = 1e-6
 #: turn more tightly hardly drive at all
 MAX_CURVATURE_PER_M = 6.0
 
+#: settings of the model error: its variances along each axis per metre, radian and second
+RATES = tuple(f"k_{axis}_{unit}" for axis in ("x", "y", "phi") for unit in ("m", "rad", "s"))
+
 
 def wheel_twist(angles_rad: Array, robot: RobotConfig) -> Array:
     """Twists ``(n, 3)`` (path m, 0, turning rad) of wheel rotations ``(n, 2)`` (left, right) rad.
@@ -53,13 +56,24 @@ def model_error_cov(twists: Array, seconds: Array, config: OdometryConfig) -> Ar
     Along the axes of each increment's start frame; linear in path, turning and the ``seconds``
     (n,) in motion, so it does not depend on how finely the odometry is sampled.
     """
-    path = np.hypot(twists[:, 0], twists[:, 1])
-    turn = np.abs(twists[:, 2])
+    rates = np.array([getattr(config, name) for name in RATES]).reshape(3, 3)
     cov = np.zeros((len(twists), 3, 3))
-    cov[:, 0, 0] = config.k_x_m * path + config.k_x_rad * turn + config.k_x_s * seconds
-    cov[:, 1, 1] = config.k_y_m * path + config.k_y_rad * turn + config.k_y_s * seconds
-    cov[:, 2, 2] = config.k_phi_m * path + config.k_phi_rad * turn + config.k_phi_s * seconds
+    cov[:, range(3), range(3)] = _amounts(twists, seconds) @ rates.T
     return cov
+
+
+def unit_error_covs(twists: Array, seconds: Array) -> Array:
+    """Covariances ``(n, 9, 3, 3)`` of `model_error_cov` by a rate of one each, as in `RATES`."""
+    covs = np.zeros((len(twists), 3, 3, 3, 3))  # motion, axis, unit, covariance
+    for axis in range(3):
+        covs[:, axis, :, axis, axis] = _amounts(twists, seconds)
+    return covs.reshape(len(twists), len(RATES), 3, 3)
+
+
+def _amounts(twists: Array, seconds: Array) -> Array:
+    """What the model error grows with, (n, 3): path, turning, time in motion."""
+    path, turn = np.hypot(twists[:, 0], twists[:, 1]), np.abs(twists[:, 2])
+    return np.column_stack([path, turn, seconds])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,6 +4,7 @@ With P the pose at the end of an interval, an additive error e of increment k in
 T(P) F_k e: F_k (3, 3) is its effect as if the interval ended at the path's origin, T(P) adds the
 lever arm from there to P. F_k does not depend on the interval. So the sums of F_k C_k F_kᵀ and
 F_k D_k up to both ends of an interval give its covariance and its derivative by the calibration.
+C_k may be several covariances (..., 3, 3), by several models of the noise.
 """
 
 from dataclasses import dataclass
@@ -58,7 +59,7 @@ class PathSums:
         """The motions (m) from points to later points of the same path, by their indices (m,)."""
         a, b = self.pose[start], self.pose[end]
         T = rotation3(-a[:, 2]) @ _lever(b)
-        cov = T @ (self.cov[end] - self.cov[start]) @ T.mT
+        cov = transformed(self.cov[end] - self.cov[start], T)
         d_cal = T @ (self.d_cal[end] - self.d_cal[start])
         return Motions(between(a, b), cov, d_cal, self.length_m[end] - self.length_m[start])
 
@@ -100,12 +101,18 @@ class IncrementSums:
         return _ends(self._poses[index] - self._poses[first], delta)
 
 
+def transformed(covs: Array, T: Array) -> Array:
+    """T C Tᵀ of covariances (n, ..., 3, 3), any number of them for each T (n, 3, 3)."""
+    T = T.reshape(len(T), *(1 for _ in covs.shape[1:-2]), 3, 3)
+    return np.asarray(T @ covs @ T.mT)
+
+
 def _effects(starts: Array, increments: Increments) -> tuple[Array, Array, Array, Array]:
     """Ends (n, 3) of increments that begin at poses (n, 3), F C Fᵀ, F D, and lengths (n,)."""
     ends = _ends(starts, increments.delta)
     F = _lever(-ends) @ rotation3(starts[:, 2])
     length_m = np.hypot(increments.delta[:, 0], increments.delta[:, 1])
-    return ends, F @ increments.cov @ F.mT, F @ increments.d_cal, length_m
+    return ends, transformed(increments.cov, F), F @ increments.d_cal, length_m
 
 
 def _ends(starts: Array, delta: Array) -> Array:

@@ -14,11 +14,12 @@ import numpy as np
 
 from graphslam.core.config import OdometryConfig
 from graphslam.core.geometry import Array
-from graphslam.odometry.preintegration import Track
+from graphslam.core.motion_models import RATES
+from graphslam.odometry.increment_sums import transformed
+from graphslam.odometry.mounted_motions import lever_to
+from graphslam.odometry.preintegration import Track, path_sums
 from graphslam.odometry.readings import IntArray
 
-#: settings of the rates
-RATES = tuple(f"k_{axis}_{unit}" for axis in ("x", "y", "phi") for unit in ("m", "rad", "s"))
 #: exponent of an extra step in the direction of the last one: without it the distance to the fixed
 #: point halves in each round where sightings are dense, with it a tenth is left
 OVER_RELAXATION = 0.7
@@ -26,6 +27,8 @@ OVER_RELAXATION = 0.7
 FLOOR_M, FLOOR_RAD = 5e-4, 1e-4
 #: residuals are cut at so many of their own sigmas: slip is left to the solution
 CLIP_SIGMAS = 3.0
+#: motions whose variances by nine rates are computed at once
+BLOCK = 1000
 #: a median of absolute values, as the sigma of a normal variable
 SIGMA_OF_MEDIAN = 1.4826
 
@@ -62,8 +65,7 @@ def fit_noise(
     """
     bare = without_floors(with_rates(track.config, np.zeros(len(RATES))))
     R, known = (motion_variances(track, config, times_ns) for config in (track.config, bare))
-    each = [motion_variances(track, with_rates(bare, one), times_ns) for one in np.eye(len(RATES))]
-    C = np.stack(each, axis=-1) - known[:, :, None]  # (n, 3, 9)
+    C = variances_by_rate(track, *times_ns)
     moved = C.any(axis=(1, 2))
     if not moved.any():
         return bare
@@ -113,6 +115,26 @@ def motion_variances(
         return np.diagonal(track.motions(*times_ns).cov, axis1=1, axis2=2).copy()
     finally:
         track.config, track.calibration = before, calibration
+
+
+def variances_by_rate(track: Track, start_ns: IntArray, end_ns: IntArray) -> Array:
+    """What the variances (n, 3) of motions gain by each rate of `RATES`, (n, 3, 9).
+
+    Args:
+        track: odometry of two readings at least.
+        start_ns: (n,) in ascending order.
+        end_ns: (n,) later than these.
+    """
+    found = [np.zeros((0, 3, len(RATES)))]
+    for block in range(0, len(start_ns), BLOCK):  # nine covariances of every reading in between
+        start, end = (times[block : block + BLOCK] for times in (start_ns, end_ns))
+        times, at = np.unique(np.concatenate([start, end]), return_inverse=True)
+        sums, _ = path_sums([track], [times - track.latency_ns], by_rate=True)
+        motions = sums.motions_between(*np.split(at, 2))
+        mount = np.broadcast_to(track.mount, (len(start), 3))
+        covs = transformed(motions.cov, lever_to(motions.delta, mount))
+        found.append(np.diagonal(covs, axis1=2, axis2=3).mT)
+    return np.concatenate(found)
 
 
 def _non_negative(A: Array, b: Array) -> Array:

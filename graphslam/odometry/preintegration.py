@@ -15,25 +15,26 @@ from graphslam.core.geometry import (
     Array,
     between,
     compose,
-    compose_jacobians,
     inverse,
     inverse_cov,
-    rotation3,
+    log,
     wrap,
 )
 from graphslam.core.motion_models import (
     MOTION_SOURCES,
+    RATES,
     Calibration,
     Compounded,
     Increments,
     compound,
-    mounted_motion,
     nominal_calibration,
     parameter_cov,
     rows_of_twists,
+    unit_error_covs,
 )
 from graphslam.core.records import Motion
 from graphslam.odometry.increment_sums import IncrementSums, Motions, PathSums
+from graphslam.odometry.mounted_motions import of_mount
 from graphslam.odometry.readings import BoolArray, IntArray, Readings, integrate_pending
 
 #: m and rad: sigma of the motion of a robot that reports none
@@ -178,7 +179,7 @@ class Track(Readings):
         delta, d_cal, cov = whole.delta, whole.d_cal, whole.cov
         if self.is_mounted:
             by_latency = self._by_latency(start_ns, end_ns, delta)
-            delta, cov, d_cal = _of_mount(delta, cov, d_cal, self.mount, by_latency)
+            delta, cov, d_cal = of_mount(delta, cov, d_cal, self.mount, by_latency)
         cov = cov + d_cal @ self.calibration.cov @ d_cal.T
         if self.source != "given":
             cov = cov + self.floor_cov_of(whole.length_m > 0 or delta[2] != 0)
@@ -272,7 +273,7 @@ class Track(Readings):
         moved = self._coarse(begin, end, mean[:, :p]).motions()
         delta, cov, d_cal = moved.delta, moved.cov, moved.d_cal
         if self.is_mounted:
-            delta, cov, d_cal = _of_mount(delta, cov, d_cal, mean[:, p : p + 3], None)
+            delta, cov, d_cal = of_mount(delta, cov, d_cal, mean[:, p : p + 3], None)
         used = d_cal.shape[2]
         cov = cov + d_cal @ cal_cov[:, :used, :used] @ d_cal.mT
         if self.source != "given":
@@ -374,7 +375,7 @@ def _motions(
         passed += len(needed)
     a, b = np.concatenate(starts), np.concatenate(ends)
     which = np.repeat(np.arange(len(tracks)), [len(start) for start in start_ns])
-    sums, earlier = _path_sums(tracks, times)
+    sums, earlier = path_sums(tracks, times)
     found, first = sums.motions_between(a, b), tracks[0]
     delta, cov, d_cal, length = found.delta, found.cov, found.d_cal, found.length_m
     if first.is_mounted:
@@ -383,7 +384,7 @@ def _motions(
         change[:, 2] = wrap(change[:, 2])
         observable = np.array([not track.has_burst_stamps for track in tracks])
         by_latency = change * np.where(observable, 1e9 / LATENCY_STEP_NS, 0.0)[which, None]
-        delta, cov, d_cal = _of_mount(delta, cov, d_cal, mount, by_latency)
+        delta, cov, d_cal = of_mount(delta, cov, d_cal, mount, by_latency)
     known = np.array([track.calibration.cov for track in tracks])[which]
     cov = (cov + cov.mT) / 2 + d_cal @ known @ d_cal.mT
     moved = (length > 0) | (delta[:, 2] != 0)
@@ -395,16 +396,19 @@ def _motions(
     return Motions(delta, cov, d_cal, length)
 
 
-def _path_sums(tracks: Sequence[Track], times: Sequence[IntArray]) -> tuple[PathSums, Array]:
+def path_sums(
+    tracks: Sequence[Track], times: Sequence[IntArray], *, by_rate: bool = False
+) -> tuple[PathSums, Array]:
     """Sums up to times (n,) of each track's clock, from a reading before all of them.
 
     The tracks have one `Track.batch_key`; their sums follow each other, and so do the poses (n, 3)
-    at times `LATENCY_STEP_NS` earlier.
+    at times `LATENCY_STEP_NS` earlier. Covariances are those of the tracks, or ``by_rate`` (n, 9,
+    3, 3), see `unit_error_covs`.
     """
     p, counts = tracks[0].increment_parameters, [len(t) for t in times]
     n = sum(counts)
     if len(tracks[0]) < 2:
-        zeros, covs = np.zeros((n, 3)), np.zeros((n, 3, 3))
+        zeros, covs = np.zeros((n, 3)), np.zeros((n, *(len(RATES),) * by_rate, 3, 3))
         return PathSums(zeros, covs, np.zeros((n, 3, p)), np.zeros(n)), zeros
     spans = [
         track.span(np.array([when, when - LATENCY_STEP_NS]))
@@ -419,30 +423,10 @@ def _path_sums(tracks: Sequence[Track], times: Sequence[IntArray]) -> tuple[Path
     mean = np.array([track.calibration.mean[:p] for track in tracks])
     of = np.concatenate([of_whole, of_time, of_time])
     made = tracks[0].increments(rows, mean[0] if len(tracks) == 1 else mean[of])
+    if by_rate:
+        made = replace(made, cov=unit_error_covs(log(made.delta), rows[:, -1]))
     first = firsts[of_time]
     index, index_earlier = np.hstack([span.index for span in spans]) + first
     sums = IncrementSums(made.part(0, w), firsts[of_whole])
     earlier = sums.poses(index_earlier, first, made.delta[w + n :])
     return sums.query(index, first, made.part(w, w + n)), earlier
-
-
-def _of_mount(
-    delta: Array, cov: Array, d_cal: Array, mount: Array, by_latency: Array | None
-) -> tuple[Array, Array, Array]:
-    """Motion, covariance, derivative of a frame at ``mount`` (..., 3) in a body that so moves.
-
-    Args:
-        delta: (..., 3) motion of the body.
-        cov: (..., 3, 3) its covariance.
-        d_cal: (..., 3, p) its derivative by the calibration. It gains columns for the mount and,
-            unless ``by_latency`` is None, for the latency.
-        mount: pose (..., 3) of the frame in the body.
-        by_latency: (..., 3) derivative of the body's motion, /s.
-    """
-    # errors of the body's motion, as they move the mounted frame: with its lever arm
-    lever = rotation3(-mount[..., 2]) @ compose_jacobians(delta, mount)[0]
-    moved, d_mount = mounted_motion(delta, mount)
-    parts = [lever @ d_cal, d_mount]
-    if by_latency is not None:
-        parts.append(lever @ by_latency[..., None])
-    return moved, lever @ cov @ lever.mT, np.concatenate(parts, axis=-1)

@@ -29,10 +29,11 @@ from graphslam.mapping.redundant_closures import untied_closures
 from graphslam.mapping.visits import tie_visits
 from graphslam.odometry.preintegration import Track
 from graphslam.slam.log_pass import timed
-from graphslam.slam.motion_noise import noise_scales, scale_motion_noise
+from graphslam.slam.motion_noise import fit_motion_noise, noise_scales, scale_motion_noise
 from graphslam.slam.path_closing import ClosedPaths, close_paths
 from graphslam.slam.reoptimise_scans import with_closures
 from graphslam.slam.scan_tracking import ScanLog
+from graphslam.slam.sighting_noise import MOTION, LogNoise
 
 #: factors on the gates of re-association (across, direction): with the closed paths, and solved
 CLOSED_FACTORS, SOLVED_FACTORS = (1.0, 1.0), (1 / 2, 2 / 3)
@@ -107,8 +108,14 @@ def _solved(
     config, counts, landmarks = scan_log.config, scan_log.counts, scan_log.landmarks
     closures = list(paths.closures)
     steps = _tied(steps, start, None, paths, scan_log)
-    rough = _solve(with_closures(steps, closures), start, tracks, config, rough=True).solution
+    first = _solve(with_closures(steps, closures), start, tracks, config, rough=True)
+    rough, rough_steps = first.solution, first.steps
     steps = _tied(steps, rough.estimate, rough, paths, scan_log)
+    if config.odometry.calibrate:
+        measured = fit_motion_noise(tracks, rough_steps, rough.graph.posterior())
+        odometry = {name: track.config for name, track in tracks.items() if name not in measured}
+        stated = {(name, MOTION): factors for name, factors in measured.items()}
+        scan_log.noise = LogNoise({}, odometry, stated).to_summary()
     # once landmarks of different visits are tied, most closures are no longer needed
     closures = untied_closures(closures, paths.spans, steps, landmarks)
     counts["closures_kept"] = len(closures)

@@ -1,7 +1,9 @@
 """How noisy the motions of a log are, as its estimate shows them.
 
-One estimator for logs of scans and logs of sightings: the median of normalised residuals, axis by
-axis. A few motions that are wrong (slip, jumps) do not move it; they are left to the solution.
+The same for logs of scans and logs of sightings. While an estimate is rough: the median of
+normalised residuals, axis by axis. A few motions that are wrong (slip, jumps) do not move it; they
+are left to the solution. With the covariances of a solution: the settings of the odometry's noise
+themselves, each residual divided by what the solution leaves of its variance.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,9 +13,15 @@ import numpy as np
 from graphslam.core.geometry import Array, between, wrap
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Step
+from graphslam.estimation.posterior_residuals import Posterior, Residuals, spans
+from graphslam.odometry.noise_estimation import fit_noise, is_stated, motion_variances
+from graphslam.odometry.preintegration import Track
+from graphslam.odometry.readings import IntArray
 
 #: motions of a robot from which their noise is estimated at least
 MIN_MOTIONS = 50
+#: m, rad: least sigma of a motion
+MIN_SIGMA = 1e-4
 #: factor on stated sigmas from which a log contradicts them
 UNDERSTATED = 2.0
 #: median of the absolute value of a standard normal variable
@@ -83,3 +91,84 @@ def scale_motion_noise(steps: Sequence[Step], scales: Mapping[str, Array]) -> tu
         )
         for step in steps
     )
+
+
+def fit_track_noise(
+    track: Track, robot: str, steps: Sequence[Step], posterior: Posterior, *, relax: bool
+) -> float | None:
+    """Give a track whose noise nobody states that of its motions in a solution.
+
+    Motions that scans replaced are left out.
+
+    Args:
+        track: odometry of ``robot``, with the calibration that was found.
+        robot: its name.
+        steps: with its motions; too few of them change nothing.
+        posterior: of their solution.
+        relax: see `fit_noise`.
+
+    Returns:
+        The largest share by which the mean variance along x, or of turning, has changed; None if
+        there are too few motions.
+    """
+    own = [step.motions[robot] for step in steps if robot in step.motions]
+    by_odometry = np.array([not motion.from_scans for motion in own], dtype=bool)
+    if by_odometry.sum() < MIN_MOTIONS:
+        return None
+    times = _times(steps, robot)
+    found = _residuals(track, robot, times, posterior)
+    used = times[0][by_odometry], times[1][by_odometry]
+    normalised, left = found.normalised[by_odometry], found.redundancy[by_odometry]
+    track.config = fit_noise(track, used, normalised, left, relax=relax)
+    after = motion_variances(track, track.config, used)
+    return float(np.abs(np.mean(after / found.variance[by_odometry], axis=0)[[0, 2]] - 1.0).max())
+
+
+def measured_motion_noise(
+    track: Track, robot: str, steps: Sequence[Step], posterior: Posterior
+) -> Array | None:
+    """Factors (3,) on a track's variances that its motions show over seconds; None if too few."""
+    begin, end = _times(steps, robot)
+    if len(begin) < MIN_MOTIONS:
+        return None
+    of = spans(np.append(begin[0], end))
+    over = begin[of[:, 0]], end[of[:, 1] - 1]
+    return _residuals(track, robot, over, posterior, over_spans=True).variance_factor()
+
+
+def fit_motion_noise(
+    tracks: Mapping[str, Track], steps: Sequence[Step], posterior: Posterior
+) -> dict[str, Array]:
+    """`fit_track_noise` of all tracks; returns `measured_motion_noise` of those that are stated."""
+    measured = {}
+    for robot, track in tracks.items():
+        if is_stated(track):
+            found = measured_motion_noise(track, robot, steps, posterior)
+            if found is not None:
+                measured[robot] = found
+        else:
+            fit_track_noise(track, robot, steps, posterior, relax=False)
+    return measured
+
+
+def _times(steps: Sequence[Step], robot: str) -> tuple[IntArray, IntArray]:
+    """When the motions (n,) of a robot begin and end."""
+    own = [step.motions[robot] for step in steps if robot in step.motions]
+    return (
+        np.array([motion.start_ns for motion in own], dtype=np.int64),
+        np.array([motion.end_ns for motion in own], dtype=np.int64),
+    )
+
+
+def _residuals(
+    track: Track,
+    robot: str,
+    times_ns: tuple[IntArray, IntArray],
+    posterior: Posterior,
+    *,
+    over_spans: bool = False,
+) -> Residuals:
+    """Residuals of a robot's motions between times (n,), by its track's noise."""
+    variances = np.maximum(motion_variances(track, track.config, times_ns), MIN_SIGMA**2)
+    deltas = track.motions(*times_ns).delta
+    return posterior.motions(robot, deltas, variances, over_spans=over_spans)

@@ -14,22 +14,16 @@ import numpy as np
 
 from graphslam.core.config import Config, OdometryConfig, RobustConfig
 from graphslam.core.geometry import Array
+from graphslam.core.motion_models import RATES
 from graphslam.core.records import Association, Estimate, Sighting, Start, Step
 from graphslam.estimation.calibration_graph import CalibrationGraph
-from graphslam.estimation.posterior_residuals import Posterior, Residuals, spans
+from graphslam.estimation.posterior_residuals import Posterior
 from graphslam.estimation.recorded_graph import ObservationNoise, Source
 from graphslam.estimation.residual_distribution import fit_distribution, shared_variance
-from graphslam.odometry.noise_estimation import (
-    RATES,
-    fit_noise,
-    is_stated,
-    motion_variances,
-    without_floors,
-)
+from graphslam.odometry.noise_estimation import is_stated, without_floors
 from graphslam.odometry.preintegration import Track
-from graphslam.odometry.readings import IntArray
+from graphslam.slam.motion_noise import fit_track_noise, measured_motion_noise
 from graphslam.slam.sighting_states import (
-    MIN_SIGMA,
     at_states,
     state_times,
     steps_at_sightings,
@@ -44,7 +38,7 @@ MAX_ROUNDS, CONVERGED_SHARE = 8, 0.1
 CONVERGED_ERROR = 1e-4
 #: smallest factor on a stated variance on the way, for logs without noise
 MIN_VARIANCE = 1e-4
-#: sightings or motions without which nothing is said about a source
+#: sightings without which nothing is said about a source
 MIN_MEASUREMENTS = 100
 #: a latency of sightings is applied if it is so many of its sigmas
 LATENCY_SIGMAS = 4.0
@@ -197,7 +191,14 @@ def _estimated(
         for name, track in tracks.items():
             cov = graph.calibration_covariance(name, posterior)
             track.calibration = replace(calibrations[name], cov=cov)
-            change = max(change, _update_track(track, name, made, posterior, measured, stated, k))
+            if name in stated:
+                factors = measured_motion_noise(track, name, made, posterior)
+                if factors is not None:
+                    measured[name, MOTION] = factors
+                continue
+            changed = fit_track_noise(track, name, made, posterior, relax=k > 0)
+            track.config = without_floors(track.config)
+            change = max(change, changed or 0.0)
         if change < CONVERGED_SHARE or not _is_white(noise):
             break
     for track in tracks.values():
@@ -274,47 +275,3 @@ def _largest_change(
     return max(
         (float(np.abs(after[s].white / before[s].white - 1.0).max()) for s in after), default=0.0
     )
-
-
-def _update_track(
-    track: Track,
-    robot: str,
-    steps: Sequence[Step],
-    posterior: Posterior,
-    measured: dict[Source, Array],
-    stated: set[str],
-    k: int,
-) -> float:
-    """Give a track the noise of its motions; returns the largest share by which it has changed."""
-    own = [step.motions[robot] for step in steps if robot in step.motions]
-    if len(own) < MIN_MEASUREMENTS:
-        track.config = without_floors(track.config)
-        return 0.0
-    times = (
-        np.array([m.start_ns for m in own], dtype=np.int64),
-        np.array([m.end_ns for m in own], dtype=np.int64),
-    )
-    if robot in stated:
-        of = spans(np.append(times[0][0], times[1]))
-        over = times[0][of[:, 0]], times[1][of[:, 1] - 1]
-        found = _residuals(track, robot, over, posterior, over_spans=True)
-        measured[robot, MOTION] = found.variance_factor()
-        return 0.0
-    found = _residuals(track, robot, times, posterior)
-    track.config = fit_noise(track, times, found.normalised, found.redundancy, relax=k > 0)
-    after = motion_variances(track, track.config, times)
-    return float(np.abs(np.mean(after / found.variance, axis=0)[[0, 2]] - 1.0).max())
-
-
-def _residuals(
-    track: Track,
-    robot: str,
-    times_ns: tuple[IntArray, IntArray],
-    posterior: Posterior,
-    *,
-    over_spans: bool = False,
-) -> Residuals:
-    """Residuals of a robot's motions between times (n,), by its track's noise."""
-    variances = np.maximum(motion_variances(track, track.config, times_ns), MIN_SIGMA**2)
-    deltas = track.motions(*times_ns).delta
-    return posterior.motions(robot, deltas, variances, over_spans=over_spans)

@@ -1,0 +1,32 @@
+"""Motions of a frame that is mounted on a moving body, with their errors."""
+
+import numpy as np
+
+from graphslam.core.geometry import Array, compose_jacobians, rotation3
+from graphslam.core.motion_models import mounted_motion
+
+
+def of_mount(
+    delta: Array, cov: Array, d_cal: Array, mount: Array, by_latency: Array | None
+) -> tuple[Array, Array, Array]:
+    """Motion, covariance, derivative of a frame at ``mount`` (..., 3) in a body that so moves.
+
+    Args:
+        delta: (..., 3) motion of the body.
+        cov: (..., 3, 3) its covariance.
+        d_cal: (..., 3, p) its derivative by the calibration. It gains columns for the mount and,
+            unless ``by_latency`` is None, for the latency.
+        mount: pose (..., 3) of the frame in the body.
+        by_latency: (..., 3) derivative of the body's motion, /s.
+    """
+    lever = lever_to(delta, mount)
+    moved, d_mount = mounted_motion(delta, mount)
+    parts = [lever @ d_cal, d_mount]
+    if by_latency is not None:
+        parts.append(lever @ by_latency[..., None])
+    return moved, lever @ cov @ lever.mT, np.concatenate(parts, axis=-1)
+
+
+def lever_to(delta: Array, mount: Array) -> Array:
+    """Errors of a body's motion, as they move a frame mounted on it: (..., 3, 3), its lever arm."""
+    return np.asarray(rotation3(-mount[..., 2]) @ compose_jacobians(delta, mount)[0])
