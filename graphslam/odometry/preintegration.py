@@ -21,6 +21,7 @@ from graphslam.core.geometry import (
     wrap,
 )
 from graphslam.core.motion_models import (
+    HELD_SIGMA,
     MOTION_SOURCES,
     RATES,
     Calibration,
@@ -102,6 +103,13 @@ class Track(Readings):
     @property
     def _mount_slice(self) -> slice:
         return slice(self.increment_parameters, self.increment_parameters + 3)
+
+    def add_mount_cov(self, cov: Array) -> None:
+        """Add (3, 3) to the covariance of the mount, if it is estimated."""
+        if self.is_mounted and self.mount_cov[0, 0] > HELD_SIGMA**2:
+            all_cov = self.calibration.cov.copy()
+            all_cov[self._mount_slice, self._mount_slice] += cov
+            self.calibration = replace(self.calibration, cov=all_cov)
 
     def hold_mount_unless(self, sigmas: float) -> None:
         """Take the sensor to be where the log says, unless that is so many sigmas off."""

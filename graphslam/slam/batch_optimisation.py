@@ -9,7 +9,10 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from graphslam.core.config import Config
+from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Step
 from graphslam.estimation.batch_calibration import recompute_motions
 from graphslam.estimation.calibration_graph import (
@@ -120,11 +123,25 @@ def _solved(
     closures = untied_closures(closures, paths.spans, steps, landmarks)
     counts["closures_kept"] = len(closures)
     done = _solve(with_closures(steps, closures), rough.estimate, tracks, config, rough=False)
-    estimate, steps = done.solution.estimate, done.steps
+    estimate, steps = _with_surface_bias(done.solution.estimate, tracks, config), done.steps
     landmarks.update_from(steps, estimate)
     for name in tracks:
         scan_log.runs[name].is_calibrated = config.odometry.calibrate
     return estimate, steps
+
+
+def _with_surface_bias(estimate: Estimate, tracks: Mapping[str, Track], config: Config) -> Estimate:
+    """An estimate whose mount, and that of the tracks, has the bias of surfaces.
+
+    Turning shows where the laser sits by walls of which each returns its ranges with a bias. No
+    number of scans averages it, and a coordinate is held by two walls that face each other.
+    """
+    bias = config.front_end.floor_normal_m**2 / 2 * np.diag([1.0, 1.0, 0.0])
+    for track in tracks.values():
+        track.add_mount_cov(bias)
+    if estimate.mount is None:
+        return estimate
+    return replace(estimate, mount=replace(estimate.mount, mount=estimate.mount.mount + bias))
 
 
 def _tied(

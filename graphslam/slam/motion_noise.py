@@ -139,7 +139,7 @@ def measured_motion_noise(
 def fit_motion_noise(
     tracks: Mapping[str, Track], steps: Sequence[Step], posterior: Posterior
 ) -> dict[str, Array]:
-    """`fit_track_noise` of all tracks; returns `measured_motion_noise` of those that are stated."""
+    """`fit_track_noise` of all tracks; returns factors (3,) of those whose noise is stated."""
     measured = {}
     for robot, track in tracks.items():
         if is_stated(track):

@@ -143,8 +143,9 @@ def test_a_folder_read_back_says_the_same_of_relations(room):
     made = Relations(scans.stamps_ns[a], scans.stamps_ns[b], reference)
     found = evaluate(saved, relations=made)["relations"]["all"]
     assert found == pytest.approx(evaluate(result, relations=made)["relations"]["all"])
-    # the reference's noise alone is inside more often than 95 %, the more the less is known
-    assert 0.93 <= found["trans_inside"] <= 1.0 and 0.93 <= found["rot_inside"] <= 1.0
+    # the reference's noise alone is inside in 95 %, or more often, the more the less is known; of
+    # 400 relations the share has a sigma of 1.1 %
+    assert 0.917 <= found["trans_inside"] <= 1.0 and 0.917 <= found["rot_inside"] <= 1.0
     unknown = evaluate(replace(saved, joint=None), relations=made)["relations"]["all"]
     assert unknown["trans_inside"] is None and unknown["trans_mean_m"] == found["trans_mean_m"]
 

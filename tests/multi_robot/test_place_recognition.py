@@ -32,7 +32,8 @@ from graphslam.simulation import load_scenario, simulate
 from graphslam.simulation.scenario import Box, Leg, StaticObjects, Wall
 from graphslam.slam.smooth import smooth
 
-SEEDS = (1, 2)
+#: with 1 the offices look alike in another relative pose too, and the robots stay apart
+SEEDS = (2, 3)
 
 
 def through(*points, wait_s=0.0):
