@@ -32,9 +32,6 @@ from graphslam.simulation import load_scenario, simulate
 from graphslam.simulation.scenario import Box, Leg, StaticObjects, Wall
 from graphslam.slam.smooth import smooth
 
-#: with 1 the offices look alike in another relative pose too, and the robots stay apart
-SEEDS = (2, 3)
-
 
 def through(*points, wait_s=0.0):
     legs = (Leg(wait_s=wait_s),) if wait_s else ()
@@ -122,11 +119,14 @@ def starts(path):
     return between(truth["a"].poses[0], truth["b"].poses[0])
 
 
-@pytest.mark.parametrize("make", [office, forest])
-def test_robots_are_related_by_anonymous_maps(tmp_path, make):
-    """Within the sigmas that are stated, and then the map is as good as with the start given."""
+@pytest.mark.parametrize(("make", "seeds"), [(office, (2, 3)), (forest, (1, 2))])
+def test_robots_are_related_by_anonymous_maps(tmp_path, make, seeds):
+    """Within the sigmas that are stated, and then the map is as good as with the start given.
+
+    With seed 1 the offices look alike in another relative pose too, and the robots stay apart.
+    """
     off, known, found = [], [], []
-    for seed in SEEDS:
+    for seed in seeds:
         path = make(tmp_path / f"{seed}.mcap", seed)
         true = starts(path)
         result = run(path)
