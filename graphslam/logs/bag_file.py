@@ -10,7 +10,7 @@ Source: https://wiki.ros.org/Bags/Format/2.0
 import bz2
 import struct
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -19,14 +19,13 @@ from typing import BinaryIO, NamedTuple
 import lz4.frame
 
 from graphslam.core.errors import LogError
-from graphslam.logs.container_files import digest, open_file, size_of
+from graphslam.logs.container_files import digest, open_file, size_of, stream_reader
 from graphslam.logs.recording import (
     MAX_BLOCK,
     Block,
     BlockList,
     Channel,
     Piece,
-    ReadBlock,
     one_line,
 )
 
@@ -70,13 +69,6 @@ def index_bag(path: Path) -> Piece:
     """
     with open_file(path) as stream:
         return _Indexer(path, stream).run()
-
-
-@contextmanager
-def _reading(piece: Piece) -> Iterator[ReadBlock]:
-    """Reads blocks of ``piece``."""
-    with open_file(piece.path) as stream:
-        yield partial(_block_messages, stream)
 
 
 def _block_messages(
@@ -367,5 +359,5 @@ class _Indexer:
             in_order=self.blocks.in_order,
             lost=lost,
             damage="; ".join(self.damage),
-            open=_reading,
+            open=partial(stream_reader, _block_messages),
         )

@@ -3,8 +3,9 @@
 import hashlib
 import io
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -12,6 +13,11 @@ import zstandard
 
 if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
+
+    from graphslam.logs.recording import Block, Piece, ReadBlock
+
+    #: number of its channel, log time ns, data
+    Message = tuple[int, int, bytes]
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _BUFFER = 1 << 20
@@ -29,6 +35,16 @@ def open_file(path: Path) -> BinaryIO:
     if is_compressed(path):
         return io.BufferedReader(_Unpacked(path), _BUFFER)
     return path.open("rb")
+
+
+@contextmanager
+def stream_reader(
+    block_messages: "Callable[[BinaryIO, Block, Collection[int]], Iterator[Message]]",
+    piece: "Piece",
+) -> "Iterator[ReadBlock]":
+    """Reads blocks of ``piece`` by ``block_messages``, whose first argument is the open file."""
+    with open_file(piece.path) as stream:
+        yield partial(block_messages, stream)
 
 
 def is_compressed(path: Path) -> bool:

@@ -8,7 +8,6 @@ reads with `mcap`.
 
 import struct
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
 from functools import partial
 from io import SEEK_CUR, BytesIO
 from itertools import islice
@@ -24,8 +23,8 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema, 
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.summary import Summary
 
-from graphslam.logs.container_files import digest, open_file, size_of
-from graphslam.logs.recording import MAX_BLOCK, Block, BlockList, Piece, ReadBlock, one_line
+from graphslam.logs.container_files import digest, open_file, size_of, stream_reader
+from graphslam.logs.recording import MAX_BLOCK, Block, BlockList, Piece, one_line
 from graphslam.logs.recording import Channel as TopicChannel
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -60,13 +59,6 @@ def index_mcap(path: Path) -> Piece:
     """
     with open_file(path) as stream:
         return _Indexer(path, stream).run()
-
-
-@contextmanager
-def _reading(piece: Piece) -> Iterator[ReadBlock]:
-    """Reads blocks of ``piece``."""
-    with open_file(piece.path) as stream:
-        yield partial(_block_messages, stream)
 
 
 # ---------------------------------------------------------------- blocks
@@ -288,6 +280,6 @@ class _Indexer:
             in_order=self.blocks.in_order,
             lost=lost,
             damage="; ".join(self.damage),
-            open=_reading,
+            open=partial(stream_reader, _block_messages),
             notes=self.notes,
         )

@@ -104,9 +104,14 @@ class Track(Readings):
     def _mount_slice(self) -> slice:
         return slice(self.increment_parameters, self.increment_parameters + 3)
 
+    @property
+    def is_mount_estimated(self) -> BoolArray:
+        """(3,) which of x, y and yaw of the mount are not held."""
+        return np.asarray(np.diag(self.mount_cov) > HELD_SIGMA**2)
+
     def add_mount_cov(self, cov: Array) -> None:
-        """Add (3, 3) to the covariance of the mount, if it is estimated."""
-        if self.is_mounted and self.mount_cov[0, 0] > HELD_SIGMA**2:
+        """Add (3, 3) to the covariance of the mount."""
+        if self.is_mounted:
             all_cov = self.calibration.cov.copy()
             all_cov[self._mount_slice, self._mount_slice] += cov
             self.calibration = replace(self.calibration, cov=all_cov)

@@ -36,7 +36,6 @@ from graphslam.slam.motion_noise import fit_motion_noise, noise_scales, scale_mo
 from graphslam.slam.path_closing import ClosedPaths, close_paths
 from graphslam.slam.reoptimise_scans import with_closures
 from graphslam.slam.scan_tracking import ScanLog
-from graphslam.slam.sighting_noise import MOTION, LogNoise
 
 #: factors on the gates of re-association (across, direction): with the closed paths, and solved
 CLOSED_FACTORS, SOLVED_FACTORS = (1.0, 1.0), (1 / 2, 2 / 3)
@@ -112,13 +111,11 @@ def _solved(
     closures = list(paths.closures)
     steps = _tied(steps, start, None, paths, scan_log)
     first = _solve(with_closures(steps, closures), start, tracks, config, rough=True)
-    rough, rough_steps = first.solution, first.steps
+    rough = first.solution
     steps = _tied(steps, rough.estimate, rough, paths, scan_log)
     if config.odometry.calibrate:
-        measured = fit_motion_noise(tracks, rough_steps, rough.graph.posterior())
-        odometry = {name: track.config for name, track in tracks.items() if name not in measured}
-        stated = {(name, MOTION): factors for name, factors in measured.items()}
-        scan_log.noise = LogNoise({}, odometry, stated).to_summary()
+        noise = fit_motion_noise(tracks, first.steps, rough.graph.posterior())
+        scan_log.noise = noise.to_summary()
     # once landmarks of different visits are tied, most closures are no longer needed
     closures = untied_closures(closures, paths.spans, steps, landmarks)
     counts["closures_kept"] = len(closures)
@@ -136,12 +133,14 @@ def _with_surface_bias(estimate: Estimate, tracks: Mapping[str, Track], config: 
     Turning shows where the laser sits by walls of which each returns its ranges with a bias. No
     number of scans averages it, and a coordinate is held by two walls that face each other.
     """
-    bias = config.front_end.floor_normal_m**2 / 2 * np.diag([1.0, 1.0, 0.0])
+    variance = config.front_end.floor_normal_m**2 / 2
     for track in tracks.values():
+        bias = np.diag(np.where(track.is_mount_estimated, [variance, variance, 0.0], 0.0))
         track.add_mount_cov(bias)
-    if estimate.mount is None:
-        return estimate
-    return replace(estimate, mount=replace(estimate.mount, mount=estimate.mount.mount + bias))
+        if estimate.mount is not None:  # the only robot's
+            mount = replace(estimate.mount, mount=estimate.mount.mount + bias)
+            estimate = replace(estimate, mount=mount)
+    return estimate
 
 
 def _tied(

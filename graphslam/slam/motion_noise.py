@@ -17,10 +17,11 @@ from graphslam.estimation.posterior_residuals import Posterior, Residuals, spans
 from graphslam.odometry.noise_estimation import fit_noise, is_stated, motion_variances
 from graphslam.odometry.preintegration import Track
 from graphslam.odometry.readings import IntArray
+from graphslam.slam.log_noise import MOTION, LogNoise
 
 #: motions of a robot from which their noise is estimated at least
 MIN_MOTIONS = 50
-#: m, rad: least sigma of a motion
+#: m, rad: least sigma of a motion, in any direction
 MIN_SIGMA = 1e-4
 #: factor on stated sigmas from which a log contradicts them
 UNDERSTATED = 2.0
@@ -138,17 +139,18 @@ def measured_motion_noise(
 
 def fit_motion_noise(
     tracks: Mapping[str, Track], steps: Sequence[Step], posterior: Posterior
-) -> dict[str, Array]:
-    """`fit_track_noise` of all tracks; returns factors (3,) of those whose noise is stated."""
+) -> LogNoise:
+    """`fit_track_noise` of all tracks; of those whose noise is stated what is measured."""
     measured = {}
     for robot, track in tracks.items():
         if is_stated(track):
             found = measured_motion_noise(track, robot, steps, posterior)
             if found is not None:
-                measured[robot] = found
+                measured[robot, MOTION] = found
         else:
             fit_track_noise(track, robot, steps, posterior, relax=False)
-    return measured
+    used = {name: track.config for name, track in tracks.items() if (name, MOTION) not in measured}
+    return LogNoise(odometry=used, measured=measured)
 
 
 def _times(steps: Sequence[Step], robot: str) -> tuple[IntArray, IntArray]:

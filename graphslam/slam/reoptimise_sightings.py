@@ -22,9 +22,9 @@ from graphslam.estimation.recorded_graph import SHARED_NS
 from graphslam.odometry.increment_sums import Motions
 from graphslam.odometry.preintegration import Track, preintegrate_batch
 from graphslam.odometry.readings import IntArray
+from graphslam.slam.log_noise import LogNoise
 from graphslam.slam.motion_noise import noise_scales, scale_motion_noise
 from graphslam.slam.sighting_batches import transport_batch, transport_target
-from graphslam.slam.sighting_noise import LogNoise
 from graphslam.slam.sighting_states import measured_from_base
 
 #: ns: residuals of one target's sightings farther apart are taken as independent

@@ -7,21 +7,20 @@ noise that is new in every sighting, and errors that sightings of one target sha
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
-from graphslam.core.config import Config, OdometryConfig, RobustConfig
+from graphslam.core.config import Config
 from graphslam.core.geometry import Array
-from graphslam.core.motion_models import RATES
-from graphslam.core.records import Association, Estimate, Sighting, Start, Step
+from graphslam.core.records import Estimate, Sighting, Start, Step
 from graphslam.estimation.calibration_graph import CalibrationGraph
 from graphslam.estimation.posterior_residuals import Posterior
 from graphslam.estimation.recorded_graph import ObservationNoise, Source
 from graphslam.estimation.residual_distribution import fit_distribution, shared_variance
 from graphslam.odometry.noise_estimation import is_stated, without_floors
 from graphslam.odometry.preintegration import Track
+from graphslam.slam.log_noise import MOTION, LogNoise, is_white
 from graphslam.slam.motion_noise import fit_track_noise, measured_motion_noise
 from graphslam.slam.sighting_states import (
     at_states,
@@ -42,71 +41,8 @@ MIN_VARIANCE = 1e-4
 MIN_MEASUREMENTS = 100
 #: a latency of sightings is applied if it is so many of its sigmas
 LATENCY_SIGMAS = 4.0
-#: name of the odometry among the sources of `LogNoise.measured`
-MOTION = "motion"
 #: m, rad: sigmas of the pose at which a robot's part of the stretch begins
 BEGIN_SIGMA = 0.01
-
-
-@dataclass(frozen=True, slots=True)
-class LogNoise:
-    """The noise of a log.
-
-    ``sightings``: that of bearings and ranges by source; ``odometry``: robot -> its settings,
-    without floors; ``measured``: source -> factors (2,) on the stated variances, shared errors
-    included, that the log shows, and likewise (3,) of motions whose covariances are stated.
-    """
-
-    sightings: Mapping[Source, ObservationNoise] = field(default_factory=dict)
-    odometry: Mapping[str, OdometryConfig] = field(default_factory=dict)
-    measured: Mapping[Source, Array] = field(default_factory=dict)
-
-    def motion_scales(self) -> dict[str, Array]:
-        """Robot -> factor (3,) on the sigmas of its motions: the stated noise is never reduced."""
-        return {
-            robot: np.sqrt(np.maximum(1.0, factors))
-            for (robot, model), factors in self.measured.items()
-            if model == MOTION
-        }
-
-    @property
-    def is_white(self) -> bool:
-        """Whether the errors of sightings are independent: then every one of them counts."""
-        return _is_white(self.sightings)
-
-    def to_summary(self) -> dict[str, Any]:
-        """Key `noise` of summary.json."""
-        quantities = {MOTION: ("motion along x", "motion along y", "turning")}
-        out: dict[str, Any] = {}
-        for (robot, model), factors in sorted(self.measured.items()):
-            names = quantities.get(model, ("bearings", "ranges"))
-            entry: dict[str, Any] = {"measured": dict(zip(names, factors.tolist(), strict=True))}
-            noise = self.sightings.get((robot, model))
-            if noise is not None:
-                entry |= {"white": noise.white.tolist(), "shared": noise.shared.tolist()}
-            out[f"{robot} {model}"] = entry
-        for robot, config in self.odometry.items():
-            out[f"{robot} odometry"] = {name: getattr(config, name) for name in RATES}
-        return out
-
-    def kernel(self, given: RobustConfig) -> RobustConfig:
-        """The kernel as wide as the tails of white noise allow; as ``given`` for any other."""
-        if not (self.is_white and self.sightings):
-            return given
-        return replace(given, scale=min(noise.kernel_scale for noise in self.sightings.values()))
-
-
-def with_own_noise(steps: Sequence[Step], noise: LogNoise) -> tuple[Step, ...]:
-    """Steps whose sightings have the noise of a log that each has by itself, shared or not."""
-
-    def widened(a: Association) -> Association:
-        own = noise.sightings.get((a.robot, a.model))
-        if own is None:
-            return a
-        sigma = np.sqrt(own.white + own.shared)
-        return a.with_measurement(a.z, a.cov * np.outer(sigma, sigma))
-
-    return tuple(replace(s, associations=tuple(map(widened, s.associations))) for s in steps)
 
 
 def estimate_noise(
@@ -199,7 +135,7 @@ def _estimated(
             changed = fit_track_noise(track, name, made, posterior, relax=k > 0)
             track.config = without_floors(track.config)
             change = max(change, changed or 0.0)
-        if change < CONVERGED_SHARE or not _is_white(noise):
+        if change < CONVERGED_SHARE or not is_white(noise):
             break
     for track in tracks.values():
         hold_insignificant_latency(track)
@@ -223,10 +159,6 @@ def hold_insignificant_latency(track: Track) -> None:
     last = [len(mean) - 1]
     track.prior = track.prior.at_zero(last)
     track.calibration = replace(track.prior, mean=np.append(mean[:-1], 0.0))
-
-
-def _is_white(noise: Mapping[Source, ObservationNoise]) -> bool:
-    return not any(found.shared.any() for found in noise.values())
 
 
 def _sighting_noise(

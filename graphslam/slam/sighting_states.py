@@ -17,11 +17,10 @@ from graphslam.odometry.increment_sums import Motions
 from graphslam.odometry.interpolation import IntArray, final_at
 from graphslam.odometry.preintegration import LATENCY_STEP_NS, Track, preintegrate_batch
 from graphslam.perception.sightings import sighting_observation
+from graphslam.slam.motion_noise import MIN_SIGMA
 
 #: ns: velocities are the motion from so long before to so long after
 BASELINE_NS = 250_000_000
-#: m, rad: least sigma of a motion, in any direction
-MIN_SIGMA = 1e-4
 
 
 def steps_at_sightings(

@@ -7,9 +7,9 @@ from graphslam.core.config import RobustConfig
 from graphslam.core.records import Estimate, Step
 from graphslam.estimation.batch_calibration import ROUNDS, calibrate
 from graphslam.odometry.preintegration import Track
+from graphslam.slam.log_noise import LogNoise, with_own_noise
 from graphslam.slam.log_pass import LogPass
 from graphslam.slam.motion_noise import scale_motion_noise
-from graphslam.slam.sighting_noise import LogNoise, with_own_noise
 from graphslam.slam.sighting_states import (
     at_states,
     state_times,

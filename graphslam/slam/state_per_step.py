@@ -9,9 +9,9 @@ import numpy as np
 from graphslam.core.config import Config
 from graphslam.core.records import Estimate, Sighting, Step
 from graphslam.odometry.preintegration import Track
+from graphslam.slam.log_noise import LogNoise, with_own_noise
 from graphslam.slam.log_pass import LogPass
 from graphslam.slam.reoptimise_sightings import SightingGroup, group_sightings, solve_sighting_log
-from graphslam.slam.sighting_noise import LogNoise, with_own_noise
 from graphslam.slam.sighting_states import at_states, steps_at_sightings
 from graphslam.slam.state_at_every_sighting import SightingProblem, state_at_every_sighting
 

@@ -1,0 +1,82 @@
+"""The noise of a log, as its solution uses it and as summary.json reports it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from graphslam.core.config import OdometryConfig, RobustConfig
+from graphslam.core.geometry import Array
+from graphslam.core.motion_models import RATES
+from graphslam.core.records import Association, Step
+from graphslam.estimation.recorded_graph import ObservationNoise, Source
+
+#: name of the odometry among the sources of `LogNoise.measured`
+MOTION = "motion"
+
+
+@dataclass(frozen=True, slots=True)
+class LogNoise:
+    """The noise of a log.
+
+    ``sightings``: that of bearings and ranges by source; ``odometry``: robot -> its settings,
+    without floors; ``measured``: source -> factors (2,) on the stated variances, shared errors
+    included, that the log shows, and likewise (3,) of motions whose covariances are stated.
+    """
+
+    sightings: Mapping[Source, ObservationNoise] = field(default_factory=dict)
+    odometry: Mapping[str, OdometryConfig] = field(default_factory=dict)
+    measured: Mapping[Source, Array] = field(default_factory=dict)
+
+    def motion_scales(self) -> dict[str, Array]:
+        """Robot -> factor (3,) on the sigmas of its motions: the stated noise is never reduced."""
+        return {
+            robot: np.sqrt(np.maximum(1.0, factors))
+            for (robot, model), factors in self.measured.items()
+            if model == MOTION
+        }
+
+    @property
+    def is_white(self) -> bool:
+        """Whether the errors of sightings are independent: then every one of them counts."""
+        return is_white(self.sightings)
+
+    def to_summary(self) -> dict[str, Any]:
+        """Key `noise` of summary.json."""
+        quantities = {MOTION: ("motion along x", "motion along y", "turning")}
+        out: dict[str, Any] = {}
+        for (robot, model), factors in sorted(self.measured.items()):
+            names = quantities.get(model, ("bearings", "ranges"))
+            entry: dict[str, Any] = {"measured": dict(zip(names, factors.tolist(), strict=True))}
+            noise = self.sightings.get((robot, model))
+            if noise is not None:
+                entry |= {"white": noise.white.tolist(), "shared": noise.shared.tolist()}
+            out[f"{robot} {model}"] = entry
+        for robot, config in self.odometry.items():
+            out[f"{robot} odometry"] = {name: getattr(config, name) for name in RATES}
+        return out
+
+    def kernel(self, given: RobustConfig) -> RobustConfig:
+        """The kernel as wide as the tails of white noise allow; as ``given`` for any other."""
+        if not (self.is_white and self.sightings):
+            return given
+        return replace(given, scale=min(noise.kernel_scale for noise in self.sightings.values()))
+
+
+def with_own_noise(steps: Sequence[Step], noise: LogNoise) -> tuple[Step, ...]:
+    """Steps whose sightings have the noise of a log that each has by itself, shared or not."""
+
+    def widened(a: Association) -> Association:
+        own = noise.sightings.get((a.robot, a.model))
+        if own is None:
+            return a
+        sigma = np.sqrt(own.white + own.shared)
+        return a.with_measurement(a.z, a.cov * np.outer(sigma, sigma))
+
+    return tuple(replace(s, associations=tuple(map(widened, s.associations))) for s in steps)
+
+
+def is_white(noise: Mapping[Source, ObservationNoise]) -> bool:
+    """Whether the errors of all sources are independent."""
+    return not any(found.shared.any() for found in noise.values())
