@@ -1,6 +1,7 @@
 """Errors of a landmark map against true landmarks."""
 
 import itertools
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -28,12 +29,12 @@ def landmark_metrics(
     Landmarks match by identity where both have one. Other points match by the assignment with the
     smallest sum of distances among pairs within 1 m. Other lines and segments each match the
     nearest true one within 1 m and 0.35 rad modulo pi, since a wall may be seen in several pieces.
-    That is of the middle of what was seen; of several the one is taken whose line is nearest to
-    it, and on which something was seen.
+    Distances are where the two lie beside each other: a Hough line reaches from its first to its
+    last return, and its middle may be far from all that was seen of it.
 
-    The error of a point is its distance. The error of a line or segment is the distance of the
-    middle of its extent from the true line; its NEES has two degrees of freedom (direction and
-    offset of the normal), since a position along a wall is a gauge.
+    The error of a point is its distance. The error of a line or segment is its distance from the
+    true line in the middle of what lies beside the true wall; its NEES has two degrees of freedom
+    (direction and offset of the normal), since a position along a wall is a gauge.
 
     ``coverage`` is that of the ellipsoids that 95 % are to be in. ``missed`` counts true
     landmarks without a match, ``extra`` estimated ones. ``worst`` has ``id``, ``nees_per_dof``
@@ -113,7 +114,7 @@ def _match(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]) -> list[
     columns = [j for j in range(len(true)) if j not in taken]
     if not rows or not columns:
         return pairs
-    cost = _match_distances([estimated[i] for i in rows], [true[j] for j in columns])
+    cost = _match_costs([estimated[i] for i in rows], [true[j] for j in columns])
     wall = np.array([estimated[i].kind != "point" for i in rows])
     nearest = cost.argmin(axis=1)
     pairs += [
@@ -133,35 +134,64 @@ def _match(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]) -> list[
     return pairs + matched
 
 
-def _match_distances(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]) -> Array:
-    """Distances (n, m) between landmarks and true ones, m; infinite where they cannot match."""
+def _match_costs(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]) -> Array:
+    """Costs (n, m) of matching landmarks to true ones, m; infinite where they cannot match.
+
+    Of points the distance. Of walls the distance where they lie beside each other and, added in
+    quadrature, how far the landmark turns off the true line along its length, root mean square: a
+    short edge that crosses a long landmark is no better match for lying in its middle.
+    """
     poses = np.array([t.pose for t in true])
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     position = np.array([e.position for e in estimated])
     extent = np.array([e.extent for e in estimated])
     points = np.array([e.kind == "point" for e in estimated], dtype=bool)
     true_points = np.array([t.kind == "point" for t in true], dtype=bool)
-    # where each true wall begins and ends along its own x axis
-    ends = np.full((len(true), 2), [-np.inf, np.inf])
-    for k, one in enumerate(true):
-        if one.extent is not None and not true_points[k]:
-            along = (one.extent - one.pose[:2]) @ np.array([c[k], s[k]])
-            ends[k] = along.min(), along.max()
+    ends = np.array([_ends(one) for one in true])
     apart = np.hypot(*(position[:, None, :2] - poses[:, :2]).transpose(2, 0, 1))
-    off = extent[:, :, None] - poses[:, :2]
-    x, y = c * off[..., 0] + s * off[..., 1], c * off[..., 1] - s * off[..., 0]
-    y = y.mean(axis=1)
-    # a gap between what was seen and the wall: what was seen may span several walls of one line
-    gap = np.maximum(x.min(axis=1) - ends[:, 1], ends[:, 0] - x.max(axis=1))
-    gap = np.maximum(gap, 0.0)
-    middle = x.mean(axis=1)
-    near = np.hypot(middle - np.clip(middle, ends[:, 0], ends[:, 1]), y) <= MATCH_DISTANCE_M
+    offset, gap = _offset_beside(extent[:, None], poses, ends)
+    near = np.hypot(gap, offset)
+    length = np.hypot(*(extent[:, 1] - extent[:, 0]).T)
     turn = wrap(2 * (position[:, None, 2] - poses[:, 2])) / 2  # modulo pi
     with np.errstate(invalid="ignore"):  # points have no direction
-        walls = np.where(near & (np.abs(turn) <= MATCH_ANGLE_RAD), np.hypot(gap, y), np.inf)
-    distance = np.where(points[:, None], apart, walls)
-    distance[points[:, None] != true_points] = np.inf
-    return np.where(distance <= MATCH_DISTANCE_M, distance, np.inf)
+        match = (near <= MATCH_DISTANCE_M) & (np.abs(turn) <= MATCH_ANGLE_RAD)
+        turned_off = np.sin(turn) * length[:, None] / math.sqrt(12)
+        walls = np.where(match, np.hypot(near, turned_off), np.inf)
+    cost = np.where(apart <= MATCH_DISTANCE_M, apart, np.inf)
+    cost = np.where(points[:, None], cost, walls)
+    cost[points[:, None] != true_points] = np.inf
+    return cost
+
+
+def _ends(true: TrueLandmark) -> tuple[float, float]:
+    """Where a true wall begins and ends along its own x axis; infinite without an extent."""
+    if true.extent is None or true.kind == "point":
+        return -np.inf, np.inf
+    along = (true.extent - true.pose[:2]) @ unit_vectors(true.pose[2])
+    return float(along.min()), float(along.max())
+
+
+def _offset_beside(extent: Array, pose: Array, ends: Array) -> tuple[Array, Array]:
+    """Offsets (...) of landmarks from walls where they lie beside each other, and gaps, m.
+
+    Args:
+        extent: both ends (..., 2, 2) of what was seen of each landmark.
+        pose: of a true wall (..., 3), the x axis along it.
+        ends: where it begins and ends along that axis (..., 2).
+
+    The offset is that in the middle of the common stretch; without one, at the landmark's nearest
+    end, and the gap is how far that is from the wall along it.
+    """
+    c, s = np.cos(pose[..., 2, None]), np.sin(pose[..., 2, None])
+    off = extent - pose[..., None, :2]
+    x, y = c * off[..., 0] + s * off[..., 1], c * off[..., 1] - s * off[..., 0]
+    begin = np.maximum(x.min(axis=-1), ends[..., 0])
+    end = np.minimum(x.max(axis=-1), ends[..., 1])
+    gap = np.maximum(begin - end, 0.0)
+    at = np.clip((begin + end) / 2, x.min(axis=-1), x.max(axis=-1))
+    length = x[..., 1] - x[..., 0]
+    across = np.abs(length) < 1e-9  # seen at a right angle to the wall
+    share = np.where(across, 0.5, (at - x[..., 0]) / np.where(across, 1.0, length))
+    return y[..., 0] + share * (y[..., 1] - y[..., 0]), gap
 
 
 def _landmark_error(estimated: Landmark, true: TrueLandmark) -> tuple[float, Array, Array]:
@@ -173,8 +203,7 @@ def _landmark_error(estimated: Landmark, true: TrueLandmark) -> tuple[float, Arr
     # a line has two normals: the true one nearer to the estimate's is taken
     true_normal = true.pose[2] + np.pi / 2
     true_normal += np.pi * np.round((normal - true_normal) / np.pi)
-    n = unit_vectors(true_normal)
-    true_offset = float(n @ true.pose[:2])
-    error = abs(float(n @ estimated.extent.mean(axis=0)) - true_offset)
+    true_offset = float(unit_vectors(true_normal) @ true.pose[:2])
+    beside, _ = _offset_beside(estimated.extent, true.pose, np.array(_ends(true)))
     difference = np.array([normal - true_normal, offset - true_offset])
-    return error, difference, cov
+    return abs(float(beside)), difference, cov

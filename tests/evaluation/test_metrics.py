@@ -1,5 +1,7 @@
 """Evaluation: every number against a case whose answer is known without it."""
 
+import math
+
 import numpy as np
 import pytest
 from paths import real_data
@@ -344,6 +346,41 @@ def test_pieces_of_a_wall_all_match_it():
     metrics = landmark_metrics(pieces, walls)
     assert (metrics["matched"], metrics["missed"], metrics["extra"]) == (3, 2, 0)
     assert metrics["rmse_m"] == pytest.approx(0.01)
+
+
+def wall(name, *ends):
+    """A true wall between two points."""
+    ends = np.array(ends, dtype=float)
+    heading = math.atan2(*(ends[1] - ends[0])[::-1])
+    return TrueLandmark("", 0, 0, name, "segment", np.array([*ends.mean(axis=0), heading]), ends)
+
+
+def seen_line(number, *ends):
+    """A line landmark that lies exactly between two points."""
+    ends = np.array(ends, dtype=float)
+    middle, heading = ends.mean(axis=0), math.atan2(*(ends[1] - ends[0])[::-1])
+    normal = heading + np.pi / 2
+    offset = float(middle @ [math.cos(normal), math.sin(normal)])
+    cov = 1e-4 * np.eye(3)
+    return landmark(number, "line", (*middle, heading), cov, ends, (normal, offset, cov[:2, :2]))
+
+
+def test_a_line_that_reaches_beyond_its_wall_is_judged_where_it_lies_on_it():
+    """A Hough line reaches to its last return, so its middle may be where nothing was seen."""
+    cupboard = wall("cupboard", (4.4, 7.5), (6.4, 7.5))
+    board = wall("board", (1.5, 7.62), (3.1, 7.82))  # beside the middle of the line, 7 degrees off
+    metrics = landmark_metrics([seen_line(0, (0.0, 7.5), (6.4, 7.5))], [board, cupboard])
+    assert metrics["matched"] == 1
+    assert metrics["rmse_m"] == pytest.approx(0, abs=1e-9)
+    assert metrics["nees_per_dof"] == pytest.approx(0, abs=1e-9)
+
+
+def test_a_short_edge_across_a_long_line_is_no_better_match_for_lying_in_its_middle():
+    door = wall("door", (0.02, -0.5), (0.02, 0.5))
+    edge = wall("edge", (0.0, -0.06), (0.02, 0.06))  # 10 degrees off, through the middle
+    metrics = landmark_metrics([seen_line(0, (0.01, -0.5), (0.01, 0.5))], [edge, door])
+    assert metrics["rmse_m"] == pytest.approx(0.01)  # the door's, not 0
+    assert metrics["nees_per_dof"] == pytest.approx(0.5)  # one sigma of offset, none of direction
 
 
 def test_an_empty_map_is_all_missed():
