@@ -245,6 +245,10 @@ OutputLogOrFolder = Annotated[
 ]
 ExperimentFolder = Annotated[Path, _output("DIR", "The experiment's folder.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+Plan = Annotated[
+    bool, typer.Option("--plan", help="Say what would be used, as info does, and write nothing.")
+]
+Strict = Annotated[bool, typer.Option("--strict", help="Exit with 3 if there is any doubt.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace what is there.")]
 ForceOrResume = Annotated[
     bool,

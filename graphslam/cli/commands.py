@@ -6,8 +6,9 @@ arguments appear at once.
 
 import inspect
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -36,6 +37,7 @@ from graphslam.cli.arguments import (
     OutputFolder,
     OutputLog,
     OutputLogOrFolder,
+    Plan,
     Preset,
     ReferenceFolder,
     Relations,
@@ -47,10 +49,12 @@ from graphslam.cli.arguments import (
     Source,
     Span,
     Starts,
+    Strict,
     TruthFiles,
     span_of,
 )
 from graphslam.cli.terminal import errors_in_one_line, progress_bar
+from graphslam.core.config import Config
 from graphslam.core.config_io import load_config, named_backend
 from graphslam.core.errors import ConfigError, EstimationError, OutputError
 from graphslam.logs import IMPORTERS
@@ -84,12 +88,14 @@ def options(
 class Output:
     """What a command prints: ``content`` with --json, else what ``show`` prints for people.
 
-    ``failure``: an error to report after that, for work that was done in part.
+    ``failure``: an error to report after that, for work that was done in part; ``code``: the exit
+    code where there is none.
     """
 
     content: Any
     show: Callable[[], None]
     failure: str = ""
+    code: int = 0
 
 
 def command(name: str) -> Callable[[Callable[..., Output]], None]:
@@ -107,6 +113,8 @@ def command(name: str) -> Callable[[Callable[..., Output]], None]:
                     output.show()
                 if output.failure:
                     raise EstimationError(output.failure)
+                if output.code:
+                    raise typer.Exit(output.code)
 
         # typer reads the options from the signature
         common = list(inspect.signature(run).parameters.values())[:2]
@@ -121,13 +129,24 @@ def command(name: str) -> Callable[[Callable[..., Output]], None]:
 
 
 @command("info")
-def info(logs: Logs, config: ConfigFile = None, settings: Settings = None) -> Output:
-    """Say what is in a log, what is usable, what is odd."""
+def info(
+    logs: Logs, strict: Strict = False, config: ConfigFile = None, settings: Settings = None
+) -> Output:
+    """Say what is in a log, what is usable, what is odd, and what mends it.
+
+    Exit code 0: usable, 1: not usable, with --strict 3: usable, with doubts.
+    """
+    return _described(logs, load_config(config, settings or ()), strict)
+
+
+def _described(logs: Sequence[Path], config: Config, strict: bool) -> Output:
+    """What `info` and `smooth --plan` tell about logs."""
     from graphslam.cli import show
     from graphslam.logs import inspect_logs
 
-    found = inspect_logs(logs, load_config(config, settings or ()))
-    return Output(found.to_dict(), lambda: show.log_info(found))
+    found = inspect_logs(logs, config)
+    code = (3 if strict and found.doubtful else 0) if found.usable else 1
+    return Output(found.to_dict(), lambda: show.log_info(found), code=code)
 
 
 @command("import")
@@ -174,6 +193,7 @@ def smooth(
     config: ConfigFile = None,
     settings: Settings = None,
     force: Force = False,
+    plan: Plan = False,
 ) -> Output:
     """Find the best trajectories and a landmark map.
 
@@ -192,6 +212,8 @@ def smooth(
     options += [] if horizon is None else [f"backend.horizon_s={horizon}"]
     options += [f"front_end.name={front_end}"] if front_end else []
     tree = load_config(config, [*options, *(start or ()), *(settings or ())], preset)
+    if plan:
+        return _described(logs, tree, strict=False)
     with progress_bar("smoothing") as progress:
         result = graphslam.smooth(logs, config=tree, output=output, force=force, progress=progress)
     return Output(result.summary, lambda: show.smoothed(result, output))

@@ -48,13 +48,17 @@ def log_info(info: LogInfo) -> None:
     console.print()
     console.print(_table(head, map(_robot_row, info.robots), texts=2))
     _reasons(console, "dropped", info.dropped)
-    for warning in info.warnings:
-        console.print(f"warning: {warning}")
-    if info.problem:
-        console.print(f"not usable: {info.problem}")
-    else:
+    for finding in info.findings:
+        kind = {"note": "note", "doubt": "warning", "unusable": "not usable"}[finding.severity]
+        # a problem of the log as a whole says itself where it is
+        where = f"{finding.topic}: " if finding.topic else ""
+        console.print(f"{kind}: {where}{finding.text}")
+        if finding.remedy:
+            console.print(f"  to mend it: {finding.remedy}")
+    if info.usable:
         names = " ".join(str(file.path) for file in info.files)
-        console.print(f"usable: graphslam smooth {names} -o DIR")
+        doubts = " with doubts" if info.doubtful else ""
+        console.print(f"usable{doubts}: graphslam smooth {names} -o DIR")
 
 
 def imported(done: ImportSummary) -> None:
@@ -363,4 +367,7 @@ def _span(topics: Sequence[TopicInfo]) -> str:
 
 def _reasons(console: Console, what: str, reasons: Mapping[str, int]) -> None:
     for reason, count in sorted(reasons.items(), key=lambda item: (-item[1], item[0])):
-        console.print(f"{what}: {_number(count)} {reason}")
+        if reason == "range: no return":  # is no loss
+            console.print(f"no return: {_number(count)} beams")
+        else:
+            console.print(f"{what}: {_number(count)} {reason}")

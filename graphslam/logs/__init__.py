@@ -9,11 +9,13 @@ from graphslam.core.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
     from graphslam.logs.containers import is_recording
+    from graphslam.logs.findings import Finding
     from graphslam.logs.import_pose_graph import pose_stamp_ns
     from graphslam.logs.import_summary import ImportSummary
     from graphslam.logs.importers import IMPORTERS
-    from graphslam.logs.log_info import LogInfo, RobotInfo, TopicInfo, inspect_logs
+    from graphslam.logs.log_info import LogInfo, inspect_logs
     from graphslam.logs.log_set import LogFile, LogSet, open_logs
+    from graphslam.logs.topic_info import RobotInfo, TopicInfo
     from graphslam.logs.truth import (
         GroundTruth,
         read_true_associations,
@@ -25,17 +27,20 @@ if TYPE_CHECKING:
 #: module -> the names that it defines
 _NAMES = {
     "containers": ("is_recording",),
+    "findings": ("Finding",),
     "import_pose_graph": ("pose_stamp_ns",),
     "import_summary": ("ImportSummary",),
     "importers": ("IMPORTERS",),
-    "log_info": ("LogInfo", "RobotInfo", "TopicInfo", "inspect_logs"),
+    "log_info": ("LogInfo", "inspect_logs"),
     "log_set": ("LogFile", "LogSet", "open_logs"),
+    "topic_info": ("RobotInfo", "TopicInfo"),
     "truth": ("GroundTruth", "read_true_associations", "read_truth", "truth_from_recordings"),
     "writer": ("LogWriter",),
 }
 
 __all__ = [
     "IMPORTERS",
+    "Finding",
     "GroundTruth",
     "ImportSummary",
     "LogFile",

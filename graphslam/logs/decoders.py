@@ -36,7 +36,8 @@ class TopicContext:
     frames of sensors that are mounted upside down. Ranges of ``no_return_m`` or more mean no
     return. With ``at_once`` all beams of a scan count as measured at its stamp. ``beams`` counts
     dropped beams of scans that are kept, by reason. With ``without_ranges`` scans get no ranges:
-    only when they were taken is of interest.
+    only when they were taken is of interest. ``by_log_time``: the messages have no stamps; that of
+    their recording is taken.
     """
 
     robot: str
@@ -48,6 +49,7 @@ class TopicContext:
     right_joint: str = ""
     beams: Counter[str] = field(default_factory=Counter)
     without_ranges: bool = False
+    by_log_time: bool = False
 
 
 class Decoder(NamedTuple):
@@ -132,7 +134,7 @@ def _count_defects(ranges: Array, beams: Counter[str]) -> None:
     finite = odd[np.isfinite(odd)]
     for defect, count in (
         ("NaN", np.count_nonzero(np.isnan(odd))),
-        ("infinite", np.count_nonzero(np.isinf(odd))),
+        ("no return", np.count_nonzero(np.isinf(odd))),
         ("negative", np.count_nonzero(finite < 0)),
         ("absurd", np.count_nonzero(finite > 0)),
     ):

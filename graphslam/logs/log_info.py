@@ -16,13 +16,15 @@ from graphslam.core.geometry import Array, between
 from graphslam.logs import time_order
 from graphslam.logs.containers import open_recording
 from graphslam.logs.decoders import TopicContext
+from graphslam.logs.findings import Finding
 from graphslam.logs.future_stamps import Recorded
+from graphslam.logs.log_checks import CheckedLog, by_severity, check_log
 from graphslam.logs.log_set import FileReader, LogFile, damage, merged_notes
 from graphslam.logs.recording import Recording
 from graphslam.logs.robots import robots_and_topics
-from graphslam.logs.schemas import SIGHTING
 from graphslam.logs.tf_tree import static_topics
-from graphslam.logs.topic_context import ScanShape, scan_shape, topic_contexts
+from graphslam.logs.topic_context import scan_shape, topic_contexts
+from graphslam.logs.topic_info import Gap, RobotInfo, TopicInfo
 from graphslam.logs.topics import (
     ODOMETRY_KINDS,
     Topic,
@@ -32,70 +34,15 @@ from graphslam.logs.topics import (
 
 _GAP_PERIODS, _GAP_S = 10, 1.0  # a gap is longer than both: 10 periods of the topic and 1 s
 _REVERSING_M = 1e-3  # smallest backward step; larger than the noise of a robot at rest
-_UNSIGNED_PATH_M = 50.0  # odometry that never reverses on a longer path is reported
-
-
-@dataclass(frozen=True, slots=True)
-class Gap:
-    """An interval without messages of a topic."""
-
-    start_ns: int
-    duration_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class TopicInfo:
-    """A topic of the logs. Fields after ``count`` are None or empty if nothing can be decoded.
-
-    ``robot`` is None for a topic of unknown schema; ``used``: whether smoothing reads the topic.
-    ``rate_hz`` is the mean over the log; ``median_period_s`` is shorter than its inverse if
-    messages come in bursts. ``jumps_back`` counts messages stamped earlier than the one recorded
-    before, ``glitches`` those whose stamp is replaced. ``no_return_m`` is the detected range that
-    means no return, ``dropouts`` the share of beams without a usable range.
-    """
-
-    name: str
-    schema: str
-    robot: str | None
-    used: bool
-    count: int
-    first_ns: int | None = None
-    last_ns: int | None = None
-    rate_hz: float | None = None
-    median_period_s: float | None = None
-    gaps: tuple[Gap, ...] = ()
-    jumps_back: int = 0
-    duplicates: int = 0
-    glitches: int = 0
-    too_late: int = 0
-    scan: ScanShape | None = None
-    no_return_m: float | None = None
-    dropouts: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class RobotInfo:
-    """A robot of the logs; ``problem`` says why it is not usable, empty if it is.
-
-    ``speed_m_s`` is the mean over the log, ``top_speed_m_s`` the largest mean over one second,
-    because odometry in bursts has no speed between two messages. ``reverses``: whether odometry
-    ever goes backwards. ``odometry`` is a topic, or says that scans are matched: then nothing more
-    is known.
-    """
-
-    name: str
-    problem: str
-    odometry: str | None = None
-    path_m: float | None = None
-    turning_rad: float | None = None
-    speed_m_s: float | None = None
-    top_speed_m_s: float | None = None
-    reverses: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class LogInfo:
-    """Result of `inspect_logs`; ``problem`` says why the logs cannot be smoothed, if so."""
+    """Result of `inspect_logs`; ``problem`` says why the logs cannot be smoothed, if so.
+
+    ``findings`` are all that is to be said, ``warnings`` those of them that are no more than notes
+    left out, as lines.
+    """
 
     files: tuple[LogFile, ...]
     topics: tuple[TopicInfo, ...]
@@ -104,10 +51,21 @@ class LogInfo:
     dropped: Mapping[str, int]
     warnings: tuple[str, ...]
     problem: str
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def usable(self) -> bool:
+        """Whether the logs can be smoothed."""
+        return not any(finding.severity == "unusable" for finding in self.findings)
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether there is a reason to expect worse results than the sensors can give."""
+        return any(finding.severity == "doubt" for finding in self.findings)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain lists, dicts, strings and numbers, ready for JSON."""
-        tree = asdict(self)
+        tree = asdict(self) | {"usable": self.usable, "doubtful": self.doubtful}
         for file in tree["files"]:
             file["path"] = str(file["path"])
         return tree
@@ -122,16 +80,16 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
         LogError: a file is missing, of no known container or without a message.
     """
     files = [open_recording(Path(path)) for path in paths]
-    warnings = [*config.warnings, *damage(files)]
+    findings = damage(files)
     topics: list[Topic] = []
     chosen: list[Topic] = []
     problem = ""
     try:
         topics = find_topics(files, config)
         files, topics, derived = robots_and_topics(files, config)
-        warnings += derived
+        findings += derived
         chosen, choices = choose_topics(files, topics)
-        warnings += choices
+        findings += choices
     except LogError as error:
         problem = str(error)
     contexts, assumed = topic_contexts(files, topics, config)
@@ -151,14 +109,20 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
         _robot_info(name, topics, chosen, readings, config.robot(name))
         for name in sorted({t.robot for t in topics if t.record is not records.TrueLandmark})
     ]
+    infos.sort(key=lambda info: info.name)
+    findings += assumed
+    said = [*config.warnings, *(finding.line for finding in findings)]
+    more = check_log(CheckedLog(infos, robots, problem, config, merged_notes(files)))
+    said += [finding.line for finding in more if finding.severity == "doubt"]
     return LogInfo(
         files=tuple(LogFile(f.path, f.sha256, f.messages, f.lost) for f in files),
-        topics=tuple(sorted(infos, key=lambda info: info.name)),
+        topics=tuple(infos),
         robots=tuple(robots),
         notes=merged_notes(files),
         dropped=dict(dropped),
-        warnings=tuple(warnings + assumed + _defects(infos, robots)),
+        warnings=tuple(said),
         problem=problem,
+        findings=tuple(sorted([*findings, *more], key=by_severity)),
     )
 
 
@@ -170,6 +134,7 @@ class _Reading:
     """Data kept from one pass over a topic."""
 
     stamps_ns: list[int] = field(default_factory=list)  # in the order of recording
+    delays_ns: list[int] = field(default_factory=list)  # of recording after the stamp
     times_ns: list[int] = field(default_factory=list)  # sorted
     motion: list[Array] = field(default_factory=list)  # poses, increments or wheel angles
     beams: int = 0
@@ -180,6 +145,7 @@ class _Reading:
         """Count stamps and beams of messages in the order of recording, and pass them on."""
         for topic, message, log_time_ns in recorded:
             self.stamps_ns.append(message.stamp_ns)
+            self.delays_ns.append(log_time_ns - message.stamp_ns)
             if isinstance(message, records.Scan):
                 self.beams += len(message.ranges)
                 self.empty_beams += int(np.isnan(message.ranges).sum())
@@ -245,6 +211,8 @@ def _topic_info(
         scan=scan_shape(files, topic) if is_scan else None,
         no_return_m=float(no_return) if is_scan and np.isfinite(no_return) else None,
         dropouts=reading.empty_beams / reading.beams if reading.beams else None,
+        recorded_after_s=float(np.median(reading.delays_ns)) * 1e-9,
+        by_log_time=contexts[topic.name].by_log_time,
     )
 
 
@@ -318,34 +286,3 @@ def _steps(topic: Topic, motion: Array, settings: RobotConfig) -> tuple[Array, A
     if topic.record is records.OdometryPose:
         motion = between(motion[:-1], motion[1:])
     return motion[:, 0], motion[:, 2], np.hypot(motion[:, 0], motion[:, 1])
-
-
-def _defects(topics: Sequence[TopicInfo], robots: Sequence[RobotInfo]) -> list[str]:
-    """One line per defect of the topics and robots."""
-    lines = []
-    for topic in topics:
-        if topic.jumps_back:
-            lines.append(
-                f"{topic.name}: {topic.jumps_back} messages are stamped earlier than the one "
-                f"recorded before; {topic.glitches} stamps are replaced"
-            )
-        if topic.duplicates:
-            lines.append(f"{topic.name}: {topic.duplicates} messages repeat a stamp")
-        if topic.too_late:
-            lines.append(
-                f"{topic.name}: {topic.too_late} messages come too late; see logs.reorder_s"
-            )
-        if topic.gaps and topic.schema != SIGHTING:  # there is not always a target in view
-            longest = max(gap.duration_s for gap in topic.gaps)
-            lines.append(f"{topic.name}: {len(topic.gaps)} gaps, the longest {longest:.1f} s")
-        if topic.no_return_m is not None:
-            lines.append(f"{topic.name}: {topic.no_return_m:g} m and more means no return")
-    for robot in robots:
-        if robot.problem:
-            lines.append(f"robot {robot.name}: {robot.problem}")
-        elif robot.reverses is False and (robot.path_m or 0) > _UNSIGNED_PATH_M:
-            lines.append(
-                f"robot {robot.name}: odometry never reverses in {robot.path_m:.0f} m; "
-                "it may be unsigned"
-            )
-    return lines

@@ -14,6 +14,7 @@ from graphslam.core.worker import Prefetch
 from graphslam.logs import time_order
 from graphslam.logs.containers import open_recording
 from graphslam.logs.decoders import TopicContext, decode_messages
+from graphslam.logs.findings import Finding
 from graphslam.logs.future_stamps import Recorded, repair_future_stamps
 from graphslam.logs.recording import Recording, raw_messages
 from graphslam.logs.robots import robots_and_topics
@@ -219,14 +220,17 @@ def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
         if file.sha256 in {other.sha256 for other in files[:n]}:
             raise LogError(f"{file.path}: is given twice; name each log once")
     files, topics, derived = robots_and_topics(files, config)
-    topics, warnings = choose_topics(files, topics)
+    topics, choices = choose_topics(files, topics)
     contexts, assumed = topic_contexts(files, topics, config)
     return LogSet(
         robots=tuple(sorted({t.robot for t in topics if t.record in MOTION_KINDS})),
         files=tuple(LogFile(f.path, f.sha256, f.messages, f.lost) for f in files),
         topics=tuple(topics),
         notes=merged_notes(files),
-        warnings=[*config.warnings, *damage(files), *derived, *warnings, *assumed],
+        warnings=[
+            *config.warnings,
+            *(found.line for found in (*damage(files), *derived, *choices, *assumed)),
+        ],
         dropped=Counter(),
         repaired=Counter(),
         opened=files,
@@ -240,11 +244,16 @@ def merged_notes(files: Iterable[Recording]) -> dict[str, str]:
     return {key: note for file in files for key, note in file.notes.items()}
 
 
-def damage(files: Iterable[Recording]) -> list[str]:
-    """One line about the losses in each damaged file."""
+def damage(files: Iterable[Recording]) -> list[Finding]:
+    """The losses in each damaged file."""
     return [
-        f"{f.path}: damaged, {'an unknown number of' if f.lost is None else f.lost} messages are "
-        f"lost, {f.messages} are read: {f.damage}"
+        Finding(
+            "doubt",
+            "damage",
+            str(f.path),
+            f"damaged, {'an unknown number of' if f.lost is None else f.lost} messages are "
+            f"lost, {f.messages} are read: {f.damage}",
+        )
         for f in files
         if f.damage
     ]
@@ -286,7 +295,12 @@ class FileReader:
                     found[place] = message
             for raw, decoded_one in zip(batch, found, strict=True):
                 if decoded_one is not None:
-                    yield raw.topic, decoded_one, raw.log_time_ns
+                    at_ns = raw.log_time_ns
+                    if own[raw.topic].by_log_time:
+                        stamped = replace(decoded_one, stamp_ns=at_ns, time_ns=at_ns)
+                        yield raw.topic, stamped, at_ns
+                    else:
+                        yield raw.topic, decoded_one, at_ns
 
     def sorted(self, recorded: Iterable[Recorded]) -> Iterator[Message]:
         """The messages in the order of their repaired times."""

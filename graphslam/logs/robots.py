@@ -13,6 +13,7 @@ from graphslam.core.config import Config
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import Array
 from graphslam.logs.decoders import frame_of
+from graphslam.logs.findings import Finding, topics_setting
 from graphslam.logs.recording import Recording
 from graphslam.logs.schemas import DEFAULT_ROBOT, ODOMETRY
 from graphslam.logs.tf_odometry import Chain, find_chain, with_odometry
@@ -87,8 +88,8 @@ class _Frames:
 
 def robots_and_topics(
     files: Sequence[Recording], config: Config
-) -> tuple[list[Recording], list[Topic], list[str]]:
-    """The usable topics with their robots, the files with topics that were derived, warnings.
+) -> tuple[list[Recording], list[Topic], list[Finding]]:
+    """The usable topics with their robots, the files with topics that were derived, findings.
 
     Raises:
         LogError: see `find_topics`; or it cannot be told whose a sensor is.
@@ -99,15 +100,25 @@ def robots_and_topics(
         robots: Mapping[str, str] = {}
     else:
         robots = assign_robots(files, topics, frames)
-    named, unused = [], []
+    named: list[Topic] = []
+    unused: list[Finding] = []
     for topic in topics:
         robot = robots.get(topic.robot, topic.robot)
         if robot == _NOBODY and topic.record in ODOMETRY_KINDS:
-            unused.append(f"{topic.name}: is not used: whose it is cannot be told")
+            setting = {t.name: robots.get(t.robot, t.robot) for t in topics} | {topic.name: "NAME"}
+            unused.append(
+                Finding(
+                    "doubt",
+                    "robots",
+                    topic.name,
+                    "is not used: whose it is cannot be told",
+                    f"say it with {topics_setting({n: r for n, r in setting.items() if r})}",
+                )
+            )
         else:
             named.append(replace(topic, robot=robot or topic.robot))
-    opened, found, warnings = _with_tf_odometry(files, named, frames)
-    return opened, found, unused + warnings
+    opened, found, derived = _with_tf_odometry(files, named, frames)
+    return opened, found, unused + derived
 
 
 def assign_robots(
@@ -185,12 +196,11 @@ def _owner_of_sensor(
         sensor = next(topic for topic in space.topics if topic.record in _SENSORS)
         names = [mover.name for mover in possible]
         of_movers = [topic for mover in movers for topic in mover.topics]
-        line = ", ".join(f'"{t.name}" = "{t.robot}"' for t in of_movers)
+        setting = {t.name: t.robot for t in of_movers} | {sensor.name: names[0]}
         raise LogError(
             f"{', '.join(str(file.path) for file in frames.files)}: whose is {sensor.name}? its "
             f"frame {', '.join(sorted(space.sensed)) or '(none)'} belongs to none of "
-            f"{', '.join(names)}; say it with "
-            f'--set \'logs.topics={{{line}, "{sensor.name}" = "{names[0]}"}}\''
+            f"{', '.join(names)}; say it with {topics_setting(setting)}"
         )
     return (possible[0].name if possible else space.name), None
 
@@ -234,9 +244,10 @@ def _named(owners: Mapping[str, str], whole: Collection[str]) -> dict[str, str]:
 
 def _with_tf_odometry(
     files: Sequence[Recording], topics: Sequence[Topic], frames: _Frames
-) -> tuple[list[Recording], list[Topic], list[str]]:
+) -> tuple[list[Recording], list[Topic], list[Finding]]:
     """The files and topics with the odometry on /tf of robots that have no better one."""
-    opened, found, warnings = list(files), list(topics), []
+    opened, found = list(files), list(topics)
+    findings: list[Finding] = []
     good = (records.OdometryIncrement, records.OdometryPose)
     moving = any(moving_topics(file) for file in files)
     for robot in sorted({t.robot for t in topics if t.count and t.record in _SENSORS}):
@@ -255,10 +266,13 @@ def _with_tf_odometry(
             if derived:
                 name, count = derived.name, count + derived.count
         found.append(Topic(name, ODOMETRY, robot, records.OdometryPose, count))
-        warnings.append(
-            f"robot {robot}: has no topic with odometry; it is taken from {chain.topic}: "
-            f"{chain.base} in {chain.odometry}"
-        )
-        if "odom" not in chain.odometry:
-            warnings[-1] += ", which is not called odom: if it is a map, the pose may jump"
-    return opened, sorted(found, key=lambda topic: topic.name), warnings
+        said = f"has no topic with odometry; it is taken from {chain.topic}: "
+        said += f"{chain.base} in {chain.odometry}"
+        where = f"robot {robot}"
+        if "odom" in chain.odometry:
+            findings.append(Finding("note", "odometry", where, said))
+        else:
+            said += ", which is not called odom: if it is a map, the pose may jump"
+            remedy = "record nav_msgs/Odometry, or odom to base on /tf"
+            findings.append(Finding("doubt", "odometry", where, said, remedy))
+    return opened, sorted(found, key=lambda topic: topic.name), findings

@@ -10,7 +10,9 @@ from graphslam.core import records
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array
 from graphslam.logs import schemas
+from graphslam.logs.cdr import HEADER
 from graphslam.logs.decoders import TopicContext, frame_of
+from graphslam.logs.findings import Finding
 from graphslam.logs.mounts import TransformTree, base_above, find_mount, is_level
 from graphslam.logs.no_return import find_no_return
 from graphslam.logs.recording import Recording, sample_messages
@@ -19,6 +21,8 @@ from graphslam.logs.topics import ODOMETRY_KINDS, Topic
 
 # 16 x 16 messages over the whole log: enough to find a frequent value, quick to read
 _SAMPLE_BLOCKS, _SAMPLE_PER_BLOCK = 16, 16
+#: records that may come without a stamp; increments have two, which must differ
+_STAMPED = (records.Scan, records.Sighting, records.OdometryPose, records.WheelAngles)
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,9 +47,9 @@ def scan_shape(files: Sequence[Recording], topic: Topic) -> ScanShape | None:
 
 def topic_contexts(
     files: Sequence[Recording], topics: Sequence[Topic], config: Config
-) -> tuple[dict[str, TopicContext], list[str]]:
-    """Decoding context of each topic, and warnings about assumptions that were made."""
-    warnings: list[str] = []
+) -> tuple[dict[str, TopicContext], list[Finding]]:
+    """Decoding context of each topic, and findings about assumptions that were made."""
+    findings: list[Finding] = []
     odometry = [t for kind in ODOMETRY_KINDS[::-1] for t in topics if t.record is kind]
     bases = {t.robot: base_frame(files, t) for t in odometry}  # the preferred kind comes last
     contexts = {}
@@ -65,9 +69,14 @@ def topic_contexts(
                 base = bases[topic.robot] if topic.robot in bases else base_above(tree, frame)
                 mounts[frame], upside_down, notes = _mount(topic, tree, base, frame, settings.laser)
                 inverted |= {frame} if upside_down else set()
-                warnings += notes
+                findings += notes
             if topic.record is records.Scan:
                 no_return = find_no_return(message.ranges for message in messages)
+        unstamped = topic.record in _STAMPED and _is_unstamped(files, topic)
+        if unstamped:
+            text = "all stamps are zero; the times of recording are used, which are less exact"
+            remedy = "let its driver stamp the messages"
+            findings.append(Finding("doubt", "stamps", topic.name, text, remedy))
         contexts[topic.name] = TopicContext(
             robot=topic.robot,
             mounts=mounts,
@@ -76,8 +85,20 @@ def topic_contexts(
             at_once=not config.logs.undistort,
             left_joint=settings.left_joint,
             right_joint=settings.right_joint,
+            by_log_time=unstamped,
         )
-    return contexts, warnings
+    return contexts, findings
+
+
+def _is_unstamped(files: Sequence[Recording], topic: Topic) -> bool:
+    """Whether all stamps of a topic are zero, as drivers leave them."""
+    count = 0
+    for file in files:
+        for data in sample_messages(file, topic.name, 1, _SAMPLE_PER_BLOCK):
+            if any(data[HEADER : HEADER + 8]):
+                return False
+            count += 1
+    return count > 1
 
 
 def sample_decoded(files: Sequence[Recording], topic: Topic) -> Iterator[Any]:
@@ -100,9 +121,10 @@ def base_frame(files: Sequence[Recording], topic: Topic) -> str:
 
 def _mount(
     topic: Topic, tree: TransformTree, base: str, frame: str, configured: Sequence[float]
-) -> tuple[Array, bool, list[str]]:
-    """Pose (3,) of ``frame`` on the robot, whether it is upside down, and warnings."""
+) -> tuple[Array, bool, list[Finding]]:
+    """Pose (3,) of ``frame`` on the robot, whether it is upside down, and findings."""
     where = f"{topic.name}: frame {frame or '(none)'}"
+    setting = f"--set 'robots.{topic.robot}.laser=[X, Y, YAW]' (m, m, rad)"
     found = find_mount(tree, base, frame)
     inverted = found is not None and found.inverted
     if len(configured) == 3 and topic.record is records.Scan:
@@ -110,10 +132,12 @@ def _mount(
     if found is None:
         if topic.record is records.Sighting and not frame:
             return np.zeros(3), False, []  # no frame: measured from the base
-        problem = f"tf_static has no transform from {base}; assumed to be the base itself"
-        return np.zeros(3), False, [f"{where}: {problem}; set robots.{topic.robot}.laser"]
+        text = f"tf_static has no transform from {base}; assumed to be the base itself"
+        remedy = f"record /tf_static, or {setting}"
+        return np.zeros(3), False, [Finding("doubt", "mount", where, text, remedy)]
     notes = []
     if not is_level(found):
         tilt = np.rad2deg(found.tilt_rad)
-        notes.append(f"{where}: is tilted by {tilt:.0f} deg; treated as level")
+        text = f"is tilted by {tilt:.0f} deg; treated as level"
+        notes.append(Finding("doubt", "mount", where, text))
     return found.pose, inverted, notes

@@ -7,6 +7,7 @@ from graphslam.core import records
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError
 from graphslam.logs.decoders import DECODERS
+from graphslam.logs.findings import Finding, topics_setting
 from graphslam.logs.recording import Recording
 from graphslam.logs.tf_tree import namespace_of
 
@@ -71,8 +72,8 @@ def find_topics(files: Sequence[Recording], config: Config) -> list[Topic]:
 
 def choose_topics(
     files: Sequence[Recording], topics: Sequence[Topic]
-) -> tuple[list[Topic], list[str]]:
-    """One odometry source and one laser per robot, all other topics, and warnings.
+) -> tuple[list[Topic], list[Finding]]:
+    """One odometry source and one laser per robot, all other topics, and findings.
 
     Raises:
         LogError: all topics are empty; a robot has sightings but neither odometry nor scans, or
@@ -85,7 +86,9 @@ def choose_topics(
             f"{names}: all usable topics are empty: {', '.join(t.name for t in topics)}; "
             "record it again"
         )
-    chosen, warnings = [], []
+    chosen: list[Topic] = []
+    findings: list[Finding] = []
+    spare: list[tuple[str, list[Topic]]] = []
     for robot in sorted({topic.robot for topic in filled}):
         own = [topic for topic in filled if topic.robot == robot]
         own.sort(key=lambda t: (-t.count, t.name))
@@ -99,21 +102,28 @@ def choose_topics(
                     f"{robot} has {sensors[0].name} but no odometry; record nav_msgs/Odometry, "
                     "or odom to base on /tf, or assign topics to robots in logs.topics"
                 )
-            warnings.append(
-                f"robot {robot}: no odometry: scan matching of {lasers[0].name} is used"
+            findings.append(
+                Finding(
+                    "doubt",
+                    "odometry",
+                    f"robot {robot}",
+                    f"no odometry: scan matching of {lasers[0].name} is used",
+                    "record nav_msgs/Odometry, or odom to base on /tf, too",
+                )
             )
         # true associations are read by `logs.truth` only
         others = (*ODOMETRY_KINDS, records.Scan, records.TrueAssociations)
         rest = [t for t in filled if t.robot == robot and t.record not in others]
         chosen += odometry[:1] + lasers[:1] + rest
-        warnings += _unused("odometry", robot, odometry) + _unused("laser", robot, lasers)
+        spare += [("odometry", odometry), ("laser", lasers)]
     if not any(topic.record in MOTION_KINDS for topic in chosen):
         raise LogError(
             f"{names}: no odometry; the log has only {', '.join(t.name for t in filled)}; "
             "smoothing needs LaserScan, nav_msgs/Odometry, odom to base on /tf, JointState or "
             "OdometryIncrement"
         )
-    return chosen, warnings
+    findings += [_unused(what, own, chosen) for what, own in spare if len(own) > 1]
+    return chosen, findings
 
 
 def _odometry_alone(topics: Sequence[Topic]) -> bool:
@@ -122,9 +132,17 @@ def _odometry_alone(topics: Sequence[Topic]) -> bool:
     return any(t.record in ODOMETRY_KINDS and t.robot not in sensing for t in topics)
 
 
-def _unused(what: str, robot: str, topics: Sequence[Topic]) -> list[str]:
-    """A warning that only the first of several ``topics`` is used."""
-    if len(topics) < 2:
-        return []
+def _unused(what: str, topics: Sequence[Topic], chosen: Sequence[Topic]) -> Finding:
+    """That only the first of several ``topics`` of a robot is used, and how to use the second."""
+    used, other = topics[0], topics[1]
     others = ", ".join(topic.name for topic in topics[1:])
-    return [f"robot {robot}: {what} is taken from {topics[0].name}; not used: {others}"]
+    wanted = [t for t in chosen if t != used and t.record is not records.TrueLandmark]
+    # what is made of transforms has no name of its own
+    setting = {t.name: t.robot for t in [*wanted, other] if " " not in t.name}
+    return Finding(
+        "note",
+        "unused",
+        f"robot {used.robot}",
+        f"{what} is taken from {used.name}; not used: {others}",
+        f"to use {other.name} instead: {topics_setting(setting)}",
+    )

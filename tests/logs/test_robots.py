@@ -202,7 +202,10 @@ def test_one_robot_is_one_robot_whatever_its_topics_are_called(names, room, tmp_
     assert used == dict.fromkeys(wanted.values(), "robot")
     scans = [m for m in open_logs([path], Config()).messages() if isinstance(m, records.Scan)]
     np.testing.assert_allclose(scans[0].mount, MOUNT, atol=1e-12)
-    assert inspect_logs([path], Config()).problem == ""
+    info = inspect_logs([path], Config())
+    assert info.usable and not info.doubtful
+    unused = {finding.topic for finding in info.findings if finding.check == "unused"}
+    assert unused >= {"/cmd_vel", "/imu"} and "/rosout" not in unused
 
 
 def test_two_odometries_of_one_body_are_one_robot(room, tmp_path):

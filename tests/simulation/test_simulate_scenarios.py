@@ -75,7 +75,7 @@ def test_every_scenario_runs_and_its_log_is_readable(name, tmp_path):
         assert not log.warnings
         kinds = {type(m) for m in log.messages()}
         # a beam without a return is written as infinity (REP 117) and counted as such
-        assert set(log.dropped) <= {"range: infinite"}
+        assert set(log.dropped) <= {"range: no return"}
         assert not log.warnings
         assert OdometryPose in kinds
         assert {Scan, Sighting} & kinds

@@ -1,0 +1,172 @@
+"""`info` as a doctor: what keeps a log from being used well is found, with what mends it."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import call, check_one_line
+
+from graphslam.core import records
+from graphslam.core.config import Config
+from graphslam.core.config_io import load_config
+from graphslam.logs import LogWriter, inspect_logs, open_logs, schemas
+
+S = 1_000_000_000
+T0 = 1_700_000_000 * S
+SCAN = {"angle_min_rad": -1.0, "angle_step_rad": 0.1, "range_max_m": 10.0}
+
+
+class Spoiled:
+    """A good log of a driving robot, of which every part may be spoiled."""
+
+    seconds = 30
+    odometry_period_ns, scan_period_ns = S // 10, S // 5
+    scan_offset_ns = scan_recorded_late_ns = 0
+    zero_stamps = False
+    mount, scans, odometry, wheels = True, True, True, False
+    speed = 0.5
+    ranges = 2.0
+
+    def write(self, path: Path) -> Path:
+        end = self.seconds * S
+        with LogWriter(path) as log:
+            if self.mount:
+                log.mount("robot", T0, (0.1, 0, 0))
+            for t in range(0, end, self.odometry_period_ns):
+                x = self.speed * abs(t - end / 2) / S
+                if self.odometry:
+                    self.pose(log, T0 + t, x)
+                if self.wheels:
+                    angle = {"left_rad": 10 * x, "right_rad": 10 * x}
+                    log.wheel_angles("robot", T0 + t, **angle)
+            for t in range(0, end, self.scan_period_ns) if self.scans else ():
+                ranges = np.full(21, self.ranges) + 0.01 * np.arange(21)
+                stamp = T0 + t + self.scan_offset_ns
+                recorded = stamp + self.scan_recorded_late_ns
+                log.scan("robot", stamp, ranges, log_time_ns=recorded, **SCAN)
+        return path
+
+    def pose(self, log: LogWriter, stamp: int, x: float) -> None:
+        if self.zero_stamps:
+            number = schemas.build
+            point = number("geometry_msgs/msg/Point", x=x, y=0.0, z=0.0)
+            turn = number("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+            no = number("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+            message = number(
+                schemas.ODOMETRY,
+                header=schemas.header(0, "odom"),
+                child_frame_id="base_link",
+                pose=number(
+                    "geometry_msgs/msg/PoseWithCovariance",
+                    pose=number("geometry_msgs/msg/Pose", position=point, orientation=turn),
+                    covariance=np.zeros(36),
+                ),
+                twist=number(
+                    "geometry_msgs/msg/TwistWithCovariance",
+                    twist=number("geometry_msgs/msg/Twist", linear=no, angular=no),
+                    covariance=np.zeros(36),
+                ),
+            )
+            log.message("/odom", schemas.ODOMETRY, message, stamp)
+        else:
+            log.odometry("robot", stamp, (x, 0, 0))
+
+
+def spoiled(path: Path, **how: object) -> Path:
+    log = Spoiled()
+    for name, value in how.items():
+        assert hasattr(Spoiled, name)
+        setattr(log, name, value)
+    return log.write(path / "log.mcap")
+
+
+# fmt: off
+#: how a log is spoiled, and severity, check and a part of the text of what is found
+CASES = {
+    "no mount": ({"mount": False}, "doubt", "mount", "no transform from base_link"),
+    "zero stamps": ({"zero_stamps": True}, "doubt", "stamps", "all stamps are zero"),
+    "odometry only": ({"scans": False}, "doubt", "sensors", "odometry only"),
+    "laser only": ({"odometry": False}, "doubt", "odometry", "no odometry: scan matching"),
+    "wheels": ({"odometry": False, "wheels": True}, "doubt", "wheels", "geometry is not known"),
+    "joints beside": ({"wheels": True}, "note", "unused", "not used: /joint_states"),
+    "slow odometry": ({"odometry_period_ns": S}, "doubt", "rate", "every 1.0 s only"),
+    "slow scans": ({"scan_period_ns": 3 * S}, "doubt", "rate", "every 3.0 s only"),
+    "standing": ({"speed": 0.0}, "doubt", "odometry", "does not move"),
+    "blind": ({"ranges": 99.0}, "doubt", "ranges", "100 % of the beams"),
+    "late clock": (
+        {"scan_offset_ns": -2 * S, "scan_recorded_late_ns": 2 * S}, "doubt", "clocks",
+        "2.0 s earlier than those of /odom",
+    ),
+    "other clock": ({"scan_offset_ns": 90 * S}, "unusable", "clocks", "60.1 s apart"),
+}
+# fmt: on
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_what_is_wrong_is_found_once_and_by_the_check_of_that_name(case, tmp_path):
+    how, severity, check, text = case
+    info = inspect_logs([spoiled(tmp_path, **how)], Config())
+    (found,) = [f for f in info.findings if f.severity != "note" or severity == "note"]
+    assert (found.severity, found.check) == (severity, check)
+    assert text in found.text and "\n" not in found.line
+    assert info.usable == (severity != "unusable") and info.doubtful == (severity == "doubt")
+    assert found.remedy
+    assert info.to_dict()["findings"][-1]["remedy"] == found.remedy
+    assert (found.line in info.warnings) == (severity == "doubt" or check == "unused")
+
+
+def test_nothing_is_wrong_with_a_good_log(tmp_path):
+    info = inspect_logs([spoiled(tmp_path)], Config())
+    assert info.usable and not info.findings and not info.warnings
+
+
+@pytest.mark.parametrize("case", ["no mount", "wheels"])
+def test_the_line_that_mends_it_does(case, tmp_path):
+    """The options that are printed are taken as they are, numbers filled in, and mend it."""
+    path = spoiled(tmp_path, **CASES[case][0])
+    (finding,) = inspect_logs([path], Config()).findings
+    options = re.findall(r"--set (?:'([^']*)'|(\S+))", finding.remedy)
+    settings = [(a or b).replace("X, Y, YAW", "0.1, 0, 0") for a, b in options]
+    if case == "wheels":  # what is assumed is not what it is
+        settings = [setting.replace("=0.1", "=0.12") for setting in settings]
+    assert settings and not inspect_logs([path], load_config(None, settings)).findings
+
+
+def test_the_line_that_takes_another_topic_does(tmp_path):
+    path = spoiled(tmp_path, wheels=True)
+    (finding,) = inspect_logs([path], Config()).findings
+    (setting,) = re.findall(r"--set '([^']*)'", finding.remedy)
+    topics = {topic.name for topic in open_logs([path], load_config(None, [setting])).topics}
+    assert topics == {"/joint_states", "/scan"}
+
+
+def test_messages_without_stamps_have_the_times_of_their_recording(tmp_path):
+    path = spoiled(tmp_path, zero_stamps=True)
+    log = open_logs([path], Config())
+    times = [m.time_ns for m in log.messages() if isinstance(m, records.OdometryPose)]
+    assert times == list(range(T0, T0 + 30 * S, S // 10))
+    assert any("all stamps are zero" in line for line in log.warnings)
+
+
+def test_exit_codes_of_info_and_of_a_plan(tmp_path):
+    """0 usable, 1 not usable, 3 with doubts if that is asked for; a plan writes nothing."""
+    doubtful = spoiled(tmp_path, mount=False)
+    assert call("info", doubtful).code == 0
+    strict = call("info", doubtful, "--strict", "--json")
+    assert strict.code == 3 and '"doubtful": true' in strict.out
+    plan = call("smooth", doubtful, "-o", tmp_path / "out", "--plan")
+    assert plan.code == 0 and plan.out == call("info", doubtful).out
+    assert not (tmp_path / "out").exists()
+    assert "to mend it: record /tf_static, or --set 'robots.robot.laser=[X, Y, YAW]'" in plan.out
+    unusable = spoiled(tmp_path, scan_offset_ns=90 * S)
+    found = call("info", unusable)
+    assert found.code == 1 and "not usable: /scan" in found.out
+    assert call("smooth", unusable, "-o", tmp_path / "out", "--plan").code == 1
+    assert call("info", spoiled(tmp_path), "--strict").code == 0
+    check_one_line(call("info", tmp_path / "none.mcap"))
+
+
+def test_beams_without_a_return_are_no_loss(tmp_path):
+    out = call("info", spoiled(tmp_path, ranges=np.inf)).out
+    assert "no return: 3 150 beams" in out and "dropped" not in out
