@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from graphslam.evaluation.relation_metrics import Relations
     from graphslam.logs import GroundTruth, LogSet, LogWriter
     from graphslam.results.folder import SavedResult
+    from graphslam.results.map_files import MapFiles
     from graphslam.results.report_comparison import Comparison
     from graphslam.simulation import Scenario, ScenarioError, Simulation
     from graphslam.slam.log_reader import Reading
@@ -68,6 +69,7 @@ _CLASSES = {
     "core.records": ("Estimate", "Landmark", "Result", "RobotResult", "Trajectory"),
     "logs": ("GroundTruth", "LogSet", "LogWriter"),
     "results.folder": ("SavedResult",),
+    "results.map_files": ("MapFiles",),
     "results.report_comparison": ("Comparison",),
     "simulation": ("ScenarioError", "Simulation"),
 }
@@ -75,9 +77,9 @@ _CLASSES = {
 __all__ = [
     "Change", "ChangeResult", "Comparison", "Config", "ConfigError", "Estimate",
     "EstimationError", "GraphSlamError", "GroundTruth", "Landmark", "LogError", "LogSet",
-    "LogWriter", "OutputError", "Result", "RobotResult", "SavedResult", "ScenarioError",
+    "LogWriter", "MapFiles", "OutputError", "Result", "RobotResult", "SavedResult", "ScenarioError",
     "Simulation", "Trajectory", "__version__", "changes_between", "compare", "evaluate",
-    "load_config", "load_result", "open_logs", "simulate", "smooth",
+    "load_config", "load_result", "make_map", "open_logs", "simulate", "smooth",
 ]  # fmt: skip
 
 if not TYPE_CHECKING:  # a type checker would take every name for defined
@@ -175,9 +177,10 @@ def smooth(
             return truth_of_logs(log, settled)
 
         def render_report() -> tuple[str, list[str]]:
+            from graphslam.evaluation.ground_truth import errors_of_run
             from graphslam.results.report import render
 
-            errors = _errors(result, known)
+            errors = errors_of_run(result, known)
             return render(result, errors), result.summary["warnings"]
 
         def finish_report(result: Result) -> str:
@@ -204,6 +207,32 @@ def load_result(directory: PathLike) -> SavedResult:
     return load(Path(directory))
 
 
+def make_map(
+    directory: PathLike,
+    *,
+    output: PathLike | None = None,
+    resolution_m: float | None = None,
+    mode: str = "trinary",
+    force: bool = False,
+) -> MapFiles:
+    """Make a grid map, drawings of the line map and tables of a result folder.
+
+    Args:
+        directory: the result folder.
+        output: the folder for the files; default: the result folder itself.
+        resolution_m: edge of a cell of the grid map; default: as fine as the scans allow.
+        mode: of the grid map, ``trinary`` or ``scale``, as nav2's map_server calls them.
+        force: replace files that exist.
+
+    Raises:
+        OutputError: it is no result folder, a file exists, or nothing can be written there.
+    """
+    from graphslam.results.map_files import make_map
+
+    target = Path(directory if output is None else output)
+    return make_map(Path(directory), target, resolution_m=resolution_m, mode=mode, force=force)
+
+
 def evaluate(
     result: Result | SavedResult | PathLike,
     *,
@@ -223,15 +252,16 @@ def evaluate(
             compared.
         LogError: a log cannot be read or holds no truth.
     """
-    from graphslam.evaluation.ground_truth import truth_of_run
+    from graphslam.evaluation.ground_truth import truth_given, truth_of_run
     from graphslam.evaluation.metrics import evaluate
+    from graphslam.evaluation.relation_metrics import relations_given
     from graphslam.logs import GroundTruth
 
     if isinstance(result, str | os.PathLike):
         result = load_result(result)
-    reference = _relations(relations)
+    reference = relations_given(relations)
     if truth is not None:
-        known = _truth(truth, tuple(result.robots))
+        known = truth_given(truth, tuple(result.robots))
     else:
         known = truth_of_run(result) if reference is None else GroundTruth({}, ())
     return evaluate(result, known.trajectories, known.landmarks, reference)
@@ -274,7 +304,8 @@ def compare(
     from graphslam.evaluation.compare_backends import compare
     from graphslam.evaluation.compare_folder import is_comparison, save_comparison
     from graphslam.evaluation.compare_variants import parse_variants
-    from graphslam.evaluation.ground_truth import truth_of_logs
+    from graphslam.evaluation.ground_truth import truth_given, truth_of_logs
+    from graphslam.evaluation.relation_metrics import relations_given
     from graphslam.results.folder import check_target
 
     settled = _settle(recording, config, settings)
@@ -287,8 +318,8 @@ def compare(
         settled,
         rows,
         mode,
-        truth=truth_of_logs(log, settled) if truth is None else _truth(truth, log.robots),
-        relations=_relations(relations),
+        truth=truth_of_logs(log, settled) if truth is None else truth_given(truth, log.robots),
+        relations=relations_given(relations),
         progress=_count(log, progress),
         say=announce,
     )
@@ -414,36 +445,3 @@ def _count(log: LogSet, progress: Callable[[int, int], None] | None) -> Callable
         return lambda _done: None
     total = log.count((Truth, TrueLandmark))
     return lambda done: progress(done, total)
-
-
-def _errors(result: Result, truth: GroundTruth) -> dict[str, Any] | None:
-    """Errors against the truth in the logs, None without; a warning where it does not fit."""
-    if not truth:
-        return None
-    from graphslam.core.errors import OutputError
-    from graphslam.evaluation.metrics import evaluate
-
-    try:
-        return evaluate(result, truth.trajectories, truth.landmarks)
-    except OutputError as error:
-        # the truth is of another time: no reason to lose the run
-        result.summary["warnings"].append(f"not evaluated: {error}")
-        return None
-
-
-def _truth(truth: Truth, robots: Sequence[str]) -> GroundTruth:
-    from graphslam.evaluation.ground_truth import truth_of_files
-    from graphslam.logs import GroundTruth
-
-    if isinstance(truth, GroundTruth):
-        return truth
-    sources = [truth] if isinstance(truth, str | os.PathLike) else truth
-    return truth_of_files([os.fspath(source) for source in sources], robots)
-
-
-def _relations(relations: Relations | PathLike | None) -> Relations | None:
-    from graphslam.evaluation.relation_metrics import read_relations
-
-    if isinstance(relations, str | os.PathLike):
-        return read_relations(Path(relations))
-    return relations

@@ -80,9 +80,21 @@ def check_horizon(value: float | None) -> float | None:
     return value
 
 
+def check_resolution(value: float | None) -> float | None:
+    """The edge of a cell in metres.
+
+    Raises:
+        typer.BadParameter: it is no length of a millimetre or more.
+    """
+    if value is not None and not 0.001 <= value < float("inf"):
+        raise typer.BadParameter(f"{value} is not a length in metres, at least 0.001")
+    return value
+
+
 BACKENDS = _choices(BackendConfig)
 FRONT_ENDS = _choices(FrontEndConfig)
 MODES = ["replay", "associate"]
+MAP_MODES = ["trinary", "scale"]
 
 
 def _choice(values: list[str], text: str, *flags: str) -> Any:
@@ -226,6 +238,27 @@ ChangeMethod = Annotated[
     ),
 ]
 ConfigFile = Annotated[Path | None, typer.Option("--config", metavar="FILE.toml", help="Settings.")]
+WithMap = Annotated[
+    bool,
+    typer.Option("--map", help="Write a grid map, drawings and tables too; see graphslam map."),
+]
+Resolution = Annotated[
+    float | None,
+    typer.Option(
+        "--resolution",
+        metavar="M",
+        callback=check_resolution,
+        help="Edge of a cell of the grid map, m; default: as fine as the scans allow.",
+    ),
+]
+MapMode = Annotated[
+    str,
+    _choice(
+        MAP_MODES,
+        "Of map_server: occupied, free and unknown, or the probability (a PNG).",
+        "--mode",
+    ),
+]
 Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="One setting, over the file's; repeatable."),
@@ -237,6 +270,9 @@ Jobs = Annotated[int | None, typer.Option(metavar="N", min=1, help="Processes; o
 # ---------------------------------------------------------------- what comes out
 
 ResultFolder = Annotated[Path, _output("DIR", "The result folder to make.")]
+MapFolder = Annotated[
+    Path | None, _output("FOLDER", "The folder for the files; default: DIR itself.")
+]
 OutputFolder = Annotated[Path, _output("DIR", "The folder to make.")]
 OutputLog = Annotated[Path, _output("LOG.mcap", "The log.")]
 OutputLogOrFolder = Annotated[

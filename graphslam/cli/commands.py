@@ -34,6 +34,8 @@ from graphslam.cli.arguments import (
     Json,
     LaterFolder,
     Logs,
+    MapFolder,
+    MapMode,
     OutputFolder,
     OutputLog,
     OutputLogOrFolder,
@@ -41,6 +43,7 @@ from graphslam.cli.arguments import (
     Preset,
     ReferenceFolder,
     Relations,
+    Resolution,
     ResultFolder,
     Runs,
     Scenario,
@@ -51,6 +54,7 @@ from graphslam.cli.arguments import (
     Starts,
     Strict,
     TruthFiles,
+    WithMap,
     span_of,
 )
 from graphslam.cli.terminal import errors_in_one_line, progress_bar
@@ -189,6 +193,7 @@ def smooth(
     front_end: FrontEnd = None,
     start: Starts = None,
     causal: Causal = False,
+    with_map: WithMap = False,
     preset: Preset = None,
     config: ConfigFile = None,
     settings: Settings = None,
@@ -216,7 +221,30 @@ def smooth(
         return _described(logs, tree, strict=False)
     with progress_bar("smoothing") as progress:
         result = graphslam.smooth(logs, config=tree, output=output, force=force, progress=progress)
+    if with_map:
+        graphslam.make_map(output)
     return Output(result.summary, lambda: show.smoothed(result, output))
+
+
+@command("map")
+def map_command(
+    directory: EvaluatedFolder,
+    output: MapFolder = None,
+    resolution: Resolution = None,
+    mode: MapMode = "trinary",
+    force: Force = False,
+) -> Output:
+    """Make maps for other tools of a result.
+
+    A grid map for nav2's map_server (map.yaml with its image), the line map as SVG, DXF and
+    GeoJSON, landmarks and trajectories as CSV.
+    """
+    from graphslam.cli import show
+
+    made = graphslam.make_map(
+        directory, output=output, resolution_m=resolution, mode=mode, force=force
+    ).to_dict()
+    return Output(made, lambda: show.mapped(made, output or directory))
 
 
 @command("evaluate")

@@ -152,6 +152,20 @@ def _clock(found: Mapping[str, Any]) -> str:
     return f"{text}; {'corrected' if found['applied'] else 'not significant, not applied'}"
 
 
+def mapped(made: Mapping[str, Any], directory: Path) -> None:
+    """The size of the grid map, and where the files are."""
+    console, grid = _console(), made["grid"]
+    if grid is None:
+        console.print("no scans, so there is no grid map")
+    else:
+        width, height = (grid["resolution_m"] * grid[side] for side in ("columns", "rows"))
+        console.print(
+            f"grid map: {width:.1f} x {height:.1f} m, cells of {_number(grid['resolution_m'])} m, "
+            f"{_number(grid['occupied'])} occupied, {_number(grid['free'])} free"
+        )
+    console.print(f"in {directory}: {', '.join(made['files'])}")
+
+
 def evaluation(errors: Mapping[str, Any]) -> None:
     """Tables of errors: trajectories, relations, landmarks, as far as they were compared."""
     console = _console()

@@ -1,11 +1,14 @@
 """Ground truth for an evaluation: from the logs of a run, other logs, or TUM files."""
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError, OutputError
 from graphslam.core.records import Result, Trajectory, TrueLandmark, Truth
+from graphslam.evaluation.metrics import evaluate
 from graphslam.logs import GroundTruth, LogSet, is_recording, read_truth, truth_from_recordings
 from graphslam.results.file_formats import read_trajectory
 from graphslam.results.folder import SavedResult
@@ -60,6 +63,33 @@ def truth_of_files(sources: Sequence[str], robots: Sequence[str]) -> GroundTruth
             robot, path = _robot_and_path(source, robots)
             trajectories[robot] = read_trajectory(path)
     return GroundTruth(trajectories, tuple(landmarks))
+
+
+def truth_given(
+    truth: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | GroundTruth,
+    robots: Sequence[str],
+) -> GroundTruth:
+    """Truth as a caller gives it: already read, or one or several of `truth_of_files`.
+
+    Raises:
+        LogError, OutputError: see `truth_of_files`.
+    """
+    if isinstance(truth, GroundTruth):
+        return truth
+    sources = [truth] if isinstance(truth, str | os.PathLike) else truth
+    return truth_of_files([os.fspath(source) for source in sources], robots)
+
+
+def errors_of_run(result: Result, truth: GroundTruth) -> dict[str, Any] | None:
+    """Errors against the truth in the logs, None without; a warning where it does not fit."""
+    if not truth:
+        return None
+    try:
+        return evaluate(result, truth.trajectories, truth.landmarks)
+    except OutputError as error:
+        # the truth is of another time: no reason to lose the run
+        result.summary["warnings"].append(f"not evaluated: {error}")
+        return None
 
 
 def _robot_and_path(source: str, robots: Sequence[str]) -> tuple[str, Path]:

@@ -4,6 +4,7 @@ Source: R. Kümmerle et al., On measuring the accuracy of SLAM algorithms, Auton
 2009, DOI 10.1007/s10514-009-9155-6.
 """
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,6 +46,17 @@ class Relations:
     def local(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
         """(n,) which relations span at most 60 s; the others are loops."""
         return np.asarray(np.abs(self.to_ns - self.from_ns) <= LOCAL_S * 1e9)
+
+
+def relations_given(relations: Relations | str | os.PathLike[str] | None) -> Relations | None:
+    """Relations as a caller gives them: already read, the path of a file, or none.
+
+    Raises:
+        OutputError: see `read_relations`.
+    """
+    if isinstance(relations, str | os.PathLike):
+        return read_relations(Path(relations))
+    return relations
 
 
 def read_relations(path: Path) -> Relations:

@@ -1,8 +1,9 @@
 """The result folder: written atomically, and read back.
 
 The layout is documented in docs/formats.md: summary.json, config.toml, trajectories/,
-landmarks.json, graph.g2o (with graph_ids.csv naming its vertices), joint.npz where there are scans,
-and report.html. The formats of the files are in `file_formats` and `joint_file`.
+landmarks.json, graph.g2o (with graph_ids.csv naming its vertices), joint.npz and scans.npz where
+there are scans, and report.html. The formats of the files are in `file_formats`, `joint_file` and
+`scans_file`.
 """
 
 import json
@@ -30,19 +31,22 @@ from graphslam.results.file_formats import (
     tum_text,
 )
 from graphslam.results.joint_file import joint_bytes, joint_scans, read_joint
+from graphslam.results.scans_file import SCANS_FILE, place_scans, scans_bytes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SavedRobot:
     """One robot's trajectories as saved; scan poses are None where the robot had no scans.
 
-    Scan trajectories have no covariance file: their ``covs`` are NaN.
+    ``odometry`` is the base by odometry alone. It and scan trajectories have no covariance file:
+    their ``covs`` are NaN.
     """
 
     final: Trajectory
     causal: Trajectory | None
     scan_final: Trajectory | None
     scan_causal: Trajectory | None
+    odometry: Trajectory | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,6 +149,9 @@ def _files(result: Result, report: Callable[[Result], str] | None) -> list[tuple
     joint = joint_scans(result.estimate, result.robots)
     if joint is not None:
         files.append((JOINT_FILE, joint_bytes(joint)))
+    scans = place_scans(result.keyframe_scans, result.estimate.states)
+    if scans:
+        files.append((SCANS_FILE, scans_bytes(scans)))
     if report is not None:
         files.append(("report.html", report(result)))
     files.append(("summary.json", to_json(result.summary, "summary.json")))
@@ -164,6 +171,7 @@ def _trajectory_files(named: tuple[str, RobotResult]) -> list[tuple[str, str]]:
     files = [
         (f"{stem}.tum", tum_text(robot.final)),
         (f"{stem}.cov.csv", cov_text(robot.final)),
+        (f"{stem}.odometry.tum", tum_text(robot.dead_reckoning)),
     ]
     if robot.causal is not None:
         files += [
@@ -231,4 +239,5 @@ def _load_robot(stem: Path) -> SavedRobot:
         read_trajectory(causal, path(".causal.cov.csv")) if causal.exists() else None,
         scan(".scan.tum"),
         scan(".scan.causal.tum"),
+        scan(".odometry.tum"),
     )

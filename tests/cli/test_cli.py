@@ -47,9 +47,10 @@ def listing(folder):
 def test_smooth_writes_every_file_of_the_contract(room):
     names = {str(p.relative_to(room.out)) for p in room.out.rglob("*") if p.is_file()}
     stems = ("tum", "causal.tum", "scan.tum", "scan.causal.tum", "cov.csv", "causal.cov.csv")
+    stems += ("odometry.tum",)
     assert names == {
         *("summary.json", "config.toml", "landmarks.json", "graph.g2o", "graph_ids.csv"),
-        *("report.html", "joint.npz"),
+        *("report.html", "joint.npz", "scans.npz"),
         *(f"trajectories/robot.{stem}" for stem in stems),
     }
     assert sorted(p.name for p in room.folder.iterdir()) == ["out", "room.mcap"]
@@ -62,7 +63,7 @@ def test_causal_files_of_a_log_of_scans_are_written_where_they_are_asked_for(roo
         out = tmp_path / f"out{len(chosen)}"
         assert call("smooth", room.log, "-o", out, *chosen).code == 0
         stems = {p.name.removeprefix("robot.") for p in (out / "trajectories").iterdir()}
-        assert stems - {"scan.causal.tum"} == {"tum", "scan.tum", "cov.csv"} | extra
+        assert stems - {"scan.causal.tum"} == {"tum", "scan.tum", "cov.csv", "odometry.tum"} | extra
         assert ("scan.causal.tum" in stems) == bool(extra)
     report = (tmp_path / "out0" / "report.html").read_text()
     assert "causal estimate" not in report and "Final against odometry" in report
@@ -555,3 +556,23 @@ def test_matrices_have_one_thread_unless_the_environment_says_otherwise():
             env=environment,
         )
         assert done.stdout.split()[-1] == (chosen or "1")
+
+
+# ---------------------------------------------------------------- maps
+
+
+def test_map_makes_in_the_folder_what_smooth_makes_with_map(room, tmp_path):
+    """And says what: of the files of the command no other is touched."""
+    done = call("smooth", room.log, "-o", tmp_path / "out", "--start", "truth", "--map")
+    assert done.code == 0, done.err
+    made = call("map", room.out, "-o", tmp_path / "maps", "--json")
+    names = json.loads(made.out)["files"]
+    assert sorted(names) == sorted(p.name for p in (tmp_path / "maps").iterdir())
+    for name in names:
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "maps" / name).read_bytes()
+    again = call("map", tmp_path / "out")
+    assert (again.code, again.err.count("\n")) == (1, 1) and "--force" in again.err
+    finer = call("map", tmp_path / "out", "--resolution", "0.02", "--mode", "scale", "--force")
+    assert "cells of 0.02 m" in finer.out
+    assert (tmp_path / "out/map.png").is_file()
+    assert call("map", room.out, "--resolution", "0").code == 2

@@ -48,7 +48,9 @@ def test_folder_holds_the_contract(made, tmp_path):
     save(made, tmp_path / "out", force=False, report=lambda _: "<html>")
     files = {str(p.relative_to(tmp_path / "out")) for p in (tmp_path / "out").rglob("*.*")}
     names = ("tum", "causal.tum", "scan.tum", "scan.causal.tum", "cov.csv", "causal.cov.csv")
+    names += ("odometry.tum",)
     assert files == {
+        "scans.npz",
         "summary.json",
         "config.toml",
         "landmarks.json",
@@ -68,8 +70,9 @@ def test_load_gives_back_what_was_saved(fixture, request, tmp_path):
     assert list(saved.robots) == sorted(result.robots)
     assert saved.summary == json.loads(json.dumps(result.summary))
     for name, robot in result.robots.items():
-        for field in ("final", "causal", "scan_final", "scan_causal"):
-            ours, back = getattr(robot, field), getattr(saved.robots[name], field)
+        for field in (*("final", "causal", "scan_final", "scan_causal", "dead_reckoning"),):
+            ours = getattr(robot, field)
+            back = getattr(saved.robots[name], field.replace("dead_reckoning", "odometry"))
             if ours is None:
                 assert back is None
                 continue
@@ -77,7 +80,7 @@ def test_load_gives_back_what_was_saved(fixture, request, tmp_path):
             # 9 decimals of position, 12 of the quaternion
             assert np.abs(ours.poses[:, :2] - back.poses[:, :2]).max() <= 0.5001e-9
             assert np.abs(wrap(ours.poses[:, 2] - back.poses[:, 2])).max() < 1e-11
-            if not field.startswith("scan"):
+            if field in ("final", "causal"):
                 assert np.array_equal(ours.covs, back.covs)  # repr floats: exact
     for ours, back in zip(result.landmarks, saved.landmarks, strict=True):
         for field in ("position", "cov", "extent"):
