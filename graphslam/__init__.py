@@ -155,6 +155,7 @@ def smooth(
             reading of logs that are open already.
         EstimationError: the estimate is indeterminate, or a robot's start is unknown.
     """
+    from graphslam.core.memory_limit import limited_memory
     from graphslam.core.worker import Future
     from graphslam.results.folder import check_target, save
     from graphslam.slam.log_reader import receive_log
@@ -162,8 +163,8 @@ def smooth(
     settled = _settle(recording, config, settings)
     if output is not None:
         check_target(Path(output), force=force)
-    ahead = _read_ahead(recording, settled)
-    with ahead or nullcontext():
+    reading = _read_ahead(recording, settled) or nullcontext()
+    with limited_memory(settled.limits.memory_mb), reading as ahead:
         # imported while the second process reads; what only that one needs is imported there
         from graphslam.slam.smooth import smooth
 

@@ -38,6 +38,8 @@ def _describe(error: Exception) -> str:
     """One line that says what and where, and what to do about it."""
     if isinstance(error, GraphSlamError):
         text = str(error)
+    elif isinstance(error, MemoryError):
+        text = "there is not enough memory; cut the log into pieces, or see the settings limits.*"
     elif isinstance(error, OSError) and error.strerror:
         where = f"{error.filename}: " if error.filename else ""
         text = f"{where}{error.strerror}"

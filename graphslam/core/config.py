@@ -13,6 +13,7 @@ from graphslam.core.sensor_config import (
     CalibrationParameter,
     FrontEndConfig,
     KeyframeConfig,
+    LimitsConfig,
     LogsConfig,
     OdometryConfig,
     RobotConfig,
@@ -29,6 +30,7 @@ __all__ = [
     "FrontEndConfig",
     "ImmConfig",
     "KeyframeConfig",
+    "LimitsConfig",
     "LogsConfig",
     "LoopClosureConfig",
     "MultiRobotConfig",
@@ -320,6 +322,7 @@ class Config:
     """
 
     logs: LogsConfig = field(default_factory=LogsConfig)
+    limits: LimitsConfig = field(default_factory=LimitsConfig)
     robots: Mapping[str, RobotConfig] = field(default_factory=dict)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
     keyframe: KeyframeConfig = field(default_factory=KeyframeConfig)

@@ -291,7 +291,7 @@ def _check_range(key: str, value: float) -> None:
 
 
 #: settings that may be infinite
-_INFINITE = {"association.delete_s", "backend.horizon_s"}
+_INFINITE = {"association.delete_s", "backend.horizon_s", "limits.memory_mb"}
 
 #: settings that would be a divisor of 0, or make a covariance singular
 _NOT_ZERO = {
@@ -328,6 +328,9 @@ _NOT_ZERO = {
     "sampling_m",
     "place_cell_m",
     "place_range_m",
+    "memory_mb",
+    "chunk_mb",
+    "chunk_records",
 }
 
 

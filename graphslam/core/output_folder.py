@@ -1,12 +1,77 @@
-"""Output folders and files that appear whole or not at all."""
+"""Output files and folders that appear whole or not at all.
+
+They are made beside their target, under a name that has the number of the process, and renamed.
+What a killed process left behind is removed by the next one that writes the same target.
+"""
 
 import os
+import re
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from graphslam.core.errors import OutputError
+
+#: device, number and time of change of what stands at a path; None: nothing does
+Identity = tuple[int, int, int] | None
+
+
+def unfinished(target: Path, kind: str = "part") -> Path:
+    """Where ``target`` is made; what dead processes left there is removed.
+
+    A folder that was moved away by a process that died before it put the new one in its place
+    is moved back.
+    """
+    final = target.absolute()
+    for path in sorted(final.parent.glob(f".{_escaped(final.name)}.*")):
+        found = re.fullmatch(r"\.(\d+)\.(part|old)", path.name[1 + len(final.name) :])
+        if found is None or _is_alive(int(found[1])):
+            continue
+        if found[2] == "old" and not os.path.lexists(final):
+            path.rename(final)
+        elif path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+    return final.with_name(f".{final.name}.{os.getpid()}.{kind}")
+
+
+def _escaped(name: str) -> str:
+    return re.sub(r"([*?[])", r"[\1]", name)
+
+
+def _is_alive(number: int) -> bool:
+    """Whether a process with this number runs on this machine."""
+    try:
+        os.kill(number, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
+
+
+def identity(path: Path) -> Identity:
+    """What stands at ``path`` now, to be compared with what stands there later."""
+    try:
+        found = path.stat(follow_symlinks=False)
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino, found.st_mtime_ns
+
+
+def check_same(target: Path, before: Identity) -> None:
+    """Check that nobody wrote ``target`` since `identity` gave ``before``.
+
+    Raises:
+        OutputError: another process did.
+    """
+    if identity(target) not in (None, before):
+        raise OutputError(
+            f"{target}: was written by another process meanwhile; it is left as it is, choose "
+            "another name"
+        )
 
 
 @contextmanager
@@ -17,14 +82,18 @@ def atomic_folder(target: Path) -> Iterator[Path]:
     of the two exists at any time. If the block raises, ``target`` stays as it was.
 
     Raises:
-        OutputError: the disk refuses; nothing is left behind.
+        OutputError: the disk refuses, or another process wrote ``target`` meanwhile; nothing is
+            left behind.
     """
     final = target.absolute()
-    part = final.with_name(f".{final.name}.{os.getpid()}.part")
-    old = final.with_name(f".{final.name}.{os.getpid()}.old")
+    part = old = None
     try:
+        part = unfinished(final)
+        old = part.with_suffix(".old")
+        before = identity(final)
         part.mkdir(parents=True)
         yield part
+        check_same(final, before)
         if final.exists():
             final.rename(old)
         try:
@@ -36,7 +105,8 @@ def atomic_folder(target: Path) -> Iterator[Path]:
     except OSError as error:
         raise OutputError(f"{target}: cannot be written: {error.strerror}") from error
     finally:
-        shutil.rmtree(part, ignore_errors=True)
+        if part is not None:
+            shutil.rmtree(part, ignore_errors=True)
     shutil.rmtree(old, ignore_errors=True)
 
 

@@ -1,5 +1,6 @@
 """Settings of what goes in: logs, robots, odometry, keyframes, front ends, scan matching."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
@@ -38,6 +39,21 @@ class LogsConfig:
     max_clock_offset_s: float = 5.0
     undistort: bool = True
     topics: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class LimitsConfig:
+    """What a log may ask for; more is an error of one line, because a damaged log can ask for all.
+
+    memory_mb: of one process. chunk_mb, chunk_records: of a chunk (a block of messages that a file
+    holds compressed) when unpacked. robots, landmarks: in one run.
+    """
+
+    memory_mb: float = math.inf
+    chunk_mb: float = 256.0
+    chunk_records: int = 1_000_000
+    robots: int = 200
+    landmarks: int = 200_000
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,9 @@ def number_vertices(estimate: Estimate) -> GraphIds:
 def graph_ids(estimate: Estimate) -> str:
     """CSV ``id,robot,stamp_ns,landmark`` naming the vertices of `graph_g2o`; unused cells empty."""
     ids = number_vertices(estimate)
-    rows = [f'{i},"{robot}",{stamp},' for (robot, stamp), i in ids.states.items()]
+    # a quote in a quoted cell is doubled (RFC 4180)
+    names = {robot: robot.replace('"', '""') for robot, _ in ids.states}
+    rows = [f'{i},"{names[robot]}",{stamp},' for (robot, stamp), i in ids.states.items()]
     rows += [f"{i},,,{landmark}" for landmark, i in ids.landmarks.items()]
     return "\n".join(["id,robot,stamp_ns,landmark", *rows]) + "\n"
 

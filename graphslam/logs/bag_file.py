@@ -19,14 +19,23 @@ from typing import BinaryIO, NamedTuple
 import lz4.frame
 
 from graphslam.core.errors import LogError
-from graphslam.logs.container_files import digest, open_file, size_of, stream_reader
+from graphslam.core.sensor_config import LimitsConfig
+from graphslam.logs.container_files import (
+    digest,
+    open_file,
+    size_of,
+    stream_reader,
+    too_large,
+)
 from graphslam.logs.recording import (
     MAX_BLOCK,
     Block,
     BlockList,
     Channel,
     Piece,
+    count_undescribed,
     one_line,
+    undescribed,
 )
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -60,15 +69,15 @@ class _Record(NamedTuple):
     end: int
 
 
-def index_bag(path: Path) -> Piece:
+def index_bag(path: Path, limits: LimitsConfig) -> Piece:
     """Read through the bag ``path`` once and index it.
 
     Raises:
-        LogError: it is encrypted.
+        LogError: it is encrypted, or a chunk is beyond ``limits``.
         OSError: it cannot be read.
     """
     with open_file(path) as stream:
-        return _Indexer(path, stream).run()
+        return _Indexer(path, stream, limits).run()
 
 
 def _block_messages(
@@ -161,8 +170,10 @@ def _records(stream: BinaryIO, offset: int, limit: int) -> Iterator[_Record]:
 # ---------------------------------------------------------------- chunks
 
 
-def _unpacked(stream: BinaryIO, chunk: _Record) -> bytes:
+def _unpacked(stream: BinaryIO, chunk: _Record, most: int = -1) -> bytes:
     """Contents of a chunk; if the file ends inside it, those before the end.
+
+    ``most``: so many bytes are enough.
 
     Raises:
         _BagError: it cannot be unpacked.
@@ -174,7 +185,7 @@ def _unpacked(stream: BinaryIO, chunk: _Record) -> bytes:
     # without a length: the bag was not closed, and its last chunk ends with the file; if it is not
     # packed, its messages are read as those outside chunks
     packed = stream.read(length or _SEARCHED * (packing != "none"))
-    limit = size or -1
+    limit = size if size and (most < 0 or size < most) else most
     try:
         if packing == "none":
             return packed
@@ -243,8 +254,8 @@ def _add_connection(
 class _Indexer:
     """One pass over a bag: `run` does it, the other methods are its steps."""
 
-    def __init__(self, path: Path, stream: BinaryIO) -> None:
-        self.path, self.stream = path, stream
+    def __init__(self, path: Path, stream: BinaryIO, limits: LimitsConfig) -> None:
+        self.path, self.stream, self.limits = path, stream, limits
         self.size = size_of(stream)
         self.connections: dict[int, Channel] = {}
         self.blocks = BlockList()
@@ -298,10 +309,14 @@ class _Indexer:
     def add_chunk(self, offset: int, record: _Record) -> None:
         messages = []
         try:
-            data = _unpacked(self.stream, record)
+            data = _unpacked(self.stream, record, 1 + int(1e6 * self.limits.chunk_mb))
+            if len(data) > 1e6 * self.limits.chunk_mb:
+                raise too_large(self.path, offset, "chunk_mb")
             # one by one: what comes before damage is kept
             for connection, log_time_ns, _, _ in _messages_in(data, self.connections):
                 messages.append((connection, log_time_ns))
+                if len(messages) > self.limits.chunk_records:
+                    raise too_large(self.path, offset, "chunk_records")
         except _BagError as error:
             if record.end <= self.size:
                 self.damage.append(f"the chunk at byte {offset} is damaged ({one_line(error)})")
@@ -347,10 +362,11 @@ class _Indexer:
     def result(self) -> Piece:
         if not self.has_index and not self.damage:
             self.damage.append("it has no index: its recording was not ended")
-        lost: int | None = None if self.damage else 0
+        unknown = count_undescribed(self.blocks.blocks, self.connections)
+        lost: int | None = None if self.damage else unknown
         if self.has_index:
             messages = sum(sum(block.counts.values()) for block in self.blocks.blocks)
-            lost = max(0, self.stated - messages)
+            lost = unknown + max(0, self.stated - messages)
         return Piece(
             path=self.path,
             sha256=digest(self.path),
@@ -358,6 +374,6 @@ class _Indexer:
             blocks=tuple(self.blocks.blocks),
             in_order=self.blocks.in_order,
             lost=lost,
-            damage="; ".join(self.damage),
-            open=partial(stream_reader, _block_messages),
+            damage="; ".join([*self.damage, *undescribed(unknown)]),
+            open=partial(stream_reader, _block_messages, (_BagError, EOFError, struct.error)),
         )

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, BinaryIO
 
 import zstandard
 
+from graphslam.core.errors import LogError
+
 if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
 
@@ -40,11 +42,41 @@ def open_file(path: Path) -> BinaryIO:
 @contextmanager
 def stream_reader(
     block_messages: "Callable[[BinaryIO, Block, Collection[int]], Iterator[Message]]",
+    errors: tuple[type[Exception], ...],
     piece: "Piece",
 ) -> "Iterator[ReadBlock]":
-    """Reads blocks of ``piece`` by ``block_messages``, whose first argument is the open file."""
+    """Reads blocks of ``piece`` by ``block_messages``, whose first argument is the open file.
+
+    ``errors`` are those that it raises on damage, which was not there before.
+    """
     with open_file(piece.path) as stream:
-        yield partial(block_messages, stream)
+        yield unchanged(partial(block_messages, stream), errors, piece.path)
+
+
+def unchanged(read: "ReadBlock", errors: tuple[type[Exception], ...], path: Path) -> "ReadBlock":
+    """``read`` with a `LogError` in place of ``errors``: what it reads was read without before."""
+    caught: tuple[type[Exception], ...] = (*errors, OSError)
+
+    def reading(block: "Block", wanted: Collection[int]) -> "Iterator[Message]":
+        try:
+            yield from read(block, wanted)
+        except caught as error:
+            raise changed(path) from error
+
+    return reading
+
+
+def changed(path: Path) -> LogError:
+    """The error for a file that is another one than when it was indexed."""
+    return LogError(f"{path}: changed while it was read; read it when it is complete")
+
+
+def too_large(path: Path, offset: int, setting: str) -> LogError:
+    """The error for a chunk at byte ``offset`` that is beyond a setting of [limits]."""
+    return LogError(
+        f"{path}: the chunk at byte {offset}, when unpacked, is beyond limits.{setting}; "
+        "raise it if the file is to be trusted"
+    )
 
 
 def is_compressed(path: Path) -> bool:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from graphslam.core.errors import LogError
+from graphslam.core.sensor_config import LimitsConfig
 from graphslam.logs import bag_file, mcap_file, sqlite_file
 from graphslam.logs.container_files import is_compressed, open_file
 from graphslam.logs.recording import Piece, Recording
@@ -16,7 +17,7 @@ class Container(NamedTuple):
     """A row of `CONTAINERS`: the bytes that a file begins with, and what indexes it."""
 
     magic: bytes
-    make_index: Callable[[Path], Piece]
+    make_index: Callable[[Path, LimitsConfig], Piece]
 
 
 CONTAINERS: dict[str, Container] = {
@@ -25,22 +26,30 @@ CONTAINERS: dict[str, Container] = {
     "ROS 1 bag": Container(bag_file.MAGIC, bag_file.index_bag),
 }
 
+#: the limits of who names none
+NO_MORE = LimitsConfig()
+
 _LONGEST = max(len(container.magic) for container in CONTAINERS.values())
 #: what is beside recordings in folders, and is not looked at
 _PACKED = {b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zXZ": "xz", b"PK\x03\x04": "zip"}
 
 
-def open_recording(path: Path) -> Recording:
+def open_recording(path: Path, limits: LimitsConfig = NO_MORE) -> Recording:
     """Read through ``path`` once and index it.
 
     It is a file of any row of `CONTAINERS`, also compressed with zstd, or a folder of such files,
     which are the pieces of one recording.
 
     Raises:
-        LogError: no such file, unreadable, of no known container, or without any message.
+        LogError: no such file, unreadable, of no known container, without any message, or with a
+            chunk beyond ``limits``.
     """
     try:
-        recording = _open_folder(path) if path.is_dir() else Recording(path, (_indexed(path),))
+        recording = (
+            _open_folder(path, limits)
+            if path.is_dir()
+            else Recording(path, (_indexed(path, limits),))
+        )
     except FileNotFoundError as error:
         raise LogError(f"{path}: no such file; check the path") from error
     except OSError as error:
@@ -57,11 +66,11 @@ def is_recording(path: Path) -> bool:
     return path.is_dir() or (path.is_file() and _container_of(path) is not None)
 
 
-def _indexed(path: Path) -> Piece:
+def _indexed(path: Path, limits: LimitsConfig) -> Piece:
     container = _container_of(path)
     if container is None:
         raise LogError(f"{path}: {_what_it_is(path)}")
-    return container.make_index(path)
+    return container.make_index(path, limits)
 
 
 def _container_of(path: Path) -> Container | None:
@@ -95,7 +104,7 @@ def _what_it_is(path: Path) -> str:
 # ---------------------------------------------------------------- folders
 
 
-def _open_folder(folder: Path) -> Recording:
+def _open_folder(folder: Path, limits: LimitsConfig) -> Recording:
     """The files of recordings in ``folder`` as the pieces of one, in the order of time."""
     metadata = read_metadata(folder / METADATA)
     paths = [path for path in sorted(folder.iterdir()) if path.is_file()]
@@ -105,7 +114,7 @@ def _open_folder(folder: Path) -> Recording:
     found = [path for path in paths if path.stat().st_size and _container_of(path)]
     if not found:
         raise LogError(f"{folder}: {_without_recording(folder)}")
-    pieces = [_counted(_indexed(path), metadata) for path in found]
+    pieces = [_counted(_indexed(path, limits), metadata) for path in found]
     pieces = [piece for piece in pieces if piece.messages or piece.damage]
     pieces.sort(key=lambda piece: piece.start_ns)
     missing = metadata.missing([path.name for path in found])

@@ -15,11 +15,10 @@ import numpy as np
 
 from graphslam.core import records
 from graphslam.core.geometry import Array, is_positive
+from graphslam.logs import physical_limits as limits
 from graphslam.logs import schemas
 from graphslam.logs.cdr import CdrError
 
-# No planar laser measures farther; some drivers write 1e6 or 65535 for an error.
-MAX_RANGE_M = 1000.0
 #: no planar laser takes longer for a sweep; it may take so much more of the time that is stated
 MAX_SWEEP_S, SWEEP_SLACK = 1.0, 1.05
 
@@ -121,14 +120,14 @@ def _usable_ranges(rows: Any, no_return_m: float) -> tuple[Array, Array]:
     low, high = (rows[name].astype(float)[:, None] for name in ("range_min", "range_max"))
     least = np.where(low > 0, low, 0.0)
     # limits of 0, NaN or inf were not set by the driver: no limit
-    most = np.where(high > 0, np.minimum(high, MAX_RANGE_M), MAX_RANGE_M)
+    most = np.where(high > 0, np.minimum(high, limits.MAX_RANGE_M), limits.MAX_RANGE_M)
     usable = (ranges > 0) & (ranges >= least) & (ranges <= most) & (ranges < no_return_m)
     return ranges, usable
 
 
 def _count_defects(ranges: Array, beams: Counter[str]) -> None:
     """Count ranges that are no measurements, by reason."""
-    odd = ranges[~((ranges >= 0) & (ranges <= MAX_RANGE_M))]
+    odd = ranges[~((ranges >= 0) & (ranges <= limits.MAX_RANGE_M))]
     if not len(odd):
         return
     finite = odd[np.isfinite(odd)]
@@ -153,12 +152,15 @@ def odometry(rows: Any, topic: TopicContext) -> list[records.OdometryPose | str]
     poses = np.column_stack([rows["xyz"][:, :2], yaw])
     is_rotation = ((norm > 0.5) & (norm < 2.0)).tolist()  # also false for NaN
     finite = np.isfinite(poses[:, :2]).all(axis=1).tolist()
+    near = (np.abs(poses[:, :2]) <= limits.MAX_POSITION_M).all(axis=1).tolist()
     found: list[records.OdometryPose | str] = []
     for i, stamp in enumerate(schemas.stamps_ns(rows).tolist()):
         if not is_rotation[i]:
             found.append("odometry: quaternion is not a rotation")
         elif not finite[i]:
             found.append("odometry: not finite")
+        elif not near[i]:
+            found.append("odometry: farther than robots drive")
         else:
             found.append(records.OdometryPose(topic.robot, stamp, stamp, poses[i].copy()))
     return found
@@ -170,6 +172,8 @@ def joint_state(message: Any, topic: TopicContext) -> records.WheelAngles:
     left = _joint(positions, topic.left_joint, "left")
     right = _joint(positions, topic.right_joint, "right")
     _check_finite("joints", np.array([left, right]))
+    if max(abs(left), abs(right)) > limits.MAX_ANGLE_RAD:
+        raise UnusableMessageError("joints: angle is beyond what a wheel turns")
     return records.WheelAngles(*_source(message, topic), left, right)
 
 
@@ -181,6 +185,8 @@ def sighting(message: Any, topic: TopicContext) -> records.Sighting:
     _check_finite("sighting", z)
     if z[1] <= 0:
         raise UnusableMessageError("sighting: range is not positive")
+    if z[1] > limits.MAX_SIGHTING_M:
+        raise UnusableMessageError("sighting: range is beyond what anything measures")
     mount = topic.mounts.get(frame_of(message), _NO_MOUNT)
     may_be = _UNNAMED.get(message.robot)
     if may_be is not None:
@@ -276,6 +282,8 @@ def _check_finite(what: str, values: Array) -> None:
 def _pose(what: str, message: Any) -> Array:
     pose = np.array([message.x, message.y, message.phi])
     _check_finite(what, pose)
+    if np.abs(pose[:2]).max() > limits.MAX_POSITION_M or abs(pose[2]) > limits.MAX_ANGLE_RAD:
+        raise UnusableMessageError(f"{what}: farther than robots drive")
     return pose
 
 
@@ -292,6 +300,10 @@ def _checked_covariance(what: str, values: bytes, size: int) -> Array:
     _check_finite(what, cov)
     if not is_positive(cov):
         raise UnusableMessageError(f"{what}: covariance is not positive definite")
+    variances = cov.diagonal()
+    most = limits.MAX_SIGHTING_VARIANCE if what == "sighting" else limits.MAX_VARIANCE
+    if variances.min() < limits.MIN_VARIANCE or variances.max() > most:
+        raise UnusableMessageError(f"{what}: variance is beyond what a sensor has")
     cov.flags.writeable = False
     return cov
 

@@ -7,6 +7,7 @@ published relations refer to it.
 Source: https://carmen.sourceforge.net/logger_playback.html
 """
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from decimal import Decimal, DecimalException
@@ -20,9 +21,9 @@ from numpy.typing import NDArray
 
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import between
-from graphslam.logs.decoders import MAX_RANGE_M
 from graphslam.logs.import_summary import ImportSummary
 from graphslam.logs.no_return import find_no_return
+from graphslam.logs.physical_limits import MAX_RANGE_M
 from graphslam.logs.schemas import DEFAULT_ROBOT
 from graphslam.logs.source_files import text_lines
 from graphslam.logs.writer import LogWriter
@@ -220,8 +221,20 @@ def _entries(source: Path, malformed: Counter[str]) -> Iterator[_Entry]:
 
 
 def _pose(fields: Sequence[str]) -> _Pose:
-    x, y, theta = map(float, fields)
+    x, y, theta = map(finite, fields)
     return x, y, theta
+
+
+def finite(text: str) -> float:
+    """A number.
+
+    Raises:
+        ValueError: it is not finite, or no number.
+    """
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text!r} is not finite")
+    return value
 
 
 def _ranges(fields: Sequence[str]) -> Ranges:
@@ -271,7 +284,7 @@ def _new_scan(laser: int, fields: list[str]) -> _Scan:
     n r1..rn m remission1..remissionm; ROBOTLASER1 goes on with the poses of laser and robot (3 + 3)
     and four or five numbers. Old logs have no m.
     """
-    start, step, beams = float(fields[2]), float(fields[4]), int(fields[8])
+    start, step, beams = finite(fields[2]), finite(fields[4]), int(fields[8])
     ranges, rest = fields[9 : 9 + beams], fields[9 + beams : -_TRAILER]
     if len(ranges) != beams:
         raise ValueError("the number of ranges differs from the count in the line")
@@ -288,7 +301,7 @@ def _new_scan(laser: int, fields: list[str]) -> _Scan:
 def _parameter(fields: list[str]) -> _Offset | None:
     """PARAM name value ipc_timestamp host logger_timestamp."""
     laser = {"robot_frontlaser_offset": 1, "robot_rearlaser_offset": 2}.get(fields[1])
-    return None if laser is None else _Offset(laser, float(fields[2]))
+    return None if laser is None else _Offset(laser, finite(fields[2]))
 
 
 #: lines of lasers; of several for one laser the first is used: those that have the robot's pose

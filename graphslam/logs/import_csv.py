@@ -24,9 +24,9 @@ from typing import TypeVar
 import numpy as np
 
 from graphslam.core.errors import LogError
-from graphslam.logs.decoders import MAX_RANGE_M
-from graphslam.logs.import_carmen import parse_stamp_ns
+from graphslam.logs.import_carmen import finite, parse_stamp_ns
 from graphslam.logs.import_summary import ImportSummary
+from graphslam.logs.physical_limits import MAX_RANGE_M
 from graphslam.logs.schemas import DEFAULT_ROBOT
 from graphslam.logs.source_files import text_files
 from graphslam.logs.writer import Event, LogWriter
@@ -113,19 +113,19 @@ def _pose_event(
 
 def _numbers(fields: list[str]) -> Pose:
     """X m, y m, heading rad; more columns are left out."""
-    x, y, phi = map(float, fields[:3])
+    x, y, phi = map(finite, fields[:3])
     return x, y, phi
 
 
 def _tum_pose(fields: list[str]) -> Pose:
     """The planar part of x y z m and the quaternion x y z w."""
-    x, y, _, qx, qy, qz, qw = map(float, fields[:7])
+    x, y, _, qx, qy, qz, qw = map(finite, fields[:7])
     phi = math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
     return x, y, phi
 
 
 def _scan(robot: str, fields: list[str]) -> Event:
-    start, step = float(fields[1]), float(fields[2])
+    start, step = finite(fields[1]), finite(fields[2])
     ranges = [float(field) if field else math.inf for field in fields[3:]]
     return Event.of(
         LogWriter.scan,

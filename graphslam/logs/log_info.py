@@ -79,7 +79,7 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
     Raises:
         LogError: a file is missing, of no known container or without a message.
     """
-    files = [open_recording(Path(path)) for path in paths]
+    files = [open_recording(Path(path), config.limits) for path in paths]
     findings = damage(files)
     topics: list[Topic] = []
     chosen: list[Topic] = []

@@ -215,7 +215,7 @@ def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
     """
     if not paths:
         raise LogError("no log given; name at least one file or folder")
-    files = [open_recording(Path(path)) for path in paths]
+    files = [open_recording(Path(path), config.limits) for path in paths]
     for n, file in enumerate(files):
         if file.sha256 in {other.sha256 for other in files[:n]}:
             raise LogError(f"{file.path}: is given twice; name each log once")
@@ -244,6 +244,10 @@ def merged_notes(files: Iterable[Recording]) -> dict[str, str]:
     return {key: note for file in files for key, note in file.notes.items()}
 
 
+#: the damage of a file in which nothing else is wrong
+_MISSING = "it says that it has more than can be found"
+
+
 def damage(files: Iterable[Recording]) -> list[Finding]:
     """The losses in each damaged file."""
     return [
@@ -252,10 +256,10 @@ def damage(files: Iterable[Recording]) -> list[Finding]:
             "damage",
             str(f.path),
             f"damaged, {'an unknown number of' if f.lost is None else f.lost} messages are "
-            f"lost, {f.messages} are read: {f.damage}",
+            f"lost, {f.messages} are read: {f.damage or _MISSING}",
         )
         for f in files
-        if f.damage
+        if f.damage or f.lost
     ]
 
 

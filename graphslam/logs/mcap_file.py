@@ -7,24 +7,40 @@ reads with `mcap`.
 """
 
 import struct
+import zlib
 from collections.abc import Collection, Iterator
 from functools import partial
-from io import SEEK_CUR, BytesIO
+from io import BytesIO
 from itertools import islice
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
+import lz4.frame
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema, Statistics
-from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.summary import Summary
 
-from graphslam.logs.container_files import digest, open_file, size_of, stream_reader
-from graphslam.logs.recording import MAX_BLOCK, Block, BlockList, Piece, one_line
+from graphslam.core.sensor_config import LimitsConfig
+from graphslam.logs.container_files import (
+    digest,
+    open_file,
+    size_of,
+    stream_reader,
+    too_large,
+)
+from graphslam.logs.recording import (
+    MAX_BLOCK,
+    Block,
+    BlockList,
+    Piece,
+    count_undescribed,
+    one_line,
+    undescribed,
+)
 from graphslam.logs.recording import Channel as TopicChannel
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -47,40 +63,87 @@ _DAMAGE = (
 # Head of every record (opcode, length), and head of a message: the same, channel, sequence number,
 # log time, publish time; then its data.
 _RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<BQHIQQ")
+_CHANNEL = struct.Struct("<H")
 # int: comparing with the enum is slow
 _IS_MESSAGE = int(Opcode.MESSAGE)
+#: opcodes from here on are for private use, and mean nothing to others
+_PRIVATE = 0x80
+#: number of the schema of channels without one
+_NO_SCHEMA = 0
+_READ: dict[int, Any] = {
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.STATISTICS: Statistics,
+    Opcode.METADATA: Metadata,
+}
+_NOT_NEEDED = frozenset(map(int, Opcode)) - _READ.keys()
+#: bytes that are unpacked at once where nobody knows how many there are
+_PART = 1 << 20
 
 
-def index_mcap(path: Path) -> Piece:
+class _TooLargeError(Exception):
+    """A chunk is beyond a setting of [limits]; its text is the name."""
+
+
+class _Most(NamedTuple):
+    """Unpacked bytes and records that a chunk may have."""
+
+    size: int
+    records: int
+
+
+#: what was indexed is not checked again
+_UNLIMITED = _Most(1 << 40, 1 << 40)
+
+
+def index_mcap(path: Path, limits: LimitsConfig) -> Piece:
     """Read through the MCAP file ``path`` once and index it.
 
     Raises:
+        LogError: a chunk is beyond ``limits``.
         OSError: it cannot be read.
     """
     with open_file(path) as stream:
-        return _Indexer(path, stream).run()
+        return _Indexer(path, stream, limits).run()
 
 
 # ---------------------------------------------------------------- blocks
 
 
-def _records(stream: BinaryIO, offset: int, limit: int) -> Iterator[tuple[int, McapRecord]]:
-    """Offset and record, chunks unopened, from ``offset`` to the footer or to the first damage."""
-    stream.seek(offset)
-    reader = StreamReader(stream, skip_magic=True, emit_chunks=True, record_size_limit=limit)
-    for record in reader.records:
-        yield offset, record
-        offset = _after_indexes(stream)
+def _records(stream: BinaryIO, offset: int) -> Iterator[tuple[int, int, bytes]]:
+    """Offset, opcode and body of the records from ``offset`` to the footer, chunks unopened.
 
+    Of message indexes only the channel: they are not needed and take longest to read.
 
-def _after_indexes(stream: BinaryIO) -> int:
-    """Skip message indexes, which are not needed and take longest to read; the new offset."""
+    Raises:
+        McapError: the file ends before the footer, or there is no record.
+        OSError: it cannot be read.
+    """
     while True:
-        offset = stream.tell()
+        stream.seek(offset)
         head = stream.read(_RECORD.size)
-        if len(head) < _RECORD.size or head[0] != Opcode.MESSAGE_INDEX:
-            return stream.seek(offset)
-        stream.seek(_RECORD.unpack(head)[1], SEEK_CUR)
+        if len(head) < _RECORD.size:
+            raise McapError("it ends without a footer")
+        opcode, length = _RECORD.unpack(head)
+        if opcode == 0:
+            raise McapError("there is no record")
+        if opcode == Opcode.MESSAGE_INDEX:
+            yield offset, opcode, stream.read(min(length, _CHANNEL.size))
+        else:
+            body = stream.read(length)
+            if len(body) < length:
+                raise McapError("it ends inside a record")
+            yield offset, opcode, body
+        if opcode == Opcode.FOOTER:
+            return
+        offset += _RECORD.size + length
+
+
+def _message(body: bytes) -> Message:
+    if len(body) < _MESSAGE.size - _RECORD.size:
+        raise McapError("a message is shorter than its head")
+    message: Message = Message.read(ReadDataStream(BytesIO(body)), len(body))
+    return message
 
 
 class _Contents(NamedTuple):
@@ -94,8 +157,10 @@ class _Contents(NamedTuple):
     others: list[McapRecord]
 
 
-def _chunk_at(stream: BinaryIO, offset: int) -> _Contents:
+def _chunk_at(stream: BinaryIO, offset: int, most: _Most) -> _Contents:
     """The records in the chunk at ``offset``; if the file ends inside it, those before the end.
+
+    ``most``: how many unpacked bytes and how many records it may have.
 
     Raises:
         One of `_DAMAGE` when the chunk is damaged in any other way, its CRC included.
@@ -107,23 +172,30 @@ def _chunk_at(stream: BinaryIO, offset: int) -> _Contents:
     length = _RECORD.unpack(head)[1]
     body = stream.read(length)
     chunk = Chunk.read(ReadDataStream(BytesIO(body)))
-    return _records_in(chunk) if len(body) == length else _cut_chunk(chunk)
+    return _records_in(chunk, most) if len(body) == length else _cut_chunk(chunk, most)
 
 
-def _records_in(chunk: Chunk) -> _Contents:
+def _records_in(chunk: Chunk, most: _Most) -> _Contents:
     """The schemas, channels and messages in a chunk.
 
     Like mcap's ``breakup_chunk``, but without an object per message, which would be slow.
 
     Raises:
         One of `_DAMAGE` when the chunk is damaged, its CRC included.
+        _TooLargeError: there is more than ``most`` in it.
     """
-    stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+    unpacked = _unpacked(chunk, most.size)
+    if len(unpacked) > most.size:
+        raise _TooLargeError("chunk_mb")
+    if chunk.uncompressed_crc not in (0, zlib.crc32(unpacked)):
+        raise McapError("its CRC is another one")
+    size = len(unpacked)
     # padded, because the head of a message is unpacked from every record, also from shorter ones
-    data = stream.read(size) + bytes(_MESSAGE.size)
+    data = unpacked + bytes(_MESSAGE.size)
     found = _Contents(data, [], [])
-    begin = 0
+    begin = records = 0
     while begin < size:
+        records += 1
         opcode, length, channel, _, log_time_ns, _ = _MESSAGE.unpack_from(data, begin)
         inside, end = begin + _RECORD.size, begin + _RECORD.size + length
         if end > size:
@@ -136,14 +208,49 @@ def _records_in(chunk: Chunk) -> _Contents:
             kind = Schema if opcode == Opcode.SCHEMA else Channel
             found.others.append(kind.read(ReadDataStream(BytesIO(data[inside:end]))))
         begin = end
+        if records > most.records:
+            raise _TooLargeError("chunk_records")
     return found
 
 
-def _cut_chunk(chunk: Chunk) -> _Contents:
+def _unpacked(chunk: Chunk, most: int) -> bytes:
+    """Contents of a chunk; of one that has more than ``most`` bytes a few more than that.
+
+    Raises:
+        One of `_DAMAGE` when it cannot be unpacked.
+    """
+    if not chunk.compression:
+        return chunk.data
+    if chunk.compression == "lz4":
+        packed = lz4.frame.LZ4FrameDecompressor()
+        # memory for all that may come is taken at once: no more than the chunk says it has
+        data = bytes(packed.decompress(chunk.data, min(chunk.uncompressed_size, most + 1)))
+        if not packed.eof and len(data) <= most:
+            raise McapError("it is not as long as it says")
+        return data
+    if chunk.compression != "zstd":
+        raise McapError(f"packed with {chunk.compression}")
+    size = zstandard.frame_content_size(chunk.data)
+    if 0 <= size <= most:
+        return zstandard.decompress(chunk.data, size)
+    # without a size, or a size that is too large, which may be the damage
+    with zstandard.ZstdDecompressor().stream_reader(chunk.data) as stream:
+        return b"".join(_parts(stream, most + 1))
+
+
+def _parts(stream: zstandard.ZstdDecompressionReader, size: int) -> Iterator[bytes]:
+    """At most ``size`` bytes of a stream, piece by piece: memory for what there is."""
+    while size > 0 and (part := stream.read(min(size, _PART))):
+        size -= len(part)
+        yield part
+
+
+def _cut_chunk(chunk: Chunk, most: _Most) -> _Contents:
     """Complete records at the beginning of a chunk whose end is missing."""
     data = chunk.data
     if chunk.compression == "zstd":
-        data = zstandard.ZstdDecompressor().decompressobj().decompress(data)
+        with zstandard.ZstdDecompressor().stream_reader(data) as stream:
+            data = b"".join(_parts(stream, most.size + 1))
     elif chunk.compression:
         raise McapError(f"the beginning of a {chunk.compression} chunk cannot be read")
     end = 0
@@ -152,7 +259,7 @@ def _cut_chunk(chunk: Chunk) -> _Contents:
         if end + 9 + length > len(data):
             break
         end += 9 + length
-    return _records_in(Chunk("", data[:end], 0, 0, 0, end))
+    return _records_in(Chunk("", data[:end], 0, 0, 0, end), most)
 
 
 def _block_messages(
@@ -161,14 +268,14 @@ def _block_messages(
     """Channel, log time ns and data of the messages of wanted channels in a block."""
     stream.seek(block.offset)
     if stream.read(1)[0] == Opcode.CHUNK:
-        data, messages, _ = _chunk_at(stream, block.offset)
+        data, messages, _ = _chunk_at(stream, block.offset, _UNLIMITED)
         for channel, log_time_ns, begin, end in messages:
             if channel in wanted:
                 yield channel, log_time_ns, data[begin:end]
         return
     count = sum(block.counts.values())
-    loose = (r for _, r in _records(stream, block.offset, 1 << 40) if isinstance(r, Message))
-    for message in islice(loose, count):
+    loose = (body for _, opcode, body in _records(stream, block.offset) if opcode == _IS_MESSAGE)
+    for message in map(_message, islice(loose, count)):
         if message.channel_id in wanted:
             yield message.channel_id, message.log_time, message.data
 
@@ -176,11 +283,13 @@ def _block_messages(
 class _Indexer:
     """One pass over a file: `run` does it, the other methods are its steps."""
 
-    def __init__(self, path: Path, stream: BinaryIO) -> None:
+    def __init__(self, path: Path, stream: BinaryIO, limits: LimitsConfig) -> None:
         self.path, self.stream = path, stream
+        self.most = _Most(int(1e6 * limits.chunk_mb), limits.chunk_records)
         self.size = size_of(stream)
         stream.seek(len(MAGIC))
         self.position = len(MAGIC)  # where the next record begins
+        self.indexed: set[bytes] | None = None  # channels whose indexes the last chunk has
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.blocks = BlockList()
@@ -192,38 +301,62 @@ class _Indexer:
 
     def run(self) -> Piece:
         try:
-            for offset, record in _records(self.stream, self.position, self.size):
-                self.add(offset, record)
-                self.position = self.stream.tell()
+            for offset, opcode, body in _records(self.stream, self.position):
+                self.position = offset
+                self.add(offset, opcode, body)
         except _DAMAGE as error:
             self.recover(error)
         self.close_loose_block()
         return self.result()
 
-    def add(self, offset: int, record: McapRecord) -> None:
-        if isinstance(record, Message):
-            self.loose.append((offset, record))
-            if len(self.loose) == MAX_BLOCK:
-                self.close_loose_block()
-        elif isinstance(record, Chunk):
-            self.close_loose_block()
+    def add(self, offset: int, opcode: int, body: bytes) -> None:
+        """Take in a record; of its own damage only it is lost, because its length is known."""
+        if opcode == Opcode.MESSAGE_INDEX:
+            if self.indexed is None or body in self.indexed:
+                self.damage.append(f"the chunk of the index at byte {offset} is missing")
+                self.indexed = set()
+            self.indexed.add(body)
+            return
+        self.indexed = set() if opcode == Opcode.CHUNK else None
+        if opcode == _IS_MESSAGE:
+            self.add_message(offset, body)
+            return
+        self.close_loose_block()
+        if opcode == Opcode.CHUNK:
             self.tried.add(offset)
-            try:
-                self.add_chunk(offset, _records_in(record))
-            except _DAMAGE as error:
-                self.damage.append(f"the chunk at byte {offset} is damaged ({one_line(error)})")
-        elif isinstance(record, Statistics):
-            self.statistics = record
-        elif isinstance(record, Metadata) and record.name == NOTES:
-            self.notes.update(record.metadata)
-        else:
-            self.describe(record)
+        try:
+            if opcode == Opcode.CHUNK:
+                chunk = Chunk.read(ReadDataStream(BytesIO(body)))
+                self.add_chunk(offset, _records_in(chunk, self.most))
+            elif opcode in _READ:
+                self.describe(_READ[opcode].read(ReadDataStream(BytesIO(body))))
+            elif opcode not in _NOT_NEEDED and opcode < _PRIVATE:
+                raise McapError(f"its kind {opcode} is unknown")
+        except _TooLargeError as setting:
+            raise too_large(self.path, offset, str(setting)) from setting
+        except _DAMAGE as error:
+            what = "chunk" if opcode == Opcode.CHUNK else "record"
+            self.damage.append(f"the {what} at byte {offset} is damaged ({one_line(error)})")
+
+    def add_message(self, offset: int, body: bytes) -> None:
+        try:
+            self.loose.append((offset, _message(body)))
+        except _DAMAGE as error:
+            # the block ends here, because its messages are counted when it is read again
+            self.damage.append(f"the record at byte {offset} is damaged ({one_line(error)})")
+            self.close_loose_block()
+        if len(self.loose) == MAX_BLOCK:
+            self.close_loose_block()
 
     def describe(self, record: McapRecord) -> None:
         if isinstance(record, Schema):
             self.schemas.setdefault(record.id, record)
         elif isinstance(record, Channel):
             self.channels.setdefault(record.id, record)
+        elif isinstance(record, Statistics):
+            self.statistics = record
+        elif isinstance(record, Metadata) and record.name == NOTES:
+            self.notes.update(record.metadata)
 
     def add_chunk(self, offset: int, found: _Contents) -> None:
         for record in found.others:
@@ -251,7 +384,9 @@ class _Indexer:
             offsets += [index.chunk_start_offset for index in summary.chunk_indexes]
         for offset in sorted(set(offsets) - self.tried):
             try:
-                self.add_chunk(offset, _chunk_at(self.stream, offset))
+                self.add_chunk(offset, _chunk_at(self.stream, offset, self.most))
+            except _TooLargeError as setting:
+                raise too_large(self.path, offset, str(setting)) from setting
             except _DAMAGE:
                 continue  # lost; counted by the statistics record, if there is one
 
@@ -263,15 +398,18 @@ class _Indexer:
             return None
 
     def result(self) -> Piece:
+        names = {number: schema.name for number, schema in self.schemas.items()}
+        names[_NO_SCHEMA] = ""
         channels = {
-            number: TopicChannel(c.topic, self.schemas[c.schema_id].name, c.message_encoding)
+            number: TopicChannel(c.topic, names[c.schema_id], c.message_encoding)
             for number, c in self.channels.items()
-            if c.schema_id in self.schemas
+            if c.schema_id in names
         }
-        lost: int | None = None if self.damage else 0
+        unknown = count_undescribed(self.blocks.blocks, channels)
+        lost: int | None = None if self.damage else unknown
         if self.statistics is not None:
             messages = sum(sum(block.counts.values()) for block in self.blocks.blocks)
-            lost = max(0, self.statistics.message_count - messages)
+            lost = unknown + max(0, self.statistics.message_count - messages)
         return Piece(
             path=self.path,
             sha256=digest(self.path),
@@ -279,7 +417,7 @@ class _Indexer:
             blocks=tuple(self.blocks.blocks),
             in_order=self.blocks.in_order,
             lost=lost,
-            damage="; ".join(self.damage),
-            open=partial(stream_reader, _block_messages),
+            damage="; ".join([*self.damage, *undescribed(unknown)]),
+            open=partial(stream_reader, _block_messages, (*_DAMAGE, IndexError)),
             notes=self.notes,
         )

@@ -16,6 +16,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+from graphslam.logs.container_files import changed
 from graphslam.logs.translations import Translate, translation
 
 _T = TypeVar("_T")
@@ -96,7 +97,8 @@ class Piece:
     @property
     def messages(self) -> int:
         """Number of readable messages."""
-        return sum(sum(block.counts.values()) for block in self.blocks)
+        counts = (block.counts.items() for block in self.blocks)
+        return sum(n for items in counts for number, n in items if number in self.channels)
 
     @property
     def start_ns(self) -> int:
@@ -196,6 +198,19 @@ class Recording:
     def with_derived(self, derived: Derived) -> "Recording":
         """The recording with one more topic."""
         return replace(self, derived=(*self.derived, derived))
+
+
+def count_undescribed(blocks: Sequence[Block], channels: Mapping[int, Channel]) -> int:
+    """How many messages are on channels that the file does not describe.
+
+    Nobody can tell what such messages are, so they are lost.
+    """
+    return sum(n for b in blocks for number, n in b.counts.items() if number not in channels)
+
+
+def undescribed(count: int) -> list[str]:
+    """What to say of messages that `count_undescribed` found."""
+    return [f"{count} messages are on channels that it does not describe"] if count else []
 
 
 class BlockList:
@@ -303,9 +318,13 @@ class _Reader:
             stack = ExitStack()
             read: ReadBlock = stack.enter_context(piece.open(piece))
             self._open[piece.path] = read, stack
+        missing = sum(n for number, n in block.counts.items() if number in wanted)
         for channel, log_time_ns, data in self._open[piece.path][0](block, wanted.keys()):
             topic, translate = wanted[channel]
+            missing -= 1
             yield RawMessage(topic, log_time_ns, translate(data) if translate else data)
+        if missing:
+            raise changed(piece.path)
 
 
 def _by_log_time(reader: _Reader, blocks: list[tuple[Piece, Block]]) -> Iterator[RawMessage]:

@@ -7,6 +7,7 @@ sensor and odometry. What else belongs to it is told by frames, or by there bein
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from urllib.parse import quote
 
 from graphslam.core import records
 from graphslam.core.config import Config
@@ -22,6 +23,8 @@ from graphslam.logs.topic_context import sample_decoded
 from graphslam.logs.topics import ODOMETRY_KINDS, Topic, find_topics
 
 _NOBODY = ""
+#: bytes of a robot's name in the names of files, of which systems allow 255
+_LONGEST_NAME = 200
 _SENSORS = (records.Scan, records.Sighting)
 
 
@@ -86,6 +89,26 @@ class _Frames:
         return find_chain(frame, *self.tree(space))
 
 
+def _check_names(robots: Collection[str], files: Sequence[Recording], config: Config) -> None:
+    """Check that there are not too many robots, and that their names can be those of files.
+
+    Raises:
+        LogError: it is not so.
+    """
+    names = ", ".join(str(file.path) for file in files)
+    if len(robots) > config.limits.robots:
+        raise LogError(
+            f"{names}: has topics of {len(robots)} robots, more than limits.robots "
+            f"({config.limits.robots}); raise it, or name topics in logs.topics"
+        )
+    for robot in robots:
+        if len(quote(robot, safe="")) > _LONGEST_NAME:
+            raise LogError(
+                f"{names}: a robot's name is too long for a file: {robot[:40]}...; give it another "
+                "one in logs.topics"
+            )
+
+
 def robots_and_topics(
     files: Sequence[Recording], config: Config
 ) -> tuple[list[Recording], list[Topic], list[Finding]]:
@@ -117,6 +140,7 @@ def robots_and_topics(
             )
         else:
             named.append(replace(topic, robot=robot or topic.robot))
+    _check_names({topic.robot for topic in named}, files, config)
     opened, found, derived = _with_tf_odometry(files, named, frames)
     return opened, found, unused + derived
 

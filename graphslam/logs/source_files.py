@@ -4,6 +4,7 @@ import bz2
 import gzip
 import lzma
 import re
+import struct
 import tarfile
 import zipfile
 import zlib
@@ -19,7 +20,23 @@ _OPENERS: dict[str, Callable[..., TextIO]] = {".bz2": bz2.open, ".gz": gzip.open
 _ARCHIVE_SUFFIXES = {".zip", ".tar", ".tgz", ".tbz2", ".txz", *_OPENERS}
 _T = TypeVar("_T")
 
-_READ_ERRORS = (OSError, EOFError, tarfile.TarError, zipfile.BadZipFile, lzma.LZMAError, zlib.error)
+#: of an encrypted archive RuntimeError, of one packed by an unknown method NotImplementedError; the
+#: others from ValueError on are those of damaged heads
+_READ_ERRORS = (
+    OSError,
+    EOFError,
+    tarfile.TarError,
+    zipfile.BadZipFile,
+    lzma.LZMAError,
+    zlib.error,
+    RuntimeError,
+    NotImplementedError,
+    ValueError,
+    OverflowError,
+    struct.error,
+)
+#: no text of a data set is larger when it is unpacked
+_MOST_BYTES = 2_000_000_000
 
 
 def text_lines(path: Path) -> Iterator[str]:
@@ -73,7 +90,10 @@ def text_files(source: Path, names: re.Pattern[str]) -> dict[str, str]:
                 continue
             if name in texts:
                 raise LogError(f"{source}: holds two files {name}; name the folder of one data set")
-            texts[name] = read().decode("utf-8", errors="replace")
+            text = read()
+            if len(text) > _MOST_BYTES:
+                raise LogError(f"{source}: {name} is larger than 2 GB when unpacked; is it a log?")
+            texts[name] = text.decode("utf-8", errors="replace")
     except _READ_ERRORS as error:
         raise _unreadable(source, error) from error
     return texts
@@ -89,14 +109,19 @@ def _members(source: Path) -> Iterator[tuple[str, Callable[[], bytes]]]:
     elif zipfile.is_zipfile(source):
         with zipfile.ZipFile(source) as packed:
             for name in packed.namelist():
-                yield name, partial(packed.read, name)
+                yield name, partial(_unpack, packed, name)
     elif source.stat().st_size and (
         source.suffix.lower() in _ARCHIVE_SUFFIXES or tarfile.is_tarfile(source)
     ):
         with tarfile.open(source, "r|*") as archive:
             for member in archive:
                 if content := archive.extractfile(member):
-                    yield member.name, content.read
+                    yield member.name, partial(content.read, 1 + _MOST_BYTES)
+
+
+def _unpack(packed: zipfile.ZipFile, name: str) -> bytes:
+    with packed.open(name) as stream:
+        return stream.read(1 + _MOST_BYTES)
 
 
 def _unreadable(source: Path, error: Exception) -> LogError:

@@ -12,7 +12,8 @@ from pathlib import Path
 from urllib.parse import quote
 
 from graphslam.core.errors import LogError
-from graphslam.logs.container_files import digest, unpacked_file
+from graphslam.core.sensor_config import LimitsConfig
+from graphslam.logs.container_files import digest, unchanged, unpacked_file
 from graphslam.logs.recording import (
     MAX_BLOCK,
     Block,
@@ -20,7 +21,9 @@ from graphslam.logs.recording import (
     Channel,
     Piece,
     ReadBlock,
+    count_undescribed,
     one_line,
+    undescribed,
 )
 
 MAGIC = b"SQLite format 3\0"
@@ -33,7 +36,7 @@ _ALL = -1
 _MOST_ROWS = 1 << 40
 
 
-def index_sqlite(path: Path) -> Piece:
+def index_sqlite(path: Path, _limits: LimitsConfig) -> Piece:
     """Read through the database ``path`` once and index it.
 
     Raises:
@@ -48,7 +51,7 @@ def index_sqlite(path: Path) -> Piece:
 def _reading(piece: Piece) -> Iterator[ReadBlock]:
     """Reads blocks of ``piece``."""
     with _database(piece.path) as database:
-        yield partial(_block_messages, database)
+        yield unchanged(partial(_block_messages, database), (sqlite3.Error,), piece.path)
 
 
 @contextmanager
@@ -122,14 +125,15 @@ def _indexed(path: Path, database: sqlite3.Connection) -> Piece:
     blocks.add(first, last, rows)
     if broken:
         damage.append("rows are not messages")
+    unknown = count_undescribed(blocks.blocks, channels)
     return Piece(
         path=path,
         sha256=digest(path),
         channels=channels,
         blocks=tuple(blocks.blocks),
         in_order=blocks.in_order,
-        lost=None if damage else 0,
-        damage="; ".join(damage),
+        lost=None if damage else unknown,
+        damage="; ".join([*damage, *undescribed(unknown)]),
         open=_reading,
     )
 

@@ -42,7 +42,7 @@ def read_truth(paths: Sequence[Path], config: Config) -> GroundTruth:
         LogError: a file is missing, of no known container, empty, or without any topic that can be
             decoded.
     """
-    return truth_from_recordings([open_recording(path) for path in paths], config)
+    return truth_from_recordings([open_recording(path, config.limits) for path in paths], config)
 
 
 def truth_from_recordings(files: Sequence[Recording], config: Config) -> GroundTruth:
@@ -78,7 +78,7 @@ def read_true_associations(
         LogError: a file is missing, of no known container, empty, or without any topic that can be
             decoded.
     """
-    files = [open_recording(path) for path in paths]
+    files = [open_recording(path, config.limits) for path in paths]
     topics = {t.name: t for t in find_topics(files, config) if t.record is TrueAssociations}
     found: dict[str, list[TrueAssociations]] = {name: [] for name in topics}
     unusable: Counter[str] = Counter()

@@ -4,6 +4,7 @@ The only module that writes with `mcap`.
 """
 
 import math
+import os
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
@@ -16,19 +17,23 @@ from numpy.typing import ArrayLike
 from graphslam import __version__
 from graphslam.core.errors import OutputError
 from graphslam.core.geometry import Array
+from graphslam.core.output_folder import Identity, check_same, identity, unfinished
 from graphslam.logs import schemas
 from graphslam.logs.mcap_file import NOTES
 from graphslam.logs.schemas import DEFAULT_ROBOT
 
 # Small chunks: a damaged one loses less; costs a few per cent of compression.
 _CHUNK_BYTES = 64 * 1024
+#: MCAP has times of 64 bits
+_TIMES = 1 << 64
 
 
 class LogWriter:
     """Context manager that writes a log.
 
     The file appears under its name only if the block ends without an error; until then it has a
-    temporary name in the same folder. Equal calls give equal bytes. Topics of robot ``robot`` are
+    temporary name in the same folder. What another process writes there meanwhile is not replaced,
+    nor is anything but a file. Equal calls give equal bytes. Topics of robot ``robot`` are
     ``/odom``, ``/scan``, ...; those of any other robot ``/NAME/odom``, ... Frames follow the same
     rule: ``odom``, ``base_link``, ``laser``.
 
@@ -41,7 +46,8 @@ class LogWriter:
         self.path = path
         self.counts: dict[str, int] = {}
         self._notes = dict(notes or {})
-        self._partial = path.with_name(f".{path.name}.partial")
+        self._partial = path
+        self._before: Identity = None
         self._stream: BinaryIO | None = None
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
@@ -50,9 +56,14 @@ class LogWriter:
         """Open the temporary file.
 
         Raises:
-            OutputError: the folder does not exist or cannot be written to.
+            OutputError: the folder does not exist or cannot be written to, or something else than
+                a file stands at the path.
         """
+        if os.path.lexists(self.path) and (self.path.is_symlink() or not self.path.is_file()):
+            raise OutputError(f"{self.path}: is no plain file, so it is not replaced")
         try:
+            self._partial = unfinished(self.path)
+            self._before = identity(self.path)
             self._stream = self._partial.open("wb")
         except OSError as error:
             raise OutputError(
@@ -74,6 +85,7 @@ class LogWriter:
                 self._writer.finish()  # type: ignore[no-untyped-call]
             self._stream.close()
             if kind is None:
+                check_same(self.path, self._before)
                 self._partial.replace(self.path)
         except OSError as problem:
             raise OutputError(f"{self.path}: cannot be written: {problem.strerror}") from problem
@@ -333,11 +345,17 @@ class LogWriter:
         self, topic: str, schema: str, message: Any, stamp_ns: int, log_time_ns: int | None
     ) -> None:
         """Write a message made by `schemas.build`, or its bytes."""
+        logged_ns = stamp_ns if log_time_ns is None else log_time_ns
+        if not (0 <= logged_ns < _TIMES and 0 <= stamp_ns < _TIMES):
+            raise OutputError(
+                f"{self.path}: {topic}: a stamp of {stamp_ns} ns (recorded at {logged_ns} ns) "
+                "cannot be written: MCAP counts from 1970"
+            )
         channel = self._channel(topic, schema)
         sequence = self.counts[topic] = self.counts.get(topic, 0) + 1
         self._writer.add_message(
             channel_id=channel,
-            log_time=stamp_ns if log_time_ns is None else log_time_ns,
+            log_time=logged_ns,
             publish_time=stamp_ns,
             data=message if isinstance(message, bytes) else schemas.encode(schema, message),
             sequence=sequence,

@@ -10,10 +10,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from graphslam.core.errors import LogError
 from graphslam.core.geometry import Array, between, compose, rotate_cov
 from graphslam.core.observation_models import MODELS
 from graphslam.core.record import replace
 from graphslam.core.records import Association, Estimate, Observation, Step, Trajectory
+from graphslam.core.sensor_config import LimitsConfig
 from graphslam.estimation.backend import Backend
 from graphslam.mapping.gating import BoolArray, IntArray
 
@@ -66,11 +68,11 @@ class LandmarkMap:
 
     ``bias_m``: sigma of an error of walls along their normals that all observations of one share.
     A laser's error on a surface (material, flatness) is the same in every scan: no number of scans
-    averages it, and no residual shows it.
+    averages it, and no residual shows it. ``most``: landmarks at one time.
     """
 
-    def __init__(self, bias_m: float = 0.0) -> None:
-        self.bias_m = bias_m
+    def __init__(self, bias_m: float = 0.0, most: int = LimitsConfig.landmarks) -> None:
+        self.bias_m, self.most = bias_m, most
         self.entries: dict[int, Entry] = {}
         self.by_identity: dict[str, int] = {}
         self.deleted = self.forgotten = 0  # tentative ones, and landmarks of the graph
@@ -96,7 +98,16 @@ class LandmarkMap:
         )
 
     def add(self, seen: Observation, pose: Array, time_ns: int) -> Entry:
-        """A new tentative landmark from an observation made at ``pose`` (3,), in its frame."""
+        """A new tentative landmark from an observation made at ``pose`` (3,), in its frame.
+
+        Raises:
+            LogError: there are as many as there may be.
+        """
+        if len(self.entries) >= self.most:
+            raise LogError(
+                f"the log has more landmarks than limits.landmarks ({self.most}); raise it, or see "
+                "whether every sighting has a name of its own"
+            )
         model = MODELS[seen.kind]
         mean = np.zeros(3)
         state = model.invert(seen.z, pose)
@@ -159,7 +170,7 @@ class LandmarkMap:
 
     def transformed(self, worlds: Mapping[int, Array]) -> "LandmarkMap":
         """The same map after the frame of each landmark was put at ``worlds[id]`` (3,)."""
-        moved = LandmarkMap(self.bias_m)
+        moved = LandmarkMap(self.bias_m, self.most)
         for i, entry in self.entries.items():
             moved.entries[i] = replace(entry, mean=compose(worlds[i], entry.mean))
         return moved

@@ -130,7 +130,8 @@ def write_folder(directory: Path, files: Sequence[tuple[str, str | bytes]]) -> N
             if isinstance(content, bytes):
                 path.write_bytes(content)
             else:
-                path.write_text(content, encoding="utf-8")
+                # names of files need not be text: what is not is written as its escape
+                path.write_text(content, encoding="utf-8", errors="backslashreplace")
 
 
 def _files(result: Result, report: Callable[[Result], str] | None) -> list[tuple[str, str | bytes]]:

@@ -63,7 +63,9 @@ class LogPass:
         self.starts = known.frame_assignment.starts
         self.frames = RobotFrames(known.frame_assignment)
         scans = any(map(log.has_scans, log.robots))
-        self.landmarks = LandmarkMap(config.front_end.floor_normal_m if scans else 0.0)
+        self.landmarks = LandmarkMap(
+            config.front_end.floor_normal_m if scans else 0.0, config.limits.landmarks
+        )
         self.steps: list[Step] = []
         self.sources: list[Sighting] = []
         self.robot_sightings: list[Sighting] = []

@@ -26,6 +26,8 @@ from graphslam.perception.scan_matching import Submap
 
 #: Hz at which the base of a robot without scans is reported
 BASE_RATE_HZ = 10
+#: poses are not reported in gaps of the odometry that are longer
+LONGEST_GAP_NS = 600_000_000_000
 
 
 @dataclass(slots=True, eq=False)
@@ -170,8 +172,22 @@ class RobotState:
             stamps, times = (np.array([scan[k] for scan in scans], dtype=np.int64) for k in (0, 1))
             return stamps, times, np.array([scan[2] for scan in scans])
         period = round(1e9 / BASE_RATE_HZ)
-        times = np.arange(self.track.first_ns, self.track.last_ns + 1, period)
+        times = times_of_readings(self.track.times, period)
         return self.clock.to_local(times), times, np.zeros((0, 3))
+
+
+def times_of_readings(readings_ns: IntArray, period_ns: int) -> IntArray:
+    """Times (n,) at an even rate from the first to the last reading, none in long gaps.
+
+    There is nothing to report where nothing was recorded, and a clock that steps by years would
+    fill the memory.
+    """
+    breaks = np.flatnonzero(np.diff(readings_ns) > LONGEST_GAP_NS)
+    begins = readings_ns[np.concatenate([[0], breaks + 1])]
+    ends = readings_ns[np.concatenate([breaks, [len(readings_ns) - 1]])]
+    return np.concatenate(
+        [np.arange(a, b + 1, period_ns) for a, b in zip(begins, ends, strict=True)]
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -322,12 +322,14 @@ def test_warnings_are_no_setting_and_reach_another_process():
 
 @pytest.mark.parametrize("table", sorted(TABLES))
 def test_every_float_bears_its_unit(table):
-    """Metres, radians or seconds at the end of the name; or a ratio, a scale or a probability."""
+    """Metres, radians, seconds or MB at the end of the name; or a ratio, scale or probability."""
     plain = ("ratio", "scale", "probability", "rate", "threshold", "sigma")
     for field in dataclasses.fields(TABLES[table]):
         if isinstance(field.default, float):
             unit = field.name.rsplit("_", 1)[-1]
-            assert unit in ("m", "rad", "s") or unit in plain, f"{table}.{field.name} has no unit"
+            assert unit in ("m", "rad", "s", "mb") or unit in plain, (
+                f"{table}.{field.name} has no unit"
+            )
 
 
 @pytest.mark.parametrize("table", sorted(TABLES))
@@ -339,7 +341,8 @@ def test_defaults_are_of_their_own_types_and_finite(table):
         if hints[field.name] in (int, float, bool, str):
             assert type(value) is hints[field.name]
         assert not isinstance(value, float) or (
-            (math.isfinite(value) or field.name in ("horizon_s", "delete_s")) and value >= 0
+            (math.isfinite(value) or field.name in ("horizon_s", "delete_s", "memory_mb"))
+            and value >= 0
         )
 
 

@@ -1,0 +1,34 @@
+"""A limit on the memory of this process, so that a log cannot take that of the whole machine."""
+
+import math
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from graphslam.core.errors import LogError
+
+
+@contextmanager
+def limited_memory(memory_mb: float) -> Iterator[None]:
+    """Give the process, and each that it forks, at most ``memory_mb`` of data; inf: no limit.
+
+    Raises:
+        LogError: the block needs more.
+    """
+    if math.isinf(memory_mb) or sys.platform == "win32":
+        yield
+        return
+    import resource  # noqa: PLC0415 (not on Windows)
+
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    most = before[1] if before[1] != resource.RLIM_INFINITY else sys.maxsize
+    resource.setrlimit(resource.RLIMIT_DATA, (min(round(memory_mb * 1e6), most), before[1]))
+    try:
+        yield
+    except MemoryError as error:
+        raise LogError(
+            f"the run needs more memory than limits.memory_mb ({memory_mb:g}) allows; raise it, or "
+            "cut the log into pieces"
+        ) from error
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, before)

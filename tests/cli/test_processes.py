@@ -1,0 +1,90 @@
+"""The command as a process: closed streams, terminals without letters, signals, odd names."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graphslam.logs import LogWriter
+
+S = 1_000_000_000
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    """Odometry and sightings of two landmarks, in a file whose name is no text."""
+    path = tmp_path_factory.mktemp("processes") / os.fsdecode(b"caf\xe9.mcap")
+    with LogWriter(path) as log:
+        for k in range(100):
+            x = 0.1 * k
+            log.odometry('tom "the" robot', k * S // 10 + S, (x, 0, 0))
+            for name, (a, b) in {"a": (3.0, 2.0), "b": (8.0, -2.0)}.items():
+                z = (np.arctan2(b, a - x), np.hypot(a - x, b))
+                cov = np.diag([1e-4, 1e-3])
+                log.sighting('tom "the" robot', k * S // 10 + S, z, cov, identity=name)
+    return path
+
+
+def started(*arguments, shell="", **variables):
+    words = [sys.executable, "-m", "graphslam", *map(os.fspath, arguments)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), **variables}
+    if shell:
+        words = ["/bin/sh", "-c", f'exec "$@" {shell}', "sh", *words]
+    return subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment, text=True
+    )
+
+
+@pytest.mark.parametrize("shell", [">&-", "2>&-", ">&- 2>&- <&-"])
+def test_closed_streams_are_no_error(log, shell):
+    done = started("info", log, shell=shell)
+    out, err = done.communicate(timeout=60)
+    assert done.returncode == 0 and "Traceback" not in out + err
+
+
+def test_a_terminal_without_letters_shows_escapes(log):
+    done = started("info", log, PYTHONIOENCODING="ascii", LC_ALL="C", MPLBACKEND="nonsense")
+    out, err = done.communicate(timeout=60)
+    assert done.returncode == 0 and "Traceback" not in err and "caf" in out
+
+
+def test_names_that_are_no_text_and_names_with_quotes_come_back(log, tmp_path):
+    """The result is not lost at the end, and its tables are still tables."""
+    import csv
+
+    target = tmp_path / "out"
+    done = started("smooth", log, "-o", target)
+    _, err = done.communicate(timeout=60)
+    assert done.returncode == 0, err
+    summary = json.loads((target / "summary.json").read_text())
+    assert Path(summary["logs"][0]["path"]) == log
+    with (target / "graph_ids.csv").open(newline="") as stream:
+        robots = {row["robot"] for row in csv.DictReader(stream)}
+    assert robots == {'tom "the" robot', ""}
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
+def test_nothing_is_left_behind_after_a_signal(tmp_path, number):
+    """Of a killed process: by the next one that writes the same file."""
+    target = tmp_path / "log.mcap"
+    running = started("simulate", "forest", "-o", target)
+    part = tmp_path / f".log.mcap.{running.pid}.part"
+    end = time.monotonic() + 60
+    while not part.exists() and running.poll() is None and time.monotonic() < end:
+        time.sleep(0.01)
+    assert part.exists()
+    running.send_signal(number)
+    _, err = running.communicate(timeout=60)
+    assert running.returncode in (-number, 128 + number) and "Traceback" not in err
+    if number == signal.SIGKILL:
+        with LogWriter(target) as log:
+            log.odometry("robot", S, (0, 0, 0))
+        target.unlink()
+    assert not list(tmp_path.iterdir())
