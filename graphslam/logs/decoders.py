@@ -18,6 +18,7 @@ from graphslam.core.geometry import Array, is_positive
 from graphslam.logs import physical_limits as limits
 from graphslam.logs import schemas
 from graphslam.logs.cdr import CdrError
+from graphslam.logs.point_cloud import beam_step, cloud_points, is_planar, sweep_of
 
 #: no planar laser takes longer for a sweep; it may take so much more of the time that is stated
 MAX_SWEEP_S, SWEEP_SLACK = 1.0, 1.05
@@ -141,6 +142,24 @@ def _count_defects(ranges: Array, beams: Counter[str]) -> None:
             beams[f"range: {defect}"] += int(count)
 
 
+def point_cloud(message: Any, topic: TopicContext) -> records.Scan:
+    """sensor_msgs/PointCloud2 of a planar laser."""
+    try:
+        points = cloud_points(message)
+    except ValueError as error:
+        raise UnusableMessageError(f"cloud: {error}") from error
+    if not is_planar(points):
+        raise UnusableMessageError("cloud: points are not those of one level laser, or none")
+    bearings, ranges = (_NO_RANGES, _NO_RANGES) if topic.without_ranges else sweep_of(points)
+    frame, stamp = frame_of(message), stamp_of(message)
+    ranges = np.where(ranges < min(topic.no_return_m, limits.MAX_RANGE_M), ranges, np.nan)
+    if frame in topic.inverted:  # see `scans`
+        bearings, ranges = -bearings[::-1], ranges[::-1].copy()
+    start, step = (float(bearings[0]), beam_step(bearings)) if len(bearings) else (0.0, 1.0)
+    mount = topic.mounts.get(frame, _NO_MOUNT)
+    return records.Scan(topic.robot, stamp, stamp, ranges, start, step, mount, bearings=bearings)
+
+
 def odometry(rows: Any, topic: TopicContext) -> list[records.OdometryPose | str]:
     """nav_msgs/Odometry: the pose (3,) of the base in the odometry frame."""
     q_x, q_y, q_z, q_w = rows["rotation"].T
@@ -243,6 +262,7 @@ def true_associations(message: Any, topic: TopicContext) -> records.TrueAssociat
 
 DECODERS: dict[str, Decoder] = {
     schemas.LASER_SCAN: Decoder(records.Scan, scans, schemas.scan_table),
+    schemas.POINT_CLOUD: Decoder(records.Scan, point_cloud),
     schemas.ODOMETRY: Decoder(records.OdometryPose, odometry, schemas.odometry_table),
     schemas.JOINT_STATE: Decoder(records.WheelAngles, joint_state),
     schemas.SIGHTING: Decoder(records.Sighting, sighting),

@@ -14,6 +14,7 @@ from graphslam.logs.schemas import (
     LASER_SCAN,
     ODOMETRY,
     ODOMETRY_INCREMENT,
+    POINT_CLOUD,
     SIGHTING,
 )
 from graphslam.logs.topic_info import RobotInfo, TopicInfo
@@ -30,13 +31,12 @@ _BLIND = 0.95
 _SAME_CLOCK_S = 0.5
 
 _MOVING = (ODOMETRY, ODOMETRY_INCREMENT, JOINT_STATE)
-_SENSING = (LASER_SCAN, SIGHTING)
+_SCANS = (LASER_SCAN, POINT_CLOUD)
+_SENSING = (*_SCANS, SIGHTING)
 
 #: schemas that tell about motion or surroundings and are not read, and what is read in their place
 _NOT_READ = {
     "sensor_msgs/msg/PointCloud": "record the laser as sensor_msgs/LaserScan",
-    "sensor_msgs/msg/PointCloud2": "record the laser as sensor_msgs/LaserScan, or make it of the "
-    "cloud with pointcloud_to_laserscan",
     "sensor_msgs/msg/Imu": "",
     "sensor_msgs/msg/Range": "",
     "sensor_msgs/msg/Image": "",
@@ -154,7 +154,7 @@ def _rates(log: CheckedLog) -> Iterable[Finding]:
         period = topic.median_period_s
         if period is None or log.invented or topic.schema == SIGHTING:
             continue
-        slow = _SLOW_SCANS_S if topic.schema == LASER_SCAN else _SLOW_ODOMETRY_S
+        slow = _SLOW_SCANS_S if topic.schema in _SCANS else _SLOW_ODOMETRY_S
         if topic.schema != ODOMETRY_INCREMENT and period > slow:
             text = f"a message every {period:.1f} s only; what is in between is guessed"
             yield Finding("doubt", "rate", topic.name, text, "record it at 10 Hz or more")

@@ -115,15 +115,15 @@ class Piece:
 class Derived:
     """A topic made of another one, ``source``.
 
-    ``make(*arguments)`` begins a reading: it gives what turns each message of the source, in their
-    order, into messages of this topic.
+    ``make(*arguments)`` begins a reading: it gives what turns each message of the source, with its
+    log time, in their order, into messages of this topic.
     """
 
     name: str
     schema: str
     source: str
     count: int
-    make: Callable[..., Callable[[bytes], Sequence[bytes]]]
+    make: Callable[..., Callable[[bytes, int], Sequence[bytes]]]
     arguments: tuple[Any, ...]
 
 
@@ -245,7 +245,7 @@ def raw_messages(recording: Recording, topics: Collection[str]) -> Iterator[RawM
     for raw in _recorded(recording, wanted):
         for one, make in makers:
             if one.source == raw.topic:
-                for data in make(raw.data):
+                for data in make(raw.data, raw.log_time_ns):
                     yield RawMessage(one.name, raw.log_time_ns, data)
         if raw.topic in topics:
             yield raw
@@ -269,13 +269,17 @@ def sample_messages(
     for derived in recording.derived:
         if derived.name == topic:
             make = derived.make(*derived.arguments)
-            for data in sample_messages(recording, derived.source, blocks, per_block):
-                yield from make(data)
+            for raw in _sampled(recording, derived.source, blocks, per_block):
+                yield from make(raw.data, raw.log_time_ns)
             return
+    yield from (raw.data for raw in _sampled(recording, topic, blocks, per_block))
+
+
+def _sampled(recording: Recording, topic: str, blocks: int, per_block: int) -> Iterator[RawMessage]:
     with _Reader((topic,)) as reader:
         holding = [(p, b) for p in recording.pieces for b in p.blocks if reader.has_any(p, b)]
         for piece, block in _spread(holding, blocks):
-            yield from _spread([raw.data for raw in reader.read(piece, block)], per_block)
+            yield from _spread(list(reader.read(piece, block)), per_block)
 
 
 def _spread(items: Sequence[_T], n: int) -> Sequence[_T]:

@@ -13,14 +13,16 @@ from graphslam.core import records
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import Array
+from graphslam.logs.cloud_topics import without_other_clouds
 from graphslam.logs.decoders import frame_of
 from graphslam.logs.findings import Finding, topics_setting
 from graphslam.logs.recording import Recording
 from graphslam.logs.schemas import DEFAULT_ROBOT, ODOMETRY
 from graphslam.logs.tf_odometry import Chain, find_chain, with_odometry
-from graphslam.logs.tf_tree import Edge, moving_topics, sampled_edges, static_tree
+from graphslam.logs.tf_tree import Edge, moving_topics, namespace_of, sampled_edges, static_tree
 from graphslam.logs.topic_context import sample_decoded
-from graphslam.logs.topics import ODOMETRY_KINDS, Topic, find_topics
+from graphslam.logs.topics import MOTION_KINDS, ODOMETRY_KINDS, Topic, find_topics
+from graphslam.logs.twist_odometry import twist_topics, with_twist_odometry
 
 _NOBODY = ""
 #: bytes of a robot's name in the names of files, of which systems allow 255
@@ -117,7 +119,10 @@ def robots_and_topics(
     Raises:
         LogError: see `find_topics`; or it cannot be told whose a sensor is.
     """
-    topics = find_topics(files, config)
+    topics, clouds = without_other_clouds(files, find_topics(files, config))
+    if not topics:
+        names = ", ".join(str(file.path) for file in files)
+        raise LogError(f"{names}: no usable topic; {clouds[0].line}")
     frames = _Frames(files)
     if config.logs.topics:
         robots: Mapping[str, str] = {}
@@ -142,7 +147,8 @@ def robots_and_topics(
             named.append(replace(topic, robot=robot or topic.robot))
     _check_names({topic.robot for topic in named}, files, config)
     opened, found, derived = _with_tf_odometry(files, named, frames)
-    return opened, found, unused + derived
+    opened, found, commands = _with_twist_odometry(opened, found)
+    return opened, found, clouds + unused + derived + commands
 
 
 def assign_robots(
@@ -299,4 +305,34 @@ def _with_tf_odometry(
             said += ", which is not called odom: if it is a map, the pose may jump"
             remedy = "record nav_msgs/Odometry, or odom to base on /tf"
             findings.append(Finding("doubt", "odometry", where, said, remedy))
+    return opened, sorted(found, key=lambda topic: topic.name), findings
+
+
+def _with_twist_odometry(
+    files: Sequence[Recording], topics: Sequence[Topic]
+) -> tuple[list[Recording], list[Topic], list[Finding]]:
+    """The files and topics with the odometry by commands of robots that nothing else tells of.
+
+    These have sightings only: how a robot with scans moved, its scans tell better.
+    """
+    opened, found, findings = list(files), list(topics), list[Finding]()
+    robots = sorted({t.robot for t in topics if t.count and t.record in _SENSORS})
+    for robot in robots:
+        if any(t.robot == robot and t.count and t.record in MOTION_KINDS for t in topics):
+            continue
+        own = [
+            name for name in twist_topics(files) if namespace_of(name) == robot or len(robots) == 1
+        ]
+        if not own:
+            continue
+        name, count = "", 0
+        for k, file in enumerate(opened):
+            opened[k], derived = with_twist_odometry(file, own[0], "base_link")
+            if derived:
+                name, count = derived.name, count + derived.count
+        found.append(Topic(name, ODOMETRY, robot, records.OdometryPose, count))
+        text = f"has no odometry; it is made of the velocities of {own[0]}"
+        remedy = "record nav_msgs/Odometry; if they are commands, --set "
+        remedy += "odometry.commanded_velocities=true"
+        findings.append(Finding("doubt", "odometry", f"robot {robot}", text, remedy))
     return opened, sorted(found, key=lambda topic: topic.name), findings

@@ -23,7 +23,10 @@ IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 DEFAULT_ROBOT = "robot"  # its topics have no namespace
 
 LASER_SCAN = "sensor_msgs/msg/LaserScan"
+POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 ODOMETRY = "nav_msgs/msg/Odometry"
+TWIST = "geometry_msgs/msg/Twist"
+TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 JOINT_STATE = "sensor_msgs/msg/JointState"
 TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 SIGHTING = "graphslam_msgs/msg/Sighting"
@@ -122,6 +125,18 @@ float32 range_max
 float32[] ranges
 float32[] intensities
 """,
+    POINT_CLOUD: """\
+std_msgs/Header header
+uint32 height
+uint32 width
+sensor_msgs/PointField[] fields
+bool is_bigendian
+uint32 point_step
+uint32 row_step
+uint8[] data
+bool is_dense
+""",
+    "sensor_msgs/PointField": "string name\nuint32 offset\nuint8 datatype\nuint32 count",
     ODOMETRY: """\
 std_msgs/Header header
 string child_frame_id
@@ -149,6 +164,8 @@ geometry_msgs/Quaternion rotation
     "geometry_msgs/TwistWithCovariance": "geometry_msgs/Twist twist\nfloat64[36] covariance",
     "geometry_msgs/Pose": "geometry_msgs/Vector3 position\ngeometry_msgs/Quaternion orientation",
     "geometry_msgs/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular",
+    TWIST: "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular",
+    TWIST_STAMPED: "std_msgs/Header header\ngeometry_msgs/Twist twist",
     "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
     "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
     "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",

@@ -3,7 +3,7 @@
 Between the two frames there may be several transforms, static and moving ones.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
 
@@ -95,7 +95,7 @@ class TfOdometry:
         self._steps = dict(zip(self._children, chain.static, strict=True))
         self._frames = (chain.odometry, chain.base)
 
-    def __call__(self, data: bytes) -> list[bytes]:
+    def __call__(self, data: bytes, _log_time_ns: int) -> list[bytes]:
         """The odometry in a message of /tf, none to several."""
         try:
             found = [t for t in transforms_of(data) if (t.parent, t.child) in self._links]
@@ -129,8 +129,9 @@ def with_odometry(recording: Recording, chain: Chain) -> tuple[Recording, Derive
     """The recording with the odometry of ``chain`` as a topic; None if it has none of it."""
     if chain.topic not in moving_topics(recording):
         return recording, None
-    make: Callable[[bytes], Sequence[bytes]] = TfOdometry(chain)
-    count = sum(len(make(raw.data)) for raw in raw_messages(recording, {chain.topic}))
+    make = TfOdometry(chain)
+    messages = raw_messages(recording, {chain.topic})
+    count = sum(len(make(raw.data, raw.log_time_ns)) for raw in messages)
     name = f"{chain.topic} ({chain.odometry} to {chain.base})"
     derived = Derived(name, schemas.ODOMETRY, chain.topic, count, TfOdometry, (chain,))
     return recording.with_derived(derived), derived

@@ -15,6 +15,7 @@ from graphslam.logs.decoders import TopicContext, frame_of
 from graphslam.logs.findings import Finding
 from graphslam.logs.mounts import TransformTree, base_above, find_mount, is_level
 from graphslam.logs.no_return import find_no_return
+from graphslam.logs.point_cloud import cloud_points, sweep_of
 from graphslam.logs.recording import Recording, sample_messages
 from graphslam.logs.tf_tree import sampled_edges, static_tree
 from graphslam.logs.topics import ODOMETRY_KINDS, Topic
@@ -38,11 +39,21 @@ class ScanShape:
 def scan_shape(files: Sequence[Recording], topic: Topic) -> ScanShape | None:
     """Shape of the first scan of ``topic`` that can be decoded; None if there is none."""
     for message in sample_decoded(files, topic):
+        if topic.schema == schemas.POINT_CLOUD:
+            return _cloud_shape(message)
         beams = len(message.ranges)
         view = abs(float(message.angle_increment)) * max(beams - 1, 0)
         limits = (float(message.range_min), float(message.range_max))
         return ScanShape(beams, view, *(limit if np.isfinite(limit) else None for limit in limits))
     return None
+
+
+def _cloud_shape(message: Any) -> ScanShape | None:
+    try:
+        bearings, ranges = sweep_of(cloud_points(message))
+    except ValueError:
+        return None
+    return ScanShape(len(ranges), float(bearings[-1] - bearings[0]), None, None)
 
 
 def topic_contexts(
@@ -70,7 +81,7 @@ def topic_contexts(
                 mounts[frame], upside_down, notes = _mount(topic, tree, base, frame, settings.laser)
                 inverted |= {frame} if upside_down else set()
                 findings += notes
-            if topic.record is records.Scan:
+            if topic.schema == schemas.LASER_SCAN:
                 no_return = find_no_return(message.ranges for message in messages)
         unstamped = topic.record in _STAMPED and _is_unstamped(files, topic)
         if unstamped:

@@ -9,6 +9,7 @@ from graphslam.core.errors import LogError
 from graphslam.logs.decoders import DECODERS
 from graphslam.logs.findings import Finding, topics_setting
 from graphslam.logs.recording import Recording
+from graphslam.logs.schemas import POINT_CLOUD
 from graphslam.logs.tf_tree import namespace_of
 
 # Sources of odometry in order of preference: an increment has its covariance, wheel angles need
@@ -91,7 +92,7 @@ def choose_topics(
     spare: list[tuple[str, list[Topic]]] = []
     for robot in sorted({topic.robot for topic in filled}):
         own = [topic for topic in filled if topic.robot == robot]
-        own.sort(key=lambda t: (-t.count, t.name))
+        own.sort(key=lambda t: (t.schema == POINT_CLOUD, -t.count, t.name))
         odometry = [t for kind in ODOMETRY_KINDS for t in own if t.record is kind]
         lasers = [t for t in own if t.record is records.Scan]
         sensors = lasers + [t for t in own if t.record is records.Sighting]
