@@ -9,7 +9,7 @@ from graphslam.change_detection.detect import ChangeResult
 from graphslam.change_detection.shapes import Displacement
 from graphslam.change_detection.visit import Bools, Visit
 from graphslam.core.config import ChangesConfig
-from graphslam.core.geometry import Array, inverse, transform
+from graphslam.core.geometry import Array, area_centroid, inverse, transform
 from graphslam.results.report_changes import ChangeMark, ChangesPicture, changes_page, tile
 
 #: the picture of the observed area: least size of its squares, m; most squares of a side; most
@@ -58,13 +58,13 @@ def render_changes(
 
 
 def _motion_of_middle(polygon: Array, by: Displacement | None) -> tuple[Array | None, Array | None]:
-    """Shift and rotation (3,) m, rad, of the middle of a new outline (c, 2) m, and sigmas (3,).
+    """Shift and rotation (3,) m, rad, of the centroid of a new outline (c, 2) m, and sigmas (3,).
 
     Those of the world's origin would depend on its distance. None without a displacement.
     """
     if by is None:
         return None, None
-    middle = polygon.mean(axis=0)
+    middle = area_centroid(polygon)
     arm = middle - by.motion[:2]
     shift = middle - transform(inverse(by.motion), middle[None])[0]
     J = np.array([[1, 0, -arm[1]], [0, 1, arm[0]], [0, 0, 1.0]])

@@ -8,9 +8,11 @@ from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from graphslam.core.geometry import area_centroid
 from graphslam.core.records import Result
 from graphslam.logs import ImportSummary, LogInfo, RobotInfo, TopicInfo
 from graphslam.results.metric_tables import evaluation_notes, evaluation_tables
@@ -115,9 +117,9 @@ def smoothed(result: Result, directory: Path) -> None:
     """A line on the run, what was rejected or dropped and why, and where the report is."""
     console, summary, robots = _console(), result.summary, len(result.robots)
     counts = summary["counts"]
-    parts = [f"{robots} robot{'s' * (robots > 1)}"]
+    parts = [_counted(robots, "robot")]
     parts += [
-        f"{_number(counts[key])} {key.replace('_', ' ')}"
+        _counted(counts[key], key.replace("_", " ").removesuffix("s"))
         for key in ("scans", "keyframes", "landmarks", "loop_closures")
         if counts[key]
     ]
@@ -230,15 +232,14 @@ def changes(found: Mapping[str, Any], directory: Path) -> None:
     )
     rows = []
     for change in found["changes"]:
-        x, y = zip(*change["polygon"], strict=True)
+        polygon = np.array(change["polygon"])
+        size = np.ptp(polygon, axis=0).tolist()
         moved = change["displacement"]
         rows.append(
             (
                 change["kind"],
-                (min(x) + max(x)) / 2,
-                (min(y) + max(y)) / 2,
-                max(x) - min(x),
-                max(y) - min(y),
+                *(f"{value:.2f}" for value in area_centroid(polygon)),
+                *size,
                 change["probability"],
                 None if moved is None else degrees(moved["phi"]),
                 change["beams"],
@@ -330,6 +331,10 @@ def _number(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
     return str(value)
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{_number(count)} {noun}{'s' * (count != 1)}"
 
 
 def _topic_row(topic: TopicInfo) -> tuple[object, ...]:

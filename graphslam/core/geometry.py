@@ -120,6 +120,23 @@ def polar_points(range_m: Array, bearing_rad: Array) -> Array:
     return np.asarray(range_m[..., None] * unit_vectors(bearing_rad))
 
 
+def area_centroid(polygon: Array) -> Array:
+    """Centroid (2,) of the area that a simple polygon (n, 2) encloses, in either sense of turning.
+
+    Unlike the mean of the corners it does not move when an edge is divided, and unlike the middle
+    of the bounding box it turns with the polygon. Of a polygon without area: the mean of its
+    corners. Source: P. Bourke, Calculating the area and centroid of a polygon, 1988.
+    """
+    middle = polygon.mean(axis=0)
+    a = polygon - middle  # far from the origin the differences would lose their digits
+    b = np.roll(a, -1, axis=0)
+    twice = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    area = twice.sum()
+    if abs(area) <= 1e-12 * max(float((a * a).sum()), 1e-300):
+        return np.asarray(middle)
+    return np.asarray(middle + ((a + b) * twice[:, None]).sum(axis=0) / (3.0 * area))
+
+
 def path_length(points: Array) -> Array:
     """Length (n,), m, of the path through points or poses (n, 2 or 3) up to each of them."""
     x, y = (points[1:] - points[:-1])[:, :2].T

@@ -26,8 +26,9 @@ from graphslam.results.drawing_elements import (
 )
 from graphslam.results.drawing_scales import Scale, linear_scale, log_scale
 
-TEXT_PT, TICK_TEXT_PT = 8.5, 8.0
+TEXT_PT, TICK_TEXT_PT, LEGEND_ROW_PT = 8.5, 8.0, 10.0
 _LETTER = 0.57  # mean width of a letter, of the height of the text
+_BESIDE = 5.0  # points that a number may stand out beside the axis
 _FAR = 10**6  # user units: what lies beyond is cut off anyway
 _DOT_PIXELS = 4.0  # per point, of pictures of dots
 
@@ -206,6 +207,12 @@ class Axes:
 
     # ------------------------------------------------------------ output
 
+    @property
+    def above_pt(self) -> float:
+        """Room that the legend needs above the drawing, points; negative where there is some."""
+        top = self.box.top / UNIT - 6
+        return legend_height(self.legend, self.box.left, self.box.right) - top
+
     def to_svg(self) -> str:
         """Grid, marks, labels and legend."""
         box = self.box
@@ -228,7 +235,10 @@ class Axes:
         for x, label in zip(at, self.x.labels(ticks), strict=True):
             parts += f"M{x:.0f} {box.top:.0f}V{box.bottom + 3 * UNIT:.0f}"
             if self.has_x_numbers:
-                texts.append(words(label, x, box.bottom + 12 * UNIT, TICK_TEXT_PT, "middle"))
+                # the last number may not leave the drawing
+                most = box.right + _BESIDE * UNIT - _width_pt(label, TICK_TEXT_PT) * UNIT / 2
+                place = min(float(x), most), box.bottom + 12 * UNIT
+                texts.append(words(label, *place, TICK_TEXT_PT, "middle"))
         ticks = self.y.ticks(_most_ticks(box.bottom - box.top, 16))
         at = self.place(np.full(len(ticks), self.x.low), np.array(ticks))[:, 1]
         for y, label in zip(at, self.y.labels(ticks), strict=True):
@@ -242,11 +252,49 @@ class Axes:
             x = (box.left + box.right) / 2
             found.append(words(self.x_label, x, box.bottom + 24 * UNIT, TEXT_PT, "middle"))
         if self.y_label:
-            x, y = box.left - self.y_label_pt * UNIT, (box.top + box.bottom) / 2
+            ticks = self.y.labels(self.y.ticks(_most_ticks(box.bottom - box.top, 16)))
+            widest = max((_width_pt(label, TICK_TEXT_PT) for label in ticks), default=0.0)
+            beside = max(self.y_label_pt, 5 + widest + 5)
+            x, y = box.left - beside * UNIT, (box.top + box.bottom) / 2
             found.append(words(self.y_label, x, y, TEXT_PT, "middle", upright=True))
         if self.title:
             found.append(words(self.title, box.left, box.top - 4 * UNIT, 9.0))
         return found
+
+
+def _width_pt(text: str, size_pt: float) -> float:
+    return len(text) * _LETTER * size_pt
+
+
+def _legend_rows(
+    entries: Sequence[tuple[str, Style]], left: float, right: float
+) -> list[list[tuple[str, Style, float]]]:
+    """Names, each once, with their styles and widths, in rows between ``left`` and ``right``."""
+    first: dict[str, Style] = {}
+    for name, style in entries:
+        first.setdefault(name, style)
+    rows: list[list[tuple[str, Style, float]]] = [[]]
+    room = right - left
+    for name, style in first.items():
+        width = (_width_pt(name, TICK_TEXT_PT) + 24) * UNIT
+        if rows[-1] and room < width:
+            rows, room = [*rows, []], right - left
+        rows[-1].append((name, style, width))
+        room -= width
+    return rows
+
+
+def legend_height(entries: Sequence[tuple[str, Style]], left: float, right: float) -> float:
+    """Height of `legend` above its last row's base line, points."""
+    return LEGEND_ROW_PT * len(_legend_rows(entries, left, right)) if entries else 0.0
+
+
+def _sample(style: Style) -> float:
+    """Length of the sample of a curve, user units: about 11 points, and whole dashes."""
+    dashes = [style.width * dash for dash in style.dashes]
+    if not dashes:
+        return 11.0 * UNIT
+    return UNIT * (max(1, round((11.0 - dashes[0]) / sum(dashes))) * sum(dashes) + dashes[0])
 
 
 def legend(entries: Sequence[tuple[str, Style]], left: float, right: float, y: float) -> list[str]:
@@ -254,25 +302,16 @@ def legend(entries: Sequence[tuple[str, Style]], left: float, right: float, y: f
 
     ``left``, ``right`` and ``y`` in user units.
     """
-    first: dict[str, Style] = {}
-    for name, style in entries:
-        first.setdefault(name, style)
-    rows: list[list[tuple[str, Style, float]]] = [[]]
-    room = right - left
-    for name, style in first.items():
-        width = (len(name) * _LETTER * TICK_TEXT_PT + 24) * UNIT
-        if rows[-1] and room < width:
-            rows, room = [*rows, []], right - left
-        rows[-1].append((name, style, width))
-        room -= width
     found = []
-    for row in reversed(rows):
+    for row in reversed(_legend_rows(entries, left, right)):
         x = right - sum(width for *_, width in row)
         for name, style, width in row:
-            found.append(stroked(f"M{x + 8 * UNIT:.0f} {y - 3 * UNIT:.0f}h{11 * UNIT}", style))
+            found.append(
+                stroked(f"M{x + 8 * UNIT:.0f} {y - 3 * UNIT:.0f}h{_sample(style):.0f}", style)
+            )
             found.append(words(name, x + 23 * UNIT, y, TICK_TEXT_PT))
             x += width
-        y -= 10 * UNIT
+        y -= LEGEND_ROW_PT * UNIT
     return found
 
 

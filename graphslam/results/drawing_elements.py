@@ -64,11 +64,17 @@ def robot_color(index: int) -> str:
     return PALETTE[index % len(PALETTE)]
 
 
-def svg_element(label: str, width_pt: float, height_pt: float, content: Sequence[str]) -> str:
-    """An inline <svg> of the page's colours and font, described for screen readers."""
+def svg_element(
+    label: str, width_pt: float, height_pt: float, content: Sequence[str], above_pt: float = 0.0
+) -> str:
+    """An inline <svg> of the page's colours and font, described for screen readers.
+
+    ``above_pt``: room above the origin, for legends of several rows.
+    """
+    top = max(0, round(above_pt * UNIT))
     return (
         f'<svg role="img" aria-label="{escape(label)}" '
-        f'viewBox="0 0 {width_pt * UNIT:.0f} {height_pt * UNIT:.0f}" '
+        f'viewBox="0 {-top} {width_pt * UNIT:.0f} {height_pt * UNIT + top:.0f}" '
         'font-family="system-ui, sans-serif" fill="currentColor">\n'
         + "\n".join(content)
         + "\n</svg>"

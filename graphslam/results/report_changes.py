@@ -8,7 +8,7 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from graphslam.core.geometry import Array
+from graphslam.core.geometry import Array, area_centroid
 from graphslam.results import report_html as html
 from graphslam.results.drawing import Axes
 from graphslam.results.drawing_elements import INK, OPAQUE, PALETTE, Levels, Shade, Style
@@ -109,13 +109,13 @@ def _headline(picture: ChangesPicture) -> str:
 
 
 def _caption(mark: ChangeMark) -> str:
-    x, y = mark.polygon.mean(axis=0)
+    x, y = area_centroid(mark.polygon)
     text = f"At x {x:.2f} m, y {y:.2f} m."
     if mark.motion is None or mark.sigmas is None:
         return text
     away = float(np.hypot(*mark.motion[:2]))
     return (
-        f"{text} Its centre moved {100 * away:.0f} cm, and it turned "
+        f"{text} Its centre moved {html.length(away)}, and it turned "
         f"{np.degrees(mark.motion[2]):.1f}° ± {np.degrees(mark.sigmas[2]):.1f}° (1σ)."
     )
 
@@ -128,9 +128,9 @@ def _table(picture: ChangesPicture) -> str:
         moved = turned = None
         if mark.motion is not None and mark.sigmas is not None:
             sigma = float(np.hypot(*mark.sigmas[:2]))
-            moved = f"{100 * np.hypot(*mark.motion[:2]):.1f} ± {100 * sigma:.1f}"
+            moved = f"{np.hypot(*mark.motion[:2]):.3f} ± {sigma:.3f}"
             turned = f"{np.degrees(mark.motion[2]):.1f} ± {np.degrees(mark.sigmas[2]):.1f}"
-        x, y = mark.polygon.mean(axis=0)
+        x, y = area_centroid(mark.polygon)
         size = np.ptp(mark.polygon, axis=0)
         rows.append(
             (
@@ -144,7 +144,7 @@ def _table(picture: ChangesPicture) -> str:
                 f"{mark.first_seen_s:.1f}",
             )
         )
-    head = ["change", "at x, y, m", "size, m", "probability", "moved, cm", "turned, °"]
+    head = ["change", "at x, y, m", "size, m", "probability", "moved, m", "turned, °"]
     head += ["beams", "first seen, s"]
     rows_html = html.table(head, rows)
     for kind in COLORS:

@@ -313,7 +313,10 @@ def render_comparison(comparison: Comparison, settings: str = "") -> str:
         numbers += f"<p class=note>{escape(text)}</p>"
     sections = [
         html.header("graphslam compare", title, headline(summary)),
-        html.warning_box(summary["warnings"]),
+        html.warning_box(
+            html.without_folders(text, (log["path"] for log in summary["logs"]))
+            for text in summary["warnings"]
+        ),
         html.section("Numbers", numbers),
         *(
             html.section(name, legend + html.figure_grid(drawings))
@@ -346,26 +349,28 @@ def _table(
         name = f'<th scope="row">{_swatch(colors, row["spec"])}{escape(label)}</th>'
         if row["error"] is None:
             content = "".join(
-                f"<td{' class=best' * best}>{html.number(value)}</td>" for value, best in cells
+                f'<td data-label="{escape(head)}"{" class=best" * best}>{html.number(value)}</td>'
+                for head, (value, best) in zip(heads, cells, strict=True)
             )
         else:
             content = f"<td class=none colspan={len(heads)}>failed: {escape(row['error'])}</td>"
         body += f"<tr>{name}{content}</tr>\n"
     return (
-        f'<div class="scroll compared"><table><caption>{escape(title)}</caption>'
+        f'<div class="scroll compared"><table class=wide><caption>{escape(title)}</caption>'
         f"<thead><tr>{top}</tr></thead>\n<tbody>{body}</tbody></table></div>"
     )
 
 
 def _reproduce(summary: Mapping[str, Any], settings: str) -> str:
-    logs = " ".join(str(log["path"]) for log in summary["logs"])
+    logs = " ".join(PurePath(log["path"]).name for log in summary["logs"])
     specs = ",".join(row["spec"] for row in summary["rows"])
     command = (
         f"graphslam compare {logs} --backends {specs} --mode {summary['mode']} "
         "--config config.toml -o DIR"
     )
     sums = "".join(
-        f"<p class=note>{escape(str(log['path']))} sha256 <code>{log['sha256']}</code></p>"
+        f"<p class=note>{escape(PurePath(log['path']).name)} sha256 "
+        f"<code>{log['sha256']}</code></p>"
         for log in summary["logs"]
     )
     return html.details(

@@ -234,7 +234,8 @@ def _styles(summary: Summary) -> dict[str, Style]:
 def _curve(axes: Axes, band: Mapping[str, Any], label: str, style: Style) -> None:
     steps = np.arange(len(band["mean"]))
     there_and_back = np.concatenate([steps, steps[::-1]])
-    outline = np.concatenate([band["low"], band["high"][::-1]])
+    # bounds of the mean of few runs pass zero, which errors do not
+    outline = np.maximum(np.concatenate([band["low"], band["high"][::-1]]), 0.0)
     axes.area(np.column_stack([there_and_back, outline]), style.color, 0.18)
     axes.line(steps, band["mean"], style, label)
 
@@ -250,6 +251,7 @@ def nees_over_time(summary: Summary) -> str:
         for name, curves in found["variants"].items():
             _curve(axes, curves["nees_per_dof"], name, styles[name])
         axes.y_label = "NEES / dof"
+        axes.set_y(0.0, axes.y.high)
 
     return _panels(summary, draw, "Mean NEES over time")
 
@@ -300,7 +302,7 @@ def error_against_noise(summary: Summary) -> str:
         scales = [row["scale"] for row in rows]
         left.line(scales, bound, Style(INK, 1.4), "bound")
         left.y_label = "final position RMSE, m"
-        right.y_label = f"end's distance from {summary['reference']}, m"
+        right.y_label = f"distance from {summary['reference']}, m"
         for axes in (left, right):
             axes.log_x = axes.log_y = True
         drawing.common_legend()

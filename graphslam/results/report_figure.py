@@ -11,8 +11,9 @@ from collections.abc import Callable
 import numpy as np
 
 from graphslam.core.geometry import Array
-from graphslam.results.drawing import Axes, legend
+from graphslam.results.drawing import Axes, legend, legend_height
 from graphslam.results.drawing_elements import UNIT, Box, Shade, opacity_levels, svg_element
+from graphslam.results.report_html import MINUTES_FROM_S
 
 WIDTH_IN = 4.9
 POINTS_PER_INCH = 72
@@ -28,6 +29,7 @@ class Drawing:
         self.label, self.height_in = label, height_in
         self._axes: list[Axes] = []
         self._legend: list[str] = []
+        self._above = 0.0
 
     def axes(self, left: float, bottom: float, right: float, top: float) -> Axes:
         """New axes between these margins, inches."""
@@ -43,7 +45,9 @@ class Drawing:
         """One legend at the top, that of the first axes, instead of one for each."""
         unit = POINTS_PER_INCH * UNIT
         entries = self._axes[0].legend
-        self._legend = legend(entries, 0.1 * unit, (WIDTH_IN - 0.1) * unit, 0.28 * unit)
+        left, right = 0.1 * unit, (WIDTH_IN - 0.1) * unit
+        self._legend = legend(entries, left, right, 0.28 * unit)
+        self._above = legend_height(entries, left, right) - 0.28 * POINTS_PER_INCH
         for axes in self._axes:
             axes.legend = []
 
@@ -51,7 +55,8 @@ class Drawing:
         """The inline SVG element."""
         size = (WIDTH_IN * POINTS_PER_INCH, self.height_in * POINTS_PER_INCH)
         parts = [axes.to_svg() for axes in self._axes]
-        return svg_element(self.label, *size, [*parts, *self._legend])
+        above = max([self._above, *(axes.above_pt for axes in self._axes)])
+        return svg_element(self.label, *size, [*parts, *self._legend], above)
 
 
 def svg(label: str, height_in: float, draw: Callable[[Drawing], None]) -> str:
@@ -113,15 +118,15 @@ def time_rows(drawing: Drawing, rows: int, label: str) -> list[Axes]:
 
 def panels(drawing: Drawing, count: int, columns: int, label: str) -> list[Axes]:
     """Axes in rows of ``columns``, below a common legend; the lowest have numbers and a label."""
-    left, bottom, right, top = 0.52, 0.46, 0.1, 0.5
+    left, bottom, right, top = 0.56, 0.46, 0.1, 0.54
     rows = -(-count // columns)
     # gaps of a share of the size of axes
-    width = (WIDTH_IN - left - right) / (columns + 0.36 * (columns - 1))
+    width = (WIDTH_IN - left - right) / (columns + 0.42 * (columns - 1))
     height = (drawing.height_in - bottom - top) / (rows + 0.28 * (rows - 1))
     found = []
     for i in range(count):
         row, column = divmod(i, columns)
-        x, y = left + 1.36 * width * column, top + 1.28 * height * row
+        x, y = left + 1.42 * width * column, top + 1.28 * height * row
         axes = drawing.axes(x, drawing.height_in - y - height, WIDTH_IN - x - width, y)
         axes.has_x_numbers = i + columns >= count
         axes.x_label = label if axes.has_x_numbers else ""
@@ -132,7 +137,9 @@ def panels(drawing: Drawing, count: int, columns: int, label: str) -> list[Axes]
 
 def time_axis(first_ns: int, last_ns: int) -> tuple[float, str]:
     """Unit, ns, and label of a time axis over a span: minutes from a quarter of an hour on."""
-    return (60e9, "time, min") if last_ns - first_ns > 900e9 else (1e9, "time, s")
+    if last_ns - first_ns > 1e9 * MINUTES_FROM_S:
+        return 60e9, "time, min"
+    return 1e9, "time, s"
 
 
 def positive(values: Array, smallest: float = SMALLEST) -> Array:

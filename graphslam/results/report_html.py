@@ -3,11 +3,16 @@
 
 from collections.abc import Iterable, Sequence
 from html import escape
+from pathlib import PurePath
 
 import numpy as np
 
 from graphslam.results.report_style import CSS
 
+#: s; above it, time is in minutes
+MINUTES_FROM_S = 900.0
+#: columns; a table with more does not fit on a phone
+WIDE = 4
 _SPACE = "\u202f"  # narrow, no break: 13 631
 
 
@@ -82,6 +87,32 @@ def number(value: object, digits: int = 3) -> str:
     return "–" if value is None else escape(str(value))
 
 
+def counted(count: int, noun: str) -> str:
+    """A number of things: 1 scan, 13 631 scans."""
+    return f"{number(count)} {noun}{'s' * (count != 1)}"
+
+
+def length(value_m: float, digits: int = 2) -> str:
+    """A length for reading, in centimetres below one metre."""
+    if abs(value_m) < 0.9995:
+        return f"{number(100 * value_m, digits)} cm"
+    return f"{number(value_m, digits + 1)} m"
+
+
+def duration(value_s: float) -> str:
+    """A duration for reading, in minutes from a quarter of an hour on, as on the axes."""
+    if value_s > MINUTES_FROM_S:
+        return f"{number(value_s / 60)} min"
+    return f"{number(value_s)} s"
+
+
+def without_folders(text: str, paths: Iterable[str]) -> str:
+    """A text with the names of files in place of their paths: a report tells of no machine."""
+    for path in sorted(set(paths), key=len, reverse=True):
+        text = text.replace(path, PurePath(path).name)
+    return text
+
+
 def _decimal(value: float, digits: int) -> str:
     if not np.isfinite(value):
         return "–"
@@ -97,14 +128,19 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[object]], caption: str =
     Cells that are numbers are formatted with `number`, texts are escaped.
     """
     top = "".join(f'<th scope="col">{escape(name)}</th>' for name in heads)
+    # on a narrow page the rows of a wide table are folded, and every cell shows its head
+    wide = len(heads) > WIDE
+    labels = [f' data-label="{escape(name)}"' if wide else "" for name in heads]
     body = "".join(
         f'<tr><th scope="row">{number(first)}</th>'
-        + "".join(f"<td>{number(cell)}</td>" for cell in rest)
+        + "".join(
+            f"<td{label}>{number(cell)}</td>" for cell, label in zip(rest, labels[1:], strict=True)
+        )
         + "</tr>\n"
         for first, *rest in rows
     )
     title = f"<caption>{escape(caption)}</caption>" if caption else ""
     return (
-        f'<div class="scroll"><table>{title}<thead><tr>{top}</tr></thead>\n'
+        f'<div class="scroll"><table{" class=wide" * wide}>{title}<thead><tr>{top}</tr></thead>\n'
         f"<tbody>{body}</tbody></table></div>"
     )

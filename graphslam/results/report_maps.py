@@ -12,7 +12,6 @@ from graphslam.results.drawing_elements import ACCENT, INK, Style, robot_color
 from graphslam.results.report_figure import WIDTH_IN, Drawing, density, map_axes, svg
 
 MAX_LABELS = 40
-MAX_ELLIPSES = 400
 _SIGMAS_95_2D = float(np.sqrt(chi2_quantile(0.95, 2)))
 _SIGMAS_95_1D = float(np.sqrt(chi2_quantile(0.95, 1)))
 
@@ -63,22 +62,25 @@ def landmark_map(result: Result, height_in: float) -> tuple[str, int]:
     """Landmarks with their ids and 95 % bounds, and the enlargement of the bounds.
 
     A point has an ellipse, a line a bar across each end. Ids and bounds are of the landmarks with
-    the most sightings.
+    the most sightings, as many as can be told apart: bars of all walls would bury them.
     """
     landmarks = result.landmarks
     paths = [robot.final.poses[:, :2] for robot in result.robots.values()]
     limits = _limits([*paths, *(landmark.extent for landmark in landmarks)])
     by_sightings = sorted(landmarks, key=lambda m: (-m.sightings, m.id))
-    shown = by_sightings[:MAX_ELLIPSES]
+    labels = _label_positions(by_sightings, limits)
+    shown = [m for m, _ in labels]
     factor = _enlargement([_size(m) for m in shown], limits)
+    bounds = [b for m in shown for b in _bounds(m, factor)]
+    limits = _including(limits, bounds)
 
     def draw(drawing: Drawing) -> None:
         axes = map_axes(drawing, limits)
         for path in paths:
             axes.path(path, Style(INK, 0.5, 0.35))
-        _draw_landmarks(axes, landmarks, 1.6)
-        axes.lines([b for m in shown for b in _bounds(m, factor)], Style(ACCENT, 0.8))
-        for landmark, (x, y) in _label_positions(by_sightings, limits):
+        _draw_landmarks(axes, landmarks, 1.2)
+        axes.lines(bounds, Style(ACCENT, 0.8))
+        for landmark, (x, y) in labels:
             axes.text(float(x), float(y), str(landmark.id), 7.5, (3, 3))
 
     return svg("Landmarks with numbers and 95 % bounds", height_in, draw), factor
@@ -91,6 +93,8 @@ def trajectory_map(result: Result, height_in: float) -> tuple[str, int]:
     limits = _limits([robot.final.poses[:, :2] for _, robot in robots])
     samples = {name: _sample(robot.final, max(40 // len(robots), 12)) for name, robot in robots}
     factor = _enlargement([float(s) for _, c in samples.values() for s in _semi_axes(c)], limits)
+    ellipses = [_ellipse(m, c, factor) for s in samples.values() for m, c in zip(*s, strict=True)]
+    limits = _including(limits, ellipses)
 
     def draw(drawing: Drawing) -> None:
         axes = map_axes(drawing, limits)
@@ -102,9 +106,7 @@ def trajectory_map(result: Result, height_in: float) -> tuple[str, int]:
                 axes.path(robot.causal.poses[:, :2], causal, "causal" if one else None)
             axes.path(robot.final.poses[:, :2], Style(color, 1.1), "final" if one else name)
             axes.symbols(robot.final.poses[:1, :2], color, 5.5)
-            means, covs = samples[name]
-            ellipses = [_ellipse(m, c, factor) for m, c in zip(means, covs, strict=True)]
-            axes.lines(ellipses, Style(ACCENT, 0.7))
+        axes.lines(ellipses, Style(ACCENT, 0.7))
 
     return svg("Trajectory with 95 % ellipses", height_in, draw), factor
 
@@ -150,6 +152,15 @@ def _limits(parts: Iterable[Array]) -> Array:
     high = np.max([box[1] for box in boxes], axis=0)
     margin = 0.03 * max(float((high - low).max()), 1.0)
     return np.column_stack([low - margin, high + margin])
+
+
+def _including(limits: Array, lines: Sequence[Array]) -> Array:
+    """Limits [[x_min, x_max], [y_min, y_max]] widened to hold polylines (k, 2)."""
+    if not lines:
+        return limits
+    points = np.concatenate(lines)
+    low, high = points.min(axis=0), points.max(axis=0)
+    return np.column_stack([np.minimum(limits[:, 0], low), np.maximum(limits[:, 1], high)])
 
 
 def _draw_landmarks(axes: Axes, landmarks: Sequence[Landmark], width: float) -> None:

@@ -42,7 +42,7 @@ def _header(result: Result, title: str) -> str:
         ("keyframes", counts.get("keyframes"), ""),
         ("landmarks", len(result.landmarks), ""),
         ("loop closures", counts.get("loop_closures"), ""),
-        ("median σ", 100 * sigma if sigma is not None else None, " cm"),
+        ("median σ", html.length(sigma, 3) if sigma is not None else None, ""),
         ("real time", summary.get("real_time_factor"), " ×"),
         ("peak memory", summary.get("peak_memory_mb"), " MB"),
     ]
@@ -54,7 +54,9 @@ def _header(result: Result, title: str) -> str:
 def _warnings(summary: Mapping[str, Any]) -> str:
     stamps = summary.get("notes", {}).get("stamps", "")
     texts = [f"stamps: {stamps}"] if stamps.startswith("invented") else []
-    return html.warning_box([*texts, *map(str, summary.get("warnings", []))])
+    paths = [log["path"] for log in summary.get("logs", [])]
+    texts += [html.without_folders(str(text), paths) for text in summary.get("warnings", [])]
+    return html.warning_box(texts)
 
 
 def _map_section(result: Result) -> str:
@@ -139,7 +141,7 @@ def _estimator_section(result: Result) -> str:
     if any(len(values) for values in result.innovations.values()):
         figures.append(
             html.figure(
-                plots.innovations(result.innovations),
+                plots.innovations(result.innovations, plots.unit_of_time(result)),
                 "Innovations.",
                 "Normalised innovation squared per degree of freedom of accepted associations; "
                 "with its running mean; orange: expectation 1 and (dashed) 95 % quantile. A "
@@ -181,7 +183,7 @@ def _landmark_section(result: Result) -> str:
 def _reproduce_section(result: Result) -> str:
     summary = result.summary
     logs = [
-        (log["path"], log["messages"], log["lost"], log["sha256"])
+        (PurePath(log["path"]).name, log["messages"], log["lost"], log["sha256"])
         for log in summary.get("logs", [])
     ]
     versions = ", ".join(f"{name} {text}" for name, text in summary.get("versions", {}).items())

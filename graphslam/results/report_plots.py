@@ -74,16 +74,18 @@ def revision(result: Result) -> str:
     return svg("Distance from the final trajectory over time", 3.5, draw)
 
 
-def innovations(found: Mapping[str, Array]) -> str:
+def innovations(found: Mapping[str, Array], unit: tuple[float, str] = (1e9, "time, s")) -> str:
     """Normalised innovation squared per degree of freedom of each model, over time.
 
     ``found[model]`` (n, 2) has a row per innovation: time s, d² / dof.
-    Its expectation is 1; the dashed line is the 95 % quantile of chi-square for one innovation.
+    ``unit``: of the axis of time, ns, and its label. The expectation is 1; the dashed line is the
+    95 % quantile of chi-square for one innovation.
     """
-    found = {model: values for model, values in sorted(found.items()) if len(values)}
+    scale = np.array([1e9 / unit[0], 1.0])
+    found = {model: values * scale for model, values in sorted(found.items()) if len(values)}
 
     def draw(drawing: Drawing) -> None:
-        rows = time_rows(drawing, len(found), "time, s")
+        rows = time_rows(drawing, len(found), unit[1])
         times = np.concatenate([values[:, 0] for values in found.values()])
         span = linear_scale(float(times.min()), float(times.max()), 0.01)
         for axes, (model, values) in zip(rows, found.items(), strict=True):
@@ -118,16 +120,22 @@ def timing(step_ms: Array) -> str:
     return svg("Wall time per keyframe", 2.6, draw)
 
 
+def unit_of_time(result: Result) -> tuple[float, str]:
+    """Unit, ns, and label of every axis of time on the page of a result."""
+    axis = _TimeAxis(result)
+    return axis.unit_ns, axis.label
+
+
 class _TimeAxis:
     """Time since the first pose of any robot, in a unit that fits the span."""
 
     def __init__(self, result: Result) -> None:
         stamps = [robot.final.stamps_ns for robot in result.robots.values()]
         self._start_ns, last_ns = int(min(s[0] for s in stamps)), int(max(s[-1] for s in stamps))
-        self._unit_ns, self.label = time_axis(self._start_ns, last_ns)
+        self.unit_ns, self.label = time_axis(self._start_ns, last_ns)
 
     def time(self, path: Trajectory) -> Array:
-        return np.asarray((path.stamps_ns - self._start_ns) / self._unit_ns)
+        return np.asarray((path.stamps_ns - self._start_ns) / self.unit_ns)
 
 
 def _worst_sigma(path: Trajectory) -> Array:

@@ -32,7 +32,7 @@ h2 { font-size: 1.1rem; margin: 2.2rem 0 .8rem; }
 .tiles dt { color: var(--soft); font-size: .78rem; }
 .tiles dd { margin: 0; font-size: 1.25rem; font-weight: 600; font-variant-numeric: tabular-nums; }
 .grid { display: grid; gap: 16px; align-items: start;
-  grid-template-columns: repeat(auto-fit, minmax(min(100%, 460px), 1fr)); }
+  grid-template-columns: repeat(auto-fill, minmax(min(100%, 460px), 1fr)); }
 figure { margin: 0; background: var(--card); border: 1px solid var(--grid); border-radius: 8px;
   padding: 12px 12px 6px; min-width: 0; }
 figcaption { color: var(--soft); font-size: .85rem; line-height: 1.4; margin-bottom: 6px; }
@@ -76,6 +76,16 @@ pre { overflow-x: auto; background: var(--bg); padding: 12px; border-radius: 6px
   figure { padding: 10px 6px 4px; }
   .tiles div { flex-basis: 100px; padding: 6px 10px; }
   .tiles dd { font-size: 1.05rem; }
+  /* a wide table is folded: every row is a block, every cell has its head above it */
+  table.wide thead { display: none; }
+  table.wide tr { display: grid; grid-template-columns: repeat(auto-fill, minmax(104px, 1fr));
+    gap: 0 10px; padding: 6px 0; border-bottom: 1px solid var(--grid); }
+  table.wide :is(th, td) { display: block; border: 0; padding: 2px 0; text-align: left;
+    white-space: normal; overflow-wrap: anywhere; }
+  table.wide th[scope=row] { grid-column: 1 / -1; font-weight: 600; }
+  table.wide td[data-label]::before { content: attr(data-label); display: block;
+    color: var(--soft); font-size: .74rem; font-weight: 400; }
+  table.wide td.none { grid-column: 1 / -1; }
 }
 @media print { details > * { display: block; } main { max-width: none; } }
 """

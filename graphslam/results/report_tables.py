@@ -10,7 +10,7 @@ import numpy as np
 from graphslam.core.geometry import path_length
 from graphslam.core.records import Landmark, Result
 from graphslam.results.metric_tables import evaluation_notes, evaluation_tables
-from graphslam.results.report_html import number, table
+from graphslam.results.report_html import counted, duration, length, number, table
 
 
 def headline(result: Result) -> str:
@@ -23,19 +23,19 @@ def headline(result: Result) -> str:
     states = result.estimate.states.values()
     metres = sum(float(path_length(p.poses)[-1]) for p in states)
     span = (max(p.stamps_ns[-1] for p in paths) - min(p.stamps_ns[0] for p in paths)) / 1e9
-    source = f"{number(counts['scans'])} scans of {fleet}" if counts.get("scans") else fleet
+    source = f"{counted(counts['scans'], 'scan')} of {fleet}" if counts.get("scans") else fleet
     kinds = {landmark.kind for landmark in result.landmarks}
     kind = {frozenset({"point"}): "point ", frozenset({"line"}): "line "}.get(frozenset(kinds), "")
     parts = [
-        f"From {source} over {number(float(metres))} m and {number(float(span))} s: "
-        f"{number(counts.get('keyframes'))} keyframes and {number(len(result.landmarks))} "
-        f"{kind}landmarks"
+        f"From {source} over {number(float(metres))} m and {duration(float(span))}: "
+        f"{counted(counts.get('keyframes', 0), 'keyframe')} and "
+        f"{counted(len(result.landmarks), kind + 'landmark')}"
     ]
     if counts.get("loop_closures"):
-        parts.append(f", {number(counts['loop_closures'])} loop closures")
+        parts.append(f", {counted(counts['loop_closures'], 'loop closure')}")
     sigma = median_sigma(result)
     if sigma is not None:
-        parts.append(f"; position known to {number(100 * sigma, 2)} cm (median 1σ)")
+        parts.append(f"; position known to {length(sigma)} (median 1σ)")
     factor = result.summary.get("real_time_factor")
     if factor:
         parts.append(f", computed {number(factor, 2)} times faster than real time")
