@@ -56,7 +56,7 @@ def log_info(info: LogInfo) -> None:
         where = f"{finding.topic}: " if finding.topic else ""
         console.print(f"{kind}: {where}{finding.text}")
         if finding.remedy:
-            console.print(f"  to mend it: {finding.remedy}")
+            console.print("  " + "to mend it: " * (finding.severity != "note") + finding.remedy)
     if info.usable:
         names = " ".join(str(file.path) for file in info.files)
         doubts = " with doubts" if info.doubtful else ""

@@ -109,6 +109,8 @@ class OdometryConfig:
     parameter_noise: `constant` = a calibration error is the same in every reading; `white` = radii,
     axle and counts are drawn anew in each, as thesis 4.9-4.13 prints it (of odometry that reports
     poses by the wheels of [robots.*]), and no parameter of the odometry is estimated.
+    gyroscope: `auto` = the odometry turns as the gyroscope of the log says, if there is one that
+    agrees with it by and large; `off`.
     floor_sigma_m and floor_sigma_rad are added once per interval in which the robot moved.
     calibrate: estimate the calibration errors online, and at the end jointly with the trajectory.
     fixed_calibration: parameters held at what the log and [robots.*] say.
@@ -153,6 +155,7 @@ class OdometryConfig:
     max_gap_s: float = 5.0
     max_speed_m_s: float = 20.0
     max_turn_rad_s: float = 20.0
+    gyroscope: Literal["auto", "off"] = "auto"
     scan_matching: Literal["auto", "on", "off"] = "auto"
 
 

@@ -49,6 +49,15 @@ def odometry_bytes(
     return _odometry_template(frame, child).filled(stamp_ns, *position, *turn)
 
 
+def imu_bytes(stamp_ns: int, frame: str, rate_rad_s: float) -> bytes:
+    """sensor_msgs/Imu of a rate of turning about z; it has no orientation and no acceleration.
+
+    Raises:
+        LogError: the stamp does not fit.
+    """
+    return _imu_template(frame).filled(stamp_ns, rate_rad_s)
+
+
 def tf_bytes(transforms: Sequence[tuple[int, str, str, Sequence[float]]]) -> bytes:
     """tf2_msgs/TFMessage of transforms: stamp ns, parent, child; x y z m, quaternion x y z w.
 
@@ -78,6 +87,25 @@ def _add_text(data: bytearray, text: str) -> None:
 
 def _align(data: bytearray, size: int) -> None:
     data += bytes(-(len(data) - HEADER) % size)
+
+
+@cache
+def _imu_template(frame: str) -> schemas.Template:
+    """sensor_msgs/Imu with the rate of turning."""
+    zero = schemas.build("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+    rate = schemas.build("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=_MARKS[0])
+    unknown = np.array([-1.0, *np.zeros(8)])
+    message = schemas.build(
+        schemas.IMU,
+        header=schemas.header(0, frame),
+        orientation=schemas.build("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+        orientation_covariance=unknown,
+        angular_velocity=rate,
+        angular_velocity_covariance=np.zeros(9),
+        linear_acceleration=zero,
+        linear_acceleration_covariance=unknown,
+    )
+    return schemas.Template(schemas.IMU, message, _MARKS[:1])
 
 
 @cache

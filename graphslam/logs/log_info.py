@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from graphslam.logs.containers import open_recording
 from graphslam.logs.decoders import TopicContext
 from graphslam.logs.findings import Finding
 from graphslam.logs.future_stamps import Recorded
+from graphslam.logs.gyroscopes import find_gyroscopes
 from graphslam.logs.log_checks import CheckedLog, by_severity, check_log
 from graphslam.logs.log_set import FileReader, LogFile, damage, merged_notes
 from graphslam.logs.recording import Recording
@@ -111,6 +112,11 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
     ]
     infos.sort(key=lambda info: info.name)
     findings += assumed
+    if not problem:
+        gyroscopes, by_gyroscope = find_gyroscopes(files, chosen, contexts, config)
+        findings += by_gyroscope
+        names = {turning.topic for turning in gyroscopes.values()}
+        infos = [replace(info, used=info.used or info.name in names) for info in infos]
     said = [*config.warnings, *(finding.line for finding in findings)]
     more = check_log(CheckedLog(infos, robots, problem, config, merged_notes(files)))
     said += [finding.line for finding in more if finding.severity == "doubt"]

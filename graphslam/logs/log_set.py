@@ -16,6 +16,8 @@ from graphslam.logs.containers import open_recording
 from graphslam.logs.decoders import TopicContext, decode_messages
 from graphslam.logs.findings import Finding
 from graphslam.logs.future_stamps import Recorded, repair_future_stamps
+from graphslam.logs.gyroscopes import find_gyroscopes
+from graphslam.logs.imu_turning import Turning, with_turning
 from graphslam.logs.recording import Recording, raw_messages
 from graphslam.logs.robots import robots_and_topics
 from graphslam.logs.stated_noise import StatedNoise, stated_noise
@@ -53,6 +55,7 @@ class LogSet:
         dropped: number of dropped messages (of dropped beams, where the reason begins with
             ``range:``) by reason; filled when `messages` is exhausted.
         repaired: the same for messages that are used in spite of a defect.
+        gyroscopes: robot -> its turning by a gyroscope, which its odometry in `messages` has.
         opened: the indexed recordings, in the order of ``files``.
         config: the settings that the logs were opened with.
     """
@@ -67,6 +70,7 @@ class LogSet:
     opened: Sequence[Recording] = field(repr=False)
     _contexts: Mapping[str, TopicContext] = field(repr=False)
     config: Config = field(repr=False)
+    gyroscopes: Mapping[str, Turning] = field(repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         self._opening_warnings = len(self.warnings)
@@ -173,7 +177,8 @@ class LogSet:
         """Messages of ``topics`` and, last, the report about all of them."""
         readers = [FileReader(file, self.config) for file in self.opened]
         streams = [reader.sorted(reader.recorded(topics, contexts)) for reader in readers]
-        yield from time_order.merge(streams)
+        merged = time_order.merge(streams)
+        yield from with_turning(merged, self.gyroscopes) if self.gyroscopes else merged
         report = ReadReport()
         for reader in readers:
             report.dropped.update(reader.dropped)
@@ -222,6 +227,7 @@ def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
     files, topics, derived = robots_and_topics(files, config)
     topics, choices = choose_topics(files, topics)
     contexts, assumed = topic_contexts(files, topics, config)
+    gyroscopes, by_gyroscope = find_gyroscopes(files, topics, contexts, config)
     return LogSet(
         robots=tuple(sorted({t.robot for t in topics if t.record in MOTION_KINDS})),
         files=tuple(LogFile(f.path, f.sha256, f.messages, f.lost) for f in files),
@@ -229,13 +235,17 @@ def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
         notes=merged_notes(files),
         warnings=[
             *config.warnings,
-            *(found.line for found in (*damage(files), *derived, *choices, *assumed)),
+            *(
+                found.line
+                for found in (*damage(files), *derived, *choices, *assumed, *by_gyroscope)
+            ),
         ],
         dropped=Counter(),
         repaired=Counter(),
         opened=files,
         _contexts=contexts,
         config=config,
+        gyroscopes=gyroscopes,
     )
 
 

@@ -53,6 +53,15 @@ def find_mount(tree: TransformTree, base: str, sensor: str) -> Mount | None:
     return planar_mount(np.asarray(np.linalg.solve(of_base[common], of_sensor[common])))
 
 
+def axis_above(tree: TransformTree, base: str, sensor: str) -> Array:
+    """The vertical (3,) of ``base`` in the axes of ``sensor``; z where ``tree`` ties them not."""
+    of_base, of_sensor = _ancestors(tree, base), _ancestors(tree, sensor)
+    common = next((frame for frame in of_sensor if frame in of_base), None)
+    if common is None:
+        return np.array([0.0, 0.0, 1.0])
+    return np.asarray(np.linalg.solve(of_base[common], of_sensor[common])[2, :3])
+
+
 def base_above(tree: TransformTree, sensor: str) -> str:
     """The frame that moves with the robot, where no odometry names it: the base of a sensor.
 

@@ -25,6 +25,7 @@ DEFAULT_ROBOT = "robot"  # its topics have no namespace
 LASER_SCAN = "sensor_msgs/msg/LaserScan"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 ODOMETRY = "nav_msgs/msg/Odometry"
+IMU = "sensor_msgs/msg/Imu"
 TWIST = "geometry_msgs/msg/Twist"
 TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -164,6 +165,15 @@ geometry_msgs/Quaternion rotation
     "geometry_msgs/TwistWithCovariance": "geometry_msgs/Twist twist\nfloat64[36] covariance",
     "geometry_msgs/Pose": "geometry_msgs/Vector3 position\ngeometry_msgs/Quaternion orientation",
     "geometry_msgs/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular",
+    IMU: """\
+std_msgs/Header header
+geometry_msgs/Quaternion orientation
+float64[9] orientation_covariance
+geometry_msgs/Vector3 angular_velocity
+float64[9] angular_velocity_covariance
+geometry_msgs/Vector3 linear_acceleration
+float64[9] linear_acceleration_covariance
+""",
     TWIST: "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular",
     TWIST_STAMPED: "std_msgs/Header header\ngeometry_msgs/Twist twist",
     "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
@@ -235,7 +245,7 @@ def odometry_table(data: Sequence[bytes]) -> Any:
 
 @lru_cache
 def _odometry_layout(order: str, frame_size: int, child_size: int) -> Layout:
-    layout = _with_header(order, frame_size)
+    layout = with_header(order, frame_size)
     layout.string("child", child_size)
     layout.number("xyz", "d", 3)
     layout.number("rotation", "d", 4)
@@ -272,7 +282,7 @@ _LIMITS = (
 
 @lru_cache
 def _scan_layout(order: str, frame_size: int, beams: int, intensities: int) -> Layout:
-    layout = _with_header(order, frame_size)
+    layout = with_header(order, frame_size)
     for name in _LIMITS:
         layout.number(name, "f")
     layout.number("ranges_size", "I")
@@ -284,12 +294,12 @@ def _scan_layout(order: str, frame_size: int, beams: int, intensities: int) -> L
 
 def _true_pose_table(data: Sequence[bytes]) -> Any:
     order = byte_order(data[0])
-    layout = _with_header(order, u32(data[0], _FRAME_SIZE, order))
+    layout = with_header(order, u32(data[0], _FRAME_SIZE, order))
     layout.number("pose", "d", 3)
     return layout.table(data, ("frame_size",))
 
 
-def _with_header(order: str, frame_size: int) -> Layout:
+def with_header(order: str, frame_size: int) -> Layout:
     """A layout that begins with a std_msgs/Header."""
     layout = Layout(order)
     layout.number("sec", "i")

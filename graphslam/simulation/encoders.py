@@ -6,7 +6,7 @@ from graphslam.core.config import RobotConfig
 from graphslam.core.geometry import Array, compose, exp
 from graphslam.core.motion_models import wheel_twist
 from graphslam.simulation.drive import BaseStates
-from graphslam.simulation.scenario import Encoders
+from graphslam.simulation.scenario import Encoders, Gyroscope
 
 
 def wheel_angles(states: BaseStates, encoders: Encoders, rng: np.random.Generator) -> Array:
@@ -16,7 +16,8 @@ def wheel_angles(states: BaseStates, encoders: Encoders, rng: np.random.Generato
     base. Readings are whole counts from an unknown initial angle of the wheel.
     """
     half = encoders.axle_m * (1 + encoders.axle_error) / 2
-    rolled = states.travel[:, None] + half * states.turned[:, None] * np.array([-1.0, 1.0])
+    turned = (1 + encoders.turn_slip) * states.turned
+    rolled = states.travel[:, None] + half * turned[:, None] * np.array([-1.0, 1.0])
     step = np.abs(np.diff(rolled, axis=0))
     slip = encoders.slip_m * np.sqrt(step) * rng.normal(size=step.shape)
     rolled[1:] += np.cumsum(slip, axis=0)
@@ -24,6 +25,18 @@ def wheel_angles(states: BaseStates, encoders: Encoders, rng: np.random.Generato
     angles = rolled / (encoders.wheel_radius_m * (1 + errors))
     count = 2 * np.pi / encoders.counts_per_turn
     return np.asarray(np.floor(angles / count + rng.random(2)) * count)
+
+
+def turn_rates(
+    states: BaseStates, times: Array, gyroscope: Gyroscope, rng: np.random.Generator
+) -> Array:
+    """Rates (n,) rad/s that a gyroscope reads at times (n,) s: the mean since the time before."""
+    steps = np.diff(times, prepend=times[0] - gyroscope.period_s)
+    rates = np.diff(states.turned, prepend=states.turned[0]) / steps
+    wander = np.radians(gyroscope.bias_wander_deg_s) * np.sqrt(steps)
+    bias = np.radians(gyroscope.bias_deg_s) + np.cumsum(wander * rng.normal(size=len(times)))
+    noise = np.radians(gyroscope.rate_sigma_deg_s) * rng.normal(size=len(times))
+    return np.asarray((1 + gyroscope.scale_error) * rates + bias + noise)
 
 
 def odometry(angles: Array, encoders: Encoders) -> Array:

@@ -3,15 +3,17 @@
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from graphslam.core.geometry import Array, compose
-from graphslam.logs.schemas import ANYTHING, SOME_ROBOT
-from graphslam.logs.writer import Event, LogWriter
-from graphslam.simulation.encoders import odometry, wheel_angles
+from graphslam.logs.cdr_writing import imu_bytes
+from graphslam.logs.schemas import ANYTHING, IMU, SOME_ROBOT
+from graphslam.logs.writer import Event, LogWriter, frame
+from graphslam.simulation.encoders import odometry, turn_rates, wheel_angles
 from graphslam.simulation.laser import (
     beam_fan,
     laser_mount,
@@ -20,7 +22,7 @@ from graphslam.simulation.laser import (
     swept_scans,
 )
 from graphslam.simulation.raycast import NO_SURFACE, Hits
-from graphslam.simulation.scenario import Body, Encoders, Laser, Scenario, SightingSensor
+from graphslam.simulation.scenario import Body, Encoders, Gyroscope, Laser, Scenario, SightingSensor
 from graphslam.simulation.scene import SimulatedRobot, SimulatedVisit
 from graphslam.simulation.sensor_clock import sample_times, stamps
 from graphslam.simulation.sightings import (
@@ -80,6 +82,7 @@ def record_visit(scenario: Scenario, visit: SimulatedVisit, path: Path, seed: in
     for name, actor in visit.actors.items():
         this = _Recorder(name, actor, visit, seed)
         wheels, end_m = _wheels(this)
+        events += _gyroscope(this)
         scans, ideal = _scans(this)
         seen = list(_sightings(this))
         events += [*wheels, *_truth(this, scenario.truth_period_s), *scans]
@@ -133,7 +136,9 @@ class _Recorder:
         """Random numbers of one of its sensors."""
         return sensor_rng(self.seed, self.visit.name, self.name, sensor)
 
-    def times(self, sensor: Encoders | Laser | SightingSensor) -> tuple[Array, list[int]]:
+    def times(
+        self, sensor: Encoders | Gyroscope | Laser | SightingSensor
+    ) -> tuple[Array, list[int]]:
         """True times (n,) s of a sensor's samples, and their stamps, ns."""
         times = sample_times(self.visit.duration_s, sensor.period_s, sensor.phase_s)
         return times, stamps(times, self.actor.robot.clock, sensor.latency_s).tolist()
@@ -163,6 +168,23 @@ def _wheels(this: _Recorder) -> tuple[list[Event], float]:
             events.append(Event.of(LogWriter.wheel_angles, this.name, t, **angle))
     ends = compose(states.poses[0], poses[-1])
     return events, float(np.hypot(*(ends - states.poses[-1])[:2]))
+
+
+def _gyroscope(this: _Recorder) -> Iterator[Event]:
+    """The messages of the gyroscope, if there is one."""
+    gyroscope = this.actor.robot.gyroscope
+    if gyroscope is None:
+        return
+    times, at = this.times(gyroscope)
+    rates = turn_rates(this.actor.drive.at(times), times, gyroscope, this.rng("gyroscope"))
+    topic = f"/{frame(this.name, 'imu')}"
+    for t, rate in zip(at, rates.tolist(), strict=True):
+        data = imu_bytes(t, frame(this.name, "imu"), rate)
+        yield Event(t, partial(_write_imu, topic, t, data))
+
+
+def _write_imu(topic: str, stamp_ns: int, data: bytes, log: LogWriter) -> None:
+    log.encoded(topic, IMU, data, stamp_ns)
 
 
 def _scans(this: _Recorder) -> tuple[list[Event], NoiseFreeScans | None]:

@@ -157,8 +157,9 @@ class Encoders(Sensor):
 
     wheel_radius_m and axle_m: nominal values that the robot uses. The true radii and the true axle
     length are larger by the shares radius_error_left, radius_error_right, axle_error.
-    slip_m: sigma of white noise of wheel travel per square root of metre. odometry, joint_states:
-    which messages to write.
+    slip_m: sigma of white noise of wheel travel per square root of metre. turn_slip: wheels
+    turn by this share more than the robot where it turns. odometry, joint_states: which messages
+    to write.
     """
 
     period_s: float = field(default=0.1, metadata=POSITIVE)
@@ -171,6 +172,22 @@ class Encoders(Sensor):
     radius_error_right: float = field(default=0.0, metadata=RELATIVE)
     axle_error: float = field(default=0.0, metadata=RELATIVE)
     slip_m: float = field(default=0.0, metadata=NOT_NEGATIVE)
+    turn_slip: float = field(default=0.0, metadata=NOT_NEGATIVE)
+
+
+@dataclass(frozen=True)
+class Gyroscope(Sensor):
+    """The gyroscope of an IMU: mean rate of turning over each period.
+
+    rate_sigma_deg_s: white noise of one reading. bias_deg_s: at the start; bias_wander_deg_s: sigma
+    of its random walk per root of a second. scale_error: share by which it turns too far.
+    """
+
+    period_s: float = field(default=0.02, metadata=POSITIVE)
+    rate_sigma_deg_s: float = field(default=0.2, metadata=NOT_NEGATIVE)
+    bias_deg_s: float = 0.0
+    bias_wander_deg_s: float = field(default=0.0, metadata=NOT_NEGATIVE)
+    scale_error: float = field(default=0.0, metadata=RELATIVE)
 
 
 @dataclass(frozen=True)
@@ -261,6 +278,7 @@ class Robot(DrivePlan):
     corner_m: float = field(default=0.5, metadata=POSITIVE)
     clock: RobotClock = field(default_factory=RobotClock)
     encoders: Encoders = field(default_factory=Encoders)
+    gyroscope: Gyroscope | None = None
     laser: Laser | None = None
     sightings: tuple[SightingSensor, ...] = ()
 
