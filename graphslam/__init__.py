@@ -79,7 +79,7 @@ __all__ = [
     "EstimationError", "GraphSlamError", "GroundTruth", "Landmark", "LogError", "LogSet",
     "LogWriter", "MapFiles", "OutputError", "Result", "RobotResult", "SavedResult", "ScenarioError",
     "Simulation", "Trajectory", "__version__", "changes_between", "compare", "evaluate",
-    "load_config", "load_result", "make_map", "open_logs", "simulate", "smooth",
+    "load_config", "load_result", "make_map", "open_logs", "simulate", "smooth", "write_viewer",
 ]  # fmt: skip
 
 if not TYPE_CHECKING:  # a type checker would take every name for defined
@@ -94,9 +94,6 @@ if not TYPE_CHECKING:  # a type checker would take every name for defined
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
-
-
-# ---------------------------------------------------------------- functions
 
 
 def load_config(
@@ -159,6 +156,7 @@ def smooth(
     from graphslam.core.worker import Future
     from graphslam.results.folder import check_target, save
     from graphslam.slam.log_reader import receive_log
+    from graphslam.slam.progress import of_all
 
     settled = _settle(recording, config, settings)
     if output is not None:
@@ -170,7 +168,7 @@ def smooth(
 
         log = cast("LogSet", recording) if ahead is None else receive_log(ahead, settled)
         if output is None:
-            return smooth(log, settled, _count(log, progress), ahead=ahead)
+            return smooth(log, settled, of_all(log, progress), ahead=ahead)
 
         def read_truth() -> GroundTruth:
             from graphslam.evaluation.ground_truth import truth_of_logs
@@ -189,7 +187,7 @@ def smooth(
             return page
 
         truth = Future(read_truth)
-        result = smooth(log, settled, _count(log, progress), ahead=ahead)
+        result = smooth(log, settled, of_all(log, progress), ahead=ahead)
         known = truth.result()
         report = Future(render_report)
         save(result, Path(output), force=force, report=finish_report)
@@ -222,7 +220,7 @@ def make_map(
         directory: the result folder.
         output: the folder for the files; default: the result folder itself.
         resolution_m: edge of a cell of the grid map; default: as fine as the scans allow.
-        mode: of the grid map, ``trinary`` or ``scale``, as nav2's map_server calls them.
+        mode: of the grid map, ``trinary`` or ``scale``, as map_server calls them.
         force: replace files that exist.
 
     Raises:
@@ -230,8 +228,24 @@ def make_map(
     """
     from graphslam.results.map_files import make_map
 
-    target = Path(directory if output is None else output)
+    target = Path(output or directory)
     return make_map(Path(directory), target, resolution_m=resolution_m, mode=mode, force=force)
+
+
+def write_viewer(
+    directory: PathLike, kind: str = "mcap", *, output: PathLike | None = None, force: bool = False
+) -> list[str]:
+    """Write a result for a viewer, ``mcap`` (Foxglove, Lichtblick, RViz) or ``rrd`` (Rerun).
+
+    Returns the names of the files. Arguments as for `make_map`.
+
+    Raises:
+        OutputError: see `make_map`; also where rerun-sdk is missing.
+        ValueError: an unknown kind.
+    """
+    from graphslam.results.viewers import write_viewer
+
+    return write_viewer(Path(directory), kind, Path(output or directory), force=force)
 
 
 def evaluate(
@@ -308,12 +322,13 @@ def compare(
     from graphslam.evaluation.ground_truth import truth_given, truth_of_logs
     from graphslam.evaluation.relation_metrics import relations_given
     from graphslam.results.folder import check_target
+    from graphslam.slam.progress import of_all
 
     settled = _settle(recording, config, settings)
     rows = parse_variants(backends.split(",") if isinstance(backends, str) else backends, settled)
     if output is not None:
         check_target(Path(output), force=force, replaceable=is_comparison)
-    log = _open(recording, settled)()
+    log = _open(recording, settled)
     comparison = compare(
         log,
         settled,
@@ -321,7 +336,7 @@ def compare(
         mode,
         truth=truth_of_logs(log, settled) if truth is None else truth_given(truth, log.robots),
         relations=relations_given(relations),
-        progress=_count(log, progress),
+        progress=of_all(log, progress),
         say=announce,
     )
     if output is not None:
@@ -398,9 +413,8 @@ def simulate(
 
 
 def _paths(paths: PathLike | Sequence[PathLike]) -> list[Path]:
-    if isinstance(paths, str | os.PathLike):
-        return [Path(paths)]
-    return [Path(path) for path in paths]
+    single = isinstance(paths, str | os.PathLike)
+    return [Path(path) for path in cast("Sequence[PathLike]", [paths] if single else paths)]
 
 
 def _settle(
@@ -418,31 +432,17 @@ def _settle(
     return settled
 
 
-def _open(recording: Recording, config: Config) -> Callable[[], LogSet]:
-    """A function that returns the logs; they are opened in the background."""
-    from graphslam.core.worker import Future
+def _open(recording: Recording, config: Config) -> LogSet:
     from graphslam.logs import LogSet, open_logs
 
-    if isinstance(recording, LogSet):
-        return lambda: recording
-    return Future(lambda: open_logs(_paths(recording), config)).result
+    return recording if isinstance(recording, LogSet) else open_logs(_paths(recording), config)
 
 
 def _read_ahead(recording: Recording, config: Config) -> Reading | None:
     """The logs and what follows in them, from the background; None if they are open already."""
-    from graphslam.logs import LogSet, open_logs
+    from graphslam.logs import LogSet
     from graphslam.slam.log_reader import open_ahead
 
     if isinstance(recording, LogSet):
         return None
-    return open_ahead(lambda: open_logs(_paths(recording), config), config)
-
-
-def _count(log: LogSet, progress: Callable[[int, int], None] | None) -> Callable[[int], None]:
-    """``progress`` with the number of messages that are read altogether."""
-    from graphslam.core.records import TrueLandmark, Truth
-
-    if progress is None:
-        return lambda _done: None
-    total = log.count((Truth, TrueLandmark))
-    return lambda done: progress(done, total)
+    return open_ahead(lambda: _open(recording, config), config)

@@ -44,6 +44,7 @@ KEEPERS = {
     "gtsam": {"estimation"},
     "matplotlib": set(),  # takes half a second to import; for benchmarks only
     "mcap": {"logs"},
+    "rerun": {"results"},  # 170 MB, for who asked for it
     "rich": {"cli"},
     "rosbags": {"logs"},
     "typer": {"cli"},

@@ -11,15 +11,22 @@ from graphslam.change_detection.detect import ChangeResult
 from graphslam.change_detection.grid import Grid
 from graphslam.change_detection.objects import Change
 from graphslam.core.geometry import Array
-from graphslam.logs import schemas
 from graphslam.logs.writer import LogWriter
 from graphslam.results.grid_map import FREE, OCCUPIED, UNKNOWN, write_grid_map
+from graphslam.results.viewer_messages import (
+    CLOUD,
+    LINE_STRIP,
+    MARKERS,
+    TEXT,
+    marker,
+    marker_array,
+    point_cloud,
+)
 
 _FRAME = "map"
 #: red, green, blue of the kinds
 _RGB = {"appeared": (0.16, 0.63, 0.17), "vanished": (0.89, 0.34, 0.1), "moved": (0.58, 0.2, 0.75)}
 _MAX_POINTS = 200_000
-_LINE_STRIP, _TEXT, _POINT_FLOAT32 = 4, 9, 7
 
 
 def write_overlay_map(folder: Path, grid: Grid, old: Iterable[Array], new: Iterable[Array]) -> None:
@@ -51,10 +58,9 @@ def write_mcap(found: ChangeResult, path: Path) -> None:
     begin = int(found.later.stamps_ns.min())
     with LogWriter(path) as log:
         for name, visit in (("reference", found.reference), ("later", found.later)):
-            cloud = schemas.build(
-                "sensor_msgs/msg/PointCloud2", **_cloud(visit.ends[visit.surface], begin)
-            )
-            log.message(f"/{name}", "sensor_msgs/msg/PointCloud2", cloud, begin)
+            points = visit.ends[visit.surface]
+            points = points[:: max(1, len(points) // _MAX_POINTS)]
+            log.message(f"/{name}", CLOUD, point_cloud(points, begin, _FRAME), begin)
         for stamp in sorted({change.first_seen_ns for change in found.changes}):
             markers = [
                 marker
@@ -62,62 +68,23 @@ def write_mcap(found: ChangeResult, path: Path) -> None:
                 if change.first_seen_ns == stamp
                 for marker in _markers(number, change)
             ]
-            kind = "visualization_msgs/msg/MarkerArray"
-            log.message("/changes", kind, schemas.build(kind, markers=markers), stamp)
-
-
-def _cloud(points: Array, stamp_ns: int) -> dict[str, Any]:
-    points = points[:: max(1, len(points) // _MAX_POINTS)]
-    data = np.zeros((len(points), 3), dtype="<f4")
-    data[:, :2] = points
-    fields = [
-        schemas.build(
-            "sensor_msgs/msg/PointField", name=axis, offset=4 * i, datatype=_POINT_FLOAT32, count=1
-        )
-        for i, axis in enumerate("xyz")
-    ]
-    return {
-        "header": schemas.header(stamp_ns, _FRAME), "height": 1, "width": len(points),
-        "fields": fields, "is_bigendian": False, "point_step": 12, "row_step": 12 * len(points),
-        "data": data.reshape(-1).view(np.uint8), "is_dense": True,
-    }  # fmt: skip
+            log.message("/changes", MARKERS, marker_array(markers), stamp)
 
 
 def _markers(number: int, change: Change) -> list[Any]:
     """Markers of the outline, of the old one if it is known, and of a label."""
-    lines = [_marker(3 * number, change, _LINE_STRIP, change.polygon, 0.03, "")]
+    lines = [_marker(3 * number, change, LINE_STRIP, change.polygon, 0.03, "")]
     if change.before is not None:
-        lines.append(_marker(3 * number + 1, change, _LINE_STRIP, change.before, 0.015, ""))
+        lines.append(_marker(3 * number + 1, change, LINE_STRIP, change.before, 0.015, ""))
     label = f"{number + 1} {change.kind}"
-    return [*lines, _marker(3 * number + 2, change, _TEXT, change.polygon, 0.25, label)]
+    return [*lines, _marker(3 * number + 2, change, TEXT, change.polygon, 0.25, label)]
 
 
 def _marker(
     number: int, change: Change, kind: int, polygon: Array, size_m: float, text: str
 ) -> Any:
-    def point(x: float, y: float) -> Any:
-        return schemas.build("geometry_msgs/msg/Point", x=float(x), y=float(y), z=0.0)
-
-    build = schemas.build
-    at = polygon.mean(axis=0) if text else np.zeros(2)
-    upright = build("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
-    r, g, b = _RGB[change.kind]
-    return build(
-        "visualization_msgs/msg/Marker",
-        header=schemas.header(change.first_seen_ns, _FRAME),
-        ns="changes", id=number, type=kind, action=0,
-        pose=build("geometry_msgs/msg/Pose", position=point(*at), orientation=upright),
-        scale=build("geometry_msgs/msg/Vector3", x=size_m, y=0.0, z=size_m),
-        color=build("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=1.0),
-        lifetime=build("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
-        frame_locked=False,
-        points=[] if text else [point(x, y) for x, y in [*polygon, polygon[0]]],
-        colors=[], texture_resource="",
-        texture=build(
-            "sensor_msgs/msg/CompressedImage", header=schemas.header(0, ""), format="",
-            data=np.zeros(0, dtype=np.uint8),
-        ),
-        uv_coordinates=[], text=text, mesh_resource="",
-        mesh_file=build("visualization_msgs/msg/MeshFile", filename="", data=np.zeros(0, np.uint8)),
-        mesh_use_embedded_materials=False,
+    points = polygon if text else np.concatenate([polygon, polygon[:1]])
+    return marker(
+        number, kind, points, stamp_ns=change.first_seen_ns, frame=_FRAME, namespace="changes",
+        size_m=size_m, rgb=_RGB[change.kind], text=text,
     )  # fmt: skip

@@ -1,6 +1,7 @@
 """The arguments and options of the commands, each defined once, and their checks (exit code 2)."""
 
 import typing
+from importlib.util import find_spec
 from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any
@@ -80,6 +81,17 @@ def check_horizon(value: float | None) -> float | None:
     return value
 
 
+def check_viewer(value: str | None) -> str | None:
+    """A kind of viewer whose files can be written here.
+
+    Raises:
+        typer.BadParameter: it is no such kind, or what it needs is not installed.
+    """
+    if _one_of(value, VIEWERS) == "rrd" and find_spec("rerun") is None:
+        raise typer.BadParameter('needs rerun-sdk: pip install "coop-graphslam[viewer]"')
+    return value
+
+
 def check_resolution(value: float | None) -> float | None:
     """The edge of a cell in metres.
 
@@ -94,6 +106,7 @@ def check_resolution(value: float | None) -> float | None:
 BACKENDS = _choices(BackendConfig)
 FRONT_ENDS = _choices(FrontEndConfig)
 MODES = ["replay", "associate"]
+VIEWERS = ["mcap", "rrd"]
 MAP_MODES = ["trinary", "scale"]
 
 
@@ -241,6 +254,15 @@ ConfigFile = Annotated[Path | None, typer.Option("--config", metavar="FILE.toml"
 WithMap = Annotated[
     bool,
     typer.Option("--map", help="Write a grid map, drawings and tables too; see graphslam map."),
+]
+Viewer = Annotated[
+    str | None,
+    typer.Option(
+        "--viewer",
+        metavar="|".join(VIEWERS),
+        callback=check_viewer,
+        help="Write result.mcap for Foxglove, Lichtblick and RViz too, or result.rrd for Rerun.",
+    ),
 ]
 Resolution = Annotated[
     float | None,

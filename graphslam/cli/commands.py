@@ -54,6 +54,7 @@ from graphslam.cli.arguments import (
     Starts,
     Strict,
     TruthFiles,
+    Viewer,
     WithMap,
     span_of,
 )
@@ -194,6 +195,7 @@ def smooth(
     start: Starts = None,
     causal: Causal = False,
     with_map: WithMap = False,
+    viewer: Viewer = None,
     preset: Preset = None,
     config: ConfigFile = None,
     settings: Settings = None,
@@ -223,6 +225,8 @@ def smooth(
         result = graphslam.smooth(logs, config=tree, output=output, force=force, progress=progress)
     if with_map:
         graphslam.make_map(output)
+    if viewer:
+        graphslam.write_viewer(output, viewer)
     return Output(result.summary, lambda: show.smoothed(result, output))
 
 

@@ -115,31 +115,39 @@ def write_into(
 ) -> None:
     """Write files (name, content) into a folder, which is made if missing: all, or none.
 
-    Each is written beside its name and renamed when all are whole.
+    Raises:
+        OutputError: see `files_in`.
+    """
+    with files_in(folder, [name for name, _ in files], force=force) as part:
+        for name, content in files:
+            (part / name).write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+@contextmanager
+def files_in(folder: Path, names: Sequence[str], *, force: bool = False) -> Iterator[Path]:
+    """A temporary folder for files of these ``names``; when the block ends they are renamed.
+
+    They go into ``folder``, which is made if missing.
 
     Raises:
-        OutputError: a file exists and ``force`` is not given, or the disk refuses; what was there
-            before is then as it was.
+        OutputError: one exists there and ``force`` is not given, or the disk refuses; what was
+            there before is then as it was.
     """
-    taken = [name for name, _ in files if os.path.lexists(folder / name)]
+    taken = [name for name in names if os.path.lexists(folder / name)]
     if taken and not force:
         raise OutputError(f"{folder / taken[0]}: already exists; give --force to replace it")
-    parts = [folder / f".{name}.{os.getpid()}.part" for name, _ in files]
-    is_new = not folder.exists()
-    done = False
+    is_new, done = not folder.exists(), False
+    part = unfinished(folder / names[0])
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for part, (_, content) in zip(parts, files, strict=True):
-            part.write_bytes(content.encode() if isinstance(content, str) else content)
-        for part, (name, _) in zip(parts, files, strict=True):
-            part.replace(folder / name)
+        part.mkdir(parents=True)
+        yield part
+        for name in names:
+            (part / name).replace(folder / name)
         done = True
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
     finally:
-        for part in parts:
-            with suppress(OSError):
-                part.unlink(missing_ok=True)
+        shutil.rmtree(part, ignore_errors=True)
         if is_new and not done:
             with suppress(OSError):
                 folder.rmdir()

@@ -24,7 +24,8 @@ def line_map_files(
     landmarks: Sequence[Landmark], paths: Mapping[str, Trajectory], name: str
 ) -> list[tuple[str, str | bytes]]:
     """Names and contents of the drawings of landmarks and of each robot's path."""
-    thin = {robot: thinned(path.poses[:, :2]) for robot, path in sorted(paths.items())}
+    points = {robot: path.poses[:, :2] for robot, path in sorted(paths.items())}
+    thin = {robot: xy[thinned_index(xy)] for robot, xy in points.items()}
     return [
         (f"{name}.svg", svg_text(landmarks, thin)),
         (f"{name}.dxf", dxf_text(landmarks, thin)),
@@ -32,15 +33,15 @@ def line_map_files(
     ]
 
 
-def thinned(points: Array) -> Array:
-    """A path (k, 2) without the points (n, 2) that are within `PATH_STEP_M` of the one before."""
+def thinned_index(points: Array, step_m: float = PATH_STEP_M) -> list[int]:
+    """Which points (n, 2) of a path to keep: those ``step_m`` or more from the one before."""
     kept = [0] if len(points) else []
     for k, (x, y) in enumerate(points.tolist()):
         if k:
             dx, dy = x - points[kept[-1], 0], y - points[kept[-1], 1]
-            if dx * dx + dy * dy >= PATH_STEP_M**2:
+            if dx * dx + dy * dy >= step_m**2:
                 kept.append(k)
-    return points[kept]
+    return kept
 
 
 def svg_text(landmarks: Sequence[Landmark], paths: Mapping[str, Array]) -> str:

@@ -5,7 +5,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 
-from graphslam.core.records import Message
+from graphslam.core.records import Message, TrueLandmark, Truth
+from graphslam.logs import LogSet
 
 #: messages between two reports of progress
 REPORT_EVERY = 500
@@ -19,6 +20,14 @@ def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     began = time.perf_counter()
     yield
     seconds[stage] += time.perf_counter() - began
+
+
+def of_all(log: LogSet, progress: Callable[[int, int], None] | None) -> Progress:
+    """``progress`` with the number of messages that are read altogether."""
+    if progress is None:
+        return lambda _done: None
+    total = log.count((Truth, TrueLandmark))
+    return lambda done: progress(done, total)
 
 
 def counted(
