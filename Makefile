@@ -8,11 +8,12 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 OUT := out
 
-.PHONY: help demo test lint types docs clean
+.PHONY: help demo test browser-test lint types docs clean
 
 help:
 	@echo 'make demo    smooth a real log (Victoria Park, shipped with gtsam) and a simulated lab into $(OUT)/'
 	@echo 'make test    run the tests'
+	@echo 'make browser-test  run the tests of the reports in a browser'
 	@echo 'make lint    check style and formatting'
 	@echo 'make types   check types'
 	@echo 'make docs    write the pages that are made from the code'
@@ -35,7 +36,12 @@ demo: $(INSTALLED)
 	@echo '$(CURDIR)/$(OUT)/lab/report.html   a laser in a cluttered room, simulated, with truth'
 
 test: $(INSTALLED)
-	$(BIN)/python -m pytest -n auto --dist loadfile
+	$(BIN)/python -m pytest -n auto --dist loadfile --ignore tests/browser
+
+# in a browser; Chromium comes from the system's packages, and without it they fail
+browser-test: $(INSTALLED)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,browser]'
+	$(BIN)/python -m pytest tests/browser
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check

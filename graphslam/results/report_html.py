@@ -7,6 +7,7 @@ from pathlib import PurePath
 
 import numpy as np
 
+from graphslam.results.live_figure import scripts
 from graphslam.results.report_style import CSS
 
 #: s; above it, time is in minutes
@@ -19,12 +20,13 @@ _SPACE = "\u202f"  # narrow, no break: 13 631
 def document(title: str, sections: Sequence[str], css: str = "") -> str:
     """A whole HTML document of the sections that are not empty; ``css`` over the style sheet."""
     body = "\n".join(part for part in sections if part)
+    moving = scripts() if 'class="live"' in body else ""
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         '<meta name="color-scheme" content="light dark">\n'
         f"<title>{escape(title)} – graphslam</title>\n<style>{CSS}{css}</style>\n</head>\n"
-        f"<body>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
+        f"<body>\n<main>\n{body}\n</main>\n{moving}</body>\n</html>\n"
     )
 
 

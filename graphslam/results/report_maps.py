@@ -12,7 +12,7 @@ from graphslam.results.drawing_elements import ACCENT, INK, Style, robot_color
 from graphslam.results.report_figure import WIDTH_IN, Drawing, density, map_axes, svg
 
 MAX_LABELS = 40
-_SIGMAS_95_2D = float(np.sqrt(chi2_quantile(0.95, 2)))
+SIGMAS_95_2D = float(np.sqrt(chi2_quantile(0.95, 2)))
 _SIGMAS_95_1D = float(np.sqrt(chi2_quantile(0.95, 1)))
 
 
@@ -111,11 +111,26 @@ def trajectory_map(result: Result, height_in: float) -> tuple[str, int]:
     return svg("Trajectory with 95 % ellipses", height_in, draw), factor
 
 
+def worst_sigma(covs: Array) -> Array:
+    """Standard deviations (n,) m of positions in their worst directions, of covariances (n, 3, 3).
+
+    The square root of the larger eigenvalue of the 2 x 2 block, in closed form.
+    """
+    a, b, c = covs[:, 0, 0], covs[:, 0, 1], covs[:, 1, 1]
+    return np.asarray(np.sqrt(np.maximum((a + c) / 2 + np.hypot((a - c) / 2, b), 0.0)))
+
+
+def result_limits(result: Result) -> Array:
+    """[[x_min, x_max], [y_min, y_max]] of paths and scans, or of paths and landmarks, m."""
+    paths = [robot.final.poses[:, :2] for robot in result.robots.values()]
+    clouds = [_cloud(result, name, r.final, False) for name, r in result.robots.items()]
+    extents = [] if result.keyframe_scans else [m.extent for m in result.landmarks]
+    return _limits([*paths, *clouds, *extents])
+
+
 def map_height(result: Result) -> float:
     """Height of the maps of a result, inches: in proportion to its extent, within limits."""
-    paths = [robot.final for robot in result.robots.values()]
-    clouds = [_cloud(result, name, r.final, False) for name, r in result.robots.items()]
-    (x0, x1), (y0, y1) = _limits([*(p.poses[:, :2] for p in paths), *clouds])
+    (x0, x1), (y0, y1) = result_limits(result)
     return WIDTH_IN * float(np.clip((y1 - y0) / (x1 - x0), 0.6, 1.15))
 
 
@@ -203,7 +218,7 @@ def _sample(trajectory: Trajectory, count: int) -> tuple[Array, Array]:
 def _semi_axes(covs: Array) -> Array:
     """Longer semi-axes (k,) of the 95 % ellipses of covariances (k, 2, 2), m."""
     values = np.linalg.eigvalsh(covs)[:, -1] if len(covs) else np.empty(0)
-    return np.asarray(_SIGMAS_95_2D * np.sqrt(np.maximum(values, 0.0)))
+    return np.asarray(SIGMAS_95_2D * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _ellipse(mean: Array, cov: Array, factor: float) -> Array:
@@ -211,7 +226,7 @@ def _ellipse(mean: Array, cov: Array, factor: float) -> Array:
     values, vectors = np.linalg.eigh(cov)
     t = np.linspace(0, 2 * np.pi, 25)
     circle = np.stack([np.cos(t), np.sin(t)])
-    axes = factor * _SIGMAS_95_2D * np.sqrt(np.maximum(values, 0.0))
+    axes = factor * SIGMAS_95_2D * np.sqrt(np.maximum(values, 0.0))
     return np.asarray(mean + (vectors @ (axes[:, None] * circle)).T)
 
 

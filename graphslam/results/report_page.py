@@ -14,6 +14,8 @@ from graphslam.results import report_html as html
 from graphslam.results import report_maps as maps
 from graphslam.results import report_plots as plots
 from graphslam.results import report_tables as tables
+from graphslam.results.live_figure import live_html
+from graphslam.results.live_map import live_map
 
 
 def page(result: Result, evaluation: Mapping[str, Any] | None) -> str:
@@ -99,7 +101,7 @@ def _map_section(result: Result) -> str:
             + ("; the faint line is the causal estimate." if _has_causal(result) else "."),
         )
     )
-    return html.section("Map", html.figure_grid(figures))
+    return html.section("Map", live_html(live_map(result)) + html.figure_grid(figures))
 
 
 def _has_causal(result: Result) -> bool:

@@ -20,6 +20,7 @@ from graphslam.results.report_figure import (
     time_axis,
     time_rows,
 )
+from graphslam.results.report_maps import worst_sigma
 
 _MAX_DOTS = 4000
 
@@ -37,7 +38,7 @@ def uncertainty(result: Result) -> str:
                     continue  # not asked for
                 label = _legend_text(name, kind, len(result.robots))
                 t, style = axis.time(path), Style(robot_color(i), opacity=opacity)
-                top.line(t, _worst_sigma(path), style, label, layer)
+                top.line(t, positive(worst_sigma(path.covs)), style, label, layer)
                 bottom.line(t, np.degrees(_root(path.covs[:, 2, 2])), style, layer=layer)
         log_scale(top, "position σ, m")
         log_scale(bottom, "heading σ, °")
@@ -136,12 +137,6 @@ class _TimeAxis:
 
     def time(self, path: Trajectory) -> Array:
         return np.asarray((path.stamps_ns - self._start_ns) / self.unit_ns)
-
-
-def _worst_sigma(path: Trajectory) -> Array:
-    """Square root (n,) of the larger eigenvalue of the position covariances, in closed form."""
-    a, b, c = path.covs[:, 0, 0], path.covs[:, 0, 1], path.covs[:, 1, 1]
-    return _root((a + c) / 2 + np.hypot((a - c) / 2, b))
 
 
 def _root(variance: Array) -> Array:

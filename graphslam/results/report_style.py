@@ -42,6 +42,18 @@ figure svg * { stroke-linejoin: round; stroke-linecap: butt; }
 svg text { fill: currentColor; }
 svg .halo { paint-order: stroke; stroke: var(--card); stroke-width: 25px;
   stroke-linejoin: round; font-weight: 600; }
+.live { margin-bottom: 16px; }
+.live-controls { display: flex; flex-wrap: wrap; gap: 6px 22px; margin: 4px 0 8px;
+  font-size: .85rem; }
+.live-layers { display: flex; flex-wrap: wrap; gap: 4px 14px; align-items: center; }
+.live-layers i.lane { margin: 0 5px 0 3px; }
+.live-range { display: flex; align-items: center; gap: 8px; flex: 1 1 300px; color: var(--soft); }
+.live-range input { flex: 1 1 80px; min-width: 60px; accent-color: var(--accent); }
+.live-range output { min-width: 5em; font-variant-numeric: tabular-nums; }
+.live button { font: inherit; color: var(--ink); background: var(--bg); padding: 2px 10px;
+  border: 1px solid var(--grid); border-radius: 6px; cursor: pointer; min-width: 6.2em; }
+.live input[type=checkbox] { accent-color: var(--robot0); vertical-align: -2px; }
+.live-stage { min-height: 320px; }
 .warn { background: var(--warn); border-left: 4px solid var(--warn-edge); border-radius: 6px;
   padding: 10px 16px; margin-top: 1.2rem; }
 .warn h2 { margin: 0 0 .2rem; font-size: .95rem; }
@@ -87,5 +99,5 @@ pre { overflow-x: auto; background: var(--bg); padding: 12px; border-radius: 6px
     color: var(--soft); font-size: .74rem; font-weight: 400; }
   table.wide td.none { grid-column: 1 / -1; }
 }
-@media print { details > * { display: block; } main { max-width: none; } }
+@media print { details > * { display: block; } main { max-width: none; } .live { display: none; } }
 """
