@@ -15,9 +15,11 @@ import numpy as np
 
 from graphslam.core import records
 from graphslam.core.geometry import Array, is_positive
+from graphslam.core.record import replace
 from graphslam.logs import physical_limits as limits
 from graphslam.logs import schemas
 from graphslam.logs.cdr import CdrError
+from graphslam.logs.mounts import Mount
 from graphslam.logs.point_cloud import beam_step, cloud_points, is_planar, sweep_of
 
 #: no planar laser takes longer for a sweep; it may take so much more of the time that is stated
@@ -33,7 +35,8 @@ class TopicContext:
     """What a decoder needs to know about a topic in addition to the message.
 
     ``mounts`` gives the pose (3,) of each sensor frame in the base frame; ``inverted`` names the
-    frames of sensors that are mounted upside down. Ranges of ``no_return_m`` or more mean no
+    frames of sensors that are mounted upside down, ``tilted`` has the mounts of those that are not
+    level. Ranges of ``no_return_m`` or more mean no
     return. With ``at_once`` all beams of a scan count as measured at its stamp. ``beams`` counts
     dropped beams of scans that are kept, by reason. With ``without_ranges`` scans get no ranges:
     only when they were taken is of interest. ``by_log_time``: the messages have no stamps; that of
@@ -43,6 +46,7 @@ class TopicContext:
     robot: str
     mounts: Mapping[str, Array] = field(default_factory=dict)
     inverted: frozenset[str] = frozenset()
+    tilted: Mapping[str, Mount] = field(default_factory=dict)
     no_return_m: float = np.inf
     at_once: bool = False
     left_joint: str = ""
@@ -97,8 +101,29 @@ def scans(rows: Any, topic: TopicContext) -> list[records.Scan | str]:
         if step < 0:
             start, step, period = start + step * (beams - 1), -step, -period
             own = own[::-1].copy()
-        found.append(records.Scan(topic.robot, stamp, stamp, own, start, step, mount, period))
+        scan = records.Scan(topic.robot, stamp, stamp, own, start, step, mount, period)
+        found.append(levelled(scan, topic.tilted[frame]) if frame in topic.tilted else scan)
     return found
+
+
+def levelled(scan: records.Scan, mount: Mount) -> records.Scan:
+    """What a tilted laser saw of vertical walls, as a level one sees them."""
+    angles = scan.angles
+    rays = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))])
+    level, _ = mount.levelled(rays)
+    if not len(scan.ranges):
+        return replace(scan, bearings=np.empty(0))  # only its time is of interest
+    _, walls = mount.levelled(np.nan_to_num(scan.ranges)[:, None] * rays)
+    bearings = np.unwrap(np.arctan2(level[:, 1], level[:, 0]))
+    ranges = np.where(walls, scan.ranges, np.nan) * np.hypot(level[:, 0], level[:, 1])
+    period = scan.beam_period_s
+    if bearings[-1] < bearings[0]:  # from above, an upside-down laser scans clockwise
+        bearings, ranges, period = bearings[::-1].copy(), ranges[::-1].copy(), -period
+    step = float(bearings[-1] - bearings[0]) / max(len(bearings) - 1, 1) or scan.angle_step_rad
+    return replace(
+        scan, ranges=ranges, angle_min_rad=float(bearings[0]), angle_step_rad=step,
+        beam_period_s=period, bearings=bearings,
+    )  # fmt: skip
 
 
 def _beam_periods(rows: Any, beams: int) -> list[float]:
@@ -150,8 +175,13 @@ def point_cloud(message: Any, topic: TopicContext) -> records.Scan:
         raise UnusableMessageError(f"cloud: {error}") from error
     if not is_planar(points):
         raise UnusableMessageError("cloud: points are not those of one level laser, or none")
-    bearings, ranges = (_NO_RANGES, _NO_RANGES) if topic.without_ranges else sweep_of(points)
     frame, stamp = frame_of(message), stamp_of(message)
+    if frame in topic.tilted:
+        points, walls = topic.tilted[frame].levelled(points)
+        points = points[walls]
+        if not len(points):
+            raise UnusableMessageError("cloud: a tilted laser sees the floor only")
+    bearings, ranges = (_NO_RANGES, _NO_RANGES) if topic.without_ranges else sweep_of(points)
     ranges = np.where(ranges < min(topic.no_return_m, limits.MAX_RANGE_M), ranges, np.nan)
     if frame in topic.inverted:  # see `scans`
         bearings, ranges = -bearings[::-1], ranges[::-1].copy()

@@ -111,7 +111,9 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
         for name in sorted({t.robot for t in topics if t.record is not records.TrueLandmark})
     ]
     infos.sort(key=lambda info: info.name)
-    findings += assumed
+    names = {topic.name for topic in chosen}
+    # how a sensor is mounted that is not used does not matter
+    findings += [f for f in assumed if problem or f.topic.partition(": ")[0] in names]
     if not problem:
         gyroscopes, by_gyroscope = find_gyroscopes(files, chosen, contexts, config)
         findings += by_gyroscope

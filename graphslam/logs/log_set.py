@@ -215,8 +215,8 @@ def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
 
     Raises:
         LogError: a file is missing, of no known container or empty; no topic is usable; all usable
-            topics are empty; a robot has sightings but neither odometry nor scans. The message
-            names file and topic.
+            topics are empty; a robot has sightings but neither odometry nor scans; a laser is
+            tilted too far. The message names file and topic.
     """
     if not paths:
         raise LogError("no log given; name at least one file or folder")
@@ -227,6 +227,9 @@ def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
     files, topics, derived = robots_and_topics(files, config)
     topics, choices = choose_topics(files, topics)
     contexts, assumed = topic_contexts(files, topics, config)
+    for finding in assumed:
+        if finding.severity == "unusable":
+            raise LogError(f"{', '.join(str(file.path) for file in files)}: {finding.line}")
     gyroscopes, by_gyroscope = find_gyroscopes(files, topics, contexts, config)
     return LogSet(
         robots=tuple(sorted({t.robot for t in topics if t.record in MOTION_KINDS})),

@@ -1,18 +1,23 @@
 """Sensor mounts in the plane from static transforms."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from graphslam.core.geometry import Array
 
+BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 # Child -> (parent, parent_from_child (4, 4)): a frame has one parent.
 TransformTree = Mapping[str, tuple[str, Array]]
 
 # A tilt of 3 degrees changes ranges to vertical walls by 1 - cos(3 deg), about one per mille.
 _MAX_TILT_RAD = np.deg2rad(3.0)
+# Beyond that few beams meet walls before the floor or the ceiling.
+_MOST_TILT_RAD = np.deg2rad(30.0)
+#: m above the base, below which a return of a tilted laser may be of the floor, not of a wall
+_FLOOR_M = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,11 +25,23 @@ class Mount:
     """Pose (3,) of a sensor in the base frame; ``inverted`` if it is mounted upside down.
 
     ``tilt_rad`` is the angle between the sensor's z axis and the vertical, 0 also if inverted.
+    ``turn`` (3, 3) takes a vector in the sensor's frame into level axes with the heading of
+    ``pose``; ``height_m`` is that of the sensor above the base.
     """
 
     pose: Array
     inverted: bool
     tilt_rad: float
+    turn: Array = field(default_factory=lambda: np.eye(3))
+    height_m: float = 0.0
+
+    def levelled(self, points: Array) -> tuple[Array, BoolArray]:
+        """Points (n, 3) of the sensor in level axes, and which of them (n,) are not of the floor.
+
+        A wall is vertical: its points lie on it at any height.
+        """
+        level = points @ self.turn.T
+        return level, np.asarray(level[:, 2] + self.height_m > _FLOOR_M)
 
 
 def transform_tree(messages: Iterable[Any]) -> dict[str, tuple[str, Array]]:
@@ -77,12 +94,20 @@ def planar_mount(base_from_sensor: Array) -> Mount:
     x, y = base_from_sensor[:2, 3]
     pose = np.array([x, y, np.arctan2(R[1, 0], R[0, 0])])
     inverted = bool(R[2, 2] < 0)
-    return Mount(pose, inverted, float(np.arccos(min(1.0, abs(R[2, 2])))))
+    tilt = float(np.arccos(min(1.0, abs(R[2, 2]))))
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) @ R
+    return Mount(pose, inverted, tilt, turn, float(base_from_sensor[2, 3]))
 
 
 def is_level(mount: Mount) -> bool:
     """Whether the tilt of the sensor is small enough for a planar map."""
     return bool(mount.tilt_rad <= _MAX_TILT_RAD)
+
+
+def is_projectable(mount: Mount) -> bool:
+    """Whether a sensor that is not level sees walls with most of its beams."""
+    return bool(mount.tilt_rad <= _MOST_TILT_RAD)
 
 
 def _ancestors(tree: TransformTree, frame: str) -> dict[str, Array]:

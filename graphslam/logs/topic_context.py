@@ -13,7 +13,14 @@ from graphslam.logs import schemas
 from graphslam.logs.cdr import HEADER
 from graphslam.logs.decoders import TopicContext, frame_of
 from graphslam.logs.findings import Finding
-from graphslam.logs.mounts import TransformTree, base_above, find_mount, is_level
+from graphslam.logs.mounts import (
+    Mount,
+    TransformTree,
+    base_above,
+    find_mount,
+    is_level,
+    is_projectable,
+)
 from graphslam.logs.no_return import find_no_return
 from graphslam.logs.point_cloud import cloud_points, sweep_of
 from graphslam.logs.recording import Recording, sample_messages
@@ -69,6 +76,7 @@ def topic_contexts(
         settings = config.robot(topic.robot)
         mounts: dict[str, Array] = {}
         inverted: set[str] = set()
+        tilted: dict[str, Mount] = {}
         no_return = None
         if topic.record in (records.Scan, records.Sighting):
             messages = list(sample_decoded(files, topic))
@@ -78,8 +86,12 @@ def topic_contexts(
             tree = trees[topic.robot]
             for frame in sorted({frame_of(message) for message in messages}):
                 base = bases[topic.robot] if topic.robot in bases else base_above(tree, frame)
-                mounts[frame], upside_down, notes = _mount(topic, tree, base, frame, settings.laser)
-                inverted |= {frame} if upside_down else set()
+                mount, notes = _mount(topic, tree, base, frame, settings.laser)
+                mounts[frame] = mount.pose
+                if topic.record is records.Scan and not is_level(mount):
+                    tilted[frame] = mount
+                elif mount.inverted:
+                    inverted.add(frame)
                 findings += notes
             if topic.schema == schemas.LASER_SCAN:
                 no_return = find_no_return(message.ranges for message in messages)
@@ -92,6 +104,7 @@ def topic_contexts(
             robot=topic.robot,
             mounts=mounts,
             inverted=frozenset(inverted),
+            tilted=tilted,
             no_return_m=np.inf if no_return is None else no_return,
             at_once=not config.logs.undistort,
             left_joint=settings.left_joint,
@@ -132,23 +145,36 @@ def base_frame(files: Sequence[Recording], topic: Topic) -> str:
 
 def _mount(
     topic: Topic, tree: TransformTree, base: str, frame: str, configured: Sequence[float]
-) -> tuple[Array, bool, list[Finding]]:
-    """Pose (3,) of ``frame`` on the robot, whether it is upside down, and findings."""
+) -> tuple[Mount, list[Finding]]:
+    """The mount of ``frame`` on the robot, and findings; one that is configured is level."""
     where = f"{topic.name}: frame {frame or '(none)'}"
     setting = f"--set 'robots.{topic.robot}.laser=[X, Y, YAW]' (m, m, rad)"
     found = find_mount(tree, base, frame)
     inverted = found is not None and found.inverted
     if len(configured) == 3 and topic.record is records.Scan:
-        return np.array(configured, dtype=float), inverted, []
+        return Mount(np.array(configured, dtype=float), inverted, 0.0), []
     if found is None:
         if topic.record is records.Sighting and not frame:
-            return np.zeros(3), False, []  # no frame: measured from the base
+            return Mount(np.zeros(3), False, 0.0), []  # no frame: measured from the base
         text = f"tf_static has no transform from {base}; assumed to be the base itself"
         remedy = f"record /tf_static, or {setting}"
-        return np.zeros(3), False, [Finding("doubt", "mount", where, text, remedy)]
-    notes = []
-    if not is_level(found):
-        tilt = np.rad2deg(found.tilt_rad)
-        text = f"is tilted by {tilt:.0f} deg; treated as level"
-        notes.append(Finding("doubt", "mount", where, text))
-    return found.pose, inverted, notes
+        return Mount(np.zeros(3), False, 0.0), [Finding("doubt", "mount", where, text, remedy)]
+    if is_level(found):
+        return found, []
+    return found, [_tilt(topic, found, where, setting)]
+
+
+def _tilt(topic: Topic, mount: Mount, where: str, setting: str) -> Finding:
+    """What is done about a sensor that is not level."""
+    text = f"is tilted by {np.rad2deg(mount.tilt_rad):.0f} deg by tf"
+    remedy = f"if it is level, {setting}"
+    if topic.record is records.Sighting:
+        text += "; bearings and ranges are taken as level"
+        return Finding("doubt", "mount", where, text, "state them in a level frame")
+    if not is_projectable(mount):
+        text += ": its scans are no section of walls"
+        remedy += "; else record a level laser, or leave this one out with logs.topics"
+        return Finding("unusable", "mount", where, text, remedy)
+    text += ": its returns are projected on the plane, as of vertical walls; those of the floor "
+    text += "are left out"
+    return Finding("doubt", "mount", where, text, remedy)
