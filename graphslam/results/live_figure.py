@@ -1,6 +1,6 @@
 """Figures that can be zoomed, hovered and played, in a page that needs no network.
 
-A figure is data for `static/live.js`, which draws it in the browser with BokehJS. The scripts of
+A figure is data for the script live.js, which draws it in the browser with BokehJS. The scripts of
 BokehJS are read from the installed package, which is not imported: that would take longer than the
 whole page. What is shown without scripts and in print are the drawings of `report_figure`.
 """
@@ -24,7 +24,7 @@ _LIBRARY = ("bokeh.min.js", "bokeh-api.min.js")
 #: numbers below this are written in single precision: metres to 0.1 mm
 _SINGLE = 2000.0
 _OWN = Path(__file__).parent / "static" / "live.js"
-#: type of numpy -> that of `live.js`
+#: type of numpy -> its name in the script
 _TYPES = {"<f8": "f8", "<f4": "f4", "<i2": "i2", "<i4": "i4"}
 #: names of the page's colours
 COLORS = {INK: "ink", ACCENT: "accent"} | {c: f"robot{i}" for i, c in enumerate(PALETTE)}
@@ -34,9 +34,9 @@ COLORS = {INK: "ink", ACCENT: "accent"} | {c: f"robot{i}" for i, c in enumerate(
 class Series:
     """What is drawn with one glyph: ``columns`` (n,) of numbers, at least x and y, in its layer.
 
-    ``glyph``: `path` (one line), `lines` or `areas` (one from each vertex ``starts`` (m,) on),
-    `ellipses` (columns width, height m, angle rad) or `points` (``marker``). ``tip``: HTML of what
-    hovering shows, ``@name`` a column or one of ``texts``. ``side``: `before` or `after` the swipe.
+    ``glyph``: "path" (one line), "lines" or "areas" (one from each vertex ``starts`` (m,) on),
+    "ellipses" (columns width, height m, angle rad) or "points" (``marker``). ``tip``: HTML of what
+    hovering shows, ``@name`` a column or one of ``texts``. ``side``: "before" or "after" the swipe.
     ``timed``: hidden until the column time, s, of a vertex, a line or a point. ``robot``: the path
     of a robot, with columns time and heading, that is drawn at the slider's time.
     """
@@ -61,7 +61,7 @@ class Series:
 class LiveFigure:
     """A figure that moves: ``limits`` [[x_min, x_max], [y_min, y_max]] and what is drawn.
 
-    ``kind``: `map` (metres, equal scales) or `chart`. ``layers``: name -> whether it is shown at
+    ``kind``: "map" (metres, equal scales) or "chart". ``layers``: name -> whether it is shown at
     first. ``duration_s``: of the replay, None without. ``sides``: names of before and after.
     ``scans`` and ``clouds`` are points, see `scan_points` and `cloud`.
     """
@@ -83,7 +83,7 @@ class LiveFigure:
 
 
 def encoded(values: Array) -> dict[str, str]:
-    """An array as type and base64, little-endian."""
+    """An array (...,) as type and base64, little-endian and row after row."""
     plain = np.ascontiguousarray(values, dtype=np.dtype(values.dtype).newbyteorder("<"))
     kind = _TYPES[plain.dtype.str]
     return {"type": kind, "data": base64.b64encode(plain.tobytes()).decode()}
