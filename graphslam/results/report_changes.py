@@ -12,6 +12,8 @@ from graphslam.core.geometry import Array, area_centroid
 from graphslam.results import report_html as html
 from graphslam.results.drawing import Axes
 from graphslam.results.drawing_elements import INK, OPAQUE, PALETTE, Levels, Shade, Style
+from graphslam.results.live_changes import live_changes
+from graphslam.results.live_figure import live_html
 from graphslam.results.report_figure import WIDTH_IN, Drawing, density, map_axes, svg
 
 COLORS = {"appeared": PALETTE[2], "vanished": PALETTE[1], "moved": PALETTE[3]}
@@ -93,7 +95,7 @@ def changes_page(picture: ChangesPicture) -> str:
     sections = [
         html.header("graphslam changes", title, _headline(picture), picture.facts.items(), notes),
         _table(picture),
-        html.section("Map", html.figure_grid(figures)),
+        html.section("Map", live_html(live_changes(picture, COLORS)) + html.figure_grid(figures)),
         html.details("Settings", f"<pre>{escape(picture.settings)}</pre>"),
     ]
     return html.document(title, sections, _CSS)

@@ -15,6 +15,7 @@ import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam.results import report_html as html
+from graphslam.results.live_figure import live_html
 from graphslam.results.metric_tables import (
     NO_COMMON_FRAME,
     Column,
@@ -311,6 +312,9 @@ def render_comparison(comparison: Comparison, settings: str = "") -> str:
         numbers += html.table(FILTER_WIN_HEADS, wins, "Where a filter is ahead of every smoother")
     for text in ("Best in bold.", *reading_notes(summary)):
         numbers += f"<p class=note>{escape(text)}</p>"
+    charts = (plots.live_errors(comparison, kind) for kind in ("final", "causal"))
+    live = [live_html(chart) for chart in charts if chart]
+    moving = {"Errors over time": html.figure_grid(live) if any(live) else ""}
     sections = [
         html.header("graphslam compare", title, headline(summary)),
         html.warning_box(
@@ -319,7 +323,7 @@ def render_comparison(comparison: Comparison, settings: str = "") -> str:
         ),
         html.section("Numbers", numbers),
         *(
-            html.section(name, legend + html.figure_grid(drawings))
+            html.section(name, moving.get(name, "") + legend + html.figure_grid(drawings))
             for name, drawings in plots.figures(comparison).items()
             if drawings
         ),

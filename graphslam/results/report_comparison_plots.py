@@ -8,6 +8,8 @@ from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.results.drawing import Axes
 from graphslam.results.drawing_elements import ACCENT, INK, PALETTE, Style, robot_color
+from graphslam.results.live_charts import Curve, live_chart
+from graphslam.results.live_figure import LiveFigure
 from graphslam.results.report_comparison import BackendCurves, Comparison, ErrorCurve
 from graphslam.results.report_figure import (
     WIDTH_IN,
@@ -58,6 +60,28 @@ def figures(comparison: Comparison) -> dict[str, list[str]]:
         drawing = _cost(comparison.backends, label, axis)
         found["Time per step"].append(figure(drawing, f"By {label}.", caption))
     return found
+
+
+def live_errors(comparison: Comparison, kind: str) -> LiveFigure | None:
+    """Position errors over time with their values where one points; None without any."""
+    curves = list(_curves(comparison, kind))
+    if not curves:
+        return None
+    start, unit, label = _clock(comparison)
+    against = "the truth" if comparison.truth else "{reference}".format(**comparison.summary)
+    drawn = []
+    for backend, style, curve in curves:
+        t, squares = _averaged((curve.stamps_ns - start) / unit, curve.position_m**2)
+        drawn.append(Curve(backend.label, style, t, np.sqrt(squares)))
+    return live_chart(
+        f"errors-{kind}",
+        f"Error, {kind}, moving.",
+        f"Distance to {against}, RMS of neighbouring poses. Drag to move; click, then turn the "
+        "wheel to zoom; point at a curve for its values; switch back ends off.",
+        drawn,
+        (label, "position, m"),
+        log=(False, True),
+    )
 
 
 def _paths(comparison: Comparison, kind: str) -> str:

@@ -14,6 +14,8 @@ import numpy as np
 from graphslam.results import report_html as html
 from graphslam.results.drawing import Axes
 from graphslam.results.drawing_elements import ACCENT, FAINT, INK, Style, robot_color
+from graphslam.results.live_charts import Curve, live_chart
+from graphslam.results.live_figure import live_html
 from graphslam.results.report_figure import Drawing, panels, positive, svg
 
 Summary = Mapping[str, Any]
@@ -34,7 +36,7 @@ def experiment_page(summary: Summary, tables: Tables | None = None) -> str:
         sections += [
             html.section("Consistency", _consistency(summary)),
             html.section("Errors against the Cramér-Rao bound", _errors(summary)),
-            html.section("Figures", html.figure_grid(drawings)),
+            html.section("Figures", _live(summary) + html.figure_grid(drawings)),
         ]
     elif tables:
         sections += [
@@ -335,6 +337,45 @@ def consistency_against_noise(summary: Summary) -> str:
         drawing.common_legend()
 
     return svg("Consistency against noise", 2.6, draw)
+
+
+def _live(summary: Summary) -> str:
+    """Charts that move: consistency and error against the noise, NEES over time."""
+    styles = _styles(summary)
+    hint = "Drag to move; click, then turn the wheel to zoom; point at a curve for its values."
+    against_noise: dict[str, list[Curve]] = {"consistency": [], "error": []}
+    for name, style in styles.items():
+        rows = [row for row in _of_variant(summary, name) if row["nees_per_dof"] is not None]
+        scales = np.array([row["scale"] for row in rows])
+        values = {
+            "consistency": [row["nees_per_dof"] for row in rows],
+            "error": [row["final"]["position_m2"]["rmse"] for row in rows],
+        }
+        for kind, found in values.items():
+            against_noise[kind].append(Curve(name, style, scales, np.array(found)))
+    scale = next(iter(summary["curves"]))
+    over_time = [
+        Curve(name, styles[name], np.arange(len(values), dtype=float), values)
+        for name, c in summary["curves"][scale]["variants"].items()
+        for values in [np.array(c["nees_per_dof"]["mean"], dtype=float)]
+    ]
+    charts = [
+        live_chart(
+            "consistency", "Consistency against noise, moving.", hint,
+            against_noise["consistency"], ("noise scale", "final joint NEES / dof"),
+            log=(True, False), marked=True,
+        ),
+        live_chart(
+            "error", "Error against noise, moving.", hint, against_noise["error"],
+            ("noise scale", "final position RMSE, m"), log=(True, True), marked=True,
+        ),
+        live_chart(
+            "nees", f"NEES over time, noise × {scale}, moving.", hint, over_time,
+            ("step", "NEES / dof"),
+        ),
+    ]  # fmt: skip
+    live = [live_html(chart) for chart in charts]
+    return html.figure_grid(live) if any(live) else ""
 
 
 #: name -> (drawing, title, caption)

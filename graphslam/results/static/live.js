@@ -301,7 +301,7 @@
         const paint = rgb(color);
         for (let k = 0; k < points.length; k += 2) {
           const x = origin[0] + unit * points[k];
-          if (this.swipe > 0 && (side === "before") !== (x < border)) continue;
+          if (this.swipe > 0 && (side === "before") !== (x < border)) continue; // both without a swipe
           put(x, origin[1] + unit * points[k + 1], paint);
         }
       }

@@ -1,0 +1,78 @@
+"""Maps of changes and charts of comparisons and experiments in a real browser."""
+
+import numpy as np
+import pytest
+
+from graphslam.results import report_html
+from graphslam.results.drawing_elements import Style
+from graphslam.results.live_charts import Curve, live_chart
+from graphslam.results.live_figure import live_html
+from graphslam.results.report_changes import ChangeMark, ChangesPicture, changes_page
+
+pytestmark = pytest.mark.browser
+
+
+def changed_room():
+    """A chest of drawers that moved by a metre in an empty room."""
+    rng = np.random.default_rng(1)
+    wall = np.column_stack([rng.uniform(-5, 5, 4000), np.full(4000, 4.0)])
+    chest = np.array([[2.0, 1.0], [3.0, 1.0], [3.0, 2.0], [2.0, 2.0]])
+    moved = ChangeMark(
+        "moved", chest, chest - [1.0, 0.0], np.array([1.0, 0.0, 0.1]), np.full(3, 0.01), 0.997,
+        321, 4.0,
+    )  # fmt: skip
+    new = ChangeMark("appeared", chest - [5.0, 3.0], None, None, None, 0.98, 45, 9.0)
+    return ChangesPicture(
+        ("morning", "evening"), wall, wall - np.array([0.0, 0.5]), np.zeros((10, 10), dtype=bool),
+        np.array([[-6.0, 6.0], [-4.0, 5.0]]), (moved, new), rng.normal(size=500), 1.0,
+        {"changes": "2"}, "",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_a_change_is_named_where_one_points_and_visits_are_swiped(width, open_page):
+    opened = open_page(changes_page(changed_room()), width)
+    box = opened.live("changes")
+    counted = (
+        "(() => { const [im] = live.picture.data.image; const found = {};"
+        " for (const v of im) if (v) found[v & 0xffffff] = 1;"
+        " return Object.keys(found).length; })()"
+    )
+    assert opened.js("changes", counted) == 2  # colours of the two visits
+    before, after = (
+        opened.js("changes", f"live.series.find((s) => s.layer === '{name}').full.{column}[0]")
+        for name, column in (("moved", "number"), ("moved", "at_x"))
+    )
+    assert before == 1
+    assert after == pytest.approx(2.5)
+    tip = opened.js("changes", "live.series.find((s) => s.layer === 'moved').tip")
+    assert "sure" in tip
+    box.locator("input[name=swipe]").fill("100")
+    opened.page.wait_for_timeout(300)
+    assert opened.js("changes", counted) == 1
+    assert opened.messages == []
+    assert [url for url in opened.requests if not url.startswith(("file:", "data:"))] == []
+    assert opened.page.evaluate("document.documentElement.scrollWidth") == width
+
+
+def test_a_chart_tells_values_and_zooms_on_logarithmic_axes(open_page):
+    x = np.array([0.03, 0.1, 0.3, 1.0])
+    curves = [
+        Curve("a <b> & @x", Style("#4477aa"), x, np.array([0.0, 1e-3, 1e-2, 1e-1])),
+        Curve("other", Style("#ee6677", dashes=(1.2, 1.2)), x, x),
+    ]
+    chart = live_chart(
+        "chart", "A chart.", "", curves, ("noise", "error, m"), log=(True, True), marked=True
+    )
+    opened = open_page(report_html.document("charts", [live_html(chart)]))
+    box = opened.live("chart")
+    before = opened.js("chart", "live.plot.y_range.end / live.plot.y_range.start")
+    box.locator(".live-stage").click()
+    opened.page.wait_for_timeout(200)
+    opened.page.mouse.wheel(0, -300)
+    opened.page.wait_for_timeout(300)
+    assert opened.js("chart", "live.plot.y_range.end / live.plot.y_range.start") < before
+    box.get_by_label("a <b> & @x").click()
+    shown = opened.js("chart", "live.series.map((s) => s.renderer.visible)")
+    assert shown == [False, False, True, True]
+    assert opened.messages == []
