@@ -8,15 +8,17 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 OUT := out
 
-.PHONY: help demo test browser-test lint types docs clean
+.PHONY: help demo test browser-test extras-test lint types pages docs clean
 
 help:
 	@echo 'make demo    smooth a real log (Victoria Park, shipped with gtsam) and a simulated lab into $(OUT)/'
 	@echo 'make test    run the tests'
 	@echo 'make browser-test  run the tests of the reports in a browser'
+	@echo 'make extras-test  viewers, notebook, site, and the wheel in a new environment'
 	@echo 'make lint    check style and formatting'
 	@echo 'make types   check types'
-	@echo 'make docs    write the pages that are made from the code'
+	@echo 'make pages   write the pages that are made from the code'
+	@echo 'make docs    these, and the documentation site into $(OUT)/docs'
 	@echo 'make clean   remove $(VENV), $(OUT) and caches'
 	@echo 'PYTHON=...   the Python (3.11 or newer) to make $(VENV) with'
 
@@ -50,8 +52,27 @@ lint: $(INSTALLED)
 types: $(INSTALLED)
 	$(BIN)/mypy
 
-docs: $(INSTALLED)
+# what make test skips without other programs; here it fails without them
+extras-test: $(INSTALLED) docs
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable \
+	  '.[dev,viewer,notebook]' evo mcap-ros2-support
+	$(BIN)/python -c 'import evo, mcap_ros2, nbclient, pandas, rerun'
+	$(BIN)/python -m pytest tests/results/test_viewers.py tests/results/test_evo.py \
+	  tests/core/test_notebook_views.py
+	rm -rf $(OUT)/wheel $(OUT)/cold
+	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps -w $(OUT)/wheel .
+	$(BIN)/python -m venv $(OUT)/cold
+	$(OUT)/cold/bin/python -m pip install --quiet --disable-pip-version-check \
+	  "$$(ls $(OUT)/wheel/*.whl)[notebook]"
+	cd $(OUT) && cp ../docs/tutorial.ipynb . && cold/bin/jupyter execute tutorial.ipynb
+
+pages: $(INSTALLED)
 	$(BIN)/python docs/configuration.py
+	$(BIN)/python docs/commands.py
+
+docs: pages
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,docs]'
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs $(OUT)/docs
 
 clean:
 	rm -rf $(VENV) $(OUT) .pytest_cache .mypy_cache .ruff_cache .hypothesis

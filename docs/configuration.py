@@ -1,6 +1,6 @@
 """Writes docs/configuration.md from the dataclasses in `graphslam.core.config`.
 
-Run: python docs/configuration.py   (or `make docs`)
+Run: python docs/configuration.py   (or `make pages`)
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ PAGE = Path(__file__).with_suffix(".md")
 HEAD = """\
 # Configuration
 
-Made from `graphslam/core/config.py` and `sensor_config.py` by `make docs`; change it there.
+Made from `graphslam/core/config.py` and `sensor_config.py` by `make pages`; change it there.
 
 One tree of settings; `graphslam config` prints it as TOML, with units. `graphslam smooth` takes the
 defaults, then `--preset NAME`, then `--config FILE.toml`, then its own options (`--backend isam2`

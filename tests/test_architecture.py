@@ -42,7 +42,7 @@ MOST_LINES = 450
 KEEPERS = {
     "cv2": {"perception", "results", "change_detection"},
     "gtsam": {"estimation"},
-    "matplotlib": set(),  # takes half a second to import; for benchmarks only
+    "matplotlib": set(),  # takes half a second to import; `plot` imports it by its name
     "mcap": {"logs"},
     "rerun": {"results"},  # 170 MB, for who asked for it
     "rich": {"cli"},

@@ -21,7 +21,7 @@ def test_the_configuration_page_is_what_the_configuration_says():
     spec = importlib.util.spec_from_file_location("configuration", ROOT / "docs/configuration.py")
     generator = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(generator)
-    assert generator.PAGE.read_text(encoding="utf-8") == generator.page(), "run `make docs`"
+    assert generator.PAGE.read_text(encoding="utf-8") == generator.page(), "run `make pages`"
 
 
 def test_the_readme_has_every_command_and_only_links_that_lead_somewhere():

@@ -17,6 +17,7 @@ from urllib.parse import quote, unquote
 from graphslam.core.config import Config, RobustConfig
 from graphslam.core.config_io import dump_config, load_config
 from graphslam.core.errors import OutputError
+from graphslam.core.notebook_views import ResultViews
 from graphslam.core.output_folder import atomic_folder
 from graphslam.core.records import JointScans, Landmark, Result, RobotResult, Trajectory
 from graphslam.core.worker import parallel_map
@@ -50,7 +51,7 @@ class SavedRobot:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SavedResult:
+class SavedResult(ResultViews):
     """A result folder read back; ``joint`` is None where nothing tells how scans are correlated."""
 
     robots: Mapping[str, SavedRobot]

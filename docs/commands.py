@@ -1,0 +1,80 @@
+"""Writes docs/commands.md from the command line itself, and docs/schemas.md from its messages.
+
+Run: python docs/commands.py   (or `make pages`)
+"""
+
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from graphslam.cli.commands import app
+from graphslam.logs import schemas
+from graphslam.logs.translations import TRANSLATIONS
+
+FOLDER = Path(__file__).parent
+PAGES = ("commands.md", "schemas.md")
+
+COMMANDS = """\
+# Commands
+
+Made from the program by `make pages`. Every command has `-h`, `--json` (exactly one object on
+stdout, see [formats](formats.md#what-commands-print-with---json)) and `--debug` (tracebacks).
+Exit codes are in [formats](formats.md#exit-codes)."""
+
+SCHEMAS = """\
+# Messages
+
+Made from the program by `make pages`. What topics mean and how they are found: [logs](logs.md).
+
+## Messages of ROS 2 that are read
+
+`{ros}`
+
+Encodings: `{translated}`; ROS 1 and Foxglove messages are translated to these.
+
+## Our own messages
+
+Their definitions are in every log that has them, so that any tool decodes them."""
+
+
+def commands() -> str:
+    """The page of commands."""
+    group = typer.main.get_command(app)
+    parts = [COMMANDS]
+    for name, command in sorted(group.commands.items()):
+        own = [p for p in command.params if p.name not in ("help", "json", "debug")]
+        usage = [p.metavar for p in own if p.param_type_name == "argument"]
+        text = " ".join((command.help or "").split())
+        line = " ".join(["graphslam", name, *usage, "[OPTIONS]"])
+        parts.append(f"## {name}\n\n{text}\n\n```text\n{line}\n```")
+        rows = [f"| `{_cell(_written(p))}` | {_cell(p.help or '')} |" for p in own]
+        parts.append("\n".join(["| | |", "|---|---|", *rows]))
+    return "\n\n".join(parts) + "\n"
+
+
+def _written(parameter: Any) -> str:
+    """A parameter as one writes it: ``-o, --output DIR``."""
+    if parameter.param_type_name == "argument":
+        return str(parameter.metavar)
+    flags = ", ".join([*parameter.opts, *parameter.secondary_opts])
+    return f"{flags} {parameter.metavar or ''}"
+
+
+def messages() -> str:
+    """The page of messages."""
+    own = schemas.DEFINITIONS
+    ros = sorted(name for name in schemas.KNOWN if name not in own)
+    head = SCHEMAS.format(ros="`, `".join(ros), translated="`, `".join(sorted(TRANSLATIONS)))
+    parts = [head]
+    parts += [f"### {name}\n\n```text\n{text.strip()}\n```" for name, text in sorted(own.items())]
+    return "\n\n".join(parts) + "\n"
+
+
+def _cell(text: str) -> str:
+    return " ".join(str(text).split()).replace("|", "\\|")
+
+
+if __name__ == "__main__":
+    for page, text in zip(PAGES, (commands(), messages()), strict=True):
+        (FOLDER / page).write_text(text, encoding="utf-8")
