@@ -65,15 +65,26 @@ def fan(scan: PlacedScan) -> Fan:
 
 
 def cell_size(fans: Sequence[Fan]) -> float:
-    """Edge of a cell, m: as fine as returns lie beside each other, as coarse as a map has room.
+    """Edge of a cell, m: as fine as beams lie beside each other, as coarse as a map has room.
 
-    The median distance between neighbouring returns, rounded up to one of `SIZES_M`.
+    The median distance of beams where they end, rounded up to one of `SIZES_M`.
     """
-    steps = [np.hypot(*np.diff(f.ends, axis=0).T) for f in fans[:: 1 + len(fans) // 200]]
-    step = float(np.median(np.concatenate([np.zeros(0), *steps]))) if fans else 0.0
+    sample = [f.ends - f.sensor for f in fans[:: 1 + len(fans) // 200] if len(f.ends) > 1]
+    spaces = [np.hypot(*ends.T) * _usual_angle(ends) for ends in sample]
+    space = float(np.median(np.concatenate([np.zeros(1), *spaces])))
     low, high = _bounds(fans)
     fewest = float(np.sqrt(np.prod(high - low) / MOST_CELLS))
-    return next((s for s in SIZES_M if s >= max(0.8 * step, fewest)), max(SIZES_M[-1], fewest))
+    return next((s for s in SIZES_M if s >= max(0.8 * space, fewest)), max(SIZES_M[-1], fewest))
+
+
+def _turns(offset: Array) -> Array:
+    """Angles (n - 1,) rad between neighbouring ends (n, 2) seen from the sensor."""
+    bearings = np.arctan2(offset[:, 1], offset[:, 0])
+    return np.asarray(np.mod(np.diff(bearings) + np.pi, 2 * np.pi) - np.pi)
+
+
+def _usual_angle(offset: Array) -> float:
+    return float(np.median(np.abs(_turns(offset))))
 
 
 def _bounds(fans: Sequence[Fan]) -> tuple[Array, Array]:
@@ -176,7 +187,7 @@ def _outline(scan: Fan) -> tuple[Array, list[tuple[int, int]]]:
     offset = scan.ends - scan.sensor
     r = np.hypot(*offset.T)
     n = len(r)
-    turn = np.mod(np.diff(np.arctan2(offset[:, 1], offset[:, 0])) + np.pi, 2 * np.pi) - np.pi
+    turn = _turns(offset)
     usual = float(np.median(np.abs(turn))) if n > 1 else 0.0
     near = np.minimum(r[1:], r[:-1])
     gap = np.hypot(*np.diff(scan.ends, axis=0).T)
