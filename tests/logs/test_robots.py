@@ -118,6 +118,26 @@ class Robot:
             linear_acceleration_covariance=np.zeros(9),
         )
         self.log.message("/imu", "sensor_msgs/msg/Imu", imu, stamp)
+        if not (stamp - START_NS) % (5 * S):
+            self.log.message("/map", "nav_msgs/msg/OccupancyGrid", _map(stamp), stamp)
+            camera = build(
+                "sensor_msgs/msg/CameraInfo",
+                header=header(stamp, self.frame("camera")),
+                height=480,
+                width=640,
+                distortion_model="plumb_bob",
+                d=np.zeros(5),
+                k=np.eye(3).ravel(),
+                r=np.eye(3).ravel(),
+                p=np.zeros(12),
+                binning_x=0,
+                binning_y=0,
+                roi=build(
+                    "sensor_msgs/msg/RegionOfInterest",
+                    x_offset=0, y_offset=0, height=0, width=0, do_rectify=False,
+                ),
+            )  # fmt: skip
+            self.log.message("/camera/camera_info", "sensor_msgs/msg/CameraInfo", camera, stamp)
         joints = build(
             schemas.JOINT_STATE,
             header=header(stamp, ""),
@@ -127,6 +147,22 @@ class Robot:
             effort=np.zeros(0),
         )
         self.log.message("/joint_states", schemas.JOINT_STATE, joints, stamp)
+
+
+def _map(stamp: int) -> object:
+    """What Nav2's map_server latches."""
+    build = schemas.build
+    info = build(
+        "nav_msgs/msg/MapMetaData",
+        map_load_time=schemas.time(stamp),
+        resolution=0.05,
+        width=4,
+        height=3,
+        origin=_pose_of(np.zeros(3)).pose,
+    )
+    cells = np.full(12, -1, dtype=np.int8)
+    kind = "nav_msgs/msg/OccupancyGrid"
+    return build(kind, header=schemas.header(stamp, "map"), info=info, data=cells)
 
 
 def _pose_of(pose: np.ndarray) -> object:
@@ -308,6 +344,25 @@ def test_two_robots_in_one_recording_are_two(parts, room, tmp_path):
         for robot in log.robots
     }
     assert len(by_robot["tb1"]) == len(by_robot["tb2"]) > 250
+
+
+def test_two_robots_in_one_recording_are_smoothed_without_an_option(room, tmp_path):
+    """Each is where its odometry and its scans put it; the start of the second is found."""
+
+    def robots(log):
+        return {
+            Robot(log, f"{name}/", odometry=f"/{name}/odom", scan=f"/{name}/scan"):
+            ("odometry", "others")
+            for name in ("tb1", "tb2")
+        }  # fmt: skip
+
+    begin = [message for message in room if message.time_ns < START_NS + 5 * S]
+    path = record(tmp_path / "log.mcap", begin, robots)
+    result = graphslam.smooth(path)
+    assert set(result.robots) == {"tb1", "tb2"}
+    first, second = (result.robots[name].final for name in ("tb1", "tb2"))
+    ends = between(first.poses[0], first.poses[-1]), between(second.poses[0], second.poses[-1])
+    np.testing.assert_allclose(ends[0], ends[1], atol=0.05)
 
 
 def test_two_robots_with_trees_of_their_own_are_two(room, tmp_path):
