@@ -164,6 +164,7 @@ def smooth(
     reading = _read_ahead(recording, settled) or nullcontext()
     with limited_memory(settled.limits.memory_mb), reading as ahead:
         # imported while the second process reads; what only that one needs is imported there
+        from graphslam.core.stages import announce
         from graphslam.slam.smooth import smooth
 
         log = cast("LogSet", recording) if ahead is None else receive_log(ahead, settled)
@@ -189,6 +190,7 @@ def smooth(
         truth = Future(read_truth)
         result = smooth(log, settled, of_all(log, progress), ahead=ahead)
         known = truth.result()
+        announce("report")
         report = Future(render_report)
         save(result, Path(output), force=force, report=finish_report)
         return result

@@ -1,6 +1,7 @@
 """The arguments and options of the commands, each defined once, and their checks (exit code 2)."""
 
 import typing
+from collections.abc import Iterable
 from importlib.util import find_spec
 from math import isfinite
 from pathlib import Path
@@ -10,6 +11,7 @@ import typer
 
 from graphslam.core.config import BackendConfig, FrontEndConfig
 from graphslam.core.presets import PRESETS
+from graphslam.core.suggestions import did_you_mean
 from graphslam.logs import IMPORTERS
 from graphslam.simulation import SCENARIOS
 
@@ -21,8 +23,14 @@ def _choices(section: Any) -> list[str]:
 
 def _one_of(value: str | None, values: list[str]) -> str | None:
     if value is not None and value not in values:
-        raise typer.BadParameter(f"{value!r} is not one of {', '.join(values)}")
+        hint = did_you_mean(value, values)
+        raise typer.BadParameter(f"{value!r} is not one of {', '.join(values)}{hint}")
     return value
+
+
+def _completion(values: Iterable[str]) -> Any:
+    """What a shell offers for an argument."""
+    return lambda incomplete: [value for value in values if value.startswith(incomplete)]
 
 
 def check_start(values: list[str] | None) -> list[str]:
@@ -116,6 +124,7 @@ def _choice(values: list[str], text: str, *flags: str) -> Any:
         *flags,
         metavar="|".join(values),
         callback=lambda value: _one_of(value, values),
+        autocompletion=_completion(values),
         help=text,
     )
 
@@ -139,6 +148,7 @@ Format = Annotated[
     typer.Argument(
         metavar="FORMAT",
         callback=lambda value: _one_of(value, sorted(IMPORTERS)),
+        autocompletion=_completion(sorted(IMPORTERS)),
         help=f"Format of SOURCE: {', '.join(sorted(IMPORTERS))}.",
     ),
 ]
@@ -146,7 +156,9 @@ Source = Annotated[Path, typer.Argument(metavar="SOURCE", help="Plain, .gz, .bz2
 Scenario = Annotated[
     str,
     typer.Argument(
-        metavar="SCENARIO", help=f"A scenario file (TOML), or one of {', '.join(SCENARIOS)}."
+        metavar="SCENARIO",
+        autocompletion=_completion(SCENARIOS),
+        help=f"A scenario file (TOML), or one of {', '.join(SCENARIOS)}.",
     ),
 ]
 Experiment = Annotated[
@@ -313,5 +325,12 @@ ForceOrResume = Annotated[
     typer.Option(
         "--force/--resume", help="Throw away what is in DIR, or run only what is missing."
     ),
+]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
+Verbose = Annotated[
+    bool, typer.Option("--verbose", help="Print every stage on stderr when it begins.")
+]
+ViewedFolder = Annotated[
+    Path, typer.Argument(metavar="DIR", help="Folder of smooth, compare, changes or experiment.")
 ]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]

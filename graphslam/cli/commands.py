@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import typer
 
 import graphslam
+from graphslam.cli import terminal
 from graphslam.cli.arguments import (
     Backend,
     Backends,
@@ -41,6 +42,7 @@ from graphslam.cli.arguments import (
     OutputLogOrFolder,
     Plan,
     Preset,
+    Quiet,
     ReferenceFolder,
     Relations,
     Resolution,
@@ -54,10 +56,13 @@ from graphslam.cli.arguments import (
     Starts,
     Strict,
     TruthFiles,
+    Verbose,
+    ViewedFolder,
     Viewer,
     WithMap,
     span_of,
 )
+from graphslam.cli.stage_bar import stage_bar
 from graphslam.cli.terminal import errors_in_one_line, progress_bar
 from graphslam.core.config import Config
 from graphslam.core.config_io import load_config, named_backend
@@ -68,7 +73,6 @@ app = typer.Typer(
     help="Logs of wheeled robots in; trajectories, a landmark map and their covariances out.",
     context_settings={"help_option_names": ["-h", "--help"]},
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
@@ -89,6 +93,25 @@ def options(
     """Logs of wheeled robots in; trajectories, a landmark map and their covariances out."""
 
 
+#: command -> lines at the end of its help
+EXAMPLES = {
+    "info": ("graphslam info drive.mcap",),
+    "import": ("graphslam import carmen intel.clf -o intel.mcap",),
+    "simulate": ("graphslam simulate lab -o lab.mcap --seed 3",),
+    "smooth": (
+        "graphslam smooth drive.mcap -o result",
+        "graphslam smooth drive.mcap -o result --backend isam2 --horizon 20",
+        "graphslam smooth drive.mcap -o result --set keyframe.distance_m=0.5 --force",
+    ),
+    "view": ("graphslam view result",),
+    "evaluate": ("graphslam evaluate result --truth robot=truth.tum",),
+    "compare": ("graphslam compare drive.mcap --backends ekf,isam2:20,batch -o comparison",),
+    "changes": ("graphslam changes morning evening -o changes",),
+    "experiment": ("graphslam experiment ekf-versus-smoothing --runs 20 -o experiment",),
+    "config": ("graphslam config > settings.toml",),
+}
+
+
 @dataclass(frozen=True)
 class Output:
     """What a command prints: ``content`` with --json, else what ``show`` prints for people.
@@ -104,17 +127,25 @@ class Output:
 
 
 def command(name: str) -> Callable[[Callable[..., Output]], None]:
-    """Register a function as a command, with the options --json and --debug that all have."""
+    """Register a function as a command, with the options that all have and its examples."""
 
     def register(function: Callable[..., Output]) -> None:
-        def run(*, json: Json = False, debug: Debug = False, **arguments: Any) -> None:
+        def run(
+            *,
+            json: Json = False,
+            quiet: Quiet = False,
+            verbose: Verbose = False,
+            debug: Debug = False,
+            **arguments: Any,
+        ) -> None:
             from graphslam.results.file_formats import to_json
 
+            terminal.output.quiet, terminal.output.verbose = quiet, verbose
             with errors_in_one_line(debug):
                 output = function(**arguments)
                 if json:
                     typer.echo(to_json(output.content, name), nl=False)
-                else:
+                elif not quiet:
                     output.show()
                 if output.failure:
                     raise EstimationError(output.failure)
@@ -122,12 +153,20 @@ def command(name: str) -> Callable[[Callable[..., Output]], None]:
                     raise typer.Exit(output.code)
 
         # typer reads the options from the signature
-        common = list(inspect.signature(run).parameters.values())[:2]
+        common = list(inspect.signature(run).parameters.values())[:4]
         own = inspect.signature(function)
         signature = own.replace(parameters=[*own.parameters.values(), *common])
         run.__dict__["__signature__"] = signature
-        run.__annotations__ = function.__annotations__ | {"json": Json, "debug": Debug}
-        run.__doc__ = function.__doc__
+        run.__annotations__ = function.__annotations__ | {
+            "json": Json,
+            "quiet": Quiet,
+            "verbose": Verbose,
+            "debug": Debug,
+        }
+        shown = "\n".join(f"  {line}" for line in EXAMPLES.get(name, ()))
+        run.__doc__ = (
+            f"{inspect.getdoc(function)}\n\n\b\nExamples:\n{shown}" if shown else function.__doc__
+        )
         app.command(name)(run)
 
     return register
@@ -221,7 +260,7 @@ def smooth(
     tree = load_config(config, [*options, *(start or ()), *(settings or ())], preset)
     if plan:
         return _described(logs, tree, strict=False)
-    with progress_bar("smoothing") as progress:
+    with stage_bar() as progress:
         result = graphslam.smooth(logs, config=tree, output=output, force=force, progress=progress)
     if with_map:
         graphslam.make_map(output)
@@ -249,6 +288,15 @@ def map_command(
         directory, output=output, resolution_m=resolution, mode=mode, force=force
     ).to_dict()
     return Output(made, lambda: show.mapped(made, output or directory))
+
+
+@command("view")
+def view(directory: ViewedFolder) -> Output:
+    """Open the report of a folder in the browser."""
+    from graphslam.cli.view import OPENERS
+
+    opened = OPENERS["report"](directory)
+    return Output({"opened": str(opened)}, lambda: typer.echo(f"opened: {opened}"))
 
 
 @command("evaluate")

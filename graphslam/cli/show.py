@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from graphslam.core.geometry import area_centroid
 from graphslam.core.records import Result
@@ -27,6 +28,7 @@ from graphslam.results.report_comparison import (
 if TYPE_CHECKING:
     from graphslam.simulation import Simulation
 
+_MUCH = 1.5  # chi2/dof above it: the noise is larger than stated, or something is wrong
 _PIPE_WIDTH = 200  # columns; output into a pipe has no width of its own
 
 
@@ -123,19 +125,39 @@ def smoothed(result: Result, directory: Path) -> None:
         for key in ("scans", "keyframes", "landmarks", "loop_closures")
         if counts[key]
     ]
-    factor = summary["real_time_factor"]
-    speed = "" if factor is None else f", {factor:.3g} x real time"
-    console.print(f"{', '.join(parts)}; {summary['stages']['all']:.1f} s{speed}")
-    if factor is None:  # the stamps are invented
+    console.print(f"{', '.join(parts)}; {summary['stages']['all']:.1f} s")
+    if summary["real_time_factor"] is None:  # the stamps are invented
         console.print(f"stamps: {summary['notes']['stamps']}")
     for robot, found in summary["clocks"].items():
         console.print(f"clock of {robot}: {_clock(found)}")
+    console.print(verdict(result))
     _reasons(console, "rejected", summary["rejected"])
     _reasons(console, "dropped", summary["dropped"])
     _unobservable(console, summary["calibration"])
     for warning in summary["warnings"]:
         console.print(f"warning: {warning}")
     console.print(f"report: {directory / 'report.html'}")
+
+
+def verdict(result: Result) -> Text:
+    """How sure, how consistent and how fast; bold and coloured on a terminal that wants colours."""
+    from graphslam.results.report_tables import median_sigma
+
+    graph, text = result.summary["graph"], Text()
+    sigma, parts = median_sigma(result), []
+    if sigma is not None:
+        parts.append((f"{100 * sigma:.2g} cm", "median position sigma", "bold cyan"))
+    if graph["dof"] > 0:
+        # twice the error is chi-square where the noise is as stated
+        ratio = 2 * graph["error"] / graph["dof"]
+        good = ratio < _MUCH
+        parts.append((f"{ratio:.2f}", "chi2/dof", "bold green" if good else "bold yellow"))
+    factor = result.summary["real_time_factor"]
+    if factor is not None:
+        parts.append((f"{factor:.3g} x", "real time", "bold cyan" if factor > 1 else "bold yellow"))
+    for i, (number, name, style) in enumerate(parts):
+        text.append(", " if i else "").append(number, style).append(f" {name}")
+    return text
 
 
 def _unobservable(console: Console, calibration: Mapping[str, Any]) -> None:

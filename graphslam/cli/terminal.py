@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import typer
 
@@ -12,6 +13,17 @@ from graphslam.core.errors import GraphSlamError
 
 DRAW_INTERVAL_S = 0.1  # smooth to the eye, and drawing takes no noticeable time
 INTERRUPTED = 130  # the exit code of a program that Ctrl-C ended, by convention of shells
+
+
+@dataclass
+class Verbosity:
+    """What the options --quiet and --verbose ask for."""
+
+    quiet: bool = False
+    verbose: bool = False
+
+
+output = Verbosity()
 
 
 @contextmanager
@@ -54,7 +66,7 @@ def _describe(error: Exception) -> str:
 @contextmanager
 def progress_bar(doing: str) -> Iterator[Callable[[int, int], None]]:
     """A function of how much is done, of how much in all; it draws only on a terminal."""
-    if not sys.stderr.isatty():
+    if output.quiet or not sys.stderr.isatty():
         yield lambda _done, _total: None
         return
     from rich import progress as bars

@@ -8,6 +8,7 @@ from graphslam.core.config import Config
 from graphslam.core.config_io import parse_setting, with_preset, with_settings
 from graphslam.core.errors import ConfigError
 from graphslam.core.presets import PRESETS
+from graphslam.core.suggestions import did_you_mean
 from graphslam.estimation.backends import BACKENDS
 
 #: names of back ends in tables; the others have the name in `BACKENDS`
@@ -59,7 +60,8 @@ def _variant(spec: str, config: Config) -> Variant:
         name, label = config.backend.name, f"{name}: {NAMES.get(config.backend.name, name)}"
     if name not in BACKENDS:
         known = ", ".join(sorted([*BACKENDS, *PRESETS]))
-        raise ConfigError(f"--backends: {spec!r} is not one of {known}")
+        hint = did_you_mean(name, [*BACKENDS, *PRESETS])
+        raise ConfigError(f"--backends: {spec!r} is not one of {known}{hint}")
     if colon and name != "isam2":
         raise ConfigError(f"--backends {spec}: only isam2 has a horizon")
     if colon:

@@ -13,6 +13,7 @@ from typing import Any
 from graphslam.core.config import Config
 from graphslam.core.config_io import load_config
 from graphslam.core.errors import ConfigError
+from graphslam.core.suggestions import did_you_mean
 from graphslam.evaluation.thesis_experiments import EXPERIMENTS as THESIS_EXPERIMENTS
 from graphslam.simulation import load_scenario
 from graphslam.simulation.scenario import NOT_NEGATIVE, POSITIVE, SHARE, Point, ScenarioError
@@ -181,7 +182,10 @@ def load_definition(name: str | Path) -> Definition:
     try:
         tree = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
-        raise ConfigError(f"{name}: neither a file nor one of {', '.join(EXPERIMENTS)}") from error
+        raise ConfigError(
+            f"{name}: neither a file nor one of {', '.join(EXPERIMENTS)}"
+            f"{did_you_mean(str(name), EXPERIMENTS)}"
+        ) from error
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

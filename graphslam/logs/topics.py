@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from graphslam.core import records
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError
+from graphslam.core.suggestions import did_you_mean
 from graphslam.logs.decoders import DECODERS
 from graphslam.logs.findings import Finding, topics_setting
 from graphslam.logs.recording import Recording
@@ -66,7 +67,7 @@ def find_topics(files: Sequence[Recording], config: Config) -> list[Topic]:
     if missing:
         raise LogError(
             f"{names}: logs.topics names {missing[0]}, which is not a usable topic of the log; "
-            f"there are {', '.join(sorted(found))}"
+            f"there are {', '.join(sorted(found))}{did_you_mean(missing[0], found)}"
         )
     return [found[name] for name in sorted(found) if not wanted or name in wanted]
 

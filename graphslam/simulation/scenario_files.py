@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+from graphslam.core.suggestions import did_you_mean
 from graphslam.simulation.scenario import (
     Laser,
     LaterVisit,
@@ -35,6 +36,7 @@ def load_scenario(scenario: str | Path) -> Scenario:
     except FileNotFoundError as error:
         raise ScenarioError(
             f"{scenario}: neither a file nor one of {', '.join(SCENARIOS)}"
+            f"{did_you_mean(str(scenario), SCENARIOS)}"
         ) from error
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from error

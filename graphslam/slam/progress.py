@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 
 from graphslam.core.records import Message, TrueLandmark, Truth
+from graphslam.core.stages import announce
 from graphslam.logs import LogSet
 
 #: messages between two reports of progress
@@ -16,7 +17,8 @@ Progress = Callable[[int], None]
 
 @contextmanager
 def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    """Adds the wall time of its body to a stage's."""
+    """Announces a stage, and adds the wall time of its body to the stage's."""
+    announce(stage)
     began = time.perf_counter()
     yield
     seconds[stage] += time.perf_counter() - began

@@ -414,9 +414,7 @@ def test_the_page_is_whole_and_repeatable():
     assert page == render_changes(found, CONFIG, ("before & after", "later"))
     assert "before &amp; after" in page
     assert "1 change: 1 appeared." in page
-    shown = re.sub(
-        r"<script[^>]*>.*?</script>", "", page, flags=re.DOTALL
-    )  # tests/browser has those
+    shown = re.sub(r"<script[^>]*>.*?</script>", "", page, flags=re.DOTALL)
     assert "http" not in shown.replace("http://www.w3.org", "")  # opens offline
 
 
