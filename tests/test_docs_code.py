@@ -122,3 +122,9 @@ def test_the_description_on_the_package_index_has_no_dead_link(monkeypatch):
 
 def test_the_citation_has_the_version():
     assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+
+
+def test_every_page_with_python_has_a_test_that_runs_it():
+    """Those of test_public_api and the one above."""
+    pages = {page.name for page in PAGES if blocks(page, "python")}
+    assert pages == {"README.md", "change-detection.md", "python.md"}
