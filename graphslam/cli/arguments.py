@@ -95,9 +95,19 @@ def check_viewer(value: str | None) -> str | None:
     Raises:
         typer.BadParameter: it is no such kind, or what it needs is not installed.
     """
-    if _one_of(value, VIEWERS) == "rrd" and find_spec("rerun") is None:
-        raise typer.BadParameter('needs rerun-sdk: pip install "coop-graphslam[viewer]"')
+    check_rerun(_one_of(value, VIEWERS) == "rrd")
     return value
+
+
+def check_rerun(wanted: bool) -> bool:
+    """Whether Rerun is wanted.
+
+    Raises:
+        typer.BadParameter: it is, and it is not installed.
+    """
+    if wanted and find_spec("rerun") is None:
+        raise typer.BadParameter('needs rerun-sdk: pip install "coop-graphslam[viewer]"')
+    return wanted
 
 
 def check_resolution(value: float | None) -> float | None:
@@ -332,5 +342,12 @@ Verbose = Annotated[
 ]
 ViewedFolder = Annotated[
     Path, typer.Argument(metavar="DIR", help="Folder of smooth, compare, changes or experiment.")
+]
+AsMcap = Annotated[
+    bool,
+    typer.Option("--mcap", help="Write result.mcap, for Foxglove, Lichtblick and RViz, instead."),
+]
+AsRerun = Annotated[
+    bool, typer.Option("--rrd", callback=check_rerun, help="Open it in the Rerun viewer instead.")
 ]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]

@@ -16,6 +16,8 @@ import typer
 import graphslam
 from graphslam.cli import terminal
 from graphslam.cli.arguments import (
+    AsMcap,
+    AsRerun,
     Backend,
     Backends,
     Causal,
@@ -291,12 +293,17 @@ def map_command(
 
 
 @command("view")
-def view(directory: ViewedFolder) -> Output:
-    """Open the report of a folder in the browser."""
+def view(directory: ViewedFolder, mcap: AsMcap = False, rrd: AsRerun = False) -> Output:
+    """Open the report of a folder in the browser, or a result in a viewer.
+
+    --mcap only writes result.mcap and its layout, where they are missing: the viewers of such
+    files open them.
+    """
     from graphslam.cli.view import OPENERS
 
-    opened = OPENERS["report"](directory)
-    return Output({"opened": str(opened)}, lambda: typer.echo(f"opened: {opened}"))
+    opened = OPENERS["mcap" if mcap else "rrd" if rrd else "report"](directory)
+    verb = "open it in Foxglove, Lichtblick or RViz" if mcap else "opened"
+    return Output({"opened": str(opened)}, lambda: typer.echo(f"{verb}: {opened}"))
 
 
 @command("evaluate")

@@ -225,3 +225,28 @@ def test_bounds_hold_95_percent_of_the_errors():
         miss = (draws[:, 1] - drawn @ end) / (drawn @ n)
         half = np.hypot(*(bar[1] - bar[0])) / 2
         assert abs((np.abs(miss) < half).mean() - 0.95) < 0.01
+
+
+def test_view_writes_a_file_for_a_viewer_where_it_is_missing(shown, tmp_path, monkeypatch):
+    """And once only: what is there is opened again as it is."""
+    import shutil
+
+    from command_line import call
+
+    folder = tmp_path / "out"
+    shutil.copytree(shown, folder, ignore=shutil.ignore_patterns("result.*"))
+    done = call("view", folder, "--mcap", "--json")
+    assert json.loads(done.out) == {"opened": str(folder / "result.mcap")}, done.err
+    assert (folder / "result.mcap").read_bytes() == (shown / "result.mcap").read_bytes()
+    (folder / "result.mcap").write_bytes(b"kept")
+    assert "Lichtblick" in call("view", folder, "--mcap").out
+    assert (folder / "result.mcap").read_bytes() == b"kept"
+    if not importlib.util.find_spec("rerun"):
+        assert call("view", folder, "--rrd").code == 2
+        return
+    from graphslam.cli import view
+
+    started = []
+    monkeypatch.setattr(view.subprocess, "Popen", lambda command, **_: started.append(command))
+    assert call("view", folder, "--rrd").code == 0
+    assert started[0][1:] == ["-m", "rerun", str(folder / "result.rrd")]
