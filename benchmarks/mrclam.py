@@ -76,7 +76,7 @@ def row(name: str, log: Path, folder: Path) -> str:
 def main() -> None:
     """Print the table."""
     options = parser(__doc__)
-    options.add_argument("names", nargs="*", choices=[[], *RUNS], default=list(RUNS))
+    options.add_argument("names", nargs="*", choices=[*RUNS, []], default=[])
     names = options.parse_args().names or list(RUNS)
     with tempfile.TemporaryDirectory() as scratch:
         log = Path(scratch) / "mrclam6.mcap"

@@ -225,10 +225,14 @@ class Association(Record):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Start(Record):
-    """Prior of a robot's first state: pose (3,), covariance (3, 3) along world axes."""
+    """Prior of a robot's first state: pose (3,), cov (3, 3) along world axes.
+
+    ``base_cov``: ``cov`` without the sensor's mount, where the start of the base was told.
+    """
 
     pose: Array
     cov: Array
+    base_cov: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -392,11 +396,7 @@ class ScanTies:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointScans:
-    """What the joint covariance of all scans follows from.
-
-    ``states[robot]`` are final states, ``ties[robot]`` how the scans of the robot follow from them;
-    ``root`` is that of the information of the states.
-    """
+    """What the joint covariance of all scans follows from: how they follow from final states."""
 
     root: InformationRoot
     states: Mapping[str, Trajectory]

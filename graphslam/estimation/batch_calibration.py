@@ -14,6 +14,7 @@ from graphslam.core.config import RobustConfig
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Motion, Step
 from graphslam.estimation.calibration_graph import (
+    CalibratedSolution,
     CalibrationGraph,
     at_calibration,
     solve_calibrated,
@@ -38,13 +39,14 @@ def calibrate(
     *,
     joint: bool = False,
     rough: bool = False,
+    solved_once: Callable[[CalibratedSolution, Sequence[Step]], None] | None = None,
 ) -> tuple[Estimate, tuple[Step, ...]]:
     """Solve for states, landmarks and calibrations together, ``rounds`` times.
 
     ``rebuild`` computes the steps again in every round, the first by ``estimate``. The calibration
     of ``tracks`` is set to the one found. Returns the estimate, with ``joint`` and the root of its
     information, and the steps behind it. All rounds but the last converge roughly, with ``rough``
-    that one too.
+    that one too. ``solved_once`` is called with every solution and its steps.
 
     Raises:
         EstimationError: the estimate is indeterminate.
@@ -69,6 +71,8 @@ def calibrate(
         estimate = solved.estimate
         for name, track in tracks.items():
             track.calibration = solved.calibrations[name]
+        if solved_once is not None:
+            solved_once(solved, steps)
     return estimate, at_calibration(steps, initial, solved.calibrations) if rounds else steps
 
 

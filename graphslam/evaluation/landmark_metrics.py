@@ -30,7 +30,8 @@ def landmark_metrics(
     smallest sum of distances among pairs within 1 m. Other lines and segments each match the
     nearest true one within 1 m and 0.35 rad modulo pi, since a wall may be seen in several pieces.
     Distances are where the two lie beside each other: a Hough line reaches from its first to its
-    last return, and its middle may be far from all that was seen of it.
+    last return, and its middle may be far from all that was seen of it. Of one that lies beside no
+    part of a wall, the middle must be within 1 m of it.
 
     The error of a point is its distance. The error of a line or segment is its distance from the
     true line in the middle of what lies beside the true wall; its NEES has two degrees of freedom
@@ -149,13 +150,15 @@ def _match_costs(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]) ->
     ends = np.array([_ends(one) for one in true])
     apart = np.hypot(*(position[:, None, :2] - poses[:, :2]).transpose(2, 0, 1))
     offset, gap = _offset_beside(extent[:, None], poses, ends)
-    near = np.hypot(gap, offset)
+    middle, beyond = _offset_beside(extent.mean(axis=1)[:, None, None].repeat(2, 2), poses, ends)
+    # what lies beside no part of a wall, only near its end, is more likely of something else
+    near = np.where(gap > 0, np.hypot(middle, beyond), np.abs(offset))
     length = np.hypot(*(extent[:, 1] - extent[:, 0]).T)
     turn = wrap(2 * (position[:, None, 2] - poses[:, 2])) / 2  # modulo pi
     with np.errstate(invalid="ignore"):  # points have no direction
         match = (near <= MATCH_DISTANCE_M) & (np.abs(turn) <= MATCH_ANGLE_RAD)
         turned_off = np.sin(turn) * length[:, None] / math.sqrt(12)
-        walls = np.where(match, np.hypot(near, turned_off), np.inf)
+        walls = np.where(match, np.hypot(np.hypot(gap, offset), turned_off), np.inf)
     cost = np.where(apart <= MATCH_DISTANCE_M, apart, np.inf)
     cost = np.where(points[:, None], cost, walls)
     cost[points[:, None] != true_points] = np.inf

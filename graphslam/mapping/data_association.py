@@ -34,8 +34,10 @@ from graphslam.mapping.gating import (
 from graphslam.mapping.landmark_map import Entry, LandmarkMap
 from graphslam.mapping.robot_candidates import (
     NOT_THERE,
+    RejectedInARow,
     RobotTarget,
     predicted_joint,
+    robot_associations,
     robot_distances,
 )
 from graphslam.odometry.preintegration import Track
@@ -128,6 +130,7 @@ class Associator:
         self._unsettled: set[int] = set()  # admitted, but not yet in the back end
         self._deleted: list[int] = []  # of the graph, see `take_deleted`
         self._floor = gate_floor(config)
+        self._rejected_robots = RejectedInARow()
 
     def associate(self, image: Image) -> tuple[Association, ...]:
         """What is to enter the graph of an image.
@@ -328,16 +331,17 @@ class Associator:
             o = seen
             if n in robots:
                 k = robots[n]
-                name, model = image.robots[-1 - of_robots.landmark[k]].name, of_robots.model[k]
-                self._record_innovation(image, model, distances, k)
-                out.append(
-                    Association(
-                        image.robot, image.time_ns, name, model, o.z, o.cov, source=o.source
-                    )
-                )
+                name = image.robots[-1 - of_robots.landmark[k]].name
+                self._record_innovation(image, of_robots.model[k], distances, k)
+                self._rejected_robots.accepted(image.robot, name)
+                out += robot_associations(image.robot, image.time_ns, [replace(o, robots=(name,))])
                 continue
             if not o.is_landmark:
-                self.rejected[NOT_THERE] += 1
+                is_sure = bool(self.map.by_identity) or n not in of_robots.observation
+                if not is_sure and self._rejected_robots.is_one_too_many(image.robot, o.robots):
+                    out += robot_associations(image.robot, image.time_ns, [o])
+                else:
+                    self.rejected[NOT_THERE] += 1
                 continue
             if n in chosen:
                 k = chosen[n]

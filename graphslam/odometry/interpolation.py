@@ -27,6 +27,9 @@ from graphslam.odometry.preintegration import Track
 
 IntArray = np.ndarray[tuple[int], np.dtype[np.int64]]
 
+#: ns: a robot's velocity is its motion from so long before to so long after
+HALF_SPAN_NS = 250_000_000
+
 
 def causal_at(
     states: Trajectory,
@@ -192,7 +195,9 @@ class FrameTransforms:
         starts = {}
         for robot, start in step.starts.items():
             world = self.robots[robot]
-            starts[robot] = Start(compose(world, start.pose), rotate_cov(start.cov, world[2]))
+            base = None if start.base_cov is None else rotate_cov(start.base_cov, world[2])
+            cov = rotate_cov(start.cov, world[2])
+            starts[robot] = Start(compose(world, start.pose), cov, base)
         return replace(step, starts=starts)
 
 
@@ -204,6 +209,27 @@ def turned(known: MountCovariance, angle_rad: float) -> MountCovariance:
         turn @ known.states,
         {i: turn[: len(cross), : len(cross)] @ cross for i, cross in known.landmarks.items()},
     )
+
+
+def with_stamp_errors(base: Trajectory, track: Track, times_ns: IntArray) -> Trajectory:
+    """Poses of a base at the stamps of its sensor, with the error of what these stamps mean.
+
+    A latency found between two sensors does not tell which of them is late, and poses are given at
+    the stamps of one. By half the square of the latency their times are uncertain: as likely it is
+    this one's as the other's.
+
+    Args:
+        base: stamped by the sensor.
+        track: the robot's odometry, its calibration the final one.
+        times_ns: (n,) of the poses, as the track counts time.
+    """
+    late_s = 1e-9 * track.latency_ns
+    if not late_s:
+        return base
+    around = times_ns - HALF_SPAN_NS, times_ns + HALF_SPAN_NS
+    twist = log(between(*map(track.pose, around))) / (2e-9 * HALF_SPAN_NS)
+    moved = (rotation3(base.poses[:, 2]) @ twist[:, :, None]) * late_s
+    return replace(base, covs=base.covs + moved @ moved.mT / 2.0)
 
 
 def origin_shift(start: Array, mounts: Array) -> Array:

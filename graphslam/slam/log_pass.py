@@ -102,6 +102,8 @@ class LogPass:
                 "--start truth"
             )
         start = self.frames.offset_start(robot, self.starts[robot])
+        if not self.known.alone:
+            start = replace(start, base_cov=start.cov)
         if robot != self.frames.of[robot]:
             # priors are on the base, states on the sensor: where it sits is not known yet, nor is
             # where that of the first robot sits, to which the world is fixed

@@ -149,7 +149,7 @@ def reoptimise(pipeline: Pipeline, estimate: Estimate) -> Estimate:
     if is_sighting_log(pipeline):
         estimate, steps = solve_unnamed(pipeline, estimate)
     else:
-        estimate, steps, counts = reoptimise_scan_log(
+        estimate, steps, counts, noise = reoptimise_scan_log(
             pipeline.steps,
             estimate,
             tracks,
@@ -158,8 +158,10 @@ def reoptimise(pipeline: Pipeline, estimate: Estimate) -> Estimate:
             config,
             pipeline.tamper,
             robots,
+            pipeline.frames.of,
         )
         pipeline.counts.update(counts)
+        pipeline.noise = noise.to_summary()
     pipeline.steps = list(steps)
     if change := robots.unused(steps) - unused:
         pipeline.rejected[NOT_THERE] += change

@@ -14,9 +14,10 @@ from functools import partial
 import numpy as np
 
 from graphslam.core.config import Config
-from graphslam.core.geometry import Array
-from graphslam.core.records import Closure, Estimate, KeyframeScan, Step
-from graphslam.estimation.batch_calibration import calibrate, recompute_motions
+from graphslam.core.geometry import Array, compose, inverse, rotate_cov
+from graphslam.core.records import Closure, Estimate, KeyframeScan, Start, Step
+from graphslam.estimation.batch_calibration import ROUNDS, calibrate, recompute_motions
+from graphslam.estimation.calibration_graph import CalibratedSolution
 from graphslam.estimation.isam2 import Reoptimiser
 from graphslam.mapping.duplicate_landmarks import (
     find_duplicates,
@@ -39,8 +40,10 @@ from graphslam.mapping.loop_closure import (
 from graphslam.mapping.reassociation import reassociate
 from graphslam.mapping.submaps import build_submaps, with_poses_from
 from graphslam.mapping.visits import rejoin_visits, split_by_visit
+from graphslam.odometry.interpolation import origin_shift
 from graphslam.odometry.preintegration import Track
-from graphslam.slam.motion_noise import noise_scales, scale_motion_noise
+from graphslam.slam.log_noise import LogNoise
+from graphslam.slam.motion_noise import fit_motion_noise, noise_scales, scale_motion_noise
 from graphslam.slam.robot_gating import RobotOffers
 
 #: factors on the gates of re-association (across, direction), round by round
@@ -65,7 +68,8 @@ def reoptimise_scan_log(
     config: Config,
     tamper: Tamper | None = None,
     robots: RobotOffers | None = None,
-) -> tuple[Estimate, tuple[Step, ...], Counter[str]]:
+    frames: Mapping[str, str] | None = None,
+) -> tuple[Estimate, tuple[Step, ...], Counter[str], LogNoise]:
     """Solve a log of scans again: motion noise, loop closure, duplicates, calibration.
 
     Args:
@@ -77,9 +81,11 @@ def reoptimise_scan_log(
         config: settings.
         tamper: for tests, see `Tamper`.
         robots: what sightings of robots could be, used or not.
+        frames: robot -> the robot whose base begins at the origin of its frame.
 
     Returns:
-        The estimate, the steps behind it, and counts of what was changed, by name.
+        The estimate, the steps behind it, counts of what was changed, by name, and the noise of
+        the odometry.
 
     Raises:
         EstimationError: the estimate is indeterminate.
@@ -87,6 +93,7 @@ def reoptimise_scan_log(
     solve = Solver(config)
     steps, estimate = _with_observed_motion_noise(recompute_motions(steps, tracks), estimate, solve)
     counts: Counter[str] = Counter()
+    noise = LogNoise()
     closures: list[Closure] = []
     if config.backend.close_loops:
         steps, closures, estimate = _close_loops(
@@ -130,18 +137,72 @@ def reoptimise_scan_log(
             made = recompute_motions(closed, tracks)
             return scale_motion_noise(made, noise_scales(made, estimate))
 
+        def find_noise(solution: CalibratedSolution, made: Sequence[Step]) -> None:
+            nonlocal noise
+            noise = fit_motion_noise(tracks, made, solution.graph.posterior())
+
+        estimate, _ = calibrate(
+            rebuild,
+            estimate,
+            tracks,
+            config.robust,
+            1,
+            rough=len(tracks) == 1,
+            solved_once=find_noise,
+        )
         if len(tracks) > 1:
             # the world lies where the mount of the first robot puts it: a mount that this drive
             # does not tell would move the others away from where they started
-            estimate, _ = calibrate(rebuild, estimate, tracks, config.robust, rounds=1)
             for track in tracks.values():
                 track.hold_mount_unless(MOUNT_SIGMAS)
-        estimate, steps = calibrate(rebuild, estimate, tracks, config.robust, joint=True)
+            closed = with_sensor_starts(closed, tracks, frames)
+        rounds = ROUNDS - (len(tracks) == 1)
+        estimate, steps = calibrate(rebuild, estimate, tracks, config.robust, rounds, joint=True)
     else:
         estimate = solve(steps, estimate, closures, rough=False, joint=True)
         steps = with_closures(steps, closures)
     landmarks.update_from(steps, estimate)
-    return estimate, steps, counts
+    return estimate, steps, counts, noise
+
+
+def with_sensor_starts(
+    steps: Sequence[Step],
+    tracks: Mapping[str, Track],
+    frames: Mapping[str, str] | None,
+) -> tuple[Step, ...]:
+    """Steps in which starts that were told of bases are those of the sensors on them.
+
+    Several starts at a distance from each other tell the direction of the world much better than
+    the heading of any of them does, if they are not taken for as uncertain as the sensors' mounts
+    are before a drive has told of them.
+
+    Args:
+        steps: of all robots.
+        tracks: with their mounts as they are now known, or held. A held one adds nothing: the
+            path of the base begins where it was told, wherever on it the sensor sits.
+        frames: see `reoptimise_scan_log`.
+    """
+    told = {
+        robot: (start.pose, start.base_cov)
+        for step in steps
+        for robot, start in step.starts.items()
+        if start.base_cov is not None and robot in tracks
+    }
+    if not told or frames is None or not {frames[robot] for robot in told} <= set(told):
+        return tuple(steps)
+    placed = {}
+    for robot, (base, cov) in told.items():
+        first = frames[robot]
+        # where the mount of the first robot puts the world, see `FrameTransforms`
+        shift = origin_shift(told[first][0], tracks[first].mount)
+        pose = compose(inverse(shift), compose(base, tracks[robot].mount))
+        placed[robot] = Start(pose, cov + rotate_cov(tracks[robot].mount_cov, pose[2]))
+    return tuple(
+        replace(step, starts={r: placed.get(r, s) for r, s in step.starts.items()})
+        if step.starts
+        else step
+        for step in steps
+    )
 
 
 class Solver:

@@ -17,6 +17,7 @@ from graphslam.odometry.interpolation import (
     origin_shift,
     trajectory_of_mount,
     transform_trajectory,
+    with_stamp_errors,
 )
 from graphslam.odometry.mount_covariance import base_trajectory
 from graphslam.odometry.online_calibration import Calibrator, to_summary
@@ -152,6 +153,8 @@ class RobotState:
         else:
             before = states.index_before(times)
             base = base_trajectory(final, self.track.mount, mount, states, before)
+        if self.scans:
+            base = with_stamp_errors(base, self.track, times)
         at_start = compose(states.poses[0], inverse(self.track.mount))
         odometry = between(
             self.track.pose(self.times[0] - late_ns), self.track.pose(times - late_ns)

@@ -560,6 +560,19 @@ def test_a_robot_is_where_its_name_says_or_the_sighting_is_rejected():
     assert not run.map.entries, "a sighting of a robot makes no landmark"
 
 
+@pytest.mark.parametrize("named", [False, True])
+def test_robots_that_are_never_where_expected_are_believed_where_landmarks_have_no_names(named):
+    """The estimate may have taken one landmark for another; sightings of robots put that right."""
+    run = run_with_robots(a=(5.0, 0.0), b=(0.0, 9.0))
+    if named:
+        run.look(point(1.0, 1.0, identity="post"))
+    used = [targets(run.look(robot_at(8.0, 0.0, "a"))) for _ in range(3)]
+    assert used == ([[], [], []] if named else [[], ["a"], ["a"]])
+    assert targets(run.look(robot_at(5.0, 0.0, "a"))) == ["a"]
+    assert not targets(run.look(robot_at(8.0, 0.0, "a")))  # counted from the beginning
+    assert not targets(run.look(robot_at(8.0, 0.0, "a", "b"))), "it does not tell of which"
+
+
 def test_unnamed_robots_are_assigned_together():
     """b and c 4 cm apart, seen 1.5 cm and -2.2 cm from b: alone the first would be b's, and the
     second too. A robot takes one sighting of an image."""

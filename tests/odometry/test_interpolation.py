@@ -26,6 +26,7 @@ from graphslam.odometry.interpolation import (
     origin_shift,
     trajectory_of_mount,
     transform_trajectory,
+    with_stamp_errors,
 )
 from graphslam.odometry.preintegration import Track
 
@@ -400,3 +401,23 @@ def test_what_a_mount_shares_with_states_and_landmarks_turns_with_their_axes():
     np.testing.assert_allclose(found.mount.states, R @ states, atol=1e-15)
     np.testing.assert_allclose(found.mount.landmarks[7], R[:2, :2] @ point, atol=1e-15)
     np.testing.assert_allclose(found.mount.landmarks[9], R @ line, atol=1e-15)
+
+
+# ------------------------------------------------------------ what stamps mean
+
+
+@pytest.mark.parametrize("late_s", [0.1, -0.1, 0.0])
+def test_a_base_is_as_uncertain_along_its_way_as_its_sensor_may_be_late(late_s):
+    """Half the square of the latency times speed and turning: either of two sensors may be late."""
+    track = odometry_track(READINGS, [curve(t) for t in READINGS], mounted=True)
+    late = track.calibration.mean.copy()
+    late[-1] = late_s
+    track.calibration = replace(track.calibration, mean=late)
+    times = np.array([2 * SECOND, 5 * SECOND])
+    known = np.tile(1e-6 * np.eye(3), (2, 1, 1))
+    base = Trajectory(times, np.array([[0, 0, 0], [3.0, 1.0, np.pi / 2]]), known)
+    found = with_stamp_errors(base, track, times)
+    moved = np.array([TWIST, [-TWIST[1], TWIST[0], TWIST[2]]]) * late_s
+    expected = known + moved[:, :, None] * moved[:, None, :] / 2
+    np.testing.assert_allclose(found.covs, expected, atol=1e-6)
+    np.testing.assert_array_equal(found.poses, base.poses)

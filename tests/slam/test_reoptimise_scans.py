@@ -5,12 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graphslam.core.config import Config
-from graphslam.core.geometry import between, compose
-from graphslam.core.records import Association, Closure, Motion, Start, Step
+from graphslam.core.config import Config, OdometryConfig, RobotConfig
+from graphslam.core.geometry import between, compose, inverse
+from graphslam.core.records import Association, Closure, Motion, OdometryPose, Start, Step
 from graphslam.estimation.isam2 import Isam2Backend
 from graphslam.mapping.loop_closure import residuals, violated
-from graphslam.slam.reoptimise_scans import Solver, _tightened, _with_observed_motion_noise
+from graphslam.odometry.interpolation import origin_shift
+from graphslam.odometry.preintegration import Track
+from graphslam.slam.reoptimise_scans import (
+    Solver,
+    _tightened,
+    _with_observed_motion_noise,
+    with_sensor_starts,
+)
 
 SECOND = 10**9
 MOTION_COV = np.diag([0.01, 0.01, 0.02]) ** 2
@@ -104,3 +111,43 @@ def test_motions_become_as_noisy_as_they_are():
     # the median of 200 is good to 0.2; asking ends where a tenth more would come
     assert scale[2] == pytest.approx(3.0, abs=0.5)
     assert scale[0] == pytest.approx(1.0, abs=0.1)
+
+
+TOLD = {"a": np.array([1.0, 2.0, 0.3]), "b": np.array([20.0, -5.0, -2.0])}
+BASE_COV = np.diag([1e-4, 1e-4, 1e-4])
+
+
+def starting(base_cov):
+    """Steps of robots whose starts are as uncertain as their sensors' mounts are at first."""
+    starts = {robot: Start(pose, np.eye(3), base_cov) for robot, pose in TOLD.items()}
+    return [Step(0, starts), Step(1, {})]
+
+
+def tracks_mounted_at(**mounts):
+    tracks = {robot: Track(OdometryConfig(), RobotConfig(), mounted=True) for robot in TOLD}
+    for robot, track in tracks.items():
+        track.add(OdometryPose(robot, 0, 0, np.zeros(3)))
+        mean = track.calibration.mean.copy()
+        mean[-4:-1] = mounts.get(robot, 0.0)
+        track.calibration = replace(track.calibration.held(), mean=mean)
+    return tracks
+
+
+@pytest.mark.parametrize("mounts", [{}, {"b": (0.1, 0.0, 0.02)}, {"a": (0.0, 0.2, -0.05)}])
+def test_bases_begin_where_they_were_told_wherever_their_sensors_sit(mounts):
+    """In the world where the mount of the first robot puts it; breaks if the mount of one is left
+    out, or if the starts stay as uncertain as mounts are before anything is known."""
+    tracks = tracks_mounted_at(**mounts)
+    made, rest = with_sensor_starts(starting(BASE_COV), tracks, {"a": "a", "b": "a"})
+    world = origin_shift(TOLD["a"], tracks["a"].mount)
+    for robot, track in tracks.items():
+        sensor = compose(world, made.starts[robot].pose)
+        base = compose(sensor, inverse(track.mount))
+        np.testing.assert_allclose(between(TOLD[robot], base), 0.0, atol=1e-12)
+        np.testing.assert_allclose(made.starts[robot].cov, BASE_COV, atol=1e-12)
+    assert not rest.starts
+
+
+def test_starts_that_were_found_stay_as_they_are():
+    steps = starting(None)
+    assert with_sensor_starts(steps, tracks_mounted_at(), {"a": "a", "b": "a"}) == tuple(steps)

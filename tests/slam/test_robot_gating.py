@@ -167,7 +167,7 @@ def test_logs_of_scans_decide_again_too():
     estimate = run("batch", of_robots, config).finish()
     robots = RobotOffers(offers, [sighting(2, "b"), sighting(5, "b")])
     for known, expected in ((robots, {0, 1}), (None, {0})):
-        _, made, _ = reoptimise_scan_log(
+        _, made, *_ = reoptimise_scan_log(
             of_robots, estimate, {}, LandmarkMap(), (), config, None, known
         )
         assert used(made) == expected
