@@ -59,7 +59,7 @@ def find_gyroscopes(
         else:
             found[robot] = turning
             text = f"turning is that of the gyroscope of {names[0]}, less a bias of "
-            text += f"{turning.bias:.2g} rad/s"
+            text += f"{turning.bias:.2g} rad/s and a delay of {1e3 * turning.late_s:.0f} ms"
             remedy = "to leave it out: --set odometry.gyroscope=off"
             findings.append(Finding("note", "gyroscope", where, text, remedy))
     return found, findings

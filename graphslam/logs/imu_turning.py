@@ -6,6 +6,9 @@ the rate of the robot plus its bias, the wheels by the rate, an unknown share of
 and an unknown turning per metre (unequal wheels). What is said of the wheels weighs most where the
 robot stands or drives straight, so slip in turns does not get into the bias.
 
+The two have their own delays. The gyroscope is shifted in time to where it goes best with the
+wheels; the delay of the odometry against the laser is the matter of calibration.
+
 The odometry then goes the way that the wheels say, and turns as the gyroscope says. A gyroscope
 that contradicts the wheels altogether (another axis, degrees, no signal) is not used.
 """
@@ -37,6 +40,8 @@ RATIOS, SPREAD = (0.5, 1.6), 0.25
 #: rad/s by which it may differ from the wheels, where they are good, before it is worse than they
 MAX_NOISE = 0.05
 _HUBER, _REWEIGHTED = 2.0, 4
+#: s: how late a gyroscope may be against the odometry, and the steps in which that is searched
+MOST_LATE_S, LATE_STEP_S = 0.4, 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,7 +49,8 @@ class Turning:
     """What a gyroscope says: the ``angle`` (n,) rad turned since ``times`` (n,)[0] ns, no bias.
 
     ``gaps`` (n,) counts the intervals up to each time that are longer than `GAP_NS`. ``topic`` is
-    where it is from; ``bias`` rad/s its mean bias.
+    where it is from; ``bias`` rad/s its mean bias; ``late_s`` how late its stamps were, which is
+    taken out of ``times``.
     """
 
     topic: str
@@ -52,6 +58,7 @@ class Turning:
     angle: Array
     gaps: IntArray
     bias: float
+    late_s: float
 
     def turned(self, start_ns: int, end_ns: int) -> float | None:
         """How far the robot turned, rad; None where the gyroscope did not measure all the time."""
@@ -79,6 +86,8 @@ def find_turning(
         return "it has no readings"
     raw, gaps = _integrated(times, rates)
     order = np.argsort(odometry_ns, kind="stable")
+    late_s = _latency_s(times, raw, odometry_ns[order], poses[order])
+    times = times - round(1e9 * late_s)
     windows = _windows(times, raw, gaps, odometry_ns[order], poses[order])
     if not len(windows.seconds):
         return "no second of it is covered by the odometry too"
@@ -97,7 +106,33 @@ def find_turning(
     steps = 1e-9 * np.diff(times)
     bias = bias_of((times[1:] + times[:-1]) / 2)
     angle = raw - np.concatenate([[0.0], np.cumsum(bias * steps)])
-    return Turning(topic, times, angle, gaps, float(np.mean(bias)))
+    return Turning(topic, times, angle, gaps, float(np.mean(bias)), late_s)
+
+
+def _latency_s(times: IntArray, angle: Array, odometry_ns: IntArray, poses: Array) -> float:
+    """How late a gyroscope is against the wheels: where the turning of both correlates best.
+
+    0 where that is at the end of what is searched: they do not go together.
+    """
+    reach_ns = round(1e9 * (MOST_LATE_S + LATE_STEP_S))
+    inside = (odometry_ns >= times[0] + reach_ns) & (odometry_ns <= times[-1] - reach_ns)
+    at = odometry_ns[inside]
+    wheels = wrap(np.diff(poses[inside, 2]))
+    if not wheels.any():
+        return 0.0
+    lags = np.arange(-MOST_LATE_S, MOST_LATE_S + LATE_STEP_S / 2, LATE_STEP_S)
+    alike = np.zeros(len(lags))
+    for n, lag in enumerate(lags):
+        turned = np.diff(np.interp(at + 1e9 * lag, times, angle))
+        if turned.std() > 0:
+            alike[n] = np.corrcoef(turned, wheels)[0, 1]
+    best = int(np.argmax(alike))
+    if not 0 < best < len(lags) - 1 or alike[best] <= 0:
+        return 0.0
+    before, peak, after = alike[best - 1 : best + 2]
+    curvature = before - 2 * peak + after
+    off = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
+    return float(lags[best] + off * LATE_STEP_S)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -85,8 +85,19 @@ def test_the_bias_is_that_of_the_gyroscope_and_not_the_slip_of_wheels():
     times, poses, truth = drive()
     found = find_turning("/imu", *gyroscope(times, truth), times, poses)
     assert isinstance(found, Turning)
-    error = found.turned(int(times[0]), int(times[-1])) - (truth[-1] - truth[0])
+    error = found.turned(int(times[5]), int(times[-5])) - (truth[-5] - truth[5])
     assert abs(error) < 0.05  # a bias that took in the slip would be 0.05 rad/s, 6 rad in all
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.12, -0.05])
+def test_a_gyroscope_that_is_late_is_put_in_its_time(late_s):
+    """0.1 s at 0.8 rad/s are 5 degrees in each turn, which scans would contradict."""
+    times, poses, truth = drive()
+    at, rates = gyroscope(times, truth)
+    found = find_turning("/imu", at + round(late_s * S), rates, times, poses)
+    assert isinstance(found, Turning) and found.late_s == pytest.approx(late_s, abs=0.01)
+    half = found.turned(T0 + 34 * S, T0 + 35 * S)  # up to the middle of a turn
+    assert half == pytest.approx(truth[350] - truth[340], abs=0.02)
 
 
 def test_the_simulated_gyroscope_of_a_scenario_is_used(tmp_path):
