@@ -176,15 +176,15 @@ def smooth(
 
             return truth_of_logs(log, settled)
 
-        def render_report() -> tuple[str, list[str]]:
+        def render_report() -> tuple[str, dict[str, Any]]:
             from graphslam.evaluation.ground_truth import errors_of_run
             from graphslam.results.report import render
 
-            errors = errors_of_run(result, known)
-            return render(result, errors), result.summary["warnings"]
+            return render(result, errors_of_run(result, known)), dict(result.summary)
 
         def finish_report(result: Result) -> str:
-            page, result.summary["warnings"][:] = report.result()
+            page, told = report.result()
+            cast("dict[str, Any]", result.summary).update(told)
             return page
 
         truth = Future(read_truth)

@@ -242,10 +242,12 @@ def smooth(
     settings: Settings = None,
     force: Force = False,
     plan: Plan = False,
+    strict: Strict = False,
 ) -> Output:
     """Find the best trajectories and a landmark map.
 
     Writes a folder with trajectories, landmarks, covariances, the factor graph and report.html.
+    With --strict the exit code is 3 if the verdict is doubtful or bad; the result is written.
     """
     from graphslam.cli import show
 
@@ -261,14 +263,15 @@ def smooth(
     options += [f"front_end.name={front_end}"] if front_end else []
     tree = load_config(config, [*options, *(start or ()), *(settings or ())], preset)
     if plan:
-        return _described(logs, tree, strict=False)
+        return _described(logs, tree, strict)
     with stage_bar() as progress:
         result = graphslam.smooth(logs, config=tree, output=output, force=force, progress=progress)
     if with_map:
         graphslam.make_map(output)
     if viewer:
         graphslam.write_viewer(output, viewer)
-    return Output(result.summary, lambda: show.smoothed(result, output))
+    code = 3 if strict and result.summary["verdict"]["verdict"] != "good" else 0
+    return Output(result.summary, lambda: show.smoothed(result, output), code=code)
 
 
 @command("map")

@@ -136,6 +136,9 @@ def smoothed(result: Result, directory: Path) -> None:
     _unobservable(console, summary["calibration"])
     for warning in summary["warnings"]:
         console.print(f"warning: {warning}")
+    for reason in summary["verdict"]["reasons"]:
+        console.print(f"{reason['level']}: {reason['text']}")
+    console.print(f"verdict: {summary['verdict']['verdict']}")
     console.print(f"report: {directory / 'report.html'}")
 
 

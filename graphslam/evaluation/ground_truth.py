@@ -12,6 +12,7 @@ from graphslam.evaluation.metrics import evaluate
 from graphslam.logs import GroundTruth, LogSet, is_recording, read_truth, truth_from_recordings
 from graphslam.results.file_formats import read_trajectory
 from graphslam.results.folder import SavedResult
+from graphslam.slam.verdict import with_truth
 
 _NO_TRUTH = "holds no true poses or landmarks; give --truth or --relations"
 
@@ -81,15 +82,20 @@ def truth_given(
 
 
 def errors_of_run(result: Result, truth: GroundTruth) -> dict[str, Any] | None:
-    """Errors against the truth in the logs, None without; a warning where it does not fit."""
+    """Errors against the truth in the logs, None without; a warning where it does not fit.
+
+    The verdict of the run takes them in.
+    """
     if not truth:
         return None
     try:
-        return evaluate(result, truth.trajectories, truth.landmarks)
+        errors = evaluate(result, truth.trajectories, truth.landmarks)
     except OutputError as error:
         # the truth is of another time: no reason to lose the run
         result.summary["warnings"].append(f"not evaluated: {error}")
         return None
+    result.summary["verdict"].update(with_truth(result.summary["verdict"], errors))
+    return errors
 
 
 def _robot_and_path(source: str, robots: Sequence[str]) -> tuple[str, Path]:

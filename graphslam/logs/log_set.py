@@ -18,7 +18,7 @@ from graphslam.logs.findings import Finding
 from graphslam.logs.future_stamps import Recorded, repair_future_stamps
 from graphslam.logs.gyroscopes import find_gyroscopes
 from graphslam.logs.imu_turning import Turning, with_turning
-from graphslam.logs.recording import Recording, raw_messages
+from graphslam.logs.recording import Recording, raw_messages, sample_messages
 from graphslam.logs.robots import robots_and_topics
 from graphslam.logs.stated_noise import StatedNoise, stated_noise
 from graphslam.logs.topic_context import topic_contexts
@@ -88,12 +88,6 @@ class LogSet:
         having = {t.robot for t in self.topics if t.record in ODOMETRY_KINDS}
         return tuple(robot for robot in self.robots if robot not in having)
 
-    @property
-    def bridged(self) -> tuple[str, ...]:
-        """Robots whose scans tell how they moved where their odometry, of poses, is silent."""
-        having = {t.robot for t in self.topics if t.record is records.OdometryPose}
-        return tuple(robot for robot in self.robots if robot in having and self.has_scans(robot))
-
     def no_return_m(self, topic: str) -> float:
         """Smallest range, m, that means no return in ``topic``; inf if none was detected."""
         return self._contexts[topic].no_return_m
@@ -105,6 +99,20 @@ class LogSet:
             own = [t for t in self.topics if t.robot == robot and t.record is kind]
             self._stated[robot] = stated_noise(self.opened, own[0]) if own else None
         return self._stated[robot]
+
+    def sample_scans(self, robot: str, number: int) -> list[records.Scan]:
+        """About ``number`` scans of ``robot`` from the whole log, sorted by stamp."""
+        found: list[records.Scan] = []
+        for topic in self.topics:
+            if topic.robot != robot or topic.record is not records.Scan:
+                continue
+            for file in self.opened:
+                data = list(sample_messages(file, topic.name, number // 10, 10))
+                if data:
+                    context = self._contexts[topic.name]
+                    decoded = decode_messages(topic.schema, data, context, Counter())
+                    found += [scan for scan in decoded if isinstance(scan, records.Scan)]
+        return sorted(found, key=lambda scan: scan.stamp_ns)
 
     def count(self, exclude: tuple[type[Message], ...] = ()) -> int:
         """Number of messages in all used topics except those of the records ``exclude``."""

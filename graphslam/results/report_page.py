@@ -16,6 +16,7 @@ from graphslam.results import report_plots as plots
 from graphslam.results import report_tables as tables
 from graphslam.results.live_figure import live_html
 from graphslam.results.live_map import live_map
+from graphslam.results.report_verdict import verdict_section
 
 
 def page(result: Result, evaluation: Mapping[str, Any] | None) -> str:
@@ -24,6 +25,7 @@ def page(result: Result, evaluation: Mapping[str, Any] | None) -> str:
     title = " + ".join(PurePath(log["path"]).name for log in summary.get("logs", [])) or "Result"
     sections = [
         _header(result, title),
+        verdict_section(summary),
         _warnings(summary),
         _map_section(result),
         _quality_section(evaluation or {}),

@@ -14,6 +14,7 @@ from graphslam.logs import LogSet
 from graphslam.mapping.landmark_records import make_landmarks
 from graphslam.mapping.loop_closure import Tamper
 from graphslam.odometry.mount_covariance import with_mount_errors
+from graphslam.slam.evidence import gather
 from graphslam.slam.initialisation import initialise
 from graphslam.slam.log_pass import Progress, timed
 from graphslam.slam.log_reader import Reading, is_scan_log
@@ -23,6 +24,7 @@ from graphslam.slam.robot_settings import check_robots
 from graphslam.slam.scan_log import solve_scan_log
 from graphslam.slam.sighting_passes import run_sighting_passes
 from graphslam.slam.summary import summarise
+from graphslam.slam.verdict import judge
 
 #: scans that a result keeps for pictures, at most
 MAX_PICTURES = 4000
@@ -110,6 +112,9 @@ def make_result(finished: FinishedPass, began: float) -> Result:
         for model, values in sorted(pipeline.innovations.items())
     }
     pipeline.seconds["all"] = time.perf_counter() - began
+    summary = summarise(pipeline, estimate, plain, len(landmarks), finished.findings.clocks)
+    evidence = gather(pipeline, robots, steps, estimate, innovations, summary)
+    summary["verdict"] = judge(evidence)
     return Result(
         robots,
         landmarks,
@@ -118,6 +123,6 @@ def make_result(finished: FinishedPass, began: float) -> Result:
         tuple(pipeline.keyframe_scans[:: 1 + len(pipeline.keyframe_scans) // MAX_PICTURES]),
         innovations,
         np.array(pipeline.step_ms),
-        summarise(pipeline, estimate, plain, len(landmarks), finished.findings.clocks),
+        summary,
         pipeline.given_config,
     )

@@ -1,0 +1,32 @@
+"""A reason to doubt a result, and what the checks that give reasons share."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from graphslam.odometry.interpolation import IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """Why a result is doubtful or bad (``level``): one line about a robot, or "" for all.
+
+    ``check`` names what was looked at.
+    """
+
+    level: str
+    check: str
+    about: str
+    text: str
+
+
+def seconds(times_ns: IntArray | int, origin_ns: int) -> str:
+    """A time, ns, as people read it: seconds since the log began at ``origin_ns``."""
+    return f"{(float(times_ns) - origin_ns) * 1e-9:.1f} s"
+
+
+def stretches(flags: np.ndarray[Any, np.dtype[np.bool_]]) -> list[tuple[int, int]]:
+    """Where flags (n,) are true without a break: first place, and the one after the last."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

@@ -1,0 +1,222 @@
+"""What a run knows about whether its result can be true, gathered where it is at hand.
+
+Three witnesses tell how a robot moved: its odometry, its scans and the landmarks that it saw. Where
+two of them contradict each other, the third tells which one is more likely wrong. What they say is
+put into arrays here; `graphslam.slam.verdict` judges it.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from graphslam.core.geometry import Array
+from graphslam.core.observation_models import MODELS
+from graphslam.core.records import Association, Estimate, KeyframeScan, RobotResult, Step
+from graphslam.odometry.interpolation import IntArray
+from graphslam.slam.doubts import stretches
+from graphslam.slam.log_pass import LogPass
+from graphslam.slam.robot_state import RobotState
+
+BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
+
+#: poses of a trajectory that are compared, at most
+MOST_POSES = 4000
+#: a robot stands that moves less in a step (ns; m, rad), and does so for at least (ns)
+PARKED_STEP_NS, PARKED_M, PARKED_RAD, PARKED_NS = 1_000_000_000, 0.01, 0.005, 4_000_000_000
+#: scans that are looked at; m: a range that changed
+SAMPLED_SCANS, CHANGED_M = 400, 0.15
+#: m: points of two scans that are nearer to each other are the same
+SAME_POINT_M = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """Sightings of landmarks or robots by one robot, sorted by time, (n,) each.
+
+    ``targets`` numbers what is seen, ``z`` (n, 2) is bearing rad and range m of ``sigmas`` (n, 2);
+    ``odometry`` (n, 3) the poses that they were made from by odometry alone; ``d2`` their squared
+    distances from the result, per degree of freedom.
+    """
+
+    times_ns: IntArray
+    targets: IntArray
+    z: Array
+    sigmas: Array
+    odometry: Array
+    d2: Array
+
+
+class Parked(NamedTuple):
+    """A time in which odometry stands; the share of a scan's beams that changed in it."""
+
+    begin_ns: int
+    end_ns: int
+    scan_change: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RobotEvidence:
+    """What one robot's sensors say.
+
+    ``source`` of its odometry; ``readings_ns`` (n,) and ``readings`` (n, 3), poses by odometry
+    alone, its resets bridged; ``resets``: how many. ``stamps_ns`` (m,), ``final`` (m, 3) and
+    ``by_odometry`` (m, 3): some poses of the result, and the same by odometry. ``scans_ns`` (k,):
+    when it had scans; ``repeated`` (j,): whether a keyframe's scan is that of the one before, at
+    ``repeated_ns`` (j,). ``motions_ns`` (q,) when motions ended, ``contradicted`` (q,) whether
+    scans contradicted them. ``seen``: what it saw. ``parked``: when it stood, by odometry.
+    """
+
+    name: str
+    source: str
+    readings_ns: IntArray
+    readings: Array
+    resets: int
+    stamps_ns: IntArray
+    final: Array
+    by_odometry: Array
+    scans_ns: IntArray
+    repeated: BoolArray
+    repeated_ns: IntArray
+    motions_ns: IntArray
+    contradicted: BoolArray
+    seen: Seen
+    parked: tuple[Parked, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """What the whole run knows; ``summary`` has what it counted.
+
+    ``without_odometry``: robots whose motion is that of their scans.
+    """
+
+    robots: tuple[RobotEvidence, ...]
+    summary: Mapping[str, Any]
+    innovations: Mapping[str, Array] = field(default_factory=dict)
+    without_odometry: tuple[str, ...] = ()
+
+
+def gather(
+    pipeline: LogPass,
+    robots: Mapping[str, RobotResult],
+    steps: Sequence[Step],
+    estimate: Estimate,
+    innovations: Mapping[str, Array],
+    summary: Mapping[str, Any],
+) -> Evidence:
+    """The evidence of a run: the last pass, and its result, see `graphslam.core.records.Result`."""
+    found = []
+    for name, run in pipeline.started.items():
+        motions = [(s.time_ns, s.motions[name].from_scans) for s in steps if name in s.motions]
+        seen = [a for s in steps for a in s.associations if a.robot == name and len(a.z) == 2]
+        own = [scan for scan in pipeline.keyframe_scans if scan.robot == name]
+        result = robots[name]
+        some = np.unique(np.linspace(0, len(result.final) - 1, MOST_POSES).astype(int))
+        found.append(
+            RobotEvidence(
+                name=name,
+                source=run.track.source,
+                readings_ns=run.track.times,
+                readings=run.track.pose(run.track.times),
+                resets=run.track.resets,
+                stamps_ns=result.final.stamps_ns[some],
+                final=result.final.poses[some],
+                by_odometry=result.dead_reckoning.poses[some],
+                scans_ns=np.array([time for _, time, _ in run.scans], dtype=np.int64),
+                repeated=_repeated(own),
+                repeated_ns=np.array([scan.time_ns for scan in own[1:]], dtype=np.int64),
+                motions_ns=np.array([time for time, _ in motions], dtype=np.int64),
+                contradicted=np.array([was for _, was in motions], dtype=bool),
+                seen=_seen(seen, run, estimate),
+                parked=tuple(_parked(pipeline, name, run)),
+            )
+        )
+    return Evidence(tuple(found), summary, innovations, tuple(pipeline.log.without_odometry))
+
+
+def _parked(pipeline: LogPass, name: str, run: RobotState) -> Iterator[Parked]:
+    """When a robot stands by its odometry, and how its scans change meanwhile."""
+    if name in pipeline.log.without_odometry or len(run.track) < 2:
+        return
+    grid = np.arange(run.track.first_ns, run.track.last_ns, PARKED_STEP_NS)
+    moved = np.abs(np.diff(run.track.pose(grid), axis=0))
+    stands = np.asarray((moved < np.array([PARKED_M, PARKED_M, PARKED_RAD])).all(axis=1))
+    long = [
+        (int(grid[a]), int(grid[b])) for a, b in stretches(stands) if grid[b] - grid[a] >= PARKED_NS
+    ]
+    scans = pipeline.log.sample_scans(name, SAMPLED_SCANS) if long and run.scans else []
+    for begin, end in long:
+        own = [scan for scan in scans if begin < scan.time_ns < end]
+        changes = [_changed(own[0].ranges, scan.ranges) for scan in own[1:]]
+        yield Parked(begin, end, max(changes, default=0.0))
+
+
+def _changed(before: Array, after: Array) -> float:
+    """Share of beams whose range changed; 0 where nothing can be compared."""
+    if len(before) != len(after):
+        return 0.0
+    both = np.isfinite(before) & np.isfinite(after)
+    if not both.any():
+        return 0.0
+    return float(np.mean(np.abs(after - before)[both] > CHANGED_M))
+
+
+def _squared(errors: Array, covs: Array) -> Array:
+    """Squared Mahalanobis distances (n,) of errors (n, k)."""
+    weighted = np.linalg.pinv(covs, hermitian=True) @ errors[:, :, None]
+    return np.asarray((errors * weighted[:, :, 0]).sum(axis=1))
+
+
+def _repeated(scans: Sequence[KeyframeScan]) -> BoolArray:
+    """Whether each scan but the first has just the points of the one before."""
+    return np.array(
+        [
+            len(a.points) == len(b.points)
+            and len(a.points) > 0
+            and bool((np.abs(a.points - b.points) < SAME_POINT_M).all())
+            for a, b in pairwise(scans)
+        ],
+        dtype=bool,
+    )
+
+
+def _seen(seen: Sequence[Association], run: RobotState, estimate: Estimate) -> Seen:
+    usable = [a for a in seen if _target(a, estimate) is not None]
+    usable.sort(key=lambda a: a.time_ns)
+    n = len(usable)
+    times = np.array([a.time_ns for a in usable], dtype=np.int64)
+    names: dict[int | str, int] = {}
+    targets = np.array([names.setdefault(a.target, len(names)) for a in usable], dtype=np.int64)
+    z = np.array([a.z for a in usable]).reshape(n, 2)
+    covs = np.array([a.cov for a in usable]).reshape(n, 2, 2)
+    d2 = np.zeros(n)
+    for model in {a.model for a in usable}:
+        of = np.array([k for k, a in enumerate(usable) if a.model == model])
+        states = estimate.states[usable[0].robot].at(times[of])
+        to = np.array([_target(usable[k], estimate) for k in of.tolist()])
+        residual = np.asarray(MODELS[model].residual(z[of], states, to))
+        d2[of] = _squared(residual, covs[of]) / residual.shape[1]
+    return Seen(
+        times,
+        targets,
+        z,
+        np.sqrt(np.diagonal(covs, axis1=1, axis2=2)),
+        run.track.mounted_pose(times) if n else np.zeros((0, 3)),
+        d2,
+    )
+
+
+def _target(a: Association, estimate: Estimate) -> Array | None:
+    """The landmark, or the pose of the robot, that an association is with; None without."""
+    if isinstance(a.target, int):
+        known = estimate.landmarks.get(a.target)
+        return None if known is None else known[0]
+    states = estimate.states.get(a.target)
+    if states is None:
+        return None
+    k = int(states.index(a.time_ns))
+    same = k < len(states) and int(states.stamps_ns[k]) == a.time_ns
+    return states.poses[k] if same else None

@@ -1,0 +1,253 @@
+"""Doubts about odometry: frozen, jumping, scaled, reversed, with gaps, or faster than robots drive.
+
+Its own readings tell what no robot does; the result, which landmarks and scans made, tells where
+odometry is alone with what it says.
+"""
+
+from collections.abc import Iterator
+from itertools import chain
+
+import numpy as np
+
+from graphslam.core.geometry import Array, between, wrap
+from graphslam.slam.doubts import Reason, seconds
+from graphslam.slam.evidence import Evidence, Parked, RobotEvidence
+
+#: share of a scan's beams that change while a robot stands, by people and doors, at most
+SCAN_CHANGE = 0.6
+#: m, rad: the robot moved by what its other sensors saw
+MOVED_M, MOVED_RAD = 0.3, 0.25
+#: share of readings, far from each other in time: the fastest that a robot drives is exceeded by
+#: those only that are wrong
+FAST_SHARE = 0.98
+#: m/s, rad/s: no robot of the kind is faster
+TOP_SPEED_M_S, TOP_TURN_RAD_S = 30.0, 12.0
+#: m, rad: a motion within one period that is more than the robot can do by so much is a jump
+JUMP_M, JUMP_RAD = 0.22, 0.4
+#: s: odometry without a reading for longer is a guess; periods of the topic
+GAP_S, GAP_PERIODS = 3.0, 8.0
+#: s: readings that are farther apart do not tell how a robot moved
+SLOW_S = 1.2
+#: s: motions over so long are compared with those of the result
+SPAN_S = 2.0
+#: factors of odometry on turning and on paths that calibration explains
+FACTORS = 0.6, 1.6
+#: share of turning or path that must be in a part of the log to compare it; rad, m
+TURNED_RAD, DRIVEN_M = 2.0, 2.0
+#: s: stamps of scans that are later or earlier by so much; what is tried; in steps of
+LATE_S, LATEST_S, LATE_STEP_S = 0.3, 2.0, 0.1
+LEAST_POSES = 50
+#: the log is compared in so many parts
+PARTS = 6
+
+
+def odometry_doubts(evidence: Evidence) -> Iterator[Reason]:
+    """What is wrong with the odometry of each robot."""
+    for robot in evidence.robots:
+        if robot.name in evidence.without_odometry or len(robot.readings_ns) < 3:
+            continue
+        found = list(chain(_gaps(robot), _speed(robot), _jumps(robot), _frozen(robot)))
+        yield from found
+        if not found:
+            yield from _factors(robot)
+            yield from _late(robot)
+
+
+def _steps(robot: RobotEvidence) -> tuple[Array, Array]:
+    """Motions (n-1, 3) between readings, and the time that each took, s."""
+    apart = np.diff(robot.readings_ns) * 1e-9
+    return between(robot.readings[:-1], robot.readings[1:]), apart
+
+
+def _reason(robot: RobotEvidence, level: str, text: str) -> Reason:
+    return Reason(level, "odometry", robot.name, f"{robot.name}: its odometry {text}")
+
+
+def _gaps(robot: RobotEvidence) -> Iterator[Reason]:
+    moved, apart = _steps(robot)
+    usual = float(np.median(apart))
+    origin = int(robot.readings_ns[0])
+    if usual > SLOW_S and robot.source != "given":
+        yield _reason(robot, "doubtful", f"has a reading every {usual:.1f} s only")
+        return
+    if robot.source == "given":
+        return
+    wide = np.flatnonzero(apart > max(GAP_S, GAP_PERIODS * usual))
+    far = np.hypot(moved[wide, 0], moved[wide, 1]) > MOVED_M
+    wide = wide[far | (np.abs(moved[wide, 2]) > MOVED_RAD)]
+    if len(wide):
+        k = int(wide[np.argmax(apart[wide])])
+        text = (
+            f"has no reading for {apart[k]:.1f} s from {seconds(robot.readings_ns[k], origin)} on, "
+            "in which the robot moved"
+        )
+        yield _reason(robot, "doubtful", text)
+
+
+def _speed(robot: RobotEvidence) -> Iterator[Reason]:
+    moved, apart = _steps(robot)
+    if robot.resets > max(3, 0.02 * len(apart)):
+        yield _reason(
+            robot,
+            "bad",
+            f"jumps {robot.resets} times, or is not in metres: it is faster than robots drive",
+        )
+        return
+    # over a second: stamps may come in bursts
+    path = np.concatenate([[0.0], np.cumsum(np.hypot(moved[:, 0], moved[:, 1]))])
+    turn = np.concatenate([[0.0], np.cumsum(np.abs(moved[:, 2]))])
+    times = (robot.readings_ns - robot.readings_ns[0]) * 1e-9
+    grid = np.arange(0.0, times[-1], 1.0)
+    for total, most, unit, hint in (
+        (path, TOP_SPEED_M_S, "m/s", "metres"),
+        (turn, TOP_TURN_RAD_S, "rad/s", "radians"),
+    ):
+        rates = np.diff(np.interp(grid, times, total))
+        if len(rates) and np.quantile(rates, FAST_SHARE) > most:
+            fast = float(np.quantile(rates, FAST_SHARE))
+            text = f"moves at {fast:.3g} {unit}, which no robot does: is it in {hint}?"
+            yield _reason(robot, "bad", text)
+
+
+def _jumps(robot: RobotEvidence) -> Iterator[Reason]:
+    """Single motions that neither the motions around them nor the result know of."""
+    origin = int(robot.readings_ns[0])
+    if robot.resets:
+        yield _reason(
+            robot, "doubtful", f"jumped {robot.resets} times; bridged at the previous speed"
+        )
+    if robot.source == "given":
+        return
+    moved, apart = _steps(robot)
+    usual = np.median(apart)
+    size = np.column_stack([np.hypot(moved[:, 0], moved[:, 1]), np.abs(moved[:, 2])])
+    at = []
+    for k, least in enumerate((JUMP_M, JUMP_RAD)):
+        rates = size[:, k] / np.maximum(apart, usual)
+        # what the robot does at its fastest, in this time and one period more: stamps jitter
+        most = float(np.quantile(rates, FAST_SHARE)) * (apart + usual)
+        at += np.flatnonzero(size[:, k] > most + least).tolist()
+    at = [k for k in sorted(set(at)) if apart[k] < GAP_S]
+    if at and len(at) <= max(5, 0.002 * len(apart)):
+        k = at[0]
+        text = (
+            f"jumps by {size[k, 0]:.2f} m and {size[k, 1]:.2f} rad at "
+            f"{seconds(robot.readings_ns[k + 1], origin)}"
+        )
+        yield _reason(robot, "doubtful", text + (f", and {len(at) - 1} times more" * (len(at) > 1)))
+
+
+def _frozen(robot: RobotEvidence) -> Iterator[Reason]:
+    """Times in which odometry stands while scans or landmarks change."""
+    origin = int(robot.readings_ns[0])
+    for parked in robot.parked:
+        witness = _who_moved(robot, parked)
+        if witness:
+            text = (
+                f"is frozen, or far too small, from {seconds(parked.begin_ns, origin)} to "
+                f"{seconds(parked.end_ns, origin)}: {witness} change meanwhile"
+            )
+            yield _reason(robot, "bad", text)
+            return
+
+
+def _who_moved(robot: RobotEvidence, parked: Parked) -> str:
+    """Which sensor says that the robot moved while it stood by odometry; empty if none does."""
+    if parked.scan_change > SCAN_CHANGE:
+        return "its scans"
+    seen = robot.seen
+    within = (seen.times_ns > parked.begin_ns) & (seen.times_ns < parked.end_ns)
+    changes = []
+    for target in np.unique(seen.targets[within]).tolist():
+        own = np.flatnonzero(within & (seen.targets == target))
+        turned = np.abs(wrap(seen.z[own, 0] - seen.z[own[0], 0]))
+        nearer = np.abs(seen.z[own, 1] - seen.z[own[0], 1])
+        # noise that does not fit was widened: it is taken for true within limits only
+        turn, path = np.clip(10 * seen.sigmas[own].mean(axis=0), (0.1, 0.3), (0.4, 1.5))
+        changes.append(max(float(np.median(turned) / turn), float(np.median(nearer) / path)))
+    return "the landmarks that it sees" if changes and np.median(changes) > 1 else ""
+
+
+def _factors(robot: RobotEvidence) -> Iterator[Reason]:
+    """Turning and path by odometry against those of the result, over parts of the log."""
+    times = (robot.stamps_ns - robot.stamps_ns[0]) * 1e-9
+    if len(times) < 3 or not times[-1] > 0:
+        return
+    grid = np.unique(np.searchsorted(times, np.arange(0.0, times[-1], SPAN_S)))
+    ours = between(robot.final[grid[:-1]], robot.final[grid[1:]])
+    its = between(robot.by_odometry[grid[:-1]], robot.by_odometry[grid[1:]])
+    known = np.isfinite(its).all(axis=1) & np.isfinite(ours).all(axis=1)
+    parts = np.arange(len(ours)) * PARTS // max(len(ours), 1)
+    worst: dict[str, tuple[float, str]] = {}
+    for part in [*range(PARTS), None]:
+        use = known & (parts == part) if part is not None else known
+        if not use.any():
+            continue
+        where = "" if part is None else f" from {times[grid[:-1][use]][0]:.0f} s on"
+        for name, a, b, least in (
+            ("turning", its[use, 2], ours[use, 2], TURNED_RAD),
+            ("forward motion", its[use, 0], ours[use, 0], DRIVEN_M),
+        ):
+            amount = np.maximum(np.abs(a), np.abs(b)).sum()
+            if amount < least:
+                continue
+            # as much of one as of the other explains: between the two regressions
+            up, down = float(a @ b), float(np.sqrt((a @ a) * (b @ b)))
+            agreement = up / max(down, 1e-12)
+            ratio = float(np.sqrt(float(b @ b) / max(float(a @ a), 1e-12)))
+            if agreement < 0.3 or not FACTORS[0] < ratio < FACTORS[1]:
+                score = min(agreement, FACTORS[0] / ratio, ratio / FACTORS[1])
+                if name not in worst or score < worst[name][0]:
+                    worst[name] = score, _how(name, agreement, ratio, where)
+    other = "scans" if len(robot.scans_ns) else "sightings"
+    for _, text in worst.values():
+        yield Reason(
+            "doubtful",
+            "odometry",
+            robot.name,
+            f"{robot.name}: its odometry and its {other} contradict each other: {text}",
+        )
+
+
+def _late(robot: RobotEvidence) -> Iterator[Reason]:
+    """Turning by odometry that fits that of the scans at another time only."""
+    if not len(robot.scans_ns) or len(robot.stamps_ns) < LEAST_POSES:
+        return
+    times = (robot.stamps_ns - robot.stamps_ns[0]) * 1e-9
+    grid = np.arange(0.0, times[-1], LATE_STEP_S)
+    known = np.isfinite(robot.by_odometry[:, 2])
+    ours, its = (
+        np.interp(grid, times[known], np.unwrap(poses[known, 2]))
+        for poses in (robot.final, robot.by_odometry)
+    )
+    width = round(0.5 / LATE_STEP_S)
+    a, b = (turned[width:] - turned[:-width] for turned in (ours, its))
+    if np.abs(a).sum() * LATE_STEP_S / 0.5 < 2 * TURNED_RAD:
+        return
+    most = round(LATEST_S / LATE_STEP_S)
+    if len(a) < 4 * most:
+        return
+    middle = a[most:-most]
+    shifts = np.arange(-most, most + 1)
+    fits = np.array([_alike(middle, b[most + k : len(b) - most + k]) for k in shifts.tolist()])
+    best, plain = int(shifts[fits.argmax()]), float(fits[most])
+    better = fits.max() > 0.7 and 1 - fits.max() < 0.5 * (1 - plain)
+    if abs(best) * LATE_STEP_S >= LATE_S and better:
+        when = "later" if best < 0 else "earlier"
+        text = (
+            f"{robot.name}: its scans are stamped {abs(best) * LATE_STEP_S:.1f} s {when} than its "
+            "odometry: two clocks, or a delay"
+        )
+        yield Reason("doubtful", "stamps", robot.name, text)
+
+
+def _alike(a: Array, b: Array) -> float:
+    return float(a @ b) / max(float(np.sqrt((a @ a) * (b @ b))), 1e-12)
+
+
+def _how(name: str, agreement: float, ratio: float, where: str) -> str:
+    if agreement < -0.3:
+        return f"{name} has the other sign{where}; one of the two is mirrored"
+    if agreement < 0.3:
+        return f"{name} has nothing in common{where}; one of the two is wrong"
+    return f"{name} by odometry is {1 / ratio:.2g} times that of the result{where}"

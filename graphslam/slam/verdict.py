@@ -1,0 +1,130 @@
+"""Whether a result can be trusted: good, doubtful or bad, with the reasons in words.
+
+Pure checks, a row of `CHECKS` each, look at the evidence of a run (`graphslam.slam.evidence`). What
+a sensor does wrong is said as what it is, where the witnesses tell; otherwise, who contradicts
+whom. The thresholds are far from what healthy logs show, see docs/reliability.md.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from graphslam.slam.doubts import Reason
+from graphslam.slam.evidence import Evidence
+from graphslam.slam.odometry_doubts import odometry_doubts
+from graphslam.slam.scan_doubts import scan_doubts
+from graphslam.slam.sighting_doubts import sighting_doubts
+
+#: factors on a stated variance that a log shows: from the first one doubtful, from the other bad
+NOISE_FACTORS = 30.0, 1000.0
+#: squared residuals per degree of freedom without kernels: of healthy logs up to 2
+MISFITS = 8.0, 100.0
+#: share of observations that fit nowhere
+REJECTED = 0.6
+#: share of messages that are lost
+LOST = 0.02
+#: mean squared error over its covariance: of healthy logs up to 5
+NEES = 30.0, 1000.0
+
+
+def judge(evidence: Evidence) -> dict[str, Any]:
+    """The key ``verdict`` of summary.json: the worst of what all `CHECKS` say, and all of it."""
+    reasons = [reason for check in CHECKS.values() for reason in check(evidence)]
+    return to_summary(reasons)
+
+
+def to_summary(reasons: Iterable[Reason]) -> dict[str, Any]:
+    """The key ``verdict`` for these reasons."""
+    told = sorted(reasons, key=lambda reason: reason.level != "bad")
+    level = "good" if not told else "bad" if told[0].level == "bad" else "doubtful"
+    return {
+        "verdict": level,
+        "reasons": [
+            {"level": one.level, "check": one.check, "about": one.about, "text": one.text}
+            for one in told
+        ],
+    }
+
+
+def with_truth(verdict: Mapping[str, Any], errors: Mapping[str, Any] | None) -> dict[str, Any]:
+    """A verdict that knows the errors against the truth of the log, where there is one."""
+    reasons = [Reason(**one) for one in verdict["reasons"]]
+    for name, found in ((errors or {}).get("robots") or {}).items():
+        nees = float((found.get("final") or {}).get("nees_per_dof") or 0.0)
+        level = _level(nees, NEES)
+        if level:
+            times = f"{math.sqrt(nees):.0f} times what the covariances say"
+            text = f"{name}: its errors against the truth in the log are {times}"
+            reasons.append(Reason(level, "truth", name, text))
+    return to_summary(reasons)
+
+
+def _level(value: float, limits: tuple[float, float]) -> str | None:
+    if not value > limits[0]:
+        return None
+    return "bad" if value > limits[1] else "doubtful"
+
+
+def _noise(evidence: Evidence) -> Iterable[Reason]:
+    """Noise that is nowhere near what was stated: no noise at all, but a contradiction."""
+    for source, found in evidence.summary["noise"].items():
+        measured = found.get("measured", {})
+        worst = max(measured, key=lambda name: float(measured[name]), default="")
+        level = _level(measured[worst], NOISE_FACTORS) if worst else None
+        if level:
+            robot = source.rpartition(" ")[0]
+            text = (
+                f"{robot}: its sightings and its odometry contradict each other: errors of {worst} "
+                f"are {measured[worst] ** 0.5:.0f} times what is stated"
+            )
+            yield Reason(level, "noise", robot, text)
+
+
+def _misfit(evidence: Evidence) -> Iterable[Reason]:
+    graph = evidence.summary["graph"]
+    misfit = graph["error_without_kernels"] / max(graph["dof"], 1)
+    level = _level(misfit, MISFITS)
+    if level:
+        text = f"observations contradict each other: residuals are {misfit:.3g} times their noise"
+        yield Reason(level, "residuals", "", text)
+
+
+def _rejected(evidence: Evidence) -> Iterable[Reason]:
+    rejected = sum(evidence.summary["rejected"].values())
+    used = evidence.summary["counts"]["observations"]
+    if rejected > REJECTED * (rejected + used) and rejected > 50:
+        text = f"{rejected} of {rejected + used} observations of landmarks fit nowhere"
+        yield Reason("doubtful", "rejected", "", text)
+
+
+def _lost(evidence: Evidence) -> Iterable[Reason]:
+    for log in evidence.summary["logs"]:
+        lost, read = log["lost"], log["messages"]
+        if lost is None:
+            text = f"{log['path']}: is damaged, and nobody knows how many messages are lost"
+            yield Reason("doubtful", "lost", log["path"], text)
+        elif lost > LOST * (lost + read):
+            text = f"{log['path']}: {lost} of {lost + read} messages are lost"
+            yield Reason("doubtful", "lost", log["path"], text)
+
+
+def _unobserved(evidence: Evidence) -> Iterable[Reason]:
+    counts = evidence.summary["counts"]
+    if not counts["observations"] and not counts["loop_closures"]:
+        if evidence.summary["closures"].get("used"):
+            return
+        text = "no landmark and no closure entered the estimate: this is dead reckoning by odometry"
+        yield Reason("doubtful", "observations", "", text)
+
+
+#: what is looked at, in the order in which it is told
+CHECKS: dict[str, Callable[[Evidence], Iterable[Reason]]] = {
+    "odometry": odometry_doubts,
+    "scans": scan_doubts,
+    "sightings": sighting_doubts,
+    "noise": _noise,
+    "residuals": _misfit,
+    "rejected": _rejected,
+    "lost": _lost,
+    "observations": _unobserved,
+}

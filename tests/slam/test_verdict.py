@@ -1,0 +1,256 @@
+"""The verdict: healthy evidence is good, and what is wrong is said as what it is."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from command_line import call
+
+from graphslam.core.geometry import between, compose
+from graphslam.logs import LogWriter
+from graphslam.slam.evidence import Evidence, Parked, RobotEvidence, Seen
+from graphslam.slam.verdict import judge, with_truth
+
+S = 1_000_000_000
+N = 600  # readings, at 10 Hz
+SUMMARY = {
+    "noise": {}, "graph": {"error_without_kernels": 100.0, "dof": 200}, "rejected": {},
+    "counts": {"observations": 500, "loop_closures": 3}, "closures": {}, "odometry": {},
+    "logs": [{"path": "log", "lost": 0, "messages": 100}],
+}  # fmt: skip
+
+
+def path(steps):
+    poses = [np.zeros(3)]
+    for step in steps:
+        poses.append(compose(poses[-1], step))
+    return np.array(poses)
+
+
+def drive():
+    """Motions (n, 3) of a robot in circles of changing size."""
+    k = np.arange(N - 1)
+    return np.column_stack([0.06 + 0 * k, 0 * k, 0.03 + 0.03 * np.sin(0.05 * k)])
+
+
+def seen_from(poses, odometry):
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-5, -3), (5, 7), (12, 2))
+    rows = []
+    for k in range(0, N, 5):
+        for n, point in enumerate(points):
+            x, y, _ = between(poses[k], np.array([*point, 0.0]))
+            if np.hypot(x, y) < 6 and abs(np.arctan2(y, x)) < 1.8:
+                rows.append((k, n, np.arctan2(y, x), np.hypot(x, y)))
+    rows = np.array(rows)
+    k = rows[:, 0].astype(int)
+    z = rows[:, 2:] + rng.normal(0, (0.005, 0.01), (len(rows), 2))
+    sigmas = np.tile([0.005, 0.01], (len(rows), 1))
+    times = S + k * S // 10
+    return Seen(times, rows[:, 1].astype(int), z, sigmas, odometry[k], np.ones(len(rows)))
+
+
+def evidence(steps=None, scans=False, seen=None, **changes):
+    """Of a healthy run, but for ``steps`` of its odometry and other ``changes``."""
+    true = path(drive())
+    odometry = path(drive() if steps is None else steps)
+    times = S + np.arange(N) * S // 10
+    own = seen_from(true, odometry)
+    nothing = np.zeros(0, dtype=np.int64)
+    robot = RobotEvidence(
+        name="tom", source="odometry", readings_ns=times, readings=odometry, resets=0,
+        stamps_ns=times, final=true, by_odometry=odometry,
+        scans_ns=times[::3] if scans else nothing, repeated=np.zeros(100, dtype=bool),
+        repeated_ns=times[:100], motions_ns=times[1:101], contradicted=np.zeros(100, dtype=bool),
+        seen=seen(own) if seen else own, parked=(),
+    )  # fmt: skip
+    return Evidence((replace(robot, **changes),), SUMMARY)
+
+
+def reasons(found):
+    verdict = judge(found)
+    assert (verdict["verdict"] == "good") == (not verdict["reasons"])
+    return verdict["verdict"], " | ".join(one["text"] for one in verdict["reasons"])
+
+
+def changed(since, *factors):
+    """Motions multiplied by ``factors`` from a reading on."""
+    steps = drive()
+    steps[since:] = steps[since:] * factors
+    return steps
+
+
+def jumped(*jump):
+    steps = drive()
+    steps[300] = compose(steps[300], np.array(jump))
+    return steps
+
+
+def from_half(change):
+    """Sightings with (bearing, range) changed from the middle of the log on."""
+
+    def seen(own):
+        z = own.z.copy()
+        late = own.times_ns > S + 30 * S
+        z[late] = change(z[late])
+        return replace(own, z=z)
+
+    return seen
+
+
+@pytest.mark.parametrize("scans", [False, True])
+def test_a_healthy_run_is_good(scans):
+    assert reasons(evidence(scans=scans)) == ("good", "")
+
+
+#: what is wrong, and what is said about it
+WRONG = {
+    "turning negated": (lambda: evidence(changed(0, 1, -1, -1)), "wrong sign"),
+    "turning negated, seen by scans": (
+        lambda: evidence(changed(300, 1, -1, -1), scans=True, seen=no_sightings),
+        "turning has the other sign",
+    ),
+    "backwards": (lambda: evidence(changed(300, -1, 1, 1)), "drives backwards"),
+    "millimetres": (lambda: evidence(changed(0, 1000, 1000, 1)), "is it in metres?"),
+    "degrees": (lambda: evidence(changed(0, 1, 1, 57.3)), "is it in radians?"),
+    "half as long": (
+        lambda: evidence(changed(0, 0.5, 1, 1), scans=True, seen=no_sightings),
+        "forward motion by odometry is 0.5 times",
+    ),
+    "jump": (lambda: evidence(jumped(0.3, 0, 0)), "jumps by 0.36 m"),
+    "turn": (lambda: evidence(jumped(0, 0, 2.0)), "jumps by 0.06 m and 2.0"),
+    "resets": (lambda: evidence(resets=2), "jumped 2 times"),
+    "frozen, by sightings": (
+        lambda: evidence(changed(300, 0, 0, 0), parked=(Parked(31 * S, 60 * S, 0.0),)),
+        "is frozen, or far too small, from 30.0 s to 59.0 s: the landmarks that it sees",
+    ),
+    "frozen, by scans": (
+        lambda: evidence(scans=True, parked=(Parked(31 * S, 60 * S, 0.9),)),
+        "its scans change meanwhile",
+    ),
+    "gap": (
+        lambda: with_gap(evidence(scans=True, seen=no_sightings)),
+        "has no reading for 28",
+    ),
+    "late scans": (
+        lambda: evidence(drive()[np.arange(N - 1) - 8], scans=True, seen=no_sightings),
+        "stamped 0.8 s",
+    ),
+    "laser repeats": (
+        lambda: evidence(scans=True, repeated=np.arange(100) > 60),
+        "the laser is frozen",
+    ),
+    "sparse": (
+        lambda: sparse(evidence(scans=True, seen=no_sightings)),
+        "too little in common",
+    ),
+    "contradictions": (
+        lambda: evidence(scans=True, contradicted=np.arange(100) % 4 == 0),
+        "contradict its odometry in 25 of 100",
+    ),
+    "bearings negated": (
+        lambda: evidence(seen=from_half(lambda z: z * (-1, 1))),
+        "have the wrong sign, from 3",
+    ),
+    "bearings off": (
+        lambda: evidence(seen=from_half(lambda z: z + np.array([0.5, 0.0]))),
+        "off by 0.5 rad",
+    ),
+    "ranges doubled": (
+        lambda: evidence(seen=from_half(lambda z: z * (1, 2))),
+        "2 times too large",
+    ),
+    "ranges in millimetres": (
+        lambda: evidence(seen=from_half(lambda z: z * (1, 1000))),
+        "100 or more times too large",
+    ),
+    "image repeated": (
+        lambda: evidence(seen=from_half(lambda z: 0 * z + np.array([0.3, 3.0]))),
+        "repeat an image",
+    ),
+    "one name": (
+        lambda: evidence(seen=lambda own: replace(own, targets=0 * own.targets)),
+        "several landmarks have one name",
+    ),
+    "names exchanged": (
+        lambda: evidence(seen=lambda own: replace(own, d2=np.where(own.times_ns > 40 * S, 90, 1))),
+        "were names exchanged?",
+    ),
+}
+
+
+def no_sightings(own):
+    none = own.times_ns < 0
+    return Seen(*(getattr(own, name)[none] for name in Seen.__slots__))
+
+
+def with_gap(found):
+    (robot,) = found.robots
+    kept = (robot.readings_ns < 20 * S) | (robot.readings_ns > 48 * S)
+    made = replace(robot, readings_ns=robot.readings_ns[kept], readings=robot.readings[kept])
+    return replace(found, robots=(made,))
+
+
+def sparse(found):
+    (robot,) = found.robots
+    made = replace(
+        robot, scans_ns=robot.scans_ns[::15], stamps_ns=robot.stamps_ns[::45],
+        final=robot.final[::45], by_odometry=robot.by_odometry[::45],
+    )  # fmt: skip
+    return replace(found, robots=(made,))
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_is_wrong_is_said_as_what_it_is(name):
+    make, text = WRONG[name]
+    verdict, told = reasons(make())
+    assert verdict != "good" and text in told, told
+
+
+@pytest.mark.parametrize(
+    ("change", "level", "text"),
+    [
+        ({"noise": {"tom point": {"measured": {"bearings": 5e3}}}}, "bad", "bearings are 71"),
+        ({"graph": {"error_without_kernels": 2e3, "dof": 100}}, "doubtful", "20 times their noise"),
+        ({"rejected": {"why": 4000}}, "doubtful", "4000 of 4500 observations"),
+        ({"logs": [{"path": "x", "lost": 9, "messages": 91}]}, "doubtful", "9 of 100 messages"),
+        ({"logs": [{"path": "x", "lost": None, "messages": 91}]}, "doubtful", "nobody knows"),
+        ({"counts": {"observations": 0, "loop_closures": 0}}, "doubtful", "dead reckoning"),
+    ],
+)  # fmt: skip
+def test_counts_of_the_run_are_judged(change, level, text):
+    verdict, told = reasons(replace(evidence(), summary=SUMMARY | change))
+    assert verdict == level and text in told
+
+
+def test_the_truth_in_a_log_is_a_witness_where_it_is():
+    good = judge(evidence())
+    assert with_truth(good, None) == good
+    near, far = ({"robots": {"tom": {"final": {"nees_per_dof": nees}}}} for nees in (3.0, 1e4))
+    assert with_truth(good, near) == good
+    found = with_truth(good, far)
+    assert found["verdict"] == "bad" and "100 times what the covariances say" in str(found)
+
+
+@pytest.mark.parametrize(("sign", "code"), [(1, 0), (-1, 3)])
+def test_strict_tells_by_its_exit_code_and_the_result_is_written(tmp_path, sign, code):
+    """Bearings of the wrong sign, from end to end: terminal, summary and report."""
+    log, target = tmp_path / "log.mcap", tmp_path / "out"
+    found = evidence().robots[0]
+    with LogWriter(log) as out:
+        for k in range(0, 200, 2):
+            out.odometry("tom", int(found.readings_ns[k]), found.readings[k])
+        for n in np.flatnonzero(found.seen.times_ns < 20 * S).tolist():
+            z = found.seen.z[n] * (sign, 1)
+            out.sighting(
+                "tom", int(found.seen.times_ns[n]), z, np.diag([2.5e-5, 1e-4]),
+                identity=f"p{found.seen.targets[n]}",
+            )  # fmt: skip
+    done = call("smooth", log, "-o", target, "--strict")
+    assert done.code == code, done.err
+    verdict = json.loads((target / "summary.json").read_text())["verdict"]
+    page = (target / "report.html").read_text()
+    assert f"verdict: {verdict['verdict']}" in done.out
+    assert (verdict["verdict"] == "good") == (code == 0)
+    assert ("wrong sign" in page) == ("wrong sign" in done.out) == (code == 3)
