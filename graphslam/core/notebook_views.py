@@ -9,23 +9,17 @@ from typing import Any
 import numpy as np
 
 
-class TrajectoryViews:
-    """What a trajectory looks like in pandas."""
-
-    __slots__ = ()
-
-    def to_dataframe(self) -> Any:
-        """Poses as a pandas.DataFrame (n, 6) by their time: m and rad, with standard deviations."""
-        own: Any = self
-        pandas = import_module("pandas")
-        variances = np.diagonal(own.covs, axis1=1, axis2=2)
-        with np.errstate(invalid="ignore"):
-            table = np.column_stack([own.poses, np.sqrt(variances)])
-        return pandas.DataFrame(
-            table,
-            index=pandas.DatetimeIndex(own.stamps_ns.astype("datetime64[ns]"), name="time"),
-            columns=["x_m", "y_m", "phi_rad", "x_sigma_m", "y_sigma_m", "phi_sigma_rad"],
-        )
+def poses_dataframe(trajectory: Any) -> Any:
+    """Poses of a trajectory as a pandas.DataFrame (n, 6) by their time: m, rad, with sigmas."""
+    pandas = import_module("pandas")
+    variances = np.diagonal(trajectory.covs, axis1=1, axis2=2)
+    with np.errstate(invalid="ignore"):
+        table = np.column_stack([trajectory.poses, np.sqrt(variances)])
+    return pandas.DataFrame(
+        table,
+        index=pandas.DatetimeIndex(trajectory.stamps_ns.astype("datetime64[ns]"), name="time"),
+        columns=["x_m", "y_m", "phi_rad", "x_sigma_m", "y_sigma_m", "phi_sigma_rad"],
+    )
 
 
 class ResultViews:
@@ -37,7 +31,7 @@ class ResultViews:
         """Final poses of all robots as a pandas.DataFrame by robot and time, m and rad."""
         own: Any = self
         pandas = import_module("pandas")
-        frames = {name: robot.final.to_dataframe() for name, robot in sorted(own.robots.items())}
+        frames = {name: poses_dataframe(robot.final) for name, robot in sorted(own.robots.items())}
         return pandas.concat(frames, names=["robot"])
 
     def landmarks_dataframe(self) -> Any:
