@@ -88,6 +88,12 @@ class LogSet:
         having = {t.robot for t in self.topics if t.record in ODOMETRY_KINDS}
         return tuple(robot for robot in self.robots if robot not in having)
 
+    @property
+    def bridged(self) -> tuple[str, ...]:
+        """Robots whose scans tell how they moved where their odometry, of poses, is silent."""
+        having = {t.robot for t in self.topics if t.record is records.OdometryPose}
+        return tuple(robot for robot in self.robots if robot in having and self.has_scans(robot))
+
     def no_return_m(self, topic: str) -> float:
         """Smallest range, m, that means no return in ``topic``; inf if none was detected."""
         return self._contexts[topic].no_return_m

@@ -61,6 +61,10 @@ class LaserOdometry:
         self._pose, self._cov, self._stated = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
         self._ways: list[tuple[Scan, Scan, Array]] = []  # since the reference: from, to, increment
         self._recent: deque[tuple[float, Array]] = deque()  # s and increment: of `VELOCITY_S`
+        #: motion (3,) of the base to the last scan from that before
+        self.increment = np.zeros(3)
+        #: m: sigma of the position since the reference, in the direction that is known least
+        self.sigma_m = 0.0
 
     def add(self, scan: Scan) -> list[OdometryIncrement]:
         """Take in the next scan.
@@ -86,7 +90,8 @@ class LaserOdometry:
         self._pose, self._cov = found.pose, _updated(cov, found.information)
         stated = self._stated + _variances(OPEN_SIGMA_M, OPEN_SIGMA_RAD) * seconds
         self._stated = _updated(stated, found.information)
-        increment = between(before, found.pose)
+        self.increment = increment = between(before, found.pose)
+        self.sigma_m = float(np.sqrt(np.linalg.eigvalsh(self._stated[:2, :2])[-1]))
         self._ways.append((last, scan, increment))
         self._recent.append((seconds, increment))
         while sum(s for s, _ in self._recent) - self._recent[0][0] >= VELOCITY_S:

@@ -61,6 +61,8 @@ class Readings:
     def __init__(self, config: OdometryConfig, robot: RobotConfig) -> None:
         """No readings yet."""
         self.source = ""
+        #: readings that were made of scans where there were none, see `gap_bridging`
+        self.bridged = 0
         self.config, self._robot = config, robot
         self._count, self._bursts, self._resets = 0, 0, 0
         self._integrated = 0  # readings that are integrated; the others' values wait in `_pending`

@@ -34,6 +34,7 @@ from graphslam.mapping.robot_candidates import robot_associations, robots_in
 from graphslam.multi_robot.identity_swaps import rename_identities
 from graphslam.multi_robot.mutual_detection import ScanBuffer
 from graphslam.multi_robot.robot_detection import RobotDetector
+from graphslam.odometry.gap_bridging import with_bridged_gaps
 from graphslam.odometry.laser_odometry import with_laser_odometry
 from graphslam.odometry.readings import integrate_pending
 from graphslam.odometry.scan_odometry import (
@@ -113,8 +114,9 @@ class Pipeline(StepRecorder):
         """Take in every message of the log; ``progress`` gets the number of messages read."""
         tracks = {name: run.track for name, run in self.runs.items()}
         read = self.accepted(to_common_clock(self.messages(progress), self.known.clocks))
+        read = with_laser_odometry(read, self.log.without_odometry, self.config)
         messages = synchronise(
-            with_laser_odometry(read, self.log.without_odometry, self.config),
+            with_bridged_gaps(read, self.log.bridged, self.config, tracks),
             tracks,
             self.config.odometry.max_gap_s,
             self.dropped,

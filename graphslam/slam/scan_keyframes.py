@@ -22,6 +22,7 @@ from graphslam.core.records import Closure, Message, Motion, Scan
 from graphslam.logs import LogSet
 from graphslam.logs.log_set import ReadReport
 from graphslam.multi_robot.robot_detection import COMPARED_SCANS, without_returns
+from graphslam.odometry.gap_bridging import with_bridged_gaps
 from graphslam.odometry.laser_odometry import with_laser_odometry
 from graphslam.odometry.scan_odometry import (
     MIN_POINTS,
@@ -178,6 +179,7 @@ class _Reader:
         read = counted(self._messages, self._counts, lambda _count: None)
         max_gap_s = self._config.odometry.max_gap_s
         read = with_laser_odometry(read, self._log.without_odometry, self._config)
+        read = with_bridged_gaps(read, self._log.bridged, self._config, {self._robot: track})
         messages = synchronise(read, {self._robot: track}, max_gap_s, self._dropped)
         first_ns, size = 0, FIRST_BLOCK
         while True:

@@ -121,6 +121,7 @@ def summarise(
                 "motions": run.motions,
                 "contradicted": run.contradicted,
                 "resets": run.track.resets,
+                "bridged": run.track.bridged,
             }
             for robot, run in runs.items()
         },
@@ -183,6 +184,12 @@ def run_warnings(pipeline: LogPass) -> list[str]:
         f"{name}: its odometry jumped {run.track.resets} times; bridged at the previous speed"
         for name, run in pipeline.runs.items()
         if run.track.resets
+    ]
+    warnings += [
+        f"{name}: its odometry is silent while {run.track.bridged} scans were measured; "
+        "they tell how it moved"
+        for name, run in pipeline.runs.items()
+        if run.track.bridged
     ]
     warnings += [
         f"{name}: scans contradict its odometry in {run.contradicted} of {run.motions} motions; "
