@@ -17,13 +17,12 @@ import numpy as np
 
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array
+from graphslam.core.notebook_views import ResultViews
 from graphslam.core.record import Record
 
 #: a time or times (...,), ns
 Stamps = int | Sequence[int] | np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
-
-# ---------------------------------------------------------------- messages of a log
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -432,7 +431,7 @@ class KeyframeScan(Record):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Result:
+class Result(ResultViews):
     """What `smooth` returns; `graphslam.results.folder` writes and reads it.
 
     ``step_ms`` (n,) is the wall time of each step; ``innovations[model]`` (n, 2) time s and d² per

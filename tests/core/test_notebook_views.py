@@ -27,6 +27,7 @@ def test_data_frames_hold_every_pose_and_landmark(two_robots):
     assert own.index.astype("int64").tolist() == final.stamps_ns.tolist()
     np.testing.assert_array_equal(own[["x_m", "y_m", "phi_rad"]], final.poses)
     np.testing.assert_allclose(own["y_sigma_m"] ** 2, final.covs[:, 1, 1])
+    assert len(orchard(keyframes=20, trees=6)[0].to_dataframe()) == len(frame)
     marks = two_robots.landmarks_dataframe()
     assert marks.index.tolist() == [m.id for m in two_robots.landmarks]
     assert marks["sightings"].sum() == sum(m.sightings for m in two_robots.landmarks)
