@@ -313,7 +313,9 @@ Jobs = Annotated[int | None, typer.Option(metavar="N", min=1, help="Processes; o
 
 # ---------------------------------------------------------------- what comes out
 
-ResultFolder = Annotated[Path, _output("DIR", "The result folder to make.")]
+ResultFolder = Annotated[
+    Path | None, _output("DIR", "The result folder to make; required without --plan.")
+]
 MapFolder = Annotated[
     Path | None, _output("FOLDER", "The folder for the files; default: DIR itself.")
 ]

@@ -229,7 +229,7 @@ def simulate(
 @command("smooth")
 def smooth(
     logs: Logs,
-    output: ResultFolder,
+    output: ResultFolder = None,
     backend: Backend = None,
     horizon: Horizon = None,
     front_end: FrontEnd = None,
@@ -264,6 +264,8 @@ def smooth(
     tree = load_config(config, [*options, *(start or ()), *(settings or ())], preset)
     if plan:
         return _described(logs, tree, strict)
+    if output is None:
+        raise typer.BadParameter("missing: the result folder to make", param_hint="'-o'")
     with stage_bar() as progress:
         result = graphslam.smooth(logs, config=tree, output=output, force=force, progress=progress)
     if with_map:

@@ -32,12 +32,13 @@ def errors_in_one_line(debug: bool) -> Iterator[None]:
 
     Raises:
         typer.Exit: in place of the error; code 130 and no output for Ctrl-C.
+        typer.BadParameter: the command line is wrong, which typer says, with code 2.
     """
     try:
         yield
     except KeyboardInterrupt:
         raise typer.Exit(INTERRUPTED) from None
-    except (typer.Exit, BrokenPipeError):  # the output is no longer read
+    except (typer.Exit, typer.BadParameter, BrokenPipeError):  # the output is no longer read
         raise
     except Exception as error:
         if debug:

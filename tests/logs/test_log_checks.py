@@ -155,7 +155,7 @@ def test_exit_codes_of_info_and_of_a_plan(tmp_path):
     assert call("info", doubtful).code == 0
     strict = call("info", doubtful, "--strict", "--json")
     assert strict.code == 3 and '"doubtful": true' in strict.out
-    plan = call("smooth", doubtful, "-o", tmp_path / "out", "--plan")
+    plan = call("smooth", doubtful, "--plan")
     assert plan.code == 0 and plan.out == call("info", doubtful).out
     assert not (tmp_path / "out").exists()
     assert "to mend it: record /tf_static, or --set 'robots.robot.laser=[X, Y, YAW]'" in plan.out
