@@ -15,8 +15,9 @@ from typing import Any
 from graphslam.cli import terminal
 from graphslam.core.stages import listening
 
-#: what is done by the begin of a stage, as a share of the whole: medians of the logs of
-#: benchmarks/speed.py; stages that alternate with reading are not among them
+#: what is done by the begin of a stage, as a share of the whole: rough, as of logs of scans with
+#: default settings; of other jobs the time left is less true. Stages that alternate with reading
+#: are not among them
 BEGINS = {
     "opening": 0.0,
     "final optimisation": 0.42,

@@ -18,7 +18,6 @@ from dataclasses import asdict, dataclass
 from functools import cache
 from multiprocessing import get_context, resource_tracker
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -28,7 +27,7 @@ from graphslam.core.errors import OutputError
 from graphslam.evaluation.monte_carlo_bench import draw_run, run_seed
 from graphslam.evaluation.monte_carlo_bench_run import run_bench
 from graphslam.evaluation.monte_carlo_definition import Definition
-from graphslam.evaluation.monte_carlo_log_run import run_log
+from graphslam.evaluation.monte_carlo_log_run import run_log, scratch_folder
 from graphslam.evaluation.thesis_experiments import EXPERIMENTS
 
 Row = dict[str, Any]
@@ -81,9 +80,9 @@ def run_job(definition: Definition, job: Job) -> Row:
         return run_bench(run, definition.config(job.variant, f"network.seed={job.run}"))
     config = definition.config(job.variant, f"front_end.name={job.front_end}")
     if definition.chapter is not None:
-        with TemporaryDirectory(prefix="graphslam-") as folder:
+        with scratch_folder() as folder:
             experiment = EXPERIMENTS[job.scenario]
-            return {"values": experiment(definition.seed + job.run, Path(folder), config)}
+            return {"values": experiment(definition.seed + job.run, folder, config)}
     drawn = definition.logs is not None and definition.logs.draw_starts
     seed = int(sequence.generate_state(1)[0])
     return run_log(job.scenario, job.scale, seed, config, draw_starts=drawn)

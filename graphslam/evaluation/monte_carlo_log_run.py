@@ -1,6 +1,8 @@
 """One run over a simulated log: simulate, smooth, evaluate."""
 
-from collections.abc import Mapping
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -10,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from graphslam.core.config import Config, StartConfig
+from graphslam.core.errors import GraphSlamError
 from graphslam.evaluation.ground_truth import truth_of_logs
 from graphslam.evaluation.metrics import evaluate
 from graphslam.logs import LogSet, open_logs
@@ -64,8 +67,8 @@ def run_log(
     Raises:
         GraphSlamError: simulating, smoothing or evaluating failed.
     """
-    with TemporaryDirectory(prefix="graphslam-") as folder:
-        path = Path(folder) / "log.mcap"
+    with scratch_folder() as folder:
+        path = folder / "log.mcap"
         simulate(scale_noise(load_scenario(scenario), scale), path, seed)
         config = replace(
             config,
@@ -78,8 +81,24 @@ def run_log(
         result = smooth(log, config)
         known = truth_of_logs(log, config)
     found = evaluate(result, known.trajectories, known.landmarks)
-    kept = {key: result.summary.get(key) for key in ("counts", "scans_per_s", "warnings")}
-    return {**found, **kept}
+    kept = {key: result.summary.get(key) for key in ("counts", "scans_per_s")}
+    warnings = [_without(folder, text) for text in result.summary.get("warnings", ())]
+    return {**found, **kept, "warnings": warnings}
+
+
+@contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """A temporary folder that errors do not name: a row is the same wherever and whenever made."""
+    with TemporaryDirectory(prefix="graphslam-") as folder:
+        try:
+            yield Path(folder)
+        except GraphSlamError as error:
+            error.args = (_without(Path(folder), str(error)),)
+            raise
+
+
+def _without(folder: Path, text: str) -> str:
+    return text.replace(f"{folder}{os.sep}", "")
 
 
 def drawn_starts(log: LogSet, start: StartConfig, seed: int) -> StartConfig:

@@ -357,7 +357,9 @@ def _table(
                 for head, (value, best) in zip(heads, cells, strict=True)
             )
         else:
-            content = f"<td class=none colspan={len(heads)}>failed: {escape(row['error'])}</td>"
+            paths = (log["path"] for log in summary["logs"])
+            error = escape(html.without_folders(row["error"], paths))
+            content = f"<td class=none colspan={len(heads)}>failed: {error}</td>"
         body += f"<tr>{name}{content}</tr>\n"
     return (
         f'<div class="scroll compared"><table class=wide><caption>{escape(title)}</caption>'

@@ -7,6 +7,7 @@ Everything is drawn from the summary of `graphslam.evaluation.monte_carlo_summar
 
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -89,9 +90,9 @@ def _header(summary: Summary) -> str:
 
 
 def _warnings(summary: Summary) -> str:
-    return html.warning_box(
-        [*summary["warnings"], *(f"{n} × {text}" for text, n in summary["errors"].items())]
-    )
+    texts = [*summary["warnings"], *(f"{n} × {text}" for text, n in summary["errors"].items())]
+    scenarios = [row["scenario"] for row in summary.get("table", ()) if row.get("scenario")]
+    return html.warning_box(html.without_folders(text, scenarios) for text in texts)
 
 
 def _consistency(summary: Summary) -> str:
@@ -154,7 +155,8 @@ def _errors(summary: Summary) -> str:
 def _logs(summary: Summary) -> str:
     rows = []
     for row in summary["table"]:
-        name = f"{row['scenario']}, {row['front_end']}, {row['variant']}, noise × {row['scale']:g}"
+        scenario = PurePath(row["scenario"]).name  # or a file of the writer's machine
+        name = f"{scenario}, {row['front_end']}, {row['variant']}, noise × {row['scale']:g}"
         cells: list[object] = [name, row["runs"], row["failed"], row.get("diverged")]
         for kind in ("final", "causal"):
             ate = row.get(kind, {}).get("ate_rmse_m", {})

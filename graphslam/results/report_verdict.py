@@ -15,8 +15,10 @@ def verdict_section(summary: Mapping[str, Any]) -> str:
     if not found["reasons"]:
         text = "<p>good: nothing that was looked at contradicts the result.</p>"
         return html.section("Verdict", text)
+    paths = [log["path"] for log in summary.get("logs", [])]
     items = "".join(
-        f"<li>{escape(one['level'])}: {escape(one['text'])}</li>" for one in found["reasons"]
+        f"<li>{escape(one['level'])}: {escape(html.without_folders(one['text'], paths))}</li>"
+        for one in found["reasons"]
     )
     return (
         f'<section class="warn"><h2>Verdict: {escape(found["verdict"])}</h2>'

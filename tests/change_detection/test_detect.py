@@ -491,7 +491,8 @@ def test_the_command_from_logs_to_json(tmp_path):
     arguments = ("changes", tmp_path / "reference", tmp_path / "later", "-o", tmp_path / "out")
     found = json.loads(done(*arguments, "--json"))
     assert found == json.loads((tmp_path / "out/changes.json").read_text())
-    assert (tmp_path / "out/report.html").exists()
+    # like all reports it tells nothing of where things are on this machine
+    assert str(tmp_path) not in (tmp_path / "out/report.html").read_text(encoding="utf-8")
     header, size, depth, pixels = (tmp_path / "out/changes.pgm").read_bytes().split(b"\n", 3)
     assert (header, depth) == (b"P5", b"255")
     assert len(pixels) == np.prod([int(n) for n in size.split()])

@@ -16,7 +16,7 @@ from finite_differences import jacobian
 from scipy.stats import chi2
 
 from graphslam.core.config_io import load_config
-from graphslam.core.errors import ConfigError, OutputError
+from graphslam.core.errors import ConfigError, LogError, OutputError
 from graphslam.core.geometry import between, compose, exp, rotation3
 from graphslam.core.observation_models import MODELS
 from graphslam.estimation.backend import JointMarginal
@@ -31,7 +31,12 @@ from graphslam.evaluation.monte_carlo_definition import (
     Logs,
     load_definition,
 )
-from graphslam.evaluation.monte_carlo_log_run import NOISE, drawn_starts, scale_noise
+from graphslam.evaluation.monte_carlo_log_run import (
+    NOISE,
+    drawn_starts,
+    scale_noise,
+    scratch_folder,
+)
 from graphslam.evaluation.monte_carlo_summary import bootstrap_interval, summarise
 from graphslam.logs import open_logs
 from graphslam.results.report_experiment import experiment_figures, experiment_page
@@ -430,6 +435,13 @@ def test_a_run_that_fails_is_a_row_with_its_error_and_is_counted(tmp_path):
     assert sum(found["errors"].values()) == 2
     assert found["warnings"] == ["2 of 2 runs failed"]
     assert "gone.toml" in experiment_page(found)  # says so rather than stumble over it
+
+
+def test_the_error_of_a_run_does_not_name_its_temporary_folder():
+    """It has another name in every run: equal errors would not be counted together."""
+    with pytest.raises(LogError, match=r"^log\.mcap: no such file"), scratch_folder() as folder:
+        open_logs([folder / "log.mcap"], load_config())
+    assert not folder.exists()
 
 
 def test_ctrl_c_leaves_whole_lines_and_exit_code_130(tmp_path):

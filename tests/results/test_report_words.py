@@ -8,9 +8,13 @@ import pytest
 from synthetic_results import room
 
 from graphslam.core.geometry import area_centroid
+from graphslam.evaluation.monte_carlo_definition import Definition, Logs
+from graphslam.evaluation.monte_carlo_summary import summarise
 from graphslam.results.drawing import legend
 from graphslam.results.drawing_elements import UNIT, Style
 from graphslam.results.report import render
+from graphslam.results.report_comparison import BackendCurves, Comparison, render_comparison
+from graphslam.results.report_experiment import experiment_page
 from graphslam.results.report_figure import Drawing
 from graphslam.results.report_html import counted, duration, length, table, without_folders
 
@@ -44,16 +48,57 @@ def test_numbers_are_written_for_reading(text, expected):
     assert text == expected
 
 
-def test_a_report_tells_nothing_of_the_machine_that_wrote_it():
+#: a log or a scenario on the writer's machine
+PATH = "/home/someone/secret/run.mcap"
+
+
+def of_a_result():
     result, _ = room(keyframes=20, beams=31)
-    path = "/home/someone/secret/run.mcap"
-    log = {**result.summary["logs"][0], "path": path} if result.summary.get("logs") else {}
-    log = {"messages": 1, "lost": 0, "sha256": "ab" * 32, **log, "path": path}
-    summary = {**result.summary, "logs": [log], "warnings": [f"{path}: /scan: late"]}
+    log = {"messages": 1, "lost": 1, "sha256": "ab" * 32, "path": PATH}
+    reason = {"level": "doubtful", "kind": "lost", "where": PATH, "text": f"{PATH}: 1 lost"}
+    summary = {
+        **result.summary,
+        "logs": [log],
+        "warnings": [f"{PATH}: /scan: late"],
+        "verdict": {"verdict": "doubtful", "reasons": [reason]},
+    }
     html = render(dataclasses.replace(result, summary=summary))
+    assert log["sha256"] in html
+    return html
+
+
+def of_a_comparison():
+    done = {
+        "spec": "ekf", "label": "EKF", "error": None, "final_is_causal": True, "steps": 3,
+        "associations": 2, "late": 0, "skipped": {}, "ms_per_step": {"p50": 1.0},
+    }  # fmt: skip
+    failed = {"spec": "batch", "label": "batch", "error": f"{PATH}: 1 lost"}
+    summary = {
+        "mode": "replay", "recorded_by": "isam2", "reference": "ekf", "rows": [done, failed],
+        "logs": [{"path": PATH, "sha256": "ab" * 32}], "warnings": [f"{PATH}: /scan: late"],
+    }  # fmt: skip
+    path, three = {"robot": np.eye(2)}, np.ones(3)
+    curves = BackendCurves(
+        "ekf", "EKF", True, {"final": path, "causal": path}, {"final": {}, "causal": {}},
+        three, three, three,
+    )  # fmt: skip
+    return render_comparison(Comparison(summary, (curves,), {}))
+
+
+def of_an_experiment():
+    row = {"scenario": PATH, "front_end": "none", "scale": 1.0, "variant": "v", "code": "c"}
+    definition = Definition(variants={"v": ()}, runs=2, logs=Logs((PATH,)), name="mine")
+    errors = (f"ScenarioError: {PATH}: 1 lost", f"LogError: {PATH}: /scan: late")
+    return experiment_page(summarise(definition, [{**row, "error": text} for text in errors]))
+
+
+@pytest.mark.parametrize("page", [of_a_result, of_a_comparison, of_an_experiment])
+def test_a_report_tells_nothing_of_the_machine_that_wrote_it(page):
+    """Neither in titles and tables nor in what warnings, reasons and failures say."""
+    html = page()
     assert "secret" not in html
     assert "run.mcap: /scan: late" in html
-    assert log["sha256"] in html
+    assert "run.mcap: 1 lost" in html
 
 
 def test_cells_of_a_wide_table_say_on_a_phone_what_they_are():
