@@ -37,9 +37,14 @@ def started(*arguments, shell="", **variables):
     environment = {**os.environ, "PYTHONPATH": str(ROOT), **variables}
     if shell:
         words = ["/bin/sh", "-c", f'exec "$@" {shell}', "sh", *words]
-    return subprocess.Popen(
-        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment, text=True
-    )
+    before = signal.getsignal(signal.SIGINT)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # jobs in the background ignore it
+    try:
+        return subprocess.Popen(
+            words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment, text=True
+        )
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.parametrize("shell", [">&-", "2>&-", ">&- 2>&- <&-"])
