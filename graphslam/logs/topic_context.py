@@ -31,6 +31,8 @@ from graphslam.logs.topics import ODOMETRY_KINDS, Topic
 _SAMPLE_BLOCKS, _SAMPLE_PER_BLOCK = 16, 16
 #: records that may come without a stamp; increments have two, which must differ
 _STAMPED = (records.Scan, records.Sighting, records.OdometryPose, records.WheelAngles)
+#: bearings beyond a whole turn, how many at least and of all: they are no radians
+LEAST_IN_DEGREES, SHARE_IN_DEGREES = 10, 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +95,8 @@ def topic_contexts(
                 elif mount.inverted:
                     inverted.add(frame)
                 findings += notes
+            if topic.schema == schemas.SIGHTING:
+                findings += in_degrees(topic.name, [float(m.bearing) for m in messages])
             if topic.schema == schemas.LASER_SCAN:
                 no_return = find_no_return(message.ranges for message in messages)
         unstamped = topic.record in _STAMPED and _is_unstamped(files, topic)
@@ -112,6 +116,21 @@ def topic_contexts(
             by_log_time=unstamped,
         )
     return contexts, findings
+
+
+def in_degrees(topic: str, bearings: Sequence[float]) -> list[Finding]:
+    """That the bearings of a source are no angles in radians, if they are in degrees.
+
+    One that is not wrapped is at most a turn away from one that is; of those in degrees few are.
+    """
+    sizes = np.abs(bearings)
+    sizes = sizes[np.isfinite(sizes)]
+    beyond = np.count_nonzero(sizes > 2 * np.pi)
+    if beyond < LEAST_IN_DEGREES or beyond < SHARE_IN_DEGREES * len(sizes) or sizes.max() > 360:
+        return []
+    text = f"its bearings are in degrees: up to {sizes.max():.0f}, where a whole turn is 6.28 rad"
+    remedy = "write them in radians: bearing * pi / 180, and their variance * (pi / 180)^2"
+    return [Finding("unusable", "units", topic, text, remedy)]
 
 
 def _is_unstamped(files: Sequence[Recording], topic: Topic) -> bool:

@@ -7,20 +7,20 @@ put into arrays here; `graphslam.slam.verdict` judges it.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam.core.observation_models import MODELS
-from graphslam.core.records import Association, Estimate, KeyframeScan, RobotResult, Step
+from graphslam.core.records import Association, Estimate, RobotResult, Step
 from graphslam.odometry.interpolation import IntArray
 from graphslam.slam.doubts import stretches
 from graphslam.slam.log_pass import LogPass
 from graphslam.slam.robot_state import RobotState
 
 BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
+IntTable = np.ndarray[tuple[int, int], np.dtype[np.int64]]
 
 #: poses of a trajectory that are compared, at most
 MOST_POSES = 4000
@@ -28,8 +28,6 @@ MOST_POSES = 4000
 PARKED_STEP_NS, PARKED_M, PARKED_RAD, PARKED_NS = 1_000_000_000, 0.01, 0.005, 4_000_000_000
 #: scans that are looked at; m: a range that changed
 SAMPLED_SCANS, CHANGED_M = 400, 0.15
-#: m: points of two scans that are nearer to each other are the same
-SAME_POINT_M = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,9 +62,10 @@ class RobotEvidence:
     ``source`` of its odometry; ``readings_ns`` (n,) and ``readings`` (n, 3), poses by odometry
     alone, its resets bridged; ``resets``: how many. ``stamps_ns`` (m,), ``final`` (m, 3) and
     ``by_odometry`` (m, 3): some poses of the result, and the same by odometry. ``scans_ns`` (k,):
-    when it had scans; ``repeated`` (j,): whether a keyframe's scan is that of the one before, at
-    ``repeated_ns`` (j,). ``motions_ns`` (q,) when motions ended, ``contradicted`` (q,) whether
-    scans contradicted them. ``seen``: what it saw. ``parked``: when it stood, by odometry.
+    when it had scans; ``repeated_ns`` (j, 2): of scans that were left out, as they repeat an
+    earlier one, their times and those of the first that is the same. ``motions_ns`` (q,) when
+    motions ended, ``contradicted`` (q,) whether scans contradicted them. ``seen``: what it saw.
+    ``parked``: when it stood, by odometry.
     """
 
     name: str
@@ -78,8 +77,7 @@ class RobotEvidence:
     final: Array
     by_odometry: Array
     scans_ns: IntArray
-    repeated: BoolArray
-    repeated_ns: IntArray
+    repeated_ns: IntTable
     motions_ns: IntArray
     contradicted: BoolArray
     seen: Seen
@@ -112,7 +110,6 @@ def gather(
     for name, run in pipeline.started.items():
         motions = [(s.time_ns, s.motions[name].from_scans) for s in steps if name in s.motions]
         seen = [a for s in steps for a in s.associations if a.robot == name and len(a.z) == 2]
-        own = [scan for scan in pipeline.keyframe_scans if scan.robot == name]
         result = robots[name]
         some = np.unique(np.linspace(0, len(result.final) - 1, MOST_POSES).astype(int))
         found.append(
@@ -126,8 +123,7 @@ def gather(
                 final=result.final.poses[some],
                 by_odometry=result.dead_reckoning.poses[some],
                 scans_ns=np.array([time for _, time, _ in run.scans], dtype=np.int64),
-                repeated=_repeated(own),
-                repeated_ns=np.array([scan.time_ns for scan in own[1:]], dtype=np.int64),
+                repeated_ns=np.array(run.repeats.left_out, dtype=np.int64).reshape(-1, 2),
                 motions_ns=np.array([time for time, _ in motions], dtype=np.int64),
                 contradicted=np.array([was for _, was in motions], dtype=bool),
                 seen=_seen(seen, run, estimate),
@@ -168,19 +164,6 @@ def _squared(errors: Array, covs: Array) -> Array:
     """Squared Mahalanobis distances (n,) of errors (n, k)."""
     weighted = np.linalg.pinv(covs, hermitian=True) @ errors[:, :, None]
     return np.asarray((errors * weighted[:, :, 0]).sum(axis=1))
-
-
-def _repeated(scans: Sequence[KeyframeScan]) -> BoolArray:
-    """Whether each scan but the first has just the points of the one before."""
-    return np.array(
-        [
-            len(a.points) == len(b.points)
-            and len(a.points) > 0
-            and bool((np.abs(a.points - b.points) < SAME_POINT_M).all())
-            for a, b in pairwise(scans)
-        ],
-        dtype=bool,
-    )
 
 
 def _seen(seen: Sequence[Association], run: RobotState, estimate: Estimate) -> Seen:

@@ -37,9 +37,13 @@ class KeyframeSelector:
         return used
 
     def used_scans(self, scans: Sequence[Scan], run: RobotState) -> list[Scan]:
-        """Those of consecutive scans of a robot for which `is_used` holds, at once."""
+        """Those of consecutive scans of a robot for which `is_used` holds, at once.
+
+        Those that `RobotState.repeats` leaves out are not among them.
+        """
+        scans = [scan for scan in scans if not run.repeats.leaves_out(scan, run.track)]
         if self._config.mode == "all" or not scans:
-            return list(scans)
+            return scans
         since = scans[0].time_ns if run.scanned_ns is None else run.scanned_ns
         times = np.array([since, *(scan.time_ns for scan in scans)], dtype=np.int64)
         (path_m, heading), *driven = run.track.driven(times).tolist()

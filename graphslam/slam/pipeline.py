@@ -285,11 +285,14 @@ class Pipeline(StepRecorder):
         self.start_if_needed(first.robot, time_ns)
         if isinstance(first, ODOMETRY) and self.config.keyframe.mode != "all":
             return  # most of a log; the track has it already
+        left_out = isinstance(first, Scan) and run.repeats.leaves_out(first, run.track)
         if isinstance(first, Scan):  # an event of its own
             event = undistorted_by_track([first], run.track)
             first = event[0]
         run.scans += [(m.stamp_ns, m.time_ns, m.mount) for m in event if isinstance(m, Scan)]
         self.counts["scans"] += isinstance(first, Scan)
+        if left_out:
+            return  # but where the robot was is reported
         used = self.keyframes.is_used(event, run)
         if isinstance(first, Scan):
             self.scan_buffer.add(first)

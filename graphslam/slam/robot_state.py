@@ -24,6 +24,7 @@ from graphslam.odometry.online_calibration import Calibrator, to_summary
 from graphslam.odometry.preintegration import Track
 from graphslam.odometry.readings import EDGE_NS
 from graphslam.perception.scan_matching import Submap
+from graphslam.slam.repeated_scans import RepeatedScans
 
 #: Hz at which the base of a robot without scans is reported
 BASE_RATE_HZ = 10
@@ -40,7 +41,8 @@ class RobotState:
     last one used. States are poses of the sensor; the base is where the calibrated mount puts it.
     ``is_calibrated``: the track's calibration was estimated together with all states. ``scan``:
     time and submap of the latest state that has a scan; ``contradicted``: how many of ``motions``
-    the scans contradicted. Times are of the common clock, stamps of the robot's own ``clock``.
+    the scans contradicted. ``repeats``: scans that are reported and not used. Times are of the
+    common clock, stamps of the robot's own ``clock``.
     """
 
     track: Track
@@ -57,6 +59,7 @@ class RobotState:
     motions: int = 0
     contradicted: int = 0
     clock: Clock = field(default_factory=Clock)
+    repeats: RepeatedScans = field(default_factory=RepeatedScans)
 
     def __post_init__(self) -> None:
         """Calibrate the track's odometry by its own settings."""

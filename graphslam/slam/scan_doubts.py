@@ -5,10 +5,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from graphslam.core.geometry import between
-from graphslam.slam.doubts import Reason, seconds, stretches
+from graphslam.slam.doubts import Reason, seconds
 from graphslam.slam.evidence import Evidence, RobotEvidence
 
-#: keyframes in a row with one scan, between which odometry moves
+#: times that one scan is repeated while odometry moves: not just sent twice
 REPEATED = 5
 #: m, rad: scans that are farther apart have little in common
 HOP_M, HOP_RAD = 1.2, 1.0
@@ -28,15 +28,16 @@ def scan_doubts(evidence: Evidence) -> Iterator[Reason]:
 
 
 def _repeated(robot: RobotEvidence) -> Iterator[Reason]:
-    for begin, end in stretches(robot.repeated):
-        if end - begin >= REPEATED:
-            first = seconds(robot.repeated_ns[begin], int(robot.scans_ns[0]))
-            text = (
-                f"{robot.name}: its laser repeats one scan from {first} on, in "
-                f"{end - begin} keyframes, while odometry moves: the laser is frozen"
-            )
-            yield Reason("bad", "scans", robot.name, text)
-            return
+    first_ns, times = np.unique(robot.repeated_ns[:, 1], return_counts=True)
+    frozen = times >= REPEATED
+    if frozen.any():
+        since = seconds(first_ns[frozen][0], int(robot.scans_ns[0]))
+        text = (
+            f"{robot.name}: its laser repeats one scan from {since} on while odometry moves: the "
+            f"laser is frozen; {len(robot.repeated_ns)} scans were left out, and odometry alone "
+            "tells how the robot moved"
+        )
+        yield Reason("doubtful", "scans", robot.name, text)
 
 
 def _sparse(robot: RobotEvidence) -> Iterator[Reason]:

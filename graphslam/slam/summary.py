@@ -55,6 +55,9 @@ def summarise(
     log_s = 1e-9 * (pipeline.last_ns - pipeline.first_ns)
     scans, total = counts["scans"], max(pipeline.seconds["all"], 1e-9)
     all_dropped = Counter(log.dropped) + pipeline.dropped + pipeline.removed_returns
+    left_out = sum(len(run.repeats.left_out) for run in runs.values())
+    if left_out:
+        all_dropped["scan: repeats an earlier one while odometry moves"] += left_out
     if pipeline.landmarks.deleted:
         all_dropped["tentative landmark: not seen often enough"] += pipeline.landmarks.deleted
     if pipeline.landmarks.forgotten:
@@ -190,6 +193,12 @@ def run_warnings(pipeline: LogPass) -> list[str]:
         "they tell how it moved"
         for name, run in pipeline.runs.items()
         if run.track.bridged
+    ]
+    warnings += [
+        f"{name}: {len(run.repeats.left_out)} scans repeat an earlier one while its odometry "
+        "moves; they were left out"
+        for name, run in pipeline.runs.items()
+        if run.repeats.left_out
     ]
     warnings += [
         f"{name}: scans contradict its odometry in {run.contradicted} of {run.motions} motions; "

@@ -170,3 +170,34 @@ def test_exit_codes_of_info_and_of_a_plan(tmp_path):
 def test_beams_without_a_return_are_no_loss(tmp_path):
     out = call("info", spoiled(tmp_path, ranges=np.inf)).out
     assert "no return: 3 150 beams" in out and "dropped" not in out
+
+
+def sightings(path, bearings):
+    with LogWriter(path) as log:
+        for k, bearing in enumerate(bearings):
+            log.odometry("robot", (k + 1) * S, (0.1 * k, 0, 0))
+            log.sighting("robot", (k + 1) * S, (bearing, 2.0), np.eye(2), identity="a")
+    return path
+
+
+def test_bearings_in_degrees_are_refused_before_anything_is_computed(tmp_path):
+    path = sightings(tmp_path / "log.mcap", np.linspace(-90, 90, 60))
+    done = call("smooth", path, "-o", tmp_path / "out")
+    line = check_one_line(done)
+    assert "bearings are in degrees: up to 90" in line and "bearing * pi / 180" in line
+    assert not (tmp_path / "out").exists()
+    told = call("info", path)
+    assert told.code == 1 and "bearings are in degrees" in told.out
+
+
+@pytest.mark.parametrize(
+    "bearings",
+    [
+        np.linspace(0, 2 * np.pi, 60),  # radians from 0 on
+        np.append(np.linspace(-3, 3, 60), [90.0] * 9),  # some are wrong
+        np.linspace(-1e6, 1e6, 60),  # no angles of any unit
+        np.linspace(-6, 6, 60),  # a narrow camera's degrees look the same
+    ],
+)
+def test_bearings_that_may_be_radians_are_read(tmp_path, bearings):
+    open_logs([sightings(tmp_path / "log.mcap", bearings)], Config())

@@ -61,8 +61,8 @@ def evidence(steps=None, scans=False, seen=None, **changes):
     robot = RobotEvidence(
         name="tom", source="odometry", readings_ns=times, readings=odometry, resets=0,
         stamps_ns=times, final=true, by_odometry=odometry,
-        scans_ns=times[::3] if scans else nothing, repeated=np.zeros(100, dtype=bool),
-        repeated_ns=times[:100], motions_ns=times[1:101], contradicted=np.zeros(100, dtype=bool),
+        scans_ns=times[::3] if scans else nothing, repeated_ns=nothing.reshape(0, 2),
+        motions_ns=times[1:101], contradicted=np.zeros(100, dtype=bool),
         seen=seen(own) if seen else own, parked=(),
     )  # fmt: skip
     return Evidence((replace(robot, **changes),), SUMMARY)
@@ -138,8 +138,8 @@ WRONG = {
         "stamped 0.8 s",
     ),
     "laser repeats": (
-        lambda: evidence(scans=True, repeated=np.arange(100) > 60),
-        "the laser is frozen",
+        lambda: evidence(scans=True, repeated_ns=S * np.array([[k, 31] for k in range(32, 40)])),
+        "from 30.0 s on while odometry moves: the laser is frozen; 8 scans were left out",
     ),
     "sparse": (
         lambda: sparse(evidence(scans=True, seen=no_sightings)),
