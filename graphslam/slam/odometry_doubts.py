@@ -22,6 +22,9 @@ MOVED_M, MOVED_RAD = 0.3, 0.25
 FAST_SHARE = 0.98
 #: m/s, rad/s: no robot of the kind is faster
 TOP_SPEED_M_S, TOP_TURN_RAD_S = 30.0, 12.0
+#: m/s: no robot that drives is slower all the time; share of that time in which it does; rad/s: it
+#: drives straight
+CREEP_M_S, CREEPING, STRAIGHT_RAD_S = 0.01, 0.5, 0.02
 #: m, rad: a motion within one period that is more than the robot can do by so much is a jump
 JUMP_M, JUMP_RAD = 0.22, 0.4
 #: s: odometry without a reading for longer is a guess; periods of the topic
@@ -36,7 +39,11 @@ FACTORS = 0.6, 1.6
 TURNED_RAD, DRIVEN_M = 2.0, 2.0
 #: s: stamps of scans that are later or earlier by so much; what is tried; in steps of
 LATE_S, LATEST_S, LATE_STEP_S = 0.3, 2.0, 0.1
+#: correlation of turning that is as good as it gets: even turning fits at any time
+FITS = 0.99
 LEAST_POSES = 50
+#: seconds of a log from which its speed is judged
+LEAST_SPEEDS = 10
 #: the log is compared in so many parts
 PARTS = 6
 
@@ -107,6 +114,30 @@ def _speed(robot: RobotEvidence) -> Iterator[Reason]:
             fast = float(np.quantile(rates, FAST_SHARE))
             text = f"moves at {fast:.3g} {unit}, which no robot does: is it in {hint}?"
             yield _reason(robot, "bad", text)
+    yield from _creep(robot, np.diff(np.interp(grid, times, path)))
+
+
+def _creep(robot: RobotEvidence, speeds: Array) -> Iterator[Reason]:
+    """Odometry that goes on and on, and nowhere: it is in a larger unit than metres.
+
+    That of a robot that stands or turns on the spot shakes to and fro; this one goes one way,
+    and straight.
+
+    Args:
+        robot: with its readings.
+        speeds: (n,) m/s in every second.
+    """
+    if robot.source == "given" or len(speeds) < LEAST_SPEEDS:
+        return
+    moved, apart = _steps(robot)
+    straight = np.abs(moved[:, 2]) < STRAIGHT_RAD_S * apart
+    ahead = moved[straight, 0]
+    total = np.abs(ahead).sum()
+    one_way = max(ahead[ahead > 0].sum(), -ahead[ahead < 0].sum()) > 0.9 * total > 0
+    goes_on = np.count_nonzero(ahead) > CREEPING * len(moved)
+    if one_way and goes_on and np.quantile(speeds, FAST_SHARE) < CREEP_M_S:
+        text = f"moves at {speeds.max():.2g} m/s at most, and never stops: is it in metres?"
+        yield _reason(robot, "doubtful", text)
 
 
 def _jumps(robot: RobotEvidence) -> Iterator[Reason]:
@@ -120,12 +151,14 @@ def _jumps(robot: RobotEvidence) -> Iterator[Reason]:
         return
     moved, apart = _steps(robot)
     usual = np.median(apart)
+    # stamps jitter, by a period at most
+    late = min(usual, float(np.quantile(np.abs(apart - usual), FAST_SHARE)))
     size = np.column_stack([np.hypot(moved[:, 0], moved[:, 1]), np.abs(moved[:, 2])])
     at = []
     for k, least in enumerate((JUMP_M, JUMP_RAD)):
         rates = size[:, k] / np.maximum(apart, usual)
-        # what the robot does at its fastest, in this time and one period more: stamps jitter
-        most = float(np.quantile(rates, FAST_SHARE)) * (apart + usual)
+        # what the robot does at its fastest
+        most = float(np.quantile(rates, FAST_SHARE)) * (apart + late)
         at += np.flatnonzero(size[:, k] > most + least).tolist()
     at = [k for k in sorted(set(at)) if apart[k] < GAP_S]
     if at and len(at) <= max(5, 0.002 * len(apart)):
@@ -231,7 +264,7 @@ def _late(robot: RobotEvidence) -> Iterator[Reason]:
     shifts = np.arange(-most, most + 1)
     fits = np.array([_alike(middle, b[most + k : len(b) - most + k]) for k in shifts.tolist()])
     best, plain = int(shifts[fits.argmax()]), float(fits[most])
-    better = fits.max() > 0.7 and 1 - fits.max() < 0.5 * (1 - plain)
+    better = plain < FITS and fits.max() > 0.7 and 1 - fits.max() < 0.5 * (1 - plain)
     if abs(best) * LATE_STEP_S >= LATE_S and better:
         when = "later" if best < 0 else "earlier"
         text = (

@@ -81,8 +81,16 @@ def changed(since, *factors):
     return steps
 
 
-def jumped(*jump):
-    steps = drive()
+def straight(step_m, seed=0, sigma_m=0.0):
+    """Motions (n, 3) along a line, some turns between."""
+    steps = np.zeros((N - 1, 3))
+    steps[:, 0] = step_m + np.random.default_rng(seed).normal(0, sigma_m, N - 1)
+    steps[::3, 2] = 0.05
+    return steps
+
+
+def jumped(*jump, faster=1):
+    steps = drive() * (faster, 1, 1)
     steps[300] = compose(steps[300], np.array(jump))
     return steps
 
@@ -104,6 +112,12 @@ def test_a_healthy_run_is_good(scans):
     assert reasons(evidence(scans=scans)) == ("good", "")
 
 
+@pytest.mark.parametrize("steps", [straight(0.0), straight(1e-5, sigma_m=1e-3)])
+def test_a_robot_that_turns_on_the_spot_is_not_said_to_creep(steps):
+    turning = evidence(steps, scans=True, seen=no_sightings, final=path(steps))
+    assert reasons(turning) == ("good", "")
+
+
 #: what is wrong, and what is said about it
 WRONG = {
     "turning negated": (lambda: evidence(changed(0, 1, -1, -1)), "wrong sign"),
@@ -118,6 +132,8 @@ WRONG = {
         lambda: evidence(changed(0, 0.5, 1, 1), scans=True, seen=no_sightings),
         "forward motion by odometry is 0.5 times",
     ),
+    "kilometres": (lambda: evidence(straight(6e-5)), "never stops: is it in metres?"),
+    "jump of a fast robot": (lambda: evidence(jumped(0.3, 0, 0, faster=5)), "jumps by 0.6"),
     "jump": (lambda: evidence(jumped(0.3, 0, 0)), "jumps by 0.36 m"),
     "turn": (lambda: evidence(jumped(0, 0, 2.0)), "jumps by 0.06 m and 2.0"),
     "resets": (lambda: evidence(resets=2), "jumped 2 times"),
