@@ -130,7 +130,7 @@ def smoothed(result: Result, directory: Path) -> None:
         console.print(f"stamps: {summary['notes']['stamps']}")
     for robot, found in summary["clocks"].items():
         console.print(f"clock of {robot}: {_clock(found)}")
-    console.print(verdict(result))
+    console.print(summary_line(result))
     _reasons(console, "rejected", summary["rejected"])
     _reasons(console, "dropped", summary["dropped"])
     _unobservable(console, summary["calibration"])
@@ -142,14 +142,15 @@ def smoothed(result: Result, directory: Path) -> None:
     console.print(f"report: {directory / 'report.html'}")
 
 
-def verdict(result: Result) -> Text:
+def summary_line(result: Result) -> Text:
     """How sure, how consistent and how fast; bold and coloured on a terminal that wants colours."""
+    from graphslam.results.report_html import length
     from graphslam.results.report_tables import median_sigma
 
     graph, text = result.summary["graph"], Text()
     sigma, parts = median_sigma(result), []
     if sigma is not None:
-        parts.append((f"{100 * sigma:.2g} cm", "median position sigma", "bold cyan"))
+        parts.append((length(sigma), "median position sigma", "bold cyan"))
     if graph["dof"] > 0:
         # twice the error is chi-square where the noise is as stated
         ratio = 2 * graph["error"] / graph["dof"]

@@ -109,7 +109,7 @@ def test_the_three_numbers_are_coloured_only_where_colours_are_wanted(
     monkeypatch, tmp_path, capsys
 ):
     result, _ = room(keyframes=20, beams=31)
-    text = show.verdict(result)
+    text = show.summary_line(result)
     assert "median position sigma" in text.plain and "chi2/dof" in text.plain
     console = Console(force_terminal=True, color_system="standard", no_color=False)
     with console.capture() as coloured:
