@@ -42,13 +42,20 @@ class PathSums:
     """Sums up to n points of paths; see `IncrementSums`.
 
     ``pose`` (n, 3) is seen from the path's origin; ``cov`` (n, 3, 3) and ``d_cal`` (n, 3, p) are
-    the sums of F_k C_k F_kᵀ and F_k D_k; ``length_m`` (n,).
+    the sums of F_k C_k F_kᵀ and F_k D_k; ``length_m`` (n,). ``whole_cov`` (n, 3, 3) is the part of
+    ``cov`` before the increment in which a point lies, of number ``index`` (n,), that ends at
+    ``index_end`` (n, 3); ``part_cov`` (n, 3, 3) what the increment adds up to the point, along the
+    origin's axes.
     """
 
     pose: Array
     cov: Array
     d_cal: Array
     length_m: Array
+    whole_cov: Array
+    part_cov: Array
+    index: IntArray
+    index_end: Array
 
     def motions(self) -> Motions:
         """The motions from the origins to the points; covariances along the origins' axes."""
@@ -56,10 +63,18 @@ class PathSums:
         return Motions(self.pose, T @ self.cov @ T.mT, T @ self.d_cal, self.length_m)
 
     def motions_between(self, start: IntArray, end: IntArray) -> Motions:
-        """The motions (m) from points to later points of the same path, by their indices (m,)."""
+        """The motions (m) from points to later points of the same path, by their indices (m,).
+
+        Noise of an increment acts where the motion leaves it. What an increment has added before
+        the start is taken from there too: with another lever more may be taken away than is there,
+        and the rest is no covariance.
+        """
         a, b = self.pose[start], self.pose[end]
+        same = self.index[start] == self.index[end]
+        left = _lever(-np.where(same[:, None], b, self.index_end[start]))
+        before = self.whole_cov[start] + transformed(self.part_cov[start], left)
         T = rotation3(-a[:, 2]) @ _lever(b)
-        cov = transformed(self.cov[end] - self.cov[start], T)
+        cov = transformed(self.cov[end] - before, T)
         d_cal = T @ (self.d_cal[end] - self.d_cal[start])
         return Motions(between(a, b), cov, d_cal, self.length_m[end] - self.length_m[start])
 
@@ -78,7 +93,7 @@ class IncrementSums:
         step = rotation3(heading[:-1] - heading[first]) @ increments.delta[:, :, None]
         self._poses = np.column_stack([_prefix(step[:, :2, 0]), heading])
         starts = self._poses[:-1] - self._poses[first]
-        _, cov, d_cal, length_m = _effects(starts, increments)
+        _, cov, d_cal, length_m, _ = _effects(starts, increments)
         self._cov, self._d_cal, self._length_m = _prefix(cov), _prefix(d_cal), _prefix(length_m)
 
     def query(self, index: IntArray, first: IntArray, part: Increments) -> PathSums:
@@ -93,8 +108,13 @@ class IncrementSums:
             sums[index] - sums[first]
             for sums in (self._poses, self._cov, self._d_cal, self._length_m)
         )
-        ends, part_cov, part_d_cal, part_m = _effects(ends, part)
-        return PathSums(ends, cov + part_cov, d_cal + part_d_cal, length_m + part_m)
+        ends, added, part_d_cal, part_m, part_cov = _effects(ends, part)
+        # of the last increment of a path, which is not known as a whole, no motion leaves
+        index_end = self._poses[np.minimum(index + 1, len(self._poses) - 1)] - self._poses[first]
+        return PathSums(
+            ends, cov + added, d_cal + part_d_cal, length_m + part_m,
+            cov, part_cov, index, index_end,
+        )  # fmt: skip
 
     def poses(self, index: IntArray, first: IntArray, delta: Array) -> Array:
         """`PathSums.pose` (n, 3) alone; ``delta`` (n, 3) is that of the parts."""
@@ -107,12 +127,13 @@ def transformed(covs: Array, T: Array) -> Array:
     return np.asarray(T @ covs @ T.mT)
 
 
-def _effects(starts: Array, increments: Increments) -> tuple[Array, Array, Array, Array]:
-    """Ends (n, 3) of increments that begin at poses (n, 3), F C Fᵀ, F D, and lengths (n,)."""
-    ends = _ends(starts, increments.delta)
-    F = _lever(-ends) @ rotation3(starts[:, 2])
+def _effects(starts: Array, increments: Increments) -> tuple[Array, Array, Array, Array, Array]:
+    """Ends (n, 3) of increments that begin at poses (n, 3), F C Fᵀ, F D, lengths (n,), turned C."""
+    ends, axes = _ends(starts, increments.delta), rotation3(starts[:, 2])
+    lever = _lever(-ends)
     length_m = np.hypot(increments.delta[:, 0], increments.delta[:, 1])
-    return ends, transformed(increments.cov, F), F @ increments.d_cal, length_m
+    turned = transformed(increments.cov, axes)
+    return ends, transformed(turned, lever), (lever @ axes) @ increments.d_cal, length_m, turned
 
 
 def _ends(starts: Array, delta: Array) -> Array:

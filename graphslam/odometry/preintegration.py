@@ -181,9 +181,8 @@ class Track(Readings):
         a mounted track it is the motion of the frame at ``mount`` in the base, the times being
         ``latency_ns`` late.
 
-        `motions` of one interval takes half as long again, and its covariance is an approximation
-        where ``start`` cuts a reading: the noise before the cut is along the axes of the reading's
-        start.
+        `motions` of one interval takes half as long again; where ``start`` cuts a reading, the noise
+        of the rest of it is along the axes of the reading's start there, not of the cut.
         """
         whole = self._base_motion(start_ns, end_ns, self.latency_ns)
         if whole is None:
@@ -422,7 +421,10 @@ def path_sums(
     n = sum(counts)
     if len(tracks[0]) < 2:
         zeros, covs = np.zeros((n, 3)), np.zeros((n, *(len(RATES),) * by_rate, 3, 3))
-        return PathSums(zeros, covs, np.zeros((n, 3, p)), np.zeros(n)), zeros
+        of = np.zeros(n, dtype=np.int64)
+        return PathSums(
+            zeros, covs, np.zeros((n, 3, p)), np.zeros(n), covs, covs, of, zeros
+        ), zeros  # fmt: skip
     spans = [
         track.span(np.array([when, when - LATENCY_STEP_NS]))
         for track, when in zip(tracks, times, strict=True)

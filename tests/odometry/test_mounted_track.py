@@ -11,6 +11,7 @@ from graphslam.core.config import OdometryConfig, RobotConfig
 from graphslam.core.geometry import between, compose, exp, inverse, inverse_cov, rotation3
 from graphslam.core.motion_models import nominal_calibration
 from graphslam.core.records import OdometryIncrement, OdometryPose, WheelAngles
+from graphslam.odometry.noise_estimation import without_floors
 from graphslam.odometry.preintegration import LATENCY_STEP_NS, STANDING_SIGMA, Track
 
 S = 1_000_000_000
@@ -48,6 +49,30 @@ def burst(**options):
     times[10::10] = times[9:-1:10] + 1e-6
     return track_of(times, curve(0.1 * np.arange(100)), mean=[0.01, 0.02, 0, *MOUNT, LATE_S],
                     mounted=True, **options)  # fmt: skip
+
+
+# ------------------------------------------------------------ readings that are cut
+
+
+@pytest.mark.parametrize("period_s", [0.1, 2.0, 28.0])
+def test_motions_that_cut_a_reading_have_the_noise_of_what_is_left_of_it(period_s):
+    """However far apart readings are: with another lever for what is taken away, 10 m of a reading
+    leave variances below zero."""
+    bare = without_floors(NOISE)
+    track = track_of(period_s * np.arange(5), curve(period_s * np.arange(5)), config=bare)
+    track.calibration = track.calibration.held()
+    rng = np.random.default_rng(0)
+    times = np.sort(rng.uniform(0, 4 * period_s, 40))
+    times = np.append(times, 2 * period_s)  # also at a reading
+    start, end = (np.sort(times[rng.integers(0, 41, (2, 60))], axis=0) * S).astype(np.int64)
+    apart = end > start
+    start, end = start[apart], end[apart]
+    many = track.motions(start, end)
+    assert np.linalg.eigvalsh(many.cov).min() > 0
+    for k, (a, b) in enumerate(zip(start.tolist(), end.tolist(), strict=True)):
+        one = track.motion(a, b)
+        assert_same_pose(many.delta[k], one.delta, atol=1e-9)
+        np.testing.assert_allclose(many.cov[k], one.cov, rtol=1e-6, atol=1e-12)
 
 
 # ------------------------------------------------------------ latency
