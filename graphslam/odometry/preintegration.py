@@ -181,8 +181,8 @@ class Track(Readings):
         a mounted track it is the motion of the frame at ``mount`` in the base, the times being
         ``latency_ns`` late.
 
-        `motions` of one interval takes half as long again; where ``start`` cuts a reading, the noise
-        of the rest of it is along the axes of the reading's start there, not of the cut.
+        `motions` of one interval takes half as long again; where ``start`` cuts a reading, the
+        noise of the rest of it is along the axes of the reading's start there, not of the cut.
         """
         whole = self._base_motion(start_ns, end_ns, self.latency_ns)
         if whole is None:
