@@ -184,7 +184,7 @@ def _unpacked(stream: BinaryIO, chunk: _Record, most: int = -1) -> bytes:
     length = chunk.end - chunk.begin
     # without a length: the bag was not closed, and its last chunk ends with the file; if it is not
     # packed, its messages are read as those outside chunks
-    packed = stream.read(length or _SEARCHED * (packing != "none"))
+    packed = _read(stream, length or _SEARCHED * (packing != "none"))
     limit = size if size and (most < 0 or size < most) else most
     try:
         if packing == "none":
@@ -196,6 +196,15 @@ def _unpacked(stream: BinaryIO, chunk: _Record, most: int = -1) -> bytes:
     except (OSError, EOFError, ValueError, RuntimeError, MemoryError) as error:
         raise _BagError(one_line(error)) from error
     raise _BagError(f"packed with {packing}")
+
+
+def _read(stream: BinaryIO, size: int) -> bytes:
+    """At most ``size`` bytes, piece by piece: memory for what there is, whatever a length says."""
+    parts = []
+    while size > 0 and (part := stream.read(min(size, _SEARCHED))):
+        parts.append(part)
+        size -= len(part)
+    return b"".join(parts)
 
 
 def _messages_in(
@@ -286,9 +295,9 @@ class _Indexer:
         return self.result()
 
     def add(self, offset: int, record: _Record) -> None:
+        if record.end > self.size and record.op != _CHUNK:
+            return  # the file ends inside it
         if record.op == _MESSAGE:
-            if record.end > self.size:
-                return
             self.loose_from = self.loose_from if self.loose else offset
             self.loose_to = record.end
             self.loose.append(_message_head(record.fields))

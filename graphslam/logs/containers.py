@@ -30,6 +30,8 @@ CONTAINERS: dict[str, Container] = {
 NO_MORE = LimitsConfig()
 
 _LONGEST = max(len(container.magic) for container in CONTAINERS.values())
+#: of files of a folder that ought to be recordings, also if their first bytes are damaged
+_SUFFIXES = frozenset({".mcap", ".db3", ".bag", ".zstd"})
 #: what is beside recordings in folders, and is not looked at
 _PACKED = {b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zXZ": "xz", b"PK\x03\x04": "zip"}
 
@@ -111,23 +113,30 @@ def _open_folder(folder: Path, limits: LimitsConfig) -> Recording:
     if metadata.files:
         # other files, for example copies, are not part of the recording
         paths = [path for path in paths if metadata.listed(path.name)]
-    found = [path for path in paths if path.stat().st_size and _container_of(path)]
+    paths = [path for path in paths if path.stat().st_size]
+    found = [path for path in paths if _container_of(path)]
+    others = [path.name for path in paths if path not in found and path.suffix in _SUFFIXES]
+    damaged = f"{', '.join(others)} does not begin as a recording" if others else ""
     if not found:
-        raise LogError(f"{folder}: {_without_recording(folder)}")
+        what = f"{damaged}; copy it again" if damaged else _without_recording(folder)
+        raise LogError(f"{folder}: {what}")
     pieces = [_counted(_indexed(path, limits), metadata) for path in found]
-    pieces = [piece for piece in pieces if piece.messages or piece.damage]
+    pieces = [piece for piece in pieces if piece.messages or piece.damage or piece.lost]
     pieces.sort(key=lambda piece: piece.start_ns)
-    missing = metadata.missing([path.name for path in found])
-    lost = f"{', '.join(missing)} of {METADATA} is not there" if missing else ""
-    return Recording(folder, tuple(pieces), lost)
+    missing = metadata.missing([path.name for path in paths])
+    absent = f"{', '.join(missing)} of {METADATA} is not there" if missing else ""
+    return Recording(folder, tuple(pieces), "; ".join(filter(None, (absent, damaged))))
 
 
 def _counted(piece: Piece, metadata: Metadata) -> Piece:
-    """The piece with its lost messages, if the metadata has their number."""
+    """The piece with its lost messages, if the metadata has their number.
+
+    It may know of more than the file does: what was cut out of it, for example.
+    """
     stated = metadata.messages_of(piece.path.name)
-    if stated is None or not piece.damage or piece.lost is not None:
+    if stated is None or stated < piece.messages:
         return piece
-    return replace(piece, lost=max(0, stated - piece.messages))
+    return replace(piece, lost=max(piece.lost or 0, stated - piece.messages))
 
 
 def _without_recording(folder: Path) -> str:

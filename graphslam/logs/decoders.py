@@ -381,10 +381,12 @@ def decode_messages(
     _, decode, table = DECODERS[schema]
     found: list[records.Message | str]
     try:
-        if table is not None:
-            found = decode(table(data), topic)
-        else:
-            found = [decode(schemas.decode(schema, one), topic) for one in data]
+        # damaged numbers are looked at, and are nothing to warn of on the terminal
+        with np.errstate(all="ignore"):
+            if table is not None:
+                found = decode(table(data), topic)
+            else:
+                found = [decode(schemas.decode(schema, one), topic) for one in data]
     except CdrError:
         found = [f"{schema}: cannot be decoded"]
     except UnusableMessageError as reason:

@@ -77,6 +77,8 @@ _READ: dict[int, Any] = {
     Opcode.METADATA: Metadata,
 }
 _NOT_NEEDED = frozenset(map(int, Opcode)) - _READ.keys()
+#: files end before this byte: a system refuses to go there
+_FARTHEST = 1 << 62
 #: bytes that are unpacked at once where nobody knows how many there are
 _PART = 1 << 20
 
@@ -120,6 +122,8 @@ def _records(stream: BinaryIO, offset: int) -> Iterator[tuple[int, int, bytes]]:
         OSError: it cannot be read.
     """
     while True:
+        if offset > _FARTHEST:
+            raise McapError("it ends inside a record")
         stream.seek(offset)
         head = stream.read(_RECORD.size)
         if len(head) < _RECORD.size:

@@ -49,7 +49,7 @@ def read_metadata(path: Path) -> Metadata:
         }
         if not counts and len(names) == 1:
             counts = {names[0]: int(found["message_count"])}
-    except (YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError, AttributeError):
+    except (YAMLError, LookupError, TypeError, ArithmeticError, ValueError, AttributeError):
         return Metadata()
     return Metadata(names, counts)
 
@@ -57,6 +57,7 @@ def read_metadata(path: Path) -> Metadata:
 def _plain(name: str) -> str:
     """Name of a file without folders and without the suffix of its compression.
 
-    Old versions of rosbag2 write the folder's name too, and leave the suffix out.
+    Old versions of rosbag2 write the folder's name too, and leave the suffix out. In one line: it
+    is shown, and may be damaged.
     """
-    return PurePosixPath(name).name.removesuffix(".zstd")
+    return " ".join(PurePosixPath(name).name.removesuffix(".zstd").split())

@@ -215,6 +215,27 @@ def test_a_piece_that_is_not_there_is_said(made, tmp_path):
     assert "an unknown number of messages" in warning
 
 
+def test_messages_that_only_the_metadata_knows_of_are_lost(made, tmp_path):
+    """Rows that are gone from a database leave no other trace."""
+    target = tmp_path / "bag"
+    shutil.copytree(made("rosbag2 folder, split"), target)
+    database = sqlite3.connect(sorted(target.glob("*.db3"))[0])
+    database.execute("DELETE FROM messages WHERE id IN (3, 5)")
+    database.commit()
+    database.close()
+    assert open_recording(target).lost == 2
+
+
+def test_a_file_whose_first_bytes_are_damaged_is_not_passed_over(made, tmp_path):
+    target = tmp_path / "logs"
+    shutil.copytree(made("folder of MCAP files"), target)
+    (target / "log_8.mcap").write_bytes(b"x" + (target / "log_8.mcap").read_bytes()[1:])
+    (target / "notes.txt").write_text("not a recording")
+    recording = open_recording(target)
+    assert recording.damage == "log_8.mcap does not begin as a recording"
+    assert recording.lost is None and recording.messages
+
+
 def test_a_folder_is_read_without_its_metadata_and_with_damaged_one(made, log, tmp_path):
     target = tmp_path / "bag"
     shutil.copytree(made("rosbag2 folder, split"), target)

@@ -6,6 +6,7 @@ import struct
 import tracemalloc
 import zipfile
 import zlib
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -18,12 +19,13 @@ from graphslam.core.errors import GraphSlamError, LogError, OutputError
 from graphslam.core.output_folder import atomic_folder
 from graphslam.logs import LogWriter, open_logs
 from graphslam.logs.containers import open_recording
+from graphslam.logs.decoders import TopicContext, decode_messages
 from graphslam.logs.import_csv import import_csv
 from graphslam.logs.importers import IMPORTERS
 from graphslam.logs.recording import raw_messages
 from graphslam.slam.robot_state import times_of_readings
 from tests import mutations
-from tests.recordings import rosbag2
+from tests.recordings import bag, rosbag2
 
 S = 1_000_000_000
 
@@ -294,6 +296,16 @@ def test_what_no_sensor_measures_is_dropped_and_counted(tmp_path, name):
     assert opened.dropped == {reason: 1}
 
 
+def test_signalling_nans_are_no_return_and_no_warning_of_python(tmp_path):
+    """Flipped bits make them; converting them is an invalid operation to the processor."""
+    file = open_recording(drive(tmp_path / "log.mcap", 1))
+    (data, *_) = (raw.data for raw in raw_messages(file, {"/scan"}))
+    bad = data[:-8] + struct.pack("<I", 0x7FA00001) + data[-4:]  # its last range
+    context = TopicContext("robot")
+    (scan,) = decode_messages("sensor_msgs/msg/LaserScan", [bad], context, Counter())
+    assert np.isnan(scan.ranges).sum() == 1
+
+
 # ---------------------------------------------------------------- writer and importers
 
 
@@ -327,3 +339,40 @@ def test_archives_that_are_encrypted_or_odd_are_errors_of_one_line(tmp_path):
         source.write_bytes(data)
         with pytest.raises(LogError, match="cannot be read to its end"):
             import_csv(source, tmp_path / "log.mcap")
+
+
+@pytest.mark.parametrize("op", [5, 6, 7])
+def test_lengths_in_a_bag_that_are_larger_than_it_take_no_memory(tmp_path, log, op):
+    """Of chunks, and of what an index says of chunks and connections: 4 GB in a file of 1 MB."""
+    (tmp_path / "log.mcap").write_bytes(log)
+    path = bag(tmp_path / "log.mcap", tmp_path / "log.bag")
+    data = bytearray(path.read_bytes())
+    at = len(b"#ROSBAG V2.0\n")
+    while b"op=" + bytes([op]) not in data[at : at + 4 + (head := u32(data, at))]:
+        at += 8 + head + u32(data, at + 4 + head)
+    struct.pack_into("<I", data, at + 4 + head, 0xFFFFFFF0)
+    path.write_bytes(data)
+    tracemalloc.start()
+    recording = open_recording(path)
+    assert tracemalloc.get_traced_memory()[1] < 50e6
+    tracemalloc.stop()
+    assert recording.damage
+
+
+def u32(data, at):
+    return int.from_bytes(data[at : at + 4], "little")
+
+
+def test_a_length_of_no_file_loses_no_chunk(tmp_path, log):
+    """Of an index behind a chunk: the other chunks are found by the summary."""
+    data = bytearray(log)
+    at = len(mutations.MAGIC)
+    for opcode, body in mutations.records(log):
+        if opcode == Opcode.MESSAGE_INDEX:
+            break
+        at += 9 + len(body)
+    data[at + 8] = 0x7F
+    path = tmp_path / "log.mcap"
+    path.write_bytes(data)
+    file, found = delivered(path)
+    assert found == file.messages == 800 and file.damage
