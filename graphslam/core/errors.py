@@ -2,7 +2,13 @@
 
 
 class GraphSlamError(Exception):
-    """Base of every error that this package raises on purpose."""
+    """Base of every error that this package raises on purpose.
+
+    Its text is one line also if a name in it, of a file, a topic or a key, is of several.
+    """
+
+    def __str__(self) -> str:
+        return " ".join(super().__str__().splitlines())
 
 
 class LogError(GraphSlamError):

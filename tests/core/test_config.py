@@ -4,11 +4,12 @@ import dataclasses
 import math
 import pickle
 import re
+import tempfile
 import typing
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from graphslam.core import config as module
@@ -231,6 +232,25 @@ def test_dump_then_load_is_the_same_configuration(config):
     """config.toml in a result folder repeats the run: every type, to the last digit of every
     float."""
     assert parse_config(dump_config(config)) == config
+
+
+KEYS = [f"{name}.{key}" for name, kind in TABLES.items() for key in settings_of(kind)]
+ODD = ["", "nan", "-inf", "1e999", "true", "[", "{}", "[[1]]", "{a=1}", "'", "0x", "-1", "9" * 400]
+
+
+@given(st.sampled_from(KEYS) | st.text(), st.sampled_from(ODD) | st.text(), st.sampled_from("=.\n"))
+@settings(max_examples=150, derandomize=True)
+def test_whatever_is_set_is_a_configuration_or_an_error_of_one_line(key, value, between):
+    for read in (lambda text: load_config(overrides=[text]), from_file):
+        try:
+            assert isinstance(read(f"{key}{between}{value}"), Config)
+        except ConfigError as error:
+            assert len(str(error).splitlines()) == 1, repr(str(error))
+
+
+def from_file(text):
+    with tempfile.TemporaryDirectory() as folder:
+        return from_text(Path(folder), text)
 
 
 def test_the_default_configuration_survives_a_file(tmp_path):

@@ -4,11 +4,12 @@ import dataclasses
 import struct
 from collections import Counter
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
@@ -25,6 +26,7 @@ from graphslam.logs.decoders import DECODERS, TopicContext, decode_messages
 from graphslam.logs.recording import raw_messages
 from graphslam.logs.schemas import ANYTHING, SOME_ROBOT
 from graphslam.logs.time_order import TOO_LATE, MessageSorter
+from tests import mutations
 
 S = 1_000_000_000
 COV2, COV3 = np.diag([0.01, 0.04]), np.diag([0.01, 0.02, 0.03])
@@ -701,6 +703,23 @@ def test_messages_are_read_as_rosbags_writes_them(schema, size, little):
                 schemas.decode(schema, data[:cut])
         with pytest.raises(CdrError):
             schemas.decode(schema, data + bytes(4))
+
+
+@pytest.mark.parametrize("schema", DECODERS)
+@given(seed=st.integers(0, 10**6))
+@settings(max_examples=40, derandomize=True, deadline=None)
+def test_a_damaged_message_is_a_record_or_counted(schema, seed):
+    """Never an error: it would stop the reading of all that follow."""
+    data = serialized(schema)
+    _, damaged = next(mutations.mutations(data, seed))
+    dropped = Counter()
+    (found,) = decode_messages(schema, [damaged], TopicContext("robot"), dropped)
+    assert (found is None) == any(not reason.startswith("range:") for reason in dropped)
+
+
+@cache
+def serialized(schema):
+    return bytes(schemas._typestore().serialize_cdr(example(schema, "odom", 4), schema))
 
 
 @pytest.mark.parametrize("schema", [schemas.LASER_SCAN, schemas.ODOMETRY])
