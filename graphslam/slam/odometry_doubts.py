@@ -22,9 +22,9 @@ MOVED_M, MOVED_RAD = 0.3, 0.25
 FAST_SHARE = 0.98
 #: m/s, rad/s: no robot of the kind is faster
 TOP_SPEED_M_S, TOP_TURN_RAD_S = 30.0, 12.0
-#: m/s: no robot that drives is slower all the time; share of that time in which it does; rad/s: it
-#: drives straight
-CREEP_M_S, CREEPING, STRAIGHT_RAD_S = 0.01, 0.5, 0.02
+#: m/s: no robot that drives is slower all the time; share of the time in which it drives, of that
+#: in which it does not turn by more than rad/s; least share of that
+CREEP_M_S, CREEPING, STRAIGHT_RAD_S, STRAIGHT = 0.01, 0.5, 0.02, 0.2
 #: m, rad: a motion within one period that is more than the robot can do by so much is a jump
 JUMP_M, JUMP_RAD = 0.22, 0.4
 #: s: odometry without a reading for longer is a guess; periods of the topic
@@ -134,7 +134,7 @@ def _creep(robot: RobotEvidence, speeds: Array) -> Iterator[Reason]:
     ahead = moved[straight, 0]
     total = np.abs(ahead).sum()
     one_way = max(ahead[ahead > 0].sum(), -ahead[ahead < 0].sum()) > 0.9 * total > 0
-    goes_on = np.count_nonzero(ahead) > CREEPING * len(moved)
+    goes_on = np.count_nonzero(ahead) > CREEPING * len(ahead) > CREEPING * STRAIGHT * len(moved)
     if one_way and goes_on and np.quantile(speeds, FAST_SHARE) < CREEP_M_S:
         text = f"moves at {speeds.max():.2g} m/s at most, and never stops: is it in metres?"
         yield _reason(robot, "doubtful", text)
