@@ -219,7 +219,8 @@ def test_other_schemas_give_the_same_trajectory(name, room, expected, tmp_path):
             np.testing.assert_allclose(mine.pose, theirs.pose, atol=1e-12)
     trajectory = graphslam.smooth(path).robots["robot"].final
     np.testing.assert_array_equal(trajectory.stamps_ns, expected.stamps_ns)
-    np.testing.assert_allclose(trajectory.poses, expected.poses, atol=1e-9)
+    # headings differ by the rounding of their text or quaternion, 1e-16, and poses by up to 1.2e-9
+    np.testing.assert_allclose(trajectory.poses, expected.poses, atol=2e-9)
 
 
 @pytest.mark.parametrize("encoding", ["json", "protobuf"])
