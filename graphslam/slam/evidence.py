@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from graphslam.core.gaussian import mahalanobis_squared
 from graphslam.core.geometry import Array
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Estimate, RobotResult, Step
@@ -160,12 +161,6 @@ def _changed(before: Array, after: Array) -> float:
     return float(np.mean(np.abs(after - before)[both] > CHANGED_M))
 
 
-def _squared(errors: Array, covs: Array) -> Array:
-    """Squared Mahalanobis distances (n,) of errors (n, k)."""
-    weighted = np.linalg.pinv(covs, hermitian=True) @ errors[:, :, None]
-    return np.asarray((errors * weighted[:, :, 0]).sum(axis=1))
-
-
 def _seen(seen: Sequence[Association], run: RobotState, estimate: Estimate) -> Seen:
     usable = [a for a in seen if _target(a, estimate) is not None]
     usable.sort(key=lambda a: a.time_ns)
@@ -181,7 +176,7 @@ def _seen(seen: Sequence[Association], run: RobotState, estimate: Estimate) -> S
         states = estimate.states[usable[0].robot].at(times[of])
         to = np.array([_target(usable[k], estimate) for k in of.tolist()])
         residual = np.asarray(MODELS[model].residual(z[of], states, to))
-        d2[of] = _squared(residual, covs[of]) / residual.shape[1]
+        d2[of] = mahalanobis_squared(residual, covs[of]) / residual.shape[1]
     return Seen(
         times,
         targets,

@@ -102,7 +102,7 @@ class LogPass:
                 "--start truth"
             )
         start = self.frames.offset_start(robot, self.starts[robot])
-        if not self.known.alone:
+        if not self.known.alone:  # nothing had to be found: the starts were told
             start = replace(start, base_cov=start.cov)
         if robot != self.frames.of[robot]:
             # priors are on the base, states on the sensor: where it sits is not known yet, nor is

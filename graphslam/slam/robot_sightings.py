@@ -16,12 +16,10 @@ from graphslam.core.geometry import Array, compose
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Motion, Sighting
 from graphslam.mapping.robot_candidates import RobotTarget
+from graphslam.odometry.interpolation import HALF_SPAN_NS
 from graphslam.perception.sightings import may_be_robot
 from graphslam.slam.robot_state import RobotState
 from graphslam.slam.sighting_batches import SightingBatch
-
-#: ns: the velocity of a robot is its motion from so long before to so long after
-HALF_SPAN_NS = 250_000_000
 
 
 class RobotCandidates:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from graphslam.core.geometry import Array, between
+from graphslam.core.geometry import Array, between, inverse, polar_points, transform_each
 from graphslam.odometry.interpolation import IntArray
 from graphslam.slam.doubts import Reason, seconds
 from graphslam.slam.evidence import Evidence, RobotEvidence, Seen
@@ -112,12 +112,8 @@ def _pairs_of(seen: Seen) -> tuple[IntArray, IntArray]:
 
 def _disagreement(z1: Array, z2: Array, moved: Array) -> Array:
     """Distances (n,) of where things are and where they were seen before, over their ranges."""
-    first, second = (
-        z[:, 1:] * np.column_stack([np.cos(z[:, 0]), np.sin(z[:, 0])]) for z in (z1, z2)
-    )
-    d = first - moved[:, :2]
-    c, s = np.cos(moved[:, 2]), np.sin(moved[:, 2])
-    expected = np.column_stack([c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0]])
+    first, second = (polar_points(z[:, 1], z[:, 0]) for z in (z1, z2))
+    expected = transform_each(inverse(moved), first)
     return np.asarray(np.hypot(*(expected - second).T) / np.maximum(z2[:, 1], 1e-9))
 
 

@@ -419,5 +419,5 @@ def test_a_base_is_as_uncertain_along_its_way_as_its_sensor_may_be_late(late_s):
     found = with_stamp_errors(base, track, times)
     moved = np.array([TWIST, [-TWIST[1], TWIST[0], TWIST[2]]]) * late_s
     expected = known + moved[:, :, None] * moved[:, None, :] / 2
-    np.testing.assert_allclose(found.covs, expected, atol=1e-6)
+    np.testing.assert_allclose(found.covs, expected, atol=1e-9)
     np.testing.assert_array_equal(found.poses, base.poses)
