@@ -8,6 +8,9 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 OUT := out
 
+# without cached bytecode every command would compile the program again, for a quarter of a second
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: help demo test browser-test extras-test lint types pages docs clean
 
 help:
@@ -92,4 +95,5 @@ $(INSTALLED): pyproject.toml
 	  "$$found" -m venv $(VENV) || exit 1; \
 	fi; \
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@$(BIN)/python -m compileall -q graphslam
 	@touch $@
