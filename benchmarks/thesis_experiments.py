@@ -14,7 +14,8 @@ from pathlib import Path
 from common import FIGURES, ROOT, parser
 from thesis_figures import draw
 
-from graphslam.evaluation.monte_carlo_campaign import run_campaign
+from graphslam.campaigns.experiment import run_campaign
+from graphslam.campaigns.tasks import Workers
 from graphslam.evaluation.monte_carlo_definition import load_definition
 from graphslam.evaluation.monte_carlo_folder import save_summary
 from graphslam.evaluation.monte_carlo_summary import summarise
@@ -43,7 +44,7 @@ def main() -> int:
     definition = replace(load_definition("thesis"), runs=arguments.seeds)
     with tempfile.TemporaryDirectory() as temporary:
         folder = arguments.folder or Path(temporary) / "thesis"
-        summary = summarise(definition, run_campaign(definition, folder, jobs=arguments.jobs))
+        summary = summarise(definition, run_campaign(definition, folder, Workers(arguments.jobs)))
         save_summary(summary, folder)
     failed = []
     for name, experiment in summary["chapter"].items():

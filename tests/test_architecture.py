@@ -31,6 +31,7 @@ PACKAGES = (
     "results",
     "change_detection",
     "evaluation",
+    "campaigns",
     "cli",
 )
 #: most pairs of packages of which one imports the other
@@ -40,6 +41,8 @@ MOST_LINES = 450
 
 #: library -> the packages that may import it: everything else stays free of its types and its cost
 KEEPERS = {
+    "dask": {"campaigns"},
+    "distributed": {"campaigns"},  # only with the extra `cluster`
     "cv2": {"perception", "results", "change_detection"},
     "gtsam": {"estimation"},
     "matplotlib": set(),  # takes half a second to import; `plot` imports it by its name

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from importlib.util import find_spec
 from math import isfinite
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,6 +14,9 @@ from graphslam.core.presets import PRESETS
 from graphslam.core.suggestions import did_you_mean
 from graphslam.logs import IMPORTERS
 from graphslam.simulation import SCENARIOS
+
+if TYPE_CHECKING:
+    from graphslam.campaigns.tasks import Workers
 
 
 def _choices(section: Any) -> list[str]:
@@ -110,6 +113,50 @@ def check_rerun(wanted: bool) -> bool:
     return wanted
 
 
+def check_scheduler(value: str | None) -> str | None:
+    """The address of a scheduler.
+
+    Raises:
+        typer.BadParameter: what is needed to reach it is not installed.
+    """
+    if value is not None and find_spec("distributed") is None:
+        raise typer.BadParameter('needs Dask: pip install "coop-graphslam[cluster]"')
+    return value
+
+
+def workers_of(jobs: int | None, scheduler: str | None, memory_mb: float | None) -> "Workers":
+    """Who works, by these options.
+
+    Raises:
+        typer.BadParameter: both processes and a cluster are wanted.
+    """
+    from graphslam.campaigns.tasks import Workers
+
+    if jobs is not None and scheduler is not None:
+        raise typer.BadParameter("give --jobs or --scheduler, not both", param_hint="'--jobs'")
+    return Workers(jobs, scheduler, memory_mb)
+
+
+def smoothing_settings(
+    backend: str | None,
+    front_end: str | None,
+    start: list[str] | None,
+    settings: list[str] | None,
+    *,
+    causal: bool = False,
+    horizon: float | None = None,
+) -> list[str]:
+    """What the options of `smooth` stand for, as ``key=value``; those of --set come last."""
+    return [
+        *([f"backend.name={backend}"] if backend else ()),
+        *(["backend.causal=true"] if causal else ()),
+        *([] if horizon is None else [f"backend.horizon_s={horizon}"]),
+        *([f"front_end.name={front_end}"] if front_end else ()),
+        *(start or ()),
+        *(settings or ()),
+    ]
+
+
 def check_resolution(value: float | None) -> float | None:
     """The edge of a cell in metres.
 
@@ -151,6 +198,13 @@ Logs = Annotated[
     typer.Argument(
         metavar="LOG",
         help="MCAP, rosbag2 (folder or .db3), ROS 1 .bag; several are one recording.",
+    ),
+]
+LogsOrFolders = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="LOG|FOLDER",
+        help="Recordings, each a log of its own, and folders that are searched for such.",
     ),
 ]
 Format = Annotated[
@@ -310,6 +364,23 @@ Settings = Annotated[
 Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of the random noise.")]
 Runs = Annotated[int | None, typer.Option(metavar="N", min=1, help="Seeds, instead of the file's.")]
 Jobs = Annotated[int | None, typer.Option(metavar="N", min=1, help="Processes; one per core.")]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        callback=check_scheduler,
+        help="A Dask scheduler whose workers do it, such as tcp://head:8786, or its file.",
+    ),
+]
+Memory = Annotated[
+    float | None,
+    typer.Option(
+        metavar="MB",
+        min=1.0,
+        help="Memory of a worker, MB; its share of the machine, or what Dask's workers have.",
+    ),
+]
+Retry = Annotated[bool, typer.Option("--retry", help="Do again what failed.")]
 
 # ---------------------------------------------------------------- what comes out
 
@@ -325,6 +396,7 @@ OutputLogOrFolder = Annotated[
     Path,
     _output("LOG.mcap|DIR", "The log; of a scenario with two visits, the folder for both."),
 ]
+BatchFolder = Annotated[Path, _output("DIR", "The folder of the batch, made if missing.")]
 ExperimentFolder = Annotated[Path, _output("DIR", "The experiment's folder.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Plan = Annotated[
@@ -343,7 +415,8 @@ Verbose = Annotated[
     bool, typer.Option("--verbose", help="Print every stage on stderr when it begins.")
 ]
 ViewedFolder = Annotated[
-    Path, typer.Argument(metavar="DIR", help="Folder of smooth, compare, changes or experiment.")
+    Path,
+    typer.Argument(metavar="DIR", help="Folder of smooth, batch, compare, changes or experiment."),
 ]
 AsMcap = Annotated[
     bool,

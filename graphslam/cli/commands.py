@@ -4,17 +4,13 @@ What takes long to import is imported by the command that needs it, so that help
 arguments appear at once.
 """
 
-import inspect
 import os
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
 
 import typer
 
 import graphslam
-from graphslam.cli import terminal
 from graphslam.cli.arguments import (
     AsMcap,
     AsRerun,
@@ -24,17 +20,11 @@ from graphslam.cli.arguments import (
     ChangeMethod,
     ComparisonMode,
     ConfigFile,
-    Debug,
     EvaluatedFolder,
-    Experiment,
-    ExperimentFolder,
     Force,
-    ForceOrResume,
     Format,
     FrontEnd,
     Horizon,
-    Jobs,
-    Json,
     LaterFolder,
     Logs,
     MapFolder,
@@ -44,12 +34,10 @@ from graphslam.cli.arguments import (
     OutputLogOrFolder,
     Plan,
     Preset,
-    Quiet,
     ReferenceFolder,
     Relations,
     Resolution,
     ResultFolder,
-    Runs,
     Scenario,
     Seed,
     Settings,
@@ -58,120 +46,19 @@ from graphslam.cli.arguments import (
     Starts,
     Strict,
     TruthFiles,
-    Verbose,
     ViewedFolder,
     Viewer,
     WithMap,
+    smoothing_settings,
     span_of,
 )
+from graphslam.cli.registry import Output, app, command
 from graphslam.cli.stage_bar import stage_bar
-from graphslam.cli.terminal import errors_in_one_line, progress_bar
+from graphslam.cli.terminal import progress_bar
 from graphslam.core.config import Config
 from graphslam.core.config_io import load_config, named_backend
-from graphslam.core.errors import ConfigError, EstimationError, OutputError
+from graphslam.core.errors import ConfigError, OutputError
 from graphslam.logs import IMPORTERS
-
-app = typer.Typer(
-    help="Logs of wheeled robots in; trajectories, a landmark map and their covariances out.",
-    context_settings={"help_option_names": ["-h", "--help"]},
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
-)
-
-
-def _version(wanted: bool) -> None:
-    if wanted:
-        typer.echo(graphslam.__version__)
-        raise typer.Exit
-
-
-@app.callback()
-def options(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
-    ] = False,
-) -> None:
-    """Logs of wheeled robots in; trajectories, a landmark map and their covariances out."""
-
-
-#: command -> lines at the end of its help
-EXAMPLES = {
-    "info": ("graphslam info drive.mcap",),
-    "import": ("graphslam import carmen intel.clf -o intel.mcap",),
-    "simulate": ("graphslam simulate lab -o lab.mcap --seed 3",),
-    "smooth": (
-        "graphslam smooth drive.mcap -o result",
-        "graphslam smooth drive.mcap -o result --backend isam2 --horizon 20",
-        "graphslam smooth drive.mcap -o result --set keyframe.distance_m=0.5 --force",
-    ),
-    "view": ("graphslam view result",),
-    "evaluate": ("graphslam evaluate result --truth robot=truth.tum",),
-    "compare": ("graphslam compare drive.mcap --backends ekf,isam2:20,batch -o comparison",),
-    "changes": ("graphslam changes morning evening -o changes",),
-    "experiment": ("graphslam experiment ekf-versus-smoothing --runs 20 -o experiment",),
-    "config": ("graphslam config > settings.toml",),
-}
-
-
-@dataclass(frozen=True)
-class Output:
-    """What a command prints: ``content`` with --json, else what ``show`` prints for people.
-
-    ``failure``: an error to report after that, for work that was done in part; ``code``: the exit
-    code where there is none.
-    """
-
-    content: Any
-    show: Callable[[], None]
-    failure: str = ""
-    code: int = 0
-
-
-def command(name: str) -> Callable[[Callable[..., Output]], None]:
-    """Register a function as a command, with the options that all have and its examples."""
-
-    def register(function: Callable[..., Output]) -> None:
-        def run(
-            *,
-            json: Json = False,
-            quiet: Quiet = False,
-            verbose: Verbose = False,
-            debug: Debug = False,
-            **arguments: Any,
-        ) -> None:
-            from graphslam.results.file_formats import to_json
-
-            terminal.output.quiet, terminal.output.verbose = quiet, verbose
-            with errors_in_one_line(debug):
-                output = function(**arguments)
-                if json:
-                    typer.echo(to_json(output.content, name), nl=False)
-                elif not quiet:
-                    output.show()
-                if output.failure:
-                    raise EstimationError(output.failure)
-                if output.code:
-                    raise typer.Exit(output.code)
-
-        # typer reads the options from the signature
-        common = list(inspect.signature(run).parameters.values())[:4]
-        own = inspect.signature(function)
-        signature = own.replace(parameters=[*own.parameters.values(), *common])
-        run.__dict__["__signature__"] = signature
-        run.__annotations__ = function.__annotations__ | {
-            "json": Json,
-            "quiet": Quiet,
-            "verbose": Verbose,
-            "debug": Debug,
-        }
-        shown = "\n".join(f"  {line}" for line in EXAMPLES.get(name, ()))
-        run.__doc__ = (
-            f"{inspect.getdoc(function)}\n\n\b\nExamples:\n{shown}" if shown else function.__doc__
-        )
-        app.command(name)(run)
-
-    return register
 
 
 @command("info")
@@ -256,12 +143,8 @@ def smooth(
         raise ConfigError(f"only isam2 supports --horizon, not {named}; omit it")
     if horizon is not None:
         backend = "isam2"
-    options = [f"backend.name={backend}"] if backend else []
-    if causal:
-        options.append("backend.causal=true")
-    options += [] if horizon is None else [f"backend.horizon_s={horizon}"]
-    options += [f"front_end.name={front_end}"] if front_end else []
-    tree = load_config(config, [*options, *(start or ()), *(settings or ())], preset)
+    chosen = smoothing_settings(backend, front_end, start, settings, causal=causal, horizon=horizon)
+    tree = load_config(config, chosen, preset)
     if plan:
         return _described(logs, tree, strict)
     if output is None:
@@ -346,8 +229,7 @@ def compare(
     """
     from graphslam.cli import show
 
-    options = [f"front_end.name={front_end}"] if front_end else []
-    tree = load_config(config, [*options, *(start or ()), *(settings or ())], preset)
+    tree = load_config(config, smoothing_settings(None, front_end, start, settings), preset)
     with progress_bar("associating") as progress:
         comparison = graphslam.compare(
             logs, [spec for spec in backends.split(",") if spec], mode=mode, truth=truth or None,
@@ -397,37 +279,6 @@ def changes(
     return Output(found, lambda: show.changes(found, output))
 
 
-@command("experiment")
-def experiment(
-    name: Experiment,
-    output: ExperimentFolder,
-    runs: Runs = None,
-    jobs: Jobs = None,
-    force: ForceOrResume = False,
-) -> Output:
-    """Run a Monte Carlo experiment: many seeds, estimators and noise scales.
-
-    Writes results.jsonl, a row per run as it ends, then summary.json, report.html and figures.
-    An interrupted run is resumed when it is called again.
-    """
-    from graphslam.cli import show
-    from graphslam.evaluation.monte_carlo_campaign import list_jobs, run_campaign
-    from graphslam.evaluation.monte_carlo_definition import load_definition
-    from graphslam.evaluation.monte_carlo_folder import save_summary
-    from graphslam.evaluation.monte_carlo_summary import summarise
-
-    definition = load_definition(name)
-    definition = replace(definition, runs=runs or definition.runs)
-    total = len(list_jobs(definition))
-    with progress_bar("running") as progress:
-        rows = run_campaign(
-            definition, output, jobs=jobs, force=force, progress=lambda n: progress(n, total)
-        )
-    summary = summarise(definition, rows)
-    save_summary(summary, output)
-    return Output(summary, lambda: show.experiment(summary, output))
-
-
 @command("config")
 def config_command(preset: Preset = None) -> Output:
     """Print all settings with their defaults, units and meaning, as TOML, and the presets.
@@ -440,3 +291,9 @@ def config_command(preset: Preset = None) -> Output:
     text = documented_settings() if preset is None else preset_text(preset)
     content = settings_tree() if preset is None else preset_settings(preset)
     return Output(content, lambda: typer.echo(text, nl=False))
+
+
+# the rest registers itself, after these
+from graphslam.cli import campaign_commands  # noqa: E402
+
+__all__ = ["app", "campaign_commands"]

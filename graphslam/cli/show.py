@@ -34,7 +34,7 @@ _PIPE_WIDTH = 200  # columns; output into a pipe has no width of its own
 
 def log_info(info: LogInfo) -> None:
     """Files, topics and robots, warnings, and whether the log can be smoothed."""
-    console = _console()
+    console = make_console()
     for file in info.files:
         lost = "an unknown number" if file.lost is None else _number(file.lost)
         damage = "" if file.lost == 0 else f", {lost} lost"
@@ -44,13 +44,13 @@ def log_info(info: LogInfo) -> None:
     console.print(_span(info.topics))
     console.print()
     head = ["topic", "schema", "robot", "used", "messages", "Hz", "gaps", "time jumps back"]
-    console.print(_table(head, map(_topic_row, info.topics), texts=4))
+    console.print(make_table(head, map(_topic_row, info.topics), texts=4))
     for topic in info.topics:
         if topic.scan is not None:
             console.print(f"{topic.name}: {_scan(topic)}")
     head = ["robot", "odometry", "path, m", "turning, deg", "mean m/s", "top m/s", "reverses"]
     console.print()
-    console.print(_table(head, map(_robot_row, info.robots), texts=2))
+    console.print(make_table(head, map(_robot_row, info.robots), texts=2))
     _reasons(console, "dropped", info.dropped)
     for finding in info.findings:
         kind = {"note": "note", "doubt": "warning", "unusable": "not usable"}[finding.severity]
@@ -67,7 +67,7 @@ def log_info(info: LogInfo) -> None:
 
 def imported(done: ImportSummary) -> None:
     """The log, its messages per topic, warnings."""
-    console = _console()
+    console = make_console()
     console.print(f"{done.target}: {_number(sum(done.counts.values()))} messages")
     for topic, count in sorted(done.counts.items()):
         console.print(f"  {topic}: {_number(count)}")
@@ -95,7 +95,7 @@ def simulation(done: "Simulation") -> dict[str, Any]:
 
 def simulated(done: "Simulation") -> None:
     """The logs, the drive of each robot, and the error of its dead reckoning at the end."""
-    console = _console()
+    console = make_console()
     head = ["log", "robot", "path, m", "s", "scans", "sightings", "dead reckoning ends off, m"]
     rows = [
         (
@@ -110,14 +110,14 @@ def simulated(done: "Simulation") -> None:
         for recording in done.recordings
         for name, facts in recording.robots.items()
     ]
-    console.print(_table(head, rows, texts=2))
+    console.print(make_table(head, rows, texts=2))
     if done.changed_cells:
         console.print(f"{done.changed_cells} changed cells in {done.target / 'truth.json'}")
 
 
 def smoothed(result: Result, directory: Path) -> None:
     """A line on the run, what was rejected or dropped and why, and where the report is."""
-    console, summary, robots = _console(), result.summary, len(result.robots)
+    console, summary, robots = make_console(), result.summary, len(result.robots)
     counts = summary["counts"]
     parts = [_counted(robots, "robot")]
     parts += [
@@ -182,7 +182,7 @@ def _clock(found: Mapping[str, Any]) -> str:
 
 def mapped(made: Mapping[str, Any], directory: Path) -> None:
     """The size of the grid map, and where the files are."""
-    console, grid = _console(), made["grid"]
+    console, grid = make_console(), made["grid"]
     if grid is None:
         console.print("no scans, so there is no grid map")
     else:
@@ -196,9 +196,9 @@ def mapped(made: Mapping[str, Any], directory: Path) -> None:
 
 def evaluation(errors: Mapping[str, Any]) -> None:
     """Tables of errors: trajectories, relations, landmarks, as far as they were compared."""
-    console = _console()
+    console = make_console()
     for _, heads, rows in evaluation_tables(errors):
-        console.print(_table(heads, rows, texts=2))
+        console.print(make_table(heads, rows, texts=2))
     for text in evaluation_notes(errors):
         console.print(text)
     landmarks = errors.get("landmarks", {})
@@ -221,7 +221,7 @@ def stage(text: str) -> None:
 
 def comparison(found: Mapping[str, Any], directory: Path) -> None:
     """Tables with a star at the best of each column; then what failed."""
-    console = _console()
+    console = make_console()
     console.print(headline(found))
     for title, (heads, rows) in comparison_tables(found).items():
         lines = [
@@ -231,11 +231,11 @@ def comparison(found: Mapping[str, Any], directory: Path) -> None:
         ]
         console.print()
         console.print(title)
-        console.print(_table(["", *heads], lines))
+        console.print(make_table(["", *heads], lines))
     if won := filter_wins(found):
         console.print("\nWhere a filter is ahead of every smoother")
         console.print(
-            _table(["", *FILTER_WIN_HEADS[1:]], [tuple(map(_number, row)) for row in won])
+            make_table(["", *FILTER_WIN_HEADS[1:]], [tuple(map(_number, row)) for row in won])
         )
     console.print()
     for text in ("* best of its column.", *reading_notes(found)):
@@ -250,7 +250,7 @@ def comparison(found: Mapping[str, Any], directory: Path) -> None:
 
 def changes(found: Mapping[str, Any], directory: Path) -> None:
     """The changes, the beams compared and flagged, and where the report is."""
-    console = _console()
+    console = make_console()
     compared, flagged = found["beams_compared"], found["beams_flagged"]
     console.print(
         f"{_number(compared)} beams compared, {100 * flagged / max(compared, 1):.2f} % flagged; "
@@ -273,7 +273,7 @@ def changes(found: Mapping[str, Any], directory: Path) -> None:
         )
     head = ["change", "x, m", "y, m", "size x, m", "size y, m", "probability", "turned, deg"]
     if rows:
-        console.print(_table([*head, "beams"], rows))
+        console.print(make_table([*head, "beams"], rows))
     else:
         console.print("no change was found where both visits observed")
     for warning in found["warnings"]:
@@ -285,7 +285,7 @@ def experiment(found: Mapping[str, Any], directory: Path) -> None:
     """A line per variant and noise scale, what failed, and where the report is."""
     from graphslam.results.report_experiment import coverage
 
-    console = _console()
+    console = make_console()
     if found["kind"] == "chapter":
         _chapter(console, found)
         console.print(f"report: {directory / 'report.html'}")
@@ -309,7 +309,7 @@ def experiment(found: Mapping[str, Any], directory: Path) -> None:
     else:
         head += ["ATE, m", "causal ATE, m", "NEES/dof", "causal NEES/dof", "coverage, %"]
         head += ["causal", "landmarks"]
-    console.print(_table(head, [(*row, *[None] * (len(head) - len(row))) for row in rows]))
+    console.print(make_table(head, [(*row, *[None] * (len(head) - len(row))) for row in rows]))
     console.print(f"diverged: {found['diverged_if']}")
     for text, count in found["errors"].items():
         console.print(f"failed {count} times: {text}")
@@ -325,18 +325,18 @@ def _chapter(console: Console, found: Mapping[str, Any]) -> None:
     for experiment in found["chapter"].values():
         head, lines = table_rows(experiment)
         console.print(experiment["title"])
-        console.print(_table(head, lines))
+        console.print(make_table(head, lines))
     for warning in found["warnings"]:
         console.print(f"warning: {warning}")
 
 
-def _console() -> Console:
+def make_console() -> Console:
     """A console for plain text: names of topics may look like markup."""
     width = None if sys.stdout.isatty() else _PIPE_WIDTH
     return Console(width=width, markup=False, highlight=False, emoji=False, soft_wrap=True)
 
 
-def _table(head: Sequence[str], rows: Iterable[Sequence[object]], texts: int = 1) -> Table:
+def make_table(head: Sequence[str], rows: Iterable[Sequence[object]], texts: int = 1) -> Table:
     """A table without borders; all but the first ``texts`` columns are right-aligned."""
     table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
     for column, name in enumerate(head):

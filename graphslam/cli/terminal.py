@@ -92,3 +92,9 @@ def progress_bar(doing: str) -> Iterator[Callable[[int, int], None]]:
                 progress.update(task, completed=done, total=total, refresh=True)
 
         yield show
+
+
+def note(text: str) -> None:
+    """A line on stderr about what happens, unless nothing is to be said."""
+    if not output.quiet:
+        typer.echo(f"graphslam: {text}", err=True)

@@ -9,8 +9,10 @@ from graphslam.core.errors import LogError
 
 
 @contextmanager
-def limited_memory(memory_mb: float) -> Iterator[None]:
+def limited_memory(memory_mb: float, needed: str = "") -> Iterator[None]:
     """Give the process, and each that it forks, at most ``memory_mb`` of data; inf: no limit.
+
+    A limit within another one does not raise it. ``needed``: what to say if it is not enough.
 
     Raises:
         LogError: the block needs more.
@@ -21,14 +23,15 @@ def limited_memory(memory_mb: float) -> Iterator[None]:
     import resource  # noqa: PLC0415 (not on Windows)
 
     before = resource.getrlimit(resource.RLIMIT_DATA)
-    most = before[1] if before[1] != resource.RLIM_INFINITY else sys.maxsize
+    most = min(sys.maxsize if limit == resource.RLIM_INFINITY else limit for limit in before)
     resource.setrlimit(resource.RLIMIT_DATA, (min(round(memory_mb * 1e6), most), before[1]))
     try:
         yield
     except MemoryError as error:
         raise LogError(
-            f"the run needs more memory than limits.memory_mb ({memory_mb:g}) allows; raise it, or "
-            "cut the log into pieces"
+            needed
+            or f"the run needs more memory than limits.memory_mb ({memory_mb:g}) allows; raise it, "
+            "or cut the log into pieces"
         ) from error
     finally:
         resource.setrlimit(resource.RLIMIT_DATA, before)

@@ -16,15 +16,17 @@ import pytest
 from finite_differences import jacobian
 from scipy.stats import chi2
 
+from graphslam.campaigns import experiment as campaign
+from graphslam.campaigns.experiment import run_campaign
+from graphslam.campaigns.tasks import Workers
 from graphslam.core.config_io import load_config
 from graphslam.core.errors import ConfigError, LogError, OutputError
 from graphslam.core.geometry import between, compose, exp, rotation3
 from graphslam.core.observation_models import MODELS
 from graphslam.estimation.backend import JointMarginal
 from graphslam.evaluation import cramer_rao_bound as bound
-from graphslam.evaluation import monte_carlo_campaign as campaign
 from graphslam.evaluation.monte_carlo_bench import Noise, draw_run, planned_path, run_seed
-from graphslam.evaluation.monte_carlo_campaign import Job, run_campaign, run_job
+from graphslam.evaluation.monte_carlo_campaign import Job, run_job
 from graphslam.evaluation.monte_carlo_consistency import joint_errors, joint_nees
 from graphslam.evaluation.monte_carlo_definition import (
     EXPERIMENTS,
@@ -378,12 +380,12 @@ def done(tmp_path_factory):
     path = folder / "small.toml"
     path.write_text(SMALL)
     definition = load_definition(path)
-    return definition, folder / "out", run_campaign(definition, folder / "out", jobs=2)
+    return definition, folder / "out", run_campaign(definition, folder / "out", Workers(2))
 
 
 def test_rows_do_not_depend_on_the_number_of_processes(done, tmp_path):
     definition, _, rows = done
-    assert content(rows) == content(run_campaign(definition, tmp_path / "one", jobs=1))
+    assert content(rows) == content(run_campaign(definition, tmp_path / "one", Workers(1)))
     assert [row["variant"] for row in rows] == 2 * list(definition.variants)
     assert all(row["error"] is None and row["nees"] > 0 for row in rows)
     assert rows[0]["seed"] == [0, 100000, 0]
@@ -400,7 +402,7 @@ def test_a_campaign_goes_on_where_it_stopped(done, tmp_path, monkeypatch):
     file.write_text("".join(lines[:2]) + lines[2][:50])
     counts = []
     again = run_campaign(
-        replace(definition, runs=3), tmp_path / "a", jobs=2, progress=counts.append
+        replace(definition, runs=3), tmp_path / "a", Workers(2), progress=counts.append
     )
     assert counts == [2, 3, 4, 5, 6]
     assert content(again)[:4] == content(whole)
@@ -413,7 +415,7 @@ def test_a_campaign_goes_on_where_it_stopped(done, tmp_path, monkeypatch):
     other = replace(definition, seed=1)
     with pytest.raises(OutputError, match="another experiment or an earlier definition"):
         run_campaign(other, tmp_path / "a")
-    fresh = run_campaign(other, tmp_path / "a", jobs=2, force=True)
+    fresh = run_campaign(other, tmp_path / "a", Workers(2), force=True)
     assert len(file.read_text().splitlines()) == 4
     assert content(fresh) != content(whole)
 
@@ -429,7 +431,7 @@ def test_a_run_that_fails_is_a_row_with_its_error_and_is_counted(tmp_path):
     """The scenario's file is gone by the time of the run."""
     logs = Logs(scenarios=("gone.toml",))
     definition = Definition(variants={"isam2": ()}, runs=2, logs=logs, name="broken")
-    rows = run_campaign(definition, tmp_path / "a", jobs=1)
+    rows = run_campaign(definition, tmp_path / "a", Workers(1))
     assert [row["error"][:25] for row in rows] == 2 * ["ScenarioError: gone.toml:"]
     found = summarise(definition, rows)
     assert [(row["runs"], row["failed"]) for row in found["table"]] == [(2, 2)]

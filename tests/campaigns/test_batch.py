@@ -1,0 +1,179 @@
+"""A batch of logs: a result of each, one overview, nothing done twice, nothing lost."""
+
+import json
+import os
+import re
+import shutil
+import socket
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from command_line import call, check_one_line
+from room_log import drive
+
+from graphslam.campaigns import batch as batch_module
+from graphslam.campaigns.one_log import LogTask, failed_row, read_row, smooth_log
+from graphslam.core.config_io import load_config
+from graphslam.core.errors import LogError
+from graphslam.logs.find_recordings import find_recordings
+from graphslam.results.folder import load
+
+SHORT_S = 6
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory):
+    """Three logs, one of them in a folder below, one that is none, and what `batch` made of them
+    with two processes."""
+    folder = tmp_path_factory.mktemp("fleet")
+    logs = folder / "logs"
+    (logs / "b").mkdir(parents=True)
+    drive(logs / "a.mcap", seconds=SHORT_S)
+    drive(logs / "b" / "day.mcap", seconds=SHORT_S + 1, robot="b")
+    drive(logs / "c.mcap", seconds=SHORT_S, truth=False)
+    (logs / "broken.mcap").write_bytes(b"no recording")
+    (logs / "notes.txt").write_text("passed over")
+    done = call("batch", logs, "-o", folder / "out", "--jobs", "2", "--json")
+    return SimpleNamespace(logs=logs, out=folder / "out", done=done, found=json.loads(done.out))
+
+
+def rows_of(found):
+    return {row["name"]: row for row in found["logs"]}
+
+
+def copy_of(fleet, tmp_path):
+    shutil.copytree(fleet.out, tmp_path / "out")
+    return tmp_path / "out"
+
+
+def test_a_folder_of_logs_becomes_a_folder_of_results_and_an_overview(fleet):
+    """The broken one is listed with its line, does not stop the rest, and is said at the end."""
+    assert fleet.done.code == 1
+    assert re.search(
+        r"graphslam: error: 1 of 4 logs failed; broken: .* not an MCAP file", fleet.done.err
+    )
+    assert [row["name"] for row in fleet.found["logs"]] == ["a", "b-day", "broken", "c"]
+    assert fleet.found == json.loads((fleet.out / "overview.json").read_text())
+    counts = fleet.found["counts"]
+    assert (counts["logs"], counts["done"], counts["failed"], counts["waiting"]) == (4, 3, 1, 0)
+    assert [Path(path).name for path in fleet.found["not_recordings"]] == ["notes.txt"]
+    rows = rows_of(fleet.found)
+    assert rows["broken"]["status"] == "failed" and "MCAP" in rows["broken"]["error"]
+    assert rows["a"]["length_m"] == pytest.approx(3.1, abs=0.4)
+    assert rows["a"]["duration_s"] == pytest.approx(SHORT_S, abs=0.2)
+    assert 0 < rows["a"]["error_m"] < 0.1 and rows["c"]["error_m"] is None
+    assert rows["b-day"]["robots"] == ["b"]
+    for name in ("a", "b-day", "c"):
+        assert 0 < rows[name]["sigma_m"] < 0.3 and rows[name]["memory_mb"] > 10
+        assert load(fleet.out / "results" / name).robots
+    assert sorted(p.name for p in fleet.out.iterdir()) == [
+        "overview.json",
+        "report.html",
+        "results",
+    ]
+
+
+def test_the_result_of_a_log_is_that_of_smooth(fleet, tmp_path):
+    assert call("smooth", fleet.logs / "a.mcap", "-o", tmp_path / "alone").code == 0
+    for alone in (tmp_path / "alone").rglob("*"):
+        if alone.suffix in (".tum", ".csv", ".g2o", ".toml") or alone.name == "landmarks.json":
+            inside = fleet.out / "results" / "a" / alone.relative_to(tmp_path / "alone")
+            assert inside.read_bytes() == alone.read_bytes()
+
+
+def test_the_page_has_a_line_and_a_map_of_every_log_and_no_path_of_the_machine(fleet):
+    page = (fleet.out / "report.html").read_text()
+    assert len(re.findall(r"<tr data-is=", page)) == 4
+    assert page.count("<svg") == 3
+    assert 'href="results/b-day/report.html"' in page
+    assert "not an MCAP file" in page
+    assert str(fleet.logs) not in page
+
+
+def test_what_is_done_is_not_done_again(fleet, tmp_path, monkeypatch):
+    """Nor is what failed, without --retry; what was touched is looked at, and smoothed only if its
+    content is new; other settings are another job."""
+    out = copy_of(fleet, tmp_path)
+    asked = []
+
+    def none(tasks, *_others):
+        asked.append([task.label for task in tasks])
+        return iter(())
+
+    with monkeypatch.context() as patch:
+        patch.setattr(batch_module, "run_tasks", none)
+        assert call("batch", fleet.logs, "-o", out, "--quiet").code == 1
+        call("batch", fleet.logs, "-o", out, "--quiet", "--retry")
+        call("batch", fleet.logs, "-o", out, "--quiet", "--set", "keyframe.distance_m=0.4")
+        os.utime(fleet.logs / "a.mcap", (1, 1))
+        call("batch", fleet.logs, "-o", out, "--quiet")
+        call("batch", fleet.logs, "-o", out, "--quiet", "--force")
+    assert asked[:2] == [[], ["broken"]]
+    assert sorted(asked[2]) == sorted(asked[4]) == ["a", "b-day", "broken", "c"]
+    assert asked[3] == ["a"]
+    task = LogTask("a", str(fleet.logs / "a.mcap"), str(out), load_config())
+    before = (out / "results/a/summary.json").stat().st_mtime_ns
+    row = smooth_log(task)
+    assert row == read_row(task.target) and row["files"][0]["mtime_ns"] == 10**9
+    assert (out / "results/a/summary.json").stat().st_mtime_ns == before
+    drive(tmp_path / "a.mcap", seconds=SHORT_S + 2)
+    other = LogTask("a", str(tmp_path / "a.mcap"), str(out), load_config())
+    assert smooth_log(other)["length_m"] > row["length_m"] + 0.5
+    assert not list((out / ".unfinished").iterdir())
+
+
+def test_a_log_that_fails_takes_the_place_of_its_earlier_result(fleet, tmp_path):
+    """Else the folder would show a result of what is not there any more."""
+    out = copy_of(fleet, tmp_path)
+    task = LogTask("a", str(fleet.logs / "a.mcap"), str(out), load_config())
+    row = failed_row(task, f"{task.path}: is gone")
+    assert row["error"] == "is gone" and row["status"] == "failed"
+    assert [path.name for path in task.target.iterdir()] == ["row.json"]
+
+
+def test_a_folder_of_something_else_or_of_another_process_is_left_alone(fleet, tmp_path):
+    (tmp_path / "mine.txt").write_text("x")
+    said = check_one_line(call("batch", fleet.logs, "-o", tmp_path))
+    assert "not the folder of a batch" in said
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+    out = copy_of(fleet, tmp_path)
+    (out / ".lock").write_text(f"{socket.gethostname()} 1\n")
+    assert "process 1 works on it" in check_one_line(call("batch", fleet.logs, "-o", out))
+    (out / ".lock").write_text(f"{socket.gethostname()} {2**22 + 1}\n")  # of a process that died
+    assert call("batch", fleet.logs, "-o", out, "--quiet").code == 1
+    assert not (out / ".lock").exists()
+
+
+def test_wrong_usage(fleet, tmp_path):
+    both = call(
+        "batch", fleet.logs, "-o", tmp_path / "x", "--jobs", "1", "--scheduler", "tcp://a:1"
+    )
+    assert both.code == 2 and "not both" in both.err
+    assert "no recording" in check_one_line(call("batch", tmp_path, "-o", tmp_path / "x"))
+    assert "no such file" in check_one_line(call("batch", tmp_path / "gone", "-o", tmp_path / "x"))
+
+
+# ------------------------------------------------------------ recordings in folders
+
+
+def test_recordings_are_found_by_content_and_named_apart(tmp_path):
+    """Damaged ones too, by their names; a folder of rosbag2 is one; hidden files and the folder of
+    results are passed over."""
+    magic = b"\x89MCAP0\r\n"
+    for name in ("x/day.mcap", "y/day.mcap", "z/day.mcap", "z/day.bag", "plain", "out/r.mcap"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(magic)
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag/metadata.yaml").write_text("rosbag2_bagfile_information: {}")
+    (tmp_path / "bag/bag_0.db3").write_bytes(b"")
+    (tmp_path / ".hidden.mcap").write_bytes(magic)
+    (tmp_path / "text.md").write_text("x")
+    found = find_recordings([tmp_path], without=tmp_path / "out")
+    names = ["bag", "plain", "x-day", "y-day", "z-day.bag", "z-day.mcap"]
+    assert [name for name, _ in found.recordings] == names
+    assert [path.name for path in found.others] == ["text.md"]
+    twice = find_recordings([tmp_path / "x", tmp_path / "y/day.mcap", tmp_path / "x/day.mcap"])
+    assert [name for name, _ in twice.recordings] == ["x-day.mcap", "y-day.mcap"]
+    with pytest.raises(LogError, match="no such file or folder"):
+        find_recordings([tmp_path / "gone"])
