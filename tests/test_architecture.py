@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 import typing
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -61,13 +62,25 @@ def package_of(path):
     return path.relative_to(ROOT).with_suffix("").parts[0]
 
 
+@cache
 def tree_of(path):
     return ast.parse(path.read_text(encoding="utf-8"), str(path))
 
 
+@cache
+def nodes_of(path):
+    """All nodes of a file: most rules here look at all of all files."""
+    return tuple(ast.walk(tree_of(path)))
+
+
+@cache
 def imports(path):
     """(line, dotted name) of everything imported anywhere in a file, inside functions as well."""
-    for node in ast.walk(tree_of(path)):
+    return tuple(_imports(path))
+
+
+def _imports(path):
+    for node in nodes_of(path):
         if isinstance(node, ast.Import):
             yield from ((node.lineno, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -289,7 +302,7 @@ def test_names_in_docstrings_and_comments_exist():
     known = {part for name in FOREIGN for part in name.split(".")} | {"toml"}
     for path in FILES:
         known |= set(path.relative_to(ROOT.parent).with_suffix("").parts)
-        for node in ast.walk(tree_of(path)):
+        for node in nodes_of(path):
             for field in ("id", "attr", "name", "arg"):
                 value = getattr(node, field, None)
                 known |= set(value.split(".")) if isinstance(value, str) else set()
@@ -316,7 +329,7 @@ def test_nothing_prints_or_exits_below_the_command_line():
     """`--json` promises one object on stdout, and a library never ends its caller's process."""
     wrong = []
     for path in below_cli():
-        for node in ast.walk(tree_of(path)):
+        for node in nodes_of(path):
             if not isinstance(node, ast.Call):
                 continue
             name = ast.unparse(node.func)
@@ -333,7 +346,7 @@ def test_no_broad_except_below_the_command_line():
     """It would turn a defect of ours into a story about the user's data."""
     wrong = []
     for path in below_cli():
-        for node in ast.walk(tree_of(path)):
+        for node in nodes_of(path):
             if isinstance(node, ast.ExceptHandler):
                 caught = "" if node.type is None else ast.unparse(node.type)
                 if not caught or re.search(r"\b(Exception|BaseException)\b", caught):
@@ -358,7 +371,7 @@ def test_asserts_only_narrow_types():
     found = [
         (place(path, node.lineno), node)
         for path in FILES
-        for node in ast.walk(tree_of(path))
+        for node in nodes_of(path)
         if isinstance(node, ast.Assert)
     ]
     wrong = [
@@ -371,7 +384,7 @@ def test_random_numbers_come_from_a_generator_that_is_passed_in():
     """A run is repeated by its seed: no global random state, no clock as a seed."""
     wrong = []
     for path in FILES:
-        for node in ast.walk(tree_of(path)):
+        for node in nodes_of(path):
             if isinstance(node, ast.Call):
                 name = ast.unparse(node.func)
                 seeds = name.endswith(("default_rng", "SeedSequence"))

@@ -14,7 +14,7 @@ from graphslam.simulation.raycast import Hits
 from graphslam.simulation.scenario import Laser
 from graphslam.simulation.world import Outline, make_world
 
-SEEDS = range(4)
+SEEDS = range(2)  # what is seen badly is seen so in every drive, whatever the noise
 HALL = Outline("hall", np.array([[0, 0], [9, 0], [9, 5], [0, 5]], float), closed=True)
 #: as the scenario `change` has it: bias of the material, mixed pixels, spurious returns, rounding
 LASER = Laser(
@@ -104,7 +104,7 @@ def test_what_is_seen_badly_is_no_change(what):
         found = found_in(seed, ([*ROOM, *things], first), ([*ROOM, *things], second), laser=laser)
         assert not found.changes
         flagged, total = flagged + found.flagged.sum(), total + found.compared.sum()
-    assert total > 12_000
+    assert total > 6_000
     assert flagged < 0.01 * total  # the rate that is asked for, pooled over the seeds
     with_box = [*ROOM, *things, NEW]
     found = found_in(0, ([*ROOM, *things], first), (with_box, second), laser=laser)

@@ -638,22 +638,22 @@ def test_filter_approaches_batch_with_the_square_of_the_noise(monkeypatch, name,
 
 
 def test_distance_to_batch_falls_as_the_horizon_grows():
-    """Mean over 10 seeds, horizons of 0 to 20 of 40 s and all. Each is the mean of as many runs
+    """Mean over 10 seeds, horizons of 0 to 10 of 30 s and all. Each is the mean of as many runs
     whose spread is as large as the mean, so one may exceed the one before by the standard error
     of their difference over the same seeds. From 0 to the shortest window is a jump: a filter
     linearises each factor where the estimate happens to be, a window keeps one place per variable
     and so never thinks that it knows how the whole map is turned."""
-    horizons = (0.0, 0.5, *HORIZONS_S[1:])
+    horizons = (0.0, 0.5, 2.0, 10.0, math.inf)
     apart = np.empty((10, len(horizons)))
     for seed in range(len(apart)):
-        steps = drive(seed, 0.5, steps=40)
+        steps = drive(seed, 0.5, steps=30)
         batch = run(steps, "batch").estimate
         for k, horizon in enumerate(horizons):
             apart[seed, k] = final_distance(run(steps, "isam2", horizon).estimate, batch)
     mean, change = apart.mean(axis=0), np.diff(apart, axis=1)
     error = change.std(axis=0) / np.sqrt(len(apart))
     assert np.all(change.mean(axis=0) < error)
-    assert mean[1] < 0.1 * mean[0]  # the jump: measured 0.031 to 0.0009 m
+    assert mean[1] < 0.1 * mean[0]  # the jump: measured 0.032 to 0.0009 m
     assert mean[-2] < 0.5 * mean[1]
     assert mean[-1] == pytest.approx(0.0, abs=1e-9)
 

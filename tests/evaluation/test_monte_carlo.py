@@ -144,7 +144,7 @@ def test_what_is_drawn_has_the_covariance_that_is_stated():
     """Normalised squares of starts, motions and sightings, at a noise so small that the models are
     linear: their means are the degrees of freedom, within the 1e-4 quantiles for so many."""
     scale, squares = 1e-3, {"start": [], "motion": [], "point": [], "line": [], "robot-pose": []}
-    for r in range(60):
+    for r in range(30):
         run = draw_run(WHOLE.bench, scale, np.random.default_rng(run_seed(1, scale, r)))
         for k, step in enumerate(run.steps):
             for name, start in step.starts.items():
@@ -168,10 +168,10 @@ def test_what_is_drawn_has_the_covariance_that_is_stated():
 
 
 def test_motions_slip_in_the_share_given_and_state_it_only_where_told():
-    """200 runs of 40 motions: errors of slipping ones are ten times as large, a tenth of them slip,
+    """100 runs of 40 motions: errors of slipping ones are ten times as large, a tenth of them slip,
     and what is told has NEES of one. The draws are the same whether it is told or not."""
     bench, share, squares, stated = load_definition("slip").bench, [], [], []
-    for run in range(200):
+    for run in range(100):
         drawn, known = (
             draw_run(bench, 1.0, np.random.default_rng(run_seed(1, 1.0, run)), told=told)
             for told in (False, True)
@@ -186,7 +186,7 @@ def test_motions_slip_in_the_share_given_and_state_it_only_where_told():
                 squares.append(e @ np.linalg.solve(motion.cov, e))
                 stated.append(e @ np.linalg.solve(cov, e))
     assert set(np.round(share, 9)) == {1.0, 100.0}
-    assert np.mean(np.array(share) > 1) == pytest.approx(0.1, abs=0.015)
+    assert np.mean(np.array(share) > 1) == pytest.approx(0.1, abs=0.02)
     assert np.mean(squares) / 3 == pytest.approx(1.0, abs=0.05)
     assert np.mean(stated) / 3 == pytest.approx(0.9 + 10, rel=0.2)
 
@@ -323,16 +323,19 @@ def test_bounds_fall_with_data_and_scale_with_noise():
 
 # ------------------------------------------------------------ filters and smoothers
 
-SEEDS, SCALES = 60, (1.0, 0.03)
+SEEDS, SCALES = 50, (1.0, 0.03)
 
 
 @pytest.fixture(scope="module")
 def consistency():
-    """Mean joint NEES per degree of freedom of 60 seeds, and the distance of the last poses."""
+    """Mean joint NEES per degree of freedom of 50 seeds, and the distance of the last poses. Two
+    sides of the room and the way round both corners are enough for a filter to show it."""
+    robots = {name: replace(one, path=one.path[:4]) for name, one in WHOLE.bench.robots.items()}
+    short = replace(WHOLE, bench=replace(WHOLE.bench, robots=robots))
     found, ends = {}, {}
     for scale in SCALES:
         for variant in ("ekf-body", "batch"):
-            rows = [run_job(WHOLE, Job("", "", scale, variant, r)) for r in range(SEEDS)]
+            rows = [run_job(short, Job("", "", scale, variant, r)) for r in range(SEEDS)]
             found[variant, scale] = np.mean([row["nees"] for row in rows]) / rows[0]["dof"]
             ends[variant, scale] = np.array([row["end"] for row in rows])
             dof = rows[0]["dof"]
