@@ -11,11 +11,12 @@ OUT := out
 # without cached bytecode every command would compile the program again, for a quarter of a second
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo test browser-test extras-test lint types pages docs clean
+.PHONY: help demo test slow-test browser-test extras-test lint types pages docs clean
 
 help:
 	@echo 'make demo    smooth a real log (Victoria Park, shipped with gtsam) and a simulated lab into $(OUT)/'
 	@echo 'make test    run the tests'
+	@echo 'make slow-test  run the tests with more seeds and whole logs'
 	@echo 'make browser-test  run the tests of the reports in a browser'
 	@echo 'make extras-test  viewers, notebook, site, and the wheel in a new environment'
 	@echo 'make lint    check style and formatting'
@@ -41,7 +42,11 @@ demo: $(INSTALLED)
 	@echo '$(CURDIR)/$(OUT)/lab/report.html   a laser in a cluttered room, simulated, with truth'
 
 test: $(INSTALLED)
-	$(BIN)/python -m pytest -n auto --dist loadfile --ignore tests/browser
+	$(BIN)/python -m pytest -n auto --dist loadfile --ignore tests/browser -m 'not slow'
+
+# more seeds and whole logs, of which make test has the short ones
+slow-test: $(INSTALLED)
+	$(BIN)/python -m pytest -n auto --ignore tests/browser -m slow
 
 # in a browser; Chromium comes from the system's packages, and without it they fail
 browser-test: $(INSTALLED)

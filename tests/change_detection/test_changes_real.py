@@ -53,6 +53,7 @@ def with_box(visit, stamps_ns, poses):
     return replace(visit, range_m=ranges, surface=surface)
 
 
+@pytest.mark.slow
 def test_two_real_visits_register_and_an_inserted_box_is_found(visits):
     """A box of 40 x 30 cm that hides what is behind it; without it nothing is there.
 

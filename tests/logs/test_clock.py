@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from robots_in_scans import both, true_offset_s
+from common import simulated_log
+from robots_in_scans import SCENARIO, both, outcome, true_offset_s
 
 from graphslam.core.config_io import load_config
 from graphslam.core.geometry import between, compose, exp
@@ -62,14 +63,14 @@ def pose(robot, seconds):
     return compose(np.array(STARTS[robot]), exp(way * np.array([1.0, 0.0, 0.5])))
 
 
-def write(folder, offset_s, drift=0.0, seed=0, mutual=True):
+def write(folder, offset_s, drift=0.0, seed=0, mutual=True, seconds=60):
     """Two files, one per robot; the clock of b is ahead, and its truth has its clock."""
     rng = np.random.default_rng(seed)
     clock = Clock(offset_s, drift, T0)
     paths = [folder / f"{robot}.mcap" for robot in STARTS]
     for robot, path in zip(STARTS, paths, strict=True):
         with LogWriter(path) as log:
-            for k in range(1200):
+            for k in range(10 * seconds):
                 time_ns = T0 + k * S // 10
                 own = int(clock.to_local(np.array([time_ns]))[0]) if robot == "b" else time_ns
                 x = pose(robot, k / 10)
@@ -113,8 +114,8 @@ def test_the_offset_of_two_files_is_found_and_made_up_for(tmp_path, offset_s):
     assert ate(result, offset_s) < 0.03
 
 
-@pytest.mark.parametrize("backend", ["ekf", "isam2", "batch"])
-def test_a_clock_is_found_with_any_back_end(tmp_path, backend):
+@pytest.mark.parametrize("backend", ["ekf", "isam2"])
+def test_a_clock_is_found_with_any_other_back_end(tmp_path, backend):
     result = run(write(tmp_path, 0.3), f"backend.name={backend}")
     assert abs(result.summary["clocks"]["b"]["offset_s"] - 0.3) < 0.02
 
@@ -129,7 +130,7 @@ def test_clocks_that_agree_are_left_alone(tmp_path):
 def test_a_drift_is_found_where_the_log_is_long_enough(tmp_path):
     """A drift of 1e-3 is beyond any quartz, so the prior shrinks it; the sign is correct."""
     drifts = [
-        run(write(tmp_path, 0.1, drift)).summary["clocks"]["b"]["drift_ppm"]
+        run(write(tmp_path, 0.1, drift, seconds=120)).summary["clocks"]["b"]["drift_ppm"]
         for drift in (-5e-4, 5e-4)
     ]
     assert drifts[0] < -30 < 30 < drifts[1]
@@ -155,6 +156,15 @@ def test_one_robot_has_no_clock_to_compare(tmp_path):
 # ------------------------------------------------------------ the thesis' experiment
 
 
+def test_robots_in_scans_find_how_far_their_clocks_are_apart(tmp_path):
+    """To 20 ms, and no worse than stated, though no sighting has a name."""
+    found = outcome(simulated_log(SCENARIO, 0, tmp_path))
+    assert found.clock["applied"]
+    assert abs(found.clock["offset_s"] - true_offset_s(0.0)) < 0.02
+    assert found.error_m < 4 * found.sigma_m
+
+
+@pytest.mark.slow
 def test_robots_in_scans_cooperate_although_their_clocks_disagree(tmp_path):
     """benchmarks/robots_in_scans.py has more seeds. The bars: a third off the error, and the offset
     to 20 ms."""

@@ -129,6 +129,7 @@ def test_a_robot_is_found_as_well_as_stated(tmp_path):
     assert 4.9 < sum(d2) < 42.3  # chi-square, 18 degrees of freedom
 
 
+@pytest.mark.slow
 def test_a_found_start_costs_nothing_against_a_known_one(tmp_path):
     """Clocks 0.4 s apart, as the map is aligned: within a tenth. Seeds differ by a hundredth."""
     few = replace(LASER, period_s=0.5, step_deg=1.0)

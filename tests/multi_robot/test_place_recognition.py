@@ -119,7 +119,15 @@ def starts(path):
     return between(truth["a"].poses[0], truth["b"].poses[0])
 
 
-@pytest.mark.parametrize(("make", "seeds"), [(office, (2, 3)), (forest, (1, 2))])
+@pytest.mark.parametrize(
+    ("make", "seeds"),
+    [
+        (office, (2,)),
+        (forest, (1,)),
+        pytest.param(office, (2, 3), marks=pytest.mark.slow),
+        pytest.param(forest, (1, 2), marks=pytest.mark.slow),
+    ],
+)
 def test_robots_are_related_by_anonymous_maps(tmp_path, make, seeds):
     """Within the sigmas that are stated, and then the map is as good as with the start given.
 
@@ -150,7 +158,7 @@ def test_robots_are_related_by_anonymous_maps(tmp_path, make, seeds):
     ("make", "why"),
     [
         (lambda path: office(path, 1, together=False), ""),
-        (lambda path: office(path, 2, together=False), ""),
+        pytest.param(lambda path: office(path, 2, together=False), "", marks=pytest.mark.slow),
         (lambda path: forest(path, 1, together=False), ""),
         (lambda path: halls(path, 1), "contradict each other"),
     ],

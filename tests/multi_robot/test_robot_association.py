@@ -1,6 +1,7 @@
 """Sightings of robots: gated by name, and associated without one."""
 
 import zlib
+from functools import cache
 
 import numpy as np
 import pytest
@@ -41,6 +42,12 @@ def anything(observer, seen, seconds):
     return {"seen_robot": ANYTHING}
 
 
+@pytest.fixture(scope="module")
+def with_names(tmp_path_factory):
+    """`run` of the log in which every sighting names what it is of, once for every back end."""
+    return cache(lambda backend: run(tmp_path_factory.mktemp("named"), named, backend))
+
+
 def run(tmp_path, say, backend):
     """The result, its error (m, root mean square) and the sightings that name the wrong robot."""
     wrong = []
@@ -66,10 +73,10 @@ def robots_used(result):
 
 
 @pytest.mark.parametrize("backend", ["batch", "isam2", "ekf"])
-def test_exchanged_names_are_rejected_and_hardly_anything_else(tmp_path, backend):
+def test_exchanged_names_are_rejected_and_hardly_anything_else(with_names, tmp_path, backend):
     """The robots are metres apart, so every false name shows; breaks if names are trusted, or if
     the gates are too narrow for true ones."""
-    right, error, wrong = run(tmp_path, named, backend)
+    right, error, wrong = with_names(backend)
     total = robots_used(right)
     assert right.summary["rejected"].get(NOT_THERE, 0) <= 0.02 * total
     result, after, _ = run(tmp_path, exchanged, backend)
@@ -81,10 +88,10 @@ def test_exchanged_names_are_rejected_and_hardly_anything_else(tmp_path, backend
 
 @pytest.mark.parametrize("backend", ["batch", "ekf"])
 @pytest.mark.parametrize("say", [unnamed, anything])
-def test_robots_without_names_are_recognised(tmp_path, backend, say):
+def test_robots_without_names_are_recognised(with_names, tmp_path, backend, say):
     """As many sightings of robots are used as with names, and the paths are as good; breaks if a
     robot is taken for another, or for a landmark, or if landmarks come of robots."""
-    right, error, _ = run(tmp_path, named, backend)
+    right, error, _ = with_names(backend)
     result, after, _ = run(tmp_path, say, backend)
     assert robots_used(result) > 0.97 * robots_used(right)
     # without landmarks' names the filter's map is poorer, whatever becomes of the robots

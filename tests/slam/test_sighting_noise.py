@@ -11,7 +11,7 @@ from graphslam.core.geometry import Array, between, compose, exp, wrap
 from graphslam.logs import LogWriter, open_logs
 from graphslam.slam.smooth import smooth
 
-PERIOD_S, SECONDS, T0, S = 0.1, 120.0, 5_000_000_000, 1_000_000_000
+PERIOD_S, SECONDS, T0, S = 0.1, 60.0, 5_000_000_000, 1_000_000_000
 #: m and rad per reading of the odometry; rad and m per sighting
 ODOMETRY, SIGHTING = np.array([6.6e-3, 1e-4, 9e-3]), np.array([0.026, 0.03])
 START = 0.01
@@ -28,13 +28,13 @@ class World:
     start: Array
 
 
-def simulate(seed, *, late_s=0.0, shared=0.0, noise=1.0):
+def simulate(seed, *, seconds=SECONDS, late_s=0.0, shared=0.0, noise=1.0):
     """A robot on changing arcs that sees the nearest five of twelve points at every reading.
 
     ``shared``: sigma, in those of a sighting, of an error that all of one point have for 10 s.
     """
     rng = np.random.default_rng(seed)
-    n = round(SECONDS / PERIOD_S)
+    n = round(seconds / PERIOD_S)
     t = PERIOD_S * np.arange(n)
     speed = 0.3 + 0.1 * np.sin(0.9 * t)
     turn = 0.5 * np.sin(0.31 * t + rng.uniform(0, 6)) + 0.25 * np.sin(1.3 * t)
@@ -164,13 +164,13 @@ def test_unstated_noise_of_odometry_is_found(tmp_path):
     amounts = np.array([np.hypot(*moved.T[:2]).sum(), np.abs(moved[:, 2]).sum(), SECONDS])
     for axis, true in (("x", ODOMETRY[0]), ("phi", ODOMETRY[2])):
         each = [rates[f"k_{axis}_{unit}"] for unit in ("m", "rad", "s")]
-        # 1200 motions, three quarters of whose noise the sightings leave open: 15 %
+        # 600 motions, three quarters of whose noise the sightings leave open: 15 %
         assert each @ amounts / len(moved) == pytest.approx(true**2, rel=0.35)
 
 
 def test_noise_that_odometry_messages_state_is_used_and_checked(tmp_path):
     """As that of increments. A tenth of the variance is named, and not believed."""
-    world, true = simulate(0), tuple(((ODOMETRY / PERIOD_S) ** 2).tolist())
+    world, true = simulate(0, seconds=120.0), tuple(((ODOMETRY / PERIOD_S) ** 2).tolist())
     result = solved(tmp_path / "true.mcap", world, increments=False, stated=true)
     error, nees = np.array(judge(result, world)) / batch(world)
     assert error < 1.1
@@ -184,7 +184,7 @@ def test_noise_that_odometry_messages_state_is_used_and_checked(tmp_path):
 
 def test_a_late_sensor_costs_next_to_nothing(tmp_path):
     """50 ms: not modelled, the path would be 1.7 cm behind, and turned at its start."""
-    world, late = simulate(2), simulate(2, late_s=0.05)
+    world, late = (simulate(2, seconds=120.0, late_s=late_s) for late_s in (0.0, 0.05))
     result = solved(tmp_path / "late.mcap", late, increments=True)
     latency = result.summary["calibration"]["robot.laser_latency_s"]
     assert latency["value"] == pytest.approx(0.05, abs=max(4 * latency["sigma"], 0.004))
