@@ -7,6 +7,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 OUT := out
+# tests that need a browser or a cluster
+ELSEWHERE := --ignore tests/browser --ignore tests/cluster
 
 # without cached bytecode every command would compile the program again, for a quarter of a second
 unexport PYTHONDONTWRITEBYTECODE
@@ -18,7 +20,7 @@ help:
 	@echo 'make test    run the tests'
 	@echo 'make slow-test  run the tests with more seeds and whole logs'
 	@echo 'make browser-test  run the tests of the reports in a browser'
-	@echo 'make extras-test  viewers, notebook, site, and the wheel in a new environment'
+	@echo 'make extras-test  viewers, notebook, a Dask cluster, site, and the wheel in a new environment'
 	@echo 'make lint    check style and formatting'
 	@echo 'make types   check types'
 	@echo 'make pages   write the pages that are made from the code'
@@ -42,11 +44,11 @@ demo: $(INSTALLED)
 	@echo '$(CURDIR)/$(OUT)/lab/report.html   a laser in a cluttered room, simulated, with truth'
 
 test: $(INSTALLED)
-	$(BIN)/python -m pytest -n auto --dist loadfile --ignore tests/browser -m 'not slow'
+	$(BIN)/python -m pytest -n auto --dist loadfile $(ELSEWHERE) -m 'not slow'
 
 # more seeds and whole logs, of which make test has the short ones
 slow-test: $(INSTALLED)
-	$(BIN)/python -m pytest -n auto --ignore tests/browser -m slow
+	$(BIN)/python -m pytest -n auto $(ELSEWHERE) -m slow
 
 # in a browser; Chromium comes from the system's packages, and without it they fail
 browser-test: $(INSTALLED)
@@ -63,10 +65,10 @@ types: $(INSTALLED)
 # what make test skips without other programs; here it fails without them
 extras-test: $(INSTALLED) docs
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable \
-	  '.[dev,viewer,notebook]' evo mcap-ros2-support
-	$(BIN)/python -c 'import evo, mcap_ros2, nbclient, pandas, rerun'
+	  '.[dev,cluster,viewer,notebook]' evo mcap-ros2-support
+	$(BIN)/python -c 'import distributed, evo, mcap_ros2, nbclient, pandas, rerun'
 	$(BIN)/python -m pytest tests/results/test_viewers.py tests/results/test_evo.py \
-	  tests/core/test_notebook_views.py
+	  tests/core/test_notebook_views.py tests/cluster
 	rm -rf $(OUT)/wheel $(OUT)/cold
 	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps -w $(OUT)/wheel .
 	$(BIN)/python -m venv $(OUT)/cold

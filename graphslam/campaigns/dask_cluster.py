@@ -5,6 +5,7 @@ worker's tasks are given to others by the scheduler; a task whose worker dies ag
 scheduler's setting ``allowed-failures``) is given up. See docs/clusters.md.
 """
 
+import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
@@ -37,6 +38,8 @@ def run_on_cluster(
     import distributed  # noqa: PLC0415 -- of an extra, and takes long
 
     assert workers.scheduler is not None  # else it is another row of `EXECUTORS`
+    # it warns of lost workers, whose tasks are done again
+    logging.getLogger("distributed").setLevel(logging.ERROR)
     client = _connect(workers.scheduler)
     futures: dict[Any, Task] = {}
     try:

@@ -9,6 +9,7 @@ import math
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -25,6 +26,8 @@ THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 MEMORY_SHARE = 0.9
 #: new objects between two garbage collections, as in commands
 COLLECTION_INTERVAL = 100_000
+#: s; garbage is collected after tasks that took longer: it takes a twentieth of a second
+LONG_S = 1.0
 
 _one_at_a_time = threading.Lock()
 
@@ -88,11 +91,13 @@ def execute(task: Task, memory_mb: float = math.inf, code: str | None = None) ->
     )
     with _one_at_a_time:
         forget_peak_memory()
+        began = time.perf_counter()
         try:
             with limited_memory(memory_mb, needed):
                 return task.function(*task.arguments)
         finally:
-            gc.collect()
+            if time.perf_counter() - began > LONG_S:
+                gc.collect()
 
 
 def forget_peak_memory() -> None:

@@ -44,6 +44,7 @@ CSS = """
 .waiting i, i.waiting { background: var(--grid); }
 @media (prefers-color-scheme: dark) { .failed i, i.failed { background: #d67ac6; } }
 .batch td, .batch th { vertical-align: middle; }
+.batch thead th:nth-child(2) { text-align: left; }
 .batch thead th { position: sticky; top: 0; background: var(--bg); z-index: 1; }
 .batch thead button { font: inherit; color: inherit; background: none; border: 0; padding: 0;
   cursor: pointer; }
@@ -55,9 +56,11 @@ CSS = """
 .batch th.log { min-width: 15em; max-width: 30em; white-space: normal; overflow-wrap: anywhere;
   text-align: left; padding-right: 18px; }
 .batch th.log a, .batch th.log b { font-weight: 600; color: var(--ink); }
-.batch .why { display: block; color: var(--soft); font-size: .8rem; line-height: 1.35;
+.batch .why { font-weight: 400; color: var(--soft); font-size: .8rem; line-height: 1.35;
   margin-top: 3px; display: -webkit-box; -webkit-line-clamp: 3; -webkit-box-orient: vertical;
   overflow: hidden; }
+.batch td.map span { display: grid; place-items: center; color: var(--soft);
+  font-size: .8rem; border-style: dashed; background: none; }
 .badge { display: inline-block; font-size: .8rem; color: var(--soft); margin-left: 8px;
   white-space: nowrap; }
 @media (max-width: 560px) {
@@ -70,6 +73,8 @@ CSS = """
   .batch th.log { grid-column: 3 / -1 !important; grid-row: 1; min-width: 0; padding: 0; }
   .batch .badge { display: block; margin: 3px 0 0; }
   .batch .why { -webkit-line-clamp: 4; }
+  .batch tr[data-is=failed] td[data-label], .batch tr[data-is=waiting] td[data-label]
+    { display: none; }
 }
 """
 
@@ -140,7 +145,7 @@ def batch_page(found: Mapping[str, Any], maps: Mapping[str, str]) -> str:
         ("logs", html.number(counts["logs"])),
         ("driven", _kilometres(totals["length_m"])),
         ("recorded", _hours(totals["duration_s"])),
-        ("computed in", _hours(totals["seconds"])),
+        ("worker time", _hours(totals["seconds"])),
         ("median error", _median(done, "error_m")),
         ("median σ", _median(done, "sigma_m")),
         ("largest memory", f"{html.number(max((r['memory_mb'] for r in done), default=0.0))} MB"),
@@ -237,7 +242,7 @@ def _row(row: Row, drawing: str, used: Iterable[tuple[str, str, str]]) -> str:
     return (
         f'<tr data-is="{state}" data-state="{STATES.index(state)}" '
         f'data-name="{escape(row["name"])}"{data}>'
-        f'<td class="map">{drawing or "<span></span>"}</td>'
+        f'<td class="map">{drawing or "<span>no result</span>"}</td>'
         f'<th scope="row" class="log">{name}<span class="badge {state}"><i></i>{state}</span>'
         f"{f'<span class=why>{why}</span>' if why else ''}</th>{cells}</tr>\n"
     )
