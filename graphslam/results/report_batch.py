@@ -37,6 +37,7 @@ CSS = """
 .states button i, .badge i { display: inline-block; width: 9px; height: 9px; border-radius: 50%;
   margin-right: 6px; }
 .tools { display: flex; flex-wrap: wrap; gap: 8px; margin: 0 0 10px; align-items: center; }
+.tools[hidden] { display: none; }
 .tools label { color: var(--soft); font-size: .84rem; }
 .tools input { flex: 1 1 160px; min-width: 120px; max-width: 340px; }
 .good i, i.good { background: var(--robot2); } .doubtful i, i.doubtful { background: #d9a21b; }
@@ -92,13 +93,14 @@ SCRIPT = """
   let state = "", key = "state", up = true;
   const value = row => {
     const text = row.dataset[key];
-    return key === "name" ? text : text === "" ? null : Number(text);
+    return text === "" ? null : Number(text);
   };
+  const byName = (a, b) => a.dataset.name.localeCompare(b.dataset.name, undefined, {numeric: true});
   const compare = (a, b) => {
+    if (key === "name") return up ? byName(a, b) : byName(b, a);
     const x = value(a), y = value(b);
-    if (x === null || y === null) return (x === null) - (y === null);
-    const less = typeof x === "string" ? x.localeCompare(y, undefined, {numeric: true}) : x - y;
-    return up ? less : -less;
+    if (x === null || y === null) return (x === null) - (y === null) || byName(a, b);
+    return (up ? x - y : y - x) || byName(a, b);
   };
   const show = () => {
     body.append(...[...rows].sort(compare));
