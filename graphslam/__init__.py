@@ -138,13 +138,15 @@ def smooth(
     config: Config | PathLike | None = None,
     output: PathLike | None = None,
     force: bool = False,
+    resume: bool = False,
     progress: Callable[[int, int], None] | None = None,
     **settings: Any,
 ) -> Result:
     """Estimate the trajectories of all robots and a landmark map: the main job.
 
     Arguments as in the module's docstring. The folder has a report, with a section on the errors
-    where the logs hold the truth.
+    where the logs hold the truth. With ``resume`` every stage is kept beside ``output`` until it is
+    written, and a run of the same logs and settings that was killed is gone on with.
 
     Raises:
         LogError: a log cannot be read, or no message of it could be used.
@@ -152,6 +154,7 @@ def smooth(
             reading of logs that are open already.
         EstimationError: the estimate is indeterminate, or a robot's start is unknown.
     """
+    from graphslam.core.errors import OutputError
     from graphslam.core.memory_limit import limited_memory
     from graphslam.core.worker import Future
     from graphslam.results.folder import check_target, save
@@ -159,12 +162,14 @@ def smooth(
     from graphslam.slam.progress import of_all
 
     settled = _settle(recording, config, settings)
-    if output is not None:
-        check_target(Path(output), force=force)
+    if resume and output is None:
+        raise OutputError("resume: there is no output beside which anything could be kept")
+    before = None if output is None else check_target(Path(output), force=force)
     reading = _read_ahead(recording, settled) or nullcontext()
     with limited_memory(settled.limits.memory_mb), reading as ahead:
         # imported while the second process reads; what only that one needs is imported there
         from graphslam.core.stages import announce
+        from graphslam.slam.checkpoint import checkpoint
         from graphslam.slam.smooth import smooth
 
         log = cast("LogSet", recording) if ahead is None else receive_log(ahead, settled)
@@ -187,13 +192,14 @@ def smooth(
             cast("dict[str, Any]", result.summary).update(told)
             return page
 
-        truth = Future(read_truth)
-        result = smooth(log, settled, of_all(log, progress), ahead=ahead)
-        known = truth.result()
-        announce("report")
-        report = Future(render_report)
-        save(result, Path(output), force=force, report=finish_report)
-        return result
+        with checkpoint(Path(output), log, settled, resume=resume) as kept:
+            truth = Future(read_truth)
+            result = smooth(log, settled, of_all(log, progress), ahead=ahead, kept=kept)
+            known = truth.result()
+            announce("report")
+            report = Future(render_report)
+            save(result, Path(output), force=force, report=finish_report, before=before)
+            return result
 
 
 def load_result(directory: PathLike) -> SavedResult:

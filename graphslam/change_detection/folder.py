@@ -8,7 +8,7 @@ from graphslam.change_detection.export import write_mcap, write_overlay_map
 from graphslam.change_detection.visit import Visit, load_visit, select_time_span
 from graphslam.core.config import ChangesConfig
 from graphslam.core.errors import OutputError
-from graphslam.core.output_folder import atomic_folder
+from graphslam.core.output_folder import Identity, atomic_folder
 from graphslam.results.file_formats import to_json
 from graphslam.results.folder import check_target, load
 
@@ -63,13 +63,15 @@ def load_visits(
     return a, b, same
 
 
-def check_changes_target(directory: Path, *, force: bool) -> None:
-    """Check before a long computation that `save_changes` may write to ``directory``.
+def check_changes_target(directory: Path, *, force: bool) -> Identity:
+    """`check_target` for `save_changes`, before a long computation.
 
     Raises:
         OutputError: it exists and may not be replaced, or it cannot be written.
     """
-    check_target(directory, force=force, replaceable=lambda d: (d / "changes.json").is_file())
+    return check_target(
+        directory, force=force, replaceable=lambda d: (d / "changes.json").is_file()
+    )
 
 
 def save_changes(
@@ -86,13 +88,13 @@ def save_changes(
     Raises:
         OutputError: the target exists and may not be replaced, or the disk refuses.
     """
-    check_changes_target(directory, force=force)
+    before = check_changes_target(directory, force=force)
     texts = {"changes.json": to_json(found.to_dict(), "changes.json")}
     if report is not None:
         texts["report.html"] = report(found)
     old = [c.polygon if c.kind == "vanished" else c.before for c in found.changes]
     new = [c.polygon for c in found.changes if c.kind != "vanished"]
-    with atomic_folder(directory) as part:
+    with atomic_folder(directory, before) as part:
         write_overlay_map(
             part, found.surfaces[0].nearest.grid, [p for p in old if p is not None], new
         )

@@ -15,7 +15,7 @@ from graphslam.change_detection.thesis_changes import ThesisChanges, reference_m
 from graphslam.change_detection.visit import Bools
 from graphslam.core.config import ChangesConfig
 from graphslam.core.geometry import Array, unit_vectors
-from graphslam.core.output_folder import atomic_folder
+from graphslam.core.output_folder import Identity, atomic_folder
 from graphslam.results import report_html as html
 from graphslam.results.drawing_elements import INK, PALETTE, Shade, Style, opacity_levels
 from graphslam.results.file_formats import to_json
@@ -63,22 +63,26 @@ def write_thesis_changes(
         OutputError: as there; or the target exists and may not be replaced, or the disk refuses.
         LogError: a log is missing or has changed.
     """
-    check_changes_target(directory, force=force)
+    before = check_changes_target(directory, force=force)
     found = thesis_changes_between(reference, later, config, reference_span_s, later_span_s)
-    write_folder(found, config, directory, (reference.name, later.name))
+    write_folder(found, config, directory, (reference.name, later.name), before)
     return found
 
 
 def write_folder(
-    found: ThesisChanges, config: ChangesConfig, directory: Path, names: tuple[str, str]
+    found: ThesisChanges,
+    config: ChangesConfig,
+    directory: Path,
+    names: tuple[str, str],
+    before: Identity,
 ) -> None:
-    """The folder, which may replace another one; ``names`` of the two visits."""
+    """The folder, instead of what stood there ``before``; ``names`` of the two visits."""
     grid, shown = found.grid, Shown.of(found, config)
     deep = np.where(shown.depth > 0, 200 - 200 * shown.depth, FREE).astype(np.uint8)
     seen = np.where(shown.visible, FREE, OCCUPIED).astype(np.uint8)
     old = [r.polygon for r in found.regions if r.kind == "vanished"]
     new = [r.polygon for r in found.regions if r.kind == "appeared"]
-    with atomic_folder(directory) as part:
+    with atomic_folder(directory, before) as part:
         (part / "changes.json").write_text(
             to_json(found.to_dict(), "changes.json"), encoding="utf-8"
         )

@@ -404,6 +404,13 @@ Plan = Annotated[
 ]
 Strict = Annotated[bool, typer.Option("--strict", help="Exit with 3 if there is any doubt.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace what is there.")]
+Resume = Annotated[
+    bool,
+    typer.Option(
+        "--resume",
+        help="Keep every stage beside DIR until it is written; go on where a killed run was.",
+    ),
+]
 ForceOrResume = Annotated[
     bool,
     typer.Option(

@@ -38,6 +38,7 @@ from graphslam.cli.arguments import (
     Relations,
     Resolution,
     ResultFolder,
+    Resume,
     Scenario,
     Seed,
     Settings,
@@ -128,6 +129,7 @@ def smooth(
     config: ConfigFile = None,
     settings: Settings = None,
     force: Force = False,
+    resume: Resume = False,
     plan: Plan = False,
     strict: Strict = False,
 ) -> Output:
@@ -150,7 +152,9 @@ def smooth(
     if output is None:
         raise typer.BadParameter("missing: the result folder to make", param_hint="'-o'")
     with stage_bar() as progress:
-        result = graphslam.smooth(logs, config=tree, output=output, force=force, progress=progress)
+        result = graphslam.smooth(
+            logs, config=tree, output=output, force=force, resume=resume, progress=progress
+        )
     if with_map:
         graphslam.make_map(output)
     if viewer:

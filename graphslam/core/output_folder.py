@@ -75,11 +75,12 @@ def check_same(target: Path, before: Identity) -> None:
 
 
 @contextmanager
-def atomic_folder(target: Path) -> Iterator[Path]:
+def atomic_folder(target: Path, before: Identity) -> Iterator[Path]:
     """A temporary folder beside ``target``; it is renamed to ``target`` when the block ends.
 
     A folder that stands at ``target`` is moved away, replaced and only then deleted, so that one
-    of the two exists at any time. If the block raises, ``target`` stays as it was.
+    of the two exists at any time. If the block raises, ``target`` stays as it was. ``before`` is
+    what stood there when it was found out that it may be replaced.
 
     Raises:
         OutputError: the disk refuses, or another process wrote ``target`` meanwhile; nothing is
@@ -90,17 +91,17 @@ def atomic_folder(target: Path) -> Iterator[Path]:
     try:
         part = unfinished(final)
         old = part.with_suffix(".old")
-        before = identity(final)
         part.mkdir(parents=True)
         yield part
         check_same(final, before)
-        if final.exists():
+        if before is not None and final.exists():  # else the rename refuses to replace it
             final.rename(old)
         try:
             part.rename(final)
         except OSError:
             with suppress(FileNotFoundError):
                 old.rename(final)
+            check_same(final, before)
             raise
     except OSError as error:
         raise OutputError(f"{target}: cannot be written: {error.strerror}") from error

@@ -27,11 +27,11 @@ def save_comparison(
     Raises:
         OutputError: the target exists and may not be replaced, or the disk refuses.
     """
-    check_target(directory, force=force, replaceable=is_comparison)
+    before = check_target(directory, force=force, replaceable=is_comparison)
     settings = dump_config(config)
     files = [
         ("compare.json", to_json(comparison.summary, "compare.json")),
         ("config.toml", settings),
         ("report.html", render_comparison(comparison, settings)),
     ]
-    write_folder(directory, files)
+    write_folder(directory, files, before)

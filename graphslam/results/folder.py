@@ -11,14 +11,14 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from urllib.parse import quote, unquote
 
 from graphslam.core.config import Config, RobustConfig
 from graphslam.core.config_io import dump_config, load_config
 from graphslam.core.errors import OutputError
 from graphslam.core.notebook_views import ResultViews
-from graphslam.core.output_folder import atomic_folder
+from graphslam.core.output_folder import Identity, atomic_folder, identity, unfinished
 from graphslam.core.records import JointScans, Landmark, Result, RobotResult, Trajectory
 from graphslam.core.worker import parallel_map
 from graphslam.estimation.g2o import graph_g2o, graph_ids
@@ -68,7 +68,7 @@ JOINT_FILE = "joint.npz"
 
 def check_target(
     directory: Path, *, force: bool, replaceable: Callable[[Path], bool] | None = None
-) -> None:
+) -> Identity:
     """Check before a long computation that a folder may be written at ``directory``.
 
     Args:
@@ -76,6 +76,10 @@ def check_target(
         force: replace an existing one.
         replaceable: whether ``force`` may replace a given existing folder; default: result
             folders. An empty folder is always replaced.
+
+    Returns:
+        What stands there; if it is something else when the folder is written, another process
+        wrote it.
 
     Raises:
         OutputError: it exists and ``force`` is not given, it exists and may not be replaced, or
@@ -86,8 +90,10 @@ def check_target(
         parent = parent.parent
     if not (parent.is_dir() and os.access(parent, os.W_OK | os.X_OK)):
         raise OutputError(f"{directory}: cannot be written: {parent} is no folder to write to")
-    if not os.path.lexists(directory):
-        return
+    unfinished(directory)  # a folder that a dead process had moved away stands there again
+    before = identity(directory)
+    if before is None:
+        return None
     if not force:
         raise OutputError(f"{directory}: already exists; give --force to replace it")
     empty = directory.is_dir() and not any(directory.iterdir())
@@ -96,6 +102,7 @@ def check_target(
             f"{directory}: is not a result folder of graphslam, so it is not replaced; "
             "choose another name"
         )
+    return before
 
 
 def save(
@@ -104,27 +111,34 @@ def save(
     *,
     force: bool,
     report: Callable[[Result], str] | None = None,
+    before: Identity | Literal["now"] = "now",
 ) -> None:
     """Write the result folder, see `write_folder`.
 
     ``report`` renders report.html, and may add to the summary; it is called when all else but that
-    is made. Without it there is no report.
+    is made. Without it there is no report. ``before``: what `check_target` found when
+    the run began, which alone may be replaced.
 
     Raises:
         OutputError: the target exists and may not be replaced, a number is not finite, or the
             disk cannot be written; no partial output is left.
     """
-    check_target(directory, force=force)
-    write_folder(directory, _files(result, report))
+    if before == "now":
+        before = check_target(directory, force=force)
+    write_folder(directory, _files(result, report), before)
 
 
-def write_folder(directory: Path, files: Sequence[tuple[str, str | bytes]]) -> None:
+def write_folder(
+    directory: Path, files: Sequence[tuple[str, str | bytes]], before: Identity
+) -> None:
     """Write files (name, content) as a folder that appears whole or not at all.
+
+    ``before``: what `check_target` found there.
 
     Raises:
         OutputError: the disk cannot be written; no partial output is left.
     """
-    with atomic_folder(directory) as part:
+    with atomic_folder(directory, before) as part:
         for name, content in files:
             path = part / name
             path.parent.mkdir(exist_ok=True)

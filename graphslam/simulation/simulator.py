@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from graphslam.core.errors import OutputError
-from graphslam.core.output_folder import atomic_folder
+from graphslam.core.output_folder import atomic_folder, identity
 from graphslam.simulation.recording import Recording, record_visit
 from graphslam.simulation.scenario import Scenario
 from graphslam.simulation.scene import prepare_visits
@@ -48,7 +48,8 @@ def simulate(scenario: Scenario, target: Path, seed: int = 0) -> Simulation:
         return Simulation(scenario.name, seed, target, (recording,), 0)
     if target.is_file() or target.suffix == ".mcap":
         raise OutputError(f"{target}: this scenario makes two logs; name a folder: -o DIR")
-    with atomic_folder(target) as part:
+    before = identity(target)
+    with atomic_folder(target, before) as part:
         first, second = (
             record_visit(scenario, visit, part / f"{visit.name}.mcap", seed) for visit in visits
         )

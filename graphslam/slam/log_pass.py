@@ -72,6 +72,7 @@ class LogPass:
         self.offers: dict[int, tuple[Association, ...]] = {}
         self.keyframe_scans: list[KeyframeScan] = []
         self.counts: Counter[str] = Counter()
+        self.skipped_before: Mapping[str, int] = {}  # by the run that this one goes on with
         self.dropped: Counter[str] = Counter()
         self.rejected: Counter[str] = Counter()
         self.removed_returns: Counter[str] = Counter()
@@ -83,7 +84,7 @@ class LogPass:
     @property
     def skipped(self) -> Mapping[str, int]:
         """Number of observations and closures that the back end could not use, by reason."""
-        return {}
+        return self.skipped_before
 
     @property
     def started(self) -> dict[str, RobotState]:

@@ -20,6 +20,7 @@ from graphslam.mapping.loop_closure import Tamper
 from graphslam.mapping.robot_candidates import NOT_THERE
 from graphslam.multi_robot.identity_swaps import find_swapped_identities
 from graphslam.slam.causal import causal_of
+from graphslam.slam.checkpoint import NOTHING_KEPT, Checkpoint
 from graphslam.slam.initialisation import with_identities
 from graphslam.slam.log_pass import LogPass, PriorKnowledge, Progress, timed
 from graphslam.slam.pipeline import Pipeline
@@ -58,6 +59,7 @@ def run_passes(
     known: PriorKnowledge,
     progress: Progress,
     tamper: Tamper | None,
+    kept: Checkpoint = NOTHING_KEPT,
 ) -> FinishedPass:
     """Read the log until nothing more is found that would change how it is read.
 
@@ -67,6 +69,7 @@ def run_passes(
         known: what is known before the first pass.
         progress: see `graphslam.slam.smooth.smooth`.
         tamper: see `graphslam.slam.reoptimise_scans.Tamper`.
+        kept: stages.
 
     Raises:
         LogError: no message of the log could be used.
@@ -74,9 +77,9 @@ def run_passes(
     """
     clock_passes = 0
     while True:
-        pipeline = run_pass(Pipeline(log, config, known, tamper), progress)
+        pipeline = Pipeline(log, config, known, tamper)
+        estimate, is_rough = kept.read_pass(pipeline, partial(estimate_of_pass, pipeline, progress))
         with timed(pipeline.seconds, "final optimisation"):
-            estimate, is_rough = current_estimate(pipeline)
             finding = Future(partial(pass_findings, pipeline, estimate))
             # a log is seldom read again, so where reoptimisation is quick it does not wait to know
             at_once = is_rough and is_sighting_log(pipeline) and not finding.done
@@ -124,6 +127,13 @@ def run_pass(pipeline: Pipeline, progress: Progress) -> Pipeline:
         raise LogError(f"{path}: nothing in it could be used; see `graphslam info`")
     pipeline.record_covariances()
     return pipeline
+
+
+def estimate_of_pass(pipeline: Pipeline, progress: Progress) -> tuple[Estimate, bool]:
+    """`current_estimate` after the pipeline has processed its log."""
+    run_pass(pipeline, progress)
+    with timed(pipeline.seconds, "final optimisation"):
+        return current_estimate(pipeline)
 
 
 def current_estimate(pipeline: Pipeline) -> tuple[Estimate, bool]:

@@ -9,6 +9,7 @@ from graphslam.logs import LogSet
 from graphslam.mapping.loop_closure import Tamper
 from graphslam.slam.batch_optimisation import optimise_scan_log
 from graphslam.slam.causal import causal_trajectories
+from graphslam.slam.checkpoint import NOTHING_KEPT, Checkpoint
 from graphslam.slam.log_pass import PriorKnowledge, Progress, timed
 from graphslam.slam.log_reader import Reading
 from graphslam.slam.passes import Findings, FinishedPass
@@ -22,6 +23,7 @@ def solve_scan_log(
     progress: Progress,
     tamper: Tamper | None,
     ahead: Reading | None = None,
+    kept: Checkpoint = NOTHING_KEPT,
 ) -> FinishedPass:
     """A log of scans as one batch; ``ahead``: the keyframes, if they are read already.
 
@@ -33,10 +35,10 @@ def solve_scan_log(
         Future(partial(causal_trajectories, log, config, known)) if config.backend.causal else None
     )
     scan_log = ScanLog(log, config, known)
-    scan_log.run(progress, ahead)
+    kept.read_pass(scan_log, partial(scan_log.run, progress, ahead))
     if not scan_log.steps:
         raise LogError(f"{log.files[0].path}: nothing in it could be used; see `graphslam info`")
     with timed(scan_log.seconds, "final optimisation"):
         estimate = optimise_scan_log(scan_log, tamper)
-    found = {} if causal is None else causal.result()
+    found = {} if causal is None else kept.stage("causal", causal.result)
     return FinishedPass(scan_log, estimate, Findings({}, {}, found))

@@ -9,6 +9,7 @@ from graphslam.core.worker import Future
 from graphslam.estimation.clock_calibration import clocks_from_paths
 from graphslam.logs import LogSet
 from graphslam.slam.causal_sightings import replay_causally
+from graphslam.slam.checkpoint import NOTHING_KEPT, Checkpoint
 from graphslam.slam.initialisation import with_identities
 from graphslam.slam.log_pass import PriorKnowledge, Progress, timed
 from graphslam.slam.passes import (
@@ -27,11 +28,15 @@ from graphslam.slam.sighting_solution import (
 
 
 def run_sighting_passes(
-    log: LogSet, config: Config, known: PriorKnowledge, progress: Progress
+    log: LogSet,
+    config: Config,
+    known: PriorKnowledge,
+    progress: Progress,
+    kept: Checkpoint = NOTHING_KEPT,
 ) -> FinishedPass | None:
     """`run_passes` without an incremental estimate; None for logs that need one.
 
-    The causal trajectories are estimated in the second process.
+    The causal trajectories are estimated in the second process; ``kept``: stages.
 
     Raises:
         LogError: no message of the log could be used.
@@ -44,7 +49,7 @@ def run_sighting_passes(
     clock_passes = 0
     while True:
         one = SightingPass(log, config, known)
-        one.run(progress)
+        kept.read_pass(one, partial(one.run, progress))
         if not one.all_named:
             return None
         if not one.steps:

@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from graphslam.logs import LogSet
 from graphslam.mapping.landmark_records import make_landmarks
 from graphslam.mapping.loop_closure import Tamper
 from graphslam.odometry.mount_covariance import with_mount_errors
+from graphslam.slam.checkpoint import NOTHING_KEPT, Checkpoint
 from graphslam.slam.evidence import gather
 from graphslam.slam.initialisation import initialise
 from graphslam.slam.log_pass import Progress, timed
@@ -36,6 +38,7 @@ def smooth(
     progress: Progress = lambda _count: None,
     tamper: Tamper | None = None,
     ahead: Reading | None = None,
+    kept: Checkpoint = NOTHING_KEPT,
 ) -> Result:
     """Estimate trajectories, landmarks and calibration from a log: the main function.
 
@@ -45,6 +48,7 @@ def smooth(
         progress: called with the number of messages read so far.
         tamper: for tests, see `graphslam.slam.reoptimise_scans.Tamper`.
         ahead: what `graphslam.slam.log_reader.open_ahead` gives after the log.
+        kept: where stages are kept, and those of an earlier run.
 
     Raises:
         LogError: no message of the log could be used.
@@ -53,15 +57,33 @@ def smooth(
     """
     began = time.perf_counter()
     check_robots(log, config)
+    solve = partial(_solved, log, config, progress, tamper, ahead, kept, began)
+    result = kept.stage("result", solve)
+    summary = {**result.summary, "resumed": kept.resumed}
+    return replace(result, summary=summary)
+
+
+def _solved(
+    log: LogSet,
+    config: Config,
+    progress: Progress,
+    tamper: Tamper | None,
+    ahead: Reading | None,
+    kept: Checkpoint,
+    began: float,
+) -> Result:
+    """The result by the way that is for logs of this kind; arguments as of `smooth`."""
     if is_pose_graph(log, config):
         return make_result(solve_pose_graph(log, config, progress), began)
-    known = initialise(log, config)
+    known = kept.stage("starts", lambda: initialise(log, config))
     initialised = time.perf_counter()
     if is_scan_log(log, config):
-        finished: FinishedPass | None = solve_scan_log(log, config, known, progress, tamper, ahead)
+        finished: FinishedPass | None = solve_scan_log(
+            log, config, known, progress, tamper, ahead, kept
+        )
     else:
-        finished = run_sighting_passes(log, config, known, progress)
-    finished = finished or run_passes(log, config, known, progress, tamper)
+        finished = run_sighting_passes(log, config, known, progress, kept)
+    finished = finished or run_passes(log, config, known, progress, tamper, kept)
     finished.pipeline.seconds["starts"] = initialised - began
     return make_result(finished, began)
 

@@ -27,7 +27,7 @@ class StepRecorder(LogPass):
     @property
     def skipped(self) -> Mapping[str, int]:
         """See `LogPass`."""
-        return self.backend.skipped
+        return {**self.skipped_before, **self.backend.skipped}
 
     def start(self, robot: str, time_ns: int) -> None:
         """Give a robot its first state.

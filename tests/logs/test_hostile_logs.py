@@ -157,7 +157,7 @@ def test_two_writers_of_one_folder_the_second_is_refused_and_what_the_dead_left_
     left.mkdir()
     (left / "half").touch()
     (tmp_path / ".out.7.x").touch()
-    with pytest.raises(OutputError, match="another process"), atomic_folder(target) as part:
+    with pytest.raises(OutputError, match="another process"), atomic_folder(target, None) as part:
         (part / "mine").touch()
         target.mkdir()
         (target / "theirs").touch()
@@ -165,7 +165,7 @@ def test_two_writers_of_one_folder_the_second_is_refused_and_what_the_dead_left_
     assert [p.name for p in target.iterdir()] == ["theirs"]
     # a process that died between moving the old folder away and putting the new one there
     target.rename(tmp_path / f".out.{dead}.old")
-    with pytest.raises(ZeroDivisionError), atomic_folder(target):
+    with pytest.raises(ZeroDivisionError), atomic_folder(target, None):
         raise ZeroDivisionError
     assert [p.name for p in target.iterdir()] == ["theirs"]
 

@@ -1,0 +1,282 @@
+"""What a run has found so far, kept beside its result, so that a killed one need not begin anew.
+
+A stage is kept as records (`graphslam.core.record_codec`) in a folder beside the target, under a
+key of everything that a result depends on: contents and paths of the logs, settings, versions and
+source of this program and its libraries. A run of another key does not use it. As every stage is
+repeatable, what follows from a kept one is what would have followed without the interruption.
+"""
+
+import hashlib
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import is_dataclass
+from functools import cache
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from platform import python_version
+from typing import Any, BinaryIO, TypeVar
+
+import graphslam
+from graphslam.core.config import Config
+from graphslam.core.config_io import dump_config
+from graphslam.core.errors import OutputError
+from graphslam.core.record_codec import CodecError, Kinds, read, write
+from graphslam.core.stages import announce
+from graphslam.logs import LogSet
+from graphslam.slam.log_pass import LogPass
+
+_T = TypeVar("_T")
+
+FORMAT = "graphslam-checkpoint-1"
+#: s: a run that was not asked for it keeps stages from then on
+LONG_S = 30.0
+LIBRARIES = ("gtsam", "numpy", "opencv-python-headless", "scipy")
+
+#: modules all of whose dataclasses and named tuples may be kept, and classes of others
+_MODULES = (
+    "core.config", "core.motion_models", "core.observation_arrays", "core.records",
+    "core.sensor_config", "estimation.clock_calibration", "logs.clock", "logs.log_set",
+    "mapping.landmark_map", "multi_robot.frame_tree", "multi_robot.relative_frames",
+    "odometry.increment_sums", "odometry.interpolation", "slam.recorded_closures",
+    "slam.repeated_scans", "slam.robot_state", "slam.scan_tracking",
+)  # fmt: skip
+_CLASSES = (
+    ("mapping.landmark_map", "LandmarkMap"),
+    ("odometry.increment_sums", "IncrementSums"),
+    ("odometry.increment_sums", "PathSums"),
+    ("odometry.online_calibration", "Calibrator"),
+    ("odometry.preintegration", "Track"),
+    ("slam.log_pass", "PriorKnowledge"),
+)
+#: what a pass has found when all of its log is read
+_FOUND = (
+    "all_named", "counts", "dropped", "first_ns", "innovations", "keyframe_scans", "landmarks",
+    "last_ns", "noise", "offers", "paths", "rejected", "removed_returns", "robot_sightings", "runs",
+    "seconds", "sources", "step_ms", "steps", "unrelated_sightings",
+)  # fmt: skip
+
+
+@cache
+def kinds() -> Kinds:
+    """The classes that are kept. The latest scan of a robot is not: it is for the next one."""
+    found = [getattr(import_module(f"graphslam.{module}"), name) for module, name in _CLASSES]
+    for name in _MODULES:
+        module = import_module(f"graphslam.{name}")
+        found += [
+            kind
+            for kind in vars(module).values()
+            if isinstance(kind, type)
+            and kind.__module__ == module.__name__
+            and (is_dataclass(kind) or issubclass(kind, tuple))
+        ]
+    robot_state = import_module("graphslam.slam.robot_state").RobotState
+    return Kinds(found, {robot_state: frozenset({"scan"})})
+
+
+class Checkpoint:
+    """The stages of one run, kept or not; `stage` and `read_pass` are given the work of each.
+
+    ``resumed``: stages that were taken from disk.
+    """
+
+    def __init__(self, folder: Path | None = None, key: str = "", *, asked: bool = False) -> None:
+        """Without a folder nothing is kept. ``asked``: from the first stage on, however short."""
+        self._folder, self._key, self._asked = folder, key, asked
+        self._began = time.monotonic()
+        self._lock: BinaryIO | None = None
+        self._passes = 0
+        self.resumed: list[str] = []
+        if asked:
+            self._open()
+
+    def stage(self, name: str, make: Callable[[], _T]) -> _T:
+        """What ``make`` gives, or what it gave to an earlier run."""
+        found = self._find(name)
+        if found is not None:
+            made: _T = found[0]
+            return made
+        made = make()
+        self._keep(name, lambda: made)
+        return made
+
+    def read_pass(self, one: LogPass, run: Callable[[], _T]) -> _T:
+        """A pass over the log by ``run``, after which ``one`` has what it found."""
+        self._passes += 1
+        name = f"pass {self._passes}"
+        found = self._find(name)
+        if found is not None:
+            result, report, one.skipped_before, state = found
+            for attribute, value in state.items():
+                setattr(one, attribute, value)
+            one.log.update(report)
+            return result  # type: ignore[no-any-return]
+        result = run()
+        self._keep(name, lambda: (result, one.log.report(), dict(one.skipped), _state(one)))
+        return result
+
+    def _find(self, name: str) -> tuple[Any, ...] | None:
+        if self._lock is None or self._folder is None:
+            return None
+        try:
+            data = (self._folder / _file_name(name)).read_bytes()
+            body, digest = data[:-32], data[-32:]
+            if hashlib.sha256(body).digest() != digest:
+                return None
+            key, value = read(body, kinds())
+        except (OSError, CodecError):
+            return None
+        if key != self._key:
+            return None
+        self.resumed.append(name)
+        announce(f"{name}: of the run before")
+        return value if name.startswith("pass") else (value,)
+
+    def _keep(self, name: str, value: Callable[[], Any]) -> None:
+        """Write a stage; what cannot be written is not kept, and the run goes on."""
+        if self._folder is None:
+            return
+        if self._lock is None and time.monotonic() - self._began > LONG_S:
+            with suppress(OutputError):
+                self._open()
+        if self._lock is None:
+            return
+        announce("checkpoint")
+        part = self._folder / "part"
+        try:
+            with part.open("wb") as stream:
+                hashed = _Hashed(stream)
+                write((self._key, value()), kinds(), hashed)
+                stream.write(hashed.digest())
+            part.rename(self._folder / _file_name(name))
+        except (OSError, TypeError):
+            part.unlink(missing_ok=True)
+
+    def _open(self) -> None:
+        """Make the folder, or take over that of a dead process; it is locked until `close`.
+
+        Raises:
+            OutputError: another process is at work there, or the disk refuses.
+        """
+        assert self._folder is not None
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+            found = self._folder.stat(follow_symlinks=False)
+            if self._folder.is_symlink() or found.st_uid != os.geteuid():
+                raise OutputError(f"{self._folder}: is not of this user; remove it")
+            self._lock = _locked(self._folder / "lock")
+        except OSError as error:
+            raise OutputError(f"{self._folder}: cannot be written: {error.strerror}") from error
+        if self._lock is None:
+            raise OutputError(
+                f"{self._folder}: another process is at work on this result; wait for it, or "
+                "choose another name"
+            )
+
+    def close(self, *, remove: bool) -> None:
+        """Let others have the folder, or ``remove`` it."""
+        if self._lock is None or self._folder is None:
+            return
+        if remove:
+            shutil.rmtree(self._folder, ignore_errors=True)
+        self._lock.close()
+        self._lock = None
+
+
+class _Hashed:
+    """A stream to write to, and the digest of what was written."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream, self._hash = stream, hashlib.sha256()
+
+    def write(self, data: bytes, /) -> int:
+        self._hash.update(data)
+        return self._stream.write(data)
+
+    def digest(self) -> bytes:
+        return self._hash.digest()
+
+
+NOTHING_KEPT = Checkpoint()
+
+
+def folder_of(target: Path) -> Path:
+    """Where the stages of a result are kept."""
+    final = target.absolute()
+    return final.with_name(f".{final.name}.checkpoint")
+
+
+@contextmanager
+def checkpoint(
+    target: Path | None, log: LogSet, config: Config, *, resume: bool
+) -> Iterator[Checkpoint]:
+    """The checkpoint of a run that writes ``target``; it is gone when the block ends well.
+
+    If the block raises, it stays where ``resume`` asked for it. Without that, what a dead process
+    left is removed.
+
+    Raises:
+        OutputError: ``resume``, and another process is at work there, or the disk refuses.
+    """
+    if target is None:
+        yield NOTHING_KEPT
+        return
+    folder = folder_of(target)
+    if not resume:
+        remove_dead(folder)
+    one = Checkpoint(folder, key_of(log, config), asked=resume)
+    done = False
+    try:
+        yield one
+        done = True
+    finally:
+        one.close(remove=done or not resume)
+
+
+def remove_dead(folder: Path) -> None:
+    """Remove a folder that no process is at work in."""
+    if not folder.is_dir() or folder.is_symlink():
+        return
+    with suppress(OSError):
+        lock = _locked(folder / "lock")
+        if lock is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+            lock.close()
+
+
+def key_of(log: LogSet, config: Config) -> str:
+    """What a result depends on, in short."""
+    told = [FORMAT, dump_config(config), python_version()]
+    told += [f"{file.path.resolve()}\n{file.sha256}" for file in log.files]
+    told += [f"{name} {version(name)}" for name in LIBRARIES]
+    digest = hashlib.sha256("\n".join(told).encode(errors="backslashreplace"))
+    package = Path(graphslam.__file__).parent
+    for path in sorted(package.rglob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def _state(one: LogPass) -> dict[str, Any]:
+    return {name: getattr(one, name) for name in _FOUND if hasattr(one, name)}
+
+
+def _file_name(stage: str) -> str:
+    return f"{stage.replace(' ', '-')}.records"
+
+
+def _locked(path: Path) -> BinaryIO | None:
+    """The file, locked by this process alone, not its children; None: another one has it."""
+    stream = path.open("ab")
+    try:
+        import fcntl  # noqa: PLC0415 (not on every system; there nothing is locked)
+
+        fcntl.lockf(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except ImportError:
+        pass
+    except OSError:
+        stream.close()
+        return None
+    return stream
