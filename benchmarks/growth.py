@@ -14,11 +14,11 @@ exit code 1 if an exponent is over 1.1, or 10 000 landmarks would take over 1.5 
 import math
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from common import parser
+from common import measured_command, parser
 from speed_logs import rings, simulated
 
 from graphslam.core.geometry import Array, between, compose
@@ -80,12 +80,70 @@ def drive(way: Array) -> Array:
             continue
         turn = math.remainder(math.atan2(d[1], d[0]) - here[2], 2 * math.pi)
         count = math.ceil(abs(turn) / (0.5 / ODOMETRY_HZ))
-        poses += [here + [0, 0, turn * (k + 1) / count] for k in range(count)]
+        poses += [here + np.array([0, 0, turn * (k + 1) / count]) for k in range(count)]
         here = poses[-1]
         count = math.ceil(np.hypot(*d) / step)
-        poses += [here + [*(d * (k + 1) / count), 0] for k in range(count)]
+        poses += [here + np.append(d * (k + 1) / count, 0) for k in range(count)]
     return np.array(poses)
 
 
+def rows(
+    what: str, sizes: Sequence[int], log_of: Callable[[int], Path], folder: Path
+) -> list[tuple[str, int, float, float]]:
+    """Of each size: what, size, peak memory in MB and CPU time in s."""
+    found = []
+    for size in sizes:
+        target = folder / f"{what.split(maxsplit=1)[0]}-{size}"
+        _, used = measured_command("smooth", str(log_of(size)), "-o", str(target), "--force")
+        found.append((what, size, used.peak_mb, used.cpu_s))
+        print(f"| {what} | {size} | {used.peak_mb:.0f} | {used.cpu_s:.1f} |", flush=True)
+    return found
+
+
+def exponents(found: Sequence[tuple[str, int, float, float]], base_mb: float) -> dict[str, float]:
+    """What is measured -> exponent of memory above ``base_mb`` between its largest two sizes."""
+    out = {}
+    for what in dict.fromkeys(row[0] for row in found):
+        (_, a, before, _), (_, b, after, _) = [row for row in found if row[0] == what][-2:]
+        out[what] = math.log((after - base_mb) / (before - base_mb)) / math.log(b / a)
+    return out
+
+
+def main() -> int:
+    options = parser(__doc__)
+    options.add_argument("folder", nargs="?", type=Path, help="where logs are made and kept")
+    options.add_argument("--landmarks", nargs="*", type=int, default=LANDMARKS)
+    options.add_argument("--rounds", nargs="*", type=int, default=ROUNDS)
+    arguments = options.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = arguments.folder or Path(name)
+        folder.mkdir(exist_ok=True)
+
+        def marks(count: int) -> Path:
+            log = folder / f"marks-{count}.mcap"
+            return log if log.exists() else field(log, count)
+
+        def again(count: int) -> Path:
+            log = folder / f"again-{count}.mcap"
+            return log if log.exists() else field(log, 40, 20 * count)
+
+        print("| what | size | memory, MB | CPU, s |\n|---|---|---|---|")
+        base_mb = rows("a short log", (20,), marks, folder)[0][2]
+        found = rows("landmarks", arguments.landmarks, marks, folder) if arguments.landmarks else []
+        if arguments.rounds:
+            found += rows("rounds of 40 landmarks", arguments.rounds, again, folder)
+            found += rows(
+                "office rings, laser",
+                arguments.rounds,
+                lambda count: simulated(rings(count), f"rings-{count}", folder),
+                folder,
+            )
+    steep = exponents(found, base_mb)
+    for what, exponent in steep.items():
+        print(f"{what}: exponent {exponent:.2f}")
+    too_much = [mb for what, size, mb, _ in found if what == "landmarks" and size <= 10_000]
+    return 1 if max(steep.values()) > STEEPEST or max(too_much, default=0) > MOST_MB else 0
+
+
 if __name__ == "__main__":
-    field(Path(sys.argv[1]), int(sys.argv[2]))
+    sys.exit(main())

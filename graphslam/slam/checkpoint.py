@@ -20,7 +20,6 @@ from pathlib import Path
 from platform import python_version
 from typing import Any, BinaryIO, TypeVar
 
-import graphslam
 from graphslam.core.config import Config
 from graphslam.core.config_io import dump_config
 from graphslam.core.errors import OutputError
@@ -253,7 +252,7 @@ def key_of(log: LogSet, config: Config) -> str:
     told += [f"{file.path.resolve()}\n{file.sha256}" for file in log.files]
     told += [f"{name} {version(name)}" for name in LIBRARIES]
     digest = hashlib.sha256("\n".join(told).encode(errors="backslashreplace"))
-    package = Path(graphslam.__file__).parent
+    package = Path(__file__).parents[1]
     for path in sorted(package.rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()
