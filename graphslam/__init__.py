@@ -19,8 +19,6 @@ are then the default. With ``output`` a function also writes the folder that its
 replaces an existing one only with ``force``; what cannot be written is an `OutputError`.
 ``progress`` is called with the number of messages read so far and of all.
 
-What a name needs is imported when it is used.
-
 Matrices are small, and a linear algebra library that uses a thread per core for them takes up to
 half as much time again. The commands tell it to use one; a script must do so itself, in the
 environment (``OMP_NUM_THREADS=1``) or in ``os.environ`` before anything imports NumPy.
@@ -145,8 +143,8 @@ def smooth(
     """Estimate the trajectories of all robots and a landmark map: the main job.
 
     Arguments as in the module's docstring. The folder has a report, with a section on the errors
-    where the logs hold the truth. With ``resume`` every stage is kept beside ``output`` until it is
-    written, and a run of the same logs and settings that was killed is gone on with.
+    where the logs hold the truth. ``resume``: keep every stage beside ``output`` until it is
+    written, and go on with a run of the same logs and settings that was killed.
 
     Raises:
         LogError: a log cannot be read, or no message of it could be used.
@@ -154,7 +152,6 @@ def smooth(
             reading of logs that are open already.
         EstimationError: the estimate is indeterminate, or a robot's start is unknown.
     """
-    from graphslam.core.errors import OutputError
     from graphslam.core.memory_limit import limited_memory
     from graphslam.core.worker import Future
     from graphslam.results.folder import check_target, save
@@ -162,8 +159,6 @@ def smooth(
     from graphslam.slam.progress import of_all
 
     settled = _settle(recording, config, settings)
-    if resume and output is None:
-        raise OutputError("resume: there is no output beside which anything could be kept")
     before = None if output is None else check_target(Path(output), force=force)
     reading = _read_ahead(recording, settled) or nullcontext()
     with limited_memory(settled.limits.memory_mb), reading as ahead:
@@ -173,8 +168,6 @@ def smooth(
         from graphslam.slam.smooth import smooth
 
         log = cast("LogSet", recording) if ahead is None else receive_log(ahead, settled)
-        if output is None:
-            return smooth(log, settled, of_all(log, progress), ahead=ahead)
 
         def read_truth() -> GroundTruth:
             from graphslam.evaluation.ground_truth import truth_of_logs
@@ -192,13 +185,14 @@ def smooth(
             cast("dict[str, Any]", result.summary).update(told)
             return page
 
-        with checkpoint(Path(output), log, settled, resume=resume) as kept:
-            truth = Future(read_truth)
+        with checkpoint(output, log, settled, resume=resume) as kept:
+            truth = None if output is None else Future(read_truth)
             result = smooth(log, settled, of_all(log, progress), ahead=ahead, kept=kept)
-            known = truth.result()
-            announce("report")
-            report = Future(render_report)
-            save(result, Path(output), force=force, report=finish_report, before=before)
+            if output is not None and truth is not None:
+                known = truth.result()
+                announce("report")
+                report = Future(render_report)
+                save(result, Path(output), force=force, report=finish_report, before=before)
             return result
 
 

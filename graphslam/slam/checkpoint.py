@@ -210,7 +210,7 @@ def folder_of(target: Path) -> Path:
 
 @contextmanager
 def checkpoint(
-    target: Path | None, log: LogSet, config: Config, *, resume: bool
+    target: str | os.PathLike[str] | None, log: LogSet, config: Config, *, resume: bool
 ) -> Iterator[Checkpoint]:
     """The checkpoint of a run that writes ``target``; it is gone when the block ends well.
 
@@ -218,12 +218,15 @@ def checkpoint(
     left is removed.
 
     Raises:
-        OutputError: ``resume``, and another process is at work there, or the disk refuses.
+        OutputError: ``resume``, and there is no target, another process is at work there, or the
+            disk refuses.
     """
     if target is None:
+        if resume:
+            raise OutputError("resume: there is no output beside which anything could be kept")
         yield NOTHING_KEPT
         return
-    folder = folder_of(target)
+    folder = folder_of(Path(target))
     if not resume:
         remove_dead(folder)
     one = Checkpoint(folder, key_of(log, config), asked=resume)
