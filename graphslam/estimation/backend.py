@@ -3,13 +3,15 @@
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import Array
 from graphslam.core.records import Estimate, Step, Trajectory
+
+IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
 #: why a back end could not use something, the keys of `Backend.skipped`
 LATE_EVIDENCE = "late evidence"
@@ -113,6 +115,20 @@ class StateTable:
             )
         return number
 
+    def numbers(self, robot: str, times_ns: IntArray) -> IntArray:
+        """`number` of the states at n times, given (n,) and returned as (n,).
+
+        Raises:
+            EstimationError: see `number`.
+        """
+        own = self.stamps(robot) if robot in self.times else np.zeros(0, dtype=np.int64)
+        found = np.searchsorted(own, times_ns)
+        known = found < len(own)
+        known[known] = own[found[known]] == times_ns[known]
+        for missing in times_ns[~known].tolist():
+            self.number(robot, missing)  # raises
+        return found
+
     def latest(self, robot: str, at_ns: int | None = None) -> int:
         """Number of the robot's latest state; ``at_ns``, for the message, is when it is needed.
 
@@ -124,7 +140,7 @@ class StateTable:
             raise EstimationError(f"robot {robot} has no start{needed}: give one with --start")
         return len(self.times[robot]) - 1
 
-    def stamps(self, robot: str) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+    def stamps(self, robot: str) -> IntArray:
         """Times (n,) of the robot's states, ns."""
         return np.array(self.times[robot], dtype=np.int64)
 

@@ -154,20 +154,17 @@ class RecordedGraph(BatchGraph):
         values: gtsam.Values,
     ) -> None:
         """Add a source's observations of bearing and range, each with the time of its step."""
-        _, model = source
-        keys, targets = [], []
-        for index, (time_ns, seen) in enumerate(observed, self.graph.size()):
-            key = self.state_key(seen.robot, self.states.number(seen.robot, seen.time_ns))
-            if isinstance(seen.target, str):
-                target = self.state_key(seen.target, self.states.number(seen.target, time_ns))
-                self.robot_observations.append((index, (key, target, seen)))
-            else:
-                target = factors.landmark_key(seen.target)
-                if seen.target not in self.landmark_dims:
-                    self.introduce(seen)
-                    factors.write(values, target, self.value_in(start, target))
-            keys.append(key)
-            targets.append(target)
+        robot, model = source
+        stamps = np.array([seen.time_ns for _, seen in observed], dtype=np.int64)
+        number = self.states.numbers(robot, stamps)
+        keys = (self.state_key(robot, 0) + number).tolist()
+        if model == "point":
+            targets = self._landmark_keys([seen for _, seen in observed], start, values)
+        else:
+            at = [(str(seen.target), time_ns) for time_ns, seen in observed]
+            targets = [self.state_key(name, self.states.number(name, ns)) for name, ns in at]
+            ends = zip(keys, targets, (seen for _, seen in observed), strict=True)
+            self.robot_observations += enumerate(ends, self.graph.size())
         z = np.array([seen.z for _, seen in observed])
         cov = np.array([seen.cov for _, seen in observed])
         for bad in np.flatnonzero(~are_positive(cov)).tolist():
@@ -187,6 +184,18 @@ class RecordedGraph(BatchGraph):
         self.bearings_and_ranges[source] = list(made)
         for factor in factors.bearing_range_factors(model, keys, targets, z, cov, kernel):
             self.graph.add(factor)
+
+    def _landmark_keys(
+        self, observed: Sequence[Association], start: Estimate, values: gtsam.Values
+    ) -> list[int]:
+        """Keys of the landmarks that are observed; the new ones get their variables."""
+        numbers = [int(seen.target) for seen in observed]
+        first = dict(zip(reversed(numbers), reversed(observed), strict=True))
+        for number in first.keys() - self.landmark_dims.keys():
+            self.introduce(first[number])
+            key = factors.landmark_key(number)
+            factors.write(values, key, self.value_in(start, key))
+        return list(map(factors.landmark_key, numbers))
 
     def _share_errors(
         self,

@@ -95,12 +95,13 @@ class CorrespondenceSide:
         variance = self.variance[:, None] + self.variance
         timed = np.flatnonzero(self.times_ns != UNTIMED)
         if len(timed):
-            t = self.times_ns[timed]
-            i, j = (k.ravel() for k in np.meshgrid(range(len(t)), range(len(t)), indexing="ij"))
-            cov = track.motions(t[i], t[j]).cov
-            odometry = cov[:, 0, 0] + cov[:, 1, 1] + self.range_m[timed][j] ** 2 * cov[:, 2, 2]
-            both = np.ix_(timed, timed)
-            variance[both] = np.minimum(variance[both], odometry.reshape(len(t), len(t)))
+            timed = timed[np.argsort(self.times_ns[timed], kind="stable")]
+            i, j = (timed[k] for k in np.triu_indices(len(timed), 1))
+            moved = track.motions(self.times_ns[i], self.times_ns[j])
+            back = inverse_cov(moved.delta, moved.cov)
+            for to, seen_from, cov in ((j, i, moved.cov), (i, j, back)):
+                odometry = cov[:, 0, 0] + cov[:, 1, 1] + self.range_m[to] ** 2 * cov[:, 2, 2]
+                variance[seen_from, to] = np.minimum(variance[seen_from, to], odometry)
         return variance
 
 

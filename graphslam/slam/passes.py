@@ -46,11 +46,15 @@ class Findings(NamedTuple):
 
 
 class FinishedPass(NamedTuple):
-    """The last pass over a log, its final estimate and what it found."""
+    """The last pass over a log, its final estimate and what it found.
+
+    ``is_settled``: the estimate is at the minimum of the steps, see `graphslam.estimation.settled`.
+    """
 
     pipeline: LogPass
     estimate: Estimate
     findings: Findings
+    is_settled: bool = False
 
 
 def run_passes(

@@ -7,6 +7,7 @@ from graphslam.core.config import Config
 from graphslam.core.errors import LogError
 from graphslam.core.worker import Future
 from graphslam.estimation.clock_calibration import clocks_from_paths
+from graphslam.estimation.settled import settled
 from graphslam.logs import LogSet
 from graphslam.slam.causal_sightings import replay_causally
 from graphslam.slam.checkpoint import NOTHING_KEPT, Checkpoint
@@ -81,13 +82,17 @@ def run_sighting_passes(
             one.steps = list(steps)
             for run in one.started.values():
                 run.is_calibrated = True
-            swapped, found = find_false_names_and_clocks(one, estimate, coarsely=False)
+            # a log is seldom read again, so the result does not wait to know
+            doubts = Future(partial(find_false_names_and_clocks, one, estimate, coarsely=False))
+            estimate = settled(one.steps, estimate, one.kernel)
+            swapped, found = doubts.result()
         following = decide_next_pass(known, Findings(swapped, found, {}), log, config, clock_passes)
         if following is None:
             with timed(one.seconds, "causal"):
                 causal = replayed.result()
             one.step_ms = causal.step_ms.tolist()
-            return FinishedPass(one, estimate, Findings(swapped, found, causal.trajectories))
+            findings = Findings(swapped, found, causal.trajectories)
+            return FinishedPass(one, estimate, findings, is_settled=True)
         replayed.cancel()
         clock_passes += following.clocks is not known.clocks
         known = following

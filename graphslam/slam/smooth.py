@@ -110,7 +110,7 @@ def make_result(finished: FinishedPass, began: float) -> Result:
         transforms = pipeline.transforms()
         estimate = transforms.estimate(finished.estimate)
         steps = tuple(map(transforms.step, pipeline.steps))
-        if is_settled(pipeline.config):
+        if is_settled(pipeline.config) and not finished.is_settled:
             estimate = settled(steps, estimate, pipeline.kernel)
         error, plain = graph_error(steps, estimate, pipeline.kernel)
         estimate = replace(estimate, error=error)
