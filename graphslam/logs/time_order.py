@@ -26,7 +26,7 @@ _LOOK_AHEAD = 128
 # equal, so the size of a group is bounded.
 _MAX_GROUP = 1000
 # Sorted messages are passed on this many times per window, not after every message.
-_EMISSIONS_PER_WINDOW = 64
+_EMISSIONS_PER_WINDOW = 16
 _LONG_AGO, _FAR_AHEAD = -(1 << 63), 1 << 63
 
 _Odometry = records.OdometryPose | records.WheelAngles | records.OdometryIncrement
@@ -101,7 +101,8 @@ class MessageSorter:
         self._checked_ns = self._latest_ns
         for name, repair in self._repairs.items():
             # a slow topic must not delay the others until its next message
-            self._place(name, repair.settle_before(self._latest_ns - self._window_ns))
+            if settled := repair.settle_before(self._latest_ns - self._window_ns):
+                self._place(name, settled)
         # a pending message may still be placed before messages that are already sorted
         pending = [repair.earliest_ns for repair in self._repairs.values()]
         yield from self._emit(min(self._latest_ns - self._window_ns, *pending))
@@ -114,10 +115,12 @@ class MessageSorter:
 
     def _place(self, topic: str, messages: Iterable[Message]) -> None:
         for message in messages:
-            if message.time_ns < self._emitted_ns:
+            time_ns = message.time_ns
+            if time_ns < self._emitted_ns:
                 self.counts[topic][TOO_LATE] += 1
                 continue
-            self._latest_ns = max(self._latest_ns, message.time_ns)
+            if time_ns > self._latest_ns:
+                self._latest_ns = time_ns
             heapq.heappush(self._heap, (sort_key(message), self._number, message))
             self._number += 1
 
