@@ -25,7 +25,7 @@ from graphslam.odometry.readings import IntArray
 from graphslam.slam.log_noise import LogNoise
 from graphslam.slam.motion_noise import noise_scales, scale_motion_noise
 from graphslam.slam.sighting_batches import transport_batch, transport_target
-from graphslam.slam.sighting_states import measured_from_base
+from graphslam.slam.sighting_states import measured_from_bases
 
 #: ns: residuals of one target's sightings farther apart are taken as independent
 WINDOW_NS = 10_000_000_000
@@ -130,15 +130,20 @@ def group_sightings(steps: Sequence[Step], sources: Sequence[Sighting]) -> list[
             if a.source is None:
                 continue
             sighting = sources[a.source]
-            z, cov = measured_from_base(sighting)
             other, landmark = (a.target, -1) if isinstance(a.target, str) else (None, a.target)
             times = (a.time_ns, sighting.time_ns, step.time_ns)
-            row = ((n, k), landmark, *times, z, cov, count[a.robot, a.target])
-            groups[a.robot, other, len(z)].append(row)
-    return [
-        SightingGroup(robot, other, *map(np.array, zip(*rows, strict=True)))
-        for (robot, other, _), rows in groups.items()
-    ]
+            row = ((n, k), landmark, *times, count[a.robot, a.target])
+            groups[a.robot, other, len(sighting.z)].append((sighting, *row))
+    made = []
+    for (robot, other, _), rows in groups.items():
+        seen, *columns = zip(*rows, strict=True)
+        where, landmarks, *times, share = map(np.array, columns)
+        state_ns, seen_ns, step_ns = times
+        z, cov = measured_from_bases(seen)
+        made.append(
+            SightingGroup(robot, other, where, landmarks, state_ns, seen_ns, step_ns, z, cov, share)
+        )
+    return made
 
 
 def recompute_steps(

@@ -18,6 +18,7 @@ from graphslam.odometry.interpolation import IntArray, final_at
 from graphslam.odometry.preintegration import LATENCY_STEP_NS, Track, preintegrate_batch
 from graphslam.perception.sightings import sighting_observation
 from graphslam.slam.motion_noise import MIN_SIGMA
+from graphslam.slam.sighting_batches import transport_batch
 
 #: ns: velocities are the motion from so long before to so long after
 BASELINE_NS = 250_000_000
@@ -80,6 +81,16 @@ def measured_from_base(sighting: Sighting) -> tuple[Array, Array]:
     if not sighting.mount.any():
         return o.z, o.cov
     return transport(o.z, o.cov, sighting.mount, np.zeros((3, 3)))
+
+
+def measured_from_bases(sightings: Sequence[Sighting]) -> tuple[Array, Array]:
+    """`measured_from_base` of n sightings of one kind: z (n, k) and covariances (n, k, k)."""
+    mounts = np.array([s.mount for s in sightings])
+    if len(sightings[0].z) == 2:
+        z, cov = np.array([s.z for s in sightings]), np.array([s.cov for s in sightings])
+        return transport_batch(z, cov, mounts, np.zeros((3, 3))) if mounts.any() else (z, cov)
+    each = [measured_from_base(s) for s in sightings]
+    return np.array([z for z, _ in each]), np.array([cov for _, cov in each])
 
 
 def timed_motion(start_ns: int, end_ns: int) -> Motion:
