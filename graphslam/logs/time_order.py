@@ -119,8 +119,7 @@ class MessageSorter:
             if time_ns < self._emitted_ns:
                 self.counts[topic][TOO_LATE] += 1
                 continue
-            if time_ns > self._latest_ns:
-                self._latest_ns = time_ns
+            self._latest_ns = max(self._latest_ns, time_ns)
             heapq.heappush(self._heap, (sort_key(message), self._number, message))
             self._number += 1
 

@@ -131,8 +131,8 @@ def group_sightings(steps: Sequence[Step], sources: Sequence[Sighting]) -> list[
                 continue
             sighting = sources[a.source]
             other, landmark = (a.target, -1) if isinstance(a.target, str) else (None, a.target)
-            times = (a.time_ns, sighting.time_ns, step.time_ns)
-            row = ((n, k), landmark, *times, count[a.robot, a.target])
+            at_ns = (a.time_ns, sighting.time_ns, step.time_ns)
+            row = ((n, k), landmark, *at_ns, count[a.robot, a.target])
             groups[a.robot, other, len(sighting.z)].append((sighting, *row))
     made = []
     for (robot, other, _), rows in groups.items():
