@@ -341,6 +341,16 @@ class Config:
     changes: ChangesConfig = field(default_factory=ChangesConfig)
     warnings: tuple[str, ...] = field(default=(), compare=False, metadata={"setting": False})
 
+    @property
+    def tracks_scans(self) -> bool:
+        """Whether scans of one robot alone are tracked and solved as one batch."""
+        return (
+            self.backend.name == "batch"
+            and self.backend.reoptimise
+            and self.keyframe.mode != "all"
+            and self.front_end.name != "none"
+        )
+
     def robot(self, name: str) -> RobotConfig:
         """Settings of robot ``name``: its own table, else [robots.default], else the defaults."""
         return self.robots.get(name, self.robots.get("default", RobotConfig()))

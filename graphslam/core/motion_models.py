@@ -250,19 +250,50 @@ def nominal_calibration(source: str, config: OdometryConfig, mounted: bool) -> C
         },
     }[source]
     if mounted:
-        sigmas |= {
-            "laser_x_m": config.laser_sigma_m,
-            "laser_y_m": config.laser_sigma_m,
-            "laser_yaw_rad": config.laser_sigma_rad,
-            "laser_latency_s": config.laser_latency_sigma_s,
-        }
+        sigmas |= _laser_sigmas(config)
     held: set[str] = set(config.fixed_calibration)
     if config.parameter_noise == "white":  # then their errors are in every increment
         held |= {name for name in sigmas if not name.startswith("laser_")}
     known = [0.0 if name in held else sigma for name, sigma in sigmas.items()]
+    return _prior(tuple(sigmas), known)
+
+
+def further_calibration(
+    first: Calibration, sensors: Sequence[str], config: OdometryConfig
+) -> Calibration:
+    """A calibration before any data, and after it mounts and latencies of further lasers.
+
+    Their names are those of the first laser's after the name of the sensor and a dot.
+    """
+    sigmas = _laser_sigmas(config)
+    known = [0.0 if name in config.fixed_calibration else s for name, s in sigmas.items()]
+    names = tuple(f"{sensor}.{name}" for sensor in sensors for name in sigmas)
+    more = _prior(names, known * len(sensors))
+    p, q = len(first.mean), len(more.mean)
+    cov = np.zeros((p + q, p + q))
+    cov[:p, :p], cov[p:, p:] = first.cov, more.cov
+    return Calibration(first.names + names, np.concatenate([first.mean, more.mean]), cov)
+
+
+def several_lasers(calibration: Calibration) -> bool:
+    """Whether there are mounts of further lasers in a calibration."""
+    return any("." in name for name in calibration.names)
+
+
+def _laser_sigmas(config: OdometryConfig) -> dict[str, float]:
+    """Prior sigmas of a laser's mount and latency."""
+    return {
+        "laser_x_m": config.laser_sigma_m,
+        "laser_y_m": config.laser_sigma_m,
+        "laser_yaw_rad": config.laser_sigma_rad,
+        "laser_latency_s": config.laser_latency_sigma_s,
+    }
+
+
+def _prior(names: tuple[str, ...], sigmas: Sequence[float]) -> Calibration:
     # a parameter whose sigma is 0 is held, without making the covariance singular
-    values = np.maximum(np.array(known, dtype=float), 1e-9)
-    return Calibration(tuple(sigmas), np.zeros(len(values)), np.diag(values**2))
+    values = np.maximum(np.array(sigmas, dtype=float), 1e-9)
+    return Calibration(names, np.zeros(len(values)), np.diag(values**2))
 
 
 #: motion source -> increments of its rows; rows scale with the share of an interval that is used

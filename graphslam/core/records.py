@@ -63,7 +63,7 @@ class WheelAngles(Message):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan(Message):
-    """One sweep of a planar laser, its pose in the base frame being ``mount`` (3,).
+    """One sweep of a planar laser (``sensor``: see `logs.lasers`) at ``mount`` (3,) in the base.
 
     ``ranges`` (n,) m, NaN without one; beam i is along ``angle_min_rad + i angle_step_rad``, or its
     ``bearings``, ``beam_period_s`` after the one before (negative: before it), see `sweep_motion`.
@@ -75,6 +75,7 @@ class Scan(Message):
     mount: Array
     beam_period_s: float = 0.0
     bearings: Array | None = None
+    sensor: str = ""
 
     @property
     def angles(self) -> Array:

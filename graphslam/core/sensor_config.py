@@ -66,6 +66,7 @@ class RobotConfig:
     outline: corners [[x m, y m], ...] of the robot's cross-section at the height of other robots'
         lasers, in its base frame, convex and in order; [[radius m]] is a circle. A robot with an
         outline is detected in other robots' scans.
+    lasers: as `laser`, of a robot's further lasers, by the names that summary.json gives them.
     """
 
     laser: tuple[float, ...] = ()
@@ -75,11 +76,17 @@ class RobotConfig:
     left_joint: str = ""
     right_joint: str = ""
     outline: tuple[tuple[float, ...], ...] = ()
+    lasers: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Raise ConfigError where `laser` is not a pose or `outline` not an outline."""
         if len(self.laser) not in (0, 3):
             raise ConfigError(f"robots.*.laser: needs [x, y, yaw], got {list(self.laser)}")
+        for name, mount in self.lasers.items():
+            if len(mount) not in (0, 3):
+                raise ConfigError(f"robots.*.lasers.{name}: needs [x, y, yaw], got {list(mount)}")
+        # the read-only mapping of a parsed configuration cannot be sent to another process
+        object.__setattr__(self, "lasers", dict(self.lasers))
         sizes = [len(corner) for corner in self.outline]
         a_circle = sizes == [1] and self.outline[0][0] > 0
         if self.outline and not a_circle and (len(sizes) < 3 or set(sizes) != {2}):

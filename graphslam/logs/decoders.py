@@ -40,7 +40,7 @@ class TopicContext:
     return. With ``at_once`` all beams of a scan count as measured at its stamp. ``beams`` counts
     dropped beams of scans that are kept, by reason. With ``without_ranges`` scans get no ranges:
     only when they were taken is of interest. ``by_log_time``: the messages have no stamps; that of
-    their recording is taken.
+    their recording is taken. ``sensor``: see `records.Scan`.
     """
 
     robot: str
@@ -54,6 +54,7 @@ class TopicContext:
     beams: Counter[str] = field(default_factory=Counter)
     without_ranges: bool = False
     by_log_time: bool = False
+    sensor: str = ""
 
 
 class Decoder(NamedTuple):
@@ -101,7 +102,9 @@ def scans(rows: Any, topic: TopicContext) -> list[records.Scan | str]:
         if step < 0:
             start, step, period = start + step * (beams - 1), -step, -period
             own = own[::-1].copy()
-        scan = records.Scan(topic.robot, stamp, stamp, own, start, step, mount, period)
+        scan = records.Scan(
+            topic.robot, stamp, stamp, own, start, step, mount, period, sensor=topic.sensor
+        )
         found.append(levelled(scan, topic.tilted[frame]) if frame in topic.tilted else scan)
     return found
 

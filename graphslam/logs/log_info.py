@@ -19,6 +19,7 @@ from graphslam.logs.decoders import TopicContext
 from graphslam.logs.findings import Finding
 from graphslam.logs.future_stamps import Recorded
 from graphslam.logs.gyroscopes import find_gyroscopes
+from graphslam.logs.lasers import FurtherLasers, further_lasers
 from graphslam.logs.log_checks import CheckedLog, by_severity, check_log
 from graphslam.logs.log_set import FileReader, LogFile, damage, merged_notes
 from graphslam.logs.recording import Recording
@@ -84,23 +85,26 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
     findings = damage(files)
     topics: list[Topic] = []
     chosen: list[Topic] = []
+    lasers = FurtherLasers()
     problem = ""
     try:
         topics = find_topics(files, config)
         files, topics, derived = robots_and_topics(files, config)
         findings += derived
         chosen, choices = choose_topics(files, topics)
-        findings += choices
+        lasers = further_lasers(files, topics, chosen, config)
+        findings += [*choices, *lasers.findings]
     except LogError as error:
         problem = str(error)
     contexts, assumed = topic_contexts(files, topics, config)
+    contexts |= lasers.contexts
     dropped: Counter[str] = Counter()
     readings = {
         topic.name: _read_topic(files, topic, contexts, config, dropped)
         for topic in topics
         if topic.count
     }
-    used = {topic.name for topic in chosen}
+    used = {topic.name for topic in (*chosen, *lasers.topics)}
     infos = [
         _topic_info(files, topic, topic.name in used, readings.get(topic.name), contexts)
         for topic in topics

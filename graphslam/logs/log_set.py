@@ -9,6 +9,7 @@ from pathlib import Path
 from graphslam.core import records
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError
+from graphslam.core.geometry import Array
 from graphslam.core.records import Message
 from graphslam.core.worker import Prefetch
 from graphslam.logs import time_order
@@ -18,6 +19,7 @@ from graphslam.logs.findings import Finding
 from graphslam.logs.future_stamps import Recorded, repair_future_stamps
 from graphslam.logs.gyroscopes import find_gyroscopes
 from graphslam.logs.imu_turning import Turning, with_turning
+from graphslam.logs.lasers import further_lasers
 from graphslam.logs.recording import Recording, raw_messages, sample_messages
 from graphslam.logs.robots import robots_and_topics
 from graphslam.logs.stated_noise import StatedNoise, stated_noise
@@ -58,6 +60,7 @@ class LogSet:
         gyroscopes: robot -> its turning by a gyroscope, which its odometry in `messages` has.
         opened: the indexed recordings, in the order of ``files``.
         config: the settings that the logs were opened with.
+        further_lasers: topics of lasers besides those in ``topics``, see `graphslam.logs.lasers`.
     """
 
     robots: tuple[str, ...]
@@ -71,6 +74,7 @@ class LogSet:
     _contexts: Mapping[str, TopicContext] = field(repr=False)
     config: Config = field(repr=False)
     gyroscopes: Mapping[str, Turning] = field(repr=False, default_factory=dict)
+    further_lasers: tuple[Topic, ...] = ()
 
     def __post_init__(self) -> None:
         self._opening_warnings = len(self.warnings)
@@ -93,6 +97,16 @@ class LogSet:
         """Robots whose scans tell how they moved where their odometry, of poses, is silent."""
         having = {t.robot for t in self.topics if t.record is records.OdometryPose}
         return tuple(robot for robot in self.robots if robot in having and self.has_scans(robot))
+
+    def sensors(self, robot: str) -> dict[str, str]:
+        """Topics of the lasers of a robot and their names, see `records.Scan.sensor`."""
+        own = [t.name for t in (*self.topics, *self.further_lasers) if t.record is records.Scan]
+        contexts = {name: self._contexts[name] for name in own}
+        return {name: c.sensor for name, c in contexts.items() if c.robot == robot}
+
+    def mount(self, topic: str) -> Array:
+        """Pose (3,) of a laser in the base frame according to the log; of its first frame."""
+        return next(iter(self._contexts[topic].mounts.values()))
 
     def no_return_m(self, topic: str) -> float:
         """Smallest range, m, that means no return in ``topic``; inf if none was detected."""
@@ -130,6 +144,7 @@ class LogSet:
         *,
         prefetch: bool = False,
         keep: bool = False,
+        all_lasers: bool = False,
     ) -> Iterator[Message]:
         """All messages sorted by ``time_ns``; at equal times odometry comes first.
 
@@ -137,9 +152,10 @@ class LogSet:
         ``logs.reorder_s`` and a hundred more, not the log. Every call starts at the beginning.
         ``prefetch``: allows a second process to read ahead, which pays if the caller takes all and
         works on each. ``keep``: a log without scans, if not longer than `KEPT_MESSAGES`, is held in
-        memory from then on, so that it is decoded once however often it is read.
+        memory from then on, so that it is decoded once however often it is read. ``all_lasers``:
+        with the scans of further lasers.
         """
-        topics = self._topics_without(exclude)
+        topics = self._topics_without(exclude, all_lasers)
         self.update(ReadReport())
         names, count = tuple(topics), self.count(exclude)
         kept, ahead = self._kept.get(names), self._ahead.pop(names, None)
@@ -148,9 +164,9 @@ class LogSet:
         elif ahead is not None:
             items = ahead
         elif prefetch and count >= WORKER_MIN_MESSAGES:
-            items = Prefetch(lambda: self.reading(exclude))
+            items = Prefetch(lambda: self._read(topics, self._contexts))
         else:
-            items = self.reading(exclude)
+            items = self._read(topics, self._contexts)
         keep &= kept is None and count <= KEPT_MESSAGES
         keep &= not any(topic.record is records.Scan for topic in topics.values())
         taken: list[Message | ReadReport] = []
@@ -174,8 +190,11 @@ class LogSet:
         """Let the next `messages` with the same ``exclude`` take a `reading` that has begun."""
         self._ahead[tuple(self._topics_without(exclude))] = reading
 
-    def _topics_without(self, exclude: tuple[type[Message], ...]) -> dict[str, Topic]:
-        return {topic.name: topic for topic in self.topics if topic.record not in exclude}
+    def _topics_without(
+        self, exclude: tuple[type[Message], ...], all_lasers: bool = False
+    ) -> dict[str, Topic]:
+        topics = self.topics + (self.further_lasers if all_lasers else ())
+        return {topic.name: topic for topic in topics if topic.record not in exclude}
 
     def odometry(self, exclude: tuple[type[Message], ...] = ()) -> Iterator[Odometry]:
         """The odometry among `messages` with the same ``exclude``, at the same times.
@@ -244,12 +263,13 @@ def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
     for n, file in enumerate(files):
         if file.sha256 in {other.sha256 for other in files[:n]}:
             raise LogError(f"{file.path}: is given twice; name each log once")
-    files, topics, derived = robots_and_topics(files, config)
-    topics, choices = choose_topics(files, topics)
+    files, found, derived = robots_and_topics(files, config)
+    topics, choices = choose_topics(files, found)
     contexts, assumed = topic_contexts(files, topics, config)
     for finding in assumed:
         if finding.severity == "unusable":
             raise LogError(f"{', '.join(str(file.path) for file in files)}: {finding.line}")
+    lasers = further_lasers(files, found, topics, config)
     gyroscopes, by_gyroscope = find_gyroscopes(files, topics, contexts, config)
     return LogSet(
         robots=tuple(sorted({t.robot for t in topics if t.record in MOTION_KINDS})),
@@ -259,16 +279,24 @@ def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
         warnings=[
             *config.warnings,
             *(
-                found.line
-                for found in (*damage(files), *derived, *choices, *assumed, *by_gyroscope)
+                said.line
+                for said in (
+                    *damage(files),
+                    *derived,
+                    *choices,
+                    *lasers.findings,
+                    *assumed,
+                    *by_gyroscope,
+                )
             ),
         ],
         dropped=Counter(),
         repaired=Counter(),
         opened=files,
-        _contexts=contexts,
+        _contexts=contexts | lasers.contexts,
         config=config,
         gyroscopes=gyroscopes,
+        further_lasers=tuple(lasers.topics),
     )
 
 

@@ -1,6 +1,6 @@
 """Decoding context of each topic, from a sample of its messages: mounts and no-return values."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,6 +34,8 @@ _STAMPED = (records.Scan, records.Sighting, records.OdometryPose, records.WheelA
 #: bearings beyond a whole turn, how many at least and of all: they are no radians
 LEAST_IN_DEGREES, SHARE_IN_DEGREES = 10, 0.25
 
+_NONE: Mapping[str, str] = {}
+
 
 @dataclass(frozen=True, slots=True)
 class ScanShape:
@@ -66,9 +68,15 @@ def _cloud_shape(message: Any) -> ScanShape | None:
 
 
 def topic_contexts(
-    files: Sequence[Recording], topics: Sequence[Topic], config: Config
+    files: Sequence[Recording],
+    topics: Sequence[Topic],
+    config: Config,
+    sensors: Mapping[str, str] = _NONE,
 ) -> tuple[dict[str, TopicContext], list[Finding]]:
-    """Decoding context of each topic, and findings about assumptions that were made."""
+    """Decoding context of each topic, and findings about assumptions that were made.
+
+    ``sensors``: topic -> name of a robot's further laser. Its mount has to be known.
+    """
     findings: list[Finding] = []
     odometry = [t for kind in ODOMETRY_KINDS[::-1] for t in topics if t.record is kind]
     bases = {t.robot: base_frame(files, t) for t in odometry}  # the preferred kind comes last
@@ -76,6 +84,8 @@ def topic_contexts(
     trees: dict[str, TransformTree] = {}
     for topic in topics:
         settings = config.robot(topic.robot)
+        sensor = sensors.get(topic.name, "")
+        laser = settings.lasers.get(sensor, ()) if sensor else settings.laser
         mounts: dict[str, Array] = {}
         inverted: set[str] = set()
         tilted: dict[str, Mount] = {}
@@ -88,7 +98,9 @@ def topic_contexts(
             tree = trees[topic.robot]
             for frame in sorted({frame_of(message) for message in messages}):
                 base = bases[topic.robot] if topic.robot in bases else base_above(tree, frame)
-                mount, notes = _mount(topic, tree, base, frame, settings.laser)
+                if sensor and base == frame:
+                    base = "the robot's base"  # nothing ties this laser to the others
+                mount, notes = _mount(topic, tree, base, (sensor, frame), laser)
                 mounts[frame] = mount.pose
                 if topic.record is records.Scan and not is_level(mount):
                     tilted[frame] = mount
@@ -114,6 +126,7 @@ def topic_contexts(
             left_joint=settings.left_joint,
             right_joint=settings.right_joint,
             by_log_time=unstamped,
+            sensor=sensor,
         )
     return contexts, findings
 
@@ -163,11 +176,20 @@ def base_frame(files: Sequence[Recording], topic: Topic) -> str:
 
 
 def _mount(
-    topic: Topic, tree: TransformTree, base: str, frame: str, configured: Sequence[float]
+    topic: Topic,
+    tree: TransformTree,
+    base: str,
+    of: tuple[str, str],
+    configured: Sequence[float],
 ) -> tuple[Mount, list[Finding]]:
-    """The mount of ``frame`` on the robot, and findings; one that is configured is level."""
+    """The mount of a sensor on the robot, and findings; one that is configured is level.
+
+    ``of``: its name, if it is a further laser, and its frame.
+    """
+    sensor, frame = of
     where = f"{topic.name}: frame {frame or '(none)'}"
-    setting = f"--set 'robots.{topic.robot}.laser=[X, Y, YAW]' (m, m, rad)"
+    key = f"lasers.{sensor}" if sensor else "laser"
+    setting = f"--set 'robots.{topic.robot}.{key}=[X, Y, YAW]' (m, m, rad)"
     found = find_mount(tree, base, frame)
     inverted = found is not None and found.inverted
     if len(configured) == 3 and topic.record is records.Scan:
@@ -175,8 +197,13 @@ def _mount(
     if found is None:
         if topic.record is records.Sighting and not frame:
             return Mount(np.zeros(3), False, 0.0), []  # no frame: measured from the base
-        text = f"tf_static has no transform from {base}; assumed to be the base itself"
+        text = f"tf_static has no transform from {base}"
         remedy = f"record /tf_static, or {setting}"
+        if sensor:
+            return Mount(np.zeros(3), False, 0.0), [
+                Finding("unusable", "mount", where, text, remedy)
+            ]
+        text += "; assumed to be the base itself"
         return Mount(np.zeros(3), False, 0.0), [Finding("doubt", "mount", where, text, remedy)]
     if is_level(found):
         return found, []

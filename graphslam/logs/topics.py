@@ -77,6 +77,8 @@ def choose_topics(
 ) -> tuple[list[Topic], list[Finding]]:
     """One odometry source and one laser per robot, all other topics, and findings.
 
+    For further lasers see `graphslam.logs.lasers`.
+
     Raises:
         LogError: all topics are empty; a robot has sightings but neither odometry nor scans, or
             scans but no odometry, which another robot without sensors has.
@@ -90,12 +92,12 @@ def choose_topics(
         )
     chosen: list[Topic] = []
     findings: list[Finding] = []
-    spare: list[tuple[str, list[Topic]]] = []
+    spare: list[list[Topic]] = []
     for robot in sorted({topic.robot for topic in filled}):
         own = [topic for topic in filled if topic.robot == robot]
         own.sort(key=lambda t: (t.schema == POINT_CLOUD, -t.count, t.name))
         odometry = [t for kind in ODOMETRY_KINDS for t in own if t.record is kind]
-        lasers = [t for t in own if t.record is records.Scan]
+        lasers = lasers_of(filled, robot)
         sensors = lasers + [t for t in own if t.record is records.Sighting]
         if sensors and not odometry:
             if not lasers or _odometry_alone(filled):
@@ -117,15 +119,21 @@ def choose_topics(
         others = (*ODOMETRY_KINDS, records.Scan, records.TrueAssociations)
         rest = [t for t in filled if t.robot == robot and t.record not in others]
         chosen += odometry[:1] + lasers[:1] + rest
-        spare += [("odometry", odometry), ("laser", lasers)]
+        spare.append(odometry)
     if not any(topic.record in MOTION_KINDS for topic in chosen):
         raise LogError(
             f"{names}: no odometry; the log has only {', '.join(t.name for t in filled)}; "
             "smoothing needs LaserScan, nav_msgs/Odometry, odom to base on /tf, JointState or "
             "OdometryIncrement"
         )
-    findings += [_unused(what, own, chosen) for what, own in spare if len(own) > 1]
+    findings += [unused("odometry", own, chosen) for own in spare if len(own) > 1]
     return chosen, findings
+
+
+def lasers_of(topics: Sequence[Topic], robot: str) -> list[Topic]:
+    """Topics with scans of a robot, the one first that is used if only one is."""
+    own = [t for t in topics if t.robot == robot and t.record is records.Scan and t.count]
+    return sorted(own, key=lambda t: (t.schema == POINT_CLOUD, -t.count, t.name))
 
 
 def _odometry_alone(topics: Sequence[Topic]) -> bool:
@@ -134,7 +142,7 @@ def _odometry_alone(topics: Sequence[Topic]) -> bool:
     return any(t.record in ODOMETRY_KINDS and t.robot not in sensing for t in topics)
 
 
-def _unused(what: str, topics: Sequence[Topic], chosen: Sequence[Topic]) -> Finding:
+def unused(what: str, topics: Sequence[Topic], chosen: Sequence[Topic]) -> Finding:
     """That only the first of several ``topics`` of a robot is used, and how to use the second."""
     used, other = topics[0], topics[1]
     others = ", ".join(topic.name for topic in topics[1:])

@@ -146,7 +146,7 @@ def with_bridged_gaps(
         if bridge is not None and isinstance(message, OdometryPose):
             yield bridge.reading(message)
             continue
-        if bridge is not None and isinstance(message, Scan):
+        if bridge is not None and isinstance(message, Scan) and not message.sensor:
             put_in = bridge.scan(message)
             tracks[message.robot].bridged += len(put_in)
             yield from put_in

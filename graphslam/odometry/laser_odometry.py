@@ -158,6 +158,8 @@ def with_laser_odometry(
 ) -> Iterator[Message]:
     """Messages in time order; in front of each scan the odometry increment that leads to it.
 
+    Of a robot with several lasers these are the scans of the first.
+
     Args:
         messages: in time order.
         robots: those that have scans and no odometry.
@@ -175,7 +177,7 @@ def with_laser_odometry(
         """What is in front and has all that it needs."""
         while waiting:
             head = waiting[0]
-            if isinstance(head, Scan) and head.robot in odometers:
+            if isinstance(head, Scan) and head.robot in odometers and not head.sensor:
                 if head.robot in begun:
                     if not ready[head.robot]:
                         return
@@ -185,7 +187,7 @@ def with_laser_odometry(
 
     for message in messages:
         waiting.append(message)
-        if isinstance(message, Scan) and message.robot in odometers:
+        if isinstance(message, Scan) and message.robot in odometers and not message.sensor:
             ready[message.robot] += odometers[message.robot].add(message)
         yield from released()
     for robot, odometer in odometers.items():

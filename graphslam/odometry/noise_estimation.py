@@ -128,10 +128,10 @@ def variances_by_rate(track: Track, start_ns: IntArray, end_ns: IntArray) -> Arr
     found = [np.zeros((0, 3, len(RATES)))]
     for block in range(0, len(start_ns), BLOCK):  # nine covariances of every reading in between
         start, end = (times[block : block + BLOCK] for times in (start_ns, end_ns))
+        start, end, mount = track.odometry_spans(start, end)
         times, at = np.unique(np.concatenate([start, end]), return_inverse=True)
-        sums, _ = path_sums([track], [times - track.latency_ns], by_rate=True)
+        sums, _ = path_sums([track], [times], by_rate=True)
         motions = sums.motions_between(*np.split(at, 2))
-        mount = np.broadcast_to(track.mount, (len(start), 3))
         covs = transformed(motions.cov, lever_to(motions.delta, mount))
         found.append(np.diagonal(covs, axis1=2, axis2=3).mT)
     return np.concatenate(found)

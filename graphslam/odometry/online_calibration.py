@@ -16,7 +16,7 @@ import numpy as np
 from graphslam.core.config import OdometryConfig
 from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared, solve
 from graphslam.core.geometry import Array, wrap
-from graphslam.core.motion_models import HELD_SIGMA, Calibration
+from graphslam.core.motion_models import HELD_SIGMA, Calibration, several_lasers
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Motion
 
@@ -176,7 +176,10 @@ def calibration_from_evidence(known: CalibrationEvidence, prior: Calibration) ->
     held = np.setdiff1d(np.arange(len(prior.mean)), free)
     told = known.vector[free] - known.information[np.ix_(free, held)] @ prior.mean[held]
     mean[free] = cov @ (information @ prior.mean[free] + told)
-    all_cov[block] = cov + MIN_SIGMA_SHARE**2 * prior.cov[block]
+    # between states of two lasers the mounts' covariance enters every motion, as if it were fresh
+    rigid = [several_lasers(prior) and "laser_" in prior.names[k] for k in free]
+    share = np.where(rigid, 0.0, MIN_SIGMA_SHARE)
+    all_cov[block] = cov + share[:, None] * prior.cov[block] * share
     return Calibration(prior.names, mean, all_cov)
 
 

@@ -33,7 +33,8 @@ from graphslam.core.motion_models import (
     rows_of_twists,
     unit_error_covs,
 )
-from graphslam.core.records import Motion
+from graphslam.core.records import Motion, Trajectory
+from graphslam.odometry.coarse_sums import coarse_sums
 from graphslam.odometry.increment_sums import IncrementSums, Motions, PathSums
 from graphslam.odometry.mounted_motions import of_mount
 from graphslam.odometry.readings import BoolArray, IntArray, Readings, integrate_pending
@@ -41,9 +42,6 @@ from graphslam.odometry.readings import BoolArray, IntArray, Readings, integrate
 #: m and rad: sigma of the motion of a robot that reports none
 STANDING_SIGMA = 1e-4
 
-#: m of effort (see `Track.effort`): a motion this short is close enough to an arc to be integrated
-#: as one increment
-COARSE_M = 0.3
 #: ns: step of the difference quotient by latency; about one period of common odometry
 LATENCY_STEP_NS = 50_000_000
 
@@ -66,14 +64,18 @@ class Track(Readings):
         just ``late``.
         """
         super().__init__(config, robot)
-        self.calibration = nominal_calibration("given", config, False)
+        self.calibration = self._nominal("given", False)
         self.prior = self.calibration  # before any data
         self._mounted, self._late = mounted, late
 
     def _begin(self, source: str, time_ns: int) -> None:
         super()._begin(source, time_ns)
         self._mounted &= source != "given" or self._late
-        self.calibration = self.prior = nominal_calibration(source, self.config, self._mounted)
+        self.calibration = self.prior = self._nominal(source, self._mounted)
+
+    def _nominal(self, source: str, mounted: bool) -> Calibration:
+        """The calibration before any data."""
+        return nominal_calibration(source, self.config, mounted)
 
     @property
     def is_mounted(self) -> bool:
@@ -140,8 +142,12 @@ class Track(Readings):
     def latency_ns(self) -> int:
         """By how long the times of states are late against the odometry's; 0 if unobservable."""
         if self.is_mounted and not self.has_burst_stamps:
-            return round(float(self.calibration.mean[-1]) * 1e9)
+            return round(float(self.calibration.mean[self._mount_slice.stop]) * 1e9)
         return 0
+
+    def laser(self, _sensor: str = "") -> tuple[Array, int]:
+        """Mount (3,), by its error, and latency, ns, of a laser; see `SeveralLasersTrack`."""
+        return self.mount, self.latency_ns
 
     def reported_late_ns(self, known: Calibration) -> int:
         """By how long the time of a state is later than that of the odometry it is reported at.
@@ -152,7 +158,7 @@ class Track(Readings):
         """
         if self.source == "commands" or not self.is_mounted or self.has_burst_stamps:
             return 0
-        return round(float(known.mean[-1]) * 1e9)
+        return round(float(known.mean[self._mount_slice.stop]) * 1e9)
 
     def increments(self, rows: Array, calibration: Array) -> Increments:
         """Increments (n) of rows (n, k), by calibration parameters (p,) or (n, p)."""
@@ -167,12 +173,25 @@ class Track(Readings):
         rows = rows_of_twists(self.source, twists, self._robot)
         return self.increments(rows, self.calibration.mean[: self.increment_parameters]).d_cal
 
-    def mounted_pose(self, times_ns: IntArray) -> Array:
+    def mounted_pose(self, times_ns: IntArray, sensor: str = "") -> Array:
         """Poses (n, 3) of the frame at ``mount``, the times ``latency_ns`` late; see `pose`.
 
         The motion between two of them is `motion` without the calibration of the odometry. Cheap.
+        ``sensor``: of which laser.
         """
-        return compose(self.pose(times_ns - self.latency_ns), self.mount)
+        mount, late_ns = self.laser(sensor)
+        return compose(self.pose(times_ns - late_ns), mount)
+
+    def odometry_spans(
+        self, start_ns: IntArray, end_ns: IntArray
+    ) -> tuple[IntArray, IntArray, Array]:
+        """Times (n,) of the odometry's clock between which states moved, and mounts at the ends."""
+        late, n = self.latency_ns, len(start_ns)
+        return start_ns - late, end_ns - late, np.broadcast_to(self.mount, (n, 3))
+
+    def at_first_laser(self, states: Trajectory) -> Trajectory:
+        """States as those of the first laser: there is one; see `SeveralLasersTrack`."""
+        return states
 
     def motion(self, start_ns: int, end_ns: int) -> Motion:
         """The motion from ``start_ns`` to ``end_ns`` with its covariance; thesis 4.4-4.15.
@@ -280,9 +299,9 @@ class Track(Readings):
         cal_cov = np.array([c.cov for c in calibrations])[which]
         p, late = self.increment_parameters, np.zeros(len(which), dtype=np.int64)
         if self.is_mounted:
-            late = np.rint(1e9 * mean[:, -1]).astype(np.int64)
+            late = np.rint(1e9 * mean[:, p + 3]).astype(np.int64)
         begin, end = start_ns - late, end_ns - late
-        moved = self._coarse(begin, end, mean[:, :p]).motions()
+        moved = coarse_sums(self, begin, end, mean[:, :p]).motions()
         delta, cov, d_cal = moved.delta, moved.cov, moved.d_cal
         if self.is_mounted:
             delta, cov, d_cal = of_mount(delta, cov, d_cal, mean[:, p : p + 3], None)
@@ -292,49 +311,6 @@ class Track(Readings):
             drove = (self.effort(end) > self.effort(begin))[:, None, None]
             cov = cov + np.where(drove, self.floor_cov_of(True), self.floor_cov_of(False))
         return delta, np.where((end_ns > start_ns)[:, None, None], cov, 0.0)
-
-    def _coarse(self, begin: IntArray, end: IntArray, calibration: Array) -> PathSums:
-        """The base's path between times (n,) of the odometry's clock, by parameters (n, p).
-
-        Knots lie `COARSE_M` of effort apart, counted from each start; motions with the same start
-        share them.
-        """
-        effort_begin, effort_end = self.effort(begin), self.effort(end)
-        _, group = np.unique(begin, return_inverse=True)
-        passed = np.zeros(len(begin), dtype=np.int64)  # pieces before each end
-        knot = begin.copy()  # the last one before each end
-        order = np.argsort(group, kind="stable")
-        members = np.split(order, np.flatnonzero(np.diff(group[order])) + 1)
-        levels = [
-            np.arange(effort_begin[own[0]] + COARSE_M, float(effort_end[own].max()), COARSE_M)
-            for own in members
-        ]
-        # of all groups at once: the whole odometry is searched
-        reached = self.times_of_effort(np.concatenate([np.zeros(0), *levels]))
-        inner = np.split(reached, np.cumsum([len(own) for own in levels]))
-        pieces: list[IntArray] = []  # knots of each group, its start included
-        for own, after in zip(members, inner, strict=False):
-            knots = np.append(begin[own[0]], after)
-            passed[own] = np.searchsorted(after, end[own], side="right")
-            knot[own] = knots[passed[own]]
-            pieces.append(knots)
-        counts = np.array([len(knots) - 1 for knots in pieces])
-        first = np.cumsum(counts) - counts
-        of = np.repeat([own[0] for own in members], counts)
-        whole = self._piece(
-            np.concatenate([knots[:-1] for knots in pieces]),
-            np.concatenate([knots[1:] for knots in pieces]),
-            calibration[of],
-        )
-        sums = IncrementSums(whole, np.repeat(first, counts))
-        return sums.query(first[group] + passed, first[group], self._piece(knot, end, calibration))
-
-    def _piece(self, begin: IntArray, end: IntArray, calibration: Array) -> Increments:
-        """Base motions between times (n,) of the odometry's clock, each as one increment."""
-        part = self.increments(self.added_rows(begin, end), np.zeros(self.increment_parameters))
-        delta = between(self.pose(begin), self.pose(end))
-        delta = delta + np.einsum("nij,nj->ni", part.d_cal, calibration)
-        return replace(part, delta=delta)
 
     def floor_cov_of(self, moved: bool) -> Array:
         """Covariance (3, 3) added once per interval; never zero, as it is inverted."""

@@ -22,7 +22,7 @@ def sweep_end_ns(scan: Scan) -> int:
 
 
 def undistorted_by_track(scans: Sequence[Scan], track: Track) -> list[Scan]:
-    """Scans of one robot without its motion during each, by its odometry."""
+    """Scans of one laser without the robot's motion during each, by its odometry."""
     found = list(scans)
     swept = [n for n, scan in enumerate(scans) if scan.beam_period_s]
     if not swept:
@@ -30,7 +30,8 @@ def undistorted_by_track(scans: Sequence[Scan], track: Track) -> list[Scan]:
     begin = np.array([scans[n].time_ns for n in swept], dtype=np.int64)
     end = np.array([sweep_end_ns(scans[n]) for n in swept], dtype=np.int64)
     mounts = np.array([scans[n].mount for n in swept])
-    first, last = (compose(track.mounted_pose(times), mounts) for times in (begin, end))
+    sensor = scans[0].sensor
+    first, last = (compose(track.mounted_pose(times, sensor), mounts) for times in (begin, end))
     velocities = log(between(first, last)) / (1e-9 * np.maximum(end - begin, 1))[:, None]
     for n, velocity in zip(swept, velocities, strict=True):
         found[n] = undistorted(scans[n], velocity)

@@ -26,6 +26,12 @@ def laser_mount(laser: Laser) -> Array:
     return np.array([*laser.mount_m, np.radians(laser.mount_deg)])
 
 
+def told_mount(laser: Laser) -> Array:
+    """Pose (3,) of the laser in the base frame according to the log."""
+    error = np.array([*laser.mount_error_m, np.radians(laser.mount_error_deg)])
+    return np.asarray(laser_mount(laser) + error)
+
+
 def noise_free_scans(
     poses: Array,
     laser: Laser,

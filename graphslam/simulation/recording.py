@@ -1,7 +1,7 @@
 """The log of one visit: all sensors of all robots sampled, with noise, stamped and written."""
 
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,6 +20,7 @@ from graphslam.simulation.laser import (
     noise_free_scans,
     noisy_ranges,
     swept_scans,
+    told_mount,
 )
 from graphslam.simulation.raycast import NO_SURFACE, Hits
 from graphslam.simulation.scenario import Body, Encoders, Gyroscope, Laser, Scenario, SightingSensor
@@ -61,7 +62,7 @@ class Recording:
     path: Path
     counts: Mapping[str, int]
     robots: Mapping[str, RobotSummary]
-    scans: Mapping[str, NoiseFreeScans]
+    scans: Mapping[str, NoiseFreeScans]  # of the first laser of each robot
 
 
 def sensor_rng(seed: int, *names: str) -> np.random.Generator:
@@ -78,18 +79,21 @@ def record_visit(scenario: Scenario, visit: SimulatedVisit, path: Path, seed: in
     events: list[Event] = []
     robots: dict[str, RobotSummary] = {}
     ideal_scans: dict[str, NoiseFreeScans] = {}
+    all_scans: list[NoiseFreeScans] = []
     sighted: set[str] = set()
     for name, actor in visit.actors.items():
         this = _Recorder(name, actor, visit, seed)
         wheels, end_m = _wheels(this)
         events += _gyroscope(this)
-        scans, ideal = _scans(this)
+        recorded = [_scans(this, *laser) for laser in actor.robot.scanners.items()]
+        scans = [event for own, _ in recorded for event in own]
         seen = list(_sightings(this))
         events += [*wheels, *_truth(this, scenario.truth_period_s), *scans]
         events += [event for event, _ in seen]
-        if ideal is not None:
-            events += _beam_associations(this, ideal, scans)
+        for own, ideal in recorded[:1]:
+            events += _beam_associations(this, ideal, own)
             ideal_scans[name] = ideal
+        all_scans += [ideal for _, ideal in recorded]
         events += _sighting_associations(this, seen)
         sighted |= {target for _, target in seen if target}
         robots[name] = RobotSummary(
@@ -99,9 +103,9 @@ def record_visit(scenario: Scenario, visit: SimulatedVisit, path: Path, seed: in
     first_ns = min(event.stamp_ns for event in events)
     with LogWriter(path, _notes(scenario, visit, seed)) as log:
         for name, actor in visit.actors.items():
-            if actor.robot.laser is not None:
-                log.mount(name, first_ns, laser_mount(actor.robot.laser))
-        for landmark in _landmarks(visit, ideal_scans, sighted):
+            for sensor, laser in actor.robot.scanners.items():
+                log.mount(name, first_ns, told_mount(laser), sensor)
+        for landmark in _landmarks(visit, all_scans, sighted):
             log.true_landmark(first_ns, **landmark)
         for event in events:
             event.write(log)
@@ -187,11 +191,8 @@ def _write_imu(topic: str, stamp_ns: int, data: bytes, log: LogWriter) -> None:
     log.encoded(topic, IMU, data, stamp_ns)
 
 
-def _scans(this: _Recorder) -> tuple[list[Event], NoiseFreeScans | None]:
-    """The laser's messages, and the noise-free scans."""
-    laser = this.actor.robot.laser
-    if laser is None:
-        return [], None
+def _scans(this: _Recorder, name: str, laser: Laser) -> tuple[list[Event], NoiseFreeScans]:
+    """A laser's messages, and the noise-free scans."""
     times, at = this.times(laser)
     poses = this.actor.drive.at(times).poses
     world = this.visit.world
@@ -201,7 +202,7 @@ def _scans(this: _Recorder) -> tuple[list[Event], NoiseFreeScans | None]:
         )
     else:
         hits = noise_free_scans(poses, laser, world, this.others(times))
-    ranges = noisy_ranges(hits, _biases(this, laser), laser, this.rng("laser"))
+    ranges = noisy_ranges(hits, _biases(this, laser), laser, this.rng(name))
     fan = beam_fan(laser)
     events = [
         Event.of(
@@ -214,6 +215,7 @@ def _scans(this: _Recorder) -> tuple[list[Event], NoiseFreeScans | None]:
             range_min_m=laser.range_min_m,
             range_max_m=laser.range_max_m,
             beam_period_s=laser.beam_period_s,
+            sensor=name,
         )
         for t, row in zip(at, ranges, strict=True)
     ]
@@ -299,11 +301,11 @@ def _sighting_associations(this: _Recorder, seen: list[tuple[Event, str]]) -> It
 
 
 def _landmarks(
-    visit: SimulatedVisit, scans: Mapping[str, NoiseFreeScans], sighted: set[str]
+    visit: SimulatedVisit, scans: Iterable[NoiseFreeScans], sighted: set[str]
 ) -> Iterator[dict[str, Any]]:
     """Fields of true landmarks: the surfaces that a noise-free beam or a sighting reached."""
     world, reached = visit.world, set(sighted)
-    for ideal in scans.values():
+    for ideal in scans:
         numbers = np.unique(ideal.hits.surfaces)
         inside = (numbers != NO_SURFACE) & (numbers < len(world.names))  # the rest are robots
         reached |= {world.names[number] for number in numbers[inside]}

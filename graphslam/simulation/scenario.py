@@ -194,10 +194,12 @@ class Gyroscope(Sensor):
 class Laser(Sensor):
     """A planar laser like the SICK LMS 200; beams from -field/2 to +field/2.
 
-    mount_m, mount_deg: its pose in the base frame. range_sigma_m: white noise. bias_sigma_m: sigma
-    of the constant range bias of a material. dropout_share: share of beams without a return;
-    spurious_share: with a return from a random range in front of the surface. mixed_share: share of
-    the beams at a range discontinuity above mixed_gap_m that return a range between its two sides.
+    mount_m, mount_deg: its pose in the base frame; mount_error_m, mount_error_deg: what the
+    transform in the log adds to it, along the axes of the base. range_sigma_m: white noise.
+    bias_sigma_m: sigma of the constant range bias of a material. dropout_share: share of beams
+    without a return; spurious_share: with a return from a random range in front of the surface.
+    mixed_share: share of the beams at a range discontinuity above mixed_gap_m that return a range
+    between its two sides.
     resolution_m: ranges are rounded to multiples of it; 0 = not rounded. sweep_s: time from the
     first beam to the last, which are measured one after the other; 0 = all at once.
     """
@@ -209,6 +211,8 @@ class Laser(Sensor):
     range_max_m: float = field(default=8.0, metadata=POSITIVE)
     mount_m: Point = (0.0, 0.0)
     mount_deg: float = 0.0
+    mount_error_m: Point = (0.0, 0.0)
+    mount_error_deg: float = 0.0
     range_sigma_m: float = field(default=0.015, metadata=NOT_NEGATIVE)
     bias_sigma_m: float = field(default=0.01, metadata=NOT_NEGATIVE)
     dropout_share: float = field(default=0.0, metadata=SHARE)
@@ -269,6 +273,7 @@ class Robot(DrivePlan):
     """A robot: its drive, outline, limits of motion, clock and sensors.
 
     corner_m: distance before a corner of the drive at which the robot leaves the straight line.
+    lasers: more lasers, or all of several, by name; each is on a topic of its own.
     """
 
     body: Body
@@ -280,7 +285,13 @@ class Robot(DrivePlan):
     encoders: Encoders = field(default_factory=Encoders)
     gyroscope: Gyroscope | None = None
     laser: Laser | None = None
+    lasers: Mapping[str, Laser] = field(default_factory=dict)
     sightings: tuple[SightingSensor, ...] = ()
+
+    @property
+    def scanners(self) -> dict[str, Laser]:
+        """All lasers by name; ``laser`` is the first."""
+        return ({} if self.laser is None else {"laser": self.laser}) | dict(self.lasers)
 
 
 # ---------------------------------------------------------------- a second visit

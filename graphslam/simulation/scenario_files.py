@@ -22,6 +22,8 @@ from graphslam.simulation.scenario_names import SCENARIOS
 from graphslam.simulation.scenario_parser import build
 from graphslam.simulation.sightings import LANDMARKS, ROBOTS
 
+_NAME = r"[A-Za-z][A-Za-z0-9_]*"
+
 
 def load_scenario(scenario: str | Path) -> Scenario:
     """Load a scenario by its name in `SCENARIOS`, or from a TOML file.
@@ -94,7 +96,7 @@ def _later(later: LaterVisit, scenario: Scenario) -> Iterator[str]:
 
 
 def _robot(name: str, robot: Robot, scenario: Scenario) -> Iterator[str]:
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+    if not re.fullmatch(_NAME, name):
         yield ": a name is letters, digits and _ (it becomes part of ROS topics)"
     body = robot.body
     if bool(body.radius_m) == bool(body.length_m and body.width_m):
@@ -105,7 +107,11 @@ def _robot(name: str, robot: Robot, scenario: Scenario) -> Iterator[str]:
         yield ".encoders: one of odometry and joint_states must be true"
     yield from _drive(robot.drive)
     if robot.laser is not None:
-        yield from _laser(robot.laser)
+        yield from (f".laser{problem}" for problem in _laser(robot.laser))
+    for sensor_name, laser in robot.lasers.items():
+        if not re.fullmatch(_NAME, sensor_name) or sensor_name in ("laser", "base_link"):
+            yield f".lasers.{sensor_name}: a name is letters, digits and _, and not laser"
+        yield from (f".lasers.{sensor_name}{problem}" for problem in _laser(laser))
     for number, sensor in enumerate(robot.sightings):
         for problem in _sighting_sensor(sensor, scenario):
             yield f".sightings[{number}]{problem}"
@@ -119,9 +125,9 @@ def _drive(legs: tuple[Leg, ...]) -> Iterator[str]:
 
 def _laser(laser: Laser) -> Iterator[str]:
     if abs(laser.field_deg / laser.step_deg - (laser.beams - 1)) > 1e-9:
-        yield ".laser: field_deg is not a multiple of step_deg"
+        yield ": field_deg is not a multiple of step_deg"
     if laser.range_min_m >= laser.range_max_m:
-        yield ".laser.range_min_m: is not below range_max_m"
+        yield ".range_min_m: is not below range_max_m"
 
 
 def _sighting_sensor(sensor: SightingSensor, scenario: Scenario) -> Iterator[str]:

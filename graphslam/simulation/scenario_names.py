@@ -14,6 +14,7 @@ SCENARIOS: dict[str, Path] = {
         "robots-in-scans",
         "change",
         "office-loop",
+        "two-lasers",
         "long-corridor",
         "forest",
         "fleet",

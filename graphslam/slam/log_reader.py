@@ -39,10 +39,7 @@ def is_scan_log(log: LogSet, config: Config) -> bool:
     """
     records = {topic.record for topic in log.topics}
     return (
-        config.backend.name == "batch"
-        and config.backend.reoptimise
-        and config.keyframe.mode != "all"
-        and config.front_end.name != "none"
+        config.tracks_scans
         and not records & {Sighting, RelativePose}
         and len(log.robots) == 1
         and log.has_scans(log.robots[0])

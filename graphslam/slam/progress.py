@@ -28,7 +28,7 @@ def of_all(log: LogSet, progress: Callable[[int, int], None] | None) -> Progress
     """``progress`` with the number of messages that are read altogether."""
     if progress is None:
         return lambda _done: None
-    total = log.count((Truth, TrueLandmark))
+    total = log.count((Truth, TrueLandmark)) + sum(t.count for t in log.further_lasers)
     return lambda done: progress(done, total)
 
 

@@ -15,6 +15,7 @@ from graphslam.logs import LogSet
 from graphslam.logs.stated_noise import StatedNoise
 from graphslam.odometry.noise_estimation import rates_of, with_rates
 from graphslam.odometry.preintegration import Track
+from graphslam.odometry.several_lasers import SeveralLasersTrack
 from graphslam.perception.robot_outlines import outline_of
 
 Settings = TypeVar("Settings", KeyframeConfig, OdometryConfig, RobotConfig)
@@ -43,20 +44,19 @@ def make_tracks(log: LogSet, config: Config) -> dict[str, Track]:
     # invented stamps are those of an order, not of clocks
     late = Sighting in kinds and not kinds & {Scan, RelativePose}
     late &= not log.notes.get("stamps", "").startswith("invented")
-    return {
-        name: Track(
-            without_laser_calibration(
-                with_stated_noise(
-                    odometry_settings(config.odometry, log.notes), log.stated_noise(name)
-                ),
-                log.has_scans(name),
-            ),
-            robot_settings(name, config, log.notes),
-            mounted=True,
-            late=late,
+    tracks: dict[str, Track] = {}
+    for name in log.robots:
+        odometry = with_stated_noise(
+            odometry_settings(config.odometry, log.notes), log.stated_noise(name)
         )
-        for name in log.robots
-    }
+        odometry = without_laser_calibration(odometry, log.has_scans(name))
+        robot = robot_settings(name, config, log.notes)
+        further = [sensor for sensor in log.sensors(name).values() if sensor]
+        if further and config.tracks_scans:
+            tracks[name] = SeveralLasersTrack(odometry, robot, further)
+        else:
+            tracks[name] = Track(odometry, robot, mounted=True, late=late)
+    return tracks
 
 
 def with_stated_noise(config: OdometryConfig, stated: StatedNoise | None) -> OdometryConfig:

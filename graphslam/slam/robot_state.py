@@ -143,6 +143,7 @@ class RobotState:
                 that revises no state does not revise the motion between states either.
         """
         stamps, times, laser = self._report_times()
+        states = self.track.at_first_laser(states)
         ties = None
         late_ns = 0
         if self.scans:

@@ -9,7 +9,7 @@ import itertools
 import time
 from collections import Counter, defaultdict, deque
 from collections.abc import Generator, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from graphslam.core.config import Config
 from graphslam.core.geometry import Array, between, compose, inverse
 from graphslam.core.motion_models import Calibration
 from graphslam.core.observation_arrays import ObservationArrays
-from graphslam.core.record import Record
+from graphslam.core.record import Record, replace
 from graphslam.core.records import Closure, Message, Motion, Scan
 from graphslam.logs import LogSet
 from graphslam.logs.log_set import ReadReport
@@ -31,6 +31,7 @@ from graphslam.odometry.scan_odometry import (
     points_off_lines,
     suspect_motions,
 )
+from graphslam.odometry.several_lasers import SeveralLasersTrack, last_part
 from graphslam.odometry.sweep_motion import undistorted_by_track
 from graphslam.perception.dynamic_objects import dynamic_returns_of_all
 from graphslam.perception.front_ends import observe_block
@@ -143,23 +144,34 @@ class _Messages(Iterator[Message]):
         return self._held.popleft() if self._held else next(self._messages)
 
 
+@dataclass(slots=True, eq=False)
+class _Laser:
+    """What is kept of one laser: its scans that were used or repeated, and the last sweeps."""
+
+    run: RobotState
+    earlier: deque[tuple[int, Sweep]] = field(default_factory=lambda: deque(maxlen=COMPARED_SCANS))
+
+
 class _Reader:
     """What is kept from block to block."""
 
     def __init__(self, log: LogSet, config: Config, robot: str) -> None:
         self._log, self._config, self._robot = log, config, robot
         self.run = RobotState(make_tracks(log, config)[robot])
+        #: by laser: what the selection of its keyframes needs; the first one's is the robot's
+        sensors = log.sensors(robot).values()
+        self._lasers = {s: _Laser(RobotState(self.run.track) if s else self.run) for s in sensors}
         self._matches_scans = config.odometry.scan_matching != "off"
         self._keyframes = KeyframeSelector(config.keyframe)
         self._state_ns: int | None = None
+        self._state_of = ""  # the laser whose state is the last one
         self._last_scan: tuple[int, Array] | None = None
-        self._earlier: deque[tuple[int, Sweep]] = deque(maxlen=COMPARED_SCANS)
         self._counts: Counter[str] = Counter()
         self._dropped: Counter[str] = Counter()
         self._removed_returns: Counter[str] = Counter()
         self._seconds: dict[str, float] = defaultdict(float)
         self._span_ns = 1 << 63, 0
-        self._messages = _Messages(iter(log.messages(TRUE_RECORDS)))
+        self._messages = _Messages(iter(log.messages(TRUE_RECORDS, all_lasers=True)))
 
     def read_ahead(self) -> None:
         """Read some of the messages that later blocks are made of."""
@@ -168,6 +180,9 @@ class _Reader:
 
     def read_log(self) -> ReadLog:
         """What is known in the end."""
+        for laser in self._lasers.values():
+            if laser.run is not self.run:
+                self.run.repeats.left_out += laser.run.repeats.left_out
         return ReadLog(
             self.run, self._span_ns, self._counts, self._dropped, self._removed_returns,
             self._seconds, self._log.report(),
@@ -202,34 +217,60 @@ class _Reader:
             )  # fmt: skip
 
     def _of_block(self, block: Sequence[Message]) -> list[ScanKeyframe]:
-        run, config = self.run, self._config
+        config, track = self._config, self.run.track
         scans = [message for message in block if isinstance(message, Scan)]
-        run.scans += [(s.stamp_ns, s.time_ns, s.mount) for s in scans]
+        self.run.scans += [(s.stamp_ns, s.time_ns, s.mount) for s in scans if not s.sensor]
         self._counts["scans"] += len(scans)
-        used = undistorted_by_track(self._keyframes.used_scans(scans, run), run.track)
+        each: list[Scan] = []
+        for sensor, laser in self._lasers.items():
+            own = [scan for scan in scans if scan.sensor == sensor]
+            each += undistorted_by_track(self._keyframes.used_scans(own, laser.run), track)
+        used = self._in_order(each)
         if not used:
             return []
         with timed(self._seconds, "motions"):
             motions = self._motions(used)
         with timed(self._seconds, "front end"):
-            used, sweeps = self._sweeps(used)
-            found = observe_block(used, sweeps, config.front_end)
-            seen = [
-                o.from_mounts(np.broadcast_to(s.mount, (len(o), 3)))
-                for o, s in zip(found, used, strict=True)
-            ]
+            seen: list[ObservationArrays] = [ObservationArrays.of(())] * len(used)
+            for sensor, laser in self._lasers.items():
+                at = [n for n, scan in enumerate(used) if scan.sensor == sensor]
+                own, sweeps = self._sweeps([used[n] for n in at], laser)
+                found = observe_block(own, sweeps, config.front_end) if at else []
+                for n, scan, o in zip(at, own, found, strict=True):
+                    used[n] = scan
+                    seen[n] = o.from_mounts(np.broadcast_to(scan.mount, (len(o), 3)))
             points = [scan_points(scan, config.front_end.max_range_m) for scan in used]
         self._counts["observations"] += sum(map(len, seen))
         matched: list[Closure | None] = [None] * len(used)
         if self._matches_scans:
             with timed(self._seconds, "scan matching"):
-                motions, matched = self._matched(used, motions, seen, points)
+                motions, matched = self._matched_of_first(used, motions, seen, points)
         return [
             ScanKeyframe(s.time_ns, s.mount, motion, image, returns, match)
             for s, motion, image, returns, match in zip(
                 used, motions, seen, points, matched, strict=True
             )
         ]
+
+    def _in_order(self, used: list[Scan]) -> list[Scan]:
+        """Scans of all lasers in the order of time, each at that of its state.
+
+        Those that two lasers measure at one time make two states, one of them 1 ns later.
+        """
+        if len(self._lasers) == 1:
+            return used
+        last_ns, last_of, found = self._state_ns or 0, self._state_of, []
+        for one in sorted(used, key=lambda scan: scan.time_ns):
+            time_ns = max(one.time_ns, last_ns + (one.sensor != last_of))
+            last_ns, last_of = time_ns, one.sensor
+            found.append(replace(one, time_ns=time_ns))
+        self._state_of = last_of
+        track = self.run.track
+        if isinstance(track, SeveralLasersTrack):
+            for sensor in filter(None, self._lasers):
+                times = [scan.time_ns for scan in found if scan.sensor == sensor]
+                track.add_states(sensor, np.array(times, dtype=np.int64))
+        return found
 
     def _motions(self, used: Sequence[Scan]) -> list[Motion | None]:
         """The motion to each scan from the state before; None where a state is there already."""
@@ -241,20 +282,20 @@ class _Reader:
             for k in range(len(used))
         ]
 
-    def _sweeps(self, used: list[Scan]) -> tuple[list[Scan], list[Sweep]]:
-        """The scans and their sweeps without the returns of moving objects.
+    def _sweeps(self, used: list[Scan], laser: "_Laser") -> tuple[list[Scan], list[Sweep]]:
+        """The scans of a laser and their sweeps without the returns of moving objects.
 
         Those are free-standing objects where earlier scans saw free space.
         """
         max_range_m = self._config.front_end.max_range_m
         sweeps = [make_sweep(scan, max_range_m) for scan in used]
-        past = list(self._earlier)
-        self._earlier += [(s.time_ns, sweep) for s, sweep in zip(used, sweeps, strict=True)]
+        past = list(laser.earlier)
+        laser.earlier += [(s.time_ns, sweep) for s, sweep in zip(used, sweeps, strict=True)]
         every = [sweep for _, sweep in past] + sweeps
-        if self._config.front_end.dynamic_objects == "keep" or not every[0].step_rad:
+        if not used or self._config.front_end.dynamic_objects == "keep" or not every[0].step_rad:
             return used, sweeps
         times = np.array([t for t, _ in past] + [s.time_ns for s in used], dtype=np.int64)
-        poses = self.run.track.mounted_pose(times)
+        poses = self.run.track.mounted_pose(times, used[0].sensor)
         mounts = np.array([s.mount for s in used])
         mounts = np.concatenate([np.repeat(mounts[:1], len(past), axis=0), mounts])
         views = []
@@ -267,6 +308,38 @@ class _Reader:
                 used[n] = without_returns(used[n], sweeps[n], gone)
                 sweeps[n] = make_sweep(used[n], max_range_m)
         return used, sweeps
+
+    def _matched_of_first(
+        self,
+        used: Sequence[Scan],
+        motions: list[Motion | None],
+        seen: Sequence[ObservationArrays],
+        points: Sequence[Array],
+    ) -> tuple[list[Motion | None], list[Closure | None]]:
+        """`_matched` of the scans of the first laser, whichever states are between them.
+
+        Where they contradict the odometry, the last of the motions between them is corrected.
+        """
+        first = [n for n, scan in enumerate(used) if not scan.sensor]
+        track, own = self.run.track, [motions[n] for n in first]
+        before_ns = -1 if self._last_scan is None else self._last_scan[0]
+        begins = [before_ns, *(used[n].time_ns for n in first)]
+        for k, (motion, begin) in enumerate(zip(own, begins, strict=False)):
+            if motion is not None and begin >= 0 and begin != motion.start_ns:
+                own[k] = track.motion(begin, motion.end_ns)
+        if not first:
+            return motions, [None] * len(used)
+        checked, matched = self._matched(
+            [used[n] for n in first], own, [seen[n] for n in first], [points[n] for n in first]
+        )
+        matches: list[Closure | None] = [None] * len(used)
+        for n, begin, better, match in zip(first, begins, checked, matched, strict=False):
+            matches[n], last = match, motions[n]
+            if better is None or last is None or last.start_ns == begin:
+                motions[n] = better
+            elif better.from_scans:
+                motions[n] = last_part(better, track.motion(begin, last.start_ns), last)
+        return motions, matches
 
     def _matched(
         self,

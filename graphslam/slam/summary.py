@@ -10,15 +10,20 @@ from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
 
+import numpy as np
+
 from graphslam import __version__
 from graphslam.core.config import RobotConfig
 from graphslam.core.config_io import dump_config
+from graphslam.core.geometry import compose
 from graphslam.core.records import Estimate
 from graphslam.estimation.clock_calibration import ClockEstimate
+from graphslam.logs import LogSet
+from graphslam.odometry.several_lasers import SeveralLasersTrack
 from graphslam.slam.log_pass import LogPass
 from graphslam.slam.motion_noise import understated_noise
 from graphslam.slam.robot_settings import robot_settings
-from graphslam.slam.robot_state import span_warnings
+from graphslam.slam.robot_state import RobotState, span_warnings
 
 FORMAT = "graphslam-result-1"
 
@@ -118,6 +123,7 @@ def summarise(
             for robot, run in runs.items()
             for name, (value, sigma, observable) in run.calibration_found().items()
         },
+        "lasers": {robot: lasers_used(log, robot, run) for robot, run in runs.items()},
         "odometry": {
             robot: {
                 "source": "scans" if robot in log.without_odometry else run.track.source,
@@ -145,6 +151,27 @@ def summarise(
             *(understated_noise(pipeline.steps, estimate) if is_relative(pipeline) else ()),
         ],
     }
+
+
+def lasers_used(log: LogSet, robot: str, run: RobotState) -> list[dict[str, Any]]:
+    """The lasers of a robot, the first one first: how they are mounted, as found and as told."""
+    lasers = []
+    for topic, sensor in log.sensors(robot).items():
+        if sensor and not isinstance(run.track, SeveralLasersTrack):
+            continue
+        error, late_ns = run.track.laser(sensor)
+        told, no_return_m = log.mount(topic), log.no_return_m(topic)
+        lasers.append(
+            {
+                "topic": topic,
+                "name": sensor,
+                "mount": compose(error, told).tolist(),
+                "mount_in_log": told.tolist(),
+                "latency_s": 1e-9 * late_ns,
+                "no_return_m": no_return_m if np.isfinite(no_return_m) else None,
+            }
+        )
+    return lasers
 
 
 #: factor on a stated variance from which the log contradicts it
@@ -213,6 +240,12 @@ def run_warnings(pipeline: LogPass) -> list[str]:
         and replace(robot_settings(name, pipeline.config, pipeline.log.notes), outline=())
         == RobotConfig()
     ]
+    if not pipeline.config.tracks_scans:
+        warnings += [
+            f"{topic.robot}: {topic.name} is not used: of several lasers only backend batch uses "
+            "more than one"
+            for topic in pipeline.log.further_lasers
+        ]
     warnings += [
         f"{a} and {b}: their identities were swapped in all sightings; corrected"
         for a, b in known.identities.items()
