@@ -104,6 +104,25 @@ class LogSet:
         contexts = {name: self._contexts[name] for name in own}
         return {name: c.sensor for name, c in contexts.items() if c.robot == robot}
 
+    def without_lasers(self, wrong: Mapping[str, float]) -> "LogSet":
+        """The logs without some of the further lasers, which is said.
+
+        ``wrong``: name -> share of its motions that its scans contradict.
+        """
+        lines, kept = [], []
+        for topic in self.further_lasers:
+            name = self._contexts[topic.name].sensor
+            if name in wrong:
+                lines.append(
+                    f"{topic.robot}: {topic.name} is not used: its scans contradict the mount in "
+                    f"{100 * wrong[name]:.0f} % of its motions; check its transform, or --set "
+                    f"'robots.{topic.robot}.lasers.{name}=[X, Y, YAW]' (m, m, rad)"
+                )
+            else:
+                kept.append(topic)
+        opening = self.warnings[: self._opening_warnings]
+        return replace(self, warnings=[*opening, *lines], further_lasers=tuple(kept))
+
     def mount(self, topic: str) -> Array:
         """Pose (3,) of a laser in the base frame according to the log; of its first frame."""
         return next(iter(self._contexts[topic].mounts.values()))

@@ -49,6 +49,7 @@ _CLASSES = (
     ("odometry.increment_sums", "PathSums"),
     ("odometry.online_calibration", "Calibrator"),
     ("odometry.preintegration", "Track"),
+    ("odometry.several_lasers", "SeveralLasersTrack"),
     ("slam.log_pass", "PriorKnowledge"),
 )
 #: what a pass has found when all of its log is read
@@ -56,6 +57,7 @@ _FOUND = (
     "all_named", "counts", "dropped", "first_ns", "innovations", "keyframe_scans", "landmarks",
     "last_ns", "noise", "offers", "paths", "rejected", "removed_returns", "robot_sightings", "runs",
     "seconds", "sources", "step_ms", "steps", "unrelated_sightings",
+    "wrong_lasers",
 )  # fmt: skip
 
 

@@ -27,6 +27,9 @@ def solve_scan_log(
 ) -> FinishedPass:
     """A log of scans as one batch; ``ahead``: the keyframes, if they are read already.
 
+    Where the scans of a further laser show that it is not where its mount says, all is done again
+    without it.
+
     Raises:
         LogError: no message of the log could be used.
         EstimationError: the estimate is indeterminate, or a robot's start is unknown.
@@ -36,6 +39,9 @@ def solve_scan_log(
     )
     scan_log = ScanLog(log, config, known)
     kept.read_pass(scan_log, partial(scan_log.run, progress, ahead))
+    if scan_log.wrong_lasers:
+        scan_log = ScanLog(log.without_lasers(scan_log.wrong_lasers), config, known)
+        kept.read_pass(scan_log, partial(scan_log.run, progress))
     if not scan_log.steps:
         raise LogError(f"{log.files[0].path}: nothing in it could be used; see `graphslam info`")
     with timed(scan_log.seconds, "final optimisation"):

@@ -96,6 +96,8 @@ class ScanLog(LogPass):
         self.paths = {self._robot: self._path}
         self._tracker: LocalTracker | None = None
         self._anchor_m = 0.0
+        #: see `ReadLog`
+        self.wrong_lasers: dict[str, float] = {}
 
     def run(self, progress: Progress, ahead: Reading | None = None) -> None:
         """Take in every message of the log; ``progress`` gets the number of messages read.
@@ -192,6 +194,7 @@ class ScanLog(LogPass):
     def _finish(self, read: ReadLog, calibration: Calibration | None) -> None:
         """The end of the log: the last landmarks, and an anchor at the last state."""
         tracker, path, run = self._tracker, self._path, read.run
+        self.wrong_lasers = read.wrong_lasers
         self.first_ns, self.last_ns = read.span_ns
         self.counts.update(read.counts)
         self.dropped.update(read.dropped)

@@ -90,7 +90,7 @@ def test_the_last_part_of_a_corrected_motion_completes_it():
     track = driven()
     first, last = track.motion(FRONT_NS[0], REAR_NS[0]), track.motion(REAR_NS[0], FRONT_NS[1])
     whole = replace(track.motion(FRONT_NS[0], FRONT_NS[1]), from_scans=True)
-    whole = replace(whole, delta=whole.delta + [0.1, -0.05, 0.02])
+    whole = replace(whole, delta=whole.delta + np.array([0.1, -0.05, 0.02]))
     part = last_part(whole, first, last)
     np.testing.assert_allclose(compose(first.delta, part.delta), whole.delta, atol=1e-12)
     assert part.from_scans and not part.d_delta_d_calibration.any()
