@@ -49,8 +49,8 @@ from graphslam.slam.synchronisation import synchronise
 BLOCK, FIRST_BLOCK = 2000, 100
 #: a further laser is not where its mount says if its scans contradict so much more of its motions
 #: than the first one's do. In the lab it is up to 0.27 for mounts that calibration corrects (0.3 m,
-#: 10°) and 0.98 for those turned by 90° or 180°; 0.55 by 180° in an office, where corridors look the
-#: same both ways
+#: 10°) and 0.98 for those turned by 90° or 180°; in an office, whose corridors look the same both
+#: ways, 0.55 by 180°
 WRONG_LASER_SHARE = 0.4
 #: messages that are read while nobody waits for them, at most: some 20 MB
 READ_AHEAD = 8000
