@@ -11,6 +11,7 @@ START_NS = 1_700_000_000 * S + 123_456_789
 BEAMS = np.radians(np.arange(-90, 91.0))
 SCAN = {"angle_min_rad": float(BEAMS[0]), "angle_step_rad": np.radians(1), "range_max_m": 20.0}
 MOUNT = np.array([0.2, 0.0, 0.0])
+REAR = np.array([-0.2, 0.05, np.pi])
 ROOM = rectangles((0, 0, 10, 8), (4, 3.5, 6, 4.5))
 SECONDS, SCANS = 30, 60
 
@@ -23,15 +24,19 @@ def true_pose(seconds):
     )
 
 
-def drive(path, *, seconds=SECONDS, robot="robot", ranges=lambda found, _k: found, truth=True):
+def drive(
+    path, *, seconds=SECONDS, robot="robot", ranges=lambda found, _k: found, truth=True, rear=False
+):
     """A log of the room with two scans a second; odometry errs by 3 % and drifts by 0.02 rad/m.
 
-    ``ranges`` may spoil scan number k.
+    ``ranges`` may spoil scan number k. ``rear``: with a second laser, at `REAR`.
     """
     rng = np.random.default_rng(7)
     odometry = np.zeros(3)
     with LogWriter(path) as log:
         log.mount(robot, START_NS, MOUNT)
+        if rear:
+            log.mount(robot, START_NS, REAR, "rear")
         for k in range(seconds * 10 + 1):
             stamp, pose = START_NS + k * S // 10, true_pose(k / 10)
             if k:
@@ -47,4 +52,8 @@ def drive(path, *, seconds=SECONDS, robot="robot", ranges=lambda found, _k: foun
                     0, 0.01, len(BEAMS)
                 )
                 log.scan(robot, stamp + 7, ranges(found, k // 5), **SCAN)
+            if rear and k % 6 == 2:
+                found = cast(ROOM, BEAMS, compose(pose, REAR), 30.0)
+                found += rng.normal(0, 0.01, len(BEAMS))
+                log.scan(robot, stamp, found, sensor="rear", **SCAN)
     return path

@@ -40,6 +40,7 @@ def logs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("logs")
     return {
         "scans": drive(folder / "room.mcap", seconds=8),
+        "two lasers": drive(folder / "lasers.mcap", seconds=8, rear=True),
         "sightings": sightings(folder / "sightings.mcap"),
     }
 
@@ -73,6 +74,7 @@ def killed(monkeypatch):
     ("kind", "settings"),
     [
         ("scans", {}),
+        ("two lasers", {}),
         ("sightings", {"start": {"poses": {"a": [0, 0, 0]}}}),
         ("sightings", {"association": {"identities": "ignore"}, "backend": "isam2"}),
     ],
