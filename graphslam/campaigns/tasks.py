@@ -27,7 +27,7 @@ MEMORY_SHARE = 0.9
 #: new objects between two garbage collections, as in commands
 COLLECTION_INTERVAL = 100_000
 #: s; garbage is collected after tasks that took longer: it takes a twentieth of a second
-LONG_S = 1.0
+LONG_S = 5.0
 
 _one_at_a_time = threading.Lock()
 
