@@ -1,7 +1,7 @@
-"""Many logs, each smoothed by itself: a folder of results and one overview of them.
+"""Many logs, each smoothed or compared by itself: a folder of results and one overview of them.
 
-The folder holds results/NAME of each log (a result folder with row.json and map.svg), overview.json
-and report.html. Nothing else is kept: what is done is known by the rows.
+The folder holds results/NAME of each log (a folder as of `smooth` or `compare`, with row.json and
+map.svg), overview.json and report.html. Nothing else is kept: what is done is known by the rows.
 """
 
 import os
@@ -25,7 +25,6 @@ from graphslam.campaigns.one_log import (
     identify,
     is_same_work,
     read_row,
-    smooth_log,
 )
 from graphslam.campaigns.tasks import Outcome, Task, Workers, code_version, described
 from graphslam.core.config import Config
@@ -33,9 +32,12 @@ from graphslam.core.errors import LogError, OutputError
 from graphslam.logs.find_recordings import find_recordings
 from graphslam.results.file_formats import read_json, to_json
 from graphslam.results.report_batch import batch_page
+from graphslam.results.report_comparisons import comparisons_page
 
 FORMAT = "graphslam-batch-1"
 OVERVIEW, PAGE, LOCK = "overview.json", "report.html", ".lock"
+#: what is done with each log -> the page of all
+PAGES = {"smooth": batch_page, "compare": comparisons_page}
 #: s; the overview is not written more often while logs are done
 WRITE_INTERVAL_S = 20.0
 
@@ -46,12 +48,14 @@ def run_batch(
     directory: Path,
     workers: Workers,
     *,
+    backends: Sequence[str] = (),
+    mode: str = "replay",
     retry: bool = False,
     force: bool = False,
     progress: Callable[[int, int], None] = lambda _done, _all: None,
     announce: Callable[[str], None] = lambda _text: None,
 ) -> dict[str, Any]:
-    """Smooth every recording in ``places`` that is not done, and return the overview.
+    """Smooth every recording in ``places`` that is not done, or compare; returns the overview.
 
     A log that fails has its error in its row, and the others go on. What is done stays, however
     this ends.
@@ -61,6 +65,8 @@ def run_batch(
         config: settings, the same for all.
         directory: the folder of the batch, made if necessary.
         workers: who does it.
+        backends: to be compared on each log, see `parse_variants`; none: logs are smoothed.
+        mode: of the comparison.
         retry: do again what failed.
         force: do everything again.
         progress: called with the number of logs that are done, and of all.
@@ -68,14 +74,23 @@ def run_batch(
 
     Raises:
         LogError: there is no recording.
+        ConfigError: a back end is unknown.
         OutputError: the folder holds something else, another process works on it, or it cannot be
             written; also see `run_tasks`.
     """
     began = time.perf_counter()
     found = find_recordings(places, without=directory)
     root = os.fspath(directory.resolve())
-    tasks = [LogTask(name, os.fspath(path), root, config, force) for name, path in found.recordings]
-    with _locked(directory):
+    if backends:  # a wrong one is said before any work
+        from graphslam.evaluation.compare_variants import parse_variants  # noqa: PLC0415
+
+        parse_variants(backends, config)
+    specs, mode = tuple(backends), mode if backends else ""
+    tasks = [
+        LogTask(name, os.fspath(path), root, config, force, specs, mode)
+        for name, path in found.recordings
+    ]
+    with _locked(directory, "compare" if backends else "smooth"):
         rows = {} if force else {task.name: row for task in tasks if (row := _kept(task, retry))}
         missing = [task for task in tasks if task.name not in rows]
         missing.sort(key=_size, reverse=True)  # the longest first: none is left over at the end
@@ -84,7 +99,7 @@ def run_batch(
         progress(len(rows), len(tasks))
         by_label = {task.name: task for task in missing}
         try:
-            jobs = [Task(task.name, smooth_log, (task,)) for task in missing]
+            jobs = [Task(task.name, make_result, (task,)) for task in missing]
             for outcome in run_tasks(jobs, workers, overview.note_workers):
                 row = _row(by_label[outcome.task.label], outcome)
                 overview.add(row)
@@ -96,13 +111,22 @@ def run_batch(
     return content
 
 
-def is_batch(directory: Path) -> bool:
-    """Whether a folder is that of a batch."""
+def make_result(task: LogTask) -> Row:
+    """See `work_on_log`; a worker imports what it needs for that, who asks for it does not."""
+    from graphslam.campaigns.log_results import work_on_log  # noqa: PLC0415
+
+    return work_on_log(task)
+
+
+def kind_of(directory: Path) -> str | None:
+    """What a batch does that a folder is of, ``smooth`` or ``compare``; None for other folders."""
     try:
         found = read_json(directory / OVERVIEW)
     except OutputError:
-        return False
-    return isinstance(found, dict) and found.get("format") == FORMAT
+        return None
+    if not isinstance(found, dict) or found.get("format") != FORMAT:
+        return None
+    return str(found.get("kind"))
 
 
 def _kept(task: LogTask, retry: bool) -> Row | None:
@@ -165,9 +189,10 @@ class _Overview:
             for task in self._tasks
         ]
         done = [row for row in logs if row["status"] == "done"]
-        verdicts = Counter(row["verdict"] for row in done)
+        verdicts = Counter(row.get("verdict") for row in done)
         return {
             "format": FORMAT,
+            "kind": "compare" if self._tasks[0].backends else "smooth",
             "version": __version__,
             "code": code_version(),
             "counts": {
@@ -177,7 +202,7 @@ class _Overview:
                 **{name: verdicts[name] for name in ("good", "doubtful", "bad")},
             },
             "totals": {
-                key: round(sum(row[key] for row in done), 3)
+                key: round(sum(row.get(key, 0.0) for row in done), 3)
                 for key in ("length_m", "duration_s", "seconds")
             },
             "workers": self._workers,
@@ -195,7 +220,7 @@ class _Overview:
         self._written = time.perf_counter()
         content = self.content()
         maps = {row["name"]: self._map(row["name"]) for row in content["logs"]}
-        files = {OVERVIEW: to_json(content, OVERVIEW), PAGE: batch_page(content, maps)}
+        files = {OVERVIEW: to_json(content, OVERVIEW), PAGE: PAGES[content["kind"]](content, maps)}
         try:
             for name, text in files.items():
                 part = self._directory / f".{name}.part"
@@ -217,17 +242,22 @@ def _count(rows: Sequence[Mapping[str, Any]], status: str) -> int:
 
 
 @contextmanager
-def _locked(directory: Path) -> Iterator[None]:
+def _locked(directory: Path, kind: str) -> Iterator[None]:
     """Make the folder, or check that it is that of a batch; nobody else works on it meanwhile.
+
+    ``kind``: as of `kind_of`.
 
     What a killed process left unfinished is removed.
     """
     if directory.exists() and not directory.is_dir():
         raise OutputError(f"{directory}: is not a folder")
-    if directory.is_dir() and any(directory.iterdir()) and not is_batch(directory):
-        known = {OVERVIEW, PAGE, LOCK, RESULTS, UNFINISHED}
-        if not {path.name for path in directory.iterdir()} <= known:
-            raise OutputError(f"{directory}: is not the folder of a batch; choose another name")
+    if directory.is_dir() and any(directory.iterdir()):
+        # the lock alone: it was killed before it wrote anything
+        there = {path.name for path in directory.iterdir()} - {LOCK, UNFINISHED}
+        if there and kind_of(directory) != kind:
+            raise OutputError(
+                f"{directory}: is not the folder of such a batch; choose another name"
+            )
     lock = directory / LOCK
     try:
         directory.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""One log of a batch: smoothed by a worker into a folder that appears whole, with its row.
+"""One log of a batch: a worker makes a folder of it that appears whole, with its row.
 
 Workers may share nothing with each other but the folder of the batch, and one log may be in the
 hands of two of them, if the first one was taken for lost. So each makes its result under a name of
@@ -10,36 +10,36 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 from uuid import uuid4
-
-import numpy as np
 
 from graphslam import __version__
 from graphslam.campaigns.tasks import code_version
 from graphslam.core.config import Config
 from graphslam.core.config_io import dump_config
 from graphslam.core.errors import LogError, OutputError
-from graphslam.core.geometry import path_length
-from graphslam.core.records import Result
 
 Row = dict[str, Any]
 
 #: in the folder of a batch: result folders, and what is not whole yet
 RESULTS, UNFINISHED = "results", ".unfinished"
 #: beside the files of a result: what the overview says of it
-ROW, MAP = "row.json", "map.svg"
+ROW = "row.json"
+
+#: writes the files of a log's folder, and returns what else its row holds
+Make: TypeAlias = Callable[["LogTask", Path], Row]
 
 
 @dataclass(frozen=True)
 class LogTask:
-    """A recording at ``path``, to be smoothed into ``results/NAME`` of ``directory``.
+    """A recording at ``path``, of which ``results/NAME`` in ``directory`` is made.
 
-    ``again``: also if that is done already.
+    ``again``: also if that is done already. ``backends``: to be compared, see `parse_variants`;
+    none: it is smoothed. ``mode``: of a comparison.
     """
 
     name: str
@@ -47,6 +47,8 @@ class LogTask:
     directory: str
     config: Config
     again: bool = False
+    backends: tuple[str, ...] = ()
+    mode: str = ""
 
     @property
     def target(self) -> Path:
@@ -60,7 +62,8 @@ def identify(task: LogTask) -> Row:
     Raises:
         LogError: the files cannot be looked at.
     """
-    settings = hashlib.sha256(dump_config(task.config).encode()).hexdigest()
+    compared = f"{task.backends} {task.mode}" if task.backends else ""
+    settings = hashlib.sha256((dump_config(task.config) + compared).encode()).hexdigest()
     return {
         "name": task.name,
         "path": task.path,
@@ -83,22 +86,14 @@ def is_same_work(row: Mapping[str, Any], asked: Mapping[str, Any]) -> bool:
     return known == [{**file, "sha256": None} for file in asked["files"]]
 
 
-def smooth_log(task: LogTask) -> Row:
-    """Smooth a log and write its result folder, unless that was done with the same contents.
+def do_log(task: LogTask, make: Make) -> Row:
+    """Write the folder of a log, unless that was done with the same contents.
 
     Returns the row of the overview.
 
     Raises:
-        GraphSlamError: the log cannot be read or smoothed, or nothing can be written.
+        GraphSlamError: the log cannot be read or used, or nothing can be written.
     """
-    # what a worker needs for logs only
-    from graphslam.evaluation.ground_truth import errors_of_run, truth_of_logs  # noqa: PLC0415
-    from graphslam.logs import open_logs  # noqa: PLC0415
-    from graphslam.results.folder import save  # noqa: PLC0415
-    from graphslam.results.report import render  # noqa: PLC0415
-    from graphslam.results.small_map import small_map  # noqa: PLC0415
-    from graphslam.slam.smooth import smooth  # noqa: PLC0415
-
     began = time.perf_counter()
     asked = identify(task)
     for file in asked["files"]:
@@ -106,14 +101,8 @@ def smooth_log(task: LogTask) -> Row:
     known = read_row(task.target)
     if known and not task.again and _is_done(known, asked):
         return put_row(task, {**known, "files": asked["files"]})
-    log = open_logs([Path(task.path)], task.config)
-    result = smooth(log, task.config)
-    errors = errors_of_run(result, truth_of_logs(log, task.config))
-    report = render(result, errors)
     with _Unfinished(task) as part:
-        save(result, part.folder, force=False, report=lambda _result: report)
-        (part.folder / MAP).write_text(small_map(result), encoding="utf-8")
-        found = {**asked, "status": "done", "error": None, **_figures(result, errors)}
+        found = {**asked, "status": "done", "error": None, **make(task, part.folder)}
         found["seconds"] = round(time.perf_counter() - began, 3)
         part.put_in_place(found)
     return found
@@ -201,32 +190,6 @@ class _Unfinished:
                     raise
         except OSError as error:
             raise OutputError(f"{self._target}: cannot be written: {error.strerror}") from error
-
-
-def _figures(result: Result, errors: Mapping[str, Any] | None) -> Row:
-    """The numbers of the overview."""
-    summary = result.summary
-    states = result.estimate.states.values()
-    spans = [p.stamps_ns[[0, -1]] for p in states if len(p.stamps_ns)]
-    covs = np.concatenate([robot.final.covs[:, :2, :2] for robot in result.robots.values()])
-    covs = covs[np.isfinite(covs).all(axis=(1, 2))]
-    sigmas = np.sqrt(np.maximum(np.linalg.eigvalsh(covs)[:, -1], 0.0))
-    final = ((errors or {}).get("joint") or {}).get("final") or {}
-    return {
-        "verdict": summary["verdict"]["verdict"],
-        "reasons": [reason["text"] for reason in summary["verdict"]["reasons"]],
-        "robots": sorted(result.robots),
-        "length_m": round(sum(float(path_length(p.poses)[-1]) for p in states), 3),
-        "duration_s": round(1e-9 * float(max(s[1] for s in spans) - min(s[0] for s in spans)), 3),
-        "error_m": final.get("ate_aligned_rmse_m"),
-        "sigma_m": float(np.median(sigmas)) if len(sigmas) else None,
-        "loops": summary["counts"]["loop_closures"],
-        "warnings": list(summary["warnings"]),
-        "messages": summary["counts"]["messages"],
-        "scans": summary["counts"]["scans"],
-        "landmarks": len(result.landmarks),
-        "memory_mb": summary["peak_memory_mb"],
-    }
 
 
 def _files(path: Path) -> list[Row]:

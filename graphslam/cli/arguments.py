@@ -380,6 +380,10 @@ Memory = Annotated[
         help="Memory of a worker, MB; its share of the machine, or what Dask's workers have.",
     ),
 ]
+Each = Annotated[
+    bool,
+    typer.Option("--each", help="Each recording is a log of its own; folders are searched."),
+]
 Retry = Annotated[bool, typer.Option("--retry", help="Do again what failed.")]
 
 # ---------------------------------------------------------------- what comes out

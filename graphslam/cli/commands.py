@@ -15,10 +15,8 @@ from graphslam.cli.arguments import (
     AsMcap,
     AsRerun,
     Backend,
-    Backends,
     Causal,
     ChangeMethod,
-    ComparisonMode,
     ConfigFile,
     EvaluatedFolder,
     Force,
@@ -55,7 +53,6 @@ from graphslam.cli.arguments import (
 )
 from graphslam.cli.registry import Output, app, command
 from graphslam.cli.stage_bar import stage_bar
-from graphslam.cli.terminal import progress_bar
 from graphslam.core.config import Config
 from graphslam.core.config_io import load_config, named_backend
 from graphslam.core.errors import ConfigError, OutputError
@@ -210,40 +207,6 @@ def evaluate(
 
     errors = graphslam.evaluate(directory, truth=truth or None, relations=relations)
     return Output(errors, lambda: show.evaluation(errors))
-
-
-@command("compare")
-def compare(
-    logs: Logs,
-    output: OutputFolder,
-    backends: Backends = "ekf,ekf+ekf.error=body,isam2:0,isam2,batch",
-    mode: ComparisonMode = "replay",
-    truth: TruthFiles = None,
-    relations: Relations = None,
-    front_end: FrontEnd = None,
-    start: Starts = None,
-    preset: Preset = None,
-    config: ConfigFile = None,
-    settings: Settings = None,
-    force: Force = False,
-) -> Output:
-    """Compare back ends on one log: errors, consistency, time, memory.
-
-    Writes a folder with compare.json and report.html.
-    """
-    from graphslam.cli import show
-
-    tree = load_config(config, smoothing_settings(None, front_end, start, settings), preset)
-    with progress_bar("associating") as progress:
-        comparison = graphslam.compare(
-            logs, [spec for spec in backends.split(",") if spec], mode=mode, truth=truth or None,
-            relations=relations, config=tree, output=output, force=force, progress=progress,
-            announce=show.stage,
-        )  # fmt: skip
-    found = comparison.summary
-    failed = [f"{row['spec']}: {row['error']}" for row in found["rows"] if row["error"]]
-    failure = f"{len(failed)} of {len(found['rows'])} back ends failed; " if failed else ""
-    return Output(found, lambda: show.comparison(found, output), failure + "".join(failed[:1]))
 
 
 @command("changes")

@@ -52,7 +52,10 @@ EXAMPLES = {
     ),
     "view": ("graphslam view result",),
     "evaluate": ("graphslam evaluate result --truth robot=truth.tum",),
-    "compare": ("graphslam compare drive.mcap --backends ekf,isam2:20,batch -o comparison",),
+    "compare": (
+        "graphslam compare drive.mcap --backends ekf,isam2:20,batch -o comparison",
+        "graphslam compare recordings --each --backends ekf,batch -o comparisons --jobs 2",
+    ),
     "changes": ("graphslam changes morning evening -o changes",),
     "batch": ("graphslam batch recordings -o results --jobs 2",),
     "experiment": ("graphslam experiment ekf-versus-smoothing --runs 20 -o experiment",),

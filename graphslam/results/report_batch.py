@@ -1,10 +1,10 @@
 # ruff: noqa: RUF001 -- σ and – are meant: people read them
 """The overview of a batch: a line of numbers and a small map of each log, to be sorted."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from pathlib import PurePath
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import quote
 
 from graphslam.results import report_html as html
@@ -12,17 +12,51 @@ from graphslam.results import report_html as html
 Row = Mapping[str, Any]
 
 #: what happened to a log, the worst first: in this order the page begins
-STATES = ("failed", "bad", "doubtful", "waiting", "good")
-#: key, head and title of the columns of numbers
+STATES = ("failed", "bad", "doubtful", "waiting", "good", "done")
+
+
+class Column(NamedTuple):
+    """A column of numbers: its head and title, the number in a row, and that as text."""
+
+    head: str
+    title: str
+    value: Callable[[Row], float | None]
+    text: Callable[[float], str]
+
+
+def _count_of(row: Row) -> float | None:
+    return len(row["warnings"]) if "warnings" in row else None
+
+
+def megabytes(value: float) -> str:
+    """A size of memory for reading."""
+    return f"{html.number(value)} MB"
+
+
 COLUMNS = (
-    ("length_m", "length", "driven by all robots of the log"),
-    ("error_m", "error", "aligned error of the positions, root mean square"),
-    ("sigma_m", "σ", "median standard deviation of the positions, in the worst direction"),
-    ("loops", "loops", "loop closures"),
-    ("warnings", "warnings", "what the result should be read with"),
-    ("duration_s", "recorded", "time that the log spans"),
-    ("seconds", "took", "time of the worker"),
-    ("memory_mb", "memory", "largest memory of the worker with this log"),
+    Column(
+        "length",
+        "driven by all robots of the log",
+        lambda row: row.get("length_m"),
+        lambda value: f"{html.number(float(value))} m",
+    ),
+    Column(
+        "error",
+        "aligned error of the positions, root mean square",
+        lambda row: row.get("error_m"),
+        html.length,
+    ),
+    Column(
+        "σ",
+        "median standard deviation of the positions, in the worst direction",
+        lambda row: row.get("sigma_m"),
+        html.length,
+    ),
+    Column("loops", "loop closures", lambda row: row.get("loops"), html.number),
+    Column("warnings", "what the result should be read with", _count_of, html.number),
+    Column("recorded", "time of the log", lambda row: row.get("duration_s"), html.duration),
+    Column("took", "time of the worker", lambda row: row.get("seconds"), html.duration),
+    Column("memory", "most memory of the worker", lambda row: row.get("memory_mb"), megabytes),
 )
 
 CSS = """
@@ -42,7 +76,7 @@ CSS = """
 .tools input { flex: 1 1 160px; min-width: 120px; max-width: 340px; }
 .good i, i.good { background: var(--robot2); } .doubtful i, i.doubtful { background: #d9a21b; }
 .bad i, i.bad { background: #c93c37; } .failed i, i.failed { background: #7a1f6b; }
-.waiting i, i.waiting { background: var(--grid); }
+.done i, i.done { background: var(--robot0); } .waiting i, i.waiting { background: var(--grid); }
 @media (prefers-color-scheme: dark) { .failed i, i.failed { background: #d67ac6; } }
 .batch td, .batch th { vertical-align: middle; }
 .batch thead th:nth-child(2) { text-align: left; }
@@ -140,24 +174,39 @@ SCRIPT = """
 
 def batch_page(found: Mapping[str, Any], maps: Mapping[str, str]) -> str:
     """The page of an overview; ``maps``: SVG by the name of the log, as far as there are any."""
-    rows = sorted(found["logs"], key=lambda row: (STATES.index(state_of(row)), row["name"]))
-    counts, totals = found["counts"], found["totals"]
-    done = [row for row in rows if row["status"] == "done"]
+    totals = found["totals"]
+    done = [row for row in found["logs"] if row["status"] == "done"]
     tiles = [
-        ("logs", html.number(counts["logs"])),
+        ("logs", html.number(found["counts"]["logs"])),
         ("driven", _kilometres(totals["length_m"])),
         ("recorded", _hours(totals["duration_s"])),
         ("worker time", _hours(totals["seconds"])),
         ("median error", _median(done, "error_m")),
         ("median σ", _median(done, "sigma_m")),
-        ("largest memory", f"{html.number(max((r['memory_mb'] for r in done), default=0.0))} MB"),
+        ("most memory", megabytes(max((r["memory_mb"] for r in done), default=0.0))),
     ]
-    shown = [tile for tile in tiles if tile[1] != "–"]
+    return overview_page("graphslam batch", found, maps, tiles, COLUMNS)
+
+
+def overview_page(
+    brand: str,
+    found: Mapping[str, Any],
+    maps: Mapping[str, str],
+    tiles: Sequence[tuple[str, str]],
+    columns: Sequence[Column],
+    above: str = "",
+) -> str:
+    """A page with a line of each log; ``above``: HTML above these lines."""
+    rows = sorted(found["logs"], key=lambda row: (STATES.index(state_of(row)), row["name"]))
+    used = [c for c in columns if any(c.value(row) is not None for row in rows)]
     sections = [
-        html.header("graphslam batch", _title(counts), _lead(found), shown),
+        html.header(
+            brand, _title(found["counts"]), _lead(found), [t for t in tiles if t[1] != "–"]
+        ),
+        above,
         _strip(rows),
-        _tools(),
-        _table(rows, maps),
+        _tools(used),
+        _table(rows, maps, used),
         _others(found["not_recordings"]),
         f"<script>{SCRIPT}</script>",
     ]
@@ -166,7 +215,7 @@ def batch_page(found: Mapping[str, Any], maps: Mapping[str, str]) -> str:
 
 def state_of(row: Row) -> str:
     """One of `STATES`: the verdict of what is done, else the status."""
-    return str(row["verdict"] if row["status"] == "done" else row["status"])
+    return str((row["status"] == "done" and row.get("verdict")) or row["status"])
 
 
 def _title(counts: Mapping[str, int]) -> str:
@@ -178,8 +227,9 @@ def _title(counts: Mapping[str, int]) -> str:
 
 def _lead(found: Mapping[str, Any]) -> str:
     counts = found["counts"]
-    told = [f"{html.number(counts[name])} {name}" for name in ("good", "doubtful", "bad")]
-    told += [f"{html.number(counts[name])} {name}" for name in ("failed", "waiting")]
+    verdicts = [name for name in ("good", "doubtful", "bad") if counts[name]]
+    names = [*(verdicts or ["done"]), "failed", "waiting"]
+    told = [f"{html.number(counts[name])} {name}" for name in names]
     words = [text for text in told if not text.startswith("0 ")]
     who = f", by {found['workers']}" if found.get("workers") else ""
     last = f"The last run did {html.number(counts['done_now'])} of them in "
@@ -200,11 +250,10 @@ def _strip(rows: Sequence[Row]) -> str:
     return f'<div class="fleet" aria-hidden="true">{bar}</div><div class="states">{buttons}</div>'
 
 
-def _tools() -> str:
-    options = "".join(
-        f'<option value="{key}">{escape(head)}</option>'
-        for key, head in (("state", "worst first"), ("name", "name"), *(c[:2] for c in COLUMNS))
-    )
+def _tools(columns: Sequence[Column]) -> str:
+    choices = [("state", "worst first"), ("name", "name")]
+    choices += [(f"c{k}", column.head) for k, column in enumerate(columns)]
+    options = "".join(f'<option value="{key}">{escape(head)}</option>' for key, head in choices)
     return (
         f'<div class="tools" hidden><label>sort by <select>{options}</select></label>'
         '<input type="search" placeholder="find a log, a robot, a warning" '
@@ -212,34 +261,40 @@ def _tools() -> str:
     )
 
 
-def _table(rows: Sequence[Row], maps: Mapping[str, str]) -> str:
-    used = [c for c in COLUMNS if any(row.get(c[0]) is not None for row in rows)]
-    heads = '<th scope="col">map</th>' + "".join(
+def _table(rows: Sequence[Row], maps: Mapping[str, str], columns: Sequence[Column]) -> str:
+    heads = [("name", "log", "worst first, until sorted otherwise")]
+    heads += [(f"c{k}", column.head, column.title) for k, column in enumerate(columns)]
+    top = '<th scope="col">map</th>' + "".join(
         f'<th scope="col" data-key="{key}" title="{escape(title)}">'
         f'<button type="button">{escape(head)}</button></th>'
-        for key, head, title in (("name", "log", "worst first, until sorted otherwise"), *used)
+        for key, head, title in heads
     )
-    body = "".join(_row(row, maps.get(row["name"], ""), used) for row in rows)
-    return (
-        f'<table class="batch wide"><thead><tr>{heads}</tr></thead>\n<tbody>{body}</tbody></table>'
-    )
+    body = "".join(_row(row, maps.get(row["name"], ""), columns) for row in rows)
+    return f'<table class="batch wide"><thead><tr>{top}</tr></thead>\n<tbody>{body}</tbody></table>'
 
 
-def _row(row: Row, drawing: str, used: Iterable[tuple[str, str, str]]) -> str:
+def _row(row: Row, drawing: str, columns: Sequence[Column]) -> str:
     state, name = state_of(row), escape(row["name"])
     if row["status"] == "done":
         link = quote(f"results/{row['name']}/report.html")
         name = f'<a href="{link}">{name}</a>'
     else:
         name = f"<b>{name}</b>"
-    told = [row["error"]] if row["error"] else [*row.get("reasons", ()), *row.get("warnings", ())]
+    backends = row.get("backends", {}).items()
+    failed = [f"{spec}: {one['error']}" for spec, one in backends if one["error"]]
+    told = [row["error"]] if row["error"] else [*failed, *row.get("reasons", ())]
+    told += row.get("warnings", ())
     # a report tells of no machine
     files = [row["path"], *(file["path"] for file in row.get("files", ()))]
     why = escape(html.without_folders("; ".join(dict.fromkeys(told)), files))
-    values = {key: _sortable(row.get(key)) for key, *_ in used}
-    data = "".join(f' data-{key}="{value}"' for key, value in values.items())
+    values = [column.value(row) for column in columns]
+    data = "".join(
+        f' data-c{k}="{"" if value is None else value}"' for k, value in enumerate(values)
+    )
     cells = "".join(
-        f'<td data-label="{escape(head)}">{_cell(key, row.get(key))}</td>' for key, head, _ in used
+        f'<td data-label="{escape(column.head)}">'
+        f"{'–' if value is None else column.text(value)}</td>"
+        for column, value in zip(columns, values, strict=True)
     )
     return (
         f'<tr data-is="{state}" data-state="{STATES.index(state)}" '
@@ -248,27 +303,6 @@ def _row(row: Row, drawing: str, used: Iterable[tuple[str, str, str]]) -> str:
         f'<th scope="row" class="log">{name}<span class="badge {state}"><i></i>{state}</span>'
         f"{f'<span class=why>{why}</span>' if why else ''}</th>{cells}</tr>\n"
     )
-
-
-def _sortable(value: object) -> str:
-    if value is None:
-        return ""
-    return str(len(value) if isinstance(value, list) else value)
-
-
-def _cell(key: str, value: Any) -> str:
-    """A number with its unit."""
-    if value is None:
-        return "–"
-    if key in ("error_m", "sigma_m"):
-        return html.length(float(value))
-    if key == "length_m":
-        return f"{html.number(float(value))} m"
-    if key in ("duration_s", "seconds"):
-        return html.duration(float(value))
-    if key == "memory_mb":
-        return f"{html.number(float(value))} MB"
-    return html.number(len(value) if isinstance(value, list) else value)
 
 
 def _others(paths: Sequence[str]) -> str:

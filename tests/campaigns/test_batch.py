@@ -13,7 +13,8 @@ from command_line import call, check_one_line
 from room_log import drive
 
 from graphslam.campaigns import batch as batch_module
-from graphslam.campaigns.one_log import LogTask, failed_row, read_row, smooth_log
+from graphslam.campaigns.log_results import work_on_log
+from graphslam.campaigns.one_log import LogTask, failed_row, read_row
 from graphslam.core.config_io import load_config
 from graphslam.core.errors import LogError
 from graphslam.logs.find_recordings import find_recordings
@@ -114,12 +115,12 @@ def test_what_is_done_is_not_done_again(fleet, tmp_path, monkeypatch):
     assert asked[3] == ["a"]
     task = LogTask("a", str(fleet.logs / "a.mcap"), str(out), load_config())
     before = (out / "results/a/summary.json").stat().st_mtime_ns
-    row = smooth_log(task)
+    row = work_on_log(task)
     assert row == read_row(task.target) and row["files"][0]["mtime_ns"] == 10**9
     assert (out / "results/a/summary.json").stat().st_mtime_ns == before
     drive(tmp_path / "a.mcap", seconds=SHORT_S + 2)
     other = LogTask("a", str(tmp_path / "a.mcap"), str(out), load_config())
-    assert smooth_log(other)["length_m"] > row["length_m"] + 0.5
+    assert work_on_log(other)["length_m"] > row["length_m"] + 0.5
     assert not list((out / ".unfinished").iterdir())
 
 
@@ -135,7 +136,7 @@ def test_a_log_that_fails_takes_the_place_of_its_earlier_result(fleet, tmp_path)
 def test_a_folder_of_something_else_or_of_another_process_is_left_alone(fleet, tmp_path):
     (tmp_path / "mine.txt").write_text("x")
     said = check_one_line(call("batch", fleet.logs, "-o", tmp_path))
-    assert "not the folder of a batch" in said
+    assert "not the folder of such a batch" in said
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
     out = copy_of(fleet, tmp_path)
     (out / ".lock").write_text(f"{socket.gethostname()} 1\n")
@@ -177,3 +178,35 @@ def test_recordings_are_found_by_content_and_named_apart(tmp_path):
     assert [name for name, _ in twice.recordings] == ["x-day.mcap", "y-day.mcap"]
     with pytest.raises(LogError, match="no such file or folder"):
         find_recordings([tmp_path / "gone"])
+
+
+# ------------------------------------------------------------ comparisons
+
+
+def test_back_ends_are_compared_on_each_log_by_the_same_engine(fleet, tmp_path):
+    """Errors as of `compare` on that log alone; a broken one does not stop the rest; a folder of
+    results is no place for them."""
+    options = ("--backends", "ekf,batch", "--json")
+    out = tmp_path / "out"
+    done = call("compare", fleet.logs, "--each", "-o", out, "--jobs", "2", *options)
+    assert done.code == 1 and "1 of 4 logs failed; broken: " in done.err
+    rows = rows_of(json.loads(done.out))
+    alone = json.loads(call("compare", fleet.logs / "a.mcap", "-o", tmp_path / "a", *options).out)
+    for row in alone["rows"]:
+        expected = row["joint"]["final"]["ate_aligned_rmse_m"]
+        assert rows["a"]["backends"][row["spec"]]["error_m"] == pytest.approx(expected, rel=1e-9)
+    assert rows["c"]["backends"]["ekf"]["error_m"] is None  # a log without truth
+    assert rows["c"]["backends"]["ekf"]["difference_m"] > 0
+    page = (out / "report.html").read_text()
+    assert "Over all logs" in page and page.count("<tr data-is=") == 4
+    assert (out / "results/a/compare.json").is_file()
+    wrong = call("compare", fleet.logs, "--each", "-o", fleet.out, *options)
+    assert "not the folder of such a batch" in check_one_line(wrong)
+
+
+def test_workers_are_for_many_logs_and_truth_for_one(fleet, tmp_path):
+    log, out = fleet.logs / "a.mcap", tmp_path / "x"
+    assert call("compare", log, "-o", out, "--jobs", "2").code == 2
+    assert call("compare", log, "-o", out, "--each", "--truth", "t.tum").code == 2
+    said = check_one_line(call("compare", log, "-o", out, "--each", "--backends", "ekff"))
+    assert "'ekff' is not one of" in said and not out.exists()
