@@ -8,7 +8,7 @@ import numpy as np
 
 from graphslam.core.config import Config
 from graphslam.core.errors import ConfigError, EstimationError, GraphSlamError, OutputError
-from graphslam.core.geometry import Array, transform, wrap
+from graphslam.core.geometry import Array, compose, transform, wrap
 from graphslam.core.records import Step, Trajectory
 from graphslam.evaluation.compare_variants import NAMES, Variant
 from graphslam.evaluation.equal_backends import equal_pairs
@@ -20,7 +20,7 @@ from graphslam.evaluation.timed_replay import TimedReplay, growth_exponent, time
 from graphslam.evaluation.trajectory_metrics import PosePairs, align, pair_poses
 from graphslam.logs import GroundTruth, LogSet
 from graphslam.results.folder import SavedResult
-from graphslam.results.report_comparison import BackendCurves, Comparison, ErrorCurve
+from graphslam.results.report_comparison import BackendCurves, Comparison, ErrorCurve, TimedPath
 from graphslam.slam.log_pass import Progress
 
 FORMAT = "graphslam-comparison-1"
@@ -251,8 +251,9 @@ class _BackendRun:
                 for name, p in found.items()
             }
             paths[kind] = {
-                name: transform(moved, getattr(robot, kind).poses[:, :2])
+                name: TimedPath(path.stamps_ns, compose(moved, path.poses))
                 for name, robot in self.result.robots.items()
+                for path in [getattr(robot, kind)]
             }
         return BackendCurves(
             self.row["spec"], self.row["label"], self.row["final_is_causal"], paths, curves,

@@ -43,10 +43,18 @@ class ErrorCurve:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class TimedPath:
+    """Poses (n, 3) m, m, rad of one robot in the frame of the truth, and their stamps (n,) ns."""
+
+    stamps_ns: Stamps
+    poses: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class BackendCurves:
     """The curves of one back end.
 
-    ``paths[kind][robot]`` (n, 2) m and ``curves[kind][robot]``, kind `final` or `causal`;
+    ``paths[kind][robot]`` and ``curves[kind][robot]``, kind `final` or `causal`;
     ``step_ms`` (n,) is the time of each step; ``landmarks`` (n,) the size of the map and ``path_m``
     (n,) the path driven by then.
     """
@@ -54,7 +62,7 @@ class BackendCurves:
     spec: str
     label: str
     final_is_causal: bool
-    paths: Mapping[str, Mapping[str, Array]]
+    paths: Mapping[str, Mapping[str, TimedPath]]
     curves: Mapping[str, Mapping[str, ErrorCurve]]
     step_ms: Array
     landmarks: Array
@@ -314,7 +322,10 @@ def render_comparison(comparison: Comparison, settings: str = "") -> str:
         numbers += f"<p class=note>{escape(text)}</p>"
     charts = (plots.live_errors(comparison, kind) for kind in ("final", "causal"))
     live = [live_html(chart) for chart in charts if chart]
-    moving = {"Errors over time": html.figure_grid(live) if any(live) else ""}
+    moving = {
+        "Trajectories": live_html(plots.live_map(comparison)),
+        "Errors over time": html.figure_grid(live) if any(live) else "",
+    }
     sections = [
         html.header("graphslam compare", title, headline(summary)),
         html.warning_box(

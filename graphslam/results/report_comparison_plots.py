@@ -10,6 +10,7 @@ from graphslam.results.drawing import Axes
 from graphslam.results.drawing_elements import ACCENT, INK, PALETTE, Style, robot_color
 from graphslam.results.live_charts import Curve, live_chart
 from graphslam.results.live_figure import LiveFigure
+from graphslam.results.live_paths import live_paths
 from graphslam.results.report_comparison import BackendCurves, Comparison, ErrorCurve
 from graphslam.results.report_figure import (
     WIDTH_IN,
@@ -84,13 +85,28 @@ def live_errors(comparison: Comparison, kind: str) -> LiveFigure | None:
     )
 
 
-def _paths(comparison: Comparison, kind: str) -> str:
+def live_map(comparison: Comparison) -> LiveFigure:
+    """The paths of all back ends in one map that moves."""
+    final, causal = (_limits(comparison, kind) for kind in ("final", "causal"))
+    limits = np.column_stack(
+        [np.minimum(final[:, 0], causal[:, 0]), np.maximum(final[:, 1], causal[:, 1])]
+    )
+    against = "the truth" if comparison.truth else "{reference}".format(**comparison.summary)
+    return live_paths(comparison, _styled(comparison.backends), limits, against)
+
+
+def _limits(comparison: Comparison, kind: str) -> Array:
+    """What shows all paths of a kind and the truth: [[x_min, x_max], [y_min, y_max]], m."""
     paths = [path for backend in comparison.backends for path in backend.paths[kind].values()]
-    shown = [*paths, *comparison.truth.values()]
+    shown = [*(path.poses[:, :2] for path in paths), *comparison.truth.values()]
     low = np.min([path.min(axis=0) for path in shown], axis=0)
     high = np.max([path.max(axis=0) for path in shown], axis=0)
     margin = 0.03 * max(float((high - low).max()), 1.0)
-    limits = np.column_stack([low - margin, high + margin])
+    return np.column_stack([low - margin, high + margin])
+
+
+def _paths(comparison: Comparison, kind: str) -> str:
+    limits = _limits(comparison, kind)
     size = limits[:, 1] - limits[:, 0]
     height = float(np.clip(WIDTH_IN * size[1] / size[0], 2.2, 5.5))
 
@@ -98,7 +114,7 @@ def _paths(comparison: Comparison, kind: str) -> str:
         axes = map_axes(drawing, limits)
         for backend, style in _styled(comparison.backends):
             for path in backend.paths[kind].values():
-                axes.path(path, style)
+                axes.path(path.poses[:, :2], style)
         for path in comparison.truth.values():
             axes.path(path, Style(INK, 0.7, dashes=(4, 2.5)), layer=8)
 

@@ -8,6 +8,13 @@ from graphslam.results.drawing_elements import Style
 from graphslam.results.live_charts import Curve, live_chart
 from graphslam.results.live_figure import live_html
 from graphslam.results.report_changes import ChangeMark, ChangesPicture, changes_page
+from graphslam.results.report_comparison import (
+    BackendCurves,
+    Comparison,
+    ErrorCurve,
+    TimedPath,
+    render_comparison,
+)
 
 pytestmark = pytest.mark.browser
 
@@ -50,6 +57,69 @@ def test_a_change_is_named_where_one_points_and_visits_are_swiped(width, open_pa
     box.locator("input[name=swipe]").fill("100")
     opened.page.wait_for_timeout(300)
     assert opened.js("changes", counted) == 1
+    assert opened.messages == []
+    assert [url for url in opened.requests if not url.startswith(("file:", "data:"))] == []
+    assert opened.page.evaluate("document.documentElement.scrollWidth") == width
+
+
+def two_back_ends():
+    """A filter and a smoother on one drive of 100 s along x; causally they drift to one side."""
+    stamps, names = np.arange(101) * 10**9, ("EKF", "batch")
+    x = np.linspace(0.0, 20.0, 101)
+    truth = np.column_stack([x, np.zeros_like(x)])
+    rows, backends = [], []
+    for name in names:
+        rows.append({
+            "spec": name, "label": name, "error": None, "final_is_causal": name == "EKF",
+            "steps": 101, "associations": 2, "late": 0, "skipped": {}, "ms_per_step": {"p50": 1.0},
+        })  # fmt: skip
+        paths, curves = {}, {}
+        for kind in ("final", "causal"):
+            off = 0.0 if name == "batch" and kind == "final" else 0.02 * x
+            poses = np.column_stack([x, off * np.ones_like(x), np.zeros_like(x)])
+            paths[kind] = {"robot": TimedPath(stamps, poses)}
+            error = ErrorCurve(stamps, np.abs(poses[:, 1]), np.zeros(101), np.ones(101))
+            curves[kind] = {"robot": error}
+        backends.append(
+            BackendCurves(name, name, name == "EKF", paths, curves, *3 * [np.ones(101)])
+        )
+    summary = {
+        "mode": "replay", "recorded_by": "batch", "reference": "batch", "rows": rows,
+        "start_given": True, "logs": [{"path": "run.mcap", "sha256": "ab" * 32}], "warnings": [],
+    }  # fmt: skip
+    return Comparison(summary, tuple(backends), {"robot": truth})
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_back_ends_share_a_map_and_are_swiped_to_their_causal_paths(width, open_page):
+    opened = open_page(render_comparison(two_back_ends()), width)
+    box = opened.live("paths")
+    path = (
+        "live.series.find((s) => s.robot && s.layer === 'batch' && s.side === '{}')"
+        ".renderer.visible"
+    )
+    assert opened.js("paths", path.format("after")) and not opened.js(
+        "paths", path.format("before")
+    )
+    box.locator("input[name=swipe]").fill("100")
+    opened.page.wait_for_timeout(300)
+    assert opened.js("paths", path.format("before"))
+    box.get_by_label("batch", exact=True).click()
+    opened.page.wait_for_timeout(100)
+    assert not opened.js("paths", path.format("before"))
+    # half of the drive: the filter is alone, 20 cm to the side, and says so where one points
+    box.locator("input[name=time]").fill("500")
+    opened.page.wait_for_timeout(300)
+    place = opened.js("paths", "[live.source.data.x, live.source.data.y]")
+    np.testing.assert_allclose(np.ravel(place), [10.0, 0.2], atol=1e-3)
+    tips = opened.js(
+        "paths",
+        "live.series.filter((s) => s.tip && s.side === 'before')"
+        ".map((s) => [s.tip, s.full.error[50]])",
+    )
+    (tip, error), _ = tips
+    assert tip.startswith("<b>EKF</b>, causal") and "cm from the truth" in tip
+    assert error == pytest.approx(20.0)
     assert opened.messages == []
     assert [url for url in opened.requests if not url.startswith(("file:", "data:"))] == []
     assert opened.page.evaluate("document.documentElement.scrollWidth") == width

@@ -451,7 +451,7 @@ def test_the_page_is_one_file_with_every_table_and_figure(two):
         assert title in page
     assert "ahead of every smoother" not in page  # odometry is no filter
     assert "a comparison of estimation alone" in page
-    labels = re.findall(r'aria-label="([^"]+)"', page)
+    labels = re.findall(r'<svg[^>]* aria-label="([^"]+)"', page)
     assert len(labels) == len(set(labels)) == 9  # paths, errors, NEES twice each; three of cost
 
 
@@ -486,7 +486,7 @@ def test_without_a_start_what_is_drawn_is_aligned(tmp_path):
     assert curve.heading_rad.max() < np.radians(2)
     assert np.isnan(curve.nees).all()
     (path,) = done.backends[0].paths["final"].values()
-    assert np.hypot(*(path[0] - done.truth["robot"][0])) < 0.1
+    assert np.hypot(*(path.poses[0, :2] - done.truth["robot"][0])) < 0.1
     page = render_comparison(done)
     assert "aligned with the truth" in page and "Consistency" not in page
 

@@ -13,7 +13,12 @@ from graphslam.evaluation.monte_carlo_summary import summarise
 from graphslam.results.drawing import legend
 from graphslam.results.drawing_elements import UNIT, Style
 from graphslam.results.report import render
-from graphslam.results.report_comparison import BackendCurves, Comparison, render_comparison
+from graphslam.results.report_comparison import (
+    BackendCurves,
+    Comparison,
+    TimedPath,
+    render_comparison,
+)
 from graphslam.results.report_experiment import experiment_page
 from graphslam.results.report_figure import Drawing
 from graphslam.results.report_html import counted, duration, length, table, without_folders
@@ -77,7 +82,7 @@ def of_a_comparison():
         "mode": "replay", "recorded_by": "isam2", "reference": "ekf", "rows": [done, failed],
         "logs": [{"path": PATH, "sha256": "ab" * 32}], "warnings": [f"{PATH}: /scan: late"],
     }  # fmt: skip
-    path, three = {"robot": np.eye(2)}, np.ones(3)
+    path, three = {"robot": TimedPath(np.arange(3), np.eye(3))}, np.ones(3)
     curves = BackendCurves(
         "ekf", "EKF", True, {"final": path, "causal": path}, {"final": {}, "causal": {}},
         three, three, three,
