@@ -3,39 +3,19 @@
 import importlib.util
 import json
 import re
-import shlex
 import sys
 import tomllib
 from types import SimpleNamespace
 
 import pytest
 import typer
+from doc_pages import PAGES, blocks, command_lines
 from paths import ROOT
 from room_log import drive
 
 from graphslam import __version__
 from graphslam.cli.commands import app
 from graphslam.core.config_io import load_config
-
-PAGES = [
-    *sorted((ROOT / "docs").glob("*.md")),
-    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "logs/README.md")),
-]
-
-
-def blocks(page, language):
-    """The code blocks of a page in a language, "" for those that name none."""
-    text = page.read_text(encoding="utf-8")
-    return re.findall(rf"^```{language}\n(.*?)^```", text, flags=re.M | re.S)
-
-
-def command_lines(page):
-    """The lines that call a program in blocks without a language: its words, without comments."""
-    for block in blocks(page, ""):
-        for line in re.sub(r"\\\n *", "", block).splitlines():
-            text = line.removeprefix("$ ").removeprefix(".venv/bin/")
-            if re.match(r"(graphslam|python|make) ", text):
-                yield shlex.split(text, comments=True)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

@@ -51,13 +51,16 @@ def write_result_rrd(directory: Path, target: Path, *, force: bool = False) -> l
     scene = read_scene(directory)
     with files_in(target, [FILE], force=force) as part:
         stream = rerun.RecordingStream("graphslam")
-        stream.save(part / FILE, default_blueprint=_blueprint(rerun, scene))
+        # not `save`: a thread of the SDK's own would write, and wait for ever on a full disk
+        memory = stream.memory_recording()
+        stream.send_blueprint(_blueprint(rerun, scene))
         _log_landmarks(rerun, stream, scene)
         for robot in scene.robots:
             _log_robot(rerun, stream, robot)
         _log_scans(rerun, stream, scene)
-        stream.flush()
+        content = memory.drain_as_bytes()
         stream.disconnect()
+        (part / FILE).write_bytes(content)
     return [FILE]
 
 

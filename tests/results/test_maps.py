@@ -301,7 +301,13 @@ def test_files_that_exist_are_kept_without_force(saved, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "problem", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()]
+    "problem",
+    [
+        OSError(errno.ENOSPC, "No space left on device"),
+        OSError(errno.EROFS, "Read-only file system"),
+        KeyboardInterrupt(),
+    ],
+    ids=str,
 )
 def test_a_full_disk_or_ctrl_c_leaves_what_was_there(saved, tmp_path, monkeypatch, problem):
     """Breaks if files are written under their names: a half map looks like a whole one."""

@@ -4,6 +4,9 @@ import errno
 import importlib.util
 import itertools
 import json
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -152,10 +155,6 @@ def test_the_other_reference_reader_decodes_every_message(shown):
 @pytest.mark.skipif(not importlib.util.find_spec("rerun"), reason="needs rerun-sdk")
 def test_a_recording_for_rerun_is_read_back(shown, tmp_path):
     """By the viewer's own program: it verifies every chunk, and lists what there is."""
-    import subprocess
-    import sys
-    from pathlib import Path
-
     assert write_viewer(shown, "rrd", tmp_path) == ["result.rrd"]
     rerun = Path(sys.executable).with_name("rerun")
     for verb in ("verify", "stats"):
@@ -175,7 +174,13 @@ def test_without_rerun_an_error_says_what_to_install(shown, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "problem", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()]
+    "problem",
+    [
+        OSError(errno.ENOSPC, "No space left on device"),
+        OSError(errno.EROFS, "Read-only file system"),
+        KeyboardInterrupt(),
+    ],
+    ids=str,
 )
 def test_a_full_disk_or_ctrl_c_leaves_no_file(shown, tmp_path, monkeypatch, problem):
     message, count = LogWriter.message, itertools.count()
@@ -188,6 +193,30 @@ def test_a_full_disk_or_ctrl_c_leaves_no_file(shown, tmp_path, monkeypatch, prob
     monkeypatch.setattr(viewer_mcap.LogWriter, "message", fails)
     with pytest.raises((OutputError, KeyboardInterrupt)):
         write_viewer(shown, "mcap", tmp_path / "new")
+    assert list(tmp_path.iterdir()) == []
+
+
+#: writes the folder's recording for Rerun where no file may be larger than 20 kB
+SMALL_DISK = """
+import resource, signal, sys
+from pathlib import Path
+from graphslam.core.errors import OutputError
+from graphslam.results.viewers import write_viewer
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+try:
+    write_viewer(Path(sys.argv[1]), "rrd", Path(sys.argv[2]))
+except OutputError as error:
+    print(error)
+"""
+
+
+def test_a_full_disk_leaves_no_recording_for_rerun(shown, tmp_path):
+    """Breaks if its SDK writes the file, in a thread of its own that waits for ever there."""
+    pytest.importorskip("rerun")
+    words = [sys.executable, "-c", SMALL_DISK, str(shown), str(tmp_path / "new")]
+    done = subprocess.run(words, capture_output=True, text=True, check=True, timeout=120)
+    assert "cannot be written" in done.stdout
     assert list(tmp_path.iterdir()) == []
 
 

@@ -1,0 +1,119 @@
+"""The commands on the pages of the documentation are run as printed, on small logs.
+
+All commands of a page run one after the other in one folder, which holds the files that the page
+takes for given. An output that is there already is replaced: a page shows several ways to make one.
+Of experiments one run is made, unless a page asks for a number. Benchmarks, which take minutes to
+hours, are begun: their options are read and taken; `make demo` is run by .ci/run.
+"""
+
+import argparse
+import runpy
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import victoria_park
+from command_line import call
+from doc_pages import PAGES, command_lines
+from paths import ROOT
+from room_log import START_NS, S, drive
+
+from graphslam.logs import IMPORTERS
+
+SECONDS = 12
+#: what takes more than a few seconds even when it is small
+LONG = {"ekf-versus-smoothing.md", "experiments.md", "several-robots.md"}
+#: values of placeholders in a command
+PLACES = {"LOG.mcap": "drive.mcap", "DIR": "result"}
+
+
+def room(path, seconds=SECONDS):
+    """A drive in a room whose scans are at the stamps that `relations` names."""
+    return drive(path, seconds=seconds)
+
+
+def relations(path):
+    """Scans two seconds apart, not moved: an error of a relation is no error of the command."""
+    stamps = [START_NS + k * S // 10 + 7 for k in range(0, 10 * SECONDS, 20)]
+    texts = [f"{stamp // S}.{stamp % S:09d}" for stamp in stamps]
+    lines = [f"{a} {b} 0 0 0 0 0 0" for a, b in pairwise(texts)]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def trees(path):
+    """The beginning of the log of Victoria Park."""
+    path.parent.mkdir(exist_ok=True)
+    part = path.with_suffix(".txt")
+    with Path(victoria_park.SOURCE).open() as lines:
+        part.write_text("".join(line for line in lines if max(map(int, line.split()[1:3])) < 200))
+    IMPORTERS["isam"](part, path)
+
+
+#: files that pages take for given -> what makes them
+GIVEN = {
+    "drive.mcap": room,
+    "before.mcap": room,
+    "after.mcap": room,
+    "intel.relations": relations,
+    "out/victoria_park.mcap": trees,
+    "logs": lambda path: path.symlink_to(ROOT / "logs"),
+}
+
+
+def runnable(page):
+    return [words for words in command_lines(page) if words[0] == "graphslam"]
+
+
+def as_param(page):
+    marks = pytest.mark.slow if page.name in LONG else ()
+    return pytest.param(page, marks=marks, id=str(page.relative_to(ROOT)))
+
+
+@pytest.mark.parametrize("page", [as_param(page) for page in PAGES if runnable(page)])
+def test_commands_on_a_page_run(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    commands = [[PLACES.get(word, word) for word in words[1:]] for words in runnable(page)]
+    made = set()
+    for words in commands:
+        target = words[words.index("-o") + 1] if "-o" in words else None
+        for name, make in GIVEN.items():
+            needs = any(word == name or word.startswith(f"{name}/") for word in words)
+            if needs and name != target and not Path(name).exists():
+                make(Path(name))
+        if words[0] == "experiment" and "--runs" not in words:
+            words += ["--runs", "1"]
+        if target in made and "--force" not in words:
+            words.append("--force")
+        done = call(*words, "--quiet")
+        assert done.code == 0, f"{' '.join(words)}: {done.err}"
+        made |= {target} - {None}
+        assert target is None or Path(target).exists()
+
+
+class NothingRunError(Exception):
+    """The options of a script are taken; nothing was run."""
+
+
+@pytest.mark.parametrize(
+    ("page", "words"),
+    [
+        pytest.param(page, words[1:], id=f"{page.name}: {' '.join(words[1:])}")
+        for page in PAGES
+        for words in command_lines(page)
+        if words[0] == "python" and words[1] != "-m"
+    ],
+)
+def test_benchmarks_on_a_page_take_their_options(page, words, monkeypatch):
+    """Breaks when a script no longer starts, or its options have other names."""
+    parse = argparse.ArgumentParser.parse_args
+
+    def taken(parser, *args, **options):
+        parse(parser, *args, **options)
+        raise NothingRunError
+
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", taken)
+    monkeypatch.setattr(sys, "argv", [str(ROOT / words[0]), *words[1:]])
+    with np.printoptions(), pytest.raises(NothingRunError):
+        runpy.run_path(str(ROOT / words[0]), run_name="__main__")
