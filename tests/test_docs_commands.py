@@ -24,7 +24,7 @@ from graphslam.logs import IMPORTERS
 
 SECONDS = 12
 #: what takes more than a few seconds even when it is small
-LONG = {"ekf-versus-smoothing.md", "experiments.md", "several-robots.md"}
+LONG = {"clusters.md", "ekf-versus-smoothing.md", "experiments.md", "several-robots.md"}
 #: values of placeholders in a command
 PLACES = {"LOG.mcap": "drive.mcap", "DIR": "result"}
 
@@ -51,19 +51,28 @@ def trees(path):
     IMPORTERS["isam"](part, path)
 
 
+def two_rooms(path):
+    path.mkdir()
+    for name in ("morning", "evening"):
+        room(path / f"{name}.mcap")
+
+
 #: files that pages take for given -> what makes them
 GIVEN = {
     "drive.mcap": room,
     "before.mcap": room,
     "after.mcap": room,
     "intel.relations": relations,
+    "recordings": two_rooms,
     "out/victoria_park.mcap": trees,
     "logs": lambda path: path.symlink_to(ROOT / "logs"),
 }
 
 
 def runnable(page):
-    return [words for words in command_lines(page) if words[0] == "graphslam"]
+    """The commands of a page, but for those that need a cluster: tests/cluster has one."""
+    found = [words for words in command_lines(page) if words[0] == "graphslam"]
+    return [words for words in found if "--scheduler" not in words]
 
 
 def as_param(page):

@@ -115,8 +115,8 @@ def _paths(comparison: Comparison, kind: str) -> str:
         for backend, style in _styled(comparison.backends):
             for path in backend.paths[kind].values():
                 axes.path(path.poses[:, :2], style)
-        for path in comparison.truth.values():
-            axes.path(path, Style(INK, 0.7, dashes=(4, 2.5)), layer=8)
+        for true in comparison.truth.values():
+            axes.path(true, Style(INK, 0.7, dashes=(4, 2.5)), layer=8)
 
     return svg(f"Paths of all back ends, {kind}", height, draw)
 
