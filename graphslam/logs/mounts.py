@@ -13,7 +13,7 @@ BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 TransformTree = Mapping[str, tuple[str, Array]]
 
 # A tilt of 3 degrees changes ranges to vertical walls by 1 - cos(3 deg), about one per mille.
-_MAX_TILT_RAD = np.deg2rad(3.0)
+MAX_TILT_RAD = np.deg2rad(3.0)
 # Beyond that few beams meet walls before the floor or the ceiling.
 _MOST_TILT_RAD = np.deg2rad(30.0)
 #: m above the base, below which a return of a tilted laser may be of the floor, not of a wall
@@ -102,7 +102,7 @@ def planar_mount(base_from_sensor: Array) -> Mount:
 
 def is_level(mount: Mount) -> bool:
     """Whether the tilt of the sensor is small enough for a planar map."""
-    return bool(mount.tilt_rad <= _MAX_TILT_RAD)
+    return bool(mount.tilt_rad <= MAX_TILT_RAD)
 
 
 def is_projectable(mount: Mount) -> bool:

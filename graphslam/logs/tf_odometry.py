@@ -3,6 +3,7 @@
 Between the two frames there may be several transforms, static and moving ones.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
@@ -119,10 +120,15 @@ class TfOdometry:
 def _pose(steps: Sequence[Array]) -> list[float]:
     """Position and quaternion of the product of transforms (4, 4)."""
     matrix = reduce(np.matmul, steps)
-    # only the heading is of interest: a quaternion about z that has it
-    heading = np.arctan2(matrix[1, 0], matrix[0, 0])
-    turn = [0.0, 0.0, float(np.sin(heading / 2)), float(np.cos(heading / 2))]
-    return [*matrix[:3, 3].tolist(), *turn]
+    # the heading to the last digit, and what leans, which is little
+    heading = math.atan2(matrix[1, 0], matrix[0, 0])
+    c, s = math.cos(heading), math.sin(heading)
+    lean = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) @ matrix[:3, :3]
+    w = math.sqrt(max(1.0 + float(np.trace(lean)), 1.0)) / 2
+    x, y, z = ((lean[i, j] - lean[j, i]) / (4 * w) for i, j in ((2, 1), (0, 2), (1, 0)))
+    c, s = math.cos(heading / 2), math.sin(heading / 2)
+    turn = [c * x - s * y, s * x + c * y, s * w + c * z, c * w - s * z]
+    return [*matrix[:3, 3].tolist(), *map(float, turn)]
 
 
 def with_odometry(recording: Recording, chain: Chain) -> tuple[Recording, Derived | None]:

@@ -4,8 +4,9 @@ Transforms on ``/tf_static`` are static. On ``/tf`` there are those that move (o
 old publishers of static ones, some that never do.
 """
 
+import math
 import struct
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -23,6 +24,8 @@ from graphslam.logs.schemas import DEFAULT_ROBOT, TF_MESSAGE
 _BLOCKS, _PER_BLOCK = 64, 32
 #: m, or a number of a quaternion: a transform that changes by less is static
 _AT_REST = 1e-6
+#: m, rad: a transform that is nearly always so near the first one is taken to be that one
+WOBBLE_M, WOBBLE_RAD, WOBBLE_SHARE = 0.05, np.deg2rad(3.0), 0.9
 
 
 class Transform(NamedTuple):
@@ -38,7 +41,8 @@ class Transform(NamedTuple):
 class Edge:
     """A transform from ``parent`` to ``child`` as seen in several messages of a topic.
 
-    ``first``: its values in the first of them. ``moves``: they differ.
+    ``first``: its values in the first of them. ``moves``: they differ; ``still``: how many of the
+    ``seen`` are within `WOBBLE_M` and `WOBBLE_RAD` of the first.
     """
 
     topic: str
@@ -46,6 +50,13 @@ class Edge:
     child: str
     first: tuple[float, ...]
     moves: bool = False
+    seen: int = 0
+    still: int = 0
+
+    @property
+    def wobbles(self) -> bool:
+        """Whether it moves so little that what it carries is at one place: a base on springs."""
+        return self.moves and self.still >= WOBBLE_SHARE * self.seen
 
 
 def transforms_of(data: bytes) -> list[Transform]:
@@ -112,9 +123,39 @@ def sampled_edges(files: Sequence[Recording], space: str) -> dict[str, Edge]:
 def _add_edges(found: dict[str, Edge], topic: str, messages: Iterable[list[Transform]]) -> None:
     for _, parent, child, values in (one for message in messages for one in message):
         edge = found.setdefault(child, Edge(topic, parent, child, values))
+        edge.seen += 1
+        edge.still += _is_near(edge.first, values)
         if not edge.moves:
             pairs = zip(edge.first, values, strict=True)
             edge.moves = any(abs(a - b) > _AT_REST for a, b in pairs)
+
+
+def _is_near(first: Sequence[float], values: Sequence[float]) -> bool:
+    if math.dist(first[:3], values[:3]) > WOBBLE_M:
+        return False
+    same = abs(sum(a * b for a, b in zip(first[3:], values[3:], strict=True)))
+    return bool(2 * math.acos(min(same, 1.0)) <= WOBBLE_RAD)
+
+
+def moving_link(
+    edges: Mapping[str, Edge], tree: Mapping[str, tuple[str, Array]], base: str, frame: str
+) -> Edge | None:
+    """The lowest link between ``base`` and a ``frame`` on it that moves; None if there is none.
+
+    ``edges`` and ``tree``, transforms (4, 4), are by the child: `sampled_edges`, `static_tree`.
+    """
+    passed, moving = {frame}, None
+    while frame != base:
+        edge = edges.get(frame)
+        if moving is None and edge is not None and frame not in tree:
+            moving = edge
+        if edge is None and frame not in tree:
+            return None  # not on this base
+        frame = edge.parent if edge is not None else tree[frame][0]
+        if frame in passed:
+            return None
+        passed.add(frame)
+    return moving
 
 
 def decoded(messages: Iterable[bytes]) -> Iterator[list[Transform]]:
@@ -127,14 +168,14 @@ def decoded(messages: Iterable[bytes]) -> Iterator[list[Transform]]:
 def static_tree(
     files: Sequence[Recording], space: str, edges: dict[str, Edge]
 ) -> dict[str, tuple[str, Array]]:
-    """Static transforms of a namespace, and those of ``edges`` that do not move.
+    """Static transforms of a namespace, and those of ``edges`` that do not move, or hardly.
 
     Child -> (parent, parent_from_child (4, 4)).
     """
     tree: dict[str, tuple[str, Array]] = {}
     for child, edge in edges.items():
         matrix = matrix_of(edge.first)
-        if not edge.moves and np.isfinite(matrix).all():
+        if (edge.wobbles or not edge.moves) and np.isfinite(matrix).all():
             tree[child] = (edge.parent, matrix)
     for file in files:
         own = [n for n in static_topics(file) if namespace_of(n) in (DEFAULT_ROBOT, space)]

@@ -1,6 +1,7 @@
 """Decoding context of each topic, from a sample of its messages: mounts and no-return values."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,10 +11,11 @@ from graphslam.core import records
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array
 from graphslam.logs import schemas
-from graphslam.logs.cdr import HEADER
+from graphslam.logs.cdr import HEADER, CdrError
 from graphslam.logs.decoders import TopicContext, frame_of
 from graphslam.logs.findings import Finding
 from graphslam.logs.mounts import (
+    MAX_TILT_RAD,
     Mount,
     TransformTree,
     base_above,
@@ -24,13 +26,15 @@ from graphslam.logs.mounts import (
 from graphslam.logs.no_return import find_no_return
 from graphslam.logs.point_cloud import cloud_points, sweep_of
 from graphslam.logs.recording import Recording, sample_messages
-from graphslam.logs.tf_tree import sampled_edges, static_tree
+from graphslam.logs.tf_tree import Edge, moving_link, sampled_edges, static_tree
 from graphslam.logs.topics import ODOMETRY_KINDS, Topic
 
 # 16 x 16 messages over the whole log: enough to find a frequent value, quick to read
 _SAMPLE_BLOCKS, _SAMPLE_PER_BLOCK = 16, 16
 #: records that may come without a stamp; increments have two, which must differ
 _STAMPED = (records.Scan, records.Sighting, records.OdometryPose, records.WheelAngles)
+#: share of the poses in which a base leans that are too many to be bumps
+SHARE_LEANING = 0.05
 #: bearings beyond a whole turn, how many at least and of all: they are no radians
 LEAST_IN_DEGREES, SHARE_IN_DEGREES = 10, 0.25
 
@@ -82,6 +86,7 @@ def topic_contexts(
     bases = {t.robot: base_frame(files, t) for t in odometry}  # the preferred kind comes last
     contexts = {}
     trees: dict[str, TransformTree] = {}
+    edges: dict[str, dict[str, Edge]] = {}
     for topic in topics:
         settings = config.robot(topic.robot)
         sensor = sensors.get(topic.name, "")
@@ -93,14 +98,16 @@ def topic_contexts(
         if topic.record in (records.Scan, records.Sighting):
             messages = list(sample_decoded(files, topic))
             if topic.robot not in trees:
-                edges = sampled_edges(files, topic.robot)
-                trees[topic.robot] = static_tree(files, topic.robot, edges)
+                own = edges[topic.robot] = sampled_edges(files, topic.robot)
+                trees[topic.robot] = static_tree(files, topic.robot, own)
             tree = trees[topic.robot]
             for frame in sorted({frame_of(message) for message in messages}):
                 base = bases[topic.robot] if topic.robot in bases else base_above(tree, frame)
                 if sensor and base == frame:
                     base = "the robot's base"  # nothing ties this laser to the others
-                mount, notes = _mount(topic, tree, base, (sensor, frame), laser)
+                is_scan = topic.record is records.Scan
+                link = moving_link(edges[topic.robot], tree, base, frame) if is_scan else None
+                mount, notes = _mount(topic, tree, base, (sensor, frame, link), laser)
                 mounts[frame] = mount.pose
                 if topic.record is records.Scan and not is_level(mount):
                     tilted[frame] = mount
@@ -111,6 +118,8 @@ def topic_contexts(
                 findings += in_degrees(topic.name, [float(m.bearing) for m in messages])
             if topic.schema == schemas.LASER_SCAN:
                 no_return = find_no_return(message.ranges for message in messages)
+        if topic.schema == schemas.ODOMETRY:
+            findings += leaning(topic.name, _turns(files, topic))
         unstamped = topic.record in _STAMPED and _is_unstamped(files, topic)
         if unstamped:
             text = "all stamps are zero; the times of recording are used, which are less exact"
@@ -129,6 +138,32 @@ def topic_contexts(
             sensor=sensor,
         )
     return contexts, findings
+
+
+def _turns(files: Sequence[Recording], topic: Topic) -> Array:
+    """Quaternions (n, 4) x y z w of some of the poses of an odometry."""
+    found = [np.zeros((0, 4))]
+    for file in files:
+        data = list(sample_messages(file, topic.name, _SAMPLE_BLOCKS, _SAMPLE_PER_BLOCK))
+        with suppress(CdrError):  # damaged ones are counted when the topic is read
+            found += [schemas.odometry_table(data)["rotation"]] if data else []
+    return np.concatenate(found)
+
+
+def leaning(topic: str, turns: Array) -> list[Finding]:
+    """That a base is not level, by quaternions (n, 4) x y z w of its poses, if that is so often."""
+    with np.errstate(all="ignore"):  # of quaternions that are none
+        off = np.hypot(turns[:, 0], turns[:, 1]) / np.linalg.norm(turns, axis=1)
+        tilt = 2 * np.arcsin(np.minimum(off, 1.0))
+    tilt = tilt[np.isfinite(tilt)]
+    leans = tilt > MAX_TILT_RAD
+    if not len(tilt) or np.mean(leans) < SHARE_LEANING:
+        return []
+    text = f"the base leans by up to {np.rad2deg(tilt.max()):.0f} deg, by more than "
+    text += f"{np.rad2deg(MAX_TILT_RAD):.0f} in {100 * np.mean(leans):.0f} % of its poses; "
+    text += "motions and scans are taken as level"
+    remedy = "leave ramps and slopes out, or expect walls seen from there to be too far"
+    return [Finding("doubt", "level", topic, text, remedy)]
 
 
 def in_degrees(topic: str, bearings: Sequence[float]) -> list[Finding]:
@@ -179,14 +214,14 @@ def _mount(
     topic: Topic,
     tree: TransformTree,
     base: str,
-    of: tuple[str, str],
+    of: tuple[str, str, Edge | None],
     configured: Sequence[float],
 ) -> tuple[Mount, list[Finding]]:
     """The mount of a sensor on the robot, and findings; one that is configured is level.
 
-    ``of``: its name, if it is a further laser, and its frame.
+    ``of``: its name, if it is a further laser, its frame, and what moves between it and the base.
     """
-    sensor, frame = of
+    sensor, frame, link = of
     where = f"{topic.name}: frame {frame or '(none)'}"
     key = f"lasers.{sensor}" if sensor else "laser"
     setting = f"--set 'robots.{topic.robot}.{key}=[X, Y, YAW]' (m, m, rad)"
@@ -199,7 +234,11 @@ def _mount(
             return Mount(np.zeros(3), False, 0.0), []  # no frame: measured from the base
         text = f"tf_static has no transform from {base}"
         remedy = f"record /tf_static, or {setting}"
-        if sensor:
+        if link is not None:
+            text = f"moves on the robot: {link.child} in {link.parent} on {link.topic}; "
+            text += "mounts that move are not followed"
+            remedy = f"record a laser that does not move; if it does not, {setting}"
+        if sensor or link is not None:
             return Mount(np.zeros(3), False, 0.0), [
                 Finding("unusable", "mount", where, text, remedy)
             ]

@@ -12,7 +12,7 @@ from graphslam.core.config_io import load_config
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import compose
 from graphslam.logs import LogWriter, inspect_logs, open_logs, schemas
-from graphslam.logs.cdr_writing import tf_bytes
+from graphslam.logs.cdr_writing import odometry_bytes, tf_bytes
 
 HEIGHT = 0.6
 
@@ -100,3 +100,58 @@ def test_a_laser_that_looks_down_is_refused_and_what_the_line_says_mends_it(leve
     info = inspect_logs([path], Config())
     assert not info.usable and info.findings[-1].check == "mount"
     assert open_logs([path], load_config(None, ["robots.robot.laser=[0.2, 0, 0]"])).robots
+
+
+def moved(path, level, *, turn=(0.0, 0.0), lean=0.0):
+    """The log with its laser on a link of /tf that turns between two angles, on a base that leans.
+
+    ``turn``: about z, at every second scan the other. ``lean``: pitch of the base, in every pose.
+    """
+    with LogWriter(path) as log:
+        _, level_turn = rotation(0.0, 0.0, 0.0)
+        fixed = tf_bytes([(START_NS, "head", "laser", (*MOUNT[:2], HEIGHT, *level_turn))])
+        log.encoded("/tf_static", schemas.TF_MESSAGE, fixed, START_NS)
+        scans = 0
+        for message in open_logs([level], Config()).messages():
+            ns = message.stamp_ns
+            if isinstance(message, records.OdometryPose):
+                _, q = rotation(0.0, lean, message.pose[2])
+                data = odometry_bytes(ns, "odom", (*message.pose[:2], 0.0), q, "base_link")
+                log.encoded("/odom", schemas.ODOMETRY, data, ns)
+            elif isinstance(message, records.Scan):
+                scans += 1
+                _, q = rotation(0.0, 0.0, turn[scans % 2])
+                link = tf_bytes([(ns, "base_link", "head", (0.0, 0.0, 0.0, *q))])
+                log.encoded("/tf", schemas.TF_MESSAGE, link, ns)
+                log.scan("robot", ns, np.where(np.isnan(message.ranges), 99.0, message.ranges),
+                         angle_min_rad=float(BEAMS[0]), angle_step_rad=float(np.radians(1)),
+                         range_max_m=20.0)  # fmt: skip
+    return path
+
+
+def test_a_laser_on_a_link_that_turns_is_refused_with_the_link(level, tmp_path):
+    """Read where the base is, each of its scans would be turned by another angle."""
+    path = moved(tmp_path / "log.mcap", level, turn=(0.0, 0.5))
+    with pytest.raises(LogError, match=r"moves on the robot: head in base_link on /tf.*--set"):
+        open_logs([path], Config())
+    assert not inspect_logs([path], Config()).usable
+    assert open_logs([path], load_config(None, ["robots.robot.laser=[0.2, 0, 0]"])).robots
+
+
+def test_a_link_that_shakes_carries_the_laser_where_it_is(level, tmp_path):
+    """A base on springs: not "no transform", and not at the base."""
+    log = open_logs([moved(tmp_path / "log.mcap", level, turn=(0.0, 0.01))], Config())
+    scan = next(m for m in log.messages() if isinstance(m, records.Scan))
+    np.testing.assert_allclose(scan.mount, MOUNT, atol=0.011)
+    assert not any("laser" in line for line in log.warnings)
+
+
+@pytest.mark.parametrize(("lean", "said"), [(0.0, False), (0.03, False), (0.1, True)])
+def test_a_base_that_leans_is_said_to(lean, said, level, tmp_path):
+    path = moved(tmp_path / "log.mcap", level, lean=lean)
+    log = open_logs([path], Config())
+    assert any("the base leans by up to 6 deg" in line for line in log.warnings) == said
+    assert inspect_logs([path], Config()).doubtful == said
+    poses = [m.pose for m in log.messages() if isinstance(m, records.OdometryPose)]
+    plain = [m.pose for m in open_logs([level], Config()).messages() if hasattr(m, "pose")]
+    np.testing.assert_allclose(poses, plain, atol=1e-12)
