@@ -37,7 +37,7 @@ def scenario(sweep_s: float) -> Scenario:
 def errors(path: Path, *settings: str) -> tuple[float, float]:
     """Of the base: aligned position error, m, and heading error, rad."""
     config = load_config(overrides=["start.from_truth=true", *settings])
-    known = truth_of_logs(open_logs([path], config), config)
+    known = truth_of_logs(open_logs([path], config))
     found = evaluate(smooth_log(path, config), known.trajectories, known.landmarks)
     (robot,) = found["robots"].values()
     return robot["final"]["ate_aligned_rmse_m"], robot["final"]["heading_rmse_rad"]

@@ -121,7 +121,7 @@ def simulated(job: tuple[str, str, int]) -> dict[str, float]:
         path = simulated_log(name, seed, Path(folder))
         log = open_logs([path], config)
         result = smooth(log, config)
-        known = truth_of_logs(log, config)
+        known = truth_of_logs(log)
         errors = evaluate(result, known.trajectories, known.landmarks)
         out = {kind: errors["joint"][kind]["ate_rmse_m"] for kind in ("final", "causal")} | {
             "nees": errors["joint"]["final"]["nees_per_dof"]

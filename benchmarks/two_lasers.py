@@ -45,7 +45,7 @@ def run(path: Path, laser: str = "") -> tuple[float, Mapping[str, Any]]:
     topics = ", ".join(f'"/{ROBOT}/{name}" = "{ROBOT}"' for name in names)
     settings = [f"logs.topics={{{topics}}}"] if laser else []
     config = load_config(overrides=["start.from_truth=true", *settings])
-    known = truth_of_logs(open_logs([path], config), config)
+    known = truth_of_logs(open_logs([path], config))
     result = smooth_log(path, config)
     found = evaluate(result, known.trajectories, known.landmarks)
     return found["robots"][ROBOT]["final"]["ate_aligned_rmse_m"], result.summary

@@ -38,7 +38,7 @@ def errors(path: Path, config: Config, seed: int) -> list[float]:
     log = open_logs([path], config)
     start = drawn_starts(log, config.start, seed)
     result = smooth_log(path, replace(config, start=start))
-    known = truth_of_logs(log, config)
+    known = truth_of_logs(log)
     found = evaluate(result, known.trajectories, known.landmarks)
     (robot,) = found["robots"].values()
     return [robot["final"][key] for key in KEYS]

@@ -172,7 +172,7 @@ def smooth(
         def read_truth() -> GroundTruth:
             from graphslam.evaluation.ground_truth import truth_of_logs
 
-            return truth_of_logs(log, settled)
+            return truth_of_logs(log)
 
         def render_report() -> tuple[str, dict[str, Any]]:
             from graphslam.evaluation.ground_truth import errors_of_run
@@ -336,7 +336,7 @@ def compare(
         settled,
         rows,
         mode,
-        truth=truth_of_logs(log, settled) if truth is None else truth_given(truth, log.robots),
+        truth=truth_of_logs(log) if truth is None else truth_given(truth, log.robots),
         relations=relations_given(relations),
         progress=of_all(log, progress),
         say=announce,

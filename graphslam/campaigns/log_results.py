@@ -35,7 +35,7 @@ def _smooth(task: LogTask, folder: Path) -> Row:
     """Write a result folder with a small map."""
     log = open_logs([Path(task.path)], task.config)
     result = smooth(log, task.config)
-    errors = errors_of_run(result, truth_of_logs(log, task.config))
+    errors = errors_of_run(result, truth_of_logs(log)
     report = render(result, errors)
     save(result, folder, force=False, report=lambda _result: report)
     (folder / MAP).write_text(small_map(result), encoding="utf-8")
@@ -46,7 +46,7 @@ def _compare(task: LogTask, folder: Path) -> Row:
     """Write the folder of a comparison with a small map of the reference's path."""
     log = open_logs([Path(task.path)], task.config)
     variants = parse_variants(task.backends, task.config)
-    truth = truth_of_logs(log, task.config)
+    truth = truth_of_logs(log)
     comparison = compare(log, task.config, variants, task.mode, truth=truth, run=_replay)
     save_comparison(comparison, task.config, folder, force=False)
     found = comparison.summary

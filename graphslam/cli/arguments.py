@@ -144,12 +144,14 @@ def smoothing_settings(
     settings: list[str] | None,
     *,
     causal: bool = False,
+    same_place: bool = False,
     horizon: float | None = None,
 ) -> list[str]:
     """What the options of `smooth` stand for, as ``key=value``; those of --set come last."""
     return [
         *([f"backend.name={backend}"] if backend else ()),
         *(["backend.causal=true"] if causal else ()),
+        *(["logs.same_place=true"] if same_place else ()),
         *([] if horizon is None else [f"backend.horizon_s={horizon}"]),
         *([f"front_end.name={front_end}"] if front_end else ()),
         *(start or ()),
@@ -271,6 +273,13 @@ Horizon = Annotated[
         callback=check_horizon,
         help="How long isam2 revises a past pose: seconds, 0 = a filter, inf = for ever (the "
         "default); backend.horizon_s in the configuration.",
+    ),
+]
+SamePlace = Annotated[
+    bool,
+    typer.Option(
+        "--same-place",
+        help="The logs are visits to one place at different times: one map, a trajectory each.",
     ),
 ]
 Causal = Annotated[

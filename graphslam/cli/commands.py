@@ -37,6 +37,7 @@ from graphslam.cli.arguments import (
     Resolution,
     ResultFolder,
     Resume,
+    SamePlace,
     Scenario,
     Seed,
     Settings,
@@ -120,6 +121,7 @@ def smooth(
     front_end: FrontEnd = None,
     start: Starts = None,
     causal: Causal = False,
+    same_place: SamePlace = False,
     with_map: WithMap = False,
     viewer: Viewer = None,
     preset: Preset = None,
@@ -142,7 +144,10 @@ def smooth(
         raise ConfigError(f"only isam2 supports --horizon, not {named}; omit it")
     if horizon is not None:
         backend = "isam2"
-    chosen = smoothing_settings(backend, front_end, start, settings, causal=causal, horizon=horizon)
+    chosen = smoothing_settings(
+        backend, front_end, start, settings,
+        causal=causal, same_place=same_place, horizon=horizon,
+    )  # fmt: skip
     tree = load_config(config, chosen, preset)
     if plan:
         return _described(logs, tree, strict)

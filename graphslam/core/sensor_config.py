@@ -31,6 +31,8 @@ class LogsConfig:
     max_clock_offset_s: largest offset between the clocks of two robots that is searched for.
     undistort: take the motion of the robot during a sweep out of scans whose messages state the
         time between two beams (`time_increment`).
+    same_place: the logs are sessions: visits to one place at different times, each with its own
+        trajectory. A session has the name of its file where a robot's is asked for.
     topics: topics to use, name -> robot; empty = every topic whose schema is known, with the
         topic's namespace as robot.
     """
@@ -38,6 +40,7 @@ class LogsConfig:
     reorder_s: float = 2.0
     max_clock_offset_s: float = 5.0
     undistort: bool = True
+    same_place: bool = False
     topics: Mapping[str, str] = field(default_factory=dict)
 
 

@@ -17,11 +17,11 @@ from graphslam.slam.verdict import with_truth
 _NO_TRUTH = "holds no true poses or landmarks; give --truth or --relations"
 
 
-def truth_of_logs(log: LogSet, config: Config) -> GroundTruth:
+def truth_of_logs(log: LogSet) -> GroundTruth:
     """The truth in opened logs; empty if there is none."""
     if not any(topic.record in (Truth, TrueLandmark) for topic in log.topics):
         return GroundTruth({}, ())  # without reading the logs again
-    return truth_from_recordings(log.opened, config)
+    return truth_from_recordings(log.opened, log.config)
 
 
 def truth_of_run(result: Result | SavedResult) -> GroundTruth:

@@ -7,6 +7,8 @@ together, named with their units, in the shape of ``evaluate --json``.
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from graphslam.core.errors import OutputError
 from graphslam.core.records import Landmark, Result, Trajectory, TrueLandmark
 from graphslam.core.worker import parallel_map
@@ -21,7 +23,12 @@ from graphslam.evaluation.common_frame import (
     moved_landmarks,
 )
 from graphslam.evaluation.landmark_metrics import landmark_metrics
-from graphslam.evaluation.relation_metrics import Relations, find_stamps, relation_metrics
+from graphslam.evaluation.relation_metrics import (
+    Relations,
+    find_stamps,
+    one_after_another,
+    relation_metrics,
+)
 from graphslam.evaluation.trajectory_metrics import PosePairs, pair_poses, trajectory_metrics
 from graphslam.results.folder import SavedResult
 from graphslam.results.joint_file import joint_scans
@@ -181,7 +188,10 @@ def _compare_trajectories(
 
 
 def _compare_relations(result: Result | SavedResult, relations: Relations) -> dict[str, Any]:
-    """``relations`` of `evaluate`."""
+    """``relations`` of `evaluate`.
+
+    They are of one robot, or of all sessions that share a frame; of sessions not with covariances.
+    """
     scans = [
         (name, robot.scan_final, robot.scan_causal)
         for name, robot in result.robots.items()
@@ -189,9 +199,16 @@ def _compare_relations(result: Result | SavedResult, relations: Relations) -> di
     ]
     if not scans:
         raise OutputError("relations need the poses of scans, and this result has none")
-    name, final, causal = max(
-        scans, key=lambda one: int(find_stamps(relations.from_ns, one[1].stamps_ns)[1].sum())
-    )
+    found_in = [int(find_stamps(relations.from_ns, one[1].stamps_ns)[1].sum()) for one in scans]
+    name, final, causal = scans[int(np.argmax(found_in))]
+    frames = result.summary.get("frames", {})
+    sessions = [
+        one
+        for one, count in zip(scans, found_in, strict=True)
+        if count and frames.get(one[0]) == frames.get(name)
+    ]
+    if len(sessions) > 1:
+        return relation_metrics(relations, one_after_another([one[1] for one in sessions]))
     if isinstance(result, SavedResult):
         joint = result.joint
     else:

@@ -79,7 +79,7 @@ def run_log(
         if draw_starts:
             config = replace(config, start=drawn_starts(log, config.start, seed))
         result = smooth(log, config)
-        known = truth_of_logs(log, config)
+        known = truth_of_logs(log)
     found = evaluate(result, known.trajectories, known.landmarks)
     kept = {key: result.summary.get(key) for key in ("counts", "scans_per_s")}
     warnings = [_without(folder, text) for text in result.summary.get("warnings", ())]

@@ -5,6 +5,7 @@ Source: R. Kümmerle et al., On measuring the accuracy of SLAM algorithms, Auton
 """
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -116,6 +117,14 @@ def match_relations(
     errors = between(relations.poses[matched], measured)
     covs = None if joint is None else relative_covariances(joint, robot, scans, pairs)
     return MatchedRelations(errors, covs, matched)
+
+
+def one_after_another(sessions: Sequence[Trajectory]) -> Trajectory:
+    """The poses of several sessions as one trajectory; covariances are left out, NaN."""
+    stamps = np.concatenate([one.stamps_ns for one in sessions])
+    order = np.argsort(stamps, kind="stable")
+    poses = np.concatenate([one.poses for one in sessions])[order]
+    return Trajectory(stamps[order], poses, np.full((len(order), 3, 3), np.nan))
 
 
 def relation_errors(relations: Relations, scans: Trajectory) -> Array:

@@ -14,7 +14,6 @@ from graphslam.core.config import Config, RobotConfig
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import Array, between
 from graphslam.logs import time_order
-from graphslam.logs.containers import open_recording
 from graphslam.logs.decoders import TopicContext
 from graphslam.logs.findings import Finding
 from graphslam.logs.future_stamps import Recorded
@@ -24,6 +23,7 @@ from graphslam.logs.log_checks import CheckedLog, by_severity, check_log
 from graphslam.logs.log_set import FileReader, LogFile, damage, merged_notes
 from graphslam.logs.recording import Recording
 from graphslam.logs.robots import robots_and_topics
+from graphslam.logs.sessions import open_recordings
 from graphslam.logs.tf_tree import static_topics
 from graphslam.logs.topic_context import scan_shape, topic_contexts
 from graphslam.logs.topic_info import Gap, RobotInfo, TopicInfo
@@ -81,7 +81,7 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
     Raises:
         LogError: a file is missing, of no known container or without a message.
     """
-    files = [open_recording(Path(path), config.limits) for path in paths]
+    files, config = open_recordings(paths, config)
     findings = damage(files)
     topics: list[Topic] = []
     chosen: list[Topic] = []

@@ -13,7 +13,6 @@ from graphslam.core.geometry import Array
 from graphslam.core.records import Message
 from graphslam.core.worker import Prefetch
 from graphslam.logs import time_order
-from graphslam.logs.containers import open_recording
 from graphslam.logs.decoders import TopicContext, decode_messages
 from graphslam.logs.findings import Finding
 from graphslam.logs.future_stamps import Recorded, repair_future_stamps
@@ -22,6 +21,7 @@ from graphslam.logs.imu_turning import Turning, with_turning
 from graphslam.logs.lasers import further_lasers
 from graphslam.logs.recording import Recording, raw_messages, sample_messages
 from graphslam.logs.robots import robots_and_topics
+from graphslam.logs.sessions import open_recordings
 from graphslam.logs.stated_noise import StatedNoise, stated_noise
 from graphslam.logs.topic_context import topic_contexts
 from graphslam.logs.topics import MOTION_KINDS, ODOMETRY_KINDS, Topic, choose_topics
@@ -278,7 +278,7 @@ def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
     """
     if not paths:
         raise LogError("no log given; name at least one file or folder")
-    files = [open_recording(Path(path), config.limits) for path in paths]
+    files, config = open_recordings(paths, config)
     for n, file in enumerate(files):
         if file.sha256 in {other.sha256 for other in files[:n]}:
             raise LogError(f"{file.path}: is given twice; name each log once")

@@ -10,9 +10,9 @@ import numpy as np
 from graphslam.core.config import Config
 from graphslam.core.records import Trajectory, TrueAssociations, TrueLandmark, Truth
 from graphslam.logs import schemas
-from graphslam.logs.containers import open_recording
 from graphslam.logs.decoders import TopicContext, decode_messages
 from graphslam.logs.recording import Recording, raw_messages
+from graphslam.logs.sessions import open_recordings
 from graphslam.logs.topics import find_topics
 
 
@@ -42,7 +42,7 @@ def read_truth(paths: Sequence[Path], config: Config) -> GroundTruth:
         LogError: a file is missing, of no known container, empty, or without any topic that can be
             decoded.
     """
-    return truth_from_recordings([open_recording(path, config.limits) for path in paths], config)
+    return truth_from_recordings(*open_recordings(paths, config))
 
 
 def truth_from_recordings(files: Sequence[Recording], config: Config) -> GroundTruth:
@@ -78,7 +78,7 @@ def read_true_associations(
         LogError: a file is missing, of no known container, empty, or without any topic that can be
             decoded.
     """
-    files = [open_recording(path, config.limits) for path in paths]
+    files, config = open_recordings(paths, config)
     topics = {t.name: t for t in find_topics(files, config) if t.record is TrueAssociations}
     found: dict[str, list[TrueAssociations]] = {name: [] for name in topics}
     unusable: Counter[str] = Counter()

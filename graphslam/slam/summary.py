@@ -252,10 +252,11 @@ def run_warnings(pipeline: LogPass) -> list[str]:
         if a < b
     ]
     warnings += noise_warnings(pipeline.noise)
-    warnings += span_warnings(
-        {name: run.track for name, run in pipeline.runs.items()},
-        unplaced=pipeline.dropped["sighting: no odometry near it"] > 0,
-    )
+    if not pipeline.config.logs.same_place:  # sessions are of different times
+        warnings += span_warnings(
+            {name: run.track for name, run in pipeline.runs.items()},
+            unplaced=pipeline.dropped["sighting: no odometry near it"] > 0,
+        )
     warnings += [
         f"the back end could not use {count} x {reason}"
         for reason, count in sorted(pipeline.skipped.items())

@@ -48,7 +48,7 @@ def two(tmp_path_factory):
     simulate(load_scenario("two-robots"), path, 0)
     config = load_config(None, START)
     log = open_logs([path], config)
-    truth = truth_of_logs(log, config)
+    truth = truth_of_logs(log)
     done = compare(
         log, config, parse_variants(SPECS, load_config(None, START)), truth=truth, run=timed_replay
     )
@@ -471,7 +471,7 @@ def test_without_truth_rows_are_compared_with_each_other(two):
 def test_without_a_start_what_is_drawn_is_aligned(tmp_path):
     """The world then has its origin at the first pose, metres from where the truth has it."""
     log = open_logs([drive(tmp_path / "room.mcap", seconds=8)], Config())
-    truth = truth_of_logs(log, Config())
+    truth = truth_of_logs(log)
     done = compare(log, Config(), parse_variants(["isam2"]), truth=truth, run=timed_replay)
     assert not done.summary["rows"][0]["common_frame"]
     assert done.summary["rows"][0]["joint"]["final"]["ate_rmse_m"] is None
@@ -556,7 +556,7 @@ def test_dead_reckoning_is_of_odometry_as_recorded(tmp_path):
     path = drive(tmp_path / "room.mcap")
     config = load_config(None, START)
     log = open_logs([path], config)
-    truth = truth_of_logs(log, config)
+    truth = truth_of_logs(log)
     done = compare(
         log, config, parse_variants(["dead-reckoning", "batch"], config), truth=truth,
         run=timed_replay,

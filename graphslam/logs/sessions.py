@@ -1,0 +1,111 @@
+"""Recordings of one place at different times: each is a session with a trajectory of its own.
+
+A session is to the estimator what a robot is: it has its own odometry, starts anywhere, and shares
+the map. So the topics of a recording get its name as namespace. Where a session starts in the
+others' frame is found like the start of a robot (`graphslam.multi_robot.place_recognition`).
+"""
+
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from graphslam.core.config import Config
+from graphslam.core.errors import LogError
+from graphslam.core.records import Sighting
+from graphslam.logs.containers import open_recording
+from graphslam.logs.recording import Piece, Recording
+from graphslam.logs.robots import robots_and_topics
+from graphslam.logs.schemas import DEFAULT_ROBOT
+from graphslam.logs.tf_tree import namespace_of
+from graphslam.logs.topics import MOTION_KINDS
+
+#: what only a robot has
+_OF_ROBOTS = (*MOTION_KINDS, Sighting)
+#: notes about a robot begin with this
+_NOTED = "robots."
+#: topics of all robots of a recording
+_SHARED = ("/tf", "/tf_static")
+#: beginnings of names: of recordings, without the endings that they have
+_STEM = re.compile(r"^(.+?)(\.mcap|\.zstd|\.bag|\.db3)*$")
+
+
+def open_recordings(paths: Sequence[Path], config: Config) -> tuple[list[Recording], Config]:
+    """Open recordings (see `open_recording`), as sessions if `logs.same_place` says so.
+
+    Returns:
+        The recordings, and the settings by the names that their topics have now.
+
+    Raises:
+        LogError: one is missing, of no known container or empty; or there is just one session.
+    """
+    files = [open_recording(Path(path), config.limits) for path in paths]
+    if not config.logs.same_place:
+        return files, config
+    if len(files) < 2:
+        raise LogError(f"{files[0].path}: is one session; --same-place joins two or more logs")
+    sessions = session_names([file.path for file in files])
+    topics: dict[str, str] = {}
+    found = []
+    for file, session in zip(files, sessions, strict=True):
+        used = robots_and_topics([file], config)[1]
+        robots = {topic.robot for topic in used if topic.count and topic.record in _OF_ROBOTS}
+        renamed = _Renamed(session, robots if len(robots) > 1 else ())
+        found.append(renamed.recording(file))
+        for topic, robot in config.logs.topics.items():
+            topics[renamed.topic(topic)] = renamed.robot(robot)
+    return found, replace(config, logs=replace(config.logs, topics=topics))
+
+
+def session_names(paths: Sequence[Path]) -> list[str]:
+    """A name for each recording: that of its file, and a number where several have the same."""
+    names: list[str] = []
+    for path in paths:
+        stem = _STEM.sub(r"\1", path.name)
+        name = re.sub(r"[^A-Za-z0-9_-]+", "_", stem).strip("_") or "session"
+        number = 2
+        unique = name
+        while unique in names:
+            unique, number = f"{name}-{number}", number + 1
+        names.append(unique)
+    return names
+
+
+class _Renamed:
+    """Names in a session: of its topics, and of its ``robots``, if it has more than one."""
+
+    def __init__(self, session: str, robots: Collection[str]) -> None:
+        self._session, self._robots = session, robots
+
+    def robot(self, name: str) -> str:
+        """The session's robot, or one of several."""
+        return f"{self._session}.{name}" if self._robots else self._session
+
+    def topic(self, name: str) -> str:
+        """The topic in the namespace of its robot; what several robots share keeps its name."""
+        if not self._robots:
+            return f"/{self._session}/{name.lstrip('/')}"
+        space = namespace_of(name)
+        if space not in self._robots or name in _SHARED:
+            return name
+        rest = name.strip("/").removeprefix(f"{space}/") if space != DEFAULT_ROBOT else name
+        return f"/{self.robot(space)}/{rest.lstrip('/')}"
+
+    def recording(self, file: Recording) -> Recording:
+        """The recording with these names."""
+        return replace(file, pieces=tuple(map(self._piece, file.pieces)))
+
+    def _piece(self, piece: Piece) -> Piece:
+        channels = {
+            number: channel._replace(topic=self.topic(channel.topic))
+            for number, channel in piece.channels.items()
+        }
+        return replace(piece, channels=channels, notes=self._notes(piece.notes))
+
+    def _notes(self, notes: Mapping[str, str]) -> dict[str, str]:
+        made = {}
+        for key, note in notes.items():
+            robot, dot, rest = key.removeprefix(_NOTED).partition(".")
+            own = key.startswith(_NOTED) and bool(dot)
+            made[f"{_NOTED}{self.robot(robot)}.{rest}" if own else key] = note
+        return made

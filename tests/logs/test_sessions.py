@@ -1,0 +1,111 @@
+"""Recordings of one place at different times: a trajectory each, one map."""
+
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from recordings import messages_of
+from room_log import drive
+
+import graphslam
+from graphslam.core.errors import LogError
+from graphslam.evaluation.metrics import evaluate
+from graphslam.logs import LogWriter, open_logs, read_truth
+from graphslam.logs.sessions import session_names
+from graphslam.simulation import load_scenario, simulate
+from graphslam.simulation.scenario import Leg
+
+SAME_PLACE = graphslam.load_config(**{"logs.same_place": True})
+DAY_S = 86_400
+
+
+def test_sessions_are_named_like_their_files(tmp_path):
+    """Without the endings of containers; what is no name of a topic is replaced."""
+    files = ("monday.mcap", "a/monday.mcap.zstd", "my robot.bag", "tuesday", "2026-11-23.db3")
+    names = session_names([tmp_path / name for name in files])
+    assert names == ["monday", "monday-2", "my_robot", "tuesday", "2026-11-23"]
+
+
+def test_the_robot_of_each_recording_is_a_session(tmp_path):
+    """Its topics, mount and truth are in the session's namespace; without the setting it is one."""
+    paths = [drive(tmp_path / "monday.mcap"), drive(tmp_path / "tuesday.mcap", seconds=20)]
+    log = open_logs(paths, SAME_PLACE)
+    assert log.robots == ("monday", "tuesday")
+    assert {topic.name for topic in log.topics} >= {"/monday/scan", "/tuesday/odom"}
+    for name in log.robots:
+        np.testing.assert_allclose(log.mount(f"/{name}/scan"), [0.2, 0, 0], atol=1e-9)
+    assert {message.robot for message in log.messages()} == {"monday", "tuesday"}
+    truth = read_truth(paths, SAME_PLACE).trajectories
+    assert {name: len(own) for name, own in truth.items()} == {"monday": 301, "tuesday": 201}
+    assert open_logs(paths, graphslam.load_config()).robots == ("robot",)
+
+
+def test_several_robots_of_a_recording_are_each_in_each_session(tmp_path):
+    """A fleet that comes again has two trajectories of every robot."""
+    paths = []
+    for day, name in enumerate(("monday", "tuesday")):
+        paths.append(tmp_path / f"{name}.mcap")
+        with LogWriter(paths[-1]) as log:
+            for robot in ("a", "b"):
+                for k in range(20):
+                    stamp = (DAY_S * day + k) * 1_000_000_000
+                    log.odometry(robot, stamp, [0.1 * k, 0, 0])
+                    log.sighting(robot, stamp, [0.1, 2.0], np.eye(2) * 1e-3, identity="post")
+    log = open_logs(paths, SAME_PLACE)
+    assert log.robots == ("monday.a", "monday.b", "tuesday.a", "tuesday.b")
+
+
+def test_topics_that_are_chosen_have_the_names_of_the_recordings(tmp_path):
+    """What `logs.topics` says holds in every session."""
+    paths = [drive(tmp_path / "monday.mcap"), drive(tmp_path / "tuesday.mcap", seconds=20)]
+    chosen = {"/scan": "robot", "/odom": "robot"}
+    config = replace(SAME_PLACE, logs=replace(SAME_PLACE.logs, topics=chosen))
+    log = open_logs(paths, config)
+    assert log.robots == ("monday", "tuesday")
+    assert len(log.topics) == 4
+
+
+def test_one_session_is_refused(tmp_path):
+    """There is nothing to join."""
+    with pytest.raises(LogError, match=r"is one session; --same-place joins two or more"):
+        open_logs([drive(tmp_path / "monday.mcap", seconds=5)], SAME_PLACE)
+
+
+def later(log, target, seconds):
+    """The recording as if it had been made so much later: its stamps follow their headers."""
+    with LogWriter(target) as made:
+        for topic, schema, log_time, data in messages_of(log):
+            (stamp,) = struct.unpack_from("<i", data, 4)
+            moved = data[:4] + struct.pack("<i", stamp + seconds) + data[8:]
+            kept = data if schema.endswith("TFMessage") else moved
+            made.encoded(topic, schema, kept, log_time + seconds * 1_000_000_000)
+    return target
+
+
+def office(path, seed, *drive, **start):
+    """One robot that drives through the simulated office."""
+    scenario = load_scenario("office-loop")
+    (robot,) = scenario.robots.values()
+    laser = replace(robot.laser, period_s=0.5)
+    robot = replace(robot, laser=laser, drive=(Leg(through_m=drive),), **start)
+    simulate(replace(scenario, robots={"robot": robot}), path, seed)
+    return path
+
+
+def test_a_second_day_that_starts_elsewhere_is_in_the_map_of_the_first(tmp_path):
+    """Where it started is found; both days have one frame, and no warning tells of the clocks.
+
+    5 cm: each day alone is within 3 cm, and what they share ties them.
+    """
+    path = (20.0, 6.1), (20.0, 17.9), (17.0, 17.9)
+    monday = office(tmp_path / "monday.mcap", 0, *path, start_m=(9.0, 6.1))
+    path = (20.0, 6.1), (20.0, 16.0)
+    same = office(tmp_path / "same.mcap", 10, *path, start_m=(30.0, 6.1), start_deg=180.0)
+    tuesday = later(same, tmp_path / "tuesday.mcap", DAY_S)
+    result = graphslam.smooth([monday, tuesday], config=SAME_PLACE)
+    assert result.summary["frames"] == {"monday": "monday", "tuesday": "monday"}
+    assert not any("clock" in warning for warning in result.summary["warnings"])
+    truth = read_truth([monday, tuesday], SAME_PLACE)
+    errors = evaluate(result, truth.trajectories, truth.landmarks)
+    assert errors["joint"]["final"]["ate_aligned_rmse_m"] < 0.05
