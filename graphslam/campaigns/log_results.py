@@ -35,7 +35,7 @@ def _smooth(task: LogTask, folder: Path) -> Row:
     """Write a result folder with a small map."""
     log = open_logs([Path(task.path)], task.config)
     result = smooth(log, task.config)
-    errors = errors_of_run(result, truth_of_logs(log)
+    errors = errors_of_run(result, truth_of_logs(log))
     report = render(result, errors)
     save(result, folder, force=False, report=lambda _result: report)
     (folder / MAP).write_text(small_map(result), encoding="utf-8")
