@@ -3,12 +3,16 @@
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
+from operator import itemgetter
 
 import numpy as np
 
-from graphslam.core.config import Config
-from graphslam.core.geometry import Array
-from graphslam.core.records import OdometryPose
+from graphslam.core.config import Config, RobotConfig
+from graphslam.core.config_io import load_config
+from graphslam.core.geometry import Array, exp, rotation3
+from graphslam.core.motion_models import wheel_twist
+from graphslam.core.record import replace
+from graphslam.core.records import OdometryPose, WheelAngles
 from graphslam.logs.decoders import TopicContext, decode_messages
 from graphslam.logs.findings import Finding
 from graphslam.logs.imu import IntArray, imu_topics, turn_rates
@@ -28,7 +32,7 @@ def find_gyroscopes(
     contexts: Mapping[str, TopicContext],
     config: Config,
 ) -> tuple[dict[str, Turning], list[Finding]]:
-    """The turning of each robot that reports poses of its odometry and has a gyroscope.
+    """The turning of each robot that reports poses or wheel angles and has a gyroscope.
 
     Args:
         files: the recordings.
@@ -40,24 +44,28 @@ def find_gyroscopes(
     findings: list[Finding] = []
     robots = sorted({t.robot for t in topics if t.record in MOTION_KINDS})
     for robot in robots if config.odometry.gyroscope == "auto" else ():
-        odometry = [t for t in topics if t.robot == robot and t.record is OdometryPose]
+        kinds = (OdometryPose, WheelAngles)
+        odometry = [t for t in topics if t.robot == robot and t.record in kinds]
         names = imu_topics(files, robot, len(robots))
         if not (names and odometry):
             continue
         tree = static_tree(files, robot, sampled_edges(files, robot))
         times, rates = turn_rates(files, names[0], tree, base_frame(files, odometry[0]))
-        poses = list(_poses(files, odometry[0], contexts[odometry[0].name]))
-        at: IntArray = np.array([time for time, _ in poses], dtype=np.int64)
-        turning = find_turning(
-            names[0], times, rates, at, np.array([pose for _, pose in poses]).reshape(-1, 3)
-        )
+        wheels = _wheels(robot, files, config)
+        readings = list(_readings(files, odometry[0], contexts[odometry[0].name]))
+        readings.sort(key=itemgetter(0))
+        at: IntArray = np.array([time for time, _ in readings], dtype=np.int64)
+        poses = np.array([reading for _, reading in readings])
+        if odometry[0].record is WheelAngles:
+            poses = _path(poses.reshape(-1, 2), wheels)
+        turning = find_turning(names[0], times, rates, at, poses.reshape(-1, 3))
         where = f"robot {robot}"
         if isinstance(turning, str):
             text = f"the gyroscope of {names[0]} is not used: {turning}"
             remedy = "check its axes in /tf_static and its units"
             findings.append(Finding("note", "gyroscope", where, text, remedy))
         else:
-            found[robot] = turning
+            found[robot] = replace(turning, wheels=wheels)
             text = f"turning is that of the gyroscope of {names[0]}, less a bias of "
             text += f"{turning.bias:.2g} rad/s and a delay of {1e3 * turning.late_s:.0f} ms"
             remedy = "to leave it out: --set odometry.gyroscope=off"
@@ -65,14 +73,44 @@ def find_gyroscopes(
     return found, findings
 
 
-def _poses(
+def _wheels(robot: str, files: Sequence[Recording], config: Config) -> RobotConfig:
+    """The settings of a robot; what is at its default there is that of the notes of the log."""
+    default, own = RobotConfig(), config.robot(robot)
+    notes = {key: value for file in files for key, value in file.notes.items()}
+    lines = [f"{k}={v}" for k, v in notes.items() if k.startswith(f"robots.{robot}.")]
+    noted = load_config(overrides=lines).robot(robot)
+    return replace(
+        own,
+        **{
+            name: getattr(noted, name)
+            for name in ("wheel_radius_left_m", "wheel_radius_right_m", "axle_m")
+            if getattr(own, name) == getattr(default, name)
+        },
+    )
+
+
+def _path(angles: Array, wheels: RobotConfig) -> Array:
+    """Poses (n, 3) by angles (n, 2) of the wheels, rad."""
+    steps = exp(wheel_twist(np.diff(angles, axis=0), wheels))
+    heading = np.concatenate([[0.0], np.cumsum(steps[:, 2])])
+    moved = (rotation3(heading[:-1]) @ steps[:, :, None])[:, :2, 0]
+    xy = np.concatenate([np.zeros((1, 2)), np.cumsum(moved, axis=0)])
+    return np.column_stack([xy, heading])
+
+
+def _readings(
     files: Sequence[Recording], topic: Topic, context: TopicContext
 ) -> Iterator[tuple[int, Array]]:
-    """Times, ns, and poses (3,) of the odometry, in the order of recording."""
+    """Times, ns, and poses (3,) of the odometry or angles (2,), in the order of recording."""
     for file in files:
         raws = raw_messages(file, {topic.name})
         while batch := list(islice(raws, _BATCH)):
             decoded = decode_messages(topic.schema, [r.data for r in batch], context, Counter())
             for raw, message in zip(batch, decoded, strict=True):
+                time_ns = raw.log_time_ns
+                if message is not None and not context.by_log_time:
+                    time_ns = message.time_ns
                 if isinstance(message, OdometryPose):
-                    yield raw.log_time_ns if context.by_log_time else message.time_ns, message.pose
+                    yield time_ns, message.pose
+                elif isinstance(message, WheelAngles):
+                    yield time_ns, np.array([message.left_rad, message.right_rad])

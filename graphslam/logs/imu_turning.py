@@ -14,13 +14,15 @@ that contradicts the wheels altogether (another axis, degrees, no signal) is not
 """
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from graphslam.core.config import RobotConfig
 from graphslam.core.geometry import Array, between, compose, exp, log, wrap
+from graphslam.core.motion_models import rows_of_twists, wheel_twist
 from graphslam.core.record import replace
-from graphslam.core.records import Message, OdometryPose
+from graphslam.core.records import Message, OdometryPose, WheelAngles
 
 IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
@@ -50,7 +52,7 @@ class Turning:
 
     ``gaps`` (n,) counts the intervals up to each time that are longer than `GAP_NS`. ``topic`` is
     where it is from; ``bias`` rad/s its mean bias; ``late_s`` how late its stamps were, which is
-    taken out of ``times``.
+    taken out of ``times``. ``wheels``: those of odometry by wheel angles.
     """
 
     topic: str
@@ -59,6 +61,7 @@ class Turning:
     gaps: IntArray
     bias: float
     late_s: float
+    wheels: RobotConfig = field(default_factory=RobotConfig)
 
     def turned(self, start_ns: int, end_ns: int) -> float | None:
         """How far the robot turned, rad; None where the gyroscope did not measure all the time."""
@@ -235,7 +238,11 @@ def with_turning(
     Where it says nothing, and where the wheels stand, the odometry stays as it is.
     """
     last: dict[str, tuple[OdometryPose, Array]] = {}
+    angles: dict[str, tuple[WheelAngles, Array]] = {}
     for message in messages:
+        if isinstance(message, WheelAngles) and message.robot in gyroscopes:
+            yield _turned_wheels(message, gyroscopes[message.robot], angles)
+            continue
         if not isinstance(message, OdometryPose) or message.robot not in gyroscopes:
             yield message
             continue
@@ -249,3 +256,25 @@ def with_turning(
             pose = compose(begin, exp(twist))
         last[message.robot] = message, pose
         yield replace(message, pose=pose)
+
+
+def _turned_wheels(
+    message: WheelAngles, gyroscope: Turning, last: dict[str, tuple[WheelAngles, Array]]
+) -> WheelAngles:
+    """Wheels that have gone as far as those of a message, and turned the robot as it turned.
+
+    ``last``: robot -> its message before, and the angles (2,) that were made of it.
+    """
+    angles = np.array([message.left_rad, message.right_rad])
+    if message.robot in last:
+        before, begin = last[message.robot]
+        moved = angles - [before.left_rad, before.right_rad]
+        if moved.any():
+            turned = gyroscope.turned(before.time_ns, message.time_ns)
+            if turned is not None:
+                twist = wheel_twist(moved[None], gyroscope.wheels)
+                twist[0, 2] = turned
+                moved = rows_of_twists("wheels", twist, gyroscope.wheels)[0, :2]
+        angles = begin + moved
+    last[message.robot] = message, angles
+    return replace(message, left_rad=float(angles[0]), right_rad=float(angles[1]))

@@ -6,9 +6,11 @@ from paths import ROOT
 
 import graphslam
 from graphslam.core import records
-from graphslam.core.config import Config
+from graphslam.core.config import Config, RobotConfig
 from graphslam.core.config_io import load_config
-from graphslam.core.geometry import compose, exp, wrap
+from graphslam.core.geometry import between, compose, exp, wrap
+from graphslam.core.geometry import log as log_of
+from graphslam.core.motion_models import rows_of_twists, wheel_twist
 from graphslam.logs import LogWriter, open_logs, schemas
 from graphslam.logs.cdr_writing import imu_bytes, tf_bytes
 from graphslam.logs.imu_turning import GAP_NS, Turning, find_turning
@@ -206,3 +208,31 @@ def test_the_message_is_that_of_the_reference_writer(frame):
     assert (message.header.frame_id, message.header.stamp.nanosec) == (frame, 7)
     assert (message.angular_velocity.z, message.angular_velocity.x) == (0.25, 0.0)
     assert schemas.decode(schemas.IMU, data).angular_velocity.z == 0.25
+
+
+def test_wheel_angles_turn_as_the_gyroscope_says_and_go_as_far(tmp_path):
+    """JointState of a robot whose wheels slip: the axle that they turn about is not the nominal."""
+    times, poses, truth = drive()
+    wheels = RobotConfig(wheel_radius_left_m=0.11, wheel_radius_right_m=0.1, axle_m=0.6)
+    steps = rows_of_twists("wheels", log_of(between(poses[:-1], poses[1:])), wheels)[:, :2]
+    angles = np.vstack([np.zeros(2), np.cumsum(steps, axis=0)])
+    at, rates = gyroscope(times, truth)
+    path = tmp_path / "log.mcap"
+    with LogWriter(path) as out:
+        for time, (left, right) in zip(times.tolist(), angles.tolist(), strict=True):
+            out.wheel_angles("robot", time, left_rad=left, right_rad=right)
+            if (time - T0) % S == 0:
+                out.scan("robot", time, np.ones(9), angle_min_rad=0, angle_step_rad=0.1,
+                         range_max_m=9.0)  # fmt: skip
+        for time, rate in zip(at.tolist(), rates.tolist(), strict=True):
+            out.encoded("/imu/data", schemas.IMU, imu_bytes(time, "imu", rate), time)
+    geometry = {"wheel_radius_left_m": 0.11, "wheel_radius_right_m": 0.1, "axle_m": 0.6}
+    settings = [f"robots.robot.{name}={value}" for name, value in geometry.items()]
+    log = open_logs([path], load_config(None, settings))
+    read = [m for m in log.messages() if isinstance(m, records.WheelAngles)]
+    found = np.diff([(m.left_rad, m.right_rad) for m in read], axis=0)
+    twists = wheel_twist(found, wheels)
+    np.testing.assert_allclose(twists[:, 0], wheel_twist(steps, wheels)[:, 0], atol=1e-12)
+    off = np.concatenate([[0.0], np.cumsum(twists[:, 2])]) - truth
+    assert abs(off).max() < 0.1
+    assert abs(np.unwrap(poses[:, 2]) - truth).max() > 1.0
