@@ -84,6 +84,8 @@ def topic_contexts(
     findings: list[Finding] = []
     odometry = [t for kind in ODOMETRY_KINDS[::-1] for t in topics if t.record is kind]
     bases = {t.robot: base_frame(files, t) for t in odometry}  # the preferred kind comes last
+    by_wheels = {t.robot for t in odometry if t.record is records.WheelAngles}
+    by_wheels -= {t.robot for t in odometry if t.record is not records.WheelAngles}
     contexts = {}
     trees: dict[str, TransformTree] = {}
     edges: dict[str, dict[str, Edge]] = {}
@@ -102,7 +104,10 @@ def topic_contexts(
                 trees[topic.robot] = static_tree(files, topic.robot, own)
             tree = trees[topic.robot]
             for frame in sorted({frame_of(message) for message in messages}):
-                base = bases[topic.robot] if topic.robot in bases else base_above(tree, frame)
+                above = base_above(tree, frame)
+                base = bases.get(topic.robot, above)
+                if topic.robot in by_wheels and above.rpartition("/")[2].startswith("base"):
+                    base = above  # no message of the wheels names it
                 if sensor and base == frame:
                     base = "the robot's base"  # nothing ties this laser to the others
                 is_scan = topic.record is records.Scan

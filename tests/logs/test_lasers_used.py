@@ -95,3 +95,16 @@ def test_what_cannot_use_more_than_one_laser_says_so(tmp_path, robots, settings)
     assert not log.further_lasers
     unused = [line for line in log.warnings if "not used" in line]
     assert len(unused) == len(robots) and all("logs.topics" in line for line in unused)
+
+
+def test_the_base_of_wheels_is_that_above_the_laser(tmp_path):
+    """JointState names no frame: of a robot with a namespace the base is not `base_link`."""
+    path = tmp_path / "log.mcap"
+    with LogWriter(path) as log:
+        log.mount("vehicle", 0, MOUNTS["laser"])
+        for k in range(20):
+            log.wheel_angles("vehicle", k * 100_000_000, 0.5 * k, 0.5 * k)
+            log.scan("vehicle", k * 100_000_000, np.linspace(2.0, 3.0, 31), **FAN)
+    log = opened(path)
+    np.testing.assert_allclose(log.mount("/vehicle/scan"), MOUNTS["laser"], atol=1e-12)
+    assert not any("no transform" in line for line in log.warnings)
