@@ -9,6 +9,7 @@ array), and floats, stamps and the order of arrays in memory are exactly what th
 """
 
 import json
+import re
 from collections import Counter, defaultdict, deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
@@ -24,6 +25,7 @@ PLAIN = frozenset({type(None), bool, int, float, str})
 _LENGTH_BYTES = 8
 #: kinds of numbers that an array may have: all of fixed size, and no objects
 _NUMBERS = "biufc"
+_NAME_OF_NUMBERS = re.compile(f"[<>|][{_NUMBERS}][0-9]{{1,2}}")
 #: what reading bytes of somebody else may end in
 _NOT_OURS = (
     ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError,
@@ -170,9 +172,9 @@ class _Reader:
         self._kinds, self._made = kinds, list[Any]()
         self._arrays = []
         for dtype, shape, order in shapes:
-            kind = np.dtype(dtype)
-            if kind.kind not in _NUMBERS or order not in ("C", "F"):
+            if not _NAME_OF_NUMBERS.fullmatch(dtype) or order not in ("C", "F"):
                 raise ValueError(f"an array of {dtype}")
+            kind = np.dtype(dtype)
             count = int(np.prod(shape, dtype=np.int64))
             flat = np.frombuffer(data, kind, count, start)
             self._arrays.append(flat.reshape(shape, order=order).copy(order="K"))
