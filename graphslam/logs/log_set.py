@@ -31,7 +31,7 @@ Odometry = records.OdometryIncrement | records.OdometryPose | records.WheelAngle
 #: fewer messages are read faster without a second process
 WORKER_MIN_MESSAGES = 10_000
 #: messages that are held in memory at most, some 400 bytes each
-KEPT_MESSAGES = 1_000_000
+KEPT_MESSAGES = 250_000
 
 
 @dataclass(frozen=True, slots=True)

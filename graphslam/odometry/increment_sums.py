@@ -7,6 +7,7 @@ F_k D_k up to both ends of an interval give its covariance and its derivative by
 C_k may be several covariances (..., 3, 3), by several models of the noise.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,6 +36,13 @@ class Motions:
         """The motions from the i-th up to the j-th, which is left out."""
         which = slice(i, j)
         return Motions(self.delta[which], self.cov[which], self.d_cal[which], self.length_m[which])
+
+    @classmethod
+    def joined(cls, parts: Sequence["Motions"], places: Sequence[IntArray]) -> "Motions":
+        """Motions of which each of ``parts`` has those at ``places``, (m,) indices."""
+        order = np.argsort(np.concatenate(places), kind="stable")
+        values = ((p.delta, p.cov, p.d_cal, p.length_m) for p in parts)
+        return cls(*(np.concatenate(each)[order] for each in zip(*values, strict=True)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -27,8 +27,8 @@ OVER_RELAXATION = 0.7
 FLOOR_M, FLOOR_RAD = 5e-4, 1e-4
 #: residuals are cut at so many of their own sigmas: slip is left to the solution
 CLIP_SIGMAS = 3.0
-#: motions whose variances by nine rates are computed at once
-BLOCK = 1000
+#: motions whose variances by nine rates are computed at once, and readings in them, at most
+BLOCK, READINGS = 1000, 20_000
 #: a median of absolute values, as the sigma of a normal variable
 SIGMA_OF_MEDIAN = 1.4826
 
@@ -126,8 +126,11 @@ def variances_by_rate(track: Track, start_ns: IntArray, end_ns: IntArray) -> Arr
         end_ns: (n,) later than these.
     """
     found = [np.zeros((0, 3, len(RATES)))]
-    for block in range(0, len(start_ns), BLOCK):  # nine covariances of every reading in between
-        start, end = (times[block : block + BLOCK] for times in (start_ns, end_ns))
+    # nine covariances of every reading in between
+    passed = np.searchsorted(track.times, start_ns)
+    number = np.arange(len(start_ns)) // BLOCK + (passed - passed[:1]) // READINGS
+    for block in np.split(np.arange(len(start_ns)), np.flatnonzero(np.diff(number)) + 1):
+        start, end = start_ns[block], end_ns[block]
         start, end, mount = track.odometry_spans(start, end)
         times, at = np.unique(np.concatenate([start, end]), return_inverse=True)
         sums, _ = path_sums([track], [times], by_rate=True)

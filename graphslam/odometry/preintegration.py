@@ -36,8 +36,9 @@ from graphslam.core.motion_models import (
 from graphslam.core.records import Motion, Trajectory
 from graphslam.odometry.coarse_sums import coarse_sums
 from graphslam.odometry.increment_sums import IncrementSums, Motions, PathSums
+from graphslam.odometry.integration_windows import in_windows
 from graphslam.odometry.mounted_motions import of_mount
-from graphslam.odometry.readings import BoolArray, IntArray, Readings, integrate_pending
+from graphslam.odometry.readings import BoolArray, IntArray, Readings
 
 #: m and rad: sigma of the motion of a robot that reports none
 STANDING_SIGMA = 1e-4
@@ -320,18 +321,18 @@ class Track(Readings):
 
 
 def preintegrate_batch(asked: Sequence[tuple[Track, IntArray, IntArray]]) -> list[Motions]:
-    """What `Track.between` gives for many times and several robots, at once.
+    """What `Track.between` gives for many times and several robots, at once: motions (n) of each.
 
-    Args:
-        asked: tracks with the start times (n,) and end times (n,) of motions.
-
-    Returns:
-        Motions (n) of each.
+    ``asked``: tracks with the start times (n,) and end times (n,) of motions.
     """
+    return in_windows(asked, _integrated)
+
+
+def _integrated(asked: Sequence[tuple[Track, IntArray, IntArray]]) -> list[Motions]:
+    """`preintegrate_batch`, all in one piece."""
     of_track: dict[Track, list[int]] = defaultdict(list)
     for k, (track, _, _) in enumerate(asked):
         of_track[track].append(k)
-    integrate_pending(of_track)
     alike: dict[Hashable, list[Track]] = defaultdict(list)
     for track in of_track:
         alike[track.batch_key].append(track)

@@ -28,6 +28,8 @@ RESET_SPEED_RATIO, SHORTEST_RESET_NS, RESET_SLACK_M = 0.5, 10_000_000, 0.5
 MAX_BURST_SHARE = 0.01
 #: ns: how long before the first reading or after the last a robot is taken to stand
 EDGE_NS = 500_000_000
+#: readings that wait for integration at most: each is an array until then
+MOST_PENDING = 50_000
 #: m per rad: how much path a turn counts for when a correction is spread over an interval
 TURNING_EFFORT_M = 0.3
 
@@ -124,6 +126,8 @@ class Readings:
             self._times[self._count] = message.time_ns
             self._count += 1
             self._pending.append(value)
+            if len(self._pending) == MOST_PENDING:
+                self._integrate_pending()
         else:
             # a second reading of one time: its motion belongs to the interval that ends here
             self._integrate_pending()
