@@ -52,13 +52,12 @@ _CLASSES = (
     ("odometry.several_lasers", "SeveralLasersTrack"),
     ("slam.log_pass", "PriorKnowledge"),
 )
-#: what a pass has found when all of its log is read
-_FOUND = (
-    "all_named", "counts", "dropped", "first_ns", "innovations", "keyframe_scans", "landmarks",
-    "last_ns", "noise", "offers", "paths", "rejected", "removed_returns", "robot_sightings", "runs",
-    "seconds", "sources", "step_ms", "steps", "unrelated_sightings",
-    "wrong_lasers",
-)  # fmt: skip
+#: of a pass: what is given to it, or works only while the log is read; all else is kept
+_MADE_ANEW = frozenset({
+    "_path", "_tracker", "associator", "backend", "candidates", "config", "frames", "front_end",
+    "given_config", "groups", "keyframes", "known", "log", "robot_detector", "scan_buffer",
+    "skipped_before", "tamper",
+})  # fmt: skip
 
 
 @cache
@@ -264,7 +263,7 @@ def key_of(log: LogSet, config: Config) -> str:
 
 
 def _state(one: LogPass) -> dict[str, Any]:
-    return {name: getattr(one, name) for name in _FOUND if hasattr(one, name)}
+    return {name: value for name, value in vars(one).items() if name not in _MADE_ANEW}
 
 
 def _file_name(stage: str) -> str:
