@@ -54,6 +54,7 @@ def run_batch(
     force: bool = False,
     progress: Callable[[int, int], None] = lambda _done, _all: None,
     announce: Callable[[str], None] = lambda _text: None,
+    detail: Callable[[str], None] = lambda _text: None,
 ) -> dict[str, Any]:
     """Smooth every recording in ``places`` that is not done, or compare; returns the overview.
 
@@ -70,7 +71,8 @@ def run_batch(
         retry: do again what failed.
         force: do everything again.
         progress: called with the number of logs that are done, and of all.
-        announce: called with a line about a log that failed, and about the workers.
+        announce: called with a line about a log that failed.
+        detail: called with a line on who works, and with how much memory.
 
     Raises:
         LogError: there is no recording.
@@ -100,7 +102,7 @@ def run_batch(
         by_label = {task.name: task for task in missing}
         try:
             jobs = [Task(task.name, make_result, (task,)) for task in missing]
-            for outcome in run_tasks(jobs, workers, overview.note_workers):
+            for outcome in run_tasks(jobs, workers, overview.noting_workers(detail)):
                 row = _row(by_label[outcome.task.label], outcome)
                 overview.add(row)
                 progress(len(rows), len(tasks))
@@ -170,9 +172,14 @@ class _Overview:
         self._new: set[str] = set()
         self._written = -WRITE_INTERVAL_S
 
-    def note_workers(self, text: str) -> None:
-        """Who works, in words."""
-        self._workers = text
+    def noting_workers(self, then: Callable[[str], None]) -> Callable[[str], None]:
+        """A function that keeps who works, in words, and passes it on."""
+
+        def noted(text: str) -> None:
+            self._workers = text
+            then(text)
+
+        return noted
 
     def add(self, row: Row) -> None:
         """A log is done, or failed."""

@@ -32,6 +32,7 @@ def run_campaign(
     *,
     force: bool = False,
     progress: Callable[[int], None] = lambda _done: None,
+    announce: Callable[[str], None] = lambda _text: None,
 ) -> list[Row]:
     """Run what is not in ``directory`` yet; returns all rows, in the order of `list_jobs`.
 
@@ -44,6 +45,7 @@ def run_campaign(
         workers: who does it; None: a process per core.
         force: delete existing rows instead of resuming.
         progress: called with the number of runs that are done.
+        announce: called with a line on who works, and with how much memory.
 
     Raises:
         OutputError: the folder holds something else, cannot be written, or workers died; also see
@@ -59,7 +61,7 @@ def run_campaign(
         missing = [job for job in wanted if job not in found]
         try:
             with file.open("a", encoding="utf-8") as stream:
-                for job, outcome in _run(definition, missing, workers or Workers()):
+                for job, outcome in _run(definition, missing, workers or Workers(), announce):
                     if isinstance(outcome.error, WorkerLostError):
                         lost.append(outcome.error)  # no row: it may go well another time
                         continue
@@ -80,11 +82,14 @@ def run_campaign(
 
 
 def _run(
-    definition: Definition, missing: Sequence[Job], workers: Workers
+    definition: Definition,
+    missing: Sequence[Job],
+    workers: Workers,
+    announce: Callable[[str], None],
 ) -> Iterator[tuple[Job, Outcome]]:
     labelled = {"-".join(map(str, asdict(job).values())): job for job in missing}
     tasks = [Task(label, _timed, (definition, job)) for label, job in labelled.items()]
-    for outcome in run_tasks(tasks, workers):
+    for outcome in run_tasks(tasks, workers, announce):
         yield labelled[outcome.task.label], outcome
 
 

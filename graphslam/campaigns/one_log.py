@@ -22,6 +22,7 @@ from graphslam.campaigns.tasks import code_version
 from graphslam.core.config import Config
 from graphslam.core.config_io import dump_config
 from graphslam.core.errors import LogError, OutputError
+from graphslam.core.memory_limit import limited_memory
 
 Row = dict[str, Any]
 
@@ -101,7 +102,7 @@ def do_log(task: LogTask, make: Make) -> Row:
     known = read_row(task.target)
     if known and not task.again and _is_done(known, asked):
         return put_row(task, {**known, "files": asked["files"]})
-    with _Unfinished(task) as part:
+    with _Unfinished(task) as part, limited_memory(task.config.limits.memory_mb):
         found = {**asked, "status": "done", "error": None, **make(task, part.folder)}
         found["seconds"] = round(time.perf_counter() - began, 3)
         part.put_in_place(found)

@@ -39,7 +39,7 @@ from graphslam.cli.arguments import (
     workers_of,
 )
 from graphslam.cli.registry import Output, command
-from graphslam.cli.terminal import note, progress_bar
+from graphslam.cli.terminal import detail, note, progress_bar
 from graphslam.core.config import Config
 from graphslam.core.config_io import load_config
 
@@ -78,8 +78,9 @@ def batch(
     tree = load_config(config, chosen, preset)
     with progress_bar("smoothing") as progress:
         found = run_batch(
-            logs, tree, output, workers, retry=retry, force=force, progress=progress, announce=note
-        )
+            logs, tree, output, workers, retry=retry, force=force, progress=progress, announce=note,
+            detail=detail,
+        )  # fmt: skip
     counts = found["counts"]
     code = 3 if strict and counts["good"] < counts["logs"] else 0
     return Output(found, lambda: show_batch(found, output), _failure(found), code)
@@ -113,8 +114,9 @@ def experiment(
     total = len(list_jobs(definition))
     with progress_bar("running") as progress:
         rows = run_campaign(
-            definition, output, workers, force=force, progress=lambda n: progress(n, total)
-        )
+            definition, output, workers, force=force, progress=lambda n: progress(n, total),
+            announce=detail,
+        )  # fmt: skip
     summary = summarise(definition, rows)
     save_summary(summary, output)
     return Output(summary, lambda: show.experiment(summary, output))
@@ -185,7 +187,7 @@ def _compare_each(
     with progress_bar("comparing") as progress:
         found = run_batch(
             logs, config, output, workers, backends=backends, mode=mode, retry=retry, force=force,
-            progress=progress, announce=note,
+            progress=progress, announce=note, detail=detail,
         )  # fmt: skip
     return Output(found, lambda: comparisons(found, output), _failure(found))
 

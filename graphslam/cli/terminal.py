@@ -98,3 +98,9 @@ def note(text: str) -> None:
     """A line on stderr about what happens, unless nothing is to be said."""
     if not output.quiet:
         typer.echo(f"graphslam: {text}", err=True)
+
+
+def detail(text: str) -> None:
+    """A line on stderr that only --verbose wants."""
+    if output.verbose:
+        note(text)

@@ -15,6 +15,7 @@ from room_log import drive
 from graphslam.campaigns import batch as batch_module
 from graphslam.campaigns.log_results import work_on_log
 from graphslam.campaigns.one_log import LogTask, failed_row, read_row
+from graphslam.campaigns.tasks import Outcome
 from graphslam.core.config_io import load_config
 from graphslam.core.errors import LogError
 from graphslam.logs.find_recordings import find_recordings
@@ -122,6 +123,36 @@ def test_what_is_done_is_not_done_again(fleet, tmp_path, monkeypatch):
     other = LogTask("a", str(tmp_path / "a.mcap"), str(out), load_config())
     assert work_on_log(other)["length_m"] > row["length_m"] + 0.5
     assert not list((out / ".unfinished").iterdir())
+
+
+def test_ctrl_c_keeps_what_is_done_and_tells_what_waits(fleet, tmp_path, monkeypatch):
+    def interrupted(tasks, *_others):
+        by_label = {task.label: task for task in tasks}
+        yield Outcome(by_label["c"], by_label["c"].function(*by_label["c"].arguments))
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(batch_module, "run_tasks", interrupted)
+        done = call("batch", fleet.logs, "-o", tmp_path / "out")
+    assert (done.code, done.out) == (130, "")
+    found = json.loads((tmp_path / "out/overview.json").read_text())
+    counts = found["counts"]
+    assert (counts["done"], counts["failed"], counts["waiting"]) == (1, 0, 3)
+    assert {row["name"] for row in found["logs"] if row["status"] == "waiting"} == {
+        "a", "b-day", "broken",
+    }  # fmt: skip
+    page = (tmp_path / "out/report.html").read_text()
+    assert "1 of 4 logs" in page and "3 waiting" in page
+    names = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert names == ["overview.json", "report.html", "results"]
+
+
+def test_a_limit_of_the_settings_holds_for_each_log(fleet, tmp_path):
+    config = load_config(None, ["limits.memory_mb=1"])
+    task = LogTask("a", str(fleet.logs / "a.mcap"), str(tmp_path), config)
+    with pytest.raises(LogError, match="more memory than limits"):
+        work_on_log(task)
+    assert not list(tmp_path.rglob("*.*"))
 
 
 def test_a_log_that_fails_takes_the_place_of_its_earlier_result(fleet, tmp_path):

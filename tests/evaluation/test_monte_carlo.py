@@ -393,7 +393,7 @@ def test_a_campaign_goes_on_where_it_stopped(done, tmp_path, monkeypatch):
     assert file.read_text().splitlines(keepends=True)[:2] == lines[:2]
     assert len([json.loads(line) for line in file.read_text().splitlines()]) == 6
     with monkeypatch.context() as patch:
-        nothing = lambda _d, missing, _j: pytest.fail("run again") if missing else iter(())  # noqa: E731
+        nothing = lambda _d, missing, *_others: pytest.fail("run again") if missing else iter(())  # noqa: E731
         patch.setattr(campaign, "_run", nothing)
         assert content(run_campaign(definition, tmp_path / "a")) == content(whole)
     other = replace(definition, seed=1)
