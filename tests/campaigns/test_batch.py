@@ -16,6 +16,7 @@ from graphslam.campaigns import batch as batch_module
 from graphslam.campaigns.log_results import work_on_log
 from graphslam.campaigns.one_log import LogTask, failed_row, read_row
 from graphslam.campaigns.tasks import Outcome
+from graphslam.cli import arguments
 from graphslam.core.config_io import load_config
 from graphslam.core.errors import LogError
 from graphslam.logs.find_recordings import find_recordings
@@ -177,10 +178,13 @@ def test_a_folder_of_something_else_or_of_another_process_is_left_alone(fleet, t
     assert not (out / ".lock").exists()
 
 
-def test_wrong_usage(fleet, tmp_path):
-    both = call(
-        "batch", fleet.logs, "-o", tmp_path / "x", "--jobs", "1", "--scheduler", "tcp://a:1"
-    )
+def test_wrong_usage(fleet, tmp_path, monkeypatch):
+    cluster = ("batch", fleet.logs, "-o", tmp_path / "x", "--scheduler", "tcp://a:1")
+    monkeypatch.setattr(arguments, "find_spec", lambda _name: None)
+    missing = call(*cluster)
+    assert missing.code == 2 and "coop-graphslam[cluster]" in missing.err
+    monkeypatch.setattr(arguments, "find_spec", lambda _name: True)
+    both = call(*cluster, "--jobs", "1")
     assert both.code == 2 and "not both" in both.err
     assert "no recording" in check_one_line(call("batch", tmp_path, "-o", tmp_path / "x"))
     assert "no such file" in check_one_line(call("batch", tmp_path / "gone", "-o", tmp_path / "x"))
