@@ -238,7 +238,8 @@ def finite(text: str) -> float:
 
 
 def _ranges(fields: Sequence[str]) -> Ranges:
-    return np.array([float(field) for field in fields], dtype=np.float32)
+    with np.errstate(over="ignore"):  # what no float32 holds becomes infinite: no return
+        return np.array([float(field) for field in fields], dtype=np.float32)
 
 
 def _odometry(fields: list[str]) -> _Odometry:

@@ -126,12 +126,13 @@ def _tum_pose(fields: list[str]) -> Pose:
 
 def _scan(robot: str, fields: list[str]) -> Event:
     start, step = finite(fields[1]), finite(fields[2])
-    ranges = [float(field) if field else math.inf for field in fields[3:]]
+    with np.errstate(over="ignore"):  # what no float32 holds becomes infinite: no return
+        ranges = np.array([float(r) if r else math.inf for r in fields[3:]]).astype(np.float32)
     return Event.of(
         LogWriter.scan,
         robot,
         parse_stamp_ns(fields[0]),
-        ranges=np.array(ranges, dtype=np.float32),
+        ranges=ranges,
         angle_min_rad=start,
         angle_step_rad=step,
         range_max_m=MAX_RANGE_M,

@@ -5,6 +5,7 @@ two of them contradict each other, the third tells which one is more likely wron
 put into arrays here; `graphslam.slam.verdict` judges it.
 """
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -29,6 +30,8 @@ MOST_POSES = 4000
 PARKED_STEP_NS, PARKED_M, PARKED_RAD, PARKED_NS = 1_000_000_000, 0.01, 0.005, 4_000_000_000
 #: scans that are looked at; m: a range that changed
 SAMPLED_SCANS, CHANGED_M = 400, 0.15
+#: how much more than by noise a range changed, and how many scans of one place show it
+NOISE_FACTOR, LEAST_SCANS = 3.0, 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,11 +52,17 @@ class Seen:
 
 
 class Parked(NamedTuple):
-    """A time in which odometry stands; the share of a scan's beams that changed in it."""
+    """A time in which odometry stands.
+
+    ``scan_change``: the largest share of a scan's beams that changed much in it; ``range_change``:
+    by how much half of the beams changed at least, as far as that is above the noise, m: people
+    who pass change fewer.
+    """
 
     begin_ns: int
     end_ns: int
     scan_change: float
+    range_change: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,7 +157,30 @@ def _parked(pipeline: LogPass, name: str, run: RobotState) -> Iterator[Parked]:
     for begin, end in long:
         own = [scan for scan in scans if begin < scan.time_ns < end]
         changes = [_changed(own[0].ranges, scan.ranges) for scan in own[1:]]
-        yield Parked(begin, end, max(changes, default=0.0))
+        # creeping by a centimetre a second is standing too, but changes ranges in the end
+        poses = run.track.pose(np.array([scan.time_ns for scan in own], dtype=np.int64))
+        still = (np.abs(poses - poses[:1]) < [PARKED_M, PARKED_M, PARKED_RAD]).all(axis=1)
+        same = [own[k] for k in np.flatnonzero(still).tolist()]
+        halves = [_half_changed(same[0].ranges, scan.ranges) for scan in same[1:]]
+        half = float(np.median(halves)) if len(halves) >= LEAST_SCANS else 0.0
+        yield Parked(begin, end, max(changes, default=0.0), half)
+
+
+def _half_changed(before: Array, after: Array) -> float:
+    """By how much half of the ranges changed at least, m; 0 where the noise may have done it.
+
+    The noise is that of neighbouring beams about straight lines.
+    """
+    if len(before) != len(after):
+        return 0.0
+    both = np.isfinite(before) & np.isfinite(after)
+    bends = before[:-2] - 2 * before[1:-1] + before[2:]
+    bends = bends[np.isfinite(bends)]
+    if not both.any() or not len(bends):
+        return 0.0
+    changed = float(np.median(np.abs(after - before)[both]))
+    noise = float(np.median(np.abs(bends))) * math.sqrt(2 / 6)  # of a difference of two ranges
+    return changed if changed > NOISE_FACTOR * noise else 0.0
 
 
 def _changed(before: Array, after: Array) -> float:

@@ -15,6 +15,8 @@ from graphslam.slam.evidence import Evidence, Parked, RobotEvidence
 
 #: share of a scan's beams that change while a robot stands, by people and doors, at most
 SCAN_CHANGE = 0.6
+#: m: half of the beams change by more than that only where a robot moved
+RANGE_CHANGE_M = 0.04
 #: m, rad: the robot moved by what its other sensors saw
 MOVED_M, MOVED_RAD = 0.3, 0.25
 #: share of readings, far from each other in time: the fastest that a robot drives is exceeded by
@@ -186,7 +188,7 @@ def _frozen(robot: RobotEvidence) -> Iterator[Reason]:
 
 def _who_moved(robot: RobotEvidence, parked: Parked) -> str:
     """Which sensor says that the robot moved while it stood by odometry; empty if none does."""
-    if parked.scan_change > SCAN_CHANGE:
+    if parked.scan_change > SCAN_CHANGE or parked.range_change > RANGE_CHANGE_M:
         return "its scans"
     seen = robot.seen
     within = (seen.times_ns > parked.begin_ns) & (seen.times_ns < parked.end_ns)

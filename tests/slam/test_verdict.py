@@ -9,7 +9,7 @@ from command_line import call
 
 from graphslam.core.geometry import between, compose
 from graphslam.logs import LogWriter
-from graphslam.slam.evidence import Evidence, Parked, RobotEvidence, Seen
+from graphslam.slam.evidence import Evidence, Parked, RobotEvidence, Seen, _half_changed
 from graphslam.slam.verdict import judge, with_truth
 
 S = 1_000_000_000
@@ -138,11 +138,15 @@ WRONG = {
     "turn": (lambda: evidence(jumped(0, 0, 2.0)), "jumps by 0.06 m and 2.0"),
     "resets": (lambda: evidence(resets=2), "jumped 2 times"),
     "frozen, by sightings": (
-        lambda: evidence(changed(300, 0, 0, 0), parked=(Parked(31 * S, 60 * S, 0.0),)),
+        lambda: evidence(changed(300, 0, 0, 0), parked=(Parked(31 * S, 60 * S, 0.0, 0.0),)),
         "is frozen, or far too small, from 30.0 s to 59.0 s: the landmarks that it sees",
     ),
     "frozen, by scans": (
-        lambda: evidence(scans=True, parked=(Parked(31 * S, 60 * S, 0.9),)),
+        lambda: evidence(scans=True, parked=(Parked(31 * S, 60 * S, 0.9, 0.0),)),
+        "its scans change meanwhile",
+    ),
+    "frozen along a corridor": (
+        lambda: evidence(scans=True, parked=(Parked(31 * S, 60 * S, 0.3, 0.06),)),
         "its scans change meanwhile",
     ),
     "gap": (
@@ -270,3 +274,18 @@ def test_strict_tells_by_its_exit_code_and_the_result_is_written(tmp_path, sign,
     assert f"verdict: {verdict['verdict']}" in done.out
     assert (verdict["verdict"] == "good") == (code == 0)
     assert ("wrong sign" in page) == ("wrong sign" in done.out) == (code == 3)
+
+
+@pytest.mark.parametrize("sigma_m", [0.005, 0.03, 0.1])
+def test_noise_and_people_do_not_change_half_of_the_ranges_but_a_step_does(sigma_m):
+    rng = np.random.default_rng(4)
+    side = np.abs(np.sin(np.radians(np.arange(-85.0, 86.0))))
+    walls = np.minimum(1.2 / np.maximum(side, 1e-9), 9 / np.sqrt(1 - side**2))  # of a corridor
+
+    def noisy(ranges):
+        return ranges + rng.normal(0, sigma_m, len(ranges))
+
+    before, people = noisy(walls), noisy(walls)
+    people[20:90] = 0.8
+    assert _half_changed(before, people) == 0.0
+    assert _half_changed(before, noisy(1.05 * walls + 0.5)) > 0.4
