@@ -58,10 +58,16 @@ def live_changes(picture: "ChangesPicture", colors: Mapping[str, str]) -> LiveFi
     return LiveFigure(
         "changes", "The map, moving.",
         "Drag to move; click, then turn the wheel to zoom; point at a change for its numbers. "
-        f"Swipe: {names[0]} (reference) left of the line, {names[1]} (later) right of it.",
+        f"Swipe: {_named('reference', names[0])} left of the line, {_named('later', names[1])} "
+        "right of it.",
         "map", picture.limits, series, layers, sides=("reference", "both"),
         clouds=clouds,
     )  # fmt: skip
+
+
+def _named(visit: str, name: str) -> str:
+    """A visit with the name of its folder, where that says more."""
+    return visit if name == visit else f"{name} ({visit})"
 
 
 def _closed(polygon: Array) -> Array:

@@ -137,6 +137,13 @@ def test_a_chart_tells_values_and_zooms_on_logarithmic_axes(open_page):
     opened = open_page(report_html.document("charts", [live_html(chart)]))
     box = opened.live("chart")
     before = opened.js("chart", "live.plot.y_range.end / live.plot.y_range.start")
+    # at least three numbers along either axis
+    for axis in ("x", "y"):
+        low, high = opened.js(
+            "chart", f"[live.plot.{axis}_range.start, live.plot.{axis}_range.end]"
+        )
+        ticks = opened.js("chart", f"Array.from(live.plot.{axis}axes[0].ticker.ticks)")
+        assert sum(low <= tick <= high for tick in ticks) >= 3
     box.locator(".live-stage").click()
     opened.page.wait_for_timeout(200)
     opened.page.mouse.wheel(0, -300)

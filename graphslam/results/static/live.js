@@ -211,6 +211,22 @@
       }
       this.drawRobots(border);
       if (this.raster) this.drawRaster(border);
+      if (this.data.x_log) this.mark(this.plot.xaxes, this.plot.xgrids, this.plot.x_range);
+      if (this.data.y_log) this.mark(this.plot.yaxes, this.plot.ygrids, this.plot.y_range);
+    }
+
+    // Numbers along a logarithmic axis: 1, 2, 5, 10 or, over many decades, 1, 10; those of a linear
+    // axis where one has zoomed so far in that none of these would be seen.
+    mark(axes, grids, { start, end }) {
+      const decades = Math.log10(end / start);
+      const steps = decades > 2.5 ? [1] : [1, 2, 5];
+      const state = decades > 0.7 ? steps.length : 0;
+      if (axes[0].marked === state) return;
+      axes[0].marked = state;
+      const ticks = [];
+      for (let k = -12; k <= 9; k += 1) for (const step of steps) ticks.push(+`${step}e${k}`);
+      const ticker = state ? new Bokeh.FixedTicker({ ticks }) : new Bokeh.BasicTicker();
+      for (const one of [...axes, ...grids]) one.ticker = ticker;
     }
 
     // Leaves out what is later than the slider, or on the other side of the divider.
