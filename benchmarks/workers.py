@@ -10,6 +10,7 @@ Both want a machine that does nothing else. Exit code 1 if a bar is not held.
 """
 
 import argparse
+import os
 import subprocess
 import sys
 import tempfile
@@ -84,13 +85,18 @@ def throughput(jobs: int, logs: int) -> bool:
             subprocess.run([*map(str, command), "--force", "--quiet"], check=True)
             return time.perf_counter() - began
 
-        took = {"two shells": [], "batch": []}
+        took: dict[str, list[float]] = {"two shells": [], "batch": []}
+        cores: dict[str, list[float]] = {"two shells": [], "batch": []}
         for _ in range(2):  # in turn, so that both meet the same machine
-            took["two shells"].append(shells())
-            took["batch"].append(batch())
+            for name, run in (("two shells", shells), ("batch", batch)):
+                before = os.times()
+                took[name].append(run())
+                after = os.times()
+                used = after.children_user + after.children_system
+                cores[name].append(used - before.children_user - before.children_system)
     least = {name: min(times) for name, times in took.items()}
     for name, seconds in least.items():
-        print(f"{name}: {logs} logs in {seconds:.1f} s")
+        print(f"{name}: {logs} logs in {seconds:.1f} s, {min(cores[name]):.1f} core seconds")
     share = least["two shells"] / least["batch"]
     print(f"throughput of the batch: {share:.2f} of that of {jobs} independent processes")
     return share >= SHARE
