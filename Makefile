@@ -13,7 +13,7 @@ ELSEWHERE := --ignore tests/browser --ignore tests/cluster
 # without cached bytecode every command would compile the program again, for a quarter of a second
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo test slow-test browser-test extras-test lint types pages docs clean
+.PHONY: help demo test slow-test browser-test extras-test reliability lint types pages docs clean
 
 help:
 	@echo 'make demo    smooth a real log (Victoria Park, shipped with gtsam) and a simulated lab into $(OUT)/'
@@ -21,6 +21,7 @@ help:
 	@echo 'make slow-test  run the tests with more seeds and whole logs'
 	@echo 'make browser-test  run the tests of the reports in a browser'
 	@echo 'make extras-test  viewers, notebook, a Dask cluster, site, and the wheel in a new environment'
+	@echo 'make reliability  the tables of docs/reliability.md, in some two hours, into $(OUT)/reliability'
 	@echo 'make lint    check style and formatting'
 	@echo 'make types   check types'
 	@echo 'make pages   write the pages that are made from the code'
@@ -54,6 +55,17 @@ slow-test: $(INSTALLED)
 browser-test: $(INSTALLED)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,browser]'
 	$(BIN)/python -m pytest tests/browser
+
+# a campaign that finds something does not stop the others
+reliability: $(INSTALLED)
+	$(BIN)/python -m pip install -q '.[fuzz]'
+	mkdir -p $(OUT)/reliability
+	-$(BIN)/python benchmarks/content_faults.py $(OUT)/reliability > $(OUT)/reliability/content_faults.txt
+	-$(BIN)/python benchmarks/mutated_files.py $(OUT)/reliability > $(OUT)/reliability/mutated_files.txt
+	-$(BIN)/python benchmarks/kills.py > $(OUT)/reliability/kills.txt
+	-$(BIN)/python benchmarks/growth.py > $(OUT)/reliability/growth.txt
+	-$(BIN)/python benchmarks/long_run.py > $(OUT)/reliability/long_run.txt
+	-$(BIN)/python benchmarks/fuzz.py $(OUT)/reliability/fuzz > $(OUT)/reliability/fuzz.txt
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check
