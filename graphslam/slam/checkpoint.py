@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import is_dataclass
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -83,9 +83,14 @@ class Checkpoint:
     ``resumed``: stages that were taken from disk.
     """
 
-    def __init__(self, folder: Path | None = None, key: str = "", *, asked: bool = False) -> None:
-        """Without a folder nothing is kept. ``asked``: from the first stage on, however short."""
-        self._folder, self._key, self._asked = folder, key, asked
+    def __init__(
+        self, folder: Path | None = None, key: Callable[[], str] = str, *, asked: bool = False
+    ) -> None:
+        """Without a folder nothing is kept. ``asked``: from the first stage on, however short.
+
+        ``key`` takes as long as reading the source of this program, and is called when needed.
+        """
+        self._folder, self._make_key, self._key = folder, key, ""
         self._began = time.monotonic()
         self._lock: BinaryIO | None = None
         self._passes = 0
@@ -175,6 +180,7 @@ class Checkpoint:
                 f"{self._folder}: another process is at work on this result; wait for it, or "
                 "choose another name"
             )
+        self._key = self._make_key()
 
     def close(self, *, remove: bool) -> None:
         """Let others have the folder, or ``remove`` it."""
@@ -230,7 +236,7 @@ def checkpoint(
     folder = folder_of(Path(target))
     if not resume:
         remove_dead(folder)
-    one = Checkpoint(folder, key_of(log, config), asked=resume)
+    one = Checkpoint(folder, partial(key_of, log, config), asked=resume)
     done = False
     try:
         yield one
