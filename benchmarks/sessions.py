@@ -1,0 +1,187 @@
+"""Sessions of one place: Intel cut into three, and five days of a simulated office that changes.
+
+Intel: the log's thirds are joined without a word about where the second and the third begin; the
+relations are those between all scans, also of different thirds. Office: every day the robot starts
+elsewhere on its round, furniture in the corridors has moved, and on the third day a wall has been
+built. The start of the first day is told, with an error drawn from its prior, those of the others
+are found; errors are of all days together, in the world, not aligned.
+
+Run: python benchmarks/sessions.py [intel] [office] [--seeds N]
+"""
+
+import struct
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from common import FREIBURG, parser
+from mcap.reader import make_reader
+
+import graphslam
+from graphslam.evaluation.metrics import evaluate
+from graphslam.evaluation.relation_metrics import read_relations
+from graphslam.logs import IMPORTERS, LogWriter, read_truth, schemas
+from graphslam.simulation import load_scenario, simulate
+from graphslam.simulation.scenario import Leg, Scenario, Wall
+
+SAME_PLACE = graphslam.load_config(**{"logs.same_place": True})
+DAYS, DAY_S = 5, 86_400
+#: m: corners of the round through the corridors, and how far furniture moves from where it was
+ROUND = ((6.9, 6.1), (20.0, 6.1), (33.1, 6.1), (33.1, 17.9), (20.0, 17.9), (6.9, 17.9))
+MOVED_M = 0.6
+#: corners of the round on a day
+LEGS = 5
+#: what stands in the corridors -> where it may be pushed
+FURNITURE = {
+    "copier": (0.0, -1.0),
+    "cabinet": (0.0, 1.0),
+    "plant 1": (1.0, 0.0),
+    "plant 2": (-1.0, 0.0),
+}
+#: messages that begin with a header
+STAMPED = (schemas.LASER_SCAN, schemas.ODOMETRY, schemas.JOINT_STATE, schemas.TRUE_POSE)
+#: m, m, rad: what the first day's start is known to
+START_SIGMA = (0.01, 0.01, 0.01)
+#: built on the third day, in front of the doors of a room
+BUILT = Wall("built", ((14.0, 18.85), (17.5, 18.85)))
+
+
+def main() -> None:
+    """Print what was asked for."""
+    options = parser(__doc__)
+    options.add_argument("which", nargs="*", default=("intel", "office"))
+    options.add_argument("--seeds", type=int, default=20)
+    chosen = options.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        if "intel" in chosen.which:
+            print(intel(folder))
+        if "office" in chosen.which:
+            for line in office(folder, chosen.seeds):
+                print(line, flush=True)
+
+
+def intel(folder: Path) -> str:
+    """The relations of Intel's thirds as sessions."""
+    log = folder / "intel.mcap"
+    IMPORTERS["carmen"](FREIBURG / "intel.clf.bz2", log)
+    thirds = list(cut(log, folder, 3))
+    result = graphslam.smooth(thirds, config=SAME_PLACE)
+    found = evaluate(result, relations=read_relations(FREIBURG / "intel.relations"))["relations"]
+    numbers = ", ".join(
+        f"{kind} {found[kind]['trans_mean_m']:.4f} m of {found[kind]['matched']}"
+        for kind in ("all", "local", "loops")
+    )
+    return f"intel in thirds: frames {result.summary['frames']}; relations: {numbers}"
+
+
+def cut(log: Path, folder: Path, parts: int) -> Iterator[Path]:
+    """A log of one robot in pieces of equal length in time, as they would have been recorded."""
+    with log.open("rb") as stream:
+        found = [
+            (channel.topic, schema.name, message.data, message.log_time)
+            for schema, channel, message in make_reader(stream).iter_messages(log_time_order=False)
+        ]
+    times = [log_time for *_, log_time in found]
+    ends = np.linspace(min(times), max(times) + 1, parts + 1).astype(np.int64)
+    for part, (begin, end) in enumerate(pairwise(ends.tolist())):
+        path = folder / f"part{part}.mcap"
+        with LogWriter(path) as made:
+            for topic, schema, data, log_time in found:
+                if begin <= log_time < end:
+                    made.encoded(topic, schema, data, log_time)
+        yield path
+
+
+def office(folder: Path, seeds: int) -> Iterator[str]:
+    """A line for each seed, and one for all."""
+    errors, nees, joined = [], [], 0
+    for seed in range(seeds):
+        rng = np.random.default_rng(seed)
+        days = [day(folder, seed, number) for number in range(DAYS)]
+        truth = read_truth(days, SAME_PLACE)
+        told = truth.trajectories["day0"].poses[0] + rng.normal(0.0, START_SIGMA, 3)
+        result = graphslam.smooth(
+            days, config=SAME_PLACE, **{"start.poses.day0": [float(x) for x in told]}
+        )
+        together = len(set(result.summary["frames"].values())) == 1
+        found = evaluate(result, truth.trajectories)["joint"]["final"]
+        joined += together
+        errors.append(found["ate_rmse_m"])
+        nees.append(found["nees_per_dof"])
+        yield (
+            f"office, seed {seed}: joined {together}, ATE {errors[-1]:.4f} m, "
+            f"NEES/dof {nees[-1]:.2f} in {found['nees_bounds']}"
+        )
+    yield (
+        f"office, {seeds} seeds: {joined} joined, ATE mean {np.mean(errors):.4f} m, worst "
+        f"{np.max(errors):.4f}; NEES/dof mean {np.mean(nees):.2f}, {np.min(nees):.2f} to "
+        f"{np.max(nees):.2f}"
+    )
+
+
+def day(folder: Path, seed: int, number: int) -> Path:
+    """The log of a day: the office as it is then, and the robot that starts anywhere on its round.
+
+    It drives half of the round, in either direction.
+    """
+    rng = np.random.default_rng([seed, number])
+    scenario = load_scenario("office-loop")
+    (robot,) = scenario.robots.values()
+    begin, back = int(rng.integers(len(ROUND))), bool(rng.integers(2))
+    corners = np.roll(np.array(ROUND), -begin, axis=0)[:: -1 if back else 1]
+    first, second = corners[:2]
+    robot = replace(
+        robot,
+        start_m=tuple(first.tolist()),
+        start_deg=float(np.degrees(np.arctan2(*(second - first)[::-1]))),
+        drive=(Leg(through_m=tuple(map(tuple, corners[1:LEGS].tolist()))),),
+    )
+    made = replace(changed(scenario, seed, number), robots={"robot": robot})
+    path = folder / f"day{number}.mcap"
+    path.unlink(missing_ok=True)
+    simulate(made, folder / "now.mcap", 100 * seed + number)
+    later(folder / "now.mcap", path, DAY_S * number)
+    (folder / "now.mcap").unlink()
+    return path
+
+
+def changed(scenario: Scenario, seed: int, number: int) -> Scenario:
+    """The office on a day: furniture stands elsewhere along its wall, but for the first day."""
+    world = scenario.world
+    rng = np.random.default_rng([seed, 1000 + number])
+    if number:
+        boxes, cylinders = (
+            tuple(moved(thing, rng.uniform(0.0, MOVED_M)) for thing in things)
+            for things in (world.boxes, world.cylinders)
+        )
+        world = replace(world, boxes=boxes, cylinders=cylinders)
+    if number >= 2:
+        world = replace(world, walls=(*world.walls, BUILT))
+    return replace(scenario, world=world)
+
+
+def moved(thing: Any, by_m: float) -> Any:
+    """A thing, pushed away from the corner if it is in a corridor."""
+    along = np.array(FURNITURE.get(thing.name, (0.0, 0.0)))
+    x, y = (np.array(thing.center_m) + by_m * along).tolist()
+    return replace(thing, center_m=(x, y))
+
+
+def later(log: Path, target: Path, seconds: int) -> None:
+    """The recording as if it had been made so much later."""
+    with log.open("rb") as stream, LogWriter(target) as made:
+        for schema, channel, message in make_reader(stream).iter_messages(log_time_order=False):
+            data = message.data
+            if schema.name in STAMPED:
+                (stamp,) = struct.unpack_from("<i", data, 4)
+                data = data[:4] + struct.pack("<i", stamp + seconds) + data[8:]
+            made.encoded(channel.topic, schema.name, data, message.log_time + seconds * 10**9)
+
+
+if __name__ == "__main__":
+    main()
