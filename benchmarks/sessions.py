@@ -73,7 +73,7 @@ def intel(folder: Path) -> str:
     result = graphslam.smooth(thirds, config=SAME_PLACE)
     found = evaluate(result, relations=read_relations(FREIBURG / "intel.relations"))["relations"]
     numbers = ", ".join(
-        f"{kind} {found[kind]['trans_mean_m']:.4f} m of {found[kind]['matched']}"
+        f"{kind} {found[kind]['trans_mean_m']:.4f} m of {found[kind]['n']}"
         for kind in ("all", "local", "loops")
     )
     return f"intel in thirds: frames {result.summary['frames']}; relations: {numbers}"
