@@ -80,7 +80,7 @@ extras-test: $(INSTALLED) docs
 	  '.[dev,cluster,viewer,notebook]' evo mcap-ros2-support
 	$(BIN)/python -c 'import distributed, evo, mcap_ros2, nbclient, pandas, rerun'
 	$(BIN)/python -m pytest tests/results/test_viewers.py tests/results/test_evo.py \
-	  tests/core/test_notebook_views.py tests/cluster
+	  tests/core/test_notebook_views.py tests/cluster tests/test_docs_code.py
 	rm -rf $(OUT)/wheel $(OUT)/cold
 	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps -w $(OUT)/wheel .
 	$(BIN)/python -m venv $(OUT)/cold

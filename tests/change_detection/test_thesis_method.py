@@ -228,7 +228,7 @@ def test_every_later_scan_is_compared_with_the_nearest_one():
 
 def test_the_folder_has_the_maps_and_a_line_per_compared_beam(tmp_path):
     found = thesis_changes(*two_visits(0.4), ChangesConfig(), same_frame=True)
-    write_folder(found, ChangesConfig(), tmp_path / "out", ("before", "after"))
+    write_folder(found, ChangesConfig(), tmp_path / "out", ("before", "after"), None)
     names = {path.name for path in (tmp_path / "out").iterdir()}
     maps = {f"{name}.{end}" for name in ("reference_map", "occlusion_map", "changes")
             for end in ("pgm", "yaml")}  # fmt: skip
