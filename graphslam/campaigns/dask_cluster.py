@@ -50,9 +50,13 @@ def run_on_cluster(
             key = f"{task.function.__name__}-{task.label}-{run}"
             asked = (task, workers.memory_mb, code_version())
             futures[client.submit(execute_on_worker, *asked, key=key, pure=False)] = task
-        for future in distributed.as_completed(list(futures), loop=client.loop):
+        # values are fetched as soon as they are there: those that a worker still holds die with it
+        ended = distributed.as_completed(
+            list(futures), loop=client.loop, with_results=True, raise_errors=False
+        )
+        for future, value in ended:
             task = futures.pop(future)
-            yield _outcome(task, future, distributed.KilledWorker)
+            yield _outcome(task, future, value, distributed.KilledWorker)
             future.release()
     except (CancelledError, distributed.comm.CommClosedError) as error:
         raise OutputError(
@@ -121,11 +125,11 @@ def _checked(client: Any, workers: Workers) -> str:
     return f"{len(there)} worker{'s' * (len(there) > 1)} of {workers.scheduler}{each}"
 
 
-def _outcome(task: Task, future: Any, killed: type[Exception]) -> Outcome:
+def _outcome(task: Task, future: Any, value: Any, killed: type[Exception]) -> Outcome:
     if future.status == "cancelled":
         raise CancelledError
-    error = future.exception()
+    error = future.exception() if future.status == "error" else None
     if isinstance(error, killed):
         said = f"{task.label}: every worker that had it died; did they run out of memory?"
         error = WorkerLostError(said)
-    return Outcome(task, None if error else future.result(), error)
+    return Outcome(task, None if error else value, error)
