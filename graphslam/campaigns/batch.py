@@ -17,6 +17,7 @@ from typing import Any
 from graphslam import __version__
 from graphslam.campaigns.engine import run_tasks
 from graphslam.campaigns.one_log import (
+    MAP,
     RESULTS,
     UNFINISHED,
     LogTask,
@@ -239,7 +240,7 @@ class _Overview:
 
     def _map(self, name: str) -> str:
         try:
-            return (self._directory / RESULTS / name / "map.svg").read_text(encoding="utf-8")
+            return (self._directory / RESULTS / name / MAP).read_text(encoding="utf-8")
         except OSError:
             return ""
 
@@ -252,9 +253,7 @@ def _count(rows: Sequence[Mapping[str, Any]], status: str) -> int:
 def _locked(directory: Path, kind: str) -> Iterator[None]:
     """Make the folder, or check that it is that of a batch; nobody else works on it meanwhile.
 
-    ``kind``: as of `kind_of`.
-
-    What a killed process left unfinished is removed.
+    What a killed process left unfinished is removed. ``kind``: as of `kind_of`.
     """
     if directory.exists() and not directory.is_dir():
         raise OutputError(f"{directory}: is not a folder")

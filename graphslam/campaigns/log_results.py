@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.campaigns.one_log import LogTask, Row, do_log
+from graphslam.campaigns.one_log import MAP, LogTask, Row, do_log
 from graphslam.campaigns.tasks import forget_peak_memory
 from graphslam.core.config import Config
 from graphslam.core.geometry import path_length
@@ -21,9 +21,6 @@ from graphslam.results.folder import save
 from graphslam.results.report import render
 from graphslam.results.small_map import draw, small_map
 from graphslam.slam.smooth import smooth
-
-#: beside the files of a result
-MAP = "map.svg"
 
 
 def work_on_log(task: LogTask) -> Row:

@@ -23,13 +23,14 @@ from graphslam.core.config import Config
 from graphslam.core.config_io import dump_config
 from graphslam.core.errors import LogError, OutputError
 from graphslam.core.memory_limit import limited_memory
+from graphslam.logs.container_files import digest
 
 Row = dict[str, Any]
 
 #: in the folder of a batch: result folders, and what is not whole yet
 RESULTS, UNFINISHED = "results", ".unfinished"
-#: beside the files of a result: what the overview says of it
-ROW = "row.json"
+#: beside the files of a result: what the overview says of it, and its picture there
+ROW, MAP = "row.json", "map.svg"
 
 #: writes the files of a log's folder, and returns what else its row holds
 Make: TypeAlias = Callable[["LogTask", Path], Row]
@@ -208,8 +209,7 @@ def _files(path: Path) -> list[Row]:
 
 def _sha256(path: Path) -> str:
     try:
-        with path.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
+        return digest(path)
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror}; check the file") from error
 

@@ -4,7 +4,6 @@ A task may be done twice, if its worker is lost on the way: it must then give th
 """
 
 import gc
-import hashlib
 import math
 import os
 import sys
@@ -13,12 +12,12 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 from graphslam.core.errors import GraphSlamError, OutputError
 from graphslam.core.memory_limit import limited_memory
+from graphslam.core.source_digest import source_digest
 
 #: variables by which linear algebra chooses its threads; one each, as there is a worker per core
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
@@ -130,14 +129,9 @@ def core_count() -> int:
     return os.cpu_count() or 1
 
 
-@cache
 def code_version() -> str:
-    """First digits of the SHA-256 of the package's sources: which code made a result."""
-    root = Path(__file__).parents[1]
-    digest = hashlib.sha256()
-    for path in sorted(root.rglob("*.py")):
-        digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()[:12]
+    """First digits of `source_digest`."""
+    return source_digest()[:12]
 
 
 def described(error: BaseException) -> str:

@@ -62,7 +62,8 @@ def evaluate(
     estimate and truth are the same (see `common_frame`): else there are only aligned errors, and
     landmarks match after an alignment, by the poses if their truth is known. With ``relations``:
     ``relations`` of the final poses, and in their key ``causal`` of the causal ones. Relations name
-    no robot: they are compared with the robot whose scans match most of them.
+    no robot: they are compared with the robot whose scans match most of them, or with all sessions
+    of one place that share its frame.
 
     Raises:
         OutputError: no pose lies within the truth's span, or relations come without scans.
@@ -190,7 +191,8 @@ def _compare_trajectories(
 def _compare_relations(result: Result | SavedResult, relations: Relations) -> dict[str, Any]:
     """``relations`` of `evaluate`.
 
-    They are of one robot, or of all sessions that share a frame; of sessions not with covariances.
+    Sessions follow each other in time, so a stamp tells which one it is of; robots at one time
+    have equal stamps. Of several sessions covariances are not compared.
     """
     scans = [
         (name, robot.scan_final, robot.scan_causal)
@@ -199,7 +201,8 @@ def _compare_relations(result: Result | SavedResult, relations: Relations) -> di
     ]
     if not scans:
         raise OutputError("relations need the poses of scans, and this result has none")
-    found_in = [int(find_stamps(relations.from_ns, one[1].stamps_ns)[1].sum()) for one in scans]
+    stamps = np.concatenate([relations.from_ns, relations.to_ns])
+    found_in = [int(find_stamps(stamps, one[1].stamps_ns)[1].sum()) for one in scans]
     name, final, causal = scans[int(np.argmax(found_in))]
     frames = result.summary.get("frames", {})
     sessions = [
@@ -207,13 +210,16 @@ def _compare_relations(result: Result | SavedResult, relations: Relations) -> di
         for one, count in zip(scans, found_in, strict=True)
         if count and frames.get(one[0]) == frames.get(name)
     ]
-    if len(sessions) > 1:
-        return relation_metrics(relations, one_after_another([one[1] for one in sessions]))
+    together = result.config.logs.same_place and len(sessions) > 1
+    if together:
+        final = one_after_another([one[1] for one in sessions])
+        paths = [one[2] for one in sessions if one[2] is not None]
+        causal = one_after_another(paths) if len(paths) == len(sessions) else None
     if isinstance(result, SavedResult):
         joint = result.joint
     else:
         joint = joint_scans(result.estimate, result.robots)
-    if joint is not None and name not in joint.ties:
+    if together or (joint is not None and name not in joint.ties):
         joint = None
     found = relation_metrics(relations, final, joint, name)
     return found if causal is None else {**found, "causal": relation_metrics(relations, causal)}

@@ -8,12 +8,13 @@ others' frame is found like the start of a robot (`graphslam.multi_robot.place_r
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain, count
 from pathlib import Path
 
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError
 from graphslam.core.records import Sighting
-from graphslam.logs.containers import open_recording
+from graphslam.logs.containers import SUFFIXES, open_recording
 from graphslam.logs.recording import Piece, Recording
 from graphslam.logs.robots import robots_and_topics
 from graphslam.logs.schemas import DEFAULT_ROBOT
@@ -26,8 +27,6 @@ _OF_ROBOTS = (*MOTION_KINDS, Sighting)
 _NOTED = "robots."
 #: topics of all robots of a recording
 _SHARED = ("/tf", "/tf_static")
-#: beginnings of names: of recordings, without the endings that they have
-_STEM = re.compile(r"^(.+?)(\.mcap|\.zstd|\.bag|\.db3)*$")
 
 
 def open_recordings(paths: Sequence[Path], config: Config) -> tuple[list[Recording], Config]:
@@ -61,13 +60,12 @@ def session_names(paths: Sequence[Path]) -> list[str]:
     """A name for each recording: that of its file, and a number where several have the same."""
     names: list[str] = []
     for path in paths:
-        stem = _STEM.sub(r"\1", path.name)
-        name = re.sub(r"[^A-Za-z0-9_-]+", "_", stem).strip("_") or "session"
-        number = 2
-        unique = name
-        while unique in names:
-            unique, number = f"{name}-{number}", number + 1
-        names.append(unique)
+        stem = path
+        while stem.suffix in SUFFIXES:
+            stem = stem.with_suffix("")
+        name = re.sub(r"[^A-Za-z0-9_-]+", "_", stem.name).strip("_") or "session"
+        candidates = chain([name], (f"{name}-{number}" for number in count(2)))
+        names.append(next(one for one in candidates if one not in names))
     return names
 
 

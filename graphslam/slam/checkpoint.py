@@ -24,6 +24,7 @@ from graphslam.core.config import Config
 from graphslam.core.config_io import dump_config
 from graphslam.core.errors import OutputError
 from graphslam.core.record_codec import CodecError, Kinds, read, write
+from graphslam.core.source_digest import source_digest
 from graphslam.core.stages import announce
 from graphslam.logs import LogSet
 from graphslam.slam.log_pass import LogPass
@@ -261,10 +262,8 @@ def key_of(log: LogSet, config: Config) -> str:
     told = [FORMAT, dump_config(config), python_version()]
     told += [f"{file.path.resolve()}\n{file.sha256}" for file in log.files]
     told += [f"{name} {version(name)}" for name in LIBRARIES]
+    told.append(source_digest())
     digest = hashlib.sha256("\n".join(told).encode(errors="backslashreplace"))
-    package = Path(__file__).parents[1]
-    for path in sorted(package.rglob("*.py")):
-        digest.update(path.read_bytes())
     return digest.hexdigest()
 
 

@@ -2,6 +2,7 @@
 
 import struct
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,9 @@ from room_log import drive
 
 import graphslam
 from graphslam.core.errors import LogError
+from graphslam.core.records import Trajectory
 from graphslam.evaluation.metrics import evaluate
+from graphslam.evaluation.relation_metrics import Relations
 from graphslam.logs import LogWriter, open_logs, read_truth
 from graphslam.logs.sessions import session_names
 from graphslam.simulation import load_scenario, simulate
@@ -96,7 +99,8 @@ def office(path, seed, *drive, **start):
 def test_a_second_day_that_starts_elsewhere_is_in_the_map_of_the_first(tmp_path):
     """Where it started is found; both days have one frame, and no warning tells of the clocks.
 
-    5 cm: each day alone is within 3 cm, and what they share ties them.
+    5 cm: where two parts of a path see little in common the pose between them is that good;
+    a session that is joined at a wrong place is off by metres.
     """
     path = (20.0, 6.1), (20.0, 17.9), (17.0, 17.9)
     monday = office(tmp_path / "monday.mcap", 0, *path, start_m=(9.0, 6.1))
@@ -109,3 +113,33 @@ def test_a_second_day_that_starts_elsewhere_is_in_the_map_of_the_first(tmp_path)
     truth = read_truth([monday, tuesday], SAME_PLACE)
     errors = evaluate(result, truth.trajectories, truth.landmarks)
     assert errors["joint"]["final"]["ate_aligned_rmse_m"] < 0.05
+
+
+def straight(first_s, offset_m):
+    """A trajectory of three scans a second apart, 1 m each, from ``offset_m`` on."""
+    stamps = (first_s + np.arange(3)) * 1_000_000_000
+    poses = np.column_stack([offset_m + np.arange(3.0), np.zeros(3), np.zeros(3)])
+    return Trajectory(stamps, poses, np.zeros((3, 3, 3)))
+
+
+@pytest.mark.parametrize("same_place", [True, False])
+def test_relations_tie_scans_of_different_sessions(same_place):
+    """Robots of one recording have equal stamps, so theirs are never taken for one trajectory."""
+    first, second = straight(0, 0.0), straight(10, 5.0)
+    robots = {
+        name: SimpleNamespace(scan_final=own, scan_causal=own, scan_ties=None)
+        for name, own in (("a", first), ("b", second))
+    }
+    result = SimpleNamespace(
+        robots=robots,
+        config=SAME_PLACE if same_place else graphslam.load_config(),
+        summary={"frames": {"a": "a", "b": "a"}},
+        estimate=SimpleNamespace(root=None),
+        landmarks=(),
+    )
+    stamps = np.concatenate([first.stamps_ns, second.stamps_ns])
+    relations = Relations(stamps[[0, 2]], stamps[[1, 4]], np.array([[1.0, 0, 0], [4.0, 0, 0]]))
+    found = evaluate(result, relations=relations)["relations"]
+    for one in (found, found["causal"]):
+        assert one["all"]["n"] == (2 if same_place else 1)
+        assert one["all"]["trans_mean_m"] < 1e-9
