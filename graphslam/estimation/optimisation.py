@@ -14,6 +14,7 @@ import numpy as np
 from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array
 from graphslam.core.records import Closure, Motion
+from graphslam.estimation.path_retraction import PathRetraction
 from graphslam.estimation.selected_inverse import CovarianceBlocks, covariance_blocks
 
 #: relative decrease of the error at which optimisation ends: without a kernel; with one
@@ -109,12 +110,15 @@ def reweighted(
     before. Where this shows, the sum of all steps to come is taken instead (A. Aitken, 1926), if
     the error agrees. That takes a third less iterations and ends nearer to the minimum.
 
+    A step that raises the error is taken along the paths instead (`PathRetraction`).
+
     Returns:
         The best values, and whether they have converged: not where a step raises the error, or the
         graph is indeterminate. Damping is needed there.
     """
     ordering: gtsam.Ordering | None = None
     error, before, share = graph.error(values), None, math.inf
+    along_paths: PathRetraction | None = None
     for _ in range(MAX_ITERATIONS):
         linear = graph.linearize(values)
         ordering = ordering or gtsam.Ordering.ColamdGaussianFactorGraph(linear)
@@ -130,9 +134,14 @@ def reweighted(
         if factor > 1.0 and not now < error:
             factor, moved = 1.0, values.retract(step)
             now = graph.error(moved)
-        if not now <= error:
-            return values, False
-        before = step if factor == 1.0 else None
+        is_straight = now <= error
+        if not is_straight:
+            along_paths = along_paths or PathRetraction(graph)
+            moved = along_paths(values, step)
+            now = graph.error(moved)
+            if not now <= error:
+                return values, False
+        before = step if factor == 1.0 and is_straight else None
         decrease, error, values = error - now, now, moved
         share = decrease / error if error > 0.0 else 0.0
         if share < converged or decrease < CONVERGED_ABSOLUTE:
