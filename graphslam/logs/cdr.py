@@ -137,9 +137,23 @@ def _string(cursor: _Cursor) -> str:
     size = _length(cursor)
     raw = cursor.data[cursor.at : cursor.at + size]
     cursor.at += size
-    if len(raw) != size or raw[-1:] != b"\0":
-        raise CdrError("a string is cut short or has no end")
-    return raw[:-1].decode()
+    if len(raw) != size:
+        raise CdrError("a string is cut short")
+    return string(raw)
+
+
+def string(raw: bytes) -> str:
+    """The text of a string with its end.
+
+    Raises:
+        CdrError: it has none, or is no text.
+    """
+    if raw[-1:] != b"\0":
+        raise CdrError("a string has no end")
+    try:
+        return raw[:-1].decode()
+    except UnicodeDecodeError as error:
+        raise CdrError(str(error)) from error
 
 
 def _aligned(at: int, size: int) -> int:
@@ -187,6 +201,28 @@ class Layout:
         if any((rows[name] != rows[name][0]).any() for name in ("head", *same)):
             raise CdrError("the messages differ in their layout")
         return rows
+
+
+def last_strings(data: Sequence[bytes], at: int, order: str, count: int) -> list[tuple[str, ...]]:
+    """The ``count`` strings with which each of many messages ends, from the byte ``at`` on.
+
+    Raises:
+        CdrError: one is cut short, or does not end there.
+    """
+    length, found = struct.Struct(order + "I").unpack_from, []
+    try:
+        for one in data:
+            end, strings = at, []
+            for _ in range(count):
+                begin = _aligned(end, 4) + 4
+                end = begin + length(one, begin - 4)[0]
+                strings.append(string(one[begin:end]))
+            if not end <= len(one) <= end + _PADDING:
+                raise CdrError("longer or shorter than its fields")
+            found.append(tuple(strings))
+    except struct.error as error:
+        raise CdrError(str(error)) from error
+    return found
 
 
 def u32(data: bytes, at: int, order: str) -> int:

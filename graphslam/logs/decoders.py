@@ -229,22 +229,38 @@ def joint_state(message: Any, topic: TopicContext) -> records.WheelAngles:
     return records.WheelAngles(*_source(message, topic), left, right)
 
 
-def sighting(message: Any, topic: TopicContext) -> records.Sighting:
+def sightings(
+    rows: tuple[Any, Sequence[tuple[str, str]]], topic: TopicContext
+) -> list[records.Sighting | str]:
     """graphslam_msgs/Sighting: bearing rad, range m and, if measured, direction rad."""
-    size = 2 if np.isnan(message.direction) else 3
-    z = np.array([message.bearing, message.range, message.direction])[:size]
-    cov = _covariance("sighting", message.covariance, size)
-    _check_finite("sighting", z)
+    numbers, of_what = rows
+    measured, covs = numbers["z"].astype(float), numbers["covariance"].astype(float)
+    sizes = np.where(np.isnan(measured[:, 2]), 2, 3).tolist()
+    mount = topic.mounts.get(numbers["frame"][0].decode().lstrip("/"), _NO_MOUNT)
+    found: list[records.Sighting | str] = []
+    for i, stamp in enumerate(schemas.stamps_ns(numbers).tolist()):
+        z, (identity, robot) = measured[i, : sizes[i]].copy(), of_what[i]
+        try:
+            cov = _covariance("sighting", covs[i], sizes[i])
+            _check_sighting(z)
+        except UnusableMessageError as reason:
+            found.append(str(reason))
+            continue
+        may_be = _UNNAMED.get(robot)
+        names = (identity or None, robot or None) if may_be is None else (None, None)
+        seen = records.Sighting(topic.robot, stamp, stamp, z, cov, *names, mount)
+        found.append(seen if may_be is None else replace(seen, may_be=may_be))
+    return found
+
+
+def _check_sighting(z: Array) -> None:
+    """Raises `UnusableMessageError` where nothing is measured like this."""
+    if not all(map(math.isfinite, z.tolist())):
+        raise UnusableMessageError("sighting: not finite")
     if z[1] <= 0:
         raise UnusableMessageError("sighting: range is not positive")
     if z[1] > limits.MAX_SIGHTING_M:
         raise UnusableMessageError("sighting: range is beyond what anything measures")
-    mount = topic.mounts.get(frame_of(message), _NO_MOUNT)
-    may_be = _UNNAMED.get(message.robot)
-    if may_be is not None:
-        return records.Sighting(*_source(message, topic), z, cov, None, None, mount, may_be)
-    identity, seen = message.identity or None, message.robot or None
-    return records.Sighting(*_source(message, topic), z, cov, identity, seen, mount)
 
 
 def odometry_increment(message: Any, topic: TopicContext) -> records.OdometryIncrement:
@@ -298,7 +314,7 @@ DECODERS: dict[str, Decoder] = {
     schemas.POINT_CLOUD: Decoder(records.Scan, point_cloud),
     schemas.ODOMETRY: Decoder(records.OdometryPose, odometry, schemas.odometry_table),
     schemas.JOINT_STATE: Decoder(records.WheelAngles, joint_state),
-    schemas.SIGHTING: Decoder(records.Sighting, sighting),
+    schemas.SIGHTING: Decoder(records.Sighting, sightings, schemas.sighting_table),
     schemas.ODOMETRY_INCREMENT: Decoder(records.OdometryIncrement, odometry_increment),
     schemas.RELATIVE_POSE: Decoder(records.RelativePose, relative_pose),
     schemas.TRUE_POSE: Decoder(records.Truth, true_pose),

@@ -343,8 +343,9 @@ def damage(files: Iterable[Recording]) -> list[Finding]:
     ]
 
 
-#: messages that are decoded together: enough for arrays to pay, few enough to hold in memory
-_BATCH = 128
+#: messages that are decoded together: enough for arrays to pay, few enough to hold in memory; fewer
+#: where there are scans, which are large
+_BATCH, _BATCH_WITH_SCANS = 1024, 128
 
 
 class FileReader:
@@ -366,7 +367,8 @@ class FileReader:
         # decoders count dropped beams in the counter of this pass
         own = {name: replace(context, beams=self.dropped) for name, context in contexts.items()}
         raws = raw_messages(self.file, topics.keys())
-        while batch := list(islice(raws, _BATCH)):
+        scans = any(topic.record is records.Scan for topic in topics.values())
+        while batch := list(islice(raws, _BATCH_WITH_SCANS if scans else _BATCH)):
             places: dict[str, list[int]] = {}
             for place, raw in enumerate(batch):
                 places.setdefault(raw.topic, []).append(place)

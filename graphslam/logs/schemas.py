@@ -16,7 +16,16 @@ import numpy as np
 
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import Array
-from graphslam.logs.cdr import HEADER, CdrError, Decoder, Layout, byte_order, u32
+from graphslam.logs.cdr import (
+    HEADER,
+    CdrError,
+    Decoder,
+    Layout,
+    byte_order,
+    last_strings,
+    string,
+    u32,
+)
 
 IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
@@ -251,6 +260,28 @@ def _odometry_layout(order: str, frame_size: int, child_size: int) -> Layout:
     layout.number("rotation", "d", 4)
     layout.skip(8 * (36 + 6))  # covariance of the pose, twist
     layout.number("twist_covariance", "d", 36)
+    return layout
+
+
+def sighting_table(data: Sequence[bytes]) -> tuple[Any, list[tuple[str, ...]]]:
+    """Rows (n,) of Sighting with stamp, ``frame``, ``z`` and ``covariance``; identities and robots.
+
+    Raises:
+        CdrError: a message is cut short or is none, or they differ in their frames.
+    """
+    order = byte_order(data[0])
+    size = u32(data[0], _FRAME_SIZE, order)
+    layout = _sighting_layout(order, size)
+    rows = layout.table([one[: layout.size] for one in data], ("frame_size", "frame"))
+    string(data[0][_FRAME_SIZE + 4 :][:size])
+    return rows, last_strings(data, layout.size, order, 2)
+
+
+@lru_cache
+def _sighting_layout(order: str, frame_size: int) -> Layout:
+    layout = with_header(order, frame_size)
+    layout.number("z", "d", 3)
+    layout.number("covariance", "d", 9)
     return layout
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from graphslam.core.companion import Exchange
 from graphslam.core.config import Config
+from graphslam.core.record import Packed, packed, unpacked
 from graphslam.core.records import Message, RelativePose, Sighting, TrueLandmark, Truth
 from graphslam.logs import LogSet
 from graphslam.logs.log_set import ReadReport
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from graphslam.slam.scan_keyframes import ReadItem
 
 #: keyframes or messages, in front of them maybe the log; what is sent is the calibration
-Reading: TypeAlias = Exchange["Calibration", "LogSet | ReadItem | list[Message | ReadReport]"]
+Reading: TypeAlias = Exchange["Calibration", "LogSet | ReadItem | Packed"]
 
 #: blocks of keyframes that are read before anything is known of the calibration
 UNCALIBRATED_BLOCKS = 2
@@ -54,9 +55,7 @@ def read_ahead(log: LogSet, config: Config) -> Reading:
 def open_ahead(open_log: Callable[[], LogSet], config: Config) -> Reading:
     """First the log itself; then its keyframes if `is_scan_log` holds for it, else its messages."""
 
-    def opened() -> Generator[
-        LogSet | ReadItem | list[Message | ReadReport], Calibration | None, None
-    ]:
+    def opened() -> Generator[LogSet | ReadItem | Packed, Calibration | None, None]:
         log = open_log()
         yield log
         if is_scan_log(log, config):
@@ -65,7 +64,7 @@ def open_ahead(open_log: Callable[[], LogSet], config: Config) -> Reading:
             items = log.reading(TRUE_RECORDS)
             size = BATCH if any(map(log.has_scans, log.robots)) else READ_AHEAD
             while batch := list(islice(items, size)):
-                yield batch
+                yield packed(batch)
                 size = BATCH
 
     return Exchange(opened, (1 + UNCALIBRATED_BLOCKS) * (None,))
@@ -88,8 +87,8 @@ def _received(reading: Reading, batches: int) -> Iterator[Message | ReadReport]:
     for _ in range(batches):
         reading.send(None)
     while (batch := reading.receive()) is not None:
-        assert isinstance(batch, list)
-        yield from batch
+        assert isinstance(batch, Packed)
+        yield from unpacked(batch)
 
 
 def _keyframes(

@@ -6,7 +6,7 @@ import pickle
 import numpy as np
 import pytest
 
-from graphslam.core.record import replace
+from graphslam.core.record import packed, replace, unpacked
 from graphslam.core.records import Association, Closure, Motion, Sighting, Step
 
 EXAMPLES = [
@@ -36,6 +36,21 @@ def test_what_records_share_is_sent_once():
     sent = [Sighting("a", k, k, np.ones(2), cov, None, None, np.zeros(3)) for k in range(2)]
     first, second = pickle.loads(pickle.dumps(sent))
     assert first.cov is second.cov
+
+
+def test_records_packed_together_come_out_as_they_were():
+    """Of several classes, in their order, arrays of different shapes among them; a covariance that
+    two share is shared, an array that only equals another is one of its own."""
+    cov = np.eye(2)
+    seen = [Sighting("a", k, k, np.full(2, k), cov, None, None, np.zeros(3)) for k in range(3)]
+    with_direction = replace(seen[0], z=np.ones(3), cov=np.eye(3))
+    for sent in ([seen[0], *EXAMPLES, *seen[1:]], [*seen, with_direction], []):
+        back = list(unpacked(pickle.loads(pickle.dumps(packed(sent)))))
+        assert [type(record) for record in back] == [type(record) for record in sent]
+        np.testing.assert_equal(list(map(contents, back)), list(map(contents, sent)))
+    first, second, _ = unpacked(packed(seen))
+    assert first.cov is second.cov
+    assert first.mount is not second.mount
 
 
 @pytest.mark.parametrize("record", EXAMPLES, ids=lambda record: type(record).__name__)

@@ -722,7 +722,7 @@ def serialized(schema):
     return bytes(schemas._typestore().serialize_cdr(example(schema, "odom", 4), schema))
 
 
-@pytest.mark.parametrize("schema", [schemas.LASER_SCAN, schemas.ODOMETRY])
+@pytest.mark.parametrize("schema", [schemas.LASER_SCAN, schemas.ODOMETRY, schemas.SIGHTING])
 @pytest.mark.parametrize("little", [True, False])
 def test_messages_read_together_are_the_single_ones(schema, little):
     """Whatever the lengths of frames and scans, and with one that is cut short between them."""
@@ -732,6 +732,9 @@ def test_messages_read_together_are_the_single_ones(schema, little):
         if schema == schemas.ODOMETRY:
             turn = message.pose.pose.orientation
             turn.x, turn.y, turn.z, turn.w = 0.0, 0.0, 0.6, 0.8
+        if schema == schemas.SIGHTING:
+            message.range, message.direction = 2.0, np.nan if size == 3 else 0.5
+            message.covariance, message.identity = np.eye(3).ravel(), size * "7"
         data.append(
             bytes(schemas._typestore().serialize_cdr(message, schema, little_endian=little))
         )
