@@ -13,7 +13,7 @@ from types import FrameType
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 #: new objects between two garbage collections: a run makes millions of records and hardly any
 #: reference cycle, and with the default of 700 collecting took a tenth of the time
-COLLECTION_INTERVAL = 100_000
+COLLECTION_INTERVAL = 1_000_000
 #: exit code of a program that a signal ended, without the signal's number; a convention of shells
 BY_SIGNAL = 128
 
