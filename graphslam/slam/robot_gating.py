@@ -79,8 +79,8 @@ class RobotOffers:
                 for a in steps[n].associations
                 if not isinstance(a.target, str) or _key(a) in chosen
             ]
-            there = set(map(_key, kept))
-            kept += [a for a in own if _key(a) in chosen - there]
+            missing = chosen & set(map(_key, own)) - set(map(_key, kept))
+            kept += [a for a in own if _key(a) in missing]
             made[n] = replace(steps[n], associations=tuple(kept))
         return tuple(made)
 

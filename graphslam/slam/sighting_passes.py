@@ -25,6 +25,7 @@ from graphslam.slam.sighting_solution import (
     solve_finely,
     solve_roughly,
     solve_without_contradiction,
+    with_gated_robots,
 )
 
 
@@ -72,9 +73,11 @@ def run_sighting_passes(
                 # the estimate keeps near its minimum
                 replayed.cancel()
                 return None
-            # before anything finer, as all of it depends on the clocks; paths need the calibration
-            clocks = {} if known.clocks else clocks_from_paths(one.seen_robots, one.tracks, config)
-            if clocks:
+            # all that is finer depends on the clocks; paths need the calibration
+            asked = Future(partial(clocks_from_paths, one.seen_robots, one.tracks, config))
+            rough = with_gated_robots(one, rough)
+            clocks = asked.result()
+            if clocks and not known.clocks:
                 replayed.cancel()
                 known = replace(known, clocks=clocks)
                 continue

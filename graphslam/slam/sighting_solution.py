@@ -93,15 +93,18 @@ def solve_finely(one: SightingPass, rough: Estimate) -> tuple[Estimate, tuple[St
     Raises:
         EstimationError: the estimate is indeterminate.
     """
-    rough = _with_gated_robots(one, rough)
     noise = estimate_noise(one.steps, one.sources, rough, one.tracks, one.config)
     one.noise = noise.to_summary()
     problem, start = sighting_problem(one, rough, noise, one.groups)
     return problem.finish(one, problem.steps, start)
 
 
-def _with_gated_robots(one: SightingPass, rough: Estimate) -> Estimate:
-    """An estimate without sightings of robots that contradict all else; their steps lose them."""
+def with_gated_robots(one: SightingPass, rough: Estimate) -> Estimate:
+    """An estimate without sightings of robots that contradict all else; their steps lose them.
+
+    Raises:
+        EstimationError: the estimate is indeterminate.
+    """
     recorded, groups, kernel = one.steps, one.groups, _wide(one.config.robust)
     kept = every = _sources(recorded)
     made: tuple[Step, ...] = ()
