@@ -44,14 +44,28 @@ if TYPE_CHECKING:
         LogError,
         OutputError,
     )
-    from graphslam.core.records import Estimate, Landmark, Result, RobotResult, Trajectory
+    from graphslam.core.records import (
+        Estimate,
+        Landmark,
+        OdometryIncrement,
+        OdometryPose,
+        RelativePose,
+        Result,
+        RobotResult,
+        Scan,
+        Sighting,
+        Trajectory,
+        WheelAngles,
+    )
     from graphslam.evaluation.relation_metrics import Relations
+    from graphslam.live.follow import follow
+    from graphslam.live.live_pass import LiveEstimate
+    from graphslam.live.session import Session
     from graphslam.logs import GroundTruth, LogSet, LogWriter
     from graphslam.results.folder import SavedResult
     from graphslam.results.map_files import MapFiles
     from graphslam.results.report_comparison import Comparison
     from graphslam.simulation import Scenario, ScenarioError, Simulation
-    from graphslam.slam.log_reader import Reading
 
     PathLike: TypeAlias = str | os.PathLike[str]
     Recording: TypeAlias = PathLike | Sequence[PathLike] | LogSet
@@ -59,12 +73,27 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-#: module -> the public classes that it defines
+#: module -> the public names that it defines
 _CLASSES = {
     "change_detection": ("Change", "ChangeResult"),
     "core.config": ("Config",),
     "core.errors": ("ConfigError", "EstimationError", "GraphSlamError", "LogError", "OutputError"),
-    "core.records": ("Estimate", "Landmark", "Result", "RobotResult", "Trajectory"),
+    "core.records": (
+        "Estimate",
+        "Landmark",
+        "OdometryIncrement",
+        "OdometryPose",
+        "RelativePose",
+        "Result",
+        "RobotResult",
+        "Scan",
+        "Sighting",
+        "Trajectory",
+        "WheelAngles",
+    ),
+    "live.follow": ("follow",),
+    "live.live_pass": ("LiveEstimate",),
+    "live.session": ("Session",),
     "logs": ("GroundTruth", "LogSet", "LogWriter"),
     "results.folder": ("SavedResult",),
     "results.map_files": ("MapFiles",),
@@ -73,17 +102,18 @@ _CLASSES = {
 }
 
 __all__ = [
-    "Change", "ChangeResult", "Comparison", "Config", "ConfigError", "Estimate",
-    "EstimationError", "GraphSlamError", "GroundTruth", "Landmark", "LogError", "LogSet",
-    "LogWriter", "MapFiles", "OutputError", "Result", "RobotResult", "SavedResult", "ScenarioError",
-    "Simulation", "Trajectory", "__version__", "changes_between", "compare", "evaluate",
+    "Change", "ChangeResult", "Comparison", "Config", "ConfigError", "Estimate", "EstimationError",
+    "GraphSlamError", "GroundTruth", "Landmark", "LiveEstimate", "LogError", "LogSet", "LogWriter",
+    "MapFiles", "OdometryIncrement", "OdometryPose", "OutputError", "RelativePose", "Result",
+    "RobotResult", "SavedResult", "Scan", "ScenarioError", "Session", "Sighting", "Simulation",
+    "Trajectory", "WheelAngles", "__version__", "changes_between", "compare", "evaluate", "follow",
     "load_config", "load_result", "make_map", "open_logs", "simulate", "smooth", "write_viewer",
 ]  # fmt: skip
 
 if not TYPE_CHECKING:  # a type checker would take every name for defined
 
     def __getattr__(name: str) -> Any:
-        """A public class, imported when it is first used."""
+        """A public name, imported when it is first used."""
         for module, names in _CLASSES.items():
             if name in names:
                 return getattr(importlib.import_module(f"{__name__}.{module}"), name)
@@ -102,14 +132,9 @@ def load_config(
     Raises:
         ConfigError: the file cannot be read, or a setting is wrong.
     """
-    from graphslam.core import config_io
-    from graphslam.core.config import Config
+    from graphslam.core.config_io import chosen_config
 
-    if not isinstance(config, Config):
-        config = config_io.load_config(Path(config) if config else None, (), preset)
-    elif preset:
-        config = config_io.with_preset(config, preset)
-    return config_io.with_settings(config, settings) if settings else config
+    return chosen_config(config, preset=preset, **settings)
 
 
 def open_logs(
@@ -125,8 +150,9 @@ def open_logs(
         LogError: a file is missing, empty or of no known container, or holds nothing usable.
     """
     from graphslam.logs import open_logs
+    from graphslam.slam.given_recording import paths_of
 
-    return open_logs(_paths(paths), load_config(config, **settings))
+    return open_logs(paths_of(paths), load_config(config, **settings))
 
 
 def smooth(
@@ -155,12 +181,13 @@ def smooth(
     from graphslam.core.memory_limit import limited_memory
     from graphslam.core.worker import Future
     from graphslam.results.folder import check_target, save
+    from graphslam.slam.given_recording import read_ahead, settle
     from graphslam.slam.log_reader import receive_log
     from graphslam.slam.progress import of_all
 
-    settled = _settle(recording, config, settings)
+    settled = settle(recording, config, settings)
     before = None if output is None else check_target(Path(output), force=force)
-    reading = _read_ahead(recording, settled) or nullcontext()
+    reading = read_ahead(recording, settled) or nullcontext()
     with limited_memory(settled.limits.memory_mb), reading as ahead:
         # imported while the second process reads; what only that one needs is imported there
         from graphslam.core.stages import announce
@@ -324,13 +351,14 @@ def compare(
     from graphslam.evaluation.ground_truth import truth_given, truth_of_logs
     from graphslam.evaluation.relation_metrics import relations_given
     from graphslam.results.folder import check_target
+    from graphslam.slam.given_recording import opened, settle
     from graphslam.slam.progress import of_all
 
-    settled = _settle(recording, config, settings)
+    settled = settle(recording, config, settings)
     rows = parse_variants(backends.split(",") if isinstance(backends, str) else backends, settled)
     if output is not None:
         check_target(Path(output), force=force, replaceable=is_comparison)
-    log = _open(recording, settled)
+    log = opened(recording, settled)
     comparison = compare(
         log,
         settled,
@@ -409,42 +437,3 @@ def simulate(
     if os.path.lexists(output) and not force:
         raise OutputError(f"{os.fspath(output)}: already exists; give --force to replace it")
     return simulate(known, Path(output), seed)
-
-
-# ---------------------------------------------------------------- arguments
-
-
-def _paths(paths: PathLike | Sequence[PathLike]) -> list[Path]:
-    single = isinstance(paths, str | os.PathLike)
-    return [Path(path) for path in cast("Sequence[PathLike]", [paths] if single else paths)]
-
-
-def _settle(
-    recording: Recording, config: Config | PathLike | None, settings: dict[str, Any]
-) -> Config:
-    """The configuration; logs that are open already bring theirs."""
-    from graphslam.core.errors import ConfigError
-    from graphslam.logs import LogSet
-
-    if not isinstance(recording, LogSet):
-        return load_config(config, **settings)
-    settled = load_config(recording.config if config is None else config, **settings)
-    if (settled.logs, settled.robots) != (recording.config.logs, recording.config.robots):
-        raise ConfigError("logs.*, robots.*: must be passed to open_logs")
-    return settled
-
-
-def _open(recording: Recording, config: Config) -> LogSet:
-    from graphslam.logs import LogSet, open_logs
-
-    return recording if isinstance(recording, LogSet) else open_logs(_paths(recording), config)
-
-
-def _read_ahead(recording: Recording, config: Config) -> Reading | None:
-    """The logs and what follows in them, from the background; None if they are open already."""
-    from graphslam.logs import LogSet
-    from graphslam.slam.log_reader import open_ahead
-
-    if isinstance(recording, LogSet):
-        return None
-    return open_ahead(lambda: _open(recording, config), config)

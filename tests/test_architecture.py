@@ -30,6 +30,7 @@ PACKAGES = (
     "multi_robot",
     "slam",
     "results",
+    "live",
     "change_detection",
     "evaluation",
     "campaigns",

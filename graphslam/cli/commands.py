@@ -266,6 +266,6 @@ def config_command(preset: Preset = None) -> Output:
 
 
 # the rest registers itself, after these
-from graphslam.cli import campaign_commands  # noqa: E402
+from graphslam.cli import campaign_commands, live_commands  # noqa: E402
 
-__all__ = ["app", "campaign_commands"]
+__all__ = ["app", "campaign_commands", "live_commands"]

@@ -1,6 +1,6 @@
 """The command line's app, and how commands are registered: their common options, what they print.
 
-The commands are in `commands` and `campaign_commands`.
+The commands are in `commands`, `live_commands` and `campaign_commands`.
 """
 
 import inspect
@@ -51,6 +51,7 @@ EXAMPLES = {
         "graphslam smooth drive.mcap -o result --set keyframe.distance_m=0.5 --force",
     ),
     "view": ("graphslam view result",),
+    "follow": ("graphslam follow recording.mcap -o now",),
     "evaluate": ("graphslam evaluate result --truth robot=truth.tum",),
     "compare": (
         "graphslam compare drive.mcap --backends ekf,isam2:20,batch -o comparison",

@@ -272,6 +272,20 @@ class MultiRobotConfig:
 
 
 @dataclass(frozen=True)
+class LiveConfig:
+    """Estimates while the robots drive (docs/live.md).
+
+    horizon_s: how long a past pose is still improved, unless backend.horizon_s says it.
+    reorder_s: how much out of order, by their stamps, messages may come and still be sorted; every
+        estimate is that late. wait_s: a recording that has not grown for so long has ended.
+    """
+
+    horizon_s: float = 20.0
+    reorder_s: float = 0.2
+    wait_s: float = 10.0
+
+
+@dataclass(frozen=True)
 class ChangesConfig:
     """Change detection (thesis chapter 5).
 
@@ -338,6 +352,7 @@ class Config:
     rbpf: RbpfConfig = field(default_factory=RbpfConfig)
     start: StartConfig = field(default_factory=StartConfig)
     multi_robot: MultiRobotConfig = field(default_factory=MultiRobotConfig)
+    live: LiveConfig = field(default_factory=LiveConfig)
     changes: ChangesConfig = field(default_factory=ChangesConfig)
     warnings: tuple[str, ...] = field(default=(), compare=False, metadata={"setting": False})
 

@@ -9,6 +9,7 @@ import dataclasses
 import difflib
 import json
 import math
+import os
 import tomllib
 import types
 import typing
@@ -51,6 +52,24 @@ def load_config(
         tree = over(preset_settings(preset), tree)
     settings = map(parse_setting, overrides)
     return _override(tree, [(_split_key(key), value) for key, value in settings])
+
+
+def chosen_config(
+    config: Config | os.PathLike[str] | str | None = None,
+    *,
+    preset: str | None = None,
+    **settings: Any,
+) -> Config:
+    """The defaults, over them preset, TOML file, ``settings``; over a `Config` the other two.
+
+    Raises:
+        ConfigError: the file cannot be read, or a setting is wrong.
+    """
+    if not isinstance(config, Config):
+        config = load_config(Path(config) if config else None, (), preset)
+    elif preset:
+        config = with_preset(config, preset)
+    return with_settings(config, settings) if settings else config
 
 
 def with_preset(config: Config, name: str) -> Config:

@@ -9,6 +9,7 @@ If the second process dies, the remaining work is done here.
 import gc
 import os
 import pickle
+import select
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -95,6 +96,10 @@ class Prefetch(Generic[_T]):
                 self._end()
         yield from islice(self._make(), taken, None)
 
+    def has_begun(self) -> bool:
+        """Whether something of the second process can be read, or it has ended."""
+        return not self.forked or bool(select.select([self._source], [], [], 0.0)[0])
+
     def cancel(self) -> None:
         """End the second process; there is nothing to iterate over any more."""
         if self.forked:
@@ -120,6 +125,10 @@ class Future(Generic[_T]):
         self.done = not self._made.forked
         if self.done:
             self._result = next(iter(self._made))
+
+    def is_ready(self) -> bool:
+        """Whether `result` would not wait; a task whose result is small is then complete."""
+        return self.done or self._made.has_begun()
 
     def cancel(self) -> None:
         """End the task; its result is not wanted any more."""

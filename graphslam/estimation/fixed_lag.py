@@ -24,7 +24,7 @@ from dataclasses import replace
 import numpy as np
 
 from graphslam.core.config import Config, RobustConfig
-from graphslam.core.geometry import Array
+from graphslam.core.geometry import Array, rotate_cov
 from graphslam.core.records import Estimate, Step
 from graphslam.estimation import factors
 from graphslam.estimation.dormant_variables import DormantVariables, covariance
@@ -146,6 +146,24 @@ class FixedLagBackend(GraphBackend):
             order = {**first, **{k: d for k, d in window.prior.dims.items() if k not in first}}
             window.prior = eliminate(stacked([window.prior], order), len(gone))
             window.remove(gone)
+
+    def landmark_estimates(self, landmarks: Sequence[int]) -> dict[int, tuple[Array, Array]]:
+        """Means (2,) or (3,) and covariances along world axes of landmarks.
+
+        Raises:
+            EstimationError: one is indeterminate.
+        """
+        dims = {factors.landmark_key(i): self.builder.landmark_dims[i] for i in landmarks}
+        found = self.marginals(dims).values()
+        return {
+            i: (mean, rotate_cov(cov, mean[2]) if len(mean) == 3 else cov)
+            for i, (mean, cov) in zip(landmarks, found, strict=True)
+        }
+
+    def forget(self) -> None:
+        """Drop the estimates of states that left, which only `finish` needs."""
+        known = self._window.prior.dims.keys() | self._dormant.anchors
+        self._past = {key: self._past[key] for key in known & self._past.keys()}
 
     def _rebuilt(self, old: Sequence[WindowFactor]) -> list[WindowFactor]:
         """The factors of lines at the current estimate; others as they are."""

@@ -19,7 +19,7 @@ from graphslam.logs.future_stamps import Recorded, repair_future_stamps
 from graphslam.logs.gyroscopes import find_gyroscopes
 from graphslam.logs.imu_turning import Turning, with_turning
 from graphslam.logs.lasers import further_lasers
-from graphslam.logs.recording import Recording, raw_messages, sample_messages
+from graphslam.logs.recording import RawMessage, Recording, raw_messages, sample_messages
 from graphslam.logs.robots import robots_and_topics
 from graphslam.logs.sessions import open_recordings
 from graphslam.logs.stated_noise import StatedNoise, stated_noise
@@ -122,6 +122,11 @@ class LogSet:
                 kept.append(topic)
         opening = self.warnings[: self._opening_warnings]
         return replace(self, warnings=[*opening, *lines], further_lasers=tuple(kept))
+
+    @property
+    def contexts(self) -> Mapping[str, TopicContext]:
+        """What is needed to decode each topic."""
+        return self._contexts
 
     def mount(self, topic: str) -> Array:
         """Pose (3,) of a laser in the base frame according to the log; of its first frame."""
@@ -282,6 +287,11 @@ def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
     for n, file in enumerate(files):
         if file.sha256 in {other.sha256 for other in files[:n]}:
             raise LogError(f"{file.path}: is given twice; name each log once")
+    return log_set_of(files, config)
+
+
+def log_set_of(files: Sequence[Recording], config: Config) -> LogSet:
+    """Recordings as one log, see `open_logs`."""
     files, found, derived = robots_and_topics(files, config)
     topics, choices = choose_topics(files, found)
     contexts, assumed = topic_contexts(files, topics, config)
@@ -369,30 +379,38 @@ class FileReader:
         raws = raw_messages(self.file, topics.keys())
         scans = any(topic.record is records.Scan for topic in topics.values())
         while batch := list(islice(raws, _BATCH_WITH_SCANS if scans else _BATCH)):
-            places: dict[str, list[int]] = {}
-            for place, raw in enumerate(batch):
-                places.setdefault(raw.topic, []).append(place)
-            found: list[Message | None] = [None] * len(batch)
-            for name, at in places.items():
-                data = [batch[place].data for place in at]
-                schema = topics[name].schema
-                decoded = decode_messages(schema, data, own[name], self.dropped)
-                for place, message in zip(at, decoded, strict=True):
-                    found[place] = message
-            for raw, decoded_one in zip(batch, found, strict=True):
-                if decoded_one is not None:
-                    at_ns = raw.log_time_ns
-                    if own[raw.topic].by_log_time:
-                        stamped = replace(decoded_one, stamp_ns=at_ns, time_ns=at_ns)
-                        yield raw.topic, stamped, at_ns
-                    else:
-                        yield raw.topic, decoded_one, at_ns
+            yield from decoded(batch, topics, own, self.dropped)
 
     def sorted(self, recorded: Iterable[Recorded]) -> Iterator[Message]:
         """The messages in the order of their repaired times."""
         for topic, message, _ in repair_future_stamps(recorded, time_order.SAMPLED):
             yield from self.sorter.push(topic, message)
         yield from self.sorter.finish()
+
+
+def decoded(
+    batch: Sequence[RawMessage],
+    topics: Mapping[str, Topic],
+    contexts: Mapping[str, TopicContext],
+    dropped: Counter[str],
+) -> Iterator[Recorded]:
+    """Messages of ``topics``, those of each decoded together; what cannot be is counted."""
+    places: dict[str, list[int]] = {}
+    for place, raw in enumerate(batch):
+        places.setdefault(raw.topic, []).append(place)
+    found: list[Message | None] = [None] * len(batch)
+    for name, at in places.items():
+        data = [batch[place].data for place in at]
+        made = decode_messages(topics[name].schema, data, contexts[name], dropped)
+        for place, message in zip(at, made, strict=True):
+            found[place] = message
+    for raw, message in zip(batch, found, strict=True):
+        if message is not None:
+            at_ns = raw.log_time_ns
+            if contexts[raw.topic].by_log_time:
+                yield raw.topic, replace(message, stamp_ns=at_ns, time_ns=at_ns), at_ns
+            else:
+                yield raw.topic, message, at_ns
 
 
 _STAMP_DEFECTS = {

@@ -48,7 +48,7 @@ NOTES = "graphslam"  # name of the metadata record in which our own logs carry n
 
 # Errors that mcap, zstandard and lz4 raise on damaged bytes, found by flipping and cutting: their
 # own, and those of the standard library for an invalid length, id or string.
-_DAMAGE = (
+DAMAGE = (
     McapError,
     zstandard.ZstdError,
     struct.error,
@@ -106,13 +106,13 @@ def index_mcap(path: Path, limits: LimitsConfig) -> Piece:
         OSError: it cannot be read.
     """
     with open_file(path) as stream:
-        return _Indexer(path, stream, limits).run()
+        return Indexer(path, stream, limits).run()
 
 
 # ---------------------------------------------------------------- blocks
 
 
-def _records(stream: BinaryIO, offset: int) -> Iterator[tuple[int, int, bytes]]:
+def records_from(stream: BinaryIO, offset: int) -> Iterator[tuple[int, int, bytes]]:
     """Offset, opcode and body of the records from ``offset`` to the footer, chunks unopened.
 
     Of message indexes only the channel: they are not needed and take longest to read.
@@ -167,7 +167,7 @@ def _chunk_at(stream: BinaryIO, offset: int, most: _Most) -> _Contents:
     ``most``: how many unpacked bytes and how many records it may have.
 
     Raises:
-        One of `_DAMAGE` when the chunk is damaged in any other way, its CRC included.
+        One of `DAMAGE` when the chunk is damaged in any other way, its CRC included.
     """
     stream.seek(offset)
     head = stream.read(_RECORD.size)
@@ -185,7 +185,7 @@ def _records_in(chunk: Chunk, most: _Most) -> _Contents:
     Like mcap's ``breakup_chunk``, but without an object per message, which would be slow.
 
     Raises:
-        One of `_DAMAGE` when the chunk is damaged, its CRC included.
+        One of `DAMAGE` when the chunk is damaged, its CRC included.
         _TooLargeError: there is more than ``most`` in it.
     """
     unpacked = _unpacked(chunk, most.size)
@@ -221,7 +221,7 @@ def _unpacked(chunk: Chunk, most: int) -> bytes:
     """Contents of a chunk; of one that has more than ``most`` bytes a few more than that.
 
     Raises:
-        One of `_DAMAGE` when it cannot be unpacked.
+        One of `DAMAGE` when it cannot be unpacked.
     """
     if not chunk.compression:
         return chunk.data
@@ -266,7 +266,7 @@ def _cut_chunk(chunk: Chunk, most: _Most) -> _Contents:
     return _records_in(Chunk("", data[:end], 0, 0, 0, end), most)
 
 
-def _block_messages(
+def block_messages(
     stream: BinaryIO, block: Block, wanted: Collection[int]
 ) -> Iterator[tuple[int, int, bytes]]:
     """Channel, log time ns and data of the messages of wanted channels in a block."""
@@ -278,13 +278,15 @@ def _block_messages(
                 yield channel, log_time_ns, data[begin:end]
         return
     count = sum(block.counts.values())
-    loose = (body for _, opcode, body in _records(stream, block.offset) if opcode == _IS_MESSAGE)
+    loose = (
+        body for _, opcode, body in records_from(stream, block.offset) if opcode == _IS_MESSAGE
+    )
     for message in map(_message, islice(loose, count)):
         if message.channel_id in wanted:
             yield message.channel_id, message.log_time, message.data
 
 
-class _Indexer:
+class Indexer:
     """One pass over a file: `run` does it, the other methods are its steps."""
 
     def __init__(self, path: Path, stream: BinaryIO, limits: LimitsConfig) -> None:
@@ -304,11 +306,12 @@ class _Indexer:
         self.tried: set[int] = set()  # offsets of chunks
 
     def run(self) -> Piece:
+        """Read the whole file."""
         try:
-            for offset, opcode, body in _records(self.stream, self.position):
+            for offset, opcode, body in records_from(self.stream, self.position):
                 self.position = offset
                 self.add(offset, opcode, body)
-        except _DAMAGE as error:
+        except DAMAGE as error:
             self.recover(error)
         self.close_loose_block()
         return self.result()
@@ -338,14 +341,15 @@ class _Indexer:
                 raise McapError(f"its kind {opcode} is unknown")
         except _TooLargeError as setting:
             raise too_large(self.path, offset, str(setting)) from setting
-        except _DAMAGE as error:
+        except DAMAGE as error:
             what = "chunk" if opcode == Opcode.CHUNK else "record"
             self.damage.append(f"the {what} at byte {offset} is damaged ({one_line(error)})")
 
     def add_message(self, offset: int, body: bytes) -> None:
+        """Take in a message outside chunks."""
         try:
             self.loose.append((offset, _message(body)))
-        except _DAMAGE as error:
+        except DAMAGE as error:
             # the block ends here, because its messages are counted when it is read again
             self.damage.append(f"the record at byte {offset} is damaged ({one_line(error)})")
             self.close_loose_block()
@@ -353,6 +357,7 @@ class _Indexer:
             self.close_loose_block()
 
     def describe(self, record: McapRecord) -> None:
+        """Take in what is said of the file: schemas, channels, statistics, notes."""
         if isinstance(record, Schema):
             self.schemas.setdefault(record.id, record)
         elif isinstance(record, Channel):
@@ -363,11 +368,13 @@ class _Indexer:
             self.notes.update(record.metadata)
 
     def add_chunk(self, offset: int, found: _Contents) -> None:
+        """Take in the contents of a chunk."""
         for record in found.others:
             self.describe(record)
         self.blocks.add(offset, offset, [message[:2] for message in found.messages])
 
     def close_loose_block(self) -> None:
+        """End the block of messages outside chunks."""
         if self.loose:
             messages = [(message.channel_id, message.log_time) for _, message in self.loose]
             self.blocks.add(self.loose[0][0], self.loose[-1][0], messages)
@@ -391,17 +398,19 @@ class _Indexer:
                 self.add_chunk(offset, _chunk_at(self.stream, offset, self.most))
             except _TooLargeError as setting:
                 raise too_large(self.path, offset, str(setting)) from setting
-            except _DAMAGE:
+            except DAMAGE:
                 continue  # lost; counted by the statistics record, if there is one
 
     def summary(self) -> Summary | None:
+        """The file's own summary, if it can be read."""
         try:
             self.stream.seek(0)
             return SeekingReader(self.stream, record_size_limit=self.size).get_summary()
-        except (*_DAMAGE, OSError, StopIteration):  # OSError: a seek to before the beginning
+        except (*DAMAGE, OSError, StopIteration):  # OSError: a seek to before the beginning
             return None
 
     def result(self) -> Piece:
+        """The index of what was taken in."""
         names = {number: schema.name for number, schema in self.schemas.items()}
         names[_NO_SCHEMA] = ""
         channels = {
@@ -422,6 +431,6 @@ class _Indexer:
             in_order=self.blocks.in_order,
             lost=lost,
             damage="; ".join([*self.damage, *undescribed(unknown)]),
-            open=partial(stream_reader, _block_messages, (*_DAMAGE, IndexError)),
+            open=partial(stream_reader, block_messages, (*DAMAGE, IndexError)),
             notes=self.notes,
         )

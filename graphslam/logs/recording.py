@@ -8,7 +8,7 @@ several that follow each other (split bags). What a message is made of is known 
 import hashlib
 import heapq
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -241,8 +241,15 @@ def raw_messages(recording: Recording, topics: Collection[str]) -> Iterator[RawM
         yield from _recorded(recording, topics)
         return
     wanted = {*topics} | {one.source for one in derived}
+    yield from with_derived(_recorded(recording, wanted), derived, topics)
+
+
+def with_derived(
+    messages: Iterable[RawMessage], derived: Sequence[Derived], topics: Collection[str]
+) -> Iterator[RawMessage]:
+    """Messages of ``topics`` and of topics that are made of them, from those of all sources."""
     makers = [(one, one.make(*one.arguments)) for one in derived]
-    for raw in _recorded(recording, wanted):
+    for raw in messages:
         for one, make in makers:
             if one.source == raw.topic:
                 for data in make(raw.data, raw.log_time_ns):

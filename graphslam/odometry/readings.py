@@ -35,6 +35,10 @@ TURNING_EFFORT_M = 0.3
 
 #: numbers in a row: a twist or two wheel turns, and the seconds in motion; or twist and covariance
 _ROW_SIZE = {"odometry": 4, "commands": 4, "given": 12, "wheels": 3}
+#: fewer readings are not forgotten by themselves
+FEWEST_FORGOTTEN = 512
+#: attributes of `Readings` with a row for each
+_ARRAYS = ("_times", "_rows", "_totals", "_poses", "_burst")
 #: columns of `Readings._totals`: path m, heading rad (not wrapped), effort m; then those of a row
 _PATH, _HEADING, _EFFORT, _ROW = 0, 1, 2, 3
 
@@ -67,6 +71,7 @@ class Readings:
         self.bridged = 0
         self.config, self._robot = config, robot
         self._count, self._bursts, self._resets = 0, 0, 0
+        self._forgotten = 0  # readings, see `forget_before`
         self._integrated = 0  # readings that are integrated; the others' values wait in `_pending`
         self._pending: list[Array] = []
         self._times = np.empty(1024, dtype=np.int64)  # time of the end of each row's interval
@@ -98,7 +103,7 @@ class Readings:
     def has_burst_stamps(self) -> bool:
         """Whether many readings were stamped in bursts: then latency cannot be estimated."""
         self._integrate_pending()
-        return self._bursts > MAX_BURST_SHARE * self._count
+        return self._bursts > MAX_BURST_SHARE * (self._forgotten + self._count)
 
     @property
     def resets(self) -> int:
@@ -144,8 +149,22 @@ class Readings:
         self._times[0] = time_ns
         self._poses[0], self._burst[0] = 0.0, False
 
+    def forget_before(self, time_ns: int) -> None:
+        """Drop the readings that only motions before a time need.
+
+        Half of them at least, or none, so that each is moved once on average.
+        """
+        self._integrate_pending()
+        n = int(self.times.searchsorted(time_ns, side="right")) - 1
+        if n < max(FEWEST_FORGOTTEN, self._count // 2):
+            return
+        for name in _ARRAYS:
+            setattr(self, name, getattr(self, name)[n : self._count].copy())
+        self._count, self._integrated = self._count - n, self._integrated - n
+        self._forgotten += n
+
     def _grow(self) -> None:
-        for name in ("_times", "_rows", "_totals", "_poses", "_burst"):
+        for name in _ARRAYS:
             full = getattr(self, name)
             setattr(self, name, np.concatenate([full, np.empty_like(full)]))
 

@@ -160,7 +160,7 @@ def _files(result: Result, report: Callable[[Result], str] | None) -> list[tuple
         ("graph.g2o", graph_g2o(result.steps, result.estimate, kernel_of(result))),
         ("graph_ids.csv", graph_ids(result.estimate)),
     ]
-    for own in parallel_map(_trajectory_files, list(result.robots.items())):
+    for own in parallel_map(trajectory_files, list(result.robots.items())):
         files += own
     joint = joint_scans(result.estimate, result.robots)
     if joint is not None:
@@ -180,7 +180,7 @@ def kernel_of(result: Result) -> RobustConfig:
     return replace(result.config.robust, scale=scale)
 
 
-def _trajectory_files(named: tuple[str, RobotResult]) -> list[tuple[str, str]]:
+def trajectory_files(named: tuple[str, RobotResult]) -> list[tuple[str, str]]:
     """Names and contents of the files of one robot."""
     name, robot = named
     stem = f"trajectories/{_file_name(name)}"

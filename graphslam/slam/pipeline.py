@@ -58,6 +58,7 @@ from graphslam.slam.recorded_closures import between_states
 from graphslam.slam.robot_settings import outlines
 from graphslam.slam.robot_sightings import RobotCandidates, with_named_robots
 from graphslam.slam.sighting_batches import (
+    Event,
     SightingBatch,
     batch_motions,
     batch_sightings,
@@ -112,10 +113,16 @@ class Pipeline(StepRecorder):
 
     def run(self, progress: Progress) -> None:
         """Take in every message of the log; ``progress`` gets the number of messages read."""
+        for _ in self.process(self.messages(progress)):
+            pass
+        self.counts["loop_closures"] += self.associator.closures
+
+    def process(self, messages: Iterable[Message]) -> Iterator[Event]:
+        """Take in messages, sorted by time; gives each event once it is taken in."""
         tracks = {name: run.track for name, run in self.runs.items()}
-        read = self.accepted(to_common_clock(self.messages(progress), self.known.clocks))
+        read = self.accepted(to_common_clock(messages, self.known.clocks))
         read = with_laser_odometry(read, self.log.without_odometry, self.config)
-        messages = synchronise(
+        synchronised = synchronise(
             with_bridged_gaps(read, self.log.bridged, self.config, tracks),
             tracks,
             self.config.odometry.max_gap_s,
@@ -128,7 +135,7 @@ class Pipeline(StepRecorder):
         span_ns = 0 if alone else round(1e9 * self.config.keyframe.sighting_window_s)
         max_gap_ns = round(1e9 * self.config.odometry.max_gap_s)
         clock = time.perf_counter()
-        for event in batch_sightings(events(messages), tracks, span_ns, max_gap_ns):
+        for event in batch_sightings(events(synchronised), tracks, span_ns, max_gap_ns):
             self.seconds["read"] += time.perf_counter() - clock
             began = time.perf_counter()
             steps = len(self.steps)
@@ -136,10 +143,10 @@ class Pipeline(StepRecorder):
                 self.add_sighting_batch(event)
             else:
                 self.add_event(event)
-            clock = time.perf_counter()
             if len(self.steps) > steps:
-                self.step_ms.append(1e3 * (clock - began))
-        self.counts["loop_closures"] += self.associator.closures
+                self.step_ms.append(1e3 * (time.perf_counter() - began))
+            yield event
+            clock = time.perf_counter()
 
     def messages(self, progress: Progress) -> Iterator[Message]:
         """The messages of the log but truth, counted; for ``progress`` see `run`."""

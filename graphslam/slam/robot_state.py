@@ -111,7 +111,21 @@ class RobotState:
             start: (3,) prior pose of the robot that defines the frame.
             away_m: offset along x of that frame while it was estimated.
         """
-        stamps, times, laser = self._report_times()
+        return self.causal_at_stamps(*self._report_times(), start, away_m)
+
+    def causal_at_stamps(
+        self,
+        stamps: IntArray,
+        times: IntArray,
+        laser: Array,
+        start: Array,
+        away_m: float = 0.0,
+    ) -> "Causal":
+        """The causal trajectories at stamps (n,), which are times (n,) of the common clock.
+
+        ``laser`` (n, 3): mounts of the sensors whose poses are asked for, if the robot has scans;
+        ``start`` and ``away_m``: see `causal`.
+        """
         poses = np.array(self.causal_poses) - np.array([away_m, 0.0, 0.0])
         known = Trajectory(np.array(self.times, dtype=np.int64), poses, np.array(self.causal_covs))
         # mount and latency as known then, for the base pose and for the frame that starts at it

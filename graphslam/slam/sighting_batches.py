@@ -9,6 +9,7 @@ import itertools
 from collections import Counter, defaultdict, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -47,9 +48,13 @@ class SightingBatch:
         return sorted(seen | {image[0].robot for image in self.images})
 
 
+#: everything one robot perceived at one time, or all images of a span
+Event: TypeAlias = Sequence[Message] | SightingBatch
+
+
 def batch_sightings(
     events: Iterable[Sequence[Message]], tracks: Mapping[str, Track], span_ns: int, max_gap_ns: int
-) -> Iterator[Sequence[Message] | SightingBatch]:
+) -> Iterator[Event]:
     """Events in order of time, images of one span as one `SightingBatch`.
 
     A batch is complete once the odometry of all its robots has reached its end (waiting at most

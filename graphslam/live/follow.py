@@ -1,0 +1,249 @@
+"""Follow a recording while it is written: estimates, and a folder that is kept current."""
+
+import os
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from graphslam.core.config import Config
+from graphslam.core.config_io import chosen_config
+from graphslam.core.errors import LogError
+from graphslam.core.output_folder import Identity, identity
+from graphslam.core.records import Landmark, Message
+from graphslam.core.worker import Future
+from graphslam.live.history import History
+from graphslam.live.live_folder import write_live_folder
+from graphslam.live.live_pass import LiveEstimate
+from graphslam.live.session import INTRODUCTION_S, Session, live_config
+from graphslam.logs import LogSet
+from graphslam.logs.container_files import digest
+from graphslam.logs.future_stamps import Recorded
+from graphslam.logs.growing_mcap import GrowingMcap, open_growing
+from graphslam.logs.log_set import FileReader, decoded, log_set_of
+from graphslam.logs.recording import RawMessage, Recording, with_derived
+from graphslam.logs.time_order import TOO_LATE
+from graphslam.results.folder import check_target
+
+#: s between two versions of the folder, at least; and how many times as long as writing one takes
+WRITE_INTERVAL_S, WRITE_SHARE = 5.0, 5.0
+
+
+def follow(
+    recording: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    *,
+    config: Config | str | os.PathLike[str] | None = None,
+    force: bool = False,
+    each: Callable[[LiveEstimate], None] = lambda _estimate: None,
+    announce: Callable[[str], None] = lambda _text: None,
+    **settings: Any,
+) -> dict[str, Any]:
+    """Estimate a recording while it is written, until it ends or stops growing.
+
+    ``output`` is a result folder of what is known now; it is replaced as a whole every few seconds,
+    beside the estimation. Its trajectories are causal: by the data up to each pose. Ctrl-C ends the
+    following, and the folder has what was estimated until then.
+
+    Args:
+        recording: an MCAP file, which need not exist yet.
+        output: the folder.
+        config: settings, or a TOML file.
+        force: replace a result folder that stands there.
+        each: called with every estimate as soon as it is made.
+        announce: called with a line on what goes on.
+        settings: as of `graphslam.smooth`.
+
+    Returns:
+        The content of summary.json.
+
+    Raises:
+        LogError: it is no MCAP file, does not begin, has nothing usable, or was cut or replaced;
+            the folder then has what was estimated until then.
+        ConfigError: a setting is wrong, or needs the whole log.
+        OutputError: the folder exists and may not be replaced, or cannot be written.
+    """
+    chosen = live_config(chosen_config(config, **settings))
+    path, target = Path(recording), Path(output)
+    before = check_target(target, force=force)
+    growing = open_growing(path, chosen.limits, chosen.live.wait_s)
+    log, file = _opened(growing, chosen, announce)
+    session = Session(chosen, log=log)
+    folder = _Folder(target, before, session, log)
+    state = "ended"
+    try:
+        messages = _messages(growing, log, file, chosen, folder)
+        for estimate in session.process_sorted(messages):
+            folder.history.add(estimate)
+            each(estimate)
+            folder.write_if_due()
+        if not growing.ended:
+            state = f"has not grown for {chosen.live.wait_s:g} s"
+    except KeyboardInterrupt:
+        state = "interrupted"
+    except LogError as error:
+        folder.warnings.append(str(error))
+        folder.write("stopped", growing)
+        raise
+    if growing.damage:
+        folder.warnings.append(f"{path}: damaged: {growing.damage}")
+    return folder.write(state, growing)
+
+
+def _opened(
+    growing: GrowingMcap, config: Config, announce: Callable[[str], None]
+) -> tuple[LogSet, Recording]:
+    """The log, once its beginning tells what is in it.
+
+    Raises:
+        LogError: nothing usable comes.
+    """
+    announce("waiting for odometry and observations")
+    reason: LogError | None = None
+    grown = time.monotonic()
+    while True:
+        if growing.poll() or growing.ended:
+            grown = time.monotonic()
+            file = growing.recording()
+            try:
+                log = log_set_of([file], config)
+                blocks = file.pieces[0].blocks
+                seconds = 1e-9 * (max(b.end_ns for b in blocks) - min(b.start_ns for b in blocks))
+                if seconds >= INTRODUCTION_S or growing.ended:
+                    announce(f"following {', '.join(log.robots)}")
+                    # of a gyroscope the whole log tells whether it can be used
+                    return replace(log, gyroscopes={}), file
+            except LogError as error:
+                reason = error
+        if growing.ended or time.monotonic() - grown > config.live.wait_s:
+            break
+        time.sleep(0.05)
+    waited = f"{growing.path}: has not grown for {config.live.wait_s:g} s, and holds too little"
+    raise reason or LogError(f"{waited}; start the recorder before, or raise live.wait_s")
+
+
+def _messages(
+    growing: GrowingMcap, log: LogSet, file: Recording, config: Config, folder: "_Folder"
+) -> Iterator[Message]:
+    """The messages of the recording, sorted by time, as they come."""
+    topics = {topic.name: topic for topic in log.topics}
+    contexts = {
+        name: replace(context, beams=folder.dropped) for name, context in log.contexts.items()
+    }
+    derived = [one for one in log.opened[0].derived if one.name in topics]
+
+    def recorded() -> Iterator[Recorded]:
+        stream = _Stream(growing.batches(config.live.wait_s, folder.write_if_due))
+        made = with_derived(stream, derived, topics) if derived else stream
+        for raw in made:
+            if raw.topic in topics:
+                yield from decoded([raw], topics, contexts, folder.dropped)
+
+    logs = replace(config.logs, reorder_s=config.live.reorder_s)
+    reader = FileReader(file, replace(config, logs=logs))
+    yield from reader.sorted(recorded())
+    for counts in reader.sorter.counts.values():
+        folder.dropped[TOO_LATE] += counts.pop(TOO_LATE, 0)
+        folder.repaired.update(counts)
+
+
+class _Stream:
+    """Batches of raw messages one by one."""
+
+    def __init__(self, batches: Iterator[list[RawMessage]]) -> None:
+        self._batches = batches
+
+    def __iter__(self) -> Iterator[RawMessage]:
+        for batch in self._batches:
+            yield from batch
+
+
+class _Folder:
+    """The folder of a drive: written beside the estimation, in a second process."""
+
+    def __init__(self, target: Path, before: Identity, session: Session, log: LogSet) -> None:
+        self.history, self.warnings = History(), list(log.warnings)
+        self.dropped: Counter[str] = Counter()
+        self.repaired: Counter[str] = Counter()
+        self._target, self._before, self._session, self._log = target, before, session, log
+        self._writing: Future[Identity] | None = None
+        self._written_s, self._began_s, self._took_s = time.monotonic(), 0.0, 0.0
+        self._estimates = 0
+
+    def write_if_due(self) -> None:
+        """Begin to write the folder, where that was long ago and something came since."""
+        now = time.monotonic()
+        if self._writing is not None and self._writing.is_ready():
+            self._finish()
+        due = now - self._written_s > max(WRITE_INTERVAL_S, WRITE_SHARE * self._took_s)
+        if self._writing is None and due and len(self.history) > self._estimates:
+            self._begin("following", "")
+
+    def write(self, state: str, growing: GrowingMcap) -> dict[str, Any]:
+        """Write the folder a last time; its summary."""
+        if self._writing is not None:
+            self._finish()
+        summary = self._begin(state, digest(growing.path) if growing.ended else "")
+        self._finish()
+        return summary
+
+    def _begin(self, state: str, sha256: str) -> dict[str, Any]:
+        landmarks = self._session.landmarks
+        summary = self._summary(state, sha256, landmarks)
+        write = partial(
+            write_live_folder,
+            self._target,
+            self._before,
+            self._session.config,
+            self.history,
+            landmarks,
+            summary,
+        )
+        self._began_s, self._estimates = time.monotonic(), len(self.history)
+        self._writing = Future(lambda: (write(), identity(self._target))[1])
+        return summary
+
+    def _finish(self) -> None:
+        assert self._writing is not None
+        self._before = self._writing.result()
+        self._writing = None
+        self._written_s = time.monotonic()
+        self._took_s = self._written_s - self._began_s
+
+    def _summary(self, state: str, sha256: str, landmarks: tuple[Landmark, ...]) -> dict[str, Any]:
+        log, history, session = self._log, self.history, self._session
+        counts = session.counts
+        dropped = self.dropped + session.dropped
+        return {
+            "logs": [
+                {
+                    "path": str(log.files[0].path.resolve()),
+                    "sha256": sha256 or None,
+                    "messages": None,
+                    "lost": None,
+                }
+            ],
+            "notes": dict(log.notes),
+            "counts": {
+                "scans": counts.get("scans", 0),
+                "keyframes": counts.get("keyframes", 0),
+                "observations": counts.get("observations", 0),
+                "loop_closures": counts.get("loop_closures", 0),
+                "landmarks": len(landmarks),
+            },
+            "world": session.world,
+            "frames": session.frames,
+            "dropped": {key: number for key, number in sorted(dropped.items()) if number},
+            "repaired": dict(sorted(self.repaired.items())),
+            "warnings": self.warnings,
+            "live": {
+                "state": state,
+                "estimates": len(history),
+                "last_ns": history.last_ns,
+                "recorded_s": round(session.seconds, 3),
+                "largest_jump_m": round(history.largest_jump_m, 4),
+            },
+        }

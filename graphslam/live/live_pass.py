@@ -1,0 +1,159 @@
+"""The pass over messages that are still to come: it keeps what its window needs, and no history.
+
+The stages are those of `graphslam.slam.pipeline`, the back end is a fixed-lag smoother. Memory is
+that of the window, of the map and of one small table of the states' times.
+"""
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphslam.core.config import Config
+from graphslam.core.geometry import Array, between, compose, inverse, transform
+from graphslam.core.records import Estimate, Landmark, Message
+from graphslam.estimation.fixed_lag import FixedLagBackend
+from graphslam.logs import LogSet
+from graphslam.mapping.landmark_records import make_landmarks
+from graphslam.slam.log_pass import PriorKnowledge
+from graphslam.slam.pipeline import Pipeline
+from graphslam.slam.robot_state import RobotState
+from graphslam.slam.sighting_batches import Event, SightingBatch
+
+#: s: odometry that is kept, at least
+SHORTEST_MEMORY_S = 10.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LiveEstimate:
+    """Where a robot was when a sensor saw something, by all data until then.
+
+    Attributes:
+        robot: its name.
+        stamp_ns: the stamp of the scan, or of the last sighting.
+        pose: (3,) of the base in the map, m and rad.
+        cov: (3, 3) along the axes of the map.
+        odometry: (3,) pose of the base by odometry alone, in the frame where that began.
+        jump: (3,) by how much ``pose`` differs from what the estimate before and the odometry since
+            would give, in the frame of the base; zeros at first.
+        loop_closed: whether landmarks not seen for long were found again since the estimate before.
+        frame: the frame of ``pose``: the robot that begins at its origin.
+        scan_pose: (3,) of the sensor of a scan; None without scans.
+        points: (n, 2) returns of a scan that became a keyframe, in the frame of its sensor; else
+            None.
+    """
+
+    robot: str
+    stamp_ns: int
+    pose: Array
+    cov: Array
+    odometry: Array
+    jump: Array
+    loop_closed: bool
+    frame: str
+    scan_pose: Array | None
+    points: Array | None = None
+
+
+class LivePass(Pipeline):
+    """A pass that reports each robot where it is, and forgets what is behind its horizon."""
+
+    backend: FixedLagBackend
+
+    def __init__(self, log: LogSet, config: Config, known: PriorKnowledge) -> None:
+        """For the arguments see `LogPass`; the back end has a finite horizon."""
+        super().__init__(log, config, known)
+        memory_s = max(self.config.backend.horizon_s, SHORTEST_MEMORY_S)
+        self._memory_ns = round(1e9 * memory_s)
+        self._reported: dict[str, LiveEstimate] = {}
+        self._closures = 0  # that were reported
+
+    def estimates(self, messages: Iterable[Message]) -> Iterator[LiveEstimate]:
+        """Take in messages, sorted by time; gives the estimates of each event."""
+        for event in self.process(messages):
+            self.record_covariances()
+            for robot, run in self.started.items():
+                yield from self._report(robot, run, event)
+            self.forget()
+
+    def _report(self, robot: str, run: RobotState, event: Event) -> Iterator[LiveEstimate]:
+        """The estimates of a robot at its new scans, or else at its sightings in ``event``."""
+        if self.log.has_scans(robot):
+            found = sorted(run.scans, key=lambda scan: scan[0])
+            stamps, times = [scan[0] for scan in found], [scan[1] for scan in found]
+            mounts = np.array([scan[2] for scan in found])
+        else:
+            times = _seen_at(robot, event)
+            stamps = [int(run.clock.to_local(np.array([time]))[0]) for time in times]
+            mounts = np.zeros((0, 3))
+        if not stamps:
+            return
+        frame = self.frames.of[robot]
+        when = np.array(times, dtype=np.int64)
+        causal = run.causal_at_stamps(
+            np.array(stamps, dtype=np.int64),
+            when,
+            mounts,
+            self.starts[frame].pose,
+            self.frames.away.get(frame, 0.0),
+        )
+        run.scans.clear()
+        odometry = run.track.pose(when)
+        closed = self.associator.closures > self._closures
+        self._closures = self.associator.closures
+        points = {
+            (one.robot, one.time_ns): transform(inverse(one.sensor), one.points)
+            for one in self.keyframe_scans
+        }
+        for k, stamp in enumerate(stamps):
+            pose, before = causal.base.poses[k], self._reported.get(robot)
+            jump = np.zeros(3)
+            if before is not None:
+                expected = compose(before.pose, between(before.odometry, odometry[k]))
+                jump = between(expected, pose)
+            scan = None if causal.scan is None else causal.scan.poses[k]
+            made = LiveEstimate(
+                robot, stamp, pose, causal.base.covs[k], odometry[k], jump, closed, frame, scan,
+                points.get((robot, times[k])),
+            )  # fmt: skip
+            self._reported[robot] = made
+            yield made
+
+    def forget(self) -> None:
+        """Drop what no later message needs."""
+        for history in (
+            self.steps, self.offers, self.sources, self.robot_sightings, self.unrelated_sightings,
+            self.keyframe_scans, self.step_ms, self.innovations,
+        ):  # fmt: skip
+            history.clear()
+        before_ns = self.last_ns - self._memory_ns
+        for robot, run in self.started.items():
+            self.landmarks.expire(self.last_ns, robot, math.inf, self._memory_ns, 0.0)
+            first = min(before_ns, run.state_ns)
+            run.track.forget_before(first)
+            run.repeats.left_out.clear()
+            # half of them at a time, so that each is moved once on average
+            behind = int(np.searchsorted(run.times[:-1], first))
+            if 2 * behind > len(run.times):
+                for states in (run.times, run.causal_poses, run.causal_covs, run.calibrations):
+                    del states[:behind]
+        self.backend.forget()
+
+    def landmark_map(self) -> tuple[Landmark, ...]:
+        """The landmarks of the map as estimated now, in their frames."""
+        ids = self.landmarks.graph_ids()
+        self.landmarks.refresh(self.backend, ids)
+        transforms = self.transforms()
+        moved = self.landmarks.transformed(transforms.landmarks)
+        estimate = transforms.estimate(Estimate({}, self.backend.landmark_estimates(ids), 0.0, 0))
+        entries = self.landmarks.entries.values()
+        return self.frames.label_landmarks(make_landmarks(moved, estimate), entries)
+
+
+def _seen_at(robot: str, event: Event) -> list[int]:
+    """When a robot saw something in ``event``: once at most."""
+    if isinstance(event, SightingBatch):
+        return [event.time_ns] if any(i[0].robot == robot for i in event.images) else []
+    first = event[0]
+    return [first.time_ns] if first.robot == robot and hasattr(first, "z") else []

@@ -1,0 +1,236 @@
+"""A session: messages in, as they come; out comes where the robots are."""
+
+import math
+import os
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import chain
+from typing import Any
+
+from graphslam.core.config import Config
+from graphslam.core.config_io import chosen_config
+from graphslam.core.errors import ConfigError, LogError
+from graphslam.core.records import Landmark, Message, Scan, Sighting
+from graphslam.live.live_pass import LiveEstimate, LivePass
+from graphslam.logs import LogSet
+from graphslam.logs.decoders import TopicContext
+from graphslam.logs.time_order import TOO_LATE, MessageSorter
+from graphslam.logs.topics import MOTION_KINDS, Topic
+from graphslam.multi_robot.frame_tree import FrameAssignment
+from graphslam.slam.log_pass import PriorKnowledge
+from graphslam.slam.log_reader import TRUE_RECORDS
+from graphslam.slam.recorded_closures import RecordedClosures
+from graphslam.slam.robot_settings import check_robots
+from graphslam.slam.start_priors import origin, start_poses
+
+#: s of messages by which the robots and their sensors are known, if nobody tells them
+INTRODUCTION_S = 2.0
+
+
+class Session:
+    """One drive, estimated while it takes place.
+
+    ::
+
+        session = graphslam.Session()
+        for estimate in session.process(messages):
+            print(estimate.robot, estimate.stamp_ns, estimate.pose, estimate.cov)
+
+    ``messages`` are records of `graphslam.core.records` in the order in which they come; one that
+    is up to ``live.reorder_s`` late by its stamp is sorted in. There is an estimate for every scan,
+    and for every set of sightings, by the data until then; a later message does not change it.
+    Memory and time per message are bounded by the horizon and the map.
+
+    A robot whose start is not given in ``start.poses`` has a frame of its own, but the first one,
+    which begins at the origin. Clocks of several robots have to agree.
+
+    Attributes:
+        config: the settings, those of docs/configuration.md.
+        dropped: number of messages that were not used, by reason.
+    """
+
+    def __init__(
+        self,
+        config: Config | str | os.PathLike[str] | None = None,
+        *,
+        robots: Mapping[str, Sequence[type[Message]]] | None = None,
+        log: LogSet | None = None,
+        **settings: Any,
+    ) -> None:
+        """Nothing is estimated yet.
+
+        Args:
+            config: settings, or a TOML file.
+            robots: the records that each robot sends; by default those that come in the first
+                `INTRODUCTION_S`.
+            log: a recording, of which more is to come, that says the same.
+            settings: as of `graphslam.smooth`.
+
+        Raises:
+            ConfigError: a setting is wrong, or needs the whole log.
+        """
+        self.config = live_config(chosen_config(config, **settings))
+        self.dropped: Counter[str] = Counter()
+        self._log = log
+        if robots is not None:
+            self._log = expected_log(robots, self.config)
+        self._pass: LivePass | None = None
+
+    @property
+    def robots(self) -> tuple[str, ...]:
+        """Names of the robots; empty until they are known."""
+        return self._log.robots if self._log is not None else ()
+
+    @property
+    def landmarks(self) -> tuple[Landmark, ...]:
+        """The map as it is known now, with covariances."""
+        return () if self._pass is None else self._pass.landmark_map()
+
+    @property
+    def world(self) -> str:
+        """The frame of the first robot, and of those whose start in it was told."""
+        return "" if self._pass is None else self._pass.frames.world
+
+    @property
+    def frames(self) -> Mapping[str, str]:
+        """Robot -> its frame, named after the robot that begins at its origin."""
+        return {} if self._pass is None else dict(sorted(self._pass.frames.of.items()))
+
+    @property
+    def seconds(self) -> float:
+        """How long the drive is so far, s."""
+        if self._pass is None or not self._pass.last_ns:
+            return 0.0
+        return 1e-9 * (self._pass.last_ns - self._pass.first_ns)
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """Numbers of keyframes, scans, observations and so on that were used."""
+        if self._pass is None:
+            return {}
+        closures = self._pass.associator.closures
+        return {**self._pass.counts, "loop_closures": closures}
+
+    def process(self, messages: Iterable[Message]) -> Iterator[LiveEstimate]:
+        """Take in messages as they come, and give each estimate as soon as it can be made.
+
+        Raises:
+            LogError: no robot has both odometry and observations.
+            EstimationError: the estimate is indeterminate.
+        """
+        rest = iter(messages)
+        if self._log is None:
+            first, kinds = introduced(rest)
+            self._log = expected_log(kinds, self.config)
+            rest = chain(first, rest)
+        yield from self.process_sorted(self._sorted(self._expected(rest)))
+
+    def process_sorted(self, messages: Iterable[Message]) -> Iterator[LiveEstimate]:
+        """As `process`, for messages that are sorted by ``time_ns``, of robots that are known."""
+        assert self._log is not None
+        check_robots(self._log, self.config)
+        self._pass = LivePass(self._log, self.config, known_starts(self._log, self.config))
+        yield from self._pass.estimates(messages)
+        self.dropped.update(self._pass.dropped)
+
+    def _expected(self, messages: Iterable[Message]) -> Iterator[Message]:
+        """The messages that can be used."""
+        assert self._log is not None
+        kinds = {(topic.robot, topic.record) for topic in self._log.topics}
+        for message in messages:
+            if isinstance(message, TRUE_RECORDS):
+                continue
+            if (message.robot, type(message)) in kinds:
+                yield message
+            else:
+                what = type(message).__name__.lower()
+                self.dropped[f"{what}: {message.robot} did not send any at first"] += 1
+
+    def _sorted(self, messages: Iterable[Message]) -> Iterator[Message]:
+        sorter = MessageSorter(round(1e9 * self.config.live.reorder_s))
+        for message in messages:
+            yield from sorter.push(f"{message.robot} {type(message).__name__}", message)
+        yield from sorter.finish()
+        for counts in sorter.counts.values():
+            self.dropped[TOO_LATE] += counts[TOO_LATE]
+
+
+def live_config(config: Config) -> Config:
+    """The settings with a finite horizon.
+
+    Raises:
+        ConfigError: a setting needs the whole log.
+    """
+    backend = config.backend
+    if backend.name not in ("batch", "isam2") or backend.horizon_s == 0:
+        raise ConfigError(
+            "backend.name: live estimates are those of isam2 with a horizon above 0 s; leave it out"
+        )
+    if config.start.from_truth:
+        raise ConfigError(
+            "start.from_truth: needs a whole log; give start.poses for live estimates"
+        )
+    horizon = backend.horizon_s if math.isfinite(backend.horizon_s) else config.live.horizon_s
+    return replace(config, backend=replace(backend, name="isam2", horizon_s=horizon))
+
+
+def introduced(
+    messages: Iterator[Message],
+) -> tuple[list[Message], dict[str, list[type[Message]]]]:
+    """The first messages, and the records that each robot sent in them."""
+    first: list[Message] = []
+    kinds: dict[str, list[type[Message]]] = {}
+    for message in messages:
+        first.append(message)
+        if isinstance(message, TRUE_RECORDS):
+            continue
+        own = kinds.setdefault(message.robot, [])
+        if type(message) not in own:
+            own.append(type(message))
+        if message.time_ns - first[0].time_ns > 1e9 * INTRODUCTION_S:
+            break
+    return first, kinds
+
+
+def expected_log(kinds: Mapping[str, Sequence[type[Message]]], config: Config) -> LogSet:
+    """A log whose messages are still to come: the robots, and the records that they send.
+
+    Raises:
+        LogError: there is no odometry, or nothing is observed.
+    """
+    topics = tuple(
+        Topic(f"/{robot}/{kind.__name__.lower()}", "", robot, kind, 1)
+        for robot, own in sorted(kinds.items())
+        for kind in own
+        if kind not in TRUE_RECORDS
+    )
+    records = {topic.record for topic in topics}
+    if not records & {Scan, Sighting} or not records & {*MOTION_KINDS}:
+        there = ", ".join(sorted(record.__name__ for record in records)) or "nothing"
+        raise LogError(
+            f"the session: needs odometry and scans or sightings, and {there} came in the first "
+            f"{INTRODUCTION_S:g} s; name what is to come in Session(robots=...)"
+        )
+    return LogSet(
+        robots=tuple(sorted({t.robot for t in topics if t.record in MOTION_KINDS})),
+        files=(),
+        topics=topics,
+        notes={},
+        warnings=[],
+        dropped=Counter(),
+        repaired=Counter(),
+        opened=(),
+        _contexts={topic.name: TopicContext(topic.robot) for topic in topics},
+        config=config,
+    )
+
+
+def known_starts(log: LogSet, config: Config) -> PriorKnowledge:
+    """The starts that were told; a robot without one is alone in its frame."""
+    starts = start_poses(log, config)
+    world = min(starts)
+    frames = {robot: world if robot in starts else robot for robot in log.robots}
+    every = {robot: starts.get(robot, origin(config)) for robot in log.robots}
+    assignment = FrameAssignment(every, frames, world)
+    return PriorKnowledge(assignment, RecordedClosures(every, frames, frozenset(), {}))

@@ -1,0 +1,143 @@
+"""An MCAP file that is still written: what was added to it since it was looked at last."""
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import BinaryIO, cast
+
+from graphslam.core.errors import LogError
+from graphslam.core.sensor_config import LimitsConfig
+from graphslam.logs.mcap_file import DAMAGE, MAGIC, Indexer, block_messages, records_from
+from graphslam.logs.recording import RawMessage, Recording
+from graphslam.logs.translations import translation
+
+#: s between two looks at the file
+POLL_S = 0.02
+#: bytes of the record read last by which it is known again
+_KNOWN_AGAIN = 64
+
+
+class GrowingMcap:
+    """A reader that follows a file to its end, wherever that is now.
+
+    Records count once they are there as a whole, chunks too: what a recorder keeps in memory is not
+    seen. ``ended``: the recorder closed the file.
+    """
+
+    def __init__(self, path: Path, stream: BinaryIO, limits: LimitsConfig) -> None:
+        """``stream``: the open file, of which MAGIC is there."""
+        self.path, self.ended = path, False
+        self._stream = stream
+        self._indexer = Indexer(path, stream, limits)
+        self._last = b""  # the beginning of the record read last, which is at the indexer's place
+        self._given = 0  # blocks
+
+    def poll(self) -> bool:
+        """Take in what was added; whether there was anything.
+
+        Raises:
+            LogError: the file was cut, replaced or taken away, or a chunk is beyond the limits.
+        """
+        self._check()
+        indexer, begin, grown = self._indexer, self._indexer.position, False
+        try:
+            for offset, opcode, body in records_from(self._stream, begin):
+                if self._last and offset == begin:
+                    continue  # the one read last
+                indexer.position, grown = offset, True
+                indexer.add(offset, opcode, body)
+            self.ended = True
+        except DAMAGE:
+            pass  # what is incomplete now may be complete soon
+        indexer.close_loose_block()
+        if grown:
+            self._stream.seek(indexer.position)
+            self._last = self._stream.read(_KNOWN_AGAIN)
+        return grown
+
+    def recording(self) -> Recording:
+        """What was read so far, as a recording."""
+        return Recording(self.path, (self._indexer.result(),))
+
+    @property
+    def damage(self) -> str:
+        """What could not be read, in one line; empty if there is nothing."""
+        return "; ".join(self._indexer.damage)
+
+    def messages(self) -> Iterator[RawMessage]:
+        """The messages that `poll` found and that were not given yet, translated."""
+        indexer = self._indexer
+        names = {number: schema.name for number, schema in indexer.schemas.items()} | {0: ""}
+        channels = {}
+        for number, c in indexer.channels.items():
+            found = translation(names.get(c.schema_id, ""), c.message_encoding)
+            channels[number] = c.topic, found.translate if found else None
+        blocks = indexer.blocks.blocks[self._given :]
+        self._given += len(blocks)
+        for block in blocks:
+            for channel, log_ns, data in block_messages(self._stream, block, channels.keys()):
+                topic, translate = channels[channel]
+                yield RawMessage(topic, log_ns, translate(data) if translate else data)
+
+    def batches(
+        self, wait_s: float, idle: Callable[[], None] = lambda: None
+    ) -> Iterator[list[RawMessage]]:
+        """The messages as they come, until the file ends or has not grown for ``wait_s``.
+
+        ``idle``: called while there is nothing to read.
+        """
+        grown = time.monotonic()
+        while True:
+            if batch := list(self.messages()):
+                yield batch
+            if self.ended:
+                return
+            if self.poll():
+                grown = time.monotonic()
+                continue
+            if time.monotonic() - grown > wait_s:
+                return
+            idle()
+            time.sleep(POLL_S)
+
+    def _check(self) -> None:
+        """Whether the file is still the one that was opened, with all that was read in it."""
+        wrong = ""
+        try:
+            if not os.path.samestat(os.fstat(self._stream.fileno()), self.path.stat()):
+                wrong = "was replaced by another file"
+        except OSError:
+            wrong = "was taken away"
+        self._stream.seek(self._indexer.position)
+        if not wrong and self._stream.read(len(self._last)) != self._last:
+            wrong = "was cut or overwritten"
+        if wrong:
+            raise LogError(f"{self.path}: {wrong} while it was followed; follow it from its start")
+
+
+def open_growing(path: Path, limits: LimitsConfig, wait_s: float) -> GrowingMcap:
+    """Open a recording that may not have begun yet.
+
+    Raises:
+        LogError: it does not appear within ``wait_s``, or is no MCAP file.
+    """
+    begin = time.monotonic()
+    while time.monotonic() - begin <= wait_s:
+        try:
+            stream = path.open("rb", buffering=0)
+        except FileNotFoundError:
+            time.sleep(POLL_S)
+            continue
+        except OSError as error:
+            raise LogError(f"{path}: cannot be read: {error.strerror}; check the path") from error
+        head = stream.read(len(MAGIC))
+        if head == MAGIC:
+            return GrowingMcap(path, cast(BinaryIO, stream), limits)
+        stream.close()
+        if not MAGIC.startswith(head):
+            raise LogError(
+                f"{path}: is no MCAP file, and only these can be followed; smooth reads the others"
+            )
+        time.sleep(POLL_S)
+    raise LogError(f"{path}: nothing was written to it for {wait_s:g} s; start the recorder")
