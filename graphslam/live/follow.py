@@ -24,7 +24,7 @@ from graphslam.logs.container_files import digest
 from graphslam.logs.future_stamps import Recorded
 from graphslam.logs.growing_mcap import GrowingMcap, open_growing
 from graphslam.logs.log_set import FileReader, decoded, log_set_of
-from graphslam.logs.recording import RawMessage, Recording, with_derived
+from graphslam.logs.recording import Recording, deriver
 from graphslam.logs.time_order import TOO_LATE
 from graphslam.results.folder import check_target
 
@@ -69,28 +69,28 @@ def follow(
     chosen = live_config(chosen_config(config, **settings))
     path, target = Path(recording), Path(output)
     before = check_target(target, force=force)
-    growing = open_growing(path, chosen.limits, chosen.live.wait_s)
-    log, file = _opened(growing, chosen, announce)
-    session = Session(chosen, log=log)
-    folder = _Folder(target, before, session, log)
-    state = "ended"
-    try:
-        messages = _messages(growing, log, file, chosen, folder)
-        for estimate in session.process_sorted(messages):
-            folder.history.add(estimate)
-            each(estimate)
-            folder.write_if_due()
-        if not growing.ended:
-            state = f"has not grown for {chosen.live.wait_s:g} s"
-    except KeyboardInterrupt:
-        state = "interrupted"
-    except LogError as error:
-        folder.warnings.append(str(error))
-        folder.write("stopped", growing)
-        raise
-    if growing.damage:
-        folder.warnings.append(f"{path}: damaged: {growing.damage}")
-    return folder.write(state, growing)
+    with open_growing(path, chosen.limits, chosen.live.wait_s) as growing:
+        log, file = _opened(growing, chosen, announce)
+        session = Session(chosen, log=log)
+        folder = _Folder(target, before, session, log)
+        state = "ended"
+        try:
+            messages = _messages(growing, log, file, chosen, folder)
+            for estimate in session.process_sorted(messages):
+                folder.history.add(estimate)
+                each(estimate)
+                folder.write_if_due()
+            if not growing.ended:
+                state = f"has not grown for {chosen.live.wait_s:g} s"
+        except KeyboardInterrupt:
+            state = "interrupted"
+        except LogError as error:
+            folder.warnings.append(str(error))
+            folder.write("stopped", growing)
+            raise
+        if growing.damage:
+            folder.warnings.append(f"{path}: damaged: {growing.damage}")
+        return folder.write(state, growing)
 
 
 def _opened(
@@ -134,13 +134,12 @@ def _messages(
         name: replace(context, beams=folder.dropped) for name, context in log.contexts.items()
     }
     derived = [one for one in log.opened[0].derived if one.name in topics]
+    used = deriver(derived, topics)
 
     def recorded() -> Iterator[Recorded]:
-        stream = _Stream(growing.batches(config.live.wait_s, folder.write_if_due))
-        made = with_derived(stream, derived, topics) if derived else stream
-        for raw in made:
-            if raw.topic in topics:
-                yield from decoded([raw], topics, contexts, folder.dropped)
+        for batch in growing.batches(config.live.wait_s, folder.write_if_due):
+            raws = [raw for message in batch for raw in used(message)]
+            yield from decoded(raws, topics, contexts, folder.dropped)
 
     logs = replace(config.logs, reorder_s=config.live.reorder_s)
     reader = FileReader(file, replace(config, logs=logs))
@@ -148,17 +147,6 @@ def _messages(
     for counts in reader.sorter.counts.values():
         folder.dropped[TOO_LATE] += counts.pop(TOO_LATE, 0)
         folder.repaired.update(counts)
-
-
-class _Stream:
-    """Batches of raw messages one by one."""
-
-    def __init__(self, batches: Iterator[list[RawMessage]]) -> None:
-        self._batches = batches
-
-    def __iter__(self) -> Iterator[RawMessage]:
-        for batch in self._batches:
-            yield from batch
 
 
 class _Folder:

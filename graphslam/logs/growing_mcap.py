@@ -19,7 +19,7 @@ _KNOWN_AGAIN = 64
 
 
 class GrowingMcap:
-    """A reader that follows a file to its end, wherever that is now.
+    """A reader that follows a file to its end, wherever that is now; a context manager.
 
     Records count once they are there as a whole, chunks too: what a recorder keeps in memory is not
     seen. ``ended``: the recorder closed the file.
@@ -32,6 +32,12 @@ class GrowingMcap:
         self._indexer = Indexer(path, stream, limits)
         self._last = b""  # the beginning of the record read last, which is at the indexer's place
         self._given = 0  # blocks
+
+    def __enter__(self) -> "GrowingMcap":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._stream.close()
 
     def poll(self) -> bool:
         """Take in what was added; whether there was anything.

@@ -8,7 +8,7 @@ several that follow each other (split bags). What a message is made of is known 
 import hashlib
 import heapq
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -241,21 +241,26 @@ def raw_messages(recording: Recording, topics: Collection[str]) -> Iterator[RawM
         yield from _recorded(recording, topics)
         return
     wanted = {*topics} | {one.source for one in derived}
-    yield from with_derived(_recorded(recording, wanted), derived, topics)
+    make = deriver(derived, topics)
+    for raw in _recorded(recording, wanted):
+        yield from make(raw)
 
 
-def with_derived(
-    messages: Iterable[RawMessage], derived: Sequence[Derived], topics: Collection[str]
-) -> Iterator[RawMessage]:
-    """Messages of ``topics`` and of topics that are made of them, from those of all sources."""
+def deriver(
+    derived: Sequence[Derived], topics: Collection[str]
+) -> Callable[[RawMessage], Iterator[RawMessage]]:
+    """What gives the messages of ``topics`` for a message of any: made of it, and it itself."""
     makers = [(one, one.make(*one.arguments)) for one in derived]
-    for raw in messages:
+
+    def messages_for(raw: RawMessage) -> Iterator[RawMessage]:
         for one, make in makers:
             if one.source == raw.topic:
                 for data in make(raw.data, raw.log_time_ns):
                     yield RawMessage(one.name, raw.log_time_ns, data)
         if raw.topic in topics:
             yield raw
+
+    return messages_for
 
 
 def _recorded(recording: Recording, topics: Collection[str]) -> Iterator[RawMessage]:

@@ -1,0 +1,189 @@
+"""Live estimates: a recording that grows at ten times real time, and a soak.
+
+`intel`: another process writes Intel ten times as fast as it was recorded, and `graphslam.follow`
+estimates it. Two times per scan: what its messages take to work on (`Session` with messages at
+hand), and from when the scan was written to its estimate, which includes that late messages are
+waited for. Relations are those of causal poses.
+
+`soak`: the five robots of `long_run.py` for two hours, as fast as it goes; memory of the process
+after every tenth of the drive, and the share by which it grew in the last half.
+
+Run: python benchmarks/live.py [intel] [soak] [--minutes 120]
+"""
+
+import multiprocessing
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from common import FREIBURG, parser
+from long_run import ROBOTS, record, true_poses
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+import graphslam
+from graphslam.core.geometry import Array
+from graphslam.core.records import Message, Scan
+from graphslam.evaluation.relation_metrics import read_relations
+from graphslam.logs import IMPORTERS
+
+#: how much faster than it was recorded
+SPEED = 10.0
+#: s; from the start of the writer to its first message
+HEAD_START_S = 3.0
+
+
+def main() -> None:
+    """Print what was asked for."""
+    options = parser(__doc__)
+    options.add_argument("which", nargs="*", default=("intel", "soak"))
+    options.add_argument("--minutes", type=int, default=120)
+    chosen = options.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        if "intel" in chosen.which:
+            print(intel(Path(name)))
+        if "soak" in chosen.which:
+            for line in soak(Path(name), chosen.minutes):
+                print(line, flush=True)
+
+
+def intel(folder: Path) -> str:
+    """Times and errors of Intel as a session, and followed while it is written."""
+    log = folder / "intel.mcap"
+    IMPORTERS["carmen"](FREIBURG / "intel.clf.bz2", log)
+    worked = work_ms(log)
+    begin = time.monotonic() + HEAD_START_S
+    recorder = multiprocessing.Process(target=write, args=(log, folder / "now.mcap", begin))
+    recorder.start()
+    due = {stamp: begin + seconds / SPEED for stamp, seconds in scan_times(log)}
+    waited: list[float] = []
+    told = graphslam.follow(
+        folder / "now.mcap",
+        folder / "now",
+        each=lambda e: waited.append(1e3 * (time.monotonic() - due[e.stamp_ns])),
+    )
+    recorder.join()
+    relations = read_relations(FREIBURG / "intel.relations")
+    found = graphslam.evaluate(folder / "now", relations=relations)["relations"]
+    errors = ", ".join(f"{k} {found[k]['trans_mean_m']:.4f} m" for k in ("all", "local", "loops"))
+    return (
+        f"work per scan, ms: {quantiles(worked)}\n"
+        f"from written to estimated at {SPEED:g} x real time, ms: {quantiles(np.array(waited))}\n"
+        f"{told['live']['estimates']} estimates, largest jump {told['live']['largest_jump_m']} m; "
+        f"relations, causal: {errors}"
+    )
+
+
+def quantiles(values: Array) -> str:
+    """Median, 99 %, 99.9 % and largest."""
+    names = ("p50", "p99", "p99.9", "max")
+    numbers = np.percentile(values, [50, 99, 99.9, 100])
+    return ", ".join(f"{name} {x:.1f}" for name, x in zip(names, numbers, strict=True))
+
+
+def work_ms(log: Path) -> Array:
+    """Times (n,), ms, between two scans that a session takes, without reading the log."""
+    messages = list(graphslam.open_logs(log).messages())
+    scans, working = 0, 0.0
+    found: list[float] = []
+    began = time.perf_counter()
+
+    def timed() -> Iterator[Message]:
+        nonlocal began, working, scans
+        for message in messages:
+            working += time.perf_counter() - began
+            if isinstance(message, Scan):
+                found.append(1e3 * working)
+                working = 0.0
+            began = time.perf_counter()
+            yield message
+
+    for _ in graphslam.Session().process(timed()):
+        pass
+    return np.array(found)
+
+
+def messages_of(log: Path) -> Iterator[tuple[str, str, bytes, int]]:
+    """Topic, schema, data and log time, ns, in the order of the file."""
+    with log.open("rb") as stream:
+        for schema, channel, message in make_reader(stream).iter_messages(log_time_order=False):
+            assert schema is not None
+            yield channel.topic, schema.name, message.data, message.log_time
+
+
+def scan_times(log: Path) -> list[tuple[int, float]]:
+    """The stamp of each scan, and when it was recorded, s since the first message."""
+    first = next(messages_of(log))[3]
+    found = []
+    for _, schema, data, log_time in messages_of(log):
+        if schema.endswith("LaserScan"):
+            seconds, nanoseconds = np.frombuffer(data, dtype="<u4", count=2, offset=4).tolist()
+            found.append((seconds * 1_000_000_000 + nanoseconds, 1e-9 * (log_time - first)))
+    return found
+
+
+def write(log: Path, target: Path, begin: float) -> None:
+    """Write a log again, each message when it is due; ``begin``: of `time.monotonic`."""
+    found = list(messages_of(log))
+    first = found[0][3]
+    with target.open("wb") as stream:
+        writer = Writer(stream, use_chunking=False)
+        writer.start()
+        channels: dict[str, int] = {}
+        for topic, schema, data, log_time in found:
+            due = begin + 1e-9 * (log_time - first) / SPEED
+            if due > time.monotonic():
+                stream.flush()
+                time.sleep(max(due - time.monotonic(), 0.0))
+            if topic not in channels:
+                number = writer.register_schema(schema, "ros2msg", b"")
+                channels[topic] = writer.register_channel(topic, "cdr", number)
+            writer.add_message(channels[topic], log_time, data, log_time)
+        writer.finish()
+
+
+def soak(folder: Path, minutes: int) -> Iterator[str]:
+    """Memory over a long drive of five robots."""
+    log = record(folder / "long.mcap", 60 * minutes)
+    starts = {f"robot{k}": true_poses(k, np.zeros(1))[0].tolist() for k in range(ROBOTS)}
+    opened = graphslam.open_logs(log)
+    session = graphslam.Session(start={"poses": starts})
+    total = opened.count()
+    memory, taken, estimates = [], 0, 0
+    began = time.perf_counter()
+
+    def counted() -> Iterator[Message]:
+        nonlocal taken
+        for message in opened.messages():
+            taken += 1
+            if taken * 20 // total > len(memory):
+                memory.append(resident_mb())
+            yield message
+
+    off: list[float] = []
+    for estimate in session.process(counted()):
+        estimates += 1
+        if estimates % 100 == 0:
+            true = true_poses(int(estimate.robot[5:]), np.array([1e-9 * estimate.stamp_ns - 1.0]))[
+                0
+            ]
+            off.append(float(np.hypot(*(estimate.pose - true)[:2])))
+    half = memory[len(memory) // 2]
+    yield (
+        f"{minutes} min, {total} messages, {estimates} estimates in "
+        f"{time.perf_counter() - began:.0f} s; error rms {np.sqrt(np.mean(np.square(off))):.3f} m; "
+        f"memory, MB: {' '.join(f'{x:.0f}' for x in memory)}; last half "
+        f"{100 * (memory[-1] / half - 1):+.1f} %"
+    )
+
+
+def resident_mb() -> float:
+    """Resident memory of this process."""
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return pages * 4096 / 1e6
+
+
+if __name__ == "__main__":
+    main()

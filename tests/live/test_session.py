@@ -1,0 +1,193 @@
+"""Estimates of messages as they come."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from room_log import START_NS, drive, true_pose
+
+import graphslam
+from graphslam.core.geometry import between, compose
+from graphslam.core.records import OdometryPose, Scan, Sighting
+
+HORIZON_S = 8.0
+S = 1_000_000_000
+
+
+def messages_of(path):
+    """The messages of a log, sorted."""
+    return [m for m in graphslam.open_logs(path).messages() if isinstance(m, (OdometryPose, Scan))]
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    """Twice round the box, and its messages."""
+    path = drive(tmp_path_factory.mktemp("room") / "room.mcap", seconds=60)
+    return path, messages_of(path)
+
+
+@pytest.fixture(scope="module")
+def live(room):
+    """The estimates of that drive, and their session."""
+    session = graphslam.Session(live={"horizon_s": HORIZON_S})
+    return session, list(session.process(room[1]))
+
+
+def test_estimates_are_the_causal_poses_of_a_fixed_lag_smoother(room, live):
+    """Poses and covariances; forgetting changes nothing.
+
+    1e-9: the same operations in the same order, but sums of a path begin elsewhere.
+    """
+    _, found = live
+    same = {"name": "isam2", "horizon_s": HORIZON_S}
+    causal = graphslam.smooth(room[0], backend=same).robots["robot"].causal
+    assert [e.stamp_ns for e in found] == causal.stamps_ns.tolist()
+    np.testing.assert_allclose([e.pose for e in found], causal.poses, rtol=0, atol=1e-9)
+    np.testing.assert_allclose([e.cov for e in found], causal.covs, rtol=0, atol=1e-9)
+
+
+def test_an_estimate_is_of_what_came_until_then(room, live):
+    """The first half of the messages gives the first half of the estimates, to the bit."""
+    half = room[1][: len(room[1]) // 2]
+    found = list(graphslam.Session(live={"horizon_s": HORIZON_S}).process(half))
+    # what is last waited for what did not come any more
+    for early, late in zip(found[:-2], live[1], strict=False):
+        assert early.stamp_ns == late.stamp_ns
+        assert np.array_equal(early.pose, late.pose)
+        assert np.array_equal(early.cov, late.cov)
+
+
+def test_what_is_behind_the_horizon_is_forgotten(live):
+    """Of 60 s at 10 readings and 2 scans a second some ten seconds are kept, twice at most."""
+    session, _ = live
+    assert not session._pass.steps
+    assert not session._pass.keyframe_scans
+    (run,) = session._pass.runs.values()
+    seconds = 1e-9 * (session._pass.last_ns - run.times[0])
+    assert seconds < 2.5 * 10.0
+    assert len(run.times) == len(run.causal_poses) == len(run.causal_covs) == len(run.calibrations)
+    # no reading is forgotten here: they are few
+    assert len(session._pass.backend._past) < len(run.times) + 20
+
+
+def test_the_map_can_be_read_at_any_time(live):
+    """The walls of the room and of the box, with covariances."""
+    session, _ = live
+    walls = [m for m in session.landmarks if m.kind in ("line", "segment")]
+    assert len(walls) >= 6
+    assert all(np.linalg.eigvalsh(m.cov)[0] > 0 for m in walls)
+
+
+def test_a_jump_is_said(live):
+    """An estimate is what the one before and the odometry give, and its jump."""
+    for before, after in zip(live[1], live[1][1:], strict=False):
+        moved = between(before.odometry, after.odometry)
+        expected = compose(compose(before.pose, moved), after.jump)
+        np.testing.assert_allclose(between(after.pose, expected), 0.0, atol=1e-9)
+    assert not live[1][0].jump.any()
+
+
+def test_estimates_are_where_the_robot_is(live):
+    """8 cm: odometry that is 3 % too long counts until it is calibrated, then 1 cm of range noise.
+
+    Dead reckoning is off by metres at the end.
+    """
+    start = true_pose(0.0)
+    for e in live[1]:
+        true = between(start, true_pose(1e-9 * (e.stamp_ns - START_NS)))
+        assert np.hypot(*(e.pose - true)[:2]) < 0.08
+
+
+def test_messages_that_are_late_are_sorted_in(room, live):
+    """Scans that come 0.9 s late give the same; those beyond live.reorder_s are left out."""
+    late = sorted(room[1], key=lambda m: m.time_ns + 900_000_000 * isinstance(m, Scan))
+    session = graphslam.Session(live={"horizon_s": HORIZON_S, "reorder_s": 1.0})
+    found = list(session.process(late))
+    assert len(found) == len(live[1])
+    np.testing.assert_array_equal([e.pose for e in found], [e.pose for e in live[1]])
+    session = graphslam.Session(live={"horizon_s": HORIZON_S, "reorder_s": 0.2})
+    assert len(list(session.process(late))) < 0.2 * len(found)
+    assert session.dropped["stamp: older than logs.reorder_s allows"] > 0.8 * len(found)
+
+
+def sightings(seconds=20):
+    """A robot that drives round four posts without names and looks at them five times a second."""
+    rng = np.random.default_rng(3)
+    posts = np.array([[0.0, 0.0], [3.0, 0.5], [2.5, 3.0], [-0.5, 3.5]])
+    mount, cov = np.zeros(3), np.diag([0.01**2, 0.02**2])
+    odometry = np.zeros(3)
+    before = circle(0.0)
+    for k in range(seconds * 10 + 1):
+        stamp, pose = S * 100 + k * S // 10, circle(k / 10)
+        odometry = compose(odometry, between(before, pose) + rng.normal(0, 5e-4, 3))
+        before = pose
+        yield OdometryPose("robot", stamp, stamp, odometry)
+        if k % 2 == 0:
+            for post in posts:
+                seen = between(pose, np.append(post, 0.0))
+                z = np.array([np.arctan2(seen[1], seen[0]), np.hypot(*seen[:2])])
+                z += rng.normal(0, [0.01, 0.02])
+                yield Sighting("robot", stamp, stamp, z, cov, None, None, mount)
+
+
+def circle(seconds):
+    """Round the posts in 20 s."""
+    a = 0.1 * np.pi * seconds
+    return np.array([1.5 + 4 * np.cos(a), 1.5 + 4 * np.sin(a), a + np.pi / 2])
+
+
+def test_sightings_have_estimates_too():
+    """Within 5 of their sigmas, which 30 is the square of with three dimensions and 100 poses."""
+    session = graphslam.Session()
+    found = list(session.process(sightings()))
+    assert len(found) > 90
+    for e in found:
+        true = between(circle(0.0), circle(1e-9 * e.stamp_ns - 100))
+        off = e.pose - true
+        assert off @ np.linalg.solve(e.cov, off) < 30.0
+        assert e.scan_pose is None
+    assert len(session.landmarks) == 4
+
+
+def test_two_robots_have_frames_of_their_own_until_their_starts_are_told(room):
+    """Nothing is assumed of where a second robot starts; its map is its own."""
+    both = [m for one in room[1] for m in (one, replace(one, robot="other"))]
+    frames = {e.robot: e.frame for e in graphslam.Session().process(both[:1500])}
+    assert frames == {"robot": "robot", "other": "other"}
+    told = {"robot": [0.0, 0.0, 0.0], "other": [0.0, 0.0, 0.0]}
+    session = graphslam.Session(start={"poses": told})
+    frames = {e.robot: e.frame for e in session.process(both[:1500])}
+    assert len(set(frames.values())) == 1
+
+
+def test_what_nobody_announced_is_left_out(room):
+    """A robot that comes later is counted, and named in `robots` it is not."""
+    stranger = [replace(m, robot="late") for m in room[1][-50:]]
+    session = graphslam.Session()
+    assert {e.robot for e in session.process([*room[1][:300], *stranger])} == {"robot"}
+    assert sum(session.dropped.values()) == 50
+    session = graphslam.Session(robots={"robot": (OdometryPose, Scan)})
+    assert {e.robot for e in session.process(room[1][:300])} == {"robot"}
+    assert session.robots == ("robot",)
+
+
+@pytest.mark.parametrize(
+    ("settings", "text"),
+    [
+        ({"backend": "ekf"}, "live estimates are those of isam2"),
+        ({"backend": {"name": "isam2", "horizon_s": 0.0}}, "with a horizon above 0 s"),
+        ({"start": {"from_truth": True}}, "needs a whole log"),
+    ],
+)
+def test_settings_that_need_the_whole_log_are_refused(settings, text):
+    """Before anything is read."""
+    with pytest.raises(graphslam.ConfigError, match=text):
+        graphslam.Session(**settings)
+
+
+def test_messages_of_which_nothing_can_be_estimated_are_refused(room):
+    """Odometry alone, or no message at all."""
+    odometry = [m for m in room[1] if isinstance(m, OdometryPose)]
+    for messages in (odometry, []):
+        with pytest.raises(graphslam.LogError, match="needs odometry and scans or sightings"):
+            list(graphslam.Session().process(messages))
