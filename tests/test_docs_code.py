@@ -64,6 +64,17 @@ def test_python_of_the_page_on_python_runs(tmp_path, monkeypatch, capsys):
     assert {"map.yaml", "result.mcap"} <= {p.name for p in (tmp_path / "result").iterdir()}
 
 
+def test_python_of_the_page_on_live_estimates_runs(tmp_path, monkeypatch):
+    """Its session, on a short log."""
+    monkeypatch.chdir(tmp_path)
+    drive(tmp_path / "drive.mcap", seconds=5)
+    (block,) = blocks(ROOT / "docs/live.md", "python")
+    found = {}
+    exec(block, found)
+    assert found["estimate"].cov.shape == (3, 3)
+    assert abs(found["x"]) > 0.1
+
+
 def test_the_tutorial_is_clean_and_its_code_parses():
     """Without outputs, so that a change of it is a change of its text; .ci/run executes it."""
     book = json.loads((ROOT / "docs/tutorial.ipynb").read_text(encoding="utf-8"))
@@ -107,6 +118,6 @@ def test_the_citation_has_the_version():
 
 
 def test_every_page_with_python_has_a_test_that_runs_it():
-    """Those of test_public_api and the one above."""
+    """Those of test_public_api and those above."""
     pages = {page.name for page in PAGES if blocks(page, "python")}
-    assert pages == {"README.md", "change-detection.md", "python.md"}
+    assert pages == {"README.md", "change-detection.md", "live.md", "python.md"}
