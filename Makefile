@@ -61,6 +61,7 @@ reliability: $(INSTALLED)
 	$(BIN)/python -m pip install -q '.[fuzz]'
 	mkdir -p $(OUT)/reliability
 	-$(BIN)/python benchmarks/content_faults.py $(OUT)/reliability > $(OUT)/reliability/content_faults.txt
+	-$(BIN)/python benchmarks/healthy_logs.py $(OUT)/reliability > $(OUT)/reliability/healthy_logs.txt
 	-$(BIN)/python benchmarks/mutated_files.py $(OUT)/reliability > $(OUT)/reliability/mutated_files.txt
 	-$(BIN)/python benchmarks/kills.py > $(OUT)/reliability/kills.txt
 	-$(BIN)/python benchmarks/growth.py > $(OUT)/reliability/growth.txt

@@ -61,6 +61,11 @@ class GapBridge:
         self._scans.append(scan)
         return made
 
+    @property
+    def sigma_m(self) -> float:
+        """Sigma of the position by the scans, m, since the last reading before a gap."""
+        return float(self._sigma_m)
+
     def _begin(self, last: OdometryPose) -> list[OdometryPose]:
         """Match the scans in front of the gap, and those in it that came already."""
         known = [scan for scan in self._scans if scan.time_ns <= last.time_ns]
@@ -135,7 +140,8 @@ def with_bridged_gaps(
         messages: in time order.
         robots: those whose odometry reports poses, and that have scans.
         config: settings.
-        tracks: of the robots; each counts the scans from which its odometry was put in.
+        tracks: of the robots; each counts the scans from which its odometry was put in, and notes
+            the largest sigma of a position by them.
     """
     if not robots:
         yield from messages
@@ -148,6 +154,9 @@ def with_bridged_gaps(
             continue
         if bridge is not None and isinstance(message, Scan) and not message.sensor:
             put_in = bridge.scan(message)
-            tracks[message.robot].bridged += len(put_in)
+            if put_in:
+                track = tracks[message.robot]
+                track.bridged += len(put_in)
+                track.bridged_sigma_m = max(track.bridged_sigma_m, bridge.sigma_m)
             yield from put_in
         yield message

@@ -69,6 +69,7 @@ class Readings:
         self.source = ""
         #: readings that were made of scans where there were none, see `gap_bridging`
         self.bridged = 0
+        self.bridged_sigma_m = 0.0
         self.config, self._robot = config, robot
         self._count, self._bursts, self._resets = 0, 0, 0
         self._forgotten = 0  # readings, see `forget_before`

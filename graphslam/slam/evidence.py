@@ -19,6 +19,14 @@ from graphslam.core.records import Association, Estimate, RobotResult, Step
 from graphslam.odometry.interpolation import IntArray
 from graphslam.slam.doubts import stretches
 from graphslam.slam.log_pass import LogPass
+from graphslam.slam.path_evidence import (
+    NO_PATH,
+    SPEEDS_M_S,
+    PathMisfits,
+    better_fit,
+    path_misfits,
+    speed_misfits,
+)
 from graphslam.slam.robot_state import RobotState
 
 BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
@@ -56,13 +64,15 @@ class Parked(NamedTuple):
 
     ``scan_change``: the largest share of a scan's beams that changed much in it; ``range_change``:
     by how much half of the beams changed at least, as far as that is above the noise, m: people
-    who pass change fewer.
+    who pass change fewer; ``speed_m_s``: at which its scans fit, along the walls, where they do
+    not fit if it stands.
     """
 
     begin_ns: int
     end_ns: int
     scan_change: float
     range_change: float
+    speed_m_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +85,8 @@ class RobotEvidence:
     when it had scans; ``repeated_ns`` (j, 2): of scans that were left out, as they repeat an
     earlier one, their times and those of the first that is the same. ``motions_ns`` (q,) when
     motions ended, ``contradicted`` (q,) whether scans contradicted them. ``seen``: what it saw.
-    ``parked``: when it stood, by odometry.
+    ``parked``: when it stood, by odometry; ``along_walls``: how its scans fit if its path was
+    another one there; ``bridged_sigma_m``: of its position where scans were all that told.
     """
 
     name: str
@@ -92,6 +103,8 @@ class RobotEvidence:
     contradicted: BoolArray
     seen: Seen
     parked: tuple[Parked, ...]
+    along_walls: PathMisfits = NO_PATH
+    bridged_sigma_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,6 +151,8 @@ def gather(
                 contradicted=np.array([was for _, was in motions], dtype=bool),
                 seen=_seen(seen, run, estimate),
                 parked=tuple(_parked(pipeline, name, run)),
+                along_walls=_along_walls(pipeline, name, estimate),
+                bridged_sigma_m=run.track.bridged_sigma_m,
             )
         )
     return Evidence(tuple(found), summary, innovations, tuple(pipeline.log.without_odometry))
@@ -163,7 +178,17 @@ def _parked(pipeline: LogPass, name: str, run: RobotState) -> Iterator[Parked]:
         same = [own[k] for k in np.flatnonzero(still).tolist()]
         halves = [_half_changed(same[0].ranges, scan.ranges) for scan in same[1:]]
         half = float(np.median(halves)) if len(halves) >= LEAST_SCANS else 0.0
-        yield Parked(begin, end, max(changes, default=0.0), half)
+        fit = better_fit(speed_misfits(same))
+        speed = 0.0 if fit is None else abs(float(SPEEDS_M_S[fit]))
+        yield Parked(begin, end, max(changes, default=0.0), half, speed)
+
+
+def _along_walls(pipeline: LogPass, name: str, estimate: Estimate) -> PathMisfits:
+    """Nothing to doubt where all motion is that of the scans."""
+    if name in pipeline.log.without_odometry:
+        return NO_PATH
+    scans = [scan for scan in pipeline.keyframe_scans if scan.robot == name]
+    return path_misfits(scans, estimate.states[name])
 
 
 def _half_changed(before: Array, after: Array) -> float:

@@ -10,8 +10,10 @@ from itertools import chain
 import numpy as np
 
 from graphslam.core.geometry import Array, between, wrap
-from graphslam.slam.doubts import Reason, seconds
+from graphslam.slam.doubts import Reason, seconds, stretches
 from graphslam.slam.evidence import Evidence, Parked, RobotEvidence
+from graphslam.slam.path_evidence import FACTORS as PATH_FACTORS
+from graphslam.slam.path_evidence import better_fit
 
 #: share of a scan's beams that change while a robot stands, by people and doors, at most
 SCAN_CHANGE = 0.6
@@ -44,6 +46,13 @@ LATE_S, LATEST_S, LATE_STEP_S = 0.3, 2.0, 0.1
 #: correlation of turning that is as good as it gets: even turning fits at any time
 FITS = 0.99
 LEAST_POSES = 50
+#: rad: turned by so much the other way, in a row of spans that each turn by more than noise and
+#: less than half a turn, which is one in either direction
+OPPOSITE_RAD, SPAN_RAD = 1.0, (0.1, 2.5)
+#: pairs of scans in which the path along walls is looked at together
+PATH_PAIRS = 8
+#: m: sigma of the position after a time without odometry from which it is doubtful
+BRIDGED_SIGMA_M = 0.15
 #: seconds of a log from which its speed is judged
 LEAST_SPEEDS = 10
 #: the log is compared in so many parts
@@ -58,7 +67,8 @@ def odometry_doubts(evidence: Evidence) -> Iterator[Reason]:
         found = list(chain(_gaps(robot), _speed(robot), _jumps(robot), _frozen(robot)))
         yield from found
         if not found:
-            yield from _factors(robot)
+            found = [*_factors(robot), *_opposite(robot), *_along_walls(robot)]
+            yield from found
             yield from _late(robot)
 
 
@@ -81,6 +91,12 @@ def _gaps(robot: RobotEvidence) -> Iterator[Reason]:
         return
     if robot.source == "given":
         return
+    if robot.bridged_sigma_m > BRIDGED_SIGMA_M:
+        text = (
+            "is silent for a while, in which nothing but its speed before tells how far it went "
+            f"(sigma {robot.bridged_sigma_m:.2f} m): its scans are of walls that look the same"
+        )
+        yield _reason(robot, "doubtful", text)
     wide = np.flatnonzero(apart > max(GAP_S, GAP_PERIODS * usual))
     far = np.hypot(moved[wide, 0], moved[wide, 1]) > MOVED_M
     wide = wide[far | (np.abs(moved[wide, 2]) > MOVED_RAD)]
@@ -188,7 +204,7 @@ def _frozen(robot: RobotEvidence) -> Iterator[Reason]:
 
 def _who_moved(robot: RobotEvidence, parked: Parked) -> str:
     """Which sensor says that the robot moved while it stood by odometry; empty if none does."""
-    if parked.scan_change > SCAN_CHANGE or parked.range_change > RANGE_CHANGE_M:
+    if parked.scan_change > SCAN_CHANGE or parked.range_change > RANGE_CHANGE_M or parked.speed_m_s:
         return "its scans"
     seen = robot.seen
     within = (seen.times_ns > parked.begin_ns) & (seen.times_ns < parked.end_ns)
@@ -242,6 +258,43 @@ def _factors(robot: RobotEvidence) -> Iterator[Reason]:
             robot.name,
             f"{robot.name}: its odometry and its {other} contradict each other: {text}",
         )
+
+
+def _opposite(robot: RobotEvidence) -> Iterator[Reason]:
+    """Turns that the result makes the other way than odometry: scans or odometry are mirrored."""
+    times = (robot.stamps_ns - robot.stamps_ns[0]) * 1e-9
+    grid = np.unique(np.searchsorted(times, np.arange(0.0, times[-1], SPAN_S)))
+    ours = between(robot.final[grid[:-1]], robot.final[grid[1:]])[:, 2]
+    its = between(robot.by_odometry[grid[:-1]], robot.by_odometry[grid[1:]])[:, 2]
+    size = np.minimum(np.abs(ours), np.abs(its))
+    most = np.maximum(np.abs(ours), np.abs(its))
+    turns = np.flatnonzero((size > SPAN_RAD[0]) & (most < SPAN_RAD[1]))
+    for a, b in stretches(ours[turns] * its[turns] < 0):
+        if size[turns[a:b]].sum() > OPPOSITE_RAD:
+            other = "scans" if len(robot.scans_ns) else "sightings"
+            since = seconds(int(robot.stamps_ns[grid[turns[a]]]), int(robot.stamps_ns[0]))
+            text = (
+                f"{robot.name}: its odometry and its {other} contradict each other: turning has "
+                f"the other sign from {since} on; one of the two is mirrored"
+            )
+            yield Reason("doubtful", "odometry", robot.name, text)
+            return
+
+
+def _along_walls(robot: RobotEvidence) -> Iterator[Reason]:
+    """Scans of corridors that fit each other if the path along the walls was another one."""
+    times, fits = robot.along_walls
+    parts = np.arange(len(times)) * max(len(times) // PATH_PAIRS, 1) // max(len(times), 1)
+    for part in np.unique(parts).tolist():
+        best = better_fit(fits[parts == part])
+        if best is not None:
+            since = seconds(int(times[parts == part][0]), int(robot.stamps_ns[0]))
+            text = (
+                f"{robot.name}: its odometry and its scans contradict each other: along the walls "
+                f"its scans fit {PATH_FACTORS[best]:.2g} times the path from {since} on"
+            )
+            yield Reason("doubtful", "odometry", robot.name, text)
+            return
 
 
 def _late(robot: RobotEvidence) -> Iterator[Reason]:

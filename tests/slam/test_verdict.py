@@ -10,6 +10,7 @@ from command_line import call
 from graphslam.core.geometry import between, compose
 from graphslam.logs import LogWriter
 from graphslam.slam.evidence import Evidence, Parked, RobotEvidence, Seen, _half_changed
+from graphslam.slam.path_evidence import FACTORS, PathMisfits
 from graphslam.slam.verdict import judge, with_truth
 
 S = 1_000_000_000
@@ -149,6 +150,24 @@ WRONG = {
         lambda: evidence(scans=True, parked=(Parked(31 * S, 60 * S, 0.3, 0.06),)),
         "its scans change meanwhile",
     ),
+    "frozen between doors": (
+        lambda: evidence(scans=True, parked=(Parked(31 * S, 60 * S, 0.3, 0.0, 0.5),)),
+        "its scans change meanwhile",
+    ),
+    "half as long, by doors": (
+        lambda: evidence(scans=True, along_walls=along_walls(column=8)),
+        "along the walls its scans fit 2 times the path from 24.0 s on",
+    ),
+    "turning has the other sign in one corner": (
+        lambda: evidence(
+            scans=True, seen=no_sightings, final=path(in_a_corner(drive() * (1, 1, -1)))
+        ),
+        "turning has the other sign from",
+    ),
+    "bridged along a corridor": (
+        lambda: evidence(scans=True, bridged_sigma_m=0.4),
+        "is silent for a while",
+    ),
     "gap": (
         lambda: with_gap(evidence(scans=True, seen=no_sightings)),
         "has no reading for 28",
@@ -198,6 +217,21 @@ WRONG = {
         "were names exchanged?",
     ),
 }
+
+
+def along_walls(column):
+    """Pairs of scans, of which those from 24 s on fit another path."""
+    misfits = np.full((40, len(FACTORS)), 3.0)
+    misfits[:, 0] = 0.7
+    misfits[24:, 0], misfits[24:, column] = 2.5, 0.8
+    return PathMisfits(S + S * np.arange(40), misfits)
+
+
+def in_a_corner(turned):
+    """Motions that differ from `drive` for 4.5 s, in which it turns by 2.6 rad."""
+    steps = drive()
+    steps[260:305] = turned[260:305]
+    return steps
 
 
 def no_sightings(own):
