@@ -11,7 +11,7 @@ from typing import Any
 
 from graphslam.core.config import Config
 from graphslam.core.config_io import chosen_config
-from graphslam.core.errors import LogError
+from graphslam.core.errors import GraphSlamError, LogError
 from graphslam.core.output_folder import Identity, identity
 from graphslam.core.records import Landmark, Message
 from graphslam.core.worker import Future
@@ -63,6 +63,7 @@ def follow(
     Raises:
         LogError: it is no MCAP file, does not begin, has nothing usable, or was cut or replaced;
             the folder then has what was estimated until then.
+        EstimationError: the estimate is indeterminate; as before.
         ConfigError: a setting is wrong, or needs the whole log.
         OutputError: the folder exists and may not be replaced, or cannot be written.
     """
@@ -84,10 +85,13 @@ def follow(
                 state = f"has not grown for {chosen.live.wait_s:g} s"
         except KeyboardInterrupt:
             state = "interrupted"
-        except LogError as error:
+        except GraphSlamError as error:
             folder.warnings.append(str(error))
-            folder.write("stopped", growing)
+            if len(folder.history):
+                folder.write("stopped", growing)
             raise
+        if not len(folder.history):
+            raise LogError(f"{path}: {state}, and nothing could be estimated; see `graphslam info`")
         if growing.damage:
             folder.warnings.append(f"{path}: damaged: {growing.damage}")
         return folder.write(state, growing)
