@@ -230,7 +230,7 @@ class _Folder:
             "frames": session.frames,
             "dropped": {key: number for key, number in sorted(dropped.items()) if number},
             "repaired": dict(sorted(self.repaired.items())),
-            "warnings": self.warnings,
+            "warnings": [*self.warnings, *_unplaced(session)],
             "live": {
                 "state": state,
                 "estimates": len(history),
@@ -239,3 +239,13 @@ class _Folder:
                 "largest_jump_m": round(history.largest_jump_m, 4),
             },
         }
+
+
+def _unplaced(session: Session) -> list[str]:
+    """A line for each robot that nothing relates to the first one."""
+    return [
+        f"{robot}: its start is not known, so it has a frame of its own; "
+        f"give --start {robot}=x,y,phi (m, rad)"
+        for robot, frame in session.frames.items()
+        if frame != session.world
+    ]

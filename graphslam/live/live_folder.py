@@ -14,6 +14,7 @@ from graphslam.core.records import Landmark
 from graphslam.live.history import History
 from graphslam.results.file_formats import landmark_json, to_json
 from graphslam.results.folder import trajectory_files
+from graphslam.results.line_map import svg_text, thinned_index
 from graphslam.results.map_files import make_map
 from graphslam.results.report_html import (
     document,
@@ -25,11 +26,17 @@ from graphslam.results.report_html import (
     warning_box,
 )
 from graphslam.results.scans_file import SCANS_FILE, scans_bytes
-from graphslam.results.small_map import draw
 from graphslam.slam.summary import FORMAT
 
 #: s after which a browser loads the page again while the drive goes on
 RELOAD_S = 5
+#: lines of the drawing are as thin on a wide page as on a phone, and walls in the page's ink
+CSS = """figure svg { width: 100%; height: auto; max-height: 85vh; }
+figure svg g { stroke-width: 1.5; }
+figure svg g * { vector-effect: non-scaling-stroke; }
+figure svg #walls, figure svg #points { stroke: currentColor; }
+figure svg #paths { stroke: var(--accent); }
+"""
 
 
 def write_live_folder(
@@ -76,11 +83,11 @@ def write_live_folder(
         files.append((SCANS_FILE, scans_bytes(history.scans)))
     world = [m for m in landmarks if m.frame is None]
     paths = {
-        name: robot.final.poses[:, :2]
+        name: robot.final.poses[thinned_index(robot.final.poses[:, :2]), :2]
         for name, robot in robots.items()
         if told["frames"].get(name) == told["world"]
     }
-    files.append(("report.html", _page(draw(paths, world), told)))
+    files.append(("report.html", _page(svg_text(world, paths), told)))
     with atomic_folder(target, before) as part:
         for name, content in files:
             path = part / name
@@ -111,6 +118,6 @@ def _page(drawing: str, told: Mapping[str, Any]) -> str:
         warning_box(told["warnings"]),
         section("Map so far" if going else "Map", f"<figure>{drawing}</figure>"),
     ]
-    page = document(name, sections, "figure svg { width: 100%; height: auto; }")
+    page = document(name, sections, CSS)
     refresh = f'<meta http-equiv="refresh" content="{RELOAD_S}">'
     return page.replace("<head>", f"<head>{refresh}", 1) if going else page

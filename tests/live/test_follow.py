@@ -4,6 +4,7 @@ import os
 
 import numpy as np
 import pytest
+from paths import LOGS
 from room_log import drive
 
 import graphslam
@@ -131,3 +132,12 @@ def test_a_recording_of_which_nothing_can_be_used_is_refused(tmp_path):
     with pytest.raises(graphslam.LogError, match="without odometry"):
         graphslam.follow(path, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_robots_of_unknown_start_are_said(tmp_path):
+    """Each has a frame of its own, and the line that places it."""
+    told = graphslam.follow(LOGS / "two-robots.mcap", tmp_path / "out")
+    frames = told["frames"]
+    (alone,) = set(frames) - {told["world"]}
+    assert any(w.startswith(f"{alone}: its start is not known") for w in told["warnings"])
+    assert f"--start {alone}=x,y,phi" in (tmp_path / "out" / "report.html").read_text("utf-8")
