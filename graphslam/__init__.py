@@ -191,9 +191,11 @@ def smooth(
     with limited_memory(settled.limits.memory_mb), reading as ahead:
         # imported while the second process reads; what only that one needs is imported there
         from graphslam.core.stages import announce
+        from graphslam.results.known_map import known_map_files, known_map_of
         from graphslam.slam.checkpoint import checkpoint
         from graphslam.slam.smooth import smooth
 
+        earlier = known_map_of(settled)
         log = cast("LogSet", recording) if ahead is None else receive_log(ahead, settled)
 
         def read_truth() -> GroundTruth:
@@ -212,14 +214,15 @@ def smooth(
             cast("dict[str, Any]", result.summary).update(told)
             return page
 
-        with checkpoint(output, log, settled, resume=resume) as kept:
+        with checkpoint(output, log, settled, earlier, resume=resume) as kept:
             truth = None if output is None else Future(read_truth)
-            result = smooth(log, settled, of_all(log, progress), ahead=ahead, kept=kept)
+            result = smooth(log, settled, of_all(log, progress), None, ahead, kept, earlier)
             if output is not None and truth is not None:
                 known = truth.result()
                 announce("report")
                 report = Future(render_report)
-                save(result, Path(output), force=force, report=finish_report, before=before)
+                more = known_map_files(result, earlier)
+                save(result, Path(output), more, force=force, report=finish_report, before=before)
             return result
 
 

@@ -16,31 +16,41 @@ ROOM = rectangles((0, 0, 10, 8), (4, 3.5, 6, 4.5))
 SECONDS, SCANS = 30, 60
 
 
-def true_pose(seconds):
-    """Once round the box in the room, on an ellipse."""
-    a = 2 * np.pi * seconds / SECONDS - np.pi / 2
+def true_pose(seconds, phase=0.0):
+    """Once round the box in the room, on an ellipse; ``phase``: where it begins, in rounds."""
+    a = 2 * np.pi * (seconds / SECONDS + phase) - np.pi / 2
     return np.array(
         [5 + 3 * np.cos(a), 4 + 2.3 * np.sin(a), np.arctan2(2.3 * np.cos(a), -3 * np.sin(a))]
     )
 
 
 def drive(
-    path, *, seconds=SECONDS, robot="robot", ranges=lambda found, _k: found, truth=True, rear=False
+    path,
+    *,
+    seconds=SECONDS,
+    robot="robot",
+    ranges=lambda found, _k: found,
+    truth=True,
+    rear=False,
+    phase=0.0,
+    room=ROOM,
+    seed=7,
 ):
     """A log of the room with two scans a second; odometry errs by 3 % and drifts by 0.02 rad/m.
 
     ``ranges`` may spoil scan number k. ``rear``: with a second laser, at `REAR`.
+    ``phase``: see `true_pose`.
     """
-    rng = np.random.default_rng(7)
+    rng = np.random.default_rng(seed)
     odometry = np.zeros(3)
     with LogWriter(path) as log:
         log.mount(robot, START_NS, MOUNT)
         if rear:
             log.mount(robot, START_NS, REAR, "rear")
         for k in range(seconds * 10 + 1):
-            stamp, pose = START_NS + k * S // 10, true_pose(k / 10)
+            stamp, pose = START_NS + k * S // 10, true_pose(k / 10, phase)
             if k:
-                moved = between(true_pose((k - 1) / 10), pose)
+                moved = between(true_pose((k - 1) / 10, phase), pose)
                 path_m = np.hypot(*moved[:2])
                 moved = moved * [1.03, 1.0, 1.0] + [0, 0, 0.02 * path_m]
                 odometry = compose(odometry, moved + rng.normal(0, 2e-4, 3))
@@ -48,12 +58,12 @@ def drive(
             if truth:
                 log.truth(robot, stamp, pose)
             if k % 5 == 0:
-                found = cast(ROOM, BEAMS, compose(pose, MOUNT), 30.0) + rng.normal(
+                found = cast(room, BEAMS, compose(pose, MOUNT), 30.0) + rng.normal(
                     0, 0.01, len(BEAMS)
                 )
                 log.scan(robot, stamp + 7, ranges(found, k // 5), **SCAN)
             if rear and k % 6 == 2:
-                found = cast(ROOM, BEAMS, compose(pose, REAR), 30.0)
+                found = cast(room, BEAMS, compose(pose, REAR), 30.0)
                 found += rng.normal(0, 0.01, len(BEAMS))
                 log.scan(robot, stamp, found, sensor="rear", **SCAN)
     return path

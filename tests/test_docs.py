@@ -107,7 +107,7 @@ def is_there(name):
 
 PACKAGES = {path.parent.name for path in (ROOT / "graphslam").glob("*/__init__.py")}
 #: names that end so are of files that a user has
-FILES = ("py", "csv", "html", "json", "jsonl", "mcap", "md", "pgm", "tum", "yaml")
+FILES = ("py", "csv", "html", "json", "jsonl", "mcap", "md", "npz", "pgm", "tum", "yaml")
 PAGES = [
     *sorted(set((ROOT / "docs").glob("*.md")) - {ROOT / "docs/configuration.md"}),
     *(

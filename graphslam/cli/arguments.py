@@ -137,28 +137,6 @@ def workers_of(jobs: int | None, scheduler: str | None, memory_mb: float | None)
     return Workers(jobs, scheduler, memory_mb)
 
 
-def smoothing_settings(
-    backend: str | None,
-    front_end: str | None,
-    start: list[str] | None,
-    settings: list[str] | None,
-    *,
-    causal: bool = False,
-    same_place: bool = False,
-    horizon: float | None = None,
-) -> list[str]:
-    """What the options of `smooth` stand for, as ``key=value``; those of --set come last."""
-    return [
-        *([f"backend.name={backend}"] if backend else ()),
-        *(["backend.causal=true"] if causal else ()),
-        *(["logs.same_place=true"] if same_place else ()),
-        *([] if horizon is None else [f"backend.horizon_s={horizon}"]),
-        *([f"front_end.name={front_end}"] if front_end else ()),
-        *(start or ()),
-        *(settings or ()),
-    ]
-
-
 def check_resolution(value: float | None) -> float | None:
     """The edge of a cell in metres.
 
@@ -280,6 +258,21 @@ SamePlace = Annotated[
     typer.Option(
         "--same-place",
         help="The logs are visits to one place at different times: one map, a trajectory each.",
+    ),
+]
+PriorMap = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="DIR",
+        help="Localise the log in the map of an earlier result of the same building; the start is "
+        "found; known_map.directory in the configuration.",
+    ),
+]
+Update = Annotated[
+    bool,
+    typer.Option(
+        "--update",
+        help="With --prior-map: continue that map: what is new is added, what is gone is retired.",
     ),
 ]
 Causal = Annotated[

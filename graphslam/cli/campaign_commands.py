@@ -35,10 +35,10 @@ from graphslam.cli.arguments import (
     Starts,
     Strict,
     TruthFiles,
-    smoothing_settings,
     workers_of,
 )
 from graphslam.cli.registry import Output, command
+from graphslam.cli.smoothing_options import smoothing_settings
 from graphslam.cli.terminal import detail, note, progress_bar
 from graphslam.core.config import Config
 from graphslam.core.config_io import load_config

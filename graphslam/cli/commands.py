@@ -32,6 +32,7 @@ from graphslam.cli.arguments import (
     OutputLogOrFolder,
     Plan,
     Preset,
+    PriorMap,
     ReferenceFolder,
     Relations,
     Resolution,
@@ -46,13 +47,14 @@ from graphslam.cli.arguments import (
     Starts,
     Strict,
     TruthFiles,
+    Update,
     ViewedFolder,
     Viewer,
     WithMap,
-    smoothing_settings,
     span_of,
 )
 from graphslam.cli.registry import Output, app, command
+from graphslam.cli.smoothing_options import smoothing_settings
 from graphslam.cli.stage_bar import stage_bar
 from graphslam.core.config import Config
 from graphslam.core.config_io import load_config, named_backend
@@ -122,6 +124,8 @@ def smooth(
     start: Starts = None,
     causal: Causal = False,
     same_place: SamePlace = False,
+    prior_map: PriorMap = None,
+    update: Update = False,
     with_map: WithMap = False,
     viewer: Viewer = None,
     preset: Preset = None,
@@ -146,7 +150,7 @@ def smooth(
         backend = "isam2"
     chosen = smoothing_settings(
         backend, front_end, start, settings,
-        causal=causal, same_place=same_place, horizon=horizon,
+        causal=causal, same_place=same_place, prior_map=prior_map, update=update, horizon=horizon,
     )  # fmt: skip
     tree = load_config(config, chosen, preset)
     if plan:

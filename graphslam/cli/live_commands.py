@@ -16,9 +16,9 @@ from graphslam.cli.arguments import (
     Settings,
     Starts,
     check_horizon,
-    smoothing_settings,
 )
 from graphslam.cli.registry import Output, command
+from graphslam.cli.smoothing_options import smoothing_settings
 from graphslam.core.config_io import load_config
 
 GrowingRecording = Annotated[

@@ -48,6 +48,7 @@ EXAMPLES = {
     "smooth": (
         "graphslam smooth drive.mcap -o result",
         "graphslam smooth drive.mcap -o result --backend isam2 --horizon 20",
+        "graphslam smooth tuesday.mcap --prior-map monday -o tuesday",
         "graphslam smooth drive.mcap -o result --set keyframe.distance_m=0.5 --force",
     ),
     "view": ("graphslam view result",),

@@ -286,6 +286,18 @@ class LiveConfig:
 
 
 @dataclass(frozen=True)
+class KnownMapConfig:
+    """A map that is known before the log is read (docs/known-maps.md).
+
+    directory: result folder of an earlier log of the same building, in which this one is localised.
+    update: continue that map: what is new is added, what is gone is retired.
+    """
+
+    directory: str = ""
+    update: bool = False
+
+
+@dataclass(frozen=True)
 class ChangesConfig:
     """Change detection (thesis chapter 5).
 
@@ -353,6 +365,7 @@ class Config:
     start: StartConfig = field(default_factory=StartConfig)
     multi_robot: MultiRobotConfig = field(default_factory=MultiRobotConfig)
     live: LiveConfig = field(default_factory=LiveConfig)
+    known_map: KnownMapConfig = field(default_factory=KnownMapConfig)
     changes: ChangesConfig = field(default_factory=ChangesConfig)
     warnings: tuple[str, ...] = field(default=(), compare=False, metadata={"setting": False})
 

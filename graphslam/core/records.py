@@ -17,6 +17,8 @@ import numpy as np
 
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array
+from graphslam.core.information_root import InformationRoot
+from graphslam.core.known_landmarks import KnownLandmarks
 from graphslam.core.notebook_views import ResultViews
 from graphslam.core.record import Record
 
@@ -264,7 +266,8 @@ class Step(Record):
 
     ``starts`` holds robots that appear for the first time, ``motions`` those that get a new
     state at ``time_ns``; ``deleted`` are landmarks that no later step observes, and that a filter
-    may drop. Steps are recorded and can be replayed into another back end.
+    may drop. Steps are recorded and can be replayed into another back end. ``known``: landmarks of
+    an earlier map, of the first step only.
     """
 
     time_ns: int
@@ -273,6 +276,7 @@ class Step(Record):
     associations: tuple[Association, ...] = ()
     closures: tuple[Closure, ...] = ()
     deleted: tuple[int, ...] = ()
+    known: KnownLandmarks | None = None
 
 
 # ---------------------------------------------------------------- estimates and results
@@ -304,37 +308,17 @@ class Trajectory:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class InformationRoot:
-    """Upper triangular root R of the information of an estimate: R'R, by cliques of its rows.
-
-    A row has entries in its own clique and in later rows only. From the last clique, which depends
-    on no other, to the first: ``above`` (C,) is the number of the clique whose rows begin what the
-    rows of this one depend on, -1 if there is none, and smaller than its own. ``own`` (C,) is how
-    many rows are its own; those of all cliques are numbered in this order. ``width`` (C,) is how
-    many rows of others it depends on, ``separators`` (sum of width,) which; ``values`` the dense
-    blocks (own, own + width), row by row. ``states[robot]`` (n,) is the first of the three rows of
-    each state. Errors are along the axes of each state's own frame, in the tangent space of its
-    pose, so that R is the same in every world frame.
-    """
-
-    above: IntArray
-    own: IntArray
-    width: IntArray
-    separators: IntArray
-    values: Array
-    states: Mapping[str, IntArray]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class MountCovariance:
     """Covariance (3, 3) of a robot's mount (x, y, yaw; base axes), and of an estimate with it.
 
-    ``states`` (n, 3, 3): rows of its states; ``landmarks``: (d, 3) by number. World axes.
+    ``states`` (n, 3, 3): rows of its states; ``landmarks``: (d, 3) by number. World axes. Where the
+    world is placed by the mount, ``placing`` are the derivatives (d, 3) of landmarks by it.
     """
 
     mount: Array
     states: Array
     landmarks: Mapping[int, Array]
+    placing: Mapping[int, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -396,11 +380,15 @@ class ScanTies:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointScans:
-    """What the joint covariance of all scans follows from: how they follow from final states."""
+    """What the joint covariance of all scans follows from: how they follow from final states.
+
+    ``mount``: see `Estimate`.
+    """
 
     root: InformationRoot
     states: Mapping[str, Trajectory]
     ties: Mapping[str, ScanTies]
+    mount: MountCovariance | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,6 +20,7 @@ import numpy as np
 from graphslam.core.config import RobustConfig
 from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import Array, compose, rotate_cov, rotation3
+from graphslam.core.known_landmarks import KnownLandmarks
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Closure, Estimate, Step, Trajectory
 from graphslam.estimation import factors
@@ -38,6 +39,7 @@ from graphslam.estimation.input_checks import (
     describe_start,
     indeterminate,
 )
+from graphslam.estimation.optimisation import joint_marginal
 from graphslam.estimation.selected_inverse import CliqueRows
 
 #: current estimate of a variable, by its key and size
@@ -45,6 +47,8 @@ Estimates = Callable[[int, int], Array]
 
 #: why a graph is indeterminate
 UNDERDETERMINED = "it has too few or too weak observations"
+#: what landmarks are of that no observation made
+KNOWN = "the known map"
 #: variables whose marginals are read together
 READ_AT_ONCE = 32
 _UNUSED = np.zeros(3)
@@ -134,6 +138,8 @@ class GraphBuilder:
             EstimationError: a covariance is not positive definite and finite, or a state that the
                 step refers to was never made.
         """
+        if step.known is not None:
+            yield from self._known(step.known)
         for robot, start in step.starts.items():
             self._first_keys[robot] = factors.state_key(len(self.robots), 0)
             self.robots.append(robot)
@@ -157,6 +163,15 @@ class GraphBuilder:
             if group is not None:
                 yield group
         yield from self.closure_groups(step.closures)
+
+    def _known(self, known: KnownLandmarks) -> Iterator[FactorGroup]:
+        """What is known of landmarks beforehand; each is a variable from its group on."""
+        for numbers, row in known.rows():
+            mean = known.means[numbers[0]]
+            self.landmark_dims[numbers[0]] = len(mean)
+            self.rows += len(mean)
+            factor = factors.known_landmark_factor(numbers, row, known.means)
+            yield FactorGroup((factor,), KNOWN, (factors.landmark_key(numbers[0]), mean))
 
     def _observation(
         self, seen: Association, time_ns: int, estimate: Estimates
@@ -257,7 +272,8 @@ class GraphBuilder:
         if key is not None:
             robot, number = factors.number_of(key)
             if robot is None:
-                what = describe(self._first_seen[number])
+                seen = self._first_seen.get(number)
+                what = KNOWN if seen is None else describe(seen)
             else:
                 name = self.robots[robot]
                 what = f"robot {name} at {self.states.times[name][number]} ns"
@@ -315,7 +331,8 @@ class GraphBuilder:
             landmarks[landmark] = (mean, rotate_cov(cov, mean[2]) if dim == 3 else cov)
             unknowns += dim
         keys = {robot: self.state_keys(robot) for robot in states}
-        root = None if rows is None else information_root(rows, keys)
+        marks = {number: factors.landmark_key(number) for number in landmarks}
+        root = None if rows is None else information_root(rows, keys, marks)
         return Estimate(states, landmarks, half_error, self.rows - unknowns, root)
 
 
@@ -427,14 +444,3 @@ class GraphBackend(ABC):
         return self.values(
             [factors.landmark_key(i) for i in landmarks], [dims[i] for i in landmarks]
         )
-
-
-def joint_marginal(tree: gtsam.ISAM2 | gtsam.GaussianBayesTree, keys: list[int]) -> Array:
-    """Joint marginal covariance (D, D) of variables in this order.
-
-    Raises:
-        RuntimeError: it is indeterminate.
-    """
-    if len(keys) == 1:
-        return np.asarray(tree.marginalCovariance(keys[0]))
-    return np.asarray(tree.jointMarginalCovariance(keys).fullMatrix())

@@ -396,3 +396,19 @@ def jacobian_factor(A: Array, b: Array, dims: Mapping[int, int]) -> gtsam.Jacobi
     if not second:
         return gtsam.JacobianFactor(first, A, b, unit)
     return gtsam.JacobianFactor(first, A[:, :dim], second[0], A[:, dim:], b, unit)
+
+
+def known_landmark_factor(
+    numbers: Sequence[int], row: Array, means: Mapping[int, Array]
+) -> gtsam.NonlinearFactor:
+    """Whitened rows of the errors of known landmarks about their means, see `KnownLandmarks`."""
+    keys = [landmark_key(number) for number in numbers]
+    values, terms, end = gtsam.Values(), [], 0
+    for key, number in zip(keys, numbers, strict=True):
+        begin, end = end, end + len(means[number])
+        terms.append((key, row[:, begin:end]))
+        write(values, key, means[number])
+    # a JacobianFactor is made of three variables at most; a conditional is one, of any number
+    unit = gtsam.noiseModel.Unit.Create(len(row))
+    made = gtsam.GaussianConditional(terms, 1, np.zeros(len(row)), unit)
+    return gtsam.LinearContainerFactor(made, values)

@@ -88,7 +88,8 @@ def graph_g2o(steps: Sequence[Step], estimate: Estimate, kernel: RobustConfig = 
     matrices are the inverse covariance along the axes of the *end* frame of an edge, because the
     residual lives there, while the records hold it along the start frame's. A direction without
     information has 1e-12 in its place (see the module). Associations whose state or landmark is not
-    in the estimate (a landmark deleted later) have no edge. A comment ``# kernel NAME SCALE``
+    in the estimate (a landmark deleted later) have no edge, nor has what is known of landmarks
+    beforehand (`Step.known`), for which the format has none. A comment ``# kernel NAME SCALE``
     applies to all edges after it, up to the next one.
 
     Residuals are GTSAM's: of poses the logarithm of z^-1 x_i^-1 x_j, to first order g2o's own.
@@ -125,7 +126,7 @@ def graph_error(
 ) -> tuple[float, float]:
     """Half the weighted squared residual of the graph: under its kernels, and without them.
 
-    It is that of the edges of `graph_g2o`.
+    It is that of the edges of `graph_g2o`, and of what is known of landmarks beforehand.
 
     Raises:
         OutputError: a covariance cannot be inverted; the message names the edge.
@@ -137,6 +138,10 @@ def graph_error(
         plain += 0.5 * float(squared.sum())
         robust = loss(np.sqrt(squared), group.scale) if group.scale else 0.5 * squared
         total += float(robust.sum())
+    for step in steps:
+        if step.known is not None:
+            known = 0.5 * step.known.squared_residual(estimate.landmarks)
+            total, plain = total + known, plain + known
     return total, plain
 
 

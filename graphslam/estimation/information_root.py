@@ -1,4 +1,4 @@
-"""The joint covariance of any poses, from the square root of the information of a whole graph.
+"""The joint covariance of any variables, from the square root of the information of a whole graph.
 
 The root of a graph of n states is sparse, their joint covariance of n² blocks is not. So the root
 is kept, and the blocks that are asked for are computed from it: with R'R the information, the
@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg.lapack import dtrtrs
 
 from graphslam.core.geometry import Array
-from graphslam.core.records import InformationRoot, IntArray
+from graphslam.core.information_root import InformationRoot, IntArray
 
 if TYPE_CHECKING:  # what reads the root of a folder needs no GTSAM
     from graphslam.estimation.selected_inverse import CliqueRows
@@ -26,16 +26,19 @@ _CHUNK = 4_000_000
 
 
 def information_root(
-    cliques: "Sequence[CliqueRows]", states: Mapping[str, Sequence[int]]
+    cliques: "Sequence[CliqueRows]",
+    states: Mapping[str, Sequence[int]],
+    landmarks: Mapping[int, int],
 ) -> InformationRoot:
-    """The root as arrays, without cliques on which no state depends.
+    """The root as arrays, without cliques on which no state and no landmark depends.
 
     Args:
         cliques: from the last one on, each after the one above it.
         states: robot -> keys of its states.
+        landmarks: number -> key.
     """
-    state_keys = {key for keys in states.values() for key in keys}
-    needed = [not state_keys.isdisjoint(clique.own) for clique in cliques]
+    wanted = {key for keys in states.values() for key in keys} | set(landmarks.values())
+    needed = [not wanted.isdisjoint(clique.own) for clique in cliques]
     for n in reversed(range(len(cliques))):
         above = cliques[n].above
         if needed[n] and above is not None:
@@ -66,7 +69,27 @@ def information_root(
             robot: np.array([rows[key].start for key in keys], dtype=np.int64)
             for robot, keys in states.items()
         },
+        {number: rows[key].start for number, key in landmarks.items()},
     )
+
+
+def joint_covariance(root: InformationRoot, rows: IntArray) -> Array:
+    """Joint covariance (k, k) of k of the variables' dimensions, given by their rows of the root.
+
+    The time is that of k forward substitutions through all of the root, in one go.
+    """
+    starts = np.concatenate([[0], np.cumsum(root.own)])
+    widths = np.concatenate([[0], np.cumsum(root.width)])
+    values = np.concatenate([[0], np.cumsum(root.own * (root.own + root.width))])
+    b = np.zeros((int(starts[-1]), len(rows)))
+    b[rows, np.arange(len(rows))] = 1.0
+    for c in reversed(range(len(root.own))):  # the last clique depends on no other
+        n, m = int(root.own[c]), int(root.width[c])
+        own = slice(starts[c], starts[c + 1])
+        block = root.values[values[c] : values[c + 1]].reshape(n, n + m)
+        b[own], _ = dtrtrs(block[:, :n], b[own], trans=1)
+        b[root.separators[widths[c] : widths[c + 1]]] -= block[:, n:].T @ b[own]
+    return np.asarray(b.T @ b)
 
 
 def pair_covariances(

@@ -11,9 +11,9 @@ from graphslam.core.config import AssociationConfig
 from graphslam.core.geometry import Array
 from graphslam.core.records import Association
 from graphslam.estimation import factors
-from graphslam.estimation.factor_graph import joint_marginal
 from graphslam.estimation.landmark_ties import Named, surest_tie, tied
 from graphslam.estimation.message_link import Inbox, Outbox
+from graphslam.estimation.optimisation import joint_marginal
 
 #: bytes of a number, and of a variable's key
 NUMBER_BYTES, KEY_BYTES = 8, 8

@@ -221,3 +221,14 @@ def marginals_of(
     if not all(np.isfinite(cov).all() for cov in blocks.marginals.values()):
         raise error
     return blocks
+
+
+def joint_marginal(tree: gtsam.ISAM2 | gtsam.GaussianBayesTree, keys: list[int]) -> Array:
+    """Joint marginal covariance (D, D) of variables in this order.
+
+    Raises:
+        RuntimeError: it is indeterminate.
+    """
+    if len(keys) == 1:
+        return np.asarray(tree.marginalCovariance(keys[0]))
+    return np.asarray(tree.jointMarginalCovariance(keys).fullMatrix())

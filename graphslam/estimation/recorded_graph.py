@@ -91,8 +91,8 @@ class RecordedGraph(BatchGraph):
         polar: dict[Source, list[tuple[int, Association]]] = defaultdict(list)
         motions: list[Motion] = []
         for step in steps:
-            if step.starts:
-                self.insert(Step(step.time_ns, step.starts), start, values)
+            if step.starts or step.known is not None:
+                self.insert(Step(step.time_ns, step.starts, known=step.known), start, values)
             for robot, motion in step.motions.items():
                 self._insert_state(robot, step.time_ns, start, values)
                 motions.append(motion)

@@ -19,6 +19,9 @@ from graphslam.core.sensor_config import LimitsConfig
 from graphslam.estimation.backend import Backend
 from graphslam.mapping.gating import BoolArray, IntArray
 
+#: m: landmarks of an earlier map that are nearer to each other are known to be different things
+KNOWN_NEAR_M = 2.0
+
 
 @dataclass(slots=True, eq=False)
 class Entry:
@@ -74,6 +77,10 @@ class LandmarkMap:
     def __init__(self, bias_m: float = 0.0, most: int = LimitsConfig.landmarks) -> None:
         self.bias_m, self.most = bias_m, most
         self.entries: dict[int, Entry] = {}
+        #: of an earlier map: number -> (mean (3,), extent (2,)) as they were
+        self.known: dict[int, tuple[Array, Array]] = {}
+        #: those of them that are near each other, which are different things
+        self.known_pairs: set[frozenset[int]] = set()
         self.by_identity: dict[str, int] = {}
         self.deleted = self.forgotten = 0  # tentative ones, and landmarks of the graph
         self._next = 0
@@ -96,6 +103,16 @@ class LandmarkMap:
             np.array([e.kind == "point" for e in entries], dtype=bool),
             np.array([e.kind == "segment" for e in entries], dtype=bool),
         )
+
+    def add_known(self, entries: Mapping[int, Entry]) -> None:
+        """Take in landmarks of an earlier map; their numbers are not used yet."""
+        self.entries |= entries
+        self.known |= {n: (e.mean.copy(), e.extent.copy()) for n, e in entries.items()}
+        self.known_pairs |= _near_each_other(list(entries.values()))
+
+    def without_known(self, into: Mapping[int, int]) -> dict[int, int]:
+        """Merges, those of landmarks of an earlier map left out: they are what they were."""
+        return {gone: kept for gone, kept in into.items() if gone not in self.known}
 
     def add(self, seen: Observation, pose: Array, time_ns: int) -> Entry:
         """A new tentative landmark from an observation made at ``pose`` (3,), in its frame.
@@ -159,6 +176,8 @@ class LandmarkMap:
             entry = self.entries[number]
             if entry.kind == "line":  # the ends of a segment move with it
                 entry.extent = extent
+                if number in self.known:  # what was not seen now is there as well
+                    entry.extend(*self.known[number])
 
     def split(self, number: int, new: int) -> None:
         """Add landmark ``new`` as a copy of ``number``, without its identity."""
@@ -200,6 +219,19 @@ class LandmarkMap:
             identity = self.entries.pop(i).identity
             if identity is not None and self.by_identity.get(identity) == i:
                 del self.by_identity[identity]
+
+
+def _near_each_other(entries: Sequence[Entry]) -> set[frozenset[int]]:
+    middles = np.array([compose(e.mean, np.array([e.extent.mean(), 0.0, 0.0])) for e in entries])
+    reach = np.array([np.ptp(e.extent) / 2 for e in entries]) + KNOWN_NEAR_M / 2
+    found: set[frozenset[int]] = set()
+    for k, e in enumerate(entries):
+        far = np.hypot(*(middles[:k, :2] - middles[k, :2]).T)
+        found |= {
+            frozenset((entries[j].id, e.id))
+            for j in np.flatnonzero(far < reach[:k] + reach[k]).tolist()
+        }
+    return found
 
 
 def retarget(a: Association, target: int, kind: str) -> Association:

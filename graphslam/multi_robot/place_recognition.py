@@ -170,21 +170,21 @@ def choose_alignment(
         PlaceMap(m.places, COV_INFLATION * m.cov + drift_covariance(m.places))
         for m in (map_a, map_b)
     )
-    starts, covs = _start_estimates(found, wide_a, wide_b)
-    best = greedy_max_clique(_pairwise_agreement(found, starts, covs), _scores(found))
+    starts, covs = start_estimates(found, wide_a, wide_b)
+    best = greedy_max_clique(pairwise_agreement(found, starts, covs), _scores(found))
     if len(best) < MIN_FOUND:
         return ""
     # the search may have overlooked places that coincide, or that should
-    more, differing = verify_places(_consensus(starts, covs, best).pose, places_a, places_b)
+    more, differing = verify_places(consensus(starts, covs, best).pose, places_a, places_b)
     found = [*found, *more]
-    starts, covs = _start_estimates(found, wide_a, wide_b)
-    agree, scores = _pairwise_agreement(found, starts, covs), _scores(found)
+    starts, covs = start_estimates(found, wide_a, wide_b)
+    agree, scores = pairwise_agreement(found, starts, covs), _scores(found)
     best = greedy_max_clique(agree, scores)
     if len(best) < MIN_MATCHES:
         return ""
     extents = (
-        _extent([places_a[found[k].index_a] for k in best]),
-        _extent([places_b[found[k].index_b] for k in best]),
+        extent([places_a[found[k].index_a] for k in best]),
+        extent([places_b[found[k].index_b] for k in best]),
     )
     if min(extents) < config.min_place_extent_m:
         return (
@@ -196,7 +196,7 @@ def choose_alignment(
     equivalent = np.array(
         [m.score > EQUIVALENT_SHARE * best_score.get(m.index_b, 0.0) for m in found]
     )
-    unlike = _consensus(starts, covs, best).d2 > chi2_quantile(AGREE, 3)
+    unlike = consensus(starts, covs, best).d2 > chi2_quantile(AGREE, 3)
     rival = rival_set(agree, scores, np.flatnonzero(unlike & equivalent))
     if has_rival(scores[best].sum(), [scores[rival].sum()]):
         return (
@@ -206,7 +206,7 @@ def choose_alignment(
     if differing > MAX_DIFFERING_SHARE * len(best):
         return f"the surroundings of the places common to {a} and {b} contradict each other"
     own = (PlaceMap(m.places, COVARIANCE_INFLATION * m.cov) for m in (map_a, map_b))
-    start = _consensus(*_start_estimates(found, *own), best)
+    start = consensus(*start_estimates(found, *own), best)
     return RelativeFrame(b, a, start.pose, start.cov, float(len(best)))
 
 
@@ -248,7 +248,7 @@ def _scores(found: Sequence[PlaceMatch]) -> Array:
     return np.array([m.score for m in found])
 
 
-def _start_estimates(
+def start_estimates(
     found: Sequence[PlaceMatch], map_a: PlaceMap, map_b: PlaceMap
 ) -> tuple[Array, Array]:
     """Start of b in the frame of a by each of n matches.
@@ -285,7 +285,7 @@ def _perpendicular(v: Array) -> Array:
     return np.column_stack([-v[:, 1], v[:, 0]])
 
 
-def _pairwise_agreement(found: Sequence[PlaceMatch], starts: Array, covs: Array) -> Array:
+def pairwise_agreement(found: Sequence[PlaceMatch], starts: Array, covs: Array) -> Array:
     """Which of n matches agree on the start: (n, n) bool. Two of one place never do."""
     n = np.arange(len(starts))
     innovation = starts[:, None] - starts
@@ -300,7 +300,7 @@ def _pairwise_agreement(found: Sequence[PlaceMatch], starts: Array, covs: Array)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Consensus:
+class Consensus:
     """The start by some of n matches together.
 
     ``pose`` (3,), ``cov`` (3, 3); ``d2`` (n,): squared Mahalanobis distance of each other match's
@@ -312,8 +312,8 @@ class _Consensus:
     d2: Array
 
 
-def _consensus(starts: Array, covs: Array, members: IntArray) -> _Consensus:
-    """Generalised least squares over members (k,) of n starts, see `_start_estimates`."""
+def consensus(starts: Array, covs: Array, members: IntArray) -> Consensus:
+    """Generalised least squares over members (k,) of n starts, see `start_estimates`."""
     n = len(starts)
     reference = starts[members[0]]
     off = starts - reference
@@ -331,10 +331,10 @@ def _consensus(starts: Array, covs: Array, members: IntArray) -> _Consensus:
     d2[members] = 0.0
     pose = reference + fit.x
     pose[2] = wrap(pose[2])
-    return _Consensus(pose, fit.cov, d2)
+    return Consensus(pose, fit.cov, d2)
 
 
-def _extent(places: Sequence[SubmapPose]) -> float:
+def extent(places: Sequence[SubmapPose]) -> float:
     """The longest distance between any two places, m."""
     points = np.array([p.pose[:2] for p in places])
     return float(np.linalg.norm(points[:, None] - points, axis=-1).max())

@@ -29,16 +29,16 @@ def with_mount_errors(estimate: Estimate, start: Array, mount: Array) -> Estimat
     covs, cross = _added(
         states.covs, known.states, _of_world(start, mount, states.poses), known.mount
     )
-    landmarks, crosses = {}, {}
+    landmarks, crosses, placing = {}, {}, {}
     for i, (mean, cov) in estimate.landmarks.items():
         J = _of_world(start, mount, np.append(mean, 0.0)[:3])[: len(mean)]
         added, crosses[i] = _added(cov, known.landmarks[i], J, known.mount)
-        landmarks[i] = mean, added
+        landmarks[i], placing[i] = (mean, added), J
     return replace(
         estimate,
         states={robot: replace(states, covs=covs)},
         landmarks=landmarks,
-        mount=MountCovariance(known.mount, cross, crosses),
+        mount=MountCovariance(known.mount, cross, crosses, placing),
     )
 
 

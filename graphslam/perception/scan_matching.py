@@ -370,14 +370,14 @@ def agreement(source: Submap, target: Submap, pose: Array) -> tuple[float, float
     """
     same = absent = 0
     for a, b, x in ((source, target, pose), (target, source, between(pose, np.zeros(3)))):
-        confirmed, free = _compare_with_scans(transform(x, a.points), b)
+        confirmed, free = compare_with_scans(transform(x, a.points), b)
         same += int(confirmed.sum())
         absent += int((free & ~confirmed).sum())
     total = len(source.points) + len(target.points)
     return same / total, absent / total
 
 
-def _compare_with_scans(points: Array, submap: Submap) -> tuple[BoolArray, BoolArray]:
+def compare_with_scans(points: Array, submap: Submap) -> tuple[BoolArray, BoolArray]:
     """Which points (n, 2) any scan of the submap confirms, and which lie in its free space.
 
     In single precision, which is finer than 0.01 mm and a thousandth of a degree.

@@ -175,7 +175,7 @@ def read_landmarks(path: Path) -> tuple[Landmark, ...]:
     landmarks = []
     for index, entry in enumerate(entries):
         try:
-            landmarks.append(_landmark(entry))
+            landmarks.append(landmark_from_json(entry))
         except (KeyError, TypeError, ValueError) as error:
             raise OutputError(f"{path}: entry {index}: malformed landmark: {error!r}") from error
     return tuple(landmarks)
@@ -202,7 +202,8 @@ def _read_covs(path: Path, stamps: np.ndarray[Any, Any]) -> Array:
     return covs
 
 
-def _landmark(entry: Mapping[str, Any]) -> Landmark:
+def landmark_from_json(entry: Mapping[str, Any]) -> Landmark:
+    """The record of an entry of landmarks.json."""
     kind = str(entry["kind"])
     size = 2 if kind == "point" else 3
     phi = np.nan if entry["phi"] is None else float(entry["phi"])

@@ -108,12 +108,13 @@ def check_target(
 def save(
     result: Result,
     directory: Path,
+    more: Sequence[tuple[str, bytes]] = (),
     *,
     force: bool,
     report: Callable[[Result], str] | None = None,
     before: Identity | Literal["now"] = "now",
 ) -> None:
-    """Write the result folder, see `write_folder`.
+    """Write the result folder, with ``more`` files (name, content), see `write_folder`.
 
     ``report`` renders report.html, and may add to the summary; it is called when all else but that
     is made. Without it there is no report. ``before``: what `check_target` found when
@@ -125,7 +126,7 @@ def save(
     """
     if before == "now":
         before = check_target(directory, force=force)
-    write_folder(directory, _files(result, report), before)
+    write_folder(directory, [*more, *_files(result, report)], before)
 
 
 def write_folder(

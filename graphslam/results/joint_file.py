@@ -14,10 +14,11 @@ import numpy as np
 
 from graphslam.core.errors import OutputError
 from graphslam.core.geometry import Array
+from graphslam.core.information_root import InformationRoot
 from graphslam.core.records import (
     Estimate,
-    InformationRoot,
     JointScans,
+    MountCovariance,
     RobotResult,
     ScanTies,
     Trajectory,
@@ -32,7 +33,8 @@ def joint_scans(estimate: Estimate, robots: Mapping[str, RobotResult]) -> JointS
     ties = {name: own.scan_ties for name, own in robots.items() if own.scan_ties is not None}
     if estimate.root is None or not ties:
         return None
-    return JointScans(estimate.root, {name: estimate.states[name] for name in ties}, ties)
+    states = {name: estimate.states[name] for name in ties}
+    return JointScans(estimate.root, states, ties, estimate.mount)
 
 
 def joint_bytes(joint: JointScans) -> bytes:
@@ -58,6 +60,19 @@ def joint_bytes(joint: JointScans) -> bytes:
             f"scan_mount_{n}": _once(ties.mounts),
             f"scan_cov_{n}": ties.covs[:, *_UPPER].astype(np.float32),
         }
+    numbers = sorted(root.landmarks)
+    arrays["landmark_ids"] = np.array(numbers, dtype=np.int64)
+    arrays["landmark_rows"] = np.array([root.landmarks[n] for n in numbers], dtype=np.int32)
+    if joint.mount is not None and joint.mount.placing:
+        arrays["mount_cov"] = joint.mount.mount
+        for name, of_landmarks in (
+            ("landmark_mount", joint.mount.landmarks),
+            ("landmark_placing", joint.mount.placing),
+        ):
+            padded = np.zeros((len(numbers), 3, 3))
+            for k, number in enumerate(numbers):
+                padded[k, : len(of_landmarks[number])] = of_landmarks[number]
+            arrays[name] = padded
     made = BytesIO()
     np.savez(made, **arrays)  # type: ignore[arg-type]  # its stub takes the names for options
     return made.getvalue()
@@ -98,5 +113,17 @@ def _joint(arrays: Mapping[str, Array]) -> JointScans:
         mounts = np.broadcast_to(arrays[f"scan_mount_{n}"], (len(state), 3))
         ties[name] = ScanTies(state, share, mounts, covs)
     above, own, width, separators = map(integers, ("above", "own", "width", "separators"))
-    root = InformationRoot(above, own, width, separators, arrays["values"], rows)
-    return JointScans(root, states, ties)
+    marks: dict[int, int] = {}
+    mount = None
+    if "landmark_ids" in arrays:  # earlier versions kept the scans only
+        numbers = integers("landmark_ids").tolist()
+        marks = dict(zip(numbers, integers("landmark_rows").tolist(), strict=True))
+        if "mount_cov" in arrays:
+            crosses, placing = (
+                dict(zip(numbers, arrays[name], strict=True))
+                for name in ("landmark_mount", "landmark_placing")
+            )
+            nothing = np.zeros((0, 3, 3))
+            mount = MountCovariance(arrays["mount_cov"], nothing, crosses, placing)
+    root = InformationRoot(above, own, width, separators, arrays["values"], rows, marks)
+    return JointScans(root, states, ties, mount)

@@ -51,13 +51,20 @@ def optimise_scan_log(scan_log: ScanLog, tamper: Tamper | None = None) -> Estima
     tracks = {name: run.track for name, run in scan_log.started.items()}
     steps: tuple[Step, ...] = tuple(scan_log.steps)
     with timed(seconds, "loop closure"):
-        paths = close_paths(scan_log, tamper, match=config.backend.close_loops)
+        known_map = scan_log.known.known_map
+        paths = close_paths(scan_log, tamper, match=config.backend.close_loops, known_map=known_map)
     fixing = sum(fix_position(paths.closures))
     counts["closures_verified"] = fixing
     counts["closures_across"] = len(paths.closures) - fixing
     counts["closures_refused"] += paths.refused
     with timed(seconds, "final"):
-        start = Estimate(paths.states, mean_landmarks(steps, paths.states), 0.0, 0)
+        marks = mean_landmarks(steps, paths.states)
+        if known_map is not None:
+            counts["closures_to_map"] = paths.to_map
+            marks |= {
+                n: (m, np.full((len(m),) * 2, np.nan)) for n, m in known_map.known.means.items()
+            }
+        start = Estimate(paths.states, marks, 0.0, 0)
         estimate, steps = _solved(steps, start, paths, scan_log, tracks)
     scan_log.steps = list(steps)
     return estimate
@@ -157,14 +164,14 @@ def _tied(
     """
     config, counts, landmarks = scan_log.config, scan_log.counts, scan_log.landmarks
     landmarks.update_from(steps, estimate)
-    apart = seen_together(steps)
-    into = tie_visits(landmarks, paths.uncertainty(steps), apart)
+    apart = seen_together(steps) | landmarks.known_pairs
+    into = landmarks.without_known(tie_visits(landmarks, paths.uncertainty(steps), apart))
     steps = merged(steps, into, landmarks)
     counts["landmarks_merged"] += len(into)
     if solution:
         apart = {frozenset(into.get(number, number) for number in pair) for pair in apart}
         known = [e for e in landmarks.entries.values() if e.id in estimate.landmarks]
-        into = find_duplicates(known, apart, solution.joint)
+        into = landmarks.without_known(find_duplicates(known, apart, solution.joint))
         steps = merged(steps, into, landmarks)
         counts["landmarks_merged"] += len(into)
     factor_m, factor_rad = SOLVED_FACTORS if solution else CLOSED_FACTORS

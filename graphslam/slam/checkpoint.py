@@ -27,6 +27,7 @@ from graphslam.core.record_codec import CodecError, Kinds, read, write
 from graphslam.core.source_digest import source_digest
 from graphslam.core.stages import announce
 from graphslam.logs import LogSet
+from graphslam.mapping.known_map import KnownMap
 from graphslam.slam.log_pass import LogPass
 
 _T = TypeVar("_T")
@@ -38,8 +39,9 @@ LIBRARIES = ("gtsam", "numpy", "opencv-python-headless", "scipy")
 
 #: modules all of whose dataclasses and named tuples may be kept, and classes of others
 _MODULES = (
-    "core.config", "core.motion_models", "core.observation_arrays", "core.records",
-    "core.sensor_config", "estimation.clock_calibration", "logs.clock", "logs.log_set",
+    "core.config", "core.information_root", "core.known_landmarks", "core.motion_models",
+    "core.observation_arrays", "core.records", "core.sensor_config", "core.sparse_gaussian",
+    "estimation.clock_calibration", "logs.clock", "logs.log_set",
     "mapping.landmark_map", "multi_robot.frame_tree", "multi_robot.relative_frames",
     "odometry.increment_sums", "odometry.interpolation", "slam.recorded_closures",
     "slam.repeated_scans", "slam.robot_state", "slam.scan_tracking",
@@ -218,7 +220,12 @@ def folder_of(target: Path) -> Path:
 
 @contextmanager
 def checkpoint(
-    target: str | os.PathLike[str] | None, log: LogSet, config: Config, *, resume: bool
+    target: str | os.PathLike[str] | None,
+    log: LogSet,
+    config: Config,
+    known_map: KnownMap | None = None,
+    *,
+    resume: bool,
 ) -> Iterator[Checkpoint]:
     """The checkpoint of a run that writes ``target``; it is gone when the block ends well.
 
@@ -237,7 +244,7 @@ def checkpoint(
     folder = folder_of(Path(target))
     if not resume:
         remove_dead(folder)
-    one = Checkpoint(folder, partial(key_of, log, config), asked=resume)
+    one = Checkpoint(folder, partial(key_of, log, config, known_map), asked=resume)
     done = False
     try:
         yield one
@@ -257,12 +264,13 @@ def remove_dead(folder: Path) -> None:
             lock.close()
 
 
-def key_of(log: LogSet, config: Config) -> str:
+def key_of(log: LogSet, config: Config, known_map: KnownMap | None = None) -> str:
     """What a result depends on, in short."""
     told = [FORMAT, dump_config(config), python_version()]
     told += [f"{file.path.resolve()}\n{file.sha256}" for file in log.files]
     told += [f"{name} {version(name)}" for name in LIBRARIES]
     told.append(source_digest())
+    told += [] if known_map is None else [known_map.sha256]
     digest = hashlib.sha256("\n".join(told).encode(errors="backslashreplace"))
     return digest.hexdigest()
 

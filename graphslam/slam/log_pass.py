@@ -5,12 +5,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
 from graphslam.core.config import Config
 from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import rotate_cov
 from graphslam.core.records import Association, KeyframeScan, Sighting, Start, Step
 from graphslam.logs import LogSet
 from graphslam.logs.clock import Clock
+from graphslam.mapping.known_map import KnownMap
 from graphslam.mapping.landmark_map import LandmarkMap
 from graphslam.multi_robot.frame_tree import FrameAssignment
 from graphslam.multi_robot.frames import RobotFrames
@@ -29,7 +32,7 @@ class PriorKnowledge:
     ``frame_assignment``: start poses and frames of the robots. ``recorded``: which relative poses
     of the log are accepted. ``identities``: false identity -> right one, of what is sighted.
     ``clocks``: of robots whose clock is not that of the first. ``alone``: estimates of robots by
-    themselves, from which their relative poses were found.
+    themselves, from which their relative poses were found. ``known_map``: of an earlier result.
     """
 
     frame_assignment: FrameAssignment
@@ -37,6 +40,7 @@ class PriorKnowledge:
     identities: Mapping[str, str] = field(default_factory=dict)
     clocks: Mapping[str, Clock] = field(default_factory=dict)
     alone: Mapping[str, RobotEstimate] = field(default_factory=dict)
+    known_map: KnownMap | None = None
 
 
 class LogPass:
@@ -118,6 +122,12 @@ class LogPass:
 
     def transforms(self) -> FrameTransforms:
         """What takes every robot and landmark from where it was estimated into its frame."""
+        if self.known.known_map is not None:  # which says where the world is
+            nowhere = np.zeros(3)
+            entries = self.landmarks.entries
+            return FrameTransforms(
+                dict.fromkeys(self.runs, nowhere), dict.fromkeys(entries, nowhere)
+            )
         tracks = {name: run.track for name, run in self.runs.items()}
         return self.frames.transforms(tracks, self.landmarks.entries.values())
 

@@ -1,6 +1,6 @@
 """Tracked paths whose loops are closed on a pose graph of submaps, and what it says about them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,6 +8,7 @@ import numpy as np
 from graphslam.core.geometry import Array, between, compose, exp, log, path_length, rotate_cov
 from graphslam.core.records import Closure, Step, Trajectory
 from graphslam.mapping.gating import IntArray
+from graphslam.mapping.known_map import MAP_ROBOT, KnownMap
 from graphslam.mapping.loop_closure import Tamper
 from graphslam.mapping.redundant_closures import Span
 from graphslam.mapping.sequential_closing import close_loops
@@ -18,6 +19,9 @@ from graphslam.slam.scan_tracking import ScanLog, TrackedPath
 #: factor on the covariance of the chain of submaps: tracking knows only what is around the robot,
 #: and takes its errors for independent. Of Intel and ACES, errors are 1 to 2 sigmas of it
 CHAIN_INFLATION = 4.0
+#: m², m², rad²: of the places of a known map, beside what it has around them. How well the map
+#: as a whole lies in the world does not matter here
+PLACE_COV = np.diag([0.02, 0.02, 0.005]) ** 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,7 +31,8 @@ class ClosedPaths:
     ``states``: robot -> poses at all its states. ``closures`` are those that corrected the paths,
     ``refused`` the number of inconsistent ones; ``spans``: state of a submap -> the time that its
     robot was around there. ``graph`` is that of the submaps, ``times`` and ``first``: robot ->
-    times of its nodes in it, and the number of the first.
+    times of its nodes in it, and the number of the first. ``places`` are the nodes of a known map,
+    ``known`` the numbers of its landmarks; ``to_map``: how many closures are with its places.
     """
 
     states: Mapping[str, Trajectory]
@@ -37,6 +42,9 @@ class ClosedPaths:
     graph: SubmapGraph
     times: Mapping[str, IntArray]
     first: Mapping[str, int]
+    places: IntArray
+    known: Collection[int] = ()
+    to_map: int = 0
 
     def node(self, robot: str, time_ns: int) -> int:
         """The node of the graph that was passed last at a time."""
@@ -51,6 +59,10 @@ class ClosedPaths:
                 if isinstance(a.target, int):
                     seen.setdefault(a.target, {})[self.node(a.robot, a.time_ns)] = None
         nodes = {number: np.array(list(found)) for number, found in seen.items()}
+        nodes |= {
+            number: np.concatenate([self.places, nodes.get(number, self.places[:0])])
+            for number in self.known
+        }
         return LandmarkUncertainty(self.graph, nodes)
 
 
@@ -106,11 +118,16 @@ def tracked_states(path: TrackedPath) -> Trajectory:
 
 
 def close_paths(
-    scan_log: ScanLog, tamper: Tamper | None = None, *, match: bool = True
+    scan_log: ScanLog,
+    tamper: Tamper | None = None,
+    *,
+    match: bool = True,
+    known_map: KnownMap | None = None,
 ) -> ClosedPaths:
     """Loops closed on a pose graph of submaps, and the paths that follow its solution.
 
-    Without ``match`` nothing is closed.
+    Without ``match`` nothing is closed. The places of a ``known_map``, in which the paths must lie,
+    are visits that were before all others.
     """
     config, tracked = scan_log.config, unclosed_paths(scan_log)
     anchors = {name: np.array(scan_log.paths[name].anchors) for name in tracked}
@@ -128,6 +145,12 @@ def close_paths(
         steps, noise = path.anchor_steps()
         delta.append(steps)
         cov.append(noise)
+    places = np.zeros(0, dtype=np.int64)
+    if known_map is not None:  # each place is a path of its own
+        places = np.arange(len(poses), len(poses) + len(known_map.places))
+        poses += [place.pose for place in known_map.places]
+        first_nodes += places.tolist()
+        start_covs += [PLACE_COV] * len(places)
     chain = RelativePoses(
         np.array(begin, dtype=np.int64),
         np.array(begin, dtype=np.int64) + 1,
@@ -139,18 +162,24 @@ def close_paths(
     numbers: IntArray = np.zeros(0, dtype=np.int64)
     if match:
         submaps, numbers = submaps_at(anchors, tracked, scan_log.keyframe_scans, config)
-    closed = close_loops(submaps, numbers, graph, config.loop_closure, tamper)
+    # earlier visits come first
+    earlier = [] if known_map is None else [*known_map.places]
+    visited, nodes = [*earlier, *submaps], np.concatenate([places, numbers])
+    closed = close_loops(visited, nodes, graph, config.loop_closure, tamper)
+    own = tuple(c for c in closed.correcting if MAP_ROBOT not in (c.robot, c.other))
     moved, times, firsts, first = {}, {}, {}, 0
     for name, states in tracked.items():
-        own = anchors[name]
+        at = anchors[name]
         moved[name] = replace(
-            states, poses=follow(states.poses, own, graph.poses[first : first + len(own)])
+            states, poses=follow(states.poses, at, graph.poses[first : first + len(at)])
         )
-        times[name], firsts[name] = states.stamps_ns[own], first
-        first += len(own)
+        times[name], firsts[name] = states.stamps_ns[at], first
+        first += len(at)
     return ClosedPaths(
-        moved, closed.correcting, closed.refused, neighbourhoods(submaps), graph, times, firsts
-    )
+        moved, own, closed.refused, neighbourhoods(submaps), graph, times, firsts, places,
+        () if known_map is None else known_map.known.means.keys(),
+        len(closed.correcting) - len(own),
+    )  # fmt: skip
 
 
 def neighbourhoods(submaps: Sequence[SubmapPose]) -> dict[State, Span]:

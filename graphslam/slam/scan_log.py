@@ -10,6 +10,7 @@ from graphslam.mapping.loop_closure import Tamper
 from graphslam.slam.batch_optimisation import optimise_scan_log
 from graphslam.slam.causal import causal_trajectories
 from graphslam.slam.checkpoint import NOTHING_KEPT, Checkpoint
+from graphslam.slam.localisation import localise
 from graphslam.slam.log_pass import PriorKnowledge, Progress, timed
 from graphslam.slam.log_reader import Reading
 from graphslam.slam.passes import Findings, FinishedPass
@@ -44,6 +45,8 @@ def solve_scan_log(
         kept.read_pass(scan_log, partial(scan_log.run, progress))
     if not scan_log.steps:
         raise LogError(f"{log.files[0].path}: nothing in it could be used; see `graphslam info`")
+    if known.known_map is not None:
+        localise(scan_log, known.known_map)
     with timed(scan_log.seconds, "final optimisation"):
         estimate = optimise_scan_log(scan_log, tamper)
     found = {} if causal is None else kept.stage("causal", causal.result)

@@ -96,6 +96,8 @@ class ScanLog(LogPass):
         self.paths = {self._robot: self._path}
         self._tracker: LocalTracker | None = None
         self._anchor_m = 0.0
+        known_map = known.known_map
+        self._first = 0 if known_map is None else known_map.next_number  # of its landmarks
         #: see `ReadLog`
         self.wrong_lasers: dict[str, float] = {}
 
@@ -132,7 +134,7 @@ class ScanLog(LogPass):
             start = self.start_prior(self._robot)
             self.steps.append(Step(block.start_ns, starts={self._robot: start}))
             self._tracker = LocalTracker(
-                self._robot, self.config.association, start.pose, itertools.count()
+                self._robot, self.config.association, start.pose, itertools.count(self._first)
             )
             self._add_state(self._tracker, block.start_ns)
             self._set_anchor(self._tracker)

@@ -7,11 +7,13 @@ from functools import partial
 import numpy as np
 
 from graphslam.core.config import Config
+from graphslam.core.errors import ConfigError
 from graphslam.core.records import Result, RobotResult
 from graphslam.core.worker import parallel_map
 from graphslam.estimation.g2o import graph_error
 from graphslam.estimation.settled import settled
 from graphslam.logs import LogSet
+from graphslam.mapping.known_map import KnownMap
 from graphslam.mapping.landmark_records import make_landmarks
 from graphslam.mapping.loop_closure import Tamper
 from graphslam.odometry.mount_covariance import with_mount_errors
@@ -22,6 +24,7 @@ from graphslam.slam.log_pass import Progress, timed
 from graphslam.slam.log_reader import Reading, is_scan_log
 from graphslam.slam.passes import FinishedPass, run_passes
 from graphslam.slam.pose_graph import is_pose_graph, solve_pose_graph
+from graphslam.slam.retirement import retired_landmarks
 from graphslam.slam.robot_settings import check_robots
 from graphslam.slam.scan_log import solve_scan_log
 from graphslam.slam.sighting_passes import run_sighting_passes
@@ -39,6 +42,7 @@ def smooth(
     tamper: Tamper | None = None,
     ahead: Reading | None = None,
     kept: Checkpoint = NOTHING_KEPT,
+    known_map: KnownMap | None = None,
 ) -> Result:
     """Estimate trajectories, landmarks and calibration from a log: the main function.
 
@@ -49,15 +53,22 @@ def smooth(
         tamper: for tests, see `graphslam.slam.reoptimise_scans.Tamper`.
         ahead: what `graphslam.slam.log_reader.open_ahead` gives after the log.
         kept: where stages are kept, and those of an earlier run.
+        known_map: of an earlier result, in which the log is localised.
 
     Raises:
         LogError: no message of the log could be used.
-        ConfigError: a setting is about a robot that is not in the log.
+        ConfigError: a setting is about a robot that is not in the log, or logs like this one
+            cannot be localised in a known map.
         EstimationError: the estimate is indeterminate, or a robot's start is unknown.
     """
     began = time.perf_counter()
     check_robots(log, config)
-    solve = partial(_solved, log, config, progress, tamper, ahead, kept, began)
+    if known_map is not None and not (is_scan_log(log, config) and not config.backend.causal):
+        raise ConfigError(
+            "known_map.directory: only scans of one robot, by back end batch and without --causal, "
+            "are localised in a known map"
+        )
+    solve = partial(_solved, log, config, progress, tamper, ahead, kept, began, known_map)
     result = kept.stage("result", solve)
     summary = {**result.summary, "resumed": kept.resumed}
     return replace(result, summary=summary)
@@ -71,11 +82,13 @@ def _solved(
     ahead: Reading | None,
     kept: Checkpoint,
     began: float,
+    known_map: KnownMap | None,
 ) -> Result:
     """The result by the way that is for logs of this kind; arguments as of `smooth`."""
     if is_pose_graph(log, config):
         return make_result(solve_pose_graph(log, config, progress), began)
     known = kept.stage("starts", lambda: initialise(log, config))
+    known = replace(known, known_map=known_map)
     initialised = time.perf_counter()
     if is_scan_log(log, config):
         finished: FinishedPass | None = solve_scan_log(
@@ -114,7 +127,8 @@ def make_result(finished: FinishedPass, began: float) -> Result:
             estimate = settled(steps, estimate, pipeline.kernel)
         error, plain = graph_error(steps, estimate, pipeline.kernel)
         estimate = replace(estimate, error=error)
-        if estimate.mount is not None:
+        # the start of the robot places the world, unless a known map does
+        if estimate.mount is not None and pipeline.known.known_map is None:
             ((name, run),) = runs.items()
             start = pipeline.starts[name].pose
             estimate = with_mount_errors(estimate, start, run.track.mount)
@@ -128,6 +142,8 @@ def make_result(finished: FinishedPass, began: float) -> Result:
     landmarks = pipeline.frames.label_landmarks(
         make_landmarks(moved, estimate), pipeline.landmarks.entries.values()
     )
+    retired = retired_landmarks(pipeline, landmarks, estimate)
+    landmarks = tuple(mark for mark in landmarks if mark.id not in retired)
     t0 = min(trajectory.stamps_ns[0] for trajectory in estimate.states.values())
     innovations = {
         model: np.array([((t - t0) * 1e-9, d2) for t, d2 in values]).reshape(-1, 2)
@@ -135,6 +151,8 @@ def make_result(finished: FinishedPass, began: float) -> Result:
     }
     pipeline.seconds["all"] = time.perf_counter() - began
     summary = summarise(pipeline, estimate, plain, len(landmarks), finished.findings.clocks)
+    if "known_map" in summary:
+        summary["known_map"]["retired"] = list(retired.values())
     evidence = gather(pipeline, robots, steps, estimate, innovations, summary)
     summary["verdict"] = judge(evidence)
     return Result(

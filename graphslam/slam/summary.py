@@ -105,6 +105,7 @@ def summarise(
         },
         "consolidated": {name: counts[name] for name in REOPTIMISED if name in counts},
         "closures": known.recorded.to_summary(),
+        **known_map_summary(pipeline),
         "world": known.frame_assignment.world,
         "frames": dict(sorted(known.frame_assignment.frames.items())),
         "starts_found": known.frame_assignment.to_summary(),
@@ -150,6 +151,29 @@ def summarise(
             *run_warnings(pipeline),
             *(understated_noise(pipeline.steps, estimate) if is_relative(pipeline) else ()),
         ],
+    }
+
+
+def known_map_summary(pipeline: LogPass) -> dict[str, Any]:
+    """What became of a known map: how many of its landmarks were seen, and how many are new."""
+    known_map = pipeline.known.known_map
+    if known_map is None:
+        return {}
+    seen = {a.target for step in pipeline.steps for a in step.associations}
+    earlier = known_map.known.means.keys()
+    return {
+        "known_map": {
+            "name": known_map.name,
+            "sha256": known_map.sha256,
+            "parents": [{"name": name, "sha256": sha256} for name, sha256 in known_map.parents],
+            "updated": pipeline.given_config.known_map.update,
+            "landmarks": len(earlier),
+            "seen": len(earlier & seen),
+            "new": len(pipeline.landmarks.entries.keys() - earlier),
+            "closures": pipeline.counts["closures_to_map"],
+            "widening": known_map.known.root.widening,
+            "retired": [],
+        }
     }
 
 

@@ -10,7 +10,8 @@ from room_log import drive
 import graphslam
 from graphslam.core.config import OdometryConfig, RobotConfig
 from graphslam.core.geometry import between, compose, exp, log
-from graphslam.core.records import InformationRoot, JointScans, OdometryPose, Trajectory
+from graphslam.core.information_root import InformationRoot
+from graphslam.core.records import JointScans, OdometryPose, Trajectory
 from graphslam.estimation.information_root import pair_covariances
 from graphslam.evaluation.metrics import evaluate
 from graphslam.evaluation.relation_covariances import relative_covariances

@@ -1,0 +1,251 @@
+"""A known map: starts found anywhere in it, errors of what is localised, and a map that goes on.
+
+Office: the simulated office is mapped once, its start told with an error drawn from its prior. Then
+a robot starts somewhere on the round through the corridors, in either direction, and drives half of
+it; nothing is said about where. Errors are in the world, not aligned. Repeated: a row of equal
+offices along a corridor, of which only the ends differ; the robot visits some in the middle, and
+then drives on to an end. Days: furniture is moved every day, and each day continues the map; all
+days are also solved anew, as sessions. Timed is the CPU time of each day.
+
+Run: python benchmarks/prior_map.py [office] [repeated] [days] [--seeds N]
+"""
+
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from common import parser
+from sessions import ROUND, SAME_PLACE, changed, later
+
+import graphslam
+from graphslam.core.errors import EstimationError
+from graphslam.evaluation.metrics import evaluate
+from graphslam.logs import read_truth
+from graphslam.results.known_map import load_known_map
+from graphslam.simulation import load_scenario, simulate
+from graphslam.simulation.scenario import Leg, Scenario, Wall
+
+#: m, m, rad: what the start of the first log is known to
+START_SIGMA = (0.005, 0.005, 0.001)
+#: corners of the round on a visit; share of the first side at which it begins, at most
+LEGS, LATEST = 5, 0.7
+DAYS, DAY_S = 10, 86_400
+#: m: a start farther off is wrong
+WRONG_M = 0.5
+
+
+def main() -> None:
+    """Print what was asked for."""
+    options = parser(__doc__)
+    options.add_argument("which", nargs="*", default=("office", "repeated", "days"))
+    options.add_argument("--seeds", type=int, default=20)
+    chosen = options.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        for which in chosen.which:
+            folder = Path(name) / which
+            folder.mkdir()
+            campaign = {"office": office, "repeated": repeated, "days": days}[which]
+            for line in campaign(folder, chosen.seeds):
+                print(line, flush=True)
+
+
+def mapped(folder: Path, log: Path, seed: int) -> Path:
+    """The result of a log whose start is told, with an error."""
+    rng = np.random.default_rng(seed)
+    (robot, truth), *_ = read_truth([log], graphslam.load_config()).trajectories.items()
+    told = truth.poses[0] + rng.normal(0.0, START_SIGMA)
+    graphslam.smooth(
+        log,
+        output=folder / "map",
+        force=True,
+        **{
+            f"start.poses.{robot}": [float(x) for x in told],
+            "start.given_sigma_m": START_SIGMA[0],
+            "start.given_sigma_rad": START_SIGMA[2],
+        },
+    )
+    return folder / "map"
+
+
+def office(folder: Path, seeds: int) -> Iterator[str]:
+    """A line for each seed, and one for all."""
+    scenario = load_scenario("office-loop")
+    errors, nees, bounds, wrong = [], [], [], 0
+    for seed in range(seeds):
+        simulate(scenario, folder / "first.mcap", 1000 + seed)
+        known = mapped(folder, folder / "first.mcap", seed)
+        log = visit(folder, scenario, seed)
+        (folder / "first.mcap").unlink()
+        try:
+            result = graphslam.smooth(log, **{"known_map.directory": str(known)})
+        except EstimationError as error:
+            yield f"office, seed {seed}: {error}"
+            continue
+        truth = read_truth([log], graphslam.load_config()).trajectories
+        found = evaluate(result, truth)["joint"]["final"]
+        wrong += found["ate_rmse_m"] > WRONG_M
+        errors.append(found["ate_rmse_m"])
+        nees.append(found["nees_per_dof"])
+        bounds.append(found["nees_bounds"])
+        yield (
+            f"office, seed {seed}: ATE {errors[-1]:.4f} m, NEES/dof {nees[-1]:.2f} in {bounds[-1]}"
+        )
+    inside = sum(low <= n <= high for n, (low, high) in zip(nees, bounds, strict=True))
+    below = sum(n <= high for n, (_, high) in zip(nees, bounds, strict=True))
+    yield (
+        f"office, {seeds} seeds: {len(errors)} found, {wrong} wrong; ATE mean "
+        f"{np.mean(errors):.4f} m, worst {np.max(errors):.4f}; NEES/dof mean {np.mean(nees):.2f}, "
+        f"{inside} inside their bounds, {below} not above"
+    )
+
+
+def visit(folder: Path, scenario: Scenario, seed: int, seconds: int = 0) -> Path:
+    """The log of half a round from anywhere on it, in either direction, so much later."""
+    rng = np.random.default_rng(seed)
+    ((name, robot),) = scenario.robots.items()
+    begin, back = int(rng.integers(len(ROUND))), bool(rng.integers(2))
+    corners = np.roll(np.array(ROUND), -begin, axis=0)[:: -1 if back else 1]
+    first, second = corners[:2]
+    start = first + rng.uniform(0.0, LATEST) * (second - first)
+    robot = replace(
+        robot,
+        start_m=tuple(start.tolist()),
+        start_deg=float(np.degrees(np.arctan2(*(second - start)[::-1]))),
+        drive=(Leg(through_m=tuple(map(tuple, corners[1:LEGS].tolist()))),),
+    )
+    path = folder / f"visit{seconds // DAY_S}.mcap"
+    (folder / "now.mcap").unlink(missing_ok=True)
+    path.unlink(missing_ok=True)
+    simulate(replace(scenario, robots={name: robot}), folder / "now.mcap", seed)
+    later(folder / "now.mcap", path, seconds)
+    return path
+
+
+#: offices along a corridor: number, width and depth, width of the corridor and of doors, m
+OFFICES, WIDE_M, DEEP_M, CORRIDOR_M, DOOR_M = 12, 4.0, 4.0, 2.4, 1.2
+
+
+def row_of_offices() -> Scenario:
+    """Equal offices on both sides of a corridor, of which one end is closed by a slanted wall."""
+    scenario = load_scenario("office-loop")
+    long = OFFICES * WIDE_M
+    top = CORRIDOR_M
+    walls = [
+        Wall("south", ((0.0, -DEEP_M), (long, -DEEP_M))),
+        Wall("north", ((0.0, top + DEEP_M), (long, top + DEEP_M))),
+        Wall("west", ((0.0, -DEEP_M), (0.0, top + DEEP_M))),
+        Wall("east 1", ((long, -DEEP_M), (long, 0.0))),
+        Wall("east 2", ((long, 0.0), (long + 4.0, 0.8))),
+        Wall("east 3", ((long + 4.0, 0.8), (long + 2.0, top), (long, top))),
+        Wall("east 4", ((long, top), (long, top + DEEP_M))),
+    ]
+    for n in range(OFFICES):
+        begin, end = n * WIDE_M, (n + 1) * WIDE_M
+        door = begin + 0.4
+        for y, back in ((0.0, -DEEP_M), (top, top + DEEP_M)):
+            walls += [
+                Wall(f"front {n} {y} 1", ((begin, y), (door, y))),
+                Wall(f"front {n} {y} 2", ((door + DOOR_M, y), (end, y))),
+            ]
+            if n:
+                walls.append(Wall(f"between {n} {y}", ((begin, y), (begin, back))))
+    world = replace(scenario.world, walls=tuple(walls), boxes=(), boards=(), cylinders=(), doors=())
+    return replace(scenario, world=world)
+
+
+def repeated(folder: Path, seeds: int) -> Iterator[str]:
+    """How often the start is refused in the middle of the row, and found at its end."""
+    scenario = row_of_offices()
+    ((name, robot),) = scenario.robots.items()
+    middle, end = CORRIDOR_M / 2, OFFICES * WIDE_M - 1.0
+    counts = {"middle": [0, 0, 0], "to the end": [0, 0, 0]}  # found, refused, wrong
+    for seed in range(seeds):
+        rng = np.random.default_rng(seed)
+        whole = replace(
+            robot,
+            start_m=(2.0, middle),
+            start_deg=0.0,
+            drive=(
+                Leg(through_m=((end, middle),)),
+                Leg(turn_deg=180.0),
+                Leg(through_m=((2.0, middle),)),
+            ),
+        )
+        log = folder / "first.mcap"
+        log.unlink(missing_ok=True)
+        simulate(replace(scenario, robots={name: whole}), log, 2000 + seed)
+        known = mapped(folder, log, seed)
+        begin = WIDE_M * int(rng.integers(3, 5)) + rng.uniform(0.0, WIDE_M)
+        for what, until in (("middle", begin + 3 * WIDE_M), ("to the end", end)):
+            drive = (Leg(through_m=((until, middle),)),)
+            own = replace(robot, start_m=(begin, middle), start_deg=0.0, drive=drive)
+            log = folder / "visit.mcap"
+            log.unlink(missing_ok=True)
+            simulate(replace(scenario, robots={name: own}), log, seed)
+            try:
+                result = graphslam.smooth(log, **{"known_map.directory": str(known)})
+            except EstimationError:
+                counts[what][1] += 1
+                continue
+            truth = read_truth([log], graphslam.load_config()).trajectories
+            error = evaluate(result, truth)["joint"]["final"]["ate_rmse_m"]
+            counts[what][2 if error > WRONG_M else 0] += 1
+    for what, (found, refused, wrong) in counts.items():
+        yield f"repeated offices, {what}: {found} found, {refused} refused, {wrong} wrong"
+
+
+def days(folder: Path, _seeds: int) -> Iterator[str]:
+    """Ten days, each of which continues the map of the day before, and all of them anew."""
+    scenario = load_scenario("office-loop")
+    first = folder / "first.mcap"
+    simulate(scenario, first, 3000)
+    known = mapped(folder, first, 0)
+    logs, continued = [first], []
+    for number in range(1, DAYS + 1):
+        log = visit(folder, changed(scenario, 0, number), number, DAY_S * number)
+        began = time.process_time()
+        try:
+            result = graphslam.smooth(
+                log,
+                output=folder / f"day{number}",
+                **{"known_map.directory": str(known), "known_map.update": True},
+            )
+        except EstimationError as error:
+            yield f"day {number}: {error}"
+            continue
+        took = time.process_time() - began
+        logs.append(log)
+        known = folder / f"day{number}"
+        truth = read_truth([log], graphslam.load_config()).trajectories
+        found = evaluate(result, truth)["joint"]["final"]
+        continued.append(found["ate_rmse_m"])
+        told, map_now = result.summary["known_map"], load_known_map(known)
+        yield (
+            f"day {number}: ATE {found['ate_rmse_m']:.4f} m, NEES/dof {found['nees_per_dof']:.2f}, "
+            f"{took:.1f} CPU s, {len(map_now.landmarks)} landmarks, {len(map_now.places)} places, "
+            f"{told['new']} new, {len(told['retired'])} retired, "
+            f"{(known / 'known_map.npz').stat().st_size / 1e6:.2f} MB, widened "
+            f"{map_now.known.root.widening:.2f}"
+        )
+    if continued:
+        yield f"{len(continued)} days, continued map: ATE mean {np.mean(continued):.4f} m"
+    truth = read_truth(logs, SAME_PLACE)
+    told = truth.trajectories["first"].poses[0]
+    began = time.process_time()
+    result = graphslam.smooth(
+        logs, config=SAME_PLACE, **{"start.poses.first": [float(x) for x in told]}
+    )
+    found = evaluate(result, truth.trajectories)["robots"]
+    anew = [found[name]["final"]["ate_rmse_m"] for name in found if name != "first"]
+    frames = len(set(result.summary["frames"].values()))
+    yield (
+        f"all {len(logs)} logs anew: {frames} frames, ATE mean {np.mean(anew):.4f} m, "
+        f"{time.process_time() - began:.0f} CPU s"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,34 @@
+"""The root of the information of an estimate: what joint covariances are computed from."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from graphslam.core.geometry import Array
+
+IntArray = np.ndarray[Any, np.dtype[np.int64]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InformationRoot:
+    """Upper triangular root R of the information of an estimate: R'R, by cliques of its rows.
+
+    A row has entries in its own clique and in later rows only. From the last clique, which depends
+    on no other, to the first: ``above`` (C,) is the number of the clique whose rows begin what the
+    rows of this one depend on, -1 if there is none, and smaller than its own. ``own`` (C,) is how
+    many rows are its own; those of all cliques are numbered in this order. ``width`` (C,) is how
+    many rows of others it depends on, ``separators`` (sum of width,) which; ``values`` the dense
+    blocks (own, own + width), row by row. ``states[robot]`` (n,) is the first of the three rows of
+    each state, ``landmarks[number]`` that of each landmark. Errors are along the axes of each
+    pose's own frame, in its tangent space, so that R is the same in every world frame.
+    """
+
+    above: IntArray
+    own: IntArray
+    width: IntArray
+    separators: IntArray
+    values: Array
+    states: Mapping[str, IntArray]
+    landmarks: Mapping[int, int] = field(default_factory=dict)

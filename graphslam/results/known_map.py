@@ -1,0 +1,239 @@
+"""A result as the known map of later logs: made of its files, or kept in known_map.npz.
+
+The joint covariance of the landmarks follows from the root of the information in joint.npz, places
+from scans.npz. A result that was itself made with a known map has all of it in known_map.npz: of
+the days before nothing else is left. The layout is documented in docs/formats.md.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+
+from graphslam.core.config import Config
+from graphslam.core.errors import ConfigError, OutputError
+from graphslam.core.geometry import Array, rotation3
+from graphslam.core.known_landmarks import KnownLandmarks
+from graphslam.core.records import JointScans, KeyframeScan, Landmark, Result, Trajectory
+from graphslam.core.sparse_gaussian import SparseRoot, sparse_root
+from graphslam.estimation.information_root import joint_covariance
+from graphslam.mapping.known_map import KnownMap, latest_places, map_place
+from graphslam.mapping.submaps import SubmapPose, build_submaps
+from graphslam.results.file_formats import landmark_from_json, landmark_json
+from graphslam.results.folder import SavedResult, load
+from graphslam.results.joint_file import joint_scans
+from graphslam.results.scans_file import SCANS_FILE, read_scans
+
+FORMAT = 1
+KNOWN_MAP_FILE = "known_map.npz"
+
+
+def load_known_map(directory: Path) -> KnownMap:
+    """The map that a result folder holds for later logs.
+
+    Raises:
+        OutputError: it is no result folder, or one that cannot be used as a map: the line says why.
+        ConfigError: its config.toml is not valid.
+    """
+    if (directory / KNOWN_MAP_FILE).exists():
+        return _read(directory / KNOWN_MAP_FILE, directory.absolute().name)
+    saved = load(directory)
+    if len(set(saved.summary.get("frames", {}).values())) > 1:
+        raise OutputError(
+            f"{directory}: its robots are in separate frames: it is no map of one place"
+        )
+    if saved.joint is None or not saved.joint.root.landmarks:
+        raise OutputError(
+            f"{directory}: has no joint covariance of its landmarks: it was made by an earlier "
+            "version or by a filter; smooth its log again"
+        )
+    landmarks = tuple(
+        mark
+        for mark in saved.landmarks
+        if mark.frame is None and mark.id in saved.joint.root.landmarks
+    )
+    known = known_landmarks(landmarks, landmark_covariance(saved.joint, landmarks))
+    places = latest_places(_submaps(directory, saved))
+    name, sha256 = directory.absolute().name, _digest(directory)
+    return KnownMap(name, sha256, landmarks, known, places)
+
+
+def known_map_of(config: Config) -> KnownMap | None:
+    """The map that the settings name, if any.
+
+    Raises:
+        ConfigError: ``known_map.update`` without one.
+        OutputError: see `load_known_map`.
+    """
+    if not config.known_map.directory:
+        if config.known_map.update:
+            raise ConfigError(
+                "known_map.update (--update): there is no map to continue; give --prior-map DIR"
+            )
+        return None
+    return load_known_map(Path(config.known_map.directory))
+
+
+def known_map_files(result: Result, earlier: KnownMap | None) -> list[tuple[str, bytes]]:
+    """Name and content of the file of a result in an earlier map: that map, or its continuation.
+
+    None for a result without an earlier map: its map is made of its other files.
+    """
+    if earlier is None:
+        return []
+    told = earlier if not result.config.known_map.update else continued(result, earlier)
+    return [(KNOWN_MAP_FILE, known_map_bytes(told))]
+
+
+def continued(result: Result, earlier: KnownMap) -> KnownMap:
+    """The map after a result that was made with it: its landmarks, and the latest of each place.
+
+    Raises:
+        OutputError: the result has no joint covariance.
+    """
+    joint = joint_scans(result.estimate, result.robots)
+    if joint is None:
+        raise OutputError("known_map.update: the result has no joint covariance")
+    known = known_landmarks(result.landmarks, landmark_covariance(joint, result.landmarks))
+    found = build_submaps(result.estimate.states, result.keyframe_scans, result.config)
+    places = latest_places([*found, *earlier.places])
+    # named by its folder, identified by its content
+    return KnownMap("", "", result.landmarks, known, places, earlier.ancestry)
+
+
+def landmark_covariance(joint: JointScans, landmarks: Sequence[Landmark]) -> Array:
+    """Joint covariance (D, D) of landmarks, errors of walls along each one's own axes."""
+    dims = [2 if mark.kind == "point" else 3 for mark in landmarks]
+    first = [joint.root.landmarks[mark.id] for mark in landmarks]
+    rows = np.concatenate(
+        [np.zeros(0), *(np.arange(row, row + dim) for row, dim in zip(first, dims, strict=True))]
+    ).astype(np.int64)
+    cov = joint_covariance(joint.root, rows)
+    if joint.mount is None or not joint.mount.placing:
+        return cov
+    # the mount places the world: an error of it moves all landmarks together
+    cross, placing = (
+        np.concatenate([
+            _own_axes(mark)[:dim, :dim] @ of[mark.id][:dim]
+            for mark, dim in zip(landmarks, dims, strict=True)
+        ])
+        for of in (joint.mount.landmarks, joint.mount.placing)
+    )  # fmt: skip
+    mixed = cross @ placing.T
+    return np.asarray(cov + mixed + mixed.T - placing @ joint.mount.mount @ placing.T)
+
+
+def _own_axes(mark: Landmark) -> Array:
+    return np.eye(3) if mark.kind == "point" else rotation3(-mark.position[2])
+
+
+def known_landmarks(landmarks: Sequence[Landmark], cov: Array) -> KnownLandmarks:
+    """Landmarks and their joint covariance (D, D), see `landmark_covariance`, for a graph."""
+    means = {mark.id: mark.position[: 2 if mark.kind == "point" else 3] for mark in landmarks}
+    # their numbers are those of the path along which they were found
+    root = sparse_root(cov, [len(mean) for mean in means.values()])
+    return KnownLandmarks(means, tuple(means), root)
+
+
+def _submaps(directory: Path, saved: SavedResult) -> list[SubmapPose]:
+    """Submaps along the paths of a result."""
+    placed = read_scans(directory / SCANS_FILE)
+    states: dict[str, Trajectory] = {}
+    for robot in sorted({scan.robot for scan in placed}):
+        own = [scan for scan in placed if scan.robot == robot]
+        times = np.array([scan.time_ns for scan in own], dtype=np.int64)
+        poses = np.array([scan.pose for scan in own])
+        states[robot] = Trajectory(times, poses, np.full((len(own), 3, 3), np.nan))
+    scans = [KeyframeScan(s.robot, s.time_ns, s.points, s.sensor) for s in placed]
+    return build_submaps(states, scans, saved.config)
+
+
+def _digest(directory: Path) -> str:
+    found = hashlib.sha256()
+    for name in ("landmarks.json", "joint.npz", SCANS_FILE):
+        path = directory / name
+        if path.exists():
+            found.update(path.read_bytes())
+    return found.hexdigest()
+
+
+# ---------------------------------------------------------------- the file
+
+
+def known_map_bytes(known: KnownMap) -> bytes:
+    """The content of the file."""
+    root = known.known.root
+    clouds = [cloud for p in known.places for cloud in p.submap.clouds]
+    arrays: dict[str, Any] = {
+        "format": np.array(FORMAT),
+        "name": np.array(known.name),
+        "sha256": np.array(known.sha256),
+        "landmarks": np.frombuffer(
+            json.dumps([landmark_json(mark) for mark in known.landmarks]).encode(), dtype=np.uint8
+        ),
+        "parents": np.array([list(p) for p in known.parents], dtype=np.str_).reshape(-1, 2),
+        "parent_count": np.array([len(p) for p in root.parents], dtype=np.int32),
+        "parent": np.array([n for p in root.parents for n in p], dtype=np.int32),
+        "rows": np.concatenate([np.zeros(0), *(row.ravel() for row in root.rows)]),
+        "widening": np.array(root.widening),
+        "place_pose": np.array([p.pose for p in known.places]).reshape(-1, 3),
+        "place_scans": np.array([len(p.submap.clouds) for p in known.places], dtype=np.int32),
+        "sensor": np.concatenate([np.zeros((0, 3)), *(p.submap.poses for p in known.places)]),
+        "count": np.array([len(cloud) for cloud in clouds], dtype=np.int32),
+        "points": np.concatenate([np.zeros((0, 2)), *clouds], dtype=np.float32),
+    }
+    made = BytesIO()
+    np.savez(made, **arrays)
+    return made.getvalue()
+
+
+def _read(path: Path, name: str) -> KnownMap:
+    try:
+        data = path.read_bytes()
+        with np.load(BytesIO(data)) as file:
+            arrays = {key: file[key] for key in file.files}
+        if int(arrays["format"]) != FORMAT:
+            raise OutputError(
+                f"{path}: is of format {int(arrays['format'])}, this version reads {FORMAT}; "
+                "smooth its logs again"
+            )
+        return _known_map(arrays, name, hashlib.sha256(data).hexdigest())
+    except (OSError, ValueError, KeyError, IndexError, BadZipFile) as error:
+        raise OutputError(f"{path}: {error}") from error
+
+
+def _known_map(arrays: Mapping[str, Array], name: str, sha256: str) -> KnownMap:
+    landmarks = tuple(map(landmark_from_json, json.loads(arrays["landmarks"].tobytes())))
+    means = {mark.id: mark.position[: 2 if mark.kind == "point" else 3] for mark in landmarks}
+    dims = [len(mean) for mean in means.values()]
+    parents = [
+        tuple(part.tolist())
+        for part in np.split(arrays["parent"], np.cumsum(arrays["parent_count"])[:-1])
+    ][: len(dims)]
+    shapes = [
+        (dim, dim + sum(dims[n] for n in before)) for dim, before in zip(dims, parents, strict=True)
+    ]
+    sizes = np.cumsum([a * b for a, b in shapes], dtype=np.int64)[:-1]
+    rows = [
+        part.reshape(shape)
+        for part, shape in zip(np.split(arrays["rows"], sizes), shapes, strict=bool(shapes))
+    ]
+    root = SparseRoot(tuple(parents), tuple(rows), float(arrays["widening"]))
+    clouds = np.split(arrays["points"].astype(float), np.cumsum(arrays["count"])[:-1])
+    first = np.concatenate([[0], np.cumsum(arrays["place_scans"])]).tolist()
+    places = tuple(
+        map_place(
+            k, pose, arrays["sensor"][first[k] : first[k + 1]], clouds[first[k] : first[k + 1]]
+        )
+        for k, pose in enumerate(arrays["place_pose"])
+    )
+    known = KnownLandmarks(means, tuple(means), root)
+    told = tuple((str(a), str(b)) for a, b in arrays["parents"])
+    if str(arrays["name"]):  # a copy
+        name, sha256 = str(arrays["name"]), str(arrays["sha256"])
+    return KnownMap(name, sha256, landmarks, known, places, told)

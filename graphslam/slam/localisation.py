@@ -1,0 +1,104 @@
+"""Where a log begins in a known map, and its path put there.
+
+The start is searched for in the whole map by what relates two robots of unknown start: submaps that
+match in several places and imply one relative pose, without a rival (`multi_robot`). A log that
+does not tell is refused.
+"""
+
+import numpy as np
+
+from graphslam.core.config import Config
+from graphslam.core.errors import EstimationError
+from graphslam.core.frame_forest import PRIOR_INFLATION
+from graphslam.core.geometry import compose, compose_cov, inverse
+from graphslam.core.record import replace
+from graphslam.core.records import Start
+from graphslam.mapping.known_map import KnownMap
+from graphslam.mapping.submaps import submaps_at, with_poses_from
+from graphslam.multi_robot.map_localisation import choose, hypotheses, support
+from graphslam.multi_robot.place_recognition import PlaceMap
+from graphslam.slam.log_pass import timed
+from graphslam.slam.path_closing import PLACE_COV, ClosedPaths, close_paths
+from graphslam.slam.scan_tracking import ScanLog
+
+
+def localise(scan_log: ScanLog, known_map: KnownMap) -> None:
+    """Put the tracked path of a log into a known map, whose landmarks are then those of the log.
+
+    Raises:
+        EstimationError: the log does not tell where it begins.
+    """
+    (robot,) = scan_log.started
+    config = scan_log.config
+    with timed(scan_log.seconds, "localisation"):
+        if is_start_given(config, robot):
+            start = given_start(scan_log, robot)
+        else:
+            start = found_start(scan_log, robot, known_map)
+    _place(scan_log, robot, start)
+    scan_log.steps[0] = replace(scan_log.steps[0], known=known_map.known)
+    scan_log.landmarks.add_known(known_map.entries(robot))
+
+
+def is_start_given(config: Config, robot: str) -> bool:
+    """Whether the start need not be found."""
+    return config.start.from_truth or robot in config.start.poses
+
+
+def given_start(scan_log: ScanLog, robot: str) -> Start:
+    """Of the first state, which is the sensor's; given is that of the base."""
+    told = scan_log.known.frame_assignment.starts[robot]
+    track = scan_log.runs[robot].track
+    cov = compose_cov(told.pose, told.cov, track.mount, track.mount_cov)
+    return Start(compose(told.pose, track.mount), cov)
+
+
+def found_start(scan_log: ScanLog, robot: str, known_map: KnownMap) -> Start:
+    """The start that the log and the map have in common.
+
+    Its sigmas are wide: the scans by which it was found enter the estimate again.
+
+    Raises:
+        EstimationError: it is not found, or another one would do as well.
+    """
+    config = scan_log.config
+    closed = close_paths(scan_log, match=config.backend.close_loops)
+    anchors = {robot: np.array(scan_log.paths[robot].anchors)}
+    submaps, nodes = submaps_at(anchors, closed.states, scan_log.keyframe_scans, config)
+    own = PlaceMap(submaps, closed.graph.covariance(nodes) if submaps else np.zeros((0, 0)))
+    places = PlaceMap(known_map.places, np.kron(np.eye(len(known_map.places)), PLACE_COV))
+    first = scan_log.steps[0].starts[robot].pose
+    starts, supports = [], []
+    for one in hypotheses(places, own, config.multi_robot):
+        start = Start(compose(one.pose, first), PRIOR_INFLATION**2 * one.cov)
+        laid = laid_into(scan_log, robot, start, known_map)
+        starts.append(start)
+        supports.append(support(known_map.places, with_poses_from(submaps, laid.states)))
+    why = "no place in it is recognised"
+    if supports:
+        chosen = choose(supports, submaps, config.multi_robot)
+        if isinstance(chosen, int):
+            return starts[chosen]
+        why = chosen
+    raise EstimationError(
+        f"robot {robot}: where it begins in the map {known_map.name} is not known: {why}; give "
+        f"another map, or --start {robot}=x,y,phi (m, rad)"
+    )
+
+
+def laid_into(scan_log: ScanLog, robot: str, start: Start, known_map: KnownMap) -> ClosedPaths:
+    """The path closed with the places of a known map, if it begins at ``start``."""
+    before, first = scan_log.paths[robot].poses, scan_log.steps[0]
+    try:
+        _place(scan_log, robot, start)
+        return close_paths(scan_log, match=scan_log.config.backend.close_loops, known_map=known_map)
+    finally:
+        scan_log.paths[robot].poses, scan_log.steps[0] = before, first
+
+
+def _place(scan_log: ScanLog, robot: str, start: Start) -> None:
+    """The tracked path begins at ``start``."""
+    path = scan_log.paths[robot]
+    world = compose(start.pose, inverse(path.poses[0]))
+    path.poses = list(compose(np.broadcast_to(world, (len(path.poses), 3)), np.array(path.poses)))
+    scan_log.steps[0] = replace(scan_log.steps[0], starts={robot: start})

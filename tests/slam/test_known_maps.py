@@ -1,0 +1,180 @@
+"""A log localised in the map of an earlier result of the same room."""
+
+import json
+
+import numpy as np
+import pytest
+from room_log import drive, true_pose
+from walls import rectangles
+
+import graphslam
+from graphslam.core.errors import ConfigError, EstimationError, OutputError
+from graphslam.core.geometry import rotation3
+from graphslam.results.folder import JOINT_FILE
+from graphslam.results.known_map import KNOWN_MAP_FILE, landmark_covariance, load_known_map
+
+#: corners of furniture that tell the room from itself turned by half a turn
+ODD = ((0, 5.5, 3, 8), (7, 0, 10, 0.8))
+FURNISHED = rectangles((0, 0, 10, 8), (4, 3.5, 6, 4.5), *ODD)
+#: the drive is 6 m long and 4.6 m wide
+SMALL = {"multi_robot.min_place_extent_m": 3.0}
+#: told to the first day, so that the map lies where the truth does
+START = {
+    "start.poses.robot": [5.0, 1.7, 0.0],
+    "start.given_sigma_m": 1e-3,
+    "start.given_sigma_rad": 1e-3,
+}
+
+
+@pytest.fixture(scope="module")
+def first_day(tmp_path_factory):
+    """Result folder of a round in the furnished room."""
+    folder = tmp_path_factory.mktemp("first")
+    log = drive(folder / "first.mcap", room=FURNISHED)
+    graphslam.smooth(log, output=folder / "first", config=graphslam.load_config(**START))
+    return folder / "first"
+
+
+def localised(log, known, **settings):
+    return graphslam.smooth(log, **{"known_map.directory": str(known)}, **SMALL, **settings)
+
+
+@pytest.mark.parametrize("phase", [0.3, 0.8])
+def test_a_start_anywhere_is_found_in_the_map(tmp_path, first_day, phase):
+    """It is not found where the search leaves out headings, or closures pull the path off."""
+    log = drive(tmp_path / "later.mcap", room=FURNISHED, phase=phase, seed=int(10 * phase))
+    result = localised(log, first_day)
+    errors = graphslam.evaluate(result)["robots"]["robot"]["final"]
+    # scans of 1 cm noise place the robot to a centimetre; three are the bar of known maps
+    assert errors["ate_rmse_m"] < 0.03
+    assert errors["nees_per_dof"] < errors["nees_bounds"][1]
+    told = result.summary["known_map"]
+    assert told["seen"] >= 6  # the room's walls, and the box
+    assert told["name"] == "first"
+
+
+def test_a_room_that_looks_the_same_turned_is_refused(tmp_path):
+    """Of two starts that explain everything neither may be taken."""
+    graphslam.smooth(drive(tmp_path / "first.mcap"), output=tmp_path / "first", **START)
+    log = drive(tmp_path / "later.mcap", phase=0.3, seed=3)
+    with pytest.raises(EstimationError, match="robot robot: where it begins in the map first is"):
+        localised(log, tmp_path / "first")
+    # a start that is told decides it
+    told = {"start.poses.robot": [7.85, 4.71, 1.97]}
+    assert localised(log, tmp_path / "first", **told).summary["known_map"]["seen"] >= 4
+
+
+def test_another_building_is_refused_and_nothing_written(tmp_path, first_day):
+    """A map in which hardly anything is recognised must not bend the path."""
+    other = rectangles((-3, -1, 17, 11), (4, 3.5, 6, 4.5), (10, 2, 11, 7))
+    log = drive(tmp_path / "later.mcap", room=other)
+    with pytest.raises(EstimationError, match="give another map"):
+        localised(log, first_day, output=tmp_path / "later")
+    assert not (tmp_path / "later").exists()
+
+
+def test_the_map_of_a_localised_result_is_the_earlier_one(tmp_path, first_day):
+    """Localisation alone leaves the map as it was; a continued one names its parent."""
+    log = drive(tmp_path / "later.mcap", room=FURNISHED, phase=0.4, seed=4)
+    before = load_known_map(first_day)
+    localised(log, first_day, output=tmp_path / "later")
+    after = load_known_map(tmp_path / "later")
+    assert (after.name, after.sha256) == (before.name, before.sha256)
+    assert len(after.places) == len(before.places)
+    for one, other in zip(before.known.rows(), after.known.rows(), strict=True):
+        assert one[0] == other[0]
+        assert np.array_equal(one[1], other[1])
+    for one, other in zip(before.landmarks, after.landmarks, strict=True):
+        assert np.array_equal(one.cov, other.cov)
+        assert np.array_equal(one.extent, other.extent)
+
+
+def test_a_continued_map_is_better_and_names_its_parent(tmp_path, first_day):
+    """Two rounds tell more of every wall than one; numbers of landmarks stay."""
+    log = drive(tmp_path / "later.mcap", room=FURNISHED, phase=0.4, seed=4)
+    before = load_known_map(first_day)
+    update = {"known_map.update": True}
+    localised(log, first_day, output=tmp_path / "later", **update)
+    after = load_known_map(tmp_path / "later")
+    assert after.parents == (("first", before.sha256),)
+    assert after.name == "later"
+    cov = {mark.id: np.trace(mark.cov[:2, :2]) for mark in after.landmarks}
+    kept = [mark for mark in before.landmarks if mark.id in cov]
+    assert len(kept) >= len(before.landmarks) - 1
+    # widening may cost a wall that was not seen again a little
+    assert np.median([cov[mark.id] / np.trace(mark.cov[:2, :2]) for mark in kept]) < 1.0
+
+
+def test_what_is_gone_is_retired_and_what_is_new_added(tmp_path, first_day):
+    """A box that was moved: neither may its old place stay a wall, nor any other wall go."""
+    boxes = ((0, 0, 10, 8), (4, 3.5, 6, 4.5), ODD[0])
+    log = drive(tmp_path / "later.mcap", room=rectangles(*boxes, (7, 7, 10, 8)), phase=0.4, seed=4)
+    before = load_known_map(first_day)
+    # in so small a room every place shows the box, and would contradict a start that is found
+    told = {"start.poses.robot": true_pose(0.0, 0.4).tolist(), "known_map.update": True}
+    result = localised(log, first_day, output=tmp_path / "later", **told)
+    retired = result.summary["known_map"]["retired"]
+    # two sides of the box were seen; the third is in line with nothing
+    assert retired
+    for entry in retired:
+        middle = np.mean(entry["extent"], axis=0)
+        assert 6.9 < middle[0] < 10.1
+        assert -0.1 < middle[1] < 0.9
+        assert entry["last_seen_ns"]
+        assert entry["gone_ns"]
+    after = load_known_map(tmp_path / "later")
+    numbers = {mark.id for mark in after.landmarks}
+    assert not numbers & {entry["id"] for entry in retired}
+    assert len({mark.id for mark in before.landmarks} - numbers) == len(retired)
+    new = [mark for mark in after.landmarks if mark.id >= before.next_number]
+    assert any(np.hypot(*(mark.extent.mean(axis=0) - [8.5, 7.0])) < 0.3 for mark in new)
+
+
+def test_what_is_no_map_is_one_clear_line(tmp_path, first_day):
+    """Folders that are no results, of earlier versions, of later formats; nothing to continue."""
+    with pytest.raises(OutputError, match="not a result folder"):
+        load_known_map(tmp_path)
+    log = tmp_path / "later.mcap"
+    with pytest.raises(ConfigError, match="no map to continue"):
+        graphslam.smooth(drive(log), **{"known_map.update": True})
+    with pytest.raises(ConfigError, match="back end batch"):
+        localised(log, first_day, backend="ekf")
+    old = tmp_path / "old"
+    old.mkdir()
+    for path in first_day.rglob("*"):
+        target = old / path.relative_to(first_day)
+        if path.is_dir():
+            target.mkdir()
+        else:
+            target.write_bytes(path.read_bytes())
+    with np.load(first_day / JOINT_FILE) as file:
+        arrays = {name: file[name] for name in file.files if not name.startswith("landmark")}
+    np.savez(old / JOINT_FILE, **arrays)
+    with pytest.raises(OutputError, match="made by an earlier version"):
+        load_known_map(old)
+    np.savez(old / KNOWN_MAP_FILE, format=np.array(99))
+    with pytest.raises(OutputError, match="is of format 99"):
+        load_known_map(old)
+    (old / KNOWN_MAP_FILE).write_bytes(b"no archive")
+    with pytest.raises(OutputError, match=KNOWN_MAP_FILE):
+        load_known_map(old)
+
+
+def test_the_joint_covariance_has_the_marginals_of_the_landmarks(first_day):
+    """The common error of the world, which the mount places, is in it as in landmarks.json."""
+    saved = graphslam.load_result(first_day)
+    known = load_known_map(first_day)
+    assert [mark.id for mark in known.landmarks] == [mark.id for mark in saved.landmarks]
+    entries = json.loads((first_day / "landmarks.json").read_text())
+    bias = saved.config.front_end.floor_normal_m**2
+    cov = landmark_covariance(saved.joint, known.landmarks)
+    end = 0
+    for mark, entry in zip(known.landmarks, entries, strict=True):
+        begin, end = end, end + len(mark.cov)
+        own, told = cov[begin:end, begin:end], np.array(entry["covariance"])
+        if mark.kind != "point":
+            # along a wall is a gauge, of which a heading that settles by 1e-5 rad has a part
+            turn = rotation3(-mark.position[2])
+            own = own[1:, 1:] + np.diag([bias, 0.0])
+            told = (turn @ told @ turn.T)[1:, 1:]
+        np.testing.assert_allclose(own, told, rtol=1e-3, atol=1e-7)
