@@ -45,6 +45,9 @@ STANDING_SIGMA = 1e-4
 
 #: ns: step of the difference quotient by latency; about one period of common odometry
 LATENCY_STEP_NS = 50_000_000
+#: of so many motions a track is integrated by itself: NumPy's cost per call no longer counts, but
+#: whether arrays fit into the processor's cache does
+MANY_MOTIONS = 1000
 
 
 class Track(Readings):
@@ -334,8 +337,9 @@ def _integrated(asked: Sequence[tuple[Track, IntArray, IntArray]]) -> list[Motio
     for k, (track, _, _) in enumerate(asked):
         of_track[track].append(k)
     alike: dict[Hashable, list[Track]] = defaultdict(list)
-    for track in of_track:
-        alike[track.batch_key].append(track)
+    for track, numbers in of_track.items():
+        is_few = sum(len(asked[k][1]) for k in numbers) < MANY_MOTIONS
+        alike[track.batch_key if is_few else track].append(track)
     found: dict[int, Motions] = {}
     for tracks in alike.values():
         order = [k for track in tracks for k in of_track[track]]
