@@ -167,7 +167,10 @@ class Readings:
     def _grow(self) -> None:
         for name in _ARRAYS:
             full = getattr(self, name)
-            setattr(self, name, np.concatenate([full, np.empty_like(full)]))
+            # what is not written yet takes no memory, so nothing is put there
+            grown = np.empty((2 * len(full), *full.shape[1:]), dtype=full.dtype)
+            grown[: len(full)] = full
+            setattr(self, name, grown)
 
     def _integrate_pending(self) -> None:
         """Integrate the readings that came since a motion was last needed, all at once."""
