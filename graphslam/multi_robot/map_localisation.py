@@ -20,7 +20,6 @@ from graphslam.mapping.submaps import SubmapPose, drift_covariance
 from graphslam.multi_robot.place_recognition import (
     ABSENT_WEIGHT,
     MAX_ABSENT_SHARE,
-    MAX_DIFFERING_SHARE,
     MIN_MATCHES,
     PlaceMap,
     consensus,
@@ -44,6 +43,11 @@ from graphslam.perception.scan_matching import (
 
 #: hypotheses that are judged at most, the best supported first
 MAX_HYPOTHESES = 5
+#: share of the confirmed places that may contradict a hypothesis: what changed, or is seen badly
+MAX_CONTRADICTED_SHARE = 0.3
+#: share of the best one's support from which another hypothesis is a rival whatever contradicts it;
+#: others are from half of it on, unless they are contradicted
+EQUAL_SHARE = 0.7
 #: m: what the map has around a place is from its places within this distance
 AROUND_M = 6.0
 #: m, rad: a place may be so far off where its hypothesis puts it, which is drift of the path
@@ -80,7 +84,7 @@ class Support:
     @property
     def is_contradicted(self) -> bool:
         """Whether more places contradict it than a few that changed."""
-        return bool(self.contradicted.sum() > MAX_DIFFERING_SHARE * self.confirmed.sum())
+        return bool(self.contradicted.sum() > MAX_CONTRADICTED_SHARE * self.confirmed.sum())
 
 
 def hypotheses(known: PlaceMap, own: PlaceMap, config: MultiRobotConfig) -> list[Hypothesis]:
@@ -176,11 +180,12 @@ def choose(
         config.min_place_extent_m
     ):
         return "the places that are recognised extend over less than multi_robot.min_place_extent_m"
+    others = [x for x in found if _differ(one, x)]
+    rivals = [x.total for x in others if not x.is_contradicted]
+    if has_rival(one.total, rivals) or has_rival(one.total, [x.total for x in others], EQUAL_SHARE):
+        return "it has places that look alike, and the path fits into it in more than one way"
     if one.is_contradicted:
         return f"{int(one.contradicted.sum())} of {len(places)} places contradict it"
-    rivals = [x.total for x in found if not x.is_contradicted and _differ(one, x)]
-    if has_rival(totals[best], rivals):
-        return "it has places that look alike, and the path fits into it in more than one way"
     return best
 
 

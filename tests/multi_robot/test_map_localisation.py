@@ -1,0 +1,59 @@
+"""Which of several hypotheses about a start in a known map is believed."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from graphslam.core.config import MultiRobotConfig
+from graphslam.multi_robot.map_localisation import Support, choose
+
+#: places along a corridor, 3 m apart
+POSES = np.column_stack([3.0 * np.arange(6), np.zeros(6), np.zeros(6)])
+PLACES = [SimpleNamespace(pose=pose) for pose in POSES]
+
+
+def hypothesis(score, contradicted, shift_m=0.0):
+    """All places confirmed with a score, the first few contradicted."""
+    return Support(
+        POSES + [shift_m, 0.0, 0.0],
+        np.full(6, score),
+        np.ones(6, bool),
+        np.arange(6) < contradicted,
+    )
+
+
+def chosen(*found):
+    return choose(found, PLACES, MultiRobotConfig())
+
+
+def test_the_best_is_taken_where_others_are_contradicted():
+    """A building that repeats itself in part must not be refused for it."""
+    assert chosen(hypothesis(0.5, 3, 8.0), hypothesis(0.9, 0)) == 1
+
+
+@pytest.mark.parametrize(
+    "rival",
+    [
+        pytest.param(hypothesis(0.5, 0, 8.0), id="not contradicted"),
+        pytest.param(hypothesis(0.8, 5, 8.0), id="nearly as good whatever contradicts it"),
+    ],
+)
+def test_a_rival_leaves_it_undecided(rival):
+    """The right one of two may be the one that furniture contradicts."""
+    assert "more than one way" in chosen(hypothesis(0.9, 0), rival)
+
+
+def test_another_beginning_of_one_path_is_no_rival():
+    """Hypotheses that end at the same path are one."""
+    assert chosen(hypothesis(0.9, 0), hypothesis(0.85, 0, 0.2)) == 0
+
+
+def test_too_little_is_refused():
+    """Few places, places of one room, and places that contradict the map."""
+    few = replace(hypothesis(0.9, 0), confirmed=np.arange(6) < 3)
+    assert "only 3 of 6" in chosen(few)
+    wide = MultiRobotConfig(min_place_extent_m=20.0)
+    assert "extend over less" in choose([hypothesis(0.9, 0)], PLACES, wide)
+    assert "3 of 6 places contradict it" in chosen(hypothesis(0.9, 3))
