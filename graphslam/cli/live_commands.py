@@ -33,6 +33,15 @@ LiveHorizon = Annotated[
         help="Poses older than this are not improved any more; default live.horizon_s.",
     ),
 ]
+LivePriorMap = Annotated[
+    Path | None,
+    typer.Option(
+        "--prior-map",
+        metavar="DIR",
+        help="Localise the robots in the map of an earlier result; --start says where in it they "
+        "begin.",
+    ),
+]
 
 
 @command("follow")
@@ -42,6 +51,7 @@ def follow(
     horizon: LiveHorizon = None,
     front_end: FrontEnd = None,
     start: Starts = None,
+    prior_map: LivePriorMap = None,
     preset: Preset = None,
     config: ConfigFile = None,
     settings: Settings = None,
@@ -52,7 +62,9 @@ def follow(
     Keeps a result folder current: causal trajectories, landmarks, a grid map and report.html. Ends
     when the recorder closes the file, when the file has not grown for live.wait_s, or with Ctrl-C.
     """
-    chosen = smoothing_settings(None, front_end, start, settings, horizon=horizon)
+    chosen = smoothing_settings(
+        None, front_end, start, settings, prior_map=prior_map, horizon=horizon
+    )
     if horizon is not None:
         chosen = ["backend.name=isam2", *chosen]
     tree = load_config(config, chosen, preset)

@@ -25,11 +25,12 @@ import numpy as np
 
 from graphslam.core.config import Config, RobustConfig
 from graphslam.core.geometry import Array, rotate_cov
+from graphslam.core.known_landmarks import KnownLandmarks
 from graphslam.core.records import Estimate, Step
 from graphslam.estimation import factors
 from graphslam.estimation.dormant_variables import DormantVariables, covariance
 from graphslam.estimation.factor_graph import GraphBackend, GraphBuilder
-from graphslam.estimation.square_root import eliminate, stacked
+from graphslam.estimation.square_root import Rows, eliminate, stacked
 from graphslam.estimation.window import IndeterminateWindowError, Window, WindowFactor
 
 
@@ -83,6 +84,9 @@ class FixedLagBackend(GraphBackend):
         seen = {
             factors.landmark_key(a.target) for a in step.associations if isinstance(a.target, int)
         }
+        if step.known is not None:
+            self._take_known(step.known)
+            step = replace(step, known=None)
         self._wake([key for key in seen if key in self._dormant])
         self._put_to_sleep(seen)
         window = self._window
@@ -99,6 +103,18 @@ class FixedLagBackend(GraphBackend):
         except IndeterminateWindowError as error:
             raise self.builder.indeterminate_at(error.key) from error
         self._marginalise_before(step.time_ns - self._horizon_ns)
+
+    def _take_known(self, known: KnownLandmarks) -> None:
+        """Known landmarks begin in the prior, at their means; what is not seen becomes dormant."""
+        for number, mean in known.means.items():
+            self.builder.landmark_dims[number] = len(mean)
+            self.builder.rows += len(mean)
+            self._window.insert(factors.landmark_key(number), mean)
+        rows = []
+        for numbers, row in known.rows():
+            dims = {factors.landmark_key(n): len(known.means[n]) for n in numbers}
+            rows.append(Rows(dims, row, np.zeros(len(row))))
+        self._window.absorb(rows)
 
     def _wake(self, keys: Sequence[int]) -> None:
         """Take dormant landmarks that are seen again into the window."""

@@ -6,13 +6,13 @@ that of the window, of the map and of one small table of the states' times.
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from graphslam.core.config import Config
-from graphslam.core.geometry import Array, between, compose, inverse, transform
-from graphslam.core.records import Estimate, Landmark, Message
+from graphslam.core.geometry import Array, between, compose, compose_cov, inverse, transform
+from graphslam.core.records import Estimate, Landmark, Message, Start, Step
 from graphslam.estimation.fixed_lag import FixedLagBackend
 from graphslam.logs import LogSet
 from graphslam.mapping.landmark_records import make_landmarks
@@ -66,6 +66,10 @@ class LivePass(Pipeline):
         super().__init__(log, config, known)
         memory_s = max(self.config.backend.horizon_s, SHORTEST_MEMORY_S)
         self._memory_ns = round(1e9 * memory_s)
+        self._known_map = known.known_map
+        if self._known_map is not None:
+            self.landmarks.add_known(self._known_map.entries(min(self.runs)))
+            self.landmarks.begin_at(self._known_map.next_number)
         self._reported: dict[str, LiveEstimate] = {}
         self._closures = 0  # that were reported
 
@@ -76,6 +80,21 @@ class LivePass(Pipeline):
             for robot, run in self.started.items():
                 yield from self._report(robot, run, event)
             self.forget()
+
+    def start_step(self, robot: str, time_ns: int) -> Step:
+        """See `StepRecorder`; a known map enters with the first robot."""
+        step = super().start_step(robot, time_ns)
+        if self._known_map is None or self.started:
+            return step
+        return replace(step, known=self._known_map.known)
+
+    def start_prior(self, robot: str) -> Start:
+        """See `LogPass`; in a known map that is the world of the states, which are the sensor's."""
+        if self._known_map is None:
+            return super().start_prior(robot)
+        told, track = self.starts[robot], self.runs[robot].track
+        cov = compose_cov(told.pose, told.cov, track.mount, track.mount_cov)
+        return Start(compose(told.pose, track.mount), cov)
 
     def _report(self, robot: str, run: RobotState, event: Event) -> Iterator[LiveEstimate]:
         """The estimates of a robot at its new scans, or else at its sightings in ``event``."""
@@ -95,7 +114,7 @@ class LivePass(Pipeline):
             np.array(stamps, dtype=np.int64),
             when,
             mounts,
-            self.starts[frame].pose,
+            None if self._known_map is not None else self.starts[frame].pose,
             self.frames.away.get(frame, 0.0),
         )
         run.scans.clear()

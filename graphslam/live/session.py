@@ -10,7 +10,7 @@ from typing import Any
 
 from graphslam.core.config import Config
 from graphslam.core.config_io import chosen_config
-from graphslam.core.errors import ConfigError, LogError
+from graphslam.core.errors import ConfigError, EstimationError, LogError
 from graphslam.core.records import Landmark, Message, Scan, Sighting
 from graphslam.live.live_pass import LiveEstimate, LivePass
 from graphslam.logs import LogSet
@@ -18,6 +18,7 @@ from graphslam.logs.decoders import TopicContext
 from graphslam.logs.time_order import TOO_LATE, MessageSorter
 from graphslam.logs.topics import MOTION_KINDS, Topic
 from graphslam.multi_robot.frame_tree import FrameAssignment
+from graphslam.results.known_map import known_map_of
 from graphslam.slam.log_pass import PriorKnowledge
 from graphslam.slam.log_reader import TRUE_RECORDS
 from graphslam.slam.recorded_closures import RecordedClosures
@@ -171,6 +172,8 @@ def live_config(config: Config) -> Config:
         raise ConfigError(
             "start.from_truth: needs a whole log; give start.poses for live estimates"
         )
+    if config.known_map.update:
+        raise ConfigError("known_map.update: needs a whole log; smooth the recording with --update")
     horizon = backend.horizon_s if math.isfinite(backend.horizon_s) else config.live.horizon_s
     return replace(config, backend=replace(backend, name="isam2", horizon_s=horizon))
 
@@ -227,10 +230,23 @@ def expected_log(kinds: Mapping[str, Sequence[type[Message]]], config: Config) -
 
 
 def known_starts(log: LogSet, config: Config) -> PriorKnowledge:
-    """The starts that were told; a robot without one is alone in its frame."""
+    """The starts that were told; a robot without one is alone in its frame, and the known map.
+
+    Raises:
+        EstimationError: there is a known map, and it was not told where in it a robot starts.
+        OutputError: the map cannot be read.
+    """
     starts = start_poses(log, config)
+    known_map = known_map_of(config)
+    missing = [robot for robot in log.robots if robot not in config.start.poses]
+    if known_map is not None and missing:
+        raise EstimationError(
+            f"robot {missing[0]}: live estimates in the map {known_map.name} need its start; give "
+            f"--start {missing[0]}=x,y,phi (m, rad), or smooth the recording, which finds it"
+        )
     world = min(starts)
     frames = {robot: world if robot in starts else robot for robot in log.robots}
     every = {robot: starts.get(robot, origin(config)) for robot in log.robots}
     assignment = FrameAssignment(every, frames, world)
-    return PriorKnowledge(assignment, RecordedClosures(every, frames, frozenset(), {}))
+    recorded = RecordedClosures(every, frames, frozenset(), {})
+    return PriorKnowledge(assignment, recorded, known_map=known_map)

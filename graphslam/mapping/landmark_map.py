@@ -110,6 +110,10 @@ class LandmarkMap:
         self.known |= {n: (e.mean.copy(), e.extent.copy()) for n, e in entries.items()}
         self.known_pairs |= _near_each_other(list(entries.values()))
 
+    def begin_at(self, number: int) -> None:
+        """New landmarks have this number and those after it."""
+        self._next = max(self._next, number)
+
     def without_known(self, into: Mapping[int, int]) -> dict[int, int]:
         """Merges, those of landmarks of an earlier map left out: they are what they were."""
         return {gone: kept for gone, kept in into.items() if gone not in self.known}

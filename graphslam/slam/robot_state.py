@@ -118,13 +118,13 @@ class RobotState:
         stamps: IntArray,
         times: IntArray,
         laser: Array,
-        start: Array,
+        start: Array | None,
         away_m: float = 0.0,
     ) -> "Causal":
         """The causal trajectories at stamps (n,), which are times (n,) of the common clock.
 
         ``laser`` (n, 3): mounts of the sensors whose poses are asked for, if the robot has scans;
-        ``start`` and ``away_m``: see `causal`.
+        ``start`` and ``away_m``: see `causal`; without ``start`` the world is that of the states.
         """
         poses = np.array(self.causal_poses) - np.array([away_m, 0.0, 0.0])
         known = Trajectory(np.array(self.times, dtype=np.int64), poses, np.array(self.causal_covs))
@@ -135,7 +135,8 @@ class RobotState:
             times = times + late_ns[last]
         causal = causal_at(known, last, self.calibrations, self.track, times, stamps)
         mount = np.array([self.track.mount_of(c) for c in self.calibrations])[last]
-        causal = transform_trajectory(causal, origin_shift(start, mount))
+        if start is not None:
+            causal = transform_trajectory(causal, origin_shift(start, mount))
         scan = trajectory_of_mount(causal, laser) if self.scans else None
         return Causal(trajectory_of_mount(causal, inverse(mount)), scan)
 

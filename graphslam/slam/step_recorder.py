@@ -35,12 +35,15 @@ class StepRecorder(LogPass):
         Raises:
             EstimationError: it is not known where.
         """
-        start = self.start_prior(robot)
-        step = Step(time_ns, starts={robot: start})
+        step = self.start_step(robot, time_ns)
         self.record_covariances()
         self.backend.add(step)
         self.steps.append(step)
         self.record_state(robot, time_ns, self.backend.state_mean(robot))
+
+    def start_step(self, robot: str, time_ns: int) -> Step:
+        """The step that gives a robot its first state."""
+        return Step(time_ns, starts={robot: self.start_prior(robot)})
 
     def start_if_needed(self, robot: str, time_ns: int) -> None:
         """Give a robot its first state, at ``time_ns`` or where its odometry begins, if earlier."""

@@ -191,3 +191,47 @@ def test_messages_of_which_nothing_can_be_estimated_are_refused(room):
     for messages in (odometry, []):
         with pytest.raises(graphslam.LogError, match="needs odometry and scans or sightings"):
             list(graphslam.Session().process(messages))
+
+
+@pytest.fixture(scope="module")
+def known(tmp_path_factory):
+    """The map of the first day, in whose world the robot starts at the origin."""
+    folder = tmp_path_factory.mktemp("known")
+    graphslam.smooth(drive(folder / "monday.mcap", seconds=32), output=folder / "monday")
+    return str(folder / "monday")
+
+
+def off(estimate):
+    """Distance, m, from the true position relative to that at the start."""
+    true = between(true_pose(0.0), true_pose(1e-9 * (estimate.stamp_ns - START_NS)))
+    return float(np.hypot(*(estimate.pose - true)[:2]))
+
+
+def test_a_robot_that_comes_back_is_localised_in_the_known_map(room, known):
+    """A start that is told 6 cm and 0.03 rad wrong is put right by the walls, and only by them.
+
+    3 cm once it moves: the error of that map. Without the map the error of the start remains.
+    """
+    start = {"poses": {"robot": [0.05, -0.04, 0.03]}}
+    later = slice(10, 60)
+    with_map = graphslam.Session(start=start, known_map={"directory": known})
+    found = list(with_map.process(room[1][:800]))[later]
+    assert max(map(off, found)) < 0.03
+    assert all(e.frame == "robot" for e in found)
+    alone = list(graphslam.Session(start=start).process(room[1][:800]))[later]
+    assert np.median(list(map(off, alone))) > 0.04
+    before = {m.id for m in graphslam.load_result(known).landmarks}
+    assert before <= {m.id for m in with_map.landmarks}
+    # what is not in view is out of the window: that the map is large costs nothing
+    assert len(with_map._pass.backend._window.dims) < len(before) + 40
+
+
+def test_a_known_map_needs_a_start_and_is_not_continued(room, known):
+    """Both take the whole log."""
+    with pytest.raises(graphslam.EstimationError, match=r"need its start; give --start robot="):
+        list(graphslam.Session(known_map={"directory": known}).process(room[1]))
+    with pytest.raises(graphslam.ConfigError, match="smooth the recording with --update"):
+        graphslam.Session(known_map={"directory": known, "update": True})
+    with pytest.raises(graphslam.OutputError, match="not a result folder"):
+        start = {"poses": {"robot": [0.0, 0.0, 0.0]}}
+        list(graphslam.Session(start=start, known_map={"directory": "none"}).process(room[1]))
