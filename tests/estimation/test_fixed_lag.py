@@ -7,9 +7,11 @@ import pytest
 
 from graphslam.core.config import Config, RobustConfig
 from graphslam.core.geometry import compose, rotate_cov, wrap
+from graphslam.core.known_landmarks import KnownLandmarks
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Motion, Start, Step
-from graphslam.estimation import dormant_variables, window
+from graphslam.core.sparse_gaussian import MAX_WIDENING, sparse_root
+from graphslam.estimation import dormant_variables, factors, window
 from graphslam.estimation.backends import BACKENDS
 
 S = 1_000_000_000
@@ -139,3 +141,58 @@ def test_no_landmark_vanishes_from_the_result(monkeypatch, horizon_s):
         if model != "line":
             sigmas = np.sqrt(np.diag(joint.cov[at, at]))
             assert np.all(np.abs(mean - place) < 5 * sigmas)
+
+
+def known_ring(seed):
+    """The landmarks of the ring as an earlier estimate has them: 4 cm each, half of it shared."""
+    rng = np.random.default_rng(seed)
+    places = {i: place for i, (_, place) in ring().items()}
+    dims = [len(place) for place in places.values()]
+    shared = np.concatenate([np.eye(dim, 3) for dim in dims])
+    cov = 0.03**2 * (np.eye(sum(dims)) + shared @ shared.T)
+    ends = np.cumsum(dims)
+    off = np.split(rng.multivariate_normal(np.zeros(sum(dims)), cov), ends[:-1])
+    means = {
+        i: compose(place, e) if len(e) == 3 else place + e
+        for (i, place), e in zip(places.items(), off, strict=True)
+    }
+    return KnownLandmarks(means, list(means), sparse_root(cov, dims)), cov
+
+
+@pytest.mark.parametrize("horizon_s", [5, 1000])
+def test_known_landmarks_enter_as_in_a_batch(horizon_s):
+    """With their joint covariance, seen or not; half a round of the ring is seen.
+
+    A tenth of a sigma, 5 % of sigma: the window keeps the first points of what left it.
+    """
+    known, _ = known_ring(3)
+    first, *rest = rounds(4, LAP_S // 2)
+    steps = [replace(first, known=known), *rest]
+    lag, full = smoother(horizon_s, "none"), smoother(np.inf, "none")
+    for step in steps:
+        lag.add(step)
+        full.add(step)
+    whole, found = full.finish(), lag.finish()
+    assert found.landmarks.keys() == whole.landmarks.keys() == set(range(LANDMARKS))
+    for i, (mean, cov) in whole.landmarks.items():
+        sigma = np.sqrt(np.diag(cov))
+        np.testing.assert_array_less(np.abs(found.landmarks[i][0] - mean), 0.1 * sigma)
+        np.testing.assert_allclose(np.sqrt(np.diag(found.landmarks[i][1])), sigma, rtol=0.05)
+
+
+def test_known_landmarks_out_of_sight_are_dormant_at_once():
+    """A large map costs the window nothing, and keeps its covariance, widened as it was."""
+    known, cov = known_ring(5)
+    first, second = rounds(6, 1)
+    backend = smoother(5, "none")
+    backend.add(replace(first, known=known))
+    assert set(backend._window.dims) == {factors.state_key(0, 0)}
+    keys = [factors.landmark_key(i) for i in known.means]
+    there = backend.covariance(keys)
+    assert 1.0 <= known.root.widening <= MAX_WIDENING
+    # nowhere more certain than the joint; what the sparse root neglects makes it less so
+    ratio = np.linalg.eigvals(np.linalg.solve(cov, there)).real
+    assert ratio.min() > 1.0 - 1e-9
+    assert ratio.max() < 3.0
+    backend.add(second)
+    assert 3 < len(backend._window.dims) < 20
