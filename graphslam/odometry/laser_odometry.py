@@ -76,7 +76,7 @@ class LaserOdometry:
         points = scan_points(undistorted(scan, _of_laser(velocity, scan.mount)), self._max_range_m)
         last, self._last = self._last, scan
         if last is None:
-            self._refer_to(points)
+            self._refer_to(points, scan.mount)
             return []
         seconds = max(1e-9 * (scan.time_ns - last.time_ns), SHORTEST_S)
         moved = exp(min(seconds, PREDICTED_S) * velocity)
@@ -101,7 +101,7 @@ class LaserOdometry:
         if near and found.share > 0.0 and len(self._ways) < REFERENCE_SCANS:
             return []
         made = self.finish()
-        self._refer_to(points)
+        self._refer_to(points, scan.mount)
         return made
 
     def finish(self) -> list[OdometryIncrement]:
@@ -127,13 +127,13 @@ class LaserOdometry:
             moved, seconds = compose(moved, increment), seconds + span
         return np.asarray(log(moved) / max(seconds, VELOCITY_S))
 
-    def _refer_to(self, points: Array) -> None:
-        """Make the last scan, of points (n, 2), the reference."""
+    def _refer_to(self, points: Array, mount: Array) -> None:
+        """Make the last scan, of points (n, 2), by a laser at ``mount`` (3,), the reference."""
         back = inverse(self._pose)
         kept = self._scans[1 - MAP_SCANS :]
         self._scans = [moved_scan(scan, back) for scan in kept]
         self._scans.append((points, scan_information(points, self._config)))
-        self._map = scan_map(self._scans, self._config)
+        self._map = scan_map(self._scans, mount, self._config)
         self._pose, self._cov, self._stated = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
 
 

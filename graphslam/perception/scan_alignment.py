@@ -13,7 +13,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from graphslam.core.config import ScanMatchingConfig
-from graphslam.core.geometry import Array, rotation, transform, wrap
+from graphslam.core.geometry import Array, inverse, rotation, transform, wrap
+from graphslam.perception.ordered_scan import Mask
 from graphslam.perception.point_to_line import (
     gauss_newton_step,
     normal_equations,
@@ -21,9 +22,11 @@ from graphslam.perception.point_to_line import (
     step_poses,
 )
 from graphslam.perception.scan_matching import (
+    BEAMS,
     CORRELATED_POINTS,
     MIN_NEIGHBOURS,
     SAME_SIGMAS,
+    beam_of,
     make_submap,
     match,
 )
@@ -49,7 +52,8 @@ ALONG_M = np.array([-0.4, -0.3, -0.2, -0.1, 0.1, 0.2, 0.3, 0.4])
 #: by so much more of the points must another pose lie on others, to be preferred
 BETTER_SHARE = 0.04
 #: share of points on others below which a pose is looked for elsewhere, and below which the scan
-#: says nothing
+#: says nothing. As much of the points out of view counts as on others: what a laser that looks
+#: back sees is new on either side, and would be on others if the robot had not moved on
 USUAL_SHARE, LOST_SHARE = 0.8, 0.3
 #: a direction is one of motion, not of turning, if this share of it is; steps of poses that are
 #: only compared, and information (1/m², 1/rad²) that holds them
@@ -60,22 +64,29 @@ OPEN_SHARE, COMPARED_STEPS, HOLD = 0.7, 1, 100.0
 class AlignedScan:
     """Where a scan lies in a map: ``pose`` (3,), and the ``share`` of its points on others.
 
-    ``information`` (3, 3) is that of the scan alone, without the prediction, by additive errors
-    along the axes of the map; zero where the scan fits nowhere.
+    ``agreement``: that share, as much of those out of view as usual included, which is what poses
+    are compared by. ``information`` (3, 3) is that of the scan alone, without the prediction, by
+    additive errors along the axes of the map; zero where the scan fits nowhere.
     """
 
     pose: Array
     information: Array
     share: float
+    agreement: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanMap:
-    """Points (n, 2) m that some scans saw and their ``information`` (n, 2, 2), see `Submap`."""
+    """Points (n, 2) m that some scans saw and their ``information`` (n, 2, 2), see `Submap`.
+
+    The last scan was made at ``mount`` (3,); ``in_view`` (`BEAMS`,) says which degrees it saw.
+    """
 
     points: Array
     information: Array
     tree: cKDTree
+    mount: Array
+    in_view: Mask
     config: ScanMatchingConfig
 
     def linearise(self, points: Array, poses: Array, reach_m: float) -> tuple[Array, Array, Array]:
@@ -83,12 +94,9 @@ class ScanMap:
 
         Returns:
             Information (n, 3, 3) and gradient (n, 3), in which `CORRELATED_POINTS` count as one,
-            and the shares (n,) of points on others: all 0 with hardly any neighbours.
+            and how much (n, m) of each point is on others: all 0 with hardly any neighbours.
         """
-        c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
-        x, y = points.T
-        arms = np.stack([c * x - s * y, s * x + c * y], axis=-1)
-        placed = arms + poses[:, None, :2]
+        placed, arms = _placed(points, poses)
         distance, near = self.tree.query(placed, distance_upper_bound=reach_m)
         ok = distance < np.inf
         near = np.where(ok, near, 0)
@@ -96,14 +104,36 @@ class ScanMap:
         w = ok / (1.0 + squared / 4.0)
         w[ok.sum(axis=1) < MIN_NEIGHBOURS] = 0.0
         A, g = normal_equations(np.einsum("knm,nm->kn", terms, w))
-        return A / CORRELATED_POINTS, g / CORRELATED_POINTS, w.mean(axis=1)
+        return A / CORRELATED_POINTS, g / CORRELATED_POINTS, w
+
+    def agreements(self, points: Array, poses: Array, on_others: Array) -> Array:
+        """See `AlignedScan`: (n,) of points (m, 2) from n poses (n, 3), by `linearise`."""
+        x, y = transform(inverse(self.mount), _placed(points, poses)[0].reshape(-1, 2)).T
+        new = ~self.in_view[beam_of(x, y)].reshape(on_others.shape) & (on_others == 0.0)
+        return np.asarray((on_others + USUAL_SHARE * new).mean(axis=1))
 
 
-def scan_map(scans: Sequence[tuple[Array, Array]], config: ScanMatchingConfig) -> ScanMap:
-    """A map of scans: points (n, 2) and `scan_information` (n, 2, 2) of each, in one frame."""
+def _placed(points: Array, poses: Array) -> tuple[Array, Array]:
+    """Points (m, 2) seen from each of n poses (n, 3), and their arms: (n, m, 2) each."""
+    c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
+    x, y = points.T
+    arms = np.stack([c * x - s * y, s * x + c * y], axis=-1)
+    return arms + poses[:, None, :2], arms
+
+
+def scan_map(
+    scans: Sequence[tuple[Array, Array]], mount: Array, config: ScanMatchingConfig
+) -> ScanMap:
+    """A map of scans: points (n, 2) and `scan_information` (n, 2, 2) of each, in one frame.
+
+    The last of them was made by a laser at ``mount`` (3,).
+    """
     points = np.concatenate([points for points, _ in scans])
     information = np.concatenate([information for _, information in scans])
-    return ScanMap(points, information, cKDTree(points), config)
+    seen = np.zeros(BEAMS, dtype=np.bool_)
+    seen[beam_of(*transform(inverse(mount), scans[-1][0]).T)] = True
+    in_view = seen | np.roll(seen, 1) | np.roll(seen, -1)  # angles between beams may be larger
+    return ScanMap(points, information, cKDTree(points), mount, in_view, config)
 
 
 def scan_information(points: Array, config: ScanMatchingConfig) -> Array:
@@ -134,7 +164,7 @@ def align_scan(
     Returns:
         The pose; that which was predicted, without a share, if the scan fits nowhere.
     """
-    lost = AlignedScan(guess, np.zeros((3, 3)), 0.0)
+    lost = AlignedScan(guess, np.zeros((3, 3)), 0.0, 0.0)
     if len(points) < MIN_NEIGHBOURS:
         return lost
     points = points[:: -(-len(points) // ALIGNED_POINTS)]
@@ -162,7 +192,7 @@ def _trusted(information: Array) -> Array:
 
 
 def _better(other: AlignedScan, one: AlignedScan) -> AlignedScan:
-    return other if other.share > one.share + BETTER_SHARE else one
+    return other if other.agreement > one.agreement + BETTER_SHARE else one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,18 +210,19 @@ class _Alignment:
 
     def from_start(self, start: Array, guess: Array, reach_m: float) -> AlignedScan:
         """The alignment from a start (3,), given a guess (3,)."""
-        x, seen, share = start[None].copy(), np.zeros((3, 3)), 0.0
+        x = at = start[None].copy()
         for _ in range(ITERATIONS):
-            A, g, shares = self.scans.linearise(self.points, x, reach_m)
+            A, g, on_others = self.scans.linearise(self.points, x, reach_m)
             off = x[0] - guess
             off[2] = wrap(off[2])
-            seen, share = A[0], float(shares[0])
+            seen, at = A[0], x
             step = gauss_newton_step(seen + self.information, g[0] + self.information @ off)
             x = step_poses(x, step)
             if reach_m <= self.near_m and np.abs(step).max() < CONVERGED:
                 break
             reach_m = max(self.near_m, 0.5 * reach_m)
-        return AlignedScan(x[0], seen, share)
+        agreement = self.scans.agreements(self.points, at, on_others)
+        return AlignedScan(x[0], seen, float(on_others.mean()), float(agreement[0]))
 
     def better_along(self, best: AlignedScan, guess: Array) -> AlignedScan:
         """The best of poses along the direction in which the scan says least, if that is open."""
@@ -203,9 +234,10 @@ class _Alignment:
         for _ in range(COMPARED_STEPS):
             A, g, _ = self.scans.linearise(self.points, x, self.near_m)
             x = step_poses(x, gauss_newton_step(A + HOLD * np.eye(3), g))
-        shares = self.scans.linearise(self.points, x, self.near_m)[2]
-        top = int(shares.argmax())
-        if shares[top] <= best.share + BETTER_SHARE:
+        on_others = self.scans.linearise(self.points, x, self.near_m)[2]
+        agreements = self.scans.agreements(self.points, x, on_others)
+        top = int(agreements.argmax())
+        if agreements[top] <= best.agreement + BETTER_SHARE:
             return best
         return _better(self.from_start(x[top], x[top], self.near_m), best)
 

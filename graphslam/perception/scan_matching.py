@@ -98,7 +98,7 @@ class Submap:
         """
         x, y = np.concatenate(self.clouds).T
         scan = np.repeat(np.arange(len(self.clouds)), [len(cloud) for cloud in self.clouds])
-        r, at = np.hypot(x, y), scan * BEAMS + _beam(x, y)
+        r, at = np.hypot(x, y), scan * BEAMS + beam_of(x, y)
         returns = np.full((2, len(self.clouds) * BEAMS), np.inf)
         np.minimum.at(returns[0], at, r)
         np.minimum.at(returns[1], at, -r)
@@ -147,7 +147,8 @@ def make_submap(
     return Submap(points, information, np.asarray(poses), clouds, tree, config)
 
 
-def _beam(x: Array, y: Array) -> IntArray:
+def beam_of(x: Array, y: Array) -> IntArray:
+    """Degree of a range image, 0 to `BEAMS` - 1, in which points (...), m, of its sensor lie."""
     degrees = np.arctan2(y, x) * (BEAMS / (2 * np.pi))
     return np.asarray(np.round(degrees).astype(np.intp) % BEAMS)
 
@@ -388,7 +389,7 @@ def compare_with_scans(points: Array, submap: Submap) -> tuple[BoolArray, BoolAr
     dx, dy = px - poses[:, :1], py - poses[:, 1:2]
     # not hypot: it takes as long as all of the rest
     r = np.sqrt(dx * dx + dy * dy)
-    at = _beam(c * dx + s * dy, c * dy - s * dx) + BEAMS * np.arange(len(poses))[:, None]
+    at = beam_of(c * dx + s * dy, c * dy - s * dx) + BEAMS * np.arange(len(poses))[:, None]
     near = np.zeros(r.shape, dtype=np.bool_)
     same_m = np.float32(SAME_SIGMAS * submap.config.point_sigma_m)
     with np.errstate(invalid="ignore"):
