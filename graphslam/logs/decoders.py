@@ -24,6 +24,9 @@ from graphslam.logs.point_cloud import beam_step, cloud_points, is_planar, sweep
 
 #: no planar laser takes longer for a sweep; it may take so much more of the time that is stated
 MAX_SWEEP_S, SWEEP_SLACK = 1.0, 1.05
+#: decimals of a heading, rad, that are taken from a quaternion. Written again, it differs by 1e-16:
+#: a solution, which ends where it has converged, would differ by 1e-9 m
+HEADING_DECIMALS = 12
 
 
 class UnusableMessageError(Exception):
@@ -201,7 +204,7 @@ def odometry(rows: Any, topic: TopicContext) -> list[records.OdometryPose | str]
         sine, cosine = 2 * (q_w * q_z + q_x * q_y), norm - 2 * (q_y * q_y + q_z * q_z)
     # numpy's arctan2 depends on the machine in the last digit
     yaw = list(map(math.atan2, sine.tolist(), cosine.tolist()))
-    poses = np.column_stack([rows["xyz"][:, :2], yaw])
+    poses = np.column_stack([rows["xyz"][:, :2], np.round(yaw, HEADING_DECIMALS)])
     is_rotation = ((norm > 0.5) & (norm < 2.0)).tolist()  # also false for NaN
     finite = np.isfinite(poses[:, :2]).all(axis=1).tolist()
     near = (np.abs(poses[:, :2]) <= limits.MAX_POSITION_M).all(axis=1).tolist()
