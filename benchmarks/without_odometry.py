@@ -4,7 +4,8 @@ Starts are drawn from their prior (1 cm, 0.01 rad), so that covariances can be j
 trajectories: error aligned as a whole and not, m; NEES per degree of freedom; share of the ellipses
 that 95 % should be in.
 
-Run: python benchmarks/without_odometry.py [SCENARIO ...] [--seeds 6]
+Run: python benchmarks/without_odometry.py [SCENARIO[:LASER] ...] [--seeds 6]
+Of several lasers the named one alone is used, for example two-lasers:rear.
 """
 
 import tempfile
@@ -16,7 +17,7 @@ from common import parser, simulated_log, smooth_log
 
 from graphslam.core.config import Config
 from graphslam.core.config_io import load_config
-from graphslam.core.records import OdometryPose
+from graphslam.core.records import OdometryPose, Scan
 from graphslam.evaluation.ground_truth import truth_of_logs
 from graphslam.evaluation.metrics import evaluate
 from graphslam.evaluation.monte_carlo_log_run import drawn_starts
@@ -25,10 +26,13 @@ from graphslam.logs import open_logs
 KEYS = ("ate_aligned_rmse_m", "ate_rmse_m", "nees_per_dof", "coverage")
 
 
-def without_odometry(path: Path) -> Config:
-    """Settings that leave the odometry of a log out."""
-    topics = open_logs([path], load_config()).topics
-    kept = {t.name: t.robot for t in topics if t.robot and t.record is not OdometryPose}
+def settings(path: Path, laser: str, *, odometry: bool) -> Config:
+    """Settings that leave out the odometry of a log, or lasers of other names."""
+    log = open_logs([path], load_config())
+    (robot,) = log.robots
+    left_out = {Scan} if odometry else {Scan, OdometryPose}
+    kept = {t.name: t.robot for t in log.topics if t.robot and t.record not in left_out}
+    kept |= {name: robot for name in log.sensors(robot) if name.endswith(laser)}
     config = load_config()
     return replace(config, logs=replace(config.logs, topics=kept))
 
@@ -55,9 +59,11 @@ def main() -> None:
         for scenario in arguments.scenarios:
             rows: dict[str, list[list[float]]] = {"with": [], "without": []}
             for seed in range(1, arguments.seeds + 1):
-                path = simulated_log(scenario, seed, Path(folder))
-                rows["with"].append(errors(path, load_config(), seed))
-                rows["without"].append(errors(path, without_odometry(path), seed))
+                name, _, laser = scenario.partition(":")
+                path = simulated_log(name, seed, Path(folder))
+                for row, found in rows.items():
+                    config = settings(path, laser, odometry=row == "with")
+                    found.append(errors(path, config, seed))
                 path.unlink()
             for name, found in rows.items():
                 mean = np.mean(found, axis=0)
