@@ -74,7 +74,7 @@ def real(folder: Path) -> dict[tuple[str, str], Make]:
     whole = {"victoria-park": imported("isam", victoria)}
     for name in ("intel", "aces"):
         if (DATA / "freiburg").is_dir():
-            whole[name] = lambda path, n=name: path.symlink_to(import_freiburg(n, path.parent))
+            whole[name] = lambda path, n=name: import_freiburg(n, path.parent) and None
     for source in sorted((DATA / "tinyslam").glob("*.dat.xz")):
         whole[f"tinyslam-{source.name.split('.')[0]}"] = imported("tinyslam", source)
     for source in sorted((DATA / "mrclam").glob("*.tar.xz")):
@@ -83,14 +83,17 @@ def real(folder: Path) -> dict[tuple[str, str], Make]:
         made["real", name] = make
         # increments of odometry, those of Victoria Park, are not written again
         for half in () if name == "victoria-park" else ("first", "second"):
-            path = folder / f"{name}.mcap"
-            made["real", f"{name}, {half} half"] = lambda p, s=path, h=half: write_half(s, h, p)
+            made["real", f"{name}, {half} half"] = lambda p, n=name, m=make, h=half: write_half(
+                folder / f"{n}.mcap", m, h, p
+            )
     for source in sorted((ROOT / "logs").glob("*.mcap")):
         made["logs/", source.stem] = lambda path, s=source: path.symlink_to(s)
     return made
 
 
-def write_half(source: Path, half: str, path: Path) -> None:
+def write_half(source: Path, make: Make, half: str, path: Path) -> None:
+    if not source.exists():
+        make(source)
     messages = recorded(source)
     middle = (messages[0].time_ns + messages[-1].time_ns) // 2
     write([m for m in messages if (m.time_ns < middle) == (half == "first")], path)
