@@ -17,7 +17,7 @@ PLACES = [SimpleNamespace(pose=pose) for pose in POSES]
 def hypothesis(score, contradicted, shift_m=0.0):
     """All places confirmed with a score, the first few contradicted."""
     return Support(
-        POSES + [shift_m, 0.0, 0.0],
+        POSES + np.array([shift_m, 0.0, 0.0]),
         np.full(6, score),
         np.ones(6, bool),
         np.arange(6) < contradicted,
