@@ -34,7 +34,6 @@ from graphslam.mapping.gating import (
 from graphslam.mapping.landmark_map import Entry, LandmarkMap
 from graphslam.mapping.robot_candidates import (
     NOT_THERE,
-    RejectedInARow,
     RobotTarget,
     predicted_joint,
     robot_associations,
@@ -130,7 +129,6 @@ class Associator:
         self._unsettled: set[int] = set()  # admitted, but not yet in the back end
         self._deleted: list[int] = []  # of the graph, see `take_deleted`
         self._floor = gate_floor(config)
-        self._rejected_robots = RejectedInARow()
 
     def associate(self, image: Image) -> tuple[Association, ...]:
         """What is to enter the graph of an image.
@@ -333,12 +331,14 @@ class Associator:
                 k = robots[n]
                 name = image.robots[-1 - of_robots.landmark[k]].name
                 self._record_innovation(image, of_robots.model[k], distances, k)
-                self._rejected_robots.accepted(image.robot, name)
                 out += robot_associations(image.robot, image.time_ns, [replace(o, robots=(name,))])
                 continue
             if not o.is_landmark:
+                # where landmarks have no names the estimate may have taken one for another, and
+                # it may be what is wrong: the sighting is used, under the robust kernel. MRCLAM 6
+                # without names of landmarks ends 0.6 m off where it is not, 0.094 m where it is
                 is_sure = bool(self.map.by_identity) or n not in of_robots.observation
-                if not is_sure and self._rejected_robots.is_one_too_many(image.robot, o.robots):
+                if not is_sure and len(o.robots) == 1:
                     out += robot_associations(image.robot, image.time_ns, [o])
                 else:
                     self.rejected[NOT_THERE] += 1

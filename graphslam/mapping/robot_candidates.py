@@ -5,7 +5,6 @@ the same gates. Unlike a landmark it has moved since its state, and a sighting t
 makes no new one.
 """
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -19,11 +18,6 @@ from graphslam.mapping.gating import PairDistances, Pairs, compare
 
 #: why a sighting that may be of robots only was not used
 NOT_THERE = "robot: not where it was seen"
-#: where landmarks have no names an estimate may have taken one for another. After so many sightings
-#: in a row that are not where a robot is expected, the next is used, under the robust kernel: it
-#: may be the estimate that is wrong. MRCLAM 6 without names of landmarks ends 0.59 m off without
-#: this rule, 0.12 with 3 and 0.106 with 1
-MAX_REJECTED = 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,28 +32,6 @@ class RobotTarget:
     name: str
     motion: Motion | None
     clock_shift: Array
-
-
-class RejectedInARow:
-    """How many sightings of a robot by another one were rejected, one after the other."""
-
-    def __init__(self) -> None:
-        """None yet."""
-        self._count: Counter[tuple[str, str]] = Counter()
-
-    def accepted(self, observer: str, robot: str) -> None:
-        """A sighting was where the robot is expected."""
-        self._count.pop((observer, robot), None)
-
-    def is_one_too_many(self, observer: str, robots: Sequence[str]) -> bool:
-        """Whether a sighting is to be used all the same, which is nowhere near ``robots``.
-
-        One that may be of several robots is not: it does not tell of which.
-        """
-        if len(robots) != 1:
-            return False
-        self._count[observer, robots[0]] += 1
-        return self._count[observer, robots[0]] > MAX_REJECTED
 
 
 def predicted_joint(
