@@ -324,6 +324,8 @@ class Associator:
         of_robots, distances = candidates.robot_pairs, candidates.robots_compared
         new_gate = gate_distance(config.new_landmark_probability, np.maximum(distances.dof, 1))
         near_robots = set(of_robots.observation[distances.d2 < new_gate].tolist())
+        # a robot takes one sighting of an image
+        taken = {image.robots[-1 - of_robots.landmark[k]].name for k in robots.values()}
         out: list[Association] = []
         for n, seen in enumerate(image.seen):
             o = seen
@@ -338,7 +340,8 @@ class Associator:
                 # it may be what is wrong: the sighting is used, under the robust kernel. MRCLAM 6
                 # without names of landmarks ends 0.6 m off where it is not, 0.094 m where it is
                 is_sure = bool(self.map.by_identity) or n not in of_robots.observation
-                if not is_sure and len(o.robots) == 1:
+                if not is_sure and len(o.robots) == 1 and o.robots[0] not in taken:
+                    taken.add(o.robots[0])
                     out += robot_associations(image.robot, image.time_ns, [o])
                 else:
                     self.rejected[NOT_THERE] += 1
