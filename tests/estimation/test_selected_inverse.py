@@ -89,7 +89,8 @@ def root_and_inverse(seed):
     P = np.linalg.inv(graph.hessian(ordering)[0])
     rows = covariance_blocks(graph, keep_rows=True).rows
     # the poses come first among the keys
-    root = information_root(rows, {"a": range(POSES // 2), "b": range(POSES // 2, POSES)})
+    states = {"a": range(POSES // 2), "b": range(POSES // 2, POSES)}
+    root = information_root(rows, states, {})
     return root, P[: 3 * POSES, : 3 * POSES].reshape(POSES, 3, POSES, 3).swapaxes(1, 2)
 
 
