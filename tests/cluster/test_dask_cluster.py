@@ -141,7 +141,8 @@ def test_who_takes_too_much_memory_is_named_and_the_rest_goes_on(three, tmp_path
     assert str(found["large.mcap"].error).startswith(
         "large.mcap: needs more memory than the 1000 MB"
     )
-    assert do.begun(tmp_path, "large") == 1
+    # it is not tried again; but a worker that `deadly` killed may have had it, and not told yet
+    assert do.begun(tmp_path, "large") <= 2
     assert isinstance(found["deadly.mcap"].error, WorkerLostError)
     assert str(found["deadly.mcap"].error).startswith("deadly.mcap: every worker that had it died")
 
