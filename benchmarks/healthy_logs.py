@@ -33,6 +33,7 @@ from mcap.reader import make_reader
 from graphslam.core.config_io import load_config
 from graphslam.evaluation.ground_truth import errors_of_run
 from graphslam.logs import LogWriter, open_logs, read_truth
+from graphslam.logs.containers import open_recording
 from graphslam.simulation import load_scenario, simulate
 from graphslam.simulation.scenario import ScenarioError
 from graphslam.slam.smooth import smooth
@@ -105,7 +106,7 @@ def write_part(source: Path, make: Make, part: str, path: Path) -> None:
         found = list(make_reader(stream).iter_messages(log_time_order=False))
     times = [message.log_time for _, _, message in found]
     begin, end = PARTS[part](min(times), max(times) + 1)
-    with LogWriter(path) as log:
+    with LogWriter(path, open_recording(source).notes) as log:
         for schema, channel, message in found:
             # mounts and true landmarks are told once, at the start
             always = channel.topic in ("/tf_static", "/true_landmarks")
