@@ -20,10 +20,9 @@ from graphslam.live.live_folder import write_live_folder
 from graphslam.live.live_pass import LiveEstimate
 from graphslam.live.session import INTRODUCTION_S, Session, live_config
 from graphslam.logs import LogSet
-from graphslam.logs.container_files import digest
 from graphslam.logs.future_stamps import Recorded
 from graphslam.logs.growing_mcap import GrowingMcap, open_growing
-from graphslam.logs.log_set import FileReader, decoded, log_set_of
+from graphslam.logs.log_set import FileReader, damage, decoded, log_set_of
 from graphslam.logs.recording import Recording, deriver
 from graphslam.logs.time_order import TOO_LATE
 from graphslam.results.folder import check_target
@@ -88,13 +87,11 @@ def follow(
         except GraphSlamError as error:
             folder.warnings.append(str(error))
             if len(folder.history):
-                folder.write("stopped", growing)
+                folder.write("stopped")
             raise
         if not len(folder.history):
             raise LogError(f"{path}: {state}, and nothing could be estimated; see `graphslam info`")
-        if growing.damage:
-            folder.warnings.append(f"{path}: damaged: {growing.damage}")
-        return folder.write(state, growing)
+        return folder.write(state, growing.recording())
 
 
 def _opened(
@@ -172,19 +169,24 @@ class _Folder:
             self._finish()
         due = now - self._written_s > max(WRITE_INTERVAL_S, WRITE_SHARE * self._took_s)
         if self._writing is None and due and len(self.history) > self._estimates:
-            self._begin("following", "")
+            self._begin("following", None)
 
-    def write(self, state: str, growing: GrowingMcap) -> dict[str, Any]:
-        """Write the folder a last time; its summary."""
+    def write(self, state: str, recording: Recording | None = None) -> dict[str, Any]:
+        """Write the folder a last time; its summary.
+
+        ``recording``: as it is at the end, if it can be read.
+        """
         if self._writing is not None:
             self._finish()
-        summary = self._begin(state, digest(growing.path) if growing.ended else "")
+        if recording is not None:
+            self.warnings += [finding.line for finding in damage([recording])]
+        summary = self._begin(state, recording)
         self._finish()
         return summary
 
-    def _begin(self, state: str, sha256: str) -> dict[str, Any]:
+    def _begin(self, state: str, recording: Recording | None) -> dict[str, Any]:
         landmarks = self._session.landmarks
-        summary = self._summary(state, sha256, landmarks)
+        summary = self._summary(state, recording, landmarks)
         write = partial(
             write_live_folder,
             self._target,
@@ -205,7 +207,9 @@ class _Folder:
         self._written_s = time.monotonic()
         self._took_s = self._written_s - self._began_s
 
-    def _summary(self, state: str, sha256: str, landmarks: tuple[Landmark, ...]) -> dict[str, Any]:
+    def _summary(
+        self, state: str, recording: Recording | None, landmarks: tuple[Landmark, ...]
+    ) -> dict[str, Any]:
         log, history, session = self._log, self.history, self._session
         counts = session.counts
         dropped = self.dropped + session.dropped
@@ -213,9 +217,9 @@ class _Folder:
             "logs": [
                 {
                     "path": str(log.files[0].path.resolve()),
-                    "sha256": sha256 or None,
-                    "messages": None,
-                    "lost": None,
+                    "sha256": recording and recording.sha256,
+                    "messages": recording and recording.messages,
+                    "lost": recording and recording.lost,
                 }
             ],
             "notes": dict(log.notes),

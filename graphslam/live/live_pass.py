@@ -12,7 +12,7 @@ import numpy as np
 
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array, between, compose, compose_cov, inverse, transform
-from graphslam.core.records import Estimate, Landmark, Message, Start, Step
+from graphslam.core.records import Estimate, Landmark, Message, Sighting, Start, Step
 from graphslam.estimation.fixed_lag import FixedLagBackend
 from graphslam.logs import LogSet
 from graphslam.mapping.landmark_records import make_landmarks
@@ -20,6 +20,7 @@ from graphslam.slam.log_pass import PriorKnowledge
 from graphslam.slam.pipeline import Pipeline
 from graphslam.slam.robot_state import RobotState
 from graphslam.slam.sighting_batches import Event, SightingBatch
+from graphslam.slam.synchronisation import ODOMETRY
 
 #: s: odometry that is kept, at least
 SHORTEST_MEMORY_S = 10.0
@@ -76,6 +77,8 @@ class LivePass(Pipeline):
     def estimates(self, messages: Iterable[Message]) -> Iterator[LiveEstimate]:
         """Take in messages, sorted by time; gives the estimates of each event."""
         for event in self.process(messages):
+            if not self.steps and _is_odometry(event):
+                continue  # most of a recording: nothing was seen, and nothing is to be forgotten
             self.record_covariances()
             for robot, run in self.started.items():
                 yield from self._report(robot, run, event)
@@ -170,9 +173,13 @@ class LivePass(Pipeline):
         return self.frames.label_landmarks(make_landmarks(moved, estimate), entries)
 
 
+def _is_odometry(event: Event) -> bool:
+    return not isinstance(event, SightingBatch) and isinstance(event[0], ODOMETRY)
+
+
 def _seen_at(robot: str, event: Event) -> list[int]:
     """When a robot saw something in ``event``: once at most."""
     if isinstance(event, SightingBatch):
         return [event.time_ns] if any(i[0].robot == robot for i in event.images) else []
     first = event[0]
-    return [first.time_ns] if first.robot == robot and hasattr(first, "z") else []
+    return [first.time_ns] if first.robot == robot and isinstance(first, Sighting) else []

@@ -66,24 +66,17 @@ class GrowingMcap:
         """What was read so far, as a recording."""
         return Recording(self.path, (self._indexer.result(),))
 
-    @property
-    def damage(self) -> str:
-        """What could not be read, in one line; empty if there is nothing."""
-        return "; ".join(self._indexer.damage)
-
     def messages(self) -> Iterator[RawMessage]:
         """The messages that `poll` found and that were not given yet, translated."""
-        indexer = self._indexer
-        names = {number: schema.name for number, schema in indexer.schemas.items()} | {0: ""}
         channels = {}
-        for number, c in indexer.channels.items():
-            found = translation(names.get(c.schema_id, ""), c.message_encoding)
-            channels[number] = c.topic, found.translate if found else None
-        blocks = indexer.blocks.blocks[self._given :]
+        for number, channel in self._indexer.described().items():
+            found = translation(channel.schema, channel.encoding)
+            channels[number] = channel.topic, found.translate if found else None
+        blocks = self._indexer.blocks.blocks[self._given :]
         self._given += len(blocks)
         for block in blocks:
-            for channel, log_ns, data in block_messages(self._stream, block, channels.keys()):
-                topic, translate = channels[channel]
+            for number, log_ns, data in block_messages(self._stream, block, channels.keys()):
+                topic, translate = channels[number]
                 yield RawMessage(topic, log_ns, translate(data) if translate else data)
 
     def batches(

@@ -409,15 +409,19 @@ class Indexer:
         except (*DAMAGE, OSError, StopIteration):  # OSError: a seek to before the beginning
             return None
 
-    def result(self) -> Piece:
-        """The index of what was taken in."""
+    def described(self) -> dict[int, TopicChannel]:
+        """The channels whose schema is there, or that have none."""
         names = {number: schema.name for number, schema in self.schemas.items()}
         names[_NO_SCHEMA] = ""
-        channels = {
+        return {
             number: TopicChannel(c.topic, names[c.schema_id], c.message_encoding)
             for number, c in self.channels.items()
             if c.schema_id in names
         }
+
+    def result(self) -> Piece:
+        """The index of what was taken in."""
+        channels = self.described()
         unknown = count_undescribed(self.blocks.blocks, channels)
         lost: int | None = None if self.damage else unknown
         if self.statistics is not None:

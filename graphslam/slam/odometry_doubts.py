@@ -274,10 +274,10 @@ def _opposite(robot: RobotEvidence) -> Iterator[Reason]:
             other = "scans" if len(robot.scans_ns) else "sightings"
             since = seconds(int(robot.stamps_ns[grid[turns[a]]]), int(robot.stamps_ns[0]))
             text = (
-                f"{robot.name}: its odometry and its {other} contradict each other: turning has "
-                f"the other sign from {since} on; one of the two is mirrored"
+                f"and its {other} contradict each other: turning has the other sign from {since} "
+                "on; one of the two is mirrored"
             )
-            yield Reason("doubtful", "odometry", robot.name, text)
+            yield _reason(robot, "doubtful", text)
             return
 
 
@@ -290,10 +290,10 @@ def _along_walls(robot: RobotEvidence) -> Iterator[Reason]:
         if best is not None:
             since = seconds(int(times[parts == part][0]), int(robot.stamps_ns[0]))
             text = (
-                f"{robot.name}: its odometry and its scans contradict each other: along the walls "
-                f"its scans fit {PATH_FACTORS[best]:.2g} times the path from {since} on"
+                "and its scans contradict each other: along the walls its scans fit "
+                f"{PATH_FACTORS[best]:.2g} times the path from {since} on"
             )
-            yield Reason("doubtful", "odometry", robot.name, text)
+            yield _reason(robot, "doubtful", text)
             return
 
 

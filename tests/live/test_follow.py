@@ -141,3 +141,17 @@ def test_robots_of_unknown_start_are_said(tmp_path):
     (alone,) = set(frames) - {told["world"]}
     assert any(w.startswith(f"{alone}: its start is not known") for w in told["warnings"])
     assert f"--start {alone}=x,y,phi" in (tmp_path / "out" / "report.html").read_text("utf-8")
+
+
+def test_what_is_lost_is_said(room, tmp_path):
+    """As `smooth` says it: a flipped bit in a chunk loses the chunk, and neither is silent."""
+    content = bytearray(room.read_bytes())
+    content[len(content) // 2] ^= 1
+    path = tmp_path / "flipped.mcap"
+    path.write_bytes(content)
+    known = graphslam.open_logs(path)
+    told = graphslam.follow(path, tmp_path / "out")
+    (file,) = told["logs"]
+    assert file["lost"] == known.files[0].lost > 0
+    assert (file["messages"], file["sha256"]) == (known.files[0].messages, known.files[0].sha256)
+    assert any("messages are lost" in warning for warning in told["warnings"])
