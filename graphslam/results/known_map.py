@@ -28,6 +28,7 @@ from graphslam.results.file_formats import landmark_from_json, landmark_json
 from graphslam.results.folder import SavedResult, load
 from graphslam.results.joint_file import joint_scans
 from graphslam.results.scans_file import SCANS_FILE, read_scans
+from graphslam.slam.summary import FORMAT as RESULT_FORMAT
 
 FORMAT = 1
 KNOWN_MAP_FILE = "known_map.npz"
@@ -43,6 +44,11 @@ def load_known_map(directory: Path) -> KnownMap:
     if (directory / KNOWN_MAP_FILE).exists():
         return _read(directory / KNOWN_MAP_FILE, directory.absolute().name)
     saved = load(directory)
+    if saved.summary["format"] != RESULT_FORMAT:
+        raise OutputError(
+            f"{directory}: is of another version of graphslam ({saved.summary['format']}, not "
+            f"{RESULT_FORMAT}); smooth its log again"
+        )
     if len(set(saved.summary.get("frames", {}).values())) > 1:
         raise OutputError(
             f"{directory}: its robots are in separate frames: it is no map of one place"

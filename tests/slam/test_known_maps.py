@@ -152,6 +152,10 @@ def test_what_is_no_map_is_one_clear_line(tmp_path, first_day):
     np.savez(old / JOINT_FILE, **arrays)
     with pytest.raises(OutputError, match="made by an earlier version"):
         load_known_map(old)
+    summary = old / "summary.json"
+    summary.write_text(summary.read_text().replace("graphslam-result-1", "graphslam-result-9"))
+    with pytest.raises(OutputError, match=r"is of another version .*result-9, not graphslam"):
+        load_known_map(old)
     np.savez(old / KNOWN_MAP_FILE, format=np.array(99))
     with pytest.raises(OutputError, match="is of format 99"):
         load_known_map(old)
