@@ -452,6 +452,7 @@ def cases(folder: Path, only: str) -> Iterator[tuple[str, str, Callable[[], Mess
 def campaign(target: Path, only: str) -> list[dict[str, Any]]:
     rows = [json.loads(line) for line in target.read_text().splitlines()] if target.exists() else []
     done = {(row["log"], row["fault"]) for row in rows}
+    target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as name, target.open("a") as out:
         folder = Path(name)
         for log, group in itertools.groupby(cases(folder, only), key=lambda case: case[0]):

@@ -85,7 +85,7 @@ def main() -> None:
     with TemporaryDirectory() as folder:
         for seed in range(given.seeds):
             log = open_logs([simulated_log(given.scenario, seed, Path(folder))], config)
-            truth, recording = truth_of_logs(log), record_steps(log)
+            truth, recording = truth_of_logs(log), record_steps(log, config)
             for label, rows in numbers.items():
                 rows.append(judge(recording, truth, label, settings))
     print("                                     causal, mm     final, mm   NEES/dof  landmarks, mm")

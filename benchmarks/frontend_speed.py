@@ -5,7 +5,7 @@ are there. CPU time, best of five.
 Then what one Hough table costs, and the next line after it, with the accumulator that is used and
 with OpenCV's, which count anew for each line.
 
-Run: python benchmarks/frontend_speed.py
+Run: python benchmarks/frontend_speed.py [--scans 500]
 """
 
 import bz2
@@ -22,7 +22,7 @@ from graphslam.perception.hough_votes import ThesisVotes
 from graphslam.perception.ordered_scan import Sweep, make_sweep
 
 
-def generated(beams: int, count: int = 500) -> list[Scan]:
+def generated(beams: int, count: int) -> list[Scan]:
     """Scans of a room with things in it: 1 cm of noise and 3 % drop-outs."""
     rng = np.random.default_rng(1)
     angles = np.linspace(-np.pi / 2, np.pi / 2, beams)
@@ -42,8 +42,8 @@ def generated(beams: int, count: int = 500) -> list[Scan]:
     return scans
 
 
-def intel(every: int = 10) -> list[Scan]:
-    """Each tenth scan of the Intel log; none if it is not there."""
+def intel(count: int) -> list[Scan]:
+    """About so many scans, spread over the Intel log; none if it is not there."""
     path = FREIBURG / "intel.clf.bz2"
     if not path.exists():
         return []
@@ -53,7 +53,7 @@ def intel(every: int = 10) -> list[Scan]:
             r = np.array(words[2 : 2 + int(words[1])], dtype=float)
             r[r >= 81] = np.nan
             scans.append(Scan("r", 0, 0, r, -np.pi / 2, np.pi / 180, np.zeros(3)))
-    return scans[::every]
+    return scans[:: -(-len(scans) // count)]
 
 
 def report(label: str, scans: Sequence[Scan], config: FrontEndConfig) -> None:
@@ -110,13 +110,15 @@ def accumulators(scans: Sequence[Scan], config: FrontEndConfig) -> None:
 
 
 def main() -> None:
-    parser(__doc__).parse_args()
+    options = parser(__doc__)
+    options.add_argument("--scans", type=int, default=500, help="of each kind")
+    count = options.parse_args().scans
     cv2.setNumThreads(1)
     config = FrontEndConfig()
-    report("generated, 180 beams", generated(180), config)
-    report("generated, 361 beams", generated(361), config)
-    accumulators(generated(180, 100), config)
-    if scans := intel():
+    report("generated, 180 beams", generated(180, count), config)
+    report("generated, 361 beams", generated(361, count), config)
+    accumulators(generated(180, min(count, 100)), config)
+    if scans := intel(count):
         report("Intel, 180 beams", scans, config)
 
 

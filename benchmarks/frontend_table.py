@@ -17,7 +17,8 @@ mean over seeds and logs. Real logs are those given, else Intel and ACES if they
 `hough, thesis` counts votes with `front_end.hough_votes = "thesis"`. `hough, raster` is OpenCV's
 transform of a raster with the weights as pixels, which is in no release: it is here to be compared.
 
-Run: python benchmarks/frontend_table.py [--no-scans] [--no-runs] [LOG.mcap=RELATIONS ...]
+Run: python benchmarks/frontend_table.py [--seeds 20] [--no-scans] [--no-runs]
+     [LOG.mcap=RELATIONS ...]
 """
 
 import tempfile
@@ -50,7 +51,6 @@ from graphslam.simulation import load_scenario, simulate
 from graphslam.simulation.scene import prepare_visits
 from graphslam.slam.smooth import smooth
 
-SEEDS = range(20)
 SCANS = 30
 """Of each recording, evenly taken."""
 
@@ -267,7 +267,7 @@ def worst(values: Sequence[float]) -> str:
     return f"{np.median(values):.4f}, {max(values):.4f}"
 
 
-def simulated_runs(folder: Path) -> dict[str, list[float]]:
+def simulated_runs(folder: Path, seeds: int) -> dict[str, list[float]]:
     """Errors of whole runs in simulation over seeds; front end -> those relative to segments."""
     relative: dict[str, list[float]] = {label: [] for label in WHOLE}
     for name in RUNS:
@@ -275,7 +275,7 @@ def simulated_runs(folder: Path) -> dict[str, list[float]]:
         for label, front in WHOLE.items():
             config = replace(Config(), front_end=front)
             rows = []
-            for seed in SEEDS:
+            for seed in range(seeds):
                 done = thesis_experiments.run(simulated_log(name, seed, folder), config)
                 own = done.aligned("vehicle", thesis_experiments.WITH)
                 moved = transform(own, done.laser("vehicle", thesis_experiments.WITH)[:, :2])
@@ -313,11 +313,11 @@ def real_runs(path: Path, relations: Path) -> dict[str, float]:
     return {label: error / errors["segments"] for label, error in errors.items()}
 
 
-def scan_table(folder: Path) -> None:
+def scan_table(folder: Path, seeds: int) -> None:
     """Precision, recall, NIS and time of every front end on every scenario."""
     print("| | what | precision | recall | NIS / dof | again | per scan | ms per scan |")
     for name in SCENARIOS:
-        truths = [list(true_scans(name, seed, folder)) for seed in SEEDS]
+        truths = [list(true_scans(name, seed, folder)) for seed in range(seeds)]
         scans = [t.scan for t in truths[0]]
         count = sum(map(len, truths))
         for label, config in FRONT.items():
@@ -343,17 +343,20 @@ def real_logs(given: Sequence[str], folder: Path) -> list[tuple[Path, Path]]:
 def main() -> None:
     options = parser(__doc__)
     options.add_argument("logs", nargs="*", metavar="LOG.mcap=RELATIONS")
+    options.add_argument("--seeds", type=int, default=20, help="of simulated logs")
     options.add_argument("--no-scans", action="store_true", help="leave out the first table")
-    options.add_argument("--no-runs", action="store_true", help="leave out simulated runs")
+    options.add_argument("--no-runs", action="store_true", help="leave out runs of logs not given")
     arguments = options.parse_args()
     cv2.setNumThreads(1)
     with tempfile.TemporaryDirectory() as folder:
         if not arguments.no_scans:
-            scan_table(Path(folder))
+            scan_table(Path(folder), arguments.seeds)
+        if arguments.no_runs and not arguments.logs:
+            return
         print("| | error (real: all) | end pose (real: loops) | walls | landmarks | ms per scan |")
         relative: dict[str, list[float]] = {label: [] for label in WHOLE}
         if not arguments.no_runs:
-            relative = simulated_runs(Path(folder))
+            relative = simulated_runs(Path(folder), arguments.seeds)
         for log, relations in real_logs(arguments.logs, Path(folder)):
             for label, share in real_runs(log, relations).items():
                 relative[label].append(share)

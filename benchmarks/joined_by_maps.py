@@ -38,10 +38,10 @@ from graphslam.multi_robot.place_recognition import PlaceMap, relate_places
 from graphslam.multi_robot.relative_frames import RelativeFrame
 from graphslam.results.folder import load
 from graphslam.slam.initialisation import anonymous_maps, separate_estimates
+from graphslam.slam.log_pass import PriorKnowledge
 from graphslam.slam.pipeline import Pipeline
 from graphslam.slam.recorded_closures import judge_recorded_closures
 from graphslam.slam.start_priors import origin, start_poses
-from graphslam.slam.step_recorder import PriorKnowledge
 
 NAMES = ("first", "second")
 #: stretches of each half; two overlap if so many submaps are so near (m); limits of a correct start
@@ -119,7 +119,7 @@ def seen_alone(log: Path) -> dict[str, AnonymousMap]:
     known = PriorKnowledge(FrameAssignment.separate_frames(opened.robots, origin(config)), recorded)
     pipeline = Pipeline(opened, config, known)
     pipeline.run(lambda _count: None)
-    return anonymous_maps(pipeline, separate_estimates(pipeline))
+    return anonymous_maps(pipeline, separate_estimates(pipeline, pipeline.backend.finish()))
 
 
 def parts(name: str, folder: Path) -> bool:

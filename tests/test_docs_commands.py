@@ -3,7 +3,8 @@
 All commands of a page run one after the other in one folder, which holds the files that the page
 takes for given. An output that is there already is replaced: a page shows several ways to make one.
 Of experiments one run is made, unless a page asks for a number. Benchmarks, which take minutes to
-hours, are begun: their options are read and taken; `make demo` is run by .ci/run.
+hours, are begun here, their options read; test_benchmarks.py runs them on small input.
+`make demo` is run by .ci/run.
 """
 
 import argparse
