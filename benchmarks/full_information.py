@@ -12,8 +12,10 @@ late     sightings stamped 50 ms late, increments; the batch knows by how much
 unnamed  identities left out, increments; landmarks beside
 sparse   one image per second
 segments sightings with a direction (3 deg): of poses, not of points
-bursty   0.9 of the variance of sightings is the same for a point for 10 s; the batch knows the
-         model, with a variable for each such error, which the log does not say
+bursty   0.9 of the variance of sightings is the same for a point for 10 s. The batch takes them for
+         white, as the log states them. Below it, without a bar for the error, is a batch that knows
+         the model, with a variable for each such error, which no log says: the limit of what
+         could be known, and the NEES that ours is judged by
 three    three robots that see the points, and each other
 
 Run: python benchmarks/full_information.py [KIND ...] [--seeds N] [--seconds S]
@@ -43,7 +45,8 @@ START = np.full(3, 0.01)
 DIRECTION = np.deg2rad(3.0)
 LATE_S, SHARED, SPAN_S = 0.05, 0.9, 10.0
 POINTS, VISIBLE = 17, 5
-#: kind -> largest error against the batch, bounds of the NEES against the batch's
+#: kind -> largest error against the batch, bounds of the NEES against the batch's (of bursty noise:
+#: against that of the batch that knows its model)
 BARS = {
     "given": (1.1, (0.8, 1.25)),
     "poses": (1.25, (0.0, 1.5)),
@@ -159,8 +162,11 @@ def write(path: Path, log: Log, kind: str) -> None:
                 one = next(sightings)
 
 
-def batch(log: Log, kind: str) -> tuple[float, float]:
-    """Error, m, and NEES per degree of freedom of the plain batch."""
+def batch(log: Log, kind: str, knows_shared: bool = False) -> tuple[float, float]:
+    """Error, m, and NEES per degree of freedom of the plain batch.
+
+    ``knows_shared``: it has a variable for each error that sightings of bursty noise share.
+    """
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     diagonal, late = gtsam.noiseModel.Diagonal.Sigmas, kind == "late"
     parts = 2 if late else 1
@@ -195,7 +201,7 @@ def batch(log: Log, kind: str) -> tuple[float, float]:
             values.insert(target, gtsam.Pose2(*place) if len(place) == 3 else place)
         if len(place) == 3:
             graph.add(gtsam.BetweenFactorPose2(at, target, *relative_pose(z)))
-        elif kind == "bursty":
+        elif knows_shared:
             error = int(gtsam.symbol("b", 1000 * number + int(k * PERIOD_S // SPAN_S)))
             if not values.exists(error):
                 values.insert(error, np.zeros(2))
@@ -286,26 +292,44 @@ def main() -> int:
         "kind      error, m (batch)    ratio  of each        NEES/dof (batch)  ratio  points  CPU s"
     )
     for kind in given.kinds:
-        rows = []
+        ours, plain, informed = [], [], []
         with tempfile.TemporaryDirectory() as folder:
             for seed in range(given.seeds):
                 log = simulated(kind, given.seconds, seed)
-                rows.append([*smoothed(log, kind, Path(folder)), *batch(log, kind)])
-        ours, nees, points, cpu_s, best, best_nees = np.array(rows).T
-        ratio, nees_ratio = ours.mean() / best.mean(), nees.mean() / best_nees.mean()
-        most, (low, high) = BARS[kind]
-        holds = ratio <= most and low <= nees_ratio <= high
-        if kind == "unnamed":
-            holds &= bool(np.all(np.abs(points - POINTS) <= 1))
+                ours.append(smoothed(log, kind, Path(folder)))
+                plain.append(batch(log, kind))
+                if kind == "bursty":
+                    informed.append(batch(log, kind, knows_shared=True))
+        found = np.array(ours)
+        holds = within_bars(kind, found, np.array(plain), np.array(informed or plain))
         missed += not holds
-        each, word = ours / best, "" if holds else "  MISSED"
-        print(
-            f"{kind:9} {ours.mean():.4f} ({best.mean():.4f})   {ratio:5.2f}  {each.min():.2f} to "
-            f"{each.max():.2f}   {nees.mean():.2f} ({best_nees.mean():.2f})  {nees_ratio:8.2f}  "
-            f"{points.min():.0f}-{points.max():.0f}  {cpu_s.mean():5.1f}{word}",
-            flush=True,
-        )
+        print(row(kind, found, np.array(plain)) + ("" if holds else "  MISSED"), flush=True)
+        if informed:
+            print(row("(informed)", found, np.array(informed)), flush=True)
     return int(missed > 0)
+
+
+def within_bars(kind: str, ours: Array, plain: Array, informed: Array) -> bool:
+    """Whether results (n, 4) hold the bars, by the plain batch's error and the informed one's NEES.
+
+    Batches have rows (n, 2) of error and NEES.
+    """
+    most, (low, high) = BARS[kind]
+    holds = ours[:, 0].mean() <= most * plain[:, 0].mean()
+    holds &= low <= ours[:, 1].mean() / informed[:, 1].mean() <= high
+    return bool(holds and (kind != "unnamed" or np.all(np.abs(ours[:, 2] - POINTS) <= 1)))
+
+
+def row(name: str, found: Array, batches: Array) -> str:
+    """A line of the table: results (n, 4) beside those of a batch (n, 2)."""
+    (ours, nees, points, cpu_s), (best, best_nees) = found.T, batches.T
+    each = ours / best
+    return (
+        f"{name:9} {ours.mean():.4f} ({best.mean():.4f})   {ours.mean() / best.mean():5.2f}  "
+        f"{each.min():.2f} to {each.max():.2f}   {nees.mean():.2f} ({best_nees.mean():.2f})  "
+        f"{nees.mean() / best_nees.mean():8.2f}  {points.min():.0f}-{points.max():.0f}  "
+        f"{cpu_s.mean():5.1f}"
+    )
 
 
 if __name__ == "__main__":
