@@ -123,6 +123,29 @@ class LogSet:
         opening = self.warnings[: self._opening_warnings]
         return replace(self, warnings=[*opening, *lines], further_lasers=tuple(kept))
 
+    def recordings_of(self, robot: str) -> list[Recording]:
+        """The recordings that have topics of a robot."""
+        own = {t.name for t in (*self.topics, *self.further_lasers) if t.robot == robot}
+        return [
+            file
+            for file in self.opened
+            if any(c.topic in own for piece in file.pieces for c in piece.channels.values())
+        ]
+
+    def of_robot(self, robot: str) -> "LogSet":
+        """The logs as if one robot were alone in them."""
+        return replace(
+            self,
+            robots=(robot,),
+            topics=tuple(t for t in self.topics if t.robot == robot),
+            further_lasers=tuple(t for t in self.further_lasers if t.robot == robot),
+            opened=self.recordings_of(robot),
+            gyroscopes={name: own for name, own in self.gyroscopes.items() if name == robot},
+            warnings=self.warnings[: self._opening_warnings],
+            dropped=Counter(),
+            repaired=Counter(),
+        )
+
     @property
     def contexts(self) -> Mapping[str, TopicContext]:
         """What is needed to decode each topic."""

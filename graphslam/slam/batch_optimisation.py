@@ -35,13 +35,13 @@ from graphslam.slam.log_pass import timed
 from graphslam.slam.motion_noise import fit_motion_noise, noise_scales, scale_motion_noise
 from graphslam.slam.path_closing import ClosedPaths, close_paths
 from graphslam.slam.reoptimise_scans import with_closures
-from graphslam.slam.scan_tracking import ScanLog
+from graphslam.slam.scan_tracking import TrackedLog
 
 #: factors on the gates of re-association (across, direction): with the closed paths, and solved
 CLOSED_FACTORS, SOLVED_FACTORS = (1.0, 1.0), (1 / 2, 2 / 3)
 
 
-def optimise_scan_log(scan_log: ScanLog, tamper: Tamper | None = None) -> Estimate:
+def optimise_scan_log(scan_log: TrackedLog, tamper: Tamper | None = None) -> Estimate:
     """The final estimate of a log; its steps, landmarks, calibration and counts follow it.
 
     Raises:
@@ -110,7 +110,7 @@ def _solved(
     steps: tuple[Step, ...],
     start: Estimate,
     paths: ClosedPaths,
-    scan_log: ScanLog,
+    scan_log: TrackedLog,
     tracks: Mapping[str, Track],
 ) -> tuple[Estimate, tuple[Step, ...]]:
     """All states, landmarks and the calibration, solved with landmarks tied and reassociated."""
@@ -155,7 +155,7 @@ def _tied(
     estimate: Estimate,
     solution: CalibratedSolution | None,
     paths: ClosedPaths,
-    scan_log: ScanLog,
+    scan_log: TrackedLog,
 ) -> tuple[Step, ...]:
     """Steps with landmarks that are one tied, and observations at the walls that they fit best.
 

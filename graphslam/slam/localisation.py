@@ -35,7 +35,7 @@ def localise(scan_log: ScanLog, known_map: KnownMap) -> None:
             start = given_start(scan_log, robot)
         else:
             start = found_start(scan_log, robot, known_map)
-    _place(scan_log, robot, start)
+    place_path(scan_log, robot, start)
     scan_log.steps[0] = replace(scan_log.steps[0], known=known_map.known)
     scan_log.landmarks.add_known(known_map.entries(robot))
 
@@ -61,22 +61,15 @@ def found_start(scan_log: ScanLog, robot: str, known_map: KnownMap) -> Start:
     Raises:
         EstimationError: it is not found, or another one would do as well.
     """
-    config = scan_log.config
-    closed = close_paths(scan_log, match=config.backend.close_loops)
-    anchors = {robot: np.array(scan_log.paths[robot].anchors)}
-    submaps, nodes = submaps_at(anchors, closed.states, scan_log.keyframe_scans, config)
-    own = PlaceMap(submaps, closed.graph.covariance(nodes) if submaps else np.zeros((0, 0)))
-    places = PlaceMap(known_map.places, np.kron(np.eye(len(known_map.places)), PLACE_COV))
-    first = scan_log.steps[0].starts[robot].pose
-    starts, supports = [], []
-    for one in hypotheses(places, own, config.multi_robot):
-        start = Start(compose(one.pose, first), PRIOR_INFLATION**2 * one.cov)
+    own = own_places(scan_log, robot)
+    starts = possible_starts(scan_log, robot, known_map, own)
+    supports = []
+    for start in starts:
         laid = laid_into(scan_log, robot, start, known_map)
-        starts.append(start)
-        supports.append(support(known_map.places, with_poses_from(submaps, laid.states)))
+        supports.append(support(known_map.places, with_poses_from(own.places, laid.states)))
     why = "no place in it is recognised"
     if supports:
-        chosen = choose(supports, submaps, config.multi_robot)
+        chosen = choose(supports, own.places, scan_log.config.multi_robot)
         if isinstance(chosen, int):
             return starts[chosen]
         why = chosen
@@ -86,17 +79,38 @@ def found_start(scan_log: ScanLog, robot: str, known_map: KnownMap) -> Start:
     )
 
 
+def own_places(scan_log: ScanLog, robot: str) -> PlaceMap:
+    """The submaps of a log by itself, its loops closed."""
+    config = scan_log.config
+    closed = close_paths(scan_log, match=config.backend.close_loops)
+    anchors = {robot: np.array(scan_log.paths[robot].anchors)}
+    submaps, nodes = submaps_at(anchors, closed.states, scan_log.keyframe_scans, config)
+    return PlaceMap(submaps, closed.graph.covariance(nodes) if submaps else np.zeros((0, 0)))
+
+
+def possible_starts(
+    scan_log: ScanLog, robot: str, known_map: KnownMap, own: PlaceMap
+) -> list[Start]:
+    """Where a log with ``own`` places may begin in a map, the best supported start first."""
+    places = PlaceMap(known_map.places, np.kron(np.eye(len(known_map.places)), PLACE_COV))
+    first = scan_log.steps[0].starts[robot].pose
+    return [
+        Start(compose(one.pose, first), PRIOR_INFLATION**2 * one.cov)
+        for one in hypotheses(places, own, scan_log.config.multi_robot)
+    ]
+
+
 def laid_into(scan_log: ScanLog, robot: str, start: Start, known_map: KnownMap) -> ClosedPaths:
     """The path closed with the places of a known map, if it begins at ``start``."""
     before, first = scan_log.paths[robot].poses, scan_log.steps[0]
     try:
-        _place(scan_log, robot, start)
+        place_path(scan_log, robot, start)
         return close_paths(scan_log, match=scan_log.config.backend.close_loops, known_map=known_map)
     finally:
         scan_log.paths[robot].poses, scan_log.steps[0] = before, first
 
 
-def _place(scan_log: ScanLog, robot: str, start: Start) -> None:
+def place_path(scan_log: ScanLog, robot: str, start: Start) -> None:
     """The tracked path begins at ``start``."""
     path = scan_log.paths[robot]
     world = compose(start.pose, inverse(path.poses[0]))

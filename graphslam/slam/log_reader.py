@@ -47,6 +47,20 @@ def is_scan_log(log: LogSet, config: Config) -> bool:
     )
 
 
+def is_session_log(log: LogSet, config: Config) -> bool:
+    """Whether a log is of several sessions, for each of which alone `is_scan_log` holds."""
+    records = {topic.record for topic in log.topics}
+    return (
+        config.logs.same_place
+        and config.tracks_scans
+        and not config.backend.causal
+        and not records & {Sighting, RelativePose}
+        and len(log.robots) == len(log.opened) > 1
+        and all(log.has_scans(robot) for robot in log.robots)
+        and all(len(log.recordings_of(robot)) == 1 for robot in log.robots)
+    )
+
+
 def read_ahead(log: LogSet, config: Config) -> Reading:
     """Keyframes of a log for which `is_scan_log` holds."""
     return Exchange(lambda: _keyframes(log, config), UNCALIBRATED_BLOCKS * (None,))

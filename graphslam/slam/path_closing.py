@@ -14,7 +14,7 @@ from graphslam.mapping.redundant_closures import Span
 from graphslam.mapping.sequential_closing import close_loops
 from graphslam.mapping.submap_graph import RelativePoses, SubmapGraph
 from graphslam.mapping.submaps import State, SubmapPose, submaps_at
-from graphslam.slam.scan_tracking import ScanLog, TrackedPath
+from graphslam.slam.scan_tracking import TrackedLog, TrackedPath
 
 #: factor on the covariance of the chain of submaps: tracking knows only what is around the robot,
 #: and takes its errors for independent. Of Intel and ACES, errors are 1 to 2 sigmas of it
@@ -106,7 +106,7 @@ class LandmarkUncertainty:
         return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 
 
-def unclosed_paths(scan_log: ScanLog) -> dict[str, Trajectory]:
+def unclosed_paths(scan_log: TrackedLog) -> dict[str, Trajectory]:
     """The states of every robot as tracked; their covariances are unknown."""
     return {name: tracked_states(scan_log.paths[name]) for name in scan_log.started}
 
@@ -118,7 +118,7 @@ def tracked_states(path: TrackedPath) -> Trajectory:
 
 
 def close_paths(
-    scan_log: ScanLog,
+    scan_log: TrackedLog,
     tamper: Tamper | None = None,
     *,
     match: bool = True,

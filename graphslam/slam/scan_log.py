@@ -17,6 +17,24 @@ from graphslam.slam.passes import Findings, FinishedPass
 from graphslam.slam.scan_tracking import ScanLog
 
 
+def track_scan_log(
+    log: LogSet,
+    config: Config,
+    known: PriorKnowledge,
+    progress: Progress,
+    ahead: Reading | None = None,
+    kept: Checkpoint = NOTHING_KEPT,
+    first: int = 0,
+) -> ScanLog:
+    """A log that is read and tracked, see `solve_scan_log`; ``first``: number of its landmarks."""
+    scan_log = ScanLog(log, config, known, first)
+    kept.read_pass(scan_log, partial(scan_log.run, progress, ahead))
+    if scan_log.wrong_lasers:
+        scan_log = ScanLog(log.without_lasers(scan_log.wrong_lasers), config, known, first)
+        kept.read_pass(scan_log, partial(scan_log.run, progress))
+    return scan_log
+
+
 def solve_scan_log(
     log: LogSet,
     config: Config,
@@ -38,11 +56,7 @@ def solve_scan_log(
     causal = (
         Future(partial(causal_trajectories, log, config, known)) if config.backend.causal else None
     )
-    scan_log = ScanLog(log, config, known)
-    kept.read_pass(scan_log, partial(scan_log.run, progress, ahead))
-    if scan_log.wrong_lasers:
-        scan_log = ScanLog(log.without_lasers(scan_log.wrong_lasers), config, known)
-        kept.read_pass(scan_log, partial(scan_log.run, progress))
+    scan_log = track_scan_log(log, config, known, progress, ahead, kept)
     if not scan_log.steps:
         raise LogError(f"{log.files[0].path}: nothing in it could be used; see `graphslam info`")
     if known.known_map is not None:

@@ -85,19 +85,28 @@ def recalibrate_path(path: TrackedPath, track: Track) -> None:
     path.poses, path.from_anchor = list(poses), list(zip(seen, known, strict=True))
 
 
-class ScanLog(LogPass):
-    """A pass over a log of scans of one robot; `run` reads and tracks it, see ``paths``."""
+class TrackedLog(LogPass):
+    """A pass that has tracked paths: ``paths`` of the robots."""
 
     def __init__(self, log: LogSet, config: Config, known: PriorKnowledge) -> None:
-        """Reads nothing yet."""
+        """Without paths."""
+        super().__init__(log, config, known)
+        self.paths: dict[str, TrackedPath] = {}
+
+
+class ScanLog(TrackedLog):
+    """A pass over a log of scans of one robot; `run` reads and tracks it, see ``paths``."""
+
+    def __init__(self, log: LogSet, config: Config, known: PriorKnowledge, first: int = 0) -> None:
+        """Reads nothing yet; landmarks are numbered from ``first``, or after a known map's."""
         super().__init__(log, config, known)
         (self._robot,) = log.robots
         self._path = TrackedPath()
-        self.paths = {self._robot: self._path}
+        self.paths[self._robot] = self._path
         self._tracker: LocalTracker | None = None
         self._anchor_m = 0.0
         known_map = known.known_map
-        self._first = 0 if known_map is None else known_map.next_number  # of its landmarks
+        self._first = first if known_map is None else known_map.next_number  # of its landmarks
         #: see `ReadLog`
         self.wrong_lasers: dict[str, float] = {}
 

@@ -21,12 +21,13 @@ from graphslam.slam.checkpoint import NOTHING_KEPT, Checkpoint
 from graphslam.slam.evidence import gather
 from graphslam.slam.initialisation import initialise
 from graphslam.slam.log_pass import Progress, timed
-from graphslam.slam.log_reader import Reading, is_scan_log
+from graphslam.slam.log_reader import Reading, is_scan_log, is_session_log
 from graphslam.slam.passes import FinishedPass, run_passes
 from graphslam.slam.pose_graph import is_pose_graph, solve_pose_graph
 from graphslam.slam.retirement import retired_landmarks
 from graphslam.slam.robot_settings import check_robots
 from graphslam.slam.scan_log import solve_scan_log
+from graphslam.slam.session_log import solve_session_log
 from graphslam.slam.sighting_passes import run_sighting_passes
 from graphslam.slam.summary import summarise
 from graphslam.slam.verdict import judge
@@ -87,6 +88,8 @@ def _solved(
     """The result by the way that is for logs of this kind; arguments as of `smooth`."""
     if is_pose_graph(log, config):
         return make_result(solve_pose_graph(log, config, progress), began)
+    if is_session_log(log, config):
+        return make_result(solve_session_log(log, config, progress, tamper, kept), began)
     known = kept.stage("starts", lambda: initialise(log, config))
     known = replace(known, known_map=known_map)
     initialised = time.perf_counter()

@@ -1,0 +1,226 @@
+"""Where the sessions of a place begin relative to each other.
+
+Each session has been tracked by itself. Sessions whose relative starts are known are a group with
+one map; at first each is alone. One group is put into the map of another like a log into a known
+map (`localisation`): the relative pose of the two is a hypothesis that lays all drives of one into
+the map of the other. Most of their places must confirm it, few contradict it, and it may have no
+rival. What was moved between two sessions costs a few places; a corridor that is taken for another
+one is contradicted all over the building. Groups grow, and what was refused with less in common is
+tried again. A group that is refused in the end has a frame of its own.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from graphslam.core.config import Config
+from graphslam.core.frame_forest import PRIOR_INFLATION
+from graphslam.core.geometry import Array, between, compose, compose_cov, inverse
+from graphslam.core.known_landmarks import KnownLandmarks
+from graphslam.core.records import Start
+from graphslam.core.sparse_gaussian import SparseRoot
+from graphslam.logs import LogSet
+from graphslam.mapping.known_map import KnownMap, latest_places
+from graphslam.mapping.submaps import SubmapPose, with_poses_from
+from graphslam.multi_robot.frame_tree import FrameAssignment
+from graphslam.multi_robot.map_localisation import Support, choose, support
+from graphslam.multi_robot.place_recognition import PlaceMap
+from graphslam.multi_robot.place_search import DISTINCT_M, DISTINCT_RAD
+from graphslam.multi_robot.relative_frames import RelativeFrame
+from graphslam.slam.localisation import (
+    laid_into,
+    own_places,
+    possible_starts,
+)
+from graphslam.slam.scan_tracking import ScanLog
+from graphslam.slam.start_priors import origin, start_poses
+
+#: a map of sessions has places only
+_NO_LANDMARKS = KnownLandmarks({}, (), SparseRoot((), (), 1.0))
+
+
+def join_sessions(log: LogSet, sessions: Mapping[str, ScanLog], config: Config) -> FrameAssignment:
+    """The start of the first state of every session, and its frame.
+
+    Args:
+        log: of all sessions.
+        sessions: by name, tracked; those without a state are left out.
+        config: settings.
+
+    Raises:
+        EstimationError: a start that is told is malformed, or truth was asked for and is missing.
+    """
+    told = start_poses(log, config)
+    world = min(told)
+    by_time = sorted(sessions, key=lambda name: sessions[name].first_ns)
+    tracked = {name: _Session.of(sessions[name], name) for name in by_time}
+    given = {name: _of_first_state(sessions, name, world, told) for name in told}
+    groups = [_group({n: start for n, start in given.items() if n in sessions}, tracked)]
+    groups += [_group({n: origin(config)}, tracked) for n in by_time if n not in given]
+    refused = _merge(groups, tracked, config)
+    starts, frames, found = dict(given), dict.fromkeys(given, world), {}
+    for group in groups:
+        leader = world if group is groups[0] else next(iter(group.starts))
+        starts |= group.starts
+        frames |= dict.fromkeys(group.starts, leader)
+        for name in group.starts.keys() - {leader, *given}:
+            start = starts[name]
+            cov = start.cov / PRIOR_INFLATION**2
+            pose = between(starts[leader].pose, start.pose)
+            found[name] = RelativeFrame(name, leader, pose, cov, group.confirmed[name])
+    undecided = {name: why for name, why in refused.items() if frames[name] == name != world}
+    return FrameAssignment(starts, frames, world, found, undecided)
+
+
+def _of_first_state(
+    sessions: Mapping[str, ScanLog], name: str, world: str, told: Mapping[str, Start]
+) -> Start:
+    """The told start of a base, as that of its first state, which is the sensor's.
+
+    The base of the first robot begins where it is told only in the end: until then its first state
+    does, see `FrameTransforms`.
+    """
+    start = told[name]
+    if name == world or name not in sessions:
+        return Start(start.pose, start.cov, start.cov)
+    own, first = (sessions[n].runs[n].track for n in (name, world))
+    base = told[world].pose
+    shift = compose(compose(base, first.mount), inverse(base))
+    pose = compose(inverse(shift), compose(start.pose, own.mount))
+    cov = compose_cov(start.pose, start.cov, own.mount, own.mount_cov + first.mount_cov)
+    return Start(pose, cov, start.cov)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Session:
+    """A session as tracked, and its places by itself, in the world of its tracked path."""
+
+    name: str
+    log: ScanLog
+    own: PlaceMap
+
+    @classmethod
+    def of(cls, log: ScanLog, name: str) -> "_Session":
+        return cls(name, log, own_places(log, name))
+
+    @property
+    def first(self) -> Array:
+        """The pose (3,) at which its tracked path begins."""
+        return self.log.steps[0].starts[self.name].pose
+
+    def at(self, start: Start) -> list[SubmapPose]:
+        """Its places, if it begins there."""
+        moved = compose(start.pose, inverse(self.first))
+        return [replace(place, pose=compose(moved, place.pose)) for place in self.own.places]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Group:
+    """Sessions whose relative starts are known.
+
+    ``starts`` in the frame of the group, the leader's first; ``seen``: places that they saw, the
+    latest session first; ``confirmed``: how many places confirmed the start of each.
+    """
+
+    starts: Mapping[str, Start]
+    seen: Sequence[SubmapPose]
+    confirmed: Mapping[str, float]
+
+    @property
+    def map(self) -> KnownMap:
+        """Its places."""
+        return KnownMap("", "", (), _NO_LANDMARKS, latest_places(self.seen))
+
+
+def _group(starts: Mapping[str, Start], sessions: Mapping[str, _Session]) -> _Group:
+    """Sessions whose starts are given."""
+    seen = [place for name in reversed(list(starts)) for place in sessions[name].at(starts[name])]
+    return _Group(starts, seen, {})
+
+
+def _merge(
+    groups: list[_Group], sessions: Mapping[str, _Session], config: Config
+) -> dict[str, str]:
+    """Join groups as long as two can be joined, the earlier ones first.
+
+    Returns:
+        Why the sessions of each group that was tried and not joined are not known: leader -> why.
+    """
+    refused: dict[str, str] = {}
+    tried: set[tuple[frozenset[str], frozenset[str]]] = set()
+    while True:
+        for one, other in combinations(groups, 2):
+            pair = frozenset(one.starts), frozenset(other.starts)
+            if pair in tried:
+                continue
+            tried.add(pair)
+            joined = _joined(one, other, sessions, config)
+            if isinstance(joined, _Group):
+                groups[groups.index(one)] = joined
+                groups.remove(other)
+                break
+            refused[next(iter(other.starts))] = joined
+        else:
+            return refused
+
+
+def _joined(
+    one: _Group, other: _Group, sessions: Mapping[str, _Session], config: Config
+) -> _Group | str:
+    """Both groups in the frame of the first one, or why their relative pose is not known."""
+    known = one.map
+    laid: list[_Laid] = []
+    for name, start in other.starts.items():
+        session = sessions[name]
+        for found in possible_starts(session.log, name, known, session.own):
+            moved = {n: _carried(found, start, s) for n, s in other.starts.items()}
+            if not any(_is_same(lies.starts, moved) for lies in laid):
+                laid.append(_lay(moved, known, sessions))
+    if not laid:
+        return "no place of the others is recognised"
+    places = [place for name in other.starts for place in sessions[name].own.places]
+    chosen = choose([lies.support for lies in laid], places, config.multi_robot)
+    if isinstance(chosen, str):
+        return chosen
+    best = laid[chosen]
+    return _Group(
+        {**one.starts, **best.starts},
+        [*best.places, *one.seen],
+        {**one.confirmed, **dict.fromkeys(best.starts, float(best.support.confirmed.sum()))},
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Laid:
+    """A group laid into a map as a hypothesis says: starts and places there, and their support."""
+
+    starts: Mapping[str, Start]
+    places: Sequence[SubmapPose]
+    support: Support
+
+
+def _carried(found: Start, before: Start, start: Start) -> Start:
+    """Where ``start`` is once ``before``, of the same group, is ``found`` elsewhere."""
+    offset = between(before.pose, start.pose)
+    cov = compose_cov(found.pose, found.cov, offset, np.zeros((3, 3)))
+    return Start(compose(found.pose, offset), cov)
+
+
+def _is_same(one: Mapping[str, Start], other: Mapping[str, Start]) -> bool:
+    """Whether two hypotheses about a group put all its sessions at about the same starts."""
+    off = np.array([between(one[name].pose, other[name].pose) for name in one])
+    near = np.hypot(off[:, 0], off[:, 1]) < DISTINCT_M
+    return bool((near & (np.abs(off[:, 2]) < DISTINCT_RAD)).all())
+
+
+def _lay(starts: Mapping[str, Start], known: KnownMap, sessions: Mapping[str, _Session]) -> _Laid:
+    """Every session closed with the places of a map from its start there."""
+    found, places = {}, []
+    for name, start in starts.items():
+        session = sessions[name]
+        states = laid_into(session.log, name, start, known).states
+        found[name] = Start(states[name].poses[0], start.cov)
+        places += with_poses_from(session.own.places, states)
+    return _Laid(found, places, support(known.places, places))
