@@ -10,10 +10,10 @@ aligned, of the days that are in one frame with the first. Timed is the CPU time
 Run: python benchmarks/sessions.py [intel] [office] [--seeds N] [--first SEED]
 """
 
+import os
 import struct
 import tempfile
-import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -117,9 +117,9 @@ def office(folder: Path, seeds: Iterable[int]) -> Iterator[str]:
             "start.given_sigma_m": START_SIGMA[0],
             "start.given_sigma_rad": START_SIGMA[2],
         }
-        began = time.process_time()
+        began = sum(os.times()[:4])
         result = graphslam.smooth(days, config=SAME_PLACE, **start)
-        seconds.append(time.process_time() - began)
+        seconds.append(sum(os.times()[:4]) - began)
         frames = result.summary["frames"]
         others = [name for name in frames if name != "day0"]
         together = [name for name in others if frames[name] == "day0"]

@@ -125,12 +125,8 @@ class LogSet:
 
     def recordings_of(self, robot: str) -> list[Recording]:
         """The recordings that have topics of a robot."""
-        own = {t.name for t in (*self.topics, *self.further_lasers) if t.robot == robot}
-        return [
-            file
-            for file in self.opened
-            if any(c.topic in own for piece in file.pieces for c in piece.channels.values())
-        ]
+        own = {topic.name for topic in self.topics if topic.robot == robot}
+        return [f for f in self.opened if not own.isdisjoint(topic.name for topic in f.topics)]
 
     def of_robot(self, robot: str) -> "LogSet":
         """The logs as if one robot were alone in them."""

@@ -48,9 +48,6 @@ MAX_CONTRADICTED_SHARE = 0.3
 #: share of the best one's support from which another hypothesis is a rival whatever contradicts it;
 #: others are from half of it on, unless they are contradicted
 EQUAL_SHARE = 0.7
-#: sigmas by which another hypothesis must be contradicted in a larger share of its places, to be
-#: none whatever its support
-REFUTED_SIGMAS = 3.0
 #: m: what the map has around a place is from its places within this distance
 AROUND_M = 6.0
 #: m, rad: a place may be so far off where its hypothesis puts it, which is drift of the path
@@ -88,21 +85,6 @@ class Support:
     def is_contradicted(self) -> bool:
         """Whether more places contradict it than a few that changed."""
         return bool(self.contradicted.sum() > MAX_CONTRADICTED_SHARE * self.confirmed.sum())
-
-    def is_refuted_beside(self, other: "Support") -> bool:
-        """Whether it is contradicted, and beyond chance in more of its places than ``other``.
-
-        What changed contradicts the right hypothesis in some places; a building that is taken for
-        itself turned, in many. Shares of confirmed places are compared as two proportions.
-        """
-        n = np.array([self.confirmed.sum(), other.confirmed.sum()])
-        against = np.array([self.contradicted.sum(), other.contradicted.sum()])
-        if not (self.is_contradicted and n.all()):
-            return False
-        share = np.minimum(against / n, 1.0)
-        pooled = min(float(against.sum() / n.sum()), 1.0)
-        sigma = np.sqrt(pooled * (1.0 - pooled) * (1.0 / n).sum())
-        return bool(share[0] - share[1] > REFUTED_SIGMAS * sigma)
 
 
 def hypotheses(known: PlaceMap, own: PlaceMap, config: MultiRobotConfig) -> list[Hypothesis]:
@@ -188,7 +170,8 @@ def choose(
     found: Sequence[Support], places: Sequence[SubmapPose], config: MultiRobotConfig
 ) -> int | str:
     """Which of several hypotheses, at least one, is right, or why that is not known."""
-    best = max(range(len(found)), key=lambda k: (not found[k].is_contradicted, found[k].total))
+    totals = [one.total for one in found]
+    best = int(np.argmax(totals))
     one = found[best]
     count = int(one.confirmed.sum())
     if count < MIN_MATCHES:
@@ -197,7 +180,7 @@ def choose(
         config.min_place_extent_m
     ):
         return "the places that are recognised extend over less than multi_robot.min_place_extent_m"
-    others = [x for x in found if _differ(one, x) and not x.is_refuted_beside(one)]
+    others = [x for x in found if _differ(one, x)]
     rivals = [x.total for x in others if not x.is_contradicted]
     if has_rival(one.total, rivals) or has_rival(one.total, [x.total for x in others], EQUAL_SHARE):
         return "it has places that look alike, and the path fits into it in more than one way"

@@ -26,7 +26,7 @@ from graphslam.mapping.known_map import KnownMap, latest_places
 from graphslam.mapping.submaps import SubmapPose, with_poses_from
 from graphslam.multi_robot.frame_tree import FrameAssignment
 from graphslam.multi_robot.map_localisation import Support, choose, support
-from graphslam.multi_robot.place_recognition import PlaceMap
+from graphslam.multi_robot.place_recognition import EQUIVALENT_SHARE, PlaceMap
 from graphslam.multi_robot.place_search import DISTINCT_M, DISTINCT_RAD
 from graphslam.multi_robot.relative_frames import RelativeFrame
 from graphslam.slam.localisation import (
@@ -181,10 +181,9 @@ def _joined(
     if not laid:
         return "no place of the others is recognised"
     places = [place for name in other.starts for place in sessions[name].own.places]
-    chosen = choose([lies.support for lies in laid], places, config.multi_robot)
-    if isinstance(chosen, str):
-        return chosen
-    best = laid[chosen]
+    best, why = _best(laid, places, config)
+    if why:
+        return why
     return _Group(
         {**one.starts, **best.starts},
         [*best.places, *one.seen],
@@ -199,6 +198,25 @@ class _Laid:
     starts: Mapping[str, Start]
     places: Sequence[SubmapPose]
     support: Support
+
+
+def _best(laid: Sequence[_Laid], places: Sequence[SubmapPose], config: Config) -> tuple[_Laid, str]:
+    """The hypothesis that explains the places best, and why it is not believed ("" if it is).
+
+    Others are rivals by what they explain about as well, place by place: a building turned by half
+    a turn has walls everywhere too, but they fit worse.
+    """
+    best = max(laid, key=lambda one: (not one.support.is_contradicted, one.support.total))
+    own = best.support.scores
+    others = [one.support for one in laid if one is not best]
+    rivals = [
+        replace(x, scores=np.where(x.scores > EQUIVALENT_SHARE * own, x.scores, 0.0))
+        for x in others
+    ]
+    chosen = choose([best.support, *rivals], places, config.multi_robot)
+    if isinstance(chosen, str):
+        return best, chosen
+    return best, "" if chosen == 0 else "more than one relative pose explains what was seen"
 
 
 def _carried(found: Start, before: Start, start: Start) -> Start:
