@@ -46,13 +46,14 @@ NOISE_FACTOR, LEAST_SCANS = 3.0, 3
 class Seen:
     """Sightings of landmarks or robots by one robot, sorted by time, (n,) each.
 
-    ``targets`` numbers what is seen, ``z`` (n, 2) is bearing rad and range m of ``sigmas`` (n, 2);
-    ``odometry`` (n, 3) the poses that they were made from by odometry alone; ``d2`` their squared
-    distances from the result, per degree of freedom.
+    ``targets`` numbers what is seen, ``stands`` says that it is a landmark; ``z`` (n, 2) is bearing
+    rad and range m of ``sigmas`` (n, 2); ``odometry`` (n, 3) the poses that they were made from by
+    odometry alone; ``d2`` their squared distances from the result, per degree of freedom.
     """
 
     times_ns: IntArray
     targets: IntArray
+    stands: BoolArray
     z: Array
     sigmas: Array
     odometry: Array
@@ -237,6 +238,7 @@ def _seen(seen: Sequence[Association], run: RobotState, estimate: Estimate) -> S
     return Seen(
         times,
         targets,
+        np.array([isinstance(a.target, int) for a in usable], dtype=bool),
         z,
         np.sqrt(np.diagonal(covs, axis1=1, axis2=2)),
         run.track.mounted_pose(times) if n else np.zeros((0, 3)),

@@ -1,7 +1,7 @@
 """Doubts about sightings: signs, units, names, repeated images, what odometry says of them.
 
-Two sightings of one thing, shortly after each other, and the motion in between by odometry must
-agree, whatever the map. Where they do not, the same is tried with a bearing of the other sign, a
+Two sightings of one landmark, shortly after each other, and the motion in between by odometry must
+agree, whatever the map. A robot that is seen may go along: that is no image which is repeated. Where they do not, the same is tried with a bearing of the other sign, a
 path of another unit and so on: what makes them agree is what is wrong.
 """
 
@@ -14,7 +14,7 @@ from graphslam.odometry.interpolation import IntArray
 from graphslam.slam.doubts import Reason, seconds
 from graphslam.slam.evidence import Evidence, RobotEvidence, Seen
 
-#: s: sightings of one thing are compared over up to this
+#: s: sightings of one landmark are compared over up to this
 PAIR_S = 3.0
 #: m, rad: between which the robot moved by at least so much, or something else did
 MOVED_M, MOVED_RAD = 0.05, 0.05
@@ -100,8 +100,9 @@ def _same_name(robot: RobotEvidence) -> Iterator[Reason]:
 
 
 def _pairs_of(seen: Seen) -> tuple[IntArray, IntArray]:
-    """Places of sightings of one thing, each with the next one of it."""
+    """Places of sightings of one landmark, each with the next one of it."""
     order = np.lexsort((seen.times_ns, seen.targets))
+    order = order[seen.stands[order]]
     a, b = order[:-1], order[1:]
     apart = (seen.times_ns[b] - seen.times_ns[a]) * 1e-9
     use = (seen.targets[a] == seen.targets[b]) & (apart > 0) & (apart < PAIR_S)

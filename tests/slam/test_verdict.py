@@ -49,7 +49,8 @@ def seen_from(poses, odometry):
     z = rows[:, 2:] + rng.normal(0, (0.005, 0.01), (len(rows), 2))
     sigmas = np.tile([0.005, 0.01], (len(rows), 1))
     times = S + k * S // 10
-    return Seen(times, rows[:, 1].astype(int), z, sigmas, odometry[k], np.ones(len(rows)))
+    targets, stands = rows[:, 1].astype(int), np.ones(len(rows), dtype=bool)
+    return Seen(times, targets, stands, z, sigmas, odometry[k], np.ones(len(rows)))
 
 
 def evidence(steps=None, scans=False, seen=None, **changes):
@@ -239,6 +240,18 @@ def no_sightings(own):
     return Seen(*(getattr(own, name)[none] for name in Seen.__slots__))
 
 
+def in_convoy(stands):
+    """Sightings with most landmarks exchanged for one thing that stays 1.5 m ahead."""
+
+    def seen(own):
+        ahead = own.targets > 2
+        z = np.where(ahead[:, None], [0.3, 1.5], own.z)
+        targets = np.where(ahead, 3, own.targets)
+        return replace(own, targets=targets, stands=own.stands & (stands | ~ahead), z=z)
+
+    return seen
+
+
 def with_gap(found):
     (robot,) = found.robots
     kept = (robot.readings_ns < 20 * S) | (robot.readings_ns > 48 * S)
@@ -253,6 +266,12 @@ def sparse(found):
         final=robot.final[::45], by_odometry=robot.by_odometry[::45],
     )  # fmt: skip
     return replace(found, robots=(made,))
+
+
+def test_a_robot_that_drives_along_is_no_repeated_image_but_a_landmark_that_does_is_doubted():
+    assert reasons(evidence(seen=in_convoy(stands=False))) == ("good", "")
+    verdict, told = reasons(evidence(seen=in_convoy(stands=True)))
+    assert verdict != "good" and "repeat an image" in told
 
 
 @pytest.mark.parametrize("name", WRONG)
