@@ -110,7 +110,9 @@ def reweighted(
     before. Where this shows, the sum of all steps to come is taken instead (A. Aitken, 1926), if
     the error agrees. That takes a third less iterations and ends nearer to the minimum.
 
-    A step that raises the error is taken along the paths instead (`PathRetraction`).
+    A step that raises the error is taken along the paths instead (`PathRetraction`). One that
+    Cholesky does not find is found by QR: damped steps would creep along the weak directions of a
+    long path, which are those that Cholesky loses.
 
     Returns:
         The best values, and whether they have converged: not where a step raises the error, or the
@@ -123,7 +125,7 @@ def reweighted(
         linear = graph.linearize(values)
         ordering = ordering or gtsam.Ordering.ColamdGaussianFactorGraph(linear)
         try:
-            step = linear.optimize(ordering)
+            step = _undamped(linear, ordering)
         except RuntimeError:
             return values, False
         factor = 1.0
@@ -147,6 +149,21 @@ def reweighted(
         if share < converged or decrease < CONVERGED_ABSOLUTE:
             return values, True
     return values, True
+
+
+def _undamped(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.VectorValues:
+    """The minimum of a linear graph, by Cholesky, or by QR where that fails.
+
+    Raises:
+        RuntimeError: the graph is indeterminate.
+    """
+    try:
+        return linear.optimize(ordering)
+    except RuntimeError:
+        step = linear.optimize(ordering, gtsam.EliminateQR)
+    if not math.isfinite(step.norm()):  # QR does not fail
+        raise RuntimeError("indeterminate")
+    return step
 
 
 def _extrapolation(before: gtsam.VectorValues, step: gtsam.VectorValues) -> float:

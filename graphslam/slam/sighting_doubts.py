@@ -1,8 +1,9 @@
 """Doubts about sightings: signs, units, names, repeated images, what odometry says of them.
 
 Two sightings of one landmark, shortly after each other, and the motion in between by odometry must
-agree, whatever the map. A robot that is seen may go along: that is no image which is repeated. Where they do not, the same is tried with a bearing of the other sign, a
-path of another unit and so on: what makes them agree is what is wrong.
+agree, whatever the map. (A robot that is seen may drive along: nobody can tell that from an image
+that is repeated.) Where they do not, the same is tried with a bearing of the other sign, a path of
+another unit and so on: what makes them agree is what is wrong.
 """
 
 from collections.abc import Iterator

@@ -2,6 +2,7 @@
 
 import gtsam
 import numpy as np
+import pytest
 
 from graphslam.core.config import RobustConfig
 from graphslam.core.records import Closure, Motion
@@ -68,6 +69,22 @@ def test_extrapolated_steps_end_nearer_to_the_minimum_after_fewer_of_them():
         assert one.count < plain.iterations()
         assert graph.error(least) <= graph.error(found) <= graph.error(walked)
         assert least.localCoordinates(found).norm() < least.localCoordinates(walked).norm()
+
+
+def test_a_step_that_cholesky_loses_is_found_by_qr():
+    """A stiff path that little holds: its information spans 14 decades, more than Cholesky has."""
+    graph, start, rng = gtsam.NonlinearFactorGraph(), gtsam.Values(), np.random.default_rng(0)
+    stiff, loose = (gtsam.noiseModel.Isotropic.Sigma(3, sigma) for sigma in (1e-6, 10.0))
+    graph.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(), loose))
+    for k in range(40):
+        start.insert(k, gtsam.Pose2(k + rng.normal(0, 0.1), *rng.normal(0, 0.1, 2)))
+        if k:
+            graph.add(gtsam.BetweenFactorPose2(k - 1, k, gtsam.Pose2(1.0, 0.0, 0.0), stiff))
+    with pytest.raises(RuntimeError):
+        graph.linearize(start).optimize()
+    found, is_done = reweighted(graph, start, 1e-6)
+    assert is_done
+    assert graph.error(found) < 1e-6  # of 1e12 at first
 
 
 def test_a_step_that_raises_the_error_is_not_taken():
