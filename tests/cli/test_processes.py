@@ -75,6 +75,22 @@ def test_names_that_are_no_text_and_names_with_quotes_come_back(log, tmp_path):
     assert robots == {'tom "the" robot', ""}
 
 
+@pytest.mark.parametrize("setting", ["limits.landmarks=1", "limits.memory_mb=1"])
+def test_a_limit_that_a_log_exceeds_is_one_line_that_names_it(log, tmp_path, setting):
+    done = started("smooth", log, "-o", tmp_path / "out", "--set", setting)
+    _, err = done.communicate(timeout=60)
+    said = err.strip().splitlines()[-1]
+    assert done.returncode == 1 and "Traceback" not in err
+    assert said.startswith("graphslam: error:") and setting.split("=")[0] in said
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_log_that_the_system_does_not_open_is_one_line(tmp_path):
+    done = started("info", tmp_path / ("n" * 300 + ".mcap"))
+    _, err = done.communicate(timeout=60)
+    assert done.returncode == 1 and len(err.splitlines()) == 1 and "cannot be read" in err
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
 def test_nothing_is_left_behind_after_a_signal(tmp_path, number):
     """Of a killed process: by the next one that writes the same file."""
