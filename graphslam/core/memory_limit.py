@@ -1,5 +1,6 @@
 """A limit on the memory of this process, so that a log cannot take that of the whole machine."""
 
+import errno
 import math
 import sys
 from collections.abc import Iterator
@@ -27,7 +28,10 @@ def limited_memory(memory_mb: float, needed: str = "") -> Iterator[None]:
     resource.setrlimit(resource.RLIMIT_DATA, (min(round(memory_mb * 1e6), most), before[1]))
     try:
         yield
-    except MemoryError as error:
+    except (MemoryError, OSError) as error:
+        # a call to the system that finds no memory
+        if isinstance(error, OSError) and error.errno != errno.ENOMEM:
+            raise
         raise LogError(
             needed
             or f"the run needs more memory than limits.memory_mb ({memory_mb:g}) allows; raise it, "
