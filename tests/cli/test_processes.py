@@ -75,13 +75,12 @@ def test_names_that_are_no_text_and_names_with_quotes_come_back(log, tmp_path):
     assert robots == {'tom "the" robot', ""}
 
 
-@pytest.mark.parametrize("setting", ["limits.landmarks=1", "limits.memory_mb=1"])
-def test_a_limit_that_a_log_exceeds_is_one_line_that_names_it(log, tmp_path, setting):
-    done = started("smooth", log, "-o", tmp_path / "out", "--set", setting)
+def test_a_limit_of_landmarks_is_one_line_that_names_it(log, tmp_path):
+    done = started("smooth", log, "-o", tmp_path / "out", "--set", "limits.landmarks=1")
     _, err = done.communicate(timeout=60)
     said = err.strip().splitlines()[-1]
     assert done.returncode == 1 and "Traceback" not in err
-    assert said.startswith("graphslam: error:") and setting.split("=")[0] in said
+    assert said.startswith("graphslam: error:") and "limits.landmarks" in said
     assert not list(tmp_path.iterdir())
 
 
