@@ -56,6 +56,18 @@ def test_every_equation_of_the_thesis_is_somewhere():
     assert wanted - found == set()
 
 
+def test_every_schema_that_is_read_names_its_test():
+    """Each row of the table schema, encoding, container in docs/logs.md: tests that there are."""
+    text = (ROOT / "docs/logs.md").read_text(encoding="utf-8")
+    table = text.split("| tested in |\n")[1].split("\n\n")[0].splitlines()[1:]
+    tests = "".join(p.read_text(encoding="utf-8") for p in (ROOT / "tests/logs").glob("test_*.py"))
+    assert table
+    for row in table:
+        named = re.findall(r"`(test_\w+)`", row.split(" | ")[-1])
+        assert named, row
+        assert all(f"def {name}(" in tests for name in named), row
+
+
 def exists(name):
     """Whether a dotted name is an object of the package, or a key of the configuration."""
     parts = name.split(".")

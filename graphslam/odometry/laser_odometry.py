@@ -41,6 +41,9 @@ OPEN_SIGMA_M, OPEN_SIGMA_RAD = 0.5, 1.0
 #: s: the velocity is that of the last interval so long, at least, as stamps jitter; a prediction
 #: goes no farther than the second
 VELOCITY_S, PREDICTED_S = 0.3, 1.0
+#: times between scans of which the mean is the usual one; no laser scans twice in this share of it:
+#: such stamps are those of messages that waited and were recorded in a burst
+PERIODS, BURST_SHARE = 32, 0.1
 #: s: no time between two scans is shorter: stamps of a burst
 SHORTEST_S = 1e-3
 #: m/s and rad/s: half of the window in which a scan that fits nowhere is searched for, besides that
@@ -61,6 +64,7 @@ class LaserOdometry:
         self._pose, self._cov, self._stated = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
         self._ways: list[tuple[Scan, Scan, Array]] = []  # since the reference: from, to, increment
         self._recent: deque[tuple[float, Array]] = deque()  # s and increment: of `VELOCITY_S`
+        self._periods: deque[float] = deque(maxlen=PERIODS)  # s between the last scans
         #: motion (3,) of the base to the last scan from that before
         self.increment = np.zeros(3)
         #: m: sigma of the position since the reference, in the direction that is known least
@@ -85,10 +89,15 @@ class LaserOdometry:
         window = np.minimum(window, [MOST_SEARCH_M, MOST_SEARCH_M, np.pi / 2])
         config = self._config
         window += [config.search_m, config.search_m, config.search_rad]
-        cov = self._cov + _variances(PREDICTED_SIGMA_M, PREDICTED_SIGMA_RAD) * seconds
+        self._periods.append(min(seconds, PREDICTED_S))
+        usual_s = self._usual_s()
+        late = (self._periods[-1] - usual_s) * velocity
+        open_s = max(seconds, usual_s)
+        cov = self._cov + _variances(PREDICTED_SIGMA_M, PREDICTED_SIGMA_RAD) * open_s
+        cov += rotate_cov(np.outer(late, late), float(before[2]))
         found = align_scan(points, self._map, guess, cov, before, window)
         self._pose, self._cov = found.pose, _updated(cov, found.information)
-        stated = self._stated + _variances(OPEN_SIGMA_M, OPEN_SIGMA_RAD) * seconds
+        stated = self._stated + _variances(OPEN_SIGMA_M, OPEN_SIGMA_RAD) * open_s
         self._stated = _updated(stated, found.information)
         self.increment = increment = between(before, found.pose)
         self.sigma_m = float(np.sqrt(np.linalg.eigvalsh(self._stated[:2, :2])[-1]))
@@ -119,6 +128,11 @@ class LaserOdometry:
             heading += float(increment[2])
         self._ways.clear()
         return made
+
+    def _usual_s(self) -> float:
+        """Time since the scan before, s; of stamps in bursts, the mean of the last times."""
+        mean = sum(self._periods) / len(self._periods)
+        return mean if min(self._periods) < BURST_SHARE * mean else self._periods[-1]
 
     def _velocity(self) -> Array:
         """Twist (3,) per second of the last scans."""
