@@ -16,8 +16,9 @@ from scipy.linalg import cholesky, eigh
 
 from graphslam.core.geometry import Array
 
-#: parents of a variable at first, and by how much the whole may be widened before they are doubled
-PARENTS, MAX_WIDENING = 16, 2.0
+#: parents of a variable at first and at most, and by how much the whole may be widened before they
+#: are doubled. What a map is widened by each day multiplies: that of ten days stays below 3
+PARENTS, MOST_PARENTS, MAX_WIDENING = 16, 128, 1.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +46,7 @@ def sparse_root(cov: Array, dims: Sequence[int]) -> SparseRoot:
     count = PARENTS
     while True:
         found = _root(cov, dims, count)
-        if found.widening <= MAX_WIDENING or count >= len(dims) - 1:
+        if found.widening <= MAX_WIDENING or count >= min(len(dims) - 1, MOST_PARENTS):
             return found
         count *= 2
 
@@ -53,7 +54,7 @@ def sparse_root(cov: Array, dims: Sequence[int]) -> SparseRoot:
 def _root(cov: Array, dims: Sequence[int], count: int) -> SparseRoot:
     ends = np.cumsum(dims)
     places = [np.arange(end - dim, end) for end, dim in zip(ends, dims, strict=True)]
-    shared = _shared_information(cov, dims)
+    shared = _partial_correlations(cov, dims)
     parents: list[tuple[int, ...]] = []
     rows: list[Array] = []
     A = np.zeros(cov.shape)  # all rows, to see what is neglected
@@ -82,13 +83,19 @@ def _conditional(cov: Array, own: Array, others: Array) -> Array:
     return np.asarray(np.hstack([R, -R @ B]))
 
 
-def _shared_information(cov: Array, dims: Sequence[int]) -> Array:
-    """How much pairs of variables tell about each other: (n, n), squared canonical correlations."""
+def _partial_correlations(cov: Array, dims: Sequence[int]) -> Array:
+    """How much a variable k tells about another one given all others before k: (n, n), squared.
+
+    Not how much they tell of each other alone: in a map whose place in the world is known badly all
+    landmarks do that, wherever they are.
+    """
     ends = np.cumsum(dims)
-    white = np.zeros(cov.shape)
-    for end, dim in zip(ends, dims, strict=True):
-        block = slice(end - dim, end)
-        white[block, block] = np.linalg.inv(np.linalg.cholesky(cov[block, block]))
-    squared = (white @ cov @ white.T) ** 2
     starts = ends - np.asarray(dims)
+    # rows take each variable, given all before it, to white noise
+    A = np.linalg.inv(np.linalg.cholesky(cov))
+    scaled = A.copy()
+    for start, end in zip(starts, ends, strict=True):
+        block = A[:, start:end]
+        scaled[:, start:end] = block @ np.linalg.cholesky(np.linalg.inv(block.T @ block))
+    squared = scaled**2
     return np.asarray(np.add.reduceat(np.add.reduceat(squared, starts, axis=0), starts, axis=1))

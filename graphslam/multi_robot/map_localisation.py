@@ -189,6 +189,19 @@ def choose(
     return best
 
 
+def contradiction(given: Support) -> str:
+    """Why a start that was given cannot be right; empty if it can.
+
+    It is trusted further than one that was found: places outside of the map speak neither for nor
+    against it, and furniture that moved in sight of every place is no reason. In another building,
+    or turned round in the right one, more places contradict the map than agree with it.
+    """
+    against, agreeing = int(given.contradicted.sum()), int(given.confirmed.sum())
+    if against <= agreeing:
+        return ""
+    return f"{against} of {len(given.confirmed)} places contradict it, {agreeing} agree with it"
+
+
 def _differ(one: Support, other: Support) -> bool:
     """Whether two hypotheses, that may have begun apart, end at different paths."""
     off = between(one.poses, other.poses)

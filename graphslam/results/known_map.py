@@ -10,6 +10,7 @@ import json
 from collections.abc import Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 from zipfile import BadZipFile
 
@@ -63,7 +64,8 @@ def load_known_map(directory: Path) -> KnownMap:
         for mark in saved.landmarks
         if mark.frame is None and mark.id in saved.joint.root.landmarks
     )
-    known = known_landmarks(landmarks, landmark_covariance(saved.joint, landmarks))
+    cov = landmark_covariance(saved.joint, landmarks)
+    known = known_landmarks(landmarks, with_surface_biases(landmarks, cov, saved.config))
     places = latest_places(_submaps(directory, saved))
     name, sha256 = directory.absolute().name, _digest(directory)
     return KnownMap(name, sha256, landmarks, known, places)
@@ -105,7 +107,10 @@ def continued(result: Result, earlier: KnownMap) -> KnownMap:
     joint = joint_scans(result.estimate, result.robots)
     if joint is None:
         raise OutputError("known_map.update: the result has no joint covariance")
-    known = known_landmarks(result.landmarks, landmark_covariance(joint, result.landmarks))
+    cov = landmark_covariance(joint, result.landmarks)
+    before = {mark.id: mark.sightings for mark in earlier.landmarks}
+    cov = with_surface_biases(result.landmarks, cov, result.config, before)
+    known = known_landmarks(result.landmarks, cov)
     found = build_submaps(result.estimate.states, result.keyframe_scans, result.config)
     places = latest_places([*found, *earlier.places])
     # named by its folder, identified by its content
@@ -132,6 +137,31 @@ def landmark_covariance(joint: JointScans, landmarks: Sequence[Landmark]) -> Arr
     )  # fmt: skip
     mixed = cross @ placing.T
     return np.asarray(cov + mixed + mixed.T - placing @ joint.mount.mount @ placing.T)
+
+
+def with_surface_biases(
+    landmarks: Sequence[Landmark],
+    cov: Array,
+    config: Config,
+    before: Mapping[int, int] = MappingProxyType({}),
+) -> Array:
+    """A joint covariance (D, D) of landmarks with the error that all sightings of a wall share.
+
+    Within a log it does not matter: whoever compares poses sees each wall with its bias. On another
+    day a wall is seen from elsewhere and in other parts, and without it many sightings of a wall
+    make the map so stiff that differences of a few millimetres bend or turn all of it. Walls that
+    the log did not see, by their number of sightings ``before``, have it from earlier days.
+    """
+    dims = [2 if mark.kind == "point" else 3 for mark in landmarks]
+    first = np.cumsum([0, *dims])[:-1]
+    across = [
+        row + 1
+        for row, mark in zip(first, landmarks, strict=True)
+        if mark.kind != "point" and mark.sightings > before.get(mark.id, 0)
+    ]
+    out = cov.copy()
+    out[across, across] += config.front_end.floor_normal_m**2
+    return out
 
 
 def _own_axes(mark: Landmark) -> Array:

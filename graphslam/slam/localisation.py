@@ -15,7 +15,7 @@ from graphslam.core.record import replace
 from graphslam.core.records import Start
 from graphslam.mapping.known_map import KnownMap
 from graphslam.mapping.submaps import submaps_at, with_poses_from
-from graphslam.multi_robot.map_localisation import choose, hypotheses, support
+from graphslam.multi_robot.map_localisation import choose, contradiction, hypotheses, support
 from graphslam.multi_robot.place_recognition import PlaceMap
 from graphslam.slam.log_pass import timed
 from graphslam.slam.path_closing import PLACE_COV, ClosedPaths, close_paths
@@ -33,6 +33,7 @@ def localise(scan_log: ScanLog, known_map: KnownMap) -> None:
     with timed(scan_log.seconds, "localisation"):
         if is_start_given(config, robot):
             start = given_start(scan_log, robot)
+            check_given(scan_log, robot, start, known_map)
         else:
             start = found_start(scan_log, robot, known_map)
     place_path(scan_log, robot, start)
@@ -51,6 +52,23 @@ def given_start(scan_log: ScanLog, robot: str) -> Start:
     track = scan_log.runs[robot].track
     cov = compose_cov(told.pose, told.cov, track.mount, track.mount_cov)
     return Start(compose(told.pose, track.mount), cov)
+
+
+def check_given(scan_log: ScanLog, robot: str, start: Start, known_map: KnownMap) -> None:
+    """See that a start that was given is not one in another building.
+
+    Raises:
+        EstimationError: from there the log sees something else than the map.
+    """
+    laid = laid_into(scan_log, robot, start, known_map)
+    anchors = {robot: np.array(scan_log.paths[robot].anchors)}
+    submaps, _ = submaps_at(anchors, laid.states, scan_log.keyframe_scans, scan_log.config)
+    why = contradiction(support(known_map.places, submaps)) if known_map.places else ""
+    if why:
+        raise EstimationError(
+            f"robot {robot}: does not begin in the map {known_map.name} where --start says: {why}; "
+            "give another map, or another start"
+        )
 
 
 def found_start(scan_log: ScanLog, robot: str, known_map: KnownMap) -> Start:

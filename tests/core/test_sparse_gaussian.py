@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from graphslam.core.sparse_gaussian import MAX_WIDENING, sparse_root
+from graphslam.core.sparse_gaussian import MAX_WIDENING, PARENTS, sparse_root
 
 
 def chain(n, rng):
@@ -49,3 +49,22 @@ def test_it_is_sparse_and_nowhere_more_certain_than_the_joint(seed):
     assert shares.max() <= 1.0 + 1e-8
     # it is not so wide that it would be of no use
     assert np.median(shares) > 0.6
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_error_of_all_together_does_not_hide_neighbours(seed):
+    """A map that lies badly in the world: parents must be those that tell most beside it.
+
+    Chosen by how much any two tell about each other, that error among it, they leave out so much
+    that the root must be 1.4 to 2.1 times as wide.
+    """
+    rng = np.random.default_rng(seed)
+    n = 60
+    at = rng.uniform(0.0, 20.0, (n, 2))
+    distance = np.linalg.norm(at[:, None] - at, axis=2)
+    whole = np.zeros((2 * n, 3))
+    whole[0::2, 0] = whole[1::2, 1] = 1.0
+    whole[0::2, 2], whole[1::2, 2] = -at[:, 1], at[:, 0]
+    cov = np.kron(np.exp(-distance / 5.0), np.eye(2)) + 100.0 * whole @ whole.T
+    root = sparse_root(cov + 0.01 * np.eye(2 * n), [2] * n)
+    assert max(map(len, root.parents)) == PARENTS

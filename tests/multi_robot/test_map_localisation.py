@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from graphslam.core.config import MultiRobotConfig
-from graphslam.multi_robot.map_localisation import Support, choose
+from graphslam.multi_robot.map_localisation import Support, choose, contradiction
 
 #: places along a corridor, 3 m apart
 POSES = np.column_stack([3.0 * np.arange(6), np.zeros(6), np.zeros(6)])
@@ -57,3 +57,13 @@ def test_too_little_is_refused():
     wide = MultiRobotConfig(min_place_extent_m=20.0)
     assert "extend over less" in choose([hypothesis(0.9, 0)], PLACES, wide)
     assert "3 of 6 places contradict it" in chosen(hypothesis(0.9, 3))
+
+
+def test_a_given_start_is_refused_where_more_contradicts_it_than_agrees():
+    """Another building; but not furniture in sight of all places, nor places outside of the map."""
+    moved = hypothesis(0.5, 6)
+    assert not contradiction(moved)
+    outside = replace(moved, confirmed=np.zeros(6, bool), contradicted=np.zeros(6, bool))
+    assert not contradiction(outside)
+    elsewhere = replace(moved, confirmed=np.arange(6) < 2)
+    assert contradiction(elsewhere) == "6 of 6 places contradict it, 2 agree with it"
