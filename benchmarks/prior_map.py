@@ -15,6 +15,7 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from common import parser
@@ -55,20 +56,20 @@ def main() -> None:
 
 def mapped(folder: Path, log: Path, seed: int) -> Path:
     """The result of a log whose start is told, with an error."""
+    graphslam.smooth(log, output=folder / "map", force=True, **told_start(log, seed))
+    return folder / "map"
+
+
+def told_start(log: Path, seed: int) -> dict[str, Any]:
+    """Settings that tell where a log's robot starts, with an error drawn from their sigmas."""
     rng = np.random.default_rng(seed)
     (robot, truth), *_ = read_truth([log], graphslam.load_config()).trajectories.items()
     told = truth.poses[0] + rng.normal(0.0, START_SIGMA)
-    graphslam.smooth(
-        log,
-        output=folder / "map",
-        force=True,
-        **{
-            f"start.poses.{robot}": [float(x) for x in told],
-            "start.given_sigma_m": START_SIGMA[0],
-            "start.given_sigma_rad": START_SIGMA[2],
-        },
-    )
-    return folder / "map"
+    return {
+        f"start.poses.{robot}": [float(x) for x in told],
+        "start.given_sigma_m": START_SIGMA[0],
+        "start.given_sigma_rad": START_SIGMA[2],
+    }
 
 
 def office(folder: Path, seeds: int) -> Iterator[str]:
@@ -243,11 +244,10 @@ def days(folder: Path, _seeds: int) -> Iterator[str]:
     if continued:
         yield f"{len(continued)} days, continued map: ATE mean {np.mean(continued):.4f} m"
     truth = read_truth(logs, SAME_PLACE)
-    told = truth.trajectories["first"].poses[0]
+    # sessions are called as their logs
+    told = {key.replace(".vehicle", ".first"): value for key, value in told_start(first, 0).items()}
     began = time.process_time()
-    result = graphslam.smooth(
-        logs, config=SAME_PLACE, **{"start.poses.first": [float(x) for x in told]}
-    )
+    result = graphslam.smooth(logs, config=SAME_PLACE, **told)
     found = evaluate(result, truth.trajectories)["robots"]
     anew = [found[name]["final"]["ate_rmse_m"] for name in found if name != "first"]
     frames = len(set(result.summary["frames"].values()))
