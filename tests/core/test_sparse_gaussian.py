@@ -52,12 +52,13 @@ def test_it_is_sparse_and_nowhere_more_certain_than_the_joint(seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_an_error_of_all_together_does_not_hide_neighbours(seed):
+def test_an_error_of_all_together_does_not_hide_neighbours(monkeypatch, seed):
     """A map that lies badly in the world: parents must be those that tell most beside it.
 
-    Chosen by how much any two tell about each other, that error among it, they leave out so much
-    that the root must be 1.4 to 2.1 times as wide.
+    Chosen by how much any two tell about each other, that error among it, the same number of them
+    leaves out so much that the root is 1.4 to 1.7 times as wide; now it is 1.06 to 1.11.
     """
+    monkeypatch.setattr("graphslam.core.sparse_gaussian.MOST_PARENTS", PARENTS)
     rng = np.random.default_rng(seed)
     n = 60
     at = rng.uniform(0.0, 20.0, (n, 2))
@@ -66,5 +67,4 @@ def test_an_error_of_all_together_does_not_hide_neighbours(seed):
     whole[0::2, 0] = whole[1::2, 1] = 1.0
     whole[0::2, 2], whole[1::2, 2] = -at[:, 1], at[:, 0]
     cov = np.kron(np.exp(-distance / 5.0), np.eye(2)) + 100.0 * whole @ whole.T
-    root = sparse_root(cov + 0.01 * np.eye(2 * n), [2] * n)
-    assert max(map(len, root.parents)) == PARENTS
+    assert sparse_root(cov + 0.01 * np.eye(2 * n), [2] * n).widening < 1.2
