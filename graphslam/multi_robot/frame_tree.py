@@ -96,12 +96,21 @@ def build_frame_tree(
     by_pair: dict[tuple[str, str], list[Sighting]] = defaultdict(list)
     for s in sightings:
         by_pair[min(s.robot, str(s.seen_robot)), max(s.robot, str(s.seen_robot))].append(s)
+    times_ns: dict[str, list[int]] = defaultdict(list)
+    for pair, seen in by_pair.items():
+        for name in pair:
+            times_ns[name] += [s.time_ns for s in seen]
     relations = [either for relation in more for either in (relation, relation.reversed())]
     undecided = dict(doubts)
     pairs = [pair for pair in combinations(sorted(estimates), 2) if not {*pair} <= set(starts)]
 
+    known = {
+        name: own.known_at(np.unique(times_ns[name])) if name in times_ns else own
+        for name, own in estimates.items()
+    }
+
     def relate(pair: tuple[str, str]) -> RelativeFrame | str:
-        return estimate_relative_frame(*pair, estimates, by_pair[pair], config)
+        return estimate_relative_frame(*pair, known, by_pair[pair], config)
 
     for pair, relation in zip(pairs, parallel_map(relate, pairs), strict=True):
         if isinstance(relation, RelativeFrame):

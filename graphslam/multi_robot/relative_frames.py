@@ -11,8 +11,8 @@ invariant: P. Lusk et al., CLIPPER, ICRA 2021, DOI 10.1109/ICRA48506.2021.956106
 determine the transform, and no set that contradicts it may have much more than half of its size.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -37,6 +37,7 @@ from graphslam.core.geometry import (
 )
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Sighting, Trajectory
+from graphslam.odometry.increment_sums import Motions
 from graphslam.odometry.preintegration import Track
 from graphslam.odometry.readings import IntArray
 
@@ -68,9 +69,32 @@ class RobotEstimate:
         """Poses (n, 3) and covariances (n, 3, 3): the last state before, propagated by odometry."""
         states = self.states
         i = states.index_before(times_ns)
-        moved = self.track.motions(states.stamps_ns[i], times_ns)
+        moved = self.motions(states.stamps_ns[i], times_ns)
         covs = compose_cov(states.poses[i], states.covs[i], moved.delta, moved.cov)
         return compose(states.poses[i], moved.delta), covs
+
+    def motions(self, start_ns: IntArray, end_ns: IntArray) -> Motions:
+        """Motions (n) by odometry between times (n,) and (n,)."""
+        return self.track.motions(start_ns, end_ns)
+
+    def known_at(self, times_ns: IntArray) -> "RobotEstimate":
+        """The same, for questions about these times (n,) alone: odometry is summed up once."""
+        first_ns = self.states.stamps_ns[self.states.index_before(times_ns)]
+        among = self.track.motions_among(np.union1d(first_ns, times_ns))
+        return _EstimateAtTimes(
+            self.states, self.track, self.landmarks, self.anonymous_points, among=among
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _EstimateAtTimes(RobotEstimate):
+    """See `RobotEstimate.known_at`."""
+
+    among: Callable[[IntArray, IntArray], Motions] = field(kw_only=True)
+
+    def motions(self, start_ns: IntArray, end_ns: IntArray) -> Motions:
+        """See `RobotEstimate`."""
+        return self.among(start_ns, end_ns)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,7 +110,7 @@ class CorrespondenceSide:
     times_ns: IntArray
     range_m: Array
 
-    def relative_variance(self, track: Track) -> Array:
+    def relative_variance(self, estimate: RobotEstimate) -> Array:
         """Variances (n, n) m² of points relative to each other, by the estimate or by odometry.
 
         Estimates of nearby times share most of their error, which a sum of marginals ignores:
@@ -97,7 +121,7 @@ class CorrespondenceSide:
         if len(timed):
             timed = timed[np.argsort(self.times_ns[timed], kind="stable")]
             i, j = (timed[k] for k in np.triu_indices(len(timed), 1))
-            moved = track.motions(self.times_ns[i], self.times_ns[j])
+            moved = estimate.motions(self.times_ns[i], self.times_ns[j])
             back = inverse_cov(moved.delta, moved.cov)
             for to, seen_from, cov in ((j, i, moved.cov), (i, j, back)):
                 odometry = cov[:, 0, 0] + cov[:, 1, 1] + self.range_m[to] ** 2 * cov[:, 2, 2]
@@ -147,7 +171,7 @@ def estimate_relative_frame(
     distance = [np.linalg.norm(e.points[:, None] - e.points, axis=-1) for e in sides]
     spread = noise[:, None] + noise
     for side, name in zip(sides, (a, b), strict=True):
-        spread = spread + side.relative_variance(estimates[name].track)
+        spread = spread + side.relative_variance(estimates[name])
     agree = (distance[0] - distance[1]) ** 2 <= chi2_quantile(AGREE, 1) * spread
     np.fill_diagonal(agree, False)
     variance = p.variance + q.variance + noise

@@ -5,7 +5,7 @@ the `readings` when needed, and can be computed again with another calibration.
 """
 
 from collections import defaultdict
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -269,6 +269,13 @@ class Track(Readings):
         """What `between` gives, for times (n,) and (n,), at once; see `preintegrate_batch`."""
         return preintegrate_batch([(self, start_ns, end_ns)])[0]
 
+    def motions_among(self, times_ns: IntArray) -> Callable[[IntArray, IntArray], Motions]:
+        """`motions` between any of these times (n,), ascending; what they share is summed once."""
+        sums = _SumsAtStates([self], [times_ns])
+        return lambda start_ns, end_ns: sums.motions(
+            np.searchsorted(times_ns, start_ns), np.searchsorted(times_ns, end_ns)
+        )
+
     @property
     def batch_key(self) -> Hashable:
         """Tracks with equal keys can be integrated together: only data and calibration differ.
@@ -359,34 +366,49 @@ def _motions(
 ) -> Motions:
     """`preintegrate_batch` tracks with one `Track.batch_key`, track after track."""
     times, starts, ends, passed = [], [], [], 0
-    for track, start, end in zip(tracks, start_ns, end_ns, strict=True):
-        both = np.concatenate([np.minimum(start, end), np.maximum(start, end)])
-        needed, at = np.unique(both, return_inverse=True)
-        times.append(needed - track.latency_ns)
+    for start, end in zip(start_ns, end_ns, strict=True):
+        needed, at = np.unique(np.concatenate([start, end]), return_inverse=True)
+        times.append(needed)
         starts.append(passed + at[: len(start)])
         ends.append(passed + at[len(start) :])
         passed += len(needed)
-    a, b = np.concatenate(starts), np.concatenate(ends)
-    which = np.repeat(np.arange(len(tracks)), [len(start) for start in start_ns])
-    sums, earlier = path_sums(tracks, times)
-    found, first = sums.motions_between(a, b), tracks[0]
-    delta, cov, d_cal, length = found.delta, found.cov, found.d_cal, found.length_m
-    if first.is_mounted:
-        mount = np.array([track.mount for track in tracks])[which]
-        change = between(earlier[a], earlier[b]) - delta
-        change[:, 2] = wrap(change[:, 2])
-        observable = np.array([not track.has_burst_stamps for track in tracks])
-        by_latency = change * np.where(observable, 1e9 / LATENCY_STEP_NS, 0.0)[which, None]
-        delta, cov, d_cal = of_mount(delta, cov, d_cal, mount, by_latency)
-    known = np.array([track.calibration.cov for track in tracks])[which]
-    cov = (cov + cov.mT) / 2 + d_cal @ known @ d_cal.mT
-    moved = (length > 0) | (delta[:, 2] != 0)
-    cov = cov + np.where(moved[:, None, None], first.floor_cov, first.floor_cov_of(False))
-    back = np.concatenate(end_ns) < np.concatenate(start_ns)
-    if back.any():
-        cov[back] = inverse_cov(delta[back], cov[back])
-        delta[back] = inverse(delta[back])
-    return Motions(delta, cov, d_cal, length)
+    return _SumsAtStates(tracks, times).motions(np.concatenate(starts), np.concatenate(ends))
+
+
+class _SumsAtStates:
+    """Sums of tracks with one `Track.batch_key` up to times of states, and motions between them.
+
+    The tracks keep their calibration as long as they are asked for motions.
+    """
+
+    def __init__(self, tracks: Sequence[Track], times_ns: Sequence[IntArray]) -> None:
+        """Sum up; times (n,) of each track, ascending. They are numbered track after track."""
+        self._tracks = tracks
+        late = [times - track.latency_ns for track, times in zip(tracks, times_ns, strict=True)]
+        self._track_of = np.repeat(np.arange(len(tracks)), [len(times) for times in late])
+        self._sums, self._earlier = path_sums(tracks, late)
+
+    def motions(self, start: IntArray, end: IntArray) -> Motions:
+        """The motions (m) between times of the same track, by their numbers (m,)."""
+        a, b, which = np.minimum(start, end), np.maximum(start, end), self._track_of[start]
+        found, tracks = self._sums.motions_between(a, b), self._tracks
+        delta, cov, d_cal, length = found.delta, found.cov, found.d_cal, found.length_m
+        if tracks[0].is_mounted:
+            mount = np.array([track.mount for track in tracks])[which]
+            change = between(self._earlier[a], self._earlier[b]) - delta
+            change[:, 2] = wrap(change[:, 2])
+            observable = np.array([not track.has_burst_stamps for track in tracks])
+            by_latency = change * np.where(observable, 1e9 / LATENCY_STEP_NS, 0.0)[which, None]
+            delta, cov, d_cal = of_mount(delta, cov, d_cal, mount, by_latency)
+        known = np.array([track.calibration.cov for track in tracks])[which]
+        cov = (cov + cov.mT) / 2 + d_cal @ known @ d_cal.mT
+        moved, floor = (length > 0) | (delta[:, 2] != 0), tracks[0].floor_cov
+        cov = cov + np.where(moved[:, None, None], floor, tracks[0].floor_cov_of(False))
+        back = end < start
+        if back.any():
+            cov[back] = inverse_cov(delta[back], cov[back])
+            delta[back] = inverse(delta[back])
+        return Motions(delta, cov, d_cal, length)
 
 
 def path_sums(

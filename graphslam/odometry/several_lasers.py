@@ -6,7 +6,7 @@ both mounts and both latencies, which are parameters of the calibration like tho
 what one laser sees needs nothing of the other.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -116,6 +116,10 @@ class SeveralLasersTrack(Track):
     def motions(self, start_ns: IntArray, end_ns: IntArray) -> Motions:
         """See `Track`; between states of whichever laser."""
         return self._motions(start_ns, end_ns, self.laser_of(start_ns), self.laser_of(end_ns))
+
+    def motions_among(self, times_ns: IntArray) -> Callable[[IntArray, IntArray], Motions]:
+        """See `Track`."""
+        return self.motions
 
     def _motions(
         self, start_ns: IntArray, end_ns: IntArray, start_of: IntArray, end_of: IntArray
