@@ -75,6 +75,17 @@ def test_motions_that_cut_a_reading_have_the_noise_of_what_is_left_of_it(period_
         np.testing.assert_allclose(many.cov[k], one.cov, rtol=1e-6, atol=1e-12)
 
 
+@pytest.mark.parametrize("track", [mounted, burst, lambda: track_of(range(12), curve(range(12)))])
+def test_motions_among_given_times_are_those_of_any_two_of_them(track):
+    """Also backwards and from a time to itself. Sums that begin elsewhere differ by rounding."""
+    track = track()
+    times = (np.sort(np.random.default_rng(0).uniform(1, 9, 20)) * S).astype(np.int64)
+    i, j = (k.ravel() for k in np.indices((20, 20)))
+    among, each = track.motions_among(times)(times[i], times[j]), track.motions(times[i], times[j])
+    for name in ("delta", "cov", "d_cal", "length_m"):
+        np.testing.assert_allclose(getattr(among, name), getattr(each, name), atol=1e-12)
+
+
 # ------------------------------------------------------------ latency
 
 
