@@ -60,7 +60,7 @@ def run_sighting_passes(
         _ = one.groups  # once for both processes
         replayed = Future(partial(replay_causally, one))
         with timed(one.seconds, "final optimisation"):
-            rough = solve_roughly(one)
+            rough, made = solve_roughly(one)
             if rough.error > rough.dof and not known.identities:
                 # residuals twice as large as stated: some sightings may be of something else
                 swapped = find_swapped_names(one, solve_without_contradiction(one))
@@ -75,7 +75,7 @@ def run_sighting_passes(
                 return None
             # all that is finer depends on the clocks; paths need the calibration
             asked = Future(partial(clocks_from_paths, one.seen_robots, one.tracks, config))
-            rough = with_gated_robots(one, rough)
+            rough = with_gated_robots(one, rough, made)
             clocks = asked.result()
             if clocks and not known.clocks:
                 replayed.cancel()

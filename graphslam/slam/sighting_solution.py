@@ -8,7 +8,8 @@ their calibration until then.
 """
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import chain
 
@@ -43,18 +44,35 @@ WIDE = 10.0
 GATING_ROUNDS, FEW = 3, 0.01
 #: rounds of the rough solution, after which the latency of odometry no longer changes much
 ROUNDS = 3
-#: the same from estimates of robots by themselves
-ROUNDS_AGAIN = 1
 
 
-def solve_roughly(one: SightingPass) -> Estimate:
-    """An estimate near that of all robots together; sets the calibration of their tracks.
+def solve_roughly(one: SightingPass) -> tuple[Estimate, tuple[Step, ...]]:
+    """An estimate near that of all robots together, and the steps behind it.
+
+    It sets the calibration of their tracks.
 
     Raises:
         EstimationError: the estimate is indeterminate.
     """
-    rounds = ROUNDS_AGAIN if set(one.tracks) <= set(one.known.alone) else ROUNDS
-    return _rough(_initial_states(one), one.steps, one.tracks, one.groups, one.config, rounds)
+    states, kernel = _initial_states(one), _wide(one.config.robust)
+    if set(one.tracks) <= set(one.known.alone):  # what calibrations need is known: once is enough
+        with _held(one.tracks):
+            start, made = _with_landmarks(states, one.steps, one.tracks, one.groups)
+        return calibrate(lambda *_: made, start, one.tracks, kernel, 1, rough=True)
+    estimate = _rough(states, one.steps, one.tracks, one.groups, one.config)
+    with _held(one.tracks):
+        return estimate, recompute_steps(one.steps, estimate, one.tracks, one.groups)
+
+
+@contextmanager
+def _held(tracks: Mapping[str, Track]) -> Iterator[None]:
+    """Let motions leave out the errors of the calibration."""
+    known = {name: track.calibration for name, track in tracks.items()}
+    for track in tracks.values():
+        track.calibration = track.calibration.held()
+    yield
+    for name, track in tracks.items():
+        track.calibration = known[name]
 
 
 def solve_without_contradiction(one: SightingPass) -> Estimate:
@@ -99,27 +117,26 @@ def solve_finely(one: SightingPass, rough: Estimate) -> tuple[Estimate, tuple[St
     return problem.finish(one, problem.steps, start)
 
 
-def with_gated_robots(one: SightingPass, rough: Estimate) -> Estimate:
+def with_gated_robots(one: SightingPass, rough: Estimate, made: tuple[Step, ...]) -> Estimate:
     """An estimate without sightings of robots that contradict all else; their steps lose them.
+
+    Args:
+        one: the pass.
+        rough: the estimate with them.
+        made: the steps behind it.
 
     Raises:
         EstimationError: the estimate is indeterminate.
     """
     recorded, groups, kernel = one.steps, one.groups, _wide(one.config.robust)
     kept = every = _sources(recorded)
-    made: tuple[Step, ...] = ()
+    used = made
 
     def rebuild(estimate: Estimate, _last: bool) -> tuple[Step, ...]:
         nonlocal made
         made = recompute_steps(recorded, estimate, one.tracks, groups)
         return _only(made, kept)
 
-    calibrations = {name: track.calibration for name, track in one.tracks.items()}
-    for track in one.tracks.values():
-        track.calibration = track.calibration.held()
-    used = rebuild(rough, False)
-    for name, track in one.tracks.items():
-        track.calibration = calibrations[name]
     for _ in range(GATING_ROUNDS):
         robots = RobotOffers.of(made, one.sources)
         before, kept = kept, _sources(robots.associated_again(used, rough, kernel, one.config))
@@ -165,7 +182,7 @@ def solve_robots_apart(one: SightingPass) -> Estimate:
         steps, tracks = steps_of_robot(one.steps, robot), {robot: track}
         groups = group_sightings(steps, one.sources)
         states = {robot: states_by_odometry(steps, robot, track)}
-        rough = _rough(states, steps, tracks, groups, one.config, ROUNDS)
+        rough = _rough(states, steps, tracks, groups, one.config)
         estimate, _ = solve_sighting_log(steps, rough, tracks, groups, one.config, 1)
         return estimate, track.calibration
 
@@ -241,8 +258,7 @@ def _rough(
     tracks: Mapping[str, Track],
     groups: Sequence[SightingGroup],
     config: Config,
-    rounds: int,
 ) -> Estimate:
     """A rough estimate from initial ``states``."""
     start, made = _with_landmarks(states, steps, tracks, groups)
-    return calibrate_roughly(made, start, tracks, _wide(config.robust), rounds)
+    return calibrate_roughly(made, start, tracks, _wide(config.robust), ROUNDS)
