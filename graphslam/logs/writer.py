@@ -61,19 +61,32 @@ class LogWriter:
         """
         if os.path.lexists(self.path) and (self.path.is_symlink() or not self.path.is_file()):
             raise OutputError(f"{self.path}: is no plain file, so it is not replaced")
+        self._partial = self._unfinished()
         try:
-            self._partial = unfinished(self.path)
-            self._before = identity(self.path)
             self._stream = self._partial.open("wb")
-        except OSError as error:
-            raise OutputError(
-                f"{self.path}: cannot be written: {error.strerror}; check the folder"
-            ) from error
-        self._writer = Writer(
-            self._stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD
-        )
-        self._writer.start(profile="ros2", library=f"graphslam {__version__}")
+            self._writer = Writer(
+                self._stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD
+            )
+            self._writer.start(profile="ros2", library=f"graphslam {__version__}")
+        except BaseException as error:  # a signal too: the block, whose end removes it, never began
+            if self._stream is not None:
+                self._stream.close()
+            self._partial.unlink(missing_ok=True)
+            if isinstance(error, OSError):
+                raise self._refused(error) from error
+            raise
         return self
+
+    def _unfinished(self) -> Path:
+        try:
+            partial = unfinished(self.path)
+            self._before = identity(self.path)
+        except OSError as error:
+            raise self._refused(error) from error
+        return partial
+
+    def _refused(self, error: OSError) -> OutputError:
+        return OutputError(f"{self.path}: cannot be written: {error.strerror}; check the folder")
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Finish and rename the file, or remove it if the block raised."""

@@ -184,6 +184,20 @@ def test_only_plain_files_are_replaced(tmp_path, what):
         drive(target, 1)
 
 
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, SystemExit, OSError(28, "disk full")])
+def test_what_ends_a_log_while_it_is_opened_leaves_nothing(tmp_path, monkeypatch, stop):
+    """The block has not begun then, so nothing else removes the file."""
+
+    def stopped(*_, **__):
+        raise stop
+
+    monkeypatch.setattr("graphslam.logs.writer.Writer.start", stopped)
+    expected = OutputError if isinstance(stop, OSError) else stop
+    with pytest.raises(expected), LogWriter(tmp_path / "log.mcap"):
+        raise AssertionError
+    assert not list(tmp_path.iterdir())
+
+
 # ---------------------------------------------------------------- bombs and limits
 
 
