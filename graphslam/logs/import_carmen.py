@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from decimal import Decimal, DecimalException
 from functools import partial
-from itertools import accumulate
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,6 +25,7 @@ from graphslam.logs.no_return import find_no_return
 from graphslam.logs.physical_limits import MAX_RANGE_M
 from graphslam.logs.schemas import DEFAULT_ROBOT
 from graphslam.logs.source_files import text_lines
+from graphslam.logs.time_order import recording_times
 from graphslam.logs.writer import LogWriter
 
 Ranges = NDArray[np.float32]
@@ -96,9 +96,7 @@ def import_carmen(source: Path, target: Path) -> ImportSummary:
             "CARMEN? Name the log"
         )
     stamped, notes = _once(stamped)
-    # log times that never decrease, so that readers keep the order of the file: a line was written
-    # before all lines after it, hence not later than the earliest of their stamps
-    log_times = list(accumulate((entry.stamp_ns for entry in reversed(stamped)), min))[::-1]
+    log_times = recording_times([entry.stamp_ns for entry in stamped])
     scans = [entry for entry in stamped if isinstance(entry, _Scan)]
     in_scans = not any(isinstance(entry, _Odometry) for entry in stamped)
     if in_scans and any(scan.robot_pose for scan in scans):

@@ -35,6 +35,12 @@ def _mrclam(source: Path, target: Path) -> ImportSummary:
     return import_mrclam(source, target)
 
 
+def _rawlog(source: Path, target: Path) -> ImportSummary:
+    from graphslam.logs.import_rawlog import import_rawlog
+
+    return import_rawlog(source, target)
+
+
 def _rosbag(source: Path, target: Path) -> ImportSummary:
     from graphslam.logs.import_rosbag import import_rosbag
 
@@ -54,6 +60,7 @@ IMPORTERS: dict[str, Callable[[Path, Path], ImportSummary]] = {
     "g2o": _pose_graph,
     "isam": _pose_graph,
     "mrclam": _mrclam,
+    "rawlog": _rawlog,
     "rosbag": _rosbag,
     "tinyslam": _tinyslam,
 }

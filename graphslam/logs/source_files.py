@@ -36,7 +36,7 @@ _READ_ERRORS = (
     struct.error,
 )
 #: no text of a data set is larger when it is unpacked
-_MOST_BYTES = 2_000_000_000
+MOST_BYTES = 2_000_000_000
 
 
 def text_lines(path: Path) -> Iterator[str]:
@@ -54,7 +54,7 @@ def text_lines(path: Path) -> Iterator[str]:
     except IsADirectoryError as error:
         raise LogError(f"{path}: is a directory; name the log in it") from error
     except _READ_ERRORS as error:
-        raise _unreadable(path, error) from error
+        raise unreadable(path, error) from error
 
 
 def first_and_all(items: Iterator[_T], if_empty: str) -> tuple[_T, Iterator[_T]]:
@@ -91,11 +91,11 @@ def text_files(source: Path, names: re.Pattern[str]) -> dict[str, str]:
             if name in texts:
                 raise LogError(f"{source}: holds two files {name}; name the folder of one data set")
             text = read()
-            if len(text) > _MOST_BYTES:
+            if len(text) > MOST_BYTES:
                 raise LogError(f"{source}: {name} is larger than 2 GB when unpacked; is it a log?")
             texts[name] = text.decode("utf-8", errors="replace")
     except _READ_ERRORS as error:
-        raise _unreadable(source, error) from error
+        raise unreadable(source, error) from error
     return texts
 
 
@@ -116,15 +116,16 @@ def _members(source: Path) -> Iterator[tuple[str, Callable[[], bytes]]]:
         with tarfile.open(source, "r|*") as archive:
             for member in archive:
                 if content := archive.extractfile(member):
-                    yield member.name, partial(content.read, 1 + _MOST_BYTES)
+                    yield member.name, partial(content.read, 1 + MOST_BYTES)
 
 
 def _unpack(packed: zipfile.ZipFile, name: str) -> bytes:
     with packed.open(name) as stream:
-        return stream.read(1 + _MOST_BYTES)
+        return stream.read(1 + MOST_BYTES)
 
 
-def _unreadable(source: Path, error: Exception) -> LogError:
+def unreadable(source: Path, error: Exception) -> LogError:
+    """What to say of a file whose reading ended with ``error``."""
     if isinstance(error, FileNotFoundError):
         return LogError(f"{source}: no such file; check the path")
     why = " ".join(str(getattr(error, "strerror", None) or error).split())

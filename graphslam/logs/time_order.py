@@ -10,7 +10,7 @@ import heapq
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import islice
+from itertools import accumulate, islice
 
 from graphslam.core import records
 from graphslam.core.records import Message
@@ -43,6 +43,15 @@ _RANKS: Mapping[type[Message], int] = {
     records.TrueLandmark: 1,
     records.RelativePose: 2,
 }
+
+
+def recording_times(stamps_ns: Sequence[int]) -> list[int]:
+    """Log times that keep the order of a file which has none.
+
+    They never decrease: a message was recorded before all that come after it, hence not later than
+    the earliest of their stamps.
+    """
+    return list(accumulate(reversed(stamps_ns), min))[::-1]
 
 
 def sort_key(message: Message) -> tuple[int, int]:
