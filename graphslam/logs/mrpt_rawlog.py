@@ -176,7 +176,7 @@ def _pose3(data: ObjectReader) -> Array:
 
 def _rotation(q: Array) -> Array:
     """Matrix (3, 3) of a quaternion w x y z."""
-    norm = float(np.linalg.norm(q))
+    norm = math.hypot(*q)
     if not 0.5 < norm < 2:  # of NaN too
         raise UnreadableError("has a rotation that is none")
     w, x, y, z = q / norm
@@ -241,10 +241,10 @@ def _mean(data: ObjectReader) -> Pose:
     if name != "CPosePDFGaussian" or version > 2:
         raise UnreadableError(f"has a {name} of version {version}, which is not read")
     mean = _pose2(data)
-    if version < 2:
-        _matrix(data)
+    if version:
+        data.take(6 * (8 if version == 2 else 4))
     else:
-        data.take(6 * 8)
+        _matrix(data)
     data.end()
     return mean
 

@@ -46,8 +46,9 @@ def test_bad_sources_get_one_line_and_leave_no_file(name, tmp_path):
     # an MRCLAM set may be a folder; this one holds none of its files
     lacking = {"mrclam": "has no RobotN_Odometry.dat", "csv": "has no odometry.csv"}
     folder = lacking.get(name, "is a directory")
-    # no log of ROS is packed with gzip
-    no_gzip = "is not an MCAP file" if name == "rosbag" else "cannot be read to its end"
+    # no log of ROS is packed with gzip, and a rawlog need not be
+    others = {"rosbag": "is not an MCAP file", "rawlog": "no object begins"}
+    no_gzip = others.get(name, "cannot be read to its end")
     for source, why in (
         (tmp_path / "missing", "no such file"),
         (tmp_path, folder),

@@ -1,4 +1,5 @@
 // Writes the tables of a drive as a rawlog, with MRPT: see ../test_import_rawlog.py.
+// Built with CMake: find_package(mrpt-obs), target_link_libraries(write_rawlog mrpt::obs).
 #include <mrpt/io/CFileGZOutputStream.h>
 #include <mrpt/obs/CActionCollection.h>
 #include <mrpt/obs/CActionRobotMovement2D.h>
@@ -22,7 +23,7 @@ static mrpt::Clock::time_point stamp(long long ns)
 	return mrpt::Clock::time_point(mrpt::Clock::duration(ns / 100 + 116444736000000000LL));
 }
 
-// stamp ns -> the numbers after it; the last column may be followed by any number of others
+// stamp ns -> the numbers after it
 static std::map<long long, Row> table(const std::string& path)
 {
 	std::map<long long, Row> rows;
