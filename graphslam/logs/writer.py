@@ -6,6 +6,7 @@ The only module that writes with `mcap`.
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, Self
@@ -24,8 +25,7 @@ from graphslam.logs.schemas import DEFAULT_ROBOT
 
 # Small chunks: a damaged one loses less; costs a few per cent of compression.
 _CHUNK_BYTES = 64 * 1024
-#: MCAP has times of 64 bits
-_TIMES = 1 << 64
+_TIMES = 1 << 64  # of 64 bits
 
 
 class LogWriter:
@@ -56,37 +56,24 @@ class LogWriter:
         """Open the temporary file.
 
         Raises:
-            OutputError: the folder does not exist or cannot be written to, or something else than
-                a file stands at the path.
+            OutputError: the folder is missing or not writable, or no plain file stands there.
         """
         if os.path.lexists(self.path) and (self.path.is_symlink() or not self.path.is_file()):
             raise OutputError(f"{self.path}: is no plain file, so it is not replaced")
-        self._partial = self._unfinished()
         try:
-            self._stream = self._partial.open("wb")
-            self._writer = Writer(
-                self._stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD
-            )
-            self._writer.start(profile="ros2", library=f"graphslam {__version__}")
-        except BaseException as error:  # a signal too: the block, whose end removes it, never began
-            if self._stream is not None:
-                self._stream.close()
-            self._partial.unlink(missing_ok=True)
-            if isinstance(error, OSError):
-                raise self._refused(error) from error
-            raise
-        return self
-
-    def _unfinished(self) -> Path:
-        try:
-            partial = unfinished(self.path)
+            self._partial = unfinished(self.path)
             self._before = identity(self.path)
+            # until the block begins, whose end removes the file, nobody else would: signals come
+            with ExitStack() as undo:
+                undo.callback(self._partial.unlink, missing_ok=True)
+                self._stream = undo.enter_context(self._partial.open("wb"))
+                self._writer = Writer(self._stream, _CHUNK_BYTES, CompressionType.ZSTD)
+                self._writer.start(profile="ros2", library=f"graphslam {__version__}")
+                undo.pop_all()
         except OSError as error:
-            raise self._refused(error) from error
-        return partial
-
-    def _refused(self, error: OSError) -> OutputError:
-        return OutputError(f"{self.path}: cannot be written: {error.strerror}; check the folder")
+            why = f"cannot be written: {error.strerror}; check the folder"
+            raise OutputError(f"{self.path}: {why}") from error
+        return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Finish and rename the file, or remove it if the block raised."""
