@@ -132,17 +132,20 @@ def _with_odometry(items: Sequence[Item], notes: list[str]) -> Iterator[_Message
     if motions and any(isinstance(item, Reading) for item in items):
         notes.append(f"{len(motions)} actions are not used: observations have the odometry")
         motions = {}
-    pose, ended = np.zeros(3), True
+    pose, open_ended = np.zeros(3), 0
     for item in items:
         if not isinstance(item, Motion):
-            if not ended and item.stamp_ns is not None:
+            if open_ended and item.stamp_ns is not None:
                 yield Reading(item.stamp_ns, "", _plain(pose))
-                ended = True
+                open_ended = 0
             yield item
         elif motions.get(item.group) is item:
-            pose, ended = compose(pose, np.array(item.delta)), item.stamp_ns is not None
-            if ended:
+            pose, open_ended = compose(pose, np.array(item.delta)), open_ended + 1
+            if item.stamp_ns is not None:
                 yield Reading(item.stamp_ns, "", _plain(pose))
+                open_ended = 0
+    if open_ended:
+        notes.append(f"{open_ended} actions have no time, nor has an observation behind them")
 
 
 def _plain(pose: Array) -> tuple[float, float, float]:

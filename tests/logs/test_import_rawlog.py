@@ -327,6 +327,7 @@ def test_a_wrong_check_sum_is_said(tmp_path):
         (packed("CObservationImage", 0) * 3, "3 CObservationImage are not used"),
         (scan(9), "CObservation2DRangeScan of version 9"),
         (scan(0), "1 observations have no time"),
+        (actions(motion(5)) * 2 + scan(9), "2 actions have no time, nor has"),
         (packed("CObservationOdometry", 2, pose2(1), ("I", 1 << 31)), "a size that it cannot have"),
         (struct.pack("<I", 23) + b"CObservation2DRangeScan", "no object begins"),
     ],
