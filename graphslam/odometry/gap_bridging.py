@@ -28,8 +28,9 @@ from graphslam.odometry.preintegration import Track
 GAP_S = 1.0
 #: scans in front of a gap that the first in it is matched with
 SCANS_BEFORE = 6
-#: m: sigma of the position in a gap up to which it is bridged
-MOST_SIGMA_M = 1.0
+#: m, rad: sigmas of the position and of the heading in a gap up to which it is bridged; the heading
+#: is that unsure only where a scan fitted nowhere, and then odometry after the gap knows better
+MOST_SIGMA_M, MOST_SIGMA_RAD = 1.0, 0.3
 #: by how much the odometry may differ from the scans after a gap: m, rad, share of the path, sigmas
 AGREED_M, AGREED_RAD, AGREED_SHARE, AGREED_SIGMAS = 0.15, 0.1, 0.1, 2.0
 
@@ -46,6 +47,7 @@ class GapBridge:
         self._laser: LaserOdometry | None = None  # in a gap
         self._pose, self._path_m = np.zeros(3), 0.0  # at the last scan in a gap
         self._sigma_m = 0.0  # of that position
+        self._sigma_rad, self._variance_rad = 0.0, 0.0  # of the heading, alike
         self._variance = 0.0  # m²: of that position, up to the reference of the matching
         self._open = False  # no more of this gap is bridged
 
@@ -73,7 +75,7 @@ class GapBridge:
             self._open = True
             return []
         self._laser = LaserOdometry(self._config)
-        self._path_m = self._variance = 0.0
+        self._path_m = self._variance = self._variance_rad = 0.0
         for scan in known:
             self._laser.add(scan)
         self._pose = self._at(known[-1].time_ns)
@@ -85,14 +87,17 @@ class GapBridge:
 
     def _matched(self, laser: LaserOdometry, scan: Scan) -> list[OdometryPose]:
         is_reference = bool(laser.add(scan))
-        if self._variance + laser.sigma_m**2 > MOST_SIGMA_M**2:
+        variance = self._variance + laser.sigma_m**2
+        variance_rad = self._variance_rad + laser.sigma_rad**2
+        if variance > MOST_SIGMA_M**2 or variance_rad > MOST_SIGMA_RAD**2:
             self._open, self._laser = True, None
             return []
         self._pose = compose(self._pose, laser.increment)
         self._path_m += float(np.hypot(*laser.increment[:2]))
-        self._sigma_m = np.sqrt(self._variance + laser.sigma_m**2)
+        self._sigma_m = np.sqrt(variance)
+        self._sigma_rad = np.sqrt(variance_rad)
         if is_reference:
-            self._variance += laser.sigma_m**2
+            self._variance, self._variance_rad = variance, variance_rad
         return [OdometryPose(scan.robot, scan.time_ns, scan.time_ns, self._pose)]
 
     def _at(self, time_ns: int) -> Array:
@@ -112,7 +117,8 @@ class GapBridge:
             off = between(self._pose, message.pose)
             # between the last scan and this reading the robot goes on as before
             reach = AGREED_M + AGREED_SHARE * self._path_m + AGREED_SIGMAS * self._sigma_m
-            if np.hypot(*off[:2]) > reach or abs(off[2]) > AGREED_RAD:
+            turn = AGREED_RAD + AGREED_SIGMAS * self._sigma_rad
+            if np.hypot(*off[:2]) > reach or abs(off[2]) > turn:
                 back = compose(self._pose, inverse(message.pose))
                 self._moved = compose(back, self._moved)
                 message = replace(message, pose=self._pose)

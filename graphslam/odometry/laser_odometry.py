@@ -69,6 +69,8 @@ class LaserOdometry:
         self.increment = np.zeros(3)
         #: m: sigma of the position since the reference, in the direction that is known least
         self.sigma_m = 0.0
+        #: rad: sigma of the heading since the reference
+        self.sigma_rad = 0.0
 
     def add(self, scan: Scan) -> list[OdometryIncrement]:
         """Take in the next scan.
@@ -101,6 +103,7 @@ class LaserOdometry:
         self._stated = _updated(stated, found.information)
         self.increment = increment = between(before, found.pose)
         self.sigma_m = float(np.sqrt(np.linalg.eigvalsh(self._stated[:2, :2])[-1]))
+        self.sigma_rad = float(np.sqrt(self._stated[2, 2]))
         self._ways.append((last, scan, increment))
         self._recent.append((seconds, increment))
         while sum(s for s, _ in self._recent) - self._recent[0][0] >= VELOCITY_S:

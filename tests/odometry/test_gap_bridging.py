@@ -89,6 +89,18 @@ def test_without_a_gap_and_without_scans_in_it_nothing_changes(room):
     assert bridged(bare)[0] == bare
 
 
+def test_a_scan_that_fits_nowhere_says_nothing_against_the_odometry(room):
+    """As where a robot turned by a radian between two scans: its heading by them is a guess."""
+    # after 2 s: its position is known to 0.7 m, as far as a robot drives meanwhile
+    scan = next(m for m in room if isinstance(m, Scan) and seconds(m) > GAP[0] + 2)
+    ranges = np.random.default_rng(0).uniform(0.5, 8, scan.ranges.shape)
+    strange = replace(scan, ranges=ranges)
+    messages = silent(room, scans=False)
+    after = next(i for i, m in enumerate(messages) if m.time_ns > strange.time_ns)
+    messages.insert(after, strange)
+    assert bridged(messages)[0] == messages
+
+
 def test_odometry_after_the_gap_goes_on_by_its_own_steps(room):
     found, _ = bridged(silent(room, counted=False))
     after = [m.pose for m in found if isinstance(m, OdometryPose) and seconds(m) >= GAP[1]]
