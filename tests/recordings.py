@@ -50,12 +50,13 @@ def rosbag2(log: Path, target: Path, storage: StoragePlugin, compression: Compre
     return target
 
 
-def bag(log: Path, target: Path, compression: str = "") -> Path:
+def bag(log: Path, target: Path, compression: str = "", chunk_bytes: int = 1 << 20) -> Path:
     """A ROS 1 bag."""
     store, made = typestore(Stores.ROS1_NOETIC), {}
     # fields of ROS 2 are read without, those of ROS 1 written with the number in headers
     plain = typestore(Stores.ROS2_HUMBLE)
     writer = rosbags.rosbag1.Writer(target)
+    writer.chunk_threshold = chunk_bytes
     if compression:
         writer.set_compression(writer.CompressionFormat[compression.upper()])
     with writer:

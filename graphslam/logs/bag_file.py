@@ -37,6 +37,7 @@ from graphslam.logs.recording import (
     one_line,
     undescribed,
 )
+from graphslam.logs.unpacked_chunks import UnpackedChunks
 
 MAGIC = b"#ROSBAG V2.0\n"
 ANY_VERSION = b"#ROSBAG V"
@@ -54,6 +55,8 @@ _CHUNK_MARK = b"\x04\0\0\0op=" + bytes([_CHUNK])
 #: bytes before this mark in which the head begins
 _BEFORE_MARK = 200
 _SEARCHED = 1 << 20
+#: compressions of which unpacking takes longer than the rest of reading
+_SLOW = (b"bz2",)
 
 
 class _BagError(Exception):
@@ -81,12 +84,14 @@ def index_bag(path: Path, limits: LimitsConfig) -> Piece:
 
 
 def _block_messages(
-    stream: BinaryIO, block: Block, wanted: Collection[int]
+    kept: UnpackedChunks, stream: BinaryIO, block: Block, wanted: Collection[int]
 ) -> Iterator[tuple[int, int, bytes]]:
     """Connection, log time ns and data of the messages of wanted connections in a block."""
     first = _record_at(stream, block.offset)
     if first.op == _CHUNK:
-        data = _unpacked(stream, first)
+        data = kept.get(block.offset)
+        if data is None:
+            data = _unpacked(stream, first)
         with suppress(_BagError):  # the index knows
             for connection, log_time_ns, begin, end in _messages_in(data, {}):
                 if connection in wanted:
@@ -273,6 +278,7 @@ class _Indexer:
         self.damage: list[str] = []
         self.stated = 0  # messages by the index
         self.has_index = False
+        self.kept = UnpackedChunks()
 
     def run(self) -> Piece:
         offset = len(MAGIC)
@@ -329,6 +335,8 @@ class _Indexer:
         except _BagError as error:
             if record.end <= self.size:
                 self.damage.append(f"the chunk at byte {offset} is damaged ({one_line(error)})")
+        if messages and record.fields[b"compression"] in _SLOW:
+            self.kept.keep(offset, data)
         self.blocks.add(offset, record.end, messages)
         if record.end > self.size:
             self.damage.append(f"it ends inside the chunk at byte {offset}")
@@ -384,5 +392,9 @@ class _Indexer:
             in_order=self.blocks.in_order,
             lost=lost,
             damage="; ".join([*self.damage, *undescribed(unknown)]),
-            open=partial(stream_reader, _block_messages, (_BagError, EOFError, struct.error)),
+            open=partial(
+                stream_reader,
+                partial(_block_messages, self.kept),
+                (_BagError, EOFError, struct.error),
+            ),
         )

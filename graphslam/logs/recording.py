@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import pairwise, starmap
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -291,7 +291,7 @@ def _sampled(recording: Recording, topic: str, blocks: int, per_block: int) -> I
     with _Reader((topic,)) as reader:
         holding = [(p, b) for p in recording.pieces for b in p.blocks if reader.has_any(p, b)]
         for piece, block in _spread(holding, blocks):
-            yield from _spread(list(reader.read(piece, block)), per_block)
+            yield from reader.sample(piece, block, per_block)
 
 
 def _spread(items: Sequence[_T], n: int) -> Sequence[_T]:
@@ -327,6 +327,14 @@ class _Reader:
 
     def read(self, piece: Piece, block: Block) -> Iterator[RawMessage]:
         """The messages of the topics in ``block``, translated."""
+        return starmap(self._translated(piece), self._read(piece, block))
+
+    def sample(self, piece: Piece, block: Block, n: int) -> Iterator[RawMessage]:
+        """At most ``n`` of them, evenly spaced; only these are translated."""
+        found = _spread(list(self._read(piece, block)), n)
+        return starmap(self._translated(piece), found)
+
+    def _read(self, piece: Piece, block: Block) -> Iterator[tuple[int, int, bytes]]:
         wanted = self._wanted[piece.path]
         if piece.path not in self._open:
             while len(self._open) >= _MAX_OPEN:
@@ -335,12 +343,20 @@ class _Reader:
             read: ReadBlock = stack.enter_context(piece.open(piece))
             self._open[piece.path] = read, stack
         missing = sum(n for number, n in block.counts.items() if number in wanted)
-        for channel, log_time_ns, data in self._open[piece.path][0](block, wanted.keys()):
-            topic, translate = wanted[channel]
+        for message in self._open[piece.path][0](block, wanted.keys()):
             missing -= 1
-            yield RawMessage(topic, log_time_ns, translate(data) if translate else data)
+            yield message
         if missing:
             raise changed(piece.path)
+
+    def _translated(self, piece: Piece) -> Callable[[int, int, bytes], RawMessage]:
+        wanted = self._wanted[piece.path]
+
+        def translated(channel: int, log_time_ns: int, data: bytes) -> RawMessage:
+            topic, translate = wanted[channel]
+            return RawMessage(topic, log_time_ns, translate(data) if translate else data)
+
+        return translated
 
 
 def _by_log_time(reader: _Reader, blocks: list[tuple[Piece, Block]]) -> Iterator[RawMessage]:
