@@ -24,9 +24,9 @@ from graphslam.perception.ordered_scan import scan_points
 from graphslam.perception.scan_alignment import (
     align_scan,
     moved_scan,
-    scan_information,
     scan_map,
 )
+from graphslam.perception.scan_surfaces import scan_surfaces
 
 #: a scan becomes the reference when the robot has moved or turned by this much since the last one,
 #: or after so many scans: they are held in memory until then
@@ -80,9 +80,11 @@ class LaserOdometry:
         """
         velocity = self._velocity()
         points = scan_points(undistorted(scan, _of_laser(velocity, scan.mount)), self._max_range_m)
+        surfaces = scan_surfaces(points, scan.mount[:2], scan.angle_step_rad, self._config)
+        shown = np.asarray(surfaces[1][: len(points)].any(axis=(1, 2)))
         last, self._last = self._last, scan
         if last is None:
-            self._refer_to(points, scan.mount)
+            self._refer_to(points, surfaces, scan.mount)
             return []
         seconds = max(1e-9 * (scan.time_ns - last.time_ns), SHORTEST_S)
         moved = exp(min(seconds, PREDICTED_S) * velocity)
@@ -97,7 +99,7 @@ class LaserOdometry:
         open_s = max(seconds, usual_s)
         cov = self._cov + _variances(PREDICTED_SIGMA_M, PREDICTED_SIGMA_RAD) * open_s
         cov += rotate_cov(np.outer(late, late), float(before[2]))
-        found = align_scan(points, self._map, guess, cov, before, window)
+        found = align_scan(points, shown, self._map, guess, cov, before, window)
         self._pose, self._cov = found.pose, _updated(cov, found.information)
         stated = self._stated + _variances(OPEN_SIGMA_M, OPEN_SIGMA_RAD) * open_s
         self._stated = _updated(stated, found.information)
@@ -113,13 +115,14 @@ class LaserOdometry:
         if near and found.share > 0.0 and len(self._ways) < REFERENCE_SCANS:
             return []
         made = self.finish()
-        self._refer_to(points, scan.mount)
+        self._refer_to(points, surfaces, scan.mount)
         return made
 
     def finish(self) -> list[OdometryIncrement]:
         """Increments to all scans that had none."""
-        shared = self._stated + _variances(self._config.floor_m, self._config.floor_rad)
-        shared = shared / max(len(self._ways), 1)
+        # the floor is an error of the map, which stays much the same from reference to reference
+        floor = _variances(self._config.floor_m, self._config.floor_rad) / MAP_SCANS
+        shared = (self._stated + floor) / max(len(self._ways), 1)
         heading, made = 0.0, []
         for start, end, increment in self._ways:
             cov = rotate_cov(shared, -heading)
@@ -144,13 +147,13 @@ class LaserOdometry:
             moved, seconds = compose(moved, increment), seconds + span
         return np.asarray(log(moved) / max(seconds, VELOCITY_S))
 
-    def _refer_to(self, points: Array, mount: Array) -> None:
+    def _refer_to(self, points: Array, surfaces: tuple[Array, Array], mount: Array) -> None:
         """Make the last scan, of points (n, 2), by a laser at ``mount`` (3,), the reference."""
         back = inverse(self._pose)
         kept = self._scans[1 - MAP_SCANS :]
         self._scans = [moved_scan(scan, back) for scan in kept]
-        self._scans.append((points, scan_information(points, self._config)))
-        self._map = scan_map(self._scans, mount, self._config)
+        self._scans.append(surfaces)
+        self._map = scan_map(self._scans, points, mount, self._config)
         self._pose, self._cov, self._stated = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
 
 

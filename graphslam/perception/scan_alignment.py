@@ -30,11 +30,7 @@ from graphslam.perception.scan_matching import (
     make_submap,
     match,
 )
-from graphslam.perception.scan_pairs import surface_information
 
-#: returns on either side of one, and their distance at most in cells, that show the surface there:
-#: with few, noise turns the surface, and walls seem to tell where along them the robot is
-BESIDE, NEIGHBOURHOOD_CELLS = 12, 12
 #: rad: noise of a surface's direction
 SURFACE_SIGMA_RAD = 0.05
 #: points of a scan that are aligned
@@ -122,24 +118,18 @@ def _placed(points: Array, poses: Array) -> tuple[Array, Array]:
 
 
 def scan_map(
-    scans: Sequence[tuple[Array, Array]], mount: Array, config: ScanMatchingConfig
+    scans: Sequence[tuple[Array, Array]], seen_last: Array, mount: Array, config: ScanMatchingConfig
 ) -> ScanMap:
-    """A map of scans: points (n, 2) and `scan_information` (n, 2, 2) of each, in one frame.
+    """A map of scans: the `scan_surfaces` of each, in one frame.
 
-    The last of them was made by a laser at ``mount`` (3,).
+    The last of them was made by a laser at ``mount`` (3,), which saw points ``seen_last`` (n, 2).
     """
     points = np.concatenate([points for points, _ in scans])
     information = np.concatenate([information for _, information in scans])
     seen = np.zeros(BEAMS, dtype=np.bool_)
-    seen[beam_of(*transform(inverse(mount), scans[-1][0]).T)] = True
+    seen[beam_of(*transform(inverse(mount), seen_last).T)] = True
     in_view = seen | np.roll(seen, 1) | np.roll(seen, -1)  # angles between beams may be larger
     return ScanMap(points, information, cKDTree(points), mount, in_view, config)
-
-
-def scan_information(points: Array, config: ScanMatchingConfig) -> Array:
-    """Information (n, 2, 2) of one scan's points (n, 2) in the order of its beams."""
-    scan = np.zeros(len(points), dtype=np.intp)
-    return surface_information(points, scan, config, BESIDE, NEIGHBOURHOOD_CELLS)
 
 
 def moved_scan(scan: tuple[Array, Array], pose: Array) -> tuple[Array, Array]:
@@ -149,12 +139,15 @@ def moved_scan(scan: tuple[Array, Array], pose: Array) -> tuple[Array, Array]:
 
 
 def align_scan(
-    points: Array, scans: ScanMap, guess: Array, cov: Array, before: Array, window: Array
-) -> AlignedScan:
+    points: Array, shown: Mask, scans: ScanMap, guess: Array, cov: Array, before: Array,
+    window: Array,
+) -> AlignedScan:  # fmt: skip
     """Where a scan of points (n, 2) lies on the scans before it.
 
     Args:
         points: in the frame of its state.
+        shown: (n,) which of them show a surface with those beside them. Others are so sparse that
+            they lie on others by chance, most of all if the robot stands, since beams are the same.
         scans: the map.
         guess: (3,) predicted pose in the map.
         cov: (3, 3) of the prediction.
@@ -167,8 +160,9 @@ def align_scan(
     lost = AlignedScan(guess, np.zeros((3, 3)), 0.0, 0.0)
     if len(points) < MIN_NEIGHBOURS:
         return lost
-    points = points[:: -(-len(points) // ALIGNED_POINTS)]
-    one = _Alignment(points, scans, np.asarray(np.linalg.inv(cov), dtype=float))
+    every = -(-len(points) // ALIGNED_POINTS)
+    points, shown = points[::every], shown[::every]
+    one = _Alignment(points, shown, scans, np.asarray(np.linalg.inv(cov), dtype=float))
     reach_m = scans.config.reach_m
     best = one.from_start(guess, guess, PREDICTED_REACH * reach_m)
     if best.share < CERTAIN_SHARE:
@@ -197,9 +191,13 @@ def _better(other: AlignedScan, one: AlignedScan) -> AlignedScan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Alignment:
-    """Points (n, 2) of a scan, the map, and the information (3, 3) of the prediction."""
+    """Points (n, 2) of a scan, the map, and the information (3, 3) of the prediction.
+
+    ``shown`` (n,): see `align_scan`.
+    """
 
     points: Array
+    shown: Mask
     scans: ScanMap
     information: Array
 
@@ -234,12 +232,21 @@ class _Alignment:
         for _ in range(COMPARED_STEPS):
             A, g, _ = self.scans.linearise(self.points, x, self.near_m)
             x = step_poses(x, gauss_newton_step(A + HOLD * np.eye(3), g))
-        on_others = self.scans.linearise(self.points, x, self.near_m)[2]
-        agreements = self.scans.agreements(self.points, x, on_others)
+        agreements = self.agreements_shown(x)
         top = int(agreements.argmax())
-        if agreements[top] <= best.agreement + BETTER_SHARE:
+        least = self.agreements_shown(best.pose[None])[0] + BETTER_SHARE
+        if agreements[top] <= least:
             return best
-        return _better(self.from_start(x[top], x[top], self.near_m), best)
+        other = self.from_start(x[top], x[top], self.near_m)
+        return other if self.agreements_shown(other.pose[None])[0] > least else best
+
+    def agreements_shown(self, poses: Array) -> Array:
+        """Agreements (n,) of points that show surfaces, from poses (n, 3)."""
+        points = self.points[self.shown]
+        if len(points) < MIN_NEIGHBOURS:
+            return np.zeros(len(poses))
+        on_others = self.scans.linearise(points, poses, self.near_m)[2]
+        return self.scans.agreements(points, poses, on_others)
 
     def searched(self, best: AlignedScan, guess: Array, window: Array) -> AlignedScan:
         """The best of the poses that a search in a window finds."""

@@ -168,12 +168,13 @@ def _information(points: Array, tree: cKDTree, config: ScanMatchingConfig) -> Ar
 
 
 def information_from_scatter(
-    count: Array, xx: Array, xy: Array, yy: Array, config: ScanMatchingConfig
-) -> Array:
+    count: Array, xx: Array, xy: Array, yy: Array, config: ScanMatchingConfig,
+    fewest: int = FEWEST_NEIGHBOURS,
+) -> Array:  # fmt: skip
     """Information (n, 2, 2) of points, see `Submap`, by the scatter of their neighbours.
 
     ``count`` (n,) of neighbours, the point included; ``xx``, ``xy``, ``yy`` (n,) of their second
-    central moments, all of a point times the same factor.
+    central moments, all of a point times the same factor. Fewer than ``fewest`` tell nothing.
     """
     along = 0.5 * np.arctan2(2 * xy, xx - yy)
     spread = np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
@@ -181,7 +182,7 @@ def information_from_scatter(
     variance = config.point_sigma_m**2
     found = line_metrics(np.column_stack([-np.sin(along), np.cos(along)])) / variance
     found[small >= 0.1 * large] = np.eye(2) / (CLUTTER_SIGMAS**2 * variance)
-    found[count < FEWEST_NEIGHBOURS] = 0.0
+    found[count < fewest] = 0.0
     return np.asarray(found)
 
 

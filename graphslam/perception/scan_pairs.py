@@ -92,26 +92,39 @@ def fit_pairs(
     )
 
 
-def surface_information(
-    points: Array,
-    scan: IntArray,
-    config: ScanMatchingConfig,
-    beside: int = BESIDE,
-    cells: float = NEIGHBOURHOOD_CELLS,
-) -> Array:
+def surface_information(points: Array, scan: IntArray, config: ScanMatchingConfig) -> Array:
     """Information (n, 2, 2) of points (n, 2) across the surface that neighbouring returns show.
 
-    ``scan`` (n,) is the scan of each point, whose points follow each other in the order of the
-    beams. Neighbours are ``beside`` of them on either side that are nearer than ``cells``. See
+    ``scan`` (n,) is the scan of each point, see `surface_scatter`; for what it is, see
     `Submap.information`.
+    """
+    near_m = np.full(len(points), NEIGHBOURHOOD_CELLS * config.cell_m)
+    count, _, (xx, xy, yy) = surface_scatter(points, scan, near_m, BESIDE)
+    return information_from_scatter(count, xx, xy, yy, config)
+
+
+def surface_scatter(
+    points: Array, scan: IntArray, near_m: Array, beside: int
+) -> tuple[Array, Array, tuple[Array, Array, Array]]:
+    """How the returns beside each point scatter.
+
+    Args:
+        points: (n, 2) m; those of a scan follow each other in the order of the beams.
+        scan: (n,) which scan each point is of.
+        near_m: (n,) how far neighbours are from a point at most.
+        beside: so many returns on either side are looked at.
+
+    Returns:
+        Number (n,) of neighbours, the point included; their mean (n, 2) m, less the point; and
+        their second central moments (n,) m²: xx, xy, yy.
     """
     n = len(points)
     sums = np.zeros((6, n))
     sums[0] = 1.0
-    limit = (cells * config.cell_m) ** 2
+    limit = near_m**2
     for k in range(1, beside + 1):
         d = points[k:] - points[:-k]
-        near = (scan[k:] == scan[:-k]) & ((d**2).sum(axis=1) <= limit)
+        near = (scan[k:] == scan[:-k]) & ((d**2).sum(axis=1) <= np.minimum(limit[k:], limit[:-k]))
         d = d * near[:, None]
         x, y = d.T
         each = np.array([near.astype(float), x, y, x * x, x * y, y * y])
@@ -120,4 +133,4 @@ def surface_information(
         sums[:, k:] += each * np.array([1.0, -1.0, -1.0, 1.0, 1.0, 1.0])[:, None]
     count = sums[0]
     x, y, xx, xy, yy = sums[1:] / count
-    return information_from_scatter(count, xx - x * x, xy - x * y, yy - y * y, config)
+    return count, np.column_stack([x, y]), (xx - x * x, xy - x * y, yy - y * y)
