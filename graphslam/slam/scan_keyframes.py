@@ -1,4 +1,4 @@
-"""Keyframes of a log of scans: read, preintegrated, segmented and matched, block by block.
+"""Keyframes of a log of scans: read, preintegrated and segmented, block by block.
 
 Nothing here needs to know where the robot is, so it goes on in the second process while the
 keyframes before are tracked (`scan_tracking`). What tracking finds of the calibration is used for
@@ -17,8 +17,8 @@ from graphslam.core.config import Config
 from graphslam.core.geometry import Array, between, compose, inverse
 from graphslam.core.motion_models import Calibration
 from graphslam.core.observation_arrays import ObservationArrays
-from graphslam.core.record import Record, replace
-from graphslam.core.records import Closure, Message, Motion, Scan
+from graphslam.core.record import replace
+from graphslam.core.records import Message, Motion, Scan
 from graphslam.logs import LogSet
 from graphslam.logs.log_set import ReadReport
 from graphslam.multi_robot.robot_detection import COMPARED_SCANS, without_returns
@@ -26,19 +26,16 @@ from graphslam.odometry.gap_bridging import with_bridged_gaps
 from graphslam.odometry.laser_odometry import with_laser_odometry
 from graphslam.odometry.scan_odometry import (
     MIN_POINTS,
-    check_motions,
-    match_off_lines,
-    points_off_lines,
     suspect_motions,
 )
-from graphslam.odometry.several_lasers import SeveralLasersTrack, last_part
+from graphslam.odometry.several_lasers import SeveralLasersTrack
 from graphslam.odometry.sweep_motion import undistorted_by_track
 from graphslam.perception.dynamic_objects import dynamic_returns_of_all
 from graphslam.perception.front_ends import observe_block
 from graphslam.perception.ordered_scan import Sweep, make_sweep, scan_points
-from graphslam.perception.scan_matching import make_submap
 from graphslam.slam.keyframes import KeyframeSelector
 from graphslam.slam.log_reader import TRUE_RECORDS
+from graphslam.slam.motion_checks import ScanKeyframe, ScanPair
 from graphslam.slam.progress import counted, timed
 from graphslam.slam.robot_settings import make_tracks, with_noted_keyframes
 from graphslam.slam.robot_state import RobotState
@@ -57,33 +54,19 @@ READ_AHEAD = 8000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ScanKeyframe(Record):
-    """A scan that is used, and how the robot came there.
-
-    ``motion`` is since the keyframe before; None if that has the same time. ``seen`` are
-    observations from the base, ``points`` (k, 2) m the returns in the frame of the laser, which is
-    at ``mount`` (3,). ``matched``: a second measurement of the motion, by the scan.
-    """
-
-    time_ns: int
-    mount: Array
-    motion: Motion | None
-    seen: ObservationArrays
-    points: Array
-    matched: Closure | None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class KeyframeBlock:
     """Consecutive keyframes; there may be none.
 
-    ``start_ns``: time of the first state of the robot. ``calibration`` is the one of the motions,
-    ``prior`` that before any data. ``messages``: number of messages read so far; ``seconds`` that
-    all this took.
+    ``start_ns``: time of the first state of the robot. ``pairs``: scans of the first laser that
+    `MotionChecker` has to compare, ``last``: the number of its last keyframe, if there is one.
+    ``calibration`` is the one of the motions, ``prior`` that before any data. ``messages``: number
+    of messages read so far; ``seconds`` that all this took.
     """
 
     start_ns: int
     keyframes: Sequence[ScanKeyframe]
+    pairs: Sequence[ScanPair]
+    last: int | None
     calibration: Calibration
     prior: Calibration
     messages: int
@@ -230,13 +213,16 @@ class _Reader:
                 # the first state is where odometry begins, or earlier
                 self._state_ns = first_ns = min(track.first_ns, block[0].time_ns)
             calibration = track.calibration
-            keyframes = self._of_block(block)
+            keyframes, pairs, last = self._of_block(block)
             yield KeyframeBlock(
-                first_ns, keyframes, calibration, track.prior, self._counts["messages"],
-                time.perf_counter() - began,
+                first_ns, keyframes, pairs, last, calibration, track.prior,
+                self._counts["messages"], time.perf_counter() - began,
             )  # fmt: skip
 
-    def _of_block(self, block: Sequence[Message]) -> list[ScanKeyframe]:
+    def _of_block(
+        self, block: Sequence[Message]
+    ) -> tuple[list[ScanKeyframe], list[ScanPair], int | None]:
+        """Keyframes, pairs to be compared, and the last of the first laser, see `KeyframeBlock`."""
         config, track = self._config, self.run.track
         scans = [message for message in block if isinstance(message, Scan)]
         self.run.scans += [(s.stamp_ns, s.time_ns, s.mount) for s in scans if not s.sensor]
@@ -247,7 +233,7 @@ class _Reader:
             each += undistorted_by_track(self._keyframes.used_scans(own, laser.run), track)
         used = self._in_order(each)
         if not used:
-            return []
+            return [], [], None
         with timed(self._seconds, "motions"):
             motions = self._motions(used)
         with timed(self._seconds, "front end"):
@@ -261,17 +247,17 @@ class _Reader:
                     seen[n] = o.from_mounts(np.broadcast_to(scan.mount, (len(o), 3)))
             points = [scan_points(scan, config.front_end.max_range_m) for scan in used]
         self._counts["observations"] += sum(map(len, seen))
-        matched: list[Closure | None] = [None] * len(used)
+        pairs: list[ScanPair] = []
         if self._matches_scans:
             with timed(self._seconds, "scan matching"):
-                motions, matched = self._matched_of_first(used, motions, seen, points)
+                pairs = self._pairs_of_first(used, motions, points)
                 self._compare_further(used, points)
-        return [
-            ScanKeyframe(s.time_ns, s.mount, motion, image, returns, match)
-            for s, motion, image, returns, match in zip(
-                used, motions, seen, points, matched, strict=True
-            )
+        keyframes = [
+            ScanKeyframe(s.time_ns, s.mount, motion, image, returns)
+            for s, motion, image, returns in zip(used, motions, seen, points, strict=True)
         ]
+        of_first = [n for n, scan in enumerate(used) if not scan.sensor]
+        return keyframes, pairs, of_first[-1] if of_first else None
 
     def _in_order(self, used: list[Scan]) -> list[Scan]:
         """Scans of all lasers in the order of time, each at that of its state.
@@ -330,37 +316,48 @@ class _Reader:
                 sweeps[n] = make_sweep(used[n], max_range_m)
         return used, sweeps
 
-    def _matched_of_first(
-        self,
-        used: Sequence[Scan],
-        motions: list[Motion | None],
-        seen: Sequence[ObservationArrays],
-        points: Sequence[Array],
-    ) -> tuple[list[Motion | None], list[Closure | None]]:
-        """`_matched` of the scans of the first laser, whichever states are between them.
+    def _pairs_of_first(
+        self, used: Sequence[Scan], motions: Sequence[Motion | None], points: Sequence[Array]
+    ) -> list[ScanPair]:
+        """Scans of the first laser to be compared with those before, whatever is between them.
 
-        Where they contradict the odometry, the last of the motions between them is corrected.
+        All of them, or those whose motion is suspect.
         """
-        first = [n for n, scan in enumerate(used) if not scan.sensor]
-        track, own = self.run.track, [motions[n] for n in first]
-        before_ns = -1 if self._last_scan is None else self._last_scan[0]
-        begins = [before_ns, *(used[n].time_ns for n in first)]
-        for k, (motion, begin) in enumerate(zip(own, begins, strict=False)):
+        last_ns, last_points = self._last_scan or (-1, np.zeros((0, 2)))
+        numbers, clouds, times = [-1], [last_points], [last_ns]
+        whole, earlier = [], []
+        for n, scan in enumerate(used):
+            if scan.sensor:
+                continue
+            motion, part, begin = motions[n], None, times[-1]
             if motion is not None and begin >= 0 and begin != motion.start_ns:
-                own[k] = track.motion(begin, motion.end_ns)
-        if not first:
-            return motions, [None] * len(used)
-        checked, matched = self._matched(
-            [used[n] for n in first], own, [seen[n] for n in first], [points[n] for n in first]
+                part = self.run.track.motion(begin, motion.start_ns)
+                motion = self.run.track.motion(begin, motion.end_ns)
+            whole.append(motion)
+            earlier.append(part)
+            numbers.append(n)
+            clouds.append(points[n])
+            times.append(scan.time_ns)
+        self._last_scan = times[-1], clouds[-1]
+        usable = [
+            (k, motion)
+            for k, motion in enumerate(whole)
+            if motion is not None
+            and times[k] == motion.start_ns
+            and min(len(clouds[k]), len(clouds[k + 1])) >= MIN_POINTS
+        ]
+        before = np.array([k for k, _ in usable], dtype=np.int64)
+        suspect = suspect_motions(
+            [m for _, m in usable], clouds, before, before + 1, self._config.scan_matching
         )
-        matches: list[Closure | None] = [None] * len(used)
-        for n, begin, better, match in zip(first, begins, checked, matched, strict=False):
-            matches[n], last = match, motions[n]
-            if better is None or last is None or last.start_ns == begin:
-                motions[n] = better
-            elif better.from_scans:
-                motions[n] = last_part(better, track.motion(begin, last.start_ns), last)
-        return motions, matches
+        self.run.motions += len(usable)
+        self._lasers[""].compared += len(usable)
+        self._lasers[""].suspect += int(suspect.sum())
+        return [
+            ScanPair(numbers[k], numbers[k + 1], motion, earlier[k], bool(one))
+            for (k, motion), one in zip(usable, suspect, strict=True)
+            if one or self._config.odometry.scan_matching != "auto"
+        ]
 
     def _compare_further(self, used: Sequence[Scan], points: Sequence[Array]) -> None:
         """Count the motions of the further lasers that their scans contradict."""
@@ -383,53 +380,3 @@ class _Reader:
             )
             laser.compared += len(motions)
             laser.suspect += int(suspect.sum())
-
-    def _matched(
-        self,
-        used: Sequence[Scan],
-        motions: Sequence[Motion | None],
-        seen: Sequence[ObservationArrays],
-        points: Sequence[Array],
-    ) -> tuple[list[Motion | None], list[Closure | None]]:
-        """Motions checked against the scans at their ends, and second measurements of them."""
-        config, auto = self._config.scan_matching, self._config.odometry.scan_matching == "auto"
-        checked: list[Motion | None] = list(motions)
-        matched: list[Closure | None] = [None] * len(used)
-        # scan k is cloud k + 1, and that before it cloud k
-        last_ns, last = self._last_scan or (-1, np.zeros((0, 2)))
-        clouds, times = [last, *points], [last_ns, *(s.time_ns for s in used)]
-        self._last_scan = times[-1], clouds[-1]
-        pairs = [
-            (k, motion)
-            for k, motion in enumerate(motions)
-            if motion is not None
-            and times[k] == motion.start_ns
-            and min(len(clouds[k]), len(clouds[k + 1])) >= MIN_POINTS
-        ]
-        self.run.motions += len(pairs)
-        before = np.array([k for k, _ in pairs], dtype=np.int64)
-        suspect = suspect_motions([m for _, m in pairs], clouds, before, before + 1, config)
-        doubtful = [pair for pair, one in zip(pairs, suspect, strict=True) if one]
-        self._lasers[""].compared += len(pairs)
-        self._lasers[""].suspect += len(doubtful)
-        compared = [k for k, _ in (doubtful if auto else pairs)]
-        submaps = {
-            n: make_submap(np.zeros((1, 3)), [clouds[n]], config)
-            for n in sorted({*compared, *(k + 1 for k, _ in doubtful)})
-        }
-        better = check_motions(
-            [m for _, m in doubtful],
-            [submaps[k] for k, _ in doubtful],
-            [submaps[k + 1] for k, _ in doubtful],
-        )
-        for (k, _), motion in zip(doubtful, better, strict=True):
-            checked[k] = motion
-            self.run.contradicted += motion.from_scans
-        if not auto:
-            for k, _ in pairs:
-                one = checked[k]
-                if one is not None and not one.from_scans:
-                    lines = [seen[k].one(n) for n in range(len(seen[k]))]
-                    free = points_off_lines(points[k], lines, config)
-                    matched[k] = match_off_lines(one, submaps[k], used[k].robot, free)
-        return checked, matched

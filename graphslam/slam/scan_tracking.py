@@ -25,7 +25,8 @@ from graphslam.odometry.online_calibration import (
 from graphslam.odometry.preintegration import Track
 from graphslam.slam.log_pass import LogPass, PriorKnowledge, Progress, timed
 from graphslam.slam.log_reader import Reading, read_ahead
-from graphslam.slam.scan_keyframes import KeyframeBlock, ReadLog, ScanKeyframe
+from graphslam.slam.motion_checks import MotionChecker, ScanKeyframe
+from graphslam.slam.scan_keyframes import KeyframeBlock, ReadLog
 
 
 @dataclass(slots=True, eq=False)
@@ -102,6 +103,7 @@ class ScanLog(TrackedLog):
         super().__init__(log, config, known)
         (self._robot,) = log.robots
         self._path = TrackedPath()
+        self._checker = MotionChecker(self._robot, config)
         self.paths[self._robot] = self._path
         self._tracker: LocalTracker | None = None
         self._anchor_m = 0.0
@@ -147,8 +149,10 @@ class ScanLog(TrackedLog):
             )
             self._add_state(self._tracker, block.start_ns)
             self._set_anchor(self._tracker)
+        with timed(self.seconds, "scan matching"):
+            keyframes = self._checker.checked(block.keyframes, block.pairs, block.last)
         with timed(self.seconds, "tracking"):
-            return [self._track_one(self._tracker, keyframe) for keyframe in block.keyframes]
+            return [self._track_one(self._tracker, keyframe) for keyframe in keyframes]
 
     def _track_one(
         self, tracker: LocalTracker, keyframe: ScanKeyframe
@@ -214,6 +218,7 @@ class ScanLog(TrackedLog):
             self.seconds[stage] += seconds
         self.log.update(read.report)
         self.runs[self._robot] = run
+        run.contradicted = self._checker.contradicted
         if tracker is None:
             return
         run.times = path.times
