@@ -57,9 +57,9 @@ _CLASSES = (
 )
 #: of a pass: what is given to it, or works only while the log is read; all else is kept
 _MADE_ANEW = frozenset({
-    "_path", "_tracker", "associator", "backend", "candidates", "config", "frames", "front_end",
-    "given_config", "groups", "keyframes", "known", "log", "robot_detector", "scan_buffer",
-    "skipped_before", "tamper",
+    "_checker", "_path", "_tracker", "associator", "backend", "candidates", "config", "frames",
+    "front_end", "given_config", "groups", "keyframes", "known", "log", "robot_detector",
+    "scan_buffer", "skipped_before", "tamper",
 })  # fmt: skip
 
 
