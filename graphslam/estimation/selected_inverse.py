@@ -131,41 +131,48 @@ class _Clique:
 
         Also the rows (n, n + m) of the root that it is made of.
         """
+        roots = [conditional.R() for conditional in self.conditionals]
         end = 0
-        for key, conditional in zip(self.own, self.conditionals, strict=True):
-            self.rows[key] = slice(end, end := end + conditional.R().shape[0])
+        for key, root in zip(self.own, roots, strict=True):
+            self.rows[key] = slice(end, end := end + len(root))
         own = end
-        joint = np.zeros((0, 0))
-        if above is not None and above._cov is not None:
-            which = above.indices(self.separator)
-            joint = above._cov[np.ix_(which, which)]
+        if above is None:
+            joint = np.zeros((0, 0))
+        else:
+            assert above._cov is not None
+            which = np.array(above.indices(self.separator))
+            joint = above._cov.take(which, axis=0).take(which, axis=1)
             for key in self.separator:
                 rows = above.rows[key]
                 self.rows[key] = slice(end, end := end + rows.stop - rows.start)
-        block = self._square_root(own, end)
-        root, rest = block[:, :own], block[:, own:]
-        inverse, singular = dtrtri(root)
+        block = self._square_root(roots, own, end)
+        inverse, singular = dtrtri(block[:, :own])
         if singular:
             inverse = np.full((own, own), np.nan)
-        gain = inverse @ rest
+        gain = inverse @ block[:, own:]
         cov = np.empty((end, end))
         cross = gain @ joint
         cov[:own, :own] = inverse @ inverse.T + cross @ gain.T
-        cov[:own, own:] = -cross
-        cov[own:, :own] = -cross.T
+        np.negative(cross, out=cov[:own, own:])
+        np.negative(cross.T, out=cov[own:, :own])
         cov[own:, own:] = joint
         if self.below:
             self._cov = cov
         return cov, block
 
-    def _square_root(self, own: int, end: int) -> Array:
-        """Rows of the own variables: upper triangular (n, n), and (n, m) of the separator."""
-        if len(self.own) == 1:
-            return np.hstack([self.conditionals[0].R(), self.conditionals[0].S()])
+    def _square_root(self, roots: Sequence[Array], own: int, end: int) -> Array:
+        """Rows of the own variables: upper triangular (n, n), and (n, m) of the separator.
+
+        ``roots``: of each own variable the triangle of its own.
+        """
         R = np.zeros((own, end))
-        for key, conditional in zip(self.own, self.conditionals, strict=True):
+        if len(self.own) == 1:
+            R[:, :own] = roots[0]
+            R[:, own:] = self.conditionals[0].S()
+            return R
+        for key, root, conditional in zip(self.own, roots, self.conditionals, strict=True):
             rows, (_, *others) = self.rows[key], conditional.keys()
-            R[rows, rows] = conditional.R()
+            R[rows, rows] = root
             R[rows, self.indices(others)] = conditional.S()
         return R
 
