@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphslam.core.config import Config
+from graphslam.core.geometry import Array
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Step
 from graphslam.estimation.batch_calibration import recompute_motions
@@ -32,13 +33,20 @@ from graphslam.mapping.redundant_closures import untied_closures
 from graphslam.mapping.visits import tie_visits
 from graphslam.odometry.preintegration import Track
 from graphslam.slam.log_pass import timed
-from graphslam.slam.motion_noise import fit_motion_noise, noise_scales, scale_motion_noise
+from graphslam.slam.motion_noise import (
+    fit_motion_noise,
+    noise_scales,
+    scale_motion_noise,
+    with_shown_noise,
+)
 from graphslam.slam.path_closing import ClosedPaths, close_paths
 from graphslam.slam.reoptimise_scans import with_closures
 from graphslam.slam.scan_tracking import TrackedLog
 
 #: factors on the gates of re-association (across, direction): with the closed paths, and solved
 CLOSED_FACTORS, SOLVED_FACTORS = (1.0, 1.0), (1 / 2, 2 / 3)
+#: on the noise of motions, where the log has not shown it yet or odometry states it
+NO_FACTORS: Mapping[str, Array] = {}
 
 
 def optimise_scan_log(scan_log: TrackedLog, tamper: Tamper | None = None) -> Estimate:
@@ -85,10 +93,12 @@ def _solve(
     config: Config,
     *,
     rough: bool,
+    factors: Mapping[str, Array] = NO_FACTORS,
 ) -> _Solved:
     """All states, landmarks and, if it is wanted, the calibration of the tracks solved together.
 
-    Motions are by the latest calibration, and as noisy as ``start`` shows them.
+    Motions are by the latest calibration, and as noisy as ``start`` shows them, those of robots
+    without odometry by ``factors``, see `with_shown_noise`.
     """
     priors = {name: track.prior for name, track in tracks.items()}
     if not config.odometry.calibrate:
@@ -97,6 +107,7 @@ def _solve(
     for track in tracks.values():
         track.calibration = track.calibration.held()
     made = recompute_motions(steps, tracks)
+    made = with_shown_noise(made, start, factors)
     made = scale_motion_noise(made, noise_scales(made, start))
     solution = solve_calibrated(
         made, start, priors, initial, config.robust, rough=rough, joint=not rough
@@ -115,7 +126,7 @@ def _solved(
 ) -> tuple[Estimate, tuple[Step, ...]]:
     """All states, landmarks and the calibration, solved with landmarks tied and reassociated."""
     config, counts, landmarks = scan_log.config, scan_log.counts, scan_log.landmarks
-    closures = list(paths.closures)
+    closures, factors = list(paths.closures), NO_FACTORS
     steps = _tied(steps, start, None, paths, scan_log)
     first = _solve(with_closures(steps, closures), start, tracks, config, rough=True)
     rough = first.solution
@@ -123,10 +134,12 @@ def _solved(
     if config.odometry.calibrate:
         noise = fit_motion_noise(tracks, first.steps, rough.graph.posterior())
         scan_log.noise = noise.to_summary()
+        factors = noise.motion_factors(scan_log.log.without_odometry)
     # once landmarks of different visits are tied, most closures are no longer needed
     closures = untied_closures(closures, paths.spans, steps, landmarks)
     counts["closures_kept"] = len(closures)
-    done = _solve(with_closures(steps, closures), rough.estimate, tracks, config, rough=False)
+    closed = with_closures(steps, closures)
+    done = _solve(closed, rough.estimate, tracks, config, rough=False, factors=factors)
     estimate, steps = _with_surface_bias(done.solution.estimate, tracks, config), done.steps
     landmarks.update_from(steps, estimate)
     for name in tracks:
