@@ -28,8 +28,8 @@ MIN_SIGMA = 1e-4
 UNDERSTATED = 2.0
 #: median of the absolute value of a standard normal variable
 MEDIAN_OF_NORMAL = 0.6745
-#: squared Mahalanobis distance of a motion that is within its noise (90 %, 3 dof)
-USUAL_D2 = float(chi2_quantile(0.9, 3))
+#: squared Mahalanobis distance of a motion that is within its noise (99 %, 3 dof)
+USUAL_D2 = float(chi2_quantile(0.99, 3))
 
 
 def noise_scales(
