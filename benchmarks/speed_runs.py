@@ -135,6 +135,8 @@ def g2o_lm(path: str) -> dict[str, float]:
     solver = g2o.BlockSolverSE2(g2o.LinearSolverEigenSE2())
     optimizer.set_algorithm(g2o.OptimizationAlgorithmLevenberg(solver))
     for words in map(str.split, Path(path).read_text(encoding="utf-8").splitlines()):
+        if not words or words[0].startswith("#"):
+            continue
         values = [float(word) for word in words[-9 if words[0] == "EDGE_SE2" else -3 :]]
         if words[0] == "VERTEX_SE2":
             vertex = g2o.VertexSE2()

@@ -38,8 +38,11 @@ from graphslam.mapping.submaps import State, SubmapPose
 
 #: submaps that are taken at a time, and rounds until nothing more is closed among them, at most
 AT_ONCE, MAX_ROUNDS = 10, 4
-#: earlier visits that one submap is compared with, at most, the nearest first
+#: earlier visits that one submap is compared with, at most
 MAX_VISITS = 3
+#: m: visits whose distances differ by less are as near as each other; of these the first ones are
+#: taken, so that what is left when all later visits are eliminated is one place, not one per visit
+SAME_M = 3.0
 #: m, m, rad: two sigmas of a relative pose that another match would not improve
 KNOWN = np.array([0.05, 0.05, 0.012])
 
@@ -92,7 +95,7 @@ class _Closer:
             j = np.flatnonzero(apart & (distance <= NEAR_M + limit[0]))
             ends = np.flatnonzero((np.diff(j) > 1) | (np.diff(self.robots[j]) != 0)) + 1
             nearest = [s[distance[s].argmin()] for s in np.split(j, ends) if len(s)]
-            nearest.sort(key=distance.__getitem__)
+            nearest.sort(key=lambda k: (distance[k] // SAME_M, k))
             pairs += [(i, int(k)) for k in nearest[:MAX_VISITS]]
         # covariances only of pairs that are to be examined: they take most of the time
         pairs = [(i, j) for i, j in pairs if not self.is_examined(i, j)]
