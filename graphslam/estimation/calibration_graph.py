@@ -150,12 +150,16 @@ class CalibrationGraph:
     def solve(
         self, converged: float, *, marginals: bool = False, joint: bool = False
     ) -> tuple[Estimate, dict[str, Calibration]]:
-        """Optimise from the last solution; see `solve_calibrated`.
+        """Optimise from the last solution, see `optimise`; what was found, see `solution`.
 
-        Args:
-            converged: relative decrease of the error at which it ends.
-            marginals: whether covariances are wanted; else they are NaN.
-            joint: whether the root of the information is wanted beside them.
+        Raises:
+            EstimationError: the estimate is indeterminate.
+        """
+        self.optimise(converged)
+        return self.solution(marginals=marginals, joint=joint)
+
+    def optimise(self, converged: float) -> None:
+        """Optimise from the last solution until the relative decrease of the error is so small.
 
         Raises:
             EstimationError: the estimate is indeterminate.
@@ -164,21 +168,38 @@ class CalibrationGraph:
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setRelativeErrorTol(converged)
         parameters.setMaxIterations(50)
-        values, found, is_done = self._values, NO_COVARIANCES, False
+        values, is_done = self._values, False
         try:
             # rough solutions begin far off
             if builder.kernel.kernel != "none" and converged < CONVERGED_ERROR_ROUGH:
                 values, is_done = reweighted(graph, values, converged)
             if not is_done:
                 values = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-            if marginals:
-                found = marginals_of(graph, values, keep_rows=joint)
         except RuntimeError as error:
             raise builder.explain(error) from error
         self._values, self._marginals = values, None
+
+    def solution(
+        self, *, marginals: bool = False, joint: bool = False
+    ) -> tuple[Estimate, dict[str, Calibration]]:
+        """The estimate and the calibrations where it was optimised last.
+
+        Args:
+            marginals: whether covariances are wanted; else they are NaN.
+            joint: whether the root of the information is wanted beside them.
+
+        Raises:
+            EstimationError: the estimate is indeterminate.
+        """
+        builder, values, found = self._builder, self._values, NO_COVARIANCES
+        if marginals:
+            try:
+                found = marginals_of(builder.graph, values, keep_rows=joint)
+            except RuntimeError as error:
+                raise builder.explain(error) from error
         covs = found.marginals
         means = with_means(values, builder.dims(), covs)
-        estimate = builder.estimate(means, float(graph.error(values)), found.rows)
+        estimate = builder.estimate(means, float(builder.graph.error(values)), found.rows)
         if found.rows is not None and len(self._priors) == 1:
             estimate = replace(estimate, mount=self._mount(found.rows, values))
         calibrations = {}

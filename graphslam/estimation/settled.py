@@ -55,6 +55,19 @@ def settled(steps: Sequence[Step], estimate: Estimate, kernel: RobustConfig) -> 
     return replace(estimate, states=states, landmarks=landmarks)
 
 
+def moved_to(minimum: Estimate, estimate: Estimate) -> Estimate:
+    """The estimate with the poses and landmarks of its ``minimum``; covariances stay its own."""
+    states = {
+        robot: replace(own, poses=minimum.states[robot].poses)
+        for robot, own in estimate.states.items()
+    }
+    landmarks = {
+        number: (minimum.landmarks[number][0], cov)
+        for number, (_, cov) in estimate.landmarks.items()
+    }
+    return replace(estimate, states=states, landmarks=landmarks)
+
+
 def _hold_lines(builder: RecordedGraph, values: gtsam.Values) -> None:
     """Replace the gauges of lines by those of the estimate; lines' other factors follow later."""
     for n in range(builder.graph.size()):

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import fft
 
 from graphslam.core.geometry import Array
 
@@ -58,6 +57,8 @@ class GridSpectrum:
 
     def correlate(self, points: Array) -> Array:
         """Mean values (shape) under points (n, 2) m with their origin in each of the cells."""
+        from scipy import fft  # noqa: PLC0415  (imports for long)
+
         x, y = _cells(points, self.cell_m).T
         image = np.zeros(self.shape, dtype=np.float32)
         np.add.at(image, (x, y), np.float32(1.0 / len(x)))
@@ -96,6 +97,8 @@ def occupancy_grid(
 
 def grid_spectrum(grid: OccupancyGrid) -> GridSpectrum:
     """The Fourier transform of a grid, for correlation at all shifts."""
+    from scipy import fft  # noqa: PLC0415  (imports for long)
+
     nx, ny = (fft.next_fast_len(size, real=True) for size in grid.values.shape)
     return GridSpectrum(fft.rfft2(grid.values, (nx, ny)), (nx, ny), grid.low, grid.cell_m)
 

@@ -13,14 +13,19 @@ import numpy as np
 
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array
+from graphslam.core.motion_models import Calibration
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Step
+from graphslam.core.worker import Future
 from graphslam.estimation.batch_calibration import recompute_motions
 from graphslam.estimation.calibration_graph import (
+    CONVERGED_ERROR,
     CalibratedSolution,
+    CalibrationGraph,
     at_calibration,
-    solve_calibrated,
 )
+from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH
+from graphslam.estimation.settled import moved_to, settled
 from graphslam.mapping.duplicate_landmarks import (
     find_duplicates,
     merged,
@@ -50,7 +55,7 @@ NO_FACTORS: Mapping[str, Array] = {}
 
 
 def optimise_scan_log(scan_log: TrackedLog, tamper: Tamper | None = None) -> Estimate:
-    """The final estimate of a log; its steps, landmarks, calibration and counts follow it.
+    """The final estimate of a log, `settled`; its steps, landmarks and calibration follow it.
 
     Raises:
         EstimationError: the estimate is indeterminate.
@@ -86,35 +91,55 @@ class _Solved:
     solution: CalibratedSolution
 
 
-def _solve(
-    steps: tuple[Step, ...],
-    start: Estimate,
-    tracks: Mapping[str, Track],
-    config: Config,
-    *,
-    rough: bool,
-    factors: Mapping[str, Array] = NO_FACTORS,
-) -> _Solved:
-    """All states, landmarks and, if it is wanted, the calibration of the tracks solved together.
+class _Problem:
+    """All states, landmarks and, if it is wanted, the calibration of the tracks, in one graph.
 
     Motions are by the latest calibration, and as noisy as ``start`` shows them, those of robots
     without odometry by ``factors``, see `with_shown_noise`.
     """
-    priors = {name: track.prior for name, track in tracks.items()}
-    if not config.odometry.calibrate:
-        priors = {name: prior.held() for name, prior in priors.items()}
-    initial = {name: track.calibration for name, track in tracks.items()}
-    for track in tracks.values():
-        track.calibration = track.calibration.held()
-    made = recompute_motions(steps, tracks)
-    made = with_shown_noise(made, start, factors)
-    made = scale_motion_noise(made, noise_scales(made, start))
-    solution = solve_calibrated(
-        made, start, priors, initial, config.robust, rough=rough, joint=not rough
-    )
-    for name, track in tracks.items():
-        track.calibration = solution.calibrations[name]
-    return _Solved(at_calibration(made, initial, solution.calibrations), solution)
+
+    def __init__(
+        self,
+        steps: tuple[Step, ...],
+        start: Estimate,
+        tracks: Mapping[str, Track],
+        config: Config,
+        factors: Mapping[str, Array] = NO_FACTORS,
+    ) -> None:
+        priors = {name: track.prior for name, track in tracks.items()}
+        if not config.odometry.calibrate:
+            priors = {name: prior.held() for name, prior in priors.items()}
+        self._tracks, self._kernel = tracks, config.robust
+        self._initial = {name: track.calibration for name, track in tracks.items()}
+        for track in tracks.values():
+            track.calibration = track.calibration.held()
+        made = recompute_motions(steps, tracks)
+        made = with_shown_noise(made, start, factors)
+        self._steps = scale_motion_noise(made, noise_scales(made, start))
+        self._graph = CalibrationGraph(self._steps, start, priors, self._initial, config.robust)
+        self._graph.calibrate_motions(self._steps, self._initial)
+
+    def solve_roughly(self) -> _Solved:
+        """Without covariances, and ended early."""
+        self._graph.optimise(CONVERGED_ERROR_ROUGH)
+        return self._found(*self._graph.solution())
+
+    def solve(self) -> tuple[_Solved, Future[Estimate]]:
+        """The solution, and the exact minimum of its steps, without covariances.
+
+        The minimum is sought in the second process while covariances are computed here.
+        """
+        self._graph.optimise(CONVERGED_ERROR)
+        near, calibrations = self._graph.solution()
+        steps = at_calibration(self._steps, self._initial, calibrations)
+        minimum = Future(lambda: settled(steps, near, self._kernel))
+        return self._found(*self._graph.solution(marginals=True, joint=True)), minimum
+
+    def _found(self, estimate: Estimate, calibrations: Mapping[str, Calibration]) -> _Solved:
+        for name, track in self._tracks.items():
+            track.calibration = calibrations[name]
+        solution = CalibratedSolution(estimate, calibrations, self._graph)
+        return _Solved(at_calibration(self._steps, self._initial, calibrations), solution)
 
 
 def _solved(
@@ -128,23 +153,31 @@ def _solved(
     config, counts, landmarks = scan_log.config, scan_log.counts, scan_log.landmarks
     closures, factors = list(paths.closures), NO_FACTORS
     steps = _tied(steps, start, None, paths, scan_log)
-    first = _solve(with_closures(steps, closures), start, tracks, config, rough=True)
+    first = _Problem(with_closures(steps, closures), start, tracks, config).solve_roughly()
     rough = first.solution
+    # both need nothing but this solution; the second process looks for the noise
+    asked = (
+        Future(lambda: fit_motion_noise(tracks, first.steps, rough.graph.posterior()))
+        if config.odometry.calibrate
+        else None
+    )
     steps = _tied(steps, rough.estimate, rough, paths, scan_log)
-    if config.odometry.calibrate:
-        noise = fit_motion_noise(tracks, first.steps, rough.graph.posterior())
+    if asked is not None:
+        noise = asked.result()
+        for name, own in noise.odometry.items():
+            tracks[name].config = own
         scan_log.noise = noise.to_summary()
         factors = noise.motion_factors(scan_log.log.without_odometry)
     # once landmarks of different visits are tied, most closures are no longer needed
     closures = untied_closures(closures, paths.spans, steps, landmarks)
     counts["closures_kept"] = len(closures)
     closed = with_closures(steps, closures)
-    done = _solve(closed, rough.estimate, tracks, config, rough=False, factors=factors)
+    done, minimum = _Problem(closed, rough.estimate, tracks, config, factors).solve()
     estimate, steps = _with_surface_bias(done.solution.estimate, tracks, config), done.steps
     landmarks.update_from(steps, estimate)
     for name in tracks:
         scan_log.runs[name].is_calibrated = config.odometry.calibrate
-    return estimate, steps
+    return moved_to(minimum.result(), estimate), steps
 
 
 def _with_surface_bias(estimate: Estimate, tracks: Mapping[str, Track], config: Config) -> Estimate:

@@ -64,4 +64,4 @@ def solve_scan_log(
     with timed(scan_log.seconds, "final optimisation"):
         estimate = optimise_scan_log(scan_log, tamper)
     found = {} if causal is None else kept.stage("causal", causal.result)
-    return FinishedPass(scan_log, estimate, Findings({}, {}, found))
+    return FinishedPass(scan_log, estimate, Findings({}, {}, found), is_settled=True)

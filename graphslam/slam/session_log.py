@@ -111,4 +111,4 @@ def solve_session_log(
     joined = SessionLog(log, config, known, sessions)
     with timed(joined.seconds, "final optimisation"):
         estimate = optimise_scan_log(joined, tamper)
-    return FinishedPass(joined, estimate, Findings({}, {}, {}))
+    return FinishedPass(joined, estimate, Findings({}, {}, {}), is_settled=True)
