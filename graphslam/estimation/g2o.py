@@ -2,7 +2,7 @@
 
 g2o has neither robots nor stamps, and readers differ in their treatment of comments, so vertices
 are numbered and `graph_ids` is the table of numbers. The format has no robust kernels either: edges
-have the plain Gaussian weights, and comments say to which a kernel applies.
+have the plain Gaussian weights, and comments say to which of them a kernel applies.
 
 What the format has no edge for is written as one that is equal at the estimate: same error, same
 derivatives. So the file's error is that of the estimate, and where the estimate is a minimum, so it
@@ -13,6 +13,8 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
+from operator import attrgetter
 
 import numpy as np
 
@@ -89,8 +91,9 @@ def graph_g2o(steps: Sequence[Step], estimate: Estimate, kernel: RobustConfig = 
     residual lives there, while the records hold it along the start frame's. A direction without
     information has 1e-12 in its place (see the module). Associations whose state or landmark is not
     in the estimate (a landmark deleted later) have no edge, nor has what is known of landmarks
-    beforehand (`Step.known`), for which the format has none. A comment ``# kernel NAME SCALE``
-    applies to all edges after it, up to the next one.
+    beforehand (`Step.known`), for which the format has none. A comment
+    ``# kernel NAME SCALE FIRST COUNT`` says that a kernel applies to so many edges from number
+    FIRST (the first edge of the file is 0). They are the last lines: GTSAM ends where it meets one.
 
     Residuals are GTSAM's: of poses the logarithm of z^-1 x_i^-1 x_j, to first order g2o's own.
     `gtsam.readG2o` reads vertices and EDGE_SE2; it skips EDGE_SE2_XY and EDGE_PRIOR_SE2.
@@ -105,20 +108,28 @@ def graph_g2o(steps: Sequence[Step], estimate: Estimate, kernel: RobustConfig = 
     states = _states(estimate, ids)
     wrapped = _wrapped(_padded(states)).tolist()
     lines = [_vertex(i, x[: len(states[i])]) for i, x in enumerate(wrapped)]
-    scale = 0.0
-    # edges without a kernel first, each kind in the order of time
-    for group in sorted(_groups(steps, estimate, kernel), key=lambda group: group.scale):
-        if group.scale != scale:
-            scale = group.scale
-            lines.append(f"# kernel {kernel.kernel} {scale!r}")
-        i, j = np.triu_indices(group.z.shape[1])
-        numbers = np.column_stack([_wrapped(group.z), group.info[:, i, j]])
-        form = " ".join([group.tag, *["%d"] * len(group.ends[0]), *["%r"] * numbers.shape[1]])
-        lines += [
-            form % (*ends, *values)
-            for ends, values in zip(group.ends, numbers.tolist(), strict=True)
-        ]
-    return "\n".join(lines) + "\n"
+    comments, edges = [], 0
+    # each kind in the order of time
+    for scale, alike in groupby(
+        sorted(_groups(steps, estimate, kernel), key=attrgetter("scale")), attrgetter("scale")
+    ):
+        first = edges
+        for group in alike:
+            lines += _edge_lines(group)
+            edges += len(group.ends)
+        if scale:
+            comments.append(f"# kernel {kernel.kernel} {scale!r} {first} {edges - first}")
+    return "\n".join([*lines, *comments]) + "\n"
+
+
+def _edge_lines(group: "_Group") -> list[str]:
+    """The lines of a group's edges."""
+    i, j = np.triu_indices(group.z.shape[1])
+    numbers = np.column_stack([_wrapped(group.z), group.info[:, i, j]])
+    form = " ".join([group.tag, *["%d"] * len(group.ends[0]), *["%r"] * numbers.shape[1]])
+    return [
+        form % (*ends, *values) for ends, values in zip(group.ends, numbers.tolist(), strict=True)
+    ]
 
 
 def graph_error(
