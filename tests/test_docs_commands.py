@@ -10,6 +10,7 @@ hours, are begun here, their options read; test_benchmarks.py runs them on small
 import argparse
 import runpy
 import sys
+import webbrowser
 from itertools import pairwise
 from pathlib import Path
 
@@ -19,13 +20,17 @@ import victoria_park
 from command_line import call
 from doc_pages import PAGES, command_lines
 from paths import ROOT
-from room_log import START_NS, S, drive
+from room_log import START_NS, S, drive, true_pose
 
 from graphslam.logs import IMPORTERS
+from graphslam.simulation import load_scenario, simulate
 
 SECONDS = 12
 #: what takes more than a few seconds even when it is small
-LONG = {"clusters.md", "ekf-versus-smoothing.md", "experiments.md", "several-robots.md"}
+LONG = {
+    "clusters.md", "commands.md", "ekf-versus-smoothing.md", "experiments.md", "known-maps.md",
+    "sessions.md", "several-robots.md",
+}  # fmt: skip
 #: values of placeholders in a command
 PLACES = {"LOG.mcap": "drive.mcap", "DIR": "result"}
 
@@ -58,6 +63,44 @@ def two_rooms(path):
         room(path / f"{name}.mcap")
 
 
+def of_the_room(path):
+    """The result of a drive in a room."""
+    log = room(path.with_name(f"{path.name}-log.mcap"))
+    assert call("smooth", log, "-o", path, "--quiet").code == 0
+
+
+def day(path):
+    """A drive in a building that can be told from itself turned."""
+    simulate(load_scenario("lab"), path, seed=len(path.stem))
+
+
+def of_the_day(path):
+    """Its result."""
+    day(path.with_suffix(".mcap"))
+    assert call("smooth", path.with_suffix(".mcap"), "-o", path, "--quiet").code == 0
+
+
+def clf(path):
+    """A CARMEN log."""
+    beams = " ".join(["4.0"] * 180)
+    lines = [
+        f"FLASER 180 {beams} {0.1 * k:.1f} 0 0 {0.1 * k:.1f} 0 0 {k}.0 host {k}.0"
+        for k in range(20)
+    ]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def true_path(path):
+    """Where the robot of `room` was."""
+    lines = [f"{START_NS // S + k}.123456789 {pose_line(k)}" for k in range(SECONDS)]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def pose_line(seconds):
+    x, y, heading = true_pose(float(seconds))
+    return f"{x} {y} 0 0 0 {np.sin(heading / 2)} {np.cos(heading / 2)}"
+
+
 #: files that pages take for given -> what makes them
 GIVEN = {
     "drive.mcap": room,
@@ -65,6 +108,16 @@ GIVEN = {
     "after.mcap": room,
     "intel.relations": relations,
     "recordings": two_rooms,
+    "result": of_the_room,
+    "morning": of_the_room,
+    "evening": of_the_room,
+    "truth.tum": true_path,
+    "intel.clf": clf,
+    "recording.mcap": room,
+    "monday": of_the_day,
+    "monday.mcap": day,
+    "tuesday.mcap": day,
+    "wednesday.mcap": day,
     "out/victoria_park.mcap": trees,
     "logs": lambda path: path.symlink_to(ROOT / "logs"),
 }
@@ -84,12 +137,16 @@ def as_param(page):
 @pytest.mark.parametrize("page", [as_param(page) for page in PAGES if runnable(page)])
 def test_commands_on_a_page_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(webbrowser, "open", lambda _url: True)
     commands = [[PLACES.get(word, word) for word in words[1:]] for words in runnable(page)]
     made = set()
     for words in commands:
         target = words[words.index("-o") + 1] if "-o" in words else None
         for name, make in GIVEN.items():
-            needs = any(word == name or word.startswith(f"{name}/") for word in words)
+            needs = any(
+                word == name or word.startswith(f"{name}/") or word.endswith(f"={name}")
+                for word in words
+            )
             if needs and name != target and not Path(name).exists():
                 make(Path(name))
         if words[0] == "experiment" and "--runs" not in words:

@@ -17,6 +17,7 @@ from graphslam.results.drawing import Axes
 from graphslam.results.drawing_elements import ACCENT, FAINT, INK, Style, robot_color
 from graphslam.results.live_charts import Curve, live_chart
 from graphslam.results.live_figure import live_html
+from graphslam.results.live_runs import RunsMap, caption, live_runs, runs_drawing
 from graphslam.results.report_figure import Drawing, panels, positive, svg
 
 Summary = Mapping[str, Any]
@@ -26,10 +27,13 @@ Summary = Mapping[str, Any]
 Tables = Mapping[str, tuple[Sequence[str], Sequence[Sequence[str]]]]
 
 
-def experiment_page(summary: Summary, tables: Tables | None = None) -> str:
+def experiment_page(
+    summary: Summary, tables: Tables | None = None, maps: Sequence[RunsMap] = ()
+) -> str:
     """The report of an experiment as one self-contained HTML document.
 
-    ``tables`` are those of an experiment that brings its own, instead of errors over logs.
+    ``tables`` are those of an experiment that brings its own, instead of errors over logs. ``maps``
+    show the paths of its runs.
     """
     sections = [_header(summary), _warnings(summary)]
     if summary["kind"] == "bench":
@@ -37,6 +41,7 @@ def experiment_page(summary: Summary, tables: Tables | None = None) -> str:
         sections += [
             html.section("Consistency", _consistency(summary)),
             html.section("Errors against the Cramér-Rao bound", _errors(summary)),
+            _maps(summary, maps),
             html.section("Figures", _live(summary) + html.figure_grid(drawings)),
         ]
     elif tables:
@@ -44,7 +49,7 @@ def experiment_page(summary: Summary, tables: Tables | None = None) -> str:
             html.section(title, html.table(head, lines)) for title, (head, lines) in tables.items()
         ]
     else:
-        sections.append(html.section("Errors over logs", _logs(summary)))
+        sections += [html.section("Errors over logs", _logs(summary)), _maps(summary, maps)]
     sections.append(_reproduce(summary))
     return html.document(str(summary["name"]), sections)
 
@@ -378,6 +383,17 @@ def _live(summary: Summary) -> str:
     ]  # fmt: skip
     live = [live_html(chart) for chart in charts]
     return html.figure_grid(live) if any(live) else ""
+
+
+def _maps(summary: Summary, maps: Sequence[RunsMap]) -> str:
+    """Every map twice: moving, and as a drawing."""
+    styles = _styles(summary)
+    live = "".join(live_html(live_runs(shown, styles)) for shown in maps)
+    drawings = [
+        html.figure(runs_drawing(shown, styles), f"{shown.title}.", caption(shown))
+        for shown in maps
+    ]
+    return html.section("Runs", live + html.figure_grid(drawings)) if maps else ""
 
 
 #: name -> (drawing, title, caption)
