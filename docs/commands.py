@@ -18,9 +18,10 @@ PAGES = ("commands.md", "schemas.md")
 COMMANDS = """\
 # Commands
 
-Made from the program by `make pages`. Every command has `-h` (with examples, which close each section
-below), `--json` (exactly one object on stdout, see [formats](formats.md#what-commands-print-with---json))
-and `--debug` (tracebacks). `graphslam --install-completion` completes commands, options and names in the shell.
+Made from the program by `make pages`. Every command has `-h` with examples (here at the end of
+each section), `--json` (exactly one object on stdout, see
+[formats](formats.md#what-commands-print-with---json)) and `--debug` (tracebacks).
+`graphslam --install-completion` completes commands, options and names in the shell.
 Exit codes are in [formats](formats.md#exit-codes)."""
 
 SCHEMAS = """\

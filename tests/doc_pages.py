@@ -22,7 +22,7 @@ def blocks(page, language):
 def command_lines(page):
     """The lines that call a program in blocks of a shell: its words, without comments.
 
-    These name no language, or sh. What the program prints goes where the page says, which is left out.
+    These name no language, or sh. Where a page sends what the program prints is left out.
     """
     for block in [*blocks(page, ""), *blocks(page, "sh")]:
         for line in re.sub(r"\\\n *", "", block).splitlines():

@@ -1,4 +1,4 @@
-"""Paths of the runs of an experiment: kept in its rows, and put together for the maps of its report."""
+"""Paths of the runs of an experiment: kept in its rows, put together for the maps of its report."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -43,7 +43,7 @@ def run_maps(definition: Definition, rows: Sequence[Row]) -> list[RunsMap]:
     """
     scale = definition.noise_scales[0]
     known = [row for row in rows if row.get("paths") and row["scale"] == scale]
-    found = []
+    found: list[RunsMap] = []
     for scenario, front_end in dict.fromkeys((row["scenario"], row["front_end"]) for row in known):
         chosen = [r for r in known if (r["scenario"], r["front_end"]) == (scenario, front_end)]
         several = definition.logs is not None and len(definition.logs.front_ends) > 1
