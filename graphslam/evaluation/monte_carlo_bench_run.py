@@ -27,9 +27,9 @@ def run_bench(run: BenchRun, config: Config) -> dict[str, Any]:
     errors at each step (K+1,), position m² and heading rad²; ``causal.nees`` of the robots' latest
     poses together, 3 degrees of freedom each. ``landmarks``: mean squares of the final map.
     ``end``: final poses at the last step; ``paths``: final and true positions at all of them, see
-    `graphslam.evaluation.monte_carlo_paths.path_columns`. ``error_frame``: the frame of the errors. ``exchanged``,
-    of robots that send messages: bytes per robot, ``sent`` and as ``measured``; ``ties``: how they
-    associated landmarks, if each has names of its own.
+    `graphslam.evaluation.monte_carlo_paths.path_columns`. ``error_frame``: the frame of the errors.
+    ``exchanged``, of robots that send messages: bytes per robot, ``sent`` and as ``measured``;
+    ``ties``: how they associated landmarks, if each has names of its own.
 
     Raises:
         EstimationError: the estimate is indeterminate.

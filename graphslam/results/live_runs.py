@@ -17,7 +17,7 @@ from graphslam.results.report_html import MINUTES_FROM_S
 
 _TRUTH, _ROOM = "the truth", "room"
 #: of the size of the map: how far the larger errors of most variants are drawn from the truth, and
-#: from where on a variant hides the others and is switched off at first
+#: from where on a variant would hide the others
 _DRAWN, _HIDING = 0.04, 0.25
 _QUANTILE = 0.9  # what the larger errors of a variant are
 _FACTORS = [step * 10**k for k in range(4) for step in (1, 2, 5)]
@@ -55,7 +55,7 @@ class RunsMap:
 
 def live_runs(shown: RunsMap, styles: Mapping[str, Style]) -> LiveFigure:
     """The figure: a layer for each variant, replayed; ``styles`` of the variants."""
-    factor, hiding = enlargement(shown)
+    factor, first = enlargement(shown), shown_first(shown)
     end_s = max(float(path.time_s[-1]) for path in _all(shown))
     in_minutes = end_s > MINUTES_FROM_S
     clock = "@clock{0.00} min" if in_minutes else "@clock{0.0} s"
@@ -91,18 +91,18 @@ def live_runs(shown: RunsMap, styles: Mapping[str, Style]) -> LiveFigure:
         )  # fmt: skip
     for path in _true_paths(shown):
         series.append(_truth(path))
-    layers = {one.layer: one.layer not in hiding for one in series}
+    layers = {one.layer: one.layer in {*first, _ROOM, _TRUTH} for one in series}
     return LiveFigure(
-        shown.name, f"{shown.title}, moving.",
+        shown.name, f"{shown.title}, interactive.",
         f"{caption(shown)} Drag to move; click, then turn the wheel to zoom; point at a path for "
-        "its run and error; switch variants off; replay the drive.",
+        "its run and error; switch variants on and off; replay the drive.",
         "map", limits(shown), series, layers, duration_s=end_s, in_minutes=in_minutes,
     )  # fmt: skip
 
 
 def runs_drawing(shown: RunsMap, styles: Mapping[str, Style]) -> str:
     """The same as a drawing, for print and where there are no scripts."""
-    factor, hiding = enlargement(shown)
+    factor, first = enlargement(shown), shown_first(shown)
     shape = limits(shown)
     size = shape[:, 1] - shape[:, 0]
     height_in = float(np.clip(WIDTH_IN * size[1] / size[0], 1.6, 5.5))
@@ -112,7 +112,7 @@ def runs_drawing(shown: RunsMap, styles: Mapping[str, Style]) -> str:
         axes.lines(list(shown.walls), Style(INK, 1.0, opacity=0.5))
         axes.symbols(shown.points, INK, 4, triangles=True)
         for variant, paths in shown.runs.items():
-            if paths and variant not in hiding:
+            if variant in first:
                 style = Style(styles[variant].color, 0.6, opacity=0.5)
                 axes.legend.append((variant, Style(styles[variant].color, 1.5)))
                 axes.lines([_enlarged(path, factor) for path in paths], style, layer=3)
@@ -125,29 +125,44 @@ def runs_drawing(shown: RunsMap, styles: Mapping[str, Style]) -> str:
 
 
 def caption(shown: RunsMap) -> str:
-    """How large errors are drawn, and what is not drawn at first."""
-    factor, hiding = enlargement(shown)
+    """Which variants are drawn at first, and how large their errors."""
+    factor, first = enlargement(shown), shown_first(shown)
     count = len({path.run for path in _all(shown)})
     runs = "one run" if count == 1 else f"{count} runs"
     how = "to scale" if factor == 1 else f"{factor} times as large"
-    text = f"Final paths of {runs} around the true one; errors are drawn {how}."
-    return f"{text} Too far off to be drawn: {', '.join(sorted(hiding))}." if hiding else text
+    return f"Final paths of {runs} of {' and '.join(first)} around the true one; errors are drawn {how}."
 
 
-def enlargement(shown: RunsMap) -> tuple[int, frozenset[str]]:
-    """How many times as large errors are drawn, and the variants that are too far off for that."""
-    shape = limits(shown)
-    size = float((shape[:, 1] - shape[:, 0]).max())
-    larger = {
+def enlargement(shown: RunsMap) -> int:
+    """How many times as large errors are drawn: those of most variants are then seen."""
+    typical = float(np.median(list(_larger_errors(shown).values())))
+    fitting = [f for f in _FACTORS if f * typical <= _DRAWN * _size(shown)]
+    return max(fitting, default=1)
+
+
+def shown_first(shown: RunsMap) -> list[str]:
+    """The first and the last variant of those that do not hide the others; more hide each other.
+
+    The others can be switched on.
+    """
+    far = _HIDING * _size(shown) / enlargement(shown)
+    errors = _larger_errors(shown)
+    near = [variant for variant, error in errors.items() if error <= far] or list(errors)
+    return list(dict.fromkeys([near[0], near[-1]]))
+
+
+def _larger_errors(shown: RunsMap) -> dict[str, float]:
+    """A high quantile, m, of the errors of each variant that has runs."""
+    return {
         variant: float(np.quantile(np.concatenate([path.errors_m for path in paths]), _QUANTILE))
         for variant, paths in shown.runs.items()
         if paths
     }
-    typical = float(np.median(list(larger.values())))
-    fitting = [f for f in _FACTORS if f * typical <= _DRAWN * size]
-    factor = max(fitting, default=1)
-    hiding = {variant for variant, error in larger.items() if factor * error > _HIDING * size}
-    return factor, frozenset(hiding)
+
+
+def _size(shown: RunsMap) -> float:
+    shape = limits(shown)
+    return float((shape[:, 1] - shape[:, 0]).max())
 
 
 def limits(shown: RunsMap) -> Array:

@@ -158,27 +158,40 @@ def _errors(summary: Summary) -> str:
 
 
 def _logs(summary: Summary) -> str:
-    rows = []
+    """A table of each kind of trajectory and one of landmarks, a row for each kind of run."""
+    several = {
+        key: len({row[key] for row in summary["table"]}) > 1 for key in ("front_end", "scale")
+    }
+    parts: dict[str, list[list[object]]] = {"final": [], "causal": [], "landmarks": []}
     for row in summary["table"]:
         scenario = PurePath(row["scenario"]).name  # or a file of the writer's machine
-        name = f"{scenario}, {row['front_end']}, {row['variant']}, noise × {row['scale']:g}"
-        cells: list[object] = [name, row["runs"], row["failed"], row.get("diverged")]
-        for kind in ("final", "causal"):
-            ate = row.get(kind, {}).get("ate_rmse_m", {})
-            cells += [_plus_minus(ate), ate.get("max"), _mean(row, kind, "nees_per_dof")]
-            cells.append(coverage(row, kind))
-        cells += [_mean(row, "landmarks", name) for name in ("rmse_m", "nees_per_dof")]
-        cells += [coverage(row, "landmarks")]
-        cells += [_mean(row, "landmarks", name) for name in ("matched", "extra")]
-        rows.append(cells)
-    columns = ["", "runs", "failed", "diverged", "final ATE, m", "worst", "NEES/dof"]
-    columns += ["coverage, %", "causal ATE, m", "worst", "NEES/dof", "coverage, %"]
-    columns += ["landmark RMSE, m", "NEES/dof", "coverage, %", "matched", "extra"]
+        named = [scenario, *([row["front_end"]] if several["front_end"] else []), row["variant"]]
+        name = ", ".join([*named, *([f"noise × {row['scale']:g}"] if several["scale"] else [])])
+        for kind, lines in parts.items():
+            error = "rmse_m" if kind == "landmarks" else "ate_rmse_m"
+            found = row.get(kind, {}).get(error, {})
+            cells: list[object] = [name, _plus_minus(found), found.get("max")]
+            cells += [_mean(row, kind, "nees_per_dof"), coverage(row, kind)]
+            if kind == "final":
+                cells += [row["runs"], row["failed"], row.get("diverged")]
+            if kind == "landmarks":
+                cells += [_mean(row, kind, count) for count in ("matched", "missed", "extra")]
+            lines.append(cells)
     note = (
         "<p class=note>Mean ± standard deviation over the runs; coverage of 95 % ellipsoids is the "
         "mean over runs with its bootstrap interval (95 %).</p>"
     )
-    return html.table(columns, rows) + note
+    heads = ["", "{}, m", "worst, m", "NEES/dof", "coverage, %"]
+    titles = {
+        "final": ("Final trajectory, from all data", "ATE", ["runs", "failed", "diverged"]),
+        "causal": ("Causal trajectory, from data up to each pose", "ATE", []),
+        "landmarks": ("Landmarks", "RMSE", ["matched", "missed", "extra"]),
+    }
+    tables = [
+        html.table([*(head.format(error) for head in heads), *more], parts[kind], title)
+        for kind, (title, error, more) in titles.items()
+    ]
+    return "".join(tables) + note
 
 
 def coverage(row: Mapping[str, Any], kind: str) -> str | None:
@@ -368,16 +381,16 @@ def _live(summary: Summary) -> str:
     ]
     charts = [
         live_chart(
-            "consistency", "Consistency against noise, moving.", hint,
+            "consistency", "Consistency against noise, interactive.", hint,
             against_noise["consistency"], ("noise scale", "final joint NEES / dof"),
             log=(True, False), marked=True,
         ),
         live_chart(
-            "error", "Error against noise, moving.", hint, against_noise["error"],
+            "error", "Error against noise, interactive.", hint, against_noise["error"],
             ("noise scale", "final position RMSE, m"), log=(True, True), marked=True,
         ),
         live_chart(
-            "nees", f"NEES over time, noise × {scale}, moving.", hint, over_time,
+            "nees", f"NEES over time, noise × {scale}, interactive.", hint, over_time,
             ("step", "NEES / dof"),
         ),
     ]  # fmt: skip

@@ -208,9 +208,15 @@ def noise_warnings(noise: Mapping[str, Any]) -> list[str]:
     for source, found in noise.items():
         for name, factor in found.get("measured", {}).items():
             if not 1 / CONTRADICTED < factor < CONTRADICTED:
-                more = f"{factor:.2g} times" if factor > 1 else f"1/{1 / factor:.2g} of"
+                digits = _two_digits(max(factor, 1 / factor))
+                more = f"{digits} times" if factor > 1 else f"1/{digits} of"
                 lines.append(f"{source}: the variance of {name} is {more} what is stated")
     return lines
+
+
+def _two_digits(value: float) -> str:
+    """Two significant digits, without an exponent: 2.2, 2200."""
+    return f"{float(f'{value:.2g}'):g}"
 
 
 def has_invented_stamps(notes: Mapping[str, str]) -> bool:

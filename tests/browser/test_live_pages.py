@@ -133,7 +133,10 @@ def test_runs_of_an_experiment_are_replayed_around_the_truth_and_tell_their_erro
     truth = np.column_stack([np.linspace(0.0, 10.0, 21), np.zeros(21)])
     time = np.linspace(0.0, 20.0, 21)
     runs = {
-        name: [RunPath(run, "a", time, truth + np.array([0.0, side * off]), truth) for run, side in sides]
+        name: [
+            RunPath(run, "a", time, truth + np.array([0.0, side * off]), truth)
+            for run, side in sides
+        ]
         for name, off in (("ekf", 0.02), ("batch", 0.01))
         for sides in [((0, -1.0), (1, 1.0))]
     }

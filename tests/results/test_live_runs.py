@@ -19,6 +19,7 @@ from graphslam.results.live_runs import (
     enlargement,
     live_runs,
     runs_drawing,
+    shown_first,
 )
 
 WALLS = [np.array([[0.0, -5.0], [20.0, -5.0]]), np.array([[0.0, 5.0], [20.0, 5.0]])]
@@ -41,36 +42,37 @@ def corridor(good_m=0.02, lost_m=4.0, runs=5):
 
 
 def test_errors_are_enlarged_by_a_round_factor_until_they_are_seen():
-    """Those of most variants; one that is far off does not make the others invisible."""
-    factor, hiding = enlargement(corridor(good_m=0.01, lost_m=0.02))
-    assert hiding == frozenset()
-    # 90 % quantiles 0.009 and 0.018 m of a map of 21.6 m: at most 4 % of it, 0.86 m
-    assert factor == 50
-    assert "50 times as large" in caption(corridor(good_m=0.01, lost_m=0.02))
+    """90 % quantiles 0.009 and 0.018 m of a map of 21.6 m: at most 4 % of it, 0.86 m."""
+    shown = corridor(good_m=0.01, lost_m=0.02)
+    assert enlargement(shown) == 50
+    assert "of good and lost" in caption(shown) and "50 times as large" in caption(shown)
 
 
-def test_a_variant_that_would_hide_the_map_is_not_drawn_at_first():
+def test_a_variant_that_is_far_off_neither_shrinks_nor_hides_the_others():
     three = corridor()
     shown = RunsMap(
         three.name, three.title, three.walls, three.points,
         {**three.runs, "fine": three.runs["good"]},
     )  # fmt: skip
-    factor, hiding = enlargement(shown)
-    assert factor > 1 and hiding == {"lost"}
+    assert enlargement(shown) > 1
+    assert shown_first(shown) == ["good", "fine"]
     figure = live_runs(shown, {**STYLES, "fine": Style("#228833")})
-    assert figure.layers == {
-        "room": True,
-        "good": True,
-        "lost": False,
-        "fine": True,
-        "the truth": True,
-    }
-    assert "lost" in caption(shown)
+    on = {"room": True, "good": True, "lost": False, "fine": True, "the truth": True}
+    assert figure.layers == on
+    assert "lost" not in caption(shown)
+
+
+def test_of_many_variants_the_first_and_the_last_are_shown_at_first():
+    """More than two hide each other."""
+    paths = corridor(0.01).runs["good"]
+    shown = RunsMap("runs-0", "", WALLS, np.empty((0, 2)), dict.fromkeys("abcd", paths))
+    assert shown_first(shown) == ["a", "d"]
+    assert shown_first(RunsMap("runs-0", "", WALLS, np.empty((0, 2)), {"a": paths})) == ["a"]
 
 
 def test_what_pointing_shows_is_the_error_and_what_is_drawn_is_that_times_the_factor():
     shown = corridor(good_m=0.01, lost_m=0.02)
-    factor, _ = enlargement(shown)
+    factor = enlargement(shown)
     series = live_runs(shown, STYLES).series
     (points,) = (one for one in series if one.glyph == "points" and one.layer == "good")
     np.testing.assert_allclose(points.columns["error"].max(), 1.0)  # cm
@@ -82,7 +84,7 @@ def test_what_pointing_shows_is_the_error_and_what_is_drawn_is_that_times_the_fa
 
 def test_errors_too_large_to_enlarge_are_drawn_to_scale():
     shown = corridor(good_m=3.0, lost_m=3.0)
-    assert enlargement(shown)[0] == 1
+    assert enlargement(shown) == 1
     assert "to scale" in caption(shown)
 
 
