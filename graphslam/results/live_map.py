@@ -4,7 +4,7 @@
 import numpy as np
 
 from graphslam.core.geometry import Array
-from graphslam.core.records import Landmark, Result, Trajectory
+from graphslam.core.records import Result, Trajectory
 from graphslam.results import report_maps as maps
 from graphslam.results.drawing_elements import ACCENT, INK, robot_color
 from graphslam.results.live_figure import (
@@ -179,26 +179,23 @@ def _closures(result: Result, clock: _Clock) -> list[Series]:
 def _ellipses(result: Result, clock: _Clock) -> list[Series]:
     """95 % ellipses along the paths and of point landmarks, to scale.
 
-    Of each robot, and of the landmarks, only ones whose centres are apart: more would bury the map.
+    Of the paths, and of the landmarks, only ones that are apart: more would bury the map.
     """
     most = max(2, _MAX_ELLIPSES // len(result.robots))
-    centres, covs, times = [], [], []
-    for robot in result.robots.values():
-        path = _thinned(robot.final, most)
-        chosen = _apart(path.poses[:, :2], path.covs[:, :2, :2])
-        centres.append(path.poses[chosen, :2])
-        covs.append(path.covs[chosen, :2, :2])
-        times.append(clock.seconds(path.stamps_ns[chosen]))
-    points: list[Landmark] = [m for m in result.landmarks if m.line is None][:_MAX_POSES]
-    if points:
-        places, bounds = (
-            np.array([m.position[:2] for m in points]), np.array([m.cov[:2, :2] for m in points])
-        )  # fmt: skip
-        chosen = _apart(places, bounds)
-        centres.append(places[chosen])
-        covs.append(bounds[chosen])
-        times.append(clock.of([points[i].first_ns for i in chosen]))
-    centre, cov, time = np.concatenate(centres), np.concatenate(covs), np.concatenate(times)
+    paths = [_thinned(robot.final, most) for robot in result.robots.values()]
+    points = [m for m in result.landmarks if m.line is None][:_MAX_POSES]
+    along = (
+        np.concatenate([path.poses[:, :2] for path in paths]),
+        np.concatenate([path.covs[:, :2, :2] for path in paths]),
+        clock.seconds(np.concatenate([path.stamps_ns for path in paths])),
+    )
+    of_points = (
+        np.array([m.position[:2] for m in points]).reshape(-1, 2),
+        np.array([m.cov[:2, :2] for m in points]).reshape(-1, 2, 2),
+        clock.of([m.first_ns for m in points]),
+    )
+    chosen = [[column[_apart(*some)] for column in some] for some in (along, of_points)]
+    centre, cov, time = (np.concatenate(columns) for columns in zip(*chosen, strict=True))
     if not len(centre):
         return []
     values, vectors = np.linalg.eigh(cov)
@@ -210,10 +207,10 @@ def _ellipses(result: Result, clock: _Clock) -> list[Series]:
     return [Series("ellipses", _ELLIPSES, ACCENT, columns, 1.0, 0.8, side="after", timed=True)]
 
 
-def _apart(centres: Array, covs: Array) -> list[int]:
+def _apart(centres: Array, covs: Array, time: Array) -> list[int]:
     """Indices of ellipses none of which has its centre within another's longer semi-axis.
 
-    Centres (n, 2) m, covariances (n, 2, 2); unknown ones are left out. The first ones win.
+    Centres (n, 2) m, covariances (n, 2, 2) m², unknown ones are left out; the earlier of two wins.
     """
     known = np.flatnonzero(np.isfinite(covs).all(axis=(1, 2)))
     reach = np.full(len(centres), np.inf)
@@ -221,7 +218,7 @@ def _apart(centres: Array, covs: Array) -> list[int]:
         np.maximum(np.linalg.eigvalsh(covs[known])[:, -1], 0.0)
     )
     kept: list[int] = []
-    for i in known.tolist():
+    for i in known[np.argsort(time[known], kind="stable")].tolist():
         off = np.hypot(*(centres[kept] - centres[i]).T)
         if (off > np.maximum(reach[kept], reach[i])).all():
             kept.append(i)

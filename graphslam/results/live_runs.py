@@ -130,7 +130,8 @@ def caption(shown: RunsMap) -> str:
     count = len({path.run for path in _all(shown)})
     runs = "one run" if count == 1 else f"{count} runs"
     how = "to scale" if factor == 1 else f"{factor} times as large"
-    return f"Final paths of {runs} of {' and '.join(first)} around the true one; errors are drawn {how}."
+    who = " and ".join(first)
+    return f"Final paths of {runs} of {who} around the true one; errors are drawn {how}."
 
 
 def enlargement(shown: RunsMap) -> int:
@@ -141,13 +142,13 @@ def enlargement(shown: RunsMap) -> int:
 
 
 def shown_first(shown: RunsMap) -> list[str]:
-    """The first and the last variant of those that do not hide the others; more hide each other.
+    """Two variants, since more hide each other: the others can be switched on.
 
-    The others can be switched on.
+    The first and the last of five that are not too far off, whose colours are told apart at once.
     """
     far = _HIDING * _size(shown) / enlargement(shown)
     errors = _larger_errors(shown)
-    near = [variant for variant, error in errors.items() if error <= far] or list(errors)
+    near = [name for name, error in errors.items() if error <= far][:5] or list(errors)
     return list(dict.fromkeys([near[0], near[-1]]))
 
 

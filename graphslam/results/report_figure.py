@@ -108,7 +108,7 @@ def time_rows(drawing: Drawing, rows: int, label: str) -> list[Axes]:
     found = []
     for row in range(rows):
         above = top + row * (1 + gap) * height
-        axes = drawing.axes(0.13 * WIDTH_IN, drawing.height_in - above - height, 0.1, above)
+        axes = drawing.axes(0.15 * WIDTH_IN, drawing.height_in - above - height, 0.1, above)
         axes.x_margin = 0.01
         axes.has_x_numbers = row == rows - 1
         found.append(axes)

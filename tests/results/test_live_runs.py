@@ -67,6 +67,8 @@ def test_of_many_variants_the_first_and_the_last_are_shown_at_first():
     paths = corridor(0.01).runs["good"]
     shown = RunsMap("runs-0", "", WALLS, np.empty((0, 2)), dict.fromkeys("abcd", paths))
     assert shown_first(shown) == ["a", "d"]
+    six = RunsMap("runs-0", "", WALLS, np.empty((0, 2)), dict.fromkeys("abcdef", paths))
+    assert shown_first(six) == ["a", "e"]  # the colour of f is nearly that of a
     assert shown_first(RunsMap("runs-0", "", WALLS, np.empty((0, 2)), {"a": paths})) == ["a"]
 
 

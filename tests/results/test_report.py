@@ -17,6 +17,7 @@ from graphslam.results.drawing import Axes
 from graphslam.results.drawing_elements import FAINT, INK, OPAQUE, Box, Shade, Style, path_data, png
 from graphslam.results.drawing_scales import Scale, linear_scale, log_scale
 from graphslam.results.folder import SavedResult
+from graphslam.results.live_map import live_map
 from graphslam.results.report import render
 from graphslam.results.report_figure import density
 from graphslam.results.report_maps import poses_at
@@ -375,3 +376,26 @@ def test_the_headline_says_what_where_and_how_good(indoors, outdoors):
     assert sentence.startswith("From 13\u202f631 scans of one robot over ")
     assert "80 keyframes and 12 line landmarks" in sentence
     assert "2 robots" in headline(outdoors[0])
+
+
+def test_the_map_holds_the_whole_path_and_ellipses_that_are_apart():
+    """However many poses it has: only returns of scans may be outliers. Breaks with quantiles of
+    the path, and with an ellipse for each of many poses in one place."""
+    result, _, _ = orchard(keyframes=30, trees=300)
+    robot = result.robots["robot1"]
+    poses = np.repeat(robot.final.poses, 100, axis=0)
+    stamps = robot.final.stamps_ns[0] + np.arange(len(poses)) * 10**8
+    poses[1234, :2] += 50.0
+    final = Trajectory(stamps, poses, np.repeat(robot.final.covs, 100, axis=0))
+    long = dataclasses.replace(robot, final=final, causal=None, dead_reckoning=final)
+    figure = live_map(dataclasses.replace(result, robots={**result.robots, "robot1": long}))
+    assert (figure.limits[:, 1] > poses[1234, :2]).all()
+    (ellipses,) = (one.columns for one in figure.series if one.glyph == "ellipses")
+    at = np.column_stack([ellipses["x"], ellipses["y"]])
+    reach = np.maximum(ellipses["width"], ellipses["height"]) / 2
+    trees = np.array([m.position[:2] for m in result.landmarks])
+    of_tree = (np.hypot(*(at[:, None] - trees).transpose(2, 0, 1)) < 1e-9).any(axis=1)
+    for of in (of_tree, ~of_tree):
+        apart = np.hypot(*(at[of, None] - at[of]).transpose(2, 0, 1))
+        np.fill_diagonal(apart, np.inf)
+        assert of.sum() > 1 and (apart > reach[of]).all()
