@@ -254,7 +254,8 @@ class Axes:
         if self.y_label:
             ticks = self.y.labels(self.y.ticks(_most_ticks(box.bottom - box.top, 16)))
             widest = max((_width_pt(label, TICK_TEXT_PT) for label in ticks), default=0.0)
-            beside = max(self.y_label_pt, 5 + widest + 8)
+            # beside the numbers, but never beyond the edge of the drawing
+            beside = min(max(self.y_label_pt, 5 + widest + 7), box.left / UNIT - 0.7 * TEXT_PT)
             x, y = box.left - beside * UNIT, (box.top + box.bottom) / 2
             found.append(words(self.y_label, x, y, TEXT_PT, "middle", upright=True))
         if self.title:

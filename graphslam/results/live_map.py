@@ -20,7 +20,7 @@ from graphslam.results.report_html import MINUTES_FROM_S
 from graphslam.results.report_tables import landmark_sigma
 
 #: of all scans, poses and ellipses together: more would make the page large or slow
-_MAX_POINTS, _MAX_POSES, _MAX_ELLIPSES = 250_000, 4000, 120
+_MAX_POINTS, _MAX_POSES, _MAX_ELLIPSES = 250_000, 4000, 60
 _SCANS, _LANDMARKS, _ELLIPSES = "scans", "landmarks", "95 % ellipses"
 _CLOSURES, _CAUSAL = "loop closures", "causal"
 

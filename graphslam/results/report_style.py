@@ -106,5 +106,11 @@ pre { overflow-x: auto; background: var(--bg); padding: 12px; border-radius: 6px
     color: var(--soft); font-size: .74rem; font-weight: 400; }
   table.wide td.none { grid-column: 1 / -1; }
 }
-@media print { details > * { display: block; } main { max-width: none; } .live { display: none; } }
+@media print {
+  details > * { display: block; }
+  details::details-content { content-visibility: visible; block-size: auto; }
+  figure, tr { break-inside: avoid; }
+  main { max-width: none; }
+  .live { display: none; }
+}
 """

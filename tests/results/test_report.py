@@ -13,13 +13,23 @@ from synthetic_results import orchard, room
 from graphslam.core.config import Config
 from graphslam.core.records import Estimate, Trajectory
 from graphslam.evaluation.metrics import evaluate
-from graphslam.results.drawing import Axes
-from graphslam.results.drawing_elements import FAINT, INK, OPAQUE, Box, Shade, Style, path_data, png
+from graphslam.results.drawing import TEXT_PT, TICK_TEXT_PT, Axes
+from graphslam.results.drawing_elements import (
+    FAINT,
+    INK,
+    OPAQUE,
+    UNIT,
+    Box,
+    Shade,
+    Style,
+    path_data,
+    png,
+)
 from graphslam.results.drawing_scales import Scale, linear_scale, log_scale
 from graphslam.results.folder import SavedResult
 from graphslam.results.live_map import live_map
 from graphslam.results.report import render
-from graphslam.results.report_figure import density
+from graphslam.results.report_figure import Drawing, density, map_axes
 from graphslam.results.report_maps import poses_at
 from graphslam.results.report_tables import headline, landmark_sigma, number
 
@@ -313,6 +323,21 @@ def test_scales_reach_a_little_beyond_the_data():
     assert linear_scale(np.nan, np.nan, 0.0) == Scale(0.0, 1.0)
     assert log_scale(4.0, 4.0, 0.0) == Scale(2.0, 8.0, is_log=True)
     assert log_scale(np.nan, np.nan, 0.0) == Scale(0.1, 1.0, is_log=True)
+
+
+@pytest.mark.parametrize("limits", [(0.0, 1.0), (-300.0, 200.0), (-20000.0, 5000.0), (0.0, 2e-4)])
+def test_the_label_of_an_axis_is_neither_cut_nor_on_its_numbers(limits):
+    """Breaks with a fixed distance from the axis, which long numbers reach."""
+    drawing = Drawing("map", 3.0)
+    axes = map_axes(drawing, np.array([limits, limits]))
+    text = drawing.to_svg()
+    (x,) = (float(v) for v in re.findall(r"rotate\(-90 (-?\d+)[^>]*>y, m</text>", text))
+    numbers = re.findall(r'text-anchor="end"[^>]*>([^<]+)</text>', text)
+    assert len(numbers) > 2
+    half = TEXT_PT * UNIT / 2
+    assert x - half >= 0
+    if max(map(len, numbers)) < 6:
+        assert x + half <= axes.box.left - (5 + 0.6 * TICK_TEXT_PT * max(map(len, numbers))) * UNIT
 
 
 def test_what_is_drawn_lies_where_the_axes_say():
