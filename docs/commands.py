@@ -18,8 +18,10 @@ PAGES = ("commands.md", "schemas.md")
 COMMANDS = """\
 # Commands
 
-Made from the program by `make pages`. Every command has `-h`, `--json` (exactly one object on
-stdout, see [formats](formats.md#what-commands-print-with---json)) and `--debug` (tracebacks).
+Made from the program by `make pages`. Every command has `-h` with examples (here at the end of
+each section), `--json` (exactly one object on stdout, see
+[formats](formats.md#what-commands-print-with---json)) and `--debug` (tracebacks).
+`graphslam --install-completion` completes commands, options and names in the shell.
 Exit codes are in [formats](formats.md#exit-codes)."""
 
 SCHEMAS = """\
@@ -45,11 +47,13 @@ def commands() -> str:
     for name, command in sorted(group.commands.items()):
         own = [p for p in command.params if p.name not in ("help", "json", "debug")]
         usage = [p.metavar for p in own if p.param_type_name == "argument"]
-        text = " ".join((command.help or "").split())
+        text, _, examples = (command.help or "").partition("\b\nExamples:\n")
         line = " ".join(["graphslam", name, *usage, "[OPTIONS]"])
-        parts.append(f"## {name}\n\n{text}\n\n```text\n{line}\n```")
+        parts.append(f"## {name}\n\n{' '.join(text.split())}\n\n```text\n{line}\n```")
         rows = [f"| `{_cell(_written(p))}` | {_cell(p.help or '')} |" for p in own]
         parts.append("\n".join(["| | |", "|---|---|", *rows]))
+        shown = "\n".join(line.strip() for line in examples.splitlines())
+        parts += [f"```\n{shown}\n```"] if shown else []
     return "\n\n".join(parts) + "\n"
 
 

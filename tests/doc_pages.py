@@ -20,9 +20,13 @@ def blocks(page, language):
 
 
 def command_lines(page):
-    """The lines that call a program in blocks without a language: its words, without comments."""
-    for block in blocks(page, ""):
+    """The lines that call a program in blocks of a shell: its words, without comments.
+
+    These name no language, or sh. Where a page sends what the program prints is left out.
+    """
+    for block in [*blocks(page, ""), *blocks(page, "sh")]:
         for line in re.sub(r"\\\n *", "", block).splitlines():
             text = line.removeprefix("$ ").removeprefix(".venv/bin/")
             if re.match(r"(graphslam|python|make) ", text):
-                yield shlex.split(text, comments=True)
+                words = shlex.split(text, comments=True)
+                yield words[: words.index(">")] if ">" in words else words

@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import re
+import shutil
 import sys
 import tomllib
 from types import SimpleNamespace
@@ -10,6 +11,7 @@ from types import SimpleNamespace
 import pytest
 import typer
 from doc_pages import PAGES, blocks, command_lines
+from markdown_it import MarkdownIt
 from paths import ROOT
 from room_log import drive
 
@@ -101,16 +103,69 @@ def test_every_page_is_in_the_index_of_the_site():
     assert not missing
 
 
-def test_the_description_on_the_package_index_has_no_dead_link(monkeypatch):
-    found = {}
-    build = SimpleNamespace(setup=lambda **given: found.update(given))
-    monkeypatch.setitem(sys.modules, "setuptools", build)
-    spec = importlib.util.spec_from_file_location("build", ROOT / "setup.py")
-    spec.loader.exec_module(importlib.util.module_from_spec(spec))
-    text = found["long_description"]
-    assert len(text) > 5000
-    links = re.findall(r"\]\(([^)]+)\)", text)
+@pytest.fixture
+def description(monkeypatch, tmp_path):
+    """A function that gives the description for the package index, with more lines in
+    pyproject.toml if wanted."""
+
+    def made(lines=""):
+        for name in ("README.md", "setup.py"):
+            shutil.copy(ROOT / name, tmp_path / name)
+        project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+        assert "[project.urls]\n" in project
+        project = project.replace("[project.urls]\n", f"[project.urls]\n{lines}")
+        (tmp_path / "pyproject.toml").write_text(project, encoding="utf-8")
+        found = {}
+        build = SimpleNamespace(setup=lambda **given: found.update(given))
+        monkeypatch.setitem(sys.modules, "setuptools", build)
+        spec = importlib.util.spec_from_file_location("build", tmp_path / "setup.py")
+        spec.loader.exec_module(importlib.util.module_from_spec(spec))
+        assert found["long_description_content_type"] == "text/markdown"
+        assert len(found["long_description"]) > 5000
+        return found["long_description"]
+
+    return made
+
+
+def links_on_the_index(text):
+    """What a page of the package index leads to or shows: its own renderer, as it is called there.
+
+    `make extras-test` has it; without it the Markdown is read as common Markdown.
+    """
+    if importlib.util.find_spec("readme_renderer"):
+        from readme_renderer.markdown import render
+
+        page = render(text, variant="GFM")
+        assert page, "the index would refuse it"
+    else:
+        page = MarkdownIt().render(text)
+    return re.findall(r'(?:href|src)="([^"]*)"', page)
+
+
+def test_the_description_on_the_package_index_has_no_dead_link(description):
+    """Breaks where a link of the README is taken over as it is, in whatever way it is written."""
+    links = links_on_the_index(description())
     assert links and all(link.startswith("https://") for link in links)
+    assert any(
+        not link.startswith("https://")
+        for link in links_on_the_index((ROOT / "README.md").read_text(encoding="utf-8"))
+    )
+
+
+def test_with_a_repository_its_links_lead_to_files_that_are_there(description):
+    """Of an address that does not exist: the day there is one, this is all that changes."""
+    base = "https://example.org/somebody/repository"
+    links = links_on_the_index(description(f'Repository = "{base}"\n'))
+    inside = [link.removeprefix(f"{base}/blob/main/") for link in links if link.startswith(base)]
+    assert len(inside) > 15
+    assert all((ROOT / link.partition("#")[0]).exists() for link in inside)
+
+
+def test_addresses_of_the_project_are_of_the_distribution_and_no_repository_is_made_up():
+    """One line a viewer of the metadata can follow: the page of its own name on the index."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert project["urls"]["Package index"] == f"https://pypi.org/project/{project['name']}/"
+    assert all(url.startswith("https://") for url in project["urls"].values())
 
 
 def test_the_citation_has_the_version():

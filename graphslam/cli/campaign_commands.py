@@ -106,6 +106,7 @@ def experiment(
     from graphslam.evaluation.monte_carlo_campaign import list_jobs
     from graphslam.evaluation.monte_carlo_definition import load_definition
     from graphslam.evaluation.monte_carlo_folder import save_summary
+    from graphslam.evaluation.monte_carlo_paths import run_maps
     from graphslam.evaluation.monte_carlo_summary import summarise
 
     workers = workers_of(jobs, scheduler, memory)
@@ -118,7 +119,7 @@ def experiment(
             announce=detail,
         )  # fmt: skip
     summary = summarise(definition, rows)
-    save_summary(summary, output)
+    save_summary(summary, output, run_maps(definition, rows))
     return Output(summary, lambda: show.experiment(summary, output))
 
 

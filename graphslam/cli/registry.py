@@ -52,6 +52,10 @@ EXAMPLES = {
         "graphslam smooth drive.mcap -o result --set keyframe.distance_m=0.5 --force",
     ),
     "view": ("graphslam view result",),
+    "map": (
+        "graphslam map result",
+        "graphslam map result --resolution 0.02 -o fine",
+    ),
     "follow": ("graphslam follow recording.mcap -o now",),
     "evaluate": ("graphslam evaluate result --truth robot=truth.tum",),
     "compare": (

@@ -10,12 +10,13 @@ from graphslam.core.records import Estimate
 from graphslam.estimation.backend import Backend
 from graphslam.estimation.backends import BACKENDS
 from graphslam.estimation.decentralised import exchanged_bytes, landmark_ties
-from graphslam.evaluation.monte_carlo_bench import BenchRun
+from graphslam.evaluation.monte_carlo_bench import STEP_NS, BenchRun
 from graphslam.evaluation.monte_carlo_consistency import (
     joint_errors,
     joint_nees,
     landmark_squares,
 )
+from graphslam.evaluation.monte_carlo_paths import path_columns
 
 
 def run_bench(run: BenchRun, config: Config) -> dict[str, Any]:
@@ -25,9 +26,10 @@ def run_bench(run: BenchRun, config: Config) -> dict[str, Any]:
     all landmarks, at the final estimate. ``final`` and ``causal``: mean over the robots of squared
     errors at each step (K+1,), position m² and heading rad²; ``causal.nees`` of the robots' latest
     poses together, 3 degrees of freedom each. ``landmarks``: mean squares of the final map.
-    ``end``: final poses at the last step. ``error_frame``: the frame of the errors. ``exchanged``,
-    of robots that send messages: bytes per robot, ``sent`` and as ``measured``; ``ties``: how they
-    associated landmarks, if each has names of its own.
+    ``end``: final poses at the last step; ``paths``: final and true positions at all of them, see
+    `graphslam.evaluation.monte_carlo_paths.path_columns`. ``error_frame``: the frame of the errors.
+    ``exchanged``, of robots that send messages: bytes per robot, ``sent`` and as ``measured``;
+    ``ties``: how they associated landmarks, if each has names of its own.
 
     Raises:
         EstimationError: the estimate is indeterminate.
@@ -53,6 +55,10 @@ def run_bench(run: BenchRun, config: Config) -> dict[str, Any]:
         "causal": causal,
         "landmarks": landmark_squares(estimate.landmarks, run.landmarks),
         "end": poses[:, -1].tolist(),
+        "paths": {
+            name: path_columns(np.arange(len(run.steps)) * STEP_NS / 1e9, own, true)
+            for name, own, true in zip(run.truth, poses, truth, strict=True)
+        },
         **_exchanged(backend),
     }
 

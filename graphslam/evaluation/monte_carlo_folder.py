@@ -1,24 +1,25 @@
 """The folder of an experiment beside its rows: summary, report and figures."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from graphslam.core.errors import OutputError
 from graphslam.evaluation.thesis_chapter import markdown_page, table_rows
 from graphslam.results.file_formats import to_json
+from graphslam.results.live_runs import RunsMap
 from graphslam.results.report_experiment import experiment_figures, experiment_page
 
 
-def save_summary(summary: Mapping[str, Any], directory: Path) -> None:
-    """Write summary.json, report.html and figures/*.svg, each atomically.
+def save_summary(summary: Mapping[str, Any], directory: Path, maps: Sequence[RunsMap] = ()) -> None:
+    """Write summary.json, report.html with its ``maps``, and figures/*.svg, each atomically.
 
     Of the thesis' chapter 6 also chapter.md: its tables.
 
     Raises:
         OutputError: nothing can be written there.
     """
-    files = {"summary.json": to_json(summary, "summary"), "report.html": _page(summary)}
+    files = {"summary.json": to_json(summary, "summary"), "report.html": _page(summary, maps)}
     if summary["kind"] == "chapter":
         files["chapter.md"] = markdown_page(summary)
     figures = experiment_figures(summary)
@@ -34,9 +35,9 @@ def save_summary(summary: Mapping[str, Any], directory: Path) -> None:
         raise OutputError(f"{directory}: cannot be written: {error.strerror}") from error
 
 
-def _page(summary: Mapping[str, Any]) -> str:
+def _page(summary: Mapping[str, Any], maps: Sequence[RunsMap]) -> str:
     tables = {
         experiment["title"]: table_rows(experiment)
         for experiment in summary.get("chapter", {}).values()
     }
-    return experiment_page(summary, tables)
+    return experiment_page(summary, tables, maps)

@@ -13,8 +13,11 @@ import numpy as np
 
 from graphslam.core.config import Config, StartConfig
 from graphslam.core.errors import GraphSlamError
+from graphslam.core.records import Result, Trajectory
 from graphslam.evaluation.ground_truth import truth_of_logs
-from graphslam.evaluation.metrics import evaluate
+from graphslam.evaluation.metrics import evaluate, robots_in_own_frame
+from graphslam.evaluation.monte_carlo_paths import path_columns
+from graphslam.evaluation.trajectory_metrics import pair_poses
 from graphslam.logs import LogSet, open_logs
 from graphslam.simulation import load_scenario, simulate
 from graphslam.simulation.scenario import Scenario
@@ -60,7 +63,8 @@ def run_log(
 ) -> dict[str, Any]:
     """Errors of the pipeline on a simulated log, as plain numbers for a row of results.jsonl.
 
-    Keys as in ``evaluate --json``, and ``counts``, ``scans_per_s`` and ``warnings`` of the summary.
+    Keys as in ``evaluate --json``, and ``counts``, ``scans_per_s`` and ``warnings`` of the summary;
+    ``paths`` of the robots, see `graphslam.evaluation.monte_carlo_paths.path_columns`.
     Every robot starts at its true pose, with the configured sigma of a start from truth; with
     ``draw_starts`` off it by an error drawn from that prior.
 
@@ -83,7 +87,18 @@ def run_log(
     found = evaluate(result, known.trajectories, known.landmarks)
     kept = {key: result.summary.get(key) for key in ("counts", "scans_per_s")}
     warnings = [_without(folder, text) for text in result.summary.get("warnings", ())]
-    return {**found, **kept, "warnings": warnings}
+    return {**found, **kept, "warnings": warnings, "paths": _paths(result, known.trajectories)}
+
+
+def _paths(result: Result, truth: Mapping[str, Trajectory]) -> dict[str, Any]:
+    """Final positions of robots in the world frame, beside the true ones."""
+    own_frame, found = robots_in_own_frame(result.summary), {}
+    for name in sorted(set(result.robots) & set(truth) - own_frame):
+        pairs = pair_poses(result.robots[name].final, truth[name])
+        if len(pairs):
+            seconds = (pairs.stamps_ns - pairs.stamps_ns[0]) / 1e9
+            found[name] = path_columns(seconds, pairs.estimate, pairs.truth)
+    return found
 
 
 @contextmanager

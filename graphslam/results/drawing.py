@@ -27,7 +27,7 @@ from graphslam.results.drawing_elements import (
 from graphslam.results.drawing_scales import Scale, linear_scale, log_scale
 
 TEXT_PT, TICK_TEXT_PT, LEGEND_ROW_PT = 8.5, 8.0, 10.0
-_LETTER = 0.57  # mean width of a letter, of the height of the text
+_LETTER = 0.6  # mean width of a letter, of the height of the text
 _BESIDE = 5.0  # points that a number may stand out beside the axis
 _FAR = 10**6  # user units: what lies beyond is cut off anyway
 _DOT_PIXELS = 4.0  # per point, of pictures of dots
@@ -254,7 +254,8 @@ class Axes:
         if self.y_label:
             ticks = self.y.labels(self.y.ticks(_most_ticks(box.bottom - box.top, 16)))
             widest = max((_width_pt(label, TICK_TEXT_PT) for label in ticks), default=0.0)
-            beside = max(self.y_label_pt, 5 + widest + 5)
+            # beside the numbers, but never beyond the edge of the drawing
+            beside = min(max(self.y_label_pt, 5 + widest + 7), box.left / UNIT - 0.7 * TEXT_PT)
             x, y = box.left - beside * UNIT, (box.top + box.bottom) / 2
             found.append(words(self.y_label, x, y, TEXT_PT, "middle", upright=True))
         if self.title:

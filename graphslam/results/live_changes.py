@@ -56,7 +56,7 @@ def live_changes(picture: "ChangesPicture", colors: Mapping[str, str]) -> LiveFi
     ]
     layers = {"reference": True, "later": True, **{one.layer: True for one in series}}
     return LiveFigure(
-        "changes", "The map, moving.",
+        "changes", "Interactive map.",
         "Drag to move; click, then turn the wheel to zoom; point at a change for its numbers. "
         f"Swipe: {_named('reference', names[0])} left of the line, {_named('later', names[1])} "
         "right of it.",

@@ -185,6 +185,8 @@ def _swatch(figure: LiveFigure, layer: str) -> str:
     """The colour of a layer that has one."""
     colors = {COLORS.get(one.color, one.color) for one in figure.series if one.layer == layer}
     colors |= {one["color"] for one in figure.clouds if one["layer"] == layer}
+    if figure.scans and figure.scans["layer"] == layer:
+        colors |= set(figure.scans["colors"])
     if len(colors) != 1:
         return ""
     return f'<i class=lane style="background:var(--{colors.pop()})"></i>'

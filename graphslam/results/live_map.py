@@ -4,7 +4,7 @@
 import numpy as np
 
 from graphslam.core.geometry import Array
-from graphslam.core.records import Landmark, Result, Trajectory
+from graphslam.core.records import Result, Trajectory
 from graphslam.results import report_maps as maps
 from graphslam.results.drawing_elements import ACCENT, INK, robot_color
 from graphslam.results.live_figure import (
@@ -20,9 +20,9 @@ from graphslam.results.report_html import MINUTES_FROM_S
 from graphslam.results.report_tables import landmark_sigma
 
 #: of all scans, poses and ellipses together: more would make the page large or slow
-_MAX_POINTS, _MAX_POSES, _MAX_ELLIPSES = 250_000, 4000, 120
+_MAX_POINTS, _MAX_POSES, _MAX_ELLIPSES = 250_000, 4000, 60
 _SCANS, _LANDMARKS, _ELLIPSES = "scans", "landmarks", "95 % ellipses"
-_CLOSURES, _ODOMETRY, _CAUSAL = "loop closures", "odometry alone", "causal"
+_CLOSURES, _CAUSAL = "loop closures", "causal"
 
 
 def live_map(result: Result) -> LiveFigure:
@@ -36,15 +36,15 @@ def live_map(result: Result) -> LiveFigure:
         series += _paths(result, name, i, clock)
     series += _ellipses(result, clock)
     layers = {_SCANS: True} if result.keyframe_scans else {}
-    for one in series:
+    # robots side by side, what is of all of them after these
+    for one in sorted(series, key=lambda one: one.layer in (_CAUSAL, _ELLIPSES)):
         layers.setdefault(one.layer, one.layer not in (_CAUSAL, _CLOSURES))
-    shown = {name: on for name, on in layers.items() if name != _ODOMETRY}
     what = "scans, paths and landmarks" if result.keyframe_scans else "paths and landmarks"
     return LiveFigure(
-        "map", "The map, moving.",
+        "map", "Interactive map.",
         f"Drag to move; click, then turn the wheel to zoom; point at {what} for their numbers. "
         "Swipe from the result to odometry alone; replay the drive. Ellipses are to scale.",
-        "map", maps.result_limits(result), series, shown,
+        "map", maps.result_limits(result), series, layers,
         duration_s=(end_ns - start_ns) / 1e9, in_minutes=clock.in_minutes,
         sides=("odometry alone", "result"),
         scans=_scans(result, robots, clock) if result.keyframe_scans else None,
@@ -177,31 +177,52 @@ def _closures(result: Result, clock: _Clock) -> list[Series]:
 
 
 def _ellipses(result: Result, clock: _Clock) -> list[Series]:
-    """95 % ellipses along the paths and of point landmarks, to scale."""
+    """95 % ellipses along the paths and of point landmarks, to scale.
+
+    Of the paths, and of the landmarks, only ones that are apart: more would bury the map.
+    """
     most = max(2, _MAX_ELLIPSES // len(result.robots))
-    centres, covs, times = [], [], []
-    for robot in result.robots.values():
-        path = _thinned(robot.final, most)
-        centres.append(path.poses[:, :2])
-        covs.append(path.covs[:, :2, :2])
-        times.append(clock.seconds(path.stamps_ns))
-    points: list[Landmark] = [m for m in result.landmarks if m.line is None][:_MAX_POSES]
-    if points:
-        centres.append(np.array([m.position[:2] for m in points]))
-        covs.append(np.array([m.cov[:2, :2] for m in points]))
-        times.append(clock.of([m.first_ns for m in points]))
-    centre, cov, time = np.concatenate(centres), np.concatenate(covs), np.concatenate(times)
-    known = np.isfinite(cov).all(axis=(1, 2))
-    if not known.any():
+    paths = [_thinned(robot.final, most) for robot in result.robots.values()]
+    points = [m for m in result.landmarks if m.line is None][:_MAX_POSES]
+    along = (
+        np.concatenate([path.poses[:, :2] for path in paths]),
+        np.concatenate([path.covs[:, :2, :2] for path in paths]),
+        clock.seconds(np.concatenate([path.stamps_ns for path in paths])),
+    )
+    of_points = (
+        np.array([m.position[:2] for m in points]).reshape(-1, 2),
+        np.array([m.cov[:2, :2] for m in points]).reshape(-1, 2, 2),
+        clock.of([m.first_ns for m in points]),
+    )
+    chosen = [[column[_apart(*some)] for column in some] for some in (along, of_points)]
+    centre, cov, time = (np.concatenate(columns) for columns in zip(*chosen, strict=True))
+    if not len(centre):
         return []
-    centre, time = centre[known], time[known]
-    values, vectors = np.linalg.eigh(cov[known])
+    values, vectors = np.linalg.eigh(cov)
     axes = 2 * maps.SIGMAS_95_2D * np.sqrt(np.maximum(values, 0.0))
     columns = {
         "x": centre[:, 0], "y": centre[:, 1], "width": axes[:, 1], "height": axes[:, 0],
         "angle": np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]), "time": time,
     }  # fmt: skip
     return [Series("ellipses", _ELLIPSES, ACCENT, columns, 1.0, 0.8, side="after", timed=True)]
+
+
+def _apart(centres: Array, covs: Array, time: Array) -> list[int]:
+    """Indices of ellipses none of which has its centre within another's longer semi-axis.
+
+    Centres (n, 2) m, covariances (n, 2, 2) m², unknown ones are left out; the earlier of two wins.
+    """
+    known = np.flatnonzero(np.isfinite(covs).all(axis=(1, 2)))
+    reach = np.full(len(centres), np.inf)
+    reach[known] = maps.SIGMAS_95_2D * np.sqrt(
+        np.maximum(np.linalg.eigvalsh(covs[known])[:, -1], 0.0)
+    )
+    kept: list[int] = []
+    for i in known[np.argsort(time[known], kind="stable")].tolist():
+        off = np.hypot(*(centres[kept] - centres[i]).T)
+        if (off > np.maximum(reach[kept], reach[i])).all():
+            kept.append(i)
+    return kept
 
 
 def _scans(result: Result, robots: list[str], clock: _Clock) -> dict[str, object]:
@@ -222,7 +243,8 @@ def _scans(result: Result, robots: list[str], clock: _Clock) -> dict[str, object
     points, unit = quantised(np.concatenate(clouds))
     return {
         "layer": _SCANS,
-        "colors": [COLORS[robot_color(i)] for i in range(len(robots))],
+        # of one robot grey, so that its path is seen on them
+        "colors": [COLORS[robot_color(i)] for i in range(len(robots))] if robots[1:] else ["soft"],
         "unit": unit,
         "points": encoded(points),
         "count": encoded(np.array([len(c) for c in clouds], dtype="<i4")),

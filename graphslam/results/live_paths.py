@@ -73,7 +73,7 @@ def live_paths(
         truth = {"x": kept[:, 0], "y": kept[:, 1]}
         series.append(Series("path", _TRUTH, INK, truth, 1.0, 0.9, "dashed"))
     return LiveFigure(
-        "paths", "The paths, moving.",
+        "paths", "Interactive map of the paths.",
         "Drag to move; click, then turn the wheel to zoom; point at a path for its back end, time "
         f"and distance to {against}. Switch back ends off; swipe from final paths (all data) to "
         "causal ones (data up to each pose); replay the drive.",

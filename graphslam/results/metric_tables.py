@@ -191,8 +191,11 @@ def nees_in_words(found: Mapping[str, Any]) -> str:
     above = value > high
     times = (value if above else 1 / max(value, 1e-9)) ** 0.5
     side = "above" if above else "below"
+    count = round(found["effective_poses"])
+    poses = f"{count} independent one{'s' * (count != 1)}"
     return (
         f"covariances are {verdict}: NEES/dof {value:.3g} is {side} its 95 % bounds {low:.3g} to "
-        f"{high:.3g} (poses count as {found['effective_poses']:.0f} independent ones); errors are "
+        f"{high:.3g} (poses count as {poses}); "
+        f"errors are "
         f"about {times:.2g} times as {'large' if above else 'small'} as stated"
     )

@@ -119,8 +119,10 @@ COLUMNS: dict[str, tuple[Column, ...]] = {
         Column("all, s", value_at("total_s")),
         Column("memory, MB", value_at("memory_mb", "growth")),
         Column("process, MB", value_at("memory_mb", "peak"), None),
-        Column("~ landmarks^", converted("{:.2f}".format, "growth_exponent", "landmarks"), None),
-        Column("~ path^", converted("{:.2f}".format, "growth_exponent", "path"), None),
+        Column(
+            "exponent, landmarks", converted("{:.2f}".format, "growth_exponent", "landmarks"), None
+        ),
+        Column("exponent, path", converted("{:.2f}".format, "growth_exponent", "path"), None),
     ),
     "Associations of each": (
         Column("states", value_at("states"), None),
@@ -237,11 +239,12 @@ def equality_notes(summary: Mapping[str, Any]) -> list[str]:
     """The equalities of a comparison as sentences."""
     labels = {row["spec"]: row["label"] for row in summary["rows"]}
     what = {"causal": "are one filter; their causal", "final": "end at one optimum; their final"}
-    return [
-        f"{' and '.join(labels[spec] for spec in pair['specs'])} {what[pair['what']]} poses differ "
-        f"by {pair['sigmas']:.1e} sigma at most."
-        for pair in summary.get("equal", ())
-    ]
+    texts = []
+    for pair in summary.get("equal", ()):
+        which = " and ".join(labels[spec] for spec in pair["specs"])
+        off = f"differ by {pair['sigmas']:.1e} sigma at most" if pair["sigmas"] else "are the same"
+        texts.append(f"{which} {what[pair['what']]} poses {off}.")
+    return texts
 
 
 def reading_notes(summary: Mapping[str, Any]) -> list[str]:
@@ -277,9 +280,10 @@ def reading_notes(summary: Mapping[str, Any]) -> list[str]:
             if text := nees_in_words(found):
                 texts.append(f"{row['label']}, {kind} poses: {text}.")
     texts.append(
-        "Times per step are of the estimator alone, without data association and covariances. Each "
-        "back end ran in a process of its own, one after another; memory is the growth of that "
-        "process."
+        "Times per step are of the estimator alone, without data association and covariances; the "
+        "exponents are those with which they grow over the number of landmarks and over the path. "
+        "Each back end ran in a process of its own, one after another; memory is the growth of "
+        "that process."
     )
     return texts
 

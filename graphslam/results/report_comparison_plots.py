@@ -76,7 +76,7 @@ def live_errors(comparison: Comparison, kind: str) -> LiveFigure | None:
         drawn.append(Curve(backend.label, style, t, np.sqrt(squares)))
     return live_chart(
         f"errors-{kind}",
-        f"Error, {kind}, moving.",
+        f"Error, {kind}, interactive.",
         f"Distance to {against}, RMS of neighbouring poses. Drag to move; click, then turn the "
         "wheel to zoom; point at a curve for its values; switch back ends off.",
         drawn,

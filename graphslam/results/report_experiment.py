@@ -17,6 +17,7 @@ from graphslam.results.drawing import Axes
 from graphslam.results.drawing_elements import ACCENT, FAINT, INK, Style, robot_color
 from graphslam.results.live_charts import Curve, live_chart
 from graphslam.results.live_figure import live_html
+from graphslam.results.live_runs import RunsMap, caption, live_runs, runs_drawing
 from graphslam.results.report_figure import Drawing, panels, positive, svg
 
 Summary = Mapping[str, Any]
@@ -26,10 +27,13 @@ Summary = Mapping[str, Any]
 Tables = Mapping[str, tuple[Sequence[str], Sequence[Sequence[str]]]]
 
 
-def experiment_page(summary: Summary, tables: Tables | None = None) -> str:
+def experiment_page(
+    summary: Summary, tables: Tables | None = None, maps: Sequence[RunsMap] = ()
+) -> str:
     """The report of an experiment as one self-contained HTML document.
 
-    ``tables`` are those of an experiment that brings its own, instead of errors over logs.
+    ``tables`` are those of an experiment that brings its own, instead of errors over logs. ``maps``
+    show the paths of its runs.
     """
     sections = [_header(summary), _warnings(summary)]
     if summary["kind"] == "bench":
@@ -37,6 +41,7 @@ def experiment_page(summary: Summary, tables: Tables | None = None) -> str:
         sections += [
             html.section("Consistency", _consistency(summary)),
             html.section("Errors against the Cramér-Rao bound", _errors(summary)),
+            _maps(summary, maps),
             html.section("Figures", _live(summary) + html.figure_grid(drawings)),
         ]
     elif tables:
@@ -44,7 +49,7 @@ def experiment_page(summary: Summary, tables: Tables | None = None) -> str:
             html.section(title, html.table(head, lines)) for title, (head, lines) in tables.items()
         ]
     else:
-        sections.append(html.section("Errors over logs", _logs(summary)))
+        sections += [html.section("Errors over logs", _logs(summary)), _maps(summary, maps)]
     sections.append(_reproduce(summary))
     return html.document(str(summary["name"]), sections)
 
@@ -153,27 +158,40 @@ def _errors(summary: Summary) -> str:
 
 
 def _logs(summary: Summary) -> str:
-    rows = []
+    """A table of each kind of trajectory and one of landmarks, a row for each kind of run."""
+    several = {
+        key: len({row[key] for row in summary["table"]}) > 1 for key in ("front_end", "scale")
+    }
+    parts: dict[str, list[list[object]]] = {"final": [], "causal": [], "landmarks": []}
     for row in summary["table"]:
         scenario = PurePath(row["scenario"]).name  # or a file of the writer's machine
-        name = f"{scenario}, {row['front_end']}, {row['variant']}, noise × {row['scale']:g}"
-        cells: list[object] = [name, row["runs"], row["failed"], row.get("diverged")]
-        for kind in ("final", "causal"):
-            ate = row.get(kind, {}).get("ate_rmse_m", {})
-            cells += [_plus_minus(ate), ate.get("max"), _mean(row, kind, "nees_per_dof")]
-            cells.append(coverage(row, kind))
-        cells += [_mean(row, "landmarks", name) for name in ("rmse_m", "nees_per_dof")]
-        cells += [coverage(row, "landmarks")]
-        cells += [_mean(row, "landmarks", name) for name in ("matched", "extra")]
-        rows.append(cells)
-    columns = ["", "runs", "failed", "diverged", "final ATE, m", "worst", "NEES/dof"]
-    columns += ["coverage, %", "causal ATE, m", "worst", "NEES/dof", "coverage, %"]
-    columns += ["landmark RMSE, m", "NEES/dof", "coverage, %", "matched", "extra"]
+        named = [scenario, *([row["front_end"]] if several["front_end"] else []), row["variant"]]
+        name = ", ".join([*named, *([f"noise × {row['scale']:g}"] if several["scale"] else [])])
+        for kind, lines in parts.items():
+            error = "rmse_m" if kind == "landmarks" else "ate_rmse_m"
+            found = row.get(kind, {}).get(error, {})
+            cells: list[object] = [name, _plus_minus(found), found.get("max")]
+            cells += [_mean(row, kind, "nees_per_dof"), coverage(row, kind)]
+            if kind == "final":
+                cells += [row["runs"], row["failed"], row.get("diverged")]
+            if kind == "landmarks":
+                cells += [_mean(row, kind, count) for count in ("matched", "missed", "extra")]
+            lines.append(cells)
     note = (
         "<p class=note>Mean ± standard deviation over the runs; coverage of 95 % ellipsoids is the "
         "mean over runs with its bootstrap interval (95 %).</p>"
     )
-    return html.table(columns, rows) + note
+    heads = ["", "{}, m", "worst, m", "NEES/dof", "coverage, %"]
+    titles = {
+        "final": ("Final trajectory, from all data", "ATE", ["runs", "failed", "diverged"]),
+        "causal": ("Causal trajectory, from data up to each pose", "ATE", []),
+        "landmarks": ("Landmarks", "RMSE", ["matched", "missed", "extra"]),
+    }
+    tables = [
+        html.table([*(head.format(error) for head in heads), *more], parts[kind], title)
+        for kind, (title, error, more) in titles.items()
+    ]
+    return "".join(tables) + note
 
 
 def coverage(row: Mapping[str, Any], kind: str) -> str | None:
@@ -363,21 +381,32 @@ def _live(summary: Summary) -> str:
     ]
     charts = [
         live_chart(
-            "consistency", "Consistency against noise, moving.", hint,
+            "consistency", "Consistency against noise, interactive.", hint,
             against_noise["consistency"], ("noise scale", "final joint NEES / dof"),
             log=(True, False), marked=True,
         ),
         live_chart(
-            "error", "Error against noise, moving.", hint, against_noise["error"],
+            "error", "Error against noise, interactive.", hint, against_noise["error"],
             ("noise scale", "final position RMSE, m"), log=(True, True), marked=True,
         ),
         live_chart(
-            "nees", f"NEES over time, noise × {scale}, moving.", hint, over_time,
+            "nees", f"NEES over time, noise × {scale}, interactive.", hint, over_time,
             ("step", "NEES / dof"),
         ),
     ]  # fmt: skip
     live = [live_html(chart) for chart in charts]
     return html.figure_grid(live) if any(live) else ""
+
+
+def _maps(summary: Summary, maps: Sequence[RunsMap]) -> str:
+    """Every map twice: moving, and as a drawing."""
+    styles = _styles(summary)
+    live = "".join(live_html(live_runs(shown, styles)) for shown in maps)
+    drawings = [
+        html.figure(runs_drawing(shown, styles), f"{shown.title}.", caption(shown))
+        for shown in maps
+    ]
+    return html.section("Runs", live + html.figure_grid(drawings)) if maps else ""
 
 
 #: name -> (drawing, title, caption)

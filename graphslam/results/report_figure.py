@@ -89,7 +89,7 @@ def density(points: Array, limits: Array, color: str, pixels: int = 900) -> Shad
 
 def map_axes(drawing: Drawing, limits: Array) -> Axes:
     """Axes in metres with equal scales that include ``limits`` [[x_min, x_max], [y_min, y_max]]."""
-    left, bottom, right, top = 0.5, 0.42, 0.08, 0.24
+    left, bottom, right, top = 0.57, 0.42, 0.08, 0.24
     box = np.array([WIDTH_IN - left - right, drawing.height_in - bottom - top])
     # widen the narrower direction for equal scales
     scale = ((limits[:, 1] - limits[:, 0]) / box).max()
@@ -108,7 +108,7 @@ def time_rows(drawing: Drawing, rows: int, label: str) -> list[Axes]:
     found = []
     for row in range(rows):
         above = top + row * (1 + gap) * height
-        axes = drawing.axes(0.13 * WIDTH_IN, drawing.height_in - above - height, 0.1, above)
+        axes = drawing.axes(0.15 * WIDTH_IN, drawing.height_in - above - height, 0.1, above)
         axes.x_margin = 0.01
         axes.has_x_numbers = row == rows - 1
         found.append(axes)

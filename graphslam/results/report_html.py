@@ -14,6 +14,8 @@ from graphslam.results.report_style import CSS
 MINUTES_FROM_S = 900.0
 #: columns; a table with more does not fit on a phone
 WIDE = 4
+#: warnings; a longer list is folded
+_FOLDED = 8
 _SPACE = "\u202f"  # narrow, no break: 13 631
 
 
@@ -50,9 +52,18 @@ def header(
 
 
 def warning_box(texts: Iterable[str]) -> str:
-    """A box with warnings; empty without any."""
-    items = "".join(f"<li>{escape(text)}</li>" for text in texts)
-    return f'<section class="warn"><h2>Warnings</h2><ul>{items}</ul></section>' if items else ""
+    """A box with warnings, a long list folded after the first ones; empty without any."""
+    items = [f"<li>{escape(text)}</li>" for text in texts]
+    if not items:
+        return ""
+    first, more = (
+        (items, []) if len(items) <= _FOLDED else (items[: _FOLDED - 2], items[_FOLDED - 2 :])
+    )
+    folded = f"<details><summary>{len(more)} more</summary><ul>{''.join(more)}</ul></details>"
+    return (
+        f'<section class="warn"><h2>Warnings</h2><ul>{"".join(first)}</ul>'
+        f"{folded if more else ''}</section>"
+    )
 
 
 def section(title: str, content: str) -> str:
@@ -67,6 +78,7 @@ def figure_grid(drawings: Sequence[str]) -> str:
 
 def figure(drawing: str, title: str, caption: str) -> str:
     """A drawing (SVG) with a caption that begins with its title."""
+    caption = caption.replace(" %", f"{_SPACE}%")  # never at the begin of a line
     return (
         f"<figure><figcaption><b>{escape(title)}</b> {escape(caption)}</figcaption>\n"
         f"{drawing}</figure>"

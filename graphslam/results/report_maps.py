@@ -41,7 +41,8 @@ def overview(result: Result, height_in: float, *, dead_reckoning: bool) -> str:
     clouds = {name: _cloud(result, name, path, dead_reckoning) for name, path in paths.items()}
     landmarks = () if result.keyframe_scans or dead_reckoning else result.landmarks
     extents = [landmark.extent for landmark in landmarks]
-    limits = _limits([*(p.poses[:, :2] for p in paths.values()), *clouds.values(), *extents])
+    whole = [*(path.poses[:, :2] for path in paths.values()), *extents]
+    limits = _limits(whole, clouds.values())
 
     def draw(drawing: Drawing) -> None:
         axes = map_axes(drawing, limits)
@@ -125,7 +126,7 @@ def result_limits(result: Result) -> Array:
     paths = [robot.final.poses[:, :2] for robot in result.robots.values()]
     clouds = [_cloud(result, name, r.final, False) for name, r in result.robots.items()]
     extents = [] if result.keyframe_scans else [m.extent for m in result.landmarks]
-    return _limits([*paths, *clouds, *extents])
+    return _limits([*paths, *extents], clouds)
 
 
 def map_height(result: Result) -> float:
@@ -152,17 +153,16 @@ def _cloud(result: Result, robot: str, path: Trajectory, dead_reckoning: bool) -
     )
 
 
-def _limits(parts: Iterable[Array]) -> Array:
-    """[[x_min, x_max], [y_min, y_max]] around the points but for a few outlying returns.
+def _limits(whole: Iterable[Array], clouds: Iterable[Array] = ()) -> Array:
+    """[[x_min, x_max], [y_min, y_max]] around paths and walls, and scans but for a few returns.
 
-    Outliers are those of each part: a path stays whole however many points the scans have.
+    Outliers are those of each cloud of returns; what is ``whole`` stays so.
     """
-    boxes = []
-    for points in parts:
-        if len(points) > 1000:
-            boxes.append(np.quantile(points, [0.002, 0.998], axis=0))
-        elif len(points):
-            boxes.append(np.stack([points.min(axis=0), points.max(axis=0)]))
+    boxes = [np.stack([points.min(axis=0), points.max(axis=0)]) for points in whole if len(points)]
+    for points in clouds:
+        if len(points):
+            least = 0.002 if len(points) > 1000 else 0.0
+            boxes.append(np.quantile(points, [least, 1.0 - least], axis=0))
     low = np.min([box[0] for box in boxes], axis=0)
     high = np.max([box[1] for box in boxes], axis=0)
     margin = 0.03 * max(float((high - low).max()), 1.0)

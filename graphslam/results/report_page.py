@@ -1,7 +1,7 @@
 # ruff: noqa: RUF001 -- σ, × and – are meant: people read them
 """The sections of the report of a result, in their order."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import PurePath
 from typing import Any
@@ -31,7 +31,7 @@ def page(result: Result, evaluation: Mapping[str, Any] | None) -> str:
         _quality_section(evaluation or {}),
         _uncertainty_section(result),
         _estimator_section(result),
-        _accounting_section(summary),
+        _accounting_section(summary, sorted(result.robots)),
         _landmark_section(result),
         _reproduce_section(result),
     ]
@@ -46,7 +46,7 @@ def _header(result: Result, title: str) -> str:
         ("keyframes", counts.get("keyframes"), ""),
         ("landmarks", len(result.landmarks), ""),
         ("loop closures", counts.get("loop_closures"), ""),
-        ("median σ", html.length(sigma, 3) if sigma is not None else None, ""),
+        ("median σ of position", html.length(sigma) if sigma is not None else None, ""),
         ("real time", summary.get("real_time_factor"), " ×"),
         ("peak memory", summary.get("peak_memory_mb"), " MB"),
     ]
@@ -157,7 +157,7 @@ def _estimator_section(result: Result) -> str:
         figures.append(
             html.figure(
                 plots.timing(result.step_ms),
-                "Wall time per keyframe.",
+                "Wall time per step.",
                 f"With its running median; p50 {html.number(float(p50))} ms, "
                 f"p99 {html.number(float(p99))} ms, max "
                 f"{html.number(float(result.step_ms.max()))} ms.",
@@ -166,22 +166,24 @@ def _estimator_section(result: Result) -> str:
     return html.section("Estimator", html.figure_grid(figures)) if figures else ""
 
 
-def _accounting_section(summary: Mapping[str, Any]) -> str:
+def _accounting_section(summary: Mapping[str, Any], robots: Sequence[str]) -> str:
+    several = len(robots) > 1  # then the table is a wide one
     parts = [
         tables.counts(summary),
         f"<div>{tables.reasons(summary)}</div>",
         f"<div>{tables.stages(summary)}</div>",
-        tables.calibration(summary),
+        "" if several else tables.calibration(summary, robots),
     ]
     content = "\n".join(part for part in parts if part)
-    return html.section("Accounts", f'<div class="accounts">{content}</div>')
+    below = tables.calibration(summary, robots) if several else ""
+    return html.section("Accounts", f'<div class="accounts">{content}</div>{below}')
 
 
 def _landmark_section(result: Result) -> str:
     if not result.landmarks:
         return ""
-    count = html.number(len(result.landmarks))
-    return html.details(f"All {count} landmarks", tables.landmarks(result.landmarks))
+    count = html.counted(len(result.landmarks), "landmark")
+    return html.details(f"Table of {count}", tables.landmarks(result.landmarks))
 
 
 def _reproduce_section(result: Result) -> str:

@@ -1,5 +1,5 @@
 # ruff: noqa: RUF001 -- σ and – are meant: people read them
-"""Curves over time: uncertainty, revision of past poses, innovations, time per keyframe."""
+"""Curves over time: uncertainty, revision of past poses, innovations, time per step."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -20,6 +20,7 @@ from graphslam.results.report_figure import (
     time_axis,
     time_rows,
 )
+from graphslam.results.report_html import number
 from graphslam.results.report_maps import worst_sigma
 
 _MAX_DOTS = 4000
@@ -95,7 +96,7 @@ def innovations(found: Mapping[str, Array], unit: tuple[float, str] = (1e9, "tim
             axes.dots(dots[:, 0], positive(dots[:, 1], 1e-3), robot_color(0), 1.25, 0.55)
             axes.line(*_running(values, np.mean), Style(INK))
             axes.level(1.0, Style(ACCENT, 1.0))
-            title = f"{model}: n {len(values)}, mean {values[:, 1].mean():.2f}"
+            title = f"{model}: n {number(len(values))}, mean {values[:, 1].mean():.2f}"
             if model in MODELS:
                 limit = float(chi2_quantile(0.95, MODELS[model].rows)) / MODELS[model].rows
                 axes.level(limit, Style(ACCENT, 0.8, dashes=(3.7, 1.6)))
@@ -108,17 +109,17 @@ def innovations(found: Mapping[str, Array], unit: tuple[float, str] = (1e9, "tim
 
 
 def timing(step_ms: Array) -> str:
-    """Wall time ``step_ms`` (n,), ms, of every keyframe with its running median."""
-    number = np.arange(len(step_ms))
+    """Wall time ``step_ms`` (n,), ms, of every step with its running median."""
+    steps = np.arange(len(step_ms))
     dots = slice(None, None, max(1, len(step_ms) // _MAX_DOTS))
 
     def draw(drawing: Drawing) -> None:
-        (axes,) = time_rows(drawing, 1, "keyframe")
-        axes.dots(number[dots], positive(step_ms[dots], 1e-3), robot_color(0), 1.5, 0.6)
-        axes.line(*_running(np.column_stack([number, step_ms]), np.median), Style(INK))
+        (axes,) = time_rows(drawing, 1, "step")
+        axes.dots(steps[dots], positive(step_ms[dots], 1e-3), robot_color(0), 1.5, 0.6)
+        axes.line(*_running(np.column_stack([steps, step_ms]), np.median), Style(INK))
         log_scale(axes, "ms")
 
-    return svg("Wall time per keyframe", 2.6, draw)
+    return svg("Wall time per step", 2.6, draw)
 
 
 def unit_of_time(result: Result) -> tuple[float, str]:

@@ -5,6 +5,7 @@ CSS = """
   color-scheme: light dark;
   --bg: #fbfbfa; --card: #ffffff; --ink: #1b1f24; --soft: #59626d; --grid: #dfe2e6;
   --accent: #c8601a; --warn: #fff4dc; --warn-edge: #e0a92e;
+  --good: #eaf5ea; --bad: #fbe9e8;
   --robot0: #4477aa; --robot1: #ee6677; --robot2: #228833;
   --robot3: #aa3377; --robot4: #b59f1e; --robot5: #3aa9d0;
 }
@@ -12,6 +13,7 @@ CSS = """
   :root {
     --bg: #14171b; --card: #1b1f24; --ink: #e4e7ea; --soft: #9aa4af; --grid: #343b43;
     --accent: #f0954f; --warn: #33290f; --warn-edge: #b98a1f;
+    --good: #17271a; --bad: #34191a;
     --robot0: #7fb0e0; --robot1: #ff8c99; --robot2: #5cc46c;
     --robot3: #dd77b0; --robot4: #e0cf63; --robot5: #84d9f5;
   }
@@ -56,6 +58,11 @@ svg .halo { paint-order: stroke; stroke: var(--card); stroke-width: 25px;
 .live-stage { min-height: 320px; }
 .warn { background: var(--warn); border-left: 4px solid var(--warn-edge); border-radius: 6px;
   padding: 10px 16px; margin-top: 1.2rem; }
+.warn.good { background: var(--good); border-color: var(--robot2); }
+.warn.bad { background: var(--bad); border-color: #c93c37; }
+.warn p { margin: 0; }
+.warn details { background: none; border: 0; padding: 0; margin: 2px 0 0; }
+.warn summary { font-weight: 400; font-size: .92rem; }
 .warn h2 { margin: 0 0 .2rem; font-size: .95rem; }
 .warn ul { margin: 0; padding-left: 1.1rem; font-size: .92rem; overflow-wrap: anywhere; }
 .accounts { display: grid; gap: 24px; align-items: start;
@@ -99,5 +106,11 @@ pre { overflow-x: auto; background: var(--bg); padding: 12px; border-radius: 6px
     color: var(--soft); font-size: .74rem; font-weight: 400; }
   table.wide td.none { grid-column: 1 / -1; }
 }
-@media print { details > * { display: block; } main { max-width: none; } .live { display: none; } }
+@media print {
+  details > * { display: block; }
+  details::details-content { content-visibility: visible; block-size: auto; }
+  figure, tr { break-inside: avoid; }
+  main { max-width: none; }
+  .live { display: none; }
+}
 """

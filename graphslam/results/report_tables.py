@@ -73,6 +73,7 @@ def reasons(summary: Mapping[str, Any]) -> str:
 def stages(summary: Mapping[str, Any]) -> str:
     """Seconds per stage with a bar each."""
     found = {name: float(value) for name, value in summary.get("stages", {}).items()}
+    found = dict(sorted(found.items(), key=lambda item: -item[1]))
     longest = max(found.values(), default=0.0) or 1.0
     rows = "".join(
         f'<tr><th scope="row">{escape(name)}</th><td>{number(value)}</td>'
@@ -88,20 +89,38 @@ def stages(summary: Mapping[str, Any]) -> str:
     )
 
 
-def calibration(summary: Mapping[str, Any]) -> str:
-    """Calibrated parameters; empty text where there are none."""
+#: ends of the names of parameters -> their units
+_UNITS = {"_rad_per_m": "rad/m", "_m2": "m²", "_m": "m", "_rad": "rad", "_s": "s"}
+
+
+def calibration(summary: Mapping[str, Any], robots: Sequence[str]) -> str:
+    """Calibrated parameters, a column for each robot; empty text where there are none.
+
+    What is fixed for all of them is named below.
+    """
     found = summary.get("calibration", {})
-    rows = [
-        (
-            name.replace(".", " · ").replace("_", " "),
-            _calibrated(p),
-        )
-        for name, p in found.items()
-    ]
-    return table(["parameter", "value ± σ"], rows, "Calibration") if rows else ""
+    names = dict.fromkeys(name.removeprefix(f"{r}.") for r in robots for name in found
+                          if name.startswith(f"{r}."))  # fmt: skip
+    cells = {n: [_calibrated(found.get(f"{r}.{n}")) for r in robots] for n in names}
+    rows = [(_parameter(n), *texts) for n, texts in cells.items() if set(texts) != {"fixed"}]
+    fixed = [_parameter(n) for n, texts in cells.items() if set(texts) == {"fixed"}]
+    note = f"<p class=note>Fixed: {escape('; '.join(fixed))}.</p>" if fixed else ""
+    heads = ["parameter", *(robots if len(robots) > 1 else ["value ± σ"])]
+    caption = "Calibration" if len(robots) == 1 else "Calibration: value ± σ"
+    return (table(heads, rows, caption) if rows else "") + note
 
 
-def _calibrated(found: Mapping[str, Any]) -> str:
+def _parameter(name: str) -> str:
+    """The name of a parameter with its unit: drift, rad/m."""
+    for end, unit in _UNITS.items():
+        if name.endswith(end):
+            return f"{name.removesuffix(end).replace('_', ' ')}, {unit}"
+    return name.replace("_", " ")
+
+
+def _calibrated(found: Mapping[str, Any] | None) -> str:
+    if found is None:
+        return "–"
     if found["observable"]:
         return f"{found['value']:.4f} ± {found['sigma']:.4f}"
     return "not observable" if found["sigma"] else "fixed"

@@ -1,3 +1,4 @@
+# ruff: noqa: RUF001 -- – is meant: people read it
 """The verdict on a result as a section of its report."""
 
 from collections.abc import Mapping
@@ -13,14 +14,12 @@ def verdict_section(summary: Mapping[str, Any]) -> str:
     if not found:
         return ""
     if not found["reasons"]:
-        text = "<p>good: nothing that was looked at contradicts the result.</p>"
-        return html.section("Verdict", text)
+        text = "nothing that was looked at contradicts the result."
+        return f'<section class="warn good"><p><b>Verdict: good</b> – {text}</p></section>'
     paths = [log["path"] for log in summary.get("logs", [])]
     items = "".join(
         f"<li>{escape(one['level'])}: {escape(html.without_folders(one['text'], paths))}</li>"
         for one in found["reasons"]
     )
-    return (
-        f'<section class="warn"><h2>Verdict: {escape(found["verdict"])}</h2>'
-        f"<ul>{items}</ul></section>"
-    )
+    verdict = escape(found["verdict"])
+    return f'<section class="warn {verdict}"><h2>Verdict: {verdict}</h2><ul>{items}</ul></section>'

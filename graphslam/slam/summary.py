@@ -202,15 +202,27 @@ def lasers_used(log: LogSet, robot: str, run: RobotState) -> list[dict[str, Any]
 CONTRADICTED = 2.0
 
 
+#: observation model -> of what the noise is
+_SEEN = {"point": " of points", "robot-point": " of robots", "robot-pose": " of robots' poses"}
+
+
 def noise_warnings(noise: Mapping[str, Any]) -> list[str]:
-    """Noise that the log contradicts, one line for each source."""
+    """Noise that the log contradicts, a line for each; ``noise`` as in summary.json."""
     lines = []
     for source, found in noise.items():
+        robot, _, model = source.rpartition(" ")
+        of = _SEEN.get(model, "")
         for name, factor in found.get("measured", {}).items():
             if not 1 / CONTRADICTED < factor < CONTRADICTED:
-                more = f"{factor:.2g} times" if factor > 1 else f"1/{1 / factor:.2g} of"
-                lines.append(f"{source}: the variance of {name} is {more} what is stated")
+                digits = _two_digits(max(factor, 1 / factor))
+                more = f"{digits} times" if factor > 1 else f"1/{digits} of"
+                lines.append(f"{robot}: the variance of {name}{of} is {more} what is stated")
     return lines
+
+
+def _two_digits(value: float) -> str:
+    """Two significant digits, without an exponent: 2.2, 2200."""
+    return f"{float(f'{value:.2g}'):g}"
 
 
 def has_invented_stamps(notes: Mapping[str, str]) -> bool:

@@ -210,6 +210,9 @@ def test_print_has_the_drawings_only(indoors, open_page):
     opened.page.emulate_media(media="print")
     assert not opened.page.locator(".live").is_visible()
     assert opened.page.locator("figure svg").first.is_visible()
+    opened.page.wait_for_timeout(200)
+    # what is folded on the screen is on paper
+    assert opened.page.locator("details table").first.bounding_box()["height"] > 100
 
 
 def test_the_theme_follows_the_system(indoors, open_page):

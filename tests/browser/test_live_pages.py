@@ -7,6 +7,7 @@ from graphslam.results import report_html
 from graphslam.results.drawing_elements import Style
 from graphslam.results.live_charts import Curve, live_chart
 from graphslam.results.live_figure import live_html
+from graphslam.results.live_runs import RunPath, RunsMap, live_runs
 from graphslam.results.report_changes import ChangeMark, ChangesPicture, changes_page
 from graphslam.results.report_comparison import (
     BackendCurves,
@@ -122,6 +123,47 @@ def test_back_ends_share_a_map_and_are_swiped_to_their_causal_paths(width, open_
     assert error == pytest.approx(20.0)
     assert opened.messages == []
     assert [url for url in opened.requests if not url.startswith(("file:", "data:"))] == []
+    assert opened.page.evaluate("document.documentElement.scrollWidth") == width
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_runs_of_an_experiment_are_replayed_around_the_truth_and_tell_their_errors(
+    width, open_page
+):
+    truth = np.column_stack([np.linspace(0.0, 10.0, 21), np.zeros(21)])
+    time = np.linspace(0.0, 20.0, 21)
+    runs = {
+        name: [
+            RunPath(run, "a", time, truth + np.array([0.0, side * off]), truth)
+            for run, side in sides
+        ]
+        for name, off in (("ekf", 0.02), ("batch", 0.01))
+        for sides in [((0, -1.0), (1, 1.0))]
+    }
+    walls = [np.array([[-1.0, 4.0], [11.0, 4.0]]), np.array([[-1.0, -4.0], [11.0, -4.0]])]
+    shown = RunsMap("runs-0", "All runs", walls, np.array([[5.0, 2.0]]), runs)
+    styles = {"ekf": Style("#4477aa"), "batch": Style("#ee6677")}
+    page = report_html.document("runs", [live_html(live_runs(shown, styles))])
+    opened = open_page(page, width)
+    box = opened.live("runs-0")
+    lines = "live.series.filter((s) => s.glyph === 'path' && s.layer === 'ekf')"
+    box.locator("input[name=time]").fill("500")
+    opened.page.wait_for_timeout(300)
+    # both runs up to half of the drive, and the robot on the true path
+    x = opened.js("runs-0", f"Array.from({lines}[0].source.data.x)")
+    seen = [value for value in x if value is not None and value == value]
+    assert len(seen) == 22 and max(seen) == pytest.approx(5.0)
+    place = opened.js("runs-0", "[live.source.data.x, live.source.data.y]")
+    np.testing.assert_allclose(np.ravel(place), [5.0, 0.0], atol=1e-3)
+    tips = opened.js(
+        "runs-0", "live.series.filter((s) => s.tip).map((s) => [s.tip, s.full.error[3]])"
+    )
+    assert [error for _, error in tips] == pytest.approx([2.0, 1.0])  # cm, not enlarged
+    assert tips[0][0].startswith("<b>ekf</b>, run @run")
+    box.get_by_label("ekf").click()
+    opened.page.wait_for_timeout(100)
+    assert not opened.js("runs-0", f"{lines}[0].renderer.visible")
+    assert opened.messages == []
     assert opened.page.evaluate("document.documentElement.scrollWidth") == width
 
 

@@ -13,12 +13,23 @@ from synthetic_results import orchard, room
 from graphslam.core.config import Config
 from graphslam.core.records import Estimate, Trajectory
 from graphslam.evaluation.metrics import evaluate
-from graphslam.results.drawing import Axes
-from graphslam.results.drawing_elements import FAINT, INK, OPAQUE, Box, Shade, Style, path_data, png
+from graphslam.results.drawing import TEXT_PT, TICK_TEXT_PT, Axes
+from graphslam.results.drawing_elements import (
+    FAINT,
+    INK,
+    OPAQUE,
+    UNIT,
+    Box,
+    Shade,
+    Style,
+    path_data,
+    png,
+)
 from graphslam.results.drawing_scales import Scale, linear_scale, log_scale
 from graphslam.results.folder import SavedResult
+from graphslam.results.live_map import live_map
 from graphslam.results.report import render
-from graphslam.results.report_figure import density
+from graphslam.results.report_figure import Drawing, density, map_axes
 from graphslam.results.report_maps import poses_at
 from graphslam.results.report_tables import headline, landmark_sigma, number
 
@@ -139,12 +150,12 @@ def test_everything_asked_for_is_shown(indoors):
         "bars across the ends",
         "Final against causal",
         "Innovations",
-        "Wall time per keyframe",
+        "Wall time per step",
         "between the two thresholds",
         "no odometry around the scan",
         "631 scans are stamped earlier than the one before <scan & odom>",  # escaped, so readable
-        "robot · translation scale",
-        "All 12 landmarks",
+        "translation scale",
+        "Table of 12 landmarks",
         "gtsam 4.3.0",
         "[front_end]",
         "Against true poses",
@@ -314,6 +325,21 @@ def test_scales_reach_a_little_beyond_the_data():
     assert log_scale(np.nan, np.nan, 0.0) == Scale(0.1, 1.0, is_log=True)
 
 
+@pytest.mark.parametrize("limits", [(0.0, 1.0), (-300.0, 200.0), (-20000.0, 5000.0), (0.0, 2e-4)])
+def test_the_label_of_an_axis_is_neither_cut_nor_on_its_numbers(limits):
+    """Breaks with a fixed distance from the axis, which long numbers reach."""
+    drawing = Drawing("map", 3.0)
+    axes = map_axes(drawing, np.array([limits, limits]))
+    text = drawing.to_svg()
+    (x,) = (float(v) for v in re.findall(r"rotate\(-90 (-?\d+)[^>]*>y, m</text>", text))
+    numbers = re.findall(r'text-anchor="end"[^>]*>([^<]+)</text>', text)
+    assert len(numbers) > 2
+    half = TEXT_PT * UNIT / 2
+    assert x - half >= 0
+    if max(map(len, numbers)) < 6:
+        assert x + half <= axes.box.left - (5 + 0.6 * TICK_TEXT_PT * max(map(len, numbers))) * UNIT
+
+
 def test_what_is_drawn_lies_where_the_axes_say():
     axes = Axes(Box(100, 50, 1100, 450), "a")
     axes.log_y = True
@@ -375,3 +401,26 @@ def test_the_headline_says_what_where_and_how_good(indoors, outdoors):
     assert sentence.startswith("From 13\u202f631 scans of one robot over ")
     assert "80 keyframes and 12 line landmarks" in sentence
     assert "2 robots" in headline(outdoors[0])
+
+
+def test_the_map_holds_the_whole_path_and_ellipses_that_are_apart():
+    """However many poses it has: only returns of scans may be outliers. Breaks with quantiles of
+    the path, and with an ellipse for each of many poses in one place."""
+    result, _, _ = orchard(keyframes=30, trees=300)
+    robot = result.robots["robot1"]
+    poses = np.repeat(robot.final.poses, 100, axis=0)
+    stamps = robot.final.stamps_ns[0] + np.arange(len(poses)) * 10**8
+    poses[1234, :2] += 50.0
+    final = Trajectory(stamps, poses, np.repeat(robot.final.covs, 100, axis=0))
+    long = dataclasses.replace(robot, final=final, causal=None, dead_reckoning=final)
+    figure = live_map(dataclasses.replace(result, robots={**result.robots, "robot1": long}))
+    assert (figure.limits[:, 1] > poses[1234, :2]).all()
+    (ellipses,) = (one.columns for one in figure.series if one.glyph == "ellipses")
+    at = np.column_stack([ellipses["x"], ellipses["y"]])
+    reach = np.maximum(ellipses["width"], ellipses["height"]) / 2
+    trees = np.array([m.position[:2] for m in result.landmarks])
+    of_tree = (np.hypot(*(at[:, None] - trees).transpose(2, 0, 1)) < 1e-9).any(axis=1)
+    for of in (of_tree, ~of_tree):
+        apart = np.hypot(*(at[of, None] - at[of]).transpose(2, 0, 1))
+        np.fill_diagonal(apart, np.inf)
+        assert of.sum() > 1 and (apart > reach[of]).all()

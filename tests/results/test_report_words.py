@@ -1,3 +1,4 @@
+# ruff: noqa: RUF001 -- σ is meant: people read it
 """What people read in a report: lengths, durations, counts; nothing of the writer's machine."""
 
 import dataclasses
@@ -21,7 +22,16 @@ from graphslam.results.report_comparison import (
 )
 from graphslam.results.report_experiment import experiment_page
 from graphslam.results.report_figure import Drawing
-from graphslam.results.report_html import counted, duration, length, table, without_folders
+from graphslam.results.report_html import (
+    counted,
+    duration,
+    length,
+    table,
+    warning_box,
+    without_folders,
+)
+from graphslam.results.report_tables import calibration
+from graphslam.slam.summary import noise_warnings
 
 SQUARE = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [0.0, 1.0]])
 
@@ -134,3 +144,36 @@ def test_the_sample_of_a_dashed_line_ends_with_a_whole_dash():
     (sample, _) = legend([("name", style)], 0, 3000, 100)
     long = int(re.search(r"h(\d+)", sample).group(1)) / (UNIT * style.width)
     assert long % 6.5 == pytest.approx(5.0, abs=0.1)
+
+
+def test_a_factor_on_a_variance_is_read_without_an_exponent():
+    noise = {
+        "robot 1 point": {"measured": {"bearings": 1 / 2213.0, "ranges": 0.9}},
+        "robot 1 motion": {"measured": {"turning": 8.17}},
+    }
+    assert noise_warnings(noise) == [
+        "robot 1: the variance of bearings of points is 1/2200 of what is stated",
+        "robot 1: the variance of turning is 8.2 times what is stated",
+    ]
+
+
+def test_a_long_list_of_warnings_is_folded_and_none_is_lost():
+    short, long = (warning_box(f"number {k}." for k in range(n)) for n in (8, 20))
+    assert "<details>" not in short
+    assert long.index("number 5.") < long.index("<details>") < long.index("number 6.")
+    assert "14 more" in long and all(f"number {k}." in long for k in range(20))
+    assert warning_box([]) == ""
+
+
+def test_calibration_of_a_fleet_has_a_column_for_each_robot_and_units():
+    def of(robot):
+        value = {"value": 0.0275, "sigma": 0.0118, "observable": True}
+        fixed = {"value": 0.0, "sigma": 0.0, "observable": False}
+        return {f"{robot}.drift_rad_per_m": value, f"{robot}.laser_x_m": fixed}
+
+    both = calibration({"calibration": of("a.b") | of("c")}, ["a.b", "c"])
+    assert re.findall(r'scope="col">([^<]*)', both) == ["parameter", "a.b", "c"]
+    assert "drift, rad/m" in both and both.count("0.0275 ± 0.0118") == 2
+    assert "Fixed: laser x, m." in both
+    assert "value ± σ</th>" in calibration({"calibration": of("a.b")}, ["a.b"])
+    assert calibration({}, ["a"]) == ""

@@ -227,6 +227,8 @@
       for (let k = -12; k <= 9; k += 1) for (const step of steps) ticks.push(+`${step}e${k}`);
       const ticker = state ? new Bokeh.FixedTicker({ ticks }) : new Bokeh.BasicTicker();
       for (const one of [...axes, ...grids]) one.ticker = ticker;
+      // 0.0005 as on the drawings, not 5.000e-4
+      for (const axis of axes) axis.formatter = new Bokeh.NumeralTickFormatter({ format: "0.[00000000]" });
     }
 
     // Leaves out what is later than the slider, or on the other side of the divider.
