@@ -9,7 +9,7 @@ Source: https://wiki.ros.org/Bags/Format/2.0
 
 import bz2
 import struct
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import suppress
 from functools import partial
 from itertools import islice
@@ -27,6 +27,7 @@ from graphslam.logs.container_files import (
     stream_reader,
     too_large,
 )
+from graphslam.logs.read_ahead import ReadAhead
 from graphslam.logs.recording import (
     MAX_BLOCK,
     Block,
@@ -56,7 +57,7 @@ _CHUNK_MARK = b"\x04\0\0\0op=" + bytes([_CHUNK])
 _BEFORE_MARK = 200
 _SEARCHED = 1 << 20
 #: compressions of which unpacking takes longer than the rest of reading
-_SLOW = (b"bz2",)
+_SLOW = ("bz2",)
 
 
 class _BagError(Exception):
@@ -70,6 +71,11 @@ class _Record(NamedTuple):
     fields: Mapping[bytes, bytes]
     begin: int
     end: int
+
+    @property
+    def packing(self) -> str:
+        """Compression of a chunk."""
+        return self.fields.get(b"compression", b"").decode(errors="replace")
 
 
 def index_bag(path: Path, limits: LimitsConfig) -> Piece:
@@ -91,7 +97,7 @@ def _block_messages(
     if first.op == _CHUNK:
         data = kept.get(block.offset)
         if data is None:
-            data = _unpacked(stream, first)
+            data = _unpacked(first, _packed(stream, first))
         with suppress(_BagError):  # the index knows
             for connection, log_time_ns, begin, end in _messages_in(data, {}):
                 if connection in wanted:
@@ -175,32 +181,35 @@ def _records(stream: BinaryIO, offset: int, limit: int) -> Iterator[_Record]:
 # ---------------------------------------------------------------- chunks
 
 
-def _unpacked(stream: BinaryIO, chunk: _Record, most: int = -1) -> bytes:
-    """Contents of a chunk; if the file ends inside it, those before the end.
+def _packed(stream: BinaryIO, chunk: _Record) -> bytes:
+    """A chunk as the file has it; if the file ends inside it, what is before the end."""
+    stream.seek(chunk.begin)
+    length = chunk.end - chunk.begin
+    # without a length: the bag was not closed, and its last chunk ends with the file; if it is not
+    # packed, its messages are read as those outside chunks
+    return _read(stream, length or _SEARCHED * (chunk.packing != "none"))
+
+
+def _unpacked(chunk: _Record, packed: bytes, most: int = -1) -> bytes:
+    """Contents of a chunk of which ``packed`` is there.
 
     ``most``: so many bytes are enough.
 
     Raises:
         _BagError: it cannot be unpacked.
     """
-    stream.seek(chunk.begin)
     size = _number(chunk.fields, b"size")
-    packing = chunk.fields.get(b"compression", b"").decode(errors="replace")
-    length = chunk.end - chunk.begin
-    # without a length: the bag was not closed, and its last chunk ends with the file; if it is not
-    # packed, its messages are read as those outside chunks
-    packed = _read(stream, length or _SEARCHED * (packing != "none"))
     limit = size if size and (most < 0 or size < most) else most
     try:
-        if packing == "none":
+        if chunk.packing == "none":
             return packed
-        if packing == "bz2":
+        if chunk.packing == "bz2":
             return bz2.BZ2Decompressor().decompress(packed, limit)
-        if packing == "lz4":
+        if chunk.packing == "lz4":
             return bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed, limit))
     except (OSError, EOFError, ValueError, RuntimeError, MemoryError) as error:
         raise _BagError(one_line(error)) from error
-    raise _BagError(f"packed with {packing}")
+    raise _BagError(f"packed with {chunk.packing}")
 
 
 def _read(stream: BinaryIO, size: int) -> bytes:
@@ -270,6 +279,8 @@ class _Indexer:
 
     def __init__(self, path: Path, stream: BinaryIO, limits: LimitsConfig) -> None:
         self.path, self.stream, self.limits = path, stream, limits
+        self.most = 1 + int(1e6 * limits.chunk_mb)  # a chunk has less
+        self.ahead: ReadAhead[tuple[int, _Record]] = ReadAhead()
         self.size = size_of(stream)
         self.connections: dict[int, Channel] = {}
         self.blocks = BlockList()
@@ -281,37 +292,44 @@ class _Indexer:
         self.kept = UnpackedChunks()
 
     def run(self) -> Piece:
+        with self.ahead:
+            self.add_all()
+            self.finish_chunks()
+        self.close_loose_block()
+        return self.result()
+
+    def add_all(self) -> None:
         offset = len(MAGIC)
         while offset < self.size:
             try:
                 record = _record_at(self.stream, offset)
                 self.add(offset, record)
                 if record.end > self.size and record.op != _CHUNK:
-                    self.damage.append(f"it ends inside the record at byte {offset}")
+                    self.add_damage(f"it ends inside the record at byte {offset}")
                 offset = record.end
                 packing = record.fields.get(b"compression", b"none")
                 if record.op == _CHUNK and record.end == record.begin and packing != b"none":
                     offset = self.next_chunk(offset + 1)
             except (_BagError, EOFError) as error:
-                self.damage.append(
+                self.add_damage(
                     f"it cannot be read from byte {offset} of {self.size} ({one_line(error)})"
                 )
                 offset = self.next_chunk(offset + 1)
-        self.close_loose_block()
-        return self.result()
 
     def add(self, offset: int, record: _Record) -> None:
-        if record.end > self.size and record.op != _CHUNK:
-            return  # the file ends inside it
+        if record.op == _CHUNK:
+            self.close_loose_block()
+            self.begin_chunk(offset, record)
+            return
+        if record.end > self.size or record.op == _INDEX:
+            return  # the file ends inside it, or it tells nothing new
+        self.finish_chunks()
         if record.op == _MESSAGE:
             self.loose_from = self.loose_from if self.loose else offset
             self.loose_to = record.end
             self.loose.append(_message_head(record.fields))
             if len(self.loose) == MAX_BLOCK:
                 self.close_loose_block()
-        elif record.op == _CHUNK:
-            self.close_loose_block()
-            self.add_chunk(offset, record)
         elif record.op == _CONNECTION:
             self.stream.seek(record.begin)
             data = self.stream.read(record.end - record.begin)
@@ -321,11 +339,32 @@ class _Indexer:
         elif record.op == _BAG and record.fields.get(b"encryptor"):
             raise LogError(f"{self.path}: is encrypted; decrypt it with `rosbag decrypt`")
 
-    def add_chunk(self, offset: int, record: _Record) -> None:
+    def add_damage(self, damage: str) -> None:
+        self.finish_chunks()  # which tell theirs first
+        self.damage.append(damage)
+
+    def begin_chunk(self, offset: int, record: _Record) -> None:
+        packed = _packed(self.stream, record)
+        unpacked = partial(_unpacked, record, packed, self.most)
+        if record.packing not in _SLOW:
+            self.finish_chunks()
+            self.add_chunk(offset, record, unpacked)
+            return
+        size = len(packed) + (
+            int.from_bytes(record.fields.get(b"size", b""), "little") or self.most
+        )
+        for (before, chunk), result in self.ahead.put((offset, record), unpacked, size):
+            self.add_chunk(before, chunk, result)
+
+    def finish_chunks(self) -> None:
+        for (offset, chunk), unpacked in self.ahead.take_all():
+            self.add_chunk(offset, chunk, unpacked)
+
+    def add_chunk(self, offset: int, record: _Record, unpacked: Callable[[], bytes]) -> None:
         messages = []
         try:
-            data = _unpacked(self.stream, record, 1 + int(1e6 * self.limits.chunk_mb))
-            if len(data) > 1e6 * self.limits.chunk_mb:
+            data = unpacked()
+            if len(data) >= self.most:
                 raise too_large(self.path, offset, "chunk_mb")
             # one by one: what comes before damage is kept
             for connection, log_time_ns, _, _ in _messages_in(data, self.connections):
@@ -335,7 +374,7 @@ class _Indexer:
         except _BagError as error:
             if record.end <= self.size:
                 self.damage.append(f"the chunk at byte {offset} is damaged ({one_line(error)})")
-        if messages and record.fields[b"compression"] in _SLOW:
+        if messages and record.packing in _SLOW:
             self.kept.keep(offset, data)
         self.blocks.add(offset, record.end, messages)
         if record.end > self.size:
