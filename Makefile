@@ -80,7 +80,7 @@ types: $(INSTALLED)
 extras-test: $(INSTALLED) docs
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable \
 	  '.[dev,cluster,viewer,notebook]' evo mcap-ros2-support 'readme_renderer[md]'
-	$(BIN)/python -c 'import cmarkgfm, distributed, evo, mcap_ros2, nbclient, pandas, readme_renderer, rerun'
+	$(BIN)/python -c 'import distributed, evo, mcap_ros2, nbclient, pandas, readme_renderer, rerun'
 	$(BIN)/python -m pytest tests/results/test_viewers.py tests/results/test_evo.py \
 	  tests/core/test_notebook_views.py tests/cluster tests/test_docs_code.py
 	rm -rf $(OUT)/wheel $(OUT)/cold

@@ -1,5 +1,6 @@
 """The terminal: stages with a time to the end, quiet, verbose, suggestions, completion, view."""
 
+import os
 import webbrowser
 
 import pytest
@@ -101,6 +102,22 @@ def test_stages_are_heard_only_within_the_block():
         announce("within")
     announce("after")
     assert heard == ["within"]
+
+
+def test_stages_of_a_fork_are_not_heard():
+    """A fork has the listener of this process, which would draw another bar over its bar."""
+    heard = []
+    source, target = os.pipe()
+    with listening(heard.append):
+        announce("here")
+        if (child := os.fork()) == 0:
+            announce("there")
+            os.write(target, "".join(heard).encode())
+            os._exit(0)
+    os.waitpid(child, 0)
+    assert os.read(source, 100) == b"here"
+    os.close(source)
+    os.close(target)
 
 
 @pytest.mark.parametrize(
