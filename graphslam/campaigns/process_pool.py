@@ -27,10 +27,10 @@ from graphslam.campaigns.tasks import (
     Task,
     WorkerLostError,
     Workers,
-    core_count,
     execute,
     memory_per_worker,
 )
+from graphslam.core.worker import core_count
 
 #: tasks in hand for each process: one that it does and one that waits for it
 AHEAD = 2

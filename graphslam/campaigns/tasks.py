@@ -6,7 +6,6 @@ A task may be done twice, if its worker is lost on the way: it must then give th
 import gc
 import math
 import os
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -120,13 +119,6 @@ def machine_memory_mb() -> float:
         limit = Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")
         total = min(total, 1e-6 * float(limit))
     return total
-
-
-def core_count() -> int:
-    """Cores that this process may use."""
-    if sys.platform == "linux":
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def code_version() -> str:

@@ -31,7 +31,14 @@ _allowed = ContextVar("allowed", default=False)
 
 def allow_fork(*, second: bool = True) -> None:
     """Whether this process may fork from now on, where it can and has a second core."""
-    _allowed.set(second and sys.platform == "linux" and len(os.sched_getaffinity(0)) > 1)
+    _allowed.set(second and sys.platform == "linux" and core_count() > 1)
+
+
+def core_count() -> int:
+    """Cores that this process may use."""
+    if sys.platform == "linux":
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def can_fork() -> bool:

@@ -109,7 +109,7 @@ def graph_g2o(steps: Sequence[Step], estimate: Estimate, kernel: RobustConfig = 
     wrapped = _wrapped(_padded(states)).tolist()
     lines = [_vertex(i, x[: len(states[i])]) for i, x in enumerate(wrapped)]
     comments, edges = [], 0
-    # each kind in the order of time
+    # edges without a kernel first, each kind in the order of time
     for scale, alike in groupby(
         sorted(_groups(steps, estimate, kernel), key=attrgetter("scale")), attrgetter("scale")
     ):

@@ -5,8 +5,6 @@ that is not taken yet, at most; a larger piece is done when it is its turn. At t
 left: a program with threads must not fork.
 """
 
-import os
-import sys
 import threading
 import time
 from collections import deque
@@ -14,7 +12,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Generic, TypeVar
 
-from graphslam.core.worker import THREADS
+from graphslam.core.worker import THREADS, core_count
 
 _T = TypeVar("_T")
 
@@ -33,7 +31,7 @@ class ReadAhead(Generic[_T]):
         self._held = 0
         self._threads: list[int] = []
         self._pool = ThreadPoolExecutor(
-            min(MOST_THREADS, _cores()),
+            min(MOST_THREADS, core_count()),
             initializer=lambda: self._threads.append(threading.get_native_id()),
         )
 
@@ -74,10 +72,3 @@ class ReadAhead(Generic[_T]):
         item, result, size = self._waiting.popleft()
         self._held -= size
         return item, result
-
-
-def _cores() -> int:
-    """Cores that this process may use."""
-    if sys.platform == "linux":
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

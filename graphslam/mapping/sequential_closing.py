@@ -40,9 +40,10 @@ from graphslam.mapping.submaps import State, SubmapPose
 AT_ONCE, MAX_ROUNDS = 10, 4
 #: earlier visits that one submap is compared with, at most
 MAX_VISITS = 3
-#: m: visits whose distances differ by less are as near as each other; of these the first ones are
-#: taken, so that what is left when all later visits are eliminated is one place, not one per visit
-SAME_M = 3.0
+#: m, the default reach of a submap: visits within one such step of distance see the same, and the
+#: first of them are taken. So later visits are joined to the first few, not to each other, and the
+#: factor of the graph has as many entries per submap however many visits there are
+SAME_M = NEAR_M
 #: m, m, rad: two sigmas of a relative pose that another match would not improve
 KNOWN = np.array([0.05, 0.05, 0.012])
 

@@ -55,7 +55,9 @@ NO_FACTORS: Mapping[str, Array] = {}
 
 
 def optimise_scan_log(scan_log: TrackedLog, tamper: Tamper | None = None) -> Estimate:
-    """The final estimate of a log, `settled`; its steps, landmarks and calibration follow it.
+    """The final estimate of a log; its steps, landmarks, calibration and counts follow it.
+
+    It is `settled` where `backend.optimise_at_end` asks for that.
 
     Raises:
         EstimationError: the estimate is indeterminate.
@@ -124,15 +126,15 @@ class _Problem:
         self._graph.optimise(CONVERGED_ERROR_ROUGH)
         return self._found(*self._graph.solution())
 
-    def solve(self) -> tuple[_Solved, Future[Estimate]]:
-        """The solution, and the exact minimum of its steps, without covariances.
+    def solve(self, *, settle: bool) -> tuple[_Solved, Future[Estimate] | None]:
+        """The solution, and if wanted the exact minimum of its steps, without covariances.
 
         The minimum is sought in the second process while covariances are computed here.
         """
         self._graph.optimise(CONVERGED_ERROR)
         near, calibrations = self._graph.solution()
         steps = at_calibration(self._steps, self._initial, calibrations)
-        minimum = Future(lambda: settled(steps, near, self._kernel))
+        minimum = Future(lambda: settled(steps, near, self._kernel)) if settle else None
         return self._found(*self._graph.solution(marginals=True, joint=True)), minimum
 
     def _found(self, estimate: Estimate, calibrations: Mapping[str, Calibration]) -> _Solved:
@@ -172,12 +174,13 @@ def _solved(
     closures = untied_closures(closures, paths.spans, steps, landmarks)
     counts["closures_kept"] = len(closures)
     closed = with_closures(steps, closures)
-    done, minimum = _Problem(closed, rough.estimate, tracks, config, factors).solve()
+    problem = _Problem(closed, rough.estimate, tracks, config, factors)
+    done, minimum = problem.solve(settle=config.backend.optimise_at_end)
     estimate, steps = _with_surface_bias(done.solution.estimate, tracks, config), done.steps
     landmarks.update_from(steps, estimate)
     for name in tracks:
         scan_log.runs[name].is_calibrated = config.odometry.calibrate
-    return moved_to(minimum.result(), estimate), steps
+    return moved_to(minimum.result(), estimate) if minimum else estimate, steps
 
 
 def _with_surface_bias(estimate: Estimate, tracks: Mapping[str, Track], config: Config) -> Estimate:
