@@ -26,13 +26,13 @@ BoolArray = NDArray[np.bool_]
 
 #: rounds in which surfaces are found and poses solved
 ROUNDS = 3
-#: m: points in a cell of this size have one surface, that of the nearest points: at least so many,
-#: if there are in so many cells and no farther away (m)
-CELL_M, AROUND, CELLS, AROUND_M = 0.03, 100, 32, 0.2
-#: cells whose neighbours are in memory at once
-BLOCK = 1 << 14
+#: m: points in a cell of this size have one surface: that of the points nearer than `NEAR_M`, which
+#: is far more than they scatter, and of the nearest until they are `ENOUGH`, up to `AROUND_M`
+CELL_M, NEAR_M, ENOUGH, AROUND_M = 0.03, 0.08, 30, 0.2
+#: cells within that, at most; cells whose neighbours are in memory at once
+CELLS, BLOCK = 32, 1 << 14
 #: of a surface: variance across over that along at most, and points at least
-FLAT, LEAST_AROUND = 0.35, 5
+FLAT, LEAST_AROUND = 0.5, 5
 #: m: pieces of surfaces are as long as this; of one piece are normals in the same of so many
 #: sectors; shift of the pieces from round to round, as a share of their length
 PIECE_M, SECTORS, SHIFT = 0.3, 12, 0.37
@@ -145,7 +145,8 @@ def _sums_around(
     distance, near = distance.reshape(-1, most), near.reshape(-1, most)
     sums = np.zeros((6, len(cells)))
     for column in range(most):
-        used = np.isfinite(distance[:, column]) & (sums[0] < AROUND)
+        used = np.isfinite(distance[:, column])
+        used &= (sums[0] < ENOUGH) | (distance[:, column] < NEAR_M)
         if not used.any():
             break
         other = near[used, column]
