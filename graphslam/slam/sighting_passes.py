@@ -58,7 +58,7 @@ def run_sighting_passes(
             path = log.files[0].path
             raise LogError(f"{path}: nothing in it could be used; see `graphslam info`")
         _ = one.groups  # once for both processes
-        replayed = Future(partial(replay_causally, one))
+        replayed = Future(partial(replay_causally, one), urgent=False)  # waited for at the end
         with timed(one.seconds, "final optimisation"):
             rough, made = solve_roughly(one)
             if rough.error > rough.dof and not known.identities:
