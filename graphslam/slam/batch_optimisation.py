@@ -129,7 +129,8 @@ class _Problem:
         near, calibrations = self._graph.solution()
         steps = at_calibration(self._steps, self._initial, calibrations)
         minimum = Future(lambda: settled(steps, near, self._kernel)) if settle else None
-        return self._found(*self._graph.solution(marginals=True, joint=True)), minimum
+        found = self._graph.solution(marginals=True, joint=True, mounts=True)
+        return self._found(*found), minimum
 
     def _found(self, estimate: Estimate, calibrations: Mapping[str, Calibration]) -> _Solved:
         for name, track in self._tracks.items():
@@ -183,19 +184,20 @@ def _solved(
 
 
 def _with_surface_bias(estimate: Estimate, tracks: Mapping[str, Track], config: Config) -> Estimate:
-    """An estimate whose mount, and that of the tracks, has the bias of surfaces.
+    """An estimate whose mounts, and those of the tracks, have the bias of surfaces.
 
     Turning shows where the laser sits by walls of which each returns its ranges with a bias. No
     number of scans averages it, and a coordinate is held by two walls that face each other.
     """
-    variance = config.front_end.floor_normal_m**2 / 2
-    for track in tracks.values():
+    variance, mounts = config.front_end.floor_normal_m**2 / 2, estimate.mounts
+    for name, track in tracks.items():
         bias = np.diag(np.where(track.is_mount_estimated, [variance, variance, 0.0], 0.0))
         track.add_mount_cov(bias)
-        if estimate.mount is not None:  # the only robot's
-            mount = replace(estimate.mount, mount=estimate.mount.mount + bias)
-            estimate = replace(estimate, mount=mount)
-    return estimate
+        if mounts is not None and name in mounts.robots:
+            own, cov = mounts.columns(name), mounts.cov.copy()
+            cov[own, own] += bias
+            mounts = replace(mounts, cov=cov)
+    return replace(estimate, mounts=mounts)
 
 
 def _tied(
