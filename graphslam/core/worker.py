@@ -55,9 +55,9 @@ class Prefetch(Generic[_T]):
     """The items of an iterator, computed ahead of the consumer as far as the pipe has room.
 
     To be iterated over once. ``urgent``: nothing else of this program is more so; else the process
-    lets others of the program have a core that both want. ``make`` is called again if the second process ended before its work
-    was complete, also because of an error, which is then raised here. ``forked``: whether there is
-    a second process.
+    lets others of the program have a core that both want. ``make`` is called again if the second
+    process ended before its work was complete, also because of an error, which is then raised here.
+    ``forked``: whether there is a second process.
     """
 
     def __init__(self, make: Callable[[], Iterator[_T]], *, urgent: bool = True) -> None:

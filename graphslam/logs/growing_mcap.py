@@ -8,7 +8,8 @@ from typing import BinaryIO, cast
 
 from graphslam.core.errors import LogError
 from graphslam.core.sensor_config import LimitsConfig
-from graphslam.logs.mcap_file import DAMAGE, MAGIC, Indexer, block_messages, records_from
+from graphslam.logs.mcap_chunks import DAMAGE
+from graphslam.logs.mcap_file import MAGIC, Indexer, block_messages, records_from
 from graphslam.logs.recording import RawMessage, Recording
 from graphslam.logs.translations import translation
 

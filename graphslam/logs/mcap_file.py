@@ -2,22 +2,18 @@
 
 The file's own summary is not trusted: one pass over the data section lists the blocks of messages
 that are readable, with their CRCs checked. From a file that was cut off, has flipped bits or lacks
-a summary everything readable is recovered, and lost messages are counted. The only module that
-reads with `mcap`.
+a summary everything readable is recovered, and lost messages are counted.
 """
 
 import struct
-import zlib
 from collections.abc import Collection, Iterator
 from functools import partial
 from io import BytesIO
 from itertools import islice
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
-import lz4.frame
 import numpy as np
-import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -33,6 +29,18 @@ from graphslam.logs.container_files import (
     stream_reader,
     too_large,
 )
+from graphslam.logs.mcap_chunks import (
+    DAMAGE,
+    IS_MESSAGE,
+    MESSAGE,
+    RECORD,
+    UNLIMITED,
+    Contents,
+    Most,
+    TooLargeError,
+    chunk_at,
+    records_in,
+)
 from graphslam.logs.recording import (
     MAX_BLOCK,
     Block,
@@ -44,36 +52,11 @@ from graphslam.logs.recording import (
 )
 from graphslam.logs.recording import Channel as TopicChannel
 
-IntArray = np.ndarray[Any, np.dtype[np.int64]]
-UnsignedArray = np.ndarray[Any, np.dtype[np.unsignedinteger[Any]]]
-
 MAGIC = b"\x89MCAP0\r\n"
 NOTES = "graphslam"  # name of the metadata record in which our own logs carry notes
 
-# Errors that mcap, zstandard and lz4 raise on damaged bytes, found by flipping and cutting: their
-# own, and those of the standard library for an invalid length, id or string.
-DAMAGE = (
-    McapError,
-    zstandard.ZstdError,
-    struct.error,
-    ValueError,
-    KeyError,
-    TypeError,
-    RuntimeError,
-    MemoryError,
-    OverflowError,
-    EOFError,
-)
-# Head of every record (opcode, length), and head of a message: the same, channel, sequence number,
-# log time, publish time; then its data.
-_RECORD, _LENGTH = struct.Struct("<BQ"), struct.Struct("<Q")
-_MESSAGE = np.dtype([
-    ("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"),
-    ("log_time_ns", "<u8"), ("publish_time_ns", "<u8"),
-])  # fmt: skip
+# Of message indexes, and how many numbers channels may have.
 _CHANNEL, _CHANNELS = struct.Struct("<H"), 1 << 16
-# int: comparing with the enum is slow
-_IS_MESSAGE = int(Opcode.MESSAGE)
 #: opcodes from here on are for private use, and mean nothing to others
 _PRIVATE = 0x80
 #: number of the schema of channels without one
@@ -87,23 +70,6 @@ _READ: dict[int, Any] = {
 _NOT_NEEDED = frozenset(map(int, Opcode)) - _READ.keys()
 #: files end before this byte: a system refuses to go there
 _FARTHEST = 1 << 62
-#: bytes that are unpacked at once where nobody knows how many there are
-_PART = 1 << 20
-
-
-class _TooLargeError(Exception):
-    """A chunk is beyond a setting of [limits]; its text is the name."""
-
-
-class _Most(NamedTuple):
-    """Unpacked bytes and records that a chunk may have."""
-
-    size: int
-    records: int
-
-
-#: what was indexed is not checked again
-_UNLIMITED = _Most(1 << 40, 1 << 40)
 
 
 def index_mcap(path: Path, limits: LimitsConfig) -> Piece:
@@ -133,10 +99,10 @@ def records_from(stream: BinaryIO, offset: int) -> Iterator[tuple[int, int, byte
         if offset > _FARTHEST:
             raise McapError("it ends inside a record")
         stream.seek(offset)
-        head = stream.read(_RECORD.size)
-        if len(head) < _RECORD.size:
+        head = stream.read(RECORD.size)
+        if len(head) < RECORD.size:
             raise McapError("it ends without a footer")
-        opcode, length = _RECORD.unpack(head)
+        opcode, length = RECORD.unpack(head)
         if opcode == 0:
             raise McapError("there is no record")
         if opcode == Opcode.MESSAGE_INDEX:
@@ -148,143 +114,14 @@ def records_from(stream: BinaryIO, offset: int) -> Iterator[tuple[int, int, byte
             yield offset, opcode, body
         if opcode == Opcode.FOOTER:
             return
-        offset += _RECORD.size + length
+        offset += RECORD.size + length
 
 
 def _message(body: bytes) -> Message:
-    if len(body) < _MESSAGE.itemsize - _RECORD.size:
+    if len(body) < MESSAGE.itemsize - RECORD.size:
         raise McapError("a message is shorter than its head")
     message: Message = Message.read(ReadDataStream(BytesIO(body)), len(body))
     return message
-
-
-class _Contents(NamedTuple):
-    """Contents of a chunk: its bytes, messages, and schemas and channels (``others``).
-
-    Of messages (n): channel and log time ns, begin and end of their data in the bytes.
-    """
-
-    data: bytes
-    channels: UnsignedArray
-    log_times_ns: UnsignedArray
-    begins: IntArray
-    ends: IntArray
-    others: list[McapRecord]
-
-
-def _chunk_at(stream: BinaryIO, offset: int, most: _Most) -> _Contents:
-    """The records in the chunk at ``offset``; if the file ends inside it, those before the end.
-
-    ``most``: how many unpacked bytes and how many records it may have.
-
-    Raises:
-        One of `DAMAGE` when the chunk is damaged in any other way, its CRC included.
-    """
-    stream.seek(offset)
-    head = stream.read(_RECORD.size)
-    if len(head) < _RECORD.size or head[0] != Opcode.CHUNK:
-        raise McapError("no chunk where the index has one")
-    length = _RECORD.unpack(head)[1]
-    body = stream.read(length)
-    chunk = Chunk.read(ReadDataStream(BytesIO(body)))
-    return _records_in(chunk, most) if len(body) == length else _cut_chunk(chunk, most)
-
-
-def _records_in(chunk: Chunk, most: _Most) -> _Contents:
-    """The schemas, channels and messages in a chunk.
-
-    Like mcap's ``breakup_chunk``, but without an object per message, which would be slow: only the
-    lengths, which lead from record to record, are read one by one.
-
-    Raises:
-        One of `DAMAGE` when the chunk is damaged, its CRC included.
-        _TooLargeError: there is more than ``most`` in it.
-    """
-    unpacked = _unpacked(chunk, most.size)
-    if len(unpacked) > most.size:
-        raise _TooLargeError("chunk_mb")
-    if chunk.uncompressed_crc not in (0, zlib.crc32(unpacked)):
-        raise McapError("its CRC is another one")
-    size = len(unpacked)
-    # padded, because the head of a message is read from every record, also from shorter ones
-    data = unpacked + bytes(_MESSAGE.itemsize)
-    starts: list[int] = []
-    begin, head, length_at, append = 0, _RECORD.size, _LENGTH.unpack_from, starts.append
-    for _ in range(min(most.records, size)):
-        if begin >= size:
-            break
-        append(begin)
-        begin += head + length_at(data, begin + 1)[0]
-    if begin < size:
-        raise _TooLargeError("chunk_records")
-    if begin > size:
-        raise McapError("a record reaches beyond its chunk")
-    bounds = np.array([*starts, begin])
-    at = bounds[:-1]
-    # what would be a head at every byte
-    heads = np.ndarray(size, f"V{_MESSAGE.itemsize}", data, strides=(1,))[at].view(_MESSAGE)
-    is_message = heads["opcode"] == _IS_MESSAGE
-    begins, ends = at[is_message] + _MESSAGE.itemsize, bounds[1:][is_message]
-    if (ends < begins).any():
-        raise McapError("a message is shorter than its head")
-    others = []
-    for k in np.flatnonzero(~is_message).tolist():
-        opcode = int(heads["opcode"][k])
-        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            kind = Schema if opcode == Opcode.SCHEMA else Channel
-            body = data[starts[k] + _RECORD.size : int(bounds[k + 1])]
-            others.append(kind.read(ReadDataStream(BytesIO(body))))
-    found = heads[is_message]
-    return _Contents(data, found["channel"], found["log_time_ns"], begins, ends, others)
-
-
-def _unpacked(chunk: Chunk, most: int) -> bytes:
-    """Contents of a chunk; of one that has more than ``most`` bytes a few more than that.
-
-    Raises:
-        One of `DAMAGE` when it cannot be unpacked.
-    """
-    if not chunk.compression:
-        return chunk.data
-    if chunk.compression == "lz4":
-        packed = lz4.frame.LZ4FrameDecompressor()
-        # memory for all that may come is taken at once: no more than the chunk says it has
-        data = bytes(packed.decompress(chunk.data, min(chunk.uncompressed_size, most + 1)))
-        if not packed.eof and len(data) <= most:
-            raise McapError("it is not as long as it says")
-        return data
-    if chunk.compression != "zstd":
-        raise McapError(f"packed with {chunk.compression}")
-    size = zstandard.frame_content_size(chunk.data)
-    if 0 <= size <= most:
-        return zstandard.decompress(chunk.data, size)
-    # without a size, or a size that is too large, which may be the damage
-    with zstandard.ZstdDecompressor().stream_reader(chunk.data) as stream:
-        return b"".join(_parts(stream, most + 1))
-
-
-def _parts(stream: zstandard.ZstdDecompressionReader, size: int) -> Iterator[bytes]:
-    """At most ``size`` bytes of a stream, piece by piece: memory for what there is."""
-    while size > 0 and (part := stream.read(min(size, _PART))):
-        size -= len(part)
-        yield part
-
-
-def _cut_chunk(chunk: Chunk, most: _Most) -> _Contents:
-    """Complete records at the beginning of a chunk whose end is missing."""
-    data = chunk.data
-    if chunk.compression == "zstd":
-        with zstandard.ZstdDecompressor().stream_reader(data) as stream:
-            data = b"".join(_parts(stream, most.size + 1))
-    elif chunk.compression:
-        raise McapError(f"the beginning of a {chunk.compression} chunk cannot be read")
-    end = 0
-    while end + 9 <= len(data):
-        length = int.from_bytes(data[end + 1 : end + 9], "little")
-        if end + 9 + length > len(data):
-            break
-        end += 9 + length
-    return _records_in(Chunk("", data[:end], 0, 0, 0, end), most)
 
 
 def block_messages(
@@ -293,7 +130,7 @@ def block_messages(
     """Channel, log time ns and data of the messages of wanted channels in a block."""
     stream.seek(block.offset)
     if stream.read(1)[0] == Opcode.CHUNK:
-        data, *columns, _ = _chunk_at(stream, block.offset, _UNLIMITED)
+        data, *columns, _ = chunk_at(stream, block.offset, UNLIMITED)
         is_wanted = np.zeros(_CHANNELS, dtype=bool)
         is_wanted[list(wanted)] = True
         use = is_wanted[columns[0]]
@@ -303,9 +140,7 @@ def block_messages(
             yield channel, log_time_ns, data[begin:end]
         return
     count = sum(block.counts.values())
-    loose = (
-        body for _, opcode, body in records_from(stream, block.offset) if opcode == _IS_MESSAGE
-    )
+    loose = (body for _, opcode, body in records_from(stream, block.offset) if opcode == IS_MESSAGE)
     for message in map(_message, islice(loose, count)):
         if message.channel_id in wanted:
             yield message.channel_id, message.log_time, message.data
@@ -316,7 +151,7 @@ class Indexer:
 
     def __init__(self, path: Path, stream: BinaryIO, limits: LimitsConfig) -> None:
         self.path, self.stream = path, stream
-        self.most = _Most(int(1e6 * limits.chunk_mb), limits.chunk_records)
+        self.most = Most(int(1e6 * limits.chunk_mb), limits.chunk_records)
         self.size = size_of(stream)
         stream.seek(len(MAGIC))
         self.position = len(MAGIC)  # where the next record begins
@@ -350,7 +185,7 @@ class Indexer:
             self.indexed.add(body)
             return
         self.indexed = set() if opcode == Opcode.CHUNK else None
-        if opcode == _IS_MESSAGE:
+        if opcode == IS_MESSAGE:
             self.add_message(offset, body)
             return
         self.close_loose_block()
@@ -359,12 +194,12 @@ class Indexer:
         try:
             if opcode == Opcode.CHUNK:
                 chunk = Chunk.read(ReadDataStream(BytesIO(body)))
-                self.add_chunk(offset, _records_in(chunk, self.most))
+                self.add_chunk(offset, records_in(chunk, self.most))
             elif opcode in _READ:
                 self.describe(_READ[opcode].read(ReadDataStream(BytesIO(body))))
             elif opcode not in _NOT_NEEDED and opcode < _PRIVATE:
                 raise McapError(f"its kind {opcode} is unknown")
-        except _TooLargeError as setting:
+        except TooLargeError as setting:
             raise too_large(self.path, offset, str(setting)) from setting
         except DAMAGE as error:
             what = "chunk" if opcode == Opcode.CHUNK else "record"
@@ -392,7 +227,7 @@ class Indexer:
         elif isinstance(record, Metadata) and record.name == NOTES:
             self.notes.update(record.metadata)
 
-    def add_chunk(self, offset: int, found: _Contents) -> None:
+    def add_chunk(self, offset: int, found: Contents) -> None:
         """Take in the contents of a chunk."""
         for record in found.others:
             self.describe(record)
@@ -421,8 +256,8 @@ class Indexer:
             offsets += [index.chunk_start_offset for index in summary.chunk_indexes]
         for offset in sorted(set(offsets) - self.tried):
             try:
-                self.add_chunk(offset, _chunk_at(self.stream, offset, self.most))
-            except _TooLargeError as setting:
+                self.add_chunk(offset, chunk_at(self.stream, offset, self.most))
+            except TooLargeError as setting:
                 raise too_large(self.path, offset, str(setting)) from setting
             except DAMAGE:
                 continue  # lost; counted by the statistics record, if there is one
