@@ -4,12 +4,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from graphslam.core.config import RobustConfig
+from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Step
-from graphslam.estimation.batch_calibration import ROUNDS, calibrate
+from graphslam.estimation.batch_calibration import calibrate
+from graphslam.estimation.calibration_graph import CalibratedSolution
 from graphslam.odometry.preintegration import Track
 from graphslam.slam.log_noise import LogNoise, with_own_noise
 from graphslam.slam.log_pass import LogPass
 from graphslam.slam.motion_noise import scale_motion_noise
+from graphslam.slam.sensor_latency import has_latency, hold_insignificant_latency
 from graphslam.slam.sighting_states import (
     at_states,
     state_times,
@@ -36,19 +39,32 @@ class SightingProblem:
     ) -> tuple[Estimate, tuple[Step, ...]]:
         """The estimate of ``steps``, `steps` with other associations, and the steps behind it.
 
-        The calibrations of the tracks are set to what is found. ``rough``: once, and not to the
-        end.
+        The calibrations of the tracks are set to what is found. ``rough``: not to the end.
 
         Raises:
             EstimationError: the estimate is indeterminate.
         """
+        if not rough:
+            start, _ = self._solved(steps, start, rough=True, decide=True)
+        return self._solved(steps, start, rough=rough)
+
+    def _solved(
+        self, steps: Sequence[Step], start: Estimate, *, rough: bool, decide: bool = False
+    ) -> tuple[Estimate, tuple[Step, ...]]:
+        """`solve`, once; ``decide`` whether sightings are late, by what the whole log says."""
 
         def rebuild(estimate: Estimate, _last: bool) -> tuple[Step, ...]:
             made = with_motions(steps, self.tracks, estimate, self.begun_ns)
             return scale_motion_noise(made, self.noise.motion_scales())
 
-        rounds = 1 if rough else ROUNDS
-        return calibrate(rebuild, start, self.tracks, self.kernel, rounds, rough=rough)
+        def hold(solved: CalibratedSolution, _steps: Sequence[Step]) -> None:
+            for name, track in self.tracks.items():
+                if decide and has_latency(track):
+                    cov = solved.graph.calibration_covariance(name)
+                    track.calibration = replace(track.calibration, cov=cov)
+                    hold_insignificant_latency(track)
+
+        return calibrate(rebuild, start, self.tracks, self.kernel, 1, rough=rough, solved_once=hold)
 
     def at_sightings(
         self, steps: tuple[Step, ...], estimate: Estimate
