@@ -175,6 +175,8 @@ class CompressedBackend(Isam2Backend):
         made, values = cls(config), gtsam.Values()
         for step in steps:
             made._builder.insert(step, start, values)
+            targets = (a.target for a in step.associations)
+            made._mark_recent(factors.landmark_key(i) for i in targets if isinstance(i, int))
         made._steps = made._relinearised = len(steps)
         made._finished = values  # a tree is built of them at the first query
         return made

@@ -13,7 +13,7 @@ import numpy as np
 
 from graphslam.core.config import AssociationConfig, Config
 from graphslam.core.gaussian import mahalanobis_squared
-from graphslam.core.geometry import Array, between, compose, rotation3
+from graphslam.core.geometry import Array, between, compose, rotation3, wrap
 from graphslam.core.motion_models import Calibration
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Estimate, Motion, Step, Trajectory
@@ -88,7 +88,7 @@ def _replay(one: SightingPass, tracks: Mapping[str, Track]) -> CausalReplay:
             began = time.perf_counter()
             false = _not_there(recorded, backend, one.clock_sigma_s, one.config.association)
             rejected |= false
-            step = _counted(recorded, _without(recorded, false), noise.known)
+            step = _merged(_counted(recorded, _without(recorded, false), noise.known))
             backend.add(step)
             poses = {name: backend.state_mean(name) for name in (*step.starts, *step.motions)}
             if one.config.odometry.calibrate and step.motions:
@@ -125,7 +125,7 @@ def _weighed_anew(
     tracks = {name: one.tracks[name] for name in estimate.states}
     groups = [part for group in noise.groups if len((part := group.of_steps(first)).where)]
     steps = recompute_steps(one.steps[:number], estimate, tracks, groups)
-    kept = [_counted(step, _without(step, rejected), noise.known) for step in steps]
+    kept = [_merged(_counted(step, _without(step, rejected), noise.known)) for step in steps]
     return CompressedBackend.at_estimate(_config(one), kept, estimate)
 
 
@@ -212,6 +212,36 @@ def _counted(step: Step, kept: Step, known: Collection[Source]) -> Step:
         for a in kept.associations
     )
     return replace(kept, associations=tuple(weighed))
+
+
+def _merged(step: Step) -> Step:
+    """A step with one bearing and range, their mean by information, for several of one target.
+
+    All are from one state, so that it tells as much, for less work.
+    """
+    groups: dict[tuple[str, int | str], list[Association]] = defaultdict(list)
+    for a in step.associations:
+        if len(a.z) == 2:
+            groups[a.robot, a.target].append(a)
+    several = [own for own in groups.values() if len(own) > 1]
+    if not several:
+        return step
+    seen = [a for own in several for a in own]
+    firsts = np.cumsum([0, *(len(own) for own in several[:-1])])
+    z, information = np.array([a.z for a in seen]), np.linalg.inv([a.cov for a in seen])
+    first = np.repeat(z[firsts], [len(own) for own in several], axis=0)
+    off = z - first
+    off[:, 0] = wrap(off[:, 0])
+    covs = np.linalg.inv(np.add.reduceat(information, firsts))
+    sums = np.add.reduceat((information @ off[:, :, None]), firsts)
+    means = z[firsts] + (covs @ sums)[:, :, 0]
+    means[:, 0] = wrap(means[:, 0])
+    one = {
+        (own[0].robot, own[0].target): own[0].with_measurement(mean, cov)
+        for own, mean, cov in zip(several, means, covs, strict=True)
+    }
+    single = (a for a in step.associations if len(a.z) != 2 or (a.robot, a.target) not in one)
+    return replace(step, associations=(*single, *one.values()))
 
 
 def _doubtful(
