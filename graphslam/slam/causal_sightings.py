@@ -39,7 +39,7 @@ BLOCK = 16
 #: how many times as long as usual the back end's interval between relinearisations is. Each one
 #: rounds differently with what is there besides: causal poses of a log cut in half, which are to be
 #: those of the whole one to 1e-9 m, differ by 2e-10 with the usual interval and by 8e-12 with twice
-#: that. No decision depends on this estimate; of MRCLAM 6 its error stays as it is (0.124 m)
+#: that. No decision depends on this estimate; of MRCLAM 6 its error stays as it is
 INTERVAL = 2
 
 

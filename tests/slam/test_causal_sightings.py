@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 from test_sighting_noise import judged, simulate, solved
 
+from graphslam.core.geometry import wrap
+from graphslam.core.records import Association, Step
 from graphslam.estimation.recorded_graph import SHARED_NS
 from graphslam.slam import causal_noise
 from graphslam.slam.causal_noise import count_so_far
+from graphslam.slam.causal_sightings import _merged
 
 S = 1_000_000_000
 
@@ -55,3 +58,20 @@ def test_what_comes_later_is_not_known(tmp_path, bursty, found):
     whole = found.robots["robot"].causal
     known = half.stamps_ns < half.stamps_ns[0] + 88 * S
     np.testing.assert_allclose(half.poses[known], whole.poses[: known.sum()], rtol=0, atol=1e-9)
+
+
+def test_sightings_of_one_target_in_a_step_are_one_that_tells_as_much():
+    """The mean by information, also of bearings on both sides of π; others are left alone."""
+    covs = [np.diag([0.01, 0.04]), np.array([[0.02, 0.005], [0.005, 0.01]])]
+    z = [np.array([np.pi - 0.01, 2.0]), np.array([0.02 - np.pi, 2.1])]
+    one, two = (Association("a", S, 7, "point", z[k], covs[k]) for k in range(2))
+    others = [Association(*who, "point", z[0], covs[0]) for who in (("a", S, 8), ("b", S, 7))]
+    merged = _merged(Step(S, {}, {}, (one, others[0], two, others[1]))).associations
+    (found,) = (a for a in merged if (a.robot, a.target) == ("a", 7))
+    np.testing.assert_allclose(
+        np.linalg.inv(found.cov), sum(np.linalg.inv(cov) for cov in covs), rtol=1e-12
+    )
+    information = [np.linalg.inv(cov) for cov in covs]
+    expected = found.cov @ (information[0] @ [-0.01, 2.0] + information[1] @ [0.02, 2.1])
+    np.testing.assert_allclose([wrap(found.z[0] - np.pi), found.z[1]], expected, rtol=0, atol=1e-12)
+    assert set(map(id, others)) <= set(map(id, merged)) and len(merged) == 3
