@@ -88,7 +88,8 @@ def _replay(one: SightingPass, tracks: Mapping[str, Track]) -> CausalReplay:
             began = time.perf_counter()
             false = _not_there(recorded, backend, one.clock_sigma_s, one.config.association)
             rejected |= false
-            step = _merged(_counted(recorded, _without(recorded, false), noise.known))
+            step = _counted(recorded, _without(recorded, false), noise.known)
+            step = _merged(step, noise.known)
             backend.add(step)
             poses = {name: backend.state_mean(name) for name in (*step.starts, *step.motions)}
             if one.config.odometry.calibrate and step.motions:
@@ -125,8 +126,9 @@ def _weighed_anew(
     tracks = {name: one.tracks[name] for name in estimate.states}
     groups = [part for group in noise.groups if len((part := group.of_steps(first)).where)]
     steps = recompute_steps(one.steps[:number], estimate, tracks, groups)
-    kept = [_merged(_counted(step, _without(step, rejected), noise.known)) for step in steps]
-    return CompressedBackend.at_estimate(_config(one), kept, estimate)
+    kept = (_counted(step, _without(step, rejected), noise.known) for step in steps)
+    merged = [_merged(step, noise.known) for step in kept]
+    return CompressedBackend.at_estimate(_config(one), merged, estimate)
 
 
 def _without(step: Step, rejected: Collection[int]) -> Step:
@@ -214,34 +216,35 @@ def _counted(step: Step, kept: Step, known: Collection[Source]) -> Step:
     return replace(kept, associations=tuple(weighed))
 
 
-def _merged(step: Step) -> Step:
+def _merged(step: Step, known: Collection[Source]) -> Step:
     """A step with one bearing and range, their mean by information, for several of one target.
 
-    All are from one state, so that it tells as much, for less work.
+    Of ``known`` sources, whose errors are shared: it tells as much, for less work.
     """
-    groups: dict[tuple[str, int | str], list[Association]] = defaultdict(list)
+    if not known:
+        return step
+    groups: dict[tuple[str, int, int | str], list[Association]] = defaultdict(list)
     for a in step.associations:
-        if len(a.z) == 2:
-            groups[a.robot, a.target].append(a)
+        if (a.robot, a.model) in known:
+            groups[a.robot, a.time_ns, a.target].append(a)
     several = [own for own in groups.values() if len(own) > 1]
     if not several:
         return step
     seen = [a for own in several for a in own]
-    firsts = np.cumsum([0, *(len(own) for own in several[:-1])])
+    counts = [len(own) for own in several]
+    firsts = np.cumsum([0, *counts[:-1]])
     z, information = np.array([a.z for a in seen]), np.linalg.inv([a.cov for a in seen])
-    first = np.repeat(z[firsts], [len(own) for own in several], axis=0)
-    off = z - first
+    off = z - np.repeat(z[firsts], counts, axis=0)
     off[:, 0] = wrap(off[:, 0])
     covs = np.linalg.inv(np.add.reduceat(information, firsts))
-    sums = np.add.reduceat((information @ off[:, :, None]), firsts)
+    sums = np.add.reduceat(information @ off[:, :, None], firsts)
     means = z[firsts] + (covs @ sums)[:, :, 0]
     means[:, 0] = wrap(means[:, 0])
-    one = {
-        (own[0].robot, own[0].target): own[0].with_measurement(mean, cov)
-        for own, mean, cov in zip(several, means, covs, strict=True)
-    }
-    single = (a for a in step.associations if len(a.z) != 2 or (a.robot, a.target) not in one)
-    return replace(step, associations=(*single, *one.values()))
+    found = zip(several, means, covs, strict=True)
+    one = [own[0].with_measurement(mean, cov) for own, mean, cov in found]
+    merged = set(map(id, seen))
+    rest = (a for a in step.associations if id(a) not in merged)
+    return replace(step, associations=(*rest, *one))
 
 
 def _doubtful(

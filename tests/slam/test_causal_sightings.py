@@ -66,7 +66,9 @@ def test_sightings_of_one_target_in_a_step_are_one_that_tells_as_much():
     z = [np.array([np.pi - 0.01, 2.0]), np.array([0.02 - np.pi, 2.1])]
     one, two = (Association("a", S, 7, "point", z[k], covs[k]) for k in range(2))
     others = [Association(*who, "point", z[0], covs[0]) for who in (("a", S, 8), ("b", S, 7))]
-    merged = _merged(Step(S, {}, {}, (one, others[0], two, others[1]))).associations
+    step = Step(S, {}, {}, (one, others[0], two, others[1]))
+    assert _merged(step, {("b", "point")}).associations == step.associations
+    merged = _merged(step, {("a", "point")}).associations
     (found,) = (a for a in merged if (a.robot, a.target) == ("a", 7))
     np.testing.assert_allclose(
         np.linalg.inv(found.cov), sum(np.linalg.inv(cov) for cov in covs), rtol=1e-12
