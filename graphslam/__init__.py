@@ -215,7 +215,7 @@ def smooth(
             return page
 
         with checkpoint(output, log, settled, earlier, resume=resume) as kept:
-            truth = None if output is None else Future(read_truth)
+            truth = None if output is None else Future(read_truth, urgent=False)
             result = smooth(log, settled, of_all(log, progress), None, ahead, kept, earlier)
             if output is not None and truth is not None:
                 known = truth.result()

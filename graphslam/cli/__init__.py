@@ -36,8 +36,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if arguments is None:
             _prepare_process()
         from graphslam.cli.commands import app
+        from graphslam.core.allocation import keep_freed_memory
         from graphslam.core.worker import allow_fork
 
+        keep_freed_memory()
         allow_fork()
         app(args=arguments, prog_name="graphslam")
     except SystemExit as done:

@@ -21,8 +21,9 @@ class InformationRoot:
     many rows are its own; those of all cliques are numbered in this order. ``width`` (C,) is how
     many rows of others it depends on, ``separators`` (sum of width,) which; ``values`` the dense
     blocks (own, own + width), row by row. ``states[robot]`` (n,) is the first of the three rows of
-    each state, ``landmarks[number]`` that of each landmark. Errors are along the axes of each
-    pose's own frame, in its tangent space, so that R is the same in every world frame.
+    each state, ``landmarks[number]`` that of each landmark, ``mounts[robot]`` (3,) those of its
+    mount, -1 of what is held. Errors are along the axes of each pose's own frame, in its tangent
+    space, so that R is the same in every world frame; those of a mount along the base's.
     """
 
     above: IntArray
@@ -32,3 +33,4 @@ class InformationRoot:
     values: Array
     states: Mapping[str, IntArray]
     landmarks: Mapping[int, int] = field(default_factory=dict)
+    mounts: Mapping[str, IntArray] = field(default_factory=dict)

@@ -19,6 +19,7 @@ from graphslam.core.config import Config
 from graphslam.core.geometry import Array
 from graphslam.core.information_root import InformationRoot
 from graphslam.core.known_landmarks import KnownLandmarks
+from graphslam.core.mount_covariances import MountCovariances
 from graphslam.core.notebook_views import ResultViews
 from graphslam.core.record import Record
 
@@ -308,20 +309,6 @@ class Trajectory:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MountCovariance:
-    """Covariance (3, 3) of a robot's mount (x, y, yaw; base axes), and of an estimate with it.
-
-    ``states`` (n, 3, 3): rows of its states; ``landmarks``: (d, 3) by number. World axes. Where the
-    world is placed by the mount, ``placing`` are the derivatives (d, 3) of landmarks by it.
-    """
-
-    mount: Array
-    states: Array
-    landmarks: Mapping[int, Array]
-    placing: Mapping[int, Array] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
     """The result of a back end: every state and every landmark, world frame.
 
@@ -329,7 +316,7 @@ class Estimate:
     and (2, 2) for points, (3,) and (3, 3) for lines and segments, additive world-axis errors.
     ``error`` is half the weighted squared residual (robust weights applied), ``dof`` rows minus
     unknowns. ``root`` has the covariance between any states; None where a back end has none.
-    ``mount``: of a single robot whose mount is estimated with its states; else None.
+    ``mounts``: of robots whose mounts are estimated with their states; None without any.
     """
 
     states: Mapping[str, Trajectory]
@@ -337,7 +324,7 @@ class Estimate:
     error: float
     dof: int
     root: InformationRoot | None = None
-    mount: MountCovariance | None = None
+    mounts: MountCovariances | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -382,13 +369,13 @@ class ScanTies:
 class JointScans:
     """What the joint covariance of all scans follows from: how they follow from final states.
 
-    ``mount``: see `Estimate`.
+    ``mounts``: see `Estimate`; without the covariances of the states with them.
     """
 
     root: InformationRoot
     states: Mapping[str, Trajectory]
     ties: Mapping[str, ScanTies]
-    mount: MountCovariance | None = None
+    mounts: MountCovariances | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -25,6 +25,8 @@ _T = TypeVar("_T")
 THREADS = Path("/proc/self/task")
 #: items sent at once
 BATCH = 256
+#: how nice a process is whose result is not waited for soon: it gets a tenth of a shared core
+LOW_PRIORITY = 10
 
 _allowed = ContextVar("allowed", default=False)
 
@@ -52,14 +54,15 @@ def can_fork() -> bool:
 class Prefetch(Generic[_T]):
     """The items of an iterator, computed ahead of the consumer as far as the pipe has room.
 
-    To be iterated over once. ``make`` is called again if the second process ended before its work
+    To be iterated over once. ``urgent``: nothing else of this program is more so; else the process
+    lets others of the program have a core that both want. ``make`` is called again if the second process ended before its work
     was complete, also because of an error, which is then raised here. ``forked``: whether there is
     a second process.
     """
 
-    def __init__(self, make: Callable[[], Iterator[_T]]) -> None:
+    def __init__(self, make: Callable[[], Iterator[_T]], *, urgent: bool = True) -> None:
         """Begin."""
-        self._make = make
+        self._make, self._urgent = make, urgent
         self.forked = can_fork() and self._fork()
 
     def _fork(self) -> bool:
@@ -78,6 +81,8 @@ class Prefetch(Generic[_T]):
             os.close(self._source)
             allow_fork(second=False)
             gc.freeze()  # else the search for cycles would copy shared memory
+            if not self._urgent:
+                os.nice(LOW_PRIORITY)
             with os.fdopen(sink, "wb") as stream:
                 items = self._make()
                 while batch := list(islice(items, BATCH)):
@@ -126,9 +131,9 @@ class Future(Generic[_T]):
     Its result must be picklable.
     """
 
-    def __init__(self, task: Callable[[], _T]) -> None:
-        """Begin."""
-        self._made = Prefetch(lambda: iter([task()]))
+    def __init__(self, task: Callable[[], _T], *, urgent: bool = True) -> None:
+        """Begin; ``urgent``: see `Prefetch`."""
+        self._made = Prefetch(lambda: iter([task()]), urgent=urgent)
         self.done = not self._made.forked
         if self.done:
             self._result = next(iter(self._made))

@@ -67,6 +67,7 @@ def calibrate(
             robust,
             rough=rough or not last,
             joint=joint and last,
+            mounts=len(tracks) == 1,  # of several robots starts have the errors of the mounts
         )
         estimate = solved.estimate
         for name, track in tracks.items():

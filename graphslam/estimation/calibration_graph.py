@@ -16,8 +16,9 @@ import numpy as np
 from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array, adjoint, between, inverse, log, rotation3, wrap
 from graphslam.core.motion_models import HELD_SIGMA, Calibration
+from graphslam.core.mount_covariances import MountCovariances
 from graphslam.core.record import replace
-from graphslam.core.records import Estimate, Motion, MountCovariance, Step
+from graphslam.core.records import Estimate, Motion, Step
 from graphslam.estimation import factors
 from graphslam.estimation.backend import JointMarginal
 from graphslam.estimation.covariance_columns import covariance_columns
@@ -44,6 +45,7 @@ def solve_calibrated(
     *,
     rough: bool = False,
     joint: bool = False,
+    mounts: bool = False,
 ) -> "CalibratedSolution":
     """Optimise all states, landmarks and calibrations together.
 
@@ -59,6 +61,7 @@ def solve_calibrated(
         kernel: of observations.
         rough: stop early, see `Reoptimiser.solve`; covariances are NaN.
         joint: whether the estimate is to have the root of the information.
+        mounts: whether it is then to have covariances with the mounts.
 
     Raises:
         EstimationError: a covariance is not positive definite, or a state is unknown.
@@ -66,7 +69,7 @@ def solve_calibrated(
     problem = CalibrationGraph(steps, start, priors, now, kernel)
     problem.calibrate_motions(steps, now)
     converged = CONVERGED_ERROR_ROUGH if rough else CONVERGED_ERROR
-    found = problem.solve(converged, marginals=not rough, joint=joint)
+    found = problem.solve(converged, marginals=not rough, joint=joint, mounts=mounts)
     return CalibratedSolution(*found, problem)
 
 
@@ -148,7 +151,12 @@ class CalibrationGraph:
                 graph.replace(index, gtsam.LinearContainerFactor(row, values))
 
     def solve(
-        self, converged: float, *, marginals: bool = False, joint: bool = False
+        self,
+        converged: float,
+        *,
+        marginals: bool = False,
+        joint: bool = False,
+        mounts: bool = False,
     ) -> tuple[Estimate, dict[str, Calibration]]:
         """Optimise from the last solution, see `optimise`; what was found, see `solution`.
 
@@ -156,7 +164,7 @@ class CalibrationGraph:
             EstimationError: the estimate is indeterminate.
         """
         self.optimise(converged)
-        return self.solution(marginals=marginals, joint=joint)
+        return self.solution(marginals=marginals, joint=joint, mounts=mounts)
 
     def optimise(self, converged: float) -> None:
         """Optimise from the last solution until the relative decrease of the error is so small.
@@ -180,13 +188,14 @@ class CalibrationGraph:
         self._values, self._marginals = values, None
 
     def solution(
-        self, *, marginals: bool = False, joint: bool = False
+        self, *, marginals: bool = False, joint: bool = False, mounts: bool = False
     ) -> tuple[Estimate, dict[str, Calibration]]:
         """The estimate and the calibrations where it was optimised last.
 
         Args:
             marginals: whether covariances are wanted; else they are NaN.
             joint: whether the root of the information is wanted beside them.
+            mounts: whether covariances with the mounts are then wanted too.
 
         Raises:
             EstimationError: the estimate is indeterminate.
@@ -199,9 +208,11 @@ class CalibrationGraph:
                 raise builder.explain(error) from error
         covs = found.marginals
         means = with_means(values, builder.dims(), covs)
-        estimate = builder.estimate(means, float(builder.graph.error(values)), found.rows)
-        if found.rows is not None and len(self._priors) == 1:
-            estimate = replace(estimate, mount=self._mount(found.rows, values))
+        mounted = self._mount_places() if mounts else {}
+        half_error = float(builder.graph.error(values))
+        estimate = builder.estimate(means, half_error, found.rows, mounted)
+        if found.rows is not None and mounted:
+            estimate = replace(estimate, mounts=self._mounts(found.rows, values, mounted))
         calibrations = {}
         for robot, prior in self._priors.items():
             mean, cov, use = prior.mean.copy(), prior.cov.copy(), self._free[robot]
@@ -212,26 +223,51 @@ class CalibrationGraph:
             calibrations[robot] = Calibration(prior.names, mean, cov)
         return estimate, calibrations
 
-    def _mount(self, cliques: Sequence[CliqueRows], values: gtsam.Values) -> MountCovariance | None:
-        """Covariance of the mount, and of states and landmarks with it; None if it is held."""
-        builder, ((robot, prior),) = self._builder, self._priors.items()
-        names = np.array(prior.names)[self._free[robot]]
-        pick = (names[:, None] == np.array(MOUNT_NAMES)).astype(float)  # parameters -> mount
-        if not pick.any():
-            return None
-        columns = covariance_columns(cliques, self._keys[robot])
-        states = builder.state_keys(robot)
-        turns = rotation3([factors.read(values, key, 3)[2] for key in states])
+    def _mount_places(self) -> dict[str, tuple[int, list[int]]]:
+        """Robots whose mounts are estimated, see `information_root`."""
+        found = {}
+        for robot, prior in self._priors.items():
+            names = [prior.names[k] for k in self._free[robot]]
+            at = [names.index(name) if name in names else -1 for name in MOUNT_NAMES]
+            if max(at) >= 0:
+                found[robot] = (self._keys[robot], at)
+        return found
+
+    def _mounts(
+        self,
+        cliques: Sequence[CliqueRows],
+        values: gtsam.Values,
+        mounted: Mapping[str, tuple[int, Sequence[int]]],
+    ) -> MountCovariances:
+        """Covariances of the mounts, and of states and landmarks with them."""
+        builder, robots = self._builder, tuple(sorted(mounted))
+        columns: list[dict[int, Array]] = []  # key -> covariance (d, 3) with each mount
+        picks = []  # parameters -> mount
+        for robot in robots:
+            key, at = mounted[robot]
+            pick = (np.arange(len(self._free[robot]))[:, None] == np.array(at)).astype(float)
+            found = covariance_columns(cliques, key)
+            columns.append({k: column @ pick for k, column in found.items()})
+            picks.append(pick)
+
+        def with_all(key: int) -> Array:
+            return np.concatenate([one[key] for one in columns], axis=1)
+
+        cov = np.concatenate([
+            pick.T @ with_all(mounted[robot][0])
+            for robot, pick in zip(robots, picks, strict=True)
+        ])  # fmt: skip
+        states = {}
+        for robot in builder.robots:
+            keys = builder.state_keys(robot)
+            turns = rotation3([factors.read(values, key, 3)[2] for key in keys])
+            states[robot] = turns @ np.array([with_all(key) for key in keys])
         landmarks = {}
         for i, dim in builder.landmark_dims.items():
             key = factors.landmark_key(i)
             turn = rotation3(factors.read(values, key, dim)[2]) if dim == 3 else np.eye(dim)
-            landmarks[i] = turn @ columns[key] @ pick
-        return MountCovariance(
-            pick.T @ columns[self._keys[robot]] @ pick,
-            turns @ np.array([columns[key] for key in states]) @ pick,
-            landmarks,
-        )
+            landmarks[i] = turn @ with_all(key)
+        return MountCovariances(robots, cov, states, landmarks)
 
     def posterior(self) -> Posterior:
         """The last solution with the covariances that its residuals need.

@@ -12,6 +12,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Literal
 
 import gtsam
@@ -312,11 +313,13 @@ class GraphBuilder:
         marginals: Mapping[int, tuple[Array, Array]],
         half_error: float,
         rows: Sequence[CliqueRows] | None = None,
+        mounts: Mapping[str, tuple[int, Sequence[int]]] = MappingProxyType({}),
     ) -> Estimate:
         """An `Estimate` of every state and landmark.
 
         ``marginals``: key -> mean and covariance, errors in body frames; ``half_error``: half the
-        weighted squared residual; ``rows``: root of the information, if it is to be kept.
+        weighted squared residual; ``rows``: root of the information, if it is to be kept, with
+        ``mounts``, see `information_root`.
         """
         states, unknowns = {}, 0
         for robot in sorted(self.robots):
@@ -332,7 +335,7 @@ class GraphBuilder:
             unknowns += dim
         keys = {robot: self.state_keys(robot) for robot in states}
         marks = {number: factors.landmark_key(number) for number in landmarks}
-        root = None if rows is None else information_root(rows, keys, marks)
+        root = None if rows is None else information_root(rows, keys, marks, mounts)
         return Estimate(states, landmarks, half_error, self.rows - unknowns, root)
 
 

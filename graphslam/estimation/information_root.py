@@ -10,6 +10,7 @@ Covariance recovery from a square root information matrix, RAS 57, 2009, DOI
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,15 +30,19 @@ def information_root(
     cliques: "Sequence[CliqueRows]",
     states: Mapping[str, Sequence[int]],
     landmarks: Mapping[int, int],
+    mounts: Mapping[str, tuple[int, Sequence[int]]] = MappingProxyType({}),
 ) -> InformationRoot:
-    """The root as arrays, without cliques on which no state and no landmark depends.
+    """The root as arrays, without cliques on which nothing of these depends.
 
     Args:
         cliques: from the last one on, each after the one above it.
         states: robot -> keys of its states.
         landmarks: number -> key.
+        mounts: robot -> key of its calibration, and which of its dimensions x, y and yaw of the
+            mount are, -1 of what is held.
     """
     wanted = {key for keys in states.values() for key in keys} | set(landmarks.values())
+    wanted |= {key for key, _ in mounts.values()}
     needed = [not wanted.isdisjoint(clique.own) for clique in cliques]
     for n in reversed(range(len(cliques))):
         above = cliques[n].above
@@ -70,19 +75,33 @@ def information_root(
             for robot, keys in states.items()
         },
         {number: rows[key].start for number, key in landmarks.items()},
+        {
+            robot: np.array([n if n < 0 else rows[key].start + n for n in at], dtype=np.int64)
+            for robot, (key, at) in mounts.items()
+        },
     )
 
 
 def joint_covariance(root: InformationRoot, rows: IntArray) -> Array:
-    """Joint covariance (k, k) of k of the variables' dimensions, given by their rows of the root.
+    """Joint covariance (k, k) of k dimensions of variables, given by their rows of the root."""
+    b = np.zeros((int(root.own.sum()), len(rows)))
+    b[rows, np.arange(len(rows))] = 1.0
+    return covariance_of(root, b)
+
+
+def covariance_of(root: InformationRoot, combinations: Array) -> Array:
+    """Joint covariance (k, k) of linear combinations of all variables.
 
     The time is that of k forward substitutions through all of the root, in one go.
+
+    Args:
+        root: of the graph.
+        combinations: (rows, k) derivatives of each by the errors; they are overwritten.
     """
     starts = np.concatenate([[0], np.cumsum(root.own)])
     widths = np.concatenate([[0], np.cumsum(root.width)])
     values = np.concatenate([[0], np.cumsum(root.own * (root.own + root.width))])
-    b = np.zeros((int(starts[-1]), len(rows)))
-    b[rows, np.arange(len(rows))] = 1.0
+    b = combinations
     for c in reversed(range(len(root.own))):  # the last clique depends on no other
         n, m = int(root.own[c]), int(root.width[c])
         own = slice(starts[c], starts[c + 1])

@@ -1,6 +1,6 @@
 """Statistics of estimation errors: root mean square, NEES with its chi-square bounds, coverage."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,12 @@ from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared
 from graphslam.core.geometry import Array
 
 #: probability of the ellipsoids whose coverage is counted, and the tails of the NEES' bounds
-PROBABILITY, TAILS = 0.95, (0.025, 0.975)
+PROBABILITY, TAILS, TAILS_99 = 0.95, (0.025, 0.975), (0.005, 0.995)
+#: draws of a weighted sum of chi-squares, and how many of its largest weights are drawn one by one
+DRAWS, DRAWN = 100_000, 60
+NEES_NUMBERS = (
+    "nees_per_dof", "effective_poses", "nees_bounds", "nees_bounds_99", "nees_verdict", "coverage"
+)  # fmt: skip
 #: what a NEES says of the covariances
 TOO_CONFIDENT, TOO_CAUTIOUS, CONSISTENT = "too confident", "too cautious", "consistent"
 
@@ -60,19 +65,60 @@ def effective_number(whitened: Array) -> float:
     return n / min(max(times, 1.0), n)
 
 
-def nees_statistics(errors: Sequence[Array], covs: Sequence[Array]) -> dict[str, Any]:
-    """``nees_per_dof``, ``effective_poses``, ``nees_bounds``, ``nees_verdict``, ``coverage``.
+def weighted_chi2_quantiles(weights: Array, probabilities: Sequence[float]) -> Array:
+    """Quantiles (p,) of the sum of chi-squares of one degree of freedom times weights (k,).
 
-    The two-sided 95 % bounds are chi-square quantiles of a mean over the `effective_number` of
-    independent poses, which is that of each series (of a robot), summed. The verdict says what it
-    means to be outside: covariances are `TOO_CONFIDENT` or `TOO_CAUTIOUS`, else `CONSISTENT`.
+    By drawing from it `DRAWS` times, from a fixed seed. Weights behind the largest count together,
+    as a chi-square with their mean and variance (B. L. Welch, The generalization of Student's
+    problem, Biometrika 34, 1947, DOI 10.1093/biomet/34.1-2.28).
+    """
+    rng = np.random.default_rng(0)
+    w = np.sort(weights)[::-1]
+    drawn = np.zeros(DRAWS)
+    for weight in w[:DRAWN]:
+        drawn += weight * np.square(rng.standard_normal(DRAWS))
+    rest = w[DRAWN:]
+    if rest.sum() > 0.0:
+        scale = np.square(rest).sum() / rest.sum()
+        drawn += rng.gamma(rest.sum() / scale / 2.0, 2.0 * scale, DRAWS)
+    return np.quantile(drawn, probabilities)
+
+
+def with_joint_bounds(found: Mapping[str, Any], weights: Array) -> dict[str, Any]:
+    """`nees_statistics` whose bounds are those of the stated joint covariance.
+
+    ``weights`` (k,): see `graphslam.evaluation.joint_nees`. Poses then count as so many independent
+    ones as give the NEES the same variance.
+    """
+    k = len(weights)
+    each = weighted_chi2_quantiles(weights, (*TAILS, *TAILS_99)) / k
+    low, high, low_99, high_99 = map(float, each)
+    return {
+        **found,
+        "effective_poses": float(np.square(weights.sum()) / np.square(weights).sum() / 3.0),
+        "nees_bounds": [low, high],
+        "nees_bounds_99": [low_99, high_99],
+        "nees_verdict": _verdict(found["nees_per_dof"], low, high),
+    }
+
+
+def _verdict(mean: float, low: float, high: float) -> str:
+    return TOO_CONFIDENT if mean > high else TOO_CAUTIOUS if mean < low else CONSISTENT
+
+
+def nees_statistics(errors: Sequence[Array], covs: Sequence[Array]) -> dict[str, Any]:
+    """The NEES of poses, its bounds and what they say: `NEES_NUMBERS`.
+
+    The two-sided 95 % bounds, and those of 99 %, are chi-square quantiles of a mean over the
+    `effective_number` of independent poses, which is that of each series (of a robot), summed;
+    where the joint covariance is known, see `with_joint_bounds`. The verdict says what it means to
+    be outside those of 95 %: covariances are `TOO_CONFIDENT` or `TOO_CAUTIOUS`, else `CONSISTENT`.
     ``coverage`` is that of the 95 % ellipsoids. Without a usable covariance all are None.
 
     Args:
         errors: of each series, (n, d), in the order of time.
         covs: the same of their covariances (n, d, d), along the same axes.
     """
-    names = ("nees_per_dof", "effective_poses", "nees_bounds", "nees_verdict", "coverage")
     values, effective, d = [], 0.0, 1
     for e, P in zip(errors, covs, strict=True):
         own = nees(e, P)
@@ -83,10 +129,11 @@ def nees_statistics(errors: Sequence[Array], covs: Sequence[Array]) -> dict[str,
             L = np.linalg.cholesky(P[good])
             effective += effective_number(np.linalg.solve(L, e[good][..., None])[..., 0])
     if not values:
-        return dict.fromkeys(names)
+        return dict.fromkeys(NEES_NUMBERS)
     each = np.concatenate(values)
     mean = float(each.mean() / d)
-    low, high = (float(q) for q in chi2_quantile(TAILS, d * effective) / (d * effective))
-    verdict = TOO_CONFIDENT if mean > high else TOO_CAUTIOUS if mean < low else CONSISTENT
+    bounds = (chi2_quantile((*TAILS, *TAILS_99), d * effective) / (d * effective)).tolist()
+    verdict = _verdict(mean, *bounds[:2])
     coverage = float(np.mean(each <= chi2_quantile(PROBABILITY, d)))
-    return dict(zip(names, (mean, effective, [low, high], verdict, coverage), strict=True))
+    numbers = (mean, effective, bounds[:2], bounds[2:], verdict, coverage)
+    return dict(zip(NEES_NUMBERS, numbers, strict=True))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from graphslam.core.errors import OutputError
-from graphslam.core.records import Landmark, Result, Trajectory, TrueLandmark
+from graphslam.core.records import JointScans, Landmark, Result, Trajectory, TrueLandmark
 from graphslam.core.worker import parallel_map
 from graphslam.evaluation.common_frame import (
     Alignment,
@@ -22,6 +22,8 @@ from graphslam.evaluation.common_frame import (
     is_start_given,
     moved_landmarks,
 )
+from graphslam.evaluation.error_statistics import NEES_NUMBERS, with_joint_bounds
+from graphslam.evaluation.joint_nees import nees_weights
 from graphslam.evaluation.landmark_metrics import landmark_metrics
 from graphslam.evaluation.relation_metrics import (
     Relations,
@@ -34,12 +36,7 @@ from graphslam.results.folder import SavedResult
 from graphslam.results.joint_file import joint_scans
 
 #: numbers that are undefined where estimate and truth have no frame in common
-_WORLD_METRICS = dict.fromkeys(
-    (
-        "ate_rmse_m", "max_m", "heading_rmse_rad", "nees_per_dof", "effective_poses",
-        "nees_bounds", "nees_verdict", "coverage",
-    )
-)  # fmt: skip
+_WORLD_METRICS = dict.fromkeys(("ate_rmse_m", "max_m", "heading_rmse_rad", *NEES_NUMBERS))
 
 
 def robots_in_own_frame(summary: Mapping[str, Any]) -> set[str]:
@@ -81,7 +78,9 @@ def evaluate(
         robots = list(in_world.values())
         if robots:
             alignment = (displacement_of_poses if common else alignment_of_poses)(robots)
-        found |= _compare_trajectories(pairs, own_frame if common else set(pairs), set(in_world))
+        elsewhere = own_frame if common else set(pairs)
+        found |= _compare_trajectories(pairs, elsewhere, set(in_world))
+        _bound_by_joint(found, result, pairs, elsewhere, set(in_world))
     if true_landmarks:
         placed = [landmark for landmark in result.landmarks if landmark.frame is None]
         if "common_frame" not in found:
@@ -188,6 +187,38 @@ def _compare_trajectories(
     return found
 
 
+def _bound_by_joint(
+    found: dict[str, Any],
+    result: Result | SavedResult,
+    pairs: Mapping[str, Mapping[str, PosePairs]],
+    elsewhere: set[str],
+    joined: set[str],
+) -> None:
+    """Put bounds by the joint covariance into ``found``, where the result has it."""
+    joint = _joint_of(result)
+    if joint is None:
+        return
+    used = {
+        name: np.searchsorted(result.robots[name].final.stamps_ns, pairs[name]["final"].stamps_ns)
+        for name in pairs.keys() - elsewhere
+    }
+    groups = [({name}, found["robots"][name]) for name in used]
+    if joined <= used.keys() and "joint" in found:
+        groups.append((joined, found["joint"]))
+    for names, both in groups:
+        if both["final"]["nees_per_dof"] is None:
+            continue
+        weights = nees_weights(joint, result.robots, {name: used[name] for name in names})
+        if weights is not None:
+            both["final"] = with_joint_bounds(both["final"], weights)
+
+
+def _joint_of(result: Result | SavedResult) -> JointScans | None:
+    if isinstance(result, SavedResult):
+        return result.joint
+    return joint_scans(result.estimate, result.robots)
+
+
 def _compare_relations(result: Result | SavedResult, relations: Relations) -> dict[str, Any]:
     """``relations`` of `evaluate`.
 
@@ -215,10 +246,7 @@ def _compare_relations(result: Result | SavedResult, relations: Relations) -> di
         final = one_after_another([one[1] for one in sessions])
         paths = [one[2] for one in sessions if one[2] is not None]
         causal = one_after_another(paths) if len(paths) == len(sessions) else None
-    if isinstance(result, SavedResult):
-        joint = result.joint
-    else:
-        joint = joint_scans(result.estimate, result.robots)
+    joint = _joint_of(result)
     if together or (joint is not None and name not in joint.ties):
         joint = None
     found = relation_metrics(relations, final, joint, name)

@@ -9,7 +9,7 @@ Source: https://wiki.ros.org/Bags/Format/2.0
 
 import bz2
 import struct
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from itertools import islice
@@ -376,7 +376,7 @@ class _Indexer:
                 self.damage.append(f"the chunk at byte {offset} is damaged ({one_line(error)})")
         if messages and record.packing in _SLOW:
             self.kept.keep(offset, data)
-        self.blocks.add(offset, record.end, messages)
+        self.add_block(offset, record.end, messages)
         if record.end > self.size:
             self.damage.append(f"it ends inside the chunk at byte {offset}")
 
@@ -388,8 +388,12 @@ class _Indexer:
         self.stated += sum(_U32.unpack_from(data, at)[0] for at in range(4, len(data) - 3, 8))
 
     def close_loose_block(self) -> None:
-        self.blocks.add(self.loose_from, self.loose_to, self.loose)
+        self.add_block(self.loose_from, self.loose_to, self.loose)
         self.loose = []
+
+    def add_block(self, offset: int, end: int, messages: Sequence[tuple[int, int]]) -> None:
+        """Add a block of messages, given by connection and log time."""
+        self.blocks.add(offset, end, [one for one, _ in messages], [ns for _, ns in messages])
 
     def next_chunk(self, offset: int) -> int:
         """Where the next chunk begins at or after ``offset``; the end of the file if nowhere."""

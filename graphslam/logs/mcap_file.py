@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import lz4.frame
+import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -43,6 +44,9 @@ from graphslam.logs.recording import (
 )
 from graphslam.logs.recording import Channel as TopicChannel
 
+IntArray = np.ndarray[Any, np.dtype[np.int64]]
+UnsignedArray = np.ndarray[Any, np.dtype[np.unsignedinteger[Any]]]
+
 MAGIC = b"\x89MCAP0\r\n"
 NOTES = "graphslam"  # name of the metadata record in which our own logs carry notes
 
@@ -62,8 +66,12 @@ DAMAGE = (
 )
 # Head of every record (opcode, length), and head of a message: the same, channel, sequence number,
 # log time, publish time; then its data.
-_RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<BQHIQQ")
-_CHANNEL = struct.Struct("<H")
+_RECORD, _LENGTH = struct.Struct("<BQ"), struct.Struct("<Q")
+_MESSAGE = np.dtype([
+    ("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"),
+    ("log_time_ns", "<u8"), ("publish_time_ns", "<u8"),
+])  # fmt: skip
+_CHANNEL, _CHANNELS = struct.Struct("<H"), 1 << 16
 # int: comparing with the enum is slow
 _IS_MESSAGE = int(Opcode.MESSAGE)
 #: opcodes from here on are for private use, and mean nothing to others
@@ -144,7 +152,7 @@ def records_from(stream: BinaryIO, offset: int) -> Iterator[tuple[int, int, byte
 
 
 def _message(body: bytes) -> Message:
-    if len(body) < _MESSAGE.size - _RECORD.size:
+    if len(body) < _MESSAGE.itemsize - _RECORD.size:
         raise McapError("a message is shorter than its head")
     message: Message = Message.read(ReadDataStream(BytesIO(body)), len(body))
     return message
@@ -153,11 +161,14 @@ def _message(body: bytes) -> Message:
 class _Contents(NamedTuple):
     """Contents of a chunk: its bytes, messages, and schemas and channels (``others``).
 
-    A message is (channel, log time ns, begin and end of its data in the bytes).
+    Of messages (n): channel and log time ns, begin and end of their data in the bytes.
     """
 
     data: bytes
-    messages: list[tuple[int, int, int, int]]
+    channels: UnsignedArray
+    log_times_ns: UnsignedArray
+    begins: IntArray
+    ends: IntArray
     others: list[McapRecord]
 
 
@@ -182,7 +193,8 @@ def _chunk_at(stream: BinaryIO, offset: int, most: _Most) -> _Contents:
 def _records_in(chunk: Chunk, most: _Most) -> _Contents:
     """The schemas, channels and messages in a chunk.
 
-    Like mcap's ``breakup_chunk``, but without an object per message, which would be slow.
+    Like mcap's ``breakup_chunk``, but without an object per message, which would be slow: only the
+    lengths, which lead from record to record, are read one by one.
 
     Raises:
         One of `DAMAGE` when the chunk is damaged, its CRC included.
@@ -194,27 +206,36 @@ def _records_in(chunk: Chunk, most: _Most) -> _Contents:
     if chunk.uncompressed_crc not in (0, zlib.crc32(unpacked)):
         raise McapError("its CRC is another one")
     size = len(unpacked)
-    # padded, because the head of a message is unpacked from every record, also from shorter ones
-    data = unpacked + bytes(_MESSAGE.size)
-    found = _Contents(data, [], [])
-    begin = records = 0
-    while begin < size:
-        records += 1
-        opcode, length, channel, _, log_time_ns, _ = _MESSAGE.unpack_from(data, begin)
-        inside, end = begin + _RECORD.size, begin + _RECORD.size + length
-        if end > size:
-            raise McapError("a record reaches beyond its chunk")
-        if opcode == _IS_MESSAGE:
-            if end < begin + _MESSAGE.size:
-                raise McapError("a message is shorter than its head")
-            found.messages.append((channel, log_time_ns, begin + _MESSAGE.size, end))
-        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+    # padded, because the head of a message is read from every record, also from shorter ones
+    data = unpacked + bytes(_MESSAGE.itemsize)
+    starts: list[int] = []
+    begin, head, length_at, append = 0, _RECORD.size, _LENGTH.unpack_from, starts.append
+    for _ in range(min(most.records, size)):
+        if begin >= size:
+            break
+        append(begin)
+        begin += head + length_at(data, begin + 1)[0]
+    if begin < size:
+        raise _TooLargeError("chunk_records")
+    if begin > size:
+        raise McapError("a record reaches beyond its chunk")
+    bounds = np.array([*starts, begin])
+    at = bounds[:-1]
+    # what would be a head at every byte
+    heads = np.ndarray(size, f"V{_MESSAGE.itemsize}", data, strides=(1,))[at].view(_MESSAGE)
+    is_message = heads["opcode"] == _IS_MESSAGE
+    begins, ends = at[is_message] + _MESSAGE.itemsize, bounds[1:][is_message]
+    if (ends < begins).any():
+        raise McapError("a message is shorter than its head")
+    others = []
+    for k in np.flatnonzero(~is_message).tolist():
+        opcode = int(heads["opcode"][k])
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             kind = Schema if opcode == Opcode.SCHEMA else Channel
-            found.others.append(kind.read(ReadDataStream(BytesIO(data[inside:end]))))
-        begin = end
-        if records > most.records:
-            raise _TooLargeError("chunk_records")
-    return found
+            body = data[starts[k] + _RECORD.size : int(bounds[k + 1])]
+            others.append(kind.read(ReadDataStream(BytesIO(body))))
+    found = heads[is_message]
+    return _Contents(data, found["channel"], found["log_time_ns"], begins, ends, others)
 
 
 def _unpacked(chunk: Chunk, most: int) -> bytes:
@@ -272,10 +293,14 @@ def block_messages(
     """Channel, log time ns and data of the messages of wanted channels in a block."""
     stream.seek(block.offset)
     if stream.read(1)[0] == Opcode.CHUNK:
-        data, messages, _ = _chunk_at(stream, block.offset, _UNLIMITED)
-        for channel, log_time_ns, begin, end in messages:
-            if channel in wanted:
-                yield channel, log_time_ns, data[begin:end]
+        data, *columns, _ = _chunk_at(stream, block.offset, _UNLIMITED)
+        is_wanted = np.zeros(_CHANNELS, dtype=bool)
+        is_wanted[list(wanted)] = True
+        use = is_wanted[columns[0]]
+        for channel, log_time_ns, begin, end in zip(
+            *(c[use].tolist() for c in columns), strict=True
+        ):
+            yield channel, log_time_ns, data[begin:end]
         return
     count = sum(block.counts.values())
     loose = (
@@ -371,13 +396,14 @@ class Indexer:
         """Take in the contents of a chunk."""
         for record in found.others:
             self.describe(record)
-        self.blocks.add(offset, offset, [message[:2] for message in found.messages])
+        self.blocks.add(offset, offset, found.channels, found.log_times_ns)
 
     def close_loose_block(self) -> None:
         """End the block of messages outside chunks."""
         if self.loose:
-            messages = [(message.channel_id, message.log_time) for _, message in self.loose]
-            self.blocks.add(self.loose[0][0], self.loose[-1][0], messages)
+            channels = [message.channel_id for _, message in self.loose]
+            times = [message.log_time for _, message in self.loose]
+            self.blocks.add(self.loose[0][0], self.loose[-1][0], channels, times)
             self.loose = []
 
     def recover(self, error: Exception) -> None:

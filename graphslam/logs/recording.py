@@ -16,6 +16,9 @@ from itertools import pairwise, starmap
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from graphslam.logs.container_files import changed
 from graphslam.logs.translations import Translate, translation
 
@@ -220,14 +223,17 @@ class BlockList:
         self.blocks: list[Block] = []
         self.in_order, self._latest_ns = True, -1
 
-    def add(self, offset: int, end: int, messages: Sequence[tuple[int, int]]) -> None:
-        """Add a block of messages, given by channel and log time; none is no block."""
-        if not messages:
+    def add(self, offset: int, end: int, channels: ArrayLike, times_ns: ArrayLike) -> None:
+        """Add a block of messages (n), given by channel and log time; none is no block."""
+        times = np.asarray(times_ns)
+        if not times.size:
             return
-        channels, times = zip(*messages, strict=True)
-        self.in_order &= all(a <= b for a, b in pairwise((self._latest_ns, *times)))
-        self._latest_ns = max(self._latest_ns, *times)
-        self.blocks.append(Block(offset, end, min(times), max(times), dict(Counter(channels))))
+        numbers, counts = np.unique(np.asarray(channels), return_counts=True)
+        first, last = int(times.min()), int(times.max())
+        self.in_order &= self._latest_ns <= times[0] and bool((times[1:] >= times[:-1]).all())
+        self._latest_ns = max(self._latest_ns, last)
+        counted = dict(zip(numbers.tolist(), counts.tolist(), strict=True))
+        self.blocks.append(Block(offset, end, first, last, counted))
 
 
 def raw_messages(recording: Recording, topics: Collection[str]) -> Iterator[RawMessage]:

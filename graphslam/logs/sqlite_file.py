@@ -107,22 +107,24 @@ def _indexed(path: Path, database: sqlite3.Connection) -> Piece:
         ) from error
     blocks = BlockList()
     damage: list[str] = []
-    rows: list[tuple[int, int]] = []
+    numbers: list[int] = []
+    times: list[int] = []
     first = last = 0
     broken = False
     for row in _readable(database, damage):
         number, topic, log_time_ns, data = row
-        if rows and (len(rows) == MAX_BLOCK or number != last + 1):
+        if times and (len(times) == MAX_BLOCK or number != last + 1):
             # a block never reaches over rows that cannot be read
-            blocks.add(first, last, rows)
-            rows = []
+            blocks.add(first, last, numbers, times)
+            numbers, times = [], []
         if not _is_message(topic, log_time_ns, data):
             broken = True
             continue
-        first = first if rows else number
+        first = first if times else number
         last = number
-        rows.append((topic, log_time_ns))
-    blocks.add(first, last, rows)
+        numbers.append(topic)
+        times.append(log_time_ns)
+    blocks.add(first, last, numbers, times)
     if broken:
         damage.append("rows are not messages")
     unknown = count_undescribed(blocks.blocks, channels)

@@ -21,8 +21,9 @@ from graphslam.core.geometry import (
     transform,
 )
 from graphslam.core.motion_models import Calibration
+from graphslam.core.mount_covariances import MountCovariances
 from graphslam.core.record import replace
-from graphslam.core.records import Estimate, MountCovariance, ScanTies, Start, Step, Trajectory
+from graphslam.core.records import Estimate, ScanTies, Start, Step, Trajectory
 from graphslam.odometry.preintegration import Track
 
 IntArray = np.ndarray[tuple[int], np.dtype[np.int64]]
@@ -184,11 +185,17 @@ class FrameTransforms:
             M = rotation3(world[2])[: len(mean), : len(mean)]
             moved = compose(world, mean) if len(mean) == 3 else transform(world, mean)
             landmarks[number] = (moved, M @ cov @ M.T)
-        mount = estimate.mount
-        if mount is not None:
-            (robot,) = estimate.states  # there is a mount of a single robot only
-            mount = turned(mount, float(self.robots[robot][2]))
-        return replace(estimate, states=states, landmarks=landmarks, mount=mount)
+        mounts = estimate.mounts and self._turned(estimate.mounts)
+        return replace(estimate, states=states, landmarks=landmarks, mounts=mounts)
+
+    def _turned(self, known: MountCovariances) -> MountCovariances:
+        """The same along the axes of the new frames."""
+        landmarks = {}
+        for number, cross in known.landmarks.items():
+            turn = rotation3(self.landmarks[number][2])[: len(cross), : len(cross)]
+            landmarks[number] = turn @ cross
+        states = {n: rotation3(self.robots[n][2]) @ c for n, c in known.states.items()}
+        return replace(known, states=states, landmarks=landmarks)
 
     def step(self, step: Step) -> Step:
         """The step with its starts in the new frame."""
@@ -199,16 +206,6 @@ class FrameTransforms:
             cov = rotate_cov(start.cov, world[2])
             starts[robot] = Start(compose(world, start.pose), cov, base)
         return replace(step, starts=starts)
-
-
-def turned(known: MountCovariance, angle_rad: float) -> MountCovariance:
-    """The same along the axes of the frame in which its world frame is turned by an angle."""
-    turn = rotation3(angle_rad)
-    return MountCovariance(
-        known.mount,
-        turn @ known.states,
-        {i: turn[: len(cross), : len(cross)] @ cross for i, cross in known.landmarks.items()},
-    )
 
 
 def with_stamp_errors(base: Trajectory, track: Track, times_ns: IntArray) -> Trajectory:

@@ -1,44 +1,64 @@
-"""What an estimated mount adds to the covariances of a robot's base, its sensor and its map.
+"""What estimated mounts add to the covariances of robots' bases, their sensors and their map.
 
 States are rigid to the sensor, and the start is where the base was: the world lies where the
-estimated mount puts it. An error of the mount moves the whole map, and the base once more about the
-sensor. The drive that tells of the mount is that of the states, so both are taken jointly: alone,
-the mount would make up most of what it adds, and its correlation takes it away again.
+estimated mount of the robot that begins there puts it. An error of that mount moves the whole map,
+and one of any robot's mount moves its base about the sensor. The drives that tell of the mounts are
+those of the states, so all are taken jointly: alone, a mount would make up most of what it adds,
+and its correlation takes it away again.
 """
+
+from collections.abc import Mapping
 
 import numpy as np
 
 from graphslam.core.geometry import Array, between, compose, compose_jacobians, inverse
+from graphslam.core.mount_covariances import MountCovariance, MountCovariances
 from graphslam.core.record import replace
-from graphslam.core.records import Estimate, MountCovariance, Trajectory
+from graphslam.core.records import Estimate, Trajectory
 from graphslam.odometry.interpolation import IntArray, trajectory_of_mount
 
 
-def with_mount_errors(estimate: Estimate, start: Array, mount: Array) -> Estimate:
-    """The estimate of a single robot, whose covariances have that of the world by its mount.
+def with_mount_errors(
+    estimate: Estimate,
+    frames: Mapping[str, str],
+    landmark_frames: Mapping[int, str],
+    starts: Mapping[str, Array],
+    mounts: Mapping[str, Array],
+) -> Estimate:
+    """The estimate, whose covariances have those of the worlds by the mounts.
 
     Args:
-        estimate: with `Estimate.mount`, in the world in which the base begins at its ``start``; its
-            covariances are as if the mount by which that world is found were known.
-        start: (3,) pose of the base.
-        mount: (3,) as estimated.
+        estimate: with `Estimate.mounts`, in worlds in which bases begin at their ``starts``; its
+            covariances are as if the mounts by which these worlds are found were known.
+        frames: robot -> the robot that begins at its start in this one's world.
+        landmark_frames: the same of landmarks.
+        starts: (3,) poses of the bases of these robots.
+        mounts: (3,) of the robots as estimated.
     """
-    known = estimate.mount
+    known = estimate.mounts
     assert known is not None
-    ((robot, states),) = estimate.states.items()
-    covs, cross = _added(
-        states.covs, known.states, _of_world(start, mount, states.poses), known.mount
-    )
-    landmarks, crosses, placing = {}, {}, {}
+    by_frame = {}
+    for first in set(frames.values()):
+        twist = np.zeros((3, len(known.cov)))
+        if first in known.robots:
+            twist[:, known.columns(first)] = _twist_of_world(starts[first], mounts[first])
+        by_frame[first] = twist
+    placing = {robot: by_frame[frames[robot]] for robot in estimate.states}
+    states, crosses = {}, {}
+    for robot, own in estimate.states.items():
+        J = moved_by_world(own.poses) @ placing[robot]
+        covs, crosses[robot] = _added(own.covs, known.states[robot], J, known.cov)
+        states[robot] = replace(own, covs=covs)
+    landmarks, of_landmarks = {}, {}
     for i, (mean, cov) in estimate.landmarks.items():
-        J = _of_world(start, mount, np.append(mean, 0.0)[:3])[: len(mean)]
-        added, crosses[i] = _added(cov, known.landmarks[i], J, known.mount)
-        landmarks[i], placing[i] = (mean, added), J
+        J = moved_by_world(np.append(mean, 0.0)[:3])[: len(mean)] @ by_frame[landmark_frames[i]]
+        added, of_landmarks[i] = _added(cov, known.landmarks[i], J, known.cov)
+        landmarks[i] = mean, added
     return replace(
         estimate,
-        states={robot: replace(states, covs=covs)},
+        states=states,
         landmarks=landmarks,
-        mount=MountCovariance(known.mount, cross, crosses, placing),
+        mounts=MountCovariances(known.robots, known.cov, crosses, of_landmarks, placing),
     )
 
 
@@ -58,25 +78,40 @@ def base_trajectory(
     base = trajectory_of_mount(sensor, back)
     at = states.poses[before]
     carried, _ = compose_jacobians(at, between(at, sensor.poses))
-    F, G = compose_jacobians(sensor.poses, back)
+    F, _ = compose_jacobians(sensor.poses, back)
+    cross = F @ carried @ known.states[before]
+    moved = moved_by_mount(sensor.poses, mount)
+    return replace(base, covs=_added(base.covs, cross, moved, known.mount)[0])
+
+
+def moved_by_mount(sensor: Array, mount: Array) -> Array:
+    """Derivative (n, 3, 3) of the base of sensors (n, 3) by their mount (3,)."""
+    _, G = compose_jacobians(sensor, inverse(mount))
     c, s = np.cos(mount[2]), np.sin(mount[2])
     x, y = mount[:2]
     of_inverse = np.array([[-c, -s, s * x - c * y], [s, -c, c * x + s * y], [0.0, 0.0, -1.0]])
-    cross = F @ carried @ known.states[before]
-    return replace(base, covs=_added(base.covs, cross, G @ of_inverse, known.mount)[0])
+    return np.asarray(G @ of_inverse)
 
 
-def _of_world(start: Array, mount: Array, poses: Array) -> Array:
-    """Derivative (..., 3, 3) by the mount of poses in the world start ∘ mount ∘ start⁻¹."""
-    inside = compose(inverse(compose(start, mount)), poses)
+def moved_by_world(poses: Array) -> Array:
+    """Derivative (..., 3, 3) of poses by the twist of their world."""
+    J = np.zeros((*poses.shape, 3))
+    J[..., range(3), range(3)] = 1.0
+    J[..., 0, 2], J[..., 1, 2] = -poses[..., 1], poses[..., 0]
+    return J
+
+
+def _twist_of_world(start: Array, mount: Array) -> Array:
+    """Twist (3, 3) of the world start ∘ mount ∘ start⁻¹ by the mount: how its origin moves."""
+    inside = inverse(compose(start, mount))
     in_base = compose(mount, inside)
-    _, G = compose_jacobians(np.broadcast_to(start, in_base.shape), in_base)
-    F, _ = compose_jacobians(np.broadcast_to(mount, inside.shape), inside)
-    return G @ F
+    _, G = compose_jacobians(start, in_base)
+    F, _ = compose_jacobians(mount, inside)
+    return np.asarray(G @ F)
 
 
-def _added(cov: Array, cross: Array, J: Array, mount: Array) -> tuple[Array, Array]:
+def _added(cov: Array, cross: Array, J: Array, mounts: Array) -> tuple[Array, Array]:
     """Covariance of x + J m and its covariance with m, from those of x and m."""
-    both = cross + J @ mount
+    both = cross + J @ mounts
     mixed = cross @ J.mT
-    return cov + mixed + mixed.mT + J @ mount @ J.mT, both
+    return cov + mixed + mixed.mT + J @ mounts @ J.mT, both

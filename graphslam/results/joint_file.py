@@ -14,17 +14,12 @@ import numpy as np
 
 from graphslam.core.errors import OutputError
 from graphslam.core.geometry import Array
-from graphslam.core.information_root import InformationRoot
-from graphslam.core.records import (
-    Estimate,
-    JointScans,
-    MountCovariance,
-    RobotResult,
-    ScanTies,
-    Trajectory,
-)
+from graphslam.core.information_root import InformationRoot, IntArray
+from graphslam.core.mount_covariances import MountCovariances
+from graphslam.core.record import replace
+from graphslam.core.records import Estimate, JointScans, RobotResult, ScanTies, Trajectory
 
-FORMAT = 1
+FORMAT = 2
 _UPPER = np.triu_indices(3)
 
 
@@ -34,7 +29,8 @@ def joint_scans(estimate: Estimate, robots: Mapping[str, RobotResult]) -> JointS
     if estimate.root is None or not ties:
         return None
     states = {name: estimate.states[name] for name in ties}
-    return JointScans(estimate.root, states, ties, estimate.mount)
+    mounts = estimate.mounts and replace(estimate.mounts, states={})
+    return JointScans(estimate.root, states, ties, mounts)
 
 
 def joint_bytes(joint: JointScans) -> bytes:
@@ -63,16 +59,22 @@ def joint_bytes(joint: JointScans) -> bytes:
     numbers = sorted(root.landmarks)
     arrays["landmark_ids"] = np.array(numbers, dtype=np.int64)
     arrays["landmark_rows"] = np.array([root.landmarks[n] for n in numbers], dtype=np.int32)
-    if joint.mount is not None and joint.mount.placing:
-        arrays["mount_cov"] = joint.mount.mount
-        for name, of_landmarks in (
-            ("landmark_mount", joint.mount.landmarks),
-            ("landmark_placing", joint.mount.placing),
-        ):
-            padded = np.zeros((len(numbers), 3, 3))
-            for k, number in enumerate(numbers):
-                padded[k, : len(of_landmarks[number])] = of_landmarks[number]
-            arrays[name] = padded
+    if joint.mounts is not None:
+        mounts, names = joint.mounts, sorted(joint.ties)
+        width = len(mounts.cov)
+        of_landmarks = np.zeros((len(numbers), 3, width))
+        for k, number in enumerate(numbers):
+            cross = mounts.landmarks[number]
+            of_landmarks[k, : len(cross)] = cross
+        held = np.full(3, -1)
+        arrays |= {
+            "mount_robots": np.array(mounts.robots),
+            "mount_cov": mounts.cov,
+            "mount_rows": np.array([root.mounts.get(n, held) for n in mounts.robots], np.int32),
+            "landmark_mount": of_landmarks,
+        }
+        if mounts.placing:
+            arrays["mount_placing"] = np.array([mounts.placing[name] for name in names])
     made = BytesIO()
     np.savez(made, **arrays)  # type: ignore[arg-type]  # its stub takes the names for options
     return made.getvalue()
@@ -114,16 +116,24 @@ def _joint(arrays: Mapping[str, Array]) -> JointScans:
         ties[name] = ScanTies(state, share, mounts, covs)
     above, own, width, separators = map(integers, ("above", "own", "width", "separators"))
     marks: dict[int, int] = {}
-    mount = None
-    if "landmark_ids" in arrays:  # earlier versions kept the scans only
+    known: MountCovariances | None = None
+    mount_rows: dict[str, IntArray] = {}
+    # earlier versions kept the scans only, or the mount of a single robot in another way
+    if "landmark_ids" in arrays and ("mount_cov" not in arrays or "mount_robots" in arrays):
         numbers = integers("landmark_ids").tolist()
         marks = dict(zip(numbers, integers("landmark_rows").tolist(), strict=True))
-        if "mount_cov" in arrays:
-            crosses, placing = (
-                dict(zip(numbers, arrays[name], strict=True))
-                for name in ("landmark_mount", "landmark_placing")
+        if "mount_robots" in arrays:
+            mounted = tuple(str(name) for name in arrays["mount_robots"])
+            mount_rows = dict(
+                zip(mounted, list(arrays["mount_rows"].astype(np.int64)), strict=True)
             )
-            nothing = np.zeros((0, 3, 3))
-            mount = MountCovariance(arrays["mount_cov"], nothing, crosses, placing)
-    root = InformationRoot(above, own, width, separators, arrays["values"], rows, marks)
-    return JointScans(root, states, ties, mount)
+            placing = arrays.get("mount_placing", ())
+            known = MountCovariances(
+                mounted,
+                arrays["mount_cov"],
+                {},
+                dict(zip(numbers, arrays["landmark_mount"], strict=True)),
+                dict(zip(names, placing, strict=True)) if len(placing) else {},
+            )
+    root = InformationRoot(above, own, width, separators, arrays["values"], rows, marks, mount_rows)
+    return JointScans(root, states, ties, known)

@@ -25,6 +25,7 @@ from graphslam.core.sparse_gaussian import SparseRoot, sparse_root
 from graphslam.estimation.information_root import joint_covariance
 from graphslam.mapping.known_map import KnownMap, latest_places, map_place
 from graphslam.mapping.submaps import SubmapPose, build_submaps
+from graphslam.odometry.mount_covariance import moved_by_world
 from graphslam.results.file_formats import landmark_from_json, landmark_json
 from graphslam.results.folder import SavedResult, load
 from graphslam.results.joint_file import joint_scans
@@ -125,18 +126,20 @@ def landmark_covariance(joint: JointScans, landmarks: Sequence[Landmark]) -> Arr
         [np.zeros(0), *(np.arange(row, row + dim) for row, dim in zip(first, dims, strict=True))]
     ).astype(np.int64)
     cov = joint_covariance(joint.root, rows)
-    if joint.mount is None or not joint.mount.placing:
+    if joint.mounts is None or not joint.mounts.placing:
         return cov
-    # the mount places the world: an error of it moves all landmarks together
+    # a mount places the world: an error of it moves all landmarks together
+    twist = next(iter(joint.mounts.placing.values()))  # there is one world
+    own_axes = [_own_axes(mark)[:dim, :dim] for mark, dim in zip(landmarks, dims, strict=True)]
     cross, placing = (
-        np.concatenate([
-            _own_axes(mark)[:dim, :dim] @ of[mark.id][:dim]
-            for mark, dim in zip(landmarks, dims, strict=True)
-        ])
-        for of in (joint.mount.landmarks, joint.mount.placing)
-    )  # fmt: skip
+        np.concatenate([axes @ one[: len(axes)] for axes, one in zip(own_axes, rows, strict=True)])
+        for rows in (
+            [joint.mounts.landmarks[mark.id] for mark in landmarks],
+            [moved_by_world(np.nan_to_num(mark.position)) @ twist for mark in landmarks],
+        )
+    )
     mixed = cross @ placing.T
-    return np.asarray(cov + mixed + mixed.T - placing @ joint.mount.mount @ placing.T)
+    return np.asarray(cov + mixed + mixed.T - placing @ joint.mounts.cov @ placing.T)
 
 
 def with_surface_biases(

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphslam.core.config import Config
-from graphslam.core.geometry import Array
 from graphslam.core.motion_models import Calibration
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Step
@@ -42,16 +41,14 @@ from graphslam.slam.motion_noise import (
     fit_motion_noise,
     noise_scales,
     scale_motion_noise,
-    with_shown_noise,
 )
 from graphslam.slam.path_closing import ClosedPaths, close_paths
 from graphslam.slam.reoptimise_scans import with_closures
+from graphslam.slam.scan_refinement import refine_motions
 from graphslam.slam.scan_tracking import TrackedLog
 
 #: factors on the gates of re-association (across, direction): with the closed paths, and solved
 CLOSED_FACTORS, SOLVED_FACTORS = (1.0, 1.0), (1 / 2, 2 / 3)
-#: on the noise of motions, where the log has not shown it yet or odometry states it
-NO_FACTORS: Mapping[str, Array] = {}
 
 
 def optimise_scan_log(scan_log: TrackedLog, tamper: Tamper | None = None) -> Estimate:
@@ -96,8 +93,7 @@ class _Solved:
 class _Problem:
     """All states, landmarks and, if it is wanted, the calibration of the tracks, in one graph.
 
-    Motions are by the latest calibration, and as noisy as ``start`` shows them, those of robots
-    without odometry by ``factors``, see `with_shown_noise`.
+    Motions are by the latest calibration, and as noisy as ``start`` shows them.
     """
 
     def __init__(
@@ -106,7 +102,6 @@ class _Problem:
         start: Estimate,
         tracks: Mapping[str, Track],
         config: Config,
-        factors: Mapping[str, Array] = NO_FACTORS,
     ) -> None:
         priors = {name: track.prior for name, track in tracks.items()}
         if not config.odometry.calibrate:
@@ -116,7 +111,6 @@ class _Problem:
         for track in tracks.values():
             track.calibration = track.calibration.held()
         made = recompute_motions(steps, tracks)
-        made = with_shown_noise(made, start, factors)
         self._steps = scale_motion_noise(made, noise_scales(made, start))
         self._graph = CalibrationGraph(self._steps, start, priors, self._initial, config.robust)
         self._graph.calibrate_motions(self._steps, self._initial)
@@ -135,7 +129,8 @@ class _Problem:
         near, calibrations = self._graph.solution()
         steps = at_calibration(self._steps, self._initial, calibrations)
         minimum = Future(lambda: settled(steps, near, self._kernel)) if settle else None
-        return self._found(*self._graph.solution(marginals=True, joint=True)), minimum
+        found = self._graph.solution(marginals=True, joint=True, mounts=True)
+        return self._found(*found), minimum
 
     def _found(self, estimate: Estimate, calibrations: Mapping[str, Calibration]) -> _Solved:
         for name, track in self._tracks.items():
@@ -153,7 +148,7 @@ def _solved(
 ) -> tuple[Estimate, tuple[Step, ...]]:
     """All states, landmarks and the calibration, solved with landmarks tied and reassociated."""
     config, counts, landmarks = scan_log.config, scan_log.counts, scan_log.landmarks
-    closures, factors = list(paths.closures), NO_FACTORS
+    closures = list(paths.closures)
     steps = _tied(steps, start, None, paths, scan_log)
     first = _Problem(with_closures(steps, closures), start, tracks, config).solve_roughly()
     rough = first.solution
@@ -169,12 +164,17 @@ def _solved(
         for name, own in noise.odometry.items():
             tracks[name].config = own
         scan_log.noise = noise.to_summary()
-        factors = noise.motion_factors(scan_log.log.without_odometry)
     # once landmarks of different visits are tied, most closures are no longer needed
     closures = untied_closures(closures, paths.spans, steps, landmarks)
     counts["closures_kept"] = len(closures)
-    closed = with_closures(steps, closures)
-    problem = _Problem(closed, rough.estimate, tracks, config, factors)
+    steps, near = refine_motions(
+        steps,
+        rough.estimate,
+        scan_log.keyframe_scans,
+        scan_log.log.without_odometry,
+        config.scan_matching,
+    )
+    problem = _Problem(with_closures(steps, closures), near, tracks, config)
     done, minimum = problem.solve(settle=config.backend.optimise_at_end)
     estimate, steps = _with_surface_bias(done.solution.estimate, tracks, config), done.steps
     landmarks.update_from(steps, estimate)
@@ -184,19 +184,20 @@ def _solved(
 
 
 def _with_surface_bias(estimate: Estimate, tracks: Mapping[str, Track], config: Config) -> Estimate:
-    """An estimate whose mount, and that of the tracks, has the bias of surfaces.
+    """An estimate whose mounts, and those of the tracks, have the bias of surfaces.
 
     Turning shows where the laser sits by walls of which each returns its ranges with a bias. No
     number of scans averages it, and a coordinate is held by two walls that face each other.
     """
-    variance = config.front_end.floor_normal_m**2 / 2
-    for track in tracks.values():
+    variance, mounts = config.front_end.floor_normal_m**2 / 2, estimate.mounts
+    for name, track in tracks.items():
         bias = np.diag(np.where(track.is_mount_estimated, [variance, variance, 0.0], 0.0))
         track.add_mount_cov(bias)
-        if estimate.mount is not None:  # the only robot's
-            mount = replace(estimate.mount, mount=estimate.mount.mount + bias)
-            estimate = replace(estimate, mount=mount)
-    return estimate
+        if mounts is not None and name in mounts.robots:
+            own, cov = mounts.columns(name), mounts.cov.copy()
+            cov[own, own] += bias
+            mounts = replace(mounts, cov=cov)
+    return replace(estimate, mounts=mounts)
 
 
 def _tied(

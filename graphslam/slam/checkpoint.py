@@ -40,8 +40,8 @@ LIBRARIES = ("gtsam", "numpy", "opencv-python-headless", "scipy")
 #: modules all of whose dataclasses and named tuples may be kept, and classes of others
 _MODULES = (
     "core.config", "core.information_root", "core.known_landmarks", "core.motion_models",
-    "core.observation_arrays", "core.records", "core.sensor_config", "core.sparse_gaussian",
-    "estimation.clock_calibration", "logs.clock", "logs.log_set",
+    "core.mount_covariances", "core.observation_arrays", "core.records", "core.sensor_config",
+    "core.sparse_gaussian", "estimation.clock_calibration", "logs.clock", "logs.log_set",
     "mapping.landmark_map", "multi_robot.frame_tree", "multi_robot.relative_frames",
     "odometry.increment_sums", "odometry.interpolation", "slam.recorded_closures",
     "slam.repeated_scans", "slam.robot_state", "slam.scan_tracking",

@@ -1,6 +1,6 @@
 """The noise of a log, as its solution uses it and as summary.json reports it."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -36,11 +36,6 @@ class LogNoise:
             for (robot, model), factors in self.measured.items()
             if model == MOTION
         }
-
-    def motion_factors(self, robots: Collection[str]) -> dict[str, Array]:
-        """Those of the robots whose motions' noise is measured -> factors (3,) on variances."""
-        found = {robot: self.measured.get((robot, MOTION)) for robot in robots}
-        return {robot: factors for robot, factors in found.items() if factors is not None}
 
     @property
     def is_white(self) -> bool:

@@ -10,10 +10,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared
 from graphslam.core.geometry import Array, between, wrap
 from graphslam.core.record import replace
-from graphslam.core.records import Estimate, Motion, Step, Trajectory
+from graphslam.core.records import Estimate, Step
 from graphslam.estimation.posterior_residuals import Posterior, Residuals, spans
 from graphslam.odometry.noise_estimation import fit_noise, is_stated, motion_variances
 from graphslam.odometry.preintegration import Track
@@ -28,8 +27,6 @@ MIN_SIGMA = 1e-4
 UNDERSTATED = 2.0
 #: median of the absolute value of a standard normal variable
 MEDIAN_OF_NORMAL = 0.6745
-#: squared Mahalanobis distance of a motion that is within its noise (99 %, 3 dof)
-USUAL_D2 = float(chi2_quantile(0.99, 3))
 
 
 def noise_scales(
@@ -50,7 +47,11 @@ def noise_scales(
         motions = [step.motions[robot] for step in steps if robot in step.motions]
         if len(motions) < MIN_MOTIONS:
             continue
-        residuals = _off(motions, states)
+        first, last = (
+            states.at([getattr(m, name) for m in motions]) for name in ("start_ns", "end_ns")
+        )
+        residuals = between(first, last) - np.array([m.delta for m in motions])
+        residuals[:, 2] = wrap(residuals[:, 2])
         normalised = residuals / np.sqrt([np.diag(m.cov) for m in motions])
         if window_ns is not None:
             moving = np.array([m.length_m != 0 or m.delta[2] != 0 for m in motions])
@@ -63,35 +64,6 @@ def noise_scales(
             normalised = sums / np.sqrt(count)[:, None]
         scales[robot] = np.maximum(1.0, np.median(np.abs(normalised), axis=0) / MEDIAN_OF_NORMAL)
     return scales
-
-
-def with_shown_noise(
-    steps: Sequence[Step], estimate: Estimate, factors: Mapping[str, Array]
-) -> tuple[Step, ...]:
-    """Steps whose motions are as noisy as a log shows them, also where that is less than stated.
-
-    For motions whose covariances are our own guess, as those of scan matching: most are far better
-    than they state, and some in a thousand far off. The former make the variances, the latter get
-    as much more as brings them to `USUAL_D2`, the weight of a Huber kernel.
-
-    Args:
-        steps: with motions as computed.
-        estimate: of all their states.
-        factors: robot -> factors (3,) on the variances of its motions.
-    """
-    steps = scale_motion_noise(steps, {robot: np.sqrt(f) for robot, f in factors.items()})
-    for robot in factors:
-        own = [n for n, step in enumerate(steps) if robot in step.motions]
-        motions = [steps[n].motions[robot] for n in own]
-        off = _off(motions, estimate.states[robot])
-        d2 = mahalanobis_squared(off, np.array([m.cov for m in motions]))
-        made = list(steps)
-        for k in np.flatnonzero(d2 > USUAL_D2):
-            step, motion = steps[own[k]], motions[k]
-            wider = replace(motion, cov=motion.cov * (d2[k] / USUAL_D2))
-            made[own[k]] = replace(step, motions={**step.motions, robot: wider})
-        steps = tuple(made)
-    return steps
 
 
 def understated_noise(steps: Sequence[Step], estimate: Estimate) -> list[str]:
@@ -179,16 +151,6 @@ def fit_motion_noise(
             fit_track_noise(track, robot, steps, posterior, relax=False)
     used = {name: track.config for name, track in tracks.items() if (name, MOTION) not in measured}
     return LogNoise(odometry=used, measured=measured)
-
-
-def _off(motions: Sequence[Motion], states: Trajectory) -> Array:
-    """Residuals (n, 3) of a robot's motions, along the axes of their starts."""
-    first, last = (
-        states.at([getattr(m, name) for m in motions]) for name in ("start_ns", "end_ns")
-    )
-    off = between(first, last) - np.array([m.delta for m in motions])
-    off[:, 2] = wrap(off[:, 2])
-    return np.asarray(off)
 
 
 def _times(steps: Sequence[Step], robot: str) -> tuple[IntArray, IntArray]:

@@ -186,19 +186,17 @@ def reoptimise(pipeline: Pipeline, estimate: Estimate) -> Estimate:
 
 def pass_findings(pipeline: Pipeline, estimate: Estimate) -> Findings:
     """Results of a pass besides its estimate; an estimate that is not optimised is enough."""
-    return Findings(*find_false_names_and_clocks(pipeline, estimate), causal_of(pipeline))
+    clocks = find_clocks(pipeline, estimate)
+    return Findings(find_swapped_names(pipeline, estimate), clocks, causal_of(pipeline))
 
 
-def find_false_names_and_clocks(
-    pipeline: Pipeline, estimate: Estimate, *, coarsely: bool = True
-) -> tuple[dict[str, str], dict[str, ClockEstimate]]:
-    """`Findings.swapped_identities` and `Findings.clocks` by an estimate of a pass.
-
-    ``coarsely``: clocks may be seconds off.
-    """
+def find_clocks(
+    pipeline: LogPass, estimate: Estimate, *, coarsely: bool = True
+) -> dict[str, ClockEstimate]:
+    """`Findings.clocks` by an estimate of a pass; ``coarsely``: they may be seconds off."""
     tracks = {name: run.track for name, run in pipeline.started.items()}
     of_robots = [s for s in pipeline.sources if s.seen_robot]
-    clocks = estimate_clocks(
+    return estimate_clocks(
         pipeline.steps,
         estimate,
         [*of_robots, *pipeline.robot_sightings] if coarsely else (),
@@ -206,7 +204,6 @@ def find_false_names_and_clocks(
         pipeline.known.clocks,
         pipeline.config,
     )
-    return find_swapped_names(pipeline, estimate), clocks
 
 
 def find_swapped_names(pipeline: Pipeline, estimate: Estimate) -> dict[str, str]:

@@ -7,7 +7,8 @@ import numpy as np
 
 from graphslam.core.geometry import Array, between, compose, inverse
 from graphslam.core.motion_models import Calibration
-from graphslam.core.records import Motion, MountCovariance, RobotResult, Trajectory
+from graphslam.core.mount_covariances import MountCovariance
+from graphslam.core.records import Motion, RobotResult, Trajectory
 from graphslam.logs.clock import Clock
 from graphslam.odometry.interpolation import (
     IntArray,

@@ -17,7 +17,7 @@ from graphslam.slam.passes import (
     Findings,
     FinishedPass,
     decide_next_pass,
-    find_false_names_and_clocks,
+    find_clocks,
     find_swapped_names,
 )
 from graphslam.slam.sighting_pass import SightingPass, can_solve_at_once
@@ -58,7 +58,7 @@ def run_sighting_passes(
             path = log.files[0].path
             raise LogError(f"{path}: nothing in it could be used; see `graphslam info`")
         _ = one.groups  # once for both processes
-        replayed = Future(partial(replay_causally, one))
+        replayed = Future(partial(replay_causally, one), urgent=False)  # waited for at the end
         with timed(one.seconds, "final optimisation"):
             rough, made = solve_roughly(one)
             if rough.error > rough.dof and not known.identities:
@@ -86,9 +86,10 @@ def run_sighting_passes(
             for run in one.started.values():
                 run.is_calibrated = True
             # a log is seldom read again, so the result does not wait to know
-            doubts = Future(partial(find_false_names_and_clocks, one, estimate, coarsely=False))
+            clocks_asked = Future(partial(find_clocks, one, estimate, coarsely=False))
+            swapped = find_swapped_names(one, estimate)
             estimate = settled(one.steps, estimate, one.kernel)
-            swapped, found = doubts.result()
+            found = clocks_asked.result()
         following = decide_next_pass(known, Findings(swapped, found, {}), log, config, clock_passes)
         if following is None:
             with timed(one.seconds, "causal"):

@@ -130,14 +130,19 @@ def make_result(finished: FinishedPass, began: float) -> Result:
             estimate = settled(steps, estimate, pipeline.kernel)
         error, plain = graph_error(steps, estimate, pipeline.kernel)
         estimate = replace(estimate, error=error)
-        # the start of the robot places the world, unless a known map does
-        if estimate.mount is not None and pipeline.known.known_map is None:
-            ((name, run),) = runs.items()
-            start = pipeline.starts[name].pose
-            estimate = with_mount_errors(estimate, start, run.track.mount)
+        # the starts of robots place their worlds, unless a known map does
+        if estimate.mounts is not None and pipeline.known.known_map is None:
+            estimate = with_mount_errors(
+                estimate,
+                pipeline.frames.of,
+                pipeline.frames.landmark_frames(pipeline.landmarks.entries.values()),
+                {name: start.pose for name, start in pipeline.starts.items()},
+                {name: run.track.mount for name, run in runs.items()},
+            )
 
         def robot_result(name: str) -> RobotResult:
-            states, mount = estimate.states[name], estimate.mount
+            states, mounts = estimate.states[name], estimate.mounts
+            mount = None if mounts is None else mounts.of(name)
             return runs[name].result(states, causal.get(name), mount, causal_only=causal_only)
 
         robots = dict(zip(runs, parallel_map(robot_result, list(runs)), strict=True))

@@ -25,6 +25,7 @@ def path(tmp_path_factory):
 @pytest.fixture
 def unpacked(monkeypatch):
     """Lengths of all that is unpacked."""
+    gc.collect()  # recordings of other tests, whose file these would share
     lengths, unpacker = [], bz2.BZ2Decompressor
 
     class Counting:

@@ -10,14 +10,8 @@ from scipy.linalg import eigh
 
 from graphslam.core.config import OdometryConfig, RobotConfig
 from graphslam.core.geometry import between, compose, compose_cov, exp, inverse, log, rotate_cov
-from graphslam.core.records import (
-    Estimate,
-    MountCovariance,
-    OdometryPose,
-    Start,
-    Step,
-    Trajectory,
-)
+from graphslam.core.mount_covariances import MountCovariances
+from graphslam.core.records import Estimate, OdometryPose, Start, Step, Trajectory
 from graphslam.odometry.interpolation import (
     FrameTransforms,
     causal_at,
@@ -391,16 +385,16 @@ def test_what_a_mount_shares_with_states_and_landmarks_turns_with_their_axes():
     rng = np.random.default_rng(3)
     world = np.array([4.0, -1.0, 2.1])
     states, point, line = (rng.normal(size=size) for size in ((5, 3, 3), (2, 3), (3, 3)))
-    known = MountCovariance(0.1 * np.eye(3), states, {7: point, 9: line})
-    found = FrameTransforms({"a": world}, {}).estimate(
-        Estimate({"a": STATES}, {}, 0.0, 0, mount=known)
+    known = MountCovariances(("a",), 0.1 * np.eye(3), {"a": states}, {7: point, 9: line})
+    found = FrameTransforms({"a": world}, {7: world, 9: world}).estimate(
+        Estimate({"a": STATES}, {}, 0.0, 0, mounts=known)
     )
     c, s = np.cos(2.1), np.sin(2.1)
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    np.testing.assert_array_equal(found.mount.mount, known.mount)
-    np.testing.assert_allclose(found.mount.states, R @ states, atol=1e-15)
-    np.testing.assert_allclose(found.mount.landmarks[7], R[:2, :2] @ point, atol=1e-15)
-    np.testing.assert_allclose(found.mount.landmarks[9], R @ line, atol=1e-15)
+    np.testing.assert_array_equal(found.mounts.cov, known.cov)
+    np.testing.assert_allclose(found.mounts.states["a"], R @ states, atol=1e-15)
+    np.testing.assert_allclose(found.mounts.landmarks[7], R[:2, :2] @ point, atol=1e-15)
+    np.testing.assert_allclose(found.mounts.landmarks[9], R @ line, atol=1e-15)
 
 
 # ------------------------------------------------------------ what stamps mean
