@@ -282,11 +282,17 @@ class CalibrationGraph:
             raise builder.explain(error) from error
         return Posterior(builder, self._values, blocks)
 
-    def calibration_covariance(self, robot: str, posterior: Posterior) -> Array:
-        """Covariance (p, p) of a robot's calibration at the last solution."""
+    def calibration_covariance(self, robot: str, posterior: Posterior | None = None) -> Array:
+        """Covariance (p, p) of a robot's calibration at the last solution, or at a ``posterior``.
+
+        Raises:
+            EstimationError: it is indeterminate.
+        """
         cov, use = self._priors[robot].cov.copy(), self._free[robot]
         if len(use):
-            cov[np.ix_(use, use)] = posterior.blocks.marginals[self._keys[robot]]
+            key = self._keys[robot]
+            known = {} if posterior is None else posterior.blocks.marginals
+            cov[np.ix_(use, use)] = known[key] if key in known else self._joint_covariance([key])
         return cov
 
     def landmark_covariance(self, landmarks: Sequence[int]) -> Array:
@@ -297,18 +303,22 @@ class CalibrationGraph:
         """
         keys = [factors.landmark_key(i) for i in landmarks]
         dims = [self._builder.landmark_dims[i] for i in landmarks]
-        try:
-            if self._marginals is None:
-                self._marginals = gtsam.Marginals(self._builder.graph, self._values)
-            own = self._marginals.jointMarginalCovariance(keys).fullMatrix()
-        except RuntimeError as error:
-            raise self._builder.explain(error) from error
+        own = self._joint_covariance(keys)
         turn, ends = np.eye(len(own)), np.cumsum(dims)
         for key, dim, end in zip(keys, dims, ends, strict=True):
             if dim == 3:
                 block = slice(end - 3, end)
                 turn[block, block] = rotation3(factors.read(self._values, key, 3)[2])
         return np.asarray(turn @ own @ turn.T)
+
+    def _joint_covariance(self, keys: Sequence[int]) -> Array:
+        """Joint covariance (D, D) of variables at the last solution, in their own axes."""
+        try:
+            if self._marginals is None:
+                self._marginals = gtsam.Marginals(self._builder.graph, self._values)
+            return np.asarray(self._marginals.jointMarginalCovariance(list(keys)).fullMatrix())
+        except RuntimeError as error:
+            raise self._builder.explain(error) from error
 
 
 @dataclass(frozen=True, slots=True, eq=False)

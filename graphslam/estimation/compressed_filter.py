@@ -163,6 +163,24 @@ class CompressedBackend(Isam2Backend):
         # states per robot in the filter: mostly those of the observations that promote a landmark
         self._past_states = config.association.sightings_to_promote
 
+    @classmethod
+    def at_estimate(
+        cls, config: Config, steps: Sequence[Step], start: Estimate
+    ) -> "CompressedBackend":
+        """The back end after ``steps``, linearised where ``start`` has their variables.
+
+        Raises:
+            EstimationError: a covariance is not positive definite and finite.
+        """
+        made, values = cls(config), gtsam.Values()
+        for step in steps:
+            made._builder.insert(step, start, values)
+            targets = (a.target for a in step.associations)
+            made._mark_recent(factors.landmark_key(i) for i in targets if isinstance(i, int))
+        made._steps = made._relinearised = len(steps)
+        made._finished = values  # a tree is built of them at the first query
+        return made
+
     def value(self, key: int, dim: int) -> Array:
         """See `GraphBackend`."""
         if self._local is not None and key in self._local:

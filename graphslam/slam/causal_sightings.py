@@ -11,13 +11,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graphslam.core.config import AssociationConfig
+from graphslam.core.config import AssociationConfig, Config
 from graphslam.core.gaussian import mahalanobis_squared
-from graphslam.core.geometry import Array, between, compose, rotation3
+from graphslam.core.geometry import Array, between, compose, rotation3, wrap
 from graphslam.core.motion_models import Calibration
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Estimate, Motion, Step, Trajectory
 from graphslam.estimation.compressed_filter import CompressedBackend
+from graphslam.estimation.recorded_graph import Source
 from graphslam.mapping.gating import gate_distance, gate_floor
 from graphslam.mapping.robot_candidates import (
     RobotTarget,
@@ -28,6 +29,7 @@ from graphslam.mapping.robot_candidates import (
 )
 from graphslam.odometry.online_calibration import observed_information
 from graphslam.odometry.preintegration import Track
+from graphslam.slam.causal_noise import NoiseSoFar
 from graphslam.slam.reoptimise_sightings import SightingGroup, recompute_steps
 from graphslam.slam.robot_state import Causal, RobotState
 from graphslam.slam.sighting_pass import SightingPass
@@ -37,7 +39,7 @@ BLOCK = 16
 #: how many times as long as usual the back end's interval between relinearisations is. Each one
 #: rounds differently with what is there besides: causal poses of a log cut in half, which are to be
 #: those of the whole one to 1e-9 m, differ by 2e-10 with the usual interval and by 8e-12 with twice
-#: that. No decision depends on this estimate; of MRCLAM 6 its error stays as it is (0.124 m)
+#: that. No decision depends on this estimate; of MRCLAM 6 its error stays as it is
 INTERVAL = 2
 
 
@@ -67,22 +69,32 @@ def replay_causally(one: SightingPass) -> CausalReplay:
 
 
 def _replay(one: SightingPass, tracks: Mapping[str, Track]) -> CausalReplay:
-    settings = one.config.backend
-    settings = replace(settings, relinearize_every=INTERVAL * settings.relinearize_every)
-    backend = CompressedBackend(replace(one.config, backend=settings))
+    backend = CompressedBackend(_config(one))
     runs = {name: RobotState(track, clock=one.runs[name].clock) for name, track in tracks.items()}
     known: set[int | str] = set()
     step_ms: list[float] = []
+    latest: dict[str, Array] = {}  # estimates of the latest states
+    rejected: set[int] = set()  # sources of sightings
+    noise = NoiseSoFar(one.steps, one.groups, one.sources, one.config)
     for first in range(0, len(one.steps), BLOCK):
         block = range(first, min(first + BLOCK, len(one.steps)))
         used = {name: run.track.calibration for name, run in runs.items()}
-        for recorded in _computed(one.steps[first : block.stop], one.groups, block, runs):
+        if noise.is_due(first):
+            found = backend.current_estimate()
+            if noise.measure(first, found, tracks):
+                backend = _weighed_anew(one, first, found, noise, rejected)
+                latest = {name: backend.state_mean(name) for name in latest}
+        for recorded in _computed(one.steps[first : block.stop], noise.groups, block, runs):
             began = time.perf_counter()
-            step = _gated(recorded, backend, one.clock_sigma_s, one.config.association)
+            false = _not_there(recorded, backend, one.clock_sigma_s, one.config.association)
+            rejected |= false
+            step = _counted(recorded, _without(recorded, false), noise.known)
+            step = _merged(step, noise.known)
             backend.add(step)
             poses = {name: backend.state_mean(name) for name in (*step.starts, *step.motions)}
             if one.config.odometry.calibrate and step.motions:
-                _learn(step, poses, runs, used, known, backend)
+                _learn(step, poses, latest, runs, used, known, backend)
+            latest |= poses
             step_ms.append(1e3 * (time.perf_counter() - began))
             known.update(a.target for a in step.associations)
             covs = backend.pose_covariances(list(poses))
@@ -96,6 +108,40 @@ def _replay(one: SightingPass, tracks: Mapping[str, Track]) -> CausalReplay:
         for frame in [frames.of[name]]
     }
     return CausalReplay(trajectories, np.array(step_ms))
+
+
+def _weighed_anew(
+    one: SightingPass, number: int, estimate: Estimate, noise: NoiseSoFar, rejected: Collection[int]
+) -> CompressedBackend:
+    """A back end with the first steps of a pass, by the noise and the calibrations known by then.
+
+    Args:
+        one: the pass.
+        number: of the steps.
+        estimate: of their states and landmarks.
+        noise: of the sightings.
+        rejected: sources of those that are left out, see `_not_there`.
+    """
+    first = range(number)
+    tracks = {name: one.tracks[name] for name in estimate.states}
+    groups = [part for group in noise.groups if len((part := group.of_steps(first)).where)]
+    steps = recompute_steps(one.steps[:number], estimate, tracks, groups)
+    kept = (_counted(step, _without(step, rejected), noise.known) for step in steps)
+    merged = [_merged(step, noise.known) for step in kept]
+    return CompressedBackend.at_estimate(_config(one), merged, estimate)
+
+
+def _without(step: Step, rejected: Collection[int]) -> Step:
+    """A step without the sightings of these sources."""
+    kept = tuple(a for a in step.associations if a.source not in rejected)
+    return step if len(kept) == len(step.associations) else replace(step, associations=kept)
+
+
+def _config(one: SightingPass) -> Config:
+    """The settings of the back end."""
+    settings = one.config.backend
+    settings = replace(settings, relinearize_every=INTERVAL * settings.relinearize_every)
+    return replace(one.config, backend=settings)
 
 
 def _computed(
@@ -122,18 +168,18 @@ def _computed(
     return recompute_steps(steps, Estimate(states, {}, 0.0, 0), tracks, own)
 
 
-def _gated(
+def _not_there(
     step: Step,
     backend: CompressedBackend,
     clock_sigma_s: float,
     config: AssociationConfig,
-) -> Step:
-    """A step without sightings of robots that are not where the back end expects these."""
+) -> set[int]:
+    """Sources of sightings of robots that are not where the back end expects these."""
     of_robots: dict[str, list[Association]] = defaultdict(list)
     floor = gate_floor(config)
     for a in _doubtful(step, backend, floor, config):
         of_robots[a.robot].append(a)
-    false: set[int | None] = set()
+    false: set[int] = set()
     for robot, own in of_robots.items():
         seen = [as_observation(a) for a in own]
         others = [
@@ -145,17 +191,60 @@ def _gated(
         joint = predicted_joint(joint, step.motions.get(robot), others)
         _, found = robot_distances(seen, others, joint, floor)
         gate = gate_distance(config.gate_probability, found.dof)
-        false |= {a.source for a, far in zip(own, found.d2 >= gate, strict=True) if far}
-    if not false:
+        far = zip(own, found.d2 >= gate, strict=True)
+        false |= {a.source for a, is_far in far if is_far and a.source is not None}
+    return false
+
+
+def _counted(step: Step, kept: Step, known: Collection[Source]) -> Step:
+    """What is ``kept`` of a step; n sightings of one target count as one, see `inflate_repeated`.
+
+    Where some are left out, n is smaller. The covariances of ``known`` sources are by another rule.
+    """
+    if kept is step:
         return step
-    kept = [a for a in step.associations if a.source not in false]
-    # n sightings of one target count as one, see `inflate_repeated`: n is smaller now
     before, left = (
-        Counter((a.robot, a.target) for a in some) for some in (step.associations, kept)
+        Counter((a.robot, a.target) for a in some.associations) for some in (step, kept)
     )
     share = {pair: n / before[pair] for pair, n in left.items()}
-    weighed = (a.with_measurement(a.z, a.cov * share[a.robot, a.target]) for a in kept)
-    return replace(step, associations=tuple(weighed))
+    weighed = (
+        a
+        if (a.robot, a.model) in known
+        else a.with_measurement(a.z, a.cov * share[a.robot, a.target])
+        for a in kept.associations
+    )
+    return replace(kept, associations=tuple(weighed))
+
+
+def _merged(step: Step, known: Collection[Source]) -> Step:
+    """A step with one bearing and range, their mean by information, for several of one target.
+
+    Of ``known`` sources, whose errors are shared: it tells as much, for less work.
+    """
+    if not known:
+        return step
+    groups: dict[tuple[str, int, int | str], list[Association]] = defaultdict(list)
+    for a in step.associations:
+        if (a.robot, a.model) in known:
+            groups[a.robot, a.time_ns, a.target].append(a)
+    several = [own for own in groups.values() if len(own) > 1]
+    if not several:
+        return step
+    seen = [a for own in several for a in own]
+    counts = [len(own) for own in several]
+    firsts = np.cumsum([0, *counts[:-1]])
+    z, information = np.array([a.z for a in seen]), np.linalg.inv([a.cov for a in seen])
+    off = z - np.repeat(z[firsts], counts, axis=0)
+    off[:, 0] = wrap(off[:, 0])
+    covs = np.linalg.inv(np.add.reduceat(information, firsts))
+    sums = np.add.reduceat(information @ off[:, :, None], firsts)
+    means = z[firsts] + (covs @ sums)[:, :, 0]
+    means[:, 0] = wrap(means[:, 0])
+    found = zip(several, means, covs, strict=True)
+    one = [own[0].with_measurement(mean, cov) for own, mean, cov in found]
+    merged = set(map(id, seen))
+    rest = (a for a in step.associations if id(a) not in merged)
+    return replace(step, associations=(*rest, *one))
 
 
 def _doubtful(
@@ -192,6 +281,7 @@ def _clock_shift(motion: Motion | None, clock_sigma_s: float) -> Array:
 def _learn(
     step: Step,
     poses: Mapping[str, Array],
+    latest: Mapping[str, Array],
     runs: Mapping[str, RobotState],
     used: Mapping[str, Calibration],
     known: Collection[int | str],
@@ -202,6 +292,7 @@ def _learn(
     Args:
         step: as the back end has it.
         poses: (3,) estimates of the states that it made.
+        latest: (3,) estimates of the states before these.
         runs: the robots, without these states.
         used: the calibrations that its motions were computed with.
         known: landmarks that were there before it.
@@ -218,7 +309,7 @@ def _learn(
     observed = observed_information(seen, poses, [means[int(a.target)] for a in seen])
     for name, motion in step.motions.items():
         run = runs[name]
-        last = run.causal_poses[-1]
+        last = latest[name]
         turn = rotation3(-float(last[2]))
         better = run.calibrator.update(
             used[name], motion, between(last, poses[name]), turn @ observed[name] @ turn.T

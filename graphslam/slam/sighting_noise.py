@@ -22,6 +22,7 @@ from graphslam.odometry.noise_estimation import is_stated, without_floors
 from graphslam.odometry.preintegration import Track
 from graphslam.slam.log_noise import MOTION, LogNoise, is_white
 from graphslam.slam.motion_noise import fit_track_noise, measured_motion_noise
+from graphslam.slam.sensor_latency import hold_insignificant_latency
 from graphslam.slam.sighting_states import (
     at_states,
     state_times,
@@ -39,8 +40,6 @@ CONVERGED_ERROR = 1e-4
 MIN_VARIANCE = 1e-4
 #: sightings without which nothing is said about a source
 MIN_MEASUREMENTS = 100
-#: a latency of sightings is applied if it is so many of its sigmas
-LATENCY_SIGMAS = 4.0
 #: m, rad: sigmas of the pose at which a robot's part of the stretch begins
 BEGIN_SIGMA = 0.01
 
@@ -137,28 +136,14 @@ def _estimated(
             change = max(change, changed or 0.0)
         if change < CONVERGED_SHARE or not is_white(noise):
             break
-    for track in tracks.values():
-        hold_insignificant_latency(track)
+    if not is_white(noise):
+        # else there will be a state at every sighting, and the whole log decides
+        for track in tracks.values():
+            hold_insignificant_latency(track)
     for source, found in noise.items():
         measured[source] = found.white + found.shared
     final = {source: _cautious(found, config) for source, found in noise.items()}
     return LogNoise(final, {name: track.config for name, track in tracks.items()}, measured)
-
-
-def hold_insignificant_latency(track: Track) -> None:
-    """Take the clocks of sightings and odometry as one, unless the log is clearly likelier not so.
-
-    Where a robot drives evenly only noise tells of an offset, and its sigma is too small.
-    ``track`` has the calibration of a stretch of the log.
-    """
-    if not track.is_mounted or track.has_burst_stamps:
-        return
-    mean, cov = track.calibration.mean, track.calibration.cov
-    if mean[-1] ** 2 > LATENCY_SIGMAS**2 * cov[-1, -1]:
-        return
-    last = [len(mean) - 1]
-    track.prior = track.prior.at_zero(last)
-    track.calibration = replace(track.prior, mean=np.append(mean[:-1], 0.0))
 
 
 def _sighting_noise(

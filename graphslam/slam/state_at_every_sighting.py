@@ -1,15 +1,19 @@
 """The final solution of a log whose sightings have white noise: a state at every sighting."""
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from graphslam.core.config import RobustConfig
+from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Step
-from graphslam.estimation.batch_calibration import ROUNDS, calibrate
+from graphslam.estimation.batch_calibration import calibrate
+from graphslam.estimation.calibration_graph import CalibratedSolution
 from graphslam.odometry.preintegration import Track
 from graphslam.slam.log_noise import LogNoise, with_own_noise
 from graphslam.slam.log_pass import LogPass
 from graphslam.slam.motion_noise import scale_motion_noise
+from graphslam.slam.sensor_latency import has_latency, hold_insignificant_latency
 from graphslam.slam.sighting_states import (
     at_states,
     state_times,
@@ -36,19 +40,47 @@ class SightingProblem:
     ) -> tuple[Estimate, tuple[Step, ...]]:
         """The estimate of ``steps``, `steps` with other associations, and the steps behind it.
 
-        The calibrations of the tracks are set to what is found. ``rough``: once, and not to the
-        end.
+        The calibrations of the tracks are set to what is found. ``rough``: not to the end.
+
+        Raises:
+            EstimationError: the estimate is indeterminate.
+        """
+        return self._solved(steps, start, rough=rough)
+
+    def decide_latencies(self, start: Estimate) -> Estimate:
+        """Decide whether sightings are late, by what the whole log says; a rough estimate.
 
         Raises:
             EstimationError: the estimate is indeterminate.
         """
 
+        def decide(solved: CalibratedSolution, _steps: Sequence[Step]) -> None:
+            for name, track in self.tracks.items():
+                if has_latency(track):
+                    cov = solved.graph.calibration_covariance(name)
+                    track.calibration = replace(track.calibration, cov=cov)
+                    hold_insignificant_latency(track)
+
+        estimate, _ = self._solved(self.steps, start, rough=True, solved_once=decide)
+        return estimate
+
+    def _solved(
+        self,
+        steps: Sequence[Step],
+        start: Estimate,
+        *,
+        rough: bool,
+        solved_once: Callable[[CalibratedSolution, Sequence[Step]], None] | None = None,
+    ) -> tuple[Estimate, tuple[Step, ...]]:
+        """`solve`; for ``solved_once`` see `calibrate`."""
+
         def rebuild(estimate: Estimate, _last: bool) -> tuple[Step, ...]:
             made = with_motions(steps, self.tracks, estimate, self.begun_ns)
             return scale_motion_noise(made, self.noise.motion_scales())
 
-        rounds = 1 if rough else ROUNDS
-        return calibrate(rebuild, start, self.tracks, self.kernel, rounds, rough=rough)
+        return calibrate(
+            rebuild, start, self.tracks, self.kernel, 1, rough=rough, solved_once=solved_once
+        )
 
     def at_sightings(
         self, steps: tuple[Step, ...], estimate: Estimate
@@ -72,18 +104,46 @@ def state_at_every_sighting(
 ) -> tuple[SightingProblem, Estimate]:
     """The problem of a pass with a state at every sighting, and an estimate of these states.
 
+    It is decided whether sightings are late, since a robot's first state depends on that.
+
     Args:
         one: the pass; its kernel and the noise of its tracks are set to the ``noise``.
         estimate: of its steps.
         noise: of the log; that of its sightings is white.
+
+    Raises:
+        EstimationError: the estimate is indeterminate.
     """
+    for name, run in one.started.items():
+        run.track.config = noise.odometry.get(name, run.track.config)
+    one.kernel = noise.kernel(one.config.robust)
+    dropped: Counter[str] = Counter()
+    late_ns = _late_ns(one)
+    problem, start = _problem(one, estimate, noise, late_ns, dropped)
+    start = problem.decide_latencies(start)
+    if (decided_ns := _late_ns(one)) != late_ns:
+        dropped.clear()
+        problem, start = _problem(one, start, noise, decided_ns, dropped)
+    one.dropped.update(dropped)
+    return problem, start
+
+
+def _late_ns(one: LogPass) -> dict[str, int]:
+    """By how much later than its odometry each robot's sightings are stamped, as known now."""
+    tracks = {name: run.track for name, run in one.started.items()}
+    return {name: track.reported_late_ns(track.calibration) for name, track in tracks.items()}
+
+
+def _problem(
+    one: LogPass,
+    estimate: Estimate,
+    noise: LogNoise,
+    late_ns: Mapping[str, int],
+    dropped: Counter[str],
+) -> tuple[SightingProblem, Estimate]:
+    """`state_at_every_sighting`, with robots that begin as ``late_ns`` says."""
     tracks = {name: run.track for name, run in one.started.items()}
     begun_ns = {name: step.time_ns for step in one.steps for name in step.starts}
-    late_ns = {name: t.reported_late_ns(t.calibration) for name, t in tracks.items()}
-    steps = steps_at_sightings(one.steps, one.sources, late_ns, one.dropped)
-    start = at_states(estimate, steps, tracks)
-    for name, track in tracks.items():
-        track.config = noise.odometry.get(name, track.config)
-    one.kernel = noise.kernel(one.config.robust)
-    steps = with_own_noise(steps, noise)
-    return SightingProblem(steps, tracks, noise, one.kernel, begun_ns), start
+    steps = with_own_noise(steps_at_sightings(one.steps, one.sources, late_ns, dropped), noise)
+    problem = SightingProblem(steps, tracks, noise, one.kernel, begun_ns)
+    return problem, at_states(estimate, steps, tracks)

@@ -9,6 +9,7 @@ import pytest
 from graphslam.core.config_io import load_config
 from graphslam.core.geometry import Array, between, compose, exp, wrap
 from graphslam.logs import LogWriter, open_logs
+from graphslam.slam import sighting_noise
 from graphslam.slam.smooth import smooth
 
 PERIOD_S, SECONDS, T0, S = 0.1, 60.0, 5_000_000_000, 1_000_000_000
@@ -226,3 +227,13 @@ def test_noise_that_the_log_contradicts_is_named(tmp_path):
         assert len(lines) == 2 and all(words in line for line in lines)
     fine = solved(tmp_path / "fine.mcap", simulate(4), increments=True)
     assert not [w for w in fine.summary["warnings"] if "variance" in w]
+
+
+def test_a_latency_that_a_stretch_leaves_open_is_decided_by_the_whole_log(tmp_path, monkeypatch):
+    """Of 10 s alone the offset has a sigma of 20 to 30 ms, so that 50 ms show nothing."""
+    monkeypatch.setattr(sighting_noise, "MAX_SIGHTINGS", 500)
+    world = simulate(2, seconds=120.0, late_s=0.05)
+    result = solved(tmp_path / "late.mcap", world, increments=True)
+    latency = result.summary["calibration"]["robot.laser_latency_s"]
+    assert latency["sigma"] < 0.01  # of the whole log
+    assert latency["value"] == pytest.approx(0.05, abs=3 * latency["sigma"])

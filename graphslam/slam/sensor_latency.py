@@ -1,0 +1,34 @@
+"""Whether the clocks of a robot's sightings and of its odometry are taken as one.
+
+An offset of the clocks costs accuracy unless it is there.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from graphslam.odometry.preintegration import Track
+
+#: a latency of sightings is applied if it is so many of its sigmas
+LATENCY_SIGMAS = 4.0
+
+
+def has_latency(track: Track) -> bool:
+    """Whether the latency of a robot's sightings is one of the parameters that are estimated."""
+    return track.is_mounted and not track.has_burst_stamps
+
+
+def hold_insignificant_latency(track: Track) -> None:
+    """Take the clocks of sightings and odometry as one, unless the log is clearly likelier not so.
+
+    Where a robot drives evenly only noise tells of an offset, and its sigma is too small.
+    ``track`` has the calibration that the log shows, with its covariance.
+    """
+    if not has_latency(track):
+        return
+    mean, cov = track.calibration.mean, track.calibration.cov
+    if mean[-1] ** 2 > LATENCY_SIGMAS**2 * cov[-1, -1]:
+        return
+    last = [len(mean) - 1]
+    track.prior = track.prior.at_zero(last)
+    track.calibration = replace(track.prior, mean=np.append(mean[:-1], 0.0))
