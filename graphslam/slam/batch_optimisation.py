@@ -46,6 +46,7 @@ from graphslam.slam.path_closing import ClosedPaths, close_paths
 from graphslam.slam.reoptimise_scans import with_closures
 from graphslam.slam.scan_refinement import refine_motions
 from graphslam.slam.scan_tracking import TrackedLog
+from graphslam.slam.scan_witness import look_at_scans
 from graphslam.slam.surface_bias import mount_bias
 
 #: factors on the gates of re-association (across, direction): with the closed paths, and solved
@@ -182,6 +183,8 @@ def _solved(
     landmarks.update_from(steps, estimate)
     for name in tracks:
         scan_log.runs[name].is_calibrated = config.odometry.calibrate
+    # what the second process does meanwhile moves the estimate by far less than scans can tell
+    scan_log.scan_witnesses = look_at_scans(scan_log, estimate)
     return moved_to(minimum.result(), estimate) if minimum else estimate, steps
 
 

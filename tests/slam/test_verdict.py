@@ -9,8 +9,9 @@ from command_line import call
 
 from graphslam.core.geometry import between, compose
 from graphslam.logs import LogWriter
-from graphslam.slam.evidence import Evidence, Parked, RobotEvidence, Seen, _half_changed
+from graphslam.slam.evidence import Evidence, RobotEvidence, Seen
 from graphslam.slam.path_evidence import FACTORS, PathMisfits
+from graphslam.slam.scan_witness import Parked, _half_changed
 from graphslam.slam.verdict import judge, with_truth
 
 S = 1_000_000_000
