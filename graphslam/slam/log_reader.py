@@ -89,6 +89,9 @@ def receive_log(reading: Reading, config: Config) -> LogSet:
 
     They are what `LogSet.messages` gives without `TRUE_RECORDS`.
     """
+    # association needs it, and it is slow to import: the log is still being opened
+    import scipy.optimize  # noqa: F401, PLC0415
+
     log = reading.receive()
     assert isinstance(log, LogSet)
     if not is_scan_log(log, config):
