@@ -72,7 +72,10 @@ class NoiseSoFar:
         own = {name: tracks[name] for name in estimate.states}
         before = {name: (track.calibration, track.prior) for name, track in own.items()}
         try:
-            noise = estimate_noise(self._steps[:taken], self._sources, estimate, own, self._config)
+            # one round tells whether errors are shared; noise that is white is used as stated
+            noise = estimate_noise(
+                self._steps[:taken], self._sources, estimate, own, self._config, rounds=1
+            )
         finally:
             for name, (calibration, prior) in before.items():
                 own[name].calibration, own[name].prior = calibration, prior

@@ -50,6 +50,7 @@ def estimate_noise(
     estimate: Estimate,
     tracks: Mapping[str, Track],
     config: Config,
+    rounds: int = MAX_ROUNDS,
 ) -> LogNoise:
     """The noise of a log of sightings.
 
@@ -59,6 +60,7 @@ def estimate_noise(
         estimate: of the states and landmarks of ``steps``.
         tracks: odometry of every robot; they get the calibration that is found on the way.
         config: settings.
+        rounds: at most. Errors that are shared show in the first, which is the last then.
 
     Raises:
         EstimationError: the estimate is indeterminate.
@@ -68,7 +70,7 @@ def estimate_noise(
     estimate = at_states(estimate, sample, tracks)
     before = {name: track.config for name, track in tracks.items()}
     try:
-        return _estimated(_beginning_at(sample, estimate), estimate, tracks, config)
+        return _estimated(_beginning_at(sample, estimate), estimate, tracks, config, rounds)
     finally:
         for name, track in tracks.items():
             track.config = before[name]
@@ -100,7 +102,11 @@ def _beginning_at(steps: Sequence[Step], estimate: Estimate) -> tuple[Step, ...]
 
 
 def _estimated(
-    steps: Sequence[Step], estimate: Estimate, tracks: Mapping[str, Track], config: Config
+    steps: Sequence[Step],
+    estimate: Estimate,
+    tracks: Mapping[str, Track],
+    config: Config,
+    rounds: int,
 ) -> LogNoise:
     """`estimate_noise` of all ``steps``; changes the tracks."""
     priors = {name: track.prior for name, track in tracks.items()}
@@ -111,7 +117,7 @@ def _estimated(
     for name in stated:
         tracks[name].config = without_floors(tracks[name].config)
     measured: dict[Source, Array] = {}
-    for k in range(MAX_ROUNDS):
+    for k in range(rounds):
         initial = {name: track.calibration for name, track in tracks.items()}
         for track in tracks.values():
             track.calibration = track.calibration.held()
