@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from graphslam.core.allocation import give_back_freed_memory
 from graphslam.core.errors import GraphSlamError, OutputError
 from graphslam.core.memory_limit import limited_memory
 from graphslam.core.source_digest import source_digest
@@ -100,6 +101,7 @@ def execute(task: Task, memory_mb: float = math.inf, code: str | None = None) ->
 
 def forget_peak_memory() -> None:
     """Let the peak memory of this process begin anew, where the system can: see proc(5)."""
+    give_back_freed_memory()
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 
