@@ -49,7 +49,6 @@ def without_floors(config: OdometryConfig) -> OdometryConfig:
 def fit_noise(
     track: Track,
     times_ns: tuple[IntArray, IntArray],
-    variances: Array,
     normalised: Array,
     redundancy: Array,
     *,
@@ -60,18 +59,17 @@ def fit_noise(
     Args:
         track: of a source that does not state its noise.
         times_ns: (n,) of the beginnings and of the ends of the motions.
-        variances: (n, 3) of the noise by which the motions were solved.
-        normalised: (n, 3) residuals by this noise, see `Residuals`.
+        normalised: (n, 3) residuals by the track's present noise, see `Residuals`.
         redundancy: (n, 3) see `Residuals`.
-        relax: whether to go farther, as the noise so far comes from such a fit already.
+        relax: whether to go farther, as the present noise comes from such a fit already.
     """
     bare = without_floors(with_rates(track.config, np.zeros(len(RATES))))
-    known = motion_variances(track, bare, times_ns)
+    R, known = (motion_variances(track, config, times_ns) for config in (track.config, bare))
     C = variances_by_rate(track, *times_ns)
     moved = C.any(axis=(1, 2))
     if not moved.any():
         return bare
-    C, R, known, left = C[moved], variances[moved], known[moved], redundancy[moved]
+    C, R, known, left = C[moved], R[moved], known[moved], redundancy[moved]
     squared = clipped(normalised[moved]) ** 2  # expected: true variance / R
     A = (C * (left / R)[:, :, None]).reshape(-1, len(RATES))
     x = _non_negative(A, ((squared - known / R) * left).ravel())

@@ -12,7 +12,7 @@ import numpy as np
 
 from graphslam.core.geometry import Array, between, wrap
 from graphslam.core.record import replace
-from graphslam.core.records import Estimate, Motion, Step
+from graphslam.core.records import Estimate, Step
 from graphslam.estimation.posterior_residuals import Posterior, Residuals, spans
 from graphslam.odometry.noise_estimation import fit_noise, is_stated, motion_variances
 from graphslam.odometry.preintegration import Track
@@ -112,38 +112,29 @@ def fit_track_noise(
         The largest share by which the mean variance along x, or of turning, has changed; None if
         there are too few motions.
     """
-    own = _motions(steps, robot)
+    own = [step.motions[robot] for step in steps if robot in step.motions]
     by_odometry = np.array([not motion.from_scans for motion in own], dtype=bool)
     if by_odometry.sum() < MIN_MOTIONS:
         return None
-    times = _times(own)
-    # a solution may have scaled what the track says: that is what its covariances are of
-    solved = np.array([np.diag(motion.cov) for motion in own])
-    found = _residuals(track, robot, times, solved, posterior)
+    times = _times(steps, robot)
+    found = _residuals(track, robot, times, posterior)
     used = times[0][by_odometry], times[1][by_odometry]
-    variances, normalised, left = (
-        of[by_odometry] for of in (found.variance, found.normalised, found.redundancy)
-    )
-    track.config = fit_noise(track, used, variances, normalised, left, relax=relax)
+    normalised, left = found.normalised[by_odometry], found.redundancy[by_odometry]
+    track.config = fit_noise(track, used, normalised, left, relax=relax)
     after = motion_variances(track, track.config, used)
-    return float(np.abs(np.mean(after / variances, axis=0)[[0, 2]] - 1.0).max())
+    return float(np.abs(np.mean(after / found.variance[by_odometry], axis=0)[[0, 2]] - 1.0).max())
 
 
 def measured_motion_noise(
     track: Track, robot: str, steps: Sequence[Step], posterior: Posterior
 ) -> Array | None:
     """Factors (3,) on a track's variances that its motions show over seconds; None if too few."""
-    own = _motions(steps, robot)
-    if len(own) < MIN_MOTIONS:
+    begin, end = _times(steps, robot)
+    if len(begin) < MIN_MOTIONS:
         return None
-    begin, end = _times(own)
-    stated = motion_variances(track, track.config, (begin, end))
-    scale = np.median([np.diag(m.cov) for m in own] / np.maximum(stated, MIN_SIGMA**2), axis=0)
     of = spans(np.append(begin[0], end))
     over = begin[of[:, 0]], end[of[:, 1] - 1]
-    solved = scale * motion_variances(track, track.config, over)
-    found = _residuals(track, robot, over, solved, posterior, over_spans=True)
-    return scale * found.variance_factor()
+    return _residuals(track, robot, over, posterior, over_spans=True).variance_factor()
 
 
 def fit_motion_noise(
@@ -162,15 +153,12 @@ def fit_motion_noise(
     return LogNoise(odometry=used, measured=measured)
 
 
-def _motions(steps: Sequence[Step], robot: str) -> list[Motion]:
-    return [step.motions[robot] for step in steps if robot in step.motions]
-
-
-def _times(motions: Sequence[Motion]) -> tuple[IntArray, IntArray]:
-    """When motions (n,) begin and end."""
+def _times(steps: Sequence[Step], robot: str) -> tuple[IntArray, IntArray]:
+    """When the motions (n,) of a robot begin and end."""
+    own = [step.motions[robot] for step in steps if robot in step.motions]
     return (
-        np.array([motion.start_ns for motion in motions], dtype=np.int64),
-        np.array([motion.end_ns for motion in motions], dtype=np.int64),
+        np.array([motion.start_ns for motion in own], dtype=np.int64),
+        np.array([motion.end_ns for motion in own], dtype=np.int64),
     )
 
 
@@ -178,12 +166,11 @@ def _residuals(
     track: Track,
     robot: str,
     times_ns: tuple[IntArray, IntArray],
-    variances: Array,
     posterior: Posterior,
     *,
     over_spans: bool = False,
 ) -> Residuals:
-    """Residuals of a robot's motions between times (n,), solved with ``variances`` (n, 3)."""
+    """Residuals of a robot's motions between times (n,), by its track's noise."""
+    variances = np.maximum(motion_variances(track, track.config, times_ns), MIN_SIGMA**2)
     deltas = track.motions(*times_ns).delta
-    variances = np.maximum(variances, MIN_SIGMA**2)
     return posterior.motions(robot, deltas, variances, over_spans=over_spans)
