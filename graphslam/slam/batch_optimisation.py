@@ -47,7 +47,6 @@ from graphslam.slam.reoptimise_scans import with_closures
 from graphslam.slam.scan_refinement import refine_motions
 from graphslam.slam.scan_tracking import TrackedLog
 from graphslam.slam.scan_witness import look_at_scans
-from graphslam.slam.surface_bias import mount_bias
 
 #: factors on the gates of re-association (across, direction): with the closed paths, and solved
 CLOSED_FACTORS, SOLVED_FACTORS = (1.0, 1.0), (1 / 2, 2 / 3)
@@ -178,8 +177,7 @@ def _solved(
     )
     problem = _Problem(with_closures(steps, closures), near, tracks, config)
     done, minimum = problem.solve(settle=config.backend.optimise_at_end)
-    steps = done.steps
-    estimate = _with_surface_bias(steps, done.solution.estimate, tracks, config)
+    estimate, steps = _with_surface_bias(done.solution.estimate, tracks, config), done.steps
     landmarks.update_from(steps, estimate)
     for name in tracks:
         scan_log.runs[name].is_calibrated = config.odometry.calibrate
@@ -188,19 +186,21 @@ def _solved(
     return moved_to(minimum.result(), estimate) if minimum else estimate, steps
 
 
-def _with_surface_bias(
-    steps: tuple[Step, ...], estimate: Estimate, tracks: Mapping[str, Track], config: Config
-) -> Estimate:
-    """An estimate whose mounts, and those of the tracks, have the bias of surfaces."""
-    mounts = estimate.mounts
-    if mounts is None:
-        return estimate
-    bias = mount_bias(steps, estimate, config.front_end.floor_normal_m)
+def _with_surface_bias(estimate: Estimate, tracks: Mapping[str, Track], config: Config) -> Estimate:
+    """An estimate whose mounts, and those of the tracks, have the bias of surfaces.
+
+    Turning shows where the laser sits by walls of which each returns its ranges with a bias. No
+    number of scans averages it, and a coordinate is held by two walls that face each other.
+    """
+    variance, mounts = config.front_end.floor_normal_m**2 / 2, estimate.mounts
     for name, track in tracks.items():
-        if name in mounts.robots:
-            own = mounts.columns(name)
-            track.add_mount_cov(bias[own, own])  # of further lasers too: they see the same walls
-    return replace(estimate, mounts=replace(mounts, cov=mounts.cov + bias))
+        bias = np.diag(np.where(track.is_mount_estimated, [variance, variance, 0.0], 0.0))
+        track.add_mount_cov(bias)
+        if mounts is not None and name in mounts.robots:
+            own, cov = mounts.columns(name), mounts.cov.copy()
+            cov[own, own] += bias
+            mounts = replace(mounts, cov=cov)
+    return replace(estimate, mounts=mounts)
 
 
 def _tied(
