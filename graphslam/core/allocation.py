@@ -16,8 +16,8 @@ def keep_freed_memory() -> None:
 
     By default every array of more than 128 kB, at first, is a mapping of its own, and the end of
     the heap goes back to the system as soon as it is free. A run frees and takes millions of bytes
-    again and again, and the system clears each page anew: a tenth of the CPU time of a run of
-    seconds. Its most memory stays the same.
+    again and again, and the system clears each page anew: a twentieth of the time of a run of
+    seconds (ACES). Its peak memory stays the same.
     """
     mallopt = _of_glibc("mallopt")
     if mallopt is not None:
@@ -28,7 +28,7 @@ def keep_freed_memory() -> None:
 def give_back_freed_memory() -> None:
     """Give the system what is kept: whoever begins something else should not count it as its own.
 
-    Tasks of a campaign follow each other in one process, and each reports its most memory.
+    Tasks of a campaign follow each other in one process, and each reports its peak memory.
     """
     trim = _of_glibc("malloc_trim")
     if trim is not None:

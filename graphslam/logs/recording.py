@@ -230,7 +230,7 @@ class BlockList:
             return
         numbers, counts = np.unique(np.asarray(channels), return_counts=True)
         first, last = int(times.min()), int(times.max())
-        self.in_order &= self._latest_ns <= times[0] and bool((times[1:] >= times[:-1]).all())
+        self.in_order &= self._latest_ns <= int(times[0]) and bool((times[1:] >= times[:-1]).all())
         self._latest_ns = max(self._latest_ns, last)
         counted = dict(zip(numbers.tolist(), counts.tolist(), strict=True))
         self.blocks.append(Block(offset, end, first, last, counted))

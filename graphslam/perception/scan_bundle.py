@@ -43,7 +43,7 @@ FITS = 3
 #: information (1/m², 1/rad²) that holds the first pose; steps of conjugate gradients at most, and
 #: residual, as a share, at which they end
 HELD, GRADIENTS, SOLVED = 1e8, 200, 1e-5
-#: information about a pose, added so that it can be inverted: that of nothing seen
+#: information (1/m², 1/rad²) about what nothing tells of, added so that it can be inverted
 NOTHING = 1e-2
 
 
@@ -108,11 +108,16 @@ def _seen(points: Array, lasers: Array, scan: IntArray, poses: Array) -> _Points
     return _Points(placed, placed - at[:, :2], placed - transform_each(at, lasers), scan)
 
 
+def _cells(points: Array, size_m: float) -> IntArray:
+    """Numbers (m,) of the cells of a grid that points (m, 2) are in."""
+    cell = np.floor(points / size_m).astype(np.int64)
+    cell -= cell.min(axis=0)
+    return np.asarray(cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1])
+
+
 def _normals(seen: _Points) -> tuple[Array, BoolArray]:
     """Normals (m, 2) of the surfaces at points, towards the laser, and whether there are any."""
-    cell = np.floor(seen.placed / CELL_M).astype(np.int64)
-    cell -= cell.min(axis=0)
-    _, own = np.unique(cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1], return_inverse=True)
+    _, own = np.unique(_cells(seen.placed, CELL_M), return_inverse=True)
     count = np.bincount(own).astype(float)
     mean = np.column_stack([np.bincount(own, v) / count for v in seen.placed.T])
     dx, dy = (seen.placed - mean[own]).T
@@ -159,11 +164,8 @@ def _sums_around(
 
 def _pieces(seen: _Points, normals: Array, flat: BoolArray, shift_m: float) -> IntArray:
     """Number (m,) of the piece of a surface that each point is on; -1 on none."""
-    cell = np.floor((seen.placed + shift_m) / PIECE_M).astype(np.int64)
-    cell -= cell.min(axis=0)
     sector = np.round(np.arctan2(normals[:, 1], normals[:, 0]) * (SECTORS / (2 * np.pi)))
-    key = cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1]
-    key = key * SECTORS + sector.astype(np.int64) % SECTORS
+    key = _cells(seen.placed + shift_m, PIECE_M) * SECTORS + sector.astype(np.int64) % SECTORS
     use = np.flatnonzero(flat)
     _, piece = np.unique(key[use], return_inverse=True)
     count = np.bincount(piece)

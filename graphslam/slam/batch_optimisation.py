@@ -44,9 +44,9 @@ from graphslam.slam.motion_noise import (
 )
 from graphslam.slam.path_closing import ClosedPaths, close_paths
 from graphslam.slam.reoptimise_scans import with_closures
+from graphslam.slam.scan_evidence import gather_scan_evidence
 from graphslam.slam.scan_refinement import refine_motions
 from graphslam.slam.scan_tracking import TrackedLog
-from graphslam.slam.scan_witness import look_at_scans
 
 #: factors on the gates of re-association (across, direction): with the closed paths, and solved
 CLOSED_FACTORS, SOLVED_FACTORS = (1.0, 1.0), (1 / 2, 2 / 3)
@@ -182,7 +182,7 @@ def _solved(
     for name in tracks:
         scan_log.runs[name].is_calibrated = config.odometry.calibrate
     # what the second process does meanwhile moves the estimate by far less than scans can tell
-    scan_log.scan_witnesses = look_at_scans(scan_log, estimate)
+    scan_log.scan_evidence = gather_scan_evidence(scan_log, estimate)
     return moved_to(minimum.result(), estimate) if minimum else estimate, steps
 
 

@@ -88,8 +88,7 @@ def _replay(one: SightingPass, tracks: Mapping[str, Track]) -> CausalReplay:
             began = time.perf_counter()
             false = _not_there(recorded, backend, one.clock_sigma_s, one.config.association)
             rejected |= false
-            step = _counted(recorded, _without(recorded, false), noise.known)
-            step = _merged(step, noise.known)
+            step = _used(recorded, false, noise.known)
             backend.add(step)
             poses = {name: backend.state_mean(name) for name in (*step.starts, *step.motions)}
             if one.config.odometry.calibrate and step.motions:
@@ -126,9 +125,13 @@ def _weighed_anew(
     tracks = {name: one.tracks[name] for name in estimate.states}
     groups = [part for group in noise.groups if len((part := group.of_steps(first)).where)]
     steps = recompute_steps(one.steps[:number], estimate, tracks, groups)
-    kept = (_counted(step, _without(step, rejected), noise.known) for step in steps)
-    merged = [_merged(step, noise.known) for step in kept]
-    return CompressedBackend.at_estimate(_config(one), merged, estimate)
+    used = [_used(step, rejected, noise.known) for step in steps]
+    return CompressedBackend.at_estimate(_config(one), used, estimate)
+
+
+def _used(step: Step, rejected: Collection[int], known: Collection[Source]) -> Step:
+    """A step as the back end gets it: without ``rejected`` sources, see `_counted`, `_merged`."""
+    return _merged(_counted(step, _without(step, rejected), known), known)
 
 
 def _without(step: Step, rejected: Collection[int]) -> Step:

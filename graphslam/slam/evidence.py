@@ -19,7 +19,7 @@ from graphslam.odometry.interpolation import IntArray
 from graphslam.slam.log_pass import LogPass
 from graphslam.slam.path_evidence import NO_PATH, PathMisfits
 from graphslam.slam.robot_state import RobotState
-from graphslam.slam.scan_witness import Parked, look_at_scans
+from graphslam.slam.scan_evidence import Parked, gather_scan_evidence
 
 BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
 IntTable = np.ndarray[tuple[int, int], np.dtype[np.int64]]
@@ -101,7 +101,7 @@ def gather(
 ) -> Evidence:
     """The evidence of a run: the last pass, and its result, see `graphslam.core.records.Result`."""
     found = []
-    witnesses = pipeline.scan_witnesses or look_at_scans(pipeline, estimate)
+    by_scans = pipeline.scan_evidence or gather_scan_evidence(pipeline, estimate)
     for name, run in pipeline.started.items():
         motions = [(s.time_ns, s.motions[name].from_scans) for s in steps if name in s.motions]
         seen = [a for s in steps for a in s.associations if a.robot == name and len(a.z) == 2]
@@ -122,8 +122,8 @@ def gather(
                 motions_ns=np.array([time for time, _ in motions], dtype=np.int64),
                 contradicted=np.array([was for _, was in motions], dtype=bool),
                 seen=_seen(seen, run, estimate),
-                parked=witnesses[name].parked,
-                along_walls=witnesses[name].along_walls,
+                parked=by_scans[name].parked,
+                along_walls=by_scans[name].along_walls,
                 bridged_sigma_m=run.track.bridged_sigma_m,
             )
         )

@@ -23,7 +23,7 @@ from graphslam.slam.progress import Progress, counted, timed
 from graphslam.slam.recorded_closures import RecordedClosures
 from graphslam.slam.robot_settings import make_tracks, with_noted_keyframes
 from graphslam.slam.robot_state import RobotState
-from graphslam.slam.scan_witness import ScanWitness
+from graphslam.slam.scan_evidence import ScanEvidence
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +52,7 @@ class LogPass:
     number of a step -> what its sightings of robots could be, used or not. ``rejected`` counts
     observations and ``removed_returns`` returns that were not used, by reason; ``innovations``:
     model -> (time, squared distance per degree of freedom) of accepted observations.
-    ``scan_witnesses``: what scans say of the robots' paths, where it has been asked already.
+    ``scan_evidence``: what scans say of the robots' paths, where it has been asked already.
     """
 
     def __init__(self, log: LogSet, config: Config, known: PriorKnowledge) -> None:
@@ -77,7 +77,7 @@ class LogPass:
         self.robot_sightings: list[Sighting] = []
         self.offers: dict[int, tuple[Association, ...]] = {}
         self.keyframe_scans: list[KeyframeScan] = []
-        self.scan_witnesses: Mapping[str, ScanWitness] = {}
+        self.scan_evidence: Mapping[str, ScanEvidence] = {}
         self.counts: Counter[str] = Counter()
         self.skipped_before: Mapping[str, int] = {}  # by the run that this one goes on with
         self.dropped: Counter[str] = Counter()

@@ -14,7 +14,7 @@ from graphslam.slam.doubts import Reason, seconds, stretches
 from graphslam.slam.evidence import Evidence, RobotEvidence
 from graphslam.slam.path_evidence import FACTORS as PATH_FACTORS
 from graphslam.slam.path_evidence import better_fit
-from graphslam.slam.scan_witness import Parked
+from graphslam.slam.scan_evidence import Parked
 
 #: share of a scan's beams that change while a robot stands, by people and doors, at most
 SCAN_CHANGE = 0.6

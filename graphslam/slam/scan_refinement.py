@@ -12,10 +12,10 @@ from graphslam.core.config import ScanMatchingConfig
 from graphslam.core.geometry import Array, between, rotate_cov
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate, KeyframeScan, Step, Trajectory
-from graphslam.perception.scan_bundle import Bundle, align_all
+from graphslam.perception.scan_bundle import NOTHING, Bundle, align_all
 
-#: information (1/m², 1/rad²) of a scan that sees nothing; m, rad: least sigma of a motion
-NOTHING, MIN_SIGMA = 1e-2, 1e-4
+#: m, rad: least sigma of a motion
+MIN_SIGMA = 1e-4
 
 
 def refine_motions(

@@ -11,7 +11,7 @@ from graphslam.core.geometry import between, compose
 from graphslam.logs import LogWriter
 from graphslam.slam.evidence import Evidence, RobotEvidence, Seen
 from graphslam.slam.path_evidence import FACTORS, PathMisfits
-from graphslam.slam.scan_witness import Parked, _half_changed
+from graphslam.slam.scan_evidence import Parked, _half_changed
 from graphslam.slam.verdict import judge, with_truth
 
 S = 1_000_000_000

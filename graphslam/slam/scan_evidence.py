@@ -49,20 +49,20 @@ class Parked(NamedTuple):
     speed_m_s: float = 0.0
 
 
-class ScanWitness(NamedTuple):
+class ScanEvidence(NamedTuple):
     """When a robot stood, by odometry; how scans fit if its path was another one along walls."""
 
     parked: tuple[Parked, ...]
     along_walls: PathMisfits
 
 
-def look_at_scans(pipeline: "LogPass", estimate: Estimate) -> dict[str, ScanWitness]:
-    """The witness of every robot's scans; ``estimate`` is of the states that they were made from.
+def gather_scan_evidence(pipeline: "LogPass", estimate: Estimate) -> dict[str, ScanEvidence]:
+    """What every robot's scans say; ``estimate`` is of the states that they were made from.
 
     At most some hundred scans of each robot are looked at, however long the log is.
     """
     return {
-        name: ScanWitness(
+        name: ScanEvidence(
             tuple(_parked(pipeline, name, run)), _along_walls(pipeline, name, estimate)
         )
         for name, run in pipeline.started.items()
