@@ -84,31 +84,59 @@ def information_root(
 
 def joint_covariance(root: InformationRoot, rows: IntArray) -> Array:
     """Joint covariance (k, k) of k dimensions of variables, given by their rows of the root."""
-    b = np.zeros((int(root.own.sum()), len(rows)))
-    b[rows, np.arange(len(rows))] = 1.0
-    return covariance_of(root, b)
+    k = len(rows)
+    return covariance_of(root, rows, np.arange(k), np.ones(k), k)
 
 
-def covariance_of(root: InformationRoot, combinations: Array) -> Array:
+def covariance_of(
+    root: InformationRoot, rows: IntArray, columns: IntArray, derivatives: Array, k: int
+) -> Array:
     """Joint covariance (k, k) of linear combinations of all variables.
 
-    The time is that of k forward substitutions through all of the root, in one go.
+    The time is that of k forward substitutions through all of the root, in one go. What is left of
+    them is held only where cliques above need it.
 
     Args:
         root: of the graph.
-        combinations: (rows, k) derivatives of each by the errors; they are overwritten.
+        rows: (n,) rows of the root on which combinations depend.
+        columns: (n,) the number of the combination; those of one row and number add up.
+        derivatives: (n,) of the combination by the error of the row.
+        k: how many combinations there are.
     """
     starts = np.concatenate([[0], np.cumsum(root.own)])
     widths = np.concatenate([[0], np.cumsum(root.width)])
     values = np.concatenate([[0], np.cumsum(root.own * (root.own + root.width))])
-    b = combinations
+    order = np.argsort(rows, kind="stable")
+    rows, columns, derivatives = rows[order], columns[order], derivatives[order]
+    entering = np.searchsorted(rows, starts)
+    below: dict[int, list[tuple[IntArray, IntArray, Array]]] = defaultdict(list)
+    P, place = np.zeros((k, k)), np.empty(k, dtype=np.int64)
+    # solved rows are multiplied many at a time
+    solved, end = np.zeros((max(int(root.own.max(initial=0)), _CHUNK // max(16 * k, 1)), k)), 0
     for c in reversed(range(len(root.own))):  # the last clique depends on no other
         n, m = int(root.own[c]), int(root.width[c])
-        own = slice(starts[c], starts[c + 1])
+        parts, new = below.pop(c, []), slice(entering[c], entering[c + 1])
+        use = np.unique(np.concatenate([columns[new], *(part[1] for part in parts)]))
+        if not len(use):
+            continue
+        place[use] = np.arange(len(use))
+        separator = root.separators[widths[c] : widths[c + 1]]
+        held = np.concatenate([np.arange(starts[c], starts[c + 1]), separator])
+        b = np.zeros((n + m, len(use)))
+        for part_rows, part_columns, rest in parts:
+            b[np.ix_(_places(held, part_rows), place[part_columns])] += rest
+        np.add.at(b, (rows[new] - starts[c], place[columns[new]]), derivatives[new])
         block = root.values[values[c] : values[c + 1]].reshape(n, n + m)
-        b[own], _ = dtrtrs(block[:, :n], b[own], trans=1)
-        b[root.separators[widths[c] : widths[c + 1]]] -= block[:, n:].T @ b[own]
-    return np.asarray(b.T @ b)
+        y, _ = dtrtrs(block[:, :n], b[:n], trans=1)
+        if root.above[c] >= 0:
+            below[int(root.above[c])].append((separator, use, b[n:] - block[:, n:].T @ y))
+        if end + n > len(solved):
+            P += solved[:end].T @ solved[:end]
+            solved[:end], end = 0.0, 0
+        solved[end : end + n, use] = y
+        end += n
+    P += solved[:end].T @ solved[:end]
+    return P
 
 
 def pair_covariances(

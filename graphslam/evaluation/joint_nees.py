@@ -72,7 +72,7 @@ def joint_base_covariance(joint: JointScans, robots: Robots, used: Mapping[str, 
     if mounts is not None:
         mount_rows = np.concatenate([root.mounts[name] for name in mounts.robots])
     ends = np.cumsum([0, *(3 * len(used[name]) for name in names)])
-    by_root = np.zeros((int(root.own.sum()), int(ends[-1])))
+    on: list[tuple[Array, ...]] = []  # rows of the root, columns, derivatives
     by_mounts = np.zeros((int(ends[-1]), len(mount_rows)))
     own = np.zeros((int(ends[-1]) // 3, 3, 3))
     for n, name in enumerate(names):
@@ -88,7 +88,7 @@ def joint_base_covariance(joint: JointScans, robots: Robots, used: Mapping[str, 
         columns = np.arange(ends[n], ends[n + 1]).reshape(-1, 3)
         for state, maps in ((before, to_base @ moved), (following, to_base @ spread)):
             rows = root.states[name][state][:, None] + np.arange(3)
-            np.add.at(by_root, (rows[:, None, :], columns[:, :, None]), maps)
+            on.append(tuple(np.broadcast_arrays(rows[:, None, :], columns[:, :, None], maps)))
         own[columns[:, 0] // 3] = to_base @ ties.covs[index] @ to_base.mT
         if mounts is None:
             continue
@@ -101,8 +101,15 @@ def joint_base_covariance(joint: JointScans, robots: Robots, used: Mapping[str, 
             part[:, :, mounts.columns(name)] += moved_by_mount(lasers, mount)
         by_mounts[columns.ravel()] = part.reshape(-1, len(mount_rows))
     free = np.flatnonzero(mount_rows >= 0)
-    np.add.at(by_root, mount_rows[free], by_mounts[:, free].T)
-    P = covariance_of(root, by_root)
+    on.append(
+        np.broadcast_arrays(
+            mount_rows[free], np.arange(len(by_mounts))[:, None], by_mounts[:, free]
+        )
+    )
+    rows, columns, derivatives = (
+        np.concatenate([part.ravel() for part in of]) for of in zip(*on, strict=True)
+    )
+    P = covariance_of(root, rows, columns, derivatives, len(by_mounts))
     if mounts is not None and len(free):
         # what a mount's covariance has beyond that of the solution: biases of surfaces
         beyond = mounts.cov[np.ix_(free, free)] - joint_covariance(root, mount_rows[free])
