@@ -6,6 +6,7 @@ while the log is read is the initial value; here it becomes a variable of the gr
 uncertainty a part of every covariance.
 """
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -127,7 +128,6 @@ def _recomputed(motions: Sequence[Motion], track: Track) -> list[Motion]:
     if not motions:
         return []
     ends = np.array([(m.start_ns, m.end_ns) for m in motions], dtype=np.int64)
-    new = track.motions(ends[:, 0], ends[:, 1])
-    for k in np.flatnonzero(track.is_uncovered(ends[:, 0], ends[:, 1])):
-        new.cov[k] += np.diag(track.uncovered_bound(*ends[k].tolist()) ** 2)
+    new = track.motions(*ends.T)
+    new = dataclasses.replace(new, cov=new.cov + track.uncovered_covs(*ends.T))
     return [new.one(k, m.start_ns, m.end_ns) for k, m in enumerate(motions)]

@@ -150,7 +150,8 @@ def with_motions(
         where.items(), queries, preintegrate_batch(queries), strict=True
     ):
         d_cal = calibration_jacobian(*query, found, estimate.states[robot])
-        made = replace(found, d_cal=d_cal, cov=_at_least(found.cov, MIN_SIGMA**2))
+        cov = _at_least(found.cov, MIN_SIGMA**2) + tracks[robot].uncovered_covs(*query[1:])
+        made = replace(found, d_cal=d_cal, cov=cov)
         for k, (n, m) in enumerate(own):
             motions[n][robot] = made.one(k, m.start_ns, m.end_ns)
     return tuple(
