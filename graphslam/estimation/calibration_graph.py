@@ -114,6 +114,7 @@ class CalibrationGraph:
         self._builder = builder = RecordedGraph(kernel, noise)
         self._values, self._priors = gtsam.Values(), priors
         self._marginals: gtsam.Marginals | None = None  # at the last solution
+        self._steps, self._now = steps, now  # the motions in the graph, and their calibration
         self._keys = {r: int(gtsam.symbol("c", k)) for k, r in enumerate(sorted(priors))}
         self._free = {r: np.flatnonzero(np.diag(c.cov) > HELD_SIGMA**2) for r, c in priors.items()}
         self._motions: dict[str, list[tuple[int, int, int]]] = defaultdict(list)  # index, two keys
@@ -137,6 +138,7 @@ class CalibrationGraph:
         """
         graph, values = self._builder.graph, self._values
         unit = gtsam.noiseModel.Unit.Create(3)
+        self._steps, self._now = steps, now
         for robot, use in self._free.items():
             if not len(use):
                 continue
@@ -213,15 +215,28 @@ class CalibrationGraph:
         estimate = builder.estimate(means, half_error, found.rows, mounted)
         if found.rows is not None and mounted:
             estimate = replace(estimate, mounts=self._mounts(found.rows, values, mounted))
+        return estimate, self._calibrations(covs)
+
+    def _calibrations(self, covs: Mapping[int, Array]) -> dict[str, Calibration]:
+        """The calibrations where it was optimised last, with those covariances that are known."""
         calibrations = {}
         for robot, prior in self._priors.items():
             mean, cov, use = prior.mean.copy(), prior.cov.copy(), self._free[robot]
             if len(use):
                 key = self._keys[robot]
-                mean[use] = values.atVector(key)
+                mean[use] = self._values.atVector(key)
                 cov[np.ix_(use, use)] = covs.get(key, np.nan)
             calibrations[robot] = Calibration(prior.names, mean, cov)
-        return estimate, calibrations
+        return calibrations
+
+    def _relinearise(self) -> None:
+        """Put motions in the graph as they are linear around the last solution.
+
+        They were around that from which it was sought, in the axes of its poses: of two poses that
+        both are uncertain and have turned since, the relative pose would have a little of both.
+        """
+        found = self._calibrations({})
+        self.calibrate_motions(at_calibration(self._steps, self._now, found), found)
 
     def _mount_places(self) -> dict[str, tuple[int, list[int]]]:
         """Robots whose mounts are estimated, see `information_root`."""
@@ -276,11 +291,14 @@ class CalibrationGraph:
             EstimationError: it is indeterminate.
         """
         builder = self._builder
+        self._relinearise()
+        free = {robot: (self._keys[robot], use) for robot, use in self._free.items() if len(use)}
+        pairs = posterior_pairs(builder, free)
         try:
-            blocks = marginals_of(builder.graph, self._values, posterior_pairs(builder))
+            blocks = marginals_of(builder.graph, self._values, pairs)
         except RuntimeError as error:
             raise builder.explain(error) from error
-        return Posterior(builder, self._values, blocks)
+        return Posterior(self._steps, builder, self._values, blocks, free)
 
     def calibration_covariance(self, robot: str, posterior: Posterior | None = None) -> Array:
         """Covariance (p, p) of a robot's calibration at the last solution, or at a ``posterior``.

@@ -217,7 +217,7 @@ def _can_fall(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, share: fl
 def marginals_of(
     graph: gtsam.NonlinearFactorGraph,
     values: gtsam.Values,
-    pairs: Iterable[tuple[int, int]] = (),
+    pairs: Iterable[tuple[int, ...]] = (),
     *,
     keep_rows: bool = False,
     use_qr: bool = False,

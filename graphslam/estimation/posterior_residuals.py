@@ -6,21 +6,23 @@ with both parts do residuals tell how large the noise is (C. R. Rao, Estimation 
 covariance components in linear models, JASA 67, 1972, DOI 10.1080/01621459.1972.10481212).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
 from graphslam.core.geometry import Array, adjoint, between, inverse, log, rotation3
+from graphslam.core.motion_models import Increments
 from graphslam.core.observation_models import MODELS
+from graphslam.core.records import Step
 from graphslam.estimation import factors
 from graphslam.estimation.recorded_graph import IntArray, RecordedGraph, Source
 from graphslam.estimation.selected_inverse import CovarianceBlocks
 from graphslam.odometry.noise_estimation import clipped
 
 #: share of its variance that a residual needs at least to tell about its noise
-MIN_REDUNDANCY = 0.02
+MIN_REDUNDANCY = 1e-3
 #: ns: errors of motions may be the same over as long as this
 SPAN_NS = 3_000_000_000
 
@@ -57,22 +59,23 @@ class Residuals:
 class Posterior:
     """A solution: its graph, values and covariances, those of `posterior_pairs` among them.
 
+    ``steps``: what was solved, with motions by the calibration that was found.
+    ``calibrations``: robot -> key of its calibration, and which of its parameters (p,) that has.
     ``blocks`` are of errors along the axes of each pose.
     """
 
+    steps: Sequence[Step]
     builder: RecordedGraph
     values: gtsam.Values
     blocks: CovarianceBlocks
+    calibrations: Mapping[str, tuple[int, IntArray]]
 
-    def motions(
-        self, robot: str, deltas: Array, variances: Array, *, over_spans: bool = False
-    ) -> Residuals:
+    def motions(self, robot: str, made: Increments, *, over_spans: bool = False) -> Residuals:
         """Residuals of all motions of a robot, along the axes of their starts.
 
         Args:
             robot: its name.
-            deltas: (n, 3) the motions as measured, by the calibration that was found.
-            variances: (n, 3) of their noise.
+            made: the n motions as they were solved, by the calibration that was found.
             over_spans: the motions are those over `spans` of its states.
         """
         if over_spans:
@@ -80,10 +83,17 @@ class Posterior:
         else:
             pairs = [(last, key) for _, name, last, key in self.builder.motions if name == robot]
         moved = between(*(self._values([pair[end] for pair in pairs], 3) for end in (0, 1)))
-        turn = rotation3(deltas[:, 2])
-        r = (turn @ log(between(deltas, moved))[:, :, None])[:, :, 0]
+        turn = rotation3(made.delta[:, 2])
+        r = (turn @ log(between(made.delta, moved))[:, :, None])[:, :, 0]
         H = np.concatenate([turn @ -adjoint(inverse(moved)), turn], axis=2)
-        return Residuals(r, variances, self._absorbed(H, pairs))
+        variances = np.diagonal(made.cov, axis1=1, axis2=2)
+        known = self.calibrations.get(robot)
+        if known is None:
+            return Residuals(r, variances, self._absorbed(H, pairs))
+        # the calibration follows the motions too
+        key, use = known
+        H = np.concatenate([H, -made.d_cal[:, :, use]], axis=2)
+        return Residuals(r, variances, self._absorbed(H, [(*pair, key) for pair in pairs]))
 
     def sightings(self, source: Source) -> Residuals:
         """Residuals of all bearings and ranges of a source, by its noise in the graph."""
@@ -116,7 +126,7 @@ class Posterior:
         H = np.concatenate([-found.axes, found.axes], axis=2)
         return Residuals(r, found.variance, self._absorbed(H, pairs))
 
-    def _absorbed(self, H: Array, pairs: Sequence[tuple[int, int]]) -> Array:
+    def _absorbed(self, H: Array, pairs: Sequence[tuple[int, ...]]) -> Array:
         P = np.array([self.blocks.joint[pair] for pair in pairs])
         return np.asarray(np.einsum("nij,njk,nik->ni", H, P, H))
 
@@ -138,10 +148,17 @@ def span_keys(builder: RecordedGraph, robot: str) -> list[tuple[int, int]]:
     return [(first + i, first + j) for i, j in spans(builder.states.stamps(robot)).tolist()]
 
 
-def posterior_pairs(builder: RecordedGraph) -> list[tuple[int, int]]:
+def posterior_pairs(
+    builder: RecordedGraph, calibrations: Mapping[str, tuple[int, IntArray]]
+) -> list[tuple[int, ...]]:
     """Keys of the variables whose joint covariances `Posterior` needs."""
-    over = [pair for robot in builder.robots for pair in span_keys(builder, robot)]
-    moved = [(last, key) for _, _, last, key in builder.motions]
+    own = {robot: (key,) for robot, (key, _) in calibrations.items()}
+    over = [
+        (*pair, *own.get(robot, ()))
+        for robot in builder.robots
+        for pair in span_keys(builder, robot)
+    ]
+    moved = [(last, key, *own.get(robot, ())) for _, robot, last, key in builder.motions]
     seen = [(key, target) for own in builder.bearings_and_ranges.values() for key, target, _ in own]
     shared = [(a, b) for found in builder.shared_errors.values() for a, b in found.keys.tolist()]
     return moved + over + seen + shared

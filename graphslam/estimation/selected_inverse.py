@@ -11,6 +11,7 @@ climbs its tree for each variable that it is asked for.
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate
 
 import gtsam
 import numpy as np
@@ -35,29 +36,29 @@ class CliqueRows:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CovarianceBlocks:
-    """``marginals``: key -> (d, d) of every variable; ``joint``: two poses' keys -> (6, 6).
+    """``marginals``: key -> (d, d) of every variable; ``joint``: keys of variables -> (D, D).
 
     ``rows``: the root of the information that they are of, from the last eliminated clique on; None
     if it was not asked for.
     """
 
     marginals: Mapping[int, Array]
-    joint: Mapping[tuple[int, int], Array]
+    joint: Mapping[tuple[int, ...], Array]
     rows: tuple[CliqueRows, ...] | None = None
 
 
 def covariance_blocks(
     graph: gtsam.GaussianFactorGraph,
-    pairs: Iterable[tuple[int, int]] = (),
+    pairs: Iterable[tuple[int, ...]] = (),
     *,
     use_qr: bool = False,
     keep_rows: bool = False,
 ) -> CovarianceBlocks:
-    """Covariances of all variables of a linear graph, and joint ones of ``pairs`` of poses.
+    """Covariances of all variables of a linear graph, and joint ones of ``pairs``.
 
     Args:
         graph: factors; it gains empty ones for those ``pairs`` that no factor connects.
-        pairs: keys of two different poses each.
+        pairs: keys of two different poses each, and of others to which factors connect both.
         use_qr: eliminate by QR, slower than Cholesky, but precise where information spans many
             orders of magnitude.
         keep_rows: whether to return the root too.
@@ -68,19 +69,19 @@ def covariance_blocks(
     wanted = set(pairs)
     if wanted:
         linked = {frozenset(graph.at(n).keys()) for n in range(graph.size())}
-        for a, b in sorted(wanted):
-            if frozenset((a, b)) not in linked:
-                graph.add(_empty_factor(a, b))
+        for pair in sorted(wanted):
+            if frozenset(pair) not in linked:
+                graph.add(_empty_factor(*pair[:2]))
     ordering = gtsam.Ordering.ColamdGaussianFactorGraph(graph)
     by_qr = (gtsam.EliminateQR,) if use_qr else ()
     net = graph.eliminateSequential(ordering, *by_qr)
     cliques, clique_of = _cliques(net)
-    pairs_in: dict[int, list[tuple[int, int]]] = defaultdict(list)
-    for a, b in wanted:
-        # of two variables in one factor the first eliminated has the other in its row
-        pairs_in[max(clique_of[a], clique_of[b])].append((a, b))
+    pairs_in: dict[int, list[tuple[int, ...]]] = defaultdict(list)
+    for pair in wanted:
+        # of the variables in one factor the first eliminated has the others in its row
+        pairs_in[max(clique_of[key] for key in pair)].append(pair)
     marginals: dict[int, Array] = {}
-    joint: dict[tuple[int, int], Array] = {}
+    joint: dict[tuple[int, ...], Array] = {}
     rows: list[CliqueRows] = []
     for number, clique in enumerate(cliques):
         above = None if clique.above is None else cliques[clique.above]
@@ -90,19 +91,21 @@ def covariance_blocks(
             rows.append(CliqueRows(own, clique.separator, clique.above, block))
         for key in clique.own:
             marginals[key] = cov[clique.rows[key], clique.rows[key]]
-        for a, b in pairs_in[number]:
-            joint[a, b] = _joint(cov, clique.rows[a], clique.rows[b])
+        for pair in pairs_in[number]:
+            joint[pair] = _joint(cov, [clique.rows[key] for key in pair])
         if above is not None:
             above.release()
     return CovarianceBlocks(marginals, joint, tuple(rows) if keep_rows else None)
 
 
-def _joint(cov: Array, a: slice, b: slice) -> Array:
-    """Joint covariance of two variables by their rows, in a third of the time of `np.ix_`."""
-    n, m = a.stop - a.start, b.stop - b.start
-    made = np.empty((n + m, n + m))
-    made[:n, :n], made[:n, n:] = cov[a, a], cov[a, b]
-    made[n:, :n], made[n:, n:] = cov[b, a], cov[b, b]
+def _joint(cov: Array, rows: Sequence[slice]) -> Array:
+    """Joint covariance of a few variables by their rows, in less time than by `np.ix_`."""
+    ends = list(accumulate((own.stop - own.start for own in rows), initial=0))
+    places = [slice(*ends[k : k + 2]) for k in range(len(rows))]
+    made = np.empty((ends[-1], ends[-1]))
+    for i, a in zip(places, rows, strict=True):
+        for j, b in zip(places, rows, strict=True):
+            made[i, j] = cov[a, b]
     return made
 
 

@@ -7,6 +7,7 @@ Estimating heteroscedastic variances in linear models, JASA 70, 1975, DOI
 10.1080/01621459.1975.10479891).
 """
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -20,9 +21,8 @@ from graphslam.odometry.mounted_motions import lever_to
 from graphslam.odometry.preintegration import Track, path_sums
 from graphslam.odometry.readings import IntArray
 
-#: exponent of an extra step in the direction of the last one: without it the distance to the fixed
-#: point halves in each round where sightings are dense, with it a tenth is left
-OVER_RELAXATION = 0.7
+#: sigma of the logarithm of an unknown variance, before any data: a factor of ten
+PRIOR_LOG_SIGMA = math.log(10.0)
 #: m, rad: floors of short motions; that of positions is above what cutting readings leaves out
 FLOOR_M, FLOOR_RAD = 5e-4, 1e-4
 #: residuals are cut at so many of their own sigmas: slip is left to the solution
@@ -49,6 +49,7 @@ def without_floors(config: OdometryConfig) -> OdometryConfig:
 def fit_noise(
     track: Track,
     times_ns: tuple[IntArray, IntArray],
+    variances: Array,
     normalised: Array,
     redundancy: Array,
     *,
@@ -56,27 +57,62 @@ def fit_noise(
 ) -> OdometryConfig:
     """The settings of a track with the noise that its motions show, without floors.
 
+    Where this no longer changes them they have the largest restricted likelihood, with a prior: the
+    mean variance along each axis is that of the default settings within `PRIOR_LOG_SIGMA`. Without
+    it, where nothing contradicts the motions along an axis, the noise there would be what the last
+    of many repetitions leaves of it.
+
     Args:
         track: of a source that does not state its noise.
         times_ns: (n,) of the beginnings and of the ends of the motions.
-        normalised: (n, 3) residuals by the track's present noise, see `Residuals`.
+        variances: (n, 3) of the noise by which the motions were solved.
+        normalised: (n, 3) residuals by this noise, see `Residuals`.
         redundancy: (n, 3) see `Residuals`.
-        relax: whether to go farther, as the present noise comes from such a fit already.
+        relax: whether to go farther, as the noise so far comes from such a fit already.
     """
     bare = without_floors(with_rates(track.config, np.zeros(len(RATES))))
-    R, known = (motion_variances(track, config, times_ns) for config in (track.config, bare))
+    known = motion_variances(track, bare, times_ns)
     C = variances_by_rate(track, *times_ns)
     moved = C.any(axis=(1, 2))
     if not moved.any():
         return bare
-    C, R, known, left = C[moved], R[moved], known[moved], redundancy[moved]
+    C, R, known, left = C[moved], variances[moved], known[moved], redundancy[moved]
     squared = clipped(normalised[moved]) ** 2  # expected: true variance / R
-    A = (C * (left / R)[:, :, None]).reshape(-1, len(RATES))
-    x = _non_negative(A, ((squared - known / R) * left).ravel())
+    default = known + C @ [getattr(OdometryConfig(), name) for name in RATES]
+    # the logarithm of the variance, linear around R
+    likely = 1.0 - np.mean(np.log(R / default), axis=0)
+    prior = 2.0 / PRIOR_LOG_SIGMA**2
+    weight = np.sqrt(np.concatenate([left, np.full(R.shape, prior / len(R))]))
+    b = np.concatenate([squared - known / R, likely - known / R]) * weight
+    A = np.concatenate([C / R[:, :, None]] * 2) * weight[:, :, None]
+    x = _non_negative(A.reshape(-1, len(RATES)), b.ravel())
     if relax:
         before = np.maximum(np.mean(1.0 - known / R, axis=0), 1e-9)
-        x *= np.repeat(np.clip(np.mean(C @ x / R, axis=0) / before, 0.5, 2.0) ** OVER_RELAXATION, 3)
+        ratio = np.clip(np.mean(C @ x / R, axis=0) / before, 0.5, 2.0)
+        x *= np.repeat(ratio ** _farther(left, prior), 3)
     return with_rates(bare, x)
+
+
+def _farther(left: Array, prior: float) -> Array:
+    """Exponents (3,) of a step beyond that in which each residual tells of its own noise alone.
+
+    With M the share of all measurements' errors in the residuals, Σ M_ij² over the motions of an
+    axis is how much these tell of its noise, where the step counts Σ M_ii: at most that, and at
+    least Σ M_ii². With a share c of it the step leaves 1 - c of the way, f times the step
+    |1 - f c|: for any such c least with f = 2 / (1 + least c).
+    """
+    counted = left.sum(axis=0) + prior
+    least = ((left**2).sum(axis=0) + prior) / counted
+    return np.asarray((1.0 - least) / (1.0 + least))
+
+
+def variance_sigma(redundancy: Array) -> Array:
+    """Sigma (3,) of the logarithm of the mean variance along each axis: at least that.
+
+    Args:
+        redundancy: (n, 3) of the residuals that it is estimated from, see `_farther`.
+    """
+    return np.asarray(1.0 / np.sqrt(redundancy.sum(axis=0) / 2.0 + PRIOR_LOG_SIGMA**-2))
 
 
 def rates_of(twists: Array, seconds: Array, variances: Array) -> Array:

@@ -155,7 +155,7 @@ def _solved(
     rough = first.solution
     # both need nothing but this solution; the second process looks for the noise
     asked = (
-        Future(lambda: fit_motion_noise(tracks, first.steps, rough.graph.posterior()))
+        Future(lambda: fit_motion_noise(tracks, rough.graph.posterior()))
         if config.odometry.calibrate
         else None
     )

@@ -11,10 +11,17 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from graphslam.core.geometry import Array, between, wrap
+from graphslam.core.motion_models import Increments
 from graphslam.core.record import replace
-from graphslam.core.records import Estimate, Step
-from graphslam.estimation.posterior_residuals import Posterior, Residuals, spans
-from graphslam.odometry.noise_estimation import fit_noise, is_stated, motion_variances
+from graphslam.core.records import Estimate, Motion, Step
+from graphslam.estimation.posterior_residuals import Posterior, spans
+from graphslam.odometry.increment_sums import IncrementSums
+from graphslam.odometry.noise_estimation import (
+    fit_noise,
+    is_stated,
+    motion_variances,
+    variance_sigma,
+)
 from graphslam.odometry.preintegration import Track
 from graphslam.odometry.readings import IntArray
 from graphslam.slam.log_noise import MOTION, LogNoise
@@ -27,6 +34,10 @@ MIN_SIGMA = 1e-4
 UNDERSTATED = 2.0
 #: median of the absolute value of a standard normal variable
 MEDIAN_OF_NORMAL = 0.6745
+#: of the sigma of a variance: smaller changes of it do not matter
+NEGLIGIBLE = 0.5
+#: what of a `Motion` is one of `Increments`
+_INCREMENT = ("delta", "cov", "d_delta_d_calibration")
 
 
 def noise_scales(
@@ -94,83 +105,82 @@ def scale_motion_noise(steps: Sequence[Step], scales: Mapping[str, Array]) -> tu
     )
 
 
-def fit_track_noise(
-    track: Track, robot: str, steps: Sequence[Step], posterior: Posterior, *, relax: bool
-) -> float | None:
+def fit_track_noise(track: Track, robot: str, posterior: Posterior, *, relax: bool) -> float | None:
     """Give a track whose noise nobody states that of its motions in a solution.
 
-    Motions that scans replaced are left out.
+    Motions that scans replaced, or of which readings miss a part, are left out.
 
     Args:
         track: odometry of ``robot``, with the calibration that was found.
         robot: its name.
-        steps: with its motions; too few of them change nothing.
-        posterior: of their solution.
+        posterior: a solution; too few motions in it change nothing.
         relax: see `fit_noise`.
 
     Returns:
-        The largest share by which the mean variance along x, or of turning, has changed; None if
-        there are too few motions.
+        The largest share by which the mean variance along x, or of turning, has changed, 0 where
+        that is `NEGLIGIBLE`; None if there are too few motions.
     """
-    own = [step.motions[robot] for step in steps if robot in step.motions]
+    own = [step.motions[robot] for step in posterior.steps if robot in step.motions]
+    times, solved = _solved(own)
     by_odometry = np.array([not motion.from_scans for motion in own], dtype=bool)
+    by_odometry &= ~track.is_uncovered(*times)
     if by_odometry.sum() < MIN_MOTIONS:
         return None
-    times = _times(steps, robot)
-    found = _residuals(track, robot, times, posterior)
+    found = posterior.motions(robot, solved)
     used = times[0][by_odometry], times[1][by_odometry]
-    normalised, left = found.normalised[by_odometry], found.redundancy[by_odometry]
-    track.config = fit_noise(track, used, normalised, left, relax=relax)
+    variances, normalised, left = (
+        of[by_odometry] for of in (found.variance, found.normalised, found.redundancy)
+    )
+    track.config = fit_noise(track, used, variances, normalised, left, relax=relax)
     after = motion_variances(track, track.config, used)
-    return float(np.abs(np.mean(after / found.variance[by_odometry], axis=0)[[0, 2]] - 1.0).max())
+    change = np.abs(np.mean(after / variances, axis=0) - 1.0)
+    change[change < NEGLIGIBLE * variance_sigma(left)] = 0.0
+    return float(change[[0, 2]].max())
 
 
-def measured_motion_noise(
-    track: Track, robot: str, steps: Sequence[Step], posterior: Posterior
-) -> Array | None:
+def measured_motion_noise(track: Track, robot: str, posterior: Posterior) -> Array | None:
     """Factors (3,) on a track's variances that its motions show over seconds; None if too few."""
-    begin, end = _times(steps, robot)
-    if len(begin) < MIN_MOTIONS:
+    own = [step.motions[robot] for step in posterior.steps if robot in step.motions]
+    if len(own) < MIN_MOTIONS:
         return None
+    (begin, end), solved = _solved(own)
     of = spans(np.append(begin[0], end))
     over = begin[of[:, 0]], end[of[:, 1] - 1]
-    return _residuals(track, robot, over, posterior, over_spans=True).variance_factor()
+    found = posterior.motions(robot, _joined(solved, of), over_spans=True)
+    stated = np.maximum(motion_variances(track, track.config, over), MIN_SIGMA**2)
+    return found.variance_factor() * np.median(found.variance / stated, axis=0)
 
 
-def fit_motion_noise(
-    tracks: Mapping[str, Track], steps: Sequence[Step], posterior: Posterior
-) -> LogNoise:
+def fit_motion_noise(tracks: Mapping[str, Track], posterior: Posterior) -> LogNoise:
     """`fit_track_noise` of all tracks; of those whose noise is stated what is measured."""
     measured = {}
     for robot, track in tracks.items():
         if is_stated(track):
-            found = measured_motion_noise(track, robot, steps, posterior)
+            found = measured_motion_noise(track, robot, posterior)
             if found is not None:
                 measured[robot, MOTION] = found
         else:
-            fit_track_noise(track, robot, steps, posterior, relax=False)
+            fit_track_noise(track, robot, posterior, relax=False)
     used = {name: track.config for name, track in tracks.items() if (name, MOTION) not in measured}
     return LogNoise(odometry=used, measured=measured)
 
 
-def _times(steps: Sequence[Step], robot: str) -> tuple[IntArray, IntArray]:
-    """When the motions (n,) of a robot begin and end."""
-    own = [step.motions[robot] for step in steps if robot in step.motions]
-    return (
-        np.array([motion.start_ns for motion in own], dtype=np.int64),
-        np.array([motion.end_ns for motion in own], dtype=np.int64),
+def _solved(motions: Sequence[Motion]) -> tuple[tuple[IntArray, IntArray], Increments]:
+    """When motions (n,) begin and end, and these as they were solved, maybe with scaled noise."""
+    times = (
+        np.array([motion.start_ns for motion in motions], dtype=np.int64),
+        np.array([motion.end_ns for motion in motions], dtype=np.int64),
     )
+    made = (np.array([getattr(m, name) for m in motions]) for name in _INCREMENT)
+    return times, Increments(*made)
 
 
-def _residuals(
-    track: Track,
-    robot: str,
-    times_ns: tuple[IntArray, IntArray],
-    posterior: Posterior,
-    *,
-    over_spans: bool = False,
-) -> Residuals:
-    """Residuals of a robot's motions between times (n,), by its track's noise."""
-    variances = np.maximum(motion_variances(track, track.config, times_ns), MIN_SIGMA**2)
-    deltas = track.motions(*times_ns).delta
-    return posterior.motions(robot, deltas, variances, over_spans=over_spans)
+def _joined(motions: Increments, ends: IntArray) -> Increments:
+    """Consecutive motions (n) over spans, by the indices (m, 2) of states at their ends."""
+    none, first = np.zeros(len(motions.delta) + 1, dtype=np.int64), motions.part(0, 1)
+    nothing = Increments(
+        *(np.zeros_like(getattr(first, f))[none] for f in ("delta", "cov", "d_cal"))
+    )
+    points = IncrementSums(motions, none[1:]).query(np.arange(len(none)), none, nothing)
+    over = points.motions_between(*ends.T)
+    return Increments(over.delta, over.cov, over.d_cal)

@@ -137,9 +137,9 @@ def reoptimise_scan_log(
             made = recompute_motions(closed, tracks)
             return scale_motion_noise(made, noise_scales(made, estimate))
 
-        def find_noise(solution: CalibratedSolution, made: Sequence[Step]) -> None:
+        def find_noise(solution: CalibratedSolution, _made: Sequence[Step]) -> None:
             nonlocal noise
-            noise = fit_motion_noise(tracks, made, solution.graph.posterior())
+            noise = fit_motion_noise(tracks, solution.graph.posterior())
 
         estimate, _ = calibrate(
             rebuild,

@@ -70,7 +70,7 @@ def estimate_noise(
     estimate = at_states(estimate, sample, tracks)
     before = {name: track.config for name, track in tracks.items()}
     try:
-        return _estimated(_beginning_at(sample, estimate), estimate, tracks, config, rounds)
+        return _estimated(sample, estimate, tracks, config, rounds)
     finally:
         for name, track in tracks.items():
             track.config = before[name]
@@ -121,7 +121,7 @@ def _estimated(
         initial = {name: track.calibration for name, track in tracks.items()}
         for track in tracks.values():
             track.calibration = track.calibration.held()
-        made = with_motions(steps, tracks, estimate)
+        made = with_motions(_beginning_at(steps, estimate), tracks, estimate)
         graph = CalibrationGraph(made, estimate, priors, initial, config.robust, noise)
         graph.calibrate_motions(made, initial)
         estimate, calibrations = graph.solve(CONVERGED_ERROR)
@@ -133,11 +133,11 @@ def _estimated(
             cov = graph.calibration_covariance(name, posterior)
             track.calibration = replace(calibrations[name], cov=cov)
             if name in stated:
-                factors = measured_motion_noise(track, name, made, posterior)
+                factors = measured_motion_noise(track, name, posterior)
                 if factors is not None:
                     measured[name, MOTION] = factors
                 continue
-            changed = fit_track_noise(track, name, made, posterior, relax=k > 0)
+            changed = fit_track_noise(track, name, posterior, relax=k > 0)
             track.config = without_floors(track.config)
             change = max(change, changed or 0.0)
         if change < CONVERGED_SHARE or not is_white(noise):

@@ -123,7 +123,7 @@ def test_what_is_rejected_changes_nothing(tmp_path, backend):
     assert false.summary["rejected"][NOT_THERE] > 20
     for robot, right in absent.robots.items():
         found = false.robots[robot]
-        for a, b, atol in ((found.causal, right.causal, 1e-7), (found.final, right.final, 2e-4)):
+        for a, b, atol in ((found.causal, right.causal, 1e-7), (found.final, right.final, 1e-4)):
             np.testing.assert_array_equal(a.stamps_ns, b.stamps_ns)
             np.testing.assert_allclose(a.poses, b.poses, atol=atol)
 

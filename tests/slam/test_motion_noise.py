@@ -1,0 +1,68 @@
+"""The noise of odometry from a solution that was made with another noise than the track's."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphslam.core.config import OdometryConfig, RobotConfig
+from graphslam.core.records import OdometryPose, Step
+from graphslam.estimation.posterior_residuals import Residuals
+from graphslam.odometry.noise_estimation import motion_variances
+from graphslam.odometry.preintegration import Track
+from graphslam.slam.motion_noise import fit_track_noise, measured_motion_noise, scale_motion_noise
+
+S = 1_000_000_000
+N = 1500
+#: the sigmas of motions by those that the track states, as they are and as they were solved
+FACTOR = 2.0
+#: share of the noise that the solution has absorbed: the log constrains the motions weakly
+ABSORBED = 0.9
+
+
+@dataclass
+class Solution:
+    """Stands for a `Posterior` that has absorbed `ABSORBED` of the noise it was made with."""
+
+    steps: list
+    stated: np.ndarray
+
+    def motions(self, robot, made, *, over_spans=False):
+        variances = np.diagonal(made.cov, axis1=1, axis2=2)
+        noise = FACTOR**2 * (self.stated.mean(axis=0) * len(self.stated) / len(made.delta))
+        noise = np.broadcast_to(noise, made.delta.shape)
+        left = (1 - ABSORBED) * noise
+        residual = np.sqrt(left) * np.random.default_rng(3).normal(size=noise.shape)
+        return Residuals(residual, variances, noise - left)
+
+
+def driven():
+    """A track that drives straight on at 0.5 m/s, its motions of a second, solved with more noise
+    than it states, and the solution."""
+    track = Track(OdometryConfig(floor_sigma_m=5e-4, floor_sigma_rad=1e-4), RobotConfig())
+    for k in range(N + 1):
+        track.add(OdometryPose("r", (k + 3) * S, (k + 3) * S, np.array([0.5 * k, 0.0, 0.0])))
+    times = S * np.arange(3, N + 3), S * np.arange(4, N + 4)
+    track.calibration = track.calibration.held()  # it is a variable of the solution
+    made = track.motions(*times)
+    steps = [
+        Step(time_ns=int(end), motions={"r": made.one(k, int(begin), int(end))})
+        for k, (begin, end) in enumerate(zip(*times, strict=True))
+    ]
+    stated = motion_variances(track, track.config, times)
+    steps = scale_motion_noise(steps, {"r": np.full(3, FACTOR)})
+    return track, times, steps, stated
+
+
+def test_noise_is_found_by_the_covariances_that_the_solution_was_made_with():
+    """Nine tenths of the noise are absorbed. By the stated variances, a quarter of those solved
+    with, nothing at all would be left in the residuals, and noise comes out five times as large."""
+    track, times, steps, stated = driven()
+    fit_track_noise(track, "r", Solution(steps, stated), relax=False)
+    found = motion_variances(track, track.config, times) / stated
+    np.testing.assert_allclose(found[:, [0, 2]].mean(axis=0), FACTOR**2, rtol=0.15)
+
+
+def test_factors_on_stated_noise_are_those_of_the_log_whatever_it_was_solved_with():
+    track, _, steps, stated = driven()
+    found = measured_motion_noise(track, "r", Solution(steps, stated))
+    np.testing.assert_allclose(found[[0, 2]], FACTOR**2, rtol=0.25)
