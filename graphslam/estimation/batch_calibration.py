@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from graphslam.core.config import RobustConfig
+from graphslam.core.geometry import Array
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Motion, Step
 from graphslam.estimation.calibration_graph import (
@@ -22,6 +23,7 @@ from graphslam.estimation.calibration_graph import (
 )
 from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH
 from graphslam.odometry.preintegration import Track
+from graphslam.odometry.readings import IntArray
 
 #: times that everything is solved: after the first the calibration moves by a tenth of its sigma
 ROUNDS = 2
@@ -129,5 +131,16 @@ def _recomputed(motions: Sequence[Motion], track: Track) -> list[Motion]:
         return []
     ends = np.array([(m.start_ns, m.end_ns) for m in motions], dtype=np.int64)
     new = track.motions(*ends.T)
-    new = dataclasses.replace(new, cov=new.cov + track.uncovered_covs(*ends.T))
+    new = dataclasses.replace(new, cov=new.cov + uncovered_covs(track, *ends.T))
     return [new.one(k, m.start_ns, m.end_ns) for k, m in enumerate(motions)]
+
+
+def uncovered_covs(track: Track, start_ns: IntArray, end_ns: IntArray) -> Array:
+    """Covariances (n, 3, 3) of those parts of motions of which a track has no readings.
+
+    Motions do not have them if the latency is held; see `Track.uncovered_bound`.
+    """
+    covs = np.zeros((len(start_ns), 3, 3))
+    for k in np.flatnonzero(track.is_uncovered(start_ns, end_ns)):
+        covs[k] = np.diag(track.uncovered_bound(int(start_ns[k]), int(end_ns[k])) ** 2)
+    return covs

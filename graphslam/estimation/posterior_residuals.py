@@ -151,7 +151,10 @@ def span_keys(builder: RecordedGraph, robot: str) -> list[tuple[int, int]]:
 def posterior_pairs(
     builder: RecordedGraph, calibrations: Mapping[str, tuple[int, IntArray]]
 ) -> list[tuple[int, ...]]:
-    """Keys of the variables whose joint covariances `Posterior` needs."""
+    """Keys of the variables whose joint covariances `Posterior` needs.
+
+    ``calibrations``: robot -> key of its calibration, and which of its parameters (p,) that has.
+    """
     own = {robot: (key,) for robot, (key, _) in calibrations.items()}
     over = [
         (*pair, *own.get(robot, ()))

@@ -257,16 +257,6 @@ class Track(Readings):
         behind = between(self.pose(self.last_ns - after), self.pose(self.last_ns))
         return np.abs(ahead) + np.abs(behind)
 
-    def uncovered_covs(self, start_ns: IntArray, end_ns: IntArray) -> Array:
-        """Covariances (n, 3, 3) of the parts of motions without readings, see `uncovered_bound`.
-
-        They are not in `motions` if the latency is held.
-        """
-        covs = np.zeros((len(start_ns), 3, 3))
-        for k in np.flatnonzero(self.is_uncovered(start_ns, end_ns)):
-            covs[k] = np.diag(self.uncovered_bound(int(start_ns[k]), int(end_ns[k])) ** 2)
-        return covs
-
     def between(self, start_ns: int, end_ns: int) -> Motion:
         """As `motion`, but ``end_ns`` may be the earlier one: then the inverse motion."""
         if end_ns >= start_ns:

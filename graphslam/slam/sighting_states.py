@@ -13,6 +13,7 @@ import numpy as np
 from graphslam.core.geometry import Array, between, compose, exp, inverse, log, wrap
 from graphslam.core.observation_models import transport
 from graphslam.core.records import Association, Estimate, Motion, Sighting, Start, Step, Trajectory
+from graphslam.estimation.batch_calibration import uncovered_covs
 from graphslam.odometry.increment_sums import Motions
 from graphslam.odometry.interpolation import IntArray, final_at
 from graphslam.odometry.preintegration import LATENCY_STEP_NS, Track, preintegrate_batch
@@ -150,7 +151,7 @@ def with_motions(
         where.items(), queries, preintegrate_batch(queries), strict=True
     ):
         d_cal = calibration_jacobian(*query, found, estimate.states[robot])
-        cov = _at_least(found.cov, MIN_SIGMA**2) + tracks[robot].uncovered_covs(*query[1:])
+        cov = _at_least(found.cov, MIN_SIGMA**2) + uncovered_covs(*query)
         made = replace(found, d_cal=d_cal, cov=cov)
         for k, (n, m) in enumerate(own):
             motions[n][robot] = made.one(k, m.start_ns, m.end_ns)
