@@ -19,7 +19,7 @@ from graphslam.slam.log_noise import LogNoise
 from graphslam.slam.reoptimise_sightings import SightingGroup
 from graphslam.slam.sighting_noise import estimate_noise
 
-#: sightings after which the noise is measured, half of what the final solution's is measured from
+#: sightings after which the noise is measured: fewer tell less, more leave less of the log
 MEASURED_AFTER = 3000
 
 

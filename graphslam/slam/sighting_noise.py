@@ -31,7 +31,7 @@ from graphslam.slam.sighting_states import (
 )
 
 #: sightings in the stretch, about
-MAX_SIGHTINGS = 6000
+MAX_SIGHTINGS = 5000
 #: rounds at most; the noise has converged when no variance changes by a larger share
 MAX_ROUNDS, CONVERGED_SHARE = 8, 0.1
 #: relative decrease of the error at which optimisation ends
