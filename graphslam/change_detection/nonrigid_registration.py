@@ -3,8 +3,9 @@
 Two runs through the same place have maps that are bent differently where little constrains them:
 odometry along a corridor, few loop closures. Each scan still fits the reference's surfaces. Both
 paths are refined by their own scans (`path_refinement`); rigid motions that make the maps overlap
-are found by correlation; from each of them the later path is fitted to the reference's surfaces as
-an elastic whole (`elastic_path`), and the fit with the highest agreement is kept.
+are found by correlation; from each of them one path is fitted to the other's surfaces as an elastic
+whole (`elastic_path`), each of the two to the other, and the fit with the highest agreement is
+kept. From there the scans of both visits are aligned at once.
 """
 
 from dataclasses import replace
@@ -13,7 +14,7 @@ import numpy as np
 
 from graphslam.change_detection.elastic_path import fit_elastic_path
 from graphslam.change_detection.grid import grid_over
-from graphslam.change_detection.path_refinement import refine_path
+from graphslam.change_detection.path_refinement import refine_path, refine_together
 from graphslam.change_detection.rigid_registration import Registration
 from graphslam.change_detection.surface_map import Surface, fit_surfaces
 from graphslam.change_detection.visit import Bools, Visit
@@ -53,13 +54,10 @@ def register_nonrigid(
     """
     started = later.poses
     reference, later = refine_path(reference), refine_path(later)
-    ends = reference.ends[reference.surface]
-    grid = grid_over(ends, config.resolution_m, config.max_side_cells**2)
-    surface = fit_surfaces(reference, grid, config.range_sigma_m, config)
-    near_m = _COARSE * config.resolution_m
-    candidates = correlate_maps(ends, later.ends[later.surface], near_m)
-    gates = tuple((config.max_pose_error_m * _GATES).tolist())
-    fitted, share = _fit(surface, later, candidates, gates, near_m)
+    shapes, near_m = (reference.poses, later.poses), _COARSE * config.resolution_m
+    reference, fitted = _together(reference, later, config)
+    reference, fitted = refine_together((reference, fitted), shapes)
+    share = agreement(_surfaces(reference, config), fitted, near_m)
     kept: Bools = share > _SCAN_SHARE
     if kept.mean() < _RUN_SHARE:
         raise OutputError(
@@ -77,13 +75,36 @@ def register_nonrigid(
     return _with_stated_cov(reference), _with_stated_cov(fitted.select(kept)), registration
 
 
-def _fit(
-    surface: Surface, later: Visit, candidates: list[Array], gates: tuple[float, ...], near_m: float
-) -> tuple[Visit, Array]:
-    """The best fit of the visit to the surfaces from ``candidates`` (3,), and its agreement (s,).
+def _together(reference: Visit, later: Visit, config: ChangesConfig) -> tuple[Visit, Visit]:
+    """Both visits where one of them fits the other's surfaces; the reference's first scan stays.
 
-    The best one is fitted again: scans that lie on the surfaces pull in their neighbours.
+    Which of two bent maps is the reference is arbitrary, and the path that is bent less makes the
+    map in which the other one is found. So each is fitted to the other's surfaces.
     """
+    fitted, share = _fit(reference, later, config)
+    turned, share_turned = _fit(later, reference, config)
+    if share_turned.mean() <= share.mean():
+        return reference, fitted
+    back = compose(reference.poses[0], inverse(turned.poses[0]))
+    return turned.transformed(back, _SCAN_COV), later.transformed(back, _SCAN_COV)
+
+
+def _surfaces(visit: Visit, config: ChangesConfig) -> Surface:
+    grid = grid_over(visit.ends[visit.surface], config.resolution_m, config.max_side_cells**2)
+    return fit_surfaces(visit, grid, config.range_sigma_m, config)
+
+
+def _fit(reference: Visit, later: Visit, config: ChangesConfig) -> tuple[Visit, Array]:
+    """The later visit fitted to the reference's surfaces, and the agreement (s,) of its scans.
+
+    The best fit from any rigid motion is fitted again: scans that lie on the surfaces pull in
+    their neighbours.
+    """
+    surface, near_m = _surfaces(reference, config), _COARSE * config.resolution_m
+    gates = tuple((config.max_pose_error_m * _GATES).tolist())
+    candidates = correlate_maps(
+        reference.ends[reference.surface], later.ends[later.surface], near_m
+    )
     fits = []
     for motion in candidates:
         start = later.transformed(motion, _SCAN_COV)

@@ -4,9 +4,12 @@ A map may bend where few landmarks constrain it, as at a corner that was turned 
 Two visits then bend differently, and no rigid motion registers them. Here each scan is matched to
 the scans shortly before it, starting from the smoothed motion, which is doubted where it jumps.
 From there `relax_scan_network` estimates all poses at once, so that the shape of the path is that
-of the scans, however the smoothed path was bent.
+of the scans, however the smoothed path was bent. Two paths of which one lies on the other's map are
+refined in the same way, together (`refine_together`): what one of them leaves open the other one
+may tell.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -45,11 +48,7 @@ _SIDE, _STRAIGHT, _FEWEST = 3, 0.1, 20
 
 def refine_path(visit: Visit) -> Visit:
     """The visit with the poses at which its scans agree; its first pose is fixed."""
-    local = polar_points(visit.range_m, visit.angle)
-    normals, straight = _normals(visit, local)
-    metrics = np.where(straight[:, None, None], line_metrics(normals), np.eye(2))
-    returned = np.isfinite(visit.range_m)
-    cloud = Cloud(visit.scan[returned], local[returned], metrics[returned])
+    cloud = _cloud(visit)
     bounds = np.searchsorted(cloud.scan, np.arange(len(visit.poses) + 1))
     scans = [(cloud.points[low:high], cloud.metrics[low:high]) for low, high in pairwise(bounds)]
     motion = between(visit.poses[:-1], visit.poses[1:])
@@ -65,7 +64,28 @@ def refine_path(visit: Visit) -> Visit:
         )
         if len(map_points) >= _FEWEST and len(scans[i][0]) >= _FEWEST:
             poses[i] = _match(poses[i], prior, scans[i][0], map_points, map_metrics)
-    return replace(visit, poses=relax_scan_network(poses, cloud, motion, _STEP_SIGMAS, _DOUBTED))
+    (poses,) = relax_scan_network([poses], [cloud], [motion], _STEP_SIGMAS, _DOUBTED)
+    return replace(visit, poses=poses)
+
+
+def refine_together(visits: Sequence[Visit], shapes: Sequence[Array]) -> list[Visit]:
+    """The visits with the poses at which the scans of all agree; the first pose of all is fixed.
+
+    The visits lie on each other to a few decimetres. ``shapes`` (s, 3) are the poses of their paths
+    in any frame, as only the motions between them count.
+    """
+    motions = [between(shape[:-1], shape[1:]) for shape in shapes]
+    clouds, poses = [_cloud(visit) for visit in visits], [visit.poses for visit in visits]
+    refined = relax_scan_network(poses, clouds, motions, _STEP_SIGMAS, _DOUBTED)
+    return [replace(v, poses=own) for v, own in zip(visits, refined, strict=True)]
+
+
+def _cloud(visit: Visit) -> Cloud:
+    local = polar_points(visit.range_m, visit.angle)
+    normals, straight = _normals(visit, local)
+    metrics = np.where(straight[:, None, None], line_metrics(normals), np.eye(2))
+    returned = np.isfinite(visit.range_m)
+    return Cloud(visit.scan[returned], local[returned], metrics[returned])
 
 
 def _normals(visit: Visit, local: Array) -> tuple[Array, Bools]:

@@ -4,10 +4,13 @@ Scan matching one scan after another drifts: by a degree over a room, and differ
 start. Here all poses are estimated together (doi:10.1023/A:1008854305733). The returns of each scan
 should lie on those of its neighbours: on the line through them where they are straight, else on the
 nearest point. The motion of the smoothed path constrains what the scans leave open. Neighbours are
-scans close in time, and scans close in space after the robot has come back.
+scans close in time, scans close in space after the robot has come back, and where several paths
+lead through one place the nearest scans of each other path.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise, permutations
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -29,6 +32,8 @@ _BEFORE = (1, 2, 4, 7, 11, 16, 22, 29)
 #: neighbours in space: fewest scans between two, their largest distance in m, and of how many scans
 #: one is taken
 _REVISIT_SCANS, _REVISIT_M, _EVERY = 60, 1.5, 3
+#: scans of each other path that a scan is matched to, at most, as far away as revisits
+_NEAREST = 4
 #: returns of a scan that are matched, and pairs of scans at a time, which bounds the memory
 _POINTS, _PAIRS = 60, 2000
 #: m, one per iteration: the wide ones let the ends of a loop find each other, and several rounds of
@@ -53,35 +58,55 @@ class Cloud:
 
 
 def relax_scan_network(
-    poses: Array, cloud: Cloud, motion: Array, sigmas: Array, doubted: float
-) -> Array:
-    """The poses (s, 3) at which all scans agree best; the first one is fixed.
+    poses: Sequence[Array],
+    clouds: Sequence[Cloud],
+    motions: Sequence[Array],
+    sigmas: Array,
+    doubted: float,
+) -> list[Array]:
+    """The poses (s, 3) of each path at which all scans agree best; the first one of all is fixed.
 
-    The initial ``poses`` are right to a few decimetres among neighbours. ``motion`` (s - 1, 3) from
-    each to the next, its ``sigmas`` and robust scale ``doubted`` are those of `motion_terms`.
+    The initial ``poses`` (s, 3) of each path, all in one frame, are right to a few decimetres among
+    neighbours. Each path has its ``clouds`` and ``motions`` (s - 1, 3) from each pose to the next;
+    their ``sigmas`` and robust scale ``doubted`` are those of `motion_terms`.
     """
+    bounds = np.cumsum([0, *(len(path) for path in poses)]).tolist()
+    cloud, placed = _joined(clouds, bounds), np.concatenate(poses)
     tree = cKDTree(np.column_stack([cloud.points, _PLANE_SPACING_M * cloud.scan]))
-    chosen, weight = _thin(cloud.scan, len(poses))
-    anchor = np.zeros((len(poses), 3, 3))
-    anchor[0] = 1e12 * np.eye(3)
-    scans = np.arange(len(poses))
+    chosen, weight = _thin(cloud.scan, len(placed))
     for gate in _GATES_M:
-        diagonal, above, right = motion_terms(poses, motion, sigmas, doubted)
-        blocks = [
-            (scans, scans, diagonal + anchor),
-            (scans[:-1], scans[1:], above),
-            (scans[1:], scans[:-1], above.mT),
-        ]
-        late, early = _neighbours(poses, weight > 0)
+        right = np.zeros_like(placed)
+        blocks = [(np.zeros(1, np.int64), np.zeros(1, np.int64), 1e12 * np.eye(3)[None])]
+        for (low, high), motion in zip(pairwise(bounds), motions, strict=True):
+            scans = np.arange(low, high)
+            diagonal, above, right[low:high] = motion_terms(
+                placed[low:high], motion, sigmas, doubted
+            )
+            blocks += [
+                (scans, scans, diagonal),
+                (scans[:-1], scans[1:], above),
+                (scans[1:], scans[:-1], above.mT),
+            ]
+        late, early = _pairs(placed, bounds, weight > 0)
         for low in range(0, len(late), _PAIRS):
             pair = late[low : low + _PAIRS], early[low : low + _PAIRS]
-            A, g, F = _match_pairs(poses, cloud, tree, pair, chosen, weight, gate)
+            A, g, F = _match_pairs(placed, cloud, tree, pair, chosen, weight, gate)
             for rows, F_row in zip(pair, F, strict=True):
                 np.add.at(right, rows, -(F_row.mT @ g[..., None])[..., 0])
                 for columns, F_column in zip(pair, F, strict=True):
                     blocks.append((rows, columns, F_row.mT @ A @ F_column))
-        poses = step_poses(poses, _solve(blocks, right))
-    return poses
+        placed = step_poses(placed, _solve(blocks, right))
+    return np.split(placed, bounds[1:-1])
+
+
+def _joined(clouds: Sequence[Cloud], bounds: Sequence[int]) -> Cloud:
+    """One cloud of all paths, whose scans follow each other from ``bounds`` on."""
+    scan = [cloud.scan + first for cloud, first in zip(clouds, bounds, strict=False)]
+    return Cloud(
+        np.concatenate(scan),
+        np.concatenate([cloud.points for cloud in clouds]),
+        np.concatenate([cloud.metrics for cloud in clouds]),
+    )
 
 
 def _thin(scan: Ints, scans: int) -> tuple[Ints, Array]:
@@ -93,18 +118,42 @@ def _thin(scan: Ints, scans: int) -> tuple[Ints, Array]:
     return np.minimum(chosen, len(scan) - 1), np.minimum((high - low) / _POINTS, 1.0)
 
 
-def _neighbours(poses: Array, with_returns: Bools) -> tuple[Ints, Ints]:
-    """Pairs (k,) of scans that are matched, the later and the earlier ones."""
+def _pairs(poses: Array, bounds: Sequence[int], with_returns: Bools) -> tuple[Ints, Ints]:
+    """Pairs (k,) of scans that are matched: the one whose returns are taken, and its neighbour."""
+    paths = [(low, poses[low:high]) for low, high in pairwise(bounds)]
+    found = [_neighbours(path) + low for low, path in paths]
+    found += [
+        _nearest(path, other) + np.array([low, first])
+        for (low, path), (first, other) in permutations(paths, 2)
+    ]
+    one, neighbour = np.concatenate(found).T
+    usable = with_returns[one] & with_returns[neighbour]
+    return one[usable], neighbour[usable]
+
+
+def _neighbours(poses: Array) -> Ints:
+    """Pairs (k, 2) of neighbouring scans of one path, the later and the earlier one."""
     scans = np.arange(len(poses))
-    late = np.repeat(scans, len(_BEFORE))
-    early = late - np.tile(_BEFORE, len(scans))
+    in_time = np.column_stack(
+        [
+            np.repeat(scans, len(_BEFORE)),
+            np.repeat(scans, len(_BEFORE)) - np.tile(_BEFORE, len(scans)),
+        ]
+    )
     some = scans[::_EVERY]
     revisits = cKDTree(poses[some, :2]).query_pairs(_REVISIT_M, output_type="ndarray")
     revisits = some[np.sort(revisits, axis=1)[:, ::-1]]
     revisits = revisits[revisits[:, 0] - revisits[:, 1] >= _REVISIT_SCANS]
-    late, early = np.concatenate([late, revisits[:, 0]]), np.concatenate([early, revisits[:, 1]])
-    usable = (early >= 0) & with_returns[late] & with_returns[early]
-    return late[usable], early[usable]
+    return np.concatenate([in_time[in_time[:, 1] >= 0], revisits])
+
+
+def _nearest(poses: Array, others: Array) -> Ints:
+    """Pairs (k, 2) of scans of one path and those of another that were made nearest to them."""
+    away, near = cKDTree(others[:, :2]).query(
+        poses[:, :2], k=np.arange(1, _NEAREST + 1), distance_upper_bound=_REVISIT_M
+    )
+    row, column = np.nonzero(np.isfinite(away))
+    return np.column_stack([row, near[row, column]])
 
 
 def _match_pairs(
