@@ -46,7 +46,7 @@ def register_nonrigid(
 ) -> tuple[Visit, Visit, Registration]:
     """Both visits with refined paths in one frame, in which the reference's first scan stays.
 
-    Later scans that do not fit the reference's surfaces are left out. The registration is the mean
+    Scans of either that do not fit the other's surfaces are left out. The registration is the mean
     motion of the others, with their scatter as covariance.
 
     Raises:
@@ -72,7 +72,9 @@ def register_nonrigid(
     away[:, 2] = wrap(away[:, 2])
     cov = away.T @ away / len(away) + _SCAN_COV
     registration = Registration(mean, cov, np.zeros((0, 2), dtype=np.int64))
-    return _with_stated_cov(reference), _with_stated_cov(fitted.select(kept)), registration
+    later = fitted.select(kept)
+    seen = agreement(_surfaces(later, config), reference, near_m) > _SCAN_SHARE
+    return _with_stated_cov(reference.select(seen)), _with_stated_cov(later), registration
 
 
 def _together(reference: Visit, later: Visit, config: ChangesConfig) -> tuple[Visit, Visit]:
