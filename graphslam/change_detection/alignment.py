@@ -18,7 +18,7 @@ from graphslam.change_detection.beam_evidence import (
     range_noise,
 )
 from graphslam.change_detection.grid import grid_over
-from graphslam.change_detection.nonrigid_registration import register_nonrigid
+from graphslam.change_detection.nonrigid_registration import aligned_at_once, register_nonrigid
 from graphslam.change_detection.rigid_registration import Registration, register
 from graphslam.change_detection.scan_to_map import align_scans
 from graphslam.change_detection.surface_map import Surface, fit_surfaces
@@ -99,9 +99,13 @@ def align_visits_nonrigid(reference: Visit, later: Visit, config: ChangesConfig)
     Raises:
         OutputError: they are hardly of one place.
     """
-    reference, later, registration = register_nonrigid(reference, later, config)
+    fitted, best = register_nonrigid(reference, later, config)
     config = replace(config, gate_m=max(config.gate_m, config.nonrigid_gate_m))
-    return _align(reference, later, registration, config, nonrigid=True)
+    aligned = _align(*fitted.registered(config, whole_reference=True), config, nonrigid=True)
+    if aligned.is_inconsistent:
+        return aligned  # of two different places: all scans at once would bend both until they fit
+    registered = aligned_at_once(best).registered(config, whole_reference=False)
+    return _align(*registered, config, nonrigid=True)
 
 
 def _align(

@@ -5,10 +5,11 @@ odometry along a corridor, few loop closures. Each scan still fits the reference
 paths are refined by their own scans (`path_refinement`); rigid motions that make the maps overlap
 are found by correlation; from each of them one path is fitted to the other's surfaces as an elastic
 whole (`elastic_path`), each of the two to the other, and the fit with the highest agreement is
-kept. From there the scans of both visits are aligned at once.
+kept. From there the scans of both visits can be aligned at once (`aligned_at_once`).
 """
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from graphslam.change_detection.visit import Bools, Visit
 from graphslam.core.config import ChangesConfig
 from graphslam.core.errors import OutputError
 from graphslam.core.geometry import Array, compose, inverse, rotation, wrap
+from graphslam.core.worker import parallel_map
 from graphslam.perception.correlation import grid_spectrum, occupancy_grid
 
 #: stated covariance of a registered scan, (2 cm, 2 cm, 0.5 deg)²: a bound, as the map is bent
@@ -41,54 +43,81 @@ _MAX_CELLS, _TURN_RAD, _CANDIDATES = 600, np.radians(2.0), 6
 _QUANTILES = (0.005, 0.995)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class BentVisits:
+    """Two visits in one frame, each scan at a pose of its own.
+
+    ``started`` (s, 3) are the poses of the ``later`` scans before. ``shapes``: the poses of both
+    paths as their own scans refine them, each in any frame.
+    """
+
+    reference: Visit
+    later: Visit
+    started: Array
+    shapes: Sequence[Array]
+
+    def registered(
+        self, config: ChangesConfig, *, whole_reference: bool
+    ) -> tuple[Visit, Visit, Registration]:
+        """Both visits without scans that do not fit the other's surfaces, and the registration.
+
+        That is the mean motion of the later scans that are left, with their scatter as covariance.
+        Of the ``whole_reference`` none are left out.
+
+        Raises:
+            OutputError: too few of the later scans fit.
+        """
+        near_m = _COARSE * config.resolution_m
+        share = agreement(_surfaces(self.reference, config), self.later, near_m)
+        kept: Bools = share > _SCAN_SHARE
+        if kept.mean() < _RUN_SHARE:
+            raise OutputError(
+                "the two runs cannot be registered: no motion brings their landmarks together, and "
+                f"only {100 * kept.mean():.0f} % of the later scans fit the reference's surfaces, "
+                "however the path is bent; did both drive through the same place?"
+            )
+        motions = compose(self.later.poses[kept], inverse(self.started[kept]))
+        mean = motions.mean(axis=0)
+        mean[2] = np.arctan2(np.sin(motions[:, 2]).mean(), np.cos(motions[:, 2]).mean())
+        away = motions - mean
+        away[:, 2] = wrap(away[:, 2])
+        cov = away.T @ away / len(away) + _SCAN_COV
+        registration = Registration(mean, cov, np.zeros((0, 2), dtype=np.int64))
+        later = self.later.select(kept)
+        reference = self.reference
+        if not whole_reference:
+            seen = agreement(_surfaces(later, config), reference, near_m) > _SCAN_SHARE
+            reference = reference.select(seen)
+        return _with_stated_cov(reference), _with_stated_cov(later), registration
+
+
 def register_nonrigid(
     reference: Visit, later: Visit, config: ChangesConfig
-) -> tuple[Visit, Visit, Registration]:
-    """Both visits with refined paths in one frame, in which the reference's first scan stays.
+) -> tuple[BentVisits, BentVisits]:
+    """Both visits in one frame, in which the reference's first scan stays, in two ways.
 
-    Scans of either that do not fit the other's surfaces are left out. The registration is the mean
-    motion of the others, with their scatter as covariance.
-
-    Raises:
-        OutputError: too few of the scans fit.
+    In the first the later path is fitted to the reference's surfaces. The second is the better one
+    of that and of the reference's path fitted to the later surfaces: which of two bent maps is the
+    reference is arbitrary, and in that of the path that is bent less the other one is found.
     """
     started = later.poses
-    reference, later = refine_path(reference), refine_path(later)
-    shapes, near_m = (reference.poses, later.poses), _COARSE * config.resolution_m
-    reference, fitted = _together(reference, later, config)
-    reference, fitted = refine_together((reference, fitted), shapes)
-    share = agreement(_surfaces(reference, config), fitted, near_m)
-    kept: Bools = share > _SCAN_SHARE
-    if kept.mean() < _RUN_SHARE:
-        raise OutputError(
-            "the two runs cannot be registered: no motion brings their landmarks together, and "
-            f"only {100 * kept.mean():.0f} % of the later scans fit the reference's surfaces, "
-            "however the path is bent; did both drive through the same place?"
-        )
-    motions = compose(fitted.poses[kept], inverse(started[kept]))
-    mean = motions.mean(axis=0)
-    mean[2] = np.arctan2(np.sin(motions[:, 2]).mean(), np.cos(motions[:, 2]).mean())
-    away = motions - mean
-    away[:, 2] = wrap(away[:, 2])
-    cov = away.T @ away / len(away) + _SCAN_COV
-    registration = Registration(mean, cov, np.zeros((0, 2), dtype=np.int64))
-    later = fitted.select(kept)
-    seen = agreement(_surfaces(later, config), reference, near_m) > _SCAN_SHARE
-    return _with_stated_cov(reference.select(seen)), _with_stated_cov(later), registration
-
-
-def _together(reference: Visit, later: Visit, config: ChangesConfig) -> tuple[Visit, Visit]:
-    """Both visits where one of them fits the other's surfaces; the reference's first scan stays.
-
-    Which of two bent maps is the reference is arbitrary, and the path that is bent less makes the
-    map in which the other one is found. So each is fitted to the other's surfaces.
-    """
-    fitted, share = _fit(reference, later, config)
-    turned, share_turned = _fit(later, reference, config)
+    reference, later = parallel_map(refine_path, [reference, later])
+    shapes = reference.poses, later.poses
+    (fitted, share), (turned, share_turned) = parallel_map(
+        lambda pair: _fit(*pair, config), [(reference, later), (later, reference)]
+    )
+    first = BentVisits(reference, fitted, started, shapes)
     if share_turned.mean() <= share.mean():
-        return reference, fitted
+        return first, first
     back = compose(reference.poses[0], inverse(turned.poses[0]))
-    return turned.transformed(back, _SCAN_COV), later.transformed(back, _SCAN_COV)
+    visits = turned.transformed(back, _SCAN_COV), later.transformed(back, _SCAN_COV)
+    return first, BentVisits(*visits, started, shapes)
+
+
+def aligned_at_once(visits: BentVisits) -> BentVisits:
+    """The visits where all scans of both agree best."""
+    reference, later = refine_together((visits.reference, visits.later), visits.shapes)
+    return replace(visits, reference=reference, later=later)
 
 
 def _surfaces(visit: Visit, config: ChangesConfig) -> Surface:
