@@ -122,7 +122,7 @@ def _align(
     Raises:
         OutputError: the later visit observed hardly any surface of the reference.
     """
-    ends = np.concatenate([v.ends[v.surface] for v in (reference, later)])
+    ends = np.concatenate([v.ends_of(v.surface) for v in (reference, later)])
     grid = grid_over(ends, config.resolution_m, config.max_side_cells**2)
     sigma = config.range_sigma_m
     prior = reference
@@ -132,7 +132,7 @@ def _align(
             reference = align_scans(prior, surface, _gates(_REFERENCE_GATES, config))
         surface = fit_surfaces(reference, grid, sigma, config)
         sigma = range_noise(surface, reference, config)
-    cells = grid.cells(later.ends[later.surface])
+    cells = grid.cells(later.ends_of(later.surface))
     near = (cells >= 0) & (surface.nearest.distance_m[cells] < config.max_pose_error_m)
     if not surface.good.any() or near.mean() < _OVERLAP:
         raise OutputError(

@@ -58,7 +58,7 @@ def write_mcap(found: ChangeResult, path: Path) -> None:
     begin = int(found.later.stamps_ns.min())
     with LogWriter(path) as log:
         for name, visit in (("reference", found.reference), ("later", found.later)):
-            points = visit.ends[visit.surface]
+            points = visit.ends_of(visit.surface)
             points = points[:: max(1, len(points) // _MAX_POINTS)]
             log.message(f"/{name}", CLOUD, point_cloud(points, begin, _FRAME), begin)
         for stamp in sorted({change.first_seen_ns for change in found.changes}):

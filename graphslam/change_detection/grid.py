@@ -24,10 +24,10 @@ class Grid:
     def cells(self, points: Array) -> Ints:
         """Flat indices (n,) of the cells that hold ``points`` (n, 2) m; -1 outside of the grid."""
         with np.errstate(invalid="ignore"):
-            ij = np.floor((points - np.array(self.origin_m)) / self.cell_m)
-            inside = ((ij >= 0) & (ij < np.array(self.shape))).all(axis=1)
-        ij = np.where(inside[:, None], ij, 0).astype(np.int64)
-        return np.where(inside, ij[:, 0] * self.shape[1] + ij[:, 1], -1)
+            i, j = np.floor((points.T - np.array(self.origin_m)[:, None]) / self.cell_m)
+            inside = (i >= 0) & (i < self.shape[0]) & (j >= 0) & (j < self.shape[1])
+            cell = i * self.shape[1] + j
+        return np.where(inside, cell, -1.0).astype(np.int64)
 
     def centers(self, cells: Ints) -> Array:
         """Centres (n, 2) m of cells (n,)."""

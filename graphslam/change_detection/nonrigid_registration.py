@@ -121,7 +121,7 @@ def aligned_at_once(visits: BentVisits) -> BentVisits:
 
 
 def _surfaces(visit: Visit, config: ChangesConfig) -> Surface:
-    grid = grid_over(visit.ends[visit.surface], config.resolution_m, config.max_side_cells**2)
+    grid = grid_over(visit.ends_of(visit.surface), config.resolution_m, config.max_side_cells**2)
     return fit_surfaces(visit, grid, config.range_sigma_m, config)
 
 
@@ -134,7 +134,7 @@ def _fit(reference: Visit, later: Visit, config: ChangesConfig) -> tuple[Visit, 
     surface, near_m = _surfaces(reference, config), _COARSE * config.resolution_m
     gates = tuple((config.max_pose_error_m * _GATES).tolist())
     candidates = correlate_maps(
-        reference.ends[reference.surface], later.ends[later.surface], near_m
+        reference.ends_of(reference.surface), later.ends_of(later.surface), near_m
     )
     fits = []
     for motion in candidates:
@@ -160,7 +160,7 @@ def _with_stated_cov(visit: Visit) -> Visit:
 def agreement(surface: Surface, visit: Visit, near_m: float) -> Array:
     """Share (s,) of each scan's returns within ``near_m`` of a surface; 0 if it has too few."""
     beams = np.nonzero(visit.surface)[0]
-    cell = surface.nearest.grid.cells(visit.ends[beams])
+    cell = surface.nearest.grid.cells(visit.ends_of(beams))
     near = (cell >= 0) & (surface.nearest.distance_m[cell] < near_m)
     scan, size = visit.scan[beams], len(visit.poses)
     returns = np.bincount(scan, minlength=size)

@@ -21,7 +21,7 @@ def render_changes(
     found: ChangeResult, config: ChangesConfig, names: tuple[str, str] = ("reference", "later")
 ) -> str:
     """The report as one self-contained HTML document; ``names`` of the two visits."""
-    reference, later = (v.ends[v.surface] for v in (found.reference, found.later))
+    reference, later = (v.ends_of(v.surface) for v in (found.reference, found.later))
     every = np.concatenate([reference, later])
     low, high = np.quantile(every, [0.002, 0.998], axis=0)
     margin = 0.04 * float((high - low).max())

@@ -14,7 +14,7 @@ from itertools import pairwise, permutations
 
 import numpy as np
 from scipy.sparse import coo_array
-from scipy.sparse.linalg import spsolve
+from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from graphslam.change_detection.elastic_path import motion_terms
@@ -176,7 +176,8 @@ def _match_pairs(
     arms = cloud.points[chosen[late]] @ rotation3(X[:, 2])[:, :2, :2].mT
     there = arms + X[:, None, :2]
     planes = np.broadcast_to((_PLANE_SPACING_M * early)[:, None, None], (*there.shape[:2], 1))
-    away, near = tree.query(np.concatenate([there, planes], axis=2), distance_upper_bound=gate_m)
+    sought = np.concatenate([there, planes], axis=2)
+    away, near = tree.query(sought, distance_upper_bound=gate_m, workers=-1)
     found = np.isfinite(away)
     near = np.where(found, near, 0)
     d = np.where(found[..., None], there - cloud.points[near], 0.0)
@@ -199,4 +200,8 @@ def _solve(blocks: list[tuple[Ints, Ints, Array]], right: Array) -> Array:
         parts.append((r.ravel(), c.ravel(), values.ravel()))
     r, c, v = (np.concatenate(part) for part in zip(*parts, strict=True))
     A = coo_array((v, (r, c)), shape=(right.size, right.size)).tocsc()
-    return np.asarray(spsolve(A, right.ravel())).reshape(right.shape)
+    # symmetric and positive definite: an order for such matrices, and no pivots
+    factors = splu(
+        A, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+    )
+    return np.asarray(factors.solve(right.ravel())).reshape(right.shape)

@@ -61,7 +61,7 @@ def scan_normal_equations(
     Information (s, 3, 3) and right-hand side (s, 3) from ``beams`` (k,) that end within ``gate_m``
     of a surface.
     """
-    ends, size = visit.ends[beams], len(visit.poses)
+    ends, size = visit.ends_of(beams), len(visit.poses)
     row, e, found = surface_offsets(surface, ends, gate_m)
     scan = visit.scan[beams][found]
     n, arm = surface.normals[row], ends[found] - visit.poses[scan, :2]

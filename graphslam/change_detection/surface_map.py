@@ -67,7 +67,7 @@ def fit_surfaces(visit: Visit, grid: Grid, sigma_m: float, config: ChangesConfig
     A piece with more scatter than range noise of ``sigma_m`` explains is not straight.
     """
     used = np.nonzero(visit.surface & (visit.range_m <= config.max_range_m))[0]
-    ends = visit.ends[used]
+    ends = visit.ends_of(used)
     cell = grid.cells(ends)
     used, ends, cell = used[cell >= 0], ends[cell >= 0], cell[cell >= 0]
     cells, row = grid.occupied(cell)

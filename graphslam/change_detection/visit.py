@@ -51,7 +51,7 @@ class Visit:
     landmarks: tuple[Landmark, ...]
     robots: int = 1
 
-    def headings(self, beams: Ints | slice = slice(None)) -> Array:
+    def headings(self, beams: Bools | Ints | slice = slice(None)) -> Array:
         """Directions (k,) rad of some beams (k,) in the world; default: of all."""
         return np.asarray(self.poses[self.scan[beams], 2] + self.angle[beams])
 
@@ -63,7 +63,12 @@ class Visit:
     @property
     def ends(self) -> Array:
         """End points (n, 2) m of the beams in the world."""
-        return np.asarray(self.poses[self.scan, :2] + self.range_m[:, None] * self.directions)
+        return self.ends_of(slice(None))
+
+    def ends_of(self, beams: Bools | Ints | slice) -> Array:
+        """`ends` (k, 2) of some of the beams."""
+        at = self.poses[self.scan[beams], :2]
+        return at + polar_points(self.range_m[beams], self.headings(beams))
 
     def transformed(self, pose: Array, cov: Array) -> "Visit":
         """The visit in a frame where its world is at ``pose`` (3,) with ``cov`` (3, 3)."""
