@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 from graphslam.change_detection.elastic_path import motion_terms
 from graphslam.change_detection.visit import Bools, Ints
 from graphslam.core.geometry import Array, between, rotation3
+from graphslam.core.worker import core_count
 from graphslam.perception.point_to_line import (
     normal_equations,
     point_terms,
@@ -177,7 +178,7 @@ def _match_pairs(
     there = arms + X[:, None, :2]
     planes = np.broadcast_to((_PLANE_SPACING_M * early)[:, None, None], (*there.shape[:2], 1))
     sought = np.concatenate([there, planes], axis=2)
-    away, near = tree.query(sought, distance_upper_bound=gate_m, workers=-1)
+    away, near = tree.query(sought, distance_upper_bound=gate_m, workers=core_count())
     found = np.isfinite(away)
     near = np.where(found, near, 0)
     d = np.where(found[..., None], there - cloud.points[near], 0.0)

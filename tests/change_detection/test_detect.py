@@ -22,7 +22,7 @@ from graphslam.change_detection.elastic_path import fit_elastic_path
 from graphslam.change_detection.folder import save_changes
 from graphslam.change_detection.grid import Grid, distance_map, grid_over, sorted_unique
 from graphslam.change_detection.nonrigid_registration import correlate_maps
-from graphslam.change_detection.path_refinement import refine_path
+from graphslam.change_detection.path_refinement import refine_path, refine_together
 from graphslam.change_detection.regions import counter_clockwise, find_regions, outline
 from graphslam.change_detection.report import render_changes
 from graphslam.change_detection.rigid_registration import register
@@ -611,16 +611,37 @@ def test_map_correlation_finds_any_relative_pose():
     assert (np.hypot(*error[:, :2].T)[np.abs(wrap(error[:, 2])) < np.radians(2)] < 0.2).any()
 
 
-def test_bent_maps_are_registered_scan_by_scan_and_say_so():
-    """No landmarks at all: only the scans can tell. What appeared is found nevertheless."""
+def test_visits_that_lie_roughly_on_each_other_are_refined_together():
+    """15 cm and a degree off as a whole, and bent: neither path alone can tell, their scans do.
+
+    Breaks if scans of the other path are not asked, or asked in the wrong frame."""
+    rng = np.random.default_rng(24)
+    things = [box(5, 4), box(1, 1, 0.8, 0.4)]
+    a, b = (visit(things, drive(90, side), rng, (1e-4, 1e-4, 1e-5)) for side in (0.0, 0.1))
+    placed = bent(b, 0.005).transformed(np.array([0.12, -0.09, 0.02]), np.zeros((3, 3)))
+    off = np.hypot(*(placed.poses - b.poses)[:, :2].T)
+    first, second = refine_together((a, placed), (a.poses, placed.poses))
+    np.testing.assert_allclose(first.poses[0], a.poses[0], atol=1e-9)
+    for found, true in ((first, a), (second, b)):
+        left = np.hypot(*(found.poses - true.poses)[:, :2].T)
+        assert left.max() < 0.03
+        assert left.max() < 0.3 * off.max()
+
+
+@pytest.mark.parametrize("kind", ["appeared", "vanished"])
+def test_bent_maps_are_registered_scan_by_scan_and_say_so(kind):
+    """No landmarks at all: only the scans can tell. What changed is found nevertheless, whichever
+    of both visits is the reference."""
     rng = np.random.default_rng(13)
     things = [box(1, 1, 0.8, 0.4), box(6.6, 0.3, 1.1, 0.3)]
     a = bent(visit(things, drive(80), rng, (1e-4, 1e-4, 1e-5)), 0.02)
     b = bent(visit([*things, box(5, 4)], drive(80, 0.1), rng, (1e-4, 1e-4, 1e-5)), -0.02)
-    found = detect_changes(a, b.transformed(np.array([2.0, 1.0, 0.8]), np.zeros((3, 3))), CONFIG)
+    reference, later = (a, b) if kind == "appeared" else (b, a)
+    later = later.transformed(np.array([2.0, 1.0, 0.8]), np.zeros((3, 3)))
+    found = detect_changes(reference, later, CONFIG)
     assert "nonrigidly" in found.warnings[0]
     largest = found.changes[0]
-    assert largest.kind == "appeared"
+    assert largest.kind == kind
     np.testing.assert_allclose(largest.polygon.mean(axis=0), [5.2, 4.2], atol=0.4)
 
 
