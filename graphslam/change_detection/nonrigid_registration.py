@@ -96,9 +96,9 @@ def register_nonrigid(
 ) -> tuple[BentVisits, BentVisits]:
     """Both visits in one frame, in which the reference's first scan stays, in two ways.
 
-    In the first the later path is fitted to the reference's surfaces. The second is the better one
-    of that and of the reference's path fitted to the later surfaces: which of two bent maps is the
-    reference is arbitrary, and in that of the path that is bent less the other one is found.
+    In the first the later path is fitted to the reference's surfaces. The second is that or the
+    reference's path fitted to the later surfaces, whichever agrees better: which of two bent maps
+    is the reference is arbitrary, and it is the one bent less in which the other one is found.
     """
     started = later.poses
     reference, later = parallel_map(refine_path, [reference, later])

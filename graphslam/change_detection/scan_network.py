@@ -35,6 +35,9 @@ _BEFORE = (1, 2, 4, 7, 11, 16, 22, 29)
 _REVISIT_SCANS, _REVISIT_M, _EVERY = 60, 1.5, 3
 #: scans of each other path that a scan is matched to, at most, as far away as revisits
 _NEAREST = 4
+#: information (1/m², 1/rad²) that holds the first pose of a path, and that with which it stays
+#: where it is in a round if scans of another path are near: these may turn out to tell nothing
+_HELD, _PLACED = 1e12, 1.0
 #: returns of a scan that are matched, and pairs of scans at a time, which bounds the memory
 _POINTS, _PAIRS = 60, 2000
 #: m, one per iteration: the wide ones let the ends of a loop find each other, and several rounds of
@@ -69,7 +72,8 @@ def relax_scan_network(
 
     The initial ``poses`` (s, 3) of each path, all in one frame, are right to a few decimetres among
     neighbours. Each path has its ``clouds`` and ``motions`` (s - 1, 3) from each pose to the next;
-    their ``sigmas`` and robust scale ``doubted`` are those of `motion_terms`.
+    their ``sigmas`` and robust scale ``doubted`` are those of `motion_terms`. A path that no other
+    comes near is refined alone, where it is.
     """
     bounds = np.cumsum([0, *(len(path) for path in poses)]).tolist()
     cloud, placed = _joined(clouds, bounds), np.concatenate(poses)
@@ -77,7 +81,10 @@ def relax_scan_network(
     chosen, weight = _thin(cloud.scan, len(placed))
     for gate in _GATES_M:
         right = np.zeros_like(placed)
-        blocks = [(np.zeros(1, np.int64), np.zeros(1, np.int64), 1e12 * np.eye(3)[None])]
+        late, early = _pairs(placed, bounds, weight > 0)
+        firsts = np.array(bounds[:-1])
+        held = np.where(_near_earlier(late, early, firsts), _PLACED, _HELD)
+        blocks = [(firsts, firsts, held[:, None, None] * np.eye(3))]
         for (low, high), motion in zip(pairwise(bounds), motions, strict=True):
             scans = np.arange(low, high)
             diagonal, above, right[low:high] = motion_terms(
@@ -88,7 +95,6 @@ def relax_scan_network(
                 (scans[:-1], scans[1:], above),
                 (scans[1:], scans[:-1], above.mT),
             ]
-        late, early = _pairs(placed, bounds, weight > 0)
         for low in range(0, len(late), _PAIRS):
             pair = late[low : low + _PAIRS], early[low : low + _PAIRS]
             A, g, F = _match_pairs(placed, cloud, tree, pair, chosen, weight, gate)
@@ -130,6 +136,12 @@ def _pairs(poses: Array, bounds: Sequence[int], with_returns: Bools) -> tuple[In
     one, neighbour = np.concatenate(found).T
     usable = with_returns[one] & with_returns[neighbour]
     return one[usable], neighbour[usable]
+
+
+def _near_earlier(one: Ints, neighbour: Ints, firsts: Ints) -> Bools:
+    """Which paths, by their first scans, have pairs (k,) of scans with a path before them."""
+    paths = np.searchsorted(firsts, np.array([one, neighbour]), side="right") - 1
+    return np.isin(np.arange(len(firsts)), paths.max(axis=0)[paths[0] != paths[1]])
 
 
 def _neighbours(poses: Array) -> Ints:

@@ -628,6 +628,18 @@ def test_visits_that_lie_roughly_on_each_other_are_refined_together():
         assert left.max() < 0.3 * off.max()
 
 
+def test_a_path_that_no_other_comes_near_keeps_its_place():
+    """Nothing relates the two: each is refined alone. Breaks if the second one is held by nothing,
+    so that there is no solution."""
+    rng = np.random.default_rng(25)
+    a, b = (visit([box(5, 4)], drive(60), rng, (1e-4, 1e-4, 1e-5)) for _ in range(2))
+    far = b.transformed(np.array([100.0, 0.0, 0.3]), np.zeros((3, 3)))
+    together = refine_together((a, far), (a.poses, far.poses))
+    for found, own in zip(together, (a, far), strict=True):
+        (alone,) = refine_together((own,), (own.poses,))
+        np.testing.assert_allclose(found.poses, alone.poses, atol=1e-6)  # rounding 100 m away
+
+
 @pytest.mark.parametrize("kind", ["appeared", "vanished"])
 def test_bent_maps_are_registered_scan_by_scan_and_say_so(kind):
     """No landmarks at all: only the scans can tell. What changed is found nevertheless, whichever
