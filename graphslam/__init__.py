@@ -180,7 +180,7 @@ def smooth(
     """
     from graphslam.core.memory_limit import limited_memory
     from graphslam.core.worker import Future
-    from graphslam.results.folder import check_target, save
+    from graphslam.results.target_folder import check_target
     from graphslam.slam.given_recording import read_ahead, settle
     from graphslam.slam.log_reader import receive_log
     from graphslam.slam.progress import of_all
@@ -191,6 +191,7 @@ def smooth(
     with limited_memory(settled.limits.memory_mb), reading as ahead:
         # imported while the second process reads; what only that one needs is imported there
         from graphslam.core.stages import announce
+        from graphslam.results.folder import save
         from graphslam.results.known_map import known_map_files, known_map_of
         from graphslam.slam.checkpoint import checkpoint
         from graphslam.slam.smooth import smooth
@@ -353,7 +354,7 @@ def compare(
     from graphslam.evaluation.compare_variants import parse_variants
     from graphslam.evaluation.ground_truth import truth_given, truth_of_logs
     from graphslam.evaluation.relation_metrics import relations_given
-    from graphslam.results.folder import check_target
+    from graphslam.results.target_folder import check_target
     from graphslam.slam.given_recording import opened, settle
     from graphslam.slam.progress import of_all
 

@@ -10,7 +10,8 @@ from graphslam.core.config import ChangesConfig
 from graphslam.core.errors import OutputError
 from graphslam.core.output_folder import Identity, atomic_folder
 from graphslam.results.file_formats import to_json
-from graphslam.results.folder import check_target, load
+from graphslam.results.folder import load
+from graphslam.results.target_folder import check_target
 
 Span = tuple[float, float]
 

@@ -141,8 +141,6 @@ def smooth(
     Writes a folder with trajectories, landmarks, covariances, the factor graph and report.html.
     With --strict the exit code is 3 if the verdict is doubtful or bad; the result is written.
     """
-    from graphslam.cli import show
-
     named = backend or named_backend(config, settings or (), preset)
     if horizon is not None and named not in (None, "isam2"):
         raise ConfigError(f"only isam2 supports --horizon, not {named}; omit it")
@@ -165,6 +163,8 @@ def smooth(
         graphslam.make_map(output)
     if viewer:
         graphslam.write_viewer(output, viewer)
+    from graphslam.cli import show  # after the work, which begins the sooner
+
     code = 3 if strict and result.summary["verdict"]["verdict"] != "good" else 0
     return Output(result.summary, lambda: show.smoothed(result, output), code=code)
 

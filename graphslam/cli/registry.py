@@ -95,12 +95,12 @@ def command(name: str) -> Callable[[Callable[..., Output]], None]:
             debug: Debug = False,
             **arguments: Any,
         ) -> None:
-            from graphslam.results.file_formats import to_json
-
             terminal.output.quiet, terminal.output.verbose = quiet, verbose
             with errors_in_one_line(debug):
                 output = function(**arguments)
                 if json:
+                    from graphslam.results.file_formats import to_json
+
                     typer.echo(to_json(output.content, name), nl=False)
                 elif not quiet:
                     output.show()

@@ -7,7 +7,20 @@ import numpy as np
 
 from graphslam.core.geometry import Array, between, log
 from graphslam.core.record import Record
-from graphslam.core.sparse_gaussian import SparseRoot
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SparseRoot:
+    """Whitened rows of n variables, each with the ones that it depends on.
+
+    ``parents``: of each variable the numbers of those before it that it depends on; ``rows``
+    (d, d + the dimensions of the parents) take the errors of the variable and of its parents to
+    white noise. ``widening``: factor on the variances, see `core.sparse_gaussian`.
+    """
+
+    parents: tuple[tuple[int, ...], ...]
+    rows: tuple[Array, ...]
+    widening: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,30 +9,16 @@ the joint: its information is then nowhere larger than that of the joint.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cholesky, eigh
 
 from graphslam.core.geometry import Array
+from graphslam.core.known_landmarks import SparseRoot
 
 #: parents of a variable at first and at most, and by how much the whole may be widened before they
 #: are doubled. What a map is widened by each day multiplies: that of ten days stays below 3
 PARENTS, MOST_PARENTS, MAX_WIDENING = 16, 128, 1.1
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SparseRoot:
-    """Whitened rows of n variables, each with the ones that it depends on.
-
-    ``parents``: of each variable the numbers of those before it that it depends on; ``rows``
-    (d, d + the dimensions of the parents) take the errors of the variable and of its parents to
-    white noise. ``widening``: factor on the variances, see the module.
-    """
-
-    parents: tuple[tuple[int, ...], ...]
-    rows: tuple[Array, ...]
-    widening: float
 
 
 def sparse_root(cov: Array, dims: Sequence[int]) -> SparseRoot:

@@ -6,8 +6,8 @@ from pathlib import Path
 from graphslam.core.config import Config
 from graphslam.core.config_io import dump_config
 from graphslam.results.file_formats import to_json
-from graphslam.results.folder import check_target, write_folder
 from graphslam.results.report_comparison import Comparison, render_comparison
+from graphslam.results.target_folder import check_target, write_folder
 
 
 def is_comparison(directory: Path) -> bool:

@@ -25,7 +25,7 @@ from graphslam.logs.growing_mcap import GrowingMcap, open_growing
 from graphslam.logs.log_set import FileReader, damage, decoded, log_set_of
 from graphslam.logs.recording import Recording, deriver
 from graphslam.logs.time_order import TOO_LATE
-from graphslam.results.folder import check_target
+from graphslam.results.target_folder import check_target
 
 #: s between two versions of the folder, at least; and how many times as long as writing one takes
 WRITE_INTERVAL_S, WRITE_SHARE = 5.0, 5.0

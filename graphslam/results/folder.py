@@ -6,8 +6,6 @@ there are scans, and report.html. The formats of the files are in `file_formats`
 `scans_file`.
 """
 
-import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +16,7 @@ from graphslam.core.config import Config, RobustConfig
 from graphslam.core.config_io import dump_config, load_config
 from graphslam.core.errors import OutputError
 from graphslam.core.notebook_views import ResultViews
-from graphslam.core.output_folder import Identity, atomic_folder, identity, unfinished
+from graphslam.core.output_folder import Identity
 from graphslam.core.records import JointScans, Landmark, Result, RobotResult, Trajectory
 from graphslam.core.worker import parallel_map
 from graphslam.estimation.g2o import graph_g2o, graph_ids
@@ -33,6 +31,7 @@ from graphslam.results.file_formats import (
 )
 from graphslam.results.joint_file import joint_bytes, joint_scans, read_joint
 from graphslam.results.scans_file import SCANS_FILE, place_scans, scans_bytes
+from graphslam.results.target_folder import check_target, is_result, write_folder
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,45 +65,6 @@ JOINT_FILE = "joint.npz"
 # ---------------------------------------------------------------- writing
 
 
-def check_target(
-    directory: Path, *, force: bool, replaceable: Callable[[Path], bool] | None = None
-) -> Identity:
-    """Check before a long computation that a folder may be written at ``directory``.
-
-    Args:
-        directory: the folder to be written.
-        force: replace an existing one.
-        replaceable: whether ``force`` may replace a given existing folder; default: result
-            folders. An empty folder is always replaced.
-
-    Returns:
-        What stands there; if it is something else when the folder is written, another process
-        wrote it.
-
-    Raises:
-        OutputError: it exists and ``force`` is not given, it exists and may not be replaced, or
-            its parent is not writable.
-    """
-    parent = directory.absolute().parent
-    while not parent.exists():
-        parent = parent.parent
-    if not (parent.is_dir() and os.access(parent, os.W_OK | os.X_OK)):
-        raise OutputError(f"{directory}: cannot be written: {parent} is no folder to write to")
-    unfinished(directory)  # a folder that a dead process had moved away stands there again
-    before = identity(directory)
-    if before is None:
-        return None
-    if not force:
-        raise OutputError(f"{directory}: already exists; give --force to replace it")
-    empty = directory.is_dir() and not any(directory.iterdir())
-    if directory.is_symlink() or not (empty or (replaceable or _is_result)(directory)):
-        raise OutputError(
-            f"{directory}: is not a result folder of graphslam, so it is not replaced; "
-            "choose another name"
-        )
-    return before
-
-
 def save(
     result: Result,
     directory: Path,
@@ -127,27 +87,6 @@ def save(
     if before == "now":
         before = check_target(directory, force=force)
     write_folder(directory, [*more, *_files(result, report)], before)
-
-
-def write_folder(
-    directory: Path, files: Sequence[tuple[str, str | bytes]], before: Identity
-) -> None:
-    """Write files (name, content) as a folder that appears whole or not at all.
-
-    ``before``: what `check_target` found there.
-
-    Raises:
-        OutputError: the disk cannot be written; no partial output is left.
-    """
-    with atomic_folder(directory, before) as part:
-        for name, content in files:
-            path = part / name
-            path.parent.mkdir(exist_ok=True)
-            if isinstance(content, bytes):
-                path.write_bytes(content)
-            else:
-                # names of files need not be text: what is not is written as its escape
-                path.write_text(content, encoding="utf-8", errors="backslashreplace")
 
 
 def _files(result: Result, report: Callable[[Result], str] | None) -> list[tuple[str, str | bytes]]:
@@ -206,17 +145,6 @@ def _file_name(robot: str) -> str:
     return quote(robot, safe="").replace(".", "%2E")
 
 
-def _is_result(directory: Path) -> bool:
-    """Whether a folder has our summary.json and trajectories/; nothing else is ever replaced."""
-    try:
-        summary = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False
-    return (
-        isinstance(summary, dict) and "format" in summary and (directory / "trajectories").is_dir()
-    )
-
-
 # ---------------------------------------------------------------- reading
 
 
@@ -227,7 +155,7 @@ def load(directory: Path) -> SavedResult:
         OutputError: it is not a result folder, or a file of it is malformed.
         ConfigError: its config.toml is not valid.
     """
-    if not _is_result(directory):
+    if not is_result(directory):
         raise OutputError(f"{directory}: not a result folder of graphslam (no summary.json)")
     folder = directory / "trajectories"
     stems = sorted(p.name.removesuffix(".tum") for p in folder.glob("*.tum"))

@@ -19,9 +19,9 @@ import numpy as np
 from graphslam.core.config import Config
 from graphslam.core.errors import ConfigError, OutputError
 from graphslam.core.geometry import Array, rotation3
-from graphslam.core.known_landmarks import KnownLandmarks
+from graphslam.core.known_landmarks import KnownLandmarks, SparseRoot
 from graphslam.core.records import JointScans, KeyframeScan, Landmark, Result, Trajectory
-from graphslam.core.sparse_gaussian import SparseRoot, sparse_root
+from graphslam.core.sparse_gaussian import sparse_root
 from graphslam.estimation.information_root import joint_covariance
 from graphslam.mapping.known_map import KnownMap, latest_places, map_place
 from graphslam.mapping.submaps import SubmapPose, build_submaps

@@ -18,9 +18,8 @@ import numpy as np
 from graphslam.core.config import Config
 from graphslam.core.frame_forest import PRIOR_INFLATION
 from graphslam.core.geometry import Array, between, compose, compose_cov, inverse
-from graphslam.core.known_landmarks import KnownLandmarks
+from graphslam.core.known_landmarks import KnownLandmarks, SparseRoot
 from graphslam.core.records import Start
-from graphslam.core.sparse_gaussian import SparseRoot
 from graphslam.logs import LogSet
 from graphslam.mapping.known_map import KnownMap, latest_places
 from graphslam.mapping.submaps import SubmapPose, with_poses_from

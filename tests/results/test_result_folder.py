@@ -22,7 +22,8 @@ from graphslam.results.file_formats import (
     stamp_ns,
     tum_text,
 )
-from graphslam.results.folder import check_target, load, save
+from graphslam.results.folder import load, save
+from graphslam.results.target_folder import check_target
 
 
 @pytest.fixture(scope="module")
