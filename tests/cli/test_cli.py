@@ -522,6 +522,20 @@ def test_the_module_runs_and_answers_before_anything_heavy_is_imported():
     assert not imported & {"gtsam", "cv2", "matplotlib", "scipy.stats"}
 
 
+def test_a_log_is_being_read_before_what_only_the_estimate_needs_is_imported(tmp_path):
+    """Importing that takes as long as a fifth of a small log; meanwhile the log can be read."""
+    code = (
+        "import sys, graphslam.cli\n"
+        "from graphslam.slam import log_reader\n"
+        "log_reader.open_ahead = lambda *_: sys.exit(' '.join(sys.modules))\n"
+        f"graphslam.cli.main(['smooth', 'logs/lab.mcap', '-o', {str(tmp_path / 'out')!r}])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    loaded = set(done.stderr.split())
+    assert "graphslam.logs.mcap_file" in loaded
+    assert not loaded & {"gtsam", "cv2", "scipy.linalg", "rich", "graphslam.results.folder"}
+
+
 def test_a_process_of_its_own_ends_with_its_exit_code_and_all_of_its_output(tmp_path):
     """It ends without the usual steps of Python: an output that is not flushed first is lost."""
     missing = [sys.executable, "-m", "graphslam", "info", str(tmp_path / "none.mcap")]
