@@ -196,18 +196,17 @@ def smooth(
         from graphslam.slam.checkpoint import checkpoint
         from graphslam.slam.smooth import smooth
 
+        if output is not None:  # for the processes that read the truth and make the report
+            from graphslam.evaluation.ground_truth import errors_of_run, truth_of_logs
+            from graphslam.results.report import render
+
         earlier = known_map_of(settled)
         log = cast("LogSet", recording) if ahead is None else receive_log(ahead, settled)
 
         def read_truth() -> GroundTruth:
-            from graphslam.evaluation.ground_truth import truth_of_logs
-
             return truth_of_logs(log)
 
         def render_report() -> tuple[str, dict[str, Any]]:
-            from graphslam.evaluation.ground_truth import errors_of_run
-            from graphslam.results.report import render
-
             return render(result, errors_of_run(result, known)), dict(result.summary)
 
         def finish_report(result: Result) -> str:

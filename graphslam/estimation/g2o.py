@@ -31,6 +31,7 @@ from graphslam.core.geometry import (
     transform_each,
     wrap,
 )
+from graphslam.core.number_text import rows_as_text
 from graphslam.core.observation_models import LineModel
 from graphslam.core.records import Estimate, Step
 from graphslam.estimation.factors import LINE_HELD_SIGMA_M, NO_KERNEL, line_rows
@@ -126,10 +127,9 @@ def _edge_lines(group: "_Group") -> list[str]:
     """The lines of a group's edges."""
     i, j = np.triu_indices(group.z.shape[1])
     numbers = np.column_stack([_wrapped(group.z), group.info[:, i, j]])
-    form = " ".join([group.tag, *["%d"] * len(group.ends[0]), *["%r"] * numbers.shape[1]])
-    return [
-        form % (*ends, *values) for ends, values in zip(group.ends, numbers.tolist(), strict=True)
-    ]
+    form = " ".join([group.tag, *["%d"] * len(group.ends[0]), "%s"])
+    rows = rows_as_text(numbers, " ")
+    return [form % (*ends, row) for ends, row in zip(group.ends, rows, strict=True)]
 
 
 def graph_error(

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from graphslam.core import records
-from graphslam.core.geometry import Array, is_positive
+from graphslam.core.geometry import Array, are_positive, is_positive
 from graphslam.core.record import replace
 from graphslam.logs import physical_limits as limits
 from graphslam.logs import schemas
@@ -239,21 +239,52 @@ def sightings(
     numbers, of_what = rows
     measured, covs = numbers["z"].astype(float), numbers["covariance"].astype(float)
     sizes = np.where(np.isnan(measured[:, 2]), 2, 3).tolist()
+    plain, usable = _polar_covariances(measured, covs)
     mount = topic.mounts.get(numbers["frame"][0].decode().lstrip("/"), _NO_MOUNT)
     found: list[records.Sighting | str] = []
     for i, stamp in enumerate(schemas.stamps_ns(numbers).tolist()):
         z, (identity, robot) = measured[i, : sizes[i]].copy(), of_what[i]
-        try:
-            cov = _covariance("sighting", covs[i], sizes[i])
-            _check_sighting(z)
-        except UnusableMessageError as reason:
-            found.append(str(reason))
-            continue
+        if usable[i]:
+            cov = plain[i]
+        else:
+            try:
+                cov = _covariance("sighting", covs[i], sizes[i])
+                _check_sighting(z)
+            except UnusableMessageError as reason:
+                found.append(str(reason))
+                continue
         may_be = _UNNAMED.get(robot)
         names = (identity or None, robot or None) if may_be is None else (None, None)
         seen = records.Sighting(topic.robot, stamp, stamp, z, cov, *names, mount)
         found.append(seen if may_be is None else replace(seen, may_be=may_be))
     return found
+
+
+def _polar_covariances(measured: Array, covs: Array) -> tuple[Sequence[Array], list[bool]]:
+    """Covariances (2, 2) of bearings and ranges, and which of the sightings surely can be used.
+
+    What is wrong with the others, or whether they are no pairs of bearing and range, is not said.
+
+    Args:
+        measured: (n, 3) bearing, range and maybe direction.
+        covs: (n, 9) what they state.
+    """
+    full = covs.reshape(-1, 3, 3)[:, :2, :2]
+    full = (full + full.mT) / 2
+    variances = np.diagonal(full, axis1=1, axis2=2)
+    usable = (
+        np.isnan(measured[:, 2])
+        & np.isfinite(measured[:, 0])
+        & (measured[:, 1] > 0)
+        & (measured[:, 1] <= limits.MAX_SIGHTING_M)
+        & are_positive(full)
+        & (variances >= limits.MIN_VARIANCE).all(axis=1)
+        & (variances <= limits.MAX_SIGHTING_VARIANCE).all(axis=1)
+    )
+    full.flags.writeable = False
+    # sensors mostly state the same one, so messages share it
+    shared = [full[0]] * len(full) if (full == full[0]).all() else list(full)
+    return shared, usable.tolist()
 
 
 def _check_sighting(z: Array) -> None:

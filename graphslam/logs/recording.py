@@ -7,7 +7,7 @@ several that follow each other (split bags). What a message is made of is known 
 
 import hashlib
 import heapq
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
@@ -252,6 +252,24 @@ def raw_messages(recording: Recording, topics: Collection[str]) -> Iterator[RawM
         yield from make(raw)
 
 
+def data_of_topics(recording: Recording, topics: Collection[str]) -> dict[str, list[bytes]]:
+    """Data of all messages of each topic that has any, in the order of recording.
+
+    What `raw_messages` gives, all at once: for topics without large messages.
+    """
+    found: dict[str, list[bytes]] = defaultdict(list)
+    if not recording.in_order or any(one.name in topics for one in recording.derived):
+        for raw in raw_messages(recording, topics):
+            found[raw.topic].append(raw.data)
+        return found
+    with _Reader(topics) as reader:
+        for piece in recording.pieces:
+            for block in piece.blocks:
+                if reader.has_any(piece, block):
+                    reader.collect(piece, block, found)
+    return found
+
+
 def deriver(
     derived: Sequence[Derived], topics: Collection[str]
 ) -> Callable[[RawMessage], Iterator[RawMessage]]:
@@ -334,6 +352,14 @@ class _Reader:
     def read(self, piece: Piece, block: Block) -> Iterator[RawMessage]:
         """The messages of the topics in ``block``, translated."""
         return starmap(self._translated(piece), self._read(piece, block))
+
+    def collect(self, piece: Piece, block: Block, found: Mapping[str, list[bytes]]) -> None:
+        """Add the data of the messages of the topics in ``block`` to the lists ``found``."""
+        wanted = self._wanted[piece.path]
+        lists = {number: found[topic] for number, (topic, _) in wanted.items()}
+        for number, _, data in self._read(piece, block):
+            translate = wanted[number][1]
+            lists[number].append(translate(data) if translate else data)
 
     def sample(self, piece: Piece, block: Block, n: int) -> Iterator[RawMessage]:
         """At most ``n`` of them, evenly spaced; only these are translated."""

@@ -1,6 +1,6 @@
 """Ground truth in logs; read by evaluation only, needs no odometry."""
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +11,7 @@ from graphslam.core.config import Config
 from graphslam.core.records import Trajectory, TrueAssociations, TrueLandmark, Truth
 from graphslam.logs import schemas
 from graphslam.logs.decoders import TopicContext, decode_messages
-from graphslam.logs.recording import Recording, raw_messages
+from graphslam.logs.recording import Recording, data_of_topics, raw_messages
 from graphslam.logs.sessions import open_recordings
 from graphslam.logs.topics import find_topics
 
@@ -48,19 +48,18 @@ def read_truth(paths: Sequence[Path], config: Config) -> GroundTruth:
 def truth_from_recordings(files: Sequence[Recording], config: Config) -> GroundTruth:
     """`read_truth` of files that are already open."""
     topics = {t.name: t for t in find_topics(files, config) if t.record in (Truth, TrueLandmark)}
-    poses: dict[str, list[bytes]] = {}
+    poses: dict[str, list[bytes]] = defaultdict(list)
     landmarks: dict[str, TrueLandmark] = {}
     unusable: Counter[str] = Counter()  # `graphslam info` counts and shows these
     for file in files:
-        for raw in raw_messages(file, topics.keys()):
-            topic = topics[raw.topic]
+        for name, data in data_of_topics(file, topics.keys()).items():
+            topic = topics[name]
             if topic.record is Truth:
-                poses.setdefault(topic.robot, []).append(raw.data)
+                poses[topic.robot] += data
                 continue
-            context = TopicContext(topic.robot)
-            (message,) = decode_messages(topic.schema, [raw.data], context, unusable)
-            if isinstance(message, TrueLandmark):
-                landmarks[message.identity or f"without identity {len(landmarks)}"] = message
+            for message in decode_messages(topic.schema, data, TopicContext(topic.robot), unusable):
+                if isinstance(message, TrueLandmark):
+                    landmarks[message.identity or f"without identity {len(landmarks)}"] = message
     trajectories = {robot: _trajectory(found) for robot, found in sorted(poses.items())}
     return GroundTruth(
         {robot: found for robot, found in trajectories.items() if len(found)},

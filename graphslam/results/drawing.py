@@ -339,10 +339,12 @@ def _dots(places: Array, shape: tuple[int, int], radius: float, opacity: float) 
     inside = ((cell >= 0) & (cell < shape[::-1])).all(axis=1)
     column, row = cell[inside].T + reach
     found = np.bincount(row * wide[1] + column, minlength=wide[0] * wide[1]).reshape(wide)
+    found = found.astype(np.int32)
     steps = range(-reach, reach + 1)
     disc = [(dy, dx) for dy in steps for dx in steps if dx * dx + dy * dy <= radius * radius]
-    count = sum(
-        found[reach + dy : reach + dy + shape[0], reach + dx : reach + dx + shape[1]]
-        for dy, dx in disc
-    )
-    return opacity_levels(1.0 - (1.0 - opacity) ** np.asarray(count))
+    count = np.zeros(shape, dtype=np.int32)
+    for dy, dx in disc:
+        count += found[reach + dy : reach + dy + shape[0], reach + dx : reach + dx + shape[1]]
+    # of as many as any pixel is covered by: there are far less of these than pixels
+    levels = opacity_levels(1.0 - (1.0 - opacity) ** np.arange(1 + count.max(initial=0)))
+    return np.asarray(levels[count])

@@ -11,6 +11,7 @@ import numpy as np
 
 from graphslam.core.errors import OutputError
 from graphslam.core.geometry import Array
+from graphslam.core.number_text import rows_as_text
 from graphslam.core.records import Landmark, Trajectory
 
 COV_HEADER = "stamp_ns,xx,xy,xphi,yy,yphi,phiphi"
@@ -47,8 +48,8 @@ def cov_text(trajectory: Trajectory) -> str:
     """
     order = np.argsort(trajectory.stamps_ns, kind="stable")
     upper = trajectory.covs[order][:, *_UPPER]
-    rows = zip(trajectory.stamps_ns[order].tolist(), *upper.T.tolist(), strict=True)
-    return f"{COV_HEADER}\n" + _lines("%d,%r,%r,%r,%r,%r,%r\n", rows)
+    rows = zip(trajectory.stamps_ns[order].tolist(), rows_as_text(upper, ","), strict=True)
+    return f"{COV_HEADER}\n" + _lines("%d,%s\n", rows)
 
 
 def _lines(form: str, rows: Iterable[tuple[object, ...]]) -> str:

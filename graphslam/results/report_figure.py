@@ -80,11 +80,12 @@ def density(points: Array, limits: Array, color: str, pixels: int = 900) -> Shad
     cell = np.floor((points - limits[:, 0]) / size * shape).astype(np.int64)
     cell = cell[((cell >= 0) & (cell < shape)).all(axis=1)]
     count = np.bincount(cell[:, 1] * shape[0] + cell[:, 0], minlength=int(shape.prod()))
-    hit = count > 0
+    hit = np.flatnonzero(count)
     # a single return is visible, the densest cells are solid; the square root between them
-    dense = np.quantile(count[hit], 0.95) if hit.any() else 1.0
-    alpha = np.where(hit, 0.25 + 0.75 * np.sqrt(np.minimum(count / dense, 1.0)), 0.0)
-    return Shade(opacity_levels(alpha.reshape(shape[1], shape[0])), color)
+    dense = np.quantile(count[hit], 0.95) if len(hit) else 1.0
+    levels = np.zeros(len(count), dtype=np.uint8)
+    levels[hit] = opacity_levels(0.25 + 0.75 * np.sqrt(np.minimum(count[hit] / dense, 1.0)))
+    return Shade(levels.reshape(shape[1], shape[0]), color)
 
 
 def map_axes(drawing: Drawing, limits: Array) -> Axes:
