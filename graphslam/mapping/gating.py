@@ -260,8 +260,12 @@ def assign(cost: Array, gate: Array, method: str) -> list[tuple[int, int]]:
     """
     allowed = np.where(cost < gate, cost, np.inf)
     n, m = allowed.shape
-    if not np.isfinite(allowed).any():
+    possible = np.flatnonzero(np.isfinite(allowed).any(axis=1))
+    if not len(possible):
         return []
+    best = allowed[possible].argmin(axis=1).tolist()
+    if len(set(best)) == len(best):  # no two rows want the same column: both methods find this
+        return list(zip(possible.tolist(), best, strict=True))
     if method == "greedy":
         found = []
         while np.isfinite(allowed).any():

@@ -13,15 +13,15 @@ from graphslam.core.geometry import Array
 
 #: value of cells next to an occupied one, which has 1: a point half a cell off still counts half
 BESIDE = 0.5
-#: values that are looked up at once
-AT_ONCE = 1 << 18
+#: values that are looked up at once, and how many a byte can sum: twice that fits
+AT_ONCE, SUMMED = 1 << 20, 63
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OccupancyGrid:
     """Cells of ``cell_m``: ``values`` (nx, ny), 1 where occupied, 0 unknown; first at ``low`` (2,).
 
-    `BESIDE` next to occupied cells.
+    `BESIDE` next to occupied cells. All are multiples of a half.
     """
 
     values: NDArray[np.float32]
@@ -34,16 +34,26 @@ class OccupancyGrid:
 
     def correlate_window(self, points: Array, shape: tuple[int, int]) -> Array:
         """Mean values (k, *shape) under k sets of points (k, n, 2) m shifted by 0, 1, ... cells."""
-        windows = np.lib.stride_tricks.sliding_window_view(self.values, shape)
-        last = np.array(windows.shape[:2]) - 1
+        width, height = shape
+        # small integers, whose sums are as exact as those of halves
+        halves = np.rint(2 * self.values).astype(np.int8)
+        # of each column on, as many columns as a window has, row after row: the values of a window
+        # are then side by side, and are copied as one element
+        columns = np.lib.stride_tricks.sliding_window_view(halves, height, axis=1)
+        strips = np.ascontiguousarray(columns.transpose(1, 0, 2))
+        starts = strips.shape[0], strips.shape[1] - width + 1
+        windows = np.ndarray(starts, f"V{width * height}", strips, strides=strips.strides[:2])
+        last = np.array([starts[1], starts[0]]) - 1
         x, y = np.moveaxis(np.clip(self.cells(points), 0, last), -1, 0)
-        at_once = max(1, AT_ONCE // (points.shape[1] * shape[0] * shape[1]))
-        return np.concatenate(
-            [
-                windows[x[k : k + at_once], y[k : k + at_once]].mean(axis=1)
-                for k in range(0, len(x), at_once)
-            ]
-        )
+        count = points.shape[1]
+        sums = np.zeros((len(x), width, height), dtype=np.int32)
+        at_once = max(1, AT_ONCE // (count * width * height))
+        for k in range(0, len(x), at_once):
+            found = windows[y[k : k + at_once], x[k : k + at_once]].view(np.int8)
+            found = found.reshape(-1, count, width, height)
+            for n in range(0, count, SUMMED):
+                sums[k : k + at_once] += found[:, n : n + SUMMED].sum(axis=1, dtype=np.int8)
+        return np.asarray(sums.astype(np.float32) / np.float32(2 * count))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

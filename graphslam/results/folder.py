@@ -6,8 +6,9 @@ there are scans, and report.html. The formats of the files are in `file_formats`
 `scans_file`.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import quote, unquote
@@ -86,32 +87,29 @@ def save(
     """
     if before == "now":
         before = check_target(directory, force=force)
-    write_folder(directory, [*more, *_files(result, report)], before)
+    write_folder(directory, chain(more, _files(result, report)), before)
 
 
-def _files(result: Result, report: Callable[[Result], str] | None) -> list[tuple[str, str | bytes]]:
-    """Names and contents of every file of the folder."""
-    files: list[tuple[str, str | bytes]] = [
-        ("config.toml", dump_config(result.config)),
-        (
-            "landmarks.json",
-            to_json([landmark_json(landmark) for landmark in result.landmarks], "landmarks.json"),
-        ),
-        ("graph.g2o", graph_g2o(result.steps, result.estimate, kernel_of(result))),
-        ("graph_ids.csv", graph_ids(result.estimate)),
-    ]
+def _files(
+    result: Result, report: Callable[[Result], str] | None
+) -> Iterator[tuple[str, str | bytes]]:
+    """Names and contents of every file of the folder, each made when it is asked for."""
+    yield "config.toml", dump_config(result.config)
+    landmarks = [landmark_json(landmark) for landmark in result.landmarks]
+    yield "landmarks.json", to_json(landmarks, "landmarks.json")
+    yield "graph.g2o", graph_g2o(result.steps, result.estimate, kernel_of(result))
+    yield "graph_ids.csv", graph_ids(result.estimate)
     for own in parallel_map(trajectory_files, list(result.robots.items())):
-        files += own
+        yield from own
     joint = joint_scans(result.estimate, result.robots)
     if joint is not None:
-        files.append((JOINT_FILE, joint_bytes(joint)))
+        yield JOINT_FILE, joint_bytes(joint)
     scans = place_scans(result.keyframe_scans, result.estimate.states)
     if scans:
-        files.append((SCANS_FILE, scans_bytes(scans)))
+        yield SCANS_FILE, scans_bytes(scans)
     if report is not None:
-        files.append(("report.html", report(result)))
-    files.append(("summary.json", to_json(result.summary, "summary.json")))
-    return files
+        yield "report.html", report(result)
+    yield "summary.json", to_json(result.summary, "summary.json")
 
 
 def kernel_of(result: Result) -> RobustConfig:

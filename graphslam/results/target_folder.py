@@ -5,7 +5,7 @@ Commands check before they import what the work needs, so little is imported her
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from graphslam.core.errors import OutputError
@@ -52,7 +52,7 @@ def check_target(
 
 
 def write_folder(
-    directory: Path, files: Sequence[tuple[str, str | bytes]], before: Identity
+    directory: Path, files: Iterable[tuple[str, str | bytes]], before: Identity
 ) -> None:
     """Write files (name, content) as a folder that appears whole or not at all.
 

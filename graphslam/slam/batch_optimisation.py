@@ -44,7 +44,7 @@ from graphslam.slam.motion_noise import (
 )
 from graphslam.slam.path_closing import ClosedPaths, close_paths
 from graphslam.slam.reoptimise_scans import with_closures
-from graphslam.slam.scan_evidence import gather_scan_evidence
+from graphslam.slam.scan_evidence import find_parked, gather_scan_evidence
 from graphslam.slam.scan_refinement import refine_motions
 from graphslam.slam.scan_tracking import TrackedLog
 
@@ -153,21 +153,22 @@ def _solved(
     steps = _tied(steps, start, None, paths, scan_log)
     first = _Problem(with_closures(steps, closures), start, tracks, config).solve_roughly()
     rough = first.solution
-    # both need nothing but this solution; the second process looks for the noise
+    # all that follows needs nothing but this solution; the second process looks for the noise
     asked = (
         Future(lambda: fit_motion_noise(tracks, rough.graph.posterior()))
         if config.odometry.calibrate
         else None
     )
     steps = _tied(steps, rough.estimate, rough, paths, scan_log)
+    # once landmarks of different visits are tied, most closures are no longer needed
+    closures = untied_closures(closures, paths.spans, steps, landmarks)
+    counts["closures_kept"] = len(closures)
+    parked = find_parked(scan_log)
     if asked is not None:
         noise = asked.result()
         for name, own in noise.odometry.items():
             tracks[name].config = own
         scan_log.noise = noise.to_summary()
-    # once landmarks of different visits are tied, most closures are no longer needed
-    closures = untied_closures(closures, paths.spans, steps, landmarks)
-    counts["closures_kept"] = len(closures)
     steps, near = refine_motions(
         steps,
         rough.estimate,
@@ -182,7 +183,7 @@ def _solved(
     for name in tracks:
         scan_log.runs[name].is_calibrated = config.odometry.calibrate
     # what the second process does meanwhile moves the estimate by far less than scans can tell
-    scan_log.scan_evidence = gather_scan_evidence(scan_log, estimate)
+    scan_log.scan_evidence = gather_scan_evidence(scan_log, estimate, parked)
     return moved_to(minimum.result(), estimate) if minimum else estimate, steps
 
 

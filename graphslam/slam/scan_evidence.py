@@ -4,7 +4,7 @@ They are compared with each other, so it hardly matters which estimate of the pa
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -56,17 +56,24 @@ class ScanEvidence(NamedTuple):
     along_walls: PathMisfits
 
 
-def gather_scan_evidence(pipeline: "LogPass", estimate: Estimate) -> dict[str, ScanEvidence]:
+def gather_scan_evidence(
+    pipeline: "LogPass", estimate: Estimate, parked: Mapping[str, Sequence[Parked]] | None = None
+) -> dict[str, ScanEvidence]:
     """What every robot's scans say; ``estimate`` is of the states that they were made from.
 
-    At most some hundred scans of each robot are looked at, however long the log is.
+    At most some hundred scans of each robot are looked at, however long the log is. ``parked``:
+    what `find_parked` gave, where it has been asked already.
     """
+    stood = find_parked(pipeline) if parked is None else parked
     return {
-        name: ScanEvidence(
-            tuple(_parked(pipeline, name, run)), _along_walls(pipeline, name, estimate)
-        )
-        for name, run in pipeline.started.items()
+        name: ScanEvidence(tuple(stood[name]), _along_walls(pipeline, name, estimate))
+        for name in pipeline.started
     }
+
+
+def find_parked(pipeline: "LogPass") -> dict[str, Sequence[Parked]]:
+    """When each robot stood by its odometry, and how its scans changed; no estimate is needed."""
+    return {name: tuple(_parked(pipeline, name, run)) for name, run in pipeline.started.items()}
 
 
 def _parked(pipeline: "LogPass", name: str, run: RobotState) -> Iterator[Parked]:

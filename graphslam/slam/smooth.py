@@ -9,7 +9,7 @@ import numpy as np
 from graphslam.core.config import Config
 from graphslam.core.errors import ConfigError
 from graphslam.core.records import Result, RobotResult
-from graphslam.core.worker import parallel_map
+from graphslam.core.worker import Future, parallel_map
 from graphslam.estimation.g2o import graph_error
 from graphslam.estimation.settled import settled
 from graphslam.logs import LogSet
@@ -128,8 +128,7 @@ def make_result(finished: FinishedPass, began: float) -> Result:
         steps = tuple(map(transforms.step, pipeline.steps))
         if is_settled(pipeline.config) and not finished.is_settled:
             estimate = settled(steps, estimate, pipeline.kernel)
-        error, plain = graph_error(steps, estimate, pipeline.kernel)
-        estimate = replace(estimate, error=error)
+        errors = Future(partial(graph_error, steps, estimate, pipeline.kernel))
         # the starts of robots place their worlds, unless a known map does
         if estimate.mounts is not None and pipeline.known.known_map is None:
             estimate = with_mount_errors(
@@ -146,6 +145,8 @@ def make_result(finished: FinishedPass, began: float) -> Result:
             return runs[name].result(states, causal.get(name), mount, causal_only=causal_only)
 
         robots = dict(zip(runs, parallel_map(robot_result, list(runs)), strict=True))
+        error, plain = errors.result()
+        estimate = replace(estimate, error=error)
     moved = pipeline.landmarks.transformed(transforms.landmarks)
     landmarks = pipeline.frames.label_landmarks(
         make_landmarks(moved, estimate), pipeline.landmarks.entries.values()

@@ -75,3 +75,15 @@ def test_a_window_and_the_whole_grid_give_the_same_correlation():
     x, y = 10, 12
     window = grid.correlate_window((points + grid.low + 0.25 * np.array([x, y]))[None], (4, 5))[0]
     np.testing.assert_allclose(window, scores[x : x + 4, y : y + 5], atol=1e-6)
+
+
+def test_the_mean_over_many_points_is_that_of_the_values_under_them():
+    """Breaks where sums of many values do not fit in what they are summed in, or wrong cells."""
+    rng = np.random.default_rng(4)
+    grid = occupancy_grid(rng.uniform(-3, 3, (2000, 2)), 0.25, 8, rng.uniform(-5, 5, (60, 2)), -0.5)
+    points = rng.uniform(-2, 2, (3, 700, 2))
+    found = grid.correlate_window(points, (5, 4))
+    cells = grid.cells(points)
+    for i, j in np.ndindex(5, 4):
+        under = grid.values[cells[..., 0] + i, cells[..., 1] + j]
+        np.testing.assert_allclose(found[:, i, j], under.mean(axis=1), rtol=1e-6)
