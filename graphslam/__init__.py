@@ -196,7 +196,7 @@ def smooth(
         from graphslam.slam.checkpoint import checkpoint
         from graphslam.slam.smooth import smooth
 
-        if output is not None:  # for the processes that read the truth and make the report
+        if output is not None:  # for the processes that read the truth and draw the report
             from graphslam.evaluation.ground_truth import errors_of_run, truth_of_logs
             from graphslam.results.report import render
 
@@ -206,23 +206,18 @@ def smooth(
         def read_truth() -> GroundTruth:
             return truth_of_logs(log)
 
-        def render_report() -> tuple[str, dict[str, Any]]:
-            return render(result, errors_of_run(result, known)), dict(result.summary)
-
-        def finish_report(result: Result) -> str:
-            page, told = report.result()
-            cast("dict[str, Any]", result.summary).update(told)
-            return page
-
         with checkpoint(output, log, settled, earlier, resume=resume) as kept:
             truth = None if output is None else Future(read_truth, urgent=False)
             result = smooth(log, settled, of_all(log, progress), None, ahead, kept, earlier)
             if output is not None and truth is not None:
-                known = truth.result()
                 announce("report")
-                report = Future(render_report)
+                errors = errors_of_run(result, truth.result())
+                page = Future(partial(render, result, errors))
                 more = known_map_files(result, earlier)
-                save(result, Path(output), more, force=force, report=finish_report, before=before)
+                save(
+                    result, Path(output), more, force=force, before=before,
+                    report=lambda _result: page.result(),
+                )  # fmt: skip
             return result
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import suppress
 from typing import Any, Generic, Self, TypeVar
 
-from graphslam.core.worker import allow_fork, can_fork
+from graphslam.core.worker import allow_fork, can_fork, wide_pipe
 
 _S = TypeVar("_S")
 _T = TypeVar("_T")
@@ -33,7 +33,7 @@ class _Partner:
         if not can_fork():
             return
         theirs, ours = os.pipe()
-        back, forth = os.pipe()
+        back, forth = wide_pipe()
         try:
             self._pid = os.fork()
         except OSError:  # no memory or no process available

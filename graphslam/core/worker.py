@@ -6,6 +6,7 @@ are sent back. Only a program that has a single thread may fork, so nothing fork
 If the second process dies, the remaining work is done here.
 """
 
+import fcntl
 import gc
 import os
 import pickle
@@ -13,6 +14,7 @@ import select
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from contextvars import ContextVar
 from itertools import islice
 from pathlib import Path
@@ -23,6 +25,8 @@ _T = TypeVar("_T")
 
 #: one entry per thread of this process
 THREADS = Path("/proc/self/task")
+#: largest pipe, bytes
+MOST_ROOM = Path("/proc/sys/fs/pipe-max-size")
 #: items sent at once
 BATCH = 256
 #: how nice a process is whose result is not waited for soon: it gets a tenth of a shared core
@@ -51,6 +55,18 @@ def can_fork() -> bool:
     return _allowed.get() and THREADS.is_dir() and sum(1 for _ in THREADS.iterdir()) == 1
 
 
+def wide_pipe() -> tuple[int, int]:
+    """Ends of a pipe, to read and to write, with all the room that the system allows.
+
+    Who writes works on while who reads is busy; a common pipe has room for some hundred records.
+    """
+    ends = os.pipe()
+    if sys.platform == "linux":
+        with suppress(OSError, ValueError):  # other pipes of the user may have all there is
+            fcntl.fcntl(ends[1], fcntl.F_SETPIPE_SZ, int(MOST_ROOM.read_text()))
+    return ends
+
+
 class Prefetch(Generic[_T]):
     """The items of an iterator, computed ahead of the consumer as far as the pipe has room.
 
@@ -66,7 +82,7 @@ class Prefetch(Generic[_T]):
         self.forked = can_fork() and self._fork()
 
     def _fork(self) -> bool:
-        self._source, sink = os.pipe()
+        self._source, sink = wide_pipe()
         try:
             self._pid = os.fork()
         except OSError:  # no memory or no process available

@@ -167,7 +167,8 @@ def _compare_trajectories(
             for kind in in_world[0]
             if all(kind in both for both in in_world)
         }
-    values = parallel_map(trajectory_metrics, list(groups.values()))
+    efforts = [sum(len(one) for one in group) for group in groups.values()]
+    values = parallel_map(trajectory_metrics, list(groups.values()), efforts=efforts)
     metrics = dict(zip(groups, values, strict=True))
     found: dict[str, Any] = {
         "robots": {

@@ -4,7 +4,7 @@ Mostly one pass is enough. What it finds may show that the log should be read ag
 identities that were swapped, or robots' clocks that differ.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -49,12 +49,15 @@ class FinishedPass(NamedTuple):
     """The last pass over a log, its final estimate and what it found.
 
     ``is_settled``: the estimate is at the minimum of the steps, see `graphslam.estimation.settled`.
+    ``causal_later``: waits for the causal trajectories and gives them, where they are not in the
+    findings yet.
     """
 
     pipeline: LogPass
     estimate: Estimate
     findings: Findings
     is_settled: bool = False
+    causal_later: Callable[[], Mapping[str, Causal]] | None = None
 
 
 def run_passes(

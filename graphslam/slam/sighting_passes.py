@@ -1,5 +1,6 @@
 """Passes over a log of named sightings, solved as a whole; see `sighting_pass`."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 
@@ -9,7 +10,7 @@ from graphslam.core.worker import Future
 from graphslam.estimation.clock_calibration import clocks_from_paths
 from graphslam.estimation.settled import settled
 from graphslam.logs import LogSet
-from graphslam.slam.causal_sightings import replay_causally
+from graphslam.slam.causal_sightings import CausalReplay, replay_causally
 from graphslam.slam.checkpoint import NOTHING_KEPT, Checkpoint
 from graphslam.slam.initialisation import with_identities
 from graphslam.slam.log_pass import PriorKnowledge, Progress, timed
@@ -20,6 +21,7 @@ from graphslam.slam.passes import (
     find_clocks,
     find_swapped_names,
 )
+from graphslam.slam.robot_state import Causal
 from graphslam.slam.sighting_pass import SightingPass, can_solve_at_once
 from graphslam.slam.sighting_solution import (
     solve_finely,
@@ -92,11 +94,21 @@ def run_sighting_passes(
             found = clocks_asked.result()
         following = decide_next_pass(known, Findings(swapped, found, {}), log, config, clock_passes)
         if following is None:
-            with timed(one.seconds, "causal"):
-                causal = replayed.result()
-            one.step_ms = causal.step_ms.tolist()
-            findings = Findings(swapped, found, causal.trajectories)
-            return FinishedPass(one, estimate, findings, is_settled=True)
+            return FinishedPass(
+                one,
+                estimate,
+                Findings(swapped, found, {}),
+                is_settled=True,
+                causal_later=partial(_causal, one, replayed),
+            )
         replayed.cancel()
         clock_passes += following.clocks is not known.clocks
         known = following
+
+
+def _causal(one: SightingPass, replayed: Future[CausalReplay]) -> Mapping[str, Causal]:
+    """The causal trajectories of a pass; it gets the times of their steps."""
+    with timed(one.seconds, "causal"):
+        done = replayed.result()
+    one.step_ms = done.step_ms.tolist()
+    return done.trajectories

@@ -158,6 +158,12 @@ def make_result(finished: FinishedPass, began: float) -> Result:
         model: np.array([((t - t0) * 1e-9, d2) for t, d2 in values]).reshape(-1, 2)
         for model, values in sorted(pipeline.innovations.items())
     }
+    if finished.causal_later is not None:  # the second process was still at them
+        own = finished.causal_later()
+        robots = {
+            name: replace(robot, causal=own[name].base, scan_causal=own[name].scan)
+            for name, robot in robots.items()
+        }
     pipeline.seconds["all"] = time.perf_counter() - began
     summary = summarise(pipeline, estimate, plain, len(landmarks), finished.findings.clocks)
     if "known_map" in summary:
