@@ -112,7 +112,8 @@ def build_frame_tree(
     def relate(pair: tuple[str, str]) -> RelativeFrame | str:
         return estimate_relative_frame(*pair, known, by_pair[pair], config)
 
-    for pair, relation in zip(pairs, parallel_map(relate, pairs), strict=True):
+    efforts = [1.0 + len(by_pair[pair]) for pair in pairs]
+    for pair, relation in zip(pairs, parallel_map(relate, pairs, efforts=efforts), strict=True):
         if isinstance(relation, RelativeFrame):
             relations += [relation, relation.reversed()]
         elif relation:

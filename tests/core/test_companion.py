@@ -1,5 +1,7 @@
 """A second process that answers questions: the same as without, whatever happens to it."""
 
+import sys
+
 import pytest
 from test_worker import printed, pytestmark
 
@@ -153,3 +155,26 @@ except ChildProcessError:
 """
     )
     assert lines == ["none"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux lets a pipe have more room")
+def test_what_is_made_ahead_does_not_wait_for_who_is_busy():
+    """Breaks with a common pipe, which has room for a quarter of these items."""
+    lines = printed(
+        """
+import tempfile, time
+from pathlib import Path
+from graphslam.core.companion import Exchange
+made = Path(tempfile.mkdtemp()) / "made"
+def items():
+    for number in range(3):
+        yield bytes(80_000)
+    made.touch()
+with Exchange(items, (None, None, None)) as ahead:
+    until = time.monotonic() + 30.0
+    while not made.exists() and time.monotonic() < until:
+        time.sleep(0.01)
+    print(made.exists(), ahead.forked)
+"""
+    )
+    assert lines == ["True True"]
