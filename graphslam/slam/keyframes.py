@@ -82,6 +82,10 @@ class KeyframeSelector:
         path_m, turned_rad = run.track.moved(since_ns, time_ns)
         return self._is_far(path_m, turned_rad, angle_rad)
 
+    def is_keyframe(self, before: Sequence[float], now: Sequence[float]) -> bool:
+        """`has_moved` by what a robot had driven then and now, see `Readings.driven`."""
+        return self._is_far(now[0] - before[0], abs(float(wrap(now[1] - before[1]))), None)
+
     def _is_far(self, path_m: float, turned_rad: float, angle_rad: float | None) -> bool:
         least_rad = self._config.angle_rad if angle_rad is None else angle_rad
         return path_m >= self._config.distance_m or turned_rad >= least_rad

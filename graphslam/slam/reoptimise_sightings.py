@@ -8,7 +8,6 @@ the last round.
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -123,25 +122,29 @@ class SightingGroup:
 
 def group_sightings(steps: Sequence[Step], sources: Sequence[Sighting]) -> list[SightingGroup]:
     """The sightings behind the associations of steps, grouped so that each is one array."""
-    groups: dict[tuple[str, str | None, int], list[tuple[Any, ...]]] = defaultdict(list)
+    groups: dict[tuple[str, str | None, int], tuple[list[Sighting], list[int]]]
+    groups = defaultdict(lambda: ([], []))
     for n, step in enumerate(steps):
         count = Counter((a.robot, a.target) for a in step.associations)
         for k, a in enumerate(step.associations):
             if a.source is None:
                 continue
-            sighting = sources[a.source]
-            other, landmark = (a.target, -1) if isinstance(a.target, str) else (None, a.target)
-            at_ns = (a.time_ns, sighting.time_ns, step.time_ns)
-            row = ((n, k), landmark, *at_ns, count[a.robot, a.target])
-            groups[a.robot, other, len(sighting.z)].append((sighting, *row))
+            sighting, target, share = sources[a.source], a.target, count[a.robot, a.target]
+            other, landmark = (target, -1) if isinstance(target, str) else (None, target)
+            seen, rows = groups[a.robot, other, len(sighting.z)]
+            seen.append(sighting)
+            rows += n, k, landmark, a.time_ns, sighting.time_ns, step.time_ns, share
     made = []
-    for (robot, other, _), rows in groups.items():
-        seen, *columns = zip(*rows, strict=True)
-        where, landmarks, *times, share = map(np.array, columns)
-        state_ns, seen_ns, step_ns = times
+    for (robot, other, _), (seen, rows) in groups.items():
+        # columns one after the other: what follows takes slices of them
+        numbers = np.array(rows, dtype=np.int64).reshape(len(seen), -1)
+        where, columns = numbers[:, :2].copy(), np.ascontiguousarray(numbers[:, 2:].T)
+        landmarks, state_ns, seen_ns, step_ns, shares = columns
         z, cov = measured_from_bases(seen)
         made.append(
-            SightingGroup(robot, other, where, landmarks, state_ns, seen_ns, step_ns, z, cov, share)
+            SightingGroup(
+                robot, other, where, landmarks, state_ns, seen_ns, step_ns, z, cov, shares
+            )
         )
     return made
 

@@ -6,7 +6,7 @@ steps are solved (`sighting_solution`) or replayed (`causal_sightings`), many at
 """
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -22,7 +22,7 @@ from graphslam.core.records import (
 from graphslam.logs import LogSet
 from graphslam.logs.clock import to_common_clock
 from graphslam.odometry.preintegration import Track
-from graphslam.odometry.readings import integrate_pending
+from graphslam.odometry.readings import IntArray, integrate_pending
 from graphslam.perception.sightings import sighting_observation
 from graphslam.slam.log_pass import PriorKnowledge, Progress, timed
 from graphslam.slam.pipeline import Pipeline
@@ -71,10 +71,12 @@ class SightingPass(Pipeline):
         span_ns = round(1e9 * self.config.keyframe.sighting_window_s)
         batches = sighting_batches(sightings, span_ns)
         starts = deque(self._starts(batches))
+        times = {*(batch.time_ns for batch in batches), *(time_ns for time_ns, _ in starts)}
+        driven = self._driven(np.array(sorted(times), dtype=np.int64))
         for batch in batches:
             while starts and starts[0][0] <= batch.time_ns:
                 self._start(*starts.popleft())
-            step = self._step(batch)
+            step = self._step(batch, driven)
             if step.motions or step.associations:
                 self.steps.append(step)
         while starts:
@@ -157,10 +159,21 @@ class SightingPass(Pipeline):
         self.steps = list(steps)
         self.__dict__.pop("groups", None)
 
-    def _step(self, batch: SightingBatch) -> Step:
+    def _driven(self, times_ns: IntArray) -> dict[str, dict[int, list[float]]]:
+        """Path, m, and heading, rad, of each robot by odometry at each of some times.
+
+        All at once: asked for one by one they took a third of a pass.
+        """
+        return {
+            name: dict(zip(times_ns.tolist(), run.track.driven(times_ns).tolist(), strict=True))
+            for name, run in self.runs.items()
+            if len(run.track)
+        }
+
+    def _step(self, batch: SightingBatch, driven: Mapping[str, Mapping[int, list[float]]]) -> Step:
         """The step of a batch: who gets a state there, and what was seen from which state.
 
-        The rule is that of `Pipeline.add_sighting_batch`.
+        The rule is that of `Pipeline.add_sighting_batch`; ``driven``: see `_driven`.
         """
         step_ns = batch.time_ns
         mutual = {
@@ -172,9 +185,9 @@ class SightingPass(Pipeline):
         }
         motions = {}
         for robot in batch.robots:
-            run = self.runs[robot]
+            run, own = self.runs[robot], driven[robot]
             if step_ns > run.state_ns and (
-                robot in mutual or self.keyframes.has_moved(run, run.state_ns, step_ns)
+                robot in mutual or self.keyframes.is_keyframe(own[run.state_ns], own[step_ns])
             ):
                 motions[robot] = timed_motion(run.state_ns, step_ns)
                 run.times.append(step_ns)
