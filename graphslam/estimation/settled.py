@@ -14,12 +14,13 @@ import numpy as np
 from graphslam.core.config import RobustConfig
 from graphslam.core.records import Estimate, Step, Trajectory
 from graphslam.estimation import factors
-from graphslam.estimation.optimisation import is_wide, optimise
+from graphslam.estimation.optimisation import CONVERGED_ERROR, is_wide, optimise
 from graphslam.estimation.recorded_graph import RecordedGraph
 
 #: all variables together have settled when they move less than this, m and rad; rounds until then
-#: at most, without a kernel, and with one, whose weights converge linearly
-SETTLED, ROUNDS, ROUNDS_ROBUST = 1e-7, 50, 1
+#: at most, without a kernel, and with one, whose weights converge linearly; and where rounding
+#: decides
+SETTLED, ROUNDS, ROUNDS_ROBUST, ROUNDS_WIDE = 1e-7, 50, 1, 5
 
 
 def settled(steps: Sequence[Step], estimate: Estimate, kernel: RobustConfig) -> Estimate:
@@ -35,13 +36,17 @@ def settled(steps: Sequence[Step], estimate: Estimate, kernel: RobustConfig) -> 
     motions = [motion for step in steps for motion in step.motions.values()]
     closures = [closure for step in steps for closure in step.closures]
     use_qr = is_wide(motions, closures)
+    only_poses = not any(step.associations for step in steps) and all(c.verified for c in closures)
     try:
-        for _ in range(ROUNDS if kernel.kernel == "none" else ROUNDS_ROBUST):
-            before = values
-            builder.rebuild_lines(values)
-            values = optimise(builder.graph, values, kernel, use_qr=use_qr)
-            if before.localCoordinates(values).norm() < SETTLED:
-                break
+        if use_qr and only_poses:
+            values = _best_of_several(builder.graph, values, kernel)
+        else:
+            for _ in range(ROUNDS if kernel.kernel == "none" else ROUNDS_ROBUST):
+                before = values
+                builder.rebuild_lines(values)
+                values = optimise(builder.graph, values, kernel, use_qr=use_qr)
+                if before.localCoordinates(values).norm() < SETTLED:
+                    break
     except RuntimeError as error:
         raise builder.explain(error) from error
     states: dict[str, Trajectory] = {}
@@ -53,6 +58,27 @@ def settled(steps: Sequence[Step], estimate: Estimate, kernel: RobustConfig) -> 
         key = factors.landmark_key(landmark)
         landmarks[landmark] = factors.read(values, key, dim), estimate.landmarks[landmark][1]
     return replace(estimate, states=states, landmarks=landmarks)
+
+
+def _best_of_several(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, kernel: RobustConfig
+) -> gtsam.Values:
+    """The best of some minima of relative poses alone, where information is wide.
+
+    They differ by rounding: GTSAM's logarithm of a pose divides by a turn, which may be 1e-9 rad,
+    and is then 1e-8 m off, where poses are known to 1e-6 m. A minimum is judged as it is reported,
+    by positions and headings; the cosines and sines behind them may have an error too small.
+    """
+    best, least = values, graph.error(values)
+    for _ in range(ROUNDS_WIDE):
+        moved = optimise(graph, values, kernel, CONVERGED_ERROR, use_qr=True)
+        values, keys = gtsam.Values(), list(moved.keys())
+        for key in keys:
+            values.insert(key, gtsam.Pose2(*factors.read(moved, key, 3)))
+        error = graph.error(values)
+        if error < least:
+            best, least = values, error
+    return best
 
 
 def moved_to(minimum: Estimate, estimate: Estimate) -> Estimate:

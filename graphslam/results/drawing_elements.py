@@ -183,5 +183,5 @@ def png(shade: Shade) -> bytes:
 
 
 def opacity_levels(alpha: Array) -> Levels:
-    """Levels (...) of opacities from 0 to 1."""
+    """Levels (n,) or (rows, columns) of opacities from 0 to 1."""
     return np.round(alpha * OPAQUE).astype(np.uint8)
