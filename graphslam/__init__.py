@@ -203,11 +203,8 @@ def smooth(
         earlier = known_map_of(settled)
         log = cast("LogSet", recording) if ahead is None else receive_log(ahead, settled)
 
-        def read_truth() -> GroundTruth:
-            return truth_of_logs(log)
-
         with checkpoint(output, log, settled, earlier, resume=resume) as kept:
-            truth = None if output is None else Future(read_truth, urgent=False)
+            truth = None if output is None else Future(partial(truth_of_logs, log), urgent=False)
             result = smooth(log, settled, of_all(log, progress), None, ahead, kept, earlier)
             if output is not None and truth is not None:
                 announce("report")

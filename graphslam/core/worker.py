@@ -6,7 +6,6 @@ are sent back. Only a program that has a single thread may fork, so nothing fork
 If the second process dies, the remaining work is done here.
 """
 
-import fcntl
 import gc
 import os
 import pickle
@@ -62,6 +61,8 @@ def wide_pipe() -> tuple[int, int]:
     """
     ends = os.pipe()
     if sys.platform == "linux":
+        import fcntl  # noqa: PLC0415 (not on every system)
+
         with suppress(OSError, ValueError):  # other pipes of the user may have all there is
             fcntl.fcntl(ends[1], fcntl.F_SETPIPE_SZ, int(MOST_ROOM.read_text()))
     return ends

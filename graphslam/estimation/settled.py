@@ -36,6 +36,7 @@ def settled(steps: Sequence[Step], estimate: Estimate, kernel: RobustConfig) -> 
     motions = [motion for step in steps for motion in step.motions.values()]
     closures = [closure for step in steps for closure in step.closures]
     use_qr = is_wide(motions, closures)
+    # no factor has a kernel
     only_poses = not any(step.associations for step in steps) and all(c.verified for c in closures)
     try:
         if use_qr and only_poses:

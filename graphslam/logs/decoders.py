@@ -261,9 +261,10 @@ def sightings(
 
 
 def _polar_covariances(measured: Array, covs: Array) -> tuple[Sequence[Array], list[bool]]:
-    """Covariances (2, 2) of bearings and ranges, and which of the sightings surely can be used.
+    """Covariances (2, 2) of bearings and ranges, and which of the sightings can be used for sure.
 
-    What is wrong with the others, or whether they are no pairs of bearing and range, is not said.
+    The conditions of `_checked_covariance` and `_check_sighting`, of all at once: most sightings
+    hold them. Those two say what is wrong with the others, and judge those with a direction.
 
     Args:
         measured: (n, 3) bearing, range and maybe direction.

@@ -356,10 +356,9 @@ class _Reader:
     def collect(self, piece: Piece, block: Block, found: Mapping[str, list[bytes]]) -> None:
         """Add the data of the messages of the topics in ``block`` to the lists ``found``."""
         wanted = self._wanted[piece.path]
-        lists = {number: found[topic] for number, (topic, _) in wanted.items()}
         for number, _, data in self._read(piece, block):
-            translate = wanted[number][1]
-            lists[number].append(translate(data) if translate else data)
+            topic, translate = wanted[number]
+            found[topic].append(translate(data) if translate else data)
 
     def sample(self, piece: Piece, block: Block, n: int) -> Iterator[RawMessage]:
         """At most ``n`` of them, evenly spaced; only these are translated."""

@@ -33,7 +33,10 @@ class OccupancyGrid:
         return _cells(points - self.low, self.cell_m)
 
     def correlate_window(self, points: Array, shape: tuple[int, int]) -> Array:
-        """Mean values (k, *shape) under k sets of points (k, n, 2) m shifted by 0, 1, ... cells."""
+        """Mean values (k, *shape) under k sets of points (k, n, 2) m shifted by 0, 1, ... cells.
+
+        It takes as many bytes as the grid has cells, times the columns of a window: for submaps.
+        """
         width, height = shape
         # small integers, whose sums are as exact as those of halves
         halves = np.rint(2 * self.values).astype(np.int8)
