@@ -265,10 +265,7 @@ def _polar_covariances(measured: Array, covs: Array) -> tuple[Sequence[Array], l
 
     The conditions of `_checked_covariance` and `_check_sighting`, of all at once: most sightings
     hold them. Those two say what is wrong with the others, and judge those with a direction.
-
-    Args:
-        measured: (n, 3) bearing, range and maybe direction.
-        covs: (n, 9) what they state.
+    ``measured`` (n, 3): bearing, range and maybe direction; ``covs`` (n, 9): what they state.
     """
     full = covs.reshape(-1, 3, 3)[:, :2, :2]
     full = (full + full.mT) / 2
@@ -279,8 +276,8 @@ def _polar_covariances(measured: Array, covs: Array) -> tuple[Sequence[Array], l
         & (measured[:, 1] > 0)
         & (measured[:, 1] <= limits.MAX_SIGHTING_M)
         & are_positive(full)
-        & (variances >= limits.MIN_VARIANCE).all(axis=1)
-        & (variances <= limits.MAX_SIGHTING_VARIANCE).all(axis=1)
+        & (variances.min(axis=1) >= limits.MIN_VARIANCE)
+        & (variances.max(axis=1) <= limits.MAX_SIGHTING_VARIANCE)
     )
     full.flags.writeable = False
     # sensors mostly state the same one, so messages share it
