@@ -13,11 +13,13 @@ from pathlib import Path
 
 from graphslam.core.errors import OutputError
 
+#: where this process makes files and folders that may be unfinished
+_made_here: set[Path] = set()
 #: device, number and time of change of what stands at a path; None: nothing does
 Identity = tuple[int, int, int] | None
 
 
-def unfinished(target: Path, kind: str = "part") -> Path:
+def unfinished(target: Path) -> Path:
     """Where ``target`` is made; what dead processes left there is removed.
 
     A folder that was moved away by a process that died before it put the new one in its place
@@ -30,11 +32,30 @@ def unfinished(target: Path, kind: str = "part") -> Path:
             continue
         if found[2] == "old" and not os.path.lexists(final):
             path.rename(final)
-        elif path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path, ignore_errors=True)
         else:
-            path.unlink(missing_ok=True)
-    return final.with_name(f".{final.name}.{os.getpid()}.{kind}")
+            _remove(path)
+    made = final.with_name(f".{final.name}.{os.getpid()}.part")
+    _made_here.add(made)
+    return made
+
+
+def remove_unfinished() -> None:
+    """Remove at the end of a process what it did not finish.
+
+    Blocks that make a file or folder remove it themselves. But a signal may come after the file
+    was opened and before the block began, or while its end is at work.
+    """
+    for path in _made_here:
+        _remove(path)
+
+
+def _remove(path: Path) -> None:
+    """Remove a file or folder, if it is there and the disk allows it."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink()
 
 
 def _escaped(name: str) -> str:

@@ -108,3 +108,25 @@ def test_nothing_is_left_behind_after_a_signal(tmp_path, number):
             log.odometry("robot", S, (0, 0, 0))
         target.unlink()
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("when", ["__enter__", "__exit__"])
+def test_a_signal_between_a_file_and_its_block_leaves_nothing(tmp_path, when):
+    """A file was left when the signal came after its opening and before the block began."""
+    command = f"""
+import os, signal
+from graphslam.cli import main
+from graphslam.logs import LogWriter
+
+before = LogWriter.{when}
+def interrupted(self, *error):
+    if "{when}" == "__enter__":
+        before(self)
+    os.kill(os.getpid(), signal.SIGTERM)
+LogWriter.{when} = interrupted
+main()
+"""
+    words = [sys.executable, "-c", command, "simulate", "forest", "-o", tmp_path / "log.mcap"]
+    done = subprocess.run(words, check=False, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 128 + signal.SIGTERM and "Traceback" not in done.stderr
+    assert not list(tmp_path.iterdir())
