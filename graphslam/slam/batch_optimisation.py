@@ -32,6 +32,7 @@ from graphslam.mapping.duplicate_landmarks import (
 )
 from graphslam.mapping.landmark_map import mean_landmarks
 from graphslam.mapping.loop_closure import Tamper, fix_position
+from graphslam.mapping.loose_returns import with_loose_returns
 from graphslam.mapping.reassociation import reassociate
 from graphslam.mapping.redundant_closures import untied_closures
 from graphslam.mapping.visits import tie_visits
@@ -164,6 +165,10 @@ def _solved(
     closures = untied_closures(closures, paths.spans, steps, landmarks)
     counts["closures_kept"] = len(closures)
     parked = find_parked(scan_log)
+    landmarks.update_from(steps, rough.estimate)
+    steps = with_loose_returns(
+        steps, rough.estimate, scan_log.keyframe_scans, landmarks.entries, config.front_end
+    )
     if asked is not None:
         noise = asked.result()
         for name, own in noise.odometry.items():

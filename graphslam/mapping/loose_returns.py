@@ -1,0 +1,326 @@
+"""Returns that are in no segment of their scan, as observations of walls that are known.
+
+Of a wall that a scan sees at grazing incidence, in short pieces between doors or behind furniture,
+it has a few returns: too few for a segment, or for one that is worth something. Once the map is
+known, they lie on its walls. A return far along a wall tells the direction in which the robot
+looks better than the dense part of that wall beside it, whose direction is known to a few
+milliradians only.
+
+Returns are few per scan and walls are found in a tree, so that the work grows with the log.
+"""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from graphslam.core.config import FrontEndConfig
+from graphslam.core.geometry import Array, between, rotation3, transform_each, unit_vectors, wrap
+from graphslam.core.record import replace
+from graphslam.core.records import Association, Estimate, KeyframeScan, Step
+from graphslam.mapping.landmark_map import Entry
+
+IntArray = np.ndarray[Any, np.dtype[np.int64]]
+Mask = np.ndarray[Any, np.dtype[np.bool_]]
+
+#: rad: how well the direction of a scan is known before (one sigma)
+HEADING_RAD = 0.003
+#: sigmas that a return may lie off a wall. With three, returns of doors in niches and of door posts
+#: are among them, and headings in the simulated office are 10 % worse
+GATE = 2.0
+#: m beyond the ends of a segment where returns may be of it, and of a wall where they may be on it
+MARGIN_M = 0.2
+#: m: walls are sampled at this distance to find those near a return
+SAMPLE_M = 0.5
+#: walls near a return that are looked at
+NEIGHBOURS = 4
+#: m: returns that are nearer to each other along a wall share the deviation of its surface
+SURFACE_M = 1.0
+#: m, rad: along a wall, and its direction, of which returns say nothing
+OPEN_M, OPEN_RAD = 1.0, 0.2
+#: returns on a wall that has no observation in the scan yet; such walls per scan, those with the
+#: most returns first. More hardly tell more (two: 2 % of the error), and cost as much again
+LEAST_RETURNS, MOST_WALLS = 2, 1
+
+
+def with_loose_returns(
+    steps: Sequence[Step],
+    estimate: Estimate,
+    scans: Sequence[KeyframeScan],
+    entries: Mapping[int, Entry],
+    config: FrontEndConfig,
+) -> tuple[Step, ...]:
+    """Steps whose observations of walls have the loose returns on these, and a few more of them.
+
+    Args:
+        steps: with observations of lines and segments, associated with landmarks.
+        estimate: of all states and landmarks, near the truth.
+        scans: seen from the states.
+        entries: the landmarks, as they are estimated.
+        config: noise of returns and of surfaces.
+    """
+    views = _Views.of(scans, estimate)
+    walls = [e for i, e in entries.items() if i in estimate.landmarks and e.kind != "point"]
+    if views is None or not walls:
+        return tuple(steps)
+    seen = _Seen.of(steps, views, {wall.id: k for k, wall in enumerate(walls)})
+    means, extents = np.array([e.mean for e in walls]), np.array([e.extent for e in walls])
+    loose = np.flatnonzero(~_in_segments(seen, views, config.split_m))
+    found = _on_walls(loose, views, means, extents, config)
+    if not len(found.row):
+        return tuple(steps)
+    pair, of = np.unique(views.scan[found.row] * len(walls) + found.wall, return_inverse=True)
+    scan, wall = pair // len(walls), pair % len(walls)
+    known = seen.among(pair, len(walls))
+    # around what the deviations of returns are measured: the wall as observed, or as predicted
+    line = between(views.poses[scan], means[wall])
+    middle = np.bincount(of, found.along) / np.bincount(of)
+    line[:, :2] += middle[:, None] * unit_vectors(line[:, 2])
+    V = np.tile(np.diag([OPEN_M**2, np.inf, OPEN_RAD**2]), (len(pair), 1, 1))
+    has = known >= 0
+    line[has] = seen.z[known[has]]
+    turn = rotation3(line[has, 2])
+    V[has] = turn.mT @ seen.cov[known[has]] @ turn
+    z, cov = _measured(line, V, of, found, views.points[found.row], config.floor_normal_m)
+    low, high = np.full(len(pair), np.inf), np.full(len(pair), -np.inf)
+    np.minimum.at(low, of, found.along)
+    np.maximum.at(high, of, found.along)
+
+    changed = {id(seen.associations[k]): n for n, k in enumerate(known.tolist()) if k >= 0}
+    more: dict[tuple[str, int], list[Association]] = defaultdict(list)
+    for n in _most_seen(np.bincount(of), scan, ~has).tolist():
+        robot, time_ns = views.states[scan[n]]
+        extent = np.array([low[n], high[n]]) - middle[n]
+        number = walls[wall[n]].id
+        more[robot, time_ns].append(
+            Association(robot, time_ns, number, "line", z[n], cov[n], extent=extent)
+        )
+    return tuple(_changed(step, changed, z, cov, more) for step in steps)
+
+
+def _changed(
+    step: Step,
+    changed: Mapping[int, int],
+    z: Array,
+    cov: Array,
+    more: dict[tuple[str, int], list[Association]],
+) -> Step:
+    """A step with its changed observations, and ``more`` of its states, which are taken."""
+    made = [
+        a if n is None else a.with_measurement(z[n], cov[n])
+        for a in step.associations
+        for n in [changed.get(id(a))]
+    ]
+    for state in dict.fromkeys((a.robot, a.time_ns) for a in step.associations):
+        made += more.pop(state, ())
+    return replace(step, associations=tuple(made)) if made else step
+
+
+class _Views(NamedTuple):
+    """Scans, with all their returns: ``states`` (k) from which they are seen, at ``poses`` (k, 3).
+
+    ``points`` (n, 2) in the frame of the state of their ``scan`` (n,), whose laser is at ``lasers``
+    (k, 2) there; those of a scan begin at ``first`` (k,) and are ``number`` (k,).
+    """
+
+    states: list[tuple[str, int]]
+    poses: Array
+    lasers: Array
+    points: Array
+    scan: IntArray
+    first: IntArray
+    number: IntArray
+
+    @classmethod
+    def of(cls, scans: Sequence[KeyframeScan], estimate: Estimate) -> "_Views | None":
+        """Those with returns, one for each state; None without any."""
+        used = {(s.robot, s.time_ns): s for s in scans if len(s.points)}
+        if not used:
+            return None
+        poses = np.empty((len(used), 3))
+        robots, times = np.array([r for r, _ in used]), np.array([t for _, t in used])
+        for robot, states in estimate.states.items():
+            poses[robots == robot] = states.at(times[robots == robot])
+        count = np.array([len(scan.points) for scan in used.values()])
+        points = np.concatenate([scan.points for scan in used.values()]).astype(float)
+        lasers = np.array([scan.sensor[:2] for scan in used.values()])
+        return cls(
+            list(used), poses, lasers, points,
+            np.repeat(np.arange(len(used)), count), np.cumsum(count) - count, count,
+        )  # fmt: skip
+
+
+class _Seen(NamedTuple):
+    """Observations (m) of walls: ``z`` (m, 3), ``cov`` (m, 3, 3), ``extents`` (m, 2).
+
+    They are in ``scan`` (m,), row of `_Views`, and of ``wall`` (m,).
+    """
+
+    associations: list[Association]
+    scan: IntArray
+    wall: IntArray
+    z: Array
+    cov: Array
+    extents: Array
+
+    @classmethod
+    def of(cls, steps: Sequence[Step], views: _Views, walls: Mapping[int, int]) -> "_Seen":
+        """All that are of ``walls`` (number -> row) and in one of the scans."""
+        row = {state: k for k, state in enumerate(views.states)}
+        found = [
+            a
+            for step in steps
+            for a in step.associations
+            if a.extent is not None and a.target in walls and (a.robot, a.time_ns) in row
+        ]
+        return cls(
+            found,
+            np.array([row[a.robot, a.time_ns] for a in found], dtype=np.int64),
+            np.array([walls[int(a.target)] for a in found], dtype=np.int64),
+            np.array([a.z for a in found]).reshape(-1, 3),
+            np.array([a.cov for a in found]).reshape(-1, 3, 3),
+            np.array([a.extent for a in found]).reshape(-1, 2),
+        )
+
+    def among(self, pairs: IntArray, walls: int) -> IntArray:
+        """Of sorted pairs (p,) of scan and wall the observation (p,), -1 where there is none."""
+        found = np.full(len(pairs), -1)
+        own = self.scan * walls + self.wall
+        at = np.minimum(np.searchsorted(pairs, own), len(pairs) - 1)
+        there = pairs[at] == own
+        found[at[there]] = np.flatnonzero(there)
+        return found
+
+
+def _in_segments(seen: _Seen, views: _Views, reach_m: float) -> Mask:
+    """Which returns (n,) are on a part of a wall that was seen as a segment."""
+    count = views.number[seen.scan]
+    i = np.repeat(np.arange(len(seen.scan)), count)
+    p = np.arange(len(i)) + np.repeat(views.first[seen.scan] + count - np.cumsum(count), count)
+    along, across = _along_and_across(views.points[p], seen.z, i)
+    low, high = seen.extents.T
+    inside = (along > (low - MARGIN_M)[i]) & (along < (high + MARGIN_M)[i])
+    found = np.zeros(len(views.points), dtype=np.bool_)
+    found[p[inside & (np.abs(across) < reach_m)]] = True
+    return found
+
+
+class _OnWalls(NamedTuple):
+    """Returns on walls: ``row`` (k,) of `_Views.points`, ``wall`` (k,), ``along`` (k,) that wall.
+
+    ``sigma`` (k,) m: noise across it.
+    """
+
+    row: IntArray
+    wall: IntArray
+    along: Array
+    sigma: Array
+
+
+def _on_walls(
+    loose: IntArray, views: _Views, means: Array, extents: Array, config: FrontEndConfig
+) -> _OnWalls:
+    """Loose returns (rows) that lie on one wall as it is predicted.
+
+    Those that may be on either of two are left out. Where a door and the wall beside it were taken
+    for one wall, between the two, each of their returns would confirm it.
+    """
+    row, wall = _near_walls(loose, views, means, extents)
+    predicted = between(views.poses[views.scan[row]], means[wall])
+    along, across = _along_and_across(views.points[row], predicted, np.arange(len(row)))
+    beam = views.points[row] - views.lasers[views.scan[row]]
+    c, s = np.cos(predicted[:, 2]), np.sin(predicted[:, 2])
+    lever, normal = c * beam[:, 0] + s * beam[:, 1], c * beam[:, 1] - s * beam[:, 0]
+    noise = config.range_sigma_m * np.abs(normal) / np.hypot(lever, normal)
+    sigma = np.maximum(noise, config.floor_normal_m)
+    low, high = extents.T
+    fits = np.flatnonzero(
+        (normal < 0)  # seen from the side on which the sensor is
+        & (along > low[wall] - MARGIN_M)
+        & (along < high[wall] + MARGIN_M)
+        & (np.abs(across) < GATE * np.hypot(sigma, HEADING_RAD * lever))
+    )
+    # `row` is sorted: those that fit one wall alone
+    first = np.diff(row[fits], prepend=-1) > 0
+    last = np.diff(row[fits], append=-1) != 0
+    fits = fits[first & last]
+    return _OnWalls(row[fits], wall[fits], along[fits], sigma[fits])
+
+
+def _near_walls(
+    loose: IntArray, views: _Views, means: Array, extents: Array
+) -> tuple[IntArray, IntArray]:
+    """Pairs (p,), (p,) of a return and a wall near it."""
+    count = 2 + np.ceil((extents[:, 1] - extents[:, 0]) / SAMPLE_M).astype(np.int64)
+    of = np.repeat(np.arange(len(means)), count)
+    nth = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
+    along = extents[of, 0] + nth / (count[of] - 1) * (extents[of, 1] - extents[of, 0])
+    samples = cKDTree(means[of, :2] + along[:, None] * unit_vectors(means[of, 2]))
+    world = transform_each(views.poses[views.scan[loose]], views.points[loose])
+    _, near = samples.query(world, NEIGHBOURS, distance_upper_bound=SAMPLE_M)
+    k, _ = np.nonzero(near < len(of))
+    pair = np.sort(k * len(means) + of[near[near < len(of)]])  # faster than `unique` here
+    pair = pair[np.diff(pair, prepend=-1) > 0]
+    return loose[pair // len(means)], pair % len(means)
+
+
+def _measured(
+    line: Array, V: Array, of: IntArray, found: _OnWalls, points: Array, floor_m: float
+) -> tuple[Array, Array]:
+    """Lines (m, 3) with covariances ``V`` (m, 3, 3) in their own frames, corrected by returns.
+
+    Args:
+        line: in the frames of the states.
+        V: infinite where nothing is known yet.
+        of: the line (k,) of each return.
+        found: the returns.
+        points: (k, 2) where they are.
+        floor_m: deviation of a surface, which all of its returns share.
+
+    Returns:
+        The lines, and their covariances along the axes of the states' frames.
+    """
+    along, across = _along_and_across(points, line, of)
+    surface = np.floor(found.along / SURFACE_M).astype(np.int64)
+    surface -= surface.min()
+    _, which, count = np.unique(
+        of * (surface.max() + 1) + surface, return_inverse=True, return_counts=True
+    )
+    weight = 1.0 / (found.sigma**2 + count[which] * floor_m**2)
+    information = np.zeros((len(line), 2, 2))
+    known = np.isfinite(V[:, 1, 1])
+    information[known] = np.linalg.inv(V[known, 1:, 1:])
+    information[~known, 1, 1] = 1.0 / V[~known, 2, 2]
+    for i, j, power in ((0, 0, weight), (0, 1, weight * along), (1, 1, weight * along**2)):
+        information[:, i, j] += np.bincount(of, power, len(line))
+    information[:, 1, 0] = information[:, 0, 1]
+    pull = [np.bincount(of, weight * across, len(line))]
+    pull.append(np.bincount(of, weight * along * across, len(line)))
+    V = V.copy()
+    V[:, 1:, 1:] = np.linalg.inv(information)
+    V[:, 0, 1:] = V[:, 1:, 0] = 0.0
+    shift = (V[:, 1:, 1:] @ np.column_stack(pull)[:, :, None])[:, :, 0]
+    moved = line.copy()
+    moved[:, 0] -= np.sin(line[:, 2]) * shift[:, 0]
+    moved[:, 1] += np.cos(line[:, 2]) * shift[:, 0]
+    moved[:, 2] = wrap(line[:, 2] + shift[:, 1])
+    turn = rotation3(moved[:, 2])
+    return moved, turn @ V @ turn.mT
+
+
+def _most_seen(count: IntArray, scan: IntArray, new: Mask) -> IntArray:
+    """Rows of the new walls to be observed: of each scan those with the most returns."""
+    rows = np.flatnonzero(new & (count >= LEAST_RETURNS))
+    rows = rows[np.lexsort((-count[rows], scan[rows]))]
+    rank = np.arange(len(rows)) - np.searchsorted(scan[rows], scan[rows])
+    return np.asarray(rows[rank < MOST_WALLS])
+
+
+def _along_and_across(points: Array, lines: Array, of: IntArray) -> tuple[Array, Array]:
+    """Where points (n, 2) are along their lines (row ``of``) and how far to the left of them, m."""
+    # the sines of lines, which are fewer than points
+    x, y, c, s = (v[of] for v in (*lines[:, :2].T, np.cos(lines[:, 2]), np.sin(lines[:, 2])))
+    dx, dy = points[:, 0] - x, points[:, 1] - y
+    return c * dx + s * dy, c * dy - s * dx
