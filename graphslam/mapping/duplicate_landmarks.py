@@ -6,10 +6,8 @@ Pairs are merged one after another, the most certain first. Each merge condition
 later merges must agree with earlier ones. What one image showed as two things is never merged.
 """
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -331,33 +329,40 @@ def seen_together(steps: Iterable[Step]) -> set[frozenset[int]]:
     Two collinear lines of one image may be parts of one wall, with a door between them. By noise
     some of many images show such parts out of line, so the majority of images decides.
     """
-    images: dict[tuple[str, int], list[Association]] = {}
+    images: dict[tuple[str, int], int] = {}
+    seen, image = [], []
     for step in steps:
         for a in step.associations:
             if isinstance(a.target, int):
-                images.setdefault((a.robot, a.time_ns), []).append(a)
-    pairs = [(a, b) for seen in images.values() for a, b in combinations(seen, 2)]
-    pairs = [(a, b) for a, b in pairs if a.target != b.target]
-    lines = np.array([a.model == b.model == "line" for a, b in pairs], dtype=bool)
-    weight = np.where(lines, 1, len(pairs))  # segments have known ends, so they are two things
-    of_lines = [pair for pair, both in zip(pairs, lines, strict=True) if both]
-    weight[lines] = np.where(_in_line(of_lines), -1, 1)
-    votes: Counter[frozenset[int]] = Counter()
-    for (a, b), vote in zip(pairs, weight.tolist(), strict=True):
-        if isinstance(a.target, int) and isinstance(b.target, int):
-            votes[frozenset((a.target, b.target))] += vote
-    return {pair for pair, sum_of_votes in votes.items() if sum_of_votes > 0}
+                seen.append(a)
+                image.append(images.setdefault((a.robot, a.time_ns), len(images)))
+    order = np.argsort(image, kind="stable")
+    image_of = np.array(image, dtype=np.int64)[order]
+    target = np.array([a.target for a in seen], dtype=np.int64)
+    pairs = [np.zeros((0, 2), dtype=np.int64)]
+    for apart in range(1, int(np.bincount(image_of).max(initial=0))):
+        together = np.flatnonzero(image_of[apart:] == image_of[:-apart])
+        pairs.append(np.column_stack([order[together], order[together + apart]]))
+    pair = np.concatenate(pairs)
+    pair = pair[target[pair[:, 0]] != target[pair[:, 1]]]
+    line = np.array([a.model == "line" for a in seen], dtype=np.bool_)
+    both = line[pair].all(axis=1)
+    votes = np.full(len(pair), len(pair))  # segments have known ends, so they are two things
+    votes[both] = np.where(_in_line(seen, pair[both]), -1, 1)
+    two, of = np.unique(np.sort(target[pair], axis=1), axis=0, return_inverse=True)
+    won = np.bincount(of.ravel(), votes, len(two)) > 0
+    return set(map(frozenset, two[won].tolist()))
 
 
-def _in_line(pairs: Sequence[tuple[Association, Association]]) -> BoolArray:
-    """Which pairs (m,) of lines, each of one image, may be collinear given their noise."""
-    if not pairs:
-        return np.zeros(0, dtype=bool)
-    z = np.array([[a.z, b.z] for a, b in pairs])
-    cov = np.array([[a.cov, b.cov] for a, b in pairs])
+def _in_line(seen: Sequence[Association], pairs: IntArray) -> BoolArray:
+    """Which ``pairs`` (m, 2) of lines, each of one image, may be collinear given their noise."""
+    used, of = np.unique(pairs, return_inverse=True)
+    of = of.reshape(pairs.shape)
+    z = np.array([seen[n].z for n in used.tolist()]).reshape(-1, 3)
+    cov = np.array([seen[n].cov for n in used.tolist()]).reshape(-1, 3, 3)
     # covariances along each line's own axes
-    own = rotate_cov(cov, -z[..., 2])
-    off = between(z[:, 0], z[:, 1])
+    own = rotate_cov(cov, -z[:, 2])[of]
+    off = between(z[of[:, 0]], z[of[:, 1]])
     turn = np.arctan(np.tan(off[:, 2]))  # modulo pi
     variance = own[:, :, 2, 2].sum(axis=1) + FLOOR_RAD**2
     across = own[:, :, 1, 1].sum(axis=1) + (off[:, 0] ** 2) * own[:, 0, 2, 2] + FLOOR_M**2

@@ -27,9 +27,9 @@ Mask = np.ndarray[Any, np.dtype[np.bool_]]
 
 #: rad: how well the direction of a scan is known before (one sigma)
 HEADING_RAD = 0.003
-#: sigmas that a return may lie off a wall. With three, returns of doors in niches and of door posts
+#: sigmas that a return may lie off a wall. With three, returns of doors in niches and of their posts
 #: are among them, and headings in the simulated office are 10 % worse
-GATE = 2.0
+GATE = 1.7
 #: m beyond the ends of a segment where returns may be of it, and of a wall where they may be on it
 MARGIN_M = 0.2
 #: m: walls are sampled at this distance to find those near a return

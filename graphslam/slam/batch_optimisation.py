@@ -7,7 +7,6 @@ is solved, tied again where the covariances show that two are one, and solved to
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -84,14 +83,6 @@ def optimise_scan_log(scan_log: TrackedLog, tamper: Tamper | None = None) -> Est
     return estimate
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Solved:
-    """A solution, and the steps as they were solved."""
-
-    steps: tuple[Step, ...]
-    solution: CalibratedSolution
-
-
 class _Problem:
     """All states, landmarks and, if it is wanted, the calibration of the tracks, in one graph.
 
@@ -117,28 +108,32 @@ class _Problem:
         self._graph = CalibrationGraph(self._steps, start, priors, self._initial, config.robust)
         self._graph.calibrate_motions(self._steps, self._initial)
 
-    def solve_roughly(self) -> _Solved:
+    def solve_roughly(self) -> CalibratedSolution:
         """Without covariances, and ended early."""
         self._graph.optimise(CONVERGED_ERROR_ROUGH)
         return self._found(*self._graph.solution())
 
-    def solve(self, *, settle: bool) -> tuple[_Solved, Future[Estimate] | None]:
-        """The solution, and if wanted the exact minimum of its steps, without covariances.
+    def solve(
+        self, *, settle: bool
+    ) -> tuple[tuple[Step, ...], CalibratedSolution, Future[Estimate] | None]:
+        """The steps as they are solved, the solution, and if wanted the exact minimum of the steps.
 
-        The minimum is sought in the second process while covariances are computed here.
+        The minimum, without covariances, is sought in the second process while they are computed
+        here.
         """
         self._graph.optimise(CONVERGED_ERROR)
         near, calibrations = self._graph.solution()
         steps = at_calibration(self._steps, self._initial, calibrations)
         minimum = Future(lambda: settled(steps, near, self._kernel)) if settle else None
         found = self._graph.solution(marginals=True, joint=True, mounts=True)
-        return self._found(*found), minimum
+        return steps, self._found(*found), minimum
 
-    def _found(self, estimate: Estimate, calibrations: Mapping[str, Calibration]) -> _Solved:
+    def _found(
+        self, estimate: Estimate, calibrations: Mapping[str, Calibration]
+    ) -> CalibratedSolution:
         for name, track in self._tracks.items():
             track.calibration = calibrations[name]
-        solution = CalibratedSolution(estimate, calibrations, self._graph)
-        return _Solved(at_calibration(self._steps, self._initial, calibrations), solution)
+        return CalibratedSolution(estimate, calibrations, self._graph)
 
 
 def _solved(
@@ -152,8 +147,7 @@ def _solved(
     config, counts, landmarks = scan_log.config, scan_log.counts, scan_log.landmarks
     closures = list(paths.closures)
     steps = _tied(steps, start, None, paths, scan_log)
-    first = _Problem(with_closures(steps, closures), start, tracks, config).solve_roughly()
-    rough = first.solution
+    rough = _Problem(with_closures(steps, closures), start, tracks, config).solve_roughly()
     # all that follows needs nothing but this solution; the second process looks for the noise
     asked = (
         Future(lambda: fit_motion_noise(tracks, rough.graph.posterior()))
@@ -182,8 +176,8 @@ def _solved(
         config.scan_matching,
     )
     problem = _Problem(with_closures(steps, closures), near, tracks, config)
-    done, minimum = problem.solve(settle=config.backend.optimise_at_end)
-    estimate, steps = _with_surface_bias(done.solution.estimate, tracks, config), done.steps
+    steps, done, minimum = problem.solve(settle=config.backend.optimise_at_end)
+    estimate = _with_surface_bias(done.estimate, tracks, config)
     landmarks.update_from(steps, estimate)
     for name in tracks:
         scan_log.runs[name].is_calibrated = config.odometry.calibrate
