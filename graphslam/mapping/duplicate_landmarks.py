@@ -394,7 +394,10 @@ def merged_steps(
         return a if target is None else retarget(a, target, kinds[target])
 
     return tuple(
-        replace(step, associations=tuple(map(renamed, step.associations))) for step in steps
+        replace(step, associations=tuple(map(renamed, step.associations)))
+        if any(a.target in into for a in step.associations)
+        else step
+        for step in steps
     )
 
 

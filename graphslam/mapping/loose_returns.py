@@ -27,8 +27,8 @@ Mask = np.ndarray[Any, np.dtype[np.bool_]]
 
 #: rad: how well the direction of a scan is known before (one sigma)
 HEADING_RAD = 0.003
-#: sigmas that a return may lie off a wall. With three, returns of doors in niches and of their posts
-#: are among them, and headings in the simulated office are 10 % worse
+#: sigmas that a return may lie off a wall. With three, returns of doors in niches and of posts are
+#: among them, and headings in the simulated office are 10 % worse
 GATE = 1.7
 #: m beyond the ends of a segment where returns may be of it, and of a wall where they may be on it
 MARGIN_M = 0.2
@@ -108,14 +108,17 @@ def _changed(
     more: dict[tuple[str, int], list[Association]],
 ) -> Step:
     """A step with its changed observations, and ``more`` of its states, which are taken."""
+    rows = [changed.get(id(a)) for a in step.associations]
+    new: list[Association] = []
+    for state in dict.fromkeys((a.robot, a.time_ns) for a in step.associations):
+        new += more.pop(state, ())
+    if not new and all(n is None for n in rows):
+        return step
     made = [
         a if n is None else a.with_measurement(z[n], cov[n])
-        for a in step.associations
-        for n in [changed.get(id(a))]
+        for a, n in zip(step.associations, rows, strict=True)
     ]
-    for state in dict.fromkeys((a.robot, a.time_ns) for a in step.associations):
-        made += more.pop(state, ())
-    return replace(step, associations=tuple(made)) if made else step
+    return replace(step, associations=(*made, *new))
 
 
 class _Views(NamedTuple):

@@ -9,6 +9,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from operator import is_
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -75,7 +76,8 @@ def reassociate(
                 kept.append(a)
             elif wall >= 0:
                 kept.append(_moved(a, walls[wall]))
-        made.append(replace(step, associations=tuple(kept)))
+        same = len(kept) == len(step.associations) and all(map(is_, kept, step.associations))
+        made.append(step if same else replace(step, associations=tuple(kept)))
     moved, dropped = (best != own) & (best >= 0), best < 0
     return Reassociated(tuple(made), int(moved.sum()), int(dropped.sum()))
 
