@@ -10,7 +10,8 @@ Returns are few per scan and walls are found in a tree, so that the work grows w
 """
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from operator import is_
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +25,8 @@ from graphslam.mapping.landmark_map import Entry
 
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
 Mask = np.ndarray[Any, np.dtype[np.bool_]]
+#: robot and time, ns
+State = tuple[str, int]
 
 #: rad: how well the direction of a scan is known before (one sigma)
 HEADING_RAD = 0.003
@@ -43,6 +46,8 @@ OPEN_M, OPEN_RAD = 1.0, 0.2
 #: returns on a wall that has no observation in the scan yet; such walls per scan, those with the
 #: most returns first. More hardly tell more (two: 2 % of the error), and cost as much again
 LEAST_RETURNS, MOST_WALLS = 2, 1
+#: scans that are looked at together: their observations are compared with all their returns
+BLOCK = 256
 
 
 def with_loose_returns(
@@ -61,21 +66,43 @@ def with_loose_returns(
         entries: the landmarks, as they are estimated.
         config: noise of returns and of surfaces.
     """
-    views = _Views.of(scans, estimate)
     walls = [e for i, e in entries.items() if i in estimate.landmarks and e.kind != "point"]
-    if views is None or not walls:
+    used = list({(scan.robot, scan.time_ns): scan for scan in scans if len(scan.points)}.values())
+    if not walls or not used:
         return tuple(steps)
-    seen = _Seen.of(steps, views, {wall.id: k for k, wall in enumerate(walls)})
-    means, extents = np.array([e.mean for e in walls]), np.array([e.extent for e in walls])
+    row = {wall.id: k for k, wall in enumerate(walls)}
+    seen: dict[State, list[Association]] = defaultdict(list)
+    for step in steps:
+        for a in step.associations:
+            if a.extent is not None and a.target in row:
+                seen[a.robot, a.time_ns].append(a)
+    tree = _WallTree.from_walls(walls)
+    changed: dict[int, Association] = {}
+    new: dict[State, list[Association]] = {}
+    for begin in range(0, len(used), BLOCK):
+        views = _Views.of(used[begin : begin + BLOCK], estimate)
+        for before, after in _observed(views, _Seen.of(seen, views, row), tree, config):
+            if before is not None:
+                changed[id(before)] = after
+            else:
+                new.setdefault((after.robot, after.time_ns), []).append(after)
+    return tuple(_changed(step, changed, new) for step in steps)
+
+
+def _observed(
+    views: "_Views", seen: "_Seen", tree: "_WallTree", config: FrontEndConfig
+) -> Iterator[tuple[Association | None, Association]]:
+    """Observations of walls with the loose returns on these, each with that before, if any."""
+    walls = tree.walls
     loose = np.flatnonzero(~_in_segments(seen, views, config.split_m))
-    found = _on_walls(loose, views, means, extents, config)
+    found = _on_walls(loose, views, tree, config)
     if not len(found.row):
-        return tuple(steps)
+        return
     pair, of = np.unique(views.scan[found.row] * len(walls) + found.wall, return_inverse=True)
     scan, wall = pair // len(walls), pair % len(walls)
     known = seen.among(pair, len(walls))
     # around what the deviations of returns are measured: the wall as observed, or as predicted
-    line = between(views.poses[scan], means[wall])
+    line = between(views.poses[scan], tree.means[wall])
     middle = np.bincount(of, found.along) / np.bincount(of)
     line[:, :2] += middle[:, None] * unit_vectors(line[:, 2])
     V = np.tile(np.diag([OPEN_M**2, np.inf, OPEN_RAD**2]), (len(pair), 1, 1))
@@ -87,38 +114,25 @@ def with_loose_returns(
     low, high = np.full(len(pair), np.inf), np.full(len(pair), -np.inf)
     np.minimum.at(low, of, found.along)
     np.maximum.at(high, of, found.along)
-
-    changed = {id(seen.associations[k]): n for n, k in enumerate(known.tolist()) if k >= 0}
-    more: dict[tuple[str, int], list[Association]] = defaultdict(list)
+    for n, k in zip(np.flatnonzero(has).tolist(), known[has].tolist(), strict=True):
+        before = seen.associations[k]
+        yield before, before.with_measurement(z[n], cov[n])
     for n in _most_seen(np.bincount(of), scan, ~has).tolist():
         robot, time_ns = views.states[scan[n]]
         extent = np.array([low[n], high[n]]) - middle[n]
         number = walls[wall[n]].id
-        more[robot, time_ns].append(
-            Association(robot, time_ns, number, "line", z[n], cov[n], extent=extent)
-        )
-    return tuple(_changed(step, changed, z, cov, more) for step in steps)
+        yield None, Association(robot, time_ns, number, "line", z[n], cov[n], extent=extent)
 
 
 def _changed(
-    step: Step,
-    changed: Mapping[int, int],
-    z: Array,
-    cov: Array,
-    more: dict[tuple[str, int], list[Association]],
+    step: Step, changed: Mapping[int, Association], new: dict[State, list[Association]]
 ) -> Step:
-    """A step with its changed observations, and ``more`` of its states, which are taken."""
-    rows = [changed.get(id(a)) for a in step.associations]
-    new: list[Association] = []
+    """A step with its changed observations, and the new ones of its states, which are taken."""
+    made = [changed.get(id(a), a) for a in step.associations]
     for state in dict.fromkeys((a.robot, a.time_ns) for a in step.associations):
-        new += more.pop(state, ())
-    if not new and all(n is None for n in rows):
-        return step
-    made = [
-        a if n is None else a.with_measurement(z[n], cov[n])
-        for a, n in zip(step.associations, rows, strict=True)
-    ]
-    return replace(step, associations=(*made, *new))
+        made += new.pop(state, ())
+    same = len(made) == len(step.associations) and all(map(is_, made, step.associations))
+    return step if same else replace(step, associations=tuple(made))
 
 
 class _Views(NamedTuple):
@@ -137,21 +151,19 @@ class _Views(NamedTuple):
     number: IntArray
 
     @classmethod
-    def of(cls, scans: Sequence[KeyframeScan], estimate: Estimate) -> "_Views | None":
-        """Those with returns, one for each state; None without any."""
-        used = {(s.robot, s.time_ns): s for s in scans if len(s.points)}
-        if not used:
-            return None
-        poses = np.empty((len(used), 3))
-        robots, times = np.array([r for r, _ in used]), np.array([t for _, t in used])
-        for robot, states in estimate.states.items():
-            poses[robots == robot] = states.at(times[robots == robot])
-        count = np.array([len(scan.points) for scan in used.values()])
-        points = np.concatenate([scan.points for scan in used.values()]).astype(float)
-        lasers = np.array([scan.sensor[:2] for scan in used.values()])
+    def of(cls, scans: Sequence[KeyframeScan], estimate: Estimate) -> "_Views":
+        """Those of scans with returns, of different states."""
+        states = [(scan.robot, scan.time_ns) for scan in scans]
+        poses = np.empty((len(scans), 3))
+        robots, times = np.array([r for r, _ in states]), np.array([t for _, t in states])
+        for robot, path in estimate.states.items():
+            poses[robots == robot] = path.at(times[robots == robot])
+        number = np.array([len(scan.points) for scan in scans])
+        points = np.concatenate([scan.points for scan in scans]).astype(float)
+        lasers = np.array([scan.sensor[:2] for scan in scans])
         return cls(
-            list(used), poses, lasers, points,
-            np.repeat(np.arange(len(used)), count), np.cumsum(count) - count, count,
+            states, poses, lasers, points,
+            np.repeat(np.arange(len(scans)), number), np.cumsum(number) - number, number,
         )  # fmt: skip
 
 
@@ -169,22 +181,18 @@ class _Seen(NamedTuple):
     extents: Array
 
     @classmethod
-    def of(cls, steps: Sequence[Step], views: _Views, walls: Mapping[int, int]) -> "_Seen":
-        """All that are of ``walls`` (number -> row) and in one of the scans."""
-        row = {state: k for k, state in enumerate(views.states)}
-        found = [
-            a
-            for step in steps
-            for a in step.associations
-            if a.extent is not None and a.target in walls and (a.robot, a.time_ns) in row
-        ]
+    def of(
+        cls, seen: Mapping[State, Sequence[Association]], views: _Views, row: Mapping[int, int]
+    ) -> "_Seen":
+        """Those ``seen`` from the states of views, of walls (number -> ``row``)."""
+        found = [(k, a) for k, state in enumerate(views.states) for a in seen.get(state, ())]
         return cls(
-            found,
-            np.array([row[a.robot, a.time_ns] for a in found], dtype=np.int64),
-            np.array([walls[int(a.target)] for a in found], dtype=np.int64),
-            np.array([a.z for a in found]).reshape(-1, 3),
-            np.array([a.cov for a in found]).reshape(-1, 3, 3),
-            np.array([a.extent for a in found]).reshape(-1, 2),
+            [a for _, a in found],
+            np.array([k for k, _ in found], dtype=np.int64),
+            np.array([row[int(a.target)] for _, a in found], dtype=np.int64),
+            np.array([a.z for _, a in found]).reshape(-1, 3),
+            np.array([a.cov for _, a in found]).reshape(-1, 3, 3),
+            np.array([a.extent for _, a in found]).reshape(-1, 2),
         )
 
     def among(self, pairs: IntArray, walls: int) -> IntArray:
@@ -199,9 +207,9 @@ class _Seen(NamedTuple):
 
 def _in_segments(seen: _Seen, views: _Views, reach_m: float) -> Mask:
     """Which returns (n,) are on a part of a wall that was seen as a segment."""
-    count = views.number[seen.scan]
-    i = np.repeat(np.arange(len(seen.scan)), count)
-    p = np.arange(len(i)) + np.repeat(views.first[seen.scan] + count - np.cumsum(count), count)
+    number = views.number[seen.scan]
+    i = np.repeat(np.arange(len(seen.scan)), number)
+    p = np.arange(len(i)) + np.repeat(views.first[seen.scan] + number - np.cumsum(number), number)
     along, across = _along_and_across(views.points[p], seen.z, i)
     low, high = seen.extents.T
     inside = (along > (low - MARGIN_M)[i]) & (along < (high + MARGIN_M)[i])
@@ -223,22 +231,24 @@ class _OnWalls(NamedTuple):
 
 
 def _on_walls(
-    loose: IntArray, views: _Views, means: Array, extents: Array, config: FrontEndConfig
+    loose: IntArray, views: _Views, tree: "_WallTree", config: FrontEndConfig
 ) -> _OnWalls:
     """Loose returns (rows) that lie on one wall as it is predicted.
 
     Those that may be on either of two are left out. Where a door and the wall beside it were taken
     for one wall, between the two, each of their returns would confirm it.
     """
-    row, wall = _near_walls(loose, views, means, extents)
-    predicted = between(views.poses[views.scan[row]], means[wall])
+    world = transform_each(views.poses[views.scan[loose]], views.points[loose])
+    k, wall = tree.near(world)
+    row = loose[k]
+    predicted = between(views.poses[views.scan[row]], tree.means[wall])
     along, across = _along_and_across(views.points[row], predicted, np.arange(len(row)))
     beam = views.points[row] - views.lasers[views.scan[row]]
     c, s = np.cos(predicted[:, 2]), np.sin(predicted[:, 2])
     lever, normal = c * beam[:, 0] + s * beam[:, 1], c * beam[:, 1] - s * beam[:, 0]
     noise = config.range_sigma_m * np.abs(normal) / np.hypot(lever, normal)
     sigma = np.maximum(noise, config.floor_normal_m)
-    low, high = extents.T
+    low, high = tree.extents.T
     fits = np.flatnonzero(
         (normal < 0)  # seen from the side on which the sensor is
         & (along > low[wall] - MARGIN_M)
@@ -252,21 +262,34 @@ def _on_walls(
     return _OnWalls(row[fits], wall[fits], along[fits], sigma[fits])
 
 
-def _near_walls(
-    loose: IntArray, views: _Views, means: Array, extents: Array
-) -> tuple[IntArray, IntArray]:
-    """Pairs (p,), (p,) of a return and a wall near it."""
-    count = 2 + np.ceil((extents[:, 1] - extents[:, 0]) / SAMPLE_M).astype(np.int64)
-    of = np.repeat(np.arange(len(means)), count)
-    nth = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
-    along = extents[of, 0] + nth / (count[of] - 1) * (extents[of, 1] - extents[of, 0])
-    samples = cKDTree(means[of, :2] + along[:, None] * unit_vectors(means[of, 2]))
-    world = transform_each(views.poses[views.scan[loose]], views.points[loose])
-    _, near = samples.query(world, NEIGHBOURS, distance_upper_bound=SAMPLE_M)
-    k, _ = np.nonzero(near < len(of))
-    pair = np.sort(k * len(means) + of[near[near < len(of)]])  # faster than `unique` here
-    pair = pair[np.diff(pair, prepend=-1) > 0]
-    return loose[pair // len(means)], pair % len(means)
+class _WallTree(NamedTuple):
+    """Walls, sampled: ``of`` (s,) is the wall of each sample."""
+
+    walls: Sequence[Entry]
+    means: Array
+    extents: Array
+    samples: cKDTree
+    of: IntArray
+
+    @classmethod
+    def from_walls(cls, walls: Sequence[Entry]) -> "_WallTree":
+        """The tree of some walls."""
+        means, extents = np.array([e.mean for e in walls]), np.array([e.extent for e in walls])
+        count = 2 + np.ceil((extents[:, 1] - extents[:, 0]) / SAMPLE_M).astype(np.int64)
+        of = np.repeat(np.arange(len(means)), count)
+        nth = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
+        along = extents[of, 0] + nth / (count[of] - 1) * (extents[of, 1] - extents[of, 0])
+        samples = cKDTree(means[of, :2] + along[:, None] * unit_vectors(means[of, 2]))
+        return cls(walls, means, extents, samples, of)
+
+    def near(self, points: Array) -> tuple[IntArray, IntArray]:
+        """Pairs (p,), (p,) of a point (n, 2) and a wall near it, sorted."""
+        _, sample = self.samples.query(points, NEIGHBOURS, distance_upper_bound=SAMPLE_M)
+        found = sample < len(self.of)
+        k, _ = np.nonzero(found)
+        pair = np.sort(k * len(self.means) + self.of[sample[found]])  # faster than `unique` here
+        pair = pair[np.diff(pair, prepend=-1) > 0]
+        return pair // len(self.means), pair % len(self.means)
 
 
 def _measured(
