@@ -22,6 +22,7 @@ from graphslam.core.geometry import Array, between, rotation3, transform_each, u
 from graphslam.core.record import replace
 from graphslam.core.records import Association, Estimate, KeyframeScan, Step
 from graphslam.mapping.landmark_map import Entry
+from graphslam.perception.line_fit import SMALLEST_SIGMA_M
 
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
 Mask = np.ndarray[Any, np.dtype[np.bool_]]
@@ -247,7 +248,7 @@ def _on_walls(
     c, s = np.cos(predicted[:, 2]), np.sin(predicted[:, 2])
     lever, normal = c * beam[:, 0] + s * beam[:, 1], c * beam[:, 1] - s * beam[:, 0]
     noise = config.range_sigma_m * np.abs(normal) / np.hypot(lever, normal)
-    sigma = np.maximum(noise, config.floor_normal_m)
+    sigma = np.maximum(noise, max(config.floor_normal_m, SMALLEST_SIGMA_M))
     low, high = tree.extents.T
     fits = np.flatnonzero(
         (normal < 0)  # seen from the side on which the sensor is
