@@ -2,7 +2,8 @@
 
 Tracking gives a path that is right over metres. Loops are closed on a pose graph of submaps, and
 the path follows its solution. There landmarks of different visits that lie together are tied; all
-is solved, tied again where the covariances show that two are one, and solved to the end.
+is solved, tied again where the covariances show that two are one, and solved to the end. By then
+the map is known well enough to tell on which walls the returns are that are in no segment.
 """
 
 import math
@@ -160,9 +161,11 @@ def _solved(
     counts["closures_kept"] = len(closures)
     parked = find_parked(scan_log)
     landmarks.update_from(steps, rough.estimate)
-    steps = with_loose_returns(
+    more = with_loose_returns(
         steps, rough.estimate, scan_log.keyframe_scans, landmarks.entries, config.front_end
     )
+    counts["observations_by_loose_returns"] = _observations(more) - _observations(steps)
+    steps = more
     if asked is not None:
         noise = asked.result()
         for name, own in noise.odometry.items():
@@ -184,6 +187,10 @@ def _solved(
     # what the second process does meanwhile moves the estimate by far less than scans can tell
     scan_log.scan_evidence = gather_scan_evidence(scan_log, estimate, parked)
     return moved_to(minimum.result(), estimate) if minimum else estimate, steps
+
+
+def _observations(steps: tuple[Step, ...]) -> int:
+    return sum(len(step.associations) for step in steps)
 
 
 def _with_surface_bias(estimate: Estimate, tracks: Mapping[str, Track], config: Config) -> Estimate:

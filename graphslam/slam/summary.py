@@ -36,6 +36,7 @@ REOPTIMISED = (
     "landmarks_merged",
     "observations_reassociated",
     "observations_dropped",
+    "observations_by_loose_returns",
 )
 
 
