@@ -336,14 +336,8 @@ def seen_together(steps: Iterable[Step]) -> set[frozenset[int]]:
             if isinstance(a.target, int):
                 seen.append(a)
                 image.append(images.setdefault((a.robot, a.time_ns), len(images)))
-    order = np.argsort(image, kind="stable")
-    image_of = np.array(image, dtype=np.int64)[order]
     target = np.array([a.target for a in seen], dtype=np.int64)
-    pairs = [np.zeros((0, 2), dtype=np.int64)]
-    for apart in range(1, int(np.bincount(image_of).max(initial=0))):
-        together = np.flatnonzero(image_of[apart:] == image_of[:-apart])
-        pairs.append(np.column_stack([order[together], order[together + apart]]))
-    pair = np.concatenate(pairs)
+    pair = _pairs_within(np.array(image, dtype=np.int64))
     pair = pair[target[pair[:, 0]] != target[pair[:, 1]]]
     line = np.array([a.model == "line" for a in seen], dtype=np.bool_)
     both = line[pair].all(axis=1)
@@ -352,6 +346,17 @@ def seen_together(steps: Iterable[Step]) -> set[frozenset[int]]:
     two, of = np.unique(np.sort(target[pair], axis=1), axis=0, return_inverse=True)
     won = np.bincount(of.ravel(), votes, len(two)) > 0
     return set(map(frozenset, two[won].tolist()))
+
+
+def _pairs_within(image: IntArray) -> IntArray:
+    """Pairs (m, 2) of rows that have the same ``image`` (n,), the earlier row first."""
+    order = np.argsort(image, kind="stable")
+    image = image[order]
+    pairs = [np.zeros((0, 2), dtype=np.int64)]
+    for apart in range(1, int(np.bincount(image).max(initial=0))):
+        together = np.flatnonzero(image[apart:] == image[:-apart])
+        pairs.append(np.column_stack([order[together], order[together + apart]]))
+    return np.concatenate(pairs)
 
 
 def _in_line(seen: Sequence[Association], pairs: IntArray) -> BoolArray:

@@ -14,7 +14,14 @@ from graphslam.core.errors import LogError
 from graphslam.core.geometry import Array, between, compose, rotate_cov
 from graphslam.core.observation_models import MODELS
 from graphslam.core.record import replace
-from graphslam.core.records import Association, Estimate, Observation, Step, Trajectory
+from graphslam.core.records import (
+    Association,
+    Estimate,
+    KeyframeScan,
+    Observation,
+    Step,
+    Trajectory,
+)
 from graphslam.core.sensor_config import LimitsConfig
 from graphslam.estimation.backend import Backend
 from graphslam.mapping.gating import BoolArray, IntArray
@@ -244,8 +251,10 @@ def retarget(a: Association, target: int, kind: str) -> Association:
     return replace(a, target=target, model="line" if line else a.model)
 
 
-def observed_from(seen: Sequence[Association], of_robots: Mapping[str, Trajectory]) -> Array:
-    """Estimated states (n, 3) from which associations were made."""
+def observed_from(
+    seen: Sequence[Association | KeyframeScan], of_robots: Mapping[str, Trajectory]
+) -> Array:
+    """Estimated states (n, 3) from which associations or scans were made."""
     poses = np.empty((len(seen), 3))
     robots, times = np.array([a.robot for a in seen]), np.array([a.time_ns for a in seen])
     for robot, states in of_robots.items():

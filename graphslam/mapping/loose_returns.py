@@ -2,9 +2,8 @@
 
 Of a wall that a scan sees at grazing incidence, in short pieces between doors or behind furniture,
 it has a few returns: too few for a segment, or for one that is worth something. Once the map is
-known, they lie on its walls. A return far along a wall tells the direction in which the robot
-looks better than the dense part of that wall beside it, whose direction is known to a few
-milliradians only.
+known, they lie on its walls. Far along a wall they tell the direction in which the robot looks;
+near ones tell where it is by walls of which it has no segment.
 
 Returns are few per scan and walls are found in a tree, so that the work grows with the log.
 """
@@ -12,7 +11,7 @@ Returns are few per scan and walls are found in a tree, so that the work grows w
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from operator import is_
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -21,13 +20,11 @@ from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array, between, rotation3, transform_each, unit_vectors, wrap
 from graphslam.core.record import replace
 from graphslam.core.records import Association, Estimate, KeyframeScan, Step
-from graphslam.mapping.landmark_map import Entry
+from graphslam.mapping.gating import BoolArray, IntArray
+from graphslam.mapping.landmark_map import Entry, observed_from
+from graphslam.mapping.submaps import State
+from graphslam.mapping.wall_samples import sample_walls
 from graphslam.perception.line_fit import SMALLEST_SIGMA_M
-
-IntArray = np.ndarray[Any, np.dtype[np.int64]]
-Mask = np.ndarray[Any, np.dtype[np.bool_]]
-#: robot and time, ns
-State = tuple[str, int]
 
 #: rad: how well the direction of a scan is known before (one sigma)
 HEADING_RAD = 0.003
@@ -143,7 +140,7 @@ class _Views(NamedTuple):
     (k, 2) there; those of a scan begin at ``first`` (k,) and are ``number`` (k,).
     """
 
-    states: list[tuple[str, int]]
+    states: list[State]
     poses: Array
     lasers: Array
     points: Array
@@ -154,16 +151,12 @@ class _Views(NamedTuple):
     @classmethod
     def of(cls, scans: Sequence[KeyframeScan], estimate: Estimate) -> "_Views":
         """Those of scans with returns, of different states."""
-        states = [(scan.robot, scan.time_ns) for scan in scans]
-        poses = np.empty((len(scans), 3))
-        robots, times = np.array([r for r, _ in states]), np.array([t for _, t in states])
-        for robot, path in estimate.states.items():
-            poses[robots == robot] = path.at(times[robots == robot])
+        poses = observed_from(scans, estimate.states)
         number = np.array([len(scan.points) for scan in scans])
         points = np.concatenate([scan.points for scan in scans]).astype(float)
         lasers = np.array([scan.sensor[:2] for scan in scans])
         return cls(
-            states, poses, lasers, points,
+            [(scan.robot, scan.time_ns) for scan in scans], poses, lasers, points,
             np.repeat(np.arange(len(scans)), number), np.cumsum(number) - number, number,
         )  # fmt: skip
 
@@ -206,7 +199,7 @@ class _Seen(NamedTuple):
         return found
 
 
-def _in_segments(seen: _Seen, views: _Views, reach_m: float) -> Mask:
+def _in_segments(seen: _Seen, views: _Views, reach_m: float) -> BoolArray:
     """Which returns (n,) are on a part of a wall that was seen as a segment."""
     number = views.number[seen.scan]
     i = np.repeat(np.arange(len(seen.scan)), number)
@@ -220,9 +213,9 @@ def _in_segments(seen: _Seen, views: _Views, reach_m: float) -> Mask:
 
 
 class _OnWalls(NamedTuple):
-    """Returns on walls: ``row`` (k,) of `_Views.points`, ``wall`` (k,), ``along`` (k,) that wall.
+    """Returns on walls: ``row`` (k,) of `_Views.points`, ``wall`` (k,) row of `_WallTree.means`.
 
-    ``sigma`` (k,) m: noise across it.
+    ``along`` (k,) m: where on the wall, along its x axis; ``sigma`` (k,) m: noise across it.
     """
 
     row: IntArray
@@ -264,7 +257,10 @@ def _on_walls(
 
 
 class _WallTree(NamedTuple):
-    """Walls, sampled: ``of`` (s,) is the wall of each sample."""
+    """Walls (n), to be found by places: ``of`` (s,) is the wall of each point in ``samples``.
+
+    ``means`` (n, 3) and ``extents`` (n, 2) are those of the landmarks, world frame.
+    """
 
     walls: Sequence[Entry]
     means: Array
@@ -276,12 +272,8 @@ class _WallTree(NamedTuple):
     def from_walls(cls, walls: Sequence[Entry]) -> "_WallTree":
         """The tree of some walls."""
         means, extents = np.array([e.mean for e in walls]), np.array([e.extent for e in walls])
-        count = 2 + np.ceil((extents[:, 1] - extents[:, 0]) / SAMPLE_M).astype(np.int64)
-        of = np.repeat(np.arange(len(means)), count)
-        nth = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
-        along = extents[of, 0] + nth / (count[of] - 1) * (extents[of, 1] - extents[of, 0])
-        samples = cKDTree(means[of, :2] + along[:, None] * unit_vectors(means[of, 2]))
-        return cls(walls, means, extents, samples, of)
+        points, of = sample_walls(means, extents, SAMPLE_M)
+        return cls(walls, means, extents, cKDTree(points), of)
 
     def near(self, points: Array) -> tuple[IntArray, IntArray]:
         """Pairs (p,), (p,) of a point (n, 2) and a wall near it, sorted."""
@@ -296,11 +288,12 @@ class _WallTree(NamedTuple):
 def _measured(
     line: Array, V: Array, of: IntArray, found: _OnWalls, points: Array, floor_m: float
 ) -> tuple[Array, Array]:
-    """Lines (m, 3) with covariances ``V`` (m, 3, 3) in their own frames, corrected by returns.
+    """Lines (m, 3) corrected by returns: the linear update of offset and direction.
 
     Args:
         line: in the frames of the states.
-        V: infinite where nothing is known yet.
+        V: (m, 3, 3) their covariances, each along the axes of its line; the variance across is
+            infinite where nothing is known yet.
         of: the line (k,) of each return.
         found: the returns.
         points: (k, 2) where they are.
@@ -337,7 +330,7 @@ def _measured(
     return moved, turn @ V @ turn.mT
 
 
-def _most_seen(count: IntArray, scan: IntArray, new: Mask) -> IntArray:
+def _most_seen(count: IntArray, scan: IntArray, new: BoolArray) -> IntArray:
     """Rows of the new walls to be observed: of each scan those with the most returns."""
     rows = np.flatnonzero(new & (count >= LEAST_RETURNS))
     rows = rows[np.lexsort((-count[rows], scan[rows]))]

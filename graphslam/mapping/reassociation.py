@@ -19,6 +19,7 @@ from graphslam.core.record import replace
 from graphslam.core.records import Association, Estimate, Step
 from graphslam.mapping.gating import IntArray
 from graphslam.mapping.landmark_map import Entry, observed_from, retarget
+from graphslam.mapping.wall_samples import sample_walls
 
 #: m across, rad: typical residuals of an observation at its own wall, the unit of the distance
 SIGMA_M, SIGMA_RAD = 0.03, 0.02
@@ -115,13 +116,8 @@ def _pairs_nearby(
     Walls are sampled; a tree finds the samples near each observation.
     """
     means, extents = np.array([e.mean for e in walls]), np.array([e.extent for e in walls])
-    low, high = extents[:, 0] - beyond_m, extents[:, 1] + beyond_m
-    count = 2 + np.ceil((high - low) / SAMPLE_M).astype(np.int64)
-    of = np.repeat(np.arange(len(walls)), count)
-    nth = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
-    along = low[of] + nth / (count[of] - 1) * (high - low)[of]
-    direction = np.column_stack([np.cos(means[of, 2]), np.sin(means[of, 2])])
-    samples = cKDTree(means[of, :2] + along[:, None] * direction)
+    points, of = sample_walls(means, extents + np.array([-beyond_m, beyond_m]), SAMPLE_M)
+    samples = cKDTree(points)
     reach = float(np.hypot(gate_m, SAMPLE_M / 2)) + 1e-9
     near = samples.query_ball_point(world[:, :2], reach)
     size = np.array([len(found) for found in near])

@@ -164,7 +164,7 @@ def _solved(
     more = with_loose_returns(
         steps, rough.estimate, scan_log.keyframe_scans, landmarks.entries, config.front_end
     )
-    counts["observations_by_loose_returns"] = _observations(more) - _observations(steps)
+    counts["observations_by_loose_returns"] = _count_observations(more) - _count_observations(steps)
     steps = more
     if asked is not None:
         noise = asked.result()
@@ -189,7 +189,7 @@ def _solved(
     return moved_to(minimum.result(), estimate) if minimum else estimate, steps
 
 
-def _observations(steps: tuple[Step, ...]) -> int:
+def _count_observations(steps: tuple[Step, ...]) -> int:
     return sum(len(step.associations) for step in steps)
 
 

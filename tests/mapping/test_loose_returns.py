@@ -60,7 +60,8 @@ def test_a_return_far_along_a_wall_tells_its_direction():
     V = np.diag([0.01**2, 0.006**2])
     gain = V @ H / (H @ V @ H + sigma_sq)
     offset, turn = gain * (0.0 - 8.0 * 0.005)
-    assert a.z[2] == pytest.approx(0.005 + turn, abs=1e-5)  # 8.0 m is along a line turned by 5 mrad
+    assert a.z[2] == pytest.approx(0.005 + turn, abs=1e-5)
+    # by hand to first order in 5 mrad, squares of which are 2.5e-5
     assert a.z[1] == pytest.approx(-1.2 + offset, abs=1e-4)
     left = V - np.outer(gain, H @ V)
     cov = rotation3(-a.z[2]) @ a.cov @ rotation3(-a.z[2]).T
@@ -99,6 +100,7 @@ def test_a_wall_without_an_observation_gets_one():
     assert np.allclose(line.extent, [-0.2, 0.2], atol=1e-6)
     # both are on one surface, whose deviation they share
     assert line.cov[1, 1] == pytest.approx(1.5 * CONFIG.floor_normal_m**2, rel=0.01)
+    # two points with 1 cm each, 0.4 m apart, tell less than 0.03 rad; 0.2 is what is known before
     assert 0.03 < np.sqrt(line.cov[2, 2]) < 0.2
 
 
