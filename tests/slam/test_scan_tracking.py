@@ -103,3 +103,14 @@ def test_the_noise_of_odometry_is_found_in_a_log_of_scans():
     slip = 0.006**2
     assert slip / 2 / 2 < along < 2 * slip / 2
     assert 2 * slip / 0.54**2 / 2 < turning < 2 * 2 * slip / 0.54**2
+
+
+def test_loose_returns_are_in_the_last_solution():
+    """Breaks if the batch no longer asks for them. In the lab nearly every scan has a wall of which
+    it sees some returns only; half of the scans is what a wider segment would leave."""
+    config = load_config()
+    result = smooth(open_logs([ROOT / "logs" / "lab.mcap"], config), config)
+    (states,) = result.estimate.states.values()
+    seen = [a for step in result.steps for a in step.associations]
+    assert result.summary["consolidated"]["observations_by_loose_returns"] > len(states) / 2
+    assert {a.target for a in seen} == {landmark.id for landmark in result.landmarks}
