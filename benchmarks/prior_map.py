@@ -6,14 +6,16 @@ it; nothing is said about where. Errors are in the world, not aligned; bounds of
 99 % under the stated joint covariance. Repeated: a row of equal offices along a corridor, of which
 only the ends differ; the robot visits some in the middle, and then drives on to an end. Days:
 furniture is moved every day, and each day continues the map; all days are also solved anew, as
-sessions. Timed is the CPU time of each day.
+sessions, and further days are localised in either map: their errors tell how good the maps are,
+where those of the days that made them also depend on what was known by then. Timed is the CPU time
+of each day.
 
-Run: python benchmarks/prior_map.py [office] [repeated] [days] [--seeds N]
+Run: python benchmarks/prior_map.py [office] [repeated] [days] [--seeds N] [--first SEED]
 """
 
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +26,7 @@ from sessions import ROUND, SAME_PLACE, changed, later
 
 import graphslam
 from graphslam.core.errors import EstimationError
+from graphslam.core.geometry import Array
 from graphslam.core.records import Result, Trajectory
 from graphslam.evaluation.metrics import evaluate
 from graphslam.logs import read_truth
@@ -36,6 +39,8 @@ START_SIGMA = (0.005, 0.005, 0.001)
 #: corners of the round on a visit; share of the first side at which it begins, at most
 LEGS, LATEST = 5, 0.7
 DAYS, DAY_S = 10, 86_400
+#: further days that are localised in the maps of the days before
+FURTHER = 5
 #: m: a start farther off is wrong
 WRONG_M = 0.5
 
@@ -45,13 +50,14 @@ def main() -> None:
     options = parser(__doc__)
     options.add_argument("which", nargs="*", default=("office", "repeated", "days"))
     options.add_argument("--seeds", type=int, default=20)
+    options.add_argument("--first", type=int, default=0)
     chosen = options.parse_args()
     with tempfile.TemporaryDirectory() as name:
         for which in chosen.which:
             folder = Path(name) / which
             folder.mkdir()
             campaign = {"office": office, "repeated": repeated, "days": days}[which]
-            for line in campaign(folder, chosen.seeds):
+            for line in campaign(folder, range(chosen.first, chosen.first + chosen.seeds)):
                 print(line, flush=True)
 
 
@@ -73,11 +79,11 @@ def told_start(log: Path, seed: int) -> dict[str, Any]:
     }
 
 
-def office(folder: Path, seeds: int) -> Iterator[str]:
+def office(folder: Path, seeds: Sequence[int]) -> Iterator[str]:
     """A line for each seed, and one for all."""
     scenario = load_scenario("office-loop")
     errors, nees, bounds, wrong = [], [], [], 0
-    for seed in range(seeds):
+    for seed in seeds:
         simulate(scenario, folder / "first.mcap", 1000 + seed)
         known = mapped(folder, folder / "first.mcap", seed)
         log = visit(folder, scenario, seed)
@@ -103,7 +109,7 @@ def office(folder: Path, seeds: int) -> Iterator[str]:
     inside = sum(low <= n <= high for n, (low, high) in zip(nees, bounds, strict=True))
     below = sum(n <= high for n, (_, high) in zip(nees, bounds, strict=True))
     yield (
-        f"office, {seeds} seeds: {len(errors)} found, {wrong} wrong; ATE mean "
+        f"office, {len(seeds)} seeds: {len(errors)} found, {wrong} wrong; ATE mean "
         f"{np.mean(errors):.4f} m, worst {np.max(errors):.4f}; NEES/dof mean {np.mean(nees):.2f}, "
         f"{inside} inside their bounds, {below} not above"
     )
@@ -170,13 +176,13 @@ def row_of_offices() -> Scenario:
     return replace(scenario, world=world)
 
 
-def repeated(folder: Path, seeds: int) -> Iterator[str]:
+def repeated(folder: Path, seeds: Sequence[int]) -> Iterator[str]:
     """How often the start is refused in the middle of the row, and found at its end."""
     scenario = row_of_offices()
     ((name, robot),) = scenario.robots.items()
     middle, end = CORRIDOR_M / 2, OFFICES * WIDE_M - 1.0
     counts = {"middle": [0, 0, 0], "to the end": [0, 0, 0]}  # found, refused, wrong
-    for seed in range(seeds):
+    for seed in seeds:
         rng = np.random.default_rng(seed)
         whole = replace(
             robot,
@@ -210,15 +216,37 @@ def repeated(folder: Path, seeds: int) -> Iterator[str]:
         yield f"repeated offices, {what}: {found} found, {refused} refused, {wrong} wrong"
 
 
-def days(folder: Path, _seeds: int) -> Iterator[str]:
-    """Ten days, each of which continues the map of the day before, and all of them anew."""
+def days(folder: Path, seeds: Sequence[int]) -> Iterator[str]:
+    """Lines for the days of each seed, and one for all seeds."""
+    means = []
+    for seed in seeds:
+        own = folder / str(seed)
+        own.mkdir()
+        found = yield from days_of_seed(own, seed)
+        means.append(found)
+    each = np.array(means)
+    mean = each.mean(axis=0)
+    yield (
+        f"days, {len(seeds)} seeds: ATE mean of the days {mean[0]:.4f} m as they came, "
+        f"{mean[1]:.4f} anew; of further days {mean[2]:.4f} m in the continued map, {mean[3]:.4f} "
+        f"in that of all days anew: ratio of means {mean[2] / mean[3]:.2f}, of seeds "
+        f"{(each[:, 2] / each[:, 3]).min():.2f} to {(each[:, 2] / each[:, 3]).max():.2f}"
+    )
+
+
+def days_of_seed(folder: Path, seed: int) -> Generator[str, None, Array]:
+    """Ten days, each of which continues the map of the day before, and all of them anew.
+
+    Returns:
+        Mean errors, m: of the days as they came and anew, of further ones in either map.
+    """
     scenario = load_scenario("office-loop")
     first = folder / "first.mcap"
-    simulate(scenario, first, 3000)
-    known = mapped(folder, first, 0)
+    simulate(scenario, first, 3000 + seed)
+    known = mapped(folder, first, seed)
     logs, continued = [first], []
     for number in range(1, DAYS + 1):
-        log = visit(folder, changed(scenario, 0, number), number, DAY_S * number)
+        log = day(folder, scenario, seed, number)
         began = time.process_time()
         try:
             result = graphslam.smooth(
@@ -227,36 +255,66 @@ def days(folder: Path, _seeds: int) -> Iterator[str]:
                 **{"known_map.directory": str(known), "known_map.update": True},
             )
         except EstimationError as error:
-            yield f"day {number}: {error}"
+            yield f"days, seed {seed}, day {number}: {error}"
             continue
         took = time.process_time() - began
         logs.append(log)
         known = folder / f"day{number}"
-        truth = read_truth([log], graphslam.load_config()).trajectories
-        found = evaluate(result, truth)["joint"]["final"]
+        found = error_in_world(result, log)
         continued.append(found["ate_rmse_m"])
         told, map_now = result.summary["known_map"], load_known_map(known)
         yield (
-            f"day {number}: ATE {found['ate_rmse_m']:.4f} m, NEES/dof {found['nees_per_dof']:.2f}, "
-            f"{took:.1f} CPU s, {len(map_now.landmarks)} landmarks, {len(map_now.places)} places, "
-            f"{told['new']} new, {len(told['retired'])} retired, "
+            f"days, seed {seed}, day {number}: ATE {found['ate_rmse_m']:.4f} m, NEES/dof "
+            f"{found['nees_per_dof']:.2f}, {took:.1f} CPU s, {len(map_now.landmarks)} landmarks, "
+            f"{len(map_now.places)} places, {told['new']} new, {len(told['retired'])} retired, "
             f"{(known / 'known_map.npz').stat().st_size / 1e6:.2f} MB, widened "
             f"{map_now.known.root.widening:.2f}"
         )
-    if continued:
-        yield f"{len(continued)} days, continued map: ATE mean {np.mean(continued):.4f} m"
-    truth = read_truth(logs, SAME_PLACE)
     # sessions are called as their logs
-    told = {key.replace(".vehicle", ".first"): value for key, value in told_start(first, 0).items()}
+    told = {
+        key.replace(".vehicle", ".first"): value for key, value in told_start(first, seed).items()
+    }
+    truth = read_truth(logs, SAME_PLACE)
     began = time.process_time()
-    result = graphslam.smooth(logs, config=SAME_PLACE, **told)
-    found = evaluate(result, truth.trajectories)["robots"]
-    anew = [found[name]["final"]["ate_rmse_m"] for name in found if name != "first"]
+    result = graphslam.smooth(logs, config=SAME_PLACE, output=folder / "anew", **told)
+    took = time.process_time() - began
+    measured = evaluate(result, truth.trajectories)["robots"]
+    anew = [one["final"]["ate_rmse_m"] for name, one in measured.items() if name != "first"]
     frames = len(set(result.summary["frames"].values()))
+    further = np.array([
+        [localised(folder / name, log) for name in (known.name, "anew")]
+        for log in (day(folder, scenario, seed, DAYS + 1 + k) for k in range(FURTHER))
+    ])  # fmt: skip
+    further = further[~np.isnan(further).any(axis=1)]
+    means = np.array([np.mean(continued), np.mean(anew), *further.mean(axis=0)])
     yield (
-        f"all {len(logs)} logs anew: {frames} frames, ATE mean {np.mean(anew):.4f} m, "
-        f"{time.process_time() - began:.0f} CPU s"
+        f"days, seed {seed}: {len(continued)} days, ATE mean {means[0]:.4f} m as they came, "
+        f"{means[1]:.4f} anew ({frames} frames, {took:.0f} CPU s); {len(further)} further days "
+        f"{means[2]:.4f} m in the continued map, {means[3]:.4f} in that of all days anew"
     )
+    return means
+
+
+def day(folder: Path, scenario: Scenario, seed: int, number: int) -> Path:
+    """The log of a day on which furniture has been moved."""
+    number_of_all = number + 100 * seed
+    return visit(folder, changed(scenario, seed, number), number_of_all, DAY_S * number)
+
+
+def localised(known: Path, log: Path) -> float:
+    """The error of a log in a map, m; NaN if where it begins is not found."""
+    try:
+        result = graphslam.smooth(log, **{"known_map.directory": str(known)})
+    except EstimationError:
+        return float("nan")
+    return float(error_in_world(result, log)["ate_rmse_m"])
+
+
+def error_in_world(result: Result, log: Path) -> Mapping[str, Any]:
+    """Errors of a result's final poses, not aligned."""
+    truth = read_truth([log], graphslam.load_config()).trajectories
+    found: Mapping[str, Any] = evaluate(result, truth)["joint"]["final"]
+    return found
 
 
 if __name__ == "__main__":

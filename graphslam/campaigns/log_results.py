@@ -9,7 +9,6 @@ import numpy as np
 from graphslam.campaigns.one_log import MAP, LogTask, Row, do_log
 from graphslam.campaigns.tasks import forget_peak_memory
 from graphslam.core.config import Config
-from graphslam.core.geometry import path_length
 from graphslam.core.records import Result, Step
 from graphslam.evaluation.compare_backends import compare
 from graphslam.evaluation.compare_folder import save_comparison
@@ -94,7 +93,7 @@ def _figures(result: Result, errors: Mapping[str, Any] | None) -> Row:
         "verdict": summary["verdict"]["verdict"],
         "reasons": [reason["text"] for reason in summary["verdict"]["reasons"]],
         "robots": sorted(result.robots),
-        "length_m": round(sum(float(path_length(p.poses)[-1]) for p in states), 3),
+        "length_m": round(sum(robot.driven_m for robot in result.robots.values()), 3),
         "duration_s": round(1e-9 * float(max(s[1] for s in spans) - min(s[0] for s in spans)), 3),
         "error_m": final.get("ate_aligned_rmse_m"),
         "sigma_m": float(np.median(sigmas)) if len(sigmas) else None,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from graphslam.core.config import Config
-from graphslam.core.geometry import Array
+from graphslam.core.geometry import Array, path_length
 from graphslam.core.information_root import InformationRoot
 from graphslam.core.known_landmarks import KnownLandmarks
 from graphslam.core.mount_covariances import MountCovariances
@@ -394,6 +394,12 @@ class RobotResult:
     scan_causal: Trajectory | None
     dead_reckoning: Trajectory
     scan_ties: ScanTies | None = None
+
+    @property
+    def driven_m(self) -> float:
+        """Length of the final path, m. States would not do: those of several lasers alternate."""
+        in_time = np.argsort(self.final.stamps_ns, kind="stable")  # stamps may come late
+        return float(path_length(self.final.poses[in_time])[-1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

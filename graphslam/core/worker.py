@@ -136,6 +136,7 @@ class Prefetch(Generic[_T]):
             self._end()
 
     def _end(self) -> None:
+        self.forked = False  # its number may be that of another process from now on
         os.kill(self._pid, signal.SIGKILL)
         os.waitpid(self._pid, 0)
 

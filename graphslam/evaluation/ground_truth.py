@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError, OutputError
 from graphslam.core.records import Result, Trajectory, TrueLandmark, Truth
@@ -94,7 +96,13 @@ def errors_of_run(result: Result, truth: GroundTruth) -> dict[str, Any] | None:
         # the truth is of another time: no reason to lose the run
         result.summary["warnings"].append(f"not evaluated: {error}")
         return None
-    result.summary["verdict"].update(with_truth(result.summary["verdict"], errors))
+    sigmas = {
+        name: float(np.sqrt(np.nanmean(np.trace(robot.final.covs[:, :2, :2], axis1=1, axis2=2))))
+        for name, robot in result.robots.items()
+        if np.isfinite(robot.final.covs[:, 0, 0]).any()
+    }
+    verdict = result.summary["verdict"]
+    verdict.update(with_truth(verdict, errors, sigmas))
     return errors
 
 

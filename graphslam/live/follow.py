@@ -202,8 +202,8 @@ class _Folder:
 
     def _finish(self) -> None:
         assert self._writing is not None
-        self._before = self._writing.result()
-        self._writing = None
+        writing, self._writing = self._writing, None
+        self._before = writing.result()
         self._written_s = time.monotonic()
         self._took_s = self._written_s - self._began_s
 

@@ -29,6 +29,10 @@ MAX_SWEEP_S, SWEEP_SLACK = 1.0, 1.05
 HEADING_DECIMALS = 12
 
 
+#: why a scan is dropped
+_OTHER_LASER = "scan: of another laser on the same topic"
+
+
 class UnusableMessageError(Exception):
     """A message that must be dropped; its text is the reason under which it is counted."""
 
@@ -43,7 +47,8 @@ class TopicContext:
     return. With ``at_once`` all beams of a scan count as measured at its stamp. ``beams`` counts
     dropped beams of scans that are kept, by reason. With ``without_ranges`` scans get no ranges:
     only when they were taken is of interest. ``by_log_time``: the messages have no stamps; that of
-    their recording is taken. ``sensor``: see `records.Scan`.
+    their recording is taken. ``sensor``: see `records.Scan`. ``only_frame``: if given, scans
+    in other frames are dropped.
     """
 
     robot: str
@@ -58,6 +63,7 @@ class TopicContext:
     without_ranges: bool = False
     by_log_time: bool = False
     sensor: str = ""
+    only_frame: str | None = None
 
 
 class Decoder(NamedTuple):
@@ -81,6 +87,8 @@ def scans(rows: Any, topic: TopicContext) -> list[records.Scan | str]:
     beams = rows["ranges"].shape[1]
     ranges, usable = ((), ()) if topic.without_ranges else _usable_ranges(rows, topic.no_return_m)
     frame = rows["frame"][0].decode().lstrip("/")
+    if topic.only_frame not in (None, frame):
+        return [_OTHER_LASER for _ in rows]
     mount, inverted = topic.mounts.get(frame, _NO_MOUNT), frame in topic.inverted
     starts, steps = (rows[n].astype(float).tolist() for n in ("angle_min", "angle_increment"))
     periods = len(rows) * [0.0] if topic.at_once else _beam_periods(rows, beams)
@@ -182,6 +190,8 @@ def point_cloud(message: Any, topic: TopicContext) -> records.Scan:
     if not is_planar(points):
         raise UnusableMessageError("cloud: points are not those of one level laser, or none")
     frame, stamp = frame_of(message), stamp_of(message)
+    if topic.only_frame not in (None, frame):
+        raise UnusableMessageError(_OTHER_LASER)
     if frame in topic.tilted:
         points, walls = topic.tilted[frame].levelled(points)
         points = points[walls]

@@ -70,6 +70,11 @@ def find_mount(tree: TransformTree, base: str, sensor: str) -> Mount | None:
     return planar_mount(np.asarray(np.linalg.solve(of_base[common], of_sensor[common])))
 
 
+def is_same(one: Mount, other: Mount) -> bool:
+    """Whether two mounts are one, to rounding."""
+    return bool(np.allclose(one.pose, other.pose) and np.allclose(one.turn, other.turn))
+
+
 def axis_above(tree: TransformTree, base: str, sensor: str) -> Array:
     """The vertical (3,) of ``base`` in the axes of ``sensor``; z where ``tree`` ties them not."""
     of_base, of_sensor = _ancestors(tree, base), _ancestors(tree, sensor)

@@ -114,7 +114,7 @@ def sampled_edges(files: Sequence[Recording], space: str) -> dict[str, Edge]:
     found: dict[str, Edge] = {}
     for file in files:
         for topic in moving_topics(file):
-            if namespace_of(topic) in (DEFAULT_ROBOT, space):
+            if _is_of(topic, space):
                 messages = sample_messages(file, topic, _BLOCKS, _PER_BLOCK)
                 _add_edges(found, topic, decoded(messages))
     return found
@@ -178,11 +178,16 @@ def static_tree(
         if (edge.wobbles or not edge.moves) and np.isfinite(matrix).all():
             tree[child] = (edge.parent, matrix)
     for file in files:
-        own = [n for n in static_topics(file) if namespace_of(n) in (DEFAULT_ROBOT, space)]
+        own = [n for n in static_topics(file) if _is_of(n, space)]
         data = (raw.data for raw in raw_messages(file, own))
         # a mount that is missing because its message is damaged causes a warning
         tree |= transform_tree(schemas.decode_all(TF_MESSAGE, data))
     return tree
+
+
+def _is_of(topic: str, space: str) -> bool:
+    """Whether a topic of transforms is of a namespace, or of none, so of all."""
+    return namespace_of(topic) == DEFAULT_ROBOT or space in topic.strip("/").split("/")[:-1]
 
 
 def namespace_of(topic: str) -> str:

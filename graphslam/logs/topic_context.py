@@ -1,6 +1,7 @@
 """Decoding context of each topic, from a sample of its messages: mounts and no-return values."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -22,6 +23,7 @@ from graphslam.logs.mounts import (
     find_mount,
     is_level,
     is_projectable,
+    is_same,
 )
 from graphslam.logs.no_return import find_no_return
 from graphslam.logs.point_cloud import cloud_points, sweep_of
@@ -87,42 +89,14 @@ def topic_contexts(
     by_wheels = {t.robot for t in odometry if t.record is records.WheelAngles}
     by_wheels -= {t.robot for t in odometry if t.record is not records.WheelAngles}
     contexts = {}
-    trees: dict[str, TransformTree] = {}
-    edges: dict[str, dict[str, Edge]] = {}
+    frames = _SensorFrames(files, config, bases, by_wheels)
     for topic in topics:
         settings = config.robot(topic.robot)
         sensor = sensors.get(topic.name, "")
-        laser = settings.lasers.get(sensor, ()) if sensor else settings.laser
-        mounts: dict[str, Array] = {}
-        inverted: set[str] = set()
-        tilted: dict[str, Mount] = {}
-        no_return = None
+        told: dict[str, Any] = {}
         if topic.record in (records.Scan, records.Sighting):
-            messages = list(sample_decoded(files, topic))
-            if topic.robot not in trees:
-                own = edges[topic.robot] = sampled_edges(files, topic.robot)
-                trees[topic.robot] = static_tree(files, topic.robot, own)
-            tree = trees[topic.robot]
-            for frame in sorted({frame_of(message) for message in messages}):
-                above = base_above(tree, frame)
-                base = bases.get(topic.robot, above)
-                if topic.robot in by_wheels and above.rpartition("/")[2].startswith("base"):
-                    base = above  # no message of the wheels names it
-                if sensor and base == frame:
-                    base = "the robot's base"  # nothing ties this laser to the others
-                is_scan = topic.record is records.Scan
-                link = moving_link(edges[topic.robot], tree, base, frame) if is_scan else None
-                mount, notes = _mount(topic, tree, base, (sensor, frame, link), laser)
-                mounts[frame] = mount.pose
-                if topic.record is records.Scan and not is_level(mount):
-                    tilted[frame] = mount
-                elif mount.inverted:
-                    inverted.add(frame)
-                findings += notes
-            if topic.schema == schemas.SIGHTING:
-                findings += in_degrees(topic.name, [float(m.bearing) for m in messages])
-            if topic.schema == schemas.LASER_SCAN:
-                no_return = find_no_return(message.ranges for message in messages)
+            told, notes = frames.context(topic, sensor)
+            findings += notes
         if topic.schema == schemas.ODOMETRY:
             findings += leaning(topic.name, _turns(files, topic))
         unstamped = topic.record in _STAMPED and _is_unstamped(files, topic)
@@ -132,17 +106,112 @@ def topic_contexts(
             findings.append(Finding("doubt", "stamps", topic.name, text, remedy))
         contexts[topic.name] = TopicContext(
             robot=topic.robot,
-            mounts=mounts,
-            inverted=frozenset(inverted),
-            tilted=tilted,
-            no_return_m=np.inf if no_return is None else no_return,
             at_once=not config.logs.undistort,
             left_joint=settings.left_joint,
             right_joint=settings.right_joint,
             by_log_time=unstamped,
             sensor=sensor,
+            **told,
         )
     return contexts, findings
+
+
+class _SensorFrames:
+    """What the frames of sensors are on their robots; transforms are read once for each robot."""
+
+    def __init__(
+        self,
+        files: Sequence[Recording],
+        config: Config,
+        bases: Mapping[str, str],
+        by_wheels: Collection[str],
+    ) -> None:
+        """``bases``: robot -> frame that moves; ``by_wheels``: robots whose wheels tell how."""
+        self._files, self._config, self._bases = files, config, bases
+        self._by_wheels = by_wheels
+        self._trees: dict[str, tuple[dict[str, Edge], TransformTree]] = {}
+
+    def _transforms(self, robot: str) -> tuple[dict[str, Edge], TransformTree]:
+        if robot not in self._trees:
+            edges = sampled_edges(self._files, robot)
+            self._trees[robot] = edges, static_tree(self._files, robot, edges)
+        return self._trees[robot]
+
+    def context(self, topic: Topic, sensor: str) -> tuple[dict[str, Any], list[Finding]]:
+        """Of a `TopicContext` what is about its frames and ranges, and findings.
+
+        ``sensor``: name of a further laser, empty for the first.
+        """
+        settings = self._config.robot(topic.robot)
+        laser = settings.lasers.get(sensor, ()) if sensor else settings.laser
+        edges, tree = self._transforms(topic.robot)
+        messages = list(sample_decoded(self._files, topic))
+        is_scan = topic.record is records.Scan
+        mounts: dict[str, Array] = {}
+        inverted: set[str] = set()
+        tilted: dict[str, Mount] = {}
+        findings: list[Finding] = []
+        counted = Counter(map(frame_of, messages))
+        only = None
+        if is_scan and len(counted) > 1:
+            only, findings = _one_laser(topic, counted, tree, self._base(topic, min(counted), tree))
+        for frame in sorted(counted) if only is None else [only]:
+            base = self._base(topic, frame, tree)
+            if sensor and base == frame:
+                base = "the robot's base"  # nothing ties this laser to the others
+            link = moving_link(edges, tree, base, frame) if is_scan else None
+            mount, notes = _mount(topic, tree, base, (sensor, frame, link), laser)
+            mounts[frame] = mount.pose
+            if is_scan and not is_level(mount):
+                tilted[frame] = mount
+            elif mount.inverted:
+                inverted.add(frame)
+            findings += notes
+        told: dict[str, Any] = {
+            "mounts": mounts, "inverted": frozenset(inverted), "tilted": tilted, "only_frame": only
+        }  # fmt: skip
+        if topic.schema == schemas.SIGHTING:
+            bearings = [float(m.bearing) for m in messages]
+            findings += in_degrees(topic.name, bearings, "their variance * (pi / 180)^2")
+        if topic.schema == schemas.LASER_SCAN:
+            first, step = (
+                np.array([getattr(m, name) for m in messages])
+                for name in ("angle_min", "angle_increment")
+            )
+            # angle_max is not what some drivers say
+            last = first + step * [len(m.ranges) - 1 for m in messages]
+            findings += in_degrees(topic.name, [*first, *last], "angle_increment too")
+            no_return = find_no_return(message.ranges for message in messages)
+            told["no_return_m"] = np.inf if no_return is None else no_return
+        return told, findings
+
+    def _base(self, topic: Topic, frame: str, tree: TransformTree) -> str:
+        """The frame that moves with a robot, on which a sensor is."""
+        above = base_above(tree, frame)
+        if topic.robot in self._by_wheels and above.rpartition("/")[2].startswith("base"):
+            return above  # no message of the wheels names it
+        return self._bases.get(topic.robot, above)
+
+
+def _one_laser(
+    topic: Topic, counted: Counter[str], tree: TransformTree, base: str
+) -> tuple[str | None, list[Finding]]:
+    """The frame of the laser that is used, where scans of several come on one topic.
+
+    ``counted``: frame -> scans of a sample. None, and nothing to say, if tf has all at one mount:
+    then they are names of one laser.
+    """
+    mounts = [find_mount(tree, base, frame) for frame in counted]
+    first = mounts[0]
+    if first is not None and all(one is not None and is_same(one, first) for one in mounts):
+        return None, []
+    used = max(sorted(counted), key=lambda frame: counted[frame])
+    others = ", ".join(frame or "(none)" for frame in sorted(counted) if frame != used)
+    text = f"scans of several lasers come on it: those in frame {used or '(none)'} are used, "
+    text += f"those in frame {others} are left out"
+    return used, [
+        Finding("doubt", "frames", topic.name, text, "record each laser on a topic of its own")
+    ]
 
 
 def _turns(files: Sequence[Recording], topic: Topic) -> Array:
@@ -171,8 +240,10 @@ def leaning(topic: str, turns: Array) -> list[Finding]:
     return [Finding("doubt", "level", topic, text, remedy)]
 
 
-def in_degrees(topic: str, bearings: Sequence[float]) -> list[Finding]:
+def in_degrees(topic: str, bearings: Sequence[float], too: str) -> list[Finding]:
     """That the bearings of a source are no angles in radians, if they are in degrees.
+
+    ``too``: what else has to be written in radians then.
 
     One that is not wrapped is at most a turn away from one that is; of those in degrees few are.
     """
@@ -182,7 +253,7 @@ def in_degrees(topic: str, bearings: Sequence[float]) -> list[Finding]:
     if beyond < LEAST_IN_DEGREES or beyond < SHARE_IN_DEGREES * len(sizes) or sizes.max() > 360:
         return []
     text = f"its bearings are in degrees: up to {sizes.max():.0f}, where a whole turn is 6.28 rad"
-    remedy = "write them in radians: bearing * pi / 180, and their variance * (pi / 180)^2"
+    remedy = f"write them in radians: bearing * pi / 180, and {too}"
     return [Finding("unusable", "units", topic, text, remedy)]
 
 

@@ -1,7 +1,8 @@
 """Selection of the topics of a log that are used, and their robots."""
 
+from collections import Counter, defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from graphslam.core import records
 from graphslam.core.config import Config
@@ -38,7 +39,8 @@ class Topic:
 def find_topics(files: Sequence[Recording], config: Config) -> list[Topic]:
     """All topics whose schema has a decoder, sorted by name.
 
-    The robot is the namespace; see `robots_and_topics` for whose it really is.
+    The robot is the namespace, a nested one where several of one namespace are robots; see
+    `robots_and_topics` for whose it really is.
     ``config.logs.topics``, where not empty, restricts the topics and names the robots.
 
     Raises:
@@ -69,7 +71,39 @@ def find_topics(files: Sequence[Recording], config: Config) -> list[Topic]:
             f"{names}: logs.topics names {missing[0]}, which is not a usable topic of the log; "
             f"there are {', '.join(sorted(found))}{did_you_mean(missing[0], found)}"
         )
-    return [found[name] for name in sorted(found) if not wanted or name in wanted]
+    if not wanted:
+        return _nested([found[name] for name in sorted(found)])
+    return [found[name] for name in sorted(found) if name in wanted]
+
+
+def _nested(topics: Sequence[Topic]) -> list[Topic]:
+    """Topics, those of ``/fleet/a`` and ``/fleet/b`` of robots a and b instead of one, fleet.
+
+    If at least two namespaces within one have each a sensor and odometry.
+    """
+    inner: dict[tuple[str, str], set[type]] = defaultdict(set)
+    for topic in topics:
+        if topic.count and len(parts := topic.name.strip("/").split("/")) > 2:
+            inner[parts[0], parts[1]].add(topic.record)
+    whole = [
+        name
+        for name, kinds in inner.items()
+        if kinds & set(ODOMETRY_KINDS) and kinds & {records.Scan, records.Sighting}
+    ]
+    outer = Counter(first for first, _ in whole)
+    taken = Counter(second for first, second in whole if outer[first] > 1)
+    taken.update({topic.robot for topic in topics})
+    robots = {
+        (first, second): second if taken[second] == 1 else f"{first}_{second}"
+        for first, second in whole
+        if outer[first] > 1
+    }
+    made = []
+    for topic in topics:
+        first, _, rest = topic.name.strip("/").partition("/")
+        robot = robots.get((first, rest.partition("/")[0]), topic.robot)
+        made.append(replace(topic, robot=robot))
+    return made
 
 
 def choose_topics(

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -9,6 +10,8 @@ from graphslam.core.geometry import Array
 
 #: share of the range that is added on both sides of the data
 MARGIN = 0.05
+#: from here on, as of coordinates in UTM, six digits do not tell ticks apart
+LARGE = 1e5
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +39,11 @@ class Scale:
     def labels(self, ticks: list[float]) -> list[str]:
         """Texts of ticks with a proper minus sign; on a linear scale with equal decimals."""
         texts = [f"{value:g}" for value in ticks]
-        if not self.is_log and not any("e" in text for text in texts):
+        if not self.is_log and max(map(abs, ticks), default=0.0) >= LARGE:
+            step = min((b - a for a, b in pairwise(ticks)), default=1.0)
+            places = max(0, math.ceil(-math.log10(step) - 1e-9))
+            texts = [f"{value:.{places}f}" for value in ticks]
+        elif not self.is_log and not any("e" in text for text in texts):
             places = max((len(text.partition(".")[2]) for text in texts), default=0)
             texts = [f"{value:.{places}f}" for value in ticks]
         return [text.replace("-", "\u2212") for text in texts]

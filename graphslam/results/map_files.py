@@ -70,7 +70,9 @@ def make_map(
     """
     saved = load(directory)
     scans = read_scans(directory / SCANS_FILE)
-    if saved.summary.get("counts", {}).get("scans") and not scans:
+    counts = saved.summary.get("counts", {})
+    # a robot that never moved far enough for a second keyframe has mapped nothing yet
+    if counts.get("scans") and counts.get("keyframes", 0) > len(saved.robots) and not scans:
         raise OutputError(
             f"{directory}: has no {SCANS_FILE}, of which maps are made: it is of an older version "
             "or of a back end that keeps no scans; run smooth again"

@@ -91,6 +91,8 @@ def density(points: Array, limits: Array, color: str, pixels: int = 900) -> Shad
 def map_axes(drawing: Drawing, limits: Array) -> Axes:
     """Axes in metres with equal scales that include ``limits`` [[x_min, x_max], [y_min, y_max]]."""
     left, bottom, right, top = 0.57, 0.42, 0.08, 0.24
+    digits = len(f"{np.abs(limits[1]).max():.0f}")
+    left += 0.06 * max(0, digits - 4)  # northings in UTM have seven
     box = np.array([WIDTH_IN - left - right, drawing.height_in - bottom - top])
     # widen the narrower direction for equal scales
     scale = ((limits[:, 1] - limits[:, 0]) / box).max()

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.core.geometry import path_length
 from graphslam.core.records import Landmark, Result
 from graphslam.results.metric_tables import evaluation_notes, evaluation_tables
 from graphslam.results.report_html import counted, duration, length, number, table
@@ -19,9 +18,7 @@ def headline(result: Result) -> str:
     robots = len(result.robots)
     fleet = "one robot" if robots == 1 else f"{robots} robots"
     paths = [robot.final for robot in result.robots.values()]
-    # states are in the order of time; a trajectory may have late stamps
-    states = result.estimate.states.values()
-    metres = sum(float(path_length(p.poses)[-1]) for p in states)
+    metres = sum(robot.driven_m for robot in result.robots.values())
     span = (max(p.stamps_ns[-1] for p in paths) - min(p.stamps_ns[0] for p in paths)) / 1e9
     source = f"{counted(counts['scans'], 'scan')} of {fleet}" if counts.get("scans") else fleet
     kinds = {landmark.kind for landmark in result.landmarks}

@@ -18,24 +18,28 @@ TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 #: types of visualization_msgs/Marker
 LINE_STRIP, LINE_LIST, SPHERE_LIST, TEXT = 4, 5, 7, 9
-_FLOAT32 = 7
+_FLOAT32, _FLOAT64 = 7, 8
+#: m: coordinates as of maps in UTM, of which a float32 has no millimetres
+_FAR_M = 4096.0
 
 Rgb = tuple[float, float, float]
 
 
 def point_cloud(points: Array, stamp_ns: int, frame: str) -> Any:
-    """PointCloud2 of points (n, 2) m, at z = 0."""
-    data = np.zeros((len(points), 3), dtype="<f4")
+    """PointCloud2 of points (n, 2) m, at z = 0; coordinates are float64 where they are large."""
+    is_far = bool((np.abs(points) > _FAR_M).any())
+    data = np.zeros((len(points), 3), dtype="<f8" if is_far else "<f4")
     data[:, :2] = points
+    size, kind = data.itemsize, _FLOAT64 if is_far else _FLOAT32
     fields = [
         schemas.build(
-            "sensor_msgs/msg/PointField", name=axis, offset=4 * i, datatype=_FLOAT32, count=1
+            "sensor_msgs/msg/PointField", name=axis, offset=size * i, datatype=kind, count=1
         )
         for i, axis in enumerate("xyz")
     ]
     return schemas.build(
         CLOUD, header=schemas.header(stamp_ns, frame), height=1, width=len(points), fields=fields,
-        is_bigendian=False, point_step=12, row_step=12 * len(points),
+        is_bigendian=False, point_step=3 * size, row_step=3 * size * len(points),
         data=data.reshape(-1).view(np.uint8), is_dense=True,
     )  # fmt: skip
 

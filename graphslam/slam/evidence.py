@@ -82,13 +82,15 @@ class RobotEvidence:
 class Evidence:
     """What the whole run knows; ``summary`` has what it counted.
 
-    ``without_odometry``: robots whose motion is that of their scans.
+    ``without_odometry``: robots whose motion is that of their scans. ``observed``: whether an
+    observation or a closure is in the estimate.
     """
 
     robots: tuple[RobotEvidence, ...]
     summary: Mapping[str, Any]
     innovations: Mapping[str, Array] = field(default_factory=dict)
     without_odometry: tuple[str, ...] = ()
+    observed: bool = True
 
 
 def gather(
@@ -127,7 +129,9 @@ def gather(
                 bridged_sigma_m=run.track.bridged_sigma_m,
             )
         )
-    return Evidence(tuple(found), summary, innovations, tuple(pipeline.log.without_odometry))
+    observed = any(step.associations or step.closures for step in steps)
+    unmoved = tuple(pipeline.log.without_odometry)
+    return Evidence(tuple(found), summary, innovations, unmoved, observed)
 
 
 def _seen(seen: Sequence[Association], run: RobotState, estimate: Estimate) -> Seen:

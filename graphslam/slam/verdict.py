@@ -7,6 +7,7 @@ whom. The thresholds are far from what healthy logs show, see docs/reliability.m
 
 import math
 from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 from graphslam.slam.doubts import Reason
@@ -25,6 +26,8 @@ REJECTED = 0.6
 LOST = 0.02
 #: mean squared error over its covariance: of healthy logs up to 5
 NEES = 30.0, 1000.0
+
+_NONE: Mapping[str, float] = MappingProxyType({})
 
 
 def judge(evidence: Evidence) -> dict[str, Any]:
@@ -46,11 +49,26 @@ def to_summary(reasons: Iterable[Reason]) -> dict[str, Any]:
     }
 
 
-def with_truth(verdict: Mapping[str, Any], errors: Mapping[str, Any] | None) -> dict[str, Any]:
-    """A verdict that knows the errors against the truth of the log, where there is one."""
+def with_truth(
+    verdict: Mapping[str, Any],
+    errors: Mapping[str, Any] | None,
+    sigmas_m: Mapping[str, float] = _NONE,
+) -> dict[str, Any]:
+    """A verdict that knows the errors against the truth of the log, where there is one.
+
+    Args:
+        verdict: without them.
+        errors: see `graphslam.evaluation.metrics.evaluate`.
+        sigmas_m: of the positions of each robot, root mean square. Where truth and result have no
+            frame in common, aligned errors are held against these: an alignment only makes errors
+            smaller, and sigmas are those of a path that begins where it is told.
+    """
     reasons = [Reason(**one) for one in verdict["reasons"]]
     for name, found in ((errors or {}).get("robots") or {}).items():
-        nees = float((found.get("final") or {}).get("nees_per_dof") or 0.0)
+        final = found.get("final") or {}
+        nees = float(final.get("nees_per_dof") or 0.0)
+        if not nees and sigmas_m.get(name):
+            nees = float(((final.get("ate_aligned_rmse_m") or 0.0) / sigmas_m[name]) ** 2)
         level = _level(nees, NEES)
         if level:
             times = f"{math.sqrt(nees):.0f} times what the covariances say"
@@ -82,7 +100,9 @@ def _noise(evidence: Evidence) -> Iterable[Reason]:
 
 def _misfit(evidence: Evidence) -> Iterable[Reason]:
     graph = evidence.summary["graph"]
-    misfit = graph["error_without_kernels"] / max(graph["dof"], 1)
+    if not graph["dof"]:  # back ends that use no observations
+        return
+    misfit = graph["error_without_kernels"] / graph["dof"]
     level = _level(misfit, MISFITS)
     if level:
         text = f"observations contradict each other: residuals are {misfit:.3g} times their noise"
@@ -110,7 +130,7 @@ def _lost(evidence: Evidence) -> Iterable[Reason]:
 
 def _unobserved(evidence: Evidence) -> Iterable[Reason]:
     counts = evidence.summary["counts"]
-    if not counts["observations"] and not counts["loop_closures"]:
+    if not evidence.observed or not (counts["observations"] or counts["loop_closures"]):
         if evidence.summary["closures"].get("used"):
             return
         text = "no landmark and no closure entered the estimate: this is dead reckoning by odometry"

@@ -114,6 +114,21 @@ def test_a_task_finds_things_as_they_were_when_it_began():
     assert lines == ["False [1] False [1] False", "True [1] True [1] True"]
 
 
+def test_the_error_of_a_task_is_raised_whenever_its_result_is_asked_for():
+    """The number of the process that is gone may be that of another one by then."""
+    lines = printed("""
+        def task():
+            raise LookupError("why")
+        one = Future(task)
+        for _ in range(2):
+            try:
+                one.result()
+            except LookupError as error:
+                print(error)
+    """)
+    assert lines == ["why", "why"]
+
+
 def test_shared_results_are_in_the_order_of_the_arguments():
     lines = printed("""
         for n in (0, 1, 2, 7):

@@ -111,6 +111,32 @@ def test_ctrl_c_ends_the_following(room, tmp_path):
     assert len(graphslam.load_result(tmp_path / "out").robots["robot"].final) == 20
 
 
+def test_a_robot_that_still_stands_has_a_folder_without_a_grid_map(tmp_path):
+    """It has one keyframe, of which nothing is mapped yet: that is no reason to end."""
+    path = tmp_path / "stands.mcap"
+    with graphslam.LogWriter(path) as log:
+        log.mount("robot", 10**9, (0, 0, 0))
+        for k in range(60):
+            stamp = 10**9 + k * 10**8
+            log.odometry("robot", stamp, (0, 0, 0))
+            shape = {"angle_min_rad": -1.0, "angle_step_rad": 0.02, "range_max_m": 10.0}
+            log.scan("robot", stamp, np.full(101, 3.0), **shape)
+    told = graphslam.follow(path, tmp_path / "out")
+    assert told["counts"]["keyframes"] == 1
+    assert (tmp_path / "out/map.svg").exists() and not (tmp_path / "out/map.pgm").exists()
+
+
+def test_an_error_of_writing_is_told_as_it_is(room, tmp_path, monkeypatch):
+    """And not what fails when it is tried once more."""
+
+    def full(*_):
+        raise graphslam.OutputError("the disk is full")
+
+    monkeypatch.setattr(follow_module, "write_live_folder", full)
+    with pytest.raises(graphslam.OutputError, match="the disk is full"):
+        graphslam.follow(room, tmp_path / "out")
+
+
 def test_what_stands_there_is_not_overwritten(room, tmp_path):
     """Neither another folder, nor a result without force."""
     (tmp_path / "mine").mkdir()

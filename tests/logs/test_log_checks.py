@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import call, check_one_line
+from mcap.reader import make_reader
 
 from graphslam.core import records
 from graphslam.core.config import Config
@@ -188,6 +189,47 @@ def test_bearings_in_degrees_are_refused_before_anything_is_computed(tmp_path):
     assert not (tmp_path / "out").exists()
     told = call("info", path)
     assert told.code == 1 and "bearings are in degrees" in told.out
+
+
+def test_scans_in_degrees_are_refused_before_anything_is_computed(tmp_path):
+    path = tmp_path / "log.mcap"
+    with LogWriter(path) as log:
+        log.mount("robot", T0, (0, 0, 0))
+        for k in range(20):
+            log.odometry("robot", T0 + k * S, (k, 0, 0))
+            shape = {"angle_min_rad": -90.0, "angle_step_rad": 1.0, "range_max_m": 9.0}
+            log.scan("robot", T0 + k * S, np.full(181, 2.0), **shape)
+    line = check_one_line(call("smooth", path, "-o", tmp_path / "out"))
+    assert "bearings are in degrees: up to 90" in line and "angle_increment too" in line
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.5])
+def test_scans_of_two_lasers_on_one_topic_are_not_taken_for_those_of_one(tmp_path, apart):
+    """Of a frame beside the first one they are left out, and it is said; if tf has both frames at
+    one place they are of one laser."""
+    path = tmp_path / "log.mcap"
+    with LogWriter(path) as log:
+        log.mount("robot", T0, (0, 0, 0), sensor="front")
+        log.mount("robot", T0, (-apart, 0, 0), sensor="rear")
+        for k in range(20):
+            log.odometry("robot", T0 + k * S, (k, 0, 0))
+            for n, sensor in enumerate(("front", "rear") if k % 2 else ("front",)):
+                stamp = T0 + k * S + n * S // 2
+                log.scan("robot", stamp, np.full(21, 2.0), sensor=sensor, **SCAN)
+    other = tmp_path / "one.mcap"
+    with path.open("rb") as stream, LogWriter(other) as made:
+        for schema, channel, message in make_reader(stream).iter_messages(log_time_order=False):
+            topic = "/scan" if channel.topic.startswith("/scan") else channel.topic
+            made.encoded(topic, schema.name, message.data, message.log_time)
+    log = open_logs([other], Config())
+    scans = [m for m in log.messages() if isinstance(m, records.Scan)]
+    told = [line for line in log.warnings if "several lasers" in line]
+    assert len(scans) == (20 if apart else 30)
+    assert bool(told) == bool(apart)
+    if apart:
+        assert "front are used, those in frame rear are left out" in told[0]
+        assert log.dropped["scan: of another laser on the same topic"] == 10
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ from tests import mutations
 
 S = 1_000_000_000
 COV2, COV3 = np.diag([0.01, 0.04]), np.diag([0.01, 0.02, 0.03])
-SCAN = {"angle_min_rad": -1.0, "angle_step_rad": 0.5, "range_max_m": 20.0}
+SCAN = {"angle_min_rad": -1.0, "angle_step_rad": 0.02, "range_max_m": 20.0}
 
 
 def read(path: Path, config: Config | None = None) -> tuple[LogSet, list[records.Message]]:
@@ -87,7 +87,7 @@ def test_every_kind_of_record_comes_back_as_it_was_written(tmp_path):
     assert isinstance(scan, records.Scan) and scan.robot == "robot1"
     np.testing.assert_array_equal(scan.ranges, [1, np.nan, 3])
     np.testing.assert_allclose(scan.mount, (0.2, -0.1, 0.3), atol=1e-15)
-    np.testing.assert_allclose(scan.angles, [-1, -0.5, 0])
+    np.testing.assert_allclose(scan.angles, [-1, -0.98, -0.96])
     assert (
         isinstance(first, records.Sighting) and first.z.shape == (2,) and first.cov.shape == (2, 2)
     )
@@ -357,7 +357,7 @@ def test_a_far_flat_wall_does_not_mean_no_return(tmp_path):
 def test_an_upside_down_laser_and_a_clockwise_one_see_the_same_as_a_normal_one(tmp_path):
     """A return straight to the left stays on the left, whichever way the beams are counted."""
     path = tmp_path / "log.mcap"
-    ranges = [1.0, 2.0, 3.0]  # at -1, -0.5 and 0 rad in the frame of the upside-down laser
+    ranges = [1.0, 2.0, 3.0]  # at -1, -0.98 and -0.96 rad in the frame of the upside-down laser
     with LogWriter(path) as log:
         log.odometry("robot", S, (0, 0, 0))
         log.scan("robot", 2 * S, ranges, **SCAN)
@@ -376,12 +376,12 @@ def test_an_upside_down_laser_and_a_clockwise_one_see_the_same_as_a_normal_one(t
         log._add("/tf_static", schemas.TF_MESSAGE, message, S, None)
     _, (_, scan) = read(path)
     np.testing.assert_allclose(scan.ranges, ranges[::-1])
-    np.testing.assert_allclose(scan.angles, [0, 0.5, 1.0], atol=1e-7)
+    np.testing.assert_allclose(scan.angles, [0.96, 0.98, 1.0], atol=1e-7)
     np.testing.assert_allclose(scan.mount, [0.5, 0, 0], atol=1e-15)
-    shape = {"angle_min_rad": 1.0, "angle_step_rad": -0.5}
+    shape = {"angle_min_rad": 1.0, "angle_step_rad": -0.02}
     _, (clockwise,) = scans_of(tmp_path / "clockwise.mcap", [ranges], **shape)
     np.testing.assert_allclose(clockwise.ranges, ranges[::-1])
-    np.testing.assert_allclose(clockwise.angles, [0, 0.5, 1.0], atol=1e-7)
+    np.testing.assert_allclose(clockwise.angles, [0.96, 0.98, 1.0], atol=1e-7)
 
 
 def test_the_mount_is_configured_or_found_or_warned_about(tmp_path):

@@ -384,6 +384,29 @@ def test_two_robots_with_trees_of_their_own_are_two(room, tmp_path):
     }  # fmt: skip
 
 
+def test_robots_in_one_namespace_are_as_many_as_have_sensors_and_odometry_there(room, tmp_path):
+    """/fleet/a and /fleet/b are two robots; /rig/front with all of a robot is one, rig."""
+
+    def recorded(path, *spaces):
+        def robots(log):
+            return {
+                Robot(log, f"{s}/", odometry=f"/{s}/odom", scan=f"/{s}/scan"): ("odometry",)
+                for s in spaces
+            }
+
+        return topics_of(record(path, room, robots))
+
+    assert recorded(tmp_path / "two.mcap", "fleet/a", "fleet/b") == {
+        "/fleet/a/odom": "a", "/fleet/a/scan": "a", "/fleet/b/odom": "b", "/fleet/b/scan": "b",
+    }  # fmt: skip
+    assert recorded(tmp_path / "one.mcap", "rig/front") == {
+        "/rig/front/odom": "rig", "/rig/front/scan": "rig",
+    }  # fmt: skip
+    assert set(recorded(tmp_path / "same.mcap", "x/a", "x/b", "y/a", "y/c").values()) == {
+        "x_a", "b", "y_a", "c",
+    }  # fmt: skip
+
+
 def test_a_sensor_belongs_to_the_robot_that_carries_its_frame(room, tmp_path):
     """The laser of tb2 has a name without namespace; its frame says whose it is."""
 

@@ -21,6 +21,7 @@ from graphslam.logs.writer import LogWriter
 from graphslam.results import viewer_mcap
 from graphslam.results.folder import load, save
 from graphslam.results.scene import ellipse, uncertainty_lines
+from graphslam.results.viewer_messages import point_cloud
 from graphslam.results.viewers import VIEWERS, write_viewer
 
 NS = 1_000_000_000
@@ -132,6 +133,18 @@ def test_what_is_shown_is_what_the_result_says(shown):
         origin = [grid.info.origin.position.x, grid.info.origin.position.y]
         i, j = ((xyz[:, :2] - origin) / grid.info.resolution).astype(int).T
         assert (cells[j, i] > 50).mean() > 0.5 and set(np.unique(cells)) <= {-1, *range(101)}
+
+
+def test_points_far_from_the_origin_keep_their_millimetres():
+    """As in UTM, where a float32 has steps of half a metre; near it viewers get float32."""
+    near = np.array([[1.0, 2.0], [3.25, 4.125]])
+    for offset, kind in ((0.0, 7), (5.2e6, 8)):
+        made = point_cloud(near + offset, NS, "map")
+        assert {field.datatype for field in made.fields} == {kind}
+        size = made.point_step // 3
+        points = made.data.view(f"<f{size}").reshape(-1, 3)
+        np.testing.assert_allclose(points[:, :2] - offset, near, atol=1e-6)
+        assert made.row_step == len(made.data) == 2 * made.point_step
 
 
 def test_the_layout_shows_every_topic(shown):

@@ -307,6 +307,27 @@ def test_the_truth_in_a_log_is_a_witness_where_it_is():
     assert found["verdict"] == "bad" and "100 times what the covariances say" in str(found)
 
 
+def test_truth_without_a_common_frame_is_a_witness_by_aligned_errors():
+    good = judge(evidence())
+    near, far = (
+        {"robots": {"tom": {"final": {"nees_per_dof": None, "ate_aligned_rmse_m": error}}}}
+        for error in (0.05, 5.0)
+    )
+    assert with_truth(good, near, {"tom": 0.02}) == good
+    assert with_truth(good, far, {"tom": 0.02})["verdict"] == "bad"
+    assert with_truth(good, far, {}) == good  # nothing is stated
+
+
+def test_what_saw_much_and_used_nothing_is_dead_reckoning():
+    verdict, told = reasons(replace(evidence(), observed=False))
+    assert verdict == "doubtful" and "dead reckoning" in told
+
+
+def test_a_back_end_without_observations_is_not_said_to_contradict_them():
+    graph = {"graph": {"error_without_kernels": 4e5, "dof": 0}}
+    assert reasons(replace(evidence(), summary=SUMMARY | graph))[0] == "good"
+
+
 @pytest.mark.parametrize(("sign", "code"), [(1, 0), (-1, 3)])
 def test_strict_tells_by_its_exit_code_and_the_result_is_written(tmp_path, sign, code):
     """Bearings of the wrong sign, from end to end: terminal, summary and report."""

@@ -7,6 +7,7 @@
   const REPLAY_S = 20; // of the whole replay
   const MIN_DOT_M = 0.015; // dots of scans grow when zoomed in, up to MAX_DOT pixels
   const MAX_DOT = 4;
+  const MOST_FITS = 4; // of a map, while its numbers find their room
 
   function decoded(array) {
     const bytes = Uint8Array.from(atob(array.data), (c) => c.charCodeAt(0));
@@ -62,6 +63,11 @@
         x_axis_label: data.x_label, y_axis_label: data.y_label,
         toolbar_location: "above", min_border_right: 12, min_border_left: 60, lod_threshold: null,
       });
+      if (isMap) {
+        for (const axis of [...plot.xaxes, ...plot.yaxes]) {
+          axis.formatter = new B.BasicTickFormatter({ use_scientific: false }); // UTM has large ones
+        }
+      }
       plot.toolbar.logo = null;
       plot.toolbar.active_scroll = null; // a page that is scrolled over it must not zoom it
       this.plot = plot;
@@ -77,7 +83,9 @@
       this.view = await B.Plotting.show(plot, stage);
       if (isMap) {
         this.fit();
-        plot.properties.inner_width.change.connect(() => this.keepScale());
+        for (const size of [plot.properties.inner_width, plot.properties.inner_height]) {
+          size.change.connect(() => this.resized());
+        }
       }
       const moved = () => this.later(() => this.draw());
       for (const range of [plot.x_range, plot.y_range]) {
@@ -106,6 +114,20 @@
           range.setv({ ...limits, reset_start: limits.start, reset_end: limits.end });
         },
       );
+    }
+
+    // What nobody has zoomed or moved is fitted again; not for ever, where the numbers at the axes
+    // change the frame and the frame the numbers.
+    resized() {
+      const { x_range, y_range } = this.plot;
+      const isWhole = [x_range, y_range].every(
+        (range) => range.start === range.reset_start && range.end === range.reset_end,
+      );
+      const width = this.box.clientWidth;
+      this.fits = width === this.fittedWidth ? this.fits + 1 : 0;
+      this.fittedWidth = width;
+      if (isWhole && this.fits < MOST_FITS) this.fit();
+      else this.keepScale();
     }
 
     // The frame has another size (a window, longer numbers at an axis): same middle, same scale.
