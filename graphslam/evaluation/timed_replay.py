@@ -22,6 +22,10 @@ from graphslam.estimation.replay import Replay, replay
 
 #: steps given to another instance first, so that libraries are loaded and caches filled
 WARM_UP = 20
+_DIED = (
+    "its process died; perhaps it ran out of memory, or the script that called this does not do so "
+    'under `if __name__ == "__main__":`'
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,7 +78,7 @@ def timed_replay_in_process(steps: Sequence[Step], config: Config) -> TimedRepla
         try:
             return pool.submit(timed_replay, steps, config).result()
         except BrokenProcessPool as error:
-            raise EstimationError("its process died; perhaps it ran out of memory") from error
+            raise EstimationError(_DIED) from error
 
 
 def _peak_mb() -> float:

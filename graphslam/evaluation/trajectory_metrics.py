@@ -95,12 +95,24 @@ def relative_errors(
     return between(true_motion, between(pairs.estimate[start], pairs.estimate[end]))
 
 
+def _aligned(distance: Array, turn: Array) -> dict[str, float | None]:
+    """What an alignment leaves of the errors (n,) of positions, m, and headings, rad."""
+    if len(distance) < 2:  # one pose lies on any other
+        return dict.fromkeys(("ate_aligned_rmse_m", "max_aligned_m", "heading_aligned_rmse_rad"))
+    return {
+        "ate_aligned_rmse_m": rms(distance),
+        "max_aligned_m": float(distance.max()),
+        "heading_aligned_rmse_rad": rms(turn),
+    }
+
+
 def trajectory_metrics(robots: Sequence[PosePairs]) -> dict[str, Any]:
     """All trajectory numbers of one robot, or of several under one common alignment.
 
     Absolute errors: ``ate_rmse_m``, ``max_m`` and ``heading_rmse_rad`` as estimated, those that are
     called aligned after one `align` of all positions. Consistency is of the poses as estimated.
-    ``rpe`` as in `relative_errors`, over 1 s and over 10 m. A number without data is None.
+    ``rpe`` as in `relative_errors`, over 1 s and over 10 m. A number without data is None, as are
+    the aligned ones of a single pose.
 
     Raises:
         ValueError: there is no pair at all.
@@ -123,9 +135,7 @@ def trajectory_metrics(robots: Sequence[PosePairs]) -> dict[str, Any]:
     return {
         "poses": len(truth),
         "ate_rmse_m": rms(distance),
-        "ate_aligned_rmse_m": rms(left),
-        "max_aligned_m": float(left.max()),
-        "heading_aligned_rmse_rad": rms(wrap(errors[:, 2] + alignment[2])),
+        **_aligned(left, wrap(errors[:, 2] + alignment[2])),
         "max_m": float(distance.max()),
         "heading_rmse_rad": rms(errors[:, 2]),
         "rpe": rpe,

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from graphslam.core.config import Config, RobotConfig
-from graphslam.logs.findings import Finding
+from graphslam.logs.findings import Finding, Severity
 from graphslam.logs.schemas import (
     JOINT_STATE,
     LASER_SCAN,
@@ -89,7 +89,13 @@ def _unreadable(log: CheckedLog) -> Iterable[Finding]:
     for topic in log.topics:
         if topic.used and topic.robot is not None and topic.count and topic.first_ns is None:
             text = f"none of its {topic.count} messages can be used; see what was dropped"
-            yield Finding("doubt", "messages", topic.name, text, "check what publishes it")
+            others = any(
+                other.robot == topic.robot and other.first_ns is not None
+                for other in log.topics
+                if other.used and other.schema in _MOVING
+            )
+            how: Severity = "doubt" if others or topic.schema not in _MOVING else "unusable"
+            yield Finding(how, "messages", topic.name, text, "check what publishes it")
 
 
 def _stamps(log: CheckedLog) -> Iterable[Finding]:
