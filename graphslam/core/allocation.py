@@ -1,6 +1,7 @@
 """Memory that a process frees, kept for what it needs next."""
 
 import ctypes
+import resource
 import sys
 from collections.abc import Callable
 
@@ -9,6 +10,8 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 #: bytes at the end of the heap that are kept; the largest block that comes from the heap (the most
 #: that `mallopt` takes)
 KEPT, LARGEST = 1 << 30, 1 << 25
+#: unit of the peak memory that the system tells, per MB
+MB_OF_RSS = 1e6 if sys.platform == "darwin" else 1e3
 
 
 def keep_freed_memory() -> None:
@@ -25,11 +28,18 @@ def keep_freed_memory() -> None:
         mallopt(_MMAP_THRESHOLD, LARGEST)
 
 
-def give_back_freed_memory() -> None:
+def give_back_freed_memory(beyond_mb: float = 0.0) -> None:
     """Give the system what is kept: whoever begins something else should not count it as its own.
 
-    Tasks of a campaign follow each other in one process, and each reports its peak memory.
+    Tasks of a campaign follow each other in one process, and each reports its peak memory. Within a
+    task it is worth its time (pages are cleared anew) where the process is large, so that the next
+    part does not come on top of what lies free in small pieces.
+
+    Args:
+        beyond_mb: the peak memory so far from which on this is done.
     """
+    if beyond_mb and resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < beyond_mb * MB_OF_RSS:
+        return
     trim = _of_glibc("malloc_trim")
     if trim is not None:
         trim(0)

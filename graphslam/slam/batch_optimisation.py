@@ -11,6 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from graphslam.core.allocation import give_back_freed_memory
 from graphslam.core.config import Config
 from graphslam.core.motion_models import Calibration
 from graphslam.core.record import replace
@@ -51,6 +52,8 @@ from graphslam.slam.scan_tracking import TrackedLog
 
 #: factors on the gates of re-association (across, direction): with the closed paths, and solved
 CLOSED_FACTORS, SOLVED_FACTORS = (1.0, 1.0), (1 / 2, 2 / 3)
+#: peak memory from which on what closing loops has freed is half of what a process holds
+LARGE_MB = 400.0
 
 
 def optimise_scan_log(scan_log: TrackedLog, tamper: Tamper | None = None) -> Estimate:
@@ -67,6 +70,8 @@ def optimise_scan_log(scan_log: TrackedLog, tamper: Tamper | None = None) -> Est
     with timed(seconds, "loop closure"):
         known_map = scan_log.known.known_map
         paths = close_paths(scan_log, tamper, match=config.backend.close_loops, known_map=known_map)
+    # of submaps: small pieces, between which the solutions find no room
+    give_back_freed_memory(LARGE_MB)
     fixing = sum(fix_position(paths.closures))
     counts["closures_verified"] = fixing
     counts["closures_across"] = len(paths.closures) - fixing
