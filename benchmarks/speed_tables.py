@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from statistics import median
 from typing import Any
 
 #: by how much a cost may grow over the baseline before the gate fails
@@ -33,8 +34,9 @@ Measured = Mapping[str, Any]
 class Cost:
     """The least cost of some runs, how far they are spread, and the same over the yardstick.
 
-    Spreads are those of wall and CPU time, largest over least less one. Ratios are least time over
-    the least of the yardsticks that ran just before.
+    Spreads are those of wall and CPU time, largest over least less one. Ratios are the median of
+    each run's time over that of the yardstick just before it: the least of either, which is of
+    different moments, would compare a job with a yardstick that met a fast one.
     """
 
     wall_s: float
@@ -55,8 +57,8 @@ def cost(runs: Sequence[Measured]) -> Cost:
         min(run["peak_mb"] for run in runs),
         max(wall) / min(wall) - 1,
         max(cpu) / min(cpu) - 1,
-        min(wall) / min(run["yardstick_wall_s"] for run in runs),
-        min(cpu) / min(run["yardstick_cpu_s"] for run in runs),
+        median(run["wall_s"] / run["yardstick_wall_s"] for run in runs),
+        median(run["cpu_s"] / run["yardstick_cpu_s"] for run in runs),
     )
 
 

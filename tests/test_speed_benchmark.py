@@ -68,6 +68,12 @@ def test_a_slow_minute_of_the_machine_does_not_change_a_ratio():
     assert (found.wall_s, found.wall_spread) == (2.0, 2.0)
 
 
+def test_a_fast_moment_in_which_only_the_yardstick_ran_does_not_change_a_ratio():
+    """Breaks if the least time of a job is divided by the least of the yardsticks."""
+    found = cost([run(2.0, 3.0), run(2.0, 3.0), run(2.0, 3.0, yardstick=0.7)])
+    assert (found.wall_ratio, found.cpu_ratio) == (2.0, 3.0)
+
+
 def test_a_faster_machine_does_not_hide_a_regression_and_a_slower_one_makes_none():
     baseline = baseline_of(measured(jobs={"lab": {"what": "", "runs": [run()]}}))
 

@@ -45,7 +45,7 @@ OPEN_M, OPEN_RAD = 1.0, 0.2
 #: most returns first. More hardly tell more (two: 2 % of the error), and cost as much again
 LEAST_RETURNS, MOST_WALLS = 2, 1
 #: scans that are looked at together: their observations are compared with all their returns
-BLOCK = 256
+BLOCK = 64
 
 
 def with_loose_returns(
