@@ -2,8 +2,9 @@
 
 Every job is a command in a fresh process with default settings. Right before each repetition runs
 the yardstick (`yardstick.py`), a fixed job; "/ Y" is a time over that of the yardstick just before,
-the median of the repetitions, which depends little on the machine. Times are the least of the repetitions, which are interleaved; the spread is
-largest over least, less one. Peak memory is that of the largest process.
+the median of the repetitions, which depends little on the machine. Times are the least of the
+repetitions, which are interleaved; the spread is largest over least, less one. Peak memory is that
+of the largest process.
 
   jobs     whole commands: help, lab, office-loop, intel, aces, mrclam6, building (2 km), grid (a
            pose graph), ...
