@@ -19,7 +19,7 @@ from graphslam.core.record import replace
 from graphslam.logs import physical_limits as limits
 from graphslam.logs import schemas
 from graphslam.logs.cdr import CdrError
-from graphslam.logs.mounts import Mount
+from graphslam.logs.mounts import Mount, levelled
 from graphslam.logs.point_cloud import beam_step, cloud_points, is_planar, sweep_of
 
 #: no planar laser takes longer for a sweep; it may take so much more of the time that is stated
@@ -118,26 +118,6 @@ def scans(rows: Any, topic: TopicContext) -> list[records.Scan | str]:
         )
         found.append(levelled(scan, topic.tilted[frame]) if frame in topic.tilted else scan)
     return found
-
-
-def levelled(scan: records.Scan, mount: Mount) -> records.Scan:
-    """What a tilted laser saw of vertical walls, as a level one sees them."""
-    angles = scan.angles
-    rays = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))])
-    level, _ = mount.levelled(rays)
-    if not len(scan.ranges):
-        return replace(scan, bearings=np.empty(0))  # only its time is of interest
-    _, walls = mount.levelled(np.nan_to_num(scan.ranges)[:, None] * rays)
-    bearings = np.unwrap(np.arctan2(level[:, 1], level[:, 0]))
-    ranges = np.where(walls, scan.ranges, np.nan) * np.hypot(level[:, 0], level[:, 1])
-    period = scan.beam_period_s
-    if bearings[-1] < bearings[0]:  # from above, an upside-down laser scans clockwise
-        bearings, ranges, period = bearings[::-1].copy(), ranges[::-1].copy(), -period
-    step = float(bearings[-1] - bearings[0]) / max(len(bearings) - 1, 1) or scan.angle_step_rad
-    return replace(
-        scan, ranges=ranges, angle_min_rad=float(bearings[0]), angle_step_rad=step,
-        beam_period_s=period, bearings=bearings,
-    )  # fmt: skip
 
 
 def _beam_periods(rows: Any, beams: int) -> list[float]:

@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from graphslam.core import records
 from graphslam.core.geometry import Array
+from graphslam.core.record import replace
 
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 # Child -> (parent, parent_from_child (4, 4)): a frame has one parent.
@@ -139,3 +141,23 @@ def _matrix(transform: Any) -> Array:
     matrix[:3, :3] += 2 * (w * cross + cross @ cross)
     matrix[:3, 3] = [t.x, t.y, t.z]
     return matrix
+
+
+def levelled(scan: records.Scan, mount: Mount) -> records.Scan:
+    """What a tilted laser saw of vertical walls, as a level one sees them."""
+    angles = scan.angles
+    rays = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))])
+    level, _ = mount.levelled(rays)
+    if not len(scan.ranges):
+        return replace(scan, bearings=np.empty(0))  # only its time is of interest
+    _, walls = mount.levelled(np.nan_to_num(scan.ranges)[:, None] * rays)
+    bearings = np.unwrap(np.arctan2(level[:, 1], level[:, 0]))
+    ranges = np.where(walls, scan.ranges, np.nan) * np.hypot(level[:, 0], level[:, 1])
+    period = scan.beam_period_s
+    if bearings[-1] < bearings[0]:  # from above, an upside-down laser scans clockwise
+        bearings, ranges, period = bearings[::-1].copy(), ranges[::-1].copy(), -period
+    step = float(bearings[-1] - bearings[0]) / max(len(bearings) - 1, 1) or scan.angle_step_rad
+    return replace(
+        scan, ranges=ranges, angle_min_rad=float(bearings[0]), angle_step_rad=step,
+        beam_period_s=period, bearings=bearings,
+    )  # fmt: skip
