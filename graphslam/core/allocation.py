@@ -1,4 +1,4 @@
-"""Memory that a process frees, kept for what it needs next."""
+"""Memory that a process frees, kept for what it needs next, and the most that it ever had."""
 
 import ctypes
 import resource
@@ -10,8 +10,6 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 #: bytes at the end of the heap that are kept; the largest block that comes from the heap (the most
 #: that `mallopt` takes)
 KEPT, LARGEST = 1 << 30, 1 << 25
-#: unit of the peak memory that the system tells, per MB
-MB_OF_RSS = 1e6 if sys.platform == "darwin" else 1e3
 
 
 def keep_freed_memory() -> None:
@@ -38,11 +36,17 @@ def give_back_freed_memory(beyond_mb: float = 0.0) -> None:
     Args:
         beyond_mb: the peak memory so far from which on this is done.
     """
-    if beyond_mb and resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < beyond_mb * MB_OF_RSS:
+    if peak_memory_mb() < beyond_mb:
         return
     trim = _of_glibc("malloc_trim")
     if trim is not None:
         trim(0)
+
+
+def peak_memory_mb() -> float:
+    """Largest resident size of this process; macOS counts bytes, Linux kilobytes."""
+    peak = float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+    return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
 
 
 def _of_glibc(name: str) -> Callable[..., int] | None:

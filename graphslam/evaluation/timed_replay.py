@@ -1,8 +1,6 @@
 """Replay of recorded steps into one back end, with its time and memory."""
 
-import resource
 import signal
-import sys
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -12,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from graphslam.core.allocation import peak_memory_mb
 from graphslam.core.config import Config
 from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import Array
@@ -90,8 +89,7 @@ def _peak_mb() -> float:
         lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
         return next(float(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 1e3
     except (OSError, StopIteration):
-        peak = float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
-        return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
+        return peak_memory_mb()
 
 
 def growth_exponent(size: Array, ms: Array) -> float | None:

@@ -27,8 +27,6 @@ MAX_SWEEP_S, SWEEP_SLACK = 1.0, 1.05
 #: decimals of a heading, rad, that are taken from a quaternion. Written again, it differs by 1e-16:
 #: a solution, which ends where it has converged, would differ by 1e-9 m
 HEADING_DECIMALS = 12
-
-
 #: why a scan is dropped
 _OTHER_LASER = "scan: of another laser on the same topic"
 

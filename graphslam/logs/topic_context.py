@@ -155,7 +155,9 @@ class _SensorFrames:
         only = None
         if is_scan and len(counted) > 1:
             only, findings = _one_laser(topic, counted, tree, self._base(topic, min(counted), tree))
-        for frame in sorted(counted) if only is None else [only]:
+        if only is not None:
+            messages = [message for message in messages if frame_of(message) == only]
+        for frame in sorted(set(map(frame_of, messages))):
             base = self._base(topic, frame, tree)
             if sensor and base == frame:
                 base = "the robot's base"  # nothing ties this laser to the others

@@ -130,8 +130,8 @@ def gather(
             )
         )
     observed = any(step.associations or step.closures for step in steps)
-    unmoved = tuple(pipeline.log.without_odometry)
-    return Evidence(tuple(found), summary, innovations, unmoved, observed)
+    by_scans_alone = tuple(pipeline.log.without_odometry)
+    return Evidence(tuple(found), summary, innovations, by_scans_alone, observed)
 
 
 def _seen(seen: Sequence[Association], run: RobotState, estimate: Estimate) -> Seen:

@@ -2,8 +2,6 @@
 
 import hashlib
 import platform
-import resource
-import sys
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
@@ -13,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from graphslam import __version__
+from graphslam.core.allocation import peak_memory_mb
 from graphslam.core.config import RobotConfig
 from graphslam.core.config_io import dump_config
 from graphslam.core.geometry import compose
@@ -95,7 +94,7 @@ def summarise(
         "scans_per_s": round(scans / total, 2),
         # invented stamps have no real time to compare with
         "real_time_factor": None if has_invented_stamps(log.notes) else round(log_s / total, 2),
-        "peak_memory_mb": round(_peak_memory_mb(), 1),
+        "peak_memory_mb": round(peak_memory_mb(), 1),
         "counts": {
             "messages": counts["messages"],
             "scans": scans,
@@ -229,12 +228,6 @@ def _two_digits(value: float) -> str:
 def has_invented_stamps(notes: Mapping[str, str]) -> bool:
     """Whether an importer had to make up the stamps: the source had none."""
     return notes.get("stamps", "").startswith("invented")
-
-
-def _peak_memory_mb() -> float:
-    """Largest resident size of this process; macOS counts bytes, Linux kilobytes."""
-    peak = float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
-    return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
 
 
 def is_relative(pipeline: LogPass) -> bool:

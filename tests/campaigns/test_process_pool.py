@@ -99,12 +99,12 @@ def _is_alive(number):
 @pytest.mark.skipif(sys.platform != "linux", reason="peak memory begins anew on Linux only")
 def test_peak_memory_is_that_of_one_task(tmp_path):
     """A worker does many: a small log after a large one does not need what that one did."""
-    from graphslam.slam.summary import _peak_memory_mb
+    from graphslam.core.allocation import peak_memory_mb
 
     execute(Task("large", do.take_memory, (tmp_path, "large", 600)))
-    large = _peak_memory_mb()
+    large = peak_memory_mb()
     execute(Task("small", do.take_memory, (tmp_path, "small", 1)))
-    assert _peak_memory_mb() < large - 500
+    assert peak_memory_mb() < large - 500
 
 
 def test_a_worker_with_other_code_refuses(tmp_path):
