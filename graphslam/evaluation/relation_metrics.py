@@ -5,6 +5,7 @@ Source: R. Kümmerle et al., On measuring the accuracy of SLAM algorithms, Auton
 """
 
 import os
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 
 from graphslam.core.errors import OutputError
 from graphslam.core.gaussian import chi2_quantile
-from graphslam.core.geometry import Array, between
+from graphslam.core.geometry import Array, between, compose, inverse
 from graphslam.core.records import JointScans, Trajectory
 from graphslam.evaluation.error_statistics import PROBABILITY, nees
 from graphslam.evaluation.relation_covariances import relative_covariances
@@ -23,14 +24,17 @@ from graphslam.results.file_formats import read_text, stamp_ns
 Stamps = np.ndarray[Any, np.dtype[np.int64]]
 
 #: what is allowed for the error of a reference relation, per axis: two scans were laid on each
-#: other by hand. Three relations among three scans close to as much: divided by sqrt(3), to 0.010 m
-#: and 0.23 deg in Intel's, 0.031 m and 0.47 deg in those of ACES
+#: other by hand. What the relations show themselves (`closing_sigmas`) is 0.010 m and 0.23 deg in
+#: Intel's, 0.031 m and 0.47 deg in those of ACES
 REFERENCE_SIGMA_M, REFERENCE_SIGMA_RAD = 0.02, np.radians(0.35)
 #: numbers of a group of relations
 _NUMBERS = (
     "trans_mean_m", "trans_std_m", "trans_median_m", "rot_mean_deg", "rot_std_deg",
-    "trans_inside", "rot_inside",
+    "trans_inside", "rot_inside", "trans_inside_closing", "rot_inside_closing",
 )  # fmt: skip
+#: triangles of relations from which on they tell the error of the reference: a sigma by 20 of them
+#: is known to a tenth
+MIN_TRIANGLES = 20
 #: relations over at most this time are called local, the others loops
 LOCAL_S = 60.0
 
@@ -151,20 +155,68 @@ def relation_metrics(
     Standard deviations are those of the sample (n, not n - 1). The
     ``inside`` shares are of errors within what is stated for 95 %: of translations within their
     ellipse, of rotations within their interval, each by the relative covariance of the two scans
-    and that of the reference (`REFERENCE_SIGMA_M`, `REFERENCE_SIGMA_RAD`). A group without matches
-    has None.
+    and that of the reference (`REFERENCE_SIGMA_M`, `REFERENCE_SIGMA_RAD`). Those of ``closing``
+    take the sigmas of the reference that its own triangles show, see `closing_errors`; what they
+    are is in ``reference``. A group without matches has None.
     """
     found = match_relations(relations, scans, joint, robot)
+    closing = closing_errors(relations)
+    sigmas = closing_sigmas(closing)
     groups = {
         "all": np.ones(len(found.matched), dtype=bool),
         "local": relations.local,
         "loops": ~relations.local,
     }
-    return {name: _relation_group(found, group) for name, group in groups.items()}
+    return {
+        **{name: _relation_group(found, group, sigmas) for name, group in groups.items()},
+        "reference": {
+            "triangles": len(closing),
+            "sigma_m": None if sigmas is None else sigmas[0],
+            "sigma_deg": None if sigmas is None else float(np.degrees(sigmas[1])),
+        },
+    }
+
+
+def closing_errors(relations: Relations) -> Array:
+    """By how much (n, 3) any three relations among three scans do not close.
+
+    Along the axes of the latest scan. O(relations x relations of one scan).
+    """
+    known: dict[int, dict[int, Array]] = defaultdict(dict)
+    ends = zip(relations.from_ns.tolist(), relations.to_ns.tolist(), strict=True)
+    for (first, second), pose in zip(ends, relations.poses, strict=True):
+        if second >= first:
+            known[first][second] = pose
+        else:
+            known[second][first] = inverse(pose)
+    three = [
+        (direct[last], direct[middle], pose)
+        for direct in list(known.values())
+        for middle in direct
+        for last, pose in known.get(middle, {}).items()
+        if last in direct
+    ]
+    if not three:
+        return np.zeros((0, 3))
+    direct, first, second = np.array(three).transpose(1, 0, 2)
+    return between(direct, compose(first, second))
+
+
+def closing_sigmas(errors: Array) -> tuple[float, float] | None:
+    """Error of one relation by n triangles of them (n, 3): m per axis, rad; None if too few.
+
+    Root mean squares divided by sqrt(3): each triangle has the errors of three relations.
+    """
+    if len(errors) < MIN_TRIANGLES:
+        return None
+    x, y, phi = np.mean(errors**2, axis=0) / 3
+    return float(np.sqrt((x + y) / 2)), float(np.sqrt(phi))
 
 
 def _relation_group(
-    found: MatchedRelations, group: np.ndarray[Any, np.dtype[np.bool_]]
+    found: MatchedRelations,
+    group: np.ndarray[Any, np.dtype[np.bool_]],
+    closing: tuple[float, float] | None,
 ) -> dict[str, Any]:
     use = group[found.matched]
     errors = found.errors[use]
@@ -172,10 +224,13 @@ def _relation_group(
     if not len(errors):
         return {**counts, **dict.fromkeys(_NUMBERS)}
     translation, rotation = _sizes(errors).T
-    inside: tuple[float | None, ...] = (None, None)
-    if found.covs is not None:
-        S = found.covs[use] + np.diag([REFERENCE_SIGMA_M**2] * 2 + [REFERENCE_SIGMA_RAD**2])
-        inside = tuple(_share_inside(errors[:, k], S[:, k, k]) for k in (slice(0, 2), slice(2, 3)))
+    inside: list[float | None] = []
+    for sigmas in ((REFERENCE_SIGMA_M, REFERENCE_SIGMA_RAD), closing):
+        if found.covs is None or sigmas is None:
+            inside += [None, None]
+            continue
+        S = found.covs[use] + np.diag([sigmas[0] ** 2] * 2 + [sigmas[1] ** 2])
+        inside += [_share_inside(errors[:, k], S[:, k, k]) for k in (slice(0, 2), slice(2, 3))]
     numbers = (
         float(translation.mean()),
         float(translation.std()),

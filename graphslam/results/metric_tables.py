@@ -104,6 +104,8 @@ _RELATION_COLUMNS = tuple(
     for head, key in (
         ("in 95 % (m), %", "trans_inside"),
         ("in 95 % (°), %", "rot_inside"),
+        ("by closing (m), %", "trans_inside_closing"),
+        ("by closing (°), %", "rot_inside_closing"),
     )
 )
 
