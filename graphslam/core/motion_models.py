@@ -17,6 +17,8 @@ from graphslam.core.geometry import Array, compose, exp, exp_jacobian, inverse, 
 
 #: a calibration parameter whose prior sigma is smaller, in any unit, is held
 HELD_SIGMA = 1e-6
+#: parameters of a calibration that are the mount of the sensor
+MOUNT_NAMES = ("laser_x_m", "laser_y_m", "laser_yaw_rad")
 #: 1/m: the shortening of the path by `command_increments` grows up to this curvature; robots that
 #: turn more tightly hardly drive at all
 MAX_CURVATURE_PER_M = 6.0

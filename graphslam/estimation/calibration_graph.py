@@ -15,7 +15,7 @@ import numpy as np
 
 from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array, adjoint, between, inverse, log, rotation3, wrap
-from graphslam.core.motion_models import HELD_SIGMA, Calibration
+from graphslam.core.motion_models import HELD_SIGMA, MOUNT_NAMES, Calibration
 from graphslam.core.mount_covariances import MountCovariances
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Motion, Step
@@ -30,8 +30,6 @@ from graphslam.estimation.selected_inverse import CliqueRows
 
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
-#: parameters of a calibration that are the mount of the sensor
-MOUNT_NAMES = ("laser_x_m", "laser_y_m", "laser_yaw_rad")
 #: relative decrease of the error at which optimisation ends
 CONVERGED_ERROR = 1e-5
 

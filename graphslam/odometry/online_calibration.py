@@ -10,14 +10,17 @@ cent; since the parameters are applied to the next motions, that bias decays geo
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from graphslam.core.config import OdometryConfig
 from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared, solve
-from graphslam.core.geometry import Array, wrap
-from graphslam.core.motion_models import HELD_SIGMA, Calibration, several_lasers
+from graphslam.core.geometry import Array, compose, wrap
+from graphslam.core.motion_models import HELD_SIGMA, MOUNT_NAMES, Calibration, several_lasers
 from graphslam.core.observation_models import MODELS
+from graphslam.core.record import replace
 from graphslam.core.records import Association, Motion
 
 #: weight of the past per state: the memory is about 1 / (1 - FORGETTING_FACTOR) states, so that
@@ -28,6 +31,8 @@ MIN_SIGMA_SHARE = 0.5
 #: squared Mahalanobis distance beyond which a difference is no calibration error but a jump of the
 #: estimate (a loop closure) or a slip
 OUTLIER_D2 = float(chi2_quantile(0.999, 3))
+#: no laser's mount is told
+NOTHING_TOLD: Mapping[str, Array] = MappingProxyType({})
 
 
 class Calibrator:
@@ -85,7 +90,9 @@ class Calibrator:
             current.names, cov @ self._vector, cov + MIN_SIGMA_SHARE**2 * self._prior
         )
 
-    def summary(self) -> dict[str, tuple[float, float, bool]]:
+    def summary(
+        self, told: Mapping[str, Array] = NOTHING_TOLD
+    ) -> dict[str, tuple[float, float, bool]]:
         """The estimate from the data so far, see `to_summary`.
 
         The sigma refers to the memory of the filter, so it has a lower bound.
@@ -94,7 +101,7 @@ class Calibrator:
             return {}
         cov: Array = np.asarray(np.linalg.inv(self._info), dtype=np.float64)
         known = Calibration(self._names, cov @ self._vector, cov)
-        return to_summary(known, self._prior)
+        return to_summary(known, self._prior, told)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,13 +190,19 @@ def calibration_from_evidence(known: CalibrationEvidence, prior: Calibration) ->
     return Calibration(prior.names, mean, all_cov)
 
 
-def to_summary(known: Calibration, prior: Array) -> dict[str, tuple[float, float, bool]]:
+def to_summary(
+    known: Calibration, prior: Array, told: Mapping[str, Array] = NOTHING_TOLD
+) -> dict[str, tuple[float, float, bool]]:
     """Parameter -> (value, sigma, observable); ``prior`` (p, p) is the covariance before data.
 
     Observable: the data at least halve the prior's sigma. A parameter that is held has sigma 0.
+    ``told``: laser ("" the first) -> its mount (3,) according to the log. The mount that is found
+    is then told plus value, also where the yaw is off: see `_deviations`.
     """
-    sigmas, before = np.sqrt(np.diag(known.cov)), np.sqrt(np.diag(prior))
-    held = before < HELD_SIGMA
+    held = np.sqrt(np.diag(prior)) < HELD_SIGMA
+    J, known = _deviations(known, held, told)
+    known = replace(known, cov=J @ known.cov @ J.T)
+    sigmas, before = (np.sqrt(np.diag(cov)) for cov in (known.cov, J @ prior @ J.T))
     sigmas[held] = 0.0
     seen = ~held & (sigmas < 0.5 * before)
     return {
@@ -198,6 +211,30 @@ def to_summary(known: Calibration, prior: Array) -> dict[str, tuple[float, float
             known.names, np.where(held, 0.0, known.mean), sigmas, seen, strict=True
         )
     }
+
+
+def _deviations(
+    known: Calibration, held: np.ndarray[Any, np.dtype[np.bool_]], told: Mapping[str, Array]
+) -> tuple[Array, Calibration]:
+    """A calibration whose mounts are deviations from those told, and its derivative by the former.
+
+    The error of a mount is estimated as a pose in the base, in front of what the log says: a yaw
+    turns the laser about the base's origin. Where the yaw is estimated and x or y is held, it stays
+    so: otherwise the held one would move.
+    """
+    J, mean = np.eye(len(known.mean)), known.mean.copy()
+    for sensor, mount in told.items():
+        names = [f"{sensor}.{name}" if sensor else name for name in MOUNT_NAMES]
+        if not set(names) <= set(known.names):
+            continue
+        at = [known.names.index(name) for name in names]
+        if held[at[:2]].any() and not held[at[2]]:
+            continue
+        found = compose(known.mean[at], mount)
+        mean[at] = found - mount
+        mean[at[2]] = known.mean[at[2]]
+        J[at[0], at[2]], J[at[1], at[2]] = -(found - known.mean[at])[1], (found - known.mean[at])[0]
+    return J, replace(known, mean=mean)
 
 
 def observed_information(

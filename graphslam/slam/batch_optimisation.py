@@ -49,6 +49,7 @@ from graphslam.slam.reoptimise_scans import with_closures
 from graphslam.slam.scan_evidence import find_parked, gather_scan_evidence
 from graphslam.slam.scan_refinement import refine_motions
 from graphslam.slam.scan_tracking import TrackedLog
+from graphslam.slam.surface_bias import mount_bias
 
 #: factors on the gates of re-association (across, direction): with the closed paths, and solved
 CLOSED_FACTORS, SOLVED_FACTORS = (1.0, 1.0), (1 / 2, 2 / 3)
@@ -185,7 +186,7 @@ def _solved(
     )
     problem = _Problem(with_closures(steps, closures), near, tracks, config)
     steps, done, minimum = problem.solve(settle=config.backend.optimise_at_end)
-    estimate = _with_surface_bias(done.estimate, tracks, config)
+    estimate = _with_surface_bias(steps, done.estimate, tracks, config)
     landmarks.update_from(steps, estimate)
     for name in tracks:
         scan_log.runs[name].is_calibrated = config.odometry.calibrate
@@ -198,21 +199,19 @@ def _count_observations(steps: tuple[Step, ...]) -> int:
     return sum(len(step.associations) for step in steps)
 
 
-def _with_surface_bias(estimate: Estimate, tracks: Mapping[str, Track], config: Config) -> Estimate:
-    """An estimate whose mounts, and those of the tracks, have the bias of surfaces.
-
-    Turning shows where the laser sits by walls of which each returns its ranges with a bias. No
-    number of scans averages it, and a coordinate is held by two walls that face each other.
-    """
-    variance, mounts = config.front_end.floor_normal_m**2 / 2, estimate.mounts
+def _with_surface_bias(
+    steps: tuple[Step, ...], estimate: Estimate, tracks: Mapping[str, Track], config: Config
+) -> Estimate:
+    """An estimate whose mounts, and those of the tracks, have the bias of surfaces."""
+    mounts = estimate.mounts
+    if mounts is None:
+        return estimate
+    bias = mount_bias(steps, estimate, config.front_end.floor_normal_m)
     for name, track in tracks.items():
-        bias = np.diag(np.where(track.is_mount_estimated, [variance, variance, 0.0], 0.0))
-        track.add_mount_cov(bias)
-        if mounts is not None and name in mounts.robots:
-            own, cov = mounts.columns(name), mounts.cov.copy()
-            cov[own, own] += bias
-            mounts = replace(mounts, cov=cov)
-    return replace(estimate, mounts=mounts)
+        if name in mounts.robots:
+            own = mounts.columns(name)
+            track.add_mount_cov(bias[own, own])  # of further lasers too: they see the same walls
+    return replace(estimate, mounts=replace(mounts, cov=mounts.cov + bias))
 
 
 def _tied(

@@ -99,11 +99,14 @@ class RobotState:
         """Whether final ``states`` equal the causal ones, as those of a filter do."""
         return np.array_equal(states.poses, self.causal_poses)
 
-    def calibration_found(self) -> dict[str, tuple[float, float, bool]]:
-        """Parameter -> (value, sigma, observable) of the estimated calibration."""
+    def calibration_found(self, told: Mapping[str, Array]) -> dict[str, tuple[float, float, bool]]:
+        """Parameter -> (value, sigma, observable) of the estimated calibration, see `to_summary`.
+
+        ``told``: laser ("" the first) -> its mount (3,) according to the log.
+        """
         if self.is_calibrated:
-            return to_summary(self.track.calibration, self.track.prior.cov)
-        return self.calibrator.summary()
+            return to_summary(self.track.calibration, self.track.prior.cov, told)
+        return self.calibrator.summary(told)
 
     def causal(self, start: Array, away_m: float = 0.0) -> "Causal":
         """The causal trajectories.

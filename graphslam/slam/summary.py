@@ -122,7 +122,9 @@ def summarise(
         "calibration": {
             f"{robot}.{name}": {"value": value, "sigma": sigma, "observable": observable}
             for robot, run in runs.items()
-            for name, (value, sigma, observable) in run.calibration_found().items()
+            for name, (value, sigma, observable) in run.calibration_found(
+                {sensor: log.mount(topic) for topic, sensor in log.sensors(robot).items()}
+            ).items()
         },
         "lasers": {robot: lasers_used(log, robot, run) for robot, run in runs.items()},
         "odometry": {

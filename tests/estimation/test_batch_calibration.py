@@ -99,6 +99,15 @@ def test_every_parameter_is_found_within_its_sigma(drawn):
     assert np.abs(z).max() < 4.0
 
 
+def test_a_mount_is_what_the_log_says_and_the_deviations_that_are_reported(drawn):
+    """Also where the yaw is 1 deg off: it does not turn the laser's place about the base."""
+    for _, done in drawn:
+        (laser,) = done.result.summary["lasers"][done.name]
+        names = ("laser_x_m", "laser_y_m", "laser_yaw_rad")
+        off = [done.found[name]["value"] for name in names]
+        np.testing.assert_allclose(np.add(laser["mount_in_log"], off), laser["mount"], atol=1e-9)
+
+
 def test_the_drive_through_a_room_shows_every_parameter(drawn):
     """A fifth of the prior's sigma is left at most; wheels to 0.2 % of their radius, which is the
     drift times the axle. The base is where it is to 2 cm though none of this was known."""
