@@ -14,7 +14,13 @@ from graphslam.core.gaussian import mahalanobis_squared
 from graphslam.core.geometry import Array, log_jacobian, wrap
 from graphslam.core.observation_arrays import LINE, POINT, SEGMENT, ObservationArrays
 from graphslam.core.observation_models import MODELS
-from graphslam.mapping.gating import LENGTH_TOLERANCE_M, MAX_ANGLE_RAD, BoolArray, IntArray
+from graphslam.mapping.gating import (
+    LENGTH_TOLERANCE_M,
+    MAX_ANGLE_RAD,
+    BoolArray,
+    IntArray,
+    overlapping,
+)
 
 
 @dataclass(slots=True, eq=False)
@@ -75,15 +81,15 @@ def candidate_pairs(
     gap = np.maximum(np.minimum(*ends) - extent[:, 1], extent[:, 0] - np.maximum(*ends))
     near = np.abs(across) < config.max_distance_m
     near &= np.abs(turned) < MAX_ANGLE_RAD
-    near &= gap < config.overlap_gap_m
+    own, known = np.diff(image.extent), np.diff(extent)[:, 0]
+    near &= overlapping(gap, np.minimum(own, known), config)
     near &= ~of_point[:, None] & ~is_point
     if of_point.any():
         close = np.hypot(along, across) < config.max_distance_m
         near |= of_point[:, None] & is_point & close
     i, j = np.nonzero(near)
-    length, known = np.diff(image.extent)[i, 0], np.diff(extent)[j, 0]
     whole = (image.kind[i] == SEGMENT) & (kind[j] == SEGMENT)
-    whole &= np.abs(length - known) < LENGTH_TOLERANCE_M
+    whole &= np.abs(own[i, 0] - known[j]) < LENGTH_TOLERANCE_M
     model = np.where(of_point[i], POINT, np.where(whole, SEGMENT, LINE))
     turned_over, z = flipped[i, j], image.z[i]
     z[turned_over, 2] += np.pi
