@@ -7,6 +7,7 @@ it, from wherever it was seen. A hypothesis is believed if it explains enough, i
 contradicted, and no other one explains about as much.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -84,7 +85,15 @@ class Support:
     @property
     def is_contradicted(self) -> bool:
         """Whether more places contradict it than a few that changed."""
-        return bool(self.contradicted.sum() > MAX_CONTRADICTED_SHARE * self.confirmed.sum())
+        return self.contradicted_share > MAX_CONTRADICTED_SHARE
+
+    @property
+    def contradicted_share(self) -> float:
+        """Places that contradict it for each that confirms it; inf if none does."""
+        confirmed, contradicted = int(self.confirmed.sum()), int(self.contradicted.sum())
+        if not confirmed:
+            return math.inf if contradicted else 0.0
+        return contradicted / confirmed
 
 
 def hypotheses(known: PlaceMap, own: PlaceMap, config: MultiRobotConfig) -> list[Hypothesis]:

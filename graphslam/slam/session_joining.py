@@ -206,16 +206,25 @@ def _best(laid: Sequence[_Laid], places: Sequence[SubmapPose], config: Config) -
     a turn has walls everywhere too, but they fit worse.
     """
     best = max(laid, key=lambda one: (not one.support.is_contradicted, one.support.total))
-    own = best.support.scores
-    others = [one.support for one in laid if one is not best]
-    rivals = [
-        replace(x, scores=np.where(x.scores > EQUIVALENT_SHARE * own, x.scores, 0.0))
-        for x in others
-    ]
+    rivals = [_as_rival(one.support, best.support) for one in laid if one is not best]
     chosen = choose([best.support, *rivals], places, config.multi_robot)
     if isinstance(chosen, str):
         return best, chosen
     return best, "" if chosen == 0 else "more than one relative pose explains what was seen"
+
+
+def _as_rival(other: Support, best: Support) -> Support:
+    """Another hypothesis with what it explains about as well as the best one.
+
+    One that is contradicted, and twice as much as the best one, often lays more of the drives into
+    the map: in a building that looks the same turned by half a turn, into what was mapped, where in
+    truth they went elsewhere. That alone does not speak for it: only places count that the best
+    one explains too.
+    """
+    equivalent = other.scores > EQUIVALENT_SHARE * best.scores
+    if other.is_contradicted and other.contradicted_share > 2 * best.contradicted_share:
+        equivalent &= best.scores > 0.0
+    return replace(other, scores=np.where(equivalent, other.scores, 0.0))
 
 
 def _carried(found: Start, before: Start, start: Start) -> Start:

@@ -124,3 +124,17 @@ def test_what_is_contradicted_all_over_is_not_the_best():
     turned = laid([0.5] * 12, 20.0, contradicted=6)
     best, why = _best([turned, laid([0.7] * 8 + [0] * 4)], PLACES, Config())
     assert (best.support.total, why) == (pytest.approx(5.6), "")
+
+
+def test_laying_more_of_a_drive_into_the_map_does_not_make_a_rival_of_what_is_contradicted():
+    """Of two hypotheses that explain about as much in all, one leaves the last places where the map
+    has nothing, and the other puts them into it, at the price of contradictions. It is no rival
+    where the best one is contradicted half as much at most, or not at all; else it is."""
+    elsewhere = [0.3] * 8 + [0.9] * 4  # as a rival three quarters of the best one, 0.7 would do
+    best = [0.6] * 8 + [0] * 4
+    for contradicted, against, is_rival in ((6, 0, False), (6, 1, False), (4, 2, True)):
+        found = [laid(elsewhere, 20.0, contradicted), laid(best, contradicted=against)]
+        assert ("more than one way" in _best(found, PLACES, Config())[1]) == is_rival
+    # what it has in common with the best one counts all the same
+    found = [laid([0.55] * 8 + [0.9] * 4, 20.0, 6), laid(best)]
+    assert "more than one way" in _best(found, PLACES, Config())[1]
