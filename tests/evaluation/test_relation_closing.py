@@ -73,7 +73,7 @@ def test_shares_are_those_of_the_error_that_was_found():
 
 
 def test_the_metrics_say_what_was_found_and_are_null_without_covariances():
-    """Shares of relations inside their 95 % need covariances of the scans; the reference does not."""
+    """Shares inside 95 % need covariances of the scans; the error of the reference does not."""
     scans, relations = path_and_relations([SIGMA_M, SIGMA_M, SIGMA_RAD])
     found = relation_metrics(relations, scans)
     assert found["reference"]["triangles"] == 398

@@ -9,8 +9,8 @@ from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import compose
 from graphslam.core.record import replace
 from graphslam.perception.line_fit import fit_lines
-from graphslam.slam import batch_optimisation
-from graphslam.slam.surface_bias import bias_of_lines, mount_shifts
+from graphslam.slam import batch_optimisation, surface_bias
+from graphslam.slam.surface_bias import bias_of_lines, mount_bias, mount_shifts
 
 BIAS_M = 0.002
 #: equal weights
@@ -87,3 +87,14 @@ def test_the_mount_moves_as_the_solution_does_when_a_surface_is_biased(log, monk
         # single observations move it as expected to a few per cent; most of that cancels in their
         # sum, so that a third may be left: wrong signs or angles leave several times as much
         assert np.linalg.norm(moved - mount - expected) < 0.35 * np.linalg.norm(expected)
+
+
+def test_half_of_the_variance_is_that_of_all_surfaces_together(monkeypatch):
+    """Two walls that face each other move the mount in opposite directions: what they have in
+    common cancels. Two that move it in one direction add up."""
+    opposite = {0: np.array([1.0, 0.0, 0.0]), 1: np.array([-1.0, 0.0, 0.0])}
+    alike = {0: np.array([1.0, 0.0, 0.0]), 1: np.array([1.0, 0.0, 0.0])}
+    for shifts, variance in ((opposite, 1.0), (alike, 1.0 + 2.0)):
+        monkeypatch.setattr(surface_bias, "mount_shifts", lambda *_, shifts=shifts: shifts)
+        cov = mount_bias((), None, 0.01)
+        np.testing.assert_allclose(cov, np.diag([0.01**2 * variance, 0.0, 0.0]), atol=1e-15)
