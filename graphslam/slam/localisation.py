@@ -10,13 +10,15 @@ import numpy as np
 from graphslam.core.config import Config
 from graphslam.core.errors import EstimationError
 from graphslam.core.frame_forest import PRIOR_INFLATION
-from graphslam.core.geometry import compose, compose_cov, inverse
+from graphslam.core.gaussian import symmetric
+from graphslam.core.geometry import Array, compose, compose_cov, inverse
 from graphslam.core.record import replace
 from graphslam.core.records import Start
 from graphslam.mapping.known_map import KnownMap
 from graphslam.mapping.submaps import submaps_at, with_poses_from
 from graphslam.multi_robot.map_localisation import choose, contradiction, hypotheses, support
 from graphslam.multi_robot.place_recognition import PlaceMap
+from graphslam.multi_robot.place_search import DISTINCT_M, DISTINCT_RAD
 from graphslam.slam.log_pass import timed
 from graphslam.slam.path_closing import PLACE_COV, ClosedPaths, close_paths
 from graphslam.slam.scan_tracking import ScanLog
@@ -80,11 +82,11 @@ def found_start(scan_log: ScanLog, robot: str, known_map: KnownMap) -> Start:
         EstimationError: it is not found, or another one would do as well.
     """
     own = own_places(scan_log, robot)
-    starts = possible_starts(scan_log, robot, known_map, own)
-    supports = []
-    for start in starts:
+    starts, supports = [], []
+    for start in possible_starts(scan_log, robot, known_map, own):
         laid = laid_into(scan_log, robot, start, known_map)
         supports.append(support(known_map.places, with_poses_from(own.places, laid.states)))
+        starts.append(laid_start(laid.states[robot].poses[0], start))
     why = "no place in it is recognised"
     if supports:
         chosen = choose(supports, own.places, scan_log.config.multi_robot)
@@ -126,6 +128,18 @@ def laid_into(scan_log: ScanLog, robot: str, start: Start, known_map: KnownMap) 
         return close_paths(scan_log, match=scan_log.config.backend.close_loops, known_map=known_map)
     finally:
         scan_log.paths[robot].poses, scan_log.steps[0] = before, first
+
+
+def laid_start(pose: Array, start: Start) -> Start:
+    """Where a log begins, ``pose`` (3,), once its whole path was laid into a map from ``start``.
+
+    What was recognised of it may be few places, far from the start, which then is known to many
+    metres. The path as laid was compared with the map, and told from all that lies `DISTINCT_M` or
+    `DISTINCT_RAD` off: farther away its loops must not be looked for again.
+    """
+    told_apart = np.diag(np.array([DISTINCT_M, DISTINCT_M, DISTINCT_RAD]) ** -2.0)
+    cov = np.linalg.inv(np.linalg.inv(start.cov) + told_apart)
+    return Start(pose, symmetric(cov))
 
 
 def place_path(scan_log: ScanLog, robot: str, start: Start) -> None:

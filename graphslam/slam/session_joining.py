@@ -30,6 +30,7 @@ from graphslam.multi_robot.place_search import DISTINCT_M, DISTINCT_RAD
 from graphslam.multi_robot.relative_frames import RelativeFrame
 from graphslam.slam.localisation import (
     laid_into,
+    laid_start,
     own_places,
     possible_starts,
 )
@@ -247,6 +248,6 @@ def _lay(starts: Mapping[str, Start], known: KnownMap, sessions: Mapping[str, _S
     for name, start in starts.items():
         session = sessions[name]
         states = laid_into(session.log, name, start, known).states
-        found[name] = Start(states[name].poses[0], start.cov)
+        found[name] = laid_start(states[name].poses[0], start)
         places += with_poses_from(session.own.places, states)
     return _Laid(found, places, support(known.places, places))
