@@ -138,7 +138,7 @@ def laid_start(pose: Array, start: Start) -> Start:
     `DISTINCT_RAD` off: farther away its loops must not be looked for again.
     """
     told_apart = np.diag(np.array([DISTINCT_M, DISTINCT_M, DISTINCT_RAD]) ** -2.0)
-    cov = np.linalg.inv(np.linalg.inv(start.cov) + told_apart)
+    cov: Array = np.asarray(np.linalg.inv(np.linalg.inv(start.cov) + told_apart))
     return Start(pose, symmetric(cov))
 
 
