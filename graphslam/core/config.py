@@ -57,9 +57,9 @@ class AssociationConfig:
     (3.25). floor_m, floor_rad: added to the innovations' sigmas before gating, for model errors;
     they never enter the estimate. new_landmark_probability: an observation is a new landmark only
     if its distance to every landmark exceeds this second, higher quantile. overlap_gap_m: largest
-    gap along the line between an observed segment and the landmark's extent where the ends of one
-    are not known, and when the solved log is associated again; overlap_ratio: where both are known,
-    share of the shorter one that must overlap. sightings_to_promote:
+    gap along the line between an observed segment and the landmark's extent. overlap_ratio: share
+    of the shorter of the two that must overlap while one robot's scans are tracked, where the
+    landmarks are those of the last metres (back end batch). sightings_to_promote:
     a tentative landmark enters the graph at this many sightings. tentative_s, tentative_m: one not
     observed again within this time and path is deleted. delete_s: one in the graph that is not
     observed for this long is not associated again, and a filter deletes it (section 4.6).

@@ -164,7 +164,6 @@ def candidate_pairs(
     end = middle[..., 0] + np.cos(middle[..., 2]) * ends[:, None, 1]
     begin, end = np.minimum(begin, end), np.maximum(begin, end)
     gap = np.maximum(begin - extents[None, :, 1], extents[None, :, 0] - end)
-    length, known = ends[:, 1] - ends[:, 0], extents[:, 1] - extents[:, 0]
     near = np.hypot(middle[..., 0], middle[..., 1]) < config.max_distance_m
     as_printed = config.nearness == "middle"
     line_ok = near & (np.abs(turned) < np.pi / 2)
@@ -172,9 +171,11 @@ def candidate_pairs(
         line_ok = (
             (np.abs(middle[..., 1]) < config.max_distance_m)
             & (np.abs(turned) < MAX_ANGLE_RAD)
-            & overlapping(gap, np.minimum(length[:, None], known), config)
+            & (gap < config.overlap_gap_m)
         )
     i, j = np.nonzero((both_points & near) | (both_lines & line_ok))
+    length = ends[:, 1] - ends[:, 0]
+    known = extents[:, 1] - extents[:, 0]
     models = tuple(
         "point"
         if points[a]
@@ -189,21 +190,6 @@ def candidate_pairs(
     apart = np.hypot(middle[i, j, 0], middle[i, j, 1]) / TYPICAL_M
     miss = np.where(is_point[j], apart, np.hypot(across, turn))
     return Pairs(i.astype(np.int64), j.astype(np.int64), models, flipped[i, j], miss)
-
-
-def overlapping(gap: Array, shorter: Array, config: AssociationConfig) -> BoolArray:
-    """Whether what is seen may be of a known wall, by where both lie along it; shapes as given.
-
-    A door leaf or a cabinet beside a wall stands a few centimetres out of its line, which far away
-    and in a turn is less than the uncertainty. What they do not have is a part in common.
-
-    Args:
-        gap: m, between the two along the line; negative where they overlap.
-        shorter: length of the shorter one, m; 0 where the ends of one are not known.
-        config: gates.
-    """
-    shared = -gap >= config.overlap_ratio * shorter
-    return np.asarray((gap < config.overlap_gap_m) & (shared | (shorter <= 0.0)))
 
 
 def compare(

@@ -14,13 +14,7 @@ from graphslam.core.gaussian import mahalanobis_squared
 from graphslam.core.geometry import Array, log_jacobian, wrap
 from graphslam.core.observation_arrays import LINE, POINT, SEGMENT, ObservationArrays
 from graphslam.core.observation_models import MODELS
-from graphslam.mapping.gating import (
-    LENGTH_TOLERANCE_M,
-    MAX_ANGLE_RAD,
-    BoolArray,
-    IntArray,
-    overlapping,
-)
+from graphslam.mapping.gating import LENGTH_TOLERANCE_M, MAX_ANGLE_RAD, BoolArray, IntArray
 
 
 @dataclass(slots=True, eq=False)
@@ -96,6 +90,23 @@ def candidate_pairs(
     r, H, R = compare(model, z, image.cov[i], means[j])
     d2 = mahalanobis_squared(r, H @ covs[j] @ H.mT + R + floor[model])
     return LocalPairs(i, j, model, turned_over, z, r, H, R, d2)
+
+
+def overlapping(gap: Array, shorter: Array, config: AssociationConfig) -> BoolArray:
+    """Whether what is seen may be of a known wall, by where both lie along it; shapes as given.
+
+    A door leaf or a cabinet beside a wall stands a few centimetres out of its line, which far away
+    and in a turn is less than the uncertainty. What they do not have is a part in common. That can
+    be asked for where the landmarks are those of the last metres of path: after a loop a short wall
+    may lie beside itself.
+
+    Args:
+        gap: m, between the two along the line; negative where they overlap.
+        shorter: length of the shorter one, m; 0 where the ends of one are not known.
+        config: gates.
+    """
+    shared = -gap >= config.overlap_ratio * shorter
+    return np.asarray((gap < config.overlap_gap_m) & (shared | (shorter <= 0.0)))
 
 
 def compare(model: IntArray, z: Array, cov: Array, t: Array) -> tuple[Array, Array, Array]:

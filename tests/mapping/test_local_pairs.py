@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from graphslam.core.config import AssociationConfig
-from graphslam.core.observation_arrays import KINDS, POINT, ROWS, SEGMENT, ObservationArrays
+from graphslam.core.observation_arrays import (
+    KINDS,
+    LINE,
+    POINT,
+    ROWS,
+    SEGMENT,
+    ObservationArrays,
+)
 from graphslam.core.observation_models import MODELS
 from graphslam.mapping.local_pairs import LocalLandmarks, candidate_pairs, compare
 
@@ -62,3 +69,40 @@ def test_pairs_are_of_walls_that_overlap_in_any_direction_and_of_points_nearby()
     assert abs(np.sin(pairs.z[0, 2] - np.pi / 2)) < 1e-12
     # 10 cm along the wall, and across the line of sight: many sigmas of 1 cm
     np.testing.assert_allclose(pairs.d2[0], 0.01 / 2.01e-4, rtol=1e-2)
+
+
+def paired(middle_m, half_m, known_m, flipped=False):
+    """Whether a wall seen with its middle there is compared with one along x that begins at -5 m."""
+    heading = np.pi if flipped else 0.0
+    image = ObservationArrays(
+        np.array([LINE]),
+        np.array([[middle_m, 0.05, heading]]),
+        1e-4 * np.eye(3)[None],
+        np.array([[-half_m, half_m]]),
+    )
+    known = LocalLandmarks(
+        np.zeros((1, 3)), 1e-4 * np.eye(3)[None], np.array([LINE]), np.array([[-5.0, known_m]])
+    )
+    floor = np.tile(1e-6 * np.eye(3), (3, 1, 1))
+    return bool(len(candidate_pairs(image, known, floor, AssociationConfig(directed=False)).d2))
+
+
+@pytest.mark.parametrize("flipped", [False, True])
+@pytest.mark.parametrize("side", [1, -1])
+def test_walls_are_compared_where_half_of_the_shorter_one_overlaps(side, flipped):
+    """A door leaf, 0.8 m wide and 5 cm out of the wall's line, is not compared with the wall that
+    ends beside it: taken for it, it turned who saw both by tens of mrad. A wall of which half is
+    known is, as the robot drives along it."""
+    end = 5.0
+    assert paired(side * (end - 0.05), 0.4, end, flipped)
+    assert not paired(side * (end + 0.05), 0.4, end, flipped)
+    assert not paired(side * (end + 0.45), 0.4, end, flipped)
+    # a longer one must have half of what is known in common
+    assert paired(side * 20.0, 20.5, end, flipped)
+    assert not paired(side * 20.0, 19.5, end, flipped)
+
+
+@pytest.mark.parametrize(("gap", "is_near"), [(-3.0, True), (0.25, True), (0.35, False)])
+def test_a_wall_without_ends_is_compared_where_it_is_near(gap, is_near):
+    """overlap_gap_m is 0.3: nothing is known of a length that they could have in common."""
+    assert paired(5.0 + gap, 0.0, 5.0) == is_near
