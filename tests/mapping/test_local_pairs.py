@@ -72,7 +72,7 @@ def test_pairs_are_of_walls_that_overlap_in_any_direction_and_of_points_nearby()
 
 
 def paired(middle_m, half_m, known_m, flipped=False):
-    """Whether a wall seen with its middle there is compared with one along x that begins at -5 m."""
+    """Whether a wall that is seen there is compared with one along x that begins at -5 m."""
     heading = np.pi if flipped else 0.0
     image = ObservationArrays(
         np.array([LINE]),
