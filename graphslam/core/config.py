@@ -80,7 +80,7 @@ class AssociationConfig:
     floor_rad: float = 0.03
     new_landmark_probability: float = 0.9999
     overlap_gap_m: float = 0.3
-    overlap_ratio: float = 0.5
+    overlap_ratio: float = 0.2
     sightings_to_promote: int = 3
     tentative_s: float = 20.0
     tentative_m: float = 5.0

@@ -89,17 +89,17 @@ def paired(middle_m, half_m, known_m, flipped=False):
 
 @pytest.mark.parametrize("flipped", [False, True])
 @pytest.mark.parametrize("side", [1, -1])
-def test_walls_are_compared_where_half_of_the_shorter_one_overlaps(side, flipped):
+def test_walls_are_compared_where_a_fifth_of_the_shorter_one_overlaps(side, flipped):
     """A door leaf, 0.8 m wide and 5 cm out of the wall's line, is not compared with the wall that
-    ends beside it: taken for it, it turned who saw both by tens of mrad. A wall of which half is
+    ends beside it: taken for it, it turned who saw both by tens of mrad. A wall of which a part is
     known is, as the robot drives along it."""
     end = 5.0
-    assert paired(side * (end - 0.05), 0.4, end, flipped)
-    assert not paired(side * (end + 0.05), 0.4, end, flipped)
+    assert paired(side * (end + 0.2), 0.4, end, flipped)
+    assert not paired(side * (end + 0.3), 0.4, end, flipped)
     assert not paired(side * (end + 0.45), 0.4, end, flipped)
-    # a longer one must have half of what is known in common
-    assert paired(side * 20.0, 20.5, end, flipped)
-    assert not paired(side * 20.0, 19.5, end, flipped)
+    # a longer one must have as much of what is known, 2 of 10 m, in common
+    assert paired(side * 20.0, 17.5, end, flipped)
+    assert not paired(side * 20.0, 16.5, end, flipped)
 
 
 @pytest.mark.parametrize(("gap", "is_near"), [(-3.0, True), (0.25, True), (0.35, False)])
