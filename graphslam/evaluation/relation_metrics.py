@@ -33,7 +33,7 @@ _NUMBERS = (
     "trans_inside", "rot_inside", "trans_inside_closing", "rot_inside_closing",
 )  # fmt: skip
 #: triangles of relations from which on they tell the error of the reference: a sigma by 20 of them
-#: is known to a tenth
+#: is known to a tenth (of two axes) and to a sixth (of the heading)
 MIN_TRIANGLES = 20
 #: relations over at most this time are called local, the others loops
 LOCAL_S = 60.0

@@ -106,7 +106,7 @@ def overlapping(gap: Array, shorter: Array, config: AssociationConfig) -> BoolAr
         config: gates.
     """
     shared = -gap >= config.overlap_ratio * shorter
-    return np.asarray((gap < config.overlap_gap_m) & (shared | (shorter <= 0.0)))
+    return np.where(shorter > 0.0, shared, gap < config.overlap_gap_m)
 
 
 def compare(model: IntArray, z: Array, cov: Array, t: Array) -> tuple[Array, Array, Array]:

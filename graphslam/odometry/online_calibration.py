@@ -231,9 +231,9 @@ def _deviations(
         if held[at[:2]].any() and not held[at[2]]:
             continue
         found = compose(known.mean[at], mount)
-        mean[at] = found - mount
-        mean[at[2]] = known.mean[at[2]]
-        J[at[0], at[2]], J[at[1], at[2]] = -(found - known.mean[at])[1], (found - known.mean[at])[0]
+        mean[at[:2]] = (found - mount)[:2]
+        lever = found - known.mean[at]  # which the yaw turns
+        J[at[:2], at[2]] = -lever[1], lever[0]
     return J, replace(known, mean=mean)
 
 

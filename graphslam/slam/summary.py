@@ -69,6 +69,7 @@ def summarise(
         all_dropped["landmark: not seen again for association.delete_s"] += (
             pipeline.landmarks.forgotten
         )
+    lasers = {robot: lasers_used(log, robot, run) for robot, run in runs.items()}
     return {
         "format": FORMAT,
         "versions": {
@@ -123,10 +124,10 @@ def summarise(
             f"{robot}.{name}": {"value": value, "sigma": sigma, "observable": observable}
             for robot, run in runs.items()
             for name, (value, sigma, observable) in run.calibration_found(
-                {sensor: log.mount(topic) for topic, sensor in log.sensors(robot).items()}
+                {one["name"]: np.array(one["mount_in_log"]) for one in lasers[robot]}
             ).items()
         },
-        "lasers": {robot: lasers_used(log, robot, run) for robot, run in runs.items()},
+        "lasers": lasers,
         "odometry": {
             robot: {
                 "source": "scans" if robot in log.without_odometry else run.track.source,

@@ -57,15 +57,14 @@ def mount_bias(steps: Sequence[Step], estimate: Estimate, sigma_m: float) -> Arr
         sigma_m: of the bias of a surface, in m; all observations of one landmark have the same,
             and `COMMON` of its variance is that of all.
     """
-    shifts = mount_shifts(steps, estimate)
-    moved = np.array(list(shifts.values())).reshape(len(shifts), -1)
+    _, moved = mount_shifts(steps, estimate)
     together = moved.sum(axis=0)
     own, common = moved.T @ moved, np.outer(together, together)
     return np.asarray(sigma_m**2 * ((1.0 - COMMON) * own + COMMON * common))
 
 
-def mount_shifts(steps: Sequence[Step], estimate: Estimate) -> dict[int, Array]:
-    """Landmark -> by how much the mounts (3R,) move for each m of bias of its ranges."""
+def mount_shifts(steps: Sequence[Step], estimate: Estimate) -> tuple[list[int], Array]:
+    """Landmarks, and by how much the mounts (n, 3R) move for each m of bias of their ranges."""
     mounts = estimate.mounts
     assert mounts is not None
     seen: dict[tuple[str, str], list[Association]] = defaultdict(list)
@@ -78,7 +77,7 @@ def mount_shifts(steps: Sequence[Step], estimate: Estimate) -> dict[int, Array]:
     for (robot, model), own in seen.items():
         rows = np.array([numbers[int(a.target)] for a in own])
         np.add.at(moved, rows, _moved(own, robot, model, estimate, mounts))
-    return dict(zip(numbers, moved, strict=True))
+    return list(numbers), moved
 
 
 def _moved(

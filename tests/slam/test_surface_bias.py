@@ -67,7 +67,7 @@ def solved(log, monkeypatch, change):
 
 def test_the_mount_moves_as_the_solution_does_when_a_surface_is_biased(log, monkeypatch):
     mount, (steps, estimate) = solved(log, monkeypatch, lambda steps: steps)
-    shifts = mount_shifts(steps, estimate)
+    shifts = dict(zip(*mount_shifts(steps, estimate), strict=True))
     strongest = sorted(shifts, key=lambda n: -np.hypot(*shifts[n][:2]))[:2]
     for landmark in strongest:
 
@@ -92,9 +92,9 @@ def test_the_mount_moves_as_the_solution_does_when_a_surface_is_biased(log, monk
 def test_half_of_the_variance_is_that_of_all_surfaces_together(monkeypatch):
     """Two walls that face each other move the mount in opposite directions: what they have in
     common cancels. Two that move it in one direction add up."""
-    opposite = {0: np.array([1.0, 0.0, 0.0]), 1: np.array([-1.0, 0.0, 0.0])}
-    alike = {0: np.array([1.0, 0.0, 0.0]), 1: np.array([1.0, 0.0, 0.0])}
-    for shifts, variance in ((opposite, 1.0), (alike, 1.0 + 2.0)):
-        monkeypatch.setattr(surface_bias, "mount_shifts", lambda *_, shifts=shifts: shifts)
+    opposite = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+    # without a wall in the map there is no bias of one
+    for moved, variance in ((opposite, 1.0), (np.abs(opposite), 1.0 + 2.0), (opposite[:0], 0.0)):
+        monkeypatch.setattr(surface_bias, "mount_shifts", lambda *_, moved=moved: ([], moved))
         cov = mount_bias((), None, 0.01)
         np.testing.assert_allclose(cov, np.diag([0.01**2 * variance, 0.0, 0.0]), atol=1e-15)
