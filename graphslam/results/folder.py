@@ -154,7 +154,8 @@ def load(directory: Path) -> SavedResult:
         ConfigError: its config.toml is not valid.
     """
     if not is_result(directory):
-        raise OutputError(f"{directory}: not a result folder of graphslam (no summary.json)")
+        why = "damaged" if (directory / "summary.json").exists() else "no"
+        raise OutputError(f"{directory}: not a result folder of graphslam ({why} summary.json)")
     folder = directory / "trajectories"
     stems = sorted(p.name.removesuffix(".tum") for p in folder.glob("*.tum"))
     robots = {unquote(stem): _load_robot(folder / stem) for stem in stems if "." not in stem}
