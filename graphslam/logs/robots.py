@@ -124,10 +124,13 @@ def robots_and_topics(
         names = ", ".join(str(file.path) for file in files)
         raise LogError(f"{names}: no usable topic; {clouds[0].line}")
     frames = _Frames(files)
-    if config.logs.topics:
-        robots: Mapping[str, str] = {}
-    else:
-        robots = assign_robots(files, topics, frames)
+    robots: dict[str, str] = {}
+    if not config.logs.topics:
+        # a session has robots of its own: what another one calls base or joints says nothing of it
+        for together in [[file] for file in files] if config.logs.same_place else [files]:
+            there = {raw.name for file in together for raw in file.topics}
+            own = [topic for topic in topics if topic.name in there]
+            robots |= assign_robots(together, own, _Frames(together))
     named: list[Topic] = []
     unused: list[Finding] = []
     for topic in topics:

@@ -49,7 +49,8 @@ def open_recordings(paths: Sequence[Path], config: Config) -> tuple[list[Recordi
     for file, session in zip(files, sessions, strict=True):
         used = robots_and_topics([file], config)[1]
         robots = {topic.robot for topic in used if topic.count and topic.record in _OF_ROBOTS}
-        renamed = _Renamed(session, robots if len(robots) > 1 else ())
+        owners = {topic.name: topic.robot for topic in used}
+        renamed = _Renamed(session, robots if len(robots) > 1 else (), owners)
         found.append(renamed.recording(file))
         for topic, robot in config.logs.topics.items():
             topics[renamed.topic(topic)] = renamed.robot(robot)
@@ -70,10 +71,13 @@ def session_names(paths: Sequence[Path]) -> list[str]:
 
 
 class _Renamed:
-    """Names in a session: of its topics, and of its ``robots``, if it has more than one."""
+    """Names in a session: of its topics, and of its ``robots``, if it has more than one.
 
-    def __init__(self, session: str, robots: Collection[str]) -> None:
-        self._session, self._robots = session, robots
+    ``owners``: topic -> robot, of topics that are not in its namespace too.
+    """
+
+    def __init__(self, session: str, robots: Collection[str], owners: Mapping[str, str]) -> None:
+        self._session, self._robots, self._owners = session, robots, owners
 
     def robot(self, name: str) -> str:
         """The session's robot, or one of several."""
@@ -83,11 +87,11 @@ class _Renamed:
         """The topic in the namespace of its robot; what several robots share keeps its name."""
         if not self._robots:
             return f"/{self._session}/{name.lstrip('/')}"
-        space = namespace_of(name)
-        if space not in self._robots or name in _SHARED:
+        robot = self._owners.get(name, namespace_of(name))
+        if robot not in self._robots or name in _SHARED:
             return name
-        rest = name.strip("/").removeprefix(f"{space}/") if space != DEFAULT_ROBOT else name
-        return f"/{self.robot(space)}/{rest.lstrip('/')}"
+        rest = name.strip("/").removeprefix(f"{robot}/") if robot != DEFAULT_ROBOT else name
+        return f"/{self.robot(robot)}/{rest.lstrip('/')}"
 
     def recording(self, file: Recording) -> Recording:
         """The recording with these names."""

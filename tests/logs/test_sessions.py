@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from recordings import messages_of
-from room_log import drive
+from room_log import BEAMS, SCAN, drive
 
 import graphslam
 from graphslam.core.errors import LogError
@@ -57,6 +57,42 @@ def test_several_robots_of_a_recording_are_each_in_each_session(tmp_path):
                     log.sighting(robot, stamp, [0.1, 2.0], np.eye(2) * 1e-3, identity="post")
     log = open_logs(paths, SAME_PLACE)
     assert log.robots == ("monday.a", "monday.b", "tuesday.a", "tuesday.b")
+
+
+def test_robots_of_a_fleet_are_each_in_each_session_by_nested_names(tmp_path):
+    """Topics of ``/fleet/a`` are those of robot a in every session, not shared by all."""
+    paths = []
+    for day, name in enumerate(("monday", "tuesday")):
+        paths.append(tmp_path / f"{name}.mcap")
+        with LogWriter(paths[-1]) as log:
+            for robot in ("fleet/a", "fleet/b"):
+                for k in range(20):
+                    stamp = (DAY_S * day + k) * 1_000_000_000
+                    log.odometry(robot, stamp, [0.1 * k, 0, 0])
+                    log.sighting(robot, stamp, [0.1, 2.0], np.eye(2) * 1e-3, identity="post")
+    log = open_logs(paths, SAME_PLACE)
+    assert log.robots == ("monday.a", "monday.b", "tuesday.a", "tuesday.b")
+    assert {topic.count for topic in log.topics} == {20}
+
+
+@pytest.mark.parametrize("first", ["angles", "nothing", "poses"])
+def test_what_tells_how_a_session_moved_says_nothing_of_another_one(tmp_path, first):
+    """One robot may count wheel angles, or nothing, where another one states poses."""
+    paths = [tmp_path / "monday.mcap", tmp_path / "tuesday.mcap"]
+    for day, (path, kind) in enumerate(zip(paths, (first, "poses"), strict=True)):
+        robot = ("robot", "vehicle")[day]
+        with LogWriter(path) as log:
+            for k in range(20):
+                stamp = (DAY_S * day + k) * 1_000_000_000
+                if kind == "angles":
+                    log.wheel_angles(robot, stamp, 2.0 * k, 2.0 * k)
+                elif kind == "poses":
+                    log.odometry(robot, stamp, [0.1 * k, 0, 0])
+                log.scan(robot, stamp, np.full(len(BEAMS), 2.0), **SCAN)
+    log = open_logs(paths, SAME_PLACE)
+    assert log.robots == ("monday", "tuesday")
+    numbers = [sum(topic.robot == name for topic in log.topics) for name in log.robots]
+    assert numbers == [1 if first == "nothing" else 2, 2]
 
 
 def test_topics_that_are_chosen_have_the_names_of_the_recordings(tmp_path):
