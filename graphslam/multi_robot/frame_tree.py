@@ -32,7 +32,7 @@ class FrameAssignment:
 
     ``world`` is the frame of the world. ``found``: robot -> the relation by which it was placed.
     ``undecided``: robot -> why it has a separate frame although it shares observations with
-    others.
+    others. ``remarks``: robot -> what is to be known about where it was placed.
     """
 
     starts: Mapping[str, Start]
@@ -40,6 +40,7 @@ class FrameAssignment:
     world: str
     found: Mapping[str, RelativeFrame] = field(default_factory=dict)
     undecided: Mapping[str, str] = field(default_factory=dict)
+    remarks: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def one_frame(cls, starts: Mapping[str, Start]) -> "FrameAssignment":

@@ -176,9 +176,16 @@ def _agreement(source: Submap, target: Submap, pose: Array) -> tuple[float, floa
 
 
 def choose(
-    found: Sequence[Support], places: Sequence[SubmapPose], config: MultiRobotConfig
+    found: Sequence[Support],
+    places: Sequence[SubmapPose],
+    config: MultiRobotConfig,
+    *,
+    may_contradict: bool = False,
 ) -> int | str:
-    """Which of several hypotheses, at least one, is right, or why that is not known."""
+    """Which of several hypotheses, at least one, is right, or why that is not known.
+
+    ``may_contradict``: however many places contradict it, if nothing else is against it.
+    """
     totals = [one.total for one in found]
     best = int(np.argmax(totals))
     one = found[best]
@@ -189,11 +196,11 @@ def choose(
         config.min_place_extent_m
     ):
         return "the places that are recognised extend over less than multi_robot.min_place_extent_m"
-    others = [x for x in found if _differ(one, x)]
+    others = [x for x in found if differ(one, x)]
     rivals = [x.total for x in others if not x.is_contradicted]
     if has_rival(one.total, rivals) or has_rival(one.total, [x.total for x in others], EQUAL_SHARE):
         return "it has places that look alike, and the path fits into it in more than one way"
-    if one.is_contradicted:
+    if one.is_contradicted and not may_contradict:
         return f"{int(one.contradicted.sum())} of {len(places)} places contradict it"
     return best
 
@@ -211,7 +218,7 @@ def contradiction(given: Support) -> str:
     return f"{against} of {len(given.confirmed)} places contradict it, {agreeing} agree with it"
 
 
-def _differ(one: Support, other: Support) -> bool:
+def differ(one: Support, other: Support) -> bool:
     """Whether two hypotheses, that may have begun apart, end at different paths."""
     off = between(one.poses, other.poses)
     apart = np.hypot(off[:, 0], off[:, 1]) > DISTINCT_M

@@ -301,6 +301,7 @@ def run_warnings(pipeline: LogPass) -> list[str]:
         for robot, run in pipeline.runs.items()
         if run.started and robot == pipeline.frames.of[robot] != known.frame_assignment.world
     ]
+    warnings += [f"{name}: {said}" for name, said in known.frame_assignment.remarks.items()]
     if known.recorded.refused:
         warnings.append(
             f"{len(known.recorded.refused)} recorded closures were rejected as inconsistent; "

@@ -24,6 +24,8 @@ MISFITS = 8.0, 100.0
 REJECTED = 0.6
 #: share of messages that are lost
 LOST = 0.02
+#: share of the scans, or sightings, at whose time it is not known how the robot moved
+UNPLACED = 0.3
 #: mean squared error over its covariance: of healthy logs up to 5
 NEES = 30.0, 1000.0
 
@@ -128,6 +130,16 @@ def _lost(evidence: Evidence) -> Iterable[Reason]:
             yield Reason("doubtful", "lost", log["path"], text)
 
 
+def _unplaced(evidence: Evidence) -> Iterable[Reason]:
+    """Much that was recorded is not in the result: of another robot, say, or by another clock."""
+    dropped, counts = evidence.summary["dropped"], evidence.summary["counts"]
+    for kind, used in (("scan", counts["scans"]), ("sighting", counts["observations"])):
+        left_out = dropped.get(f"{kind}: no odometry near it", 0)
+        if left_out > UNPLACED * (left_out + used):
+            text = f"{left_out} of {left_out + used} {kind}s were left out: no odometry is near them"
+            yield Reason("doubtful", "unplaced", "", text)
+
+
 def _unobserved(evidence: Evidence) -> Iterable[Reason]:
     counts = evidence.summary["counts"]
     if not evidence.observed or not (counts["observations"] or counts["loop_closures"]):
@@ -146,5 +158,6 @@ CHECKS: dict[str, Callable[[Evidence], Iterable[Reason]]] = {
     "residuals": _misfit,
     "rejected": _rejected,
     "lost": _lost,
+    "unplaced": _unplaced,
     "observations": _unobserved,
 }

@@ -152,3 +152,19 @@ def test_five_robots_find_landmarks_without_names(tmp_path, start_sigma_m):
     errors = graphslam.evaluate(result, truth=log)
     assert errors["joint"]["final"]["ate_rmse_m"] < 0.105
     assert (errors["landmarks"]["missed"], errors["landmarks"]["extra"]) == (0, 0)
+
+
+def test_two_drives_through_a_lab_in_which_much_was_moved_are_one_map(tmp_path):
+    """Nearly all places of the second are recognised at one relative pose, and many of them
+    contradict it. Change detection, which aligns all scans, puts the second drive there too."""
+    logs = [tmp_path / "monday.mcap", tmp_path / "tuesday.mcap"]
+    for number, log in enumerate(logs, 1):
+        IMPORTERS["tinyslam"](real_data(f"tinyslam/exp{number}.dat.xz"), log)
+    config = graphslam.load_config(**{"logs.same_place": True})
+    result = smooth(open_logs(logs, config), config)
+    assert result.summary["frames"] == {"monday": "monday", "tuesday": "monday"}
+    start = result.summary["starts_found"]["tuesday"]
+    off = np.array([start["x"], start["y"], start["phi"]]) - [1.35, -0.32, 0.03]
+    assert (np.abs(off) < [0.15, 0.15, 0.03]).all()  # the drives bend by a few decimetres
+    (said,) = [line for line in result.summary["warnings"] if line.startswith("tuesday: ")][-1:]
+    assert "places contradict where it was placed" in said

@@ -138,3 +138,18 @@ def test_laying_more_of_a_drive_into_the_map_does_not_make_a_rival_of_what_is_co
     # what it has in common with the best one counts all the same
     found = [laid([0.55] * 8 + [0.9] * 4, 20.0, 6), laid(best)]
     assert "more than one way" in _best(found, PLACES, Config())[1]
+
+
+def test_much_may_have_been_moved_where_nothing_else_explains_anything():
+    """Ten of twelve places contradict it; it is taken only where nearly all are recognised and no
+    other relative pose explains a tenth as much, as parts of the office turned round do."""
+    moved = laid([0.4] * 12, contradicted=10)
+    faint, less_faint = (laid([score] * 2 + [0] * 10, 20.0, 2) for score in (0.2, 0.3))
+    assert _best([moved, faint], PLACES, Config()) == (moved, "")
+    for found in ([moved, less_faint], [laid([0.4] * 8 + [0] * 4, contradicted=6)]):
+        assert "places contradict it" in _best(found, PLACES, Config())[1]
+    # few places, or places of one room, are refused whatever speaks for them
+    assert (
+        "less than multi_robot.min_place_extent_m"
+        in (_best([moved], [SimpleNamespace(pose=np.zeros(3))] * 12, Config())[1])
+    )

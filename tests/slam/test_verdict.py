@@ -18,7 +18,8 @@ S = 1_000_000_000
 N = 600  # readings, at 10 Hz
 SUMMARY = {
     "noise": {}, "graph": {"error_without_kernels": 100.0, "dof": 200}, "rejected": {},
-    "counts": {"observations": 500, "loop_closures": 3}, "closures": {}, "odometry": {},
+    "counts": {"scans": 100, "observations": 500, "loop_closures": 3}, "closures": {},
+    "odometry": {}, "dropped": {"scan: no odometry near it": 20},
     "logs": [{"path": "log", "lost": 0, "messages": 100}],
 }  # fmt: skip
 
@@ -290,7 +291,9 @@ def test_what_is_wrong_is_said_as_what_it_is(name):
         ({"rejected": {"why": 4000}}, "doubtful", "4000 of 4500 observations"),
         ({"logs": [{"path": "x", "lost": 9, "messages": 91}]}, "doubtful", "9 of 100 messages"),
         ({"logs": [{"path": "x", "lost": None, "messages": 91}]}, "doubtful", "nobody knows"),
-        ({"counts": {"observations": 0, "loop_closures": 0}}, "doubtful", "dead reckoning"),
+        ({"dropped": {"scan: no odometry near it": 50}}, "doubtful", "50 of 150 scans were left"),
+        ({"dropped": {"sighting: no odometry near it": 300}}, "doubtful", "300 of 800 sightings"),
+        ({"counts": {"scans": 100, "observations": 0, "loop_closures": 0}}, "doubtful", "dead reck"),
     ],
 )  # fmt: skip
 def test_counts_of_the_run_are_judged(change, level, text):
