@@ -136,7 +136,8 @@ def _unplaced(evidence: Evidence) -> Iterable[Reason]:
     for kind, used in (("scan", counts["scans"]), ("sighting", counts["observations"])):
         left_out = dropped.get(f"{kind}: no odometry near it", 0)
         if left_out > UNPLACED * (left_out + used):
-            text = f"{left_out} of {left_out + used} {kind}s were left out: no odometry is near them"
+            part = f"{left_out} of {left_out + used} {kind}s"
+            text = f"{part} were left out: no odometry is near them"
             yield Reason("doubtful", "unplaced", "", text)
 
 

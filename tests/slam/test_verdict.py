@@ -293,7 +293,7 @@ def test_what_is_wrong_is_said_as_what_it_is(name):
         ({"logs": [{"path": "x", "lost": None, "messages": 91}]}, "doubtful", "nobody knows"),
         ({"dropped": {"scan: no odometry near it": 50}}, "doubtful", "50 of 150 scans were left"),
         ({"dropped": {"sighting: no odometry near it": 300}}, "doubtful", "300 of 800 sightings"),
-        ({"counts": {"scans": 100, "observations": 0, "loop_closures": 0}}, "doubtful", "dead reck"),
+        ({"counts": {"scans": 100, "observations": 0, "loop_closures": 0}}, "doubtful", "dead"),
     ],
 )  # fmt: skip
 def test_counts_of_the_run_are_judged(change, level, text):
