@@ -19,6 +19,7 @@ import numpy as np
 
 from graphslam.core.config import Config
 from graphslam.core.consistency import has_rival
+from graphslam.core.errors import EstimationError
 from graphslam.core.frame_forest import PRIOR_INFLATION
 from graphslam.core.geometry import Array, between, compose, compose_cov, inverse
 from graphslam.core.known_landmarks import KnownLandmarks, SparseRoot
@@ -27,7 +28,13 @@ from graphslam.logs import LogSet
 from graphslam.mapping.known_map import KnownMap, latest_places
 from graphslam.mapping.submaps import SubmapPose, with_poses_from
 from graphslam.multi_robot.frame_tree import FrameAssignment
-from graphslam.multi_robot.map_localisation import Support, choose, differ, support
+from graphslam.multi_robot.map_localisation import (
+    Support,
+    choose,
+    contradiction,
+    differ,
+    support,
+)
 from graphslam.multi_robot.place_recognition import EQUIVALENT_SHARE, PlaceMap
 from graphslam.multi_robot.place_search import DISTINCT_M, DISTINCT_RAD
 from graphslam.multi_robot.relative_frames import RelativeFrame
@@ -57,13 +64,15 @@ def join_sessions(log: LogSet, sessions: Mapping[str, ScanLog], config: Config) 
         config: settings.
 
     Raises:
-        EstimationError: a start that is told is malformed, or truth was asked for and is missing.
+        EstimationError: a start that is told is malformed, or contradicts another one; or truth was
+            asked for and is missing.
     """
     told = start_poses(log, config)
     world = min(told)
     by_time = sorted(sessions, key=lambda name: sessions[name].first_ns)
     tracked = {name: _Session.of(sessions[name], name) for name in by_time}
     given = {name: _of_first_state(sessions, name, world, told) for name in told}
+    _check_given(given, tracked)
     groups = [_group({n: start for n, start in given.items() if n in sessions}, tracked)]
     groups += [_group({n: origin(config)}, tracked) for n in by_time if n not in given]
     refused = _merge(groups, tracked, config)
@@ -81,6 +90,27 @@ def join_sessions(log: LogSet, sessions: Mapping[str, ScanLog], config: Config) 
             found[name] = RelativeFrame(name, leader, pose, cov, group.confirmed[name])
     undecided = {name: why for name, why in refused.items() if frames[name] == name != world}
     return FrameAssignment(starts, frames, world, found, undecided, remarks)
+
+
+def _check_given(given: Mapping[str, Start], sessions: Mapping[str, "_Session"]) -> None:
+    """See that sessions whose starts are told agree with those before them.
+
+    Raises:
+        EstimationError: from there one sees something else than the others.
+    """
+    before: dict[str, Start] = {}
+    for name, start in given.items():
+        if name not in sessions:
+            continue
+        known = _group(before, sessions).map
+        if known.places:
+            why = contradiction(_lay({name: start}, known, sessions).support)
+            if why:
+                raise EstimationError(
+                    f"session {name}: --start contradicts that of {', '.join(before)}: {why}; "
+                    "give another start, or none"
+                )
+        before[name] = start
 
 
 def _of_first_state(
@@ -242,11 +272,16 @@ def _stands_alone(best: Support, all_of_them: Sequence[Support]) -> bool:
     """Whether a hypothesis recognises nearly all places, and no other one explains a bit of them.
 
     Then it is right though much was moved. The same building turned by half a turn recognises all
-    places too, but is never alone: parts of it fit elsewhere.
+    places too, but is never alone: parts of it fit elsewhere, or the right pose does, contradicted
+    as much.
     """
-    others = [one.total for one in all_of_them if differ(best, one)]
+    others = [one for one in all_of_them if differ(best, one)]
+    recognised = float(best.confirmed.sum())
     return bool(
-        best.confirmed.mean() >= RECOGNISED_SHARE and not has_rival(best.total, others, FAINT_SHARE)
+        recognised >= RECOGNISED_SHARE * len(best.confirmed)
+        and best.total > 0.0
+        and not has_rival(best.total, (one.total for one in others), FAINT_SHARE)
+        and not has_rival(recognised, (float(one.confirmed.sum()) for one in others))
     )
 
 

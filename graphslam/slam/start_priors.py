@@ -16,6 +16,8 @@ MAX_TRUTH_LAG_NS = 500_000_000
 def start_poses(log: LogSet, config: Config) -> dict[str, Start]:
     """Start poses as given or from one truth sample; without any the first robot is at the origin.
 
+    Of sessions that is the one of the first recording that was given.
+
     Raises:
         EstimationError: truth was asked for and a robot has none, or a given pose is malformed.
     """
@@ -32,8 +34,15 @@ def start_poses(log: LogSet, config: Config) -> dict[str, Start]:
             )
         starts[robot] = Start(np.array(pose), given)
     if log.robots and not starts:
-        starts[log.robots[0]] = origin(config)
+        starts[_leader(log, config)] = origin(config)
     return starts
+
+
+def _leader(log: LogSet, config: Config) -> str:
+    """The robot at the origin: the first by name; of sessions that of the first recording."""
+    there = {topic.name for topic in log.opened[0].topics} if config.logs.same_place else set()
+    own = {topic.robot for topic in log.topics if topic.name in there}
+    return min(own & set(log.robots), default=log.robots[0])
 
 
 def origin(config: Config) -> Start:

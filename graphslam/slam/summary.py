@@ -110,6 +110,7 @@ def summarise(
         "world": known.frame_assignment.world,
         "frames": dict(sorted(known.frame_assignment.frames.items())),
         "starts_found": known.frame_assignment.to_summary(),
+        **_sessions(pipeline),
         "rejected": dict(sorted(pipeline.rejected.items())),
         "dropped": dict(sorted(all_dropped.items())),
         "repaired": dict(sorted(log.repaired.items())),
@@ -223,6 +224,27 @@ def noise_warnings(noise: Mapping[str, Any]) -> list[str]:
     return lines
 
 
+def _sessions(pipeline: LogPass) -> dict[str, Any]:
+    """The key ``sessions``, of logs of one place: those apart, and doubts about others."""
+    if not pipeline.config.logs.same_place:
+        return {}
+    known = pipeline.known.frame_assignment
+    apart = {name: _why_apart(pipeline, name) for name in _apart(pipeline)}
+    return {"sessions": {"apart": apart, "doubts": dict(known.remarks)}}
+
+
+def _apart(pipeline: LogPass) -> list[str]:
+    """Robots with poses in frames of their own."""
+    known, of = pipeline.known.frame_assignment, pipeline.frames.of
+    runs = pipeline.runs.items()
+    return [name for name, run in runs if run.started and name == of[name] != known.world]
+
+
+def _why_apart(pipeline: LogPass, robot: str) -> str:
+    undecided = pipeline.known.frame_assignment.undecided
+    return undecided.get(robot, "nothing in the log tells its start pose")
+
+
 def _two_digits(value: float) -> str:
     """Two significant digits, without an exponent: 2.2, 2200."""
     return f"{float(f'{value:.2g}'):g}"
@@ -242,7 +264,6 @@ def is_relative(pipeline: LogPass) -> bool:
 def run_warnings(pipeline: LogPass) -> list[str]:
     """What a user should know about a run although it went through."""
     known = pipeline.known
-    undecided = known.frame_assignment.undecided
     warnings = [
         f"{name}: its odometry jumped {run.track.resets} times; bridged at the previous speed"
         for name, run in pipeline.runs.items()
@@ -295,11 +316,10 @@ def run_warnings(pipeline: LogPass) -> list[str]:
         for reason, count in sorted(pipeline.skipped.items())
     ]
     warnings += [
-        f"{robot}: {undecided.get(robot, 'nothing in the log tells its start pose')}; "
+        f"{robot}: {_why_apart(pipeline, robot)}; "
         "its poses are in a separate frame with its origin at its first pose; "
         f"--start {robot}=x,y,phi places it"
-        for robot, run in pipeline.runs.items()
-        if run.started and robot == pipeline.frames.of[robot] != known.frame_assignment.world
+        for robot in _apart(pipeline)
     ]
     warnings += [f"{name}: {said}" for name, said in known.frame_assignment.remarks.items()]
     if known.recorded.refused:

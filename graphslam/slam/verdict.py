@@ -141,6 +141,15 @@ def _unplaced(evidence: Evidence) -> Iterable[Reason]:
             yield Reason("doubtful", "unplaced", "", text)
 
 
+def _sessions(evidence: Evidence) -> Iterable[Reason]:
+    """Recordings of one place that are not one map, or of which much speaks against it."""
+    found = evidence.summary.get("sessions", {})
+    for name, why in found.get("apart", {}).items():
+        yield Reason("doubtful", "sessions", name, f"{name}: is no part of the map: {why}")
+    for name, said in found.get("doubts", {}).items():
+        yield Reason("doubtful", "sessions", name, f"{name}: {said}")
+
+
 def _unobserved(evidence: Evidence) -> Iterable[Reason]:
     counts = evidence.summary["counts"]
     if not evidence.observed or not (counts["observations"] or counts["loop_closures"]):
@@ -160,5 +169,6 @@ CHECKS: dict[str, Callable[[Evidence], Iterable[Reason]]] = {
     "rejected": _rejected,
     "lost": _lost,
     "unplaced": _unplaced,
+    "sessions": _sessions,
     "observations": _unobserved,
 }

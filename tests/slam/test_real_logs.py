@@ -168,3 +168,4 @@ def test_two_drives_through_a_lab_in_which_much_was_moved_are_one_map(tmp_path):
     assert (np.abs(off) < [0.15, 0.15, 0.03]).all()  # the drives bend by a few decimetres
     (said,) = [line for line in result.summary["warnings"] if line.startswith("tuesday: ")][-1:]
     assert "places contradict where it was placed" in said
+    assert result.summary["verdict"]["verdict"] == "doubtful"

@@ -1,5 +1,6 @@
 """Sessions of one room, solved as one batch: joined by what the whole drives show, or refused."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,11 +10,13 @@ from walls import rectangles
 
 import graphslam
 from graphslam.core.config import Config
+from graphslam.core.errors import EstimationError
 from graphslam.evaluation.metrics import evaluate
 from graphslam.logs import open_logs, read_truth
 from graphslam.multi_robot.map_localisation import Support
 from graphslam.slam.log_reader import is_session_log
 from graphslam.slam.session_joining import _best, _Laid
+from graphslam.slam.start_priors import start_poses
 
 BOX = (0, 0, 10, 8), (4, 3.5, 6, 4.5)
 #: corners of furniture that tell the room from itself turned by half a turn
@@ -62,12 +65,32 @@ def test_a_room_that_looks_the_same_turned_is_refused(tmp_path):
     (why,) = [line for line in result.summary["warnings"] if line.startswith("day1: ")]
     assert "more than one way" in why
     assert "--start day1=x,y,phi places it" in why
+    assert result.summary["sessions"]["apart"].keys() == {"day1"}
+    assert result.summary["verdict"]["verdict"] == "doubtful"
     # told starts decide it
     told = {f"start.poses.day{n}": true_pose(0.0, 0.3 * n).tolist() for n in range(2)}
     result = graphslam.smooth(days, config=SAME_PLACE, **told)
     assert set(result.summary["frames"].values()) == {"day0"}
+    assert not result.summary["sessions"]["apart"]
     errors = evaluate(result, read_truth(days, SAME_PLACE).trajectories)["joint"]["final"]
     assert errors["ate_aligned_rmse_m"] < 0.03
+
+
+def test_a_start_that_contradicts_another_one_is_refused(tmp_path):
+    """Two told starts 2 m off would lay one room into another one beside it, without a word."""
+    days = sessions(tmp_path, FURNISHED, FURNISHED)
+    told = {"start.poses.day0": [5.0, 1.7, 0.0], "start.poses.day1": [5.0, 3.7, 1.5]}
+    with pytest.raises(EstimationError, match="day1: --start contradicts that of day0: "):
+        graphslam.smooth(days, config=SAME_PLACE, **told)
+
+
+def test_the_first_recording_is_at_the_origin_whatever_its_name(tmp_path):
+    """A map must not move when a recording is added whose name comes before the others'."""
+    days = sessions(tmp_path, FURNISHED, FURNISHED)
+    late = days[0].rename(tmp_path / "zebra.mcap")
+    log = open_logs([late, days[1]], SAME_PLACE)
+    assert list(start_poses(log, SAME_PLACE)) == ["zebra"]
+    assert list(start_poses(open_logs([days[1], late], SAME_PLACE), SAME_PLACE)) == ["day1"]
 
 
 @pytest.mark.parametrize(("setting", "value"), [("backend.name", "ekf"), ("backend.causal", True)])
@@ -147,6 +170,11 @@ def test_much_may_have_been_moved_where_nothing_else_explains_anything():
     faint, less_faint = (laid([score] * 2 + [0] * 10, 20.0, 2) for score in (0.2, 0.3))
     assert _best([moved, faint], PLACES, Config()) == (moved, "")
     for found in ([moved, less_faint], [laid([0.4] * 8 + [0] * 4, contradicted=6)]):
+        assert "places contradict it" in _best(found, PLACES, Config())[1]
+    # where all are contradicted nothing is explained, and the right pose may be as contradicted
+    nothing = Support(POSES, np.zeros(12), np.ones(12, dtype=bool), np.ones(12, dtype=bool))
+    turned = replace(nothing, poses=POSES + [20.0, 0, 0], confirmed=np.arange(12) < 7)
+    for found in ([_Laid({}, [], nothing)], [moved, _Laid({}, [], turned)]):
         assert "places contradict it" in _best(found, PLACES, Config())[1]
     # few places, or places of one room, are refused whatever speaks for them
     assert (

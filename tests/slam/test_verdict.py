@@ -293,6 +293,8 @@ def test_what_is_wrong_is_said_as_what_it_is(name):
         ({"logs": [{"path": "x", "lost": None, "messages": 91}]}, "doubtful", "nobody knows"),
         ({"dropped": {"scan: no odometry near it": 50}}, "doubtful", "50 of 150 scans were left"),
         ({"dropped": {"sighting: no odometry near it": 300}}, "doubtful", "300 of 800 sightings"),
+        ({"sessions": {"apart": {"day1": "why"}}}, "doubtful", "day1: is no part of the map: why"),
+        ({"sessions": {"doubts": {"day1": "much was moved"}}}, "doubtful", "day1: much was moved"),
         ({"counts": {"scans": 100, "observations": 0, "loop_closures": 0}}, "doubtful", "dead"),
     ],
 )  # fmt: skip
