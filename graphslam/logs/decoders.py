@@ -46,7 +46,8 @@ class TopicContext:
     dropped beams of scans that are kept, by reason. With ``without_ranges`` scans get no ranges:
     only when they were taken is of interest. ``by_log_time``: the messages have no stamps; that of
     their recording is taken. ``sensor``: see `records.Scan`. ``only_frame``: if given, scans
-    in other frames are dropped.
+    in other frames are dropped. ``session``: of a recording of several robots, which messages
+    name as that recording does.
     """
 
     robot: str
@@ -62,6 +63,11 @@ class TopicContext:
     by_log_time: bool = False
     sensor: str = ""
     only_frame: str | None = None
+    session: str = ""
+
+    def named(self, robot: str) -> str:
+        """The name in the log of a robot that a message names; empty if none."""
+        return f"{self.session}.{robot}" if robot and self.session else robot
 
 
 class Decoder(NamedTuple):
@@ -242,7 +248,7 @@ def sightings(
                 found.append(str(reason))
                 continue
         may_be = _UNNAMED.get(robot)
-        names = (identity or None, robot or None) if may_be is None else (None, None)
+        names = (identity or None, topic.named(robot) or None) if may_be is None else (None, None)
         seen = records.Sighting(topic.robot, stamp, stamp, z, cov, *names, mount)
         found.append(seen if may_be is None else replace(seen, may_be=may_be))
     return found
@@ -298,7 +304,7 @@ def relative_pose(message: Any, topic: TopicContext) -> records.RelativePose:
     start = schemas.stamp_ns(message.start)
     delta = _pose("relative pose", message)
     cov = _covariance("relative pose", message.covariance, 3)
-    other = message.other or topic.robot
+    other = topic.named(message.other) or topic.robot
     return records.RelativePose(*_source(message, topic), other, start, delta, cov)
 
 

@@ -111,9 +111,16 @@ def topic_contexts(
             right_joint=settings.right_joint,
             by_log_time=unstamped,
             sensor=sensor,
+            session=session_of(topic.robot) if config.logs.same_place else "",
             **told,
         )
     return contexts, findings
+
+
+def session_of(robot: str) -> str:
+    """The session of one of its several robots, empty for its only one; see `logs.sessions`."""
+    session, _, own = robot.partition(".")
+    return session if own else ""
 
 
 class _SensorFrames:

@@ -10,6 +10,7 @@ from recordings import messages_of
 from room_log import BEAMS, SCAN, drive
 
 import graphslam
+from graphslam.core import records
 from graphslam.core.errors import LogError
 from graphslam.core.records import Trajectory
 from graphslam.evaluation.metrics import evaluate
@@ -57,6 +58,31 @@ def test_several_robots_of_a_recording_are_each_in_each_session(tmp_path):
                     log.sighting(robot, stamp, [0.1, 2.0], np.eye(2) * 1e-3, identity="post")
     log = open_logs(paths, SAME_PLACE)
     assert log.robots == ("monday.a", "monday.b", "tuesday.a", "tuesday.b")
+
+
+def test_robots_see_those_of_their_own_session(tmp_path):
+    """A message names a robot as its recording does; the log has one of that name in each session.
+    What is measured between them was dropped as of a robot that is not in the log."""
+    paths = [tmp_path / "monday.mcap", tmp_path / "tuesday.mcap"]
+    for day, path in enumerate(paths):
+        with LogWriter(path) as log:
+            for robot, other in (("a", "b"), ("b", "a")):
+                for k in range(1, 20):
+                    stamp = (DAY_S * day + k) * 1_000_000_000
+                    log.odometry(robot, stamp, [0.1 * k, 0, 0])
+                    log.sighting(robot, stamp, [0.1, 2.0], np.eye(2) * 1e-3, seen_robot=other)
+                    log.relative_pose(
+                        robot, stamp, stamp, delta=np.ones(3), cov=np.eye(3), other=other
+                    )
+    seen = [(m.robot, m.seen_robot) for m in messages(paths) if isinstance(m, records.Sighting)]
+    given = [(m.robot, m.other) for m in messages(paths) if isinstance(m, records.RelativePose)]
+    pairs = {(f"{day}.{a}", f"{day}.{b}") for day in ("monday", "tuesday") for a, b in ("ab", "ba")}
+    assert set(seen) == set(given) == pairs
+
+
+def messages(paths):
+    """Of all sessions."""
+    return open_logs(paths, SAME_PLACE).messages()
 
 
 def test_robots_of_a_fleet_are_each_in_each_session_by_nested_names(tmp_path):

@@ -173,7 +173,7 @@ def test_much_may_have_been_moved_where_nothing_else_explains_anything():
         assert "places contradict it" in _best(found, PLACES, Config())[1]
     # where all are contradicted nothing is explained, and the right pose may be as contradicted
     nothing = Support(POSES, np.zeros(12), np.ones(12, dtype=bool), np.ones(12, dtype=bool))
-    turned = replace(nothing, poses=POSES + [20.0, 0, 0], confirmed=np.arange(12) < 7)
+    turned = replace(nothing, poses=np.add(POSES, [20.0, 0, 0]), confirmed=np.arange(12) < 7)
     for found in ([_Laid({}, [], nothing)], [moved, _Laid({}, [], turned)]):
         assert "places contradict it" in _best(found, PLACES, Config())[1]
     # few places, or places of one room, are refused whatever speaks for them
