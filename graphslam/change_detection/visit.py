@@ -132,8 +132,12 @@ def load_visit(saved: SavedResult, directory: Path, config: ChangesConfig = _DEF
 
     Raises:
         LogError: a log is missing or has changed.
-        OutputError: the result has no scans or no covariances.
+        OutputError: the result has no scans or no covariances, or several frames.
     """
+    if len(set(saved.summary.get("frames", {}).values())) > 1:
+        raise OutputError(
+            f"{directory}: its robots are in separate frames: it is no map of one place"
+        )
     logs = saved.summary["logs"]
     log = open_logs([Path(entry["path"]) for entry in logs], saved.config)
     for entry, file in zip(logs, log.files, strict=True):
@@ -165,9 +169,10 @@ def load_visit(saved: SavedResult, directory: Path, config: ChangesConfig = _DEF
         (s.angles, s.ranges) if s.angle_step_rad > 0 else (s.angles[::-1], s.ranges[::-1])
         for s in scans
     ]
-    visit = visit_from_scans(
-        stamps, np.array(poses), np.array(covs), sweeps, saved.landmarks, config
-    )
+    # of a known map, what this log did not see is not of this visit
+    unseen = set(saved.summary.get("known_map", {}).get("unseen", ()))
+    landmarks = tuple(one for one in saved.landmarks if one.id not in unseen)
+    visit = visit_from_scans(stamps, np.array(poses), np.array(covs), sweeps, landmarks, config)
     return replace(visit, robots=len({name for name, _ in laser_poses}))
 
 

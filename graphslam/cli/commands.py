@@ -80,7 +80,8 @@ def _described(logs: Sequence[Path], config: Config, strict: bool) -> Output:
 
     found = inspect_logs(logs, config)
     code = (3 if strict and found.doubtful else 0) if found.usable else 1
-    return Output(found.to_dict(), lambda: show.log_info(found), code=code)
+    sessions = config.logs.same_place
+    return Output(found.to_dict(), lambda: show.log_info(found, same_place=sessions), code=code)
 
 
 @command("import")

@@ -32,8 +32,11 @@ _MUCH = 1.5  # chi2/dof above it: the noise is larger than stated, or something 
 _PIPE_WIDTH = 200  # columns; output into a pipe has no width of its own
 
 
-def log_info(info: LogInfo) -> None:
-    """Files, topics and robots, warnings, and whether the log can be smoothed."""
+def log_info(info: LogInfo, *, same_place: bool = False) -> None:
+    """Files, topics and robots, warnings, and whether the log can be smoothed.
+
+    ``same_place``: the files are sessions.
+    """
     console = make_console()
     for file in info.files:
         lost = "an unknown number" if file.lost is None else _number(file.lost)
@@ -62,7 +65,8 @@ def log_info(info: LogInfo) -> None:
     if info.usable:
         names = " ".join(str(file.path) for file in info.files)
         doubts = " with doubts" if info.doubtful else ""
-        console.print(f"usable{doubts}: graphslam smooth {names} -o DIR")
+        sessions = " --same-place" if same_place else ""
+        console.print(f"usable{doubts}: graphslam smooth {names}{sessions} -o DIR")
 
 
 def imported(done: ImportSummary) -> None:

@@ -45,16 +45,36 @@ def open_recordings(paths: Sequence[Path], config: Config) -> tuple[list[Recordi
         raise LogError(f"{files[0].path}: is one session; --same-place joins two or more logs")
     sessions = session_names([file.path for file in files])
     topics: dict[str, str] = {}
+    wanted = config.logs.topics
+    unknown = set(wanted)
     found = []
     for file, session in zip(files, sessions, strict=True):
-        used = robots_and_topics([file], config)[1]
+        names = {topic: _own_name(topic, file, session) for topic in wanted}
+        chosen = {
+            name: wanted[topic].removeprefix(f"{session}.") for topic, name in names.items() if name
+        }
+        if wanted and not chosen:
+            raise LogError(f"{file.path}: has none of the topics that logs.topics names")
+        unknown -= {topic for topic, name in names.items() if name}
+        own = replace(config, logs=replace(config.logs, topics=chosen))
+        used = robots_and_topics([file], own)[1]
         robots = {topic.robot for topic in used if topic.count and topic.record in _OF_ROBOTS}
         owners = {topic.name: topic.robot for topic in used}
         renamed = _Renamed(session, robots if len(robots) > 1 else (), owners)
         found.append(renamed.recording(file))
-        for topic, robot in config.logs.topics.items():
+        for topic, robot in chosen.items():
             topics[renamed.topic(topic)] = renamed.robot(robot)
+    for topic in sorted(unknown):
+        raise LogError(f"logs.topics names {topic}, which is a topic of none of the recordings")
     return found, replace(config, logs=replace(config.logs, topics=topics))
+
+
+def _own_name(topic: str, file: Recording, session: str) -> str | None:
+    """What a recording calls a topic, named as it does or as in the log of all sessions."""
+    there = {one.name for one in file.topics}
+    inner = re.fullmatch(rf"/{re.escape(session)}(?:\.([^/]+))?(/.+)", topic)
+    names = [topic, *((inner[2], f"/{inner[1]}{inner[2]}") if inner else ())]
+    return next((name for name in names if name in there), None)
 
 
 def session_names(paths: Sequence[Path]) -> list[str]:

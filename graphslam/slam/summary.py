@@ -173,6 +173,7 @@ def known_map_summary(pipeline: LogPass) -> dict[str, Any]:
             "updated": pipeline.given_config.known_map.update,
             "landmarks": len(earlier),
             "seen": len(earlier & seen),
+            "unseen": sorted(earlier - seen),
             "new": len(pipeline.landmarks.entries.keys() - earlier),
             "closures": pipeline.counts["closures_to_map"],
             "widening": known_map.known.root.widening,

@@ -131,6 +131,23 @@ def test_topics_that_are_chosen_have_the_names_of_the_recordings(tmp_path):
     assert len(log.topics) == 4
 
 
+def test_topics_may_be_named_as_in_the_log_of_all_sessions(tmp_path):
+    """So remedies name them. A recording need not have all of them, but some; each is in one."""
+    paths = [drive(tmp_path / "monday.mcap"), drive(tmp_path / "tuesday.mcap", seconds=20)]
+
+    def opened(chosen):
+        return open_logs(paths, replace(SAME_PLACE, logs=replace(SAME_PLACE.logs, topics=chosen)))
+
+    monday = {"/monday/scan": "monday", "/monday/odom": "monday"}
+    log = opened(monday | {"/tuesday/scan": "tuesday"})
+    assert [topic.name for topic in log.topics] == [*sorted(monday), "/tuesday/scan"]
+    assert log.robots == ("monday", "tuesday")
+    with pytest.raises(LogError, match=r"tuesday.mcap: has none of the topics that logs.topics"):
+        opened(monday)
+    with pytest.raises(LogError, match=r"names /scam, which is a topic of none of the recordings"):
+        opened({"/scan": "robot", "/scam": "robot"})
+
+
 def test_one_session_is_refused(tmp_path):
     """There is nothing to join."""
     with pytest.raises(LogError, match=r"is one session; --same-place joins two or more"):

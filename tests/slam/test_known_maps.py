@@ -8,6 +8,7 @@ from room_log import drive, true_pose
 from walls import rectangles
 
 import graphslam
+from graphslam.change_detection.visit import load_visit
 from graphslam.core.errors import ConfigError, EstimationError, OutputError
 from graphslam.core.geometry import rotation3
 from graphslam.results.folder import JOINT_FILE
@@ -148,6 +149,11 @@ def test_what_is_gone_is_retired_and_what_is_new_added(tmp_path, first_day):
     numbers = {mark.id for mark in after.landmarks}
     assert not numbers & {entry["id"] for entry in retired}
     assert len({mark.id for mark in before.landmarks} - numbers) == len(retired)
+    # changes of the day are those from what it saw, not from what its map knew before
+    unseen = set(result.summary["known_map"]["unseen"])
+    visit = load_visit(graphslam.load_result(tmp_path / "later"), tmp_path / "later")
+    assert unseen >= {entry["id"] for entry in retired}
+    assert {mark.id for mark in visit.landmarks} == numbers - unseen
     new = [mark for mark in after.landmarks if mark.id >= before.next_number]
     assert any(np.hypot(*(mark.extent.mean(axis=0) - [8.5, 7.0])) < 0.3 for mark in new)
 
