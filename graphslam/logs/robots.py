@@ -129,8 +129,10 @@ def robots_and_topics(
         # a session has robots of its own: what another one calls base or joints says nothing of it
         for together in [[file] for file in files] if config.logs.same_place else [files]:
             there = {raw.name for file in together for raw in file.topics}
-            own = [topic for topic in topics if topic.name in there]
+            own = by_frames(together, [topic for topic in topics if topic.name in there])
+            topics = [topic for topic in topics if topic.name not in there] + own
             robots |= assign_robots(together, own, _Frames(together))
+        topics.sort(key=lambda topic: topic.name)
     named: list[Topic] = []
     unused: list[Finding] = []
     for topic in topics:
@@ -152,6 +154,39 @@ def robots_and_topics(
     opened, found, derived = _with_tf_odometry(files, named, frames)
     opened, found, commands = _with_twist_odometry(opened, found)
     return opened, found, clouds + unused + derived + commands
+
+
+def by_frames(files: Sequence[Recording], topics: Sequence[Topic]) -> list[Topic]:
+    """Topics, those of several robots in one namespace of the robots that their frames name.
+
+    ``/scan_anna`` in the frame ``anna/laser`` and ``/odom_anna`` of ``anna/base_link`` are one
+    robot's if another one has a sensor and odometry beside them.
+    """
+    kinds = (*_SENSORS, *ODOMETRY_KINDS)
+    own = [topic for topic in topics if topic.count and topic.record in kinds]
+    sensing = sum(topic.record in _SENSORS for topic in own)
+    if sensing < 2 or len(own) - sensing < 2:
+        return list(topics)
+    of = {topic.name: _prefix(files, topic) for topic in own}
+    named: dict[str, set[str]] = {}
+    for topic in own:
+        named.setdefault(topic.robot, set()).add(of[topic.name])
+    shared = [topic for topic in own if len(named[topic.robot] - {""}) > 1]
+    both = {of[t.name] for t in shared if t.record in _SENSORS} - {""}
+    both &= {of[t.name] for t in shared if t.record not in _SENSORS}
+    if len(both) < 2:
+        return list(topics)
+    robots = {t.name: of[t.name] for t in shared if of[t.name] in both}
+    return [replace(topic, robot=robots.get(topic.name, topic.robot)) for topic in topics]
+
+
+def _prefix(files: Sequence[Recording], topic: Topic) -> str:
+    """The robot that the frames of a topic name, empty if none."""
+    for message in sample_decoded(files, topic):
+        moved = str(message.child_frame_id) if topic.record is records.OdometryPose else ""
+        name, _, frame = (moved or frame_of(message)).lstrip("/").rpartition("/")
+        return name.rpartition("/")[2] if frame else ""
+    return ""
 
 
 def assign_robots(

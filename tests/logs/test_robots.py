@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from room_log import MOUNT, START_NS, S, drive
+from recordings import messages_of
+from room_log import BEAMS, MOUNT, SCAN, START_NS, S, drive
 
 import graphslam
 from graphslam.core import records
@@ -443,3 +444,32 @@ def test_what_cannot_be_decided_prints_the_setting_that_decides_it(room, tmp_pat
         "/a/odom": "a", "/a/scan": "a", "/b/odom": "b", "/lidar/scan": "b",
     }  # fmt: skip
     assert inspect_logs([path], Config()).problem == text
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("/scan_{}", "/odom_{}"),
+        ("/scan/{}", "/odom/{}"),
+        ("/site/fleet/{}/scan", "/site/fleet/{}/odom"),
+    ],
+)
+def test_robots_in_one_namespace_are_told_by_their_frames(tmp_path, names):
+    """Else they are one robot, with the laser of one and the odometry of the other."""
+    plain, renamed = tmp_path / "plain.mcap", tmp_path / "renamed.mcap"
+    with LogWriter(plain) as log:
+        for k in range(20):
+            for robot in ("anna", "ben"):
+                log.odometry(robot, START_NS + k * S, [0.1 * k, 0, 0])
+                log.scan(robot, START_NS + k * S, np.full(len(BEAMS), 2.0), **SCAN)
+    scan, odometry = names
+    kinds = {schemas.LASER_SCAN: scan, schemas.ODOMETRY: odometry}
+    with LogWriter(renamed) as log:
+        for topic, schema, log_time, data in messages_of(plain):
+            robot = topic.split("/")[1]
+            log.encoded(kinds[schema].format(robot), schema, data, log_time)
+    log = open_logs([renamed], Config())
+    assert log.robots == ("anna", "ben")
+    assert {(topic.robot, topic.name) for topic in log.topics} == {
+        (robot, name.format(robot)) for robot in ("anna", "ben") for name in names
+    }
