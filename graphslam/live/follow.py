@@ -3,7 +3,7 @@
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -29,6 +29,8 @@ from graphslam.results.target_folder import check_target
 
 #: s between two versions of the folder, at least; and how many times as long as writing one takes
 WRITE_INTERVAL_S, WRITE_SHARE = 5.0, 5.0
+#: observations from which it is told that fewer than this share of them are of the known map
+ENOUGH_SEEN, FAMILIAR_SHARE = 100, 0.4
 
 
 def follow(
@@ -211,7 +213,7 @@ class _Folder:
         self, state: str, recording: Recording | None, landmarks: tuple[Landmark, ...]
     ) -> dict[str, Any]:
         log, history, session = self._log, self.history, self._session
-        counts = session.counts
+        counts, known_map = session.counts, session.known_map
         dropped = self.dropped + session.dropped
         return {
             "logs": [
@@ -230,11 +232,12 @@ class _Folder:
                 "loop_closures": counts.get("loop_closures", 0),
                 "landmarks": len(landmarks),
             },
+            **({"known_map": dict(known_map)} if known_map else {}),
             "world": session.world,
             "frames": session.frames,
             "dropped": {key: number for key, number in sorted(dropped.items()) if number},
             "repaired": dict(sorted(self.repaired.items())),
-            "warnings": [*self.warnings, *_unplaced(session)],
+            "warnings": [*self.warnings, *_unplaced(session), *_astray(known_map)],
             "live": {
                 "state": state,
                 "estimates": len(history),
@@ -243,6 +246,19 @@ class _Folder:
                 "largest_jump_m": round(history.largest_jump_m, 4),
             },
         }
+
+
+def _astray(known_map: Mapping[str, Any] | None) -> list[str]:
+    """A line where hardly anything that is seen is in a known map."""
+    if known_map is None:
+        return []
+    own, others = (known_map[f"observations_of_{of}"] for of in ("it", "others"))
+    if own + others < ENOUGH_SEEN or own > FAMILIAR_SHARE * (own + others):
+        return []
+    return [
+        f"{own} of {own + others} observations are of landmarks of the map {known_map['name']}: "
+        "it is another place, or the start that was given is wrong, or this part is not in the map"
+    ]
 
 
 def _unplaced(session: Session) -> list[str]:

@@ -7,6 +7,7 @@ that of the window, of the map and of one small table of the states' times.
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -71,6 +72,9 @@ class LivePass(Pipeline):
         if self._known_map is not None:
             self.landmarks.add_known(self._known_map.entries(min(self.runs)))
             self.landmarks.begin_at(self._known_map.next_number)
+        #: known landmarks that were seen, and how many observations were of them, and of others
+        self.known_seen: set[int] = set()
+        self.on_map = self.off_map = 0
         self._reported: dict[str, LiveEstimate] = {}
         self._closures = 0  # that were reported
 
@@ -142,8 +146,34 @@ class LivePass(Pipeline):
             self._reported[robot] = made
             yield made
 
+    def known_map_summary(self) -> dict[str, Any] | None:
+        """The known map, how many of its landmarks were seen, and what was seen beside; or None."""
+        known = self._known_map
+        if known is None:
+            return None
+        return {
+            "name": known.name,
+            "sha256": known.sha256,
+            "landmarks": len(known.known.means),
+            "seen": len(self.known_seen),
+            "observations_of_it": self.on_map,
+            "observations_of_others": self.off_map,
+        }
+
+    def _count_known(self) -> None:
+        """Count what the latest steps saw of a known map."""
+        if self._known_map is None:
+            return
+        earlier = self._known_map.known.means.keys()
+        seen = [a.target for s in self.steps for a in s.associations if isinstance(a.target, int)]
+        of_map = [target for target in seen if target in earlier]
+        self.known_seen.update(of_map)
+        self.on_map += len(of_map)
+        self.off_map += len(seen) - len(of_map)
+
     def forget(self) -> None:
         """Drop what no later message needs."""
+        self._count_known()
         for history in (
             self.steps, self.offers, self.sources, self.robot_sightings, self.unrelated_sightings,
             self.keyframe_scans, self.step_ms, self.innovations,

@@ -106,6 +106,11 @@ class Session:
         return 1e-9 * (self._pass.last_ns - self._pass.first_ns)
 
     @property
+    def known_map(self) -> Mapping[str, Any] | None:
+        """What was seen of a known map, see docs/live.md; None without one."""
+        return None if self._pass is None else self._pass.known_map_summary()
+
+    @property
     def counts(self) -> Mapping[str, int]:
         """Numbers of keyframes, scans, observations and so on that were used."""
         if self._pass is None:

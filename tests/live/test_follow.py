@@ -181,3 +181,21 @@ def test_what_is_lost_is_said(room, tmp_path):
     assert file["lost"] == known.files[0].lost > 0
     assert (file["messages"], file["sha256"]) == (known.files[0].messages, known.files[0].sha256)
     assert any("messages are lost" in warning for warning in told["warnings"])
+
+
+@pytest.mark.parametrize(("start", "astray"), [([0.0, 0.0, 0.0], False), ([3.0, 2.5, 2.0], True)])
+def test_a_start_that_is_wrong_in_the_known_map_is_said(room, tmp_path, start, astray):
+    """Hardly anything that is seen is in the map then: the room is mapped again beside itself."""
+    graphslam.smooth(room, output=tmp_path / "known")
+    told = graphslam.follow(
+        room,
+        tmp_path / "out",
+        **{"known_map.directory": str(tmp_path / "known"), "start.poses.robot": start},
+    )
+    found = told["known_map"]
+    share = found["observations_of_it"] / (
+        found["observations_of_it"] + found["observations_of_others"]
+    )
+    assert share < 0.3 if astray else share > 0.8
+    said = [w for w in told["warnings"] if "are of landmarks of the map known" in w]
+    assert len(said) == astray
