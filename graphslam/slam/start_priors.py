@@ -40,7 +40,8 @@ def start_poses(log: LogSet, config: Config) -> dict[str, Start]:
 
 def _leader(log: LogSet, config: Config) -> str:
     """The robot at the origin: the first by name; of sessions that of the first recording."""
-    there = {topic.name for topic in log.opened[0].topics} if config.logs.same_place else set()
+    first = log.opened[:1] if config.logs.same_place else ()
+    there = {topic.name for file in first for topic in file.topics}
     own = {topic.robot for topic in log.topics if topic.name in there}
     return min(own & set(log.robots), default=log.robots[0])
 
