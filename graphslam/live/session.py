@@ -74,6 +74,11 @@ class Session:
         self.config = live_config(chosen_config(config, **settings))
         self.dropped: Counter[str] = Counter()
         self._log = log
+        if robots is not None and not isinstance(robots, Mapping):
+            raise ConfigError(
+                "Session(robots=...): needs a dict of what each sends, such as "
+                "{'robot': [OdometryPose, Scan]}"
+            )
         if robots is not None:
             self._log = expected_log(robots, self.config)
         self._pass: LivePass | None = None

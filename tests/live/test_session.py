@@ -234,3 +234,9 @@ def test_a_known_map_needs_a_start_and_is_not_continued(room, known):
     with pytest.raises(graphslam.OutputError, match="not a result folder"):
         start = {"poses": {"robot": [0.0, 0.0, 0.0]}}
         list(graphslam.Session(start=start, known_map={"directory": "none"}).process(room[1]))
+
+
+def test_robots_are_told_with_what_they_send():
+    """Names alone do not say whether scans or sightings come."""
+    with pytest.raises(graphslam.ConfigError, match="needs a dict of what each sends"):
+        graphslam.Session(robots=["anna", "ben"])
