@@ -9,8 +9,9 @@ from room_log import drive, true_pose
 from walls import rectangles
 
 import graphslam
+from graphslam.change_detection.visit import load_visit
 from graphslam.core.config import Config
-from graphslam.core.errors import EstimationError
+from graphslam.core.errors import EstimationError, OutputError
 from graphslam.evaluation.metrics import evaluate
 from graphslam.logs import open_logs, read_truth
 from graphslam.multi_robot.map_localisation import Support
@@ -67,6 +68,8 @@ def test_a_room_that_looks_the_same_turned_is_refused(tmp_path):
     assert "--start day1=x,y,phi places it" in why
     assert result.summary["sessions"]["apart"].keys() == {"day1"}
     assert result.summary["verdict"]["verdict"] == "doubtful"
+    with pytest.raises(OutputError, match="separate frames: it is no map of one place"):
+        load_visit(SimpleNamespace(summary=result.summary), tmp_path)  # changes of what map?
     # told starts decide it
     told = {f"start.poses.day{n}": true_pose(0.0, 0.3 * n).tolist() for n in range(2)}
     result = graphslam.smooth(days, config=SAME_PLACE, **told)
