@@ -14,7 +14,7 @@ from graphslam.core.geometry import Array, between, compose, compose_cov, polar_
 from graphslam.core.records import Landmark, Scan
 from graphslam.logs import open_logs
 from graphslam.odometry.interpolation import trajectory_of_mount
-from graphslam.results.folder import SavedResult
+from graphslam.results.folder import SavedResult, check_one_frame
 
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
@@ -134,10 +134,7 @@ def load_visit(saved: SavedResult, directory: Path, config: ChangesConfig = _DEF
         LogError: a log is missing or has changed.
         OutputError: the result has no scans or no covariances, or several frames.
     """
-    if len(set(saved.summary.get("frames", {}).values())) > 1:
-        raise OutputError(
-            f"{directory}: its robots are in separate frames: it is no map of one place"
-        )
+    check_one_frame(saved, directory)
     logs = saved.summary["logs"]
     log = open_logs([Path(entry["path"]) for entry in logs], saved.config)
     for entry, file in zip(logs, log.files, strict=True):

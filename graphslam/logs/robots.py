@@ -126,13 +126,12 @@ def robots_and_topics(
     frames = _Frames(files)
     robots: dict[str, str] = {}
     if not config.logs.topics:
+        topics = by_frames(files, topics)
         # a session has robots of its own: what another one calls base or joints says nothing of it
         for together in [[file] for file in files] if config.logs.same_place else [files]:
             there = {raw.name for file in together for raw in file.topics}
-            own = by_frames(together, [topic for topic in topics if topic.name in there])
-            topics = [topic for topic in topics if topic.name not in there] + own
+            own = [topic for topic in topics if topic.name in there]
             robots |= assign_robots(together, own, _Frames(together))
-        topics.sort(key=lambda topic: topic.name)
     named: list[Topic] = []
     unused: list[Finding] = []
     for topic in topics:
@@ -167,7 +166,7 @@ def by_frames(files: Sequence[Recording], topics: Sequence[Topic]) -> list[Topic
     sensing = sum(topic.record in _SENSORS for topic in own)
     if sensing < 2 or len(own) - sensing < 2:
         return list(topics)
-    of = {topic.name: _prefix(files, topic) for topic in own}
+    of = {topic.name: _robot_named(_first_frames(files, topic)) for topic in own}
     named: dict[str, set[str]] = {}
     for topic in own:
         named.setdefault(topic.robot, set()).add(of[topic.name])
@@ -180,13 +179,20 @@ def by_frames(files: Sequence[Recording], topics: Sequence[Topic]) -> list[Topic
     return [replace(topic, robot=robots.get(topic.name, topic.robot)) for topic in topics]
 
 
-def _prefix(files: Sequence[Recording], topic: Topic) -> str:
-    """The robot that the frames of a topic name, empty if none."""
+def _first_frames(files: Sequence[Recording], topic: Topic) -> set[str]:
+    """The frames in the first message of a sensor or of odometry that can be decoded."""
     for message in sample_decoded(files, topic):
-        moved = str(message.child_frame_id) if topic.record is records.OdometryPose else ""
-        name, _, frame = (moved or frame_of(message)).lstrip("/").rpartition("/")
-        return name.rpartition("/")[2] if frame else ""
-    return ""
+        found = {frame_of(message)}
+        if topic.record is records.OdometryPose:
+            found.add(str(message.child_frame_id).lstrip("/"))
+        return found - {""}
+    return set()
+
+
+def _robot_named(frames: Collection[str]) -> str:
+    """The robot that frames such as ``anna/base_link`` name; empty if none, or several."""
+    names = {frame.rpartition("/")[0].rpartition("/")[2] for frame in frames} - {""}
+    return names.pop() if len(names) == 1 else ""
 
 
 def assign_robots(
@@ -232,16 +238,10 @@ def assign_robots(
 
 def _add_frames(space: _Space, files: Sequence[Recording]) -> None:
     for topic in space.topics:
-        for message in sample_decoded(files, topic):
-            if topic.record in _SENSORS:
-                space.sensed.add(frame_of(message))
-            elif topic.record is records.OdometryPose:
-                space.moved |= {str(message.child_frame_id).lstrip("/"), frame_of(message)}
-            elif topic.record is records.OdometryIncrement:
-                space.moved.add(frame_of(message))
-            break
-    space.sensed.discard("")
-    space.moved.discard("")
+        if topic.record in _SENSORS:
+            space.sensed |= _first_frames(files, topic)
+        elif topic.record in (records.OdometryPose, records.OdometryIncrement):
+            space.moved |= _first_frames(files, topic)
 
 
 def _owner_of_sensor(

@@ -64,8 +64,10 @@ def open_recordings(paths: Sequence[Path], config: Config) -> tuple[list[Recordi
         found.append(renamed.recording(file))
         for topic, robot in chosen.items():
             topics[renamed.topic(topic)] = renamed.robot(robot)
-    for topic in sorted(unknown):
-        raise LogError(f"logs.topics names {topic}, which is a topic of none of the recordings")
+    if unknown:
+        raise LogError(
+            f"logs.topics names {min(unknown)}, which is a topic of none of the recordings"
+        )
     return found, replace(config, logs=replace(config.logs, topics=topics))
 
 

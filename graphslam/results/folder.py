@@ -146,6 +146,18 @@ def _file_name(robot: str) -> str:
 # ---------------------------------------------------------------- reading
 
 
+def check_one_frame(saved: SavedResult, directory: Path) -> None:
+    """See that a result is a map of one place.
+
+    Raises:
+        OutputError: its robots are in separate frames.
+    """
+    if len(set(saved.summary.get("frames", {}).values())) > 1:
+        raise OutputError(
+            f"{directory}: its robots are in separate frames: it is no map of one place"
+        )
+
+
 def load(directory: Path) -> SavedResult:
     """Read a result folder back.
 

@@ -27,7 +27,7 @@ from graphslam.mapping.known_map import KnownMap, latest_places, map_place
 from graphslam.mapping.submaps import SubmapPose, build_submaps
 from graphslam.odometry.mount_covariance import moved_by_world
 from graphslam.results.file_formats import landmark_from_json, landmark_json
-from graphslam.results.folder import SavedResult, load
+from graphslam.results.folder import SavedResult, check_one_frame, load
 from graphslam.results.joint_file import joint_scans
 from graphslam.results.scans_file import SCANS_FILE, read_scans
 from graphslam.slam.summary import FORMAT as RESULT_FORMAT
@@ -51,10 +51,7 @@ def load_known_map(directory: Path) -> KnownMap:
             f"{directory}: is of another version of graphslam ({saved.summary['format']}, not "
             f"{RESULT_FORMAT}); smooth its log again"
         )
-    if len(set(saved.summary.get("frames", {}).values())) > 1:
-        raise OutputError(
-            f"{directory}: its robots are in separate frames: it is no map of one place"
-        )
+    check_one_frame(saved, directory)
     if saved.joint is None or not saved.joint.root.landmarks:
         raise OutputError(
             f"{directory}: has no joint covariance of its landmarks: it was made by an earlier "

@@ -72,8 +72,9 @@ def join_sessions(log: LogSet, sessions: Mapping[str, ScanLog], config: Config) 
     by_time = sorted(sessions, key=lambda name: sessions[name].first_ns)
     tracked = {name: _Session.of(sessions[name], name) for name in by_time}
     given = {name: _of_first_state(sessions, name, world, told) for name in told}
-    _check_given(given, tracked)
-    groups = [_group({n: start for n, start in given.items() if n in sessions}, tracked)]
+    placed = {name: start for name, start in given.items() if name in sessions}
+    _check_given(placed, tracked)
+    groups = [_group(placed, tracked)]
     groups += [_group({n: origin(config)}, tracked) for n in by_time if n not in given]
     refused = _merge(groups, tracked, config)
     starts, frames, found = dict(given), dict.fromkeys(given, world), {}
@@ -100,8 +101,6 @@ def _check_given(given: Mapping[str, Start], sessions: Mapping[str, "_Session"])
     """
     before: dict[str, Start] = {}
     for name, start in given.items():
-        if name not in sessions:
-            continue
         known = _group(before, sessions).map
         if known.places:
             why = contradiction(_lay({name: start}, known, sessions).support)
@@ -227,10 +226,9 @@ def _joined(
         return why
     remarks = {**one.remarks, **other.remarks}
     if best.support.is_contradicted:
-        said = (
-            f"{int(best.support.contradicted.sum())} of {len(places)} places contradict where it "
-        )
-        said += "was placed, but nothing else explains them: much was moved"
+        against = int(best.support.contradicted.sum())
+        said = f"{against} of {len(places)} places contradict where it was placed, "
+        said += "but nothing else explains them: much was moved"
         remarks |= dict.fromkeys(best.starts, said)
     return _Group(
         {**one.starts, **best.starts},

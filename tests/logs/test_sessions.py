@@ -45,8 +45,10 @@ def test_the_robot_of_each_recording_is_a_session(tmp_path):
     assert open_logs(paths, graphslam.load_config()).robots == ("robot",)
 
 
-def test_several_robots_of_a_recording_are_each_in_each_session(tmp_path):
-    """A fleet that comes again has two trajectories of every robot."""
+@pytest.mark.parametrize("space", ["", "fleet/"])
+def test_several_robots_of_a_recording_are_each_in_each_session(tmp_path, space):
+    """A fleet that comes again has two trajectories of every robot, also in ``/fleet/a``: its
+    topics are not shared by all sessions."""
     paths = []
     for day, name in enumerate(("monday", "tuesday")):
         paths.append(tmp_path / f"{name}.mcap")
@@ -54,10 +56,13 @@ def test_several_robots_of_a_recording_are_each_in_each_session(tmp_path):
             for robot in ("a", "b"):
                 for k in range(20):
                     stamp = (DAY_S * day + k) * 1_000_000_000
-                    log.odometry(robot, stamp, [0.1 * k, 0, 0])
-                    log.sighting(robot, stamp, [0.1, 2.0], np.eye(2) * 1e-3, identity="post")
+                    log.odometry(space + robot, stamp, [0.1 * k, 0, 0])
+                    log.sighting(
+                        space + robot, stamp, [0.1, 2.0], np.eye(2) * 1e-3, identity="post"
+                    )
     log = open_logs(paths, SAME_PLACE)
     assert log.robots == ("monday.a", "monday.b", "tuesday.a", "tuesday.b")
+    assert {topic.count for topic in log.topics} == {20}
 
 
 def test_robots_see_those_of_their_own_session(tmp_path):
@@ -83,22 +88,6 @@ def test_robots_see_those_of_their_own_session(tmp_path):
 def messages(paths):
     """Of all sessions."""
     return open_logs(paths, SAME_PLACE).messages()
-
-
-def test_robots_of_a_fleet_are_each_in_each_session_by_nested_names(tmp_path):
-    """Topics of ``/fleet/a`` are those of robot a in every session, not shared by all."""
-    paths = []
-    for day, name in enumerate(("monday", "tuesday")):
-        paths.append(tmp_path / f"{name}.mcap")
-        with LogWriter(paths[-1]) as log:
-            for robot in ("fleet/a", "fleet/b"):
-                for k in range(20):
-                    stamp = (DAY_S * day + k) * 1_000_000_000
-                    log.odometry(robot, stamp, [0.1 * k, 0, 0])
-                    log.sighting(robot, stamp, [0.1, 2.0], np.eye(2) * 1e-3, identity="post")
-    log = open_logs(paths, SAME_PLACE)
-    assert log.robots == ("monday.a", "monday.b", "tuesday.a", "tuesday.b")
-    assert {topic.count for topic in log.topics} == {20}
 
 
 @pytest.mark.parametrize("first", ["angles", "nothing", "poses"])
