@@ -110,6 +110,32 @@ def calibrate_roughly(
     return estimate
 
 
+def calibrate_so_far(
+    steps: Sequence[Step], estimate: Estimate, tracks: Mapping[str, Track], kernel: RobustConfig
+) -> Estimate:
+    """A rough estimate of states, landmarks and calibrations, from one of all but the latter.
+
+    The calibration of ``tracks`` is set to the one found, with its own covariance.
+
+    Raises:
+        EstimationError: the estimate is indeterminate.
+    """
+    now = {name: track.calibration for name, track in tracks.items()}
+    priors = {name: track.prior for name, track in tracks.items()}
+    try:
+        for track in tracks.values():
+            track.calibration = track.calibration.held()
+        made = recompute_motions(steps, tracks)
+    finally:
+        for name, track in tracks.items():
+            track.calibration = now[name]
+    solved = solve_calibrated(made, estimate, priors, now, kernel, rough=True)
+    for name, track in tracks.items():
+        cov = solved.graph.calibration_covariance(name)
+        track.calibration = replace(solved.calibrations[name], cov=cov)
+    return solved.estimate
+
+
 def recompute_motions(steps: Sequence[Step], tracks: Mapping[str, Track]) -> tuple[Step, ...]:
     """Steps with motions by the tracks' calibration, except those from scan matching.
 

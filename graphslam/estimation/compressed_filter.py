@@ -24,7 +24,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.records import Estimate, Step
 from graphslam.estimation import factors
 from graphslam.estimation.factor_graph import FactorGroup
-from graphslam.estimation.isam2 import Isam2Backend
+from graphslam.estimation.isam2 import BatchGraph, Isam2Backend
 
 
 class LocalFilter:
@@ -172,14 +172,26 @@ class CompressedBackend(Isam2Backend):
         Raises:
             EstimationError: a covariance is not positive definite and finite.
         """
-        made, values = cls(config), gtsam.Values()
-        for step in steps:
-            made._builder.insert(step, start, values)
-            targets = (a.target for a in step.associations)
-            made._mark_recent(factors.landmark_key(i) for i in targets if isinstance(i, int))
-        made._steps = made._relinearised = len(steps)
-        made._finished = values  # a tree is built of them at the first query
+        made = cls(config)
+        made.restart(steps, start)
         return made
+
+    def restart(self, steps: Sequence[Step], start: Estimate) -> None:
+        """Forget all; go on after ``steps``, linearised where ``start`` has their variables.
+
+        Raises:
+            EstimationError: a covariance is not positive definite and finite.
+        """
+        self.builder = self._builder = BatchGraph(self._config.robust)
+        self._joints.clear()
+        self._local, self._pending, self._recent = None, [], {}
+        values = gtsam.Values()
+        for step in steps:
+            self._builder.insert(step, start, values)
+            targets = (a.target for a in step.associations)
+            self._mark_recent(factors.landmark_key(i) for i in targets if isinstance(i, int))
+        self._steps = self._relinearised = len(steps)
+        self._finished = values  # a tree is built of them at the first query
 
     def value(self, key: int, dim: int) -> Array:
         """See `GraphBackend`."""

@@ -90,6 +90,22 @@ class Calibrator:
             current.names, cov @ self._vector, cov + MIN_SIGMA_SHARE**2 * self._prior
         )
 
+    def restart(self, prior: Calibration, found: Calibration) -> Calibration:
+        """Go on from a calibration that was estimated together with all states so far.
+
+        Args:
+            prior: before any data.
+            found: with its own covariance.
+
+        Returns:
+            See `update`.
+        """
+        self._prior, self._names = prior.cov, prior.names
+        self._prior_info = np.asarray(np.linalg.inv(prior.cov), dtype=np.float64)
+        self._info = np.asarray(np.linalg.inv(found.cov), dtype=np.float64)
+        self._vector = self._info @ found.mean
+        return replace(found, cov=found.cov + MIN_SIGMA_SHARE**2 * prior.cov)
+
     def summary(
         self, told: Mapping[str, Array] = NOTHING_TOLD
     ) -> dict[str, tuple[float, float, bool]]:

@@ -160,7 +160,7 @@ def _computed(
         if not run.started and not starts:
             continue
         begin_ns = run.state_ns if run.started else starts[0].time_ns
-        pose = run.causal_poses[-1] if run.started else starts[0].starts[name].pose
+        pose = run.latest_pose if run.started else starts[0].starts[name].pose
         ends = [step.motions[name].end_ns for step in steps if name in step.motions]
         times = np.array([begin_ns, *ends], dtype=np.int64)
         path = run.track.mounted_pose(times)

@@ -223,7 +223,7 @@ class Pipeline(StepRecorder):
             )
             self.sources += sightings
             heading = {
-                name: self.runs[name].causal_poses[-1][2]
+                name: self.runs[name].latest_pose[2]
                 + (motions[name].delta[2] if name in motions else 0.0)
                 for name in state_ns
             }
@@ -278,7 +278,7 @@ class Pipeline(StepRecorder):
         robot = image[0].robot
         run = self.runs[robot]
         self.counts["observations"] += len(seen)
-        pose, motion = run.causal_poses[-1], motions.get(robot)
+        pose, motion = run.latest_pose, motions.get(robot)
         others = self.candidates.targets(robots_in(seen), image[0].time_ns)
         return self.associator.associate(
             Image(robot, state_ns, seen, pose, motion, run.track, run.path_m, True, others)
@@ -392,7 +392,7 @@ class Pipeline(StepRecorder):
             associations: tuple[Association, ...] = ()
             offers = robot_associations(robot, state_ns, seen)
             if seen:
-                pose, others = run.causal_poses[-1], robots_in(seen)
+                pose, others = run.latest_pose, robots_in(seen)
                 targets = self.candidates.targets(others, state_ns)
                 associations = self.associator.associate(
                     Image(

@@ -84,7 +84,7 @@ class RobotCandidates:
 
     def _predicted(self, name: str, time_ns: int) -> Array:
         """Where a robot is at a time, by its latest state."""
-        pose, motion = self._runs[name].causal_poses[-1], self._since(name, time_ns)
+        pose, motion = self._runs[name].latest_pose, self._since(name, time_ns)
         return pose if motion is None else compose(pose, motion.delta)
 
     def clock_shift(self, name: str, time_ns: int) -> Array:

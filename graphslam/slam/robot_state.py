@@ -38,12 +38,13 @@ class RobotState:
     """One robot's odometry, its states so far and its scans.
 
     ``times``: of the states, ns; for each state there is the causal pose, its covariance and the
-    calibration known then. ``scans``: (stamp, time, mount) of each; ``scanned_ns``: time of the
-    last one used. States are poses of the sensor; the base is where the calibrated mount puts it.
-    ``is_calibrated``: the track's calibration was estimated together with all states. ``scan``:
-    time and submap of the latest state that has a scan; ``contradicted``: how many of ``motions``
-    the scans contradicted. ``repeats``: scans that are reported and not used. Times are of the
-    common clock, stamps of the robot's own ``clock``.
+    calibration known then. ``latest_pose`` (3,) is what is known of the latest one by now, which
+    may be more than when it was made. ``scans``: (stamp, time, mount) of each; ``scanned_ns``: time
+    of the last one used. States are poses of the sensor; the base is where the calibrated mount
+    puts it. ``is_calibrated``: the track's calibration was estimated together with all states.
+    ``scan``: time and submap of the latest state that has a scan; ``contradicted``: how many of
+    ``motions`` the scans contradicted. ``repeats``: scans that are reported and not used. Times are
+    of the common clock, stamps of the robot's own ``clock``.
     """
 
     track: Track
@@ -52,6 +53,7 @@ class RobotState:
     scanned_ns: int | None = None
     times: list[int] = field(default_factory=list)
     causal_poses: list[Array] = field(default_factory=list)
+    latest_pose: Array = field(default_factory=lambda: np.zeros(3))
     causal_covs: list[Array] = field(default_factory=list)
     calibrations: list[Calibration] = field(default_factory=list)
     scans: list[tuple[int, int, Array]] = field(default_factory=list)
@@ -80,6 +82,7 @@ class RobotState:
         """Record a new state; its covariance follows."""
         self.times.append(time_ns)
         self.causal_poses.append(pose)
+        self.latest_pose = pose
         self.calibrations.append(self.track.used_calibration)
 
     def learn(self, motion: Motion, pose: Array, observed: Array) -> None:
@@ -90,7 +93,7 @@ class RobotState:
             pose: (3,) estimate of the new state.
             observed: (3, 3) see `Calibrator.update`.
         """
-        moved = between(self.causal_poses[-1], pose)
+        moved = between(self.latest_pose, pose)
         self.track.calibration = self.calibrator.update(
             self.track.calibration, motion, moved, observed
         )

@@ -4,13 +4,22 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from graphslam.core.config import Config
+from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import Array, rotation3
 from graphslam.core.records import Association, Motion, Step
 from graphslam.estimation.backends import BACKENDS
+from graphslam.estimation.batch_calibration import calibrate_so_far, recompute_motions
+from graphslam.estimation.compressed_filter import CompressedBackend
 from graphslam.logs import LogSet
 from graphslam.mapping.data_association import Associator
 from graphslam.odometry.online_calibration import observed_information
 from graphslam.slam.log_pass import LogPass, PriorKnowledge, timed
+
+#: the scans of one robot are solved as a whole after so many steps, and again whenever there are so
+#: many times as many, so that all solutions together cost five times the last one. Of Intel from
+#: its first, 20th and 40th second on, causal relations are off by 0.056 m; with a factor of 1.5 by
+#: 0.055 m, with 2 by 0.11 m, without any by 0.09 m
+FIRST_BATCH_STEP, BATCH_STEP_GROWTH = 100, 1.25
 
 
 class StepRecorder(LogPass):
@@ -23,6 +32,10 @@ class StepRecorder(LogPass):
         self.associator = Associator(self.config.association, self.backend, self.landmarks)
         self.rejected = self.associator.rejected
         self.innovations = self.associator.innovations
+        # several robots' starts are told with the errors of the mounts, see `start_prior`: a mount
+        # that is not told yet would move them. Sightings have passes of their own
+        alone = len(log.robots) == 1 and log.has_scans(log.robots[0])
+        self._next_batch_step = FIRST_BATCH_STEP if alone else None
 
     @property
     def skipped(self) -> Mapping[str, int]:
@@ -85,8 +98,45 @@ class StepRecorder(LogPass):
             poses = {name: self.backend.state_mean(name) for name in step.motions}
             if self.config.odometry.calibrate:
                 self.learn(step, poses, known)
+            if self._is_batch_step_due() and self.batch_step():
+                poses = {name: self.backend.state_mean(name) for name in poses}
             for name, pose in poses.items():
                 self.record_state(name, step.time_ns, pose)
+
+    def _is_batch_step_due(self) -> bool:
+        due = self._next_batch_step is not None and len(self.steps) >= self._next_batch_step
+        if due:
+            self._next_batch_step = round(BATCH_STEP_GROWTH * len(self.steps))
+        return due and self.config.odometry.calibrate
+
+    def batch_step(self) -> bool:
+        """Solve all steps so far with the calibrations; the back end goes on from there.
+
+        What the calibration was taken for while the first steps were made has bent the path. The
+        back end takes those errors for independent ones of each motion, so it does not take that
+        back when the calibration is known better. The periodic batch steps of M. Kaess et al.,
+        iSAM: Incremental Smoothing and Mapping, T-RO 24(6), 2008, DOI 10.1109/TRO.2008.2006706.
+
+        Returns:
+            Whether the back end is one that smooths all states, and could do so.
+        """
+        backend = self.backend
+        if not isinstance(backend, CompressedBackend):
+            return False
+        tracks = {name: run.track for name, run in self.started.items()}
+        try:
+            found = calibrate_so_far(
+                self.steps, backend.current_estimate(), tracks, self.config.robust
+            )
+        except EstimationError:  # the tree goes on with QR where this calls it indeterminate
+            return False
+        self.steps[:] = recompute_motions(self.steps, tracks)
+        backend.restart(self.steps, found)
+        for name, track in tracks.items():
+            run = self.runs[name]
+            track.calibration = run.calibrator.restart(track.prior, track.calibration)
+            run.latest_pose = backend.state_mean(name)
+        return True
 
     def learn(self, step: Step, poses: Mapping[str, Array], known: set[int]) -> None:
         """Improve robots' calibration from a step.
@@ -104,7 +154,7 @@ class StepRecorder(LogPass):
         landmarks = self.backend.landmark_means([a.target for a in seen if a.target in known])
         observed = observed_information(seen, poses, landmarks)
         for robot, pose in poses.items():
-            turn = rotation3(-float(self.runs[robot].causal_poses[-1][2]))
+            turn = rotation3(-float(self.runs[robot].latest_pose[2]))
             self.runs[robot].learn(step.motions[robot], pose, turn @ observed[robot] @ turn.T)
 
     def record_state(self, robot: str, time_ns: int, pose: Array) -> None:

@@ -205,6 +205,31 @@ def test_isam2_ends_where_a_batch_from_odometry_ends(scenario):
     assert estimate.error == pytest.approx(whole.error, rel=1e-6)
 
 
+def test_isam2_goes_on_from_a_solution_as_from_its_own(scenario):
+    """Restarted in the middle at the minimum of the steps so far, it ends where it ends without,
+    and what it says on the way is that of the restarted steps alone: within 1e-6 m or rad, where
+    optimisation is declared to have converged."""
+    steps = without_lines(scenario[0])
+    half = len(steps) // 2
+    restarted = run("isam2", steps)
+    solved = run("batch", steps[:half]).finish()
+    restarted.restart(steps[:half], solved)
+    for robot in ("a", "b"):
+        np.testing.assert_allclose(
+            restarted.state_mean(robot), solved.states[robot].poses[-1], rtol=0, atol=1e-6
+        )
+        cov = restarted.joint(robot, []).cov
+        np.testing.assert_allclose(cov, solved.states[robot].covs[-1], rtol=1e-4, atol=1e-9)
+    for step in steps[half:]:
+        restarted.add(step)
+    found, expected = restarted.finish(), run("isam2", steps).finish()
+    for robot in ("a", "b"):
+        np.testing.assert_allclose(
+            found.states[robot].poses, expected.states[robot].poses, rtol=0, atol=1e-6
+        )
+    assert found.error == pytest.approx(expected.error, rel=1e-6)
+
+
 def test_isam2_with_default_thresholds_is_near_batch(scenario):
     """Lines included: converged within 2 % of its sigma (variables that move less than 0.02 m or
     rad are not linearised anew), and causally, before convergence, within a tenth."""

@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 from graphslam.core.config import OdometryConfig, RobotConfig
 from graphslam.core.geometry import between, compose, exp
-from graphslam.core.motion_models import wheel_twist
+from graphslam.core.motion_models import Calibration, wheel_twist
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, OdometryIncrement, OdometryPose, WheelAngles
 from graphslam.odometry.online_calibration import (
@@ -143,6 +143,28 @@ def test_one_step_is_the_information_filter_by_hand():
     np.testing.assert_allclose(after.mean, expected, rtol=1e-7)
     found = [sigma for _, sigma, _ in drive.calibrator.summary().values()]
     np.testing.assert_allclose(found, np.sqrt(np.diag(np.linalg.inv(info))), rtol=1e-7)
+
+
+def test_going_on_from_a_joint_estimate_is_the_information_filter_by_hand():
+    """What was learned before is replaced by the estimate of all states so far: the next motion
+    adds to its information, of which `FORGETTING_FACTOR` and the prior's share remain."""
+    drive = Drive(weaving(1000, np.random.default_rng(1)), mounted=False)
+    prior = drive.track.prior
+    drive.learn()
+    found = Calibration(prior.names, np.full(3, 0.01), 0.09 * prior.cov)
+    used = drive.calibrator.restart(prior, found)
+    np.testing.assert_array_equal(used.mean, found.mean)
+    np.testing.assert_allclose(used.cov, (0.09 + MIN_SIGMA_SHARE**2) * prior.cov, rtol=1e-12)
+    drive.track.calibration = used
+    motion = drive.track.motion(SECOND, 3 * SECOND)
+    miss = np.array([0.002, 0.001, -0.001])
+    after = drive.calibrator.update(used, motion, motion.delta + miss, PLENTY)
+    D = motion.d_delta_d_calibration
+    noise = motion.cov - D @ used.cov @ D.T + np.diag(np.square(FLOOR))
+    past, known = FORGETTING_FACTOR, np.linalg.inv(found.cov)
+    info = past * known + (1 - past) * np.linalg.inv(prior.cov) + D.T @ np.linalg.solve(noise, D)
+    vector = past * known @ found.mean + D.T @ np.linalg.solve(noise, miss + D @ found.mean)
+    np.testing.assert_allclose(after.mean, np.linalg.solve(info, vector), rtol=1e-7)
 
 
 def test_wheels_of_unequal_size_are_found():
