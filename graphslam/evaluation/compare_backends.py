@@ -60,12 +60,15 @@ def compare(
 
     Raises:
         LogError: no message of the log could be used.
-        ConfigError: no such mode, or rows differ in more than estimation in mode ``replay``.
+        ConfigError: no such mode, rows differ in more than estimation in mode ``replay``, or there
+            is a known map, in which no back end begins here.
         EstimationError: data association failed, or every back end did.
         OutputError: the truth is of other robots.
     """
     if mode not in MODES:
         raise ConfigError(f"--mode {mode}: is not one of {', '.join(MODES)}")
+    if any(own.known_map.directory for own in (config, *(row.config for row in rows))):
+        raise ConfigError("known_map.directory: back ends are compared without a known map")
     truth = truth or GroundTruth({}, ())
     if truth.trajectories and not set(truth.trajectories) & set(log.robots):
         raise OutputError(

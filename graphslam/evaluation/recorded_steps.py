@@ -112,7 +112,9 @@ def record_steps(
     """
     check_robots(log, config)
     began = time.perf_counter()
-    pipeline = Pipeline(log, config, initialise(log, config))
+    # batch steps change the motions of all steps by what is known of the calibration later, which
+    # no back end that replays them knows then
+    pipeline = Pipeline(log, config, initialise(log, config), batch_steps=False)
     pipeline.run(progress)
     if not pipeline.steps:
         raise LogError(f"{log.files[0].path}: nothing in it could be used; see `graphslam info`")

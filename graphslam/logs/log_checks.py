@@ -52,13 +52,17 @@ _NOT_READ = {
 
 @dataclass(frozen=True, slots=True)
 class CheckedLog:
-    """The description of a log: ``problem`` why it cannot be opened, ``notes`` of its writer."""
+    """The description of a log: ``problem`` why it cannot be opened, ``notes`` of its writer.
+
+    ``recordings``: of how many it is made.
+    """
 
     topics: Sequence[TopicInfo]
     robots: Sequence[RobotInfo]
     problem: str
     config: Config
     notes: Mapping[str, str]
+    recordings: int = 1
 
     @property
     def used(self) -> Iterator[TopicInfo]:
@@ -152,6 +156,8 @@ def _gaps(log: CheckedLog) -> Iterable[Finding]:
         if topic.schema in _MOVING and longest > log.config.odometry.max_gap_s:
             remedy = "scans and sightings in gaps longer than odometry.max_gap_s are dropped: "
             remedy += f"--set odometry.max_gap_s={longest + 0.1:.1f}"
+            if log.recordings > 1:
+                remedy += "; recordings that are drives of their own: --same-place"
         yield Finding("doubt" if topic.used else "note", "gaps", topic.name, text, remedy)
 
 

@@ -23,6 +23,7 @@ from graphslam.logs.log_checks import CheckedLog, by_severity, check_log
 from graphslam.logs.log_set import FileReader, LogFile, damage, merged_notes
 from graphslam.logs.recording import Recording
 from graphslam.logs.robots import robots_and_topics
+from graphslam.logs.separate_times import check_separate_times
 from graphslam.logs.sessions import open_recordings
 from graphslam.logs.tf_tree import static_topics
 from graphslam.logs.topic_context import scan_shape, topic_contexts
@@ -94,6 +95,7 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
         chosen, choices = choose_topics(files, topics)
         lasers = further_lasers(files, topics, chosen, config)
         findings += [*choices, *lasers.findings]
+        check_separate_times(files, chosen)
     except LogError as error:
         problem = str(error)
     contexts, assumed = topic_contexts(files, topics, config)
@@ -124,7 +126,8 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
         names = {turning.topic for turning in gyroscopes.values()}
         infos = [replace(info, used=info.used or info.name in names) for info in infos]
     said = [*config.warnings, *(finding.line for finding in findings)]
-    more = check_log(CheckedLog(infos, robots, problem, config, merged_notes(files)))
+    known = CheckedLog(infos, robots, problem, config, merged_notes(files), len(files))
+    more = check_log(known)
     said += [finding.line for finding in more if finding.severity == "doubt"]
     return LogInfo(
         files=tuple(LogFile(f.path, f.sha256, f.messages, f.lost) for f in files),

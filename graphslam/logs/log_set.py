@@ -21,6 +21,7 @@ from graphslam.logs.imu_turning import Turning, with_turning
 from graphslam.logs.lasers import further_lasers
 from graphslam.logs.recording import RawMessage, Recording, raw_messages, sample_messages
 from graphslam.logs.robots import robots_and_topics
+from graphslam.logs.separate_times import check_separate_times
 from graphslam.logs.sessions import open_recordings
 from graphslam.logs.stated_noise import StatedNoise, stated_noise
 from graphslam.logs.topic_context import topic_contexts
@@ -313,31 +314,20 @@ def log_set_of(files: Sequence[Recording], config: Config) -> LogSet:
     """Recordings as one log, see `open_logs`."""
     files, found, derived = robots_and_topics(files, config)
     topics, choices = choose_topics(files, found)
+    check_separate_times(files, topics)
     contexts, assumed = topic_contexts(files, topics, config)
     for finding in assumed:
         if finding.severity == "unusable":
             raise LogError(f"{', '.join(str(file.path) for file in files)}: {finding.line}")
     lasers = further_lasers(files, found, topics, config)
     gyroscopes, by_gyroscope = find_gyroscopes(files, topics, contexts, config)
+    findings = (*damage(files), *derived, *choices, *lasers.findings, *assumed, *by_gyroscope)
     return LogSet(
         robots=tuple(sorted({t.robot for t in topics if t.record in MOTION_KINDS})),
         files=tuple(LogFile(f.path, f.sha256, f.messages, f.lost) for f in files),
         topics=tuple(topics),
         notes=merged_notes(files),
-        warnings=[
-            *config.warnings,
-            *(
-                said.line
-                for said in (
-                    *damage(files),
-                    *derived,
-                    *choices,
-                    *lasers.findings,
-                    *assumed,
-                    *by_gyroscope,
-                )
-            ),
-        ],
+        warnings=[*config.warnings, *(said.line for said in findings)],
         dropped=Counter(),
         repaired=Counter(),
         opened=files,

@@ -198,6 +198,16 @@ class Recording:
         topics += [RawTopic(d.name, d.schema, "cdr", d.count) for d in self.derived]
         return tuple(sorted(topics))
 
+    def span_ns(self, topic: str) -> tuple[int, int]:
+        """Log times between which the messages of a recorded ``topic`` lie; (0, 0) without any."""
+        spans = [
+            (block.start_ns, block.end_ns)
+            for piece in self.pieces
+            for block in piece.blocks
+            if any(piece.channels[n].topic == topic for n in block.counts if n in piece.channels)
+        ]
+        return (min(a for a, _ in spans), max(b for _, b in spans)) if spans else (0, 0)
+
     def with_derived(self, derived: Derived) -> "Recording":
         """The recording with one more topic."""
         return replace(self, derived=(*self.derived, derived))
@@ -296,6 +306,20 @@ def _recorded(recording: Recording, topics: Collection[str]) -> Iterator[RawMess
                 yield from reader.read(piece, block)
         else:
             yield from _by_log_time(reader, blocks)
+
+
+def messages_between(
+    recording: Recording, topic: str, begin_ns: int, end_ns: int
+) -> Iterator[RawMessage]:
+    """Messages of a recorded ``topic`` with log times in an interval; other blocks are not read."""
+    with _Reader((topic,)) as reader:
+        for piece in recording.pieces:
+            for block in piece.blocks:
+                apart = block.end_ns < begin_ns or block.start_ns > end_ns
+                if not apart and reader.has_any(piece, block):
+                    for raw in reader.read(piece, block):
+                        if begin_ns <= raw.log_time_ns <= end_ns:
+                            yield raw
 
 
 def sample_messages(

@@ -83,10 +83,16 @@ class Pipeline(StepRecorder):
     """
 
     def __init__(
-        self, log: LogSet, config: Config, known: PriorKnowledge, tamper: Tamper | None = None
+        self,
+        log: LogSet,
+        config: Config,
+        known: PriorKnowledge,
+        tamper: Tamper | None = None,
+        *,
+        batch_steps: bool = True,
     ) -> None:
         """Reads nothing yet; for ``tamper`` see `graphslam.slam.reoptimise_scans.Tamper`."""
-        super().__init__(log, config, known)
+        super().__init__(log, config, known, batch_steps=batch_steps)
         self.tamper = tamper
         self.front_end = FRONT_ENDS[config.front_end.name]
         # dead reckoning is of odometry alone

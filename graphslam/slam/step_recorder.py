@@ -25,8 +25,10 @@ FIRST_BATCH_STEP, BATCH_STEP_GROWTH = 100, 1.25
 class StepRecorder(LogPass):
     """A pass that gives each step to a back end, and its observations to an associator."""
 
-    def __init__(self, log: LogSet, config: Config, known: PriorKnowledge) -> None:
-        """Without states, see `LogPass`."""
+    def __init__(
+        self, log: LogSet, config: Config, known: PriorKnowledge, *, batch_steps: bool = True
+    ) -> None:
+        """Without states, see `LogPass`; ``batch_steps``: whether `batch_step` is used."""
         super().__init__(log, config, known)
         self.backend = BACKENDS[self.config.backend.name](self.config)
         self.associator = Associator(self.config.association, self.backend, self.landmarks)
@@ -35,7 +37,7 @@ class StepRecorder(LogPass):
         # several robots' starts are told with the errors of the mounts, see `start_prior`: a mount
         # that is not told yet would move them. Sightings have passes of their own
         alone = len(log.robots) == 1 and log.has_scans(log.robots[0])
-        self._next_batch_step = FIRST_BATCH_STEP if alone else None
+        self._next_batch_step = FIRST_BATCH_STEP if alone and batch_steps else None
 
     @property
     def skipped(self) -> Mapping[str, int]:

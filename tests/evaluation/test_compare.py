@@ -256,6 +256,13 @@ def test_what_the_recording_follows_from_is_the_same_for_all_in_replay(two):
     assert found["states"] < rows_of(two.done)["isam2"]["states"]
 
 
+def test_a_known_map_is_refused(two):
+    """Rows would silently be of a map of their own."""
+    config = load_config(None, ["known_map.directory=there", *START])
+    with pytest.raises(ConfigError, match=r"known_map\.directory"):
+        compare(two.log, config, parse_variants(["isam2"], config), run=timed_replay)
+
+
 def test_the_settings_survive_the_way_to_another_process():
     """Tables with names are read-only mappings, which have no pickle of their own."""
     config = load_config(None, ["robots.a.axle_m=0.3", "start.poses.a=[1,2,3]", *START])
