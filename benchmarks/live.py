@@ -11,6 +11,10 @@ after every tenth of the drive, and the share by which it grew in the last half.
 Run: python benchmarks/live.py [intel] [soak] [--minutes 120]
 """
 
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line has it; read by NumPy
+
 import multiprocessing
 import tempfile
 import time
