@@ -19,6 +19,8 @@ IntArray = NDArray[np.int64]
 
 #: probability up to which a point or a relative pose still fits what it is compared with
 FIT_PROBABILITY = 0.9999
+#: m: points that lie closer together (root mean square) tell no direction
+COINCIDENT_M = 1e-9
 #: an alternative with more than this share of the best one's support leaves a decision open
 RIVAL_SHARE = 0.5
 #: the same for squared Mahalanobis distances: an alternative at most this much farther off is a
@@ -215,7 +217,7 @@ def fit_rigid_transform(p: Array, q: Array, variance: Array) -> tuple[Array, Arr
     misfit = (w * ((p - transform(pose, q)) ** 2).sum(axis=1)).sum()
     scale = max(1.0, misfit / max(2 * len(p) - 3, 1))
     turning = (w * (v**2).sum(axis=1)).sum()
-    turned = 1.0 / turning if turning > 0 else np.inf
+    turned = 1.0 / turning if turning > w.sum() * COINCIDENT_M**2 else np.inf
     lever = pose[:2] - p_mean  # the turn is about the middle of the points
     J = np.array([-lever[1], lever[0], 1.0])
     cov = np.diag([1.0 / w.sum()] * 2 + [0.0])

@@ -1,6 +1,7 @@
 """Consistent sets, rivals, rigid fits and least squares with correlated errors."""
 
 import numpy as np
+import pytest
 
 from graphslam.core.consistency import (
     fit_rigid_transform,
@@ -28,6 +29,17 @@ def test_a_rigid_move_is_recovered_and_its_covariance_is_honest():
         d2.append(off @ np.linalg.solve(cov, off))
     # scaled up where residuals are large by chance: below 3, and not far below
     assert 2.0 < np.mean(d2) < 3.3
+
+
+@pytest.mark.filterwarnings("error")
+def test_coincident_points_tell_where_something_is_and_no_direction():
+    """All points at one place up to rounding, where the inverse of their spread overflows: the
+    heading is unknown, and nothing but that is said."""
+    q = np.full((3, 2), 2.0) + 1e-160 * np.arange(6).reshape(3, 2)
+    for points in (q, np.array([[1e-160, 0.0], [0.0, 0.0], [0.0, 1e-160]])):
+        pose, cov = fit_rigid_transform(points + 1.0, points, np.full(3, 0.01))
+        assert np.isfinite(pose).all()
+        assert np.isinf(cov[2, 2])
 
 
 def test_the_largest_set_is_found_among_pairs_that_agree_by_chance():
