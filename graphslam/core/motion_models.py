@@ -103,6 +103,11 @@ class Calibration:
     mean: Array
     cov: Array
 
+    @property
+    def is_held(self) -> bool:
+        """Whether no parameter is to be estimated."""
+        return not np.any(np.diag(self.cov) > HELD_SIGMA**2)
+
     def held(self) -> "Calibration":
         """The same means as if they were known: motions computed with it leave its errors out.
 

@@ -95,11 +95,15 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
         chosen, choices = choose_topics(files, topics)
         lasers = further_lasers(files, topics, chosen, config)
         findings += [*choices, *lasers.findings]
-        check_separate_times(files, chosen)
     except LogError as error:
         problem = str(error)
     contexts, assumed = topic_contexts(files, topics, config)
     contexts |= lasers.contexts
+    if not problem:
+        try:
+            check_separate_times(files, chosen, contexts)
+        except LogError as error:
+            problem = str(error)
     dropped: Counter[str] = Counter()
     readings = {
         topic.name: _read_topic(files, topic, contexts, config, dropped)

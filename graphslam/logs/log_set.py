@@ -314,11 +314,11 @@ def log_set_of(files: Sequence[Recording], config: Config) -> LogSet:
     """Recordings as one log, see `open_logs`."""
     files, found, derived = robots_and_topics(files, config)
     topics, choices = choose_topics(files, found)
-    check_separate_times(files, topics)
     contexts, assumed = topic_contexts(files, topics, config)
     for finding in assumed:
         if finding.severity == "unusable":
             raise LogError(f"{', '.join(str(file.path) for file in files)}: {finding.line}")
+    check_separate_times(files, topics, contexts)
     lasers = further_lasers(files, found, topics, config)
     gyroscopes, by_gyroscope = find_gyroscopes(files, topics, contexts, config)
     findings = (*damage(files), *derived, *choices, *lasers.findings, *assumed, *by_gyroscope)

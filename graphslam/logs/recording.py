@@ -198,15 +198,16 @@ class Recording:
         topics += [RawTopic(d.name, d.schema, "cdr", d.count) for d in self.derived]
         return tuple(sorted(topics))
 
-    def span_ns(self, topic: str) -> tuple[int, int]:
-        """Log times between which the messages of a recorded ``topic`` lie; (0, 0) without any."""
+    def span_ns(self, topic: str) -> tuple[int, int] | None:
+        """Log times between which the messages of a topic lie; None if it has none."""
+        source = next((one.source for one in self.derived if one.name == topic), topic)
         spans = [
             (block.start_ns, block.end_ns)
             for piece in self.pieces
             for block in piece.blocks
-            if any(piece.channels[n].topic == topic for n in block.counts if n in piece.channels)
+            if any(piece.channels[n].topic == source for n in block.counts if n in piece.channels)
         ]
-        return (min(a for a, _ in spans), max(b for _, b in spans)) if spans else (0, 0)
+        return (min(a for a, _ in spans), max(b for _, b in spans)) if spans else None
 
     def with_derived(self, derived: Derived) -> "Recording":
         """The recording with one more topic."""
@@ -311,7 +312,11 @@ def _recorded(recording: Recording, topics: Collection[str]) -> Iterator[RawMess
 def messages_between(
     recording: Recording, topic: str, begin_ns: int, end_ns: int
 ) -> Iterator[RawMessage]:
-    """Messages of a recorded ``topic`` with log times in an interval; other blocks are not read."""
+    """Messages of a recorded ``topic`` with log times in an interval; other blocks are not read.
+
+    Of a derived topic they are those of its source.
+    """
+    topic = next((one.source for one in recording.derived if one.name == topic), topic)
     with _Reader((topic,)) as reader:
         for piece in recording.pieces:
             for block in piece.blocks:
@@ -320,6 +325,16 @@ def messages_between(
                     for raw in reader.read(piece, block):
                         if begin_ns <= raw.log_time_ns <= end_ns:
                             yield raw
+
+
+def first_and_last(recording: Recording, topic: str) -> list[RawMessage]:
+    """Messages of a recorded ``topic`` in the first and in the last block that has any."""
+    with _Reader((topic,)) as reader:
+        having = [(p, b) for p in recording.pieces for b in p.blocks if reader.has_any(p, b)]
+        if not having:
+            return []
+        ends = min(having, key=lambda x: x[1].start_ns), max(having, key=lambda x: x[1].end_ns)
+        return [raw for piece, block in ends for raw in reader.read(piece, block)]
 
 
 def sample_messages(

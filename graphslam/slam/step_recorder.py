@@ -109,7 +109,9 @@ class StepRecorder(LogPass):
         due = self._next_batch_step is not None and len(self.steps) >= self._next_batch_step
         if due:
             self._next_batch_step = round(BATCH_STEP_GROWTH * len(self.steps))
-        return due and self.config.odometry.calibrate
+        # what is measured by scans alone has nothing to calibrate
+        held = all(run.track.prior.is_held for run in self.started.values())
+        return due and not held and self.config.odometry.calibrate
 
     def batch_step(self) -> bool:
         """Solve all steps so far with the calibrations; the back end goes on from there.

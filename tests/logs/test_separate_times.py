@@ -1,6 +1,8 @@
 """Recordings that have the same topics: one after the other, twice the same, or of two robots."""
 
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
 
 import graphslam
 from graphslam.core.errors import LogError
@@ -50,6 +52,61 @@ def test_a_drive_that_was_recorded_twice_is_one_robots(tmp_path):
         record(tmp_path / "by_radio.mcap", 5, 28, but=range(100, 280, 3)),
     ]
     assert open_logs(paths, graphslam.load_config()).robots == ("robot",)
+
+
+def relogged(path, shift_s):
+    """The recording with other log times, stamps as they are."""
+    target = path.with_name(f"late_{path.name}")
+    schemas, channels = {}, {}
+    with path.open("rb") as file, target.open("wb") as out:
+        log = Writer(out)
+        log.start()
+        for schema, channel, message in make_reader(file).iter_messages(log_time_order=False):
+            if channel.id not in channels:
+                schemas[schema.id] = log.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = log.register_channel(
+                    channel.topic, channel.message_encoding, schemas[schema.id], channel.metadata
+                )
+            at = message.log_time + shift_s * SECOND
+            log.add_message(channels[channel.id], at, message.data, at, message.sequence)
+        log.finish()
+    return target
+
+
+def test_stamps_place_messages_not_the_times_of_recording(tmp_path):
+    """Parts of a drive whose times of recording begin at the same time are one robot's, as is a
+    drive recorded twice, once by a clock that is wrong by 9 s. Two robots are two, whenever their
+    messages were recorded."""
+    first = record(tmp_path / "1.mcap", 0, 30)
+    second = relogged(record(tmp_path / "2.mcap", 31, 60), -31)
+    assert open_logs([first, second], graphslam.load_config()).robots == ("robot",)
+    again = relogged(record(tmp_path / "again.mcap", 0, 30), 9)
+    assert open_logs([first, again], graphslam.load_config()).robots == ("robot",)
+    other = relogged(record(tmp_path / "other.mcap", 0, 30, speed=1), 5000)
+    with pytest.raises(LogError, match="different messages"):
+        open_logs([first, other], graphslam.load_config())
+
+
+def test_a_robot_that_is_silent_for_a_while_is_another_one_all_the_same(tmp_path):
+    """In the middle of the time that both have there is nothing to compare."""
+    paths = [
+        record(tmp_path / "anna.mcap", 0, 120),
+        record(tmp_path / "ben.mcap", 0, 120, speed=1, but=range(500, 700)),
+    ]
+    with pytest.raises(LogError, match="different messages"):
+        open_logs(paths, graphslam.load_config())
+
+
+def test_recordings_in_one_folder_are_compared_like_others(tmp_path):
+    """A folder is one recording of several pieces: of one drive, not of two robots."""
+    for name, robots in (("two", (0.5, 1.0)), ("split", (0.5, 0.5))):
+        (tmp_path / name).mkdir()
+        for k, speed in enumerate(robots):
+            begin_s = 10 * k if name == "two" else 30 * k
+            record(tmp_path / name / f"{k}.mcap", begin_s, begin_s + 30, speed=speed)
+    with pytest.raises(LogError, match=r"0\.mcap and .*1\.mcap"):
+        open_logs([tmp_path / "two"], graphslam.load_config())
+    assert open_logs([tmp_path / "split"], graphslam.load_config()).robots == ("robot",)
 
 
 def test_what_a_robot_says_may_be_in_several_recordings(tmp_path):
