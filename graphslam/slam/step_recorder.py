@@ -116,10 +116,11 @@ class StepRecorder(LogPass):
     def batch_step(self) -> bool:
         """Solve all steps so far with the calibrations; the back end goes on from there.
 
-        What the calibration was taken for while the first steps were made has bent the path. The
-        back end takes those errors for independent ones of each motion, so it does not take that
-        back when the calibration is known better. The periodic batch steps of M. Kaess et al.,
-        iSAM: Incremental Smoothing and Mapping, T-RO 24(6), 2008, DOI 10.1109/TRO.2008.2006706.
+        An incremental estimate lags behind its minimum: variables are linearised, and observations
+        of lines slid along them, where they were believed to be. And what the calibration was taken
+        for at first has bent the path, which the back end takes for independent errors of the
+        motions. The periodic batch steps of M. Kaess et al., iSAM: Incremental Smoothing and
+        Mapping, T-RO 24(6), 2008, DOI 10.1109/TRO.2008.2006706.
 
         Returns:
             Whether the back end is one that smooths all states, and could do so.
