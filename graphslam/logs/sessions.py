@@ -86,7 +86,7 @@ def session_names(paths: Sequence[Path]) -> list[str]:
         stem = path
         while stem.suffix in SUFFIXES:
             stem = stem.with_suffix("")
-        name = re.sub(r"[^A-Za-z0-9_-]+", "_", stem.name).strip("_") or "session"
+        name = re.sub(r"[^\w-]+", "_", stem.name).strip("_") or "session"
         candidates = chain([name], (f"{name}-{number}" for number in count(2)))
         names.append(next(one for one in candidates if one not in names))
     return names

@@ -111,7 +111,7 @@ class Calibrator:
     ) -> dict[str, tuple[float, float, bool]]:
         """The estimate from the data so far, see `to_summary`.
 
-        The sigma refers to the memory of the filter, so it has a lower bound.
+        The sigma refers to the memory of the filter, and to what `restart` was given.
         """
         if self._prior is None:
             return {}

@@ -25,10 +25,11 @@ DAY_S = 86_400
 
 
 def test_sessions_are_named_like_their_files(tmp_path):
-    """Without the endings of containers; what is no name of a topic is replaced."""
+    """Without the endings of containers; what is no letter, number or dash is replaced."""
     files = ("monday.mcap", "a/monday.mcap.zstd", "my robot.bag", "tuesday", "2026-11-23.db3")
     names = session_names([tmp_path / name for name in files])
     assert names == ["monday", "monday-2", "my_robot", "tuesday", "2026-11-23"]
+    assert session_names([tmp_path / "火曜日.mcap", tmp_path / "!.mcap"]) == ["火曜日", "session"]
 
 
 def test_the_robot_of_each_recording_is_a_session(tmp_path):
