@@ -62,7 +62,7 @@ class CheckedLog:
     problem: str
     config: Config
     notes: Mapping[str, str]
-    recordings: int = 1
+    recordings: int
 
     @property
     def used(self) -> Iterator[TopicInfo]:

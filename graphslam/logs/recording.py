@@ -198,9 +198,13 @@ class Recording:
         topics += [RawTopic(d.name, d.schema, "cdr", d.count) for d in self.derived]
         return tuple(sorted(topics))
 
+    def source_of(self, topic: str) -> str:
+        """The recorded topic that a topic is made of: itself, if it is not derived."""
+        return next((one.source for one in self.derived if one.name == topic), topic)
+
     def span_ns(self, topic: str) -> tuple[int, int] | None:
         """Log times between which the messages of a topic lie; None if it has none."""
-        source = next((one.source for one in self.derived if one.name == topic), topic)
+        source = self.source_of(topic)
         spans = [
             (block.start_ns, block.end_ns)
             for piece in self.pieces
@@ -316,8 +320,7 @@ def messages_between(
 
     Of a derived topic they are those of its source.
     """
-    topic = next((one.source for one in recording.derived if one.name == topic), topic)
-    with _Reader((topic,)) as reader:
+    with _Reader((recording.source_of(topic),)) as reader:
         for piece in recording.pieces:
             for block in piece.blocks:
                 apart = block.end_ns < begin_ns or block.start_ns > end_ns

@@ -10,8 +10,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
 
-import numpy as np
-
 from graphslam.core.errors import LogError
 from graphslam.core.record import replace
 from graphslam.core.records import Sighting
@@ -104,7 +102,7 @@ class _Stamps:
         if span is None:
             return None
         begin, end = span
-        if context.by_log_time or any(one.name == topic.name for one in file.derived):
+        if context.by_log_time or file.source_of(topic.name) != topic.name:
             return cls(file, topic.name, begin, end, 0)
         read = first_and_last(file, topic.name)
         known = _stamps(read, topic, context) if read else []
@@ -144,4 +142,4 @@ def _differ(a: _Stamps, b: _Stamps, begin_ns: int, end_ns: int) -> bool:
             if own and there:
                 shares.append(len(own & there) / len(own))
     # a recording that lacks messages has only those that the other one has
-    return bool(shares) and float(np.max(shares)) < _SAME
+    return bool(shares) and max(shares) < _SAME

@@ -91,7 +91,10 @@ class Pipeline(StepRecorder):
         *,
         batch_steps: bool = True,
     ) -> None:
-        """Reads nothing yet; for ``tamper`` see `graphslam.slam.reoptimise_scans.Tamper`."""
+        """Reads nothing yet.
+
+        For ``tamper`` see `graphslam.slam.reoptimise_scans.Tamper`, for the others `StepRecorder`.
+        """
         super().__init__(log, config, known, batch_steps=batch_steps)
         self.tamper = tamper
         self.front_end = FRONT_ENDS[config.front_end.name]

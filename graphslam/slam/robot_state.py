@@ -38,13 +38,13 @@ class RobotState:
     """One robot's odometry, its states so far and its scans.
 
     ``times``: of the states, ns; for each state there is the causal pose, its covariance and the
-    calibration known then. ``latest_pose`` (3,) is what is known of the latest one by now, which
-    may be more than when it was made. ``scans``: (stamp, time, mount) of each; ``scanned_ns``: time
-    of the last one used. States are poses of the sensor; the base is where the calibrated mount
-    puts it. ``is_calibrated``: the track's calibration was estimated together with all states.
-    ``scan``: time and submap of the latest state that has a scan; ``contradicted``: how many of
-    ``motions`` the scans contradicted. ``repeats``: scans that are reported and not used. Times are
-    of the common clock, stamps of the robot's own ``clock``.
+    calibration known then. ``latest_pose`` (3,) is the present estimate of the latest one: after a
+    batch step by more than when it was made. ``scans``: (stamp, time, mount) of each;
+    ``scanned_ns``: time of the last one used. States are poses of the sensor; the base is where the
+    calibrated mount puts it. ``is_calibrated``: the track's calibration was estimated together with
+    all states. ``scan``: time and submap of the latest state that has a scan; ``contradicted``: how
+    many of ``motions`` the scans contradicted. ``repeats``: scans that are reported and not used.
+    Times are of the common clock, stamps of the robot's own ``clock``.
     """
 
     track: Track

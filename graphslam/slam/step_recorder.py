@@ -1,5 +1,6 @@
 """Steps into the back end, and what is recorded of them: states, calibration, covariances."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -37,7 +38,8 @@ class StepRecorder(LogPass):
         # several robots' starts are told with the errors of the mounts, see `start_prior`: a mount
         # that is not told yet would move them. Sightings have passes of their own
         alone = len(log.robots) == 1 and log.has_scans(log.robots[0])
-        self._next_batch_step = FIRST_BATCH_STEP if alone and batch_steps else None
+        wanted = batch_steps and alone and self.config.odometry.calibrate
+        self._next_batch_step = FIRST_BATCH_STEP if wanted else math.inf  # number of steps
 
     @property
     def skipped(self) -> Mapping[str, int]:
@@ -100,18 +102,12 @@ class StepRecorder(LogPass):
             poses = {name: self.backend.state_mean(name) for name in step.motions}
             if self.config.odometry.calibrate:
                 self.learn(step, poses, known)
-            if self._is_batch_step_due() and self.batch_step():
-                poses = {name: self.backend.state_mean(name) for name in poses}
+            if len(self.steps) >= self._next_batch_step:
+                self._next_batch_step = round(BATCH_STEP_GROWTH * len(self.steps))
+                if self.batch_step():
+                    poses = {name: self.runs[name].latest_pose for name in poses}
             for name, pose in poses.items():
                 self.record_state(name, step.time_ns, pose)
-
-    def _is_batch_step_due(self) -> bool:
-        due = self._next_batch_step is not None and len(self.steps) >= self._next_batch_step
-        if due:
-            self._next_batch_step = round(BATCH_STEP_GROWTH * len(self.steps))
-        # what is measured by scans alone has nothing to calibrate
-        held = all(run.track.prior.is_held for run in self.started.values())
-        return due and not held and self.config.odometry.calibrate
 
     def batch_step(self) -> bool:
         """Solve all steps so far with the calibrations; the back end goes on from there.
@@ -123,12 +119,14 @@ class StepRecorder(LogPass):
         Mapping, T-RO 24(6), 2008, DOI 10.1109/TRO.2008.2006706.
 
         Returns:
-            Whether the back end is one that smooths all states, and could do so.
+            Whether that was done: not if the back end does not smooth all states, if there is
+            nothing to calibrate, as without odometry, or if the solution fails.
         """
         backend = self.backend
-        if not isinstance(backend, CompressedBackend):
-            return False
         tracks = {name: run.track for name, run in self.started.items()}
+        held = all(track.prior.is_held for track in tracks.values())
+        if held or not isinstance(backend, CompressedBackend):
+            return False
         try:
             found = calibrate_so_far(
                 self.steps, backend.current_estimate(), tracks, self.config.robust

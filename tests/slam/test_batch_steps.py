@@ -25,10 +25,10 @@ def corridor(tmp_path_factory):
     return log
 
 
-def causal_error(log, *settings):
+def causal_error(log):
     """Of the causal trajectory: root mean square of position, m, and NEES per dof."""
     names = ("backend.name=isam2", "backend.causal=true", "backend.reoptimise=false")
-    config = load_config(overrides=(*names, "start.from_truth=true", *settings))
+    config = load_config(overrides=(*names, "start.from_truth=true"))
     result = smooth(open_logs([log], config), config)
     known = truth_of_run(result)
     found = evaluate(result, known.trajectories, known.landmarks)["robots"]["vehicle"]["causal"]
