@@ -26,6 +26,7 @@ from graphslam.estimation.isam2 import NO_COVARIANCES, with_means
 from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH, marginals_of, reweighted
 from graphslam.estimation.posterior_residuals import Posterior, posterior_pairs
 from graphslam.estimation.recorded_graph import ObservationNoise, RecordedGraph, Source
+from graphslam.estimation.sandwich_covariance import CovarianceFactors, covariance_factors
 from graphslam.estimation.selected_inverse import CliqueRows
 
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
@@ -297,6 +298,10 @@ class CalibrationGraph:
         except RuntimeError as error:
             raise builder.explain(error) from error
         return Posterior(self._steps, builder, self._values, blocks, free)
+
+    def covariance_factors(self, noise: Mapping[Source, ObservationNoise]) -> CovarianceFactors:
+        """See `sandwich_covariance`; of the last solution."""
+        return covariance_factors(self._builder, self._values, noise)
 
     def calibration_covariance(self, robot: str, posterior: Posterior | None = None) -> Array:
         """Covariance (p, p) of a robot's calibration at the last solution, or at a ``posterior``.

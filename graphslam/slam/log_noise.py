@@ -1,7 +1,9 @@
 """The noise of a log, as its solution uses it and as summary.json reports it."""
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -10,7 +12,8 @@ from graphslam.core.config import OdometryConfig, RobustConfig
 from graphslam.core.geometry import Array
 from graphslam.core.motion_models import RATES
 from graphslam.core.records import Association, Step
-from graphslam.estimation.recorded_graph import ObservationNoise, Source
+from graphslam.estimation.recorded_graph import SHARED_NS, ObservationNoise, Source
+from graphslam.estimation.sandwich_covariance import weighing_variance
 
 #: name of the odometry among the sources of `LogNoise.measured`
 MOTION = "motion"
@@ -77,6 +80,45 @@ def with_own_noise(steps: Sequence[Step], noise: LogNoise) -> tuple[Step, ...]:
     return tuple(replace(s, associations=tuple(map(widened, s.associations))) for s in steps)
 
 
+def weighed(steps: Sequence[Step], noise: LogNoise) -> tuple[Step, ...]:
+    """Steps whose sightings have the weights that the noise of a log gives them.
+
+    White noise has its own, for errors that are shared see `weighing_variance`.
+    """
+    spans = Counter(_span(a) for step in steps for a in step.associations)
+
+    @cache
+    def scale(robot: str, model: str, count: int) -> Array | None:
+        own = noise.sightings.get((robot, model))
+        if own is None:
+            return None
+        (sigma,) = np.sqrt(weighing_variance(own, np.array([count])))
+        return np.outer(sigma, sigma)
+
+    def widened(a: Association) -> Association:
+        factors = scale(a.robot, a.model, spans[_span(a)])
+        return a if factors is None else a.with_measurement(a.z, a.cov * factors)
+
+    return tuple(replace(s, associations=tuple(map(widened, s.associations))) for s in steps)
+
+
+def _span(a: Association) -> tuple[str, int | str, int]:
+    """Sightings with an equal one may share an error."""
+    return a.robot, a.target, a.time_ns // SHARED_NS
+
+
 def is_white(noise: Mapping[Source, ObservationNoise]) -> bool:
     """Whether the errors of all sources are independent."""
     return not any(found.shared.any() for found in noise.values())
+
+
+def has_state_at_every_sighting(
+    noise: Mapping[Source, ObservationNoise], robots: Collection[str]
+) -> bool:
+    """Whether the final solution has a state at every sighting instead of one per step.
+
+    Otherwise odometry carries sightings to the state, and its noise hides what they tell of the
+    motion meanwhile. Of several robots those that are seen would need states too, which takes twice
+    as long where it gains little: MRCLAM 6, whose errors are shared, has 0.073 m instead of 0.076.
+    """
+    return is_white(noise) or len(robots) == 1

@@ -17,7 +17,8 @@ from graphslam.core.observation_models import MODELS
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Motion, Sighting, Step
 from graphslam.estimation.batch_calibration import ROUNDS, calibrate
-from graphslam.estimation.recorded_graph import SHARED_NS
+from graphslam.estimation.calibration_graph import CalibratedSolution
+from graphslam.estimation.sandwich_covariance import shared_spans, weighing_variance
 from graphslam.odometry.increment_sums import Motions
 from graphslam.odometry.preintegration import Track, preintegrate_batch
 from graphslam.odometry.readings import IntArray
@@ -74,17 +75,28 @@ def solve_sighting_log(
             return scale_motion_noise(made, noise.motion_scales())
         return scale_motion_noise(made, noise_scales(made, estimate, MOTION_WINDOW_NS))
 
-    return calibrate(rebuild, estimate, tracks, config.robust, rounds)
+    solutions: list[CalibratedSolution] = []
+    found, made = calibrate(
+        rebuild,
+        estimate,
+        tracks,
+        config.robust,
+        rounds,
+        solved_once=lambda solved, _: solutions.append(solved),
+    )
+    if noise is not None and not noise.is_white:
+        problem = solutions[-1].graph
+        found = problem.covariance_factors(noise.sightings).applied_to(found)
+    return found, made
 
 
 def with_shared_errors(group: "SightingGroup", noise: LogNoise) -> "SightingGroup":
-    """Sightings with the noise of a log, an error that n of them share counted n times in each."""
+    """Sightings with the noise of a log, weighed by how many of them share an error."""
     known = noise.sightings.get((group.robot, "point" if group.other is None else "robot-point"))
     if known is None or group.z.shape[1] != 2:
         return group
-    spans = np.column_stack([group.landmarks, group.seen_ns // SHARED_NS])
-    _, of, count = np.unique(spans, axis=0, return_inverse=True, return_counts=True)
-    sigma = np.sqrt(known.white + count[of.ravel(), None] * known.shared)
+    _, count = shared_spans(group.landmarks, group.state_ns)
+    sigma = np.sqrt(weighing_variance(known, count))
     cov = group.cov * sigma[:, :, None] * sigma[:, None, :]
     return replace(group, cov=cov, share=np.ones_like(group.share))
 

@@ -20,7 +20,7 @@ from graphslam.estimation.recorded_graph import ObservationNoise, Source
 from graphslam.estimation.residual_distribution import fit_distribution, shared_variance
 from graphslam.odometry.noise_estimation import is_stated, without_floors
 from graphslam.odometry.preintegration import Track
-from graphslam.slam.log_noise import MOTION, LogNoise, is_white
+from graphslam.slam.log_noise import MOTION, LogNoise, has_state_at_every_sighting, is_white
 from graphslam.slam.motion_noise import fit_track_noise, measured_motion_noise
 from graphslam.slam.sensor_latency import hold_insignificant_latency
 from graphslam.slam.sighting_states import (
@@ -142,8 +142,7 @@ def _estimated(
             change = max(change, changed or 0.0)
         if change < CONVERGED_SHARE or not is_white(noise):
             break
-    if not is_white(noise):
-        # else there will be a state at every sighting, and the whole log decides
+    if not has_state_at_every_sighting(noise, tracks):  # else the whole log decides
         for track in tracks.values():
             hold_insignificant_latency(track)
     for source, found in noise.items():

@@ -1,4 +1,4 @@
-"""The final solution of a log whose sightings have white noise: a state at every sighting."""
+"""The final solution of a log of sightings with a state at every sighting."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -10,7 +10,7 @@ from graphslam.core.records import Estimate, Step
 from graphslam.estimation.batch_calibration import calibrate
 from graphslam.estimation.calibration_graph import CalibratedSolution
 from graphslam.odometry.preintegration import Track
-from graphslam.slam.log_noise import LogNoise, with_own_noise
+from graphslam.slam.log_noise import LogNoise, weighed, with_own_noise
 from graphslam.slam.log_pass import LogPass
 from graphslam.slam.motion_noise import scale_motion_noise
 from graphslam.slam.sensor_latency import has_latency, hold_insignificant_latency
@@ -24,7 +24,7 @@ from graphslam.slam.sighting_states import (
 
 @dataclass(frozen=True)
 class SightingProblem:
-    """Steps at the times of sightings, with the noise of their log, and what their motions need.
+    """Steps at the times of sightings, as measured, the noise of their log, and what motions need.
 
     ``begun_ns``: see `with_motions`.
     """
@@ -45,7 +45,14 @@ class SightingProblem:
         Raises:
             EstimationError: the estimate is indeterminate.
         """
-        return self._solved(steps, start, rough=rough)
+        solutions: list[CalibratedSolution] = []
+        found, made = self._solved(
+            steps, start, rough=rough, solved_once=lambda solved, _: solutions.append(solved)
+        )
+        if not (rough or self.noise.is_white):
+            problem = solutions[-1].graph
+            found = problem.covariance_factors(self.noise.sightings).applied_to(found)
+        return found, made
 
     def decide_latencies(self, start: Estimate) -> Estimate:
         """Decide whether sightings are late, by what the whole log says; a rough estimate.
@@ -73,9 +80,10 @@ class SightingProblem:
         solved_once: Callable[[CalibratedSolution, Sequence[Step]], None] | None = None,
     ) -> tuple[Estimate, tuple[Step, ...]]:
         """`solve`; for ``solved_once`` see `calibrate`."""
+        seen = weighed(steps, self.noise)
 
         def rebuild(estimate: Estimate, _last: bool) -> tuple[Step, ...]:
-            made = with_motions(steps, self.tracks, estimate, self.begun_ns)
+            made = with_motions(seen, self.tracks, estimate, self.begun_ns)
             return scale_motion_noise(made, self.noise.motion_scales())
 
         return calibrate(
@@ -86,7 +94,7 @@ class SightingProblem:
         self, steps: tuple[Step, ...], estimate: Estimate
     ) -> tuple[tuple[Step, ...], Estimate]:
         """``steps`` and their estimate: there is a state wherever something was seen."""
-        return steps, estimate
+        return with_own_noise(steps, self.noise), estimate
 
     def finish(
         self, one: LogPass, steps: Sequence[Step], start: Estimate
@@ -109,7 +117,7 @@ def state_at_every_sighting(
     Args:
         one: the pass; its kernel and the noise of its tracks are set to the ``noise``.
         estimate: of its steps.
-        noise: of the log; that of its sightings is white.
+        noise: of the log.
 
     Raises:
         EstimationError: the estimate is indeterminate.
@@ -144,6 +152,6 @@ def _problem(
     """`state_at_every_sighting`, with robots that begin as ``late_ns`` says."""
     tracks = {name: run.track for name, run in one.started.items()}
     begun_ns = {name: step.time_ns for step in one.steps for name in step.starts}
-    steps = with_own_noise(steps_at_sightings(one.steps, one.sources, late_ns, dropped), noise)
+    steps = steps_at_sightings(one.steps, one.sources, late_ns, dropped)
     problem = SightingProblem(steps, tracks, noise, one.kernel, begun_ns)
     return problem, at_states(estimate, steps, tracks)

@@ -9,7 +9,7 @@ import numpy as np
 from graphslam.core.config import Config
 from graphslam.core.records import Estimate, Sighting, Step
 from graphslam.odometry.preintegration import Track
-from graphslam.slam.log_noise import LogNoise, with_own_noise
+from graphslam.slam.log_noise import LogNoise, has_state_at_every_sighting, with_own_noise
 from graphslam.slam.log_pass import LogPass
 from graphslam.slam.reoptimise_sightings import SightingGroup, group_sightings, solve_sighting_log
 from graphslam.slam.sighting_states import at_states, steps_at_sightings
@@ -75,15 +75,15 @@ def sighting_problem(
     noise: LogNoise,
     groups: Sequence[SightingGroup] | None = None,
 ) -> tuple[SightingProblem | SteppedProblem, Estimate]:
-    """The problem of a pass as the ``noise`` of its log allows, and an estimate of its states.
+    """The problem of a pass as the ``noise`` of its log asks for it, and an estimate of its states.
 
     Args:
-        one: the pass; where the noise is white, its kernel and noise are set to that.
+        one: the pass; with a state at every sighting its kernel and noise are set to that.
         estimate: of its steps.
         noise: of the log.
         groups: the sightings of its steps, if they are known.
     """
-    if noise.is_white:
+    if has_state_at_every_sighting(noise.sightings, one.started):
         return state_at_every_sighting(one, estimate, noise)
     steps, tracks = tuple(one.steps), {name: run.track for name, run in one.started.items()}
     if groups is None:
