@@ -5,10 +5,13 @@ estimates it. Two times per scan: what its messages take to work on (`Session` w
 hand), and from when the scan was written to its estimate, which includes that late messages are
 waited for. Relations are those of causal poses.
 
+`beginnings`: causal relations of Intel without its first 0, 20, 40, 60 and 80 s and of ACES, live
+and by `smooth --causal`: those of one log differ by chance, as the first round decides.
+
 `soak`: the five robots of `long_run.py` for two hours, as fast as it goes; memory of the process
 after every tenth of the drive, and the share by which it grew in the last half.
 
-Run: python benchmarks/live.py [intel] [soak] [--minutes 120]
+Run: python benchmarks/live.py [intel] [beginnings] [soak] [--minutes 120]
 """
 
 import os
@@ -18,7 +21,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line has it
 import multiprocessing
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +38,8 @@ from graphslam.logs import IMPORTERS
 
 #: how much faster than it was recorded
 SPEED = 10.0
+#: what `beginnings` runs: logs, and s that are left out at first
+BEGINNINGS = {"intel": (0, 20, 40, 60, 80), "aces": (0,)}
 #: s; from the start of the writer to its first message
 HEAD_START_S = 3.0
 
@@ -42,12 +47,15 @@ HEAD_START_S = 3.0
 def main() -> None:
     """Print what was asked for."""
     options = parser(__doc__)
-    options.add_argument("which", nargs="*", default=("intel", "soak"))
+    options.add_argument("which", nargs="*", default=("intel", "beginnings", "soak"))
     options.add_argument("--minutes", type=int, default=120)
     chosen = options.parse_args()
     with tempfile.TemporaryDirectory() as name:
         if "intel" in chosen.which:
             print(intel(Path(name)))
+        if "beginnings" in chosen.which:
+            for line in beginnings(Path(name)):
+                print(line, flush=True)
         if "soak" in chosen.which:
             for line in soak(Path(name), chosen.minutes):
                 print(line, flush=True)
@@ -141,10 +149,55 @@ def write(log: Path, target: Path, begin: float) -> None:
             if due > time.monotonic():
                 stream.flush()
                 time.sleep(max(due - time.monotonic(), 0.0))
-            if topic not in channels:
-                number = writer.register_schema(schema, "ros2msg", b"")
-                channels[topic] = writer.register_channel(topic, "cdr", number)
-            writer.add_message(channels[topic], log_time, data, log_time)
+            add(writer, channels, topic, schema, log_time, data)
+        writer.finish()
+
+
+def add(
+    writer: Writer, channels: dict[str, int], topic: str, schema: str, time_ns: int, data: bytes
+) -> None:
+    """Write a message; its topic is registered with the first one."""
+    if topic not in channels:
+        number = writer.register_schema(schema, "ros2msg", b"")
+        channels[topic] = writer.register_channel(topic, "cdr", number)
+    writer.add_message(channels[topic], time_ns, data, time_ns)
+
+
+def beginnings(folder: Path) -> Iterator[str]:
+    """Causal errors of each beginning of a log, live and with the whole past smoothed."""
+    rows = []
+    for name, beginning in BEGINNINGS.items():
+        whole, part = folder / f"{name}.mcap", folder / f"{name}-part.mcap"
+        IMPORTERS["carmen"](FREIBURG / f"{name}.clf.bz2", whole)
+        relations = read_relations(FREIBURG / f"{name}.relations")
+        for seconds in beginning:
+            write_from(whole, part, seconds)
+            graphslam.follow(part, folder / "now", force=True)
+            graphslam.smooth(part, output=folder / "causal", force=True, backend={"causal": True})
+            live = graphslam.evaluate(folder / "now", relations=relations)["relations"]
+            smoothed = graphslam.evaluate(folder / "causal", relations=relations)["relations"]
+            rows.append([live["all"]["trans_mean_m"], smoothed["causal"]["all"]["trans_mean_m"]])
+            yield f"{name} from {seconds} s on: {told(rows[-1])}"
+    yield f"means: {told(np.mean(rows, axis=0).tolist())}"
+
+
+def told(errors_m: Sequence[float]) -> str:
+    """Causal errors, m, live and by `--causal`."""
+    live_m, causal_m = errors_m
+    return f"live {live_m:.4f} m, --causal {causal_m:.4f} m"
+
+
+def write_from(log: Path, target: Path, seconds: float) -> None:
+    """Write a log without its first seconds; what is static stays."""
+    found = list(messages_of(log))
+    first = found[0][3] + round(1e9 * seconds)
+    with target.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        channels: dict[str, int] = {}
+        for topic, schema, data, log_time in found:
+            if log_time >= first or "static" in topic:
+                add(writer, channels, topic, schema, log_time, data)
         writer.finish()
 
 
