@@ -2,11 +2,13 @@
 
 Imported, smoothed from the true start poses and evaluated by the commands that a user types; then
 without sightings of robots, both also by the filter, without identities, with two codes exchanged
-in the table of who bears which, and with the start of one robot alone given. Errors are root mean
-squares over all robots at 10 Hz over the whole log, stretches without sightings included; s and
-CPU s are those of the whole `smooth` command with its report.
+in the table of who bears which, with the start of one robot alone given, and every robot by itself,
+from its own messages. Errors are root mean squares over all robots at 10 Hz over the whole log,
+stretches without sightings included; s and CPU s are those of the whole `smooth` command with its
+report.
 
-Run: python benchmarks/mrclam.py [robots|alone|ekf|ekf-alone|unnamed|exchanged|start1..start5 ...]
+Run: python benchmarks/mrclam.py [NAME ...], of robots, alone, ekf, ekf-alone, unnamed, exchanged,
+start1 to start5, robot1 to robot5
 """
 
 import tarfile
@@ -14,6 +16,8 @@ import tempfile
 from pathlib import Path
 
 from common import DATA, command, measured_command, parser
+from mcap.reader import make_reader
+from mcap.writer import Writer
 
 from graphslam.core.config import Config
 from graphslam.logs import open_logs
@@ -28,6 +32,7 @@ RUNS = {
     "unnamed": ["--set", "association.identities=ignore"],
     "exchanged": [],
     **{f"start{k}": [] for k in range(1, 6)},
+    **{f"robot{k}": [] for k in range(1, 6)},
 }
 #: subjects of which the run `exchanged` has each bear the other's code
 EXCHANGED = ("2", "9")
@@ -48,6 +53,26 @@ def exchanged(folder: Path) -> Path:
     codes[a], codes[b] = codes[b], codes[a]
     table.write_text("".join(f"{subject} {code}\n" for subject, code in codes.items()))
     return table.parent
+
+
+def by_itself(log: Path, robot: str, target: Path) -> Path:
+    """The messages of one robot, and the true landmarks, as a log."""
+    with log.open("rb") as source, target.open("wb") as stream:
+        writer, channels = Writer(stream), dict[str, int]()
+        writer.start()
+        for schema, channel, message in make_reader(source).iter_messages():
+            topic = channel.topic
+            if topic != "/true_landmarks" and not topic.startswith(f"/{robot}/"):
+                continue
+            assert schema is not None
+            if topic not in channels:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[topic] = writer.register_channel(topic, channel.message_encoding, number)
+            writer.add_message(
+                channels[topic], message.log_time, message.data, message.publish_time
+            )
+        writer.finish()
+    return target
 
 
 def row(name: str, log: Path, folder: Path) -> str:
@@ -91,6 +116,8 @@ def main() -> None:
             if name == "exchanged":
                 source = Path(scratch) / "exchanged.mcap"
                 command("import", "mrclam", str(exchanged(Path(scratch))), "-o", str(source))
+            if name.startswith("robot") and name != "robots":
+                source = by_itself(log, name, Path(scratch) / f"{name}.mcap")
             print(row(name, source, Path(scratch)), flush=True)
     print(BARS)
 

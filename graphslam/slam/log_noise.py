@@ -1,7 +1,7 @@
 """The noise of a log, as its solution uses it and as summary.json reports it."""
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
@@ -112,13 +112,11 @@ def is_white(noise: Mapping[Source, ObservationNoise]) -> bool:
     return not any(found.shared.any() for found in noise.values())
 
 
-def has_state_at_every_sighting(
-    noise: Mapping[Source, ObservationNoise], robots: Collection[str]
-) -> bool:
+def has_state_at_every_sighting(noise: Mapping[Source, ObservationNoise]) -> bool:
     """Whether the final solution has a state at every sighting instead of one per step.
 
     Otherwise odometry carries sightings to the state, and its noise hides what they tell of the
-    motion meanwhile. Of several robots those that are seen would need states too, which takes twice
-    as long where it gains little: MRCLAM 6, whose errors are shared, has 0.073 m instead of 0.076.
+    motion meanwhile. Where robots see each other those that are seen would need states too, which
+    takes twice as long and gains little if errors are shared: MRCLAM 6 has 0.073 m instead of 0.076.
     """
-    return is_white(noise) or len(robots) == 1
+    return is_white(noise) or all(model == "point" for _, model in noise)

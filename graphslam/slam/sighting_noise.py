@@ -142,7 +142,7 @@ def _estimated(
             change = max(change, changed or 0.0)
         if change < CONVERGED_SHARE or not is_white(noise):
             break
-    if not has_state_at_every_sighting(noise, tracks):  # else the whole log decides
+    if not has_state_at_every_sighting(noise):  # else the whole log decides
         for track in tracks.values():
             hold_insignificant_latency(track)
     for source, found in noise.items():

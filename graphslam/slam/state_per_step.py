@@ -83,7 +83,7 @@ def sighting_problem(
         noise: of the log.
         groups: the sightings of its steps, if they are known.
     """
-    if has_state_at_every_sighting(noise.sightings, one.started):
+    if has_state_at_every_sighting(noise.sightings):
         return state_at_every_sighting(one, estimate, noise)
     steps, tracks = tuple(one.steps), {name: run.track for name, run in one.started.items()}
     if groups is None:
