@@ -22,6 +22,7 @@ from graphslam.estimation.calibration_graph import (
     solve_calibrated,
 )
 from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH
+from graphslam.estimation.recorded_graph import ObservationNoise, Source
 from graphslam.odometry.preintegration import Track
 from graphslam.odometry.readings import IntArray
 
@@ -43,13 +44,15 @@ def calibrate(
     joint: bool = False,
     rough: bool = False,
     solved_once: Callable[[CalibratedSolution, Sequence[Step]], None] | None = None,
+    shared: Mapping[Source, ObservationNoise] | None = None,
 ) -> tuple[Estimate, tuple[Step, ...]]:
     """Solve for states, landmarks and calibrations together, ``rounds`` times.
 
     ``rebuild`` computes the steps again in every round, the first by ``estimate``. The calibration
     of ``tracks`` is set to the one found. Returns the estimate, with ``joint`` and the root of its
     information, and the steps behind it. All rounds but the last converge roughly, with ``rough``
-    that one too. ``solved_once`` is called with every solution and its steps.
+    that one too. ``solved_once`` is called with every solution and its steps. ``shared``: noise of
+    sightings that share errors; covariances are then those of `sandwich_covariance`, if not rough.
 
     Raises:
         EstimationError: the estimate is indeterminate.
@@ -77,6 +80,8 @@ def calibrate(
             track.calibration = solved.calibrations[name]
         if solved_once is not None:
             solved_once(solved, steps)
+    if rounds and shared is not None and not rough:
+        estimate = solved.graph.covariance_factors(shared).applied_to(estimate)
     return estimate, at_calibration(steps, initial, solved.calibrations) if rounds else steps
 
 

@@ -300,8 +300,15 @@ class CalibrationGraph:
         return Posterior(self._steps, builder, self._values, blocks, free)
 
     def covariance_factors(self, noise: Mapping[Source, ObservationNoise]) -> CovarianceFactors:
-        """See `sandwich_covariance`; of the last solution."""
-        return covariance_factors(self._builder, self._values, noise)
+        """See `sandwich_covariance`; of the last solution.
+
+        Raises:
+            EstimationError: it is indeterminate.
+        """
+        try:
+            return covariance_factors(self._builder, self._values, noise)
+        except RuntimeError as error:
+            raise self._builder.explain(error) from error
 
     def calibration_covariance(self, robot: str, posterior: Posterior | None = None) -> Array:
         """Covariance (p, p) of a robot's calibration at the last solution, or at a ``posterior``.

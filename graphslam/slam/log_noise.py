@@ -1,7 +1,7 @@
 """The noise of a log, as its solution uses it and as summary.json reports it."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
@@ -45,6 +45,11 @@ class LogNoise:
         """Whether the errors of sightings are independent: then every one of them counts."""
         return is_white(self.sightings)
 
+    @property
+    def shared_errors(self) -> Mapping[Source, ObservationNoise] | None:
+        """The noise of sightings where some share errors; else None."""
+        return None if self.is_white else self.sightings
+
     def to_summary(self) -> dict[str, Any]:
         """Key `noise` of summary.json."""
         quantities = {MOTION: ("motion along x", "motion along y", "turning")}
@@ -69,15 +74,7 @@ class LogNoise:
 
 def with_own_noise(steps: Sequence[Step], noise: LogNoise) -> tuple[Step, ...]:
     """Steps whose sightings have the noise of a log that each has by itself, shared or not."""
-
-    def widened(a: Association) -> Association:
-        own = noise.sightings.get((a.robot, a.model))
-        if own is None:
-            return a
-        sigma = np.sqrt(own.white + own.shared)
-        return a.with_measurement(a.z, a.cov * np.outer(sigma, sigma))
-
-    return tuple(replace(s, associations=tuple(map(widened, s.associations))) for s in steps)
+    return _widened(steps, noise, lambda _: 1)
 
 
 def weighed(steps: Sequence[Step], noise: LogNoise) -> tuple[Step, ...]:
@@ -86,17 +83,24 @@ def weighed(steps: Sequence[Step], noise: LogNoise) -> tuple[Step, ...]:
     White noise has its own, for errors that are shared see `weighing_variance`.
     """
     spans = Counter(_span(a) for step in steps for a in step.associations)
+    return _widened(steps, noise, lambda a: spans[_span(a)])
+
+
+def _widened(
+    steps: Sequence[Step], noise: LogNoise, count: Callable[[Association], int]
+) -> tuple[Step, ...]:
+    """Steps with the variances of sightings of which ``count`` share an error."""
 
     @cache
-    def scale(robot: str, model: str, count: int) -> Array | None:
+    def scale(robot: str, model: str, sharing: int) -> Array | None:
         own = noise.sightings.get((robot, model))
         if own is None:
             return None
-        (sigma,) = np.sqrt(weighing_variance(own, np.array([count])))
+        (sigma,) = np.sqrt(weighing_variance(own, np.array([sharing])))
         return np.outer(sigma, sigma)
 
     def widened(a: Association) -> Association:
-        factors = scale(a.robot, a.model, spans[_span(a)])
+        factors = scale(a.robot, a.model, count(a))
         return a if factors is None else a.with_measurement(a.z, a.cov * factors)
 
     return tuple(replace(s, associations=tuple(map(widened, s.associations))) for s in steps)

@@ -17,7 +17,6 @@ from graphslam.core.observation_models import MODELS
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Motion, Sighting, Step
 from graphslam.estimation.batch_calibration import ROUNDS, calibrate
-from graphslam.estimation.calibration_graph import CalibratedSolution
 from graphslam.estimation.sandwich_covariance import shared_spans, weighing_variance
 from graphslam.odometry.increment_sums import Motions
 from graphslam.odometry.preintegration import Track, preintegrate_batch
@@ -75,19 +74,8 @@ def solve_sighting_log(
             return scale_motion_noise(made, noise.motion_scales())
         return scale_motion_noise(made, noise_scales(made, estimate, MOTION_WINDOW_NS))
 
-    solutions: list[CalibratedSolution] = []
-    found, made = calibrate(
-        rebuild,
-        estimate,
-        tracks,
-        config.robust,
-        rounds,
-        solved_once=lambda solved, _: solutions.append(solved),
-    )
-    if noise is not None and not noise.is_white:
-        problem = solutions[-1].graph
-        found = problem.covariance_factors(noise.sightings).applied_to(found)
-    return found, made
+    shared = None if noise is None else noise.shared_errors
+    return calibrate(rebuild, estimate, tracks, config.robust, rounds, shared=shared)
 
 
 def with_shared_errors(group: "SightingGroup", noise: LogNoise) -> "SightingGroup":

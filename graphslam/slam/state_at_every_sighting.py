@@ -45,14 +45,7 @@ class SightingProblem:
         Raises:
             EstimationError: the estimate is indeterminate.
         """
-        solutions: list[CalibratedSolution] = []
-        found, made = self._solved(
-            steps, start, rough=rough, solved_once=lambda solved, _: solutions.append(solved)
-        )
-        if not (rough or self.noise.is_white):
-            problem = solutions[-1].graph
-            found = problem.covariance_factors(self.noise.sightings).applied_to(found)
-        return found, made
+        return self._solved(steps, start, rough=rough)
 
     def decide_latencies(self, start: Estimate) -> Estimate:
         """Decide whether sightings are late, by what the whole log says; a rough estimate.
@@ -87,7 +80,14 @@ class SightingProblem:
             return scale_motion_noise(made, self.noise.motion_scales())
 
         return calibrate(
-            rebuild, start, self.tracks, self.kernel, 1, rough=rough, solved_once=solved_once
+            rebuild,
+            start,
+            self.tracks,
+            self.kernel,
+            1,
+            rough=rough,
+            solved_once=solved_once,
+            shared=self.noise.shared_errors,
         )
 
     def at_sightings(

@@ -93,11 +93,12 @@ def test_factors_are_those_of_the_whole_sandwich():
     builder, values, _ = solved(SHARED)
     found = covariance_factors(builder, values, noise_of(SHARED))
     states, landmarks = exact_factors(builder, values, SHARED)
-    chosen = np.linspace(0, N - 1, SAMPLE).round().astype(int)
-    assert states.mean() > 1.2  # else nothing is tested
+    chosen = ((np.arange(SAMPLE) + 0.5) / SAMPLE * N).astype(int)
+    assert states.mean() > 1.15  # else nothing is tested
+    # the same products in another order
     np.testing.assert_allclose(found.states["r"], states[chosen].mean(), rtol=1e-6)
     np.testing.assert_allclose(found.landmarks, landmarks.mean(), rtol=1e-6)
-    # what is said of all states by some: they differ by a quarter along this path
+    # what is said of all states by some: they are 0.96 to 1.45 along this path
     np.testing.assert_allclose(found.states["r"], states.mean(), rtol=0.1)
 
 
