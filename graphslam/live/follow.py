@@ -24,7 +24,7 @@ from graphslam.logs.future_stamps import Recorded
 from graphslam.logs.growing_mcap import GrowingMcap, open_growing
 from graphslam.logs.log_set import FileReader, damage, decoded, log_set_of
 from graphslam.logs.recording import Recording, deriver
-from graphslam.logs.time_order import TOO_LATE
+from graphslam.logs.time_order import DROPPED
 from graphslam.results.target_folder import check_target
 
 #: s between two versions of the folder, at least; and how many times as long as writing one takes
@@ -148,7 +148,7 @@ def _messages(
     reader = FileReader(file, replace(config, logs=logs))
     yield from reader.sorted(recorded())
     for counts in reader.sorter.counts.values():
-        folder.dropped[TOO_LATE] += counts.pop(TOO_LATE, 0)
+        folder.dropped += Counter({kind: counts.pop(kind, 0) for kind in DROPPED})
         folder.repaired.update(counts)
 
 

@@ -15,7 +15,8 @@ from graphslam.core.records import Landmark, Message, Scan, Sighting
 from graphslam.live.live_pass import LiveEstimate, LivePass
 from graphslam.logs import LogSet
 from graphslam.logs.decoders import TopicContext
-from graphslam.logs.time_order import TOO_LATE, MessageSorter
+from graphslam.logs.record_checks import UnusableMessageError, check
+from graphslam.logs.time_order import DROPPED, MessageSorter
 from graphslam.logs.topics import MOTION_KINDS, Topic
 from graphslam.multi_robot.frame_tree import FrameAssignment
 from graphslam.results.known_map import known_map_of
@@ -27,6 +28,9 @@ from graphslam.slam.start_priors import origin, start_poses
 
 #: s of messages by which the robots and their sensors are known, if nobody tells them
 INTRODUCTION_S = 2.0
+#: ns: a single stamp that is so much later than all before is wrong
+LEAP_NS = 10_000_000_000
+LEAP = "stamp: far later than those before and after"
 
 
 class Session:
@@ -152,19 +156,49 @@ class Session:
         for message in messages:
             if isinstance(message, TRUE_RECORDS):
                 continue
-            if (message.robot, type(message)) in kinds:
-                yield message
-            else:
+            if (message.robot, type(message)) not in kinds:
                 what = type(message).__name__.lower()
                 self.dropped[f"{what}: {message.robot} did not send any at first"] += 1
+                continue
+            try:
+                check(message)
+            except UnusableMessageError as reason:
+                self.dropped[str(reason)] += 1
+            else:
+                yield message
 
     def _sorted(self, messages: Iterable[Message]) -> Iterator[Message]:
-        sorter = MessageSorter(round(1e9 * self.config.live.reorder_s))
-        for message in messages:
+        # messages come in any order, and what comes late says nothing of the stamps of the others
+        sorter = MessageSorter(round(1e9 * self.config.live.reorder_s), repair=False)
+        for message in without_leaps(messages, self.dropped):
             yield from sorter.push(f"{message.robot} {type(message).__name__}", message)
         yield from sorter.finish()
         for counts in sorter.counts.values():
-            self.dropped[TOO_LATE] += counts[TOO_LATE]
+            self.dropped += Counter({kind: counts[kind] for kind in DROPPED})
+
+
+def without_leaps(messages: Iterable[Message], dropped: Counter[str]) -> Iterator[Message]:
+    """The messages without those that are stamped far later than the ones before and after them.
+
+    Sorted by time, all that comes after one would be too late. Where two stamps in a row are far
+    later, time did go on.
+    """
+    latest_ns: int | None = None
+    leapt: list[Message] = []  # of one stamp
+    for message in messages:
+        leaps = latest_ns is not None and message.time_ns > latest_ns + LEAP_NS
+        if leaps and (not leapt or message.time_ns == leapt[0].time_ns):
+            leapt.append(message)
+            continue
+        if leaps:
+            yield from leapt
+        elif leapt:
+            dropped[LEAP] += len(leapt)
+        leapt = []
+        latest_ns = message.time_ns if latest_ns is None else max(latest_ns, message.time_ns)
+        yield message
+    if leapt:
+        dropped[LEAP] += len(leapt)
 
 
 def live_config(config: Config) -> Config:

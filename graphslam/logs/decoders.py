@@ -8,19 +8,26 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from graphslam.core import records
-from graphslam.core.geometry import Array, are_positive, is_positive
+from graphslam.core.geometry import Array, are_positive
 from graphslam.core.record import replace
 from graphslam.logs import physical_limits as limits
 from graphslam.logs import schemas
 from graphslam.logs.cdr import CdrError
 from graphslam.logs.mounts import Mount, levelled
 from graphslam.logs.point_cloud import beam_step, cloud_points, is_planar, sweep_of
+from graphslam.logs.record_checks import (
+    UnusableMessageError,
+    check_finite,
+    check_pose,
+    check_sighting,
+    check_wheels,
+    checked_covariance,
+)
 
 #: no planar laser takes longer for a sweep; it may take so much more of the time that is stated
 MAX_SWEEP_S, SWEEP_SLACK = 1.0, 1.05
@@ -29,10 +36,6 @@ MAX_SWEEP_S, SWEEP_SLACK = 1.0, 1.05
 HEADING_DECIMALS = 12
 #: why a scan is dropped
 _OTHER_LASER = "scan: of another laser on the same topic"
-
-
-class UnusableMessageError(Exception):
-    """A message that must be dropped; its text is the reason under which it is counted."""
 
 
 @dataclass(frozen=True)
@@ -220,9 +223,7 @@ def joint_state(message: Any, topic: TopicContext) -> records.WheelAngles:
     positions = dict(zip(message.name, np.asarray(message.position).tolist(), strict=False))
     left = _joint(positions, topic.left_joint, "left")
     right = _joint(positions, topic.right_joint, "right")
-    _check_finite("joints", np.array([left, right]))
-    if max(abs(left), abs(right)) > limits.MAX_ANGLE_RAD:
-        raise UnusableMessageError("joints: angle is beyond what a wheel turns")
+    check_wheels(left, right)
     return records.WheelAngles(*_source(message, topic), left, right)
 
 
@@ -242,8 +243,8 @@ def sightings(
             cov = plain[i]
         else:
             try:
-                cov = _covariance("sighting", covs[i], sizes[i])
-                _check_sighting(z)
+                cov = checked_covariance("sighting", covs[i], sizes[i])
+                check_sighting(z)
             except UnusableMessageError as reason:
                 found.append(str(reason))
                 continue
@@ -257,7 +258,7 @@ def sightings(
 def _polar_covariances(measured: Array, covs: Array) -> tuple[Sequence[Array], list[bool]]:
     """Covariances (2, 2) of bearings and ranges, and which of the sightings can be used for sure.
 
-    The conditions of `_checked_covariance` and `_check_sighting`, of all at once: most sightings
+    The conditions of `checked_covariance` and `check_sighting`, of all at once: most sightings
     hold them. Those two say what is wrong with the others, and judge those with a direction.
     ``measured`` (n, 3): bearing, range and maybe direction; ``covs`` (n, 9): what they state.
     """
@@ -279,23 +280,13 @@ def _polar_covariances(measured: Array, covs: Array) -> tuple[Sequence[Array], l
     return shared, usable.tolist()
 
 
-def _check_sighting(z: Array) -> None:
-    """Raises `UnusableMessageError` where nothing is measured like this."""
-    if not all(map(math.isfinite, z.tolist())):
-        raise UnusableMessageError("sighting: not finite")
-    if z[1] <= 0:
-        raise UnusableMessageError("sighting: range is not positive")
-    if z[1] > limits.MAX_SIGHTING_M:
-        raise UnusableMessageError("sighting: range is beyond what anything measures")
-
-
 def odometry_increment(message: Any, topic: TopicContext) -> records.OdometryIncrement:
     """graphslam_msgs/OdometryIncrement; it must end after its start."""
     start, stamp = schemas.stamp_ns(message.start), stamp_of(message)
     if stamp <= start:
         raise UnusableMessageError("increment: does not end after its start")
     delta = _pose("increment", message)
-    cov = _covariance("increment", message.covariance, 3)
+    cov = checked_covariance("increment", message.covariance, 3)
     return records.OdometryIncrement(topic.robot, stamp, stamp, start, delta, cov)
 
 
@@ -303,7 +294,7 @@ def relative_pose(message: Any, topic: TopicContext) -> records.RelativePose:
     """graphslam_msgs/RelativePose; without another robot it is relative to the robot itself."""
     start = schemas.stamp_ns(message.start)
     delta = _pose("relative pose", message)
-    cov = _covariance("relative pose", message.covariance, 3)
+    cov = checked_covariance("relative pose", message.covariance, 3)
     other = topic.named(message.other) or topic.robot
     return records.RelativePose(*_source(message, topic), other, start, delta, cov)
 
@@ -318,7 +309,7 @@ def true_landmark(message: Any, _topic: TopicContext) -> records.TrueLandmark:
     if message.kind not in ("point", "segment", "line"):
         raise UnusableMessageError("true landmark: kind is not point, segment or line")
     pose = np.array([message.x, message.y, message.phi])
-    _check_finite("true landmark", pose[:2] if message.kind == "point" else pose)
+    check_finite("true landmark", pose[:2] if message.kind == "point" else pose)
     extent = np.asarray(message.extent, dtype=float)
     if len(extent) not in (0, 4):
         raise UnusableMessageError("true landmark: extent is not x1 y1 x2 y2")
@@ -369,38 +360,8 @@ def _source(message: Any, topic: TopicContext) -> tuple[str, int, int]:
     return topic.robot, stamp, stamp
 
 
-def _check_finite(what: str, values: Array) -> None:
-    if not np.isfinite(values).all():
-        raise UnusableMessageError(f"{what}: not finite")
-
-
 def _pose(what: str, message: Any) -> Array:
-    pose = np.array([message.x, message.y, message.phi])
-    _check_finite(what, pose)
-    if np.abs(pose[:2]).max() > limits.MAX_POSITION_M or abs(pose[2]) > limits.MAX_ANGLE_RAD:
-        raise UnusableMessageError(f"{what}: farther than robots drive")
-    return pose
-
-
-def _covariance(what: str, values: Any, size: int) -> Array:
-    """The upper left (size, size) block of nine numbers, made exactly symmetric."""
-    return _checked_covariance(what, np.asarray(values, dtype=float).tobytes(), size)
-
-
-@lru_cache(maxsize=1024)
-def _checked_covariance(what: str, values: bytes, size: int) -> Array:
-    """See `_covariance`: sensors mostly state the same one, so messages share it."""
-    cov = np.frombuffer(values).reshape(3, 3)[:size, :size]
-    cov = np.asarray((cov + cov.T) / 2)
-    _check_finite(what, cov)
-    if not is_positive(cov):
-        raise UnusableMessageError(f"{what}: covariance is not positive definite")
-    variances = cov.diagonal()
-    most = limits.MAX_SIGHTING_VARIANCE if what == "sighting" else limits.MAX_VARIANCE
-    if variances.min() < limits.MIN_VARIANCE or variances.max() > most:
-        raise UnusableMessageError(f"{what}: variance is beyond what a sensor has")
-    cov.flags.writeable = False
-    return cov
+    return check_pose(what, np.array([message.x, message.y, message.phi]))
 
 
 def _joint(positions: Mapping[str, float], name: str, side: str) -> float:

@@ -86,20 +86,34 @@ class GrowingMcap:
         """The messages as they come, until the file ends or has not grown for ``wait_s``.
 
         ``idle``: called while there is nothing to read.
+
+        Raises:
+            LogError: it has grown for ``wait_s``, but by nothing that can be read; or see `poll`.
         """
-        grown = time.monotonic()
+        grown = longer = time.monotonic()  # by records, and by bytes
+        size = self._size()
         while True:
             if batch := list(self.messages()):
                 yield batch
             if self.ended:
                 return
+            if self._size() != size:
+                longer, size = time.monotonic(), self._size()
             if self.poll():
                 grown = time.monotonic()
                 continue
             if time.monotonic() - grown > wait_s:
-                return
+                if longer - grown < 0.5 * wait_s:
+                    return  # at most a record that was not finished
+                raise LogError(
+                    f"{self.path}: grows, but is damaged: nothing can be read from byte "
+                    f"{self._indexer.position} on; start the recorder and follow again"
+                )
             idle()
             time.sleep(POLL_S)
+
+    def _size(self) -> int:
+        return os.fstat(self._stream.fileno()).st_size
 
     def _check(self) -> None:
         """Whether the file is still the one that was opened, with all that was read in it."""

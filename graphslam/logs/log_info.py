@@ -224,7 +224,7 @@ def _topic_info(
         median_period_s=period_s or None,
         gaps=_gaps(times, period_s),
         jumps_back=int(np.count_nonzero(np.diff(np.array(reading.stamps_ns)) < 0)),
-        duplicates=reading.counts[time_order.DUPLICATE],
+        duplicates=reading.counts[time_order.DUPLICATE] + reading.counts[time_order.REPEATED],
         glitches=reading.counts[time_order.GLITCH],
         too_late=reading.counts[time_order.TOO_LATE],
         scan=scan_shape(files, topic) if is_scan else None,

@@ -267,7 +267,8 @@ class LogSet:
             report.dropped.update(reader.dropped)
             for topic, counts in sorted(reader.sorter.counts.items()):
                 report.warnings.extend(_stamp_warnings(reader.file, topic, counts))
-                report.dropped[time_order.TOO_LATE] += counts.pop(time_order.TOO_LATE, 0)
+                for kind in time_order.DROPPED:
+                    report.dropped[kind] += counts.pop(kind, 0)
                 report.repaired.update(counts)
         yield report
 
@@ -427,6 +428,7 @@ _STAMP_DEFECTS = {
     time_order.DUPLICATE: "messages repeat a stamp; kept",
     time_order.TOO_LATE: "messages came too late and were dropped; raise logs.reorder_s to "
     "keep them",
+    time_order.REPEATED: "increments were recorded twice; the second of each was dropped",
 }
 
 

@@ -18,6 +18,9 @@ from graphslam.core.records import Message
 TOO_LATE = "stamp: older than logs.reorder_s allows"
 GLITCH = "stamp: glitch"
 DUPLICATE = "stamp: duplicate"
+REPEATED = "increment: recorded twice"
+#: what is counted of messages that are dropped
+DROPPED = (TOO_LATE, REPEATED)
 
 # A stamp is compared with at most this many later ones of its topic within the window: an absurd
 # one far in the future would otherwise never leave the window.
@@ -68,7 +71,7 @@ class MessageSorter:
     odometry recorded around it keep their order if both are late; ``stamp_ns`` is not changed. Two
     messages that contradict only each other are swapped, and their stamps are used. A message may
     come up to ``window_ns`` after younger ones; one older than what was already passed on is
-    dropped.
+    dropped. So is the second of two increments over the same time: it would count twice.
 
     The order of recording is more reliable than stamps because a topic has one publisher and one
     transport, which keep its order, and because clocks are read late, not early. The repair changed
@@ -76,15 +79,20 @@ class MessageSorter:
     order of recording it is 509 m.
 
     Attributes:
-        counts: per topic, how many were `GLITCH`, `DUPLICATE` (kept) and `TOO_LATE` (dropped).
+        counts: per topic, how many were `GLITCH`, `DUPLICATE` (kept) and of each of `DROPPED`.
     """
 
-    def __init__(self, window_ns: int) -> None:
-        """Hold messages for about ``window_ns`` of log time."""
+    def __init__(self, window_ns: int, *, repair: bool = True) -> None:
+        """Hold messages for about ``window_ns`` of log time.
+
+        Without ``repair`` stamps are taken for true, and the order tells when messages came.
+        """
         self.counts: dict[str, Counter[str]] = {}
+        self._repair = repair
         self._window_ns = window_ns
         self._repairs: dict[str, _GlitchRepair] = {}
-        self._heap: list[tuple[tuple[int, int], int, Message]] = []
+        self._heap: list[tuple[tuple[int, int], int, str, Message]] = []
+        self._spans: dict[str, tuple[int, int]] = {}  # topic -> that of its latest increment
         self._number = 0
         self._recorded = 0
         self._latest_ns = self._emitted_ns = self._checked_ns = _LONG_AGO
@@ -98,7 +106,7 @@ class MessageSorter:
         self._recorded += 1
         if message.time_ns != message.stamp_ns:
             self.counts[topic][GLITCH] += 1
-        settled = repair.push(message, self._recorded)
+        settled = repair.push(message, self._recorded) if self._repair else [message]
         if settled:
             self._place(topic, settled)
         if self._latest_ns < self._checked_ns + self._window_ns // _EMISSIONS_PER_WINDOW:
@@ -129,13 +137,19 @@ class MessageSorter:
                 self.counts[topic][TOO_LATE] += 1
                 continue
             self._latest_ns = max(self._latest_ns, time_ns)
-            heapq.heappush(self._heap, (sort_key(message), self._number, message))
+            heapq.heappush(self._heap, (sort_key(message), self._number, topic, message))
             self._number += 1
 
     def _emit(self, before_ns: int) -> Iterator[Message]:
         while self._heap and self._heap[0][0][0] < before_ns:
-            message = heapq.heappop(self._heap)[2]
+            *_, topic, message = heapq.heappop(self._heap)
             self._emitted_ns = message.time_ns
+            if isinstance(message, records.OdometryIncrement):
+                span = message.start_ns, message.stamp_ns
+                if self._spans.get(topic) == span:
+                    self.counts[topic][REPEATED] += 1
+                    continue
+                self._spans[topic] = span
             yield message
 
 

@@ -212,14 +212,16 @@ class Readings:
         return self._count > 0 and self.last_ns >= time_ns
 
     def covers(self, time_ns: int, gap_ns: int) -> bool:
-        """Whether ``time_ns`` lies between readings at most ``gap_ns`` apart, or just outside."""
+        """Whether ``time_ns`` lies between readings at most ``gap_ns`` apart, or just after them.
+
+        Not before them: a robot begins where its odometry does, which is where its start is told.
+        """
         if not self._count:
             return False
         i = int(self.times.searchsorted(time_ns))
         if 0 < i < self._count:
             return bool(self._times[i] - self._times[i - 1] <= gap_ns)
-        end_ns = self.first_ns if i == 0 else self.last_ns
-        return abs(time_ns - end_ns) <= EDGE_NS
+        return self.first_ns <= time_ns <= self.last_ns + EDGE_NS
 
     def covers_each(self, times_ns: IntArray, gap_ns: int) -> BoolArray:
         """`covers` of many times (n,)."""
@@ -227,7 +229,7 @@ class Readings:
             return np.zeros(len(times_ns), dtype=np.bool_)
         i = self.times.searchsorted(times_ns)
         before, after = (self.times[k.clip(0, self._count - 1)] for k in (i - 1, i))
-        near = np.minimum(abs(times_ns - before), abs(times_ns - after)) <= EDGE_NS
+        near = (self.first_ns <= times_ns) & (times_ns <= self.last_ns + EDGE_NS)
         return np.asarray(np.where((i > 0) & (i < self._count), after - before <= gap_ns, near))
 
     def pose(self, times_ns: IntArray | int) -> Array:

@@ -28,6 +28,8 @@ from graphslam.slam.log_noise import MOTION, LogNoise
 
 #: motions of a robot from which their noise is estimated at least
 MIN_MOTIONS = 50
+#: and with a prior (`fit_noise`): fewer hardly tell more than it
+FEW_MOTIONS = 8
 #: m, rad: least sigma of a motion, in any direction
 MIN_SIGMA = 1e-4
 #: factor on stated sigmas from which a log contradicts them
@@ -124,7 +126,7 @@ def fit_track_noise(track: Track, robot: str, posterior: Posterior, *, relax: bo
     times, solved = _solved(own)
     by_odometry = np.array([not motion.from_scans for motion in own], dtype=bool)
     by_odometry &= ~track.is_uncovered(*times)
-    if by_odometry.sum() < MIN_MOTIONS:
+    if by_odometry.sum() < FEW_MOTIONS:
         return None
     found = posterior.motions(robot, solved)
     used = times[0][by_odometry], times[1][by_odometry]

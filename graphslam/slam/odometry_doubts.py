@@ -208,7 +208,7 @@ def _who_moved(robot: RobotEvidence, parked: Parked) -> str:
     if parked.scan_change > SCAN_CHANGE or parked.range_change > RANGE_CHANGE_M or parked.speed_m_s:
         return "its scans"
     seen = robot.seen
-    within = (seen.times_ns > parked.begin_ns) & (seen.times_ns < parked.end_ns)
+    within = (seen.times_ns > parked.begin_ns) & (seen.times_ns < parked.end_ns) & seen.stands
     changes = []
     for target in np.unique(seen.targets[within]).tolist():
         own = np.flatnonzero(within & (seen.targets == target))

@@ -196,7 +196,7 @@ class Pipeline(StepRecorder):
         self.record_time(batch.first_ns)
         self.record_time(step_ns)
         for image in batch.images:
-            self.start_if_needed(image[0].robot, image[0].time_ns)
+            self.start_if_needed(image[0].robot)
         sightings = [sighting for image in batch.images for sighting in image]
         possible = [self.candidates.possible(sighting) for sighting in sightings]
         named, behind = with_named_robots(batch, possible)
@@ -209,7 +209,7 @@ class Pipeline(StepRecorder):
             for robot in (s.robot, s.seen_robot)
         }
         for robot in sorted(mutual):  # states in an order that no hash decides
-            self.start_if_needed(robot, step_ns)
+            self.start_if_needed(robot)
         integrate_pending(self.runs[robot].track for robot in named.robots)
         last_ns = {
             robot: run.state_ns
@@ -298,7 +298,7 @@ class Pipeline(StepRecorder):
         first = event[0]
         run, time_ns = self.runs[first.robot], first.time_ns
         self.record_time(time_ns)
-        self.start_if_needed(first.robot, time_ns)
+        self.start_if_needed(first.robot)
         if isinstance(first, ODOMETRY) and self.config.keyframe.mode != "all":
             return  # most of a log; the track has it already
         left_out = isinstance(first, Scan) and run.repeats.leaves_out(first, run.track)
@@ -363,7 +363,7 @@ class Pipeline(StepRecorder):
             elif isinstance(message, Sighting):
                 found = (sighting_observation(message),)
                 if message.seen_robot is not None:
-                    self.start_if_needed(message.seen_robot, message.time_ns)
+                    self.start_if_needed(message.seen_robot)
                 robots, is_landmark = self.candidates.possible(message), may_be_landmark(message)
                 kept = self.sources if self.of_sightings else self.robot_sightings
                 if self.of_sightings or may_be_robot(message):

@@ -70,7 +70,7 @@ class SightingPass(Pipeline):
             return
         span_ns = round(1e9 * self.config.keyframe.sighting_window_s)
         batches = sighting_batches(sightings, span_ns)
-        starts = deque(self._starts(batches))
+        starts = deque(self._starts())
         times = {*(batch.time_ns for batch in batches), *(time_ns for time_ns, _ in starts)}
         driven = self._driven(np.array(sorted(times), dtype=np.int64))
         for batch in batches:
@@ -121,17 +121,10 @@ class SightingPass(Pipeline):
                 self.dropped["sighting: no odometry near it"] += 1
         return covered
 
-    def _starts(self, batches: Iterable[SightingBatch]) -> list[tuple[int, str]]:
-        """When each robot starts: with its odometry, or with its first sighting if that is earlier.
-
-        Sorted by time.
-        """
-        first_ns = {name: run.track.first_ns for name, run in self.runs.items() if len(run.track)}
-        for batch in batches:
-            for image in batch.images:
-                for robot in {image[0].robot, *(s.seen_robot for s in image if s.seen_robot)}:
-                    first_ns[robot] = min(first_ns[robot], image[0].time_ns)
-        return sorted((time_ns, robot) for robot, time_ns in first_ns.items())
+    def _starts(self) -> list[tuple[int, str]]:
+        """When each robot starts: with its odometry. Sorted by time."""
+        runs = self.runs.items()
+        return sorted((run.track.first_ns, name) for name, run in runs if len(run.track))
 
     def _start(self, time_ns: int, robot: str) -> None:
         """Give a robot its first state."""

@@ -62,17 +62,17 @@ class StepRecorder(LogPass):
         """The step that gives a robot its first state."""
         return Step(time_ns, starts={robot: self.start_prior(robot)})
 
-    def start_if_needed(self, robot: str, time_ns: int) -> None:
-        """Give a robot its first state, at ``time_ns`` or where its odometry begins, if earlier."""
+    def start_if_needed(self, robot: str) -> None:
+        """Give a robot its first state, where its odometry begins."""
         run = self.runs[robot]
         if not run.started:
-            self.start(robot, min(run.track.first_ns, time_ns))
+            self.start(robot, run.track.first_ns)
 
     def has_started(self, robot: str, time_ns: int) -> bool:
         """Whether a robot has a state at ``time_ns``, given one if its start pose is known."""
         run = self.runs[robot]
-        if robot in self.starts and len(run.track):
-            self.start_if_needed(robot, time_ns)
+        if robot in self.starts and len(run.track) and run.track.first_ns <= time_ns:
+            self.start_if_needed(robot)
         return run.started
 
     def motion_since_state(self, robot: str, time_ns: int) -> Motion | None:

@@ -494,8 +494,9 @@ def test_reaches_and_near_tell_what_odometry_covers():
     # between readings: they are no farther apart than the gap
     assert track.covers(10 * SECOND + 1, SECOND) and not track.covers(12 * SECOND, SECOND)
     assert track.covers(12 * SECOND, 3 * SECOND)
-    # outside: the robot is taken to stand for half a second, whatever the gap
-    first, last = 10 * SECOND - EDGE_NS, 14 * SECOND + EDGE_NS
+    # after: the robot is taken to stand for half a second, whatever the gap; before: not at all,
+    # as its start is where its odometry begins
+    first, last = 10 * SECOND, 14 * SECOND + EDGE_NS
     assert track.covers(first, 9 * SECOND) and track.covers(last, 9 * SECOND)
     assert not track.covers(first - 1, 9 * SECOND) and not track.covers(last + 1, 9 * SECOND)
     # many at once

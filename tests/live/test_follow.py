@@ -96,6 +96,20 @@ def test_a_recording_that_is_cut_keeps_what_was_estimated(room, tmp_path, monkey
     assert len(saved.robots["robot"].final) > 20
 
 
+def test_a_recording_that_grows_by_what_cannot_be_read_is_damaged(room, tmp_path, monkeypatch):
+    """It is not said to have stopped; the folder has the estimates until then."""
+    recorder = Recorder(room, tmp_path / "now.mcap", monkeypatch, stop=20)
+
+    def add_garbage():
+        with recorder.path.open("ab") as stream:
+            stream.write(b"\x99" * 1000)
+
+    recorder.then = add_garbage
+    with pytest.raises(graphslam.LogError, match="grows, but is damaged: nothing can be read from"):
+        graphslam.follow(recorder.path, tmp_path / "out", live={"wait_s": 4.0})
+    assert len(graphslam.load_result(tmp_path / "out").robots["robot"].final) > 20
+
+
 def test_ctrl_c_ends_the_following(room, tmp_path):
     """The folder has what was estimated until then."""
 

@@ -149,6 +149,56 @@ def test_sightings_have_estimates_too():
     assert len(session.landmarks) == 4
 
 
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"z": np.full(2, np.nan)}, "sighting: not finite"),
+        ({"cov": np.zeros((2, 2))}, "sighting: covariance is not positive definite"),
+        ({"time_ns": 9 * 10**18, "stamp_ns": 9 * 10**18}, "stamp: far later than those before"),
+    ],
+)
+def test_a_message_that_cannot_be_used_is_left_out_and_counted(changes, reason):
+    """The rest is estimated to the bit as if it had not come."""
+    messages = list(sightings())
+    bad = 1 + [isinstance(m, Sighting) for m in messages[:400]][::-1].index(True)
+    bad = 400 - bad
+    left = list(graphslam.Session().process(messages[:bad] + messages[bad + 1 :]))
+    session = graphslam.Session()
+    wrong = [*messages[:bad], replace(messages[bad], **changes), *messages[bad + 1 :]]
+    found = list(session.process(wrong))
+    assert [(key.startswith(reason), n) for key, n in session.dropped.items() if n] == [(True, 1)]
+    np.testing.assert_array_equal([e.pose for e in found], [e.pose for e in left])
+
+
+def test_time_may_go_on_after_a_pause():
+    """Nothing for a minute, and then everything as before: no stamp is taken for wrong."""
+    messages = list(sightings())
+    half = next(k for k in range(300, 400) if isinstance(messages[k], OdometryPose))
+    later = [replace(m, stamp_ns=m.stamp_ns + 60 * S, time_ns=m.time_ns + 60 * S)
+             for m in messages[half:]]  # fmt: skip
+    session = graphslam.Session()
+    found = list(session.process(messages[:half] + later))
+    assert not any(n for key, n in session.dropped.items() if key.startswith("stamp"))
+    assert len(found) > 90
+
+
+def test_what_is_late_says_nothing_of_the_stamps_of_the_others():
+    """Of odometry, too, what is beyond live.reorder_s is left out; nothing else is moved in time.
+
+    Estimates are those without it, to the bit.
+    """
+    messages = list(sightings())
+    late = [m for m in messages if isinstance(m, OdometryPose)][20:-20:20]
+    rest = [m for m in messages if not any(m is one for one in late)]
+    left = list(graphslam.Session().process(rest))
+    mixed = sorted([*rest, *late], key=lambda m: m.time_ns + 2 * S * any(m is x for x in late))
+    session = graphslam.Session(live={"reorder_s": 0.3})
+    found = list(session.process(mixed))
+    assert sum(session.dropped.values()) == len(late)
+    assert [e.stamp_ns for e in found] == [e.stamp_ns for e in left]
+    np.testing.assert_array_equal([e.pose for e in found], [e.pose for e in left])
+
+
 def test_two_robots_have_frames_of_their_own_until_their_starts_are_told(room):
     """Nothing is assumed of where a second robot starts; its map is its own."""
     both = [m for one in room[1] for m in (one, replace(one, robot="other"))]

@@ -281,6 +281,18 @@ def test_whatever_the_stamps_nothing_is_lost_uncounted_and_time_never_goes_back(
     assert {m.stamp_ns for m in placed} <= {stamp for _, stamp in recorded}
 
 
+def test_increments_that_were_recorded_twice_count_once(tmp_path):
+    """The second would double the path; that of another span stays."""
+    path = tmp_path / "log.mcap"
+    with LogWriter(path) as log:
+        for k in (1, 1, 2, 3, 3):
+            log.increment("robot", k * S, (k + 1) * S, delta=(1, 0, 0), cov=1e-4 * np.eye(3))
+    logs, messages = read(path)
+    assert [m.stamp_ns for m in messages] == [2 * S, 3 * S, 4 * S]
+    assert {k: n for k, n in logs.dropped.items() if n} == {"increment: recorded twice": 2}
+    assert any("2 increments were recorded twice" in warning for warning in logs.warnings)
+
+
 def test_several_files_are_one_log(tmp_path):
     one, two = drive(tmp_path / "1.mcap", 5, "b"), drive(tmp_path / "2.mcap", 5, "a")
     logs = open_logs([one, two], Config())

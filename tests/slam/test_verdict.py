@@ -122,6 +122,26 @@ def test_a_robot_that_turns_on_the_spot_is_not_said_to_creep(steps):
     assert reasons(turning) == ("good", "")
 
 
+@pytest.mark.parametrize(("stands", "verdict"), [(True, "bad"), (False, "good")])
+def test_a_parked_robot_may_watch_another_one(stands, verdict):
+    """What drives past says nothing of it; a landmark that changes does."""
+    steps = drive()
+    steps[300:] = 0.0
+
+    def passing(own):
+        """From half of the log on one target comes nearer by 6 m in 30 s."""
+        late = own.times_ns > S + 30 * S
+        z = np.column_stack([0.1 * np.ones(late.sum()), np.linspace(8.0, 2.0, late.sum())])
+        kept = [getattr(own, name)[late] for name in ("times_ns", "targets", "stands")]
+        return Seen(kept[0], 0 * kept[1], np.full(late.sum(), stands), z,
+                    own.sigmas[late], own.odometry[late], own.d2[late])  # fmt: skip
+
+    still = evidence(
+        steps, seen=passing, final=path(steps), parked=(Parked(31 * S, 60 * S, 0.0, 0.0),)
+    )
+    assert reasons(still)[0] == verdict
+
+
 #: what is wrong, and what is said about it
 WRONG = {
     "turning negated": (lambda: evidence(changed(0, 1, -1, -1)), "wrong sign"),

@@ -1,0 +1,130 @@
+"""What a record must hold to be used: finite numbers, as sensors measure them, and covariances.
+
+Records that are decoded are checked by the decoders as they are made, those that a program makes
+itself (`graphslam.Session`) by `check`. Both are dropped and counted for the same reasons.
+"""
+
+import math
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from graphslam.core import records
+from graphslam.core.geometry import Array, is_positive
+from graphslam.logs import physical_limits as limits
+
+
+class UnusableMessageError(Exception):
+    """A message that must be dropped; its text is the reason under which it is counted."""
+
+
+def check(message: records.Message) -> None:
+    """Check what a record holds.
+
+    Raises:
+        UnusableMessageError: it cannot be used.
+    """
+    _CHECKS.get(type(message), _nothing)(message)
+
+
+def check_finite(what: str, values: Array) -> None:
+    """Raises `UnusableMessageError` where not all ``values`` are finite."""
+    if not np.isfinite(values).all():
+        raise UnusableMessageError(f"{what}: not finite")
+
+
+def check_pose(what: str, pose: Array) -> Array:
+    """A pose (3,), m and rad; raises `UnusableMessageError` where no robot can be there."""
+    check_finite(what, pose)
+    if np.abs(pose[:2]).max() > limits.MAX_POSITION_M or abs(pose[2]) > limits.MAX_ANGLE_RAD:
+        raise UnusableMessageError(f"{what}: farther than robots drive")
+    return pose
+
+
+def check_wheels(left_rad: float, right_rad: float) -> None:
+    """Raises `UnusableMessageError` where no wheel turns like this."""
+    check_finite("joints", np.array([left_rad, right_rad]))
+    if max(abs(left_rad), abs(right_rad)) > limits.MAX_ANGLE_RAD:
+        raise UnusableMessageError("joints: angle is beyond what a wheel turns")
+
+
+def check_sighting(z: Array) -> None:
+    """Raises `UnusableMessageError` where nothing is measured like this."""
+    if not all(map(math.isfinite, z.tolist())):
+        raise UnusableMessageError("sighting: not finite")
+    if z[1] <= 0:
+        raise UnusableMessageError("sighting: range is not positive")
+    if z[1] > limits.MAX_SIGHTING_M:
+        raise UnusableMessageError("sighting: range is beyond what anything measures")
+
+
+def checked_covariance(what: str, values: Array, size: int) -> Array:
+    """The upper left (size, size) block of a square covariance, made exactly symmetric.
+
+    Raises:
+        UnusableMessageError: it is no covariance, or none that a sensor has.
+    """
+    return _checked_covariance(what, np.asarray(values, dtype=float).tobytes(), size)
+
+
+@lru_cache(maxsize=1024)
+def _checked_covariance(what: str, values: bytes, size: int) -> Array:
+    """See `checked_covariance`: sensors mostly state the same one, so messages share it."""
+    numbers = np.frombuffer(values)
+    whole = numbers.reshape(math.isqrt(len(numbers)), -1)
+    cov = whole[:size, :size]
+    cov = np.asarray((cov + cov.T) / 2)
+    check_finite(what, cov)
+    if not is_positive(cov):
+        raise UnusableMessageError(f"{what}: covariance is not positive definite")
+    variances = cov.diagonal()
+    most = limits.MAX_SIGHTING_VARIANCE if what == "sighting" else limits.MAX_VARIANCE
+    if variances.min() < limits.MIN_VARIANCE or variances.max() > most:
+        raise UnusableMessageError(f"{what}: variance is beyond what a sensor has")
+    cov.flags.writeable = False
+    return cov
+
+
+def _nothing(message: records.Message) -> None:
+    """Nothing in it is used in arithmetic."""
+
+
+def _sighting(message: records.Sighting) -> None:
+    check_sighting(message.z)
+    checked_covariance("sighting", message.cov, len(message.z))
+
+
+def _odometry(message: records.OdometryPose) -> None:
+    check_pose("odometry", message.pose)
+
+
+def _wheels(message: records.WheelAngles) -> None:
+    check_wheels(message.left_rad, message.right_rad)
+
+
+def _increment(message: records.OdometryIncrement) -> None:
+    if message.stamp_ns <= message.start_ns:
+        raise UnusableMessageError("increment: does not end after its start")
+    check_pose("increment", message.delta)
+    checked_covariance("increment", message.cov, 3)
+
+
+def _relative_pose(message: records.RelativePose) -> None:
+    check_pose("relative pose", message.delta)
+    checked_covariance("relative pose", message.cov, 3)
+
+
+def _scan(message: records.Scan) -> None:
+    check_finite("scan", np.array([message.angle_min_rad, message.angle_step_rad]))
+
+
+_CHECKS: dict[type[records.Message], Callable[[Any], None]] = {
+    records.OdometryPose: _odometry,
+    records.OdometryIncrement: _increment,
+    records.WheelAngles: _wheels,
+    records.Scan: _scan,
+    records.Sighting: _sighting,
+    records.RelativePose: _relative_pose,
+}
