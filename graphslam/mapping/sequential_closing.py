@@ -139,8 +139,10 @@ class _Closer:
 
     def solve(self) -> None:
         """Solve with all accepted closures; those that the solution violates are taken back."""
+        before = self.graph.poses.copy()
         while self.accepted:
             measured = self.relative_poses()
+            self.graph.poses = before.copy()  # wrong closures may bend the path beyond return
             self.graph.solve(measured)
             poses = self.graph.poses
             off = between(measured.delta, between(poses[measured.begin], poses[measured.end]))
@@ -154,6 +156,7 @@ class _Closer:
                 self.refused.add(pairs[k])
                 self.correcting.discard(pairs[k])
                 del self.accepted[pairs[k]]
+        self.graph.poses = before
         self.graph.solve(None)
 
     def ends(self, closure: Closure) -> tuple[int, int]:

@@ -28,6 +28,8 @@ from graphslam.mapping.gating import BoolArray, IntArray
 
 #: Gauss-Newton steps at most; m or rad: it has converged when nothing moves more than this
 MAX_STEPS, CONVERGED = 10, 1e-5
+#: times that a step which makes the error larger is halved
+MAX_HALVINGS = 5
 #: m or rad: after a smaller step the matrix is not factorised again
 SMALL_STEP = 0.01
 #: submaps whose columns of the covariance are computed at once
@@ -115,10 +117,17 @@ class SubmapGraph:
         self._closures = closures
         edges, information = self._measured()
         factor = self._factorised(edges, information)
+        error = self._error(edges, information)
         for _ in range(MAX_STEPS):
             step = -factor.solve(self._gradient(edges, information)).reshape(-1, 3)
-            self.poses[self._used] = compose(self.poses[self._used], exp(step))
-            largest = np.abs(step).max()
+            before = self.poses[self._used]
+            for _ in range(MAX_HALVINGS):
+                self.poses[self._used] = compose(before, exp(step))
+                after = self._error(edges, information)
+                if after <= error or np.abs(step).max() < SMALL_STEP:
+                    break
+                step = step / 2  # a path that is bent far is beyond what is linear
+            error, largest = after, np.abs(step).max()
             if largest < CONVERGED:
                 break
             if largest > SMALL_STEP:  # else the matrix hardly changes
@@ -168,6 +177,15 @@ class SubmapGraph:
         """Chain and closures, and their information (m, 3, 3) along the axes of their ends."""
         edges = self._chain if self._closures is None else self._chain.and_also(self._closures)
         return edges, np.asarray(np.linalg.inv(rotate_cov(edges.cov, -edges.delta[:, 2])))
+
+    def _error(self, edges: RelativePoses, information: Array) -> float:
+        """Half of the squared error."""
+        off = log(between(edges.delta, between(self.poses[edges.begin], self.poses[edges.end])))
+        begun = log(between(self._starts, self.poses[self._first]))
+        return 0.5 * float(
+            np.einsum("ij,ijk,ik", off, information, off)
+            + np.einsum("ij,ijk,ik", begun, self._start_info, begun)
+        )
 
     def _gradient(self, edges: RelativePoses, information: Array) -> Array:
         """The gradient (3u,) at the u poses in use."""
