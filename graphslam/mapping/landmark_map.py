@@ -121,6 +121,11 @@ class LandmarkMap:
         """New landmarks have this number and those after it."""
         self._next = max(self._next, number)
 
+    @property
+    def next_number(self) -> int:
+        """Of the next landmark that is new."""
+        return self._next
+
     def without_known(self, into: Mapping[int, int]) -> dict[int, int]:
         """Merges, those of landmarks of an earlier map left out: they are what they were."""
         return {gone: kept for gone, kept in into.items() if gone not in self.known}

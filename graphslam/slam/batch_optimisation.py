@@ -26,6 +26,7 @@ from graphslam.estimation.calibration_graph import (
 )
 from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH
 from graphslam.estimation.settled import moved_to, settled
+from graphslam.mapping.composite_walls import split_composites
 from graphslam.mapping.duplicate_landmarks import (
     find_duplicates,
     merged,
@@ -162,13 +163,14 @@ def _solved(
         else None
     )
     steps = _tied(steps, rough.estimate, rough, paths, scan_log)
+    steps, found = split_composites(steps, rough.estimate, landmarks)
     # once landmarks of different visits are tied, most closures are no longer needed
     closures = untied_closures(closures, paths.spans, steps, landmarks)
     counts["closures_kept"] = len(closures)
     parked = find_parked(scan_log)
-    landmarks.update_from(steps, rough.estimate)
+    landmarks.update_from(steps, found)
     more = with_loose_returns(
-        steps, rough.estimate, scan_log.keyframe_scans, landmarks.entries, config.front_end
+        steps, found, scan_log.keyframe_scans, landmarks.entries, config.front_end
     )
     counts["observations_by_loose_returns"] = _count_observations(more) - _count_observations(steps)
     steps = more
@@ -179,7 +181,7 @@ def _solved(
         scan_log.noise = noise.to_summary()
     steps, near = refine_motions(
         steps,
-        rough.estimate,
+        found,
         scan_log.keyframe_scans,
         scan_log.log.without_odometry,
         config.scan_matching,
