@@ -30,7 +30,7 @@ def check(message: records.Message) -> None:
 
 
 def check_finite(what: str, values: Array) -> None:
-    """Raises `UnusableMessageError` where not all ``values`` are finite."""
+    """Raises `UnusableMessageError` where not all of ``values`` (n, ...) are finite."""
     if not np.isfinite(values).all():
         raise UnusableMessageError(f"{what}: not finite")
 
@@ -51,7 +51,7 @@ def check_wheels(left_rad: float, right_rad: float) -> None:
 
 
 def check_sighting(z: Array) -> None:
-    """Raises `UnusableMessageError` where nothing is measured like this."""
+    """Raises `UnusableMessageError` where no bearing rad, range m and direction rad are like z."""
     if not all(map(math.isfinite, z.tolist())):
         raise UnusableMessageError("sighting: not finite")
     if z[1] <= 0:
@@ -61,7 +61,7 @@ def check_sighting(z: Array) -> None:
 
 
 def checked_covariance(what: str, values: Array, size: int) -> Array:
-    """The upper left (size, size) block of a square covariance, made exactly symmetric.
+    """The upper left (size, size) block of a covariance (n, n), made exactly symmetric.
 
     Raises:
         UnusableMessageError: it is no covariance, or none that a sensor has.
