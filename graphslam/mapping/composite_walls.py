@@ -27,6 +27,9 @@ BETTER = 40.0
 ACROSS_M, ACROSS_SHARE = 0.5, 0.3
 #: m: the step between the parts, at least: less bends nothing
 STEP_M = 0.02
+#: m: one of the parts is shorter, as doors and cabinets are. That two long ones are in line says
+#: more of the direction of a corridor than all else
+SHORT_M = 2.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,7 +132,14 @@ def step_of(wall: Observed) -> int | None:
     across = (wall.ends[:, 0] < edge - ACROSS_M) & (wall.ends[:, 1] > edge + ACROSS_M)
     apart = np.count_nonzero(across) <= ACROSS_SHARE * min(cut, n - cut)
     high = abs(np.array([1.0, edge]) @ (lines[1][best] - lines[0][best])) > STEP_M
-    return cut if apart and high and gain[best] > BETTER else None
+    short = min(_length(wall.ends[:cut]), _length(wall.ends[cut:])) < SHORT_M
+    return cut if apart and high and short and gain[best] > BETTER else None
+
+
+def _length(ends: Array) -> float:
+    """Length, m, of a part by the ends (n, 2) of its observations, but for a few."""
+    low, high = np.quantile(ends[:, 0], 0.2), np.quantile(ends[:, 1], 0.8)
+    return float(high - low)
 
 
 def _normal_equations(wall: Observed) -> tuple[Array, Array]:
