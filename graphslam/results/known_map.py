@@ -52,6 +52,8 @@ def load_known_map(directory: Path) -> KnownMap:
             f"{RESULT_FORMAT}); smooth its log again"
         )
     check_one_frame(saved, directory)
+    if not (directory / SCANS_FILE).exists():
+        raise OutputError(f"{directory}: is of a log without scans; known maps are for scans")
     if saved.joint is None or not saved.joint.root.landmarks:
         raise OutputError(
             f"{directory}: has no joint covariance of its landmarks: it was made by an earlier "

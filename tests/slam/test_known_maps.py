@@ -18,6 +18,7 @@ from graphslam.results.known_map import (
     load_known_map,
     with_surface_biases,
 )
+from graphslam.results.scans_file import SCANS_FILE
 
 #: corners of furniture that tell the room from itself turned by half a turn
 ODD = ((0, 5.5, 3, 8), (7, 0, 10, 0.8))
@@ -179,6 +180,9 @@ def test_what_is_no_map_is_one_clear_line(tmp_path, first_day):
         arrays = {name: file[name] for name in file.files if not name.startswith("landmark")}
     np.savez(old / JOINT_FILE, **arrays)
     with pytest.raises(OutputError, match="made by an earlier version"):
+        load_known_map(old)
+    (old / SCANS_FILE).rename(tmp_path / SCANS_FILE)
+    with pytest.raises(OutputError, match="is of a log without scans"):
         load_known_map(old)
     summary = old / "summary.json"
     summary.write_text(summary.read_text().replace("graphslam-result-1", "graphslam-result-9"))
