@@ -163,7 +163,9 @@ def _solved(
         else None
     )
     steps = _tied(steps, rough.estimate, rough, paths, scan_log)
-    steps, found = split_composites(steps, rough.estimate, landmarks)
+    found = rough.estimate
+    if len(tracks) == 1:  # many sightings of a wall on several days show steps by its bias alone
+        steps, found = split_composites(steps, found, landmarks)
     # once landmarks of different visits are tied, most closures are no longer needed
     closures = untied_closures(closures, paths.spans, steps, landmarks)
     counts["closures_kept"] = len(closures)
