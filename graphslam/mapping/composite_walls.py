@@ -66,8 +66,8 @@ def split_composites(
     seen: dict[int, list[Association]] = defaultdict(list)
     for step in steps:
         for a in step.associations:
-            if a.model == "line" and a.target in estimate.landmarks and isinstance(a.target, int):
-                seen[a.target].append(a)
+            if a.model == "line" and a.extent is not None and a.target in estimate.landmarks:
+                seen[int(a.target)].append(a)
     marks, targets = dict(estimate.landmarks), dict[int, int]()
     for wall, own in seen.items():
         if wall in landmarks.known or len(own) < 2 * LEAST:

@@ -160,8 +160,7 @@ def test_sightings_have_estimates_too():
 def test_a_message_that_cannot_be_used_is_left_out_and_counted(changes, reason):
     """The rest is estimated to the bit as if it had not come."""
     messages = list(sightings())
-    bad = 1 + [isinstance(m, Sighting) for m in messages[:400]][::-1].index(True)
-    bad = 400 - bad
+    bad = max(k for k in range(400) if isinstance(messages[k], Sighting))
     left = list(graphslam.Session().process(messages[:bad] + messages[bad + 1 :]))
     session = graphslam.Session()
     wrong = [*messages[:bad], replace(messages[bad], **changes), *messages[bad + 1 :]]
