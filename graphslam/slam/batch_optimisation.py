@@ -58,10 +58,13 @@ CLOSED_FACTORS, SOLVED_FACTORS = (1.0, 1.0), (1 / 2, 2 / 3)
 LARGE_MB = 400.0
 
 
-def optimise_scan_log(scan_log: TrackedLog, tamper: Tamper | None = None) -> Estimate:
+def optimise_scan_log(
+    scan_log: TrackedLog, tamper: Tamper | None = None, closed: ClosedPaths | None = None
+) -> Estimate:
     """The final estimate of a log; its steps, landmarks, calibration and counts follow it.
 
-    It is `settled` where `backend.optimise_at_end` asks for that.
+    It is `settled` where `backend.optimise_at_end` asks for that. ``closed``: the paths, if their
+    loops are closed already, as those in a known map are.
 
     Raises:
         EstimationError: the estimate is indeterminate.
@@ -70,8 +73,7 @@ def optimise_scan_log(scan_log: TrackedLog, tamper: Tamper | None = None) -> Est
     tracks = {name: run.track for name, run in scan_log.started.items()}
     steps: tuple[Step, ...] = tuple(scan_log.steps)
     with timed(seconds, "loop closure"):
-        known_map = scan_log.known.known_map
-        paths = close_paths(scan_log, tamper, match=config.backend.close_loops, known_map=known_map)
+        paths = closed or close_paths(scan_log, tamper, match=config.backend.close_loops)
     # of submaps: small pieces, between which the solutions find no room
     give_back_freed_memory(LARGE_MB)
     fixing = sum(fix_position(paths.closures))
@@ -80,6 +82,7 @@ def optimise_scan_log(scan_log: TrackedLog, tamper: Tamper | None = None) -> Est
     counts["closures_refused"] += paths.refused
     with timed(seconds, "final"):
         marks = mean_landmarks(steps, paths.states)
+        known_map = scan_log.known.known_map
         if known_map is not None:
             counts["closures_to_map"] = paths.to_map
             marks |= {

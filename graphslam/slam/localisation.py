@@ -11,10 +11,11 @@ from graphslam.core.config import Config
 from graphslam.core.errors import EstimationError
 from graphslam.core.frame_forest import PRIOR_INFLATION
 from graphslam.core.gaussian import symmetric
-from graphslam.core.geometry import Array, compose, compose_cov, inverse
+from graphslam.core.geometry import compose, compose_cov, inverse
 from graphslam.core.record import replace
 from graphslam.core.records import Start
 from graphslam.mapping.known_map import KnownMap
+from graphslam.mapping.loop_closure import Tamper
 from graphslam.mapping.submaps import submaps_at, with_poses_from
 from graphslam.multi_robot.map_localisation import choose, contradiction, hypotheses, support
 from graphslam.multi_robot.place_recognition import PlaceMap
@@ -24,8 +25,13 @@ from graphslam.slam.path_closing import PLACE_COV, ClosedPaths, close_paths
 from graphslam.slam.scan_tracking import ScanLog
 
 
-def localise(scan_log: ScanLog, known_map: KnownMap) -> None:
+def localise(scan_log: ScanLog, known_map: KnownMap, tamper: Tamper | None = None) -> ClosedPaths:
     """Put the tracked path of a log into a known map, whose landmarks are then those of the log.
+
+    Returns:
+        The path closed with the map's places: what was compared with all of the map. Its start is
+        not known as well as that to the estimate, and from a wide one the loops of a corridor may
+        be closed a door too far.
 
     Raises:
         EstimationError: the log does not tell where it begins.
@@ -35,12 +41,14 @@ def localise(scan_log: ScanLog, known_map: KnownMap) -> None:
     with timed(scan_log.seconds, "localisation"):
         if is_start_given(config, robot):
             start = given_start(scan_log, robot)
-            check_given(scan_log, robot, start, known_map)
+            laid = laid_into(scan_log, robot, start, known_map, tamper)
+            check_given(scan_log, robot, laid, known_map)
         else:
-            start = found_start(scan_log, robot, known_map)
+            start, laid = found_start(scan_log, robot, known_map, tamper)
     place_path(scan_log, robot, start)
     scan_log.steps[0] = replace(scan_log.steps[0], known=known_map.known)
     scan_log.landmarks.add_known(known_map.entries(robot))
+    return laid
 
 
 def is_start_given(config: Config, robot: str) -> bool:
@@ -56,13 +64,12 @@ def given_start(scan_log: ScanLog, robot: str) -> Start:
     return Start(compose(told.pose, track.mount), cov)
 
 
-def check_given(scan_log: ScanLog, robot: str, start: Start, known_map: KnownMap) -> None:
-    """See that a start that was given is not one in another building.
+def check_given(scan_log: ScanLog, robot: str, laid: ClosedPaths, known_map: KnownMap) -> None:
+    """See that a start that was given, from where the path is ``laid``, is in this building.
 
     Raises:
         EstimationError: from there the log sees something else than the map.
     """
-    laid = laid_into(scan_log, robot, start, known_map)
     anchors = {robot: np.array(scan_log.paths[robot].anchors)}
     submaps, _ = submaps_at(anchors, laid.states, scan_log.keyframe_scans, scan_log.config)
     why = contradiction(support(known_map.places, submaps)) if known_map.places else ""
@@ -73,8 +80,10 @@ def check_given(scan_log: ScanLog, robot: str, start: Start, known_map: KnownMap
         )
 
 
-def found_start(scan_log: ScanLog, robot: str, known_map: KnownMap) -> Start:
-    """The start that the log and the map have in common.
+def found_start(
+    scan_log: ScanLog, robot: str, known_map: KnownMap, tamper: Tamper | None = None
+) -> tuple[Start, ClosedPaths]:
+    """The start that the log and the map have in common, and the path laid from there.
 
     Its sigmas are wide: the scans by which it was found enter the estimate again.
 
@@ -82,16 +91,16 @@ def found_start(scan_log: ScanLog, robot: str, known_map: KnownMap) -> Start:
         EstimationError: it is not found, or another one would do as well.
     """
     own = own_places(scan_log, robot)
-    starts, supports = [], []
+    found, supports = [], []
     for start in possible_starts(scan_log, robot, known_map, own):
-        laid = laid_into(scan_log, robot, start, known_map)
+        laid = laid_into(scan_log, robot, start, known_map, tamper)
         supports.append(support(known_map.places, with_poses_from(own.places, laid.states)))
-        starts.append(laid_start(laid.states[robot].poses[0], start))
+        found.append((laid_start(laid, robot), laid))
     why = "no place in it is recognised"
     if supports:
         chosen = choose(supports, own.places, scan_log.config.multi_robot)
         if isinstance(chosen, int):
-            return starts[chosen]
+            return found[chosen]
         why = chosen
     raise EstimationError(
         f"robot {robot}: where it begins in the map {known_map.name} is not known: {why}; give "
@@ -120,26 +129,34 @@ def possible_starts(
     ]
 
 
-def laid_into(scan_log: ScanLog, robot: str, start: Start, known_map: KnownMap) -> ClosedPaths:
+def laid_into(
+    scan_log: ScanLog,
+    robot: str,
+    start: Start,
+    known_map: KnownMap,
+    tamper: Tamper | None = None,
+) -> ClosedPaths:
     """The path closed with the places of a known map, if it begins at ``start``."""
     before, first = scan_log.paths[robot].poses, scan_log.steps[0]
     try:
         place_path(scan_log, robot, start)
-        return close_paths(scan_log, match=scan_log.config.backend.close_loops, known_map=known_map)
+        match = scan_log.config.backend.close_loops
+        return close_paths(scan_log, tamper, match=match, known_map=known_map)
     finally:
         scan_log.paths[robot].poses, scan_log.steps[0] = before, first
 
 
-def laid_start(pose: Array, start: Start) -> Start:
-    """Where a log begins, ``pose`` (3,), once its whole path was laid into a map from ``start``.
+def laid_start(laid: ClosedPaths, robot: str) -> Start:
+    """Where a log begins whose whole path was ``laid`` into a map.
 
-    What was recognised of it may be few places, far from the start, which then is known to many
-    metres. The path as laid was compared with the map, and told from all that lies `DISTINCT_M` or
-    `DISTINCT_RAD` off: farther away its loops must not be looked for again.
+    The path as laid was compared with the map, so its loops must not be looked for far from there:
+    it is `PRIOR_INFLATION` times as uncertain as the submaps say, wide enough for their scans to
+    enter the estimate again, and by no more than what was told apart.
     """
+    pose = laid.states[robot].poses[0]
     told_apart = np.diag(np.array([DISTINCT_M, DISTINCT_M, DISTINCT_RAD]) ** -2.0)
-    cov: Array = np.asarray(np.linalg.inv(np.linalg.inv(start.cov) + told_apart))
-    return Start(pose, symmetric(cov))
+    cov = PRIOR_INFLATION**2 * laid.start_covariance(robot)
+    return Start(pose, symmetric(np.linalg.inv(np.linalg.inv(cov) + told_apart)))
 
 
 def place_path(scan_log: ScanLog, robot: str, start: Start) -> None:

@@ -51,6 +51,12 @@ class ClosedPaths:
         before = int(np.searchsorted(self.times[robot], time_ns, side="right")) - 1
         return self.first[robot] + max(before, 0)
 
+    def start_covariance(self, robot: str) -> Array:
+        """Covariance (3, 3), m and rad, of a robot's first pose, along world axes."""
+        first = self.first[robot]
+        cov = self.graph.covariance(np.array([first]))
+        return np.asarray(rotate_cov(cov, float(self.graph.poses[first, 2])))
+
     def uncertainty(self, steps: Sequence[Step]) -> "LandmarkUncertainty":
         """How well the relative position of landmarks is known that ``steps`` have."""
         seen: dict[int, dict[int, None]] = {}

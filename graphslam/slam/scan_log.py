@@ -59,9 +59,10 @@ def solve_scan_log(
     scan_log = track_scan_log(log, config, known, progress, ahead, kept)
     if not scan_log.steps:
         raise LogError(f"{log.files[0].path}: nothing in it could be used; see `graphslam info`")
+    closed = None
     if known.known_map is not None:
-        localise(scan_log, known.known_map)
+        closed = localise(scan_log, known.known_map, tamper)
     with timed(scan_log.seconds, "final optimisation"):
-        estimate = optimise_scan_log(scan_log, tamper)
+        estimate = optimise_scan_log(scan_log, tamper, closed)
     found = {} if causal is None else kept.stage("causal", causal.result)
     return FinishedPass(scan_log, estimate, Findings({}, {}, found), is_settled=True)

@@ -316,7 +316,7 @@ def _lay(starts: Mapping[str, Start], known: KnownMap, sessions: Mapping[str, _S
     found, places = {}, []
     for name, start in starts.items():
         session = sessions[name]
-        states = laid_into(session.log, name, start, known).states
-        found[name] = laid_start(states[name].poses[0], start)
-        places += with_poses_from(session.own.places, states)
+        laid = laid_into(session.log, name, start, known)
+        found[name] = laid_start(laid, name)
+        places += with_poses_from(session.own.places, laid.states)
     return _Laid(found, places, support(known.places, places))
