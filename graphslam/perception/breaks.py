@@ -20,8 +20,10 @@ TINY = 1e-12
 LEAST_SIGMA_M = 1e-4
 #: returns that each part has at least: one line has two
 FEWEST = 2
-#: chance of a break where there is none
-FALSE_BREAK = 1e-3
+#: chance of a break where there is none. One too many costs a wall a little of its direction. One
+#: too few, of a door 0.1 m behind its wall seen from 12 m, is a line turned by 0.07 rad, from
+#: wherever both are seen alike: seven sigmas, which no later test of one observation would survive
+FALSE_BREAK = 0.03
 
 
 class Returns:

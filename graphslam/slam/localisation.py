@@ -156,7 +156,7 @@ def laid_start(laid: ClosedPaths, robot: str) -> Start:
     pose = laid.states[robot].poses[0]
     told_apart = np.diag(np.array([DISTINCT_M, DISTINCT_M, DISTINCT_RAD]) ** -2.0)
     cov = PRIOR_INFLATION**2 * laid.start_covariance(robot)
-    return Start(pose, symmetric(np.linalg.inv(np.linalg.inv(cov) + told_apart)))
+    return Start(pose, symmetric(np.asarray(np.linalg.inv(np.linalg.inv(cov) + told_apart))))
 
 
 def place_path(scan_log: ScanLog, robot: str, start: Start) -> None:

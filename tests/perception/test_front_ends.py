@@ -13,6 +13,7 @@ from walls import cast, make_scan, scan_of
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import compose, rotate_cov, rotation, wrap
+from graphslam.perception.breaks import FALSE_BREAK
 from graphslam.perception.front_ends import FRONT_ENDS
 from graphslam.perception.hough import _borders as run_borders
 from graphslam.perception.line_fit import fit_lines, observations
@@ -376,15 +377,23 @@ def test_the_thesis_overstates_the_normal_noise_by_the_cosine(incidence_deg, rat
 
 
 def test_the_whole_front_end_is_honest_on_a_noisy_room():
-    """Split, merge and the choice of points leave the NEES of all walls at 2 (99.8 %)."""
+    """Split, merge and the choice of points leave the NEES of all walls at 2 (99.8 %).
+
+    One in a few dozen is broken by noise: where it fits best, so its parts are off by more.
+    """
     config = FrontEndConfig(floor_normal_m=0.0, floor_angle_rad=0.0, range_sigma_m=0.01)
-    nees = []
+    nees, broken = [], 0
     for seed in range(150):
         found = segments(scan_of(ROOM, sigma=0.01, seed=seed), config)
         for wall in ROOM[:3]:
-            (line,) = near(found, wall, 0.1)
-            error = normal_error(line, wall)
-            nees.append(error @ np.linalg.solve(normal_cov(line), error))
+            lines = near(found, wall, 0.1)
+            broken += len(lines) > 1
+            for line in lines:
+                error = normal_error(line, wall)
+                nees.append(error @ np.linalg.solve(normal_cov(line), error))
+    # the chance of a break, and three sigmas of how many that makes
+    runs = 3 * 150
+    assert broken < FALSE_BREAK * runs + 3 * np.sqrt(FALSE_BREAK * runs)
     low, high = chi2.ppf([0.001, 0.999], 2 * len(nees)) / len(nees)
     assert low < np.mean(nees) < high
 
