@@ -44,6 +44,31 @@ class KnownLandmarks(Record):
             for own, parents, row in zip(name, root.parents, root.rows, strict=True)
         ]
 
+    def given_the_others(
+        self, landmarks: Mapping[int, tuple[Array, Array]]
+    ) -> dict[int, tuple[Array, Array]]:
+        """Where each landmark is by what is known of it, if all others are as estimated.
+
+        Args:
+            landmarks: number -> mean and covariance, as estimated.
+
+        Returns:
+            Number -> how far (d,) from its own estimate, m and rad along its own axes, and the
+            covariance (d, d) of that.
+        """
+        off = {n: _error(mean, landmarks[n][0]) for n, mean in self.means.items()}
+        information = {n: np.zeros((len(e), len(e))) for n, e in off.items()}
+        gradient = {n: np.zeros(len(e)) for n, e in off.items()}
+        for numbers, row in self.rows():
+            residual, first = row @ np.concatenate([off[n] for n in numbers]), 0
+            for n in numbers:
+                own = row[:, first : first + len(off[n])]
+                first += len(off[n])
+                information[n] += own.T @ own
+                gradient[n] += own.T @ residual
+        cov = {n: np.asarray(np.linalg.inv(one)) for n, one in information.items()}
+        return {n: (-cov[n] @ gradient[n], cov[n]) for n in off}
+
     def squared_residual(self, landmarks: Mapping[int, tuple[Array, Array]]) -> float:
         """Of landmarks as estimated: number -> mean and covariance."""
         off = {n: _error(mean, landmarks[n][0]) for n, mean in self.means.items()}

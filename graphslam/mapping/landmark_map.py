@@ -111,9 +111,14 @@ class LandmarkMap:
             np.array([e.kind == "segment" for e in entries], dtype=bool),
         )
 
+    def add_all(self, entries: Mapping[int, Entry]) -> None:
+        """Take in landmarks with the numbers that they have."""
+        self.entries |= entries
+        self.begin_at(1 + max(entries, default=-1))
+
     def add_known(self, entries: Mapping[int, Entry]) -> None:
         """Take in landmarks of an earlier map; their numbers are not used yet."""
-        self.entries |= entries
+        self.add_all(entries)
         self.known |= {n: (e.mean.copy(), e.extent.copy()) for n, e in entries.items()}
         self.known_pairs |= _near_each_other(list(entries.values()))
 

@@ -35,6 +35,7 @@ from graphslam.mapping.duplicate_landmarks import (
 from graphslam.mapping.landmark_map import mean_landmarks
 from graphslam.mapping.loop_closure import Tamper, fix_position
 from graphslam.mapping.loose_returns import with_loose_returns
+from graphslam.mapping.moved_walls import part_moved
 from graphslam.mapping.reassociation import reassociate
 from graphslam.mapping.redundant_closures import untied_closures
 from graphslam.mapping.visits import tie_visits
@@ -167,6 +168,9 @@ def _solved(
     )
     steps = _tied(steps, rough.estimate, rough, paths, scan_log)
     found = rough.estimate
+    steps, found, counts["landmarks_moved"] = part_moved(
+        steps, found, landmarks, scan_log.steps[0].known
+    )
     if len(tracks) == 1:  # many sightings of a wall on several days show steps by its bias alone
         steps, found = split_composites(steps, found, landmarks)
     # once landmarks of different visits are tied, most closures are no longer needed

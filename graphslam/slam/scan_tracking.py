@@ -228,7 +228,7 @@ class ScanLog(TrackedLog):
         if self.config.odometry.calibrate:
             recalibrate_path(path, run.track)
         tracker.retire_all()
-        self.landmarks.entries |= tracker.entries
+        self.landmarks.add_all(tracker.entries)
         self.landmarks.deleted += tracker.deleted
         self.rejected.update(tracker.rejected)
         for model, values in tracker.innovations.items():

@@ -60,7 +60,7 @@ class SessionLog(TrackedLog):
         self.steps += one.steps
         self.keyframe_scans += one.keyframe_scans
         self.step_ms += one.step_ms
-        self.landmarks.entries |= one.landmarks.entries
+        self.landmarks.add_all(one.landmarks.entries)
         self.landmarks.deleted += one.landmarks.deleted
         for mine, others in (
             (self.counts, one.counts),

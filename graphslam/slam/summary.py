@@ -33,6 +33,7 @@ REOPTIMISED = (
     "closures_refused",
     "closures_kept",
     "landmarks_merged",
+    "landmarks_moved",
     "observations_reassociated",
     "observations_dropped",
     "observations_by_loose_returns",
