@@ -171,8 +171,7 @@ def _solved(
     steps, found, counts["landmarks_moved"] = part_moved(
         steps, found, landmarks, scan_log.steps[0].known
     )
-    if len(tracks) == 1:  # many sightings of a wall on several days show steps by its bias alone
-        steps, found = split_composites(steps, found, landmarks)
+    steps, found = split_composites(steps, found, landmarks)
     # once landmarks of different visits are tied, most closures are no longer needed
     closures = untied_closures(closures, paths.spans, steps, landmarks)
     counts["closures_kept"] = len(closures)
