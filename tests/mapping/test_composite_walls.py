@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from graphslam.core.geometry import between, compose
+from graphslam.core.record import replace
 from graphslam.core.records import Association, Estimate, Step, Trajectory
 from graphslam.mapping.composite_walls import split_composites
 from graphslam.mapping.landmark_map import Entry, LandmarkMap
@@ -100,3 +101,14 @@ def test_a_wall_of_an_earlier_map_stays_what_it_was():
     steps, estimate, landmarks = seen(WALL + [DOOR] * 12, np.random.default_rng(0))
     landmarks.add_known(dict(landmarks.entries))
     assert split_composites(steps, estimate, landmarks)[0] is steps
+
+
+def test_the_other_part_gets_a_number_that_nothing_has():
+    """Tracking numbers its landmarks itself; the map once gave the door the number of landmark 0,
+    and both were one."""
+    steps, estimate, _ = seen(WALL + [DOOR] * 12, np.random.default_rng(0))
+    landmarks = LandmarkMap()
+    entry = Entry(7, "line", np.zeros(3), np.eye(3), np.zeros(2), 0, 1, None)
+    landmarks.add_all({0: replace(entry, id=0), 7: entry, 30: replace(entry, id=30)})
+    made, _ = split_composites(steps, estimate, landmarks)
+    assert set(targets(made)) == {7, 31}
