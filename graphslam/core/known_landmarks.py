@@ -44,6 +44,21 @@ class KnownLandmarks(Record):
             for own, parents, row in zip(name, root.parents, root.rows, strict=True)
         ]
 
+    def covariance(self, landmarks: Sequence[int]) -> Array:
+        """Joint covariance (D, D) of some landmarks, errors along their own axes."""
+        dims = [len(self.means[n]) for n in self.numbers]
+        first = dict(zip(self.numbers, np.cumsum([0, *dims])[:-1].tolist(), strict=True))
+
+        def rows(numbers: Sequence[int]) -> list[int]:
+            return [first[n] + k for n in numbers for k in range(len(self.means[n]))]
+
+        information = np.zeros((sum(dims), sum(dims)))
+        for numbers, row in self.rows():
+            own = rows(numbers)
+            information[np.ix_(own, own)] += row.T @ row
+        wanted = rows(landmarks)
+        return np.asarray(np.linalg.inv(information)[np.ix_(wanted, wanted)])
+
     def given_the_others(
         self, landmarks: Mapping[int, tuple[Array, Array]]
     ) -> dict[int, tuple[Array, Array]]:

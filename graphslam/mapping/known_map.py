@@ -13,6 +13,7 @@ import numpy as np
 from graphslam.core.geometry import Array, between, wrap
 from graphslam.core.known_landmarks import KnownLandmarks
 from graphslam.core.records import Landmark
+from graphslam.core.sensor_config import FrontEndConfig
 from graphslam.mapping.landmark_map import Entry
 from graphslam.mapping.submaps import SubmapPose
 from graphslam.perception.scan_matching import make_submap
@@ -28,8 +29,9 @@ class KnownMap:
     """What is known of a building.
 
     ``name`` of the result that it is of, ``sha256`` of its content. ``landmarks``: all of them;
-    ``known``: their joint Gaussian. ``places``: submaps at poses in the world. ``parents``: the
-    maps that it continues, the first one first, name and sha256 each.
+    ``known``: their joint Gaussian as a day sees them, each wall with an error of its own across
+    it, of sigma ``bias_m``. ``places``: submaps at poses in the world. ``parents``: the maps that
+    it continues, the first one first, name and sha256 each.
     """
 
     name: str
@@ -37,6 +39,7 @@ class KnownMap:
     landmarks: tuple[Landmark, ...]
     known: KnownLandmarks
     places: tuple[SubmapPose, ...]
+    bias_m: float = FrontEndConfig.floor_normal_m
     parents: tuple[tuple[str, str], ...] = ()
 
     @property

@@ -10,7 +10,6 @@ import json
 from collections.abc import Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 from zipfile import BadZipFile
 
@@ -21,9 +20,11 @@ from graphslam.core.errors import ConfigError, OutputError
 from graphslam.core.geometry import Array, rotation3
 from graphslam.core.known_landmarks import KnownLandmarks, SparseRoot
 from graphslam.core.records import JointScans, KeyframeScan, Landmark, Result, Trajectory
+from graphslam.core.sensor_config import FrontEndConfig
 from graphslam.core.sparse_gaussian import sparse_root
 from graphslam.estimation.information_root import joint_covariance
 from graphslam.mapping.known_map import KnownMap, latest_places, map_place
+from graphslam.mapping.map_update import with_surface_biases, without_days_biases
 from graphslam.mapping.submaps import SubmapPose, build_submaps
 from graphslam.odometry.mount_covariance import moved_by_world
 from graphslam.results.file_formats import landmark_from_json, landmark_json
@@ -64,11 +65,12 @@ def load_known_map(directory: Path) -> KnownMap:
         for mark in saved.landmarks
         if mark.frame is None and mark.id in saved.joint.root.landmarks
     )
-    cov = landmark_covariance(saved.joint, landmarks)
-    known = known_landmarks(landmarks, with_surface_biases(landmarks, cov, saved.config))
+    bias_m = saved.config.front_end.floor_normal_m
+    cov = with_surface_biases(landmarks, landmark_covariance(saved.joint, landmarks), bias_m)
+    known = known_landmarks(landmarks, cov)
     places = latest_places(_submaps(directory, saved))
     name, sha256 = directory.absolute().name, _digest(directory)
-    return KnownMap(name, sha256, landmarks, known, places)
+    return KnownMap(name, sha256, landmarks, known, places, bias_m)
 
 
 def known_map_of(config: Config) -> KnownMap | None:
@@ -107,14 +109,14 @@ def continued(result: Result, earlier: KnownMap) -> KnownMap:
     joint = joint_scans(result.estimate, result.robots)
     if joint is None:
         raise OutputError("known_map.update: the result has no joint covariance")
+    bias_m = result.config.front_end.floor_normal_m
     cov = landmark_covariance(joint, result.landmarks)
-    before = {mark.id: mark.sightings for mark in earlier.landmarks}
-    cov = with_surface_biases(result.landmarks, cov, result.config, before)
-    known = known_landmarks(result.landmarks, cov)
+    landmarks, cov = without_days_biases(earlier.known, earlier.bias_m, result.landmarks, cov)
+    known = known_landmarks(landmarks, with_surface_biases(landmarks, cov, bias_m))
     found = build_submaps(result.estimate.states, result.keyframe_scans, result.config)
     places = latest_places([*found, *earlier.places])
     # named by its folder, identified by its content
-    return KnownMap("", "", result.landmarks, known, places, earlier.ancestry)
+    return KnownMap("", "", landmarks, known, places, bias_m, earlier.ancestry)
 
 
 def landmark_covariance(joint: JointScans, landmarks: Sequence[Landmark]) -> Array:
@@ -139,31 +141,6 @@ def landmark_covariance(joint: JointScans, landmarks: Sequence[Landmark]) -> Arr
     )
     mixed = cross @ placing.T
     return np.asarray(cov + mixed + mixed.T - placing @ joint.mounts.cov @ placing.T)
-
-
-def with_surface_biases(
-    landmarks: Sequence[Landmark],
-    cov: Array,
-    config: Config,
-    before: Mapping[int, int] = MappingProxyType({}),
-) -> Array:
-    """A joint covariance (D, D) of landmarks with the error that all sightings of a wall share.
-
-    Within a log it does not matter: whoever compares poses sees each wall with its bias. On another
-    day a wall is seen from elsewhere and in other parts, and without it many sightings of a wall
-    make the map so stiff that differences of a few millimetres bend or turn all of it. Walls that
-    the log did not see, by their number of sightings ``before``, have it from earlier days.
-    """
-    dims = [2 if mark.kind == "point" else 3 for mark in landmarks]
-    first = np.cumsum([0, *dims])[:-1]
-    across = [
-        row + 1
-        for row, mark in zip(first, landmarks, strict=True)
-        if mark.kind != "point" and mark.sightings > before.get(mark.id, 0)
-    ]
-    out = cov.copy()
-    out[across, across] += config.front_end.floor_normal_m**2
-    return out
 
 
 def _own_axes(mark: Landmark) -> Array:
@@ -219,6 +196,7 @@ def known_map_bytes(known: KnownMap) -> bytes:
         "parent": np.array([n for p in root.parents for n in p], dtype=np.int32),
         "rows": np.concatenate([np.zeros(0), *(row.ravel() for row in root.rows)]),
         "widening": np.array(root.widening),
+        "bias_m": np.array(known.bias_m),
         "place_pose": np.array([p.pose for p in known.places]).reshape(-1, 3),
         "place_scans": np.array([len(p.submap.clouds) for p in known.places], dtype=np.int32),
         "sensor": np.concatenate([np.zeros((0, 3)), *(p.submap.poses for p in known.places)]),
@@ -274,4 +252,5 @@ def _known_map(arrays: Mapping[str, Array], name: str, sha256: str) -> KnownMap:
     told = tuple((str(a), str(b)) for a, b in arrays["parents"])
     if str(arrays["name"]):  # a copy
         name, sha256 = str(arrays["name"]), str(arrays["sha256"])
-    return KnownMap(name, sha256, landmarks, known, places, told)
+    bias_m = float(arrays.get("bias_m", FrontEndConfig.floor_normal_m))  # older ones have that
+    return KnownMap(name, sha256, landmarks, known, places, bias_m, told)

@@ -16,7 +16,6 @@ from graphslam.results.known_map import (
     KNOWN_MAP_FILE,
     landmark_covariance,
     load_known_map,
-    with_surface_biases,
 )
 from graphslam.results.scans_file import SCANS_FILE
 from graphslam.slam import batch_optimisation
@@ -128,20 +127,6 @@ def test_a_continued_map_is_better_and_names_its_parent(tmp_path, first_day):
     assert len(kept) >= len(before.landmarks) - 1
     # widening may cost a wall that was not seen again a little
     assert np.median([cov[mark.id] / np.trace(mark.cov[:2, :2]) for mark in kept]) < 1.0
-
-
-def test_the_common_error_of_the_sightings_of_a_wall_is_in_the_map(first_day):
-    """However often a wall is seen; walls that a day did not see have it from earlier ones."""
-    saved = graphslam.load_result(first_day)
-    marks = tuple(m for m in saved.landmarks if m.id in saved.joint.root.landmarks)
-    cov = landmark_covariance(saved.joint, marks)
-    unseen = {marks[0].id: marks[0].sightings}
-    added = with_surface_biases(marks, cov, saved.config, unseen) - cov
-    expected = np.zeros(len(cov))
-    ends = np.cumsum([2 if m.kind == "point" else 3 for m in marks])
-    walls = [end for end, m in zip(ends[1:], marks[1:], strict=True) if m.kind != "point"]
-    expected[np.array(walls) - 2] = saved.config.front_end.floor_normal_m**2
-    np.testing.assert_allclose(added, np.diag(expected), atol=1e-12)
 
 
 def test_what_is_gone_is_retired_and_what_is_new_added(tmp_path, first_day):
