@@ -12,6 +12,7 @@ from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Step
 from graphslam.mapping.landmark_map import LandmarkMap
 from graphslam.mapping.wall_observations import (
+    PATH_M,
     WallObservations,
     retargeted,
     wall_observations,
@@ -27,6 +28,8 @@ BETTER = 40.0
 ACROSS_M, ACROSS_SHARE = 0.5, 0.3
 #: m: the step between the parts, at least: less bends nothing
 STEP_M = 0.02
+#: and between what two visits saw that each saw one part: their difference, three times
+VISITS_SIGMAS = 3.0 * np.sqrt(2.0)
 #: m: one of the parts is shorter, as doors and cabinets are. That two long ones are in line says
 #: more of the direction of a corridor than all else
 SHORT_M = 2.5
@@ -45,30 +48,38 @@ def split_composites(
         if wall in landmarks.known or len(own) < 2 * LEAST:
             continue
         mean = marks[wall][0]
-        parts = parts_of(wall_observations(own, estimate, mean))
+        parts = parts_of(wall_observations(own, estimate, mean), landmarks.bias_m)
         rest, *parts = sorted(parts, key=lambda part: -len(part.along))
-        if parts:
-            marks[wall] = rest.landmark(mean)
         for part in parts:
             number = landmarks.next_number
             landmarks.split(wall, number)
+            landmarks.recount(number, [own[k] for k in part.index.tolist()])
             marks[number] = part.landmark(mean)
             targets |= {id(own[k]): number for k in part.index.tolist()}
+        if parts:
+            landmarks.recount(wall, [own[k] for k in rest.index.tolist()])
+            marks[wall] = rest.landmark(mean)
     if not targets:
         return steps, estimate
     return retargeted(steps, targets, landmarks), replace(estimate, landmarks=marks)
 
 
-def parts_of(wall: WallObservations) -> list[WallObservations]:
+def parts_of(wall: WallObservations, bias_m: float) -> list[WallObservations]:
     """The parts of a wall, in their order along it; itself if it is one."""
-    cut = step_of(wall)
+    cut = step_of(wall, bias_m)
     if cut is None:
         return [wall]
-    return [*parts_of(wall.only(slice(cut))), *parts_of(wall.only(slice(cut, None)))]
+    return [
+        *parts_of(wall.only(slice(cut)), bias_m),
+        *parts_of(wall.only(slice(cut, None)), bias_m),
+    ]
 
 
-def step_of(wall: WallObservations) -> int | None:
-    """Index of the first observation behind a step; None without one."""
+def step_of(wall: WallObservations, bias_m: float) -> int | None:
+    """Index of the first observation behind a step; None without one.
+
+    ``bias_m``: sigma of what two visits differ by that each saw one side.
+    """
     n = len(wall.along)
     cuts = np.arange(LEAST, n - LEAST + 1)
     if not len(cuts):
@@ -86,6 +97,9 @@ def step_of(wall: WallObservations) -> int | None:
     # of a wall that is bent, as its path is, most are across the edge
     across = (wall.ends[:, 0] < edge - ACROSS_M) & (wall.ends[:, 1] > edge + ACROSS_M)
     apart = np.count_nonzero(across) <= ACROSS_SHARE * min(cut, n - cut)
-    high = abs(np.array([1.0, edge]) @ (lines[1][best] - lines[0][best])) > STEP_M
+    least = STEP_M
+    if not set(wall.robot[:cut]) & set(wall.robot[cut:]):
+        least = max(least, VISITS_SIGMAS * np.hypot(bias_m, PATH_M))
+    high = abs(np.array([1.0, edge]) @ (lines[1][best] - lines[0][best])) > least
     short = min(wall.only(slice(cut)).length, wall.only(slice(cut, None)).length) < SHORT_M
     return cut if apart and high and short and gain[best] > BETTER else None

@@ -13,7 +13,6 @@ import numpy as np
 from graphslam.core.geometry import Array, between, wrap
 from graphslam.core.known_landmarks import KnownLandmarks
 from graphslam.core.records import Landmark
-from graphslam.core.sensor_config import FrontEndConfig
 from graphslam.mapping.landmark_map import Entry
 from graphslam.mapping.submaps import SubmapPose
 from graphslam.perception.scan_matching import make_submap
@@ -39,7 +38,7 @@ class KnownMap:
     landmarks: tuple[Landmark, ...]
     known: KnownLandmarks
     places: tuple[SubmapPose, ...]
-    bias_m: float = FrontEndConfig.floor_normal_m
+    bias_m: float = 0.0
     parents: tuple[tuple[str, str], ...] = ()
 
     @property

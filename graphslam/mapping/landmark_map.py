@@ -67,6 +67,13 @@ class Entry:
         ends = relative[0] + np.cos(relative[2]) * extent
         self.extent = np.array([min(self.extent[0], ends.min()), max(self.extent[1], ends.max())])
 
+    def copied(self, number: int) -> "Entry":
+        """The same as landmark ``number``, to be changed by itself."""
+        return replace(
+            self, id=number, mean=self.mean.copy(), extent=self.extent.copy(),
+            path_m=dict(self.path_m), evidence=list(self.evidence),
+        )  # fmt: skip
+
     def move(self, mean: Array) -> None:
         """A new estimate (2,) or (3,)."""
         self.extent = self.extent_at(mean)
@@ -84,8 +91,8 @@ class LandmarkMap:
     def __init__(self, bias_m: float = 0.0, most: int = LimitsConfig.landmarks) -> None:
         self.bias_m, self.most = bias_m, most
         self.entries: dict[int, Entry] = {}
-        #: of an earlier map: number -> (mean (3,), extent (2,)) as they were
-        self.known: dict[int, tuple[Array, Array]] = {}
+        #: of an earlier map, as they were
+        self.known: dict[int, Entry] = {}
         #: those of them that are near each other, which are different things
         self.known_pairs: set[frozenset[int]] = set()
         self.by_identity: dict[str, int] = {}
@@ -119,7 +126,7 @@ class LandmarkMap:
     def add_known(self, entries: Mapping[int, Entry]) -> None:
         """Take in landmarks of an earlier map; their numbers are not used yet."""
         self.add_all(entries)
-        self.known |= {n: (e.mean.copy(), e.extent.copy()) for n, e in entries.items()}
+        self.known |= {n: e.copied(n) for n, e in entries.items()}
         self.known_pairs |= _near_each_other(list(entries.values()))
 
     def begin_at(self, number: int) -> None:
@@ -198,15 +205,24 @@ class LandmarkMap:
             if entry.kind == "line":  # the ends of a segment move with it
                 entry.extent = extent
                 if number in self.known:  # what was not seen now is there as well
-                    entry.extend(*self.known[number])
+                    entry.extend(self.known[number].mean, self.known[number].extent)
 
     def split(self, number: int, new: int) -> None:
         """Add landmark ``new`` as a copy of ``number``, without its identity."""
-        old = self.entries[number]
-        self.entries[new] = replace(
-            old, id=new, mean=old.mean.copy(), extent=old.extent.copy(), identity=None
-        )
+        self.entries[new] = replace(self.entries[number].copied(new), identity=None)
         self._next = max(self._next, new + 1)
+
+    def recount(self, number: int, seen: Sequence[Association]) -> None:
+        """Landmark ``number`` has these observations, those of an earlier map, and no others."""
+        entry, before = self.entries[number], self.known.get(number)
+        times = [a.time_ns for a in seen]
+        entry.sightings = len(times)
+        if before is not None:
+            entry.sightings += before.sightings
+            times += [before.first_ns, before.last_ns]
+            if not seen:
+                entry.extent = before.extent - between(before.mean, entry.mean)[0]
+        entry.first_ns, entry.last_ns = min(times), max(times)
 
     def transformed(self, worlds: Mapping[int, Array]) -> "LandmarkMap":
         """The same map after the frame of each landmark was put at ``worlds[id]`` (3,)."""

@@ -9,11 +9,10 @@ would win if its error were added to what it left.
 """
 
 from collections.abc import Sequence
-from itertools import accumulate
 
 import numpy as np
 
-from graphslam.core.geometry import Array, between, compose, exp, log
+from graphslam.core.geometry import Array, between, compose, exp, log, rotate_cov
 from graphslam.core.known_landmarks import KnownLandmarks
 from graphslam.core.record import replace
 from graphslam.core.records import Landmark
@@ -74,13 +73,29 @@ def without_days_biases(
     return tuple(moved.get(mark.id, mark) for mark in landmarks), 0.5 * (out + out.T)
 
 
+def with_covariances(landmarks: Sequence[Landmark], cov: Array) -> tuple[Landmark, ...]:
+    """Landmarks with their blocks of a joint covariance (D, D), see `without_days_biases`."""
+    return tuple(
+        _with_covariance(mark, cov[first : first + _dim(mark), first : first + _dim(mark)])
+        for first, mark in zip(_first(landmarks), landmarks, strict=True)
+    )
+
+
+def _with_covariance(mark: Landmark, own: Array) -> Landmark:
+    if mark.kind == "point":
+        return replace(mark, cov=own)
+    cov = rotate_cov(own, float(mark.position[2]))
+    return replace(mark, cov=cov, line=line_parameters(mark.position, cov))
+
+
 def _dim(mark: Landmark) -> int:
     return 2 if mark.kind == "point" else 3
 
 
 def _first(landmarks: Sequence[Landmark]) -> list[int]:
     """The first row of each."""
-    return list(accumulate((_dim(mark) for mark in landmarks[:-1]), initial=0))
+    rows: list[int] = np.cumsum([0, *map(_dim, landmarks)])[:-1].tolist()
+    return rows
 
 
 def _across(landmarks: Sequence[Landmark]) -> list[int]:
@@ -106,4 +121,4 @@ def _moved(mark: Landmark, mean: Array, off: Array) -> Landmark:
     pose = compose(mean, exp(off))
     ends = np.column_stack([mark.extent, np.zeros(len(mark.extent))])
     extent = compose(pose, between(mark.position, ends))[:, :2]
-    return replace(mark, position=pose, extent=extent, line=line_parameters(pose, mark.cov))
+    return replace(mark, position=pose, extent=extent)

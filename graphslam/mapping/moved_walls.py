@@ -11,12 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphslam.core.gaussian import chi2_quantile
-from graphslam.core.geometry import Array
+from graphslam.core.geometry import Array, compose, exp
 from graphslam.core.known_landmarks import KnownLandmarks
 from graphslam.core.record import replace
 from graphslam.core.records import Association, Estimate, Step
 from graphslam.mapping.landmark_map import LandmarkMap
 from graphslam.mapping.wall_observations import (
+    PATH_M,
+    PATH_RAD,
     WallObservations,
     retargeted,
     wall_observations,
@@ -28,8 +30,6 @@ GATE = chi2_quantile(0.99, 2)
 #: m: what is longer belongs to the building. What two visits say of the direction of a long wall
 #: is worth more than one that was moved costs
 LONGEST_M = 2.5
-#: m, rad: error of a visit's path where it sees the thing
-PATH_M, PATH_RAD = 0.005, 0.002
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,41 +55,54 @@ def part_moved(
     estimate: Estimate,
     landmarks: LandmarkMap,
     known: KnownLandmarks | None = None,
-) -> tuple[tuple[Step, ...], Estimate, int]:
+) -> tuple[tuple[Step, ...], Estimate, dict[int, int]]:
     """Steps in which what was moved between visits is a landmark for each place.
 
     A visit is what one robot name saw, as sessions have one each; ``known`` is what an earlier map
     says. The first visit keeps the landmark. The work grows with the number of observations.
 
     Returns:
-        The steps, the estimate with the new landmarks, whose covariances are unknown, and how many
-        they are. The map gets them too.
+        The steps, the estimate with the new landmarks, whose covariances are unknown, and these:
+        new number -> that of the landmark where it was before. The map gets them too.
     """
     before = {} if known is None else known.given_the_others(estimate.landmarks)
     if not before and len(estimate.states) < 2:
-        return steps, estimate, 0
-    marks, targets = dict(estimate.landmarks), dict[int, int]()
-    made = 0
+        return steps, estimate, {}
+    marks, targets, made = dict(estimate.landmarks), dict[int, int](), dict[int, int]()
     for wall, seen in walls_seen(steps, estimate, ("line", "segment")).items():
         mean = marks[wall][0]
-        if wall_observations(seen, estimate, mean).length > LONGEST_M:
+        if _length(wall, wall_observations(seen, estimate, mean), landmarks) > LONGEST_M:
             continue
         prior = _Line(before[wall][0][1:], before[wall][1][1:, 1:]) if wall in before else None
-        for part in _elsewhere(seen, estimate, mean, prior, landmarks.bias_m):
+        stayed, *moved = _places(seen, estimate, mean, prior, landmarks.bias_m)
+        for part in moved:
             number = landmarks.next_number
             landmarks.split(wall, number)
+            landmarks.recount(number, part)
             marks[number] = wall_observations(part, estimate, mean).landmark(mean)
             targets |= {id(a): number for a in part}
-            made += 1
+            made[number] = wall
+        if moved:
+            landmarks.recount(wall, stayed)
+            if prior is not None:
+                marks[wall] = compose(mean, exp(before[wall][0])), marks[wall][1]
+            else:
+                marks[wall] = wall_observations(stayed, estimate, mean).landmark(mean)
     if not made:
-        return steps, estimate, 0
+        return steps, estimate, {}
     return retargeted(steps, targets, landmarks), replace(estimate, landmarks=marks), made
 
 
-def _elsewhere(
+def _length(number: int, wall: WallObservations, landmarks: LandmarkMap) -> float:
+    """Length, m, of what was ever seen of a wall."""
+    known = landmarks.known.get(number)
+    return wall.length if known is None else max(wall.length, float(np.ptp(known.extent)))
+
+
+def _places(
     seen: list[Association], estimate: Estimate, mean: Array, prior: _Line | None, bias_m: float
 ) -> list[list[Association]]:
-    """What was seen at each place but the first, which is that of ``prior`` if there is one."""
+    """What was seen at each place; the first is that of ``prior``, if there is one."""
     visits: dict[str, list[Association]] = defaultdict(list)
     for a in sorted(seen, key=lambda a: a.time_ns):
         visits[a.robot].append(a)
@@ -102,7 +115,7 @@ def _elsewhere(
                 break
         else:
             places.append((line, own))
-    return [own for _, own in places[1:]]
+    return [own for _, own in places]
 
 
 def _line_of(wall: WallObservations, bias_m: float) -> _Line:

@@ -7,6 +7,7 @@ those of one visit, show another line than the others (`composite_walls`, `moved
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from graphslam.core.records import Association, Estimate, Step
 from graphslam.mapping.gating import IntArray
 from graphslam.mapping.landmark_map import LandmarkMap, observed_from, retarget
 
+#: m, rad: error of a visit's path where it sees a wall
+PATH_M, PATH_RAD = 0.005, 0.002
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WallObservations:
@@ -23,7 +27,7 @@ class WallObservations:
 
     ``along`` (n,) m, of their middles; ``measured`` (n, 2): across, m, and direction, rad;
     ``weight`` (n, 2, 2): its information; ``ends`` (n, 2) m, along the wall; ``index`` (n,): of the
-    observation.
+    observation; ``robot`` (n,) who made it.
     """
 
     along: Array
@@ -31,12 +35,13 @@ class WallObservations:
     weight: Array
     ends: Array
     index: IntArray
+    robot: np.ndarray[Any, np.dtype[np.str_]]
 
     def only(self, which: slice) -> "WallObservations":
         """Some of them."""
         return WallObservations(
             self.along[which], self.measured[which], self.weight[which], self.ends[which],
-            self.index[which],
+            self.index[which], self.robot[which],
         )  # fmt: skip
 
     @property
@@ -97,7 +102,8 @@ def wall_observations(
     measured = np.column_stack([at[:, 1], direction])
     ends = np.sort(at[:, :1] + np.cos(at[:, 2:]) * np.array([a.extent for a in seen]), axis=1)
     weight = np.linalg.inv(cov[order])
-    return WallObservations(at[order, 0], measured[order], weight, ends[order], order)
+    robot = np.array([a.robot for a in seen])[order]
+    return WallObservations(at[order, 0], measured[order], weight, ends[order], order, robot)
 
 
 def retargeted(

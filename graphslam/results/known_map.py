@@ -20,11 +20,14 @@ from graphslam.core.errors import ConfigError, OutputError
 from graphslam.core.geometry import Array, rotation3
 from graphslam.core.known_landmarks import KnownLandmarks, SparseRoot
 from graphslam.core.records import JointScans, KeyframeScan, Landmark, Result, Trajectory
-from graphslam.core.sensor_config import FrontEndConfig
 from graphslam.core.sparse_gaussian import sparse_root
 from graphslam.estimation.information_root import joint_covariance
 from graphslam.mapping.known_map import KnownMap, latest_places, map_place
-from graphslam.mapping.map_update import with_surface_biases, without_days_biases
+from graphslam.mapping.map_update import (
+    with_covariances,
+    with_surface_biases,
+    without_days_biases,
+)
 from graphslam.mapping.submaps import SubmapPose, build_submaps
 from graphslam.odometry.mount_covariance import moved_by_world
 from graphslam.results.file_formats import landmark_from_json, landmark_json
@@ -112,7 +115,8 @@ def continued(result: Result, earlier: KnownMap) -> KnownMap:
     bias_m = result.config.front_end.floor_normal_m
     cov = landmark_covariance(joint, result.landmarks)
     landmarks, cov = without_days_biases(earlier.known, earlier.bias_m, result.landmarks, cov)
-    known = known_landmarks(landmarks, with_surface_biases(landmarks, cov, bias_m))
+    cov = with_surface_biases(landmarks, cov, bias_m)
+    landmarks, known = with_covariances(landmarks, cov), known_landmarks(landmarks, cov)
     found = build_submaps(result.estimate.states, result.keyframe_scans, result.config)
     places = latest_places([*found, *earlier.places])
     # named by its folder, identified by its content
@@ -252,5 +256,5 @@ def _known_map(arrays: Mapping[str, Array], name: str, sha256: str) -> KnownMap:
     told = tuple((str(a), str(b)) for a, b in arrays["parents"])
     if str(arrays["name"]):  # a copy
         name, sha256 = str(arrays["name"]), str(arrays["sha256"])
-    bias_m = float(arrays.get("bias_m", FrontEndConfig.floor_normal_m))  # older ones have that
+    bias_m = float(arrays.get("bias_m", 0.0))  # of older ones it is not known
     return KnownMap(name, sha256, landmarks, known, places, bias_m, told)

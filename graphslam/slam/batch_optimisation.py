@@ -168,9 +168,8 @@ def _solved(
     )
     steps = _tied(steps, rough.estimate, rough, paths, scan_log)
     found = rough.estimate
-    steps, found, counts["landmarks_moved"] = part_moved(
-        steps, found, landmarks, scan_log.steps[0].known
-    )
+    steps, found, scan_log.moved = part_moved(steps, found, landmarks, scan_log.steps[0].known)
+    counts["landmarks_moved"] = len(scan_log.moved)
     steps, found = split_composites(steps, found, landmarks)
     # once landmarks of different visits are tied, most closures are no longer needed
     closures = untied_closures(closures, paths.spans, steps, landmarks)

@@ -78,6 +78,8 @@ class LogPass:
         self.offers: dict[int, tuple[Association, ...]] = {}
         self.keyframe_scans: list[KeyframeScan] = []
         self.scan_evidence: Mapping[str, ScanEvidence] = {}
+        #: landmarks that were moved: number -> the landmark that they were before
+        self.moved: Mapping[int, int] = {}
         self.counts: Counter[str] = Counter()
         self.skipped_before: Mapping[str, int] = {}  # by the run that this one goes on with
         self.dropped: Counter[str] = Counter()

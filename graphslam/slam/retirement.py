@@ -13,14 +13,18 @@ def retired_landmarks(
 ) -> dict[int, dict[str, Any]]:
     """Number -> entry of summary.json, of landmarks that are to leave the map.
 
-    None where the map does not go on. What the log observed is there, glass among it.
+    None where the map does not go on. What the log observed is there, glass among it. What was
+    moved a little is gone from where it was, though no beam went through.
     """
     known_map = pipeline.known.known_map
     if known_map is None or not pipeline.given_config.known_map.update:
         return {}
     seen = {a.target for step in pipeline.steps for a in step.associations}
     unseen = [m for m in landmarks if m.id in known_map.known.means and m.id not in seen]
-    gone = seen_through(unseen, pipeline.keyframe_scans, estimate.states)
+    gone = {
+        *seen_through(unseen, pipeline.keyframe_scans, estimate.states),
+        *pipeline.moved.values(),
+    }
     return {
         mark.id: {
             "id": mark.id,

@@ -112,3 +112,19 @@ def test_the_other_part_gets_a_number_that_nothing_has():
     landmarks.add_all({0: replace(entry, id=0), 7: entry, 30: replace(entry, id=30)})
     made, _ = split_composites(steps, estimate, landmarks)
     assert set(targets(made)) == {7, 31}
+
+
+@pytest.mark.parametrize(("step_m", "parts"), [(0.03, 1), (0.1, 2)])
+def test_a_wall_of_which_two_visits_saw_a_part_each_has_a_step_by_their_biases(step_m, parts):
+    """Of 3 cm: a surface looks 1 cm nearer on one day. A door is told from its wall even so."""
+    door = (np.array([-0.45, step_m, 0.0]), 0.4)
+    steps, estimate, landmarks = seen(WALL + [door] * 12, np.random.default_rng(0))
+    landmarks.bias_m = 0.01
+    both = tuple(
+        replace(step, associations=tuple(replace(a, robot="s") for a in step.associations))
+        if k >= 20 else step
+        for k, step in enumerate(steps)
+    )  # fmt: skip
+    estimate = replace(estimate, states={"r": estimate.states["r"], "s": estimate.states["r"]})
+    made, _ = split_composites(both, estimate, landmarks)
+    assert len(set(targets(made))) == parts

@@ -10,7 +10,7 @@ from walls import rectangles
 import graphslam
 from graphslam.change_detection.visit import load_visit
 from graphslam.core.errors import ConfigError, EstimationError, OutputError
-from graphslam.core.geometry import rotation3
+from graphslam.core.geometry import rotate_cov, rotation3
 from graphslam.results.folder import JOINT_FILE
 from graphslam.results.known_map import (
     KNOWN_MAP_FILE,
@@ -122,11 +122,27 @@ def test_a_continued_map_is_better_and_names_its_parent(tmp_path, first_day):
     after = load_known_map(tmp_path / "later")
     assert after.parents == (("first", before.sha256),)
     assert after.name == "later"
-    cov = {mark.id: np.trace(mark.cov[:2, :2]) for mark in after.landmarks}
-    kept = [mark for mark in before.landmarks if mark.id in cov]
+    kept = [mark.id for mark in before.landmarks if mark.id in after.known.means]
     assert len(kept) >= len(before.landmarks) - 1
+    was, now = (known_map.known.covariance(kept) for known_map in (before, after))
+    dims = np.cumsum([0, *(len(before.known.means[number]) for number in kept)])[:-1]
     # widening may cost a wall that was not seen again a little
-    assert np.median([cov[mark.id] / np.trace(mark.cov[:2, :2]) for mark in kept]) < 1.0
+    assert np.median(np.diag(now)[dims + 1] / np.diag(was)[dims + 1]) < 1.0
+
+
+def test_landmarks_of_a_continued_map_are_those_of_its_joint_gaussian(tmp_path, first_day):
+    """Their means, and their covariances but for the widening."""
+    log = drive(tmp_path / "later.mcap", room=FURNISHED, phase=0.4, seed=4)
+    localised(log, first_day, output=tmp_path / "later", **{"known_map.update": True})
+    after = load_known_map(tmp_path / "later")
+    assert after.bias_m == graphslam.load_config().front_end.floor_normal_m
+    for mark in after.landmarks:
+        mean = after.known.means[mark.id]
+        np.testing.assert_array_equal(mark.position[: len(mean)], mean)
+        own = after.known.covariance([mark.id]) / after.known.root.widening
+        stated = mark.cov if mark.kind == "point" else rotate_cov(mark.cov, -mark.position[2])
+        # parents that are left out change it a little
+        np.testing.assert_allclose(np.diag(stated), np.diag(own), rtol=0.15)
 
 
 def test_what_is_gone_is_retired_and_what_is_new_added(tmp_path, first_day):
