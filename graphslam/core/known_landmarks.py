@@ -45,7 +45,10 @@ class KnownLandmarks(Record):
         ]
 
     def covariance(self, landmarks: Sequence[int]) -> Array:
-        """Joint covariance (D, D) of some landmarks, errors along their own axes."""
+        """Joint covariance (D, D) of some landmarks, m and rad, errors along their own axes.
+
+        The time grows with the cube of the number of all landmarks.
+        """
         dims = [len(self.means[n]) for n in self.numbers]
         first = dict(zip(self.numbers, np.cumsum([0, *dims])[:-1].tolist(), strict=True))
 

@@ -28,7 +28,8 @@ BETTER = 40.0
 ACROSS_M, ACROSS_SHARE = 0.5, 0.3
 #: m: the step between the parts, at least: less bends nothing
 STEP_M = 0.02
-#: and between what two visits saw that each saw one part: their difference, three times
+#: sigmas of one visit's error that the step is higher than, where each visit saw one part: three of
+#: the difference of two
 VISITS_SIGMAS = 3.0 * np.sqrt(2.0)
 #: m: one of the parts is shorter, as doors and cabinets are. That two long ones are in line says
 #: more of the direction of a corridor than all else
@@ -78,7 +79,7 @@ def parts_of(wall: WallObservations, bias_m: float) -> list[WallObservations]:
 def step_of(wall: WallObservations, bias_m: float) -> int | None:
     """Index of the first observation behind a step; None without one.
 
-    ``bias_m``: sigma of what two visits differ by that each saw one side.
+    ``bias_m``: sigma, m, of the error across the wall that all observations of a visit share.
     """
     n = len(wall.along)
     cuts = np.arange(LEAST, n - LEAST + 1)

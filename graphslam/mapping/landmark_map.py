@@ -68,7 +68,7 @@ class Entry:
         self.extent = np.array([min(self.extent[0], ends.min()), max(self.extent[1], ends.max())])
 
     def copied(self, number: int) -> "Entry":
-        """The same as landmark ``number``, to be changed by itself."""
+        """The same with another number; nothing that changes is shared."""
         return replace(
             self, id=number, mean=self.mean.copy(), extent=self.extent.copy(),
             path_m=dict(self.path_m), evidence=list(self.evidence),

@@ -21,8 +21,8 @@ LEAST_SIGMA_M = 1e-4
 #: returns that each part has at least: one line has two
 FEWEST = 2
 #: chance of a break where there is none. One too many costs a wall a little of its direction. One
-#: too few, of a door 0.1 m behind its wall seen from 12 m, is a line turned by 0.07 rad, from
-#: wherever both are seen alike: seven sigmas, which no later test of one observation would survive
+#: too few, of a door 0.1 m behind its wall seen from 12 m, is a line turned by 0.07 rad from
+#: wherever both are seen: seven of its sigmas, and always to the same side
 FALSE_BREAK = 0.03
 
 
