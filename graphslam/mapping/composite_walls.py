@@ -3,13 +3,16 @@
 A closed door lies a decimetre behind the wall that it is in. Segments that go across the step, and
 ends that are uncertain, tie both: one wall is estimated, which is turned by what lies between the
 parts, and the path with it. No single observation contradicts that by much. All together do: on
-either side of the step they have a line of their own, and the two lines do not meet.
+either side of the step they have a line of their own, and the two lines do not meet. A door has the
+wall on both sides, or on one.
 """
 
 import numpy as np
 
+from graphslam.core.geometry import Array
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Step
+from graphslam.mapping.gating import BoolArray, IntArray
 from graphslam.mapping.landmark_map import LandmarkMap
 from graphslam.mapping.wall_observations import (
     PATH_M,
@@ -34,6 +37,8 @@ VISITS_SIGMAS = 3.0 * np.sqrt(2.0)
 #: m: one of the parts is shorter, as doors and cabinets are. That two long ones are in line says
 #: more of the direction of a corridor than all else
 SHORT_M = 2.5
+#: m: parts are told apart to this
+CELL_M = 0.1
 
 
 def split_composites(
@@ -66,41 +71,76 @@ def split_composites(
 
 
 def parts_of(wall: WallObservations, bias_m: float) -> list[WallObservations]:
-    """The parts of a wall, in their order along it; itself if it is one."""
-    cut = step_of(wall, bias_m)
-    if cut is None:
+    """The parts of a wall; itself if it is one."""
+    aside = part_aside(wall, bias_m)
+    if aside is None:
         return [wall]
-    return [
-        *parts_of(wall.only(slice(cut)), bias_m),
-        *parts_of(wall.only(slice(cut, None)), bias_m),
-    ]
+    return [*parts_of(wall.only(~aside), bias_m), *parts_of(wall.only(aside), bias_m)]
 
 
-def step_of(wall: WallObservations, bias_m: float) -> int | None:
-    """Index of the first observation behind a step; None without one.
+def part_aside(wall: WallObservations, bias_m: float) -> BoolArray | None:
+    """Which observations (n,) show a part that stands aside from the others; None without one.
 
-    ``bias_m``: sigma, m, of the error across the wall that all observations of a visit share.
+    A part at an end is looked for first, then one with the others on both sides. ``bias_m``: sigma,
+    m, of the error across the wall that all observations of a visit share. The work grows with the
+    length of the wall and the number of observations.
     """
     n = len(wall.along)
     cuts = np.arange(LEAST, n - LEAST + 1)
-    if not len(cuts):
-        return None
-    A, b = wall.normal_equations()
-    A, b = np.cumsum(A, axis=0), np.cumsum(b, axis=0)
-    sides = [(A[cuts - 1], b[cuts - 1]), (A[-1] - A[cuts - 1], b[-1] - b[cuts - 1])]
+    for first, end in ((np.zeros_like(cuts), cuts), _inner_runs(wall.along)):
+        if len(first):
+            part = _best_part(wall, first, end, bias_m)
+            if part is not None:
+                return part
+    return None
+
+
+def _best_part(
+    wall: WallObservations, first: IntArray, end: IntArray, bias_m: float
+) -> BoolArray | None:
+    """Which observations (n,) are in the run whose line and that of the others fit best.
+
+    ``first`` and ``end`` (m,) are the runs. None where they are no two things.
+    """
+    n = len(wall.along)
+    A, b = (np.concatenate([0.0 * of[:1], np.cumsum(of, axis=0)]) for of in wall.normal_equations())
+    M, v = A[end] - A[first], b[end] - b[first]
+    sides = ((M, v), (A[-1] - M, b[-1] - v))
     lines = [np.linalg.solve(M, v[:, :, None])[:, :, 0] for M, v in sides]
     # what lines take off the squared error
     two = sum(np.einsum("ni,ni->n", v, line) for (_, v), line in zip(sides, lines, strict=True))
     gain = np.asarray(two) - b[-1] @ np.linalg.solve(A[-1], b[-1])
     best = int(gain.argmax())
-    cut = int(cuts[best])
-    edge = float(wall.along[cut - 1 : cut + 1].mean())
-    # of a wall that is bent, as its path is, most are across the edge
-    across = (wall.ends[:, 0] < edge - ACROSS_M) & (wall.ends[:, 1] > edge + ACROSS_M)
-    apart = np.count_nonzero(across) <= ACROSS_SHARE * min(cut, n - cut)
+    part = np.zeros(n, dtype=np.bool_)
+    part[first[best] : end[best]] = True
+    ends = np.array([k for k in (first[best], end[best]) if 0 < k < n])
+    edges = 0.5 * (wall.along[ends - 1] + wall.along[ends])
+    # of a wall that is bent, as its path is, most are across an edge
+    over = (wall.ends[:, :1] < edges - ACROSS_M) & (wall.ends[:, 1:] > edges + ACROSS_M)
+    fewer = min(np.count_nonzero(part), np.count_nonzero(~part))
+    apart = np.count_nonzero(over.any(axis=1)) <= ACROSS_SHARE * fewer
     least = STEP_M
-    if not set(wall.robot[:cut]) & set(wall.robot[cut:]):
+    if not set(wall.robot[part]) & set(wall.robot[~part]):
         least = max(least, VISITS_SIGMAS * np.hypot(bias_m, PATH_M))
-    high = abs(np.array([1.0, edge]) @ (lines[1][best] - lines[0][best])) > least
-    short = min(wall.only(slice(cut)).length, wall.only(slice(cut, None)).length) < SHORT_M
-    return cut if apart and high and short and gain[best] > BETTER else None
+    off = lines[0][best] - lines[1][best]
+    far = (abs(off[0] + edges * off[1]) > least).all()
+    short = min(wall.only(part).length, wall.only(~part).length) < SHORT_M
+    return part if apart and far and short and gain[best] > BETTER else None
+
+
+def _inner_runs(along: Array) -> tuple[IntArray, IntArray]:
+    """First (m,) and end (m,) of short runs of observations (n,), with others on both sides.
+
+    ``along`` (n,) m, sorted, is where these are. Their number grows with the length of the wall.
+    """
+    cells = np.arange(along[0], along[-1], CELL_M)[1:]
+    cuts = np.unique(np.searchsorted(along, cells))
+    cuts = cuts[(cuts >= LEAST) & (len(along) - cuts >= LEAST)]
+    if not len(cuts):
+        return cuts, cuts
+    steps = np.arange(1, int(SHORT_M / CELL_M) + 1)
+    i, j = (of.ravel() for of in np.broadcast_arrays(np.arange(len(cuts))[:, None], steps))
+    i, j = i[i + j < len(cuts)], (i + j)[i + j < len(cuts)]
+    first, end = cuts[i], cuts[j]
+    may = (end - first >= LEAST) & (along[end - 1] - along[first] <= SHORT_M)
+    return first[may], end[may]

@@ -14,7 +14,7 @@ import numpy as np
 from graphslam.core.geometry import Array, between, compose, rotation3
 from graphslam.core.record import replace
 from graphslam.core.records import Association, Estimate, Step
-from graphslam.mapping.gating import IntArray
+from graphslam.mapping.gating import BoolArray, IntArray
 from graphslam.mapping.landmark_map import LandmarkMap, observed_from, retarget
 
 #: m, rad: error of a visit's path where it sees a wall
@@ -37,8 +37,8 @@ class WallObservations:
     index: IntArray
     robot: np.ndarray[Any, np.dtype[np.str_]]
 
-    def only(self, which: slice) -> "WallObservations":
-        """Some of them."""
+    def only(self, which: BoolArray) -> "WallObservations":
+        """Some of them (n,)."""
         return WallObservations(
             self.along[which], self.measured[which], self.weight[which], self.ends[which],
             self.index[which], self.robot[which],

@@ -19,6 +19,7 @@ from graphslam.core.records import Closure, Estimate, KeyframeScan, Start, Step
 from graphslam.estimation.batch_calibration import ROUNDS, calibrate, recompute_motions
 from graphslam.estimation.calibration_graph import CalibratedSolution
 from graphslam.estimation.isam2 import Reoptimiser
+from graphslam.mapping.composite_walls import split_composites
 from graphslam.mapping.duplicate_landmarks import (
     find_duplicates,
     merged,
@@ -101,6 +102,7 @@ def reoptimise_scan_log(
         )
     association = config.association
     for factor_m, factor_rad in GATE_FACTORS:
+        steps, estimate = split_composites(steps, estimate, landmarks)
         estimate = solve(steps, estimate, closures)
         landmarks.update_from(steps, estimate)
         known = [e for e in landmarks.entries.values() if e.id in estimate.landmarks]

@@ -76,6 +76,15 @@ def test_a_wall_between_two_doors_is_three_things():
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_a_door_with_the_wall_on_both_sides_is_told_from_it(seed):
+    """Breaks if only a step is looked for: both sides of one show much of the wall."""
+    sides = [(np.array([along, 0.0, 0.0]), 0.5) for along in np.linspace(-8, -1.5, 30)]
+    things = sides + [DOOR] * 12 + WALL * 2
+    made, *_ = split_composites(*seen(things, np.random.default_rng(seed)))
+    assert targets(made) == [7] * 30 + [8] * 12 + [7] * 40
+
+
 @pytest.mark.parametrize(
     "things",
     [
