@@ -178,6 +178,8 @@ class KeyframeConfig:
     `all` = at every odometry, scan and sighting stamp.
     sighting_window_s: in logs of several robots without scans, sightings within this span enter as
     one step, transported to its end by odometry.
+    scans_between: how scans without a state follow from the states around them (back end batch):
+    `map` = by odometry, and matched to the walls of the final map; `odometry` = by that alone.
     """
 
     mode: Literal["motion", "all"] = "motion"
@@ -185,6 +187,7 @@ class KeyframeConfig:
     angle_rad: float = 0.15
     scan_angle_rad: float = 0.25
     sighting_window_s: float = 0.8
+    scans_between: Literal["map", "odometry"] = "map"
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ from operator import is_
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array, between, rotation3, transform_each, unit_vectors, wrap
@@ -22,9 +21,8 @@ from graphslam.core.record import replace
 from graphslam.core.records import Association, Estimate, KeyframeScan, Step
 from graphslam.mapping.gating import BoolArray, IntArray
 from graphslam.mapping.landmark_map import Entry, observed_from
+from graphslam.mapping.returns_on_walls import OnWalls, WallTree, returns_on_walls
 from graphslam.mapping.submaps import State
-from graphslam.mapping.wall_samples import sample_walls
-from graphslam.perception.line_fit import SMALLEST_SIGMA_M
 
 #: rad: how well the direction of a scan is known before (one sigma)
 HEADING_RAD = 0.003
@@ -33,12 +31,6 @@ HEADING_RAD = 0.003
 GATE = 1.7
 #: m beyond the ends of a segment where returns may be of it, and of a wall where they may be on it
 MARGIN_M = 0.2
-#: m: walls are sampled at this distance to find those near a return
-SAMPLE_M = 0.5
-#: walls near a return that are looked at
-NEIGHBOURS = 4
-#: m: returns that are nearer to each other along a wall share the deviation of its surface
-SURFACE_M = 1.0
 #: m, rad: along a wall, and its direction, of which returns say nothing
 OPEN_M, OPEN_RAD = 1.0, 0.2
 #: returns on a wall that has no observation in the scan yet; such walls per scan, those with the
@@ -74,12 +66,15 @@ def with_loose_returns(
         for a in step.associations:
             if a.extent is not None and a.target in row:
                 seen[a.robot, a.time_ns].append(a)
-    tree = _WallTree.from_walls(walls)
+    numbers = np.array([wall.id for wall in walls])
+    tree = WallTree.from_walls(
+        np.array([wall.mean for wall in walls]), np.array([wall.extent for wall in walls])
+    )
     changed: dict[int, Association] = {}
     new: dict[State, list[Association]] = {}
     for begin in range(0, len(used), BLOCK):
         views = _Views.of(used[begin : begin + BLOCK], estimate)
-        for before, after in _observed(views, _Seen.of(seen, views, row), tree, config):
+        for before, after in _observed(views, _Seen.of(seen, views, row), tree, numbers, config):
             if before is not None:
                 changed[id(before)] = after
             else:
@@ -88,17 +83,20 @@ def with_loose_returns(
 
 
 def _observed(
-    views: "_Views", seen: "_Seen", tree: "_WallTree", config: FrontEndConfig
+    views: "_Views", seen: "_Seen", tree: WallTree, numbers: IntArray, config: FrontEndConfig
 ) -> Iterator[tuple[Association | None, Association]]:
-    """Observations of walls with the loose returns on these, each with that before, if any."""
-    walls = tree.walls
+    """Observations of walls with the loose returns on these, each with that before, if any.
+
+    ``numbers`` (n,): of the landmarks that the walls of the tree are.
+    """
+    walls = len(numbers)
     loose = np.flatnonzero(~_in_segments(seen, views, config.split_m))
     found = _on_walls(loose, views, tree, config)
     if not len(found.row):
         return
-    pair, of = np.unique(views.scan[found.row] * len(walls) + found.wall, return_inverse=True)
-    scan, wall = pair // len(walls), pair % len(walls)
-    known = seen.among(pair, len(walls))
+    pair, of = np.unique(views.scan[found.row] * walls + found.wall, return_inverse=True)
+    scan, wall = pair // walls, pair % walls
+    known = seen.among(pair, walls)
     # around what the deviations of returns are measured: the wall as observed, or as predicted
     line = between(views.poses[scan], tree.means[wall])
     middle = np.bincount(of, found.along) / np.bincount(of)
@@ -118,7 +116,7 @@ def _observed(
     for n in _most_seen(np.bincount(of), scan, ~has).tolist():
         robot, time_ns = views.states[scan[n]]
         extent = np.array([low[n], high[n]]) - middle[n]
-        number = walls[wall[n]].id
+        number = int(numbers[wall[n]])
         yield None, Association(robot, time_ns, number, "line", z[n], cov[n], extent=extent)
 
 
@@ -212,81 +210,20 @@ def _in_segments(seen: _Seen, views: _Views, reach_m: float) -> BoolArray:
     return found
 
 
-class _OnWalls(NamedTuple):
-    """Returns on walls: ``row`` (k,) of `_Views.points`, ``wall`` (k,) row of `_WallTree.means`.
-
-    ``along`` (k,) m: where on the wall, along its x axis; ``sigma`` (k,) m: noise across it.
-    """
-
-    row: IntArray
-    wall: IntArray
-    along: Array
-    sigma: Array
-
-
-def _on_walls(
-    loose: IntArray, views: _Views, tree: "_WallTree", config: FrontEndConfig
-) -> _OnWalls:
-    """Loose returns (rows) that lie on one wall as it is predicted.
-
-    Those that may be on either of two are left out. Where a door and the wall beside it were taken
-    for one wall, between the two, each of their returns would confirm it.
-    """
-    world = transform_each(views.poses[views.scan[loose]], views.points[loose])
-    k, wall = tree.near(world)
-    row = loose[k]
-    predicted = between(views.poses[views.scan[row]], tree.means[wall])
-    along, across = _along_and_across(views.points[row], predicted, np.arange(len(row)))
-    beam = views.points[row] - views.lasers[views.scan[row]]
-    c, s = np.cos(predicted[:, 2]), np.sin(predicted[:, 2])
-    lever, normal = c * beam[:, 0] + s * beam[:, 1], c * beam[:, 1] - s * beam[:, 0]
-    noise = config.range_sigma_m * np.abs(normal) / np.hypot(lever, normal)
-    sigma = np.maximum(noise, max(config.floor_normal_m, SMALLEST_SIGMA_M))
-    low, high = tree.extents.T
-    fits = np.flatnonzero(
-        (normal < 0)  # seen from the side on which the sensor is
-        & (along > low[wall] - MARGIN_M)
-        & (along < high[wall] + MARGIN_M)
-        & (np.abs(across) < GATE * np.hypot(sigma, HEADING_RAD * lever))
-    )
-    # `row` is sorted: those that fit one wall alone
-    first = np.diff(row[fits], prepend=-1) > 0
-    last = np.diff(row[fits], append=-1) != 0
-    fits = fits[first & last]
-    return _OnWalls(row[fits], wall[fits], along[fits], sigma[fits])
-
-
-class _WallTree(NamedTuple):
-    """Walls (n), to be found by places: ``of`` (s,) is the wall of each point in ``samples``.
-
-    ``means`` (n, 3) and ``extents`` (n, 2) are those of the landmarks, world frame.
-    """
-
-    walls: Sequence[Entry]
-    means: Array
-    extents: Array
-    samples: cKDTree
-    of: IntArray
-
-    @classmethod
-    def from_walls(cls, walls: Sequence[Entry]) -> "_WallTree":
-        """The tree of some walls."""
-        means, extents = np.array([e.mean for e in walls]), np.array([e.extent for e in walls])
-        points, of = sample_walls(means, extents, SAMPLE_M)
-        return cls(walls, means, extents, cKDTree(points), of)
-
-    def near(self, points: Array) -> tuple[IntArray, IntArray]:
-        """Pairs (p,), (p,) of a point (n, 2) and a wall near it, sorted."""
-        _, sample = self.samples.query(points, NEIGHBOURS, distance_upper_bound=SAMPLE_M)
-        found = sample < len(self.of)
-        k, _ = np.nonzero(found)
-        pair = np.sort(k * len(self.means) + self.of[sample[found]])  # faster than `unique` here
-        pair = pair[np.diff(pair, prepend=-1) > 0]
-        return pair // len(self.means), pair % len(self.means)
+def _on_walls(loose: IntArray, views: _Views, tree: WallTree, config: FrontEndConfig) -> OnWalls:
+    """Loose returns (rows of `_Views.points`) that lie on one wall as it is predicted."""
+    scan = views.scan[loose]
+    world = transform_each(views.poses[scan], views.points[loose])
+    lasers = transform_each(views.poses, views.lasers)[scan]
+    found = returns_on_walls(
+        tree.near(world), world, lasers, tree, config,
+        gate=GATE, margin_m=MARGIN_M, heading_rad=HEADING_RAD,
+    )  # fmt: skip
+    return found._replace(row=loose[found.row])
 
 
 def _measured(
-    line: Array, V: Array, of: IntArray, found: _OnWalls, points: Array, floor_m: float
+    line: Array, V: Array, of: IntArray, found: OnWalls, points: Array, floor_m: float
 ) -> tuple[Array, Array]:
     """Lines (m, 3) corrected by returns: the linear update of offset and direction.
 
@@ -303,12 +240,7 @@ def _measured(
         The lines, and their covariances along the axes of the states' frames.
     """
     along, across = _along_and_across(points, line, of)
-    surface = np.floor(found.along / SURFACE_M).astype(np.int64)
-    surface -= surface.min()
-    _, which, count = np.unique(
-        of * (surface.max() + 1) + surface, return_inverse=True, return_counts=True
-    )
-    weight = 1.0 / (found.sigma**2 + count[which] * floor_m**2)
+    weight = found.weights(of, floor_m)
     information = np.zeros((len(line), 2, 2))
     known = np.isfinite(V[:, 1, 1])
     information[known] = np.linalg.inv(V[known, 1:, 1:])

@@ -32,6 +32,27 @@ IntArray = np.ndarray[tuple[int], np.dtype[np.int64]]
 HALF_SPAN_NS = 250_000_000
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class MatchedScans:
+    """Scans between states whose poses are known better than by odometry.
+
+    ``times_ns`` (m,), sorted; ``offsets`` (m, 3): their poses seen from where `between_states` has
+    them; ``covs`` (m, 3, 3) of these given the states, along their own axes.
+    """
+
+    times_ns: IntArray
+    offsets: Array
+    covs: Array
+
+    def among(self, times_ns: IntArray) -> tuple[IntArray, IntArray]:
+        """Rows of ``times_ns`` (n,) and rows of these scans, of those that are in both."""
+        if not len(self.times_ns):
+            return self.times_ns, self.times_ns
+        at = np.minimum(np.searchsorted(self.times_ns, times_ns), len(self.times_ns) - 1)
+        there = np.flatnonzero(self.times_ns[at] == times_ns)
+        return there, at[there]
+
+
 def causal_at(
     states: Trajectory,
     last: IntArray,
@@ -90,6 +111,11 @@ class _Interval:
         share = np.clip(np.where(driven > 0, share, 0.0), 0.0, 1.0)
         return cls(i, following, inside, share, delta, noise, whole, whole_noise)
 
+    def noise_between(self) -> Array:
+        """Covariances (n, 3, 3) given the states, along the axes of the one before."""
+        s = self.share[:, None, None]
+        return np.where(self.inside[:, None, None], s * (1 - s) * self.whole_noise, self.noise)
+
 
 def final_at(
     states: Trajectory, track: Track, times_ns: IntArray, stamps_ns: IntArray
@@ -105,30 +131,51 @@ def final_at(
         times_ns: (n,) when.
         stamps_ns: (n,) what the result is stamped with.
     """
-    return _final(states, _Interval.of(states, track, times_ns), stamps_ns)
+    interval = _Interval.of(states, track, times_ns)
+    poses = _between(states, interval)
+    return Trajectory(stamps_ns, poses, _covs(states, interval, poses, interval.noise_between()))
 
 
-def _final(states: Trajectory, interval: _Interval, stamps_ns: IntArray) -> Trajectory:
-    i, following, inside = interval.before, interval.following, interval.inside
-    delta, noise, whole_noise = interval.delta, interval.noise, interval.whole_noise
-    share = interval.share
+def between_states(states: Trajectory, track: Track, times_ns: IntArray) -> tuple[Array, Array]:
+    """Poses (n, 3) at ``times_ns`` (n,), see `final_at`, and covariances (n, 3, 3) of them.
+
+    The latter are given the states, along the axes of each pose.
+    """
+    interval = _Interval.of(states, track, times_ns)
+    poses = _between(states, interval)
+    turn = states.poses[interval.before, 2] - poses[:, 2]
+    return poses, rotate_cov(interval.noise_between(), turn)
+
+
+def _between(states: Trajectory, interval: _Interval) -> Array:
+    i, following = interval.before, interval.following
     miss = log(between(compose(states.poses[i], interval.whole), states.poses[following]))
-    poses = compose(states.poses[i], delta)
-    poses = compose(poses, exp(share[:, None] * np.where(inside[:, None], miss, 0.0)))
+    poses = compose(states.poses[i], interval.delta)
+    miss = np.where(interval.inside[:, None], miss, 0.0)
+    return compose(poses, exp(interval.share[:, None] * miss))
+
+
+def _covs(states: Trajectory, interval: _Interval, poses: Array, noise: Array) -> Array:
+    """Covariances (n, 3, 3) of poses between states, ``noise`` (n, 3, 3) being that given these.
+
+    The noise is along the axes of the state before.
+    """
+    i, s = interval.before, interval.share[:, None, None]
     F, _ = compose_jacobians(states.poses[i], between(states.poses[i], poses))
-    s, turn = share[:, None, None], rotation3(states.poses[i, 2])
     propagated = F @ states.covs[i] @ F.mT
-    bridge = (
-        (1 - s) * propagated
-        + s * states.covs[following]
-        + turn @ (s * (1 - s) * whole_noise) @ turn.mT
-    )
-    beyond = propagated + turn @ noise @ turn.mT
-    return Trajectory(stamps_ns, poses, np.where(inside[:, None, None], bridge, beyond))
+    bridge = (1 - s) * propagated + s * states.covs[interval.following]
+    turn = rotation3(states.poses[i, 2])
+    known = np.where(interval.inside[:, None, None], bridge, propagated)
+    return np.asarray(known + turn @ noise @ turn.mT)
 
 
 def final_scans(
-    states: Trajectory, track: Track, times_ns: IntArray, stamps_ns: IntArray, mounts: Array
+    states: Trajectory,
+    track: Track,
+    times_ns: IntArray,
+    stamps_ns: IntArray,
+    mounts: Array,
+    matched: MatchedScans | None = None,
 ) -> tuple[Trajectory, ScanTies]:
     """Poses of the states' frame at scans, see `final_at`, and how those of the scans follow.
 
@@ -141,19 +188,20 @@ def final_scans(
         times_ns: (n,) of the scans.
         stamps_ns: (n,) what the result is stamped with.
         mounts: (n, 3) of the scans' sensors in the frame of the states.
+        matched: scans that are known better.
     """
     interval = _Interval.of(states, track, times_ns)
-    final = _final(states, interval, stamps_ns)
-    i, share = interval.before, interval.share
-    noise = np.where(
-        interval.inside[:, None, None],
-        (share * (1 - share))[:, None, None] * interval.whole_noise,
-        interval.noise,
-    )
+    poses, before = _between(states, interval), interval.before
+    noise = interval.noise_between()
+    if matched is not None:
+        own, row = matched.among(times_ns)
+        poses[own] = compose(poses[own], matched.offsets[row])
+        noise[own] = rotate_cov(matched.covs[row], poses[own, 2] - states.poses[before[own], 2])
+    final = Trajectory(stamps_ns, poses, _covs(states, interval, poses, noise))
     # from the axes of the state before to those of the robot at the scan, then about the sensor
-    noise = rotate_cov(noise, states.poses[i, 2] - final.poses[:, 2])
+    noise = rotate_cov(noise, states.poses[before, 2] - poses[:, 2])
     J = adjoint(inverse(mounts))
-    return final, ScanTies(i, share, mounts, J @ noise @ J.mT)
+    return final, ScanTies(before, interval.share, mounts, J @ noise @ J.mT)
 
 
 def trajectory_of_mount(base: Trajectory, mounts: Array) -> Trajectory:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphslam.core.geometry import Array, polar_points, transform
+from graphslam.core.record import replace
 from graphslam.core.records import Scan
 from graphslam.perception.line_moments import point_moments
 
@@ -87,6 +88,24 @@ def _open_circle(ranges: Array, angles: Array) -> tuple[Array, Array]:
     known = np.nan_to_num(ranges, nan=0.0, posinf=0.0, neginf=0.0)
     start = int(np.argmax(np.abs(known - np.roll(known, 1))))
     return np.roll(ranges, -start), np.roll(angles, -start)
+
+
+def thinned(scan: Scan, most: int) -> Scan:
+    """A scan of which only each second, third, ... beam is left, at most so many."""
+    n = len(scan.ranges)
+    every = -(-n // most)
+    if every <= 1:
+        return scan
+    # the beam that was measured at the time of the scan stays
+    first = (n - 1) % every if scan.beam_period_s < 0 else 0
+    return replace(
+        scan,
+        ranges=scan.ranges[first::every],
+        angle_min_rad=scan.angle_min_rad + first * scan.angle_step_rad,
+        angle_step_rad=every * scan.angle_step_rad,
+        beam_period_s=every * scan.beam_period_s,
+        bearings=None if scan.bearings is None else scan.bearings[first::every],
+    )
 
 
 def scan_points(scan: Scan, max_range_m: float) -> Array:

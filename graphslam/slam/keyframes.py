@@ -36,24 +36,27 @@ class KeyframeSelector:
             run.scanned_ns = first.time_ns
         return used
 
-    def used_scans(self, scans: Sequence[Scan], run: RobotState) -> list[Scan]:
-        """Those of consecutive scans of a robot for which `is_used` holds, at once.
+    def used_scans(self, scans: Sequence[Scan], run: RobotState) -> tuple[list[Scan], list[Scan]]:
+        """Those of consecutive scans of a robot for which `is_used` holds, at once; and others.
 
-        Those that `RobotState.repeats` leaves out are not among them.
+        The others were measured while the robot drove. Those that `RobotState.repeats` leaves out
+        are among neither.
         """
         scans = [scan for scan in scans if not run.repeats.leaves_out(scan, run.track)]
         if self._config.mode == "all" or not scans:
-            return scans
+            return scans, []
         since = scans[0].time_ns if run.scanned_ns is None else run.scanned_ns
         times = np.array([since, *(scan.time_ns for scan in scans)], dtype=np.int64)
         (path_m, heading), *driven = run.track.driven(times).tolist()
-        used, angle_rad = [], self._config.scan_angle_rad
+        used, others, angle_rad = [], [], self._config.scan_angle_rad
         for scan, (at_m, at_rad) in zip(scans, driven, strict=True):
             turned = abs(float(wrap(at_rad - heading)))
             if run.scanned_ns is None or self._is_far(at_m - path_m, turned, angle_rad):
                 run.scanned_ns, path_m, heading = scan.time_ns, at_m, at_rad
                 used.append(scan)
-        return used
+            elif at_m > path_m or turned:
+                others.append(scan)
+        return used, others
 
     def gets_state(self, event: Sequence[Message], run: RobotState) -> bool:
         """Whether a used event gets a state at its own time; else it is moved to the last one."""

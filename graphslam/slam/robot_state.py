@@ -5,13 +5,18 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array, between, compose, inverse
 from graphslam.core.motion_models import Calibration
 from graphslam.core.mount_covariances import MountCovariance
 from graphslam.core.records import Motion, RobotResult, Trajectory
 from graphslam.logs.clock import Clock
+from graphslam.mapping.returns_on_walls import WallTree
+from graphslam.mapping.scan_to_map import ScanReturns, match_to_walls
 from graphslam.odometry.interpolation import (
     IntArray,
+    MatchedScans,
+    between_states,
     causal_at,
     final_at,
     final_scans,
@@ -39,7 +44,8 @@ class RobotState:
 
     ``times``: of the states, ns; for each state there is the causal pose, its covariance and the
     calibration known then. ``latest_pose`` (3,) is the present estimate of the latest one: after a
-    batch step by more than when it was made. ``scans``: (stamp, time, mount) of each;
+    batch step by more than when it was made. ``scans``: (stamp, time, mount) of each; ``returns``
+    of those without a state, which ``matched`` says the poses of;
     ``scanned_ns``: time of the last one used. States are poses of the sensor; the base is where the
     calibrated mount puts it. ``is_calibrated``: the track's calibration was estimated together with
     all states. ``scan``: time and submap of the latest state that has a scan; ``contradicted``: how
@@ -63,6 +69,8 @@ class RobotState:
     contradicted: int = 0
     clock: Clock = field(default_factory=Clock)
     repeats: RepeatedScans = field(default_factory=RepeatedScans)
+    returns: ScanReturns | None = None
+    matched: MatchedScans | None = None
 
     def __post_init__(self) -> None:
         """Calibrate the track's odometry by its own settings."""
@@ -147,6 +155,24 @@ class RobotState:
         scan = trajectory_of_mount(causal, laser) if self.scans else None
         return Causal(trajectory_of_mount(causal, inverse(mount)), scan)
 
+    def match_scans(
+        self, states: Trajectory, walls: WallTree | None, config: FrontEndConfig
+    ) -> None:
+        """Match scans without a state to the walls of the map, see `scan_to_map`.
+
+        ``states`` are the final ones, ``walls`` those of the map beside them.
+        """
+        returns, self.returns = self.returns, None
+        if returns is None or not len(returns.times_ns):
+            return
+        states = self.track.at_first_laser(states)
+        poses, covs = between_states(states, self.track, returns.times_ns)
+        found, covs = match_to_walls(poses, covs, returns, walls, config)
+        order = np.argsort(returns.times_ns, kind="stable")
+        self.matched = MatchedScans(
+            returns.times_ns[order], between(poses, found)[order], covs[order]
+        )
+
     def result(
         self,
         states: Trajectory,
@@ -169,7 +195,7 @@ class RobotState:
         ties = None
         late_ns = 0
         if self.scans:
-            final, ties = final_scans(states, self.track, times, stamps, laser)
+            final, ties = final_scans(states, self.track, times, stamps, laser, self.matched)
         else:
             late_ns = self.track.reported_late_ns(self.track.calibration)
             times = times + late_ns

@@ -7,12 +7,13 @@ from walls import AROUND, L_ROOM, cast
 
 from graphslam.core.config import Config, LogsConfig, OdometryConfig, RobotConfig
 from graphslam.core.geometry import compose, exp, inverse, transform
+from graphslam.core.record import replace
 from graphslam.core.records import OdometryPose, Scan
 from graphslam.logs import LogWriter, open_logs
 from graphslam.odometry.laser_odometry import with_laser_odometry
 from graphslam.odometry.preintegration import Track
 from graphslam.odometry.sweep_motion import sweep_end_ns, undistorted, undistorted_by_track
-from graphslam.perception.ordered_scan import scan_points
+from graphslam.perception.ordered_scan import scan_points, thinned
 from graphslam.simulation import simulate
 
 S = 1_000_000_000
@@ -78,6 +79,21 @@ def test_returns_lie_where_they_were_measured(backwards):
     assert np.isnan(mended.ranges[7]) and np.isfinite(mended.bearings).all()
     assert mended.beam_period_s == 0.0 and mended.time_ns == scan.time_ns
     assert sweep_end_ns(scan) - scan.time_ns == pytest.approx(0.1 * S, rel=0.01)
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_a_thinned_scan_has_some_of_the_returns(backwards):
+    """Each where it was measured, also where the last beam is measured first: on the walls to
+    0.1 mm once the robot's motion is taken out. Their number is no multiple of those that stay."""
+    scan = swept(backwards, start_s=0.2)
+    thin = thinned(scan, 50)
+    assert len(thin.ranges) == 45 and (N - 1) % 8
+    (mended,) = undistorted_by_track([thin], driven())
+    assert off_walls(mended, base(0.2)) < 1e-4
+    assert sweep_end_ns(thin) <= sweep_end_ns(scan)
+    told = replace(scan, bearings=scan.angles, angle_min_rad=np.nan)
+    np.testing.assert_allclose(thinned(told, 50).angles, thin.angles, atol=1e-12)
+    assert thinned(scan, N) is scan
 
 
 def test_a_scan_of_one_instant_is_left_alone():

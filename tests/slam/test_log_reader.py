@@ -1,5 +1,7 @@
 """Reading that begins in the second process while the first loads libraries."""
 
+import itertools
+
 import numpy as np
 import pytest
 import three_robots
@@ -51,10 +53,17 @@ def test_keyframes_of_a_block_are_those_found_one_by_one():
         scans = [message for message in read if isinstance(message, Scan)]
         runs.append(run)
     one_by_one = [s.time_ns for s in scans if selector.is_used((s,), runs[0])]
-    at_once = [
-        scan.time_ns
-        for block in np.array_split(np.arange(len(scans)), 7)
-        for scan in selector.used_scans([scans[k] for k in block], runs[1])
-    ]
+    at_once, others = [], []
+    for block in np.array_split(np.arange(len(scans)), 7):
+        used, driven = selector.used_scans([scans[k] for k in block], runs[1])
+        at_once += [scan.time_ns for scan in used]
+        others += [scan.time_ns for scan in driven]
     assert 10 < len(one_by_one) < len(scans)
     assert at_once == one_by_one
+    # of the others those are left out that were measured while the robot stood
+    assert others and not set(others) & set(at_once)
+    for a, b in itertools.pairwise(one_by_one):
+        between = [s.time_ns for s in scans if a < s.time_ns < b]
+        assert [t for t in between if any(runs[1].track.moved(a, t))] == [
+            t for t in others if a < t < b
+        ]
