@@ -18,8 +18,6 @@ from graphslam.core.geometry import Array, between, rotate_cov, transform_each, 
 from graphslam.mapping.gating import IntArray
 from graphslam.mapping.returns_on_walls import WallTree, returns_on_walls
 
-Stamps = np.ndarray[tuple[int], np.dtype[np.int64]]
-
 #: sigmas that a return may be off the wall that it is taken for, and from which on it pulls with
 #: less than its distance (Huber)
 GATE, HUBER = 2.5, 1.5
@@ -40,11 +38,10 @@ BLOCK = 512
 class ScanReturns:
     """Some returns of each of n scans.
 
-    ``times_ns`` (n,); ``number`` (n,) how many of ``points`` (k, 2) m are of each, one scan after
-    the other, in the frame in which its pose is asked for, with the laser at ``lasers`` (n, 2) m.
+    ``number`` (n,): how many of ``points`` (k, 2) m are of each, one scan after the other, in the
+    frame in which its pose is asked for, with the laser at ``lasers`` (n, 2) m.
     """
 
-    times_ns: Stamps
     number: IntArray
     points: Array
     lasers: Array
@@ -61,9 +58,7 @@ class ScanReturns:
         for begin in range(0, len(self.number), size):
             own = slice(begin, min(begin + size, len(self.number)))
             points = self.points[ends[begin] - self.number[begin] : ends[own.stop - 1]]
-            found.append(
-                (own, ScanReturns(self.times_ns[own], self.number[own], points, self.lasers[own]))
-            )
+            found.append((own, ScanReturns(self.number[own], points, self.lasers[own])))
         return found
 
 

@@ -32,13 +32,12 @@ from graphslam.mapping.duplicate_landmarks import (
     merged,
     seen_together,
 )
-from graphslam.mapping.landmark_map import LandmarkMap, mean_landmarks
+from graphslam.mapping.landmark_map import mean_landmarks
 from graphslam.mapping.loop_closure import Tamper, fix_position
 from graphslam.mapping.loose_returns import with_loose_returns
 from graphslam.mapping.moved_walls import part_moved
 from graphslam.mapping.reassociation import reassociate
 from graphslam.mapping.redundant_closures import untied_closures
-from graphslam.mapping.returns_on_walls import WallTree
 from graphslam.mapping.visits import tie_visits
 from graphslam.odometry.preintegration import Track
 from graphslam.slam.log_pass import timed
@@ -93,10 +92,6 @@ def optimise_scan_log(
         start = Estimate(paths.states, marks, 0.0, 0)
         estimate, steps = _solved(steps, start, paths, scan_log, tracks)
     scan_log.steps = list(steps)
-    with timed(seconds, "scan matching"):
-        walls = _walls(scan_log.landmarks, estimate)
-        for name, run in scan_log.started.items():
-            run.match_scans(estimate.states[name], walls, config.front_end)
     return estimate
 
 
@@ -207,16 +202,6 @@ def _solved(
     # what the second process does meanwhile moves the estimate by far less than scans can tell
     scan_log.scan_evidence = gather_scan_evidence(scan_log, estimate, parked)
     return moved_to(minimum.result(), estimate) if minimum else estimate, steps
-
-
-def _walls(landmarks: LandmarkMap, estimate: Estimate) -> WallTree | None:
-    """The walls of the map where the estimate has them; None without any."""
-    found = [
-        (estimate.landmarks[number][0], entry.extent)
-        for number, entry in landmarks.entries.items()
-        if number in estimate.landmarks and entry.kind != "point"
-    ]
-    return WallTree.from_walls(*map(np.array, zip(*found, strict=True))) if found else None
 
 
 def _count_observations(steps: tuple[Step, ...]) -> int:

@@ -57,6 +57,7 @@ from graphslam.slam.log_reader import TRUE_RECORDS
 from graphslam.slam.recorded_closures import between_states
 from graphslam.slam.robot_settings import outlines
 from graphslam.slam.robot_sightings import RobotCandidates, with_named_robots
+from graphslam.slam.scans_between import are_matched
 from graphslam.slam.sighting_batches import (
     Event,
     SightingBatch,
@@ -315,6 +316,8 @@ class Pipeline(StepRecorder):
             event = self.robot_detector.process(first, used, self.has_started)
             if self.config.association.robot_sightings == "ignore":
                 event = [m for m in event if isinstance(m, Scan)]
+            if not used and are_matched(self.config):
+                run.keep_between(first, self.config.front_end)
         elif not used:
             event = ()
         if not event:

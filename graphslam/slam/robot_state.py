@@ -9,14 +9,11 @@ from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array, between, compose, inverse
 from graphslam.core.motion_models import Calibration
 from graphslam.core.mount_covariances import MountCovariance
-from graphslam.core.records import Motion, RobotResult, Trajectory
+from graphslam.core.records import Motion, RobotResult, Scan, Trajectory
 from graphslam.logs.clock import Clock
-from graphslam.mapping.returns_on_walls import WallTree
-from graphslam.mapping.scan_to_map import ScanReturns, match_to_walls
 from graphslam.odometry.interpolation import (
     IntArray,
     MatchedScans,
-    between_states,
     causal_at,
     final_at,
     final_scans,
@@ -31,6 +28,7 @@ from graphslam.odometry.preintegration import Track
 from graphslam.odometry.readings import EDGE_NS
 from graphslam.perception.scan_matching import Submap
 from graphslam.slam.repeated_scans import RepeatedScans
+from graphslam.slam.scans_between import ScansBetween
 
 #: Hz at which the base of a robot without scans is reported
 BASE_RATE_HZ = 10
@@ -44,8 +42,8 @@ class RobotState:
 
     ``times``: of the states, ns; for each state there is the causal pose, its covariance and the
     calibration known then. ``latest_pose`` (3,) is the present estimate of the latest one: after a
-    batch step by more than when it was made. ``scans``: (stamp, time, mount) of each; ``returns``
-    of those without a state, which ``matched`` says the poses of;
+    batch step by more than when it was made. ``scans``: (stamp, time, mount) of each; ``between``:
+    returns of those without a state, where they are kept;
     ``scanned_ns``: time of the last one used. States are poses of the sensor; the base is where the
     calibrated mount puts it. ``is_calibrated``: the track's calibration was estimated together with
     all states. ``scan``: time and submap of the latest state that has a scan; ``contradicted``: how
@@ -69,8 +67,7 @@ class RobotState:
     contradicted: int = 0
     clock: Clock = field(default_factory=Clock)
     repeats: RepeatedScans = field(default_factory=RepeatedScans)
-    returns: ScanReturns | None = None
-    matched: MatchedScans | None = None
+    between: ScansBetween = field(default_factory=ScansBetween)
 
     def __post_init__(self) -> None:
         """Calibrate the track's odometry by its own settings."""
@@ -85,6 +82,11 @@ class RobotState:
     def state_ns(self) -> int:
         """Time of the latest state; -1 before the first."""
         return self.times[-1] if self.times else -1
+
+    def keep_between(self, scan: Scan, config: FrontEndConfig) -> None:
+        """Keep returns of a scan that gets no state, if the robot drove since the last one used."""
+        if self.scanned_ns is not None and any(self.track.moved(self.scanned_ns, scan.time_ns)):
+            self.between.add([scan], self.track, config)
 
     def append(self, time_ns: int, pose: Array) -> None:
         """Record a new state; its covariance follows."""
@@ -155,24 +157,6 @@ class RobotState:
         scan = trajectory_of_mount(causal, laser) if self.scans else None
         return Causal(trajectory_of_mount(causal, inverse(mount)), scan)
 
-    def match_scans(
-        self, states: Trajectory, walls: WallTree | None, config: FrontEndConfig
-    ) -> None:
-        """Match scans without a state to the walls of the map, see `scan_to_map`.
-
-        ``states`` are the final ones, ``walls`` those of the map beside them.
-        """
-        returns, self.returns = self.returns, None
-        if returns is None or not len(returns.times_ns):
-            return
-        states = self.track.at_first_laser(states)
-        poses, covs = between_states(states, self.track, returns.times_ns)
-        found, covs = match_to_walls(poses, covs, returns, walls, config)
-        order = np.argsort(returns.times_ns, kind="stable")
-        self.matched = MatchedScans(
-            returns.times_ns[order], between(poses, found)[order], covs[order]
-        )
-
     def result(
         self,
         states: Trajectory,
@@ -180,6 +164,7 @@ class RobotState:
         mount: MountCovariance | None = None,
         *,
         causal_only: bool = False,
+        matched: MatchedScans | None = None,
     ) -> RobotResult:
         """Trajectories of the robot at the stamps that it is reported at.
 
@@ -189,13 +174,14 @@ class RobotState:
             mount: covariances of the states with the mount, where it is estimated with them.
             causal_only: final poses are the causal ones, also between the states, as a back end
                 that revises no state does not revise the motion between states either.
+            matched: scans between states that are known better than by odometry.
         """
         stamps, times, laser = self._report_times()
         states = self.track.at_first_laser(states)
         ties = None
         late_ns = 0
         if self.scans:
-            final, ties = final_scans(states, self.track, times, stamps, laser, self.matched)
+            final, ties = final_scans(states, self.track, times, stamps, laser, matched)
         else:
             late_ns = self.track.reported_late_ns(self.track.calibration)
             times = times + late_ns

@@ -21,7 +21,6 @@ from graphslam.core.record import replace
 from graphslam.core.records import Message, Motion, Scan
 from graphslam.logs import LogSet
 from graphslam.logs.log_set import ReadReport
-from graphslam.mapping.scan_to_map import ScanReturns
 from graphslam.multi_robot.robot_detection import COMPARED_SCANS, without_returns
 from graphslam.odometry.gap_bridging import with_bridged_gaps
 from graphslam.odometry.laser_odometry import with_laser_odometry
@@ -33,13 +32,14 @@ from graphslam.odometry.several_lasers import SeveralLasersTrack
 from graphslam.odometry.sweep_motion import undistorted_by_track
 from graphslam.perception.dynamic_objects import dynamic_returns_of_all
 from graphslam.perception.front_ends import observe_block
-from graphslam.perception.ordered_scan import Sweep, make_sweep, scan_points, thinned
+from graphslam.perception.ordered_scan import Sweep, make_sweep, scan_points
 from graphslam.slam.keyframes import KeyframeSelector
 from graphslam.slam.log_reader import TRUE_RECORDS
 from graphslam.slam.motion_checks import ScanKeyframe, ScanPair
 from graphslam.slam.progress import counted, timed
 from graphslam.slam.robot_settings import make_tracks, with_noted_keyframes
 from graphslam.slam.robot_state import RobotState
+from graphslam.slam.scans_between import are_matched
 from graphslam.slam.synchronisation import synchronise
 
 #: messages that are processed at once; the first blocks are smaller, as little is known of the
@@ -50,8 +50,6 @@ BLOCK, FIRST_BLOCK = 2000, 100
 #: 10°) and 0.98 for those turned by 90° or 180°; in an office, whose corridors look the same both
 #: ways, 0.55 by 180°
 WRONG_LASER_SHARE = 0.4
-#: beams of a scan without a state that are kept, at most. All 180 of Intel's make errors 2 % less
-BETWEEN_BEAMS = 60
 #: messages that are read while nobody waits for them, at most: some 20 MB
 READ_AHEAD = 8000
 
@@ -166,7 +164,6 @@ class _Reader:
         self._state_ns: int | None = None
         self._state_of = ""  # the laser whose state is the last one
         self._last_scan: tuple[int, Array] | None = None
-        self._between: list[tuple[int, Array, Array]] = []  # time, laser, returns
         self._counts: Counter[str] = Counter()
         self._dropped: Counter[str] = Counter()
         self._removed_returns: Counter[str] = Counter()
@@ -181,13 +178,6 @@ class _Reader:
 
     def read_log(self) -> ReadLog:
         """What is known in the end."""
-        times, lasers, points = zip(*self._between, strict=True) if self._between else ((), (), ())
-        self.run.returns = ScanReturns(
-            np.array(times, dtype=np.int64),
-            np.array([len(own) for own in points], dtype=np.int64),
-            np.concatenate([np.zeros((0, 2), np.float32), *points]),
-            np.array(lasers).reshape(-1, 2),
-        )
         for laser in self._lasers.values():
             if laser.run is not self.run:
                 self.run.repeats.left_out += laser.run.repeats.left_out
@@ -243,8 +233,8 @@ class _Reader:
             own = [scan for scan in scans if scan.sensor == sensor]
             kept, others = self._keyframes.used_scans(own, laser.run)
             each += undistorted_by_track(kept, track)
-            if not sensor and config.keyframe.scans_between == "map":
-                self._between += self._thinned(others)
+            if not sensor and are_matched(config):
+                self.run.between.add(others, track, config.front_end)
         used = self._in_order(each)
         if not used:
             return [], [], None
@@ -272,15 +262,6 @@ class _Reader:
         ]
         of_first = [n for n, scan in enumerate(used) if not scan.sensor]
         return keyframes, pairs, of_first[-1] if of_first else None
-
-    def _thinned(self, scans: Sequence[Scan]) -> list[tuple[int, Array, Array]]:
-        """Time, place of the laser (2,) and some returns (n, 2) of scans that get no state."""
-        thin = [thinned(scan, BETWEEN_BEAMS) for scan in scans]
-        reach = self._config.front_end.max_range_m
-        return [
-            (scan.time_ns, scan.mount[:2], scan_points(scan, reach).astype(np.float32))
-            for scan in undistorted_by_track(thin, self.run.track)
-        ]
 
     def _in_order(self, used: list[Scan]) -> list[Scan]:
         """Scans of all lasers in the order of time, each at that of its state.

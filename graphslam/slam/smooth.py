@@ -27,6 +27,7 @@ from graphslam.slam.pose_graph import is_pose_graph, solve_pose_graph
 from graphslam.slam.retirement import retired_landmarks
 from graphslam.slam.robot_settings import check_robots
 from graphslam.slam.scan_log import solve_scan_log
+from graphslam.slam.scans_between import walls_of_frames
 from graphslam.slam.session_log import solve_session_log
 from graphslam.slam.sighting_passes import run_sighting_passes
 from graphslam.slam.summary import summarise
@@ -129,20 +130,31 @@ def make_result(finished: FinishedPass, began: float) -> Result:
         if is_settled(pipeline.config) and not finished.is_settled:
             estimate = settled(steps, estimate, pipeline.kernel)
         errors = Future(partial(graph_error, steps, estimate, pipeline.kernel))
+        frames = pipeline.frames.landmark_frames(pipeline.landmarks.entries.values())
         # the starts of robots place their worlds, unless a known map does
         if estimate.mounts is not None and pipeline.known.known_map is None:
             estimate = with_mount_errors(
                 estimate,
                 pipeline.frames.of,
-                pipeline.frames.landmark_frames(pipeline.landmarks.entries.values()),
+                frames,
                 {name: start.pose for name, start in pipeline.starts.items()},
                 {name: run.track.mount for name, run in runs.items()},
             )
 
+        walls = walls_of_frames(pipeline.landmarks, estimate, frames)
+
         def robot_result(name: str) -> RobotResult:
-            states, mounts = estimate.states[name], estimate.mounts
+            run, states, mounts = runs[name], estimate.states[name], estimate.mounts
             mount = None if mounts is None else mounts.of(name)
-            return runs[name].result(states, causal.get(name), mount, causal_only=causal_only)
+            matched = run.between.matched(
+                run.track.at_first_laser(states),
+                run.track,
+                walls.get(pipeline.frames.of[name]),
+                pipeline.config.front_end,
+            )
+            return run.result(
+                states, causal.get(name), mount, causal_only=causal_only, matched=matched
+            )
 
         robots = dict(zip(runs, parallel_map(robot_result, list(runs)), strict=True))
         error, plain = errors.result()

@@ -39,7 +39,6 @@ def cast(pose, walls, beams=60, rng=None, reach_m=25.0):
 
 def returns_of(points):
     return ScanReturns(
-        np.arange(len(points), dtype=np.int64),
         np.array([len(own) for own in points], dtype=np.int64),
         np.concatenate(points).astype(np.float32),
         np.tile(LASER, (len(points), 1)),

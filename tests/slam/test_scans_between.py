@@ -1,0 +1,78 @@
+"""Scans that have no state: where they were, by the walls of the solved map."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from paths import LOGS
+
+from graphslam.core.config_io import load_config
+from graphslam.core.geometry import wrap
+from graphslam.core.records import Estimate
+from graphslam.evaluation.metrics import evaluate
+from graphslam.logs import open_logs, read_truth
+from graphslam.slam.scans_between import walls_of_frames
+from graphslam.slam.smooth import smooth
+
+
+@pytest.fixture(scope="module")
+def results():
+    """Results of the lab's log, with scans between keyframes by the map and by odometry alone."""
+    found = {}
+    for way in ("map", "odometry"):
+        config = load_config(overrides=(f"keyframe.scans_between={way}", "start.from_truth=true"))
+        found[way] = smooth(open_logs([LOGS / "lab.mcap"], config), config)
+    return found
+
+
+def test_the_map_tells_where_scans_between_keyframes_looked(results):
+    """A third of the errors that odometry leaves, as large as those of keyframes."""
+    (truth,) = read_truth([LOGS / "lab.mcap"], load_config()).trajectories.values()
+    errors = {}
+    for way, result in results.items():
+        (robot,) = result.robots.values()
+        states = next(iter(result.estimate.states.values())).stamps_ns
+        true = np.interp(robot.final.stamps_ns, truth.stamps_ns, np.unwrap(truth.poses[:, 2]))
+        off = wrap(robot.final.poses[:, 2] - true)
+        has_state = np.isin(robot.final.stamps_ns, states)
+        errors[way] = [np.sqrt(np.mean(off[own] ** 2)) for own in (~has_state, has_state)]
+    assert errors["map"][0] < 0.4 * errors["odometry"][0]
+    assert errors["map"][0] < 2.0 * errors["map"][1]
+
+
+def test_neither_states_nor_landmarks_move(results):
+    """Only trajectories differ, and only where there is no state."""
+    a, b = results["map"], results["odometry"]
+    for mark, other in zip(a.landmarks, b.landmarks, strict=True):
+        np.testing.assert_array_equal(mark.position, other.position)
+    ((name, one),) = a.robots.items()
+    other = b.robots[name]
+    at_states = np.isin(one.final.stamps_ns, a.estimate.states[name].stamps_ns)
+    assert 0.1 < at_states.mean() < 0.9
+    np.testing.assert_allclose(
+        one.final.poses[at_states], other.final.poses[at_states], rtol=0, atol=1e-12
+    )
+    assert np.all(np.abs(one.final.poses - other.final.poses)[~at_states].max(axis=1) > 0)
+
+
+def test_what_is_stated_of_them_is_less_and_true(results):
+    """Headings given the states are stated better; NEES of the whole path stays below its bound."""
+    (one,), (other,) = (r.robots.values() for r in (results["map"], results["odometry"]))
+    between = np.trace(other.scan_ties.covs, axis1=1, axis2=2) > 0
+    left = one.scan_ties.covs[between, 2, 2] / other.scan_ties.covs[between, 2, 2]
+    assert np.median(left) < 0.5
+    truth = read_truth([LOGS / "lab.mcap"], load_config()).trajectories
+    (robot,) = evaluate(results["map"], truth)["robots"].values()
+    assert robot["final"]["nees_per_dof"] < robot["final"]["nees_bounds"][1]
+
+
+def test_a_robot_is_matched_to_the_walls_of_its_own_frame():
+    """Frames that nothing relates lie on each other; points are no walls."""
+    wall = SimpleNamespace(kind="line", extent=np.array([-1.0, 1.0]))
+    entries = {1: wall, 2: wall, 3: SimpleNamespace(kind="point", extent=np.zeros(2)), 4: wall}
+    marks = {n: (np.array([float(n), 0.0, 0.0]), np.eye(3)) for n in (1, 2, 3)}
+    frames = {1: "a", 2: "b", 3: "a", 4: "a"}
+    found = walls_of_frames(SimpleNamespace(entries=entries), Estimate({}, marks, 0.0, 0), frames)
+    assert {name: tree.means[:, 0].tolist() for name, tree in found.items()} == {
+        "a": [1.0], "b": [2.0]
+    }  # fmt: skip
