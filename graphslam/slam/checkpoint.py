@@ -44,7 +44,7 @@ _MODULES = (
     "core.sparse_gaussian", "estimation.clock_calibration", "logs.clock", "logs.log_set",
     "mapping.landmark_map", "multi_robot.frame_tree", "multi_robot.relative_frames",
     "odometry.increment_sums", "odometry.interpolation", "slam.recorded_closures",
-    "slam.repeated_scans", "slam.robot_state", "slam.scan_tracking",
+    "slam.repeated_scans", "slam.robot_state", "slam.scan_tracking", "slam.scans_between",
 )  # fmt: skip
 _CLASSES = (
     ("mapping.landmark_map", "LandmarkMap"),
