@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -32,25 +32,17 @@ IntArray = np.ndarray[tuple[int], np.dtype[np.int64]]
 HALF_SPAN_NS = 250_000_000
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MatchedScans:
-    """Scans between states whose poses are known better than by odometry.
+class BetterScans(Protocol):
+    """Says of some scans better than odometry does where they were."""
 
-    ``times_ns`` (m,), sorted; ``offsets`` (m, 3): their poses seen from where `between_states` has
-    them; ``covs`` (m, 3, 3) of these given the states, along their own axes.
-    """
+    def __call__(
+        self, times_ns: IntArray, poses: Array, covs: Array
+    ) -> tuple[IntArray, Array, Array]:
+        """Of scans at ``times_ns`` (n,) rows (m,), poses (m, 3) and covariances (m, 3, 3).
 
-    times_ns: IntArray
-    offsets: Array
-    covs: Array
-
-    def among(self, times_ns: IntArray) -> tuple[IntArray, IntArray]:
-        """Rows of ``times_ns`` (n,) and rows of these scans, of those that are in both."""
-        if not len(self.times_ns):
-            return self.times_ns, self.times_ns
-        at = np.minimum(np.searchsorted(self.times_ns, times_ns), len(self.times_ns) - 1)
-        there = np.flatnonzero(self.times_ns[at] == times_ns)
-        return there, at[there]
+        ``poses`` (n, 3) are those by odometry between states, ``covs`` (n, 3, 3) their errors given
+        the states, along their own axes, as the covariances that are returned.
+        """
 
 
 def causal_at(
@@ -133,18 +125,8 @@ def final_at(
     """
     interval = _Interval.of(states, track, times_ns)
     poses = _between(states, interval)
-    return Trajectory(stamps_ns, poses, _covs(states, interval, poses, interval.noise_between()))
-
-
-def between_states(states: Trajectory, track: Track, times_ns: IntArray) -> tuple[Array, Array]:
-    """Poses (n, 3) at ``times_ns`` (n,), see `final_at`, and covariances (n, 3, 3) of them.
-
-    The latter are given the states, along the axes of each pose.
-    """
-    interval = _Interval.of(states, track, times_ns)
-    poses = _between(states, interval)
-    turn = states.poses[interval.before, 2] - poses[:, 2]
-    return poses, rotate_cov(interval.noise_between(), turn)
+    noise = rotate_cov(interval.noise_between(), states.poses[interval.before, 2] - poses[:, 2])
+    return Trajectory(stamps_ns, poses, _covs(states, interval, poses, noise))
 
 
 def _between(states: Trajectory, interval: _Interval) -> Array:
@@ -158,15 +140,14 @@ def _between(states: Trajectory, interval: _Interval) -> Array:
 def _covs(states: Trajectory, interval: _Interval, poses: Array, noise: Array) -> Array:
     """Covariances (n, 3, 3) of poses between states, ``noise`` (n, 3, 3) being that given these.
 
-    The noise is along the axes of the state before.
+    The noise is along the axes of each pose.
     """
     i, s = interval.before, interval.share[:, None, None]
     F, _ = compose_jacobians(states.poses[i], between(states.poses[i], poses))
     propagated = F @ states.covs[i] @ F.mT
     bridge = (1 - s) * propagated + s * states.covs[interval.following]
-    turn = rotation3(states.poses[i, 2])
     known = np.where(interval.inside[:, None, None], bridge, propagated)
-    return np.asarray(known + turn @ noise @ turn.mT)
+    return np.asarray(known + rotate_cov(noise, poses[:, 2]))
 
 
 def final_scans(
@@ -175,7 +156,7 @@ def final_scans(
     times_ns: IntArray,
     stamps_ns: IntArray,
     mounts: Array,
-    matched: MatchedScans | None = None,
+    better: BetterScans | None = None,
 ) -> tuple[Trajectory, ScanTies]:
     """Poses of the states' frame at scans, see `final_at`, and how those of the scans follow.
 
@@ -188,18 +169,16 @@ def final_scans(
         times_ns: (n,) of the scans.
         stamps_ns: (n,) what the result is stamped with.
         mounts: (n, 3) of the scans' sensors in the frame of the states.
-        matched: scans that are known better.
+        better: of scans that are known better.
     """
     interval = _Interval.of(states, track, times_ns)
     poses, before = _between(states, interval), interval.before
-    noise = interval.noise_between()
-    if matched is not None:
-        own, row = matched.among(times_ns)
-        poses[own] = compose(poses[own], matched.offsets[row])
-        noise[own] = rotate_cov(matched.covs[row], poses[own, 2] - states.poses[before[own], 2])
+    noise = rotate_cov(interval.noise_between(), states.poses[before, 2] - poses[:, 2])
+    if better is not None:
+        rows, found, left = better(times_ns, poses, noise)
+        poses[rows], noise[rows] = found, left
     final = Trajectory(stamps_ns, poses, _covs(states, interval, poses, noise))
-    # from the axes of the state before to those of the robot at the scan, then about the sensor
-    noise = rotate_cov(noise, states.poses[before, 2] - poses[:, 2])
+    # from the robot at the scan to the sensor
     J = adjoint(inverse(mounts))
     return final, ScanTies(before, interval.share, mounts, J @ noise @ J.mT)
 

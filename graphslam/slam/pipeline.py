@@ -317,7 +317,7 @@ class Pipeline(StepRecorder):
             if self.config.association.robot_sightings == "ignore":
                 event = [m for m in event if isinstance(m, Scan)]
             if not used and are_matched(self.config):
-                run.keep_between(first, self.config.front_end)
+                run.keep_between(first)
         elif not used:
             event = ()
         if not event:

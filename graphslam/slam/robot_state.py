@@ -5,15 +5,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array, between, compose, inverse
 from graphslam.core.motion_models import Calibration
 from graphslam.core.mount_covariances import MountCovariance
 from graphslam.core.records import Motion, RobotResult, Scan, Trajectory
 from graphslam.logs.clock import Clock
 from graphslam.odometry.interpolation import (
+    BetterScans,
     IntArray,
-    MatchedScans,
     causal_at,
     final_at,
     final_scans,
@@ -43,7 +42,7 @@ class RobotState:
     ``times``: of the states, ns; for each state there is the causal pose, its covariance and the
     calibration known then. ``latest_pose`` (3,) is the present estimate of the latest one: after a
     batch step by more than when it was made. ``scans``: (stamp, time, mount) of each; ``between``:
-    returns of those without a state, where they are kept;
+    beams of those without a state, where they are kept;
     ``scanned_ns``: time of the last one used. States are poses of the sensor; the base is where the
     calibrated mount puts it. ``is_calibrated``: the track's calibration was estimated together with
     all states. ``scan``: time and submap of the latest state that has a scan; ``contradicted``: how
@@ -83,10 +82,10 @@ class RobotState:
         """Time of the latest state; -1 before the first."""
         return self.times[-1] if self.times else -1
 
-    def keep_between(self, scan: Scan, config: FrontEndConfig) -> None:
-        """Keep returns of a scan that gets no state, if the robot drove since the last one used."""
+    def keep_between(self, scan: Scan) -> None:
+        """Keep beams of a scan that gets no state, if the robot drove since the last one used."""
         if self.scanned_ns is not None and any(self.track.moved(self.scanned_ns, scan.time_ns)):
-            self.between.add([scan], self.track, config)
+            self.between.add([scan], self.track)
 
     def append(self, time_ns: int, pose: Array) -> None:
         """Record a new state; its covariance follows."""
@@ -164,7 +163,7 @@ class RobotState:
         mount: MountCovariance | None = None,
         *,
         causal_only: bool = False,
-        matched: MatchedScans | None = None,
+        better: BetterScans | None = None,
     ) -> RobotResult:
         """Trajectories of the robot at the stamps that it is reported at.
 
@@ -174,14 +173,14 @@ class RobotState:
             mount: covariances of the states with the mount, where it is estimated with them.
             causal_only: final poses are the causal ones, also between the states, as a back end
                 that revises no state does not revise the motion between states either.
-            matched: scans between states that are known better than by odometry.
+            better: of scans that are known better than by odometry between states.
         """
         stamps, times, laser = self._report_times()
         states = self.track.at_first_laser(states)
         ties = None
         late_ns = 0
         if self.scans:
-            final, ties = final_scans(states, self.track, times, stamps, laser, matched)
+            final, ties = final_scans(states, self.track, times, stamps, laser, better)
         else:
             late_ns = self.track.reported_late_ns(self.track.calibration)
             times = times + late_ns

@@ -234,7 +234,7 @@ class _Reader:
             kept, others = self._keyframes.used_scans(own, laser.run)
             each += undistorted_by_track(kept, track)
             if not sensor and are_matched(config):
-                self.run.between.add(others, track, config.front_end)
+                self.run.between.add(others, track)
         used = self._in_order(each)
         if not used:
             return [], [], None

@@ -146,14 +146,10 @@ def make_result(finished: FinishedPass, began: float) -> Result:
         def robot_result(name: str) -> RobotResult:
             run, states, mounts = runs[name], estimate.states[name], estimate.mounts
             mount = None if mounts is None else mounts.of(name)
-            matched = run.between.matched(
-                run.track.at_first_laser(states),
-                run.track,
-                walls.get(pipeline.frames.of[name]),
-                pipeline.config.front_end,
-            )
+            own = walls.get(pipeline.frames.of[name])
+            better = run.between.matched_to(own, pipeline.config.front_end)
             return run.result(
-                states, causal.get(name), mount, causal_only=causal_only, matched=matched
+                states, causal.get(name), mount, causal_only=causal_only, better=better
             )
 
         robots = dict(zip(runs, parallel_map(robot_result, list(runs)), strict=True))

@@ -132,5 +132,3 @@ def test_a_scan_without_returns_on_walls_stays(points):
     found, left = match_to_walls(pose, PRIOR[None], returns_of([points]), walls, CONFIG)
     np.testing.assert_allclose(found, pose, atol=1e-12)
     np.testing.assert_allclose(left[0], PRIOR, rtol=1e-3, atol=1e-12)
-    found, left = match_to_walls(pose, PRIOR[None], returns_of([points]), None, CONFIG)
-    np.testing.assert_array_equal(found, pose)

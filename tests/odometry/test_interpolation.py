@@ -1,6 +1,7 @@
 """Trajectories between states: through the states, by odometry, honest about what is known when."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -23,8 +24,6 @@ from graphslam.core.mount_covariances import MountCovariances
 from graphslam.core.records import Estimate, OdometryPose, Start, Step, Trajectory
 from graphslam.odometry.interpolation import (
     FrameTransforms,
-    MatchedScans,
-    between_states,
     causal_at,
     final_at,
     final_scans,
@@ -267,27 +266,32 @@ def test_between_two_states_a_scan_is_as_uncertain_as_the_odometry_bridge():
 
 
 def test_a_scan_that_is_known_better_lies_where_it_was_found():
-    """Its own error replaces that of odometry; other scans stay. In the frame of its own pose, so
-    that a result that is moved as a whole takes it along."""
+    """Its own error replaces that of odometry, which is told with the poses; other scans stay."""
     times, mounts = [5.0, 6.2, 11.8], np.array([[0.3, 0.1, 0.2]] * 3)
     plain, ties = final_scans(STATES, TRACK, ns(times), ns(times), mounts)
     covs = np.diag([1e-4, 4e-4, 1e-6]) + np.zeros((2, 3, 3))
     offsets = np.array([[0.01, -0.02, 0.03], [0.05, 0.0, -0.1]])
-    known = MatchedScans(ns([6.2, 11.8]), offsets, covs)
-    final, better = final_scans(STATES, TRACK, ns(times), ns(times), mounts, known)
-    np.testing.assert_array_equal(final.poses[0], plain.poses[0])
-    np.testing.assert_array_equal(better.covs[0], ties.covs[0])
-    assert_same_pose(final.poses[1:], compose(plain.poses[1:], offsets), atol=1e-12)
+    asked = []
+
+    def better(times_ns, poses, noise, covs=covs):
+        asked.append((times_ns, poses.copy(), noise.copy()))
+        return np.array([1, 2]), compose(poses[1:], offsets), covs
+
+    final, known = final_scans(STATES, TRACK, ns(times), ns(times), mounts, better)
+    ((when, poses, noise),) = asked
+    assert when.tolist() == ns(times).tolist()
+    np.testing.assert_array_equal(poses, plain.poses)
     J = adjoint(inverse(mounts[0]))
-    np.testing.assert_allclose(better.covs[1:], J @ covs @ J.T, rtol=1e-9)
+    np.testing.assert_allclose(J @ noise @ J.mT, ties.covs, rtol=1e-9, atol=1e-18)
+    np.testing.assert_array_equal(final.poses[0], plain.poses[0])
+    np.testing.assert_array_equal(known.covs[0], ties.covs[0])
+    assert_same_pose(final.poses[1:], compose(plain.poses[1:], offsets), atol=1e-12)
+    np.testing.assert_allclose(known.covs[1:], J @ covs @ J.mT, rtol=1e-9)
+    exact, _ = final_scans(
+        STATES, TRACK, ns(times), ns(times), mounts, partial(better, covs=0.0 * covs)
+    )
     own = rotate_cov(covs, final.poses[1:, 2])  # world axes
-    P = final.covs[1:] - own
-    without = MatchedScans(known.times_ns, offsets, 0.0 * covs)
-    alone, _ = final_scans(STATES, TRACK, ns(times), ns(times), mounts, without)
-    np.testing.assert_allclose(P, alone.covs[1:], rtol=1e-9, atol=1e-15)
-    poses, noise = between_states(STATES, TRACK, ns(times))
-    assert_same_pose(poses, plain.poses, atol=0)
-    np.testing.assert_allclose(J @ noise @ J.T, ties.covs, rtol=1e-9, atol=1e-18)
+    np.testing.assert_allclose(final.covs[1:] - own, exact.covs[1:], rtol=1e-9, atol=1e-15)
 
 
 def test_after_the_last_state_a_scan_is_as_uncertain_as_the_odometry_since():
