@@ -21,8 +21,8 @@ from graphslam.perception.line_fit import SMALLEST_SIGMA_M
 
 #: m: walls are sampled at this distance to find those near a return
 SAMPLE_M = 0.5
-#: walls near a return that are looked at
-NEIGHBOURS = 4
+#: m: walls are looked up by cells of this size; how many of their samples near a cell count
+CELL_M, NEIGHBOURS = 0.25, 6
 #: m: returns that are nearer to each other along a wall share the deviation of its surface
 SURFACE_M = 1.0
 
@@ -45,13 +45,27 @@ class WallTree(NamedTuple):
         return cls(means, extents, cKDTree(points), of)
 
     def near(self, points: Array) -> tuple[IntArray, IntArray]:
-        """Pairs (p,), (p,) of a point (n, 2) and a wall near it, sorted."""
-        _, sample = self.samples.query(points, NEIGHBOURS, distance_upper_bound=SAMPLE_M)
+        """Pairs (p,), (p,) of a point (n, 2) and a wall near it, sorted.
+
+        Looked up by cells, of which there are fewer than points.
+        """
+        cell = np.floor(points / CELL_M).astype(np.int64)
+        low = cell.min(axis=0, initial=0)
+        columns = int(cell[:, 1].max(initial=0) - low[1]) + 1
+        key, of = np.unique((cell - low) @ np.array([columns, 1]), return_inverse=True)
+        centre = (np.column_stack(np.divmod(key, columns)) + low + 0.5) * CELL_M
+        reach = SAMPLE_M + CELL_M / np.sqrt(2.0)
+        _, sample = self.samples.query(centre, NEIGHBOURS, distance_upper_bound=reach)
         found = sample < len(self.of)
         k, _ = np.nonzero(found)
-        pair = np.sort(k * len(self.means) + self.of[sample[found]])  # faster than `unique` here
-        pair = pair[np.diff(pair, prepend=-1) > 0]
-        return pair // len(self.means), pair % len(self.means)
+        pair = np.unique(k * len(self.means) + self.of[sample[found]])
+        cell_of, wall = pair // len(self.means), pair % len(self.means)
+        count = np.bincount(cell_of, minlength=len(key))
+        number = count[of]
+        begin = (np.cumsum(count) - count)[of]
+        row = np.repeat(np.arange(len(points)), number)
+        at = np.arange(len(row)) + np.repeat(begin + number - np.cumsum(number), number)
+        return row, wall[at]
 
 
 class OnWalls(NamedTuple):

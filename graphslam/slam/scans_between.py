@@ -33,21 +33,26 @@ def are_matched(config: Config) -> bool:
 class ScansBetween:
     """Some beams of each scan of a robot that got no state, in the order of the log.
 
-    ``times`` ns; ``mounts`` (3,) of the laser; ``ranges`` (k,) m and ``angles`` (k,) rad.
+    Lists of what was added at once: ``times`` (n,) ns; ``mounts`` (n, 3) of the laser; ``number``
+    (n,) of beams; ``ranges`` (k,) m and ``angles`` (k,) rad of all these, one scan after the other.
     """
 
-    times: list[int] = field(default_factory=list)
+    times: list[IntArray] = field(default_factory=list)
     mounts: list[Array] = field(default_factory=list)
+    number: list[IntArray] = field(default_factory=list)
     ranges: list[Array] = field(default_factory=list)
     angles: list[Array] = field(default_factory=list)
 
     def add(self, scans: Sequence[Scan], track: Track) -> None:
         """Keep some beams of scans of one laser; ``track`` is the odometry until their end."""
-        for scan in undistorted_by_track([thinned(scan, BEAMS) for scan in scans], track):
-            self.times.append(scan.time_ns)
-            self.mounts.append(scan.mount)
-            self.ranges.append(scan.ranges.astype(np.float32))
-            self.angles.append(scan.angles.astype(np.float32))
+        thin = undistorted_by_track([thinned(scan, BEAMS) for scan in scans], track)
+        if not thin:
+            return
+        self.times.append(np.array([scan.time_ns for scan in thin], dtype=np.int64))
+        self.mounts.append(np.array([scan.mount for scan in thin]))
+        self.number.append(np.array([len(scan.ranges) for scan in thin], dtype=np.int64))
+        self.ranges.append(np.concatenate([scan.ranges for scan in thin]).astype(np.float32))
+        self.angles.append(np.concatenate([scan.angles for scan in thin]).astype(np.float32))
 
     def matched_to(self, walls: WallTree | None, config: FrontEndConfig) -> BetterScans | None:
         """Says where the scans were by the walls of their map; None without scans or walls."""
@@ -55,7 +60,7 @@ class ScansBetween:
             return None
 
         def better(times_ns: IntArray, poses: Array, covs: Array) -> tuple[IntArray, Array, Array]:
-            own = np.array(self.times, dtype=np.int64)
+            own = np.concatenate(self.times)
             _, rows, scans = np.intersect1d(times_ns, own, return_indices=True)
             returns = self._returns(config.max_range_m).only(scans)
             return rows, *match_to_walls(poses[rows], covs[rows], returns, walls, config)
@@ -63,11 +68,11 @@ class ScansBetween:
         return better
 
     def _returns(self, max_range_m: float) -> ScanReturns:
-        mounts, ranges = np.array(self.mounts), np.concatenate(self.ranges).astype(float)
+        mounts, ranges = np.concatenate(self.mounts), np.concatenate(self.ranges).astype(float)
         angles = np.concatenate(self.angles).astype(float)
         with np.errstate(invalid="ignore"):
             kept = (ranges > 0) & (ranges < max_range_m)
-        scan = np.repeat(np.arange(len(mounts)), [len(own) for own in self.ranges])[kept]
+        scan = np.repeat(np.arange(len(mounts)), np.concatenate(self.number))[kept]
         points = transform_each(mounts[scan], polar_points(ranges[kept], angles[kept]))
         return ScanReturns(np.bincount(scan, minlength=len(mounts)), points, mounts[:, :2])
 
