@@ -9,27 +9,36 @@ points), its pose by odometry being the prior.
 The work grows with the number of scans and of walls; a scan has a limited number of returns.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array, between, rotate_cov, transform_each, wrap
-from graphslam.mapping.gating import IntArray
-from graphslam.mapping.returns_on_walls import WallTree, returns_on_walls
+from graphslam.mapping.gating import BoolArray, IntArray
+from graphslam.mapping.returns_on_walls import OnWalls, WallTree, returns_on_walls
 
 #: sigmas that a return may be off the wall that it is taken for, and from which on it pulls with
 #: less than its distance (Huber)
 GATE, HUBER = 2.5, 1.5
 #: m, rad: a scan is taken to be off by so much at least while its returns look for their walls
 LEAST_M, LEAST_RAD = 0.01, 0.003
-#: rounds of Gauss-Newton, in each of which returns look for their walls
-ROUNDS = 2
-#: the noise of the prior is found from so many scans, spread over all, in at most so many rounds,
-#: until its sigmas grow by less
+#: rounds of Gauss-Newton, in each of which returns look for their walls: of all scans, and of those
+#: that moved by more (m, rad) in the last of these
+ROUNDS, MORE_ROUNDS, SETTLED = 2, 4, (0.002, 0.002, 0.002)
+#: a scan of which a smaller share of returns is on walls than this one of the median share has not
+#: found its place, or sees what is not in the map: nothing is better known of it
+LEAST_SHARE = 0.45
+#: noise is found from so many scans, spread over all, in at most so many rounds, until it grows by
+#: less
 SAMPLE, MAX_ROUNDS, NOISE_GROWTH = 600, 6, 1.02
 #: power of the growth that each round finds: expectation maximisation by itself is slow
 ACCELERATION = 2.0
+#: the spread of returns is that of those within so many times the gate; the median of the absolute
+#: value of a normal variable is 0.6745 sigmas
+SPREAD_GATE, MEDIAN_SIGMAS = 3.0, 0.6745
 #: m, rad: added to the prior, which may be exact
 TINY = np.diag([1e-4, 1e-4, 1e-5]) ** 2
 #: scans that are matched at once: memory is that of their returns
@@ -64,7 +73,7 @@ class ScanReturns:
 def match_to_walls(
     poses: Array,
     covs: Array,
-    returns: ScanReturns,
+    returns: Callable[[IntArray], ScanReturns],
     walls: WallTree,
     config: FrontEndConfig,
 ) -> tuple[Array, Array]:
@@ -74,9 +83,10 @@ def match_to_walls(
         poses: (n, 3) of the scans, world frame, near the truth.
         covs: (n, 3, 3) of their errors, along their own axes, independent of each other. Where they
             turn out to be larger by a factor on each axis, that is taken into account.
-        returns: of the scans, in the frames of ``poses``.
+        returns: of scans (m,), rows; in the frames of ``poses``.
         walls: as they are estimated, world frame.
-        config: noise of returns and of surfaces.
+        config: noise of returns and of surfaces. Where returns turn out to spread more, so does
+            their noise.
 
     Returns:
         Poses (n, 3), world frame; their covariances (n, 3, 3) given the map, along their own axes.
@@ -86,37 +96,75 @@ def match_to_walls(
     covs = covs + TINY
     scans = np.arange(len(poses))
     some = scans[:: -(-len(scans) // SAMPLE)]
-    sample = _Block(poses[some], covs[some], returns.only(some), walls, config)
-    scale = _noise_scale(sample)
+    scale, spread = _noise(_Block(poses[some], covs[some], returns(some), walls, config))
+    covs = scale[:, None] * covs * scale
+    config = replace(config, range_sigma_m=spread * config.range_sigma_m)
     made = []
     for begin in range(0, len(scans), BLOCK):
         own = scans[begin : begin + BLOCK]
-        block = _Block(poses[own], covs[own], returns.only(own), walls, config)
-        found, left = poses[own], covs[own]
-        for _ in range(ROUNDS):
-            found, left = block.matched(found, scale)
-        made.append((found, left))
+        made.append(_matched(poses[own], covs[own], returns(own), walls, config))
     found, left = (np.concatenate(parts) for parts in zip(*made, strict=True))
     return found, left
 
 
-def _noise_scale(block: "_Block") -> Array:
-    """Factors (3,) on the sigmas of the prior of some scans, at least 1."""
-    scale, poses = np.ones(3), block.prior
+def _noise(block: "_Block") -> tuple[Array, float]:
+    """Factors on the sigmas of the prior of some scans (3,), and on that of ranges, at least 1."""
+    scale, spread, poses = np.ones(3), 1.0, block.prior
     for round_ in range(MAX_ROUNDS):
-        poses, left = block.matched(poses, scale)
+        step = block.matched(poses, scale, spread)
+        poses = step.poses
         # what the prior is off by, and what is not known of that
-        off = between(block.prior, poses) ** 2 + np.diagonal(left, axis1=1, axis2=2)
-        share = np.mean(off / np.diagonal(block.covs, axis1=1, axis2=2), axis=0)
-        growth = np.sqrt(share) / scale
-        scale = np.maximum(scale * growth**ACCELERATION, 1.0)
-        if round_ and np.all(growth < NOISE_GROWTH):
+        off = between(block.prior, poses) ** 2 + np.diagonal(step.covs, axis1=1, axis2=2)
+        ratio = (off / np.diagonal(block.covs, axis1=1, axis2=2))[_found(step.share)]
+        growth = np.sqrt(ratio.mean(axis=0)) / scale if len(ratio) else np.ones(3)
+        wider = max(block.spread(poses, spread), 1.0)
+        scale, spread = np.maximum(scale * growth**ACCELERATION, 1.0), spread * wider
+        if round_ and np.all(growth < NOISE_GROWTH) and wider < NOISE_GROWTH:
             break
-    return scale
+    return scale, spread
+
+
+def _matched(
+    prior: Array, covs: Array, returns: ScanReturns, walls: WallTree, config: FrontEndConfig
+) -> tuple[Array, Array]:
+    """`match_to_walls` of some scans with known noise."""
+    block = _Block(prior, covs, returns, walls, config)
+    step, before = block.matched(prior), prior
+    for _ in range(ROUNDS - 1):
+        before = step.poses
+        step = block.matched(before)
+    poses, left, share = step
+    far = np.flatnonzero((np.abs(between(before, poses)) > SETTLED).any(axis=1))
+    if len(far):
+        block = _Block(prior[far], covs[far], returns.only(far), walls, config, poses[far])
+        step = block.matched(poses[far])
+        for _ in range(MORE_ROUNDS - 1):
+            step = block.matched(step.poses)
+        poses[far], left[far], share[far] = step
+    lost = ~_found(share)
+    poses[lost], left[lost] = prior[lost], covs[lost]
+    return poses, left
+
+
+def _found(share: Array) -> BoolArray:
+    """Which scans, of whose returns a ``share`` (n,) is on walls, have found their place."""
+    some = share[share > 0]
+    return share >= LEAST_SHARE * np.median(some) if len(some) else share > 0
+
+
+class _Step(NamedTuple):
+    """Poses (n, 3), covariances (n, 3, 3), and the share (n,) of returns that are on walls."""
+
+    poses: Array
+    covs: Array
+    share: Array
 
 
 class _Block:
-    """Scans that are matched together, with the pairs of returns and walls that may be one."""
+    """Scans that are matched together, with the pairs of returns and walls that may be one.
+
+    These are found from where the scans ``start``, mostly their ``prior``.
+    """
 
     def __init__(
         self,
@@ -125,32 +173,29 @@ class _Block:
         returns: ScanReturns,
         walls: WallTree,
         config: FrontEndConfig,
+        start: Array | None = None,
     ) -> None:
         self.prior, self.covs = prior, covs
         self._walls, self._config = walls, config
         self._scan, self._points = returns.scan, returns.points.astype(float)
-        self._lasers = returns.lasers
-        self._near = walls.near(transform_each(prior[self._scan], self._points))
+        self._number, self._lasers = returns.number, returns.lasers
+        self._near = walls.near(self._in_world(prior if start is None else start))
 
-    def matched(self, poses: Array, scale: Array) -> tuple[Array, Array]:
-        """A step from ``poses`` (n, 3) to better ones; the covariances (n, 3, 3) of these.
+    def matched(self, poses: Array, scale: Array | float = 1.0, spread: float = 1.0) -> _Step:
+        """A step from ``poses`` (n, 3) to better ones.
 
-        ``scale`` (3,): factors on the sigmas of the prior.
+        ``scale``: factors (3,) on the sigmas of the prior; ``spread``: one on that of ranges.
         """
-        scan, walls, config = self._scan, self._walls, self._config
-        covs = scale[:, None] * self.covs * scale
+        covs = np.multiply.outer(scale, scale) * self.covs if np.ndim(scale) else self.covs
         place_m = np.maximum(np.sqrt(0.5 * (covs[:, 0, 0] + covs[:, 1, 1])), LEAST_M)
         heading_rad = np.maximum(np.sqrt(covs[:, 2, 2]), LEAST_RAD)
-        world = transform_each(poses[scan], self._points)
-        on = returns_on_walls(
-            self._near, world, transform_each(poses, self._lasers)[scan], walls, config,
-            gate=GATE, margin_m=0.0, heading_rad=heading_rad[scan], place_m=place_m[scan],
-        )  # fmt: skip
-        of = scan[on.row]
-        weight = on.weights(of * len(walls.means) + on.wall, config.floor_normal_m)
-        far = np.abs(on.across) / np.hypot(on.sigma, config.floor_normal_m)
+        world = self._in_world(poses)
+        on = self._on_walls(world, poses, GATE, heading_rad, place_m, spread)
+        of, floor_m = self._scan[on.row], self._config.floor_normal_m
+        weight = on.weights(of * len(self._walls.means) + on.wall, floor_m)
+        far = np.abs(on.across) / np.hypot(on.sigma, floor_m)
         weight *= np.minimum(1.0, HUBER / np.maximum(far, HUBER))
-        c, s = (f(walls.means[:, 2])[on.wall] for f in (np.cos, np.sin))
+        c, s = (f(self._walls.means[:, 2])[on.wall] for f in (np.cos, np.sin))
         x, y = (world[on.row] - poses[of, :2]).T
         J = -s, c, c * x + s * y  # of the distance across, by the pose
         off = self.prior - poses
@@ -164,4 +209,33 @@ class _Block:
                 M[:, i, j] += np.bincount(of, own * J[j], len(poses))
                 M[:, j, i] = M[:, i, j]
         found = poses + np.linalg.solve(M, b[:, :, None])[:, :, 0]
-        return found, rotate_cov(np.asarray(np.linalg.inv(M)), -found[:, 2])
+        left = rotate_cov(np.asarray(np.linalg.inv(M)), -found[:, 2])
+        share = np.bincount(of, minlength=len(poses)) / np.maximum(self._number, 1)
+        return _Step(found, left, share)
+
+    def spread(self, poses: Array, spread: float) -> float:
+        """By which factor returns spread more about the walls than they should."""
+        least = np.full(len(poses), LEAST_RAD), np.full(len(poses), LEAST_M)
+        gate = SPREAD_GATE * GATE
+        on = self._on_walls(self._in_world(poses), poses, gate, *least, spread)
+        off = np.abs(on.across) / np.hypot(on.sigma, self._config.floor_normal_m)
+        return float(np.median(off)) / MEDIAN_SIGMAS if len(off) else 1.0
+
+    def _in_world(self, poses: Array) -> Array:
+        return transform_each(poses[self._scan], self._points)
+
+    def _on_walls(
+        self,
+        world: Array,
+        poses: Array,
+        gate: float,
+        heading_rad: Array,
+        place_m: Array,
+        spread: float,
+    ) -> OnWalls:
+        scan = self._scan
+        config = replace(self._config, range_sigma_m=spread * self._config.range_sigma_m)
+        return returns_on_walls(
+            self._near, world, transform_each(poses, self._lasers)[scan], self._walls, config,
+            gate=gate, margin_m=0.0, heading_rad=heading_rad[scan], place_m=place_m[scan],
+        )  # fmt: skip

@@ -39,8 +39,8 @@ class KeyframeSelector:
     def used_scans(self, scans: Sequence[Scan], run: RobotState) -> tuple[list[Scan], list[Scan]]:
         """Those of consecutive scans of a robot for which `is_used` holds, at once; and others.
 
-        The others were measured while the robot drove. Those that `RobotState.repeats` leaves out
-        are among neither.
+        Of scans while the robot stands one is among the others. Those that `RobotState.repeats`
+        leaves out are among neither.
         """
         scans = [scan for scan in scans if not run.repeats.leaves_out(scan, run.track)]
         if self._config.mode == "all" or not scans:
@@ -49,13 +49,17 @@ class KeyframeSelector:
         times = np.array([since, *(scan.time_ns for scan in scans)], dtype=np.int64)
         (path_m, heading), *driven = run.track.driven(times).tolist()
         used, others, angle_rad = [], [], self._config.scan_angle_rad
+        there = run.track.driven(np.array([run.kept_ns or since], dtype=np.int64))[0].tolist()
         for scan, (at_m, at_rad) in zip(scans, driven, strict=True):
             turned = abs(float(wrap(at_rad - heading)))
             if run.scanned_ns is None or self._is_far(at_m - path_m, turned, angle_rad):
                 run.scanned_ns, path_m, heading = scan.time_ns, at_m, at_rad
                 used.append(scan)
-            elif at_m > path_m or turned:
+            elif [at_m, at_rad] != there:
                 others.append(scan)
+            else:
+                continue
+            run.kept_ns, there = scan.time_ns, [at_m, at_rad]
         return used, others
 
     def gets_state(self, event: Sequence[Message], run: RobotState) -> bool:

@@ -42,7 +42,8 @@ class RobotState:
     ``times``: of the states, ns; for each state there is the causal pose, its covariance and the
     calibration known then. ``latest_pose`` (3,) is the present estimate of the latest one: after a
     batch step by more than when it was made. ``scans``: (stamp, time, mount) of each; ``between``:
-    beams of those without a state, where they are kept;
+    beams of those without a state, where they are kept, ``kept_ns`` the time of the last of these
+    or of a scan with a state;
     ``scanned_ns``: time of the last one used. States are poses of the sensor; the base is where the
     calibrated mount puts it. ``is_calibrated``: the track's calibration was estimated together with
     all states. ``scan``: time and submap of the latest state that has a scan; ``contradicted``: how
@@ -67,6 +68,7 @@ class RobotState:
     clock: Clock = field(default_factory=Clock)
     repeats: RepeatedScans = field(default_factory=RepeatedScans)
     between: ScansBetween = field(default_factory=ScansBetween)
+    kept_ns: int | None = None
 
     def __post_init__(self) -> None:
         """Calibrate the track's odometry by its own settings."""
@@ -83,9 +85,11 @@ class RobotState:
         return self.times[-1] if self.times else -1
 
     def keep_between(self, scan: Scan) -> None:
-        """Keep beams of a scan that gets no state, if the robot drove since the last one used."""
-        if self.scanned_ns is not None and any(self.track.moved(self.scanned_ns, scan.time_ns)):
+        """Keep beams of a scan that gets no state, if the robot drove since the last one."""
+        since_ns = max(self.scanned_ns or 0, self.kept_ns or 0)
+        if since_ns and any(self.track.moved(since_ns, scan.time_ns)):
             self.between.add([scan], self.track)
+            self.kept_ns = scan.time_ns
 
     def append(self, time_ns: int, pose: Array) -> None:
         """Record a new state; its covariance follows."""

@@ -21,12 +21,15 @@ from graphslam.perception.ordered_scan import thinned
 
 #: beams of a scan that are kept, at most. More make the errors of Intel 2 % less
 BEAMS = 40
+#: m, m, rad: a robot that moved by less stands
+STILL = (1e-9, 1e-9, 1e-9)
 
 
 def are_matched(config: Config) -> bool:
     """Whether scans between keyframes are matched to the map: where a whole log is solved again."""
     backend = config.backend
-    return config.keyframe.scans_between == "map" and backend.name == "batch" and backend.reoptimise
+    solved = backend.name == "batch" and backend.reoptimise
+    return config.keyframe.scans_between == "map" and solved and config.front_end.name != "none"
 
 
 @dataclass(slots=True, eq=False)
@@ -55,26 +58,42 @@ class ScansBetween:
         self.angles.append(np.concatenate([scan.angles for scan in thin]).astype(np.float32))
 
     def matched_to(self, walls: WallTree | None, config: FrontEndConfig) -> BetterScans | None:
-        """Says where the scans were by the walls of their map; None without scans or walls."""
+        """Says where the scans were by the walls of their map; None without scans or walls.
+
+        While a robot stands one of its scans is kept: the others are where that one was, as those
+        of the same stamp are.
+        """
         if walls is None or not self.times:
             return None
 
         def better(times_ns: IntArray, poses: Array, covs: Array) -> tuple[IntArray, Array, Array]:
-            own = np.concatenate(self.times)
-            _, rows, scans = np.intersect1d(times_ns, own, return_indices=True)
-            returns = self._returns(config.max_range_m).only(scans)
-            return rows, *match_to_walls(poses[rows], covs[rows], returns, walls, config)
+            own, kept = np.unique(np.concatenate(self.times), return_index=True)
+            first, given = np.unique(times_ns, return_index=True)
+            _, rows, scans = np.intersect1d(first, own, return_indices=True)
+            rows = given[rows]
+            returns = self._returns(config.max_range_m)
+            found, left = match_to_walls(
+                poses[rows], covs[rows], lambda some: returns.only(kept[scans[some]]), walls, config
+            )
+            before = np.searchsorted(times_ns[rows], times_ns, side="right") - 1
+            still = np.abs(poses - poses[rows[before]]) < STILL
+            same = np.flatnonzero((before >= 0) & still.all(axis=1)) if len(rows) else rows
+            return same, found[before[same]], left[before[same]]
 
         return better
 
     def _returns(self, max_range_m: float) -> ScanReturns:
-        mounts, ranges = np.concatenate(self.mounts), np.concatenate(self.ranges).astype(float)
-        angles = np.concatenate(self.angles).astype(float)
-        with np.errstate(invalid="ignore"):
-            kept = (ranges > 0) & (ranges < max_range_m)
-        scan = np.repeat(np.arange(len(mounts)), np.concatenate(self.number))[kept]
-        points = transform_each(mounts[scan], polar_points(ranges[kept], angles[kept]))
-        return ScanReturns(np.bincount(scan, minlength=len(mounts)), points, mounts[:, :2])
+        number, points = [], []
+        added = zip(self.mounts, self.number, self.ranges, self.angles, strict=True)
+        for mounts, beams, ranges, angles in added:  # one after the other, for the memory
+            with np.errstate(invalid="ignore"):
+                kept = (ranges > 0) & (ranges < max_range_m)
+            scan = np.repeat(np.arange(len(mounts)), beams)[kept]
+            seen = polar_points(ranges[kept].astype(float), angles[kept].astype(float))
+            points.append(transform_each(mounts[scan], seen).astype(np.float32))
+            number.append(np.bincount(scan, minlength=len(mounts)))
+        lasers = np.concatenate(self.mounts)[:, :2]
+        return ScanReturns(np.concatenate(number), np.concatenate(points), lasers)
 
 
 def walls_of_frames(
@@ -83,7 +102,7 @@ def walls_of_frames(
     """The walls of each frame where the estimate has them.
 
     Args:
-        landmarks: the map: what is a wall, and its ends.
+        landmarks: the map: what is a wall, and its ends; in the same frames as the estimate.
         estimate: where they are.
         frames: landmark -> its frame.
     """
@@ -91,7 +110,7 @@ def walls_of_frames(
     for number, entry in landmarks.entries.items():
         if number in estimate.landmarks and entry.kind != "point":
             mean, _ = estimate.landmarks[number]
-            found.setdefault(frames[number], []).append((mean, entry.extent))
+            found.setdefault(frames[number], []).append((mean, entry.extent_at(mean)))
     return {
         frame: WallTree.from_walls(*map(np.array, zip(*walls, strict=True)))
         for frame, walls in found.items()

@@ -141,7 +141,8 @@ def make_result(finished: FinishedPass, began: float) -> Result:
                 {name: run.track.mount for name, run in runs.items()},
             )
 
-        walls = walls_of_frames(pipeline.landmarks, estimate, frames)
+        moved = pipeline.landmarks.transformed(transforms.landmarks)
+        walls = walls_of_frames(moved, estimate, frames)
 
         def robot_result(name: str) -> RobotResult:
             run, states, mounts = runs[name], estimate.states[name], estimate.mounts
@@ -155,7 +156,6 @@ def make_result(finished: FinishedPass, began: float) -> Result:
         robots = dict(zip(runs, parallel_map(robot_result, list(runs)), strict=True))
         error, plain = errors.result()
         estimate = replace(estimate, error=error)
-    moved = pipeline.landmarks.transformed(transforms.landmarks)
     landmarks = pipeline.frames.label_landmarks(
         make_landmarks(moved, estimate), pipeline.landmarks.entries.values()
     )
