@@ -17,6 +17,7 @@ import numpy as np
 
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array, between, rotate_cov, transform_each, wrap
+from graphslam.core.worker import parallel_map
 from graphslam.mapping.gating import BoolArray, IntArray
 from graphslam.mapping.returns_on_walls import OnWalls, WallTree, returns_on_walls
 
@@ -99,10 +100,11 @@ def match_to_walls(
     scale, spread = _noise(_Block(poses[some], covs[some], returns(some), walls, config))
     covs = scale[:, None] * covs * scale
     config = replace(config, range_sigma_m=spread * config.range_sigma_m)
-    made = []
-    for begin in range(0, len(scans), BLOCK):
-        own = scans[begin : begin + BLOCK]
-        made.append(_matched(poses[own], covs[own], returns(own), walls, config))
+
+    def matched(own: IntArray) -> tuple[Array, Array]:
+        return _matched(poses[own], covs[own], returns(own), walls, config)
+
+    made = parallel_map(matched, [scans[k : k + BLOCK] for k in range(0, len(scans), BLOCK)])
     found, left = (np.concatenate(parts) for parts in zip(*made, strict=True))
     return found, left
 

@@ -95,7 +95,10 @@ class _Interval:
         following = np.minimum(i + 1, len(at) - 1)
         same = np.zeros(len(i), dtype=np.int64)
         delta, noise = track.coarse_motions(at[i], times_ns, known, same)
-        whole, whole_noise = track.coarse_motions(at[i], at[following], known, same)
+        begin, first, of = np.unique(i, return_index=True, return_inverse=True)
+        end = at[following[first]]
+        whole, whole_noise = track.coarse_motions(at[begin], end, known, same[: len(begin)])
+        whole, whole_noise = whole[of], whole_noise[of]
         inside = following > i
         effort = track.effort(at)
         driven = np.where(inside, effort[following] - effort[i], 0.0)
