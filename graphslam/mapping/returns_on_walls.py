@@ -20,7 +20,7 @@ from graphslam.mapping.wall_samples import sample_walls
 from graphslam.perception.line_fit import SMALLEST_SIGMA_M
 
 #: m: walls are sampled at this distance to find those near a return
-SAMPLE_M = 0.5
+SAMPLE_M = 0.25
 #: m: walls are looked up by cells of this size; how many of their samples near a cell count
 CELL_M, NEIGHBOURS = 0.25, 6
 #: m: returns that are nearer to each other along a wall share the deviation of its surface

@@ -17,7 +17,6 @@ import numpy as np
 
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array, between, rotate_cov, transform_each, wrap
-from graphslam.core.worker import parallel_map
 from graphslam.mapping.gating import BoolArray, IntArray
 from graphslam.mapping.returns_on_walls import OnWalls, WallTree, returns_on_walls
 
@@ -26,9 +25,9 @@ from graphslam.mapping.returns_on_walls import OnWalls, WallTree, returns_on_wal
 GATE, HUBER = 2.5, 1.5
 #: m, rad: a scan is taken to be off by so much at least while its returns look for their walls
 LEAST_M, LEAST_RAD = 0.01, 0.003
-#: rounds of Gauss-Newton, in each of which returns look for their walls: of all scans, and of those
-#: that moved by more (m, rad) in the last of these
-ROUNDS, MORE_ROUNDS, SETTLED = 2, 4, (0.002, 0.002, 0.002)
+#: rounds of Gauss-Newton, at most, in each of which returns look for their walls: of all scans,
+#: then of those that moved by more (m, m, rad) in the one before
+ROUNDS, SETTLED = 6, (0.004, 0.004, 0.004)
 #: a scan of which a smaller share of returns is on walls than this one of the median share has not
 #: found its place, or sees what is not in the map: nothing is better known of it
 LEAST_SHARE = 0.45
@@ -100,11 +99,10 @@ def match_to_walls(
     scale, spread = _noise(_Block(poses[some], covs[some], returns(some), walls, config))
     covs = scale[:, None] * covs * scale
     config = replace(config, range_sigma_m=spread * config.range_sigma_m)
-
-    def matched(own: IntArray) -> tuple[Array, Array]:
-        return _matched(poses[own], covs[own], returns(own), walls, config)
-
-    made = parallel_map(matched, [scans[k : k + BLOCK] for k in range(0, len(scans), BLOCK)])
+    made = []
+    for begin in range(0, len(scans), BLOCK):
+        own = scans[begin : begin + BLOCK]
+        made.append(_matched(poses[own], covs[own], returns(own), walls, config))
     found, left = (np.concatenate(parts) for parts in zip(*made, strict=True))
     return found, left
 
@@ -130,19 +128,17 @@ def _matched(
     prior: Array, covs: Array, returns: ScanReturns, walls: WallTree, config: FrontEndConfig
 ) -> tuple[Array, Array]:
     """`match_to_walls` of some scans with known noise."""
-    block = _Block(prior, covs, returns, walls, config)
-    step, before = block.matched(prior), prior
+    poses, left, share = _Block(prior, covs, returns, walls, config).matched(prior)
+    moved, far = between(prior, poses), np.arange(len(prior))
     for _ in range(ROUNDS - 1):
-        before = step.poses
-        step = block.matched(before)
-    poses, left, share = step
-    far = np.flatnonzero((np.abs(between(before, poses)) > SETTLED).any(axis=1))
-    if len(far):
-        block = _Block(prior[far], covs[far], returns.only(far), walls, config, poses[far])
-        step = block.matched(poses[far])
-        for _ in range(MORE_ROUNDS - 1):
-            step = block.matched(step.poses)
-        poses[far], left[far], share[far] = step
+        moving = (np.abs(moved) > SETTLED).any(axis=1)
+        far = far[moving]
+        if not len(far):
+            break
+        before = poses[far]
+        block = _Block(prior[far], covs[far], returns.only(far), walls, config, before)
+        poses[far], left[far], share[far] = block.matched(before)
+        moved = between(before, poses[far])
     lost = ~_found(share)
     poses[lost], left[lost] = prior[lost], covs[lost]
     return poses, left

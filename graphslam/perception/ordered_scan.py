@@ -90,14 +90,18 @@ def _open_circle(ranges: Array, angles: Array) -> tuple[Array, Array]:
     return np.roll(ranges, -start), np.roll(angles, -start)
 
 
+def beam_step(scan: Scan, most: int) -> int:
+    """Every how many beams one is left of a scan if at most so many are."""
+    return max(-(-len(scan.ranges) // most), 1)
+
+
 def thinned(scan: Scan, most: int) -> Scan:
     """A scan of which only each second, third, ... beam is left, at most so many."""
-    n = len(scan.ranges)
-    every = -(-n // most)
-    if every <= 1:
+    every = beam_step(scan, most)
+    if every == 1:
         return scan
     # the beam that was measured at the time of the scan stays
-    first = (n - 1) % every if scan.beam_period_s < 0 else 0
+    first = (len(scan.ranges) - 1) % every if scan.beam_period_s < 0 else 0
     return replace(
         scan,
         ranges=scan.ranges[first::every],

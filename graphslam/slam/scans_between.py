@@ -17,7 +17,7 @@ from graphslam.mapping.scan_to_map import ScanReturns, match_to_walls
 from graphslam.odometry.interpolation import BetterScans, IntArray
 from graphslam.odometry.preintegration import Track
 from graphslam.odometry.sweep_motion import undistorted_by_track
-from graphslam.perception.ordered_scan import thinned
+from graphslam.perception.ordered_scan import beam_step, thinned
 
 #: beams of a scan that are kept, at most. More make the errors of Intel 2 % less
 BEAMS = 40
@@ -48,14 +48,20 @@ class ScansBetween:
 
     def add(self, scans: Sequence[Scan], track: Track) -> None:
         """Keep some beams of scans of one laser; ``track`` is the odometry until their end."""
-        thin = undistorted_by_track([thinned(scan, BEAMS) for scan in scans], track)
-        if not thin:
+        if not scans:
             return
-        self.times.append(np.array([scan.time_ns for scan in thin], dtype=np.int64))
-        self.mounts.append(np.array([scan.mount for scan in thin]))
-        self.number.append(np.array([len(scan.ranges) for scan in thin], dtype=np.int64))
-        self.ranges.append(np.concatenate([scan.ranges for scan in thin]).astype(np.float32))
-        self.angles.append(np.concatenate([scan.angles for scan in thin]).astype(np.float32))
+        self.times.append(np.array([scan.time_ns for scan in scans], dtype=np.int64))
+        self.mounts.append(np.array([scan.mount for scan in scans]))
+        if _are_alike(scans):
+            every = beam_step(scans[0], BEAMS)
+            ranges = [scan.ranges[::every] for scan in scans]
+            angles = [scans[0].angles[::every]] * len(scans)
+        else:
+            thin = undistorted_by_track([thinned(scan, BEAMS) for scan in scans], track)
+            ranges, angles = [scan.ranges for scan in thin], [scan.angles for scan in thin]
+        self.number.append(np.array([len(own) for own in ranges], dtype=np.int64))
+        self.ranges.append(np.concatenate(ranges).astype(np.float32))
+        self.angles.append(np.concatenate(angles).astype(np.float32))
 
     def matched_to(self, walls: WallTree | None, config: FrontEndConfig) -> BetterScans | None:
         """Says where the scans were by the walls of their map; None without scans or walls.
@@ -94,6 +100,12 @@ class ScansBetween:
             number.append(np.bincount(scan, minlength=len(mounts)))
         lasers = np.concatenate(self.mounts)[:, :2]
         return ScanReturns(np.concatenate(number), np.concatenate(points), lasers)
+
+
+def _are_alike(scans: Sequence[Scan]) -> bool:
+    """Whether scans have the same beams, all measured at once."""
+    beams = {(len(s.ranges), s.angle_min_rad, s.angle_step_rad, s.beam_period_s) for s in scans}
+    return len(beams) == 1 and not scans[0].beam_period_s and all(s.bearings is None for s in scans)
 
 
 def walls_of_frames(
