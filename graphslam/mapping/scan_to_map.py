@@ -30,7 +30,7 @@ LEAST_M, LEAST_RAD = 0.01, 0.003
 ROUNDS, SETTLED = 6, (0.004, 0.004, 0.004)
 #: a scan of which a smaller share of returns is on walls than this one of the median share has not
 #: found its place, or sees what is not in the map: nothing is better known of it
-LEAST_SHARE = 0.45
+LEAST_SHARE = 0.6
 #: noise is found from so many scans, spread over all, in at most so many rounds, until it grows by
 #: less
 SAMPLE, MAX_ROUNDS, NOISE_GROWTH = 600, 6, 1.02

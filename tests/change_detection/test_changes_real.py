@@ -87,5 +87,5 @@ def test_hardly_anything_changed_whichever_visit_is_the_reference(visits):
     of the other alone it is 2 to 9 %, with 7 and 13 changes that are bends of the paths."""
     for reference, later in (visits, visits[::-1]):
         found = detect_changes(reference, later, ChangesConfig())
-        assert found.flagged.sum() < 0.02 * found.compared.sum()  # measured: 0.010, 0.006
-        assert len(found.changes) <= 4  # measured: 2, 2
+        assert found.flagged.sum() < 0.02 * found.compared.sum()  # measured: 0.006, 0.016
+        assert len(found.changes) <= 4  # measured: 2, 3
