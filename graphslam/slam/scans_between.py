@@ -77,13 +77,15 @@ class ScansBetween:
             first, given = np.unique(times_ns, return_index=True)
             _, rows, scans = np.intersect1d(first, own, return_indices=True)
             rows = given[rows]
+            if not len(rows):
+                return rows, poses[rows], covs[rows]
             returns = self._returns(config.max_range_m)
             found, left = match_to_walls(
                 poses[rows], covs[rows], lambda some: returns.only(kept[scans[some]]), walls, config
             )
             before = np.searchsorted(times_ns[rows], times_ns, side="right") - 1
             still = np.abs(poses - poses[rows[before]]) < STILL
-            same = np.flatnonzero((before >= 0) & still.all(axis=1)) if len(rows) else rows
+            same = np.flatnonzero((before >= 0) & still.all(axis=1))
             return same, found[before[same]], left[before[same]]
 
         return better
