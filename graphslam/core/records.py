@@ -356,13 +356,15 @@ class ScanTies:
 
     A scan is ``share`` of the way, by motion, from state ``state`` to the next one; its sensor is
     at ``mounts`` (n, 3) in the frame of the robot's states. ``covs`` (n, 3, 3) are of its error
-    between the two states, along the axes of the scan's own frame.
+    between the two states, along the axes of the scan's own frame; ``odometry_covs`` (n, 3, 3) are
+    what they would be by odometry alone, which is what scans between the same states share.
     """
 
     state: IntArray
     share: Array
     mounts: Array
     covs: Array
+    odometry_covs: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)

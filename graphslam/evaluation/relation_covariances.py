@@ -46,20 +46,45 @@ def _some_covariances(joint: JointScans, robot: str, scans: Trajectory, pairs: I
     maps = np.stack([moved, spread], axis=1)
     own, cross = pair_covariances(joint.root, joint.root.states[robot][states], maps, ends)
     own = own + ties.covs[used]
-    cross = cross + _shared_odometry(before, share, ties.covs[used], ends)
     a, b = ends.T
     back = -adjoint(inverse(between(poses[a], poses[b])))
+    odometry = ties.odometry_covs[used]
+    cross = cross + _shared_odometry(before, share, ties.covs[used], odometry, ends, back)
     mixed = back @ cross
     return np.asarray(own[b] + back @ own[a] @ back.mT + mixed + mixed.mT)
 
 
-def _shared_odometry(before: IntArray, share: Array, covs: Array, ends: IntArray) -> Array:
-    """Covariance (p, 3, 3) of the odometry's errors at two scans between the same two states.
+def _shared_odometry(
+    before: IntArray, share: Array, covs: Array, odometry: Array, ends: IntArray, back: Array
+) -> Array:
+    """Covariance (p, 3, 3) of the errors between states of two scans between the same two.
 
-    That of a bridge between s and t is s (1 - t) of the whole, s (1 - s) that at s.
+    Along the axes of each. By odometry alone that of a bridge between s and t is s (1 - t) of the
+    whole, s (1 - s) that at s. Where a scan was matched to the map, P is left of the covariance C
+    by odometry: of its error e, P C⁻¹ e, beside one that is its own. Scans at one place that were
+    not matched apart have the same error.
+
+    Args:
+        before: (n,) the states before the scans.
+        share: (n,) of the motion from there to the next one.
+        covs: (n, 3, 3) P.
+        odometry: (n, 3, 3) C.
+        ends: (p, 2) pairs of the n.
+        back: (p, 3, 3) what errors of the first of a pair change of the relative pose.
     """
+    found = np.zeros((len(ends), 3, 3))
     s, t = share[ends].min(axis=1), share[ends].max(axis=1)
-    at_first = np.where((share[ends[:, 0]] <= share[ends[:, 1]]), ends[:, 0], ends[:, 1])
-    same = (before[ends[:, 0]] == before[ends[:, 1]]) & (s > 0) & (t < 1)
-    factor = np.where(same, (1 - t) / np.where(same, 1 - s, 1.0), 0.0)
-    return np.asarray(factor[:, None, None] * covs[at_first])
+    same = np.flatnonzero((before[ends[:, 0]] == before[ends[:, 1]]) & (s > 0) & (t < 1))
+    s, t, ends, back = s[same], t[same], ends[same], back[same]
+    backwards = share[ends[:, 0]] > share[ends[:, 1]]
+    early, late = np.where(backwards[:, None], ends[:, ::-1], ends).T
+    # from the axes of the early one to those of the late one
+    onward = -np.where(backwards[:, None, None], np.linalg.inv(back), back)
+    kept = np.broadcast_to(np.eye(3), onward.shape).copy()
+    matched = (covs[late] != odometry[late]).any(axis=(1, 2))
+    kept[matched] = np.linalg.solve(odometry[late[matched]], covs[late[matched]])
+    cross = ((1 - t) / (1 - s))[:, None, None] * (covs[early] @ onward.mT @ kept)
+    at_once = (s == t) & (covs[early] == covs[late]).all(axis=(1, 2))
+    cross = np.where(at_once[:, None, None], covs[early], cross)
+    found[same] = np.where(backwards[:, None, None], cross.mT, cross)
+    return found

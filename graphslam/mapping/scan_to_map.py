@@ -70,13 +70,25 @@ class ScanReturns:
         return ScanReturns(number, self.points[rows], self.lasers[scans])
 
 
+class MatchedScans(NamedTuple):
+    """Poses (n, 3), world frame; covariances (n, 3, 3) given the map; those without the returns.
+
+    Covariances are along the scans' own axes. ``prior_covs`` (n, 3, 3) are as large as the returns
+    show them to be.
+    """
+
+    poses: Array
+    covs: Array
+    prior_covs: Array
+
+
 def match_to_walls(
     poses: Array,
     covs: Array,
     returns: Callable[[IntArray], ScanReturns],
     walls: WallTree,
     config: FrontEndConfig,
-) -> tuple[Array, Array]:
+) -> MatchedScans:
     """Poses of scans by their returns on walls, and by what was known of them.
 
     Args:
@@ -87,12 +99,9 @@ def match_to_walls(
         walls: as they are estimated, world frame.
         config: noise of returns and of surfaces. Where returns turn out to spread more, so does
             their noise.
-
-    Returns:
-        Poses (n, 3), world frame; their covariances (n, 3, 3) given the map, along their own axes.
     """
     if not len(poses):
-        return poses, covs
+        return MatchedScans(poses, covs, covs)
     covs = covs + TINY
     scans = np.arange(len(poses))
     some = scans[:: -(-len(scans) // SAMPLE)]
@@ -104,7 +113,7 @@ def match_to_walls(
         own = scans[begin : begin + BLOCK]
         made.append(_matched(poses[own], covs[own], returns(own), walls, config))
     found, left = (np.concatenate(parts) for parts in zip(*made, strict=True))
-    return found, left
+    return MatchedScans(found, left, covs)
 
 
 def _noise(block: "_Block") -> tuple[Array, float]:

@@ -37,11 +37,12 @@ class BetterScans(Protocol):
 
     def __call__(
         self, times_ns: IntArray, poses: Array, covs: Array
-    ) -> tuple[IntArray, Array, Array]:
-        """Of scans at ``times_ns`` (n,) rows (m,), poses (m, 3) and covariances (m, 3, 3).
+    ) -> tuple[IntArray, Array, Array, Array]:
+        """Of scans at ``times_ns`` (n,) rows (m,), poses (m, 3) and two covariances (m, 3, 3).
 
         ``poses`` (n, 3) are those by odometry between states, ``covs`` (n, 3, 3) their errors given
-        the states, along their own axes, as the covariances that are returned.
+        the states, along their own axes. So are the covariances that are returned: of the better
+        poses, and of those by odometry, which may turn out to be larger than was thought.
         """
 
 
@@ -177,13 +178,15 @@ def final_scans(
     interval = _Interval.of(states, track, times_ns)
     poses, before = _between(states, interval), interval.before
     noise = rotate_cov(interval.noise_between(), states.poses[before, 2] - poses[:, 2])
+    by_odometry = noise.copy()
     if better is not None:
-        rows, found, left = better(times_ns, poses, noise)
-        poses[rows], noise[rows] = found, left
+        rows, found, left, prior = better(times_ns, poses, noise)
+        poses[rows], noise[rows], by_odometry[rows] = found, left, prior
     final = Trajectory(stamps_ns, poses, _covs(states, interval, poses, noise))
     # from the robot at the scan to the sensor
     J = adjoint(inverse(mounts))
-    return final, ScanTies(before, interval.share, mounts, J @ noise @ J.mT)
+    covs, odometry_covs = (J @ one @ J.mT for one in (noise, by_odometry))
+    return final, ScanTies(before, interval.share, mounts, covs, odometry_covs)
 
 
 def trajectory_of_mount(base: Trajectory, mounts: Array) -> Trajectory:

@@ -56,6 +56,8 @@ def joint_bytes(joint: JointScans) -> bytes:
             f"scan_mount_{n}": _once(ties.mounts),
             f"scan_cov_{n}": ties.covs[:, *_UPPER].astype(np.float32),
         }
+        if not np.array_equal(ties.covs, ties.odometry_covs):
+            arrays[f"scan_odometry_cov_{n}"] = ties.odometry_covs[:, *_UPPER].astype(np.float32)
     numbers = sorted(root.landmarks)
     arrays["landmark_ids"] = np.array(numbers, dtype=np.int64)
     arrays["landmark_rows"] = np.array([root.landmarks[n] for n in numbers], dtype=np.int32)
@@ -102,18 +104,25 @@ def _joint(arrays: Mapping[str, Array]) -> JointScans:
     def integers(name: str) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
         return arrays[name].astype(np.int64)
 
+    def symmetric(name: str) -> Array:
+        upper = arrays[name].astype(float)
+        made = np.empty((len(upper), 3, 3))
+        made[:, *_UPPER] = made[:, _UPPER[1], _UPPER[0]] = upper
+        return made
+
     names = [str(name) for name in arrays["robots"]]
     states, rows, ties = {}, {}, {}
     for n, name in enumerate(names):
         poses, stamps = arrays[f"state_poses_{n}"], integers(f"state_stamps_ns_{n}")
         states[name] = Trajectory(stamps, poses, np.full((len(poses), 3, 3), np.nan))
         rows[name] = integers(f"state_rows_{n}")
-        upper = arrays[f"scan_cov_{n}"].astype(float)
-        covs = np.empty((len(upper), 3, 3))
-        covs[:, *_UPPER] = covs[:, _UPPER[1], _UPPER[0]] = upper
+        covs = symmetric(f"scan_cov_{n}")
+        # where nothing is known better than by odometry, and in earlier versions, it is not there
+        of_odometry = f"scan_odometry_cov_{n}"
+        odometry_covs = symmetric(of_odometry) if of_odometry in arrays else covs
         state, share = integers(f"scan_state_{n}"), arrays[f"scan_share_{n}"]
         mounts = np.broadcast_to(arrays[f"scan_mount_{n}"], (len(state), 3))
-        ties[name] = ScanTies(state, share, mounts, covs)
+        ties[name] = ScanTies(state, share, mounts, covs, odometry_covs)
     above, own, width, separators = map(integers, ("above", "own", "width", "separators"))
     marks: dict[int, int] = {}
     known: MountCovariances | None = None

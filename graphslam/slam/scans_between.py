@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from graphslam.core.config import Config, FrontEndConfig
-from graphslam.core.geometry import Array, polar_points, transform_each
+from graphslam.core.geometry import Array, polar_points, transform_each, wrap
 from graphslam.core.records import Estimate, Scan
 from graphslam.mapping.landmark_map import LandmarkMap
 from graphslam.mapping.returns_on_walls import WallTree
@@ -21,8 +21,8 @@ from graphslam.perception.ordered_scan import beam_step, thinned
 
 #: beams of a scan that are kept, at most. More make the errors of Intel 2 % less
 BEAMS = 40
-#: m, m, rad: a robot that moved by less stands
-STILL = (1e-9, 1e-9, 1e-9)
+#: m, m, rad: a robot that moved by less, and no share of the way to the next state, stands
+STILL = (1e-3, 1e-3, 1e-3)
 
 
 def are_matched(config: Config) -> bool:
@@ -72,21 +72,28 @@ class ScansBetween:
         if walls is None or not self.times:
             return None
 
-        def better(times_ns: IntArray, poses: Array, covs: Array) -> tuple[IntArray, Array, Array]:
+        def better(
+            times_ns: IntArray, poses: Array, covs: Array
+        ) -> tuple[IntArray, Array, Array, Array]:
             own, kept = np.unique(np.concatenate(self.times), return_index=True)
             first, given = np.unique(times_ns, return_index=True)
             _, rows, scans = np.intersect1d(first, own, return_indices=True)
             rows = given[rows]
             if not len(rows):
-                return rows, poses[rows], covs[rows]
+                return rows, poses[rows], covs[rows], covs[rows]
             returns = self._returns(config.max_range_m)
-            found, left = match_to_walls(
+            found, left, prior = match_to_walls(
                 poses[rows], covs[rows], lambda some: returns.only(kept[scans[some]]), walls, config
             )
             before = np.searchsorted(times_ns[rows], times_ns, side="right") - 1
-            still = np.abs(poses - poses[rows[before]]) < STILL
-            same = np.flatnonzero((before >= 0) & still.all(axis=1))
-            return same, found[before[same]], left[before[same]]
+            moved = poses - poses[rows[before]]
+            moved[:, 2] = wrap(moved[:, 2])
+            near = (np.abs(moved) < STILL).all(axis=1)
+            # the error of a heading between states tells how far from them it is
+            still = near & (covs[:, 2, 2] == covs[rows[before], 2, 2])
+            same = np.flatnonzero((before >= 0) & still)
+            given = before[same]
+            return same, found[given], left[given], prior[given]
 
         return better
 

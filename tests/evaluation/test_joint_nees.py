@@ -107,7 +107,9 @@ def two_robots(rng):
         base = Trajectory(stamps, compose(scans, inverse(mounts[name])), unknown)
         results[name] = RobotResult(base, None, states[name], None, base)
         zeros = np.zeros((n, 3))
-        ties[name] = ScanTies(np.arange(n), zeros[:, 0], zeros, np.zeros((n, 3, 3)))
+        ties[name] = ScanTies(
+            np.arange(n), zeros[:, 0], zeros, np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
+        )
     step = 1e-6
     twist = np.array([
         (compose(origin_shift(START, mounts["a"] + step * e), inverse(shift))) / step

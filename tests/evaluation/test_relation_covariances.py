@@ -9,7 +9,7 @@ from room_log import drive
 
 import graphslam
 from graphslam.core.config import OdometryConfig, RobotConfig
-from graphslam.core.geometry import between, compose, exp, log
+from graphslam.core.geometry import adjoint, between, compose, exp, log
 from graphslam.core.information_root import InformationRoot
 from graphslam.core.records import JointScans, OdometryPose, Trajectory
 from graphslam.estimation.information_root import pair_covariances
@@ -97,6 +97,38 @@ def test_scans_between_the_same_states_share_the_odometry():
     assert alone[0] == 0.0 and (alone[1:] > 0).all()
     assert near < 0.4 * alone[1] and near < far
     assert one > 0.9 * alone[1] and after > alone[3]
+
+
+def test_scans_matched_to_the_map_share_what_is_left_of_the_odometry():
+    """By K = P C^-1 of both and the bridge's covariance, as by hand: a scan that was matched well
+    shares next to nothing with its neighbour, one that was not all. Taken to share P as if that
+    were of odometry, two scans 0.1 s apart were known relative to each other better than either
+    was matched. Scans at one place, not matched apart, are not apart at all."""
+    _, scans_of, joint = joint_of([3.5, 3.6, 3.6, 4.0], 1e-12 * np.eye(12), track())
+    ties, scans = joint.ties["r"], scans_of(joint.states["r"].poses)
+    C = ties.odometry_covs
+    P = C * np.array([0.1, 0.05, 0.05, 1.0])[:, None, None]
+    joint = replace(joint, ties={"r": replace(ties, covs=P)})
+    pairs = np.array([[0, 1], [1, 0], [1, 2], [0, 3], [3, 0]])
+    found = relative_covariances(joint, "r", scans, pairs)
+    s, t = ties.share[:2]
+    factor = (1 - t) / (1 - s)
+
+    def expected(a, b, kept):
+        A = adjoint(between(scans.poses[b], scans.poses[a]))
+        cross = A @ (kept * C[a]) @ A.T
+        return A @ P[a] @ A.T + P[b] - 2 * cross
+
+    # errors along the other axes differ by how far the scans are apart, which is little here
+    near = expected(0, 1, factor * 0.1 * 0.05)
+    np.testing.assert_allclose(found[0], near, atol=0.02 * np.abs(near).max())
+    assert np.trace(found[0]) > 0.9 * np.trace(P[0] + P[1])
+    np.testing.assert_allclose(found[2], 0.0, atol=1e-12)
+    far = expected(0, 3, (1 - ties.share[3]) / (1 - s) * 0.1)
+    np.testing.assert_allclose(found[3], far, atol=0.02 * np.abs(far).max())
+    for one, other, (a, b) in ((found[0], found[1], (0, 1)), (found[3], found[4], (0, 3))):
+        turned = adjoint(between(scans.poses[a], scans.poses[b]))
+        np.testing.assert_allclose(other, turned @ one @ turned.T, atol=1e-12)
 
 
 def test_the_root_of_a_back_end_has_the_joint_covariance_of_gtsam():

@@ -56,7 +56,7 @@ def tried(walls, n, seed, known=None):
     prior = compose(true, rng.multivariate_normal(np.zeros(3), PRIOR, size=n))
     covs = np.tile(PRIOR, (n, 1, 1))
     tree = WallTree.from_walls(*(known or around))
-    found, left = match_to_walls(prior, covs, returns_of(points), tree, CONFIG)
+    found, left, _ = match_to_walls(prior, covs, returns_of(points), tree, CONFIG)
     return true, prior, found, left
 
 
@@ -95,7 +95,7 @@ def test_what_is_not_in_the_map_moves_nothing():
     moved[0, 1] = 0.15  # the wall at y = 0 is hidden
     points = cast(pose, (moved, EXTENTS), rng=rng)
     tree = WallTree.from_walls(ROOM, EXTENTS)
-    (found,), _ = match_to_walls(pose[None], PRIOR[None], returns_of([points]), tree, CONFIG)
+    (found,), *_ = match_to_walls(pose[None], PRIOR[None], returns_of([points]), tree, CONFIG)
     assert np.all(np.abs(between(pose, found)) < [0.02, 0.02, 0.006])
 
 
@@ -118,7 +118,7 @@ def test_odometry_that_is_worse_than_it_states_is_believed_less():
     tree = WallTree.from_walls(ROOM, EXTENTS)
     good, bad = (
         np.sqrt(np.mean(between(true, found) ** 2, axis=0))
-        for found, _ in (
+        for found, *_ in (
             match_to_walls(prior, np.tile(PRIOR / s**2, (300, 1, 1)), points, tree, CONFIG)
             for s in (1.0, 3.0)
         )
@@ -129,7 +129,7 @@ def test_odometry_that_is_worse_than_it_states_is_believed_less():
 @pytest.mark.parametrize("points", [np.zeros((0, 2)), np.array([[1.0, 1.0]])])
 def test_a_scan_without_returns_on_walls_stays(points):
     pose, walls = np.array([[3.0, 2.0, 0.5]]), WallTree.from_walls(ROOM, EXTENTS)
-    found, left = match_to_walls(pose, PRIOR[None], returns_of([points]), walls, CONFIG)
+    found, left, _ = match_to_walls(pose, PRIOR[None], returns_of([points]), walls, CONFIG)
     np.testing.assert_allclose(found, pose, atol=1e-12)
     np.testing.assert_allclose(left[0], PRIOR, rtol=1e-3, atol=1e-12)
 
@@ -144,7 +144,7 @@ def test_a_laser_that_is_noisier_than_settings_say_is_believed_less():
     prior = compose(true, rng.multivariate_normal(np.zeros(3), cov, size=300))
     tree = WallTree.from_walls(ROOM, EXTENTS)
     covs = np.tile(cov, (300, 1, 1))
-    found, left = match_to_walls(prior, covs, returns_of(noisy), tree, CONFIG)
+    found, left, _ = match_to_walls(prior, covs, returns_of(noisy), tree, CONFIG)
     off = between(true, found)
     assert np.all(np.sqrt(np.mean(off**2, axis=0)) < 1.1 * np.sqrt(np.diag(cov)))
     assert np.mean(np.einsum("ni,nij,nj->n", off, np.linalg.inv(left), off)) / 3 < 1.5
@@ -160,7 +160,7 @@ def test_scans_that_do_not_find_their_place_stay_with_what_was_known():
     prior[::10, 2] += np.radians(25.0)
     tree = WallTree.from_walls(ROOM, EXTENTS)
     covs = np.tile(0.25 * PRIOR, (200, 1, 1))
-    found, left = match_to_walls(prior, covs, points, tree, CONFIG)
+    found, left, _ = match_to_walls(prior, covs, points, tree, CONFIG)
     off = np.abs(between(true, found))
     lost = np.arange(200) % 10 == 0
     assert off[~lost, 2].max() < 0.02
@@ -175,7 +175,7 @@ def test_a_scan_far_off_is_brought_home():
     prior = compose(true, rng.multivariate_normal(np.zeros(3), PRIOR, size=200))
     prior[::10, 2] += np.radians(4.0)
     tree = WallTree.from_walls(ROOM, EXTENTS)
-    found, left = match_to_walls(prior, np.tile(PRIOR, (200, 1, 1)), points, tree, CONFIG)
+    found, left, _ = match_to_walls(prior, np.tile(PRIOR, (200, 1, 1)), points, tree, CONFIG)
     home = np.abs(between(true, found)[:, 2]) < 0.02
     assert np.count_nonzero(home[::10]) >= 17  # of 20: some are 6 degrees off by their noise
     assert np.all(home | (left[:, 2, 2] > 0.9 * PRIOR[2, 2]))
