@@ -196,12 +196,15 @@ def _solved(
     problem = _Problem(with_closures(steps, closures), near, tracks, config)
     steps, done, minimum = problem.solve(settle=config.backend.optimise_at_end)
     estimate = _with_surface_bias(steps, done.estimate, tracks, config)
-    landmarks.update_from(steps, estimate)
     for name in tracks:
         scan_log.runs[name].is_calibrated = config.odometry.calibrate
     # what the second process does meanwhile moves the estimate by far less than scans can tell
     scan_log.scan_evidence = gather_scan_evidence(scan_log, estimate, parked)
-    return moved_to(minimum.result(), estimate) if minimum else estimate, steps
+    if minimum:
+        estimate = moved_to(minimum.result(), estimate)
+    # the minimum may have turned the map as a whole: ends of walls are where they are seen there
+    landmarks.update_from(steps, estimate)
+    return estimate, steps
 
 
 def _count_observations(steps: tuple[Step, ...]) -> int:

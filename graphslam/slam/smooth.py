@@ -127,8 +127,10 @@ def make_result(finished: FinishedPass, began: float) -> Result:
         transforms = pipeline.transforms()
         estimate = transforms.estimate(finished.estimate)
         steps = tuple(map(transforms.step, pipeline.steps))
+        moved = pipeline.landmarks.transformed(transforms.landmarks)
         if is_settled(pipeline.config) and not finished.is_settled:
             estimate = settled(steps, estimate, pipeline.kernel)
+            moved.update_from(steps, estimate)
         errors = Future(partial(graph_error, steps, estimate, pipeline.kernel))
         frames = pipeline.frames.landmark_frames(pipeline.landmarks.entries.values())
         # the starts of robots place their worlds, unless a known map does
@@ -141,7 +143,6 @@ def make_result(finished: FinishedPass, began: float) -> Result:
                 {name: run.track.mount for name, run in runs.items()},
             )
 
-        moved = pipeline.landmarks.transformed(transforms.landmarks)
         walls = walls_of_frames(moved, estimate, frames)
 
         def robot_result(name: str) -> RobotResult:

@@ -1,5 +1,6 @@
 """The pipeline on small logs whose truth is known: what comes out, at which stamps, and why."""
 
+import importlib
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -19,6 +20,7 @@ from graphslam.core.observation_models import MODELS
 from graphslam.core.records import OdometryPose, RelativePose, Sighting, Trajectory
 from graphslam.evaluation.trajectory_metrics import align
 from graphslam.logs import LogWriter, open_logs
+from graphslam.mapping.landmark_map import seen_extents
 from graphslam.odometry.interpolation import origin_shift, transform_trajectory
 from graphslam.odometry.preintegration import Track
 from graphslam.slam.pipeline import Pipeline
@@ -546,3 +548,35 @@ def test_sightings_beside_scans_enter_at_their_own_time():
     assert images <= set(states.stamps_ns.tolist())
     seen = {a.time_ns for step in result.steps for a in step.associations}
     assert seen <= images
+
+
+# ------------------------------------------------------------ ends of walls
+
+
+@pytest.mark.parametrize(
+    ("log", "module"), [("lab", "batch_optimisation"), ("two-robots", "smooth")]
+)
+def test_walls_end_where_they_were_seen_also_if_the_minimum_has_turned_the_map(
+    log, module, monkeypatch
+):
+    """One robot, solved as a batch, and two. The prior of a start is so weak that a large map turns
+    by some mrad on the last step: ends of walls then lay metres along the walls from where they
+    were seen. They come from the robots' poses through each observation, to 1e-6 m."""
+    where = importlib.import_module(f"graphslam.slam.{module}")
+    minimum = where.settled
+    world = np.array([3.0, -1.0, 0.4])
+
+    def turned(steps, estimate, kernel):
+        found = minimum(steps, estimate, kernel)
+        states = {name: transform_trajectory(t, world) for name, t in found.states.items()}
+        landmarks = {n: (compose(world, m), cov) for n, (m, cov) in found.landmarks.items()}
+        return replace(found, states=states, landmarks=landmarks)
+
+    monkeypatch.setattr(where, "settled", turned)
+    result = run(ROOT / f"logs/{log}.mcap")
+    seen = seen_extents(result.steps, result.estimate)
+    lines = [mark for mark in result.landmarks if mark.kind == "line"]
+    assert lines
+    for mark in lines:
+        ends = np.column_stack([seen[mark.id], np.zeros(2)])
+        assert mark.extent == pytest.approx(transform(mark.position, ends), abs=1e-6)
