@@ -33,10 +33,10 @@ from graphslam.evaluation.metrics import evaluate
 from graphslam.logs import open_logs, read_true_associations, read_truth
 from graphslam.results.folder import load, save
 from graphslam.simulation import Scenario, load_scenario, simulate
+from graphslam.slam.final_result import make_result
 from graphslam.slam.initialisation import initialise
 from graphslam.slam.passes import FinishedPass, run_passes
 from graphslam.slam.sighting_passes import run_sighting_passes
-from graphslam.slam.smooth import make_result
 
 SCENARIOS = {"passing": Path(__file__).with_name("passing.toml"), "fleet": "fleet"}
 #: what changes in the sensors of robots; those of landmarks change in `untold` alone

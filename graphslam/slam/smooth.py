@@ -4,37 +4,23 @@ import time
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
-
 from graphslam.core.config import Config
 from graphslam.core.errors import ConfigError
-from graphslam.core.records import Result, RobotResult
-from graphslam.core.worker import Future, parallel_map
-from graphslam.estimation.g2o import graph_error
-from graphslam.estimation.settled import settled
+from graphslam.core.records import Result
 from graphslam.logs import LogSet
 from graphslam.mapping.known_map import KnownMap
-from graphslam.mapping.landmark_records import make_landmarks
 from graphslam.mapping.loop_closure import Tamper
-from graphslam.odometry.mount_covariance import with_mount_errors
 from graphslam.slam.checkpoint import NOTHING_KEPT, Checkpoint
-from graphslam.slam.evidence import gather
+from graphslam.slam.final_result import make_result
 from graphslam.slam.initialisation import initialise
-from graphslam.slam.log_pass import Progress, timed
+from graphslam.slam.log_pass import Progress
 from graphslam.slam.log_reader import Reading, is_scan_log, is_session_log
 from graphslam.slam.passes import FinishedPass, run_passes
 from graphslam.slam.pose_graph import is_pose_graph, solve_pose_graph
-from graphslam.slam.retirement import retired_landmarks
 from graphslam.slam.robot_settings import check_robots
 from graphslam.slam.scan_log import solve_scan_log
-from graphslam.slam.scans_between import walls_of_frames
 from graphslam.slam.session_log import solve_session_log
 from graphslam.slam.sighting_passes import run_sighting_passes
-from graphslam.slam.summary import summarise
-from graphslam.slam.verdict import judge
-
-#: scans that a result keeps for pictures, at most
-MAX_PICTURES = 4000
 
 
 def smooth(
@@ -103,90 +89,3 @@ def _solved(
     finished = finished or run_passes(log, config, known, progress, tamper, kept)
     finished.pipeline.seconds["starts"] = initialised - began
     return make_result(finished, began)
-
-
-def is_settled(config: Config) -> bool:
-    """Whether the estimate is a minimum: that of the batch, not of a filter or of a window."""
-    backend = config.backend
-    return backend.name == "batch" and backend.optimise_at_end and backend.reoptimise
-
-
-def make_result(finished: FinishedPass, began: float) -> Result:
-    """Everything in the robots' own frames, as one record.
-
-    Args:
-        finished: the last pass.
-        began: when the job began (`time.perf_counter`).
-    """
-    pipeline, causal = finished.pipeline, finished.findings.causal
-    runs = pipeline.started
-    with timed(pipeline.seconds, "trajectories"):
-        causal_only = bool(causal) and all(
-            run.is_causal(finished.estimate.states[name]) for name, run in runs.items()
-        )
-        transforms = pipeline.transforms()
-        estimate = transforms.estimate(finished.estimate)
-        steps = tuple(map(transforms.step, pipeline.steps))
-        moved = pipeline.landmarks.transformed(transforms.landmarks)
-        if is_settled(pipeline.config) and not finished.is_settled:
-            estimate = settled(steps, estimate, pipeline.kernel)
-            moved.update_from(steps, estimate)
-        errors = Future(partial(graph_error, steps, estimate, pipeline.kernel))
-        frames = pipeline.frames.landmark_frames(pipeline.landmarks.entries.values())
-        # the starts of robots place their worlds, unless a known map does
-        if estimate.mounts is not None and pipeline.known.known_map is None:
-            estimate = with_mount_errors(
-                estimate,
-                pipeline.frames.of,
-                frames,
-                {name: start.pose for name, start in pipeline.starts.items()},
-                {name: run.track.mount for name, run in runs.items()},
-            )
-
-        walls = walls_of_frames(moved, estimate, frames)
-
-        def robot_result(name: str) -> RobotResult:
-            run, states, mounts = runs[name], estimate.states[name], estimate.mounts
-            mount = None if mounts is None else mounts.of(name)
-            own = walls.get(pipeline.frames.of[name])
-            better = run.between.matched_to(own, pipeline.config.front_end)
-            return run.result(
-                states, causal.get(name), mount, causal_only=causal_only, better=better
-            )
-
-        robots = dict(zip(runs, parallel_map(robot_result, list(runs)), strict=True))
-        error, plain = errors.result()
-        estimate = replace(estimate, error=error)
-    landmarks = pipeline.frames.label_landmarks(
-        make_landmarks(moved, estimate), pipeline.landmarks.entries.values()
-    )
-    retired = retired_landmarks(pipeline, landmarks, estimate)
-    landmarks = tuple(mark for mark in landmarks if mark.id not in retired)
-    t0 = min(trajectory.stamps_ns[0] for trajectory in estimate.states.values())
-    innovations = {
-        model: np.array([((t - t0) * 1e-9, d2) for t, d2 in values]).reshape(-1, 2)
-        for model, values in sorted(pipeline.innovations.items())
-    }
-    if finished.causal_later is not None:  # the second process was still at them
-        own = finished.causal_later()
-        robots = {
-            name: replace(robot, causal=own[name].base, scan_causal=own[name].scan)
-            for name, robot in robots.items()
-        }
-    pipeline.seconds["all"] = time.perf_counter() - began
-    summary = summarise(pipeline, estimate, plain, len(landmarks), finished.findings.clocks)
-    if "known_map" in summary:
-        summary["known_map"]["retired"] = list(retired.values())
-    evidence = gather(pipeline, robots, steps, estimate, innovations, summary)
-    summary["verdict"] = judge(evidence)
-    return Result(
-        robots,
-        landmarks,
-        estimate,
-        steps,
-        tuple(pipeline.keyframe_scans[:: 1 + len(pipeline.keyframe_scans) // MAX_PICTURES]),
-        innovations,
-        np.array(pipeline.step_ms),
-        summary,
-        pipeline.given_config,
-    )

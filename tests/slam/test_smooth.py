@@ -554,7 +554,7 @@ def test_sightings_beside_scans_enter_at_their_own_time():
 
 
 @pytest.mark.parametrize(
-    ("log", "module"), [("lab", "batch_optimisation"), ("two-robots", "smooth")]
+    ("log", "module"), [("lab", "batch_optimisation"), ("two-robots", "final_result")]
 )
 def test_walls_end_where_they_were_seen_also_if_the_minimum_has_turned_the_map(
     log, module, monkeypatch
