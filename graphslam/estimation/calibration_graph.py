@@ -114,6 +114,7 @@ class CalibrationGraph:
         self._values, self._priors = gtsam.Values(), priors
         self._marginals: gtsam.Marginals | None = None  # at the last solution
         self._steps, self._now = steps, now  # the motions in the graph, and their calibration
+        self._linear_at: gtsam.Values | None = None  # the solution around which they are linear
         self._keys = {r: int(gtsam.symbol("c", k)) for k, r in enumerate(sorted(priors))}
         self._free = {r: np.flatnonzero(np.diag(c.cov) > HELD_SIGMA**2) for r, c in priors.items()}
         self._motions: dict[str, list[tuple[int, int, int]]] = defaultdict(list)  # index, two keys
@@ -203,6 +204,7 @@ class CalibrationGraph:
         """
         builder, values, found = self._builder, self._values, NO_COVARIANCES
         if marginals:
+            self._relinearise()
             try:
                 found = marginals_of(builder.graph, values, keep_rows=joint)
             except RuntimeError as error:
@@ -229,11 +231,15 @@ class CalibrationGraph:
         return calibrations
 
     def _relinearise(self) -> None:
-        """Put motions in the graph as they are linear around the last solution.
+        """Put motions in the graph as they are linear around the last solution, for covariances.
 
-        They were around that from which it was sought, in the axes of its poses: of two poses that
-        both are uncertain and have turned since, the relative pose would have a little of both.
+        They were around that from which it was sought, in the axes of its poses. Where these have
+        turned since, the motions change if all is turned alike, which would be information about
+        the direction of the whole map that no measurement has.
         """
+        if self._linear_at is self._values:
+            return
+        self._linear_at = self._values
         found = self._calibrations({})
         self.calibrate_motions(at_calibration(self._steps, self._now, found), found)
 
@@ -343,6 +349,7 @@ class CalibrationGraph:
         """Joint covariance (D, D) of variables at the last solution, in their own axes."""
         try:
             if self._marginals is None:
+                self._relinearise()
                 self._marginals = gtsam.Marginals(self._builder.graph, self._values)
             return np.asarray(self._marginals.jointMarginalCovariance(list(keys)).fullMatrix())
         except RuntimeError as error:

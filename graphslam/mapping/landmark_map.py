@@ -28,6 +28,8 @@ from graphslam.mapping.gating import BoolArray, IntArray
 
 #: m: landmarks of an earlier map that are nearer to each other are known to be different things
 KNOWN_NEAR_M = 2.0
+#: observations of a wall of which the one that reaches farthest is not believed
+LEAST_SEEN = 3
 
 
 @dataclass(slots=True, eq=False)
@@ -290,7 +292,11 @@ def observed_from(
 
 
 def seen_extents(steps: Sequence[Step], estimate: Estimate) -> dict[int, Array]:
-    """Number of each wall -> extent (2,) of all observations of it, m along its x axis."""
+    """Number of each wall -> extent (2,) of its observations, m along its x axis.
+
+    Of three or more it ends where a second one does: one may have a return in it that is of the
+    wall beyond an opening.
+    """
     seen = [
         a
         for step in steps
@@ -305,10 +311,13 @@ def seen_extents(steps: Sequence[Step], estimate: Estimate) -> dict[int, Array]:
     relative = between(means[wall], world)
     ends = relative[:, :1] + np.cos(relative[:, 2:]) * np.array([a.extent for a in seen])
     ends.sort(axis=1)  # an observation may have the opposite direction
-    low, high = np.full(len(walls), np.inf), np.full(len(walls), -np.inf)
-    np.minimum.at(low, wall, ends[:, 0])
-    np.maximum.at(high, wall, ends[:, 1])
-    return dict(zip(walls.tolist(), np.column_stack([low, high]), strict=True))
+    count = np.bincount(wall)
+    first = np.cumsum(count) - count
+    outermost = np.where(count >= LEAST_SEEN, 1, 0)  # of the sorted ends of each wall
+    low = ends[np.lexsort((ends[:, 0], wall)), 0][first + outermost]
+    high = ends[np.lexsort((-ends[:, 1], wall)), 1][first + outermost]
+    extents = np.column_stack([np.minimum(low, high), np.maximum(low, high)])
+    return dict(zip(walls.tolist(), extents, strict=True))
 
 
 def mean_landmarks(

@@ -46,9 +46,10 @@ def thinned_index(points: Array, step_m: float = PATH_STEP_M) -> list[int]:
 
 def svg_text(landmarks: Sequence[Landmark], paths: Mapping[str, Array]) -> str:
     """An SVG, one unit 1 m, north up; walls, points and ``paths`` (n, 2) are groups."""
-    corners = [m.extent for m in landmarks] + list(paths.values()) + [np.zeros((1, 2))]
-    low = np.concatenate(corners).min(axis=0) - _MARGIN_M
-    high = np.concatenate(corners).max(axis=0) + _MARGIN_M
+    corners = np.concatenate([*(m.extent for m in landmarks), *paths.values(), np.zeros((0, 2))])
+    if not len(corners):
+        corners = np.zeros((1, 2))
+    low, high = corners.min(axis=0) - _MARGIN_M, corners.max(axis=0) + _MARGIN_M
     width, height = (high - low).tolist()
 
     def at(point: Array) -> tuple[str, str]:

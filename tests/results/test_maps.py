@@ -19,6 +19,7 @@ from graphslam.core.geometry import compose, polar_points
 from graphslam.results import occupancy_grid
 from graphslam.results.folder import save
 from graphslam.results.grid_map import grid_map_files
+from graphslam.results.line_map import svg_text
 from graphslam.results.map_files import make_map
 from graphslam.results.occupancy_grid import GridMap, OccupancyGrid, fan, grid_map
 from graphslam.results.scans_file import PlacedScan, place_scans, read_scans, scans_bytes
@@ -336,3 +337,17 @@ def test_a_target_that_is_no_folder_is_an_error_in_one_line(saved, tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(OutputError, match="cannot be written"):
         make_map(saved[0], tmp_path / "file" / "map")
+
+
+def test_a_drawing_is_as_large_as_the_map_wherever_that_is(saved):
+    """The world's origin was always in it: of a building kilometres away nothing could be seen."""
+    _, result = saved
+    far = np.array([1000.0, -2000.0])
+    moved = [replace(m, extent=m.extent + far) for m in result.landmarks]
+
+    def size(landmarks):
+        svg = ET.fromstring(svg_text(landmarks, {}))
+        return [float(v) for v in svg.get("viewBox").split()[2:]]
+
+    assert size(moved) == pytest.approx(size(result.landmarks), abs=1e-3)
+    assert min(size([])) > 0

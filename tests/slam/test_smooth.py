@@ -12,7 +12,7 @@ from paths import ROOT
 from pose_checks import assert_same_pose
 from walls import cast, rectangles
 
-from graphslam.core.config import Config, OdometryConfig, RobotConfig
+from graphslam.core.config import Config, OdometryConfig, RobotConfig, StartConfig
 from graphslam.core.config_io import load_config
 from graphslam.core.errors import EstimationError, GraphSlamError
 from graphslam.core.geometry import between, compose, exp, inverse, transform, wrap
@@ -580,3 +580,18 @@ def test_walls_end_where_they_were_seen_also_if_the_minimum_has_turned_the_map(
     for mark in lines:
         ends = np.column_stack([seen[mark.id], np.zeros(2)])
         assert mark.extent == pytest.approx(transform(mark.position, ends), abs=1e-6)
+
+
+# ------------------------------------------------------------ the direction of the world
+
+
+def test_no_measurement_tells_the_direction_of_the_world():
+    """The first pose is as uncertain as its prior says, to 1e-3: nothing else is about the world.
+    Motions that were linear around poses that have turned since told something of it: a prior of
+    0.5 rad became 0.03 rad, and all covariances far from the start were too small by that."""
+    config = load_config(overrides=["start.given_sigma_rad=0.5"])
+    start = StartConfig(poses={"vehicle": (30.0, -20.0, 2.5)}, given_sigma_rad=0.5)
+    result = run(ROOT / "logs/office-loop.mcap", config=replace(config, start=start))
+    sigmas = np.sqrt(np.diagonal(result.estimate.states["vehicle"].covs, axis1=1, axis2=2))
+    assert sigmas[0, 2] == pytest.approx(0.5, rel=1e-3)
+    assert np.all(sigmas[:, 2] > 0.499)  # the wheels and walls add to it
