@@ -37,6 +37,8 @@ POSE_EVERY_S = 1.0
 MOST_POSES = 3000
 #: a path has a pose at every such part of its extent, but not nearer than `PATH_STEP_M`
 PATH_STEPS = 1000
+#: height of the camera above the map, in sizes of the map, and at least, m
+VIEW, LEAST_VIEW_M = 1.5, 20.0
 _BLACK, _RED, _BLUE = (0.1, 0.1, 0.1), (0.85, 0.3, 0.1), (0.17, 0.37, 0.7)
 
 
@@ -143,6 +145,14 @@ def _landmark_markers(landmarks: Sequence[Landmark], stamp: int, frame: str) -> 
     return ros.marker_array(found)
 
 
+def _bounds(scene: Scene) -> tuple[Array, Array]:
+    """Corners (2,), m, of what is in frame ``map``."""
+    inside = [robot.final.poses[:, :2] for robot in scene.robots if robot.world == "map"]
+    inside += [m.extent for m in scene.landmarks if scene.frame_of(m) == "map"]
+    points = np.concatenate(inside) if inside else np.zeros((1, 2))
+    return points.min(axis=0), points.max(axis=0)
+
+
 def layout(scene: Scene) -> str:
     """A layout for Foxglove and Lichtblick, which hide topics until they are asked to show them."""
     topics: dict[str, Any] = {"/map": {"visible": True, "colorMode": "map", "alpha": 0.6}}
@@ -161,13 +171,15 @@ def layout(scene: Scene) -> str:
                 "decayTime": 1,
             },
         }
+    low, high = _bounds(scene)
+    x, y = ((low + high) / 2).tolist()
     panel = {
         "cameraState": {
             "perspective": False,
-            "distance": 60,
+            "distance": max(float((high - low).max()) * VIEW, LEAST_VIEW_M),
             "phi": 0,
             "thetaOffset": 90,
-            "targetOffset": [0, 0, 0],
+            "targetOffset": [x, y, 0],
             "target": [0, 0, 0],
             "targetOrientation": [0, 0, 0, 1],
             "fovy": 45,

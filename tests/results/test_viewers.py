@@ -155,6 +155,16 @@ def test_the_layout_shows_every_topic(shown):
     assert all(topics[topic]["visible"] for topic in written)
 
 
+def test_the_camera_is_above_the_map_and_sees_all_of_it(shown):
+    """It looked at the world's origin from 60 m, wherever the map was."""
+    layout = json.loads((shown / "result.layout.json").read_text())
+    panel = next(p for p in layout["configById"].values() if "cameraState" in p)
+    camera = panel["cameraState"]
+    paths = [robot.final.poses[:, :2] for robot in load(shown).robots.values()]
+    off = np.abs(np.concatenate(paths) - camera["targetOffset"][:2])
+    assert off.max() < camera["distance"] * np.tan(np.radians(camera["fovy"]))
+
+
 @pytest.mark.skipif(not importlib.util.find_spec("mcap_ros2"), reason="needs mcap-ros2-support")
 def test_the_other_reference_reader_decodes_every_message(shown):
     from mcap_ros2.decoder import DecoderFactory
