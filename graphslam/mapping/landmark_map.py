@@ -29,7 +29,7 @@ from graphslam.mapping.gating import BoolArray, IntArray
 #: m: landmarks of an earlier map that are nearer to each other are known to be different things
 KNOWN_NEAR_M = 2.0
 #: observations of a wall of which the one that reaches farthest is not believed
-LEAST_SEEN = 3
+LEAST_SEEN = 10
 
 
 @dataclass(slots=True, eq=False)
@@ -294,8 +294,8 @@ def observed_from(
 def seen_extents(steps: Sequence[Step], estimate: Estimate) -> dict[int, Array]:
     """Number of each wall -> extent (2,) of its observations, m along its x axis.
 
-    Of three or more it ends where a second one does: one may have a return in it that is of the
-    wall beyond an opening.
+    Of many (`LEAST_SEEN`) it ends where a second one does: one may have a return in it that is of
+    the wall beyond an opening.
     """
     seen = [
         a

@@ -73,6 +73,7 @@ def check_motions(
         k
         for k, motion in enumerate(motions)
         if is_suspect(float(here[k]), steps[k], motion.cov + covs[k])
+        and min(len(before[k].points), len(now[k].points)) >= MIN_POINTS
     ]
     if not left:
         return checked

@@ -22,6 +22,8 @@ STRIDE, LENGTH_M, LEAST_PIECES = 5, (0.1, 1.0), 10
 #: share of walls in other directions (of squared sines) up to which one direction is open
 OPEN = 0.15
 LEAST_RETURNS = 30
+#: share of returns that a pose must put where the first scan could see
+LEAST_IN_VIEW = 0.5
 #: returns of a scan that are compared
 MOST_RETURNS = 90
 #: segments of a surface beside the bearing of a return that it may lie on
@@ -83,4 +85,10 @@ def misfits(surface: NearReturns, scan: NearReturns, poses: Array) -> Array:
         share = np.where(is_joined[k], share, np.round(share))
         away -= share[..., None] * along[k]
         nearest = np.minimum(nearest, (away**2).sum(axis=-1))
-    return np.asarray(np.minimum(nearest / SIGMA_M**2, MOST**2).mean(axis=-1))
+    # where the first scan could not see nothing speaks for a pose or against it
+    in_view = (np.hypot(placed[..., 0], placed[..., 1]) < NEAR_M) & (at > 0)
+    in_view &= at < len(surface.points)
+    squared = np.minimum(nearest / SIGMA_M**2, MOST**2)
+    count = in_view.sum(axis=-1)
+    mean = (squared * in_view).sum(axis=-1) / np.maximum(count, 1)
+    return np.asarray(np.where(count >= LEAST_IN_VIEW * len(points), mean, MOST**2))

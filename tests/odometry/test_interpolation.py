@@ -275,7 +275,7 @@ def test_a_scan_that_is_known_better_lies_where_it_was_found():
 
     def better(times_ns, poses, noise, covs=covs):
         asked.append((times_ns, poses.copy(), noise.copy()))
-        return np.array([1, 2]), compose(poses[1:], offsets), covs
+        return np.array([1, 2]), compose(poses[1:], offsets), covs, 4.0 * noise[1:]
 
     final, known = final_scans(STATES, TRACK, ns(times), ns(times), mounts, better)
     ((when, poses, noise),) = asked
@@ -285,6 +285,8 @@ def test_a_scan_that_is_known_better_lies_where_it_was_found():
     np.testing.assert_allclose(J @ noise @ J.mT, ties.covs, rtol=1e-9, atol=1e-18)
     np.testing.assert_array_equal(final.poses[0], plain.poses[0])
     np.testing.assert_array_equal(known.covs[0], ties.covs[0])
+    np.testing.assert_allclose(known.odometry_covs[1:], 4.0 * ties.covs[1:], rtol=1e-9, atol=1e-18)
+    np.testing.assert_array_equal(ties.odometry_covs, ties.covs)
     assert_same_pose(final.poses[1:], compose(plain.poses[1:], offsets), atol=1e-12)
     np.testing.assert_allclose(known.covs[1:], J @ covs @ J.mT, rtol=1e-9)
     exact, _ = final_scans(

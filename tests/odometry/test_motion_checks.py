@@ -22,6 +22,7 @@ from graphslam.odometry.scan_odometry import (
     scan_submap,
     suspect_motions,
 )
+from graphslam.perception.scan_matching import make_submap
 from graphslam.perception.scan_pairs import fit_pairs
 
 S = 1_000_000_000
@@ -259,3 +260,21 @@ def test_along_a_corridor_only_the_turn_is_corrected():
     found = check_motions([said(straight + np.array([0, 0, 0.15]), cov)], [before], [now])[0]
     assert found.from_scans and abs(found.delta[2]) < 0.01
     assert found.cov[0, 0] == pytest.approx(cov[0, 0], rel=0.1)
+
+
+@pytest.mark.parametrize("few", [None, 0, 1])
+def test_scans_of_few_returns_correct_nothing(monkeypatch, few):
+    """A laser of 4 m saw 28 returns at the end of a corridor: at some motion half of them lie on
+    another scan, and odometry that was right was turned by a radian for it."""
+    name = "graphslam.odometry.scan_odometry."
+    pose, cov = STEP + np.array([0.9, 0.0, 0.0]), SURE[None]
+    monkeypatch.setattr(name + "fits", lambda *_: (np.array([0.4]), np.zeros((1, 3)), cov))
+    monkeypatch.setattr(name + "align_pairs", lambda *_: (pose[None], cov, None))
+    monkeypatch.setattr(name + "shares_on_others", lambda ends, *_: np.full(len(ends), 0.7))
+    monkeypatch.setattr(name + "match_pairs", lambda ends, *_: [[]] * len(ends))
+    points = cloud(np.zeros(3), L_ROOM)
+    before, now = (
+        make_submap(np.zeros((1, 3)), [points[:28] if k == few else points]) for k in (0, 1)
+    )
+    (found,) = check_motions([said(STEP)], [before], [now])
+    assert found.from_scans is (few is None)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from graphslam.core.records import KeyframeScan, Scan, Trajectory
+from graphslam.perception.along_walls import misfits, near_returns
 from graphslam.slam.path_evidence import (
     FACTORS,
     SPEEDS_M_S,
@@ -75,3 +76,15 @@ def test_scans_of_few_returns_and_few_scans_are_no_evidence():
     assert better_fit(path_misfits(few, states).misfits) is None
     assert better_fit(path_misfits(scans[:5], states).misfits) is None
     assert better_fit(path_misfits([], states).misfits) is None
+
+
+def test_what_a_pose_puts_out_of_view_does_not_speak_against_it():
+    """A wall of which the second scan sees 2 m more than the first could: on the wall all the
+    same. Returns beyond the first one's view counted as far from it, so less motion fitted
+    better. A pose that puts most of them there is no explanation, however."""
+    along = np.arange(0.5, 5.7, 0.02)
+    wall = np.column_stack([along, np.full(len(along), 1.2)])
+    first = near_returns(wall, np.zeros(3))
+    poses = np.array([[2.0, 0.0, 0.0], [4.5, 0.0, 0.0], [2.0, 0.3, 0.0]])
+    right, beyond, aside = misfits(first, first, poses)
+    assert right < 0.1 and beyond > 8.0 and aside > 8.0
