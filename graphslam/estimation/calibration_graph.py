@@ -138,7 +138,7 @@ class CalibrationGraph:
         """
         graph, values = self._builder.graph, self._values
         unit = gtsam.noiseModel.Unit.Create(3)
-        self._steps, self._now = steps, now
+        self._steps, self._now, self._linear_at = steps, now, values
         for robot, use in self._free.items():
             if not len(use):
                 continue
@@ -239,7 +239,6 @@ class CalibrationGraph:
         """
         if self._linear_at is self._values:
             return
-        self._linear_at = self._values
         found = self._calibrations({})
         self.calibrate_motions(at_calibration(self._steps, self._now, found), found)
 

@@ -28,7 +28,8 @@ from graphslam.mapping.gating import BoolArray, IntArray
 
 #: m: landmarks of an earlier map that are nearer to each other are known to be different things
 KNOWN_NEAR_M = 2.0
-#: observations of a wall of which the one that reaches farthest is not believed
+#: observations of a wall from which on the one that reaches farthest is not believed; of fewer each
+#: may have seen a part of its own
 LEAST_SEEN = 10
 
 
@@ -316,6 +317,7 @@ def seen_extents(steps: Sequence[Step], estimate: Estimate) -> dict[int, Array]:
     outermost = np.where(count >= LEAST_SEEN, 1, 0)  # of the sorted ends of each wall
     low = ends[np.lexsort((ends[:, 0], wall)), 0][first + outermost]
     high = ends[np.lexsort((-ends[:, 1], wall)), 1][first + outermost]
+    # parts that do not overlap have their second ends the other way round
     extents = np.column_stack([np.minimum(low, high), np.maximum(low, high)])
     return dict(zip(walls.tolist(), extents, strict=True))
 

@@ -62,6 +62,9 @@ def check_motions(
 ) -> list[Motion]:
     """Motions, corrected by scan matching where the scans contradict them (``from_scans``).
 
+    Scans of few points (`MIN_POINTS`) contradict nothing: half of them lie on another scan at some
+    motion.
+
     Args:
         motions: according to odometry.
         before: scans of the states where they start, in these states' frames.

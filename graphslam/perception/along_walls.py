@@ -64,6 +64,9 @@ def open_direction(scan: NearReturns) -> Array | None:
 def misfits(surface: NearReturns, scan: NearReturns, poses: Array) -> Array:
     """Mean squared distances (h,), in sigmas and limited, of a scan seen from several poses.
 
+    Returns that a pose puts where the first scan could not see do not count for it; a pose that
+    puts most of them there has the largest distance.
+
     Args:
         surface: the scan that it is compared with; neighbouring returns are joined.
         scan: the other.
