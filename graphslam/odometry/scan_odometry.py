@@ -78,15 +78,29 @@ def check_motions(
         if is_suspect(float(here[k]), steps[k], motion.cov + covs[k])
         and min(len(before[k].points), len(now[k].points)) >= MIN_POINTS
     ]
-    if not left:
-        return checked
+    some = [motions[k] for k in left], [before[k] for k in left], [now[k] for k in left]
+    for k, match in zip(left, match_motions(*some, here[left]), strict=True):
+        if match is not None:
+            checked[k] = _corrected(motions[k], *match, before[0].config)
+    return checked
+
+
+def match_motions(
+    motions: Sequence[Motion], before: Sequence[Submap], now: Sequence[Submap], overlap: Array
+) -> list[tuple[Array, Array] | None]:
+    """What scans say of motions: pose (3,) and its cov (3, 3); None where they do not match.
+
+    Arguments are those of `check_motions`; ``overlap`` (n,) is the share of points of ``now`` on
+    ``before`` at the motion: a match has more.
+    """
+    if not motions:
+        return []
     config = before[0].config
-    ends, starts = [now[k] for k in left], [before[k] for k in left]
-    poses, covs, _ = align_pairs(ends, starts, [motions[k].delta for k in left])
-    shares = shares_on_others(ends, starts, poses)
-    needed = np.maximum(MIN_OVERLAP, here[left] + MIN_OVERLAP_GAIN)
-    found = {k: [(s, p, c)] for k, s, p, c in zip(left, shares, poses, covs, strict=True)}
-    lost = [k for k, share, least in zip(left, shares, needed, strict=True) if share < least]
+    poses, covs, _ = align_pairs(now, before, [motion.delta for motion in motions])
+    shares = shares_on_others(now, before, poses)
+    needed = np.maximum(MIN_OVERLAP, overlap + MIN_OVERLAP_GAIN)
+    found = [[(s, p, c)] for s, p, c in zip(shares, poses, covs, strict=True)]
+    lost = np.flatnonzero(shares < needed).tolist()
     window = np.array([config.search_m, config.search_m, config.search_rad])
     matches = match_pairs(
         [now[k] for k in lost],
@@ -99,11 +113,11 @@ def check_motions(
         at = np.array([m.pose for m in own]).reshape(-1, 3)
         again = shares_on_others([now[k]] * len(own), [before[k]] * len(own), at)
         found[k] += [(share, m.pose, m.cov) for share, m in zip(again, own, strict=True)]
-    for k, least in zip(left, needed, strict=True):
-        share, pose, cov = max(found[k], key=lambda one: one[0])
-        if share >= least:
-            checked[k] = _corrected(motions[k], pose, cov, config)
-    return checked
+    best = [max(candidates, key=lambda one: one[0]) for candidates in found]
+    return [
+        (pose, cov) if share >= least else None
+        for (share, pose, cov), least in zip(best, needed, strict=True)
+    ]
 
 
 def _corrected(motion: Motion, pose: Array, cov: Array, config: ScanMatchingConfig) -> Motion:
@@ -134,8 +148,10 @@ def suspect_motions(
     before: IntArray,
     now: IntArray,
     config: ScanMatchingConfig,
-) -> BoolArray:
+) -> tuple[BoolArray, Array]:
     """Which motions (n,) between consecutive scans `check_motions` has to look at.
+
+    Also the share (n,) of the points of each later scan that lie on the earlier one.
 
     Args:
         motions: according to odometry.
@@ -145,12 +161,12 @@ def suspect_motions(
         config: noise and reach.
     """
     if not motions:
-        return np.zeros(0, dtype=np.bool_)
+        return np.zeros(0, dtype=np.bool_), np.zeros(0)
     delta = np.array([m.delta for m in motions])
     found = fit_pairs(clouds, before, now, delta, config)
     cov = np.array([m.cov for m in motions]) + found.cov
     off = mahalanobis_squared(found.step, cov) >= SUSPECT_D2
-    return np.asarray((found.share < USUAL_OVERLAP) | off)
+    return np.asarray((found.share < USUAL_OVERLAP) | off), found.share
 
 
 def fused(motion: Motion, H: Array, R: Array, innovation: Array) -> Motion:

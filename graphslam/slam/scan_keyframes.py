@@ -10,6 +10,7 @@ import time
 from collections import Counter, defaultdict, deque
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,8 +34,10 @@ from graphslam.odometry.sweep_motion import undistorted_by_track
 from graphslam.perception.dynamic_objects import dynamic_returns_of_all
 from graphslam.perception.front_ends import observe_block
 from graphslam.perception.ordered_scan import Sweep, make_sweep, scan_points
+from graphslam.slam.consecutive_scans import ComparedScans, ConsecutiveScans
 from graphslam.slam.keyframes import KeyframeSelector
 from graphslam.slam.log_reader import TRUE_RECORDS
+from graphslam.slam.lost_overlap import HELD, scans_to_add
 from graphslam.slam.motion_checks import ScanKeyframe, ScanPair
 from graphslam.slam.progress import counted, timed
 from graphslam.slam.robot_settings import make_tracks, with_noted_keyframes
@@ -150,6 +153,14 @@ class _Laser:
     earlier: deque[tuple[int, Sweep]] = field(default_factory=lambda: deque(maxlen=COMPARED_SCANS))
 
 
+class _Image(NamedTuple):
+    """A scan, what is seen in it from the base, and its returns (k, 2) m from the laser."""
+
+    scan: Scan
+    seen: ObservationArrays
+    points: Array
+
+
 class _Reader:
     """What is kept from block to block."""
 
@@ -163,7 +174,9 @@ class _Reader:
         self._keyframes = KeyframeSelector(config.keyframe)
         self._state_ns: int | None = None
         self._state_of = ""  # the laser whose state is the last one
-        self._last_scan: tuple[int, Array] | None = None
+        self._consecutive = ConsecutiveScans(self.run.track, config.scan_matching)
+        #: of the first laser, since the last keyframe: the next one may show that they are needed
+        self._held: list[Scan] = []
         self._counts: Counter[str] = Counter()
         self._dropped: Counter[str] = Counter()
         self._removed_returns: Counter[str] = Counter()
@@ -224,7 +237,7 @@ class _Reader:
         self, block: Sequence[Message]
     ) -> tuple[list[ScanKeyframe], list[ScanPair], int | None]:
         """Keyframes, pairs to be compared, and the last of the first laser, see `KeyframeBlock`."""
-        config, track = self._config, self.run.track
+        track = self.run.track
         scans = [message for message in block if isinstance(message, Scan)]
         self.run.scans += [(s.stamp_ns, s.time_ns, s.mount) for s in scans if not s.sensor]
         self._counts["scans"] += len(scans)
@@ -233,35 +246,82 @@ class _Reader:
             own = [scan for scan in scans if scan.sensor == sensor]
             kept, others = self._keyframes.used_scans(own, laser.run)
             each += undistorted_by_track(kept, track)
-            if not sensor and are_matched(config):
-                self.run.between.add(others, track)
+            if not sensor:
+                self._held += others
         used = self._in_order(each)
         if not used:
+            self._keep_between(self._held[:-HELD])
             return [], [], None
-        with timed(self._seconds, "motions"):
-            motions = self._motions(used)
+        images = self._observed(used)
+        motions = self._motions([image.scan for image in images])
+        compared = ComparedScans()
+        if self._matches_scans:
+            compared = self._compared(images, motions)
+            more = self._scans_to_add(compared) if len(self._lasers) == 1 else []
+            if more:
+                # odometry does not say where these are, so not what moved since the ones before
+                images += self._observed(more, keep_moving=True)
+                images.sort(key=lambda image: image.scan.time_ns)
+                motions = self._motions([image.scan for image in images])
+                compared = self._compared(images, motions)
+            self._count(images, compared)
+        return self._finished(images, motions, compared)
+
+    def _observed(self, used: list[Scan], *, keep_moving: bool = False) -> list["_Image"]:
+        """What is seen in scans, without the returns of moving things or with them."""
+        config = self._config.front_end
+        seen: list[ObservationArrays] = [ObservationArrays.of(())] * len(used)
         with timed(self._seconds, "front end"):
-            seen: list[ObservationArrays] = [ObservationArrays.of(())] * len(used)
             for sensor, laser in self._lasers.items():
                 at = [n for n, scan in enumerate(used) if scan.sensor == sensor]
-                own, sweeps = self._sweeps([used[n] for n in at], laser)
-                found = observe_block(own, sweeps, config.front_end) if at else []
+                own, sweeps = self._sweeps([used[n] for n in at], laser, keep_moving)
+                found = observe_block(own, sweeps, config) if at else []
                 for n, scan, o in zip(at, own, found, strict=True):
                     used[n] = scan
                     seen[n] = o.from_mounts(np.broadcast_to(scan.mount, (len(o), 3)))
-            points = [scan_points(scan, config.front_end.max_range_m) for scan in used]
-        self._counts["observations"] += sum(map(len, seen))
-        pairs: list[ScanPair] = []
-        if self._matches_scans:
-            with timed(self._seconds, "scan matching"):
-                pairs = self._pairs_of_first(used, motions, points)
-                self._compare_further(used, points)
+            return [
+                _Image(scan, o, scan_points(scan, config.max_range_m))
+                for scan, o in zip(used, seen, strict=True)
+            ]
+
+    def _compared(
+        self, images: Sequence["_Image"], motions: Sequence[Motion | None]
+    ) -> ComparedScans:
+        with timed(self._seconds, "scan matching"):
+            return self._consecutive.compare(
+                [i.scan for i in images], motions, [i.points for i in images]
+            )
+
+    def _scans_to_add(self, compared: ComparedScans) -> list[Scan]:
+        """Scans that become keyframes: those before and after them have little in common."""
+        more = scans_to_add(compared.lost, self._held)
+        added = {scan.time_ns for scan in more}
+        self._held = [scan for scan in self._held if scan.time_ns not in added]
+        return undistorted_by_track(more, self.run.track)
+
+    def _finished(
+        self, images: Sequence["_Image"], motions: Sequence[Motion | None], compared: ComparedScans
+    ) -> tuple[list[ScanKeyframe], list[ScanPair], int | None]:
+        """See `_of_block`; the next block begins after the last of the scans."""
+        last_ns = images[-1].scan.time_ns
+        self._state_ns = last_ns
+        self._counts["observations"] += sum(len(image.seen) for image in images)
+        self._consecutive.end_block([i.scan for i in images], [i.points for i in images])
+        self._keep_between([scan for scan in self._held if scan.time_ns <= last_ns])
         keyframes = [
-            ScanKeyframe(s.time_ns, s.mount, motion, image, returns)
-            for s, motion, image, returns in zip(used, motions, seen, points, strict=True)
+            ScanKeyframe(i.scan.time_ns, i.scan.mount, motion, i.seen, i.points)
+            for i, motion in zip(images, motions, strict=True)
         ]
-        of_first = [n for n, scan in enumerate(used) if not scan.sensor]
+        every = self._config.odometry.scan_matching != "auto"
+        pairs = [pair for pair in compared.pairs if pair.suspect or every]
+        of_first = [n for n, image in enumerate(images) if not image.scan.sensor]
         return keyframes, pairs, of_first[-1] if of_first else None
+
+    def _keep_between(self, scans: Sequence[Scan]) -> None:
+        """These, the first of those held, stay without a state."""
+        del self._held[: len(scans)]
+        if are_matched(self._config):
+            self.run.between.add(scans, self.run.track)
 
     def _in_order(self, used: list[Scan]) -> list[Scan]:
         """Scans of all lasers in the order of time, each at that of its state.
@@ -286,20 +346,24 @@ class _Reader:
     def _motions(self, used: Sequence[Scan]) -> list[Motion | None]:
         """The motion to each scan from the state before; None where a state is there already."""
         ends = np.array([self._state_ns, *(s.time_ns for s in used)], dtype=np.int64)
-        self._state_ns = int(ends[-1])
-        many = self.run.track.motions(ends[:-1], ends[1:])
+        with timed(self._seconds, "motions"):
+            many = self.run.track.motions(ends[:-1], ends[1:])
         return [
             many.one(k, int(ends[k]), int(ends[k + 1])) if ends[k + 1] > ends[k] else None
             for k in range(len(used))
         ]
 
-    def _sweeps(self, used: list[Scan], laser: "_Laser") -> tuple[list[Scan], list[Sweep]]:
+    def _sweeps(
+        self, used: list[Scan], laser: "_Laser", keep_moving: bool
+    ) -> tuple[list[Scan], list[Sweep]]:
         """The scans of a laser and their sweeps without the returns of moving objects.
 
         Those are free-standing objects where earlier scans saw free space.
         """
         max_range_m = self._config.front_end.max_range_m
         sweeps = [make_sweep(scan, max_range_m) for scan in used]
+        if keep_moving:
+            return used, sweeps
         past = list(laser.earlier)
         laser.earlier += [(s.time_ns, sweep) for s, sweep in zip(used, sweeps, strict=True)]
         every = [sweep for _, sweep in past] + sweeps
@@ -320,48 +384,13 @@ class _Reader:
                 sweeps[n] = make_sweep(used[n], max_range_m)
         return used, sweeps
 
-    def _pairs_of_first(
-        self, used: Sequence[Scan], motions: Sequence[Motion | None], points: Sequence[Array]
-    ) -> list[ScanPair]:
-        """Scans of the first laser to be compared with those before, whatever is between them.
-
-        All of them, or those whose motion is suspect.
-        """
-        last_ns, last_points = self._last_scan or (-1, np.zeros((0, 2)))
-        numbers, clouds, times = [-1], [last_points], [last_ns]
-        whole, earlier = [], []
-        for n, scan in enumerate(used):
-            if scan.sensor:
-                continue
-            motion, part, begin = motions[n], None, times[-1]
-            if motion is not None and begin >= 0 and begin != motion.start_ns:
-                part = self.run.track.motion(begin, motion.start_ns)
-                motion = self.run.track.motion(begin, motion.end_ns)
-            whole.append(motion)
-            earlier.append(part)
-            numbers.append(n)
-            clouds.append(points[n])
-            times.append(scan.time_ns)
-        self._last_scan = times[-1], clouds[-1]
-        usable = [
-            (k, motion)
-            for k, motion in enumerate(whole)
-            if motion is not None
-            and times[k] == motion.start_ns
-            and min(len(clouds[k]), len(clouds[k + 1])) >= MIN_POINTS
-        ]
-        before = np.array([k for k, _ in usable], dtype=np.int64)
-        suspect = suspect_motions(
-            [m for _, m in usable], clouds, before, before + 1, self._config.scan_matching
-        )
-        self.run.motions += len(usable)
-        self._lasers[""].compared += len(usable)
-        self._lasers[""].suspect += int(suspect.sum())
-        return [
-            ScanPair(numbers[k], numbers[k + 1], motion, earlier[k], bool(one))
-            for (k, motion), one in zip(usable, suspect, strict=True)
-            if one or self._config.odometry.scan_matching != "auto"
-        ]
+    def _count(self, images: Sequence["_Image"], compared: ComparedScans) -> None:
+        """Count motions, and those that scans contradict, of all lasers."""
+        self.run.motions += len(compared.pairs)
+        self._lasers[""].compared += len(compared.pairs)
+        self._lasers[""].suspect += sum(pair.suspect for pair in compared.pairs)
+        with timed(self._seconds, "scan matching"):
+            self._compare_further([i.scan for i in images], [i.points for i in images])
 
     def _compare_further(self, used: Sequence[Scan], points: Sequence[Array]) -> None:
         """Count the motions of the further lasers that their scans contradict."""
@@ -379,7 +408,7 @@ class _Reader:
             motions = [many.one(k, *times[k : k + 2].tolist()) for k in range(len(seen) - 1)]
             before = np.arange(len(motions), dtype=np.int64)
             clouds = [cloud for _, cloud in seen]
-            suspect = suspect_motions(
+            suspect, _ = suspect_motions(
                 motions, clouds, before, before + 1, self._config.scan_matching
             )
             laser.compared += len(motions)

@@ -69,7 +69,7 @@ def test_suspicion_of_many_motions_is_that_of_each():
     loose = np.diag([0.1, 0.1, 0.1]) ** 2
     motions = [said(STEP + e, SURE) for e in off]
     motions[2] = said(STEP + off[2], loose)
-    found = suspect_motions(motions, clouds, before, now, CONFIG)
+    found, _ = suspect_motions(motions, clouds, before, now, CONFIG)
     assert found.tolist() == [False, True, False, True, True, False]
     fit = fit_pairs(clouds, before, now, np.array([m.delta for m in motions]), CONFIG)
     each = [
@@ -77,7 +77,7 @@ def test_suspicion_of_many_motions_is_that_of_each():
         for share, step, motion, cov in zip(fit.share, fit.step, motions, fit.cov, strict=True)
     ]
     assert found.tolist() == each
-    assert suspect_motions([], clouds, before[:0], now[:0], CONFIG).tolist() == []
+    assert suspect_motions([], clouds, before[:0], now[:0], CONFIG)[0].tolist() == []
 
 
 # ------------------------------------------------------------ contradiction
