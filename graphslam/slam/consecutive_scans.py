@@ -75,7 +75,7 @@ class ConsecutiveScans:
         )
 
     def end_block(self, scans: Sequence[Scan], points: Sequence[Array]) -> None:
-        """The next block begins after the last of the scans (``points`` as in `compare`)."""
+        """The next block begins after the last of the scans; ``points`` (k, 2) as in `compare`."""
         own = [n for n, scan in enumerate(scans) if not scan.sensor]
         if own:
             self._last = scans[own[-1]].time_ns, points[own[-1]]

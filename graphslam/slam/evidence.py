@@ -57,7 +57,8 @@ class RobotEvidence:
     earlier one, their times and those of the first that is the same. ``motions_ns`` (q,) when
     motions ended, ``contradicted`` (q,) whether scans contradicted them. ``seen``: what it saw.
     ``parked``: when it stood, by odometry; ``along_walls``: how its scans fit if its path was
-    another one there; ``bridged_sigma_m``: of its position where scans were all that told.
+    another one there; ``bridged_sigma_m``: of its position where scans were all that told;
+    ``lost_ns`` (l, 2): times of consecutive scans that have nothing in common, see `ComparedScans`.
     """
 
     name: str
@@ -76,6 +77,7 @@ class RobotEvidence:
     parked: tuple[Parked, ...]
     along_walls: PathMisfits = NO_PATH
     bridged_sigma_m: float = 0.0
+    lost_ns: IntTable = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,6 +129,7 @@ def gather(
                 parked=by_scans[name].parked,
                 along_walls=by_scans[name].along_walls,
                 bridged_sigma_m=run.track.bridged_sigma_m,
+                lost_ns=np.array(run.lost, dtype=np.int64).reshape(-1, 2),
             )
         )
     observed = any(step.associations or step.closures for step in steps)

@@ -47,7 +47,8 @@ class RobotState:
     ``scanned_ns``: time of the last one used. States are poses of the sensor; the base is where the
     calibrated mount puts it. ``is_calibrated``: the track's calibration was estimated together with
     all states. ``scan``: time and submap of the latest state that has a scan; ``contradicted``: how
-    many of ``motions`` the scans contradicted. ``repeats``: scans that are reported and not used.
+    many of ``motions`` the scans contradicted; ``lost``: times of consecutive scans that have
+    nothing in common, see `ComparedScans`. ``repeats``: scans that are reported and not used.
     Times are of the common clock, stamps of the robot's own ``clock``.
     """
 
@@ -65,6 +66,7 @@ class RobotState:
     scan: tuple[int, Submap] | None = None
     motions: int = 0
     contradicted: int = 0
+    lost: list[tuple[int, int]] = field(default_factory=list)
     clock: Clock = field(default_factory=Clock)
     repeats: RepeatedScans = field(default_factory=RepeatedScans)
     between: ScansBetween = field(default_factory=ScansBetween)

@@ -6,7 +6,7 @@ import numpy as np
 
 from graphslam.core.geometry import between
 from graphslam.slam.doubts import Reason, seconds
-from graphslam.slam.evidence import Evidence, RobotEvidence
+from graphslam.slam.evidence import BoolArray, Evidence, IntTable, RobotEvidence
 
 #: times that one scan is repeated while odometry moves: not just sent twice
 REPEATED = 5
@@ -16,6 +16,8 @@ HOP_M, HOP_RAD = 1.2, 1.0
 HOPS = 0.3
 #: share of motions in which scans contradict odometry, and how many of so many in a row
 CONTRADICTED, IN_A_ROW, ROW = 0.12, 8, 12
+#: ns without a scan in which a robot may be carried; m, rad: it is where odometry does not say
+UNSEEN_NS, MOVED_M, MOVED_RAD = 2_000_000_000, 0.3, 0.25
 
 
 def scan_doubts(evidence: Evidence) -> Iterator[Reason]:
@@ -25,6 +27,7 @@ def scan_doubts(evidence: Evidence) -> Iterator[Reason]:
             yield from _repeated(robot)
             yield from _sparse(robot)
             yield from _contradictions(robot, evidence)
+            yield from _moved_unseen(robot, evidence)
 
 
 def _repeated(robot: RobotEvidence) -> Iterator[Reason]:
@@ -68,3 +71,49 @@ def _contradictions(robot: RobotEvidence, evidence: Evidence) -> Iterator[Reason
             "motions; one of the two is wrong"
         )
         yield Reason("doubtful", "scans", robot.name, text)
+
+
+def _moved_unseen(robot: RobotEvidence, evidence: Evidence) -> Iterator[Reason]:
+    """Pauses of the laser after which scans have nothing in common with those before.
+
+    Or they do where odometry does not say that the robot is, and it may be another place that looks
+    the same.
+    """
+    if robot.name in evidence.without_odometry:
+        return
+    which = np.flatnonzero(robot.contradicted[1:])
+    motions = np.column_stack([robot.motions_ns[which], robot.motions_ns[which + 1]])
+    spans = np.concatenate([robot.lost_ns, motions[_is_elsewhere(robot, motions)]])
+    pauses = np.array([_pause(robot, *span) for span in spans.tolist()]).reshape(-1, 2)
+    pauses = pauses[pauses[:, 1] - pauses[:, 0] >= UNSEEN_NS]
+    at = np.minimum(np.searchsorted(robot.readings_ns, pauses), len(robot.readings_ns) - 1)
+    moved = np.abs(between(robot.readings[at[:, 0]], robot.readings[at[:, 1]]))
+    pauses = pauses[(np.hypot(moved[:, 0], moved[:, 1]) < HOP_M) & (moved[:, 2] < HOP_RAD)]
+    if len(pauses):
+        begin, end = min(pauses.tolist())
+        text = (
+            f"{robot.name}: its scans before and after a pause of {seconds(end, begin)}, "
+            f"{seconds(begin, int(robot.scans_ns[0]))} after the first one, are not as its "
+            "odometry says, which hardly moved: it was moved meanwhile, and where to is a guess"
+        )
+        yield Reason("doubtful", "scans", robot.name, text)
+
+
+def _is_elsewhere(robot: RobotEvidence, spans_ns: IntTable) -> BoolArray:
+    """Whether the robot is not where odometry says after times (n, 2): by more than it slips."""
+    begin = np.searchsorted(robot.stamps_ns, spans_ns[:, 0], side="right") - 1
+    begin = np.maximum(begin, 0)
+    end = np.minimum(np.searchsorted(robot.stamps_ns, spans_ns[:, 1]), len(robot.stamps_ns) - 1)
+    moved = between(robot.final[begin], robot.final[end])
+    off = np.abs(between(between(robot.by_odometry[begin], robot.by_odometry[end]), moved))
+    return np.asarray((np.hypot(off[:, 0], off[:, 1]) > MOVED_M) | (off[:, 2] > MOVED_RAD))
+
+
+def _pause(robot: RobotEvidence, begin_ns: int, end_ns: int) -> tuple[int, int]:
+    """The longest time without a scan between two times at which there is one, ns."""
+    first, last = np.searchsorted(robot.scans_ns, [begin_ns, end_ns]).tolist()
+    scans = robot.scans_ns[first : last + 1]
+    if len(scans) < 2:
+        return begin_ns, begin_ns
+    k = int(np.argmax(np.diff(scans)))
+    return int(scans[k]), int(scans[k + 1])

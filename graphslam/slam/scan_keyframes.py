@@ -191,6 +191,7 @@ class _Reader:
 
     def read_log(self) -> ReadLog:
         """What is known in the end."""
+        self._keep_between(list(self._held))
         for laser in self._lasers.values():
             if laser.run is not self.run:
                 self.run.repeats.left_out += laser.run.repeats.left_out
@@ -387,6 +388,7 @@ class _Reader:
     def _count(self, images: Sequence["_Image"], compared: ComparedScans) -> None:
         """Count motions, and those that scans contradict, of all lasers."""
         self.run.motions += len(compared.pairs)
+        self.run.lost += compared.lost
         self._lasers[""].compared += len(compared.pairs)
         self._lasers[""].suspect += sum(pair.suspect for pair in compared.pairs)
         with timed(self._seconds, "scan matching"):

@@ -161,6 +161,17 @@ WRONG = {
     "jump": (lambda: evidence(jumped(0.3, 0, 0)), "jumps by 0.36 m"),
     "turn": (lambda: evidence(jumped(0, 0, 2.0)), "jumps by 0.06 m and 2.0"),
     "resets": (lambda: evidence(resets=2), "jumped 2 times"),
+    "carried while the laser pauses, to where nothing is as before": (
+        lambda: paused(lost_ns=np.array([[199 * S, 241 * S]]) // 10),
+        "before and after a pause of 4.2 s, 18.9 s after the first one",
+    ),
+    "carried while the laser pauses, to where scans say": (
+        lambda: paused(
+            contradicted=np.arange(100) == 50,
+            motions_ns=np.append(S + np.arange(50) * S // 3, 24 * S + np.arange(50) * S // 3),
+        ),
+        "it was moved meanwhile",
+    ),
     "frozen, by sightings": (
         lambda: evidence(changed(300, 0, 0, 0), parked=(Parked(31 * S, 60 * S, 0.0, 0.0),)),
         "is frozen, or far too small, from 30.0 s to 59.0 s: the landmarks that it sees",
@@ -279,6 +290,28 @@ def with_gap(found):
     kept = (robot.readings_ns < 20 * S) | (robot.readings_ns > 48 * S)
     made = replace(robot, readings_ns=robot.readings_ns[kept], readings=robot.readings[kept])
     return replace(found, robots=(made,))
+
+
+def paused(**changes):
+    """A robot that stands from 20 to 24 s by its odometry, without scans; it is moved by 2 m."""
+    steps = drive()
+    true = steps.copy()
+    steps[190:230], true[190:230] = 0.0, [0.05, 0.0, 0.0]
+    found = evidence(scans=True, seen=no_sightings)
+    (robot,) = found.robots
+    kept = (robot.scans_ns <= 20 * S) | (robot.scans_ns >= 24 * S)
+    made = replace(
+        robot, scans_ns=robot.scans_ns[kept], final=path(true), by_odometry=path(steps),
+        readings=path(steps), **changes,
+    )  # fmt: skip
+    return replace(found, robots=(made,))
+
+
+def test_a_laser_that_pauses_while_its_robot_stands_is_no_doubt():
+    assert reasons(paused()) == ("good", "")
+    # nor are scans that have nothing in common without a pause
+    lost = np.array([[196 * S, 199 * S]]) // 10
+    assert reasons(evidence(scans=True, seen=no_sightings, lost_ns=lost)) == ("good", "")
 
 
 def sparse(found):
