@@ -125,6 +125,8 @@ class LivePass(Pipeline):
             self.frames.away.get(frame, 0.0),
         )
         run.scans.clear()
+        if run.since_keyframe is not None:
+            run.since_keyframe.forget()
         odometry = run.track.pose(when)
         closed = self.associator.closures > self._closures
         self._closures = self.associator.closures

@@ -111,7 +111,10 @@ def match_to_walls(
     made = []
     for begin in range(0, len(scans), BLOCK):
         own = scans[begin : begin + BLOCK]
-        made.append(_matched(poses[own], covs[own], returns(own), walls, config))
+        fits = fit_to_walls(poses[own], covs[own], returns(own), walls, config)
+        lost = ~_found(fits.share)
+        fits.poses[lost], fits.covs[lost] = poses[own][lost], covs[own][lost]
+        made.append(fits[:2])
     found, left = (np.concatenate(parts) for parts in zip(*made, strict=True))
     return MatchedScans(found, left, covs)
 
@@ -133,10 +136,18 @@ def _noise(block: "_Block") -> tuple[Array, float]:
     return scale, spread
 
 
-def _matched(
+def fit_to_walls(
     prior: Array, covs: Array, returns: ScanReturns, walls: WallTree, config: FrontEndConfig
-) -> tuple[Array, Array]:
-    """`match_to_walls` of some scans with known noise."""
+) -> "ScanFits":
+    """`match_to_walls` of some scans with known noise; whether they are lost is to be seen.
+
+    Args:
+        prior: (n, 3) poses of the scans.
+        covs: (n, 3, 3) of their errors, along their own axes.
+        returns: of the scans, in the frames of ``prior``.
+        walls: in the frame in which ``prior`` is.
+        config: noise of returns and of surfaces.
+    """
     poses, left, share = _Block(prior, covs, returns, walls, config).matched(prior)
     moved, far = between(prior, poses), np.arange(len(prior))
     for _ in range(ROUNDS - 1):
@@ -148,9 +159,7 @@ def _matched(
         block = _Block(prior[far], covs[far], returns.only(far), walls, config, before)
         poses[far], left[far], share[far] = block.matched(before)
         moved = between(before, poses[far])
-    lost = ~_found(share)
-    poses[lost], left[lost] = prior[lost], covs[lost]
-    return poses, left
+    return ScanFits(poses, left, share)
 
 
 def _found(share: Array) -> BoolArray:
@@ -159,8 +168,8 @@ def _found(share: Array) -> BoolArray:
     return share >= LEAST_SHARE * np.median(some) if len(some) else share > 0
 
 
-class _Step(NamedTuple):
-    """Poses (n, 3), covariances (n, 3, 3), and the share (n,) of returns that are on walls."""
+class ScanFits(NamedTuple):
+    """Poses (n, 3), covariances (n, 3, 3) along their own axes, and the share (n,) on walls."""
 
     poses: Array
     covs: Array
@@ -188,7 +197,7 @@ class _Block:
         self._number, self._lasers = returns.number, returns.lasers
         self._near = walls.near(self._in_world(prior if start is None else start))
 
-    def matched(self, poses: Array, scale: Array | float = 1.0, spread: float = 1.0) -> _Step:
+    def matched(self, poses: Array, scale: Array | float = 1.0, spread: float = 1.0) -> ScanFits:
         """A step from ``poses`` (n, 3) to better ones.
 
         ``scale``: factors (3,) on the sigmas of the prior; ``spread``: one on that of ranges.
@@ -218,7 +227,7 @@ class _Block:
         found = poses + np.linalg.solve(M, b[:, :, None])[:, :, 0]
         left = rotate_cov(np.asarray(np.linalg.inv(M)), -found[:, 2])
         share = np.bincount(of, minlength=len(poses)) / np.maximum(self._number, 1)
-        return _Step(found, left, share)
+        return ScanFits(found, left, share)
 
     def spread(self, poses: Array, spread: float) -> float:
         """By which factor returns spread more about the walls than they should."""

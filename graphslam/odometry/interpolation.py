@@ -53,6 +53,7 @@ def causal_at(
     track: Track,
     times_ns: IntArray,
     stamps_ns: IntArray,
+    better: tuple[IntArray, Array, Array] | None = None,
 ) -> Trajectory:
     """Poses at ``times_ns``: the last state known at each, propagated by odometry.
 
@@ -66,9 +67,14 @@ def causal_at(
         track: the robot's odometry.
         times_ns: (n,) when.
         stamps_ns: (n,) what the result is stamped with.
+        better: rows (m,) where the motion since the state is known better than by odometry, motions
+            (m, 3) and their covariances (m, 3, 3) along the axes of the state.
     """
     i = last
     delta, noise = track.coarse_motions(states.stamps_ns[i], times_ns, calibrations, i)
+    if better is not None:
+        rows, motions, covs = better
+        delta[rows], noise[rows] = motions, covs
     covs = compose_cov(states.poses[i], states.covs[i], delta, noise)
     return Trajectory(stamps_ns, compose(states.poses[i], delta), covs)
 

@@ -45,6 +45,7 @@ _MODULES = (
     "mapping.landmark_map", "multi_robot.frame_tree", "multi_robot.relative_frames",
     "odometry.increment_sums", "odometry.interpolation", "slam.recorded_closures",
     "slam.repeated_scans", "slam.robot_state", "slam.scan_tracking", "slam.scans_between",
+    "slam.scans_since_keyframe",
 )  # fmt: skip
 _CLASSES = (
     ("mapping.landmark_map", "LandmarkMap"),

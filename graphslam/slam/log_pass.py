@@ -24,6 +24,7 @@ from graphslam.slam.recorded_closures import RecordedClosures
 from graphslam.slam.robot_settings import make_tracks, with_noted_keyframes
 from graphslam.slam.robot_state import RobotState
 from graphslam.slam.scan_evidence import ScanEvidence
+from graphslam.slam.scans_since_keyframe import ScansSinceKeyframe
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +62,11 @@ class LogPass:
         config = with_noted_keyframes(log, config)
         self.log, self.config, self.known = log, config, known
         self.runs = {
-            name: RobotState(track, clock=known.clocks.get(name, Clock()))
+            name: RobotState(
+                track,
+                clock=known.clocks.get(name, Clock()),
+                since_keyframe=ScansSinceKeyframe.of_smoother(config, track),
+            )
             for name, track in make_tracks(log, config).items()
         }
         self.kernel = config.robust  # of the final estimate

@@ -318,6 +318,8 @@ class Pipeline(StepRecorder):
                 event = [m for m in event if isinstance(m, Scan)]
             if not used and are_matched(self.config):
                 run.keep_between(first)
+            if not used and run.since_keyframe is not None:
+                run.since_keyframe.add(first, run.track)
         elif not used:
             event = ()
         if not event:
@@ -424,6 +426,8 @@ class Pipeline(StepRecorder):
         self.add_step(Step(time_ns, {}, motions, associations, closures), known, offers)
         for message in event:
             if isinstance(message, Scan):
+                if run.since_keyframe is not None:
+                    run.since_keyframe.begin(state_ns, run.calibrations[-1], seen, run.track)
                 points = scan_points(message, self.config.front_end.max_range_m)
                 self.keyframe_scans.append(
                     KeyframeScan(robot, state_ns, points.astype(np.float32), message.mount)

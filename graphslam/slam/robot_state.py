@@ -28,6 +28,7 @@ from graphslam.odometry.readings import EDGE_NS
 from graphslam.perception.scan_matching import Submap
 from graphslam.slam.repeated_scans import RepeatedScans
 from graphslam.slam.scans_between import ScansBetween
+from graphslam.slam.scans_since_keyframe import ScansSinceKeyframe
 
 #: Hz at which the base of a robot without scans is reported
 BASE_RATE_HZ = 10
@@ -44,6 +45,7 @@ class RobotState:
     batch step by more than when it was made. ``scans``: (stamp, time, mount) of each; ``between``:
     beams of those without a state, where they are kept, ``kept_ns`` the time of the last of these
     or of a scan with a state;
+    ``since_keyframe``: where they were when they came, if that is asked for;
     ``scanned_ns``: time of the last one used. States are poses of the sensor; the base is where the
     calibrated mount puts it. ``is_calibrated``: the track's calibration was estimated together with
     all states. ``scan``: time and submap of the latest state that has a scan; ``contradicted``: how
@@ -71,6 +73,7 @@ class RobotState:
     repeats: RepeatedScans = field(default_factory=RepeatedScans)
     between: ScansBetween = field(default_factory=ScansBetween)
     kept_ns: int | None = None
+    since_keyframe: ScansSinceKeyframe | None = None
 
     def __post_init__(self) -> None:
         """Calibrate the track's odometry by its own settings."""
@@ -155,7 +158,11 @@ class RobotState:
         if not self.scans:
             late_ns = np.array([self.track.reported_late_ns(c) for c in self.calibrations])
             times = times + late_ns[last]
-        causal = causal_at(known, last, self.calibrations, self.track, times, stamps)
+        better = None
+        if self.since_keyframe is not None:
+            self.since_keyframe.match(self.track)
+            better = self.since_keyframe.at(times, known.stamps_ns[last])
+        causal = causal_at(known, last, self.calibrations, self.track, times, stamps, better)
         mount = np.array([self.track.mount_of(c) for c in self.calibrations])[last]
         if start is not None:
             causal = transform_trajectory(causal, origin_shift(start, mount))

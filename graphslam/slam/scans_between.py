@@ -25,11 +25,16 @@ BEAMS = 40
 STILL = (1e-3, 1e-3, 1e-3)
 
 
+def can_match(config: Config) -> bool:
+    """Whether scans without a state may be matched to walls."""
+    return config.keyframe.scans_between == "map" and config.front_end.name != "none"
+
+
 def are_matched(config: Config) -> bool:
     """Whether scans between keyframes are matched to the map: where a whole log is solved again."""
     backend = config.backend
     solved = backend.name == "batch" and backend.reoptimise
-    return config.keyframe.scans_between == "map" and solved and config.front_end.name != "none"
+    return solved and can_match(config)
 
 
 @dataclass(slots=True, eq=False)
