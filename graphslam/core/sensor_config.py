@@ -180,6 +180,7 @@ class KeyframeConfig:
     one step, transported to its end by odometry.
     scans_between: how scans without a state follow from the states around them (back end batch):
     `map` = by odometry, and matched to the walls of the final map; `odometry` = by that alone.
+    Causal and live poses of smoothers: matched to the walls that the last keyframe saw.
     """
 
     mode: Literal["motion", "all"] = "motion"
