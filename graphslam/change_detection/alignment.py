@@ -19,7 +19,11 @@ from graphslam.change_detection.beam_evidence import (
 )
 from graphslam.change_detection.grid import grid_over
 from graphslam.change_detection.nonrigid_registration import aligned_at_once, register_nonrigid
-from graphslam.change_detection.rigid_registration import Registration, register
+from graphslam.change_detection.rigid_registration import (
+    Registration,
+    landmarks_of_map,
+    register_rivals,
+)
 from graphslam.change_detection.scan_to_map import align_scans
 from graphslam.change_detection.surface_map import Surface, fit_surfaces
 from graphslam.change_detection.visit import Bools, Ints, Visit
@@ -39,6 +43,9 @@ _OVERLAP = 0.05  # least share of the later returns on surfaces of the reference
 #: null sigma above which two maps are not of one place, by whether the registration is nonrigid: a
 #: path that was bent to fit should leave less; and from which on there is a warning
 _MAX_SIGMA, _WARN_SIGMA = {False: 5.0, True: 1.8}, 1.5
+#: surface with a higher score is elsewhere in the other visit. Scans prefer another pose than that
+#: which landmarks explain best if it has less of that than this share
+_ELSEWHERE_SIGMAS, _CLEARLY = 5.0, 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,13 +80,38 @@ def align_visits(
     Raises:
         OutputError: neither is possible.
     """
-    if registration is None:
+    if registration is not None:
+        rivals: tuple[Registration, ...] = (registration,)
+    else:
         try:
-            registration = register(reference.landmarks, later.landmarks)
+            rivals = register_rivals(landmarks_of_map(reference), landmarks_of_map(later))
         except OutputError:
             if max(reference.robots, later.robots) > 1:  # consecutive scans are of several paths
                 raise
             return align_visits_nonrigid(reference, later, config)
+    if len(rivals) == 1:
+        return _align_rigidly(reference, later, rivals[0], config)
+    # scans see more than the landmarks that two poses of a symmetric building explain alike
+    tried: list[AlignedVisits] = []
+    for number, one in enumerate(rivals, 1):
+        try:
+            tried.append(_align_rigidly(reference, later, one, config))
+        except OutputError:
+            if number == len(rivals) and not tried:
+                raise
+    shares = [_share_elsewhere(aligned.evidence) for aligned in tried]
+    k = int(np.argmin(shares))
+    return tried[k if shares[k] < _CLEARLY * shares[0] else 0]
+
+
+def _align_rigidly(
+    reference: Visit, later: Visit, registration: Registration, config: ChangesConfig
+) -> AlignedVisits:
+    """`align_visits` at one pose; what changed does not count in the end.
+
+    Raises:
+        OutputError: the later visit observed hardly any surface of the reference.
+    """
     prior = later.transformed(registration.pose, registration.cov)
     aligned = _align(reference, prior, registration, config, nonrigid=False)
     suspects = _suspects(aligned)
@@ -164,6 +196,12 @@ def _evidence(
         beams_past_surfaces(surfaces[0], visits[1], sigmas[1], config),
         beams_past_surfaces(surfaces[1], visits[0], sigmas[0], config),
     )
+
+
+def _share_elsewhere(evidence: tuple[Evidence, ...]) -> float:
+    """Share of the surface that both visits saw which is elsewhere in the other."""
+    scores = np.concatenate([e.scores(1.0)[e.tested] for e in evidence])
+    return float(np.mean(np.abs(scores) > _ELSEWHERE_SIGMAS)) if len(scores) else 1.0
 
 
 def _suspects(aligned: AlignedVisits) -> Bools:

@@ -13,11 +13,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphslam.change_detection.visit import Bools, Ints
+from graphslam.change_detection.visit import Bools, Ints, Visit
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.errors import OutputError
 from graphslam.core.gaussian import chi2_quantile
-from graphslam.core.geometry import Array, compose, rotation, transform, unit_vectors, wrap
+from graphslam.core.geometry import (
+    Array,
+    between,
+    compose,
+    rotation,
+    transform,
+    unit_vectors,
+    wrap,
+)
+from graphslam.core.record import replace
 from graphslam.core.records import Landmark
 from graphslam.perception.point_to_line import offset_jacobian
 
@@ -35,6 +44,10 @@ _GATE = float(chi2_quantile(0.999, 2))
 _MAX_PAIRS = 2500
 #: factors on the gates of the matching, one per iteration of the refinement
 _SLACKS = (8.0, 4.0, 2.0, 1.0, 1.0, 1.0)
+#: share of the best score from which on another pose explains nearly as much, and how many are told
+_NEARLY, _RIVALS = 0.7, 3
+#: m, m, rad: poses that differ by less are one
+_SAME = (0.5, 0.5, 0.05)
 #: least information of a registration: no direction may be known worse than to 0.1 m or 0.1 rad
 _MIN_INFORMATION = 1e2
 
@@ -77,16 +90,78 @@ def register(reference: Sequence[Landmark], later: Sequence[Landmark]) -> Regist
     Raises:
         OutputError: there are not enough landmarks in common to fix a pose.
     """
+    return register_rivals(reference, later)[0]
+
+
+def register_rivals(
+    reference: Sequence[Landmark], later: Sequence[Landmark]
+) -> tuple[Registration, ...]:
+    """`register`, and other poses that explain nearly as much: a building may be symmetric.
+
+    Best first, at most `_RIVALS`.
+
+    Raises:
+        OutputError: there are not enough landmarks in common to fix a pose.
+    """
     a, b = (_lines(reference), _points(reference)), (_lines(later), _points(later))
     votes = np.concatenate([_motions_of_lines(a[0], b[0]), _motions_of_points(a[1], b[1])])
     refined = (_refine(motion, a, b) for motion in _vote_peaks(votes))
-    best = max((r for r in refined if r is not None), key=lambda r: r[0], default=None)
-    if best is None:
+    best = sorted((r for r in refined if r is not None), key=lambda r: -r[0])
+    if not best:
         raise OutputError(
             "the two runs cannot be registered: their maps have no landmarks in common that fix a "
             "pose (two crossing lines or two points); did both drive through the same place?"
         )
-    return best[1]
+    rivals: list[Registration] = []
+    for score, found in best:
+        if score >= _NEARLY * best[0][0] and not any(_is_same(found, one) for one in rivals):
+            rivals.append(found)
+    return tuple(rivals[:_RIVALS])
+
+
+def _is_same(a: Registration, b: Registration) -> bool:
+    """Whether two registrations are one: they turn alike and move alike, where the maps are."""
+    return bool(np.all(np.abs(between(a.pose, b.pose)) < _SAME))
+
+
+def landmarks_of_map(visit: Visit) -> tuple[Landmark, ...]:
+    """The landmarks of a visit, without what is not known of where its robot began."""
+    if visit.robots > 1:
+        return visit.landmarks
+    return within_map(visit.landmarks, visit.poses[0], visit.covs[0])
+
+
+def within_map(landmarks: Sequence[Landmark], pose: Array, cov: Array) -> tuple[Landmark, ...]:
+    """The landmarks with covariances as if one pose of the robot were known.
+
+    What is not known of where a map begins, and of how it is turned there, moves all of it: it says
+    nothing of its shape, which registers it.
+
+    Args:
+        landmarks: in the world.
+        pose: (3,) early in the drive.
+        cov: (3, 3) its additive world-axis errors.
+    """
+    made = []
+    for one in landmarks:
+        if one.line is None:
+            x, y = one.position[:2] - pose[:2]
+            J = np.array([[1.0, 0.0, -y], [0.0, 1.0, x]])
+            left = one.cov.copy()
+            left[:2, :2] = _positive(one.cov[:2, :2] - J @ cov @ J.T)
+            made.append(replace(one, cov=left))
+            continue
+        normal, offset, known = one.line
+        nx, ny = np.cos(normal), np.sin(normal)
+        J = np.array([[0.0, 0.0, 1.0], [nx, ny, nx * pose[1] - ny * pose[0]]])
+        made.append(replace(one, line=(normal, offset, _positive(known - J @ cov @ J.T))))
+    return tuple(made)
+
+
+def _positive(cov: Array) -> Array:
+    """The nearest covariance (2, 2) to a difference of two."""
+    values, axes = np.linalg.eigh((cov + cov.T) / 2)
+    return np.asarray((axes * np.maximum(values, 0.0)) @ axes.T)
 
 
 def _lines(landmarks: Sequence[Landmark]) -> _Lines:
@@ -187,7 +262,7 @@ def _refine(
             gradient += np.einsum("n,nia,nij,nj->a", weight, H, W, r)
             # what agrees counts, hardly how well: a few exact ones must not outweigh many
             score += float((size * np.maximum(1 - d2 / (2 * _GATE), 0.0)).sum())
-        if np.linalg.eigvalsh(information)[0] < _MIN_INFORMATION:
+        if not _fixes_pose(information, pose, pairs, b):
             return None
         cov = np.asarray(np.linalg.inv(information), dtype=float)
         step = cov @ gradient
@@ -195,6 +270,18 @@ def _refine(
     if len(pairs) < 2:
         return None
     return score, Registration(pose, cov, pairs)
+
+
+def _fixes_pose(information: Array, pose: Array, pairs: Ints, b: tuple[_Lines, _Points]) -> bool:
+    """Whether the pose is known where the landmarks are: at the origin a lever would be in it."""
+    if not len(pairs):
+        return False
+    middles = np.concatenate([b[0].ends.mean(axis=1), b[1].xy])
+    number = np.concatenate([b[0].index, b[1].index])
+    x, y = transform(pose, middles[np.isin(number, pairs[:, 1])].mean(axis=0)) - pose[:2]
+    # by how much the pose changes if it is moved and turned there
+    G = np.array([[1.0, 0.0, y], [0.0, 1.0, -x], [0.0, 0.0, 1.0]])
+    return bool(np.linalg.eigvalsh(G.T @ information @ G)[0] >= _MIN_INFORMATION)
 
 
 _Rows = tuple[Array, Array, Array, Array]

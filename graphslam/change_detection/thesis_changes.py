@@ -19,7 +19,7 @@ from scipy.ndimage import binary_dilation, label
 
 from graphslam.change_detection.detect import identity_registration
 from graphslam.change_detection.grid import Grid, grid_over
-from graphslam.change_detection.rigid_registration import Registration, register
+from graphslam.change_detection.rigid_registration import Registration, landmarks_of_map, register
 from graphslam.change_detection.thesis_method import (
     Comparison,
     DentMap,
@@ -125,7 +125,7 @@ def thesis_changes(
     found = (
         identity_registration(reference)
         if same_frame
-        else register(reference.landmarks, later.landmarks)
+        else register(landmarks_of_map(reference), landmarks_of_map(later))
     )
     reference, later = _thinned(reference), _thinned(later.transformed(found.pose, found.cov))
     every = np.concatenate([visit.ends[np.isfinite(visit.range_m)] for visit in (reference, later)])
