@@ -186,7 +186,10 @@ def smooth(
     from graphslam.slam.progress import of_all
 
     settled = settle(recording, config, settings)
-    before = None if output is None else check_target(Path(output), force=force)
+    before = None
+    if output is not None:
+        prior_map = settled.known_map.directory
+        before = check_target(Path(output), force=force, known_map=prior_map)
     reading = read_ahead(recording, settled) or nullcontext()
     with limited_memory(settled.limits.memory_mb), reading as ahead:
         # imported while the second process reads; what only that one needs is imported there

@@ -70,7 +70,7 @@ def follow(
     """
     chosen = live_config(chosen_config(config, **settings))
     path, target = Path(recording), Path(output)
-    before = check_target(target, force=force)
+    before = check_target(target, force=force, known_map=chosen.known_map.directory)
     with open_growing(path, chosen.limits, chosen.live.wait_s) as growing:
         log, file = _opened(growing, chosen, announce)
         session = Session(chosen, log=log)

@@ -13,7 +13,11 @@ from graphslam.core.output_folder import Identity, atomic_folder, identity, unfi
 
 
 def check_target(
-    directory: Path, *, force: bool, replaceable: Callable[[Path], bool] | None = None
+    directory: Path,
+    *,
+    force: bool,
+    replaceable: Callable[[Path], bool] | None = None,
+    known_map: str = "",
 ) -> Identity:
     """Check before a long computation that a folder may be written at ``directory``.
 
@@ -22,14 +26,15 @@ def check_target(
         force: replace an existing one.
         replaceable: whether ``force`` may replace a given existing folder; default: result
             folders. An empty folder is always replaced.
+        known_map: a folder that the work needs, and later work too; empty if there is none.
 
     Returns:
         What stands there; if it is something else when the folder is written, another process
         wrote it.
 
     Raises:
-        OutputError: it exists and ``force`` is not given, it exists and may not be replaced, or
-            its parent is not writable.
+        OutputError: it exists and ``force`` is not given, it exists and may not be replaced, it
+            is or holds the known map, or its parent is not writable.
     """
     parent = directory.absolute().parent
     while not parent.exists():
@@ -40,6 +45,11 @@ def check_target(
     before = identity(directory)
     if before is None:
         return None
+    if known_map and Path(known_map).resolve().is_relative_to(directory.resolve()):
+        raise OutputError(
+            f"{directory}: has the known map in it ({known_map}), which is never replaced; choose "
+            "another name"
+        )
     if not force:
         raise OutputError(f"{directory}: already exists; give --force to replace it")
     empty = directory.is_dir() and not any(directory.iterdir())

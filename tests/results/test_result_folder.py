@@ -129,6 +129,22 @@ def test_what_is_not_a_result_folder_is_never_replaced(made, tmp_path):
     assert {p.name for p in tmp_path.iterdir()} == {"documents", "file", "link"}
 
 
+def test_a_known_map_is_never_replaced_by_a_result_in_it(made, tmp_path):
+    """Nor is a folder that holds it; one beside it, and one within it, are."""
+    save(made, tmp_path / "building" / "monday", force=False)
+    monday = str(tmp_path / "building" / "monday")
+    (tmp_path / "same").symlink_to(monday)
+    for name, known in (("building/monday", monday), ("building", monday)):
+        for spelled in (known, str(tmp_path / "same"), f"{known}/../monday"):
+            with pytest.raises(OutputError, match="has the known map in it"):
+                check_target(tmp_path / name, force=True, known_map=spelled)
+    save(made, tmp_path / "building" / "tuesday", force=False)
+    assert check_target(tmp_path / "building" / "tuesday", force=True, known_map=monday)
+    assert (
+        check_target(tmp_path / "building" / "monday" / "day", force=True, known_map=monday) is None
+    )
+
+
 @pytest.mark.parametrize("existing", [False, True])
 def test_a_failure_leaves_nothing_and_keeps_the_old(made, tmp_path, existing):
     target = tmp_path / "out"
