@@ -11,6 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from graphslam.campaigns.one_log import (
 )
 from graphslam.campaigns.tasks import Outcome, Task, Workers, code_version, described
 from graphslam.core.config import Config
-from graphslam.core.errors import LogError, OutputError
+from graphslam.core.errors import ConfigError, LogError, OutputError
 from graphslam.logs.find_recordings import find_recordings
 from graphslam.results.file_formats import read_json, to_json
 from graphslam.results.report_batch import batch_page
@@ -77,9 +78,9 @@ def run_batch(
 
     Raises:
         LogError: there is no recording.
-        ConfigError: a back end is unknown.
+        ConfigError: a back end is unknown, or back ends are to be compared in a known map.
         OutputError: the folder holds something else, another process works on it, or it cannot be
-            written; also see `run_tasks`.
+            written; the known map cannot be read; also see `run_tasks`.
     """
     began = time.perf_counter()
     found = find_recordings(places, without=directory)
@@ -88,6 +89,7 @@ def run_batch(
         from graphslam.evaluation.compare_variants import parse_variants  # noqa: PLC0415
 
         parse_variants(backends, config)
+    config = _with_known_map(config, backends)
     specs, mode = tuple(backends), mode if backends else ""
     tasks = [
         LogTask(name, os.fspath(path), root, config, force, specs, mode)
@@ -112,6 +114,19 @@ def run_batch(
         finally:
             content = overview.write()
     return content
+
+
+def _with_known_map(config: Config, backends: Sequence[str]) -> Config:
+    """The settings with a known map, if any, where workers find it; it can be read."""
+    if not config.known_map.directory:
+        return config
+    if backends:
+        raise ConfigError("known_map.directory: back ends are compared without a known map")
+    from graphslam.results.known_map import known_map_of  # noqa: PLC0415
+
+    known_map_of(config)
+    directory = os.fspath(Path(config.known_map.directory).resolve())
+    return replace(config, known_map=replace(config.known_map, directory=directory))
 
 
 def make_result(task: LogTask) -> Row:

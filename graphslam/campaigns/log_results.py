@@ -17,6 +17,7 @@ from graphslam.evaluation.ground_truth import errors_of_run, truth_of_logs
 from graphslam.evaluation.timed_replay import TimedReplay, timed_replay
 from graphslam.logs import open_logs
 from graphslam.results.folder import save
+from graphslam.results.known_map import known_map_files, known_map_of
 from graphslam.results.report import render
 from graphslam.results.small_map import draw, small_map
 from graphslam.slam.smooth import smooth
@@ -30,10 +31,12 @@ def work_on_log(task: LogTask) -> Row:
 def _smooth(task: LogTask, folder: Path) -> Row:
     """Write a result folder with a small map."""
     log = open_logs([Path(task.path)], task.config)
-    result = smooth(log, task.config)
+    known_map = known_map_of(task.config)
+    result = smooth(log, task.config, known_map=known_map)
     errors = errors_of_run(result, truth_of_logs(log))
     report = render(result, errors)
-    save(result, folder, force=False, report=lambda _result: report)
+    more = known_map_files(result, known_map)
+    save(result, folder, more, force=False, report=lambda _result: report)
     (folder / MAP).write_text(small_map(result), encoding="utf-8")
     return _figures(result, errors)
 

@@ -86,6 +86,25 @@ def test_the_result_of_a_log_is_that_of_smooth(fleet, tmp_path):
             assert inside.read_bytes() == alone.read_bytes()
 
 
+def test_logs_of_a_batch_are_localised_in_a_known_map(tmp_path, monkeypatch):
+    """Given from where the command runs, which need not be where workers are."""
+    monkeypatch.chdir(tmp_path)
+    drive(tmp_path / "monday.mcap")
+    (tmp_path / "logs").mkdir()
+    drive(tmp_path / "logs" / "tuesday.mcap", seed=8)
+    assert call("smooth", "monday.mcap", "-o", "monday").code == 0
+    at = ("--set", "known_map.directory=monday", "--start", "robot=0,0,0")
+    done = call("batch", "logs", "-o", "out", *at)
+    assert done.code == 0, done.err
+    folder = tmp_path / "out" / "results" / "tuesday"
+    known = json.loads((folder / "summary.json").read_text())["known_map"]
+    assert known["name"] == "monday" and known["seen"] > 3
+    assert (folder / "known_map.npz").exists()
+    wrong = call("batch", "logs", "-o", "other", "--set", "known_map.directory=nowhere")
+    check_one_line(wrong)
+    assert "nowhere" in wrong.err and not Path("other").exists()
+
+
 def test_the_page_has_a_line_and_a_map_of_every_log_and_no_path_of_the_machine(fleet):
     page = (fleet.out / "report.html").read_text()
     assert len(re.findall(r"<tr data-is=", page)) == 4
@@ -151,7 +170,7 @@ def test_ctrl_c_keeps_what_is_done_and_tells_what_waits(fleet, tmp_path, monkeyp
 
 def test_a_limit_of_the_settings_holds_for_each_log(fleet, tmp_path, monkeypatch):
     # 4.3 GB; the limit leaves this process, and threads of who runs the tests, what they have
-    monkeypatch.setattr(log_results, "smooth", lambda *_: bytearray(1 << 32))
+    monkeypatch.setattr(log_results, "smooth", lambda *_, **_known: bytearray(1 << 32))
     config = load_config(None, ["limits.memory_mb=3000"])
     task = LogTask("a", str(fleet.logs / "a.mcap"), str(tmp_path), config)
     with pytest.raises(LogError, match="more memory than limits"):
