@@ -24,13 +24,15 @@ from graphslam.logs.future_stamps import Recorded
 from graphslam.logs.growing_mcap import GrowingMcap, open_growing
 from graphslam.logs.log_set import FileReader, damage, decoded, log_set_of
 from graphslam.logs.recording import Recording, deriver
-from graphslam.logs.time_order import DROPPED
+from graphslam.logs.time_order import DROPPED, TOO_LATE, MessageSorter
 from graphslam.results.target_folder import check_target
 
 #: s between two versions of the folder, at least; and how many times as long as writing one takes
 WRITE_INTERVAL_S, WRITE_SHARE = 5.0, 5.0
 #: observations from which it is told that fewer than this share of them are of the known map
 ENOUGH_SEEN, FAMILIAR_SHARE = 100, 0.4
+#: messages that come too late, and how many for each scan, from which on there is a warning
+LEAST_LATE, LATE_SHARE = 20, 0.1
 
 
 def follow(
@@ -146,6 +148,7 @@ def _messages(
 
     logs = replace(config.logs, reorder_s=config.live.reorder_s)
     reader = FileReader(file, replace(config, logs=logs))
+    folder.sorter = reader.sorter
     yield from reader.sorted(recorded())
     for counts in reader.sorter.counts.values():
         folder.dropped += Counter({kind: counts.pop(kind, 0) for kind in DROPPED})
@@ -159,6 +162,8 @@ class _Folder:
         self.history, self.warnings = History(), list(log.warnings)
         self.dropped: Counter[str] = Counter()
         self.repaired: Counter[str] = Counter()
+        #: whose counts are moved to the others in the end
+        self.sorter: MessageSorter | None = None
         self._target, self._before, self._session, self._log = target, before, session, log
         self._writing: Future[Identity] | None = None
         self._written_s, self._began_s, self._took_s = time.monotonic(), 0.0, 0.0
@@ -215,6 +220,8 @@ class _Folder:
         log, history, session = self._log, self.history, self._session
         counts, known_map = session.counts, session.known_map
         dropped = self.dropped + session.dropped
+        for late in self.sorter.counts.values() if self.sorter is not None else ():
+            dropped += Counter({kind: late.get(kind, 0) for kind in DROPPED})
         return {
             "logs": [
                 {
@@ -237,7 +244,12 @@ class _Folder:
             "frames": session.frames,
             "dropped": {key: number for key, number in sorted(dropped.items()) if number},
             "repaired": dict(sorted(self.repaired.items())),
-            "warnings": [*self.warnings, *_unplaced(session), *_astray(known_map)],
+            "warnings": [
+                *self.warnings,
+                *_unplaced(session),
+                *_astray(known_map),
+                *_too_late(dropped[TOO_LATE], counts.get("scans", 0)),
+            ],
             "live": {
                 "state": state,
                 "estimates": len(history),
@@ -246,6 +258,16 @@ class _Folder:
                 "largest_jump_m": round(history.largest_jump_m, 4),
             },
         }
+
+
+def _too_late(messages: int, scans: int) -> list[str]:
+    """A line where many messages were left out since they came too late by their stamps."""
+    if messages < LEAST_LATE or messages < LATE_SHARE * scans:
+        return []
+    return [
+        f"{messages} messages were left out: they are stamped more than live.reorder_s before "
+        "others that came earlier; a clock was set back, or live.reorder_s is too short"
+    ]
 
 
 def _astray(known_map: Mapping[str, Any] | None) -> list[str]:

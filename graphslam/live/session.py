@@ -52,7 +52,6 @@ class Session:
 
     Attributes:
         config: the settings, those of docs/configuration.md.
-        dropped: number of messages that were not used, by reason.
     """
 
     def __init__(
@@ -76,7 +75,8 @@ class Session:
             ConfigError: a setting is wrong, or needs the whole log.
         """
         self.config = live_config(chosen_config(config, **settings))
-        self.dropped: Counter[str] = Counter()
+        self._unused: Counter[str] = Counter()
+        self._sorter: MessageSorter | None = None
         self._log = log
         if robots is not None and not isinstance(robots, Mapping):
             raise ConfigError(
@@ -86,6 +86,15 @@ class Session:
         if robots is not None:
             self._log = expected_log(robots, self.config)
         self._pass: LivePass | None = None
+
+    @property
+    def dropped(self) -> Counter[str]:
+        """Number of messages so far that were not used, by reason."""
+        found = self._unused.copy()
+        if self._sorter is not None:
+            for counts in self._sorter.counts.values():
+                found += Counter({kind: counts[kind] for kind in DROPPED})
+        return found if self._pass is None else found + self._pass.dropped
 
     @property
     def robots(self) -> tuple[str, ...]:
@@ -132,6 +141,7 @@ class Session:
 
         Raises:
             LogError: no robot has both odometry and observations.
+            ConfigError: it was called before: there is one drive, which begins once.
             EstimationError: the estimate is indeterminate.
         """
         rest = iter(messages)
@@ -142,12 +152,20 @@ class Session:
         yield from self.process_sorted(self._sorted(self._expected(rest)))
 
     def process_sorted(self, messages: Iterable[Message]) -> Iterator[LiveEstimate]:
-        """As `process`, for messages that are sorted by ``time_ns``, of robots that are known."""
+        """As `process`, for messages that are sorted by ``time_ns``, of robots that are known.
+
+        Raises:
+            LogError, ConfigError, EstimationError: as `process`.
+        """
         assert self._log is not None
+        if self._pass is not None:
+            raise ConfigError(
+                "Session.process: was called before, and a drive begins once; give it one iterable "
+                "of all messages, such as a generator that waits for a queue"
+            )
         check_robots(self._log, self.config)
         self._pass = LivePass(self._log, self.config, known_starts(self._log, self.config))
         yield from self._pass.estimates(messages)
-        self.dropped.update(self._pass.dropped)
 
     def _expected(self, messages: Iterable[Message]) -> Iterator[Message]:
         """The messages that can be used."""
@@ -158,23 +176,22 @@ class Session:
                 continue
             if (message.robot, type(message)) not in kinds:
                 what = type(message).__name__.lower()
-                self.dropped[f"{what}: {message.robot} did not send any at first"] += 1
+                self._unused[f"{what}: {message.robot} did not send any at first"] += 1
                 continue
             try:
                 check(message)
             except UnusableMessageError as reason:
-                self.dropped[str(reason)] += 1
+                self._unused[str(reason)] += 1
             else:
                 yield message
 
     def _sorted(self, messages: Iterable[Message]) -> Iterator[Message]:
         # messages come in any order, and what comes late says nothing of the stamps of the others
         sorter = MessageSorter(round(1e9 * self.config.live.reorder_s), repair=False)
-        for message in without_leaps(messages, self.dropped):
+        self._sorter = sorter
+        for message in without_leaps(messages, self._unused):
             yield from sorter.push(f"{message.robot} {type(message).__name__}", message)
         yield from sorter.finish()
-        for counts in sorter.counts.values():
-            self.dropped += Counter({kind: counts[kind] for kind in DROPPED})
 
 
 def without_leaps(messages: Iterable[Message], dropped: Counter[str]) -> Iterator[Message]:

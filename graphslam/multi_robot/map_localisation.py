@@ -46,6 +46,9 @@ from graphslam.perception.scan_matching import (
 MAX_HYPOTHESES = 5
 #: share of the confirmed places that may contradict a hypothesis: what changed, or is seen badly
 MAX_CONTRADICTED_SHARE = 0.3
+#: share of them, and number, from which there is a doubt: of 24 days in the simulated office that
+#: were placed right 23 had none, one 0.19; of those in a part that only looks alike 0.2 to 0.3
+DOUBT_SHARE, LEAST_DOUBTED = 0.2, 2
 #: share of the best one's support from which another hypothesis is a rival whatever contradicts it;
 #: others are from half of it on, unless they are contradicted
 EQUAL_SHARE = 0.7
@@ -216,6 +219,20 @@ def contradiction(given: Support) -> str:
     if against <= agreeing:
         return ""
     return f"{against} of {len(given.confirmed)} places contradict it, {agreeing} agree with it"
+
+
+def doubt(placed: Support) -> str:
+    """What is to be said of a path that is placed in a map; empty if hardly anything is against it.
+
+    Things that were moved contradict the right place too, so it is no reason to refuse it.
+    """
+    against = int(placed.contradicted.sum())
+    if against < LEAST_DOUBTED or placed.contradicted_share <= DOUBT_SHARE:
+        return ""
+    return (
+        f"{against} of {len(placed.contradicted)} places contradict where it was placed: much was "
+        "moved, or it drove elsewhere, where it looks alike"
+    )
 
 
 def differ(one: Support, other: Support) -> bool:

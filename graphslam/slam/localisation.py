@@ -17,7 +17,7 @@ from graphslam.core.records import Start
 from graphslam.mapping.known_map import KnownMap
 from graphslam.mapping.loop_closure import Tamper
 from graphslam.mapping.submaps import submaps_at, with_poses_from
-from graphslam.multi_robot.map_localisation import choose, contradiction, hypotheses, support
+from graphslam.multi_robot.map_localisation import choose, contradiction, doubt, hypotheses, support
 from graphslam.multi_robot.place_recognition import PlaceMap
 from graphslam.multi_robot.place_search import DISTINCT_M, DISTINCT_RAD
 from graphslam.slam.log_pass import timed
@@ -72,7 +72,11 @@ def check_given(scan_log: ScanLog, robot: str, laid: ClosedPaths, known_map: Kno
     """
     anchors = {robot: np.array(scan_log.paths[robot].anchors)}
     submaps, _ = submaps_at(anchors, laid.states, scan_log.keyframe_scans, scan_log.config)
-    why = contradiction(support(known_map.places, submaps)) if known_map.places else ""
+    if not known_map.places:
+        return
+    placed = support(known_map.places, submaps)
+    scan_log.map_doubt = doubt(placed)
+    why = contradiction(placed)
     if why:
         raise EstimationError(
             f"robot {robot}: does not begin in the map {known_map.name} where --start says: {why}; "
@@ -100,6 +104,7 @@ def found_start(
     if supports:
         chosen = choose(supports, own.places, scan_log.config.multi_robot)
         if isinstance(chosen, int):
+            scan_log.map_doubt = doubt(supports[chosen])
             return found[chosen]
         why = chosen
     raise EstimationError(

@@ -82,6 +82,7 @@ class LogPass:
         self.robot_sightings: list[Sighting] = []
         self.offers: dict[int, tuple[Association, ...]] = {}
         self.keyframe_scans: list[KeyframeScan] = []
+        self.map_doubt = ""  # of where it was placed in a known map
         self.scan_evidence: Mapping[str, ScanEvidence] = {}
         #: landmarks that were moved: number -> the landmark that they were before
         self.moved: Mapping[int, int] = {}

@@ -33,6 +33,7 @@ from graphslam.multi_robot.map_localisation import (
     choose,
     contradiction,
     differ,
+    doubt,
     support,
 )
 from graphslam.multi_robot.place_recognition import EQUIVALENT_SHARE, PlaceMap
@@ -73,12 +74,12 @@ def join_sessions(log: LogSet, sessions: Mapping[str, ScanLog], config: Config) 
     tracked = {name: _Session.of(sessions[name], name) for name in by_time}
     given = {name: _of_first_state(sessions, name, world, told) for name in told}
     placed = {name: start for name, start in given.items() if name in sessions}
-    _check_given(placed, tracked)
+    doubted = _check_given(placed, tracked)
     groups = [_group(placed, tracked)]
     groups += [_group({n: origin(config)}, tracked) for n in by_time if n not in given]
     refused = _merge(groups, tracked, config)
     starts, frames, found = dict(given), dict.fromkeys(given, world), {}
-    remarks: dict[str, str] = {}
+    remarks = dict(doubted)
     for group in groups:
         leader = world if group is groups[0] else next(iter(group.starts))
         starts |= group.starts
@@ -93,23 +94,28 @@ def join_sessions(log: LogSet, sessions: Mapping[str, ScanLog], config: Config) 
     return FrameAssignment(starts, frames, world, found, undecided, remarks)
 
 
-def _check_given(given: Mapping[str, Start], sessions: Mapping[str, "_Session"]) -> None:
-    """See that sessions whose starts are told agree with those before them.
+def _check_given(given: Mapping[str, Start], sessions: Mapping[str, "_Session"]) -> dict[str, str]:
+    """See that sessions whose starts are told agree with those before them; doubts of some.
 
     Raises:
         EstimationError: from there one sees something else than the others.
     """
     before: dict[str, Start] = {}
+    doubted: dict[str, str] = {}
     for name, start in given.items():
         known = _group(before, sessions).map
         if known.places:
-            why = contradiction(_lay({name: start}, known, sessions).support)
+            placed = _lay({name: start}, known, sessions).support
+            why = contradiction(placed)
             if why:
                 raise EstimationError(
                     f"session {name}: --start contradicts that of {', '.join(before)}: {why}; "
                     "give another start, or none"
                 )
+            if said := doubt(placed):
+                doubted[name] = said
         before[name] = start
+    return doubted
 
 
 def _of_first_state(
@@ -229,6 +235,8 @@ def _joined(
         against = int(best.support.contradicted.sum())
         said = f"{against} of {len(places)} places contradict where it was placed, "
         said += "but nothing else explains them: much was moved"
+        remarks |= dict.fromkeys(best.starts, said)
+    elif said := doubt(best.support):
         remarks |= dict.fromkeys(best.starts, said)
     return _Group(
         {**one.starts, **best.starts},

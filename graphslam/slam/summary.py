@@ -170,6 +170,7 @@ def known_map_summary(pipeline: LogPass) -> dict[str, Any]:
         "known_map": {
             "name": known_map.name,
             "sha256": known_map.sha256,
+            "doubt": pipeline.map_doubt,
             "parents": [{"name": name, "sha256": sha256} for name, sha256 in known_map.parents],
             "updated": pipeline.given_config.known_map.update,
             "landmarks": len(earlier),

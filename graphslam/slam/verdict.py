@@ -150,6 +150,13 @@ def _sessions(evidence: Evidence) -> Iterable[Reason]:
         yield Reason("doubtful", "sessions", name, f"{name}: {said}")
 
 
+def _known_map(evidence: Evidence) -> Iterable[Reason]:
+    """A place in a known map of which much speaks against it."""
+    known = evidence.summary.get("known_map", {})
+    if known.get("doubt"):
+        yield Reason("doubtful", "known map", known["name"], f"{known['name']}: {known['doubt']}")
+
+
 def _unobserved(evidence: Evidence) -> Iterable[Reason]:
     counts = evidence.summary["counts"]
     if not evidence.observed or not (counts["observations"] or counts["loop_closures"]):
@@ -170,5 +177,6 @@ CHECKS: dict[str, Callable[[Evidence], Iterable[Reason]]] = {
     "lost": _lost,
     "unplaced": _unplaced,
     "sessions": _sessions,
+    "known map": _known_map,
     "observations": _unobserved,
 }

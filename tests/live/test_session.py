@@ -110,6 +110,29 @@ def test_messages_that_are_late_are_sorted_in(room, live):
     assert session.dropped["stamp: older than logs.reorder_s allows"] > 0.8 * len(found)
 
 
+def test_what_is_left_out_is_counted_while_it_happens(room):
+    """A clock that is set back by an hour: the drive has not ended, and the count tells."""
+    back = [replace(m, stamp_ns=m.stamp_ns - 3600 * S, time_ns=m.time_ns - 3600 * S)
+            for m in room[1][-100:]]  # fmt: skip
+    session, counted = graphslam.Session(), []
+
+    def queue():
+        yield from room[1][:600]
+        for message in back:
+            yield message
+            counted.append(sum(session.dropped.values()))
+
+    list(session.process(queue()))
+    assert counted == list(range(1, 101))
+
+
+def test_a_drive_begins_once(room):
+    session = graphslam.Session()
+    assert list(session.process(room[1][:300]))
+    with pytest.raises(graphslam.ConfigError, match="was called before"):
+        next(session.process(room[1][300:600]))
+
+
 def sightings(seconds=20):
     """A robot that drives round four posts without names and looks at them five times a second."""
     rng = np.random.default_rng(3)

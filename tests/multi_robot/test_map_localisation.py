@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from graphslam.core.config import MultiRobotConfig
-from graphslam.multi_robot.map_localisation import Support, choose, contradiction
+from graphslam.multi_robot.map_localisation import Support, choose, contradiction, doubt
 
 #: places along a corridor, 3 m apart
 POSES = np.column_stack([3.0 * np.arange(6), np.zeros(6), np.zeros(6)])
@@ -57,6 +57,20 @@ def test_too_little_is_refused():
     wide = MultiRobotConfig(min_place_extent_m=20.0)
     assert "extend over less" in choose([hypothesis(0.9, 0)], PLACES, wide)
     assert "3 of 6 places contradict it" in chosen(hypothesis(0.9, 3))
+
+
+@pytest.mark.parametrize(
+    ("confirmed", "against", "is_doubted"), [(16, 0, False), (16, 3, False), (4, 1, False),
+                                             (10, 3, True), (8, 2, True), (0, 2, True)],
+)  # fmt: skip
+def test_a_place_that_some_contradict_is_a_doubt_and_one_thing_that_moved_is_none(
+    confirmed, against, is_doubted
+):
+    yes = np.arange(18) < confirmed
+    no = np.arange(18) >= 18 - against
+    said = doubt(Support(np.zeros((18, 3)), np.ones(18), yes, no))
+    assert bool(said) == is_doubted
+    assert not said or said.startswith(f"{against} of 18 places contradict")
 
 
 def test_a_given_start_is_refused_where_more_contradicts_it_than_agrees():

@@ -348,6 +348,7 @@ def test_what_is_wrong_is_said_as_what_it_is(name):
         ({"dropped": {"sighting: no odometry near it": 300}}, "doubtful", "300 of 800 sightings"),
         ({"sessions": {"apart": {"day1": "why"}}}, "doubtful", "day1: is no part of the map: why"),
         ({"sessions": {"doubts": {"day1": "much was moved"}}}, "doubtful", "day1: much was moved"),
+        ({"known_map": {"name": "monday", "doubt": "much"}}, "doubtful", "monday: much"),
         ({"counts": {"scans": 100, "observations": 0, "loop_closures": 0}}, "doubtful", "dead"),
     ],
 )  # fmt: skip
