@@ -5,11 +5,12 @@ import os
 import numpy as np
 import pytest
 from paths import LOGS
-from room_log import drive
+from room_log import SCAN, S, drive
 
 import graphslam
+from graphslam.core.records import OdometryPose, Scan
 from graphslam.live import follow as follow_module
-from graphslam.logs import growing_mcap
+from graphslam.logs import LogWriter, growing_mcap
 
 
 @pytest.fixture(scope="module")
@@ -181,6 +182,23 @@ def test_robots_of_unknown_start_are_said(tmp_path):
     (alone,) = set(frames) - {told["world"]}
     assert any(w.startswith(f"{alone}: its start is not known") for w in told["warnings"])
     assert f"--start {alone}=x,y,phi" in (tmp_path / "out" / "report.html").read_text("utf-8")
+
+
+def test_a_clock_that_is_set_back_is_said(room, tmp_path):
+    """What comes then is stamped an hour before what is estimated already."""
+    messages = list(graphslam.open_logs(room).messages())
+    half, hour = len(messages) // 2, 3600 * S
+    with LogWriter(tmp_path / "back.mcap") as log:
+        for k, m in enumerate(messages):
+            stamp = m.stamp_ns - hour * (k > half)
+            if isinstance(m, OdometryPose):
+                log.odometry(m.robot, stamp, m.pose, log_time_ns=m.time_ns)
+            elif isinstance(m, Scan):
+                log.scan(m.robot, stamp, m.ranges, log_time_ns=m.time_ns, **SCAN)
+    summary = graphslam.follow(tmp_path / "back.mcap", tmp_path / "now")
+    (said,) = (line for line in summary["warnings"] if "a clock was set back" in line)
+    assert int(said.split()[0]) > 0.4 * half
+    assert 0.4 < summary["live"]["estimates"] / summary["counts"]["scans"] <= 1.0
 
 
 def test_what_is_lost_is_said(room, tmp_path):
