@@ -120,7 +120,7 @@ def register_rivals(
 
 
 def _is_same(a: Registration, b: Registration) -> bool:
-    """Whether two registrations are one: they turn alike and move alike, where the maps are."""
+    """Whether two registrations are one: they turn alike, and move the world's origin alike."""
     return bool(np.all(np.abs(between(a.pose, b.pose)) < _SAME))
 
 

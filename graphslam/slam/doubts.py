@@ -7,6 +7,9 @@ import numpy as np
 
 from graphslam.odometry.interpolation import IntArray
 
+#: m, rad: a robot that its other sensors saw move by more did move, whatever odometry says
+MOVED_M, MOVED_RAD = 0.3, 0.25
+
 
 @dataclass(frozen=True, slots=True)
 class Reason:

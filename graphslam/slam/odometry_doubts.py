@@ -10,7 +10,7 @@ from itertools import chain
 import numpy as np
 
 from graphslam.core.geometry import Array, between, wrap
-from graphslam.slam.doubts import Reason, seconds, stretches
+from graphslam.slam.doubts import MOVED_M, MOVED_RAD, Reason, seconds, stretches
 from graphslam.slam.evidence import Evidence, RobotEvidence
 from graphslam.slam.path_evidence import FACTORS as PATH_FACTORS
 from graphslam.slam.path_evidence import better_fit
@@ -20,8 +20,6 @@ from graphslam.slam.scan_evidence import Parked
 SCAN_CHANGE = 0.6
 #: m: half of the beams change by more than that only where a robot moved
 RANGE_CHANGE_M = 0.04
-#: m, rad: the robot moved by what its other sensors saw
-MOVED_M, MOVED_RAD = 0.3, 0.25
 #: share of readings, far from each other in time: the fastest that a robot drives is exceeded by
 #: those only that are wrong
 FAST_SHARE = 0.98

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from graphslam.core.geometry import between
-from graphslam.slam.doubts import Reason, seconds
+from graphslam.slam.doubts import MOVED_M, MOVED_RAD, Reason, seconds
 from graphslam.slam.evidence import BoolArray, Evidence, IntTable, RobotEvidence
 
 #: times that one scan is repeated while odometry moves: not just sent twice
@@ -16,8 +16,8 @@ HOP_M, HOP_RAD = 1.2, 1.0
 HOPS = 0.3
 #: share of motions in which scans contradict odometry, and how many of so many in a row
 CONTRADICTED, IN_A_ROW, ROW = 0.12, 8, 12
-#: ns without a scan in which a robot may be carried; m, rad: it is where odometry does not say
-UNSEEN_NS, MOVED_M, MOVED_RAD = 2_000_000_000, 0.3, 0.25
+#: ns without a scan in which a robot may be carried
+UNSEEN_NS = 2_000_000_000
 
 
 def scan_doubts(evidence: Evidence) -> Iterator[Reason]:
