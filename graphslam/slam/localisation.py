@@ -10,19 +10,31 @@ import numpy as np
 from graphslam.core.config import Config
 from graphslam.core.errors import EstimationError
 from graphslam.core.frame_forest import PRIOR_INFLATION
-from graphslam.core.gaussian import symmetric
-from graphslam.core.geometry import compose, compose_cov, inverse
+from graphslam.core.gaussian import chi2_quantile, symmetric
+from graphslam.core.geometry import between, compose, compose_cov, inverse, wrap
 from graphslam.core.record import replace
 from graphslam.core.records import Start
 from graphslam.mapping.known_map import KnownMap
 from graphslam.mapping.loop_closure import Tamper
 from graphslam.mapping.submaps import submaps_at, with_poses_from
-from graphslam.multi_robot.map_localisation import choose, contradiction, doubt, hypotheses, support
+from graphslam.multi_robot.map_localisation import (
+    Support,
+    choose,
+    contradiction,
+    doubt,
+    hypotheses,
+    support,
+)
 from graphslam.multi_robot.place_recognition import PlaceMap
 from graphslam.multi_robot.place_search import DISTINCT_M, DISTINCT_RAD
 from graphslam.slam.log_pass import timed
 from graphslam.slam.path_closing import PLACE_COV, ClosedPaths, close_paths
 from graphslam.slam.scan_tracking import ScanLog
+
+#: chi-square of three degrees of freedom at 99.9 %
+START_GATE = float(chi2_quantile(0.999, 3))
+#: share of the least variance of a start by which the map has to make it smaller to contradict it
+LEAST_TOLD = 1e-3
 
 
 def localise(scan_log: ScanLog, known_map: KnownMap, tamper: Tamper | None = None) -> ClosedPaths:
@@ -40,9 +52,7 @@ def localise(scan_log: ScanLog, known_map: KnownMap, tamper: Tamper | None = Non
     config = scan_log.config
     with timed(scan_log.seconds, "localisation"):
         if is_start_given(config, robot):
-            start = given_start(scan_log, robot)
-            laid = laid_into(scan_log, robot, start, known_map, tamper)
-            check_given(scan_log, robot, laid, known_map)
+            start, laid = start_as_given(scan_log, robot, known_map, tamper)
         else:
             start, laid = found_start(scan_log, robot, known_map, tamper)
     place_path(scan_log, robot, start)
@@ -64,24 +74,66 @@ def given_start(scan_log: ScanLog, robot: str) -> Start:
     return Start(compose(told.pose, track.mount), cov)
 
 
-def check_given(scan_log: ScanLog, robot: str, laid: ClosedPaths, known_map: KnownMap) -> None:
-    """See that a start that was given, from where the path is ``laid``, is in this building.
+def start_as_given(
+    scan_log: ScanLog, robot: str, known_map: KnownMap, tamper: Tamper | None = None
+) -> tuple[Start, ClosedPaths]:
+    """The start by one that was given, and the path laid from there.
+
+    Which of the places that look alike it is, the given one says. Where exactly, the map does, as
+    for a start that is found: in the estimate a start that is told some decimetres off would rather
+    move the whole map, which is hardly known in the world. If the map contradicts it by more than
+    what both are known to, that is a doubt. Only where no place of the map is recognised the start
+    is as given.
+
+    Raises:
+        EstimationError: from there the log sees something else than the map.
+    """
+    given = given_start(scan_log, robot)
+    laid = laid_into(scan_log, robot, given, known_map, tamper)
+    is_wrong = is_contradicted(given, laid, robot)
+    if is_wrong:  # pulled to what was told, the beginning of the path is torn
+        laid = laid_into(scan_log, robot, laid_start(laid, robot), known_map, tamper)
+    placed = check_given(scan_log, robot, laid, known_map)
+    said = doubt(placed)
+    if is_wrong:
+        off = between(given.pose, laid.states[robot].poses[0])
+        what = f"{np.hypot(off[0], off[1]):.2f} m and {np.degrees(abs(off[2])):.1f}°"
+        wrong = f"the start that was told is {what} from where the map has it, and was not used"
+        said = f"{wrong}; {said}" if said else wrong
+    scan_log.map_doubt = said
+    return (laid_start(laid, robot) if placed.confirmed.any() else given), laid
+
+
+def is_contradicted(given: Start, laid: ClosedPaths, robot: str) -> bool:
+    """Whether the map contradicts a start that was given by more than both are known to.
+
+    The path was ``laid`` with the start as a prior: how far it ends from that has the covariance of
+    the prior less that of the estimate.
+    """
+    off = laid.states[robot].poses[0] - given.pose
+    off[2] = wrap(off[2])
+    values, axes = np.linalg.eigh(symmetric(given.cov - laid.start_covariance(robot)))
+    # along axes in which the map tells nothing there is nothing left, and nothing off
+    told = values > LEAST_TOLD * np.diag(given.cov).min()
+    return bool(((axes.T @ off)[told] ** 2 / values[told]).sum() > START_GATE)
+
+
+def check_given(scan_log: ScanLog, robot: str, laid: ClosedPaths, known_map: KnownMap) -> Support:
+    """How well a path that was ``laid`` from a start that was given explains its places.
 
     Raises:
         EstimationError: from there the log sees something else than the map.
     """
     anchors = {robot: np.array(scan_log.paths[robot].anchors)}
     submaps, _ = submaps_at(anchors, laid.states, scan_log.keyframe_scans, scan_log.config)
-    if not known_map.places:
-        return
-    placed = support(known_map.places, submaps)
-    scan_log.map_doubt = doubt(placed)
+    placed = support(known_map.places, submaps if known_map.places else ())
     why = contradiction(placed)
     if why:
         raise EstimationError(
             f"robot {robot}: does not begin in the map {known_map.name} where --start says: {why}; "
             "give another map, or another start"
         )
+    return placed
 
 
 def found_start(

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from room_log import drive, true_pose
+from room_log import START_NS, drive, true_pose
 from walls import rectangles
 
 import graphslam
@@ -95,6 +95,26 @@ def test_another_building_is_refused_and_nothing_written(tmp_path, first_day):
     with pytest.raises(EstimationError, match="does not begin in the map first where"):
         localised(log, first_day, output=tmp_path / "later", **told)
     assert not (tmp_path / "later").exists()
+
+
+@pytest.mark.parametrize(("off_m", "doubted"), [(0.3, False), (0.6, True)])
+def test_a_start_that_is_told_wrong_does_not_move_the_map(tmp_path, off_m, doubted):
+    """A map whose own start is known to decimetres followed the told one, by as much as that."""
+    loose = {**START, "start.given_sigma_m": 0.3, "start.given_sigma_rad": 0.03}
+    graphslam.smooth(
+        drive(tmp_path / "first.mcap", room=FURNISHED), output=tmp_path / "first", **loose
+    )
+    log = drive(tmp_path / "later.mcap", room=FURNISHED, phase=0.3, seed=3)
+    told = true_pose(0.0, 0.3) + np.array([0.6, -0.8, 0.0]) * off_m
+    settings = {"start.poses.robot": told.tolist()}
+    result = localised(log, tmp_path / "first", **settings)
+    final = result.robots["robot"].final
+    off = final.poses[:, :2] - [true_pose(1e-9 * (t - START_NS), 0.3)[:2] for t in final.stamps_ns]
+    # the first day began where it was told, and three centimetres are the bar of known maps
+    assert np.sqrt((off**2).sum(axis=1).mean()) < 0.03
+    # 0.05 m is what a start is told to by default, and the mount of the laser is known to 0.06
+    assert bool(result.summary["known_map"]["doubt"]) == doubted
+    assert (result.summary["verdict"]["verdict"] == "doubtful") == doubted
 
 
 def test_the_map_of_a_localised_result_is_the_earlier_one(tmp_path, first_day):
