@@ -15,7 +15,7 @@ from graphslam.core.records import Landmark, Message, Scan, Sighting
 from graphslam.live.live_pass import LiveEstimate, LivePass
 from graphslam.logs import LogSet
 from graphslam.logs.decoders import TopicContext
-from graphslam.logs.record_checks import UnusableMessageError, check
+from graphslam.logs.record_checks import UnusableMessageError, checked
 from graphslam.logs.time_order import DROPPED, MessageSorter
 from graphslam.logs.topics import MOTION_KINDS, Topic
 from graphslam.multi_robot.frame_tree import FrameAssignment
@@ -78,7 +78,7 @@ class Session:
         self._unused: Counter[str] = Counter()
         self._sorter: MessageSorter | None = None
         self._log = log
-        if robots is not None and not isinstance(robots, Mapping):
+        if robots is not None and not _names_records(robots):
             raise ConfigError(
                 "Session(robots=...): needs a dict of what each sends, such as "
                 "{'robot': [OdometryPose, Scan]}"
@@ -144,7 +144,7 @@ class Session:
             ConfigError: it was called before: there is one drive, which begins once.
             EstimationError: the estimate is indeterminate.
         """
-        rest = iter(messages)
+        rest = self._records(messages)
         if self._log is None:
             first, kinds = introduced(rest)
             self._log = expected_log(kinds, self.config)
@@ -167,6 +167,14 @@ class Session:
         self._pass = LivePass(self._log, self.config, known_starts(self._log, self.config))
         yield from self._pass.estimates(messages)
 
+    def _records(self, messages: Iterable[Message]) -> Iterator[Message]:
+        """What is a message at all."""
+        for message in messages:
+            if isinstance(message, Message):
+                yield message
+            else:
+                self._unused[f"{type(message).__name__}: is no record of graphslam"] += 1
+
     def _expected(self, messages: Iterable[Message]) -> Iterator[Message]:
         """The messages that can be used."""
         assert self._log is not None
@@ -179,11 +187,11 @@ class Session:
                 self._unused[f"{what}: {message.robot} did not send any at first"] += 1
                 continue
             try:
-                check(message)
+                usable = checked(message)
             except UnusableMessageError as reason:
                 self._unused[str(reason)] += 1
             else:
-                yield message
+                yield usable
 
     def _sorted(self, messages: Iterable[Message]) -> Iterator[Message]:
         # messages come in any order, and what comes late says nothing of the stamps of the others
@@ -192,6 +200,15 @@ class Session:
         for message in without_leaps(messages, self._unused):
             yield from sorter.push(f"{message.robot} {type(message).__name__}", message)
         yield from sorter.finish()
+
+
+def _names_records(robots: object) -> bool:
+    """Whether it is a mapping of robots to the records that each sends."""
+    return isinstance(robots, Mapping) and all(
+        isinstance(kind, type) and issubclass(kind, Message)
+        for own in robots.values()
+        for kind in (own if isinstance(own, Sequence) and not isinstance(own, str) else [None])
+    )
 
 
 def without_leaps(messages: Iterable[Message], dropped: Counter[str]) -> Iterator[Message]:

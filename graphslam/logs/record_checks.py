@@ -1,18 +1,20 @@
 """What a record must hold to be used: finite numbers, as sensors measure them, and covariances.
 
 Records that are decoded are checked by the decoders as they are made, those that a program makes
-itself (`graphslam.Session`) by `check`. Both are dropped and counted for the same reasons.
+itself (`graphslam.Session`) by `checked`. Both are dropped and counted for the same reasons.
 """
 
 import math
 from collections.abc import Callable
 from functools import lru_cache
+from numbers import Integral
 from typing import Any
 
 import numpy as np
 
 from graphslam.core import records
 from graphslam.core.geometry import Array, is_positive
+from graphslam.core.record import replace
 from graphslam.logs import physical_limits as limits
 
 
@@ -20,13 +22,43 @@ class UnusableMessageError(Exception):
     """A message that must be dropped; its text is the reason under which it is counted."""
 
 
-def check(message: records.Message) -> None:
-    """Check what a record holds.
+def checked(message: records.Message) -> records.Message:
+    """A record that a program made, with its numbers as arrays, if it can be used.
 
     Raises:
-        UnusableMessageError: it cannot be used.
+        UnusableMessageError: it cannot.
     """
-    _CHECKS.get(type(message), _nothing)(message)
+    made = _with_arrays(message)
+    _CHECKS.get(type(made), _nothing)(made)
+    return made
+
+
+def _with_arrays(message: records.Message) -> records.Message:
+    """The record with lists as arrays; raises `UnusableMessageError` where shapes are wrong."""
+    what = type(message).__name__
+    if not all(isinstance(t, Integral) for t in (message.stamp_ns, message.time_ns)):
+        raise UnusableMessageError(f"{what}: stamp_ns and time_ns must be whole numbers")
+    sizes: dict[str, int] = {}
+    arrays: dict[str, Array] = {}
+    for field, shape in _SHAPES.get(type(message), {}).items():
+        value = getattr(message, field)
+        if value is None:
+            continue
+        try:
+            array = np.asarray(value, dtype=float)
+        except (TypeError, ValueError):
+            array = np.array(np.nan)
+        wanted = [n if isinstance(n, int) else sizes.get(n) for n in shape]
+        if array.ndim != len(shape) or any(
+            n not in (None, found) for n, found in zip(wanted, array.shape, strict=True)
+        ):
+            raise UnusableMessageError(
+                f"{what}: {field} must be an array ({', '.join(map(str, shape))}) of numbers"
+            )
+        sizes |= {n: k for n, k in zip(shape, array.shape, strict=True) if isinstance(n, str)}
+        if array is not value:
+            arrays[field] = array
+    return replace(message, **arrays) if arrays else message
 
 
 def check_finite(what: str, values: Array) -> None:
@@ -92,6 +124,8 @@ def _nothing(message: records.Message) -> None:
 
 
 def _sighting(message: records.Sighting) -> None:
+    if len(message.z) not in (2, 3):
+        raise UnusableMessageError("Sighting: z must be bearing, range and perhaps direction")
     check_sighting(message.z)
     checked_covariance("sighting", message.cov, len(message.z))
 
@@ -119,6 +153,15 @@ def _relative_pose(message: records.RelativePose) -> None:
 def _scan(message: records.Scan) -> None:
     check_finite("scan", np.array([message.angle_min_rad, message.angle_step_rad]))
 
+
+#: the arrays of records; where the same letter stands, the same number of elements
+_SHAPES: dict[type[records.Message], dict[str, tuple[int | str, ...]]] = {
+    records.OdometryPose: {"pose": (3,)},
+    records.OdometryIncrement: {"delta": (3,), "cov": (3, 3)},
+    records.Scan: {"ranges": ("n",), "mount": (3,), "bearings": ("n",)},
+    records.Sighting: {"z": ("k",), "cov": ("k", "k"), "mount": (3,)},
+    records.RelativePose: {"delta": (3,), "cov": (3, 3)},
+}
 
 _CHECKS: dict[type[records.Message], Callable[[Any], None]] = {
     records.OdometryPose: _odometry,

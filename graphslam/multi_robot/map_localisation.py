@@ -14,24 +14,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphslam.core.config import MultiRobotConfig
-from graphslam.core.consistency import greedy_max_clique, has_rival
+from graphslam.core.consistency import greedy_max_clique
 from graphslam.core.geometry import Array, between, compose, inverse, transform
 from graphslam.mapping.loop_closure import COV_INFLATION, MIN_CONFIRMED
 from graphslam.mapping.submaps import SubmapPose, drift_covariance
 from graphslam.multi_robot.place_recognition import (
     ABSENT_WEIGHT,
     MAX_ABSENT_SHARE,
-    MIN_MATCHES,
     PlaceMap,
     consensus,
-    extent,
     match_places,
     pairwise_agreement,
     start_estimates,
 )
 from graphslam.multi_robot.place_search import (
-    DISTINCT_M,
-    DISTINCT_RAD,
     alternative_alignments,
 )
 from graphslam.perception.scan_matching import (
@@ -46,12 +42,6 @@ from graphslam.perception.scan_matching import (
 MAX_HYPOTHESES = 5
 #: share of the confirmed places that may contradict a hypothesis: what changed, or is seen badly
 MAX_CONTRADICTED_SHARE = 0.3
-#: share of them, and number, from which there is a doubt: of 24 days in the simulated office that
-#: were placed right 23 had none, one 0.19; of those in a part that only looks alike 0.2 to 0.3
-DOUBT_SHARE, LEAST_DOUBTED = 0.2, 2
-#: share of the best one's support from which another hypothesis is a rival whatever contradicts it;
-#: others are from half of it on, unless they are contradicted
-EQUAL_SHARE = 0.7
 #: m: what the map has around a place is from its places within this distance
 AROUND_M = 6.0
 #: m, rad: a place may be so far off where its hypothesis puts it, which is drift of the path
@@ -176,67 +166,3 @@ def _agreement(source: Submap, target: Submap, pose: Array) -> tuple[float, floa
     visible = int(seen.sum()) + missing
     n = len(source.points)
     return same / n, max(absent / n, missing / max(visible, 1))
-
-
-def choose(
-    found: Sequence[Support],
-    places: Sequence[SubmapPose],
-    config: MultiRobotConfig,
-    *,
-    may_contradict: bool = False,
-) -> int | str:
-    """Which of several hypotheses, at least one, is right, or why that is not known.
-
-    ``may_contradict``: however many places contradict it, if nothing else is against it.
-    """
-    totals = [one.total for one in found]
-    best = int(np.argmax(totals))
-    one = found[best]
-    count = int(one.confirmed.sum())
-    if count < MIN_MATCHES:
-        return f"only {count} of {len(places)} places are recognised"
-    if extent([p for p, is_seen in zip(places, one.confirmed, strict=True) if is_seen]) < (
-        config.min_place_extent_m
-    ):
-        return "the places that are recognised extend over less than multi_robot.min_place_extent_m"
-    others = [x for x in found if differ(one, x)]
-    rivals = [x.total for x in others if not x.is_contradicted]
-    if has_rival(one.total, rivals) or has_rival(one.total, [x.total for x in others], EQUAL_SHARE):
-        return "it has places that look alike, and the path fits into it in more than one way"
-    if one.is_contradicted and not may_contradict:
-        return f"{int(one.contradicted.sum())} of {len(places)} places contradict it"
-    return best
-
-
-def contradiction(given: Support) -> str:
-    """Why a start that was given cannot be right; empty if it can.
-
-    It is trusted further than one that was found: places outside of the map speak neither for nor
-    against it, and furniture that moved in sight of every place is no reason. In another building,
-    or turned round in the right one, more places contradict the map than agree with it.
-    """
-    against, agreeing = int(given.contradicted.sum()), int(given.confirmed.sum())
-    if against <= agreeing:
-        return ""
-    return f"{against} of {len(given.confirmed)} places contradict it, {agreeing} agree with it"
-
-
-def doubt(placed: Support) -> str:
-    """What is to be said of a path that is placed in a map; empty if hardly anything is against it.
-
-    Things that were moved contradict the right place too, so it is no reason to refuse it.
-    """
-    against = int(placed.contradicted.sum())
-    if against < LEAST_DOUBTED or placed.contradicted_share <= DOUBT_SHARE:
-        return ""
-    return (
-        f"{against} of {len(placed.contradicted)} places contradict where it was placed: much was "
-        "moved, or it drove elsewhere, where it looks alike"
-    )
-
-
-def differ(one: Support, other: Support) -> bool:
-    """Whether two hypotheses, that may have begun apart, end at different paths."""
-    off = between(one.poses, other.poses)
-    apart = np.hypot(off[:, 0], off[:, 1]) > DISTINCT_M
-    return bool(np.median(apart | (np.abs(off[:, 2]) > DISTINCT_RAD)))

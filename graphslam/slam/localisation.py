@@ -17,14 +17,8 @@ from graphslam.core.records import Start
 from graphslam.mapping.known_map import KnownMap
 from graphslam.mapping.loop_closure import Tamper
 from graphslam.mapping.submaps import submaps_at, with_poses_from
-from graphslam.multi_robot.map_localisation import (
-    Support,
-    choose,
-    contradiction,
-    doubt,
-    hypotheses,
-    support,
-)
+from graphslam.multi_robot.hypothesis_choice import best_explanation, contradiction, doubt
+from graphslam.multi_robot.map_localisation import Support, hypotheses, support
 from graphslam.multi_robot.place_recognition import PlaceMap
 from graphslam.multi_robot.place_search import DISTINCT_M, DISTINCT_RAD
 from graphslam.slam.log_pass import timed
@@ -154,11 +148,10 @@ def found_start(
         found.append((laid_start(laid, robot), laid))
     why = "no place in it is recognised"
     if supports:
-        chosen = choose(supports, own.places, scan_log.config.multi_robot)
-        if isinstance(chosen, int):
-            scan_log.map_doubt = doubt(supports[chosen])
-            return found[chosen]
-        why = chosen
+        best, why = best_explanation(supports, own.places, scan_log.config.multi_robot)
+        if not why:
+            scan_log.map_doubt = doubt(supports[best])
+            return found[best]
     raise EstimationError(
         f"robot {robot}: where it begins in the map {known_map.name} is not known: {why}; give "
         f"another map, or --start {robot}=x,y,phi (m, rad)"

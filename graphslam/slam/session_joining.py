@@ -18,7 +18,6 @@ from itertools import combinations
 import numpy as np
 
 from graphslam.core.config import Config
-from graphslam.core.consistency import has_rival
 from graphslam.core.errors import EstimationError
 from graphslam.core.frame_forest import PRIOR_INFLATION
 from graphslam.core.geometry import Array, between, compose, compose_cov, inverse
@@ -28,15 +27,9 @@ from graphslam.logs import LogSet
 from graphslam.mapping.known_map import KnownMap, latest_places
 from graphslam.mapping.submaps import SubmapPose, with_poses_from
 from graphslam.multi_robot.frame_tree import FrameAssignment
-from graphslam.multi_robot.map_localisation import (
-    Support,
-    choose,
-    contradiction,
-    differ,
-    doubt,
-    support,
-)
-from graphslam.multi_robot.place_recognition import EQUIVALENT_SHARE, PlaceMap
+from graphslam.multi_robot.hypothesis_choice import best_explanation, contradiction, doubt
+from graphslam.multi_robot.map_localisation import Support, support
+from graphslam.multi_robot.place_recognition import PlaceMap
 from graphslam.multi_robot.place_search import DISTINCT_M, DISTINCT_RAD
 from graphslam.multi_robot.relative_frames import RelativeFrame
 from graphslam.slam.localisation import (
@@ -48,10 +41,6 @@ from graphslam.slam.localisation import (
 from graphslam.slam.scan_tracking import ScanLog
 from graphslam.slam.start_priors import origin, start_poses
 
-#: share of the places that a hypothesis recognises which stands alone, and share of its support
-#: that no other one reaches. Another building has 0.25 at most; in the simulated office wrong ones
-#: have others with 0.18 or more
-RECOGNISED_SHARE, FAINT_SHARE = 0.75, 0.1
 #: a map of sessions has places only
 _NO_LANDMARKS = KnownLandmarks({}, (), SparseRoot((), (), 1.0))
 
@@ -227,7 +216,8 @@ def _joined(
     if not laid:
         return "no place of the others is recognised"
     places = [place for name in other.starts for place in sessions[name].own.places]
-    best, why = _best(laid, places, config)
+    index, why = best_explanation([one.support for one in laid], places, config.multi_robot)
+    best = laid[index]
     if why:
         return why
     remarks = {**one.remarks, **other.remarks}
@@ -253,56 +243,6 @@ class _Laid:
     starts: Mapping[str, Start]
     places: Sequence[SubmapPose]
     support: Support
-
-
-def _best(laid: Sequence[_Laid], places: Sequence[SubmapPose], config: Config) -> tuple[_Laid, str]:
-    """The hypothesis that explains the places best, and why it is not believed ("" if it is).
-
-    Others are rivals by what they explain about as well, place by place: a building turned by half
-    a turn has walls everywhere too, but they fit worse.
-    """
-    best = max(laid, key=lambda one: (not one.support.is_contradicted, one.support.total))
-    rivals = [_as_rival(one.support, best.support) for one in laid if one is not best]
-    chosen = choose(
-        [best.support, *rivals],
-        places,
-        config.multi_robot,
-        may_contradict=_stands_alone(best.support, [one.support for one in laid]),
-    )
-    if isinstance(chosen, str):
-        return best, chosen
-    return best, "" if chosen == 0 else "more than one relative pose explains what was seen"
-
-
-def _stands_alone(best: Support, all_of_them: Sequence[Support]) -> bool:
-    """Whether a hypothesis recognises nearly all places, and no other one explains a bit of them.
-
-    Then it is right though much was moved. The same building turned by half a turn recognises all
-    places too, but is never alone: parts of it fit elsewhere, or the right pose does, contradicted
-    as much.
-    """
-    others = [one for one in all_of_them if differ(best, one)]
-    recognised = float(best.confirmed.sum())
-    return bool(
-        recognised >= RECOGNISED_SHARE * len(best.confirmed)
-        and best.total > 0.0
-        and not has_rival(best.total, (one.total for one in others), FAINT_SHARE)
-        and not has_rival(recognised, (float(one.confirmed.sum()) for one in others))
-    )
-
-
-def _as_rival(other: Support, best: Support) -> Support:
-    """Another hypothesis with what it explains about as well as the best one.
-
-    One that is contradicted, and twice as much as the best one, often lays more of the drives into
-    the map: in a building that looks the same turned by half a turn, into what was mapped, where in
-    truth they went elsewhere. That alone does not speak for it: only places count that the best
-    one explains too.
-    """
-    equivalent = other.scores > EQUIVALENT_SHARE * best.scores
-    if other.is_contradicted and other.contradicted_share > 2 * best.contradicted_share:
-        equivalent &= best.scores > 0.0
-    return replace(other, scores=np.where(equivalent, other.scores, 0.0))
 
 
 def _carried(found: Start, before: Start, start: Start) -> Start:

@@ -178,6 +178,10 @@ def test_sightings_have_estimates_too():
         ({"z": np.full(2, np.nan)}, "sighting: not finite"),
         ({"cov": np.zeros((2, 2))}, "sighting: covariance is not positive definite"),
         ({"time_ns": 9 * 10**18, "stamp_ns": 9 * 10**18}, "stamp: far later than those before"),
+        ({"z": np.zeros(4), "cov": np.eye(4)}, "Sighting: z must be bearing, range and perhaps"),
+        ({"cov": np.eye(3)}, "Sighting: cov must be an array (k, k) of numbers"),
+        ({"mount": [0.0, "left", 0.0]}, "Sighting: mount must be an array (3) of numbers"),
+        ({"stamp_ns": 1e18}, "Sighting: stamp_ns and time_ns must be whole numbers"),
     ],
 )
 def test_a_message_that_cannot_be_used_is_left_out_and_counted(changes, reason):
@@ -190,6 +194,28 @@ def test_a_message_that_cannot_be_used_is_left_out_and_counted(changes, reason):
     found = list(session.process(wrong))
     assert [(key.startswith(reason), n) for key, n in session.dropped.items() if n] == [(True, 1)]
     np.testing.assert_array_equal([e.pose for e in found], [e.pose for e in left])
+
+
+def test_lists_are_arrays_and_what_is_no_message_is_counted():
+    """A program that has its numbers as lists gets the same estimates; None is no end of all."""
+    messages = list(sightings())
+    as_lists = [
+        replace(m, z=m.z.tolist(), cov=m.cov.tolist()) if isinstance(m, Sighting)
+        else replace(m, pose=m.pose.tolist())
+        for m in messages
+    ]  # fmt: skip
+    session = graphslam.Session()
+    found = list(session.process([*as_lists[:50], None, *as_lists[50:]]))
+    assert session.dropped == {"NoneType: is no record of graphslam": 1}
+    expected = [e.pose for e in graphslam.Session().process(messages)]
+    np.testing.assert_array_equal([e.pose for e in found], expected)
+
+
+@pytest.mark.parametrize("robots", [["robot"], {"robot": ["scan"]}, {"robot": OdometryPose}])
+def test_robots_that_are_no_records_are_refused(robots):
+    """Not with an error from inside."""
+    with pytest.raises(graphslam.ConfigError, match="needs a dict of what each sends"):
+        graphslam.Session(robots=robots)
 
 
 def test_time_may_go_on_after_a_pause():
