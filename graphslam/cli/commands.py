@@ -96,6 +96,8 @@ def import_log(
 
     if os.path.lexists(output) and not force:
         raise OutputError(f"{output}: already exists; give --force to replace it")
+    if os.path.realpath(output) == os.path.realpath(source):
+        raise OutputError(f"{output}: is what is to be imported; choose another name")
     done = IMPORTERS[format_name](source, output)
     content = {"log": str(output), "counts": done.counts, "warnings": done.warnings}
     return Output(content, lambda: show.imported(done))

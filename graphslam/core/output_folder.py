@@ -18,6 +18,12 @@ _made_here: set[Path] = set()
 #: device, number and time of change of what stands at a path; None: nothing does
 Identity = tuple[int, int, int] | None
 
+#: of recordings in files, see `graphslam.logs.containers`
+RECORDING_SUFFIXES = frozenset({".mcap", ".db3", ".bag", ".zstd"})
+#: what graphslam writes into folders itself: of results, of changes, of simulated visits
+OWN_FOLDERS = frozenset({"trajectories"})
+OWN_RECORDINGS = frozenset({"result.mcap", "changes.mcap", "reference.mcap", "later.mcap"})
+
 
 def unfinished(target: Path) -> Path:
     """Where ``target`` is made; what dead processes left there is removed.
@@ -92,6 +98,25 @@ def check_same(target: Path, before: Identity) -> None:
         raise OutputError(
             f"{target}: was written by another process meanwhile; it is left as it is, choose "
             "another name"
+        )
+
+
+def check_nothing_else_in(directory: Path) -> None:
+    """See that no recording and no folder would be lost with a folder that is to be replaced.
+
+    Raises:
+        OutputError: there is one that graphslam does not write there.
+    """
+    foreign = sorted(
+        one.name
+        for one in directory.iterdir()
+        if (one.name not in OWN_FOLDERS and one.is_dir())
+        or (one.name not in OWN_RECORDINGS and one.suffix in RECORDING_SUFFIXES)
+    )
+    if foreign:
+        raise OutputError(
+            f"{directory}: has {foreign[0]} in it, which would be lost, so it is not replaced; "
+            "move that, or choose another name"
         )
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from graphslam.core.errors import LogError
+from graphslam.core.output_folder import RECORDING_SUFFIXES
 from graphslam.core.sensor_config import LimitsConfig
 from graphslam.logs import bag_file, mcap_file, sqlite_file
 from graphslam.logs.container_files import is_compressed, open_file
@@ -30,8 +31,6 @@ CONTAINERS: dict[str, Container] = {
 NO_MORE = LimitsConfig()
 
 _LONGEST = max(len(container.magic) for container in CONTAINERS.values())
-#: of files of a folder that ought to be recordings, also if their first bytes are damaged
-SUFFIXES = frozenset({".mcap", ".db3", ".bag", ".zstd"})
 #: what is beside recordings in folders, and is not looked at
 _PACKED = {b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zXZ": "xz", b"PK\x03\x04": "zip"}
 
@@ -115,7 +114,8 @@ def _open_folder(folder: Path, limits: LimitsConfig) -> Recording:
         paths = [path for path in paths if metadata.listed(path.name)]
     paths = [path for path in paths if path.stat().st_size]
     found = [path for path in paths if _container_of(path)]
-    others = [path.name for path in paths if path not in found and path.suffix in SUFFIXES]
+    rest = [path for path in paths if path not in found]
+    others = [path.name for path in rest if path.suffix in RECORDING_SUFFIXES]
     damaged = f"{', '.join(others)} does not begin as a recording" if others else ""
     if not found:
         what = f"{damaged}; copy it again" if damaged else _without_recording(folder)

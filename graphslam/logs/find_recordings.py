@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from graphslam.core.errors import LogError
-from graphslam.logs.containers import SUFFIXES, is_recording
+from graphslam.core.output_folder import RECORDING_SUFFIXES
+from graphslam.logs.containers import is_recording
 from graphslam.logs.rosbag2_metadata import METADATA
 
 
@@ -65,7 +66,7 @@ def _unique(found: Mapping[Path, Path]) -> list[str]:
 
 
 def _without_suffix(path: Path) -> Path:
-    return path.with_suffix("") if path.suffix in SUFFIXES else path
+    return path.with_suffix("") if path.suffix in RECORDING_SUFFIXES else path
 
 
 def _search(place: Path, skipped: Path | None) -> Iterator[tuple[Path, bool]]:
@@ -85,7 +86,7 @@ def _search(place: Path, skipped: Path | None) -> Iterator[tuple[Path, bool]]:
                 if path.resolve() != skipped:
                     yield from _search(path, skipped)
             elif entry.is_file():
-                yield path, path.suffix in SUFFIXES or is_recording(path)
+                yield path, path.suffix in RECORDING_SUFFIXES or is_recording(path)
     except OSError as error:
         raise LogError(f"{place}: cannot be searched: {error.strerror}") from error
 

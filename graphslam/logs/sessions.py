@@ -13,8 +13,9 @@ from pathlib import Path
 
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError
+from graphslam.core.output_folder import RECORDING_SUFFIXES
 from graphslam.core.records import Sighting
-from graphslam.logs.containers import SUFFIXES, open_recording
+from graphslam.logs.containers import open_recording
 from graphslam.logs.recording import Piece, Recording
 from graphslam.logs.robots import robots_and_topics
 from graphslam.logs.schemas import DEFAULT_ROBOT
@@ -84,7 +85,7 @@ def session_names(paths: Sequence[Path]) -> list[str]:
     names: list[str] = []
     for path in paths:
         stem = path
-        while stem.suffix in SUFFIXES:
+        while stem.suffix in RECORDING_SUFFIXES:
             stem = stem.with_suffix("")
         name = re.sub(r"[^\w-]+", "_", stem.name).strip("_") or "session"
         candidates = chain([name], (f"{name}-{number}" for number in count(2)))

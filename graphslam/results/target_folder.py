@@ -9,7 +9,13 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from graphslam.core.errors import OutputError
-from graphslam.core.output_folder import Identity, atomic_folder, identity, unfinished
+from graphslam.core.output_folder import (
+    Identity,
+    atomic_folder,
+    check_nothing_else_in,
+    identity,
+    unfinished,
+)
 
 
 def check_target(
@@ -34,7 +40,8 @@ def check_target(
 
     Raises:
         OutputError: it exists and ``force`` is not given, it exists and may not be replaced, it
-            is or holds the known map, or its parent is not writable.
+            is or holds the known map, or holds recordings or folders of others, or its parent is
+            not writable.
     """
     parent = directory.absolute().parent
     while not parent.exists():
@@ -58,6 +65,7 @@ def check_target(
             f"{directory}: is not a result folder of graphslam, so it is not replaced; "
             "choose another name"
         )
+    check_nothing_else_in(directory)
     return before
 
 

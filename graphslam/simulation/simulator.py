@@ -7,11 +7,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from graphslam.core.errors import OutputError
-from graphslam.core.output_folder import atomic_folder, identity
+from graphslam.core.output_folder import atomic_folder, check_nothing_else_in, identity
 from graphslam.simulation.recording import Recording, record_visit
 from graphslam.simulation.scenario import Scenario
 from graphslam.simulation.scene import prepare_visits
 from graphslam.simulation.true_changes import true_changes
+
+#: of what changed between the visits
+TRUTH = "truth.json"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,7 +41,7 @@ def simulate(scenario: Scenario, target: Path, seed: int = 0) -> Simulation:
 
     Raises:
         ScenarioError: the scenario is infeasible, see `graphslam.simulation.scene.prepare_visits`.
-        OutputError: nothing can be written there.
+        OutputError: nothing can be written there, or something else would be lost.
     """
     visits = prepare_visits(scenario)
     if len(visits) == 1:
@@ -49,12 +52,16 @@ def simulate(scenario: Scenario, target: Path, seed: int = 0) -> Simulation:
     if target.is_file() or target.suffix == ".mcap":
         raise OutputError(f"{target}: this scenario makes two logs; name a folder: -o DIR")
     before = identity(target)
+    if target.is_dir():
+        check_nothing_else_in(target)
+        if any(target.iterdir()) and not (target / TRUTH).is_file():
+            raise OutputError(f"{target}: is no folder of two visits; choose another name")
     with atomic_folder(target, before) as part:
         first, second = (
             record_visit(scenario, visit, part / f"{visit.name}.mcap", seed) for visit in visits
         )
         truth = true_changes(scenario, (first, second), seed)
         text = json.dumps(truth, indent=1, allow_nan=False) + "\n"
-        (part / "truth.json").write_text(text, encoding="utf-8")
+        (part / TRUTH).write_text(text, encoding="utf-8")
     written = tuple(replace(r, path=target / r.path.name) for r in (first, second))
     return Simulation(scenario.name, seed, target, written, len(truth["cells"]))

@@ -102,6 +102,23 @@ def test_names_with_slashes_and_dots_stay_apart(made, tmp_path):
     assert set(load(tmp_path / "out").robots) == set(names)
 
 
+@pytest.mark.parametrize("name", ["drive.mcap", "rosbag_0.db3", "tuesday/summary.json"])
+def test_what_others_put_into_a_result_is_not_lost_with_it(made, tmp_path, name):
+    """A recording in the folder of its own result was gone after --force, as was another result."""
+    target = tmp_path / "out"
+    save(made, target, force=False)
+    (target / name).parent.mkdir(exist_ok=True)
+    (target / name).write_bytes(b"dear")
+    with pytest.raises(OutputError, match=f"out: has {name.split('/')[0]} in it, which would be"):
+        save(made, target, force=True)
+    assert (target / name).read_bytes() == b"dear"
+    (target / name).rename(target / "result.mcap")  # what viewers read is made anew
+    if "/" in name:
+        (target / name).parent.rmdir()
+    save(made, target, force=True)
+    assert not (target / "result.mcap").exists()
+
+
 def test_an_existing_result_needs_force_and_is_replaced(made, tmp_path):
     target = tmp_path / "out"
     save(made, target, force=False)

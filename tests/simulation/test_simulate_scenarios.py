@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from command_line import call
+from command_line import call, check_one_line
 from paths import ROOT
 
 from graphslam.core.config_io import load_config
@@ -208,6 +208,18 @@ def test_two_visits_need_a_folder(tmp_path):
     done = call("simulate", "change", "-o", tmp_path / "x.mcap")
     assert done.code == 1
     assert "-o DIR" in done.err
+
+
+@pytest.mark.parametrize("name", ["thesis.txt", "drive.mcap", "folder/thesis.txt"])
+def test_two_visits_replace_no_folder_of_others(tmp_path, name):
+    """With --force any folder was deleted."""
+    target = tmp_path / "mine"
+    (target / name).parent.mkdir(parents=True)
+    (target / name).write_text("dear", encoding="utf-8")
+    done = call("simulate", "change", "-o", target, "--force")
+    assert done.code == 1
+    assert "mine: " in check_one_line(done)
+    assert (target / name).read_text(encoding="utf-8") == "dear"
 
 
 def test_sightings_without_identity_have_none(tmp_path):
