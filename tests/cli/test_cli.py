@@ -387,11 +387,11 @@ def test_import_keeps_an_existing_log_without_force(tmp_path):
     before = listing(tmp_path)
     assert "already exists" in check_one_line(call("import", "carmen", source, "-o", target))
     assert call("import", "carmen", source, "-o", target, "--force").code == 0
-    before = source.read_bytes()
+    content = source.read_bytes()
     assert "is what is to be imported" in check_one_line(
         call("import", "carmen", source, "-o", source, "--force")
     )
-    assert source.read_bytes() == before
+    assert source.read_bytes() == content
     assert listing(tmp_path) == before
     missing = call("import", "carmen", tmp_path / "nothing.clf", "-o", tmp_path / "b.mcap")
     assert "nothing.clf: no such file" in check_one_line(missing)
