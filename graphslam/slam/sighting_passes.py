@@ -22,6 +22,7 @@ from graphslam.slam.passes import (
     find_swapped_names,
 )
 from graphslam.slam.robot_state import Causal
+from graphslam.slam.rough_solution import is_misfit
 from graphslam.slam.sighting_pass import SightingPass, can_solve_at_once
 from graphslam.slam.sighting_solution import (
     solve_finely,
@@ -63,14 +64,14 @@ def run_sighting_passes(
         replayed = Future(partial(replay_causally, one), urgent=False)  # waited for at the end
         with timed(one.seconds, "final optimisation"):
             rough, made = solve_roughly(one)
-            if rough.error > rough.dof and not known.identities:
-                # residuals twice as large as stated: some sightings may be of something else
+            if is_misfit(rough) and not known.identities:
+                # some sightings may be of something else
                 swapped = find_swapped_names(one, solve_without_contradiction(one))
                 if swapped:
                     replayed.cancel()
                     known = with_identities(known, log, config, swapped)
                     continue
-            if rough.error > rough.dof and len(one.tracks) == 1:
+            if is_misfit(rough) and len(one.tracks) == 1:
                 # or odometry drifts too far for a start of the whole at once: grown step by step,
                 # the estimate keeps near its minimum
                 replayed.cancel()
