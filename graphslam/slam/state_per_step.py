@@ -8,6 +8,7 @@ import numpy as np
 
 from graphslam.core.config import Config
 from graphslam.core.records import Estimate, Sighting, Step
+from graphslam.odometry.noise_estimation import is_stated
 from graphslam.odometry.preintegration import Track
 from graphslam.slam.log_noise import LogNoise, has_state_at_every_sighting, with_own_noise
 from graphslam.slam.log_pass import LogPass
@@ -78,7 +79,8 @@ def sighting_problem(
     """The problem of a pass as the ``noise`` of its log asks for it, and an estimate of its states.
 
     Args:
-        one: the pass; with a state at every sighting its kernel and noise are set to that.
+        one: the pass; noise of odometry that nobody states is set to that of the log, and with a
+            state at every sighting its kernel and all noise.
         estimate: of its steps.
         noise: of the log.
         groups: the sightings of its steps, if they are known.
@@ -86,6 +88,9 @@ def sighting_problem(
     if has_state_at_every_sighting(noise.sightings):
         return state_at_every_sighting(one, estimate, noise)
     steps, tracks = tuple(one.steps), {name: run.track for name, run in one.started.items()}
+    for name, track in tracks.items():
+        if not is_stated(track):
+            track.config = noise.odometry.get(name, track.config)
     if groups is None:
         groups = group_sightings(steps, one.sources)
     return SteppedProblem(steps, one.sources, groups, tracks, noise, one.config), estimate
