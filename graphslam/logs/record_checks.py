@@ -42,23 +42,29 @@ def _with_arrays(message: records.Message) -> records.Message:
     arrays: dict[str, Array] = {}
     for field, shape in _SHAPES.get(type(message), {}).items():
         value = getattr(message, field)
-        if value is None:
+        if value is None and field in _OPTIONAL:
             continue
-        try:
-            array = np.asarray(value, dtype=float)
-        except (TypeError, ValueError):
-            array = np.array(np.nan)
+        array = _as_array(value)
         wanted = [n if isinstance(n, int) else sizes.get(n) for n in shape]
-        if array.ndim != len(shape) or any(
-            n not in (None, found) for n, found in zip(wanted, array.shape, strict=True)
+        if (
+            array is None
+            or array.ndim != len(shape)
+            or any(n not in (None, found) for n, found in zip(wanted, array.shape, strict=True))
         ):
-            raise UnusableMessageError(
-                f"{what}: {field} must be an array ({', '.join(map(str, shape))}) of numbers"
-            )
+            many = f"an array ({', '.join(map(str, shape))}) of numbers" if shape else "a number"
+            raise UnusableMessageError(f"{what}: {field} must be {many}")
         sizes |= {n: k for n, k in zip(shape, array.shape, strict=True) if isinstance(n, str)}
-        if array is not value:
+        if shape and array is not value:
             arrays[field] = array
     return replace(message, **arrays) if arrays else message
+
+
+def _as_array(value: Any) -> Array | None:
+    """Numbers as an array; None if they are none."""
+    try:
+        return None if value is None else np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        return None
 
 
 def check_finite(what: str, values: Array) -> None:
@@ -154,14 +160,24 @@ def _scan(message: records.Scan) -> None:
     check_finite("scan", np.array([message.angle_min_rad, message.angle_step_rad]))
 
 
-#: the arrays of records; where the same letter stands, the same number of elements
+#: the numbers of records; where the same letter stands, the same number of elements
 _SHAPES: dict[type[records.Message], dict[str, tuple[int | str, ...]]] = {
     records.OdometryPose: {"pose": (3,)},
     records.OdometryIncrement: {"delta": (3,), "cov": (3, 3)},
-    records.Scan: {"ranges": ("n",), "mount": (3,), "bearings": ("n",)},
+    records.WheelAngles: {"left_rad": (), "right_rad": ()},
+    records.Scan: {
+        "ranges": ("n",),
+        "bearings": ("n",),
+        "mount": (3,),
+        "angle_min_rad": (),
+        "angle_step_rad": (),
+        "beam_period_s": (),
+    },
     records.Sighting: {"z": ("k",), "cov": ("k", "k"), "mount": (3,)},
     records.RelativePose: {"delta": (3,), "cov": (3, 3)},
 }
+#: those that a record need not have
+_OPTIONAL = frozenset({"bearings"})
 
 _CHECKS: dict[type[records.Message], Callable[[Any], None]] = {
     records.OdometryPose: _odometry,

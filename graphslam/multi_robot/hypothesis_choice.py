@@ -17,8 +17,9 @@ from graphslam.multi_robot.map_localisation import Support
 from graphslam.multi_robot.place_recognition import EQUIVALENT_SHARE, MIN_MATCHES, extent
 from graphslam.multi_robot.place_search import DISTINCT_M, DISTINCT_RAD
 
-#: share of them, and number, from which there is a doubt: of 24 days in the simulated office that
-#: were placed right 23 had none, one 0.19; of those in a part that only looks alike 0.2 to 0.3
+#: contradicted places for each confirmed one, and how many, from which there is a doubt: of 24 days
+#: in the simulated office that were placed right 23 had none, one 0.19; of those in a part that only
+#: looks alike 0.2 to 0.3
 DOUBT_SHARE, LEAST_DOUBTED = 0.2, 2
 #: share of the best one's support from which another hypothesis is a rival whatever contradicts it;
 #: others are from half of it on, unless they are contradicted

@@ -3,8 +3,7 @@
 Places of the robot are recognised in the map one by one (`place_recognition`). Those that imply one
 start form a hypothesis; buildings repeat themselves, so there are several. Each is judged with the
 whole path laid into the map as it says: every place is compared with all that the map has around
-it, from wherever it was seen. A hypothesis is believed if it explains enough, is hardly
-contradicted, and no other one explains about as much.
+it, from wherever it was seen. Which one is believed is up to `hypothesis_choice`.
 """
 
 import math
@@ -27,9 +26,7 @@ from graphslam.multi_robot.place_recognition import (
     pairwise_agreement,
     start_estimates,
 )
-from graphslam.multi_robot.place_search import (
-    alternative_alignments,
-)
+from graphslam.multi_robot.place_search import alternative_alignments
 from graphslam.perception.scan_matching import (
     BoolArray,
     Submap,

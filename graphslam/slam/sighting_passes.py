@@ -72,8 +72,8 @@ def run_sighting_passes(
                     known = with_identities(known, log, config, swapped)
                     continue
             if is_misfit(rough) and len(one.tracks) == 1:
-                # or odometry drifts too far for a start of the whole at once: grown step by step,
-                # the estimate keeps near its minimum
+                # or odometry drifts too far for the rough solution, also for one that grows: with
+                # every step added by itself the estimate mostly keeps near its minimum
                 replayed.cancel()
                 return None
             # all that is finer depends on the clocks; paths need the calibration

@@ -48,12 +48,15 @@ def solve_roughly(one: SightingPass) -> tuple[Estimate, tuple[Step, ...]]:
     Raises:
         EstimationError: the estimate is indeterminate.
     """
-    states, problem = _initial_states(one), _rough_problem(one)
+    problem = _rough_problem(one)
     if set(one.tracks) <= set(one.known.alone):  # what calibrations need is known: once is enough
+        states = _initial_states(one)
         with _held(one.tracks):
             start, made = with_landmarks(problem, states, {})
         kernel = wide(one.config.robust)
         return calibrate(lambda *_: made, start, one.tracks, kernel, 1, rough=True)
+    for track in one.tracks.values():
+        track.calibration = track.prior
     estimate = solve_rough_problem(problem)
     with _held(one.tracks):
         return estimate, recompute_steps(one.steps, estimate, one.tracks, one.groups)

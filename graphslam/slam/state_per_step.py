@@ -89,7 +89,7 @@ def sighting_problem(
         return state_at_every_sighting(one, estimate, noise)
     steps, tracks = tuple(one.steps), {name: run.track for name, run in one.started.items()}
     for name, track in tracks.items():
-        if not is_stated(track):
+        if not is_stated(track):  # noise that is stated keeps its floors
             track.config = noise.odometry.get(name, track.config)
     if groups is None:
         groups = group_sightings(steps, one.sources)

@@ -1,0 +1,34 @@
+"""What a program's own records must hold, see tests/live/test_session.py for sightings."""
+
+import numpy as np
+import pytest
+
+from graphslam.core.records import Scan, WheelAngles
+from graphslam.logs.record_checks import UnusableMessageError, checked
+
+SCAN = Scan("robot", 1, 1, np.ones(3), 0.0, 0.1, np.zeros(3))
+
+
+def changed(record, **values):
+    return type(record)(**{n: getattr(record, n) for n in record.__dataclass_fields__} | values)
+
+
+def test_a_record_that_is_right_is_the_same_one():
+    """It is on the way of every message, and copies nothing."""
+    assert checked(SCAN) is SCAN
+
+
+@pytest.mark.parametrize(
+    ("record", "reason"),
+    [
+        (changed(SCAN, mount=None), r"Scan: mount must be an array \(3\) of numbers"),
+        (changed(SCAN, bearings=np.ones(2)), r"Scan: bearings must be an array \(n\) of numbers"),
+        (changed(SCAN, angle_min_rad="left"), "Scan: angle_min_rad must be a number"),
+        (changed(SCAN, angle_step_rad=np.nan), "scan: not finite"),
+        (WheelAngles("robot", 1, 1, None, 0.0), "WheelAngles: left_rad must be a number"),
+    ],
+)
+def test_what_is_missing_or_of_another_shape_is_said(record, reason):
+    """Not with an error from inside, later."""
+    with pytest.raises(UnusableMessageError, match=reason):
+        checked(record)
