@@ -18,8 +18,8 @@ from graphslam.multi_robot.place_recognition import EQUIVALENT_SHARE, MIN_MATCHE
 from graphslam.multi_robot.place_search import DISTINCT_M, DISTINCT_RAD
 
 #: contradicted places for each confirmed one, and how many, from which there is a doubt: of 24 days
-#: in the simulated office that were placed right 23 had none, one 0.19; of those in a part that only
-#: looks alike 0.2 to 0.3
+#: in the simulated office that were placed right 23 had none, one 0.19; of those in a part that
+#: only looks alike 0.2 to 0.3
 DOUBT_SHARE, LEAST_DOUBTED = 0.2, 2
 #: share of the best one's support from which another hypothesis is a rival whatever contradicts it;
 #: others are from half of it on, unless they are contradicted
