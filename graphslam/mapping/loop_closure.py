@@ -17,13 +17,15 @@ from graphslam.core.companion import Companion
 from graphslam.core.config import LoopClosureConfig
 from graphslam.core.consistency import largest_consistent_set
 from graphslam.core.gaussian import mahalanobis_squared
-from graphslam.core.geometry import Array, between, log, rotate_cov, rotation3, wrap
+from graphslam.core.geometry import Array, between, log, rotate_cov, rotation3
 from graphslam.core.records import Closure, Trajectory
+from graphslam.mapping.corridor_direction import common_direction, open_along
 from graphslam.mapping.submap_graph import relative_jacobian
 from graphslam.mapping.submaps import State, SubmapPose, drift_covariance
 from graphslam.perception.scan_matching import (
     IntArray,
     Match,
+    Submap,
     agreement,
     align_pairs,
     match_pairs,
@@ -44,9 +46,8 @@ MIN_COARSE_OVERLAP = 0.2
 MAX_SIGMA_M = 0.08
 #: the second best match may have at most this share of the best one's score
 RIVAL_SHARE = 0.8
-#: m, rad: matches that differ less, across and in heading, differ along a corridor only; m: sigma
-#: of a match along it; m: directions with larger sigmas do not count in a residual
-SAME_ACROSS, UNKNOWN_ALONG_M, UNKNOWN_M = (0.1, 0.02), 5.0, 0.5
+#: m: directions with larger sigmas do not count in a residual
+UNKNOWN_M = 0.5
 #: m: a match shifted by so much must have less than this share of the points on others
 OPEN_SHIFT_M, OPEN_SHARE = 0.3, 0.95
 #: probability of the chi-square limits between closures, and factor on the covariance of the
@@ -118,11 +119,11 @@ def verify_match(matches: Sequence[Match]) -> Match | None:
     return best if _is_confirmed(best.same, best.absent) and sigma <= MAX_SIGMA_M else None
 
 
-def verify_match_across(matches: Sequence[Match]) -> Match | None:
+def verify_match_across(matches: Sequence[Match], earlier: Submap) -> Match | None:
     """As `verify_match`, but of several matches one behind the other along a corridor.
 
     If all that are nearly as good as the best differ in this one direction only, the best is
-    returned with a covariance that leaves it open.
+    returned with a covariance that leaves it open. The matches are poses in the ``earlier`` submap.
     """
     rivals = _rivals(matches)
     along = common_direction(matches[0], rivals) if rivals else None
@@ -132,7 +133,7 @@ def verify_match_across(matches: Sequence[Match]) -> Match | None:
     sigma = np.sqrt(np.linalg.eigvalsh(best.cov[:2, :2])[-1])
     if not _is_confirmed(best.same, best.absent) or sigma > MAX_SIGMA_M:
         return None
-    return replace(best, cov=_open_along(best.cov, along))
+    return replace(best, cov=open_along(best.cov, earlier, along))
 
 
 def _rivals(matches: Sequence[Match]) -> list[Match]:
@@ -141,17 +142,6 @@ def _rivals(matches: Sequence[Match]) -> list[Match]:
         return []
     least = RIVAL_SHARE * (matches[0].same - matches[0].absent)
     return [m for m in matches[1:] if m.same - m.absent > least]
-
-
-def common_direction(best: Match, rivals: Sequence[Match]) -> Array | None:
-    """Unit vector (2,) along which all rivals differ from the best match; None if they do not."""
-    off = np.array([m.pose for m in rivals]) - best.pose
-    turned = np.abs(wrap(off[:, 2]))
-    _, axes = np.linalg.eigh(off[:, :2].T @ off[:, :2])
-    along = axes[:, 1]
-    beside = np.abs(off[:, :2] @ axes[:, 0])
-    is_line = beside.max() <= SAME_ACROSS[0] and turned.max() <= SAME_ACROSS[1]
-    return along if is_line else None
 
 
 def loop_closures(
@@ -284,7 +274,8 @@ def verify_pairs(pairs: Sequence[SubmapPair], *, along: bool = False) -> list[Ve
         MIN_COARSE_OVERLAP,
     )
     for k, own in zip(rest, matches, strict=True):
-        best = verify_match_across(own) if along else verify_match(own)
+        earlier = pairs[k].earlier.submap
+        best = verify_match_across(own, earlier) if along else verify_match(own)
         if best is not None:
             found[k] = Verified(best.pose, best.cov, True)
     return leave_open(pairs, found) if along else found
@@ -317,7 +308,7 @@ def leave_open(
     Between parallel walls the noise of points looks like structure along them.
     """
     opened = list(found)
-    matched = [(k, one) for k, one in enumerate(found) if one is not None]
+    matched = [(k, one) for k, one in enumerate(found) if one is not None and _is_position(one.cov)]
     if not matched:
         return opened
     along = np.linalg.eigh(np.array([one.cov[:2, :2] for _, one in matched]))[1][:, :, 1]
@@ -331,14 +322,7 @@ def leave_open(
     is_open = np.maximum(before, behind) >= OPEN_SHARE * here
     for (k, one), direction, really in zip(matched, along, is_open, strict=True):
         if really:
-            opened[k] = replace(one, cov=_open_along(one.cov, direction))
-    return opened
-
-
-def _open_along(cov: Array, along: Array) -> Array:
-    """A covariance (3, 3) that knows nothing in a direction (2,)."""
-    opened = cov.copy()
-    opened[:2, :2] += UNKNOWN_ALONG_M**2 * np.outer(along, along)
+            opened[k] = replace(one, cov=open_along(one.cov, pairs[k].earlier.submap, direction))
     return opened
 
 
@@ -423,7 +407,12 @@ def inflate_covariances(
 
 def fix_position(closures: Sequence[Closure]) -> list[bool]:
     """Which closures determine a relative pose in all directions."""
-    return [bool(np.linalg.eigvalsh(c.cov[:2, :2])[-1] <= UNKNOWN_M**2) for c in closures]
+    return [_is_position(c.cov) for c in closures]
+
+
+def _is_position(cov: Array) -> bool:
+    """Whether a covariance (3, 3) of a relative pose is that of a position, not of a line."""
+    return bool(np.linalg.eigvalsh(cov[:2, :2])[-1] <= UNKNOWN_M**2)
 
 
 def violated(

@@ -13,6 +13,7 @@ from walls import L_ROOM, cloud
 from graphslam.core.config import Config, LoopClosureConfig
 from graphslam.core.geometry import between, compose
 from graphslam.core.records import Closure, KeyframeScan, Trajectory
+from graphslam.mapping.corridor_direction import wall_direction
 from graphslam.mapping.loop_closure import (
     SubmapPair,
     Verified,
@@ -219,20 +220,59 @@ def behind_each_other(*along, across=0.0, turn=0.0):
     return [replace(GOOD, pose=GOOD.pose + np.array([x, across, turn])) for x in along]
 
 
+def corridor(direction=0.0):
+    """A submap of two walls 2 m apart, with scattered points and a niche, in a direction, rad."""
+    x = np.linspace(-6.0, 6.0, 400)
+    walls = np.concatenate([np.column_stack([x, np.full(400, y)]) for y in (-1.0, 1.0)])
+    walls[(walls[:, 1] > 0) & (np.abs(walls[:, 0] - 2.0) < 0.5), 1] += 0.1
+    walls += np.random.default_rng(0).normal(0.0, 0.02, walls.shape)
+    c, s = np.cos(direction), np.sin(direction)
+    return make_submap(np.zeros((1, 3)), [walls @ np.array([[c, s], [-s, c]])])
+
+
+def open_direction(cov):
+    """In which direction, rad, a covariance (3, 3) is largest."""
+    x, y = np.linalg.eigh(cov[:2, :2])[1][:, 1]
+    return np.arctan(y / x)
+
+
 def test_matches_one_behind_the_other_leave_that_direction_open():
     """The best is used for what all of them say: across and heading. Along, nothing is known."""
     assert verify_match([GOOD, *behind_each_other(0.6, -0.5)]) is None
-    found = verify_match_across([GOOD, *behind_each_other(0.6, -0.5)])
+    found = verify_match_across([GOOD, *behind_each_other(0.6, -0.5)], corridor())
     assert found is not None
     assert np.sqrt(found.cov[0, 0]) > 4.0
-    np.testing.assert_allclose(found.cov[1:, 1:], GOOD.cov[1:, 1:], atol=1e-9)
+    # the direction of the walls is known to a few milliradians: 15 mm across at a sigma along
+    across = np.sqrt(GOOD.cov[1, 1] + 0.015**2 + (4.0 * open_direction(found.cov)) ** 2)
+    assert np.sqrt(np.linalg.eigvalsh(found.cov[:2, :2])[0]) <= 1.01 * across
+    assert found.cov[2, 2] == GOOD.cov[2, 2]
+
+
+@pytest.mark.parametrize("direction", [0.0, 0.7, -1.3])
+def test_what_is_open_is_the_direction_of_the_walls(direction):
+    """Not that of a match 0.7 m on and 3 cm aside: 40 mrad off, 5 m on the match would be 0.2 m
+    off across, with a sigma of centimetres. 5 mrad: what the noise of the points leaves."""
+    c, s = np.cos(direction), np.sin(direction)
+    on = np.array([c * 0.7 - s * 0.03, s * 0.7 + c * 0.03, 0.0])
+    rival = replace(GOOD, pose=GOOD.pose + on)
+    found = verify_match_across([GOOD, rival], corridor(direction))
+    assert found is not None
+    assert open_direction(found.cov) == pytest.approx(direction, abs=0.005)
+
+
+def test_where_few_points_show_walls_the_matches_show_the_direction():
+    """Breaks if an empty or cluttered place has a direction of walls."""
+    scattered = np.random.default_rng(1).uniform(-5.0, 5.0, (200, 2))
+    place = make_submap(np.zeros((1, 3)), [scattered])
+    near = np.array([np.cos(0.4), np.sin(0.4)])
+    np.testing.assert_array_equal(wall_direction(place, near), near)
 
 
 @pytest.mark.parametrize("other", [{"across": 0.3}, {"turn": 0.1}])
 def test_matches_that_differ_otherwise_are_rivals(other):
     """Also when one of several does: another corridor, or the same the other way round."""
     rivals = [*behind_each_other(0.6), *behind_each_other(0.3, **other)]
-    assert verify_match_across([GOOD, *rivals]) is None
+    assert verify_match_across([GOOD, *rivals], corridor()) is None
 
 
 def test_between_parallel_walls_a_match_is_open_along_them_and_in_a_room_it_is_not():
@@ -249,7 +289,8 @@ def test_between_parallel_walls_a_match_is_open_along_them_and_in_a_room_it_is_n
         missing, found = leave_open([pair, pair], [None, Verified(np.zeros(3), cov, True)])
         assert missing is None
         assert bool(np.sqrt(found.cov[0, 0]) > 4.0) is is_open
-        assert np.sqrt(found.cov[1, 1]) == pytest.approx(0.02)
+        # across, what is open along adds the 15 mm of its direction's 3 mrad
+        assert np.sqrt(found.cov[1, 1]) == pytest.approx(0.025 if is_open else 0.02)
 
 
 def test_what_a_closure_leaves_open_is_no_residual():
