@@ -16,10 +16,12 @@ from graphslam.perception.scan_matching import Match, Submap
 
 #: m, rad: matches that differ less, across and in heading, differ along a corridor only
 SAME_ACROSS = (0.1, 0.02)
-#: m: sigma of a match along an open direction
-UNKNOWN_ALONG_M = 5.0
-#: rad: walls that far from a direction may be those of its corridor; sigma of their direction
-NEAR_RAD, DIRECTION_RAD = 0.2, 0.003
+#: m: sigma of a match along an open direction. Where it lies there is no news: several such matches
+#: of a path that drifted together must not pull it
+UNKNOWN_ALONG_M = 50.0
+#: rad: walls that far from a direction may be those of its corridor; m: sigma across that their
+#: direction, known to 3 mrad, adds: a match is searched for at most 5 m off
+NEAR_RAD, ASIDE_M = 0.2, 0.015
 #: points that show the direction of walls, at least
 LEAST_POINTS = 30
 #: rad: turns of the median that are looked at; m: width of half a line that points are in
@@ -71,13 +73,10 @@ def _points_in_line(points: Array, heading: Array) -> Array:
     return np.asarray(((count[:, 1:] + count[:, :-1]) ** 2).sum(axis=1), dtype=float)
 
 
-def open_along(cov: Array, submap: Submap, along: Array) -> Array:
-    """The covariance (3, 3) of a match that knows nothing along walls of the ``submap``.
-
-    ``along`` (2,) is nearly their direction.
-    """
-    c, s = wall_direction(submap, along)
+def open_along(cov: Array, along: Array) -> Array:
+    """The covariance (3, 3) of a match that knows nothing along a direction (2,) of walls."""
+    c, s = along
     turn = np.array([[c, -s], [s, c]])
     opened = cov.copy()
-    opened[:2, :2] += turn @ np.diag([1.0, DIRECTION_RAD**2]) @ turn.T * UNKNOWN_ALONG_M**2
+    opened[:2, :2] += turn @ np.diag([UNKNOWN_ALONG_M, ASIDE_M]) ** 2 @ turn.T
     return opened

@@ -19,7 +19,11 @@ from graphslam.core.consistency import largest_consistent_set
 from graphslam.core.gaussian import mahalanobis_squared
 from graphslam.core.geometry import Array, between, log, rotate_cov, rotation3
 from graphslam.core.records import Closure, Trajectory
-from graphslam.mapping.corridor_direction import common_direction, open_along
+from graphslam.mapping.corridor_direction import (
+    common_direction,
+    open_along,
+    wall_direction,
+)
 from graphslam.mapping.submap_graph import relative_jacobian
 from graphslam.mapping.submaps import State, SubmapPose, drift_covariance
 from graphslam.perception.scan_matching import (
@@ -133,7 +137,7 @@ def verify_match_across(matches: Sequence[Match], earlier: Submap) -> Match | No
     sigma = np.sqrt(np.linalg.eigvalsh(best.cov[:2, :2])[-1])
     if not _is_confirmed(best.same, best.absent) or sigma > MAX_SIGMA_M:
         return None
-    return replace(best, cov=open_along(best.cov, earlier, along))
+    return replace(best, cov=open_along(best.cov, wall_direction(earlier, along)))
 
 
 def _rivals(matches: Sequence[Match]) -> list[Match]:
@@ -303,7 +307,7 @@ def verify_in_place(pairs: Sequence[SubmapPair]) -> list[Verified | None]:
 def leave_open(
     pairs: Sequence[SubmapPair], found: Sequence[Verified | None]
 ) -> list[Verified | None]:
-    """Verified pairs, the weakest direction of each open if a shift along it fits as well.
+    """Verified pairs, each open along the walls of a corridor if a shift along them fits as well.
 
     Between parallel walls the noise of points looks like structure along them.
     """
@@ -311,7 +315,11 @@ def leave_open(
     matched = [(k, one) for k, one in enumerate(found) if one is not None and _is_position(one.cov)]
     if not matched:
         return opened
-    along = np.linalg.eigh(np.array([one.cov[:2, :2] for _, one in matched]))[1][:, :, 1]
+    weakest = np.linalg.eigh(np.array([one.cov[:2, :2] for _, one in matched]))[1][:, :, 1]
+    along = np.array([
+        wall_direction(pairs[k].earlier.submap, axis)
+        for (k, _), axis in zip(matched, weakest, strict=True)
+    ])  # fmt: skip
     shift = OPEN_SHIFT_M * np.column_stack([along, np.zeros(len(along))])
     poses = np.array([one.pose for _, one in matched])
     here, before, behind = shares_on_others(
@@ -322,7 +330,7 @@ def leave_open(
     is_open = np.maximum(before, behind) >= OPEN_SHARE * here
     for (k, one), direction, really in zip(matched, along, is_open, strict=True):
         if really:
-            opened[k] = replace(one, cov=open_along(one.cov, pairs[k].earlier.submap, direction))
+            opened[k] = replace(one, cov=open_along(one.cov, direction))
     return opened
 
 

@@ -34,7 +34,8 @@ class Seen:
 
     ``targets`` numbers what is seen, ``stands`` says that it is a landmark; ``z`` (n, 2) is bearing
     rad and range m of ``sigmas`` (n, 2); ``odometry`` (n, 3) the poses that they were made from by
-    odometry alone; ``d2`` their squared distances from the result, per degree of freedom.
+    odometry alone, ``poses`` (n, 3) the same in the result; ``d2`` their squared distances from
+    the result, per degree of freedom.
     """
 
     times_ns: IntArray
@@ -43,6 +44,7 @@ class Seen:
     z: Array
     sigmas: Array
     odometry: Array
+    poses: Array
     d2: Array
 
 
@@ -160,6 +162,7 @@ def _seen(seen: Sequence[Association], run: RobotState, estimate: Estimate) -> S
         z,
         np.sqrt(np.diagonal(covs, axis1=1, axis2=2)),
         run.track.mounted_pose(times) if n else np.zeros((0, 3)),
+        estimate.states[usable[0].robot].at(times) if n else np.zeros((0, 3)),
         d2,
     )
 

@@ -15,6 +15,7 @@ from graphslam.slam.evidence import Evidence
 from graphslam.slam.odometry_doubts import odometry_doubts
 from graphslam.slam.scan_doubts import scan_doubts
 from graphslam.slam.sighting_doubts import sighting_doubts
+from graphslam.slam.vanished_points import vanished_doubts
 
 #: factors on a stated variance that a log shows: from the first one doubtful, from the other bad
 NOISE_FACTORS = 30.0, 1000.0
@@ -171,6 +172,7 @@ CHECKS: dict[str, Callable[[Evidence], Iterable[Reason]]] = {
     "odometry": odometry_doubts,
     "scans": scan_doubts,
     "sightings": sighting_doubts,
+    "points": vanished_doubts,
     "noise": _noise,
     "residuals": _misfit,
     "rejected": _rejected,

@@ -1,7 +1,7 @@
 """The verdict: healthy evidence is good, and what is wrong is said as what it is."""
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -52,7 +52,7 @@ def seen_from(poses, odometry):
     sigmas = np.tile([0.005, 0.01], (len(rows), 1))
     times = S + k * S // 10
     targets, stands = rows[:, 1].astype(int), np.ones(len(rows), dtype=bool)
-    return Seen(times, targets, stands, z, sigmas, odometry[k], np.ones(len(rows)))
+    return Seen(times, targets, stands, z, sigmas, odometry[k], poses[k], np.ones(len(rows)))
 
 
 def evidence(steps=None, scans=False, seen=None, **changes):
@@ -134,7 +134,8 @@ def test_a_parked_robot_may_watch_another_one(stands, verdict):
         z = np.column_stack([0.1 * np.ones(late.sum()), np.linspace(8.0, 2.0, late.sum())])
         kept = [getattr(own, name)[late] for name in ("times_ns", "targets", "stands")]
         return Seen(kept[0], 0 * kept[1], np.full(late.sum(), stands), z,
-                    own.sigmas[late], own.odometry[late], own.d2[late])  # fmt: skip
+                    own.sigmas[late], own.odometry[late], own.poses[late],
+                    own.d2[late])  # fmt: skip
 
     still = evidence(
         steps, seen=passing, final=path(steps), parked=(Parked(31 * S, 60 * S, 0.0, 0.0),)
@@ -142,8 +143,21 @@ def test_a_parked_robot_may_watch_another_one(stands, verdict):
     assert reasons(still)[0] == verdict
 
 
+def mapped_twice(own):
+    """From half of the log on, after an unseen turn by 0.4 rad, every point is another one."""
+    late = own.times_ns > S + 30 * S
+    poses = own.poses.copy()
+    turned = compose(np.array([0.0, 0.0, 0.4]), between(poses[late][0], poses[late]))
+    poses[late] = compose(poses[late][0], turned)
+    return replace(own, targets=own.targets + 100 * late, poses=poses)
+
+
 #: what is wrong, and what is said about it
 WRONG = {
+    "an unseen turn, points without names": (
+        lambda: evidence(seen=mapped_twice),
+        "part of the map is there twice",
+    ),
     "turning negated": (lambda: evidence(changed(0, 1, -1, -1)), "wrong sign"),
     "turning negated, seen by scans": (
         lambda: evidence(changed(300, 1, -1, -1), scans=True, seen=no_sightings),
@@ -327,6 +341,31 @@ def test_a_robot_that_drives_along_is_no_repeated_image_but_a_landmark_that_does
     assert reasons(evidence(seen=in_convoy(stands=False))) == ("good", "")
     verdict, told = reasons(evidence(seen=in_convoy(stands=True)))
     assert verdict != "good" and "repeat an image" in told
+
+
+@pytest.mark.parametrize("taken", ["no longer", "at first not"])
+def test_things_that_were_taken_away_are_no_second_map(taken):
+    """Nor are things that came: only both together are what odometry that slips leaves behind."""
+
+    def some(own):
+        far = own.times_ns > S + 30 * S if taken == "no longer" else own.times_ns < S + 30 * S
+        kept = ~(far & (own.targets < 6))
+        return Seen(*(getattr(own, f.name)[kept] for f in fields(Seen)))
+
+    assert reasons(evidence(seen=some)) == ("good", "")
+
+
+def test_a_sensor_that_sees_the_nearest_alone_loses_nothing():
+    """What is behind the farthest thing in an image, or beside all of them, is not in sight."""
+
+    def nearest(own):
+        order = np.lexsort((own.z[:, 1], own.times_ns))
+        _, first = np.unique(own.times_ns[order], return_index=True)
+        rank = np.arange(len(order)) - np.repeat(first, np.diff(np.append(first, len(order))))
+        kept = np.sort(order[rank < 3])
+        return Seen(*(getattr(own, f.name)[kept] for f in fields(Seen)))
+
+    assert reasons(evidence(seen=nearest)) == ("good", "")
 
 
 @pytest.mark.parametrize("name", WRONG)
