@@ -41,12 +41,12 @@ class LogWriter:
     (default: the stamp), which gives the order of recording.
     """
 
-    def __init__(self, path: Path, notes: Mapping[str, str] | None = None) -> None:
+    def __init__(self, path: Path | str, notes: Mapping[str, str] | None = None) -> None:
         """Prepare to write ``path``; ``notes`` go into the metadata record `graphslam`."""
-        self.path = path
+        self.path = Path(path)
         self.counts: dict[str, int] = {}
         self._notes = dict(notes or {})
-        self._partial = path
+        self._partial = self.path
         self._before: Identity = None
         self._stream: BinaryIO | None = None
         self._channels: dict[str, int] = {}

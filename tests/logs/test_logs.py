@@ -130,6 +130,13 @@ def test_equal_calls_give_equal_bytes_and_a_ros2_file_of_cdr_only(tmp_path):
         assert {s.encoding for s in summary.schemas.values()} == {"ros2msg"}
 
 
+def test_a_log_is_written_where_a_string_says(tmp_path):
+    """As every other path of the library's."""
+    with LogWriter(f"{tmp_path}/named.mcap") as log:
+        log.odometry("robot", S, np.zeros(3))
+    assert len(read(tmp_path / "named.mcap")[1]) == 1
+
+
 def test_a_log_that_failed_half_way_leaves_nothing_and_keeps_the_old_file(tmp_path):
     path = drive(tmp_path / "log.mcap", 1)
     before = path.read_bytes()
