@@ -83,7 +83,7 @@ class GraphBuilder:
 
     ``rows`` counts the residual rows that carry information: GTSAM counts a line's empty row too.
     ``oldest`` is the number of each robot's oldest state that is still estimated; what refers to
-    older ones is left out and counted in ``skipped``, by reason.
+    older ones is left out and counted in ``skipped``, by reason; but for those that are ``kept``.
     """
 
     def __init__(
@@ -101,6 +101,7 @@ class GraphBuilder:
         self.landmark_dims: dict[int, int] = {}
         self.rows = 0
         self.oldest: dict[str, int] = defaultdict(int)
+        self.kept: set[int] = set()
         self.skipped: Counter[str] = Counter()
         self._late, self._wide, self._make_lines = late, wide, lines
         self._first_seen: dict[int, Association] = {}  # landmark -> its first observation
@@ -226,9 +227,9 @@ class GraphBuilder:
     def closure_groups(self, closures: Iterable[Closure]) -> Iterator[FactorGroup]:
         """Factors of closures between states that are still estimated."""
         for closure in closures:
-            ends = (closure.robot, closure.time_ns), (closure.other, closure.other_time_ns)
-            numbers = [(robot, self.states.number(robot, time_ns)) for robot, time_ns in ends]
-            if any(number < self.oldest[robot] for robot, number in numbers):
+            numbers = [(robot, self.states.number(robot, t)) for robot, t in closure.pair]
+            left = {self.state_key(r, n) for r, n in numbers if n < self.oldest[r]}
+            if not left <= self.kept:
                 self.skipped[PAST_CLOSURE] += 1
                 continue
             key, other = (self.state_key(*number) for number in numbers)

@@ -50,6 +50,7 @@ class FixedLagBackend(GraphBackend):
         self._points: dict[int, Array] = {}  # linearisation points of dormant landmarks
         self._z: dict[int, Array] | None = None  # their corrections, if computed since the step
         self._past: dict[int, tuple[Array, Array]] = {}  # states that left
+        self._kept: dict[tuple[str, int], int] = {}  # robot and time -> a state that stays
 
     def value(self, key: int, dim: int) -> Array:
         """See `GraphBackend`."""
@@ -84,6 +85,8 @@ class FixedLagBackend(GraphBackend):
         seen = {
             factors.landmark_key(a.target) for a in step.associations if isinstance(a.target, int)
         }
+        ends = {end for closure in step.closures for end in closure.pair}
+        seen |= {self._kept[end] for end in ends & self._kept.keys()}
         if step.known is not None:
             self._take_known(step.known)
             step = replace(step, known=None)
@@ -128,8 +131,14 @@ class FixedLagBackend(GraphBackend):
         """Make landmarks dormant that the window does not see, nor the next step."""
         window = self._window
         seen = {*needed, *(key for each in window.factors for key in each.keys)}
-        idle = [k for k in window.prior.dims if not factors.is_state(k) and k not in seen]
-        keys = self._dormant.due(idle, [key for key in window.prior.dims if key in self._past])
+        kept = self.builder.kept & self._past.keys()
+        idle = [
+            key
+            for key in window.prior.dims
+            if key not in seen and (key in kept or not factors.is_state(key))
+        ]
+        past = [key for key in window.prior.dims if key in self._past and key not in kept]
+        keys = self._dormant.due(idle, past)
         if keys:
             self._points |= {key: window.point(key) for key in keys}
             window.prior = self._dormant.add(window.prior, keys)
@@ -156,7 +165,13 @@ class FixedLagBackend(GraphBackend):
         window.factors = [each for each in window.factors if leaving.isdisjoint(each.keys)]
         # lines are built a last time, at the best estimate that there will be
         window.absorb(window.weighted_rows(self._rebuilt(involved)))
-        gone = [key for key in window.prior.dims if key in leaving - self._dormant.anchors]
+        leaving = leaving - self.builder.kept
+        self._eliminate([key for key in window.prior.dims if key in leaving])
+
+    def _eliminate(self, states: Sequence[int]) -> None:
+        """Eliminate states from the prior that no factor involves, unless a block is given them."""
+        window = self._window
+        gone = [key for key in states if key not in self._dormant.anchors]
         if gone:
             first = dict.fromkeys(gone, 3)
             order = {**first, **{k: d for k, d in window.prior.dims.items() if k not in first}}
@@ -175,6 +190,51 @@ class FixedLagBackend(GraphBackend):
             i: (mean, rotate_cov(cov, mean[2]) if len(mean) == 3 else cov)
             for i, (mean, cov) in zip(landmarks, found, strict=True)
         }
+
+    def keep(self, robot: str, time_ns: int) -> None:
+        """Estimate a state of the window on when it is behind the horizon, like a landmark."""
+        self._kept[robot, time_ns] = self._key(robot, time_ns)
+        self.builder.kept = set(self._kept.values())
+
+    def drop(self, robot: str, time_ns: int) -> bool:
+        """Marginalise out a state that was kept, unless a closure of the window is with it.
+
+        Returns:
+            Whether it is no longer kept.
+        """
+        key, window = self._kept[robot, time_ns], self._window
+        is_past = key in self._past
+        if is_past and any(key in each.keys for each in window.factors):
+            return False
+        del self._kept[robot, time_ns]
+        self.builder.kept = set(self._kept.values())
+        self._joints.clear()
+        if is_past:
+            self._wake([key] if key in self._dormant else [])
+            self._eliminate([key])
+            self._z = None
+            window.optimise()
+        return True
+
+    def poses(self, states: Sequence[tuple[str, int]]) -> tuple[Array, Array]:
+        """Poses (n, 3) of states that are estimated, and their joint covariance (3n, 3n).
+
+        Errors are along each one's own axes. ``states``: robots and times.
+        """
+        keys = [self._key(*state) for state in states]
+        means = self.values(keys, [3] * len(keys))
+        return np.array(means).reshape(-1, 3), self.covariance(keys)
+
+    def latest_pose(self, robot: str, time_ns: int) -> Array:
+        """The pose (3,) of a state, also of one that has just left the window."""
+        key = self._key(robot, time_ns)
+        if key in self._window.dims or key in self._dormant:
+            return self.value(key, 3)
+        return self._past[key][0]
+
+    def _key(self, robot: str, time_ns: int) -> int:
+        """The key of a state."""
+        return self.builder.state_key(robot, self.builder.states.number(robot, time_ns))
 
     def forget(self) -> None:
         """Drop the estimates of states that left, which only `finish` needs."""

@@ -15,6 +15,7 @@ from graphslam.core.config import Config
 from graphslam.core.geometry import Array, between, compose, compose_cov, inverse, transform
 from graphslam.core.records import Estimate, Landmark, Message, Sighting, Start, Step
 from graphslam.estimation.fixed_lag import FixedLagBackend
+from graphslam.live.loop_closing import LoopCloser
 from graphslam.logs import LogSet
 from graphslam.mapping.landmark_records import make_landmarks
 from graphslam.slam.log_pass import PriorKnowledge
@@ -77,16 +78,32 @@ class LivePass(Pipeline):
         self.on_map = self.off_map = 0
         self._reported: dict[str, LiveEstimate] = {}
         self._closures = 0  # that were reported
+        closes = self.config.backend.close_loops and self._known_map is None
+        self._closer = LoopCloser(self.config, self.backend, self.frames.of) if closes else None
 
     def estimates(self, messages: Iterable[Message]) -> Iterator[LiveEstimate]:
         """Take in messages, sorted by time; gives the estimates of each event."""
         for event in self.process(messages):
             if not self.steps and _is_odometry(event):
                 continue  # most of a recording: nothing was seen, and nothing is to be forgotten
+            self._close_loops()
             self.record_covariances()
             for robot, run in self.started.items():
                 yield from self._report(robot, run, event)
             self.forget()
+
+    def _close_loops(self) -> None:
+        """Look for places that were passed before; what they say moves the estimate."""
+        if self._closer is None or not self.keyframe_scans:
+            return
+        self._closer.add(self.keyframe_scans)
+        found = self._closer.closures()
+        if not found:
+            return
+        self.backend.add(Step(self.last_ns, closures=found))
+        self.associator.closures += 1
+        for robot, run in self.started.items():
+            run.latest_pose = self.backend.state_mean(robot)
 
     def start_step(self, robot: str, time_ns: int) -> Step:
         """See `StepRecorder`; a known map enters with the first robot."""

@@ -64,7 +64,7 @@ def build_submaps(
         path = path_length(poses)
         spacing = max(config.loop_closure.submap_spacing_m, path[-1] / MAX_SUBMAPS)
         middles = np.unique(np.searchsorted(path, np.arange(0.0, path[-1], spacing)))
-        found += _submaps(robot, poses, stamps, middles, clouds, config)
+        found += submaps_around(robot, poses, stamps, middles, clouds, config)
     return found
 
 
@@ -95,7 +95,7 @@ def submaps_at(
         has_scan = seen[own]
         poses, stamps = states_of.poses[seen], states_of.stamps_ns[seen]
         place = (np.cumsum(seen) - 1)[own[has_scan]]
-        found += _submaps(robot, poses, stamps, place, clouds, config)
+        found += submaps_around(robot, poses, stamps, place, clouds, config)
         numbers += (first + np.flatnonzero(has_scan)).tolist()
         first += len(own)
     return found, np.array(numbers, dtype=np.int64)
@@ -106,10 +106,10 @@ def _clouds(keyframe_scans: Iterable[KeyframeScan]) -> dict[State, KeyframeScan]
     return {(p.robot, p.time_ns): p for p in keyframe_scans if len(p.points) >= MIN_POINTS}
 
 
-def _submaps(
+def submaps_around(
     robot: str,
     poses: Array,
-    stamps: Array,
+    stamps: IntArray,
     middles: IntArray,
     clouds: Mapping[State, KeyframeScan],
     config: Config,

@@ -36,14 +36,15 @@ def live(room):
 def test_estimates_are_the_causal_poses_of_a_fixed_lag_smoother(room, live):
     """Poses and covariances; forgetting changes nothing.
 
-    1e-9: the same operations in the same order, but sums of a path begin elsewhere.
+    1e-7: sums of a path begin elsewhere, and places that are kept are variables of the window too,
+    so that its Gauss-Newton steps end a little elsewhere.
     """
     _, found = live
     same = {"name": "isam2", "horizon_s": HORIZON_S}
     causal = graphslam.smooth(room[0], backend=same).robots["robot"].causal
     assert [e.stamp_ns for e in found] == causal.stamps_ns.tolist()
-    np.testing.assert_allclose([e.pose for e in found], causal.poses, rtol=0, atol=1e-9)
-    np.testing.assert_allclose([e.cov for e in found], causal.covs, rtol=0, atol=1e-9)
+    np.testing.assert_allclose([e.pose for e in found], causal.poses, rtol=0, atol=1e-7)
+    np.testing.assert_allclose([e.cov for e in found], causal.covs, rtol=0, atol=1e-7)
 
 
 def test_an_estimate_is_of_what_came_until_then(room, live):
