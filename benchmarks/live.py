@@ -9,10 +9,13 @@ causal poses.
 `beginnings`: causal relations of Intel without its first 0, 20, 40, 60 and 80 s and of ACES, live
 and by `smooth --causal`: those of one log differ by chance, as the first round decides.
 
+`drifting`: ACES, as recorded and with two draws of noise on its odometry (`perturbed_logs.py`),
+live, with loops closed by places and by landmarks alone.
+
 `soak`: the five robots of `long_run.py` for two hours, as fast as it goes; memory of the process
 after every tenth of the drive, and the share by which it grew in the last half.
 
-Run: python benchmarks/live.py [intel] [beginnings] [soak] [--minutes 120]
+Run: python benchmarks/live.py [intel] [beginnings] [drifting] [soak] [--minutes 120]
 """
 
 import os
@@ -26,6 +29,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+import perturbed_logs
 from common import FREIBURG, parser
 from long_run import ROBOTS, record, true_poses
 from mcap.reader import make_reader
@@ -49,7 +53,7 @@ HEAD_START_S = 3.0
 def main() -> None:
     """Print what was asked for."""
     options = parser(__doc__)
-    options.add_argument("which", nargs="*", default=("intel", "beginnings", "soak"))
+    options.add_argument("which", nargs="*", default=("intel", "beginnings", "drifting", "soak"))
     options.add_argument("--minutes", type=int, default=120)
     chosen = options.parse_args()
     with tempfile.TemporaryDirectory() as name:
@@ -57,6 +61,9 @@ def main() -> None:
             print(intel(Path(name)))
         if "beginnings" in chosen.which:
             for line in beginnings(Path(name)):
+                print(line, flush=True)
+        if "drifting" in chosen.which:
+            for line in drifting(Path(name)):
                 print(line, flush=True)
         if "soak" in chosen.which:
             for line in soak(Path(name), chosen.minutes):
@@ -182,6 +189,24 @@ def beginnings(folder: Path) -> Iterator[str]:
             rows.append([live["all"]["trans_mean_m"], smoothed["causal"]["all"]["trans_mean_m"]])
             yield f"{name} from {seconds} s on: {told(rows[-1])}"
     yield f"means: {told(np.mean(rows, axis=0).tolist())}"
+
+
+def drifting(folder: Path) -> Iterator[str]:
+    """Causal errors of logs whose drift is larger than the estimate knows."""
+    whole, part = folder / "whole.mcap", folder / "drifting.mcap"
+    IMPORTERS["carmen"](FREIBURG / "aces.clf.bz2", whole)
+    relations = read_relations(FREIBURG / "aces.relations")
+    for kind, seed in (("as-recorded", 0), ("noisy", 1), ("noisy", 2)):
+        messages = list(graphslam.open_logs(whole).messages())
+        degraded = perturbed_logs.PERTURBATIONS[kind][0](messages, relations, seed)
+        part.unlink(missing_ok=True)
+        perturbed_logs.write(degraded, part)
+        for closes in (True, False):
+            now = folder / "now"
+            graphslam.follow(part, now, force=True, backend={"close_loops": closes})
+            found = graphslam.evaluate(now, relations=relations)["relations"]
+            errors = ", ".join(f"{k} {found[k]['trans_mean_m']:.4f} m" for k in ("all", "loops"))
+            yield f"aces {kind} {seed}, by {'places' if closes else 'landmarks alone'}: {errors}"
 
 
 def told(errors_m: Sequence[float]) -> str:

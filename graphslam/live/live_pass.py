@@ -24,6 +24,8 @@ from graphslam.slam.robot_state import RobotState
 from graphslam.slam.sighting_batches import Event, SightingBatch
 from graphslam.slam.synchronisation import ODOMETRY
 
+#: after so many keyframes in a row places are compared, though none of them waits for that
+BUSY = 2
 #: s: odometry that is kept, at least
 SHORTEST_MEMORY_S = 10.0
 
@@ -79,6 +81,7 @@ class LivePass(Pipeline):
         self._reported: dict[str, LiveEstimate] = {}
         self._closures = 0  # that were reported
         closes = self.config.backend.close_loops and self._known_map is None
+        self._busy = 0  # scans in a row that became keyframes
         self._closer = LoopCloser(self.config, self.backend, self.frames.of) if closes else None
 
     def estimates(self, messages: Iterable[Message]) -> Iterator[LiveEstimate]:
@@ -94,16 +97,23 @@ class LivePass(Pipeline):
 
     def _close_loops(self) -> None:
         """Look for places that were passed before; what they say moves the estimate."""
-        if self._closer is None or not self.keyframe_scans:
+        if self._closer is None:
             return
-        self._closer.add(self.keyframe_scans)
+        if self.keyframe_scans:
+            self._closer.add(self.keyframe_scans)
+            self._busy += 1
+            if self._busy <= BUSY:
+                return  # such a scan takes time enough
+        self._busy = 0
         found = self._closer.closures()
         if not found:
             return
         self.backend.add(Step(self.last_ns, closures=found))
         self.associator.closures += 1
         for robot, run in self.started.items():
-            run.latest_pose = self.backend.state_mean(robot)
+            # what is reported from now on is seen from there
+            run.latest_pose = run.causal_poses[-1] = self.backend.state_mean(robot)
+            del run.causal_covs[len(run.times) - 1 :]
 
     def start_step(self, robot: str, time_ns: int) -> Step:
         """See `StepRecorder`; a known map enters with the first robot."""

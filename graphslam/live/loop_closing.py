@@ -10,7 +10,7 @@ moves at once, and says so.
 Places stay, one where several are near each other: memory is that of the map.
 """
 
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -89,8 +89,8 @@ class LoopCloser:
         self._config, self._backend, self._frames = config, backend, frames
         self._trails: dict[str, _Trail] = defaultdict(_Trail)
         self._places: list[SubmapPose] = []
-        self._waiting: list[list[SubmapPair]] = []
-        self._asked: tuple[list[SubmapPair], Future[list[Verified | None]]] | None = None
+        self._waiting: deque[SubmapPair] = deque()
+        self._asked: tuple[SubmapPair, Future[list[Verified | None]]] | None = None
         self._found: list[Closure] = []  # of recent places
         self._repeated: set[State] = set()  # places that are earlier ones
 
@@ -126,10 +126,8 @@ class LoopCloser:
         middle = np.array([trail.index(time_ns)], dtype=np.int64)
         made = submaps_around(robot, np.array(trail.poses), stamps, middle, clouds, self._config)
         place = replace(made[0], path_m=trail.path_m[middle[0]])
-        pairs = self._candidates(place)
+        self._waiting += self._candidates(place)
         self._places.append(place)
-        if pairs:
-            self._waiting.append(pairs)
 
     def _drop_repeated(self) -> None:
         """Keep the first of places that are one, once no closure waits for the others."""
@@ -175,32 +173,35 @@ class LoopCloser:
         return pairs
 
     def closures(self) -> tuple[Closure, ...]:
-        """The closures that are to enter the estimate now."""
+        """The closures that are to enter the estimate now.
+
+        One pair is compared at a time: in this process, where there is no second one, that delays
+        the next scan.
+        """
         agreed: tuple[Closure, ...] = ()
         if self._asked is not None and self._asked[1].is_ready():
-            pairs, answer = self._asked
+            pair, answer = self._asked
             self._asked = None
-            self._take(pairs, answer.result())
-            agreed = self._agreed()
-        if self._asked is None and self._waiting:
-            pairs = self._waiting.pop(0)
-            task = Future(lambda: verify_pairs(pairs, along=True), urgent=False)
-            self._asked = pairs, task
+            (found,) = answer.result()
+            if found is not None:
+                self._take(pair, found)
+                agreed = self._agreed()
+        elif self._asked is None and self._waiting:
+            pair = self._waiting.popleft()
+            self._asked = pair, Future(lambda: verify_pairs([pair], along=True), urgent=False)
         return agreed
 
-    def _take(self, pairs: Sequence[SubmapPair], found: Sequence[Verified | None]) -> None:
+    def _take(self, pair: SubmapPair, found: Verified) -> None:
         """Note what was found."""
-        for pair, one in zip(pairs, found, strict=True):
-            if one is not None:
-                images = min(len(pair.later.submap.clouds), len(pair.earlier.submap.clouds))
-                ends = *pair.later.state, *pair.earlier.state
-                closure = Closure(*ends, one.pose, one.cov, verified=True, scan_count=images)
-                self._found.append(closure)
-                # along a corridor a match tells nothing, unless the estimate says the same
-                is_told = not one.is_searched or fix_position([closure])[0]
-                x, y, turn = np.abs(one.pose).tolist()
-                if is_told and np.hypot(x, y) <= SAME_M and turn <= SAME_RAD:
-                    self._repeated.add(pair.later.state)
+        images = min(len(pair.later.submap.clouds), len(pair.earlier.submap.clouds))
+        ends = *pair.later.state, *pair.earlier.state
+        closure = Closure(*ends, found.pose, found.cov, verified=True, scan_count=images)
+        self._found.append(closure)
+        # along a corridor a match tells nothing, unless the estimate says the same
+        is_told = not found.is_searched or fix_position([closure])[0]
+        x, y, turn = np.abs(found.pose).tolist()
+        if is_told and np.hypot(x, y) <= SAME_M and turn <= SAME_RAD:
+            self._repeated.add(pair.later.state)
 
     def _agreed(self) -> tuple[Closure, ...]:
         """Of the closures so far, those that agree and move the estimate; they are spent."""

@@ -8,7 +8,8 @@ from room_log import MOUNT, START_NS, drive, true_pose
 
 import graphslam
 from graphslam.core.geometry import between, compose
-from graphslam.core.records import OdometryPose, Scan, Sighting
+from graphslam.core.records import Closure, OdometryPose, Scan, Sighting
+from graphslam.live import live_pass
 
 HORIZON_S = 8.0
 S = 1_000_000_000
@@ -86,6 +87,33 @@ def test_a_jump_is_said(live):
         expected = compose(compose(before.pose, moved), after.jump)
         np.testing.assert_allclose(between(after.pose, expected), 0.0, atol=1e-9)
     assert not live[1][0].jump.any()
+
+
+class OneClosure:
+    """Closes a loop once: the robot is 0.5 m ahead of where its last motion took it."""
+
+    def __init__(self, *_settings):
+        self.states, self.is_done = [], False
+
+    def add(self, scans):
+        self.states += [(scan.robot, scan.time_ns) for scan in scans]
+
+    def closures(self):
+        if self.is_done or len(self.states) < 20:
+            return ()
+        self.is_done = True
+        ends, far = (*self.states[-1], *self.states[-2]), np.array([0.5, 0.0, 0.0])
+        return (Closure(*ends, far, 1e-8 * np.eye(3), verified=True),)
+
+
+def test_a_loop_that_a_place_closes_moves_the_estimate_and_says_so(room, monkeypatch):
+    """By no more than it says. This one is wrong, so landmarks take some of it back."""
+    monkeypatch.setattr(live_pass, "LoopCloser", OneClosure)
+    found = list(graphslam.Session().process(room[1]))
+    said = next(e for e in found if np.hypot(*e.jump[:2]) > 0.1)
+    assert said.loop_closed
+    assert np.hypot(*said.jump[:2]) < 0.6
+    assert not any(e.loop_closed for e in found[: found.index(said)])
 
 
 def test_estimates_are_where_the_robot_is(live):
