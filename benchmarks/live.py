@@ -23,6 +23,7 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line has it; read by NumPy
 
 import multiprocessing
+import shutil
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -196,11 +197,14 @@ def drifting(folder: Path) -> Iterator[str]:
     whole, part = folder / "whole.mcap", folder / "drifting.mcap"
     IMPORTERS["carmen"](FREIBURG / "aces.clf.bz2", whole)
     relations = read_relations(FREIBURG / "aces.relations")
-    for kind, seed in (("as-recorded", 0), ("noisy", 1), ("noisy", 2)):
-        messages = list(graphslam.open_logs(whole).messages())
-        degraded = perturbed_logs.PERTURBATIONS[kind][0](messages, relations, seed)
+    for kind, seed in (("original", 0), ("as-recorded", 0), ("noisy", 1), ("noisy", 2)):
         part.unlink(missing_ok=True)
-        perturbed_logs.write(degraded, part)
+        if kind == "original":
+            shutil.copy(whole, part)
+        else:
+            messages = list(graphslam.open_logs(whole).messages())
+            degraded = perturbed_logs.PERTURBATIONS[kind][0](messages, relations, seed)
+            perturbed_logs.write(degraded, part)
         for closes in (True, False):
             now = folder / "now"
             graphslam.follow(part, now, force=True, backend={"close_loops": closes})
