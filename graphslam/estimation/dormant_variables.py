@@ -148,6 +148,10 @@ class DormantVariables:
                 self._keys += [key] * dim
         return columns_of(dims, self._slices)
 
+    def is_given(self, key: int) -> bool:
+        """Whether a block is given a variable in use."""
+        return key in self._given()
+
     def _given(self) -> list[int]:
         """The variables in use that the blocks are given."""
         if self._given_keys is None:

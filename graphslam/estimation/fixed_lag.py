@@ -131,7 +131,7 @@ class FixedLagBackend(GraphBackend):
         """Make landmarks dormant that the window does not see, nor the next step."""
         window = self._window
         seen = {*needed, *(key for each in window.factors for key in each.keys)}
-        kept = self.builder.kept & self._past.keys()
+        kept = {key for key in self.builder.kept if self._has_left(key)}
         idle = [
             key
             for key in window.prior.dims
@@ -197,20 +197,21 @@ class FixedLagBackend(GraphBackend):
         self.builder.kept = set(self._kept.values())
 
     def drop(self, robot: str, time_ns: int) -> bool:
-        """Marginalise out a state that was kept, unless a closure of the window is with it.
+        """Keep a state no longer; one that is dormant, and costs no step anything, stays so.
 
         Returns:
-            Whether it is no longer kept.
+            Whether that was possible: not while others in use, or dormant ones, are given it.
         """
         key, window = self._kept[robot, time_ns], self._window
-        is_past = key in self._past
-        if is_past and any(key in each.keys for each in window.factors):
+        in_use = self._has_left(key) and key not in self._dormant
+        if in_use and (
+            any(key in each.keys for each in window.factors) or self._dormant.is_given(key)
+        ):
             return False
         del self._kept[robot, time_ns]
         self.builder.kept = set(self._kept.values())
-        self._joints.clear()
-        if is_past:
-            self._wake([key] if key in self._dormant else [])
+        if in_use:
+            self._joints.clear()
             self._eliminate([key])
             self._z = None
             window.optimise()
@@ -225,12 +226,17 @@ class FixedLagBackend(GraphBackend):
         means = self.values(keys, [3] * len(keys))
         return np.array(means).reshape(-1, 3), self.covariance(keys)
 
-    def latest_pose(self, robot: str, time_ns: int) -> Array:
+    def pose_of(self, robot: str, time_ns: int) -> Array:
         """The pose (3,) of a state, also of one that has just left the window."""
         key = self._key(robot, time_ns)
         if key in self._window.dims or key in self._dormant:
             return self.value(key, 3)
         return self._past[key][0]
+
+    def _has_left(self, key: int) -> bool:
+        """Whether a state is behind the horizon."""
+        robot, number = factors.number_of(key)
+        return robot is not None and number < self.builder.oldest[self.builder.robots[robot]]
 
     def _key(self, robot: str, time_ns: int) -> int:
         """The key of a state."""

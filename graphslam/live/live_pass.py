@@ -24,7 +24,7 @@ from graphslam.slam.robot_state import RobotState
 from graphslam.slam.sighting_batches import Event, SightingBatch
 from graphslam.slam.synchronisation import ODOMETRY
 
-#: after so many keyframes in a row places are compared, though none of them waits for that
+#: keyframes in a row after which places are compared; else that waits for a scan that becomes none
 BUSY = 2
 #: s: odometry that is kept, at least
 SHORTEST_MEMORY_S = 10.0

@@ -7,7 +7,7 @@ for in those that may be the same (`mapping.loop_closure`), in a second process 
 allows that. What two searches agree on becomes a closure between two kept states. The estimate then
 moves at once, and says so.
 
-Places stay, one where several are near each other: memory is that of the map.
+Places stay, one where several are near each other: of the others three dormant numbers each are left.
 """
 
 from collections import defaultdict, deque
@@ -34,10 +34,12 @@ from graphslam.mapping.loop_closure import (
     verify_pairs,
 )
 from graphslam.mapping.submap_graph import relative_jacobian
-from graphslam.mapping.submaps import State, SubmapPose, submaps_around
+from graphslam.mapping.submaps import MIN_POINTS, State, SubmapPose, submaps_around
 
 #: places that a new one is compared with, at most
 MOST_COMPARED = 4
+#: comparisons that wait, at most: where all scans are keyframes, older ones are given up
+MOST_WAITING = 16
 #: places that must agree, at least: if the estimate may be as far off as they say, and if its
 #: covariance denies that; m: the last ones are so far back
 AGREEING, AGAINST, RECENT_M = 2, 3, 40.0
@@ -51,7 +53,7 @@ SAME_M, SAME_RAD = 1.5, 0.8
 
 @dataclass(slots=True, eq=False)
 class _Trail:
-    """The last metres of a robot's path, the drift of the estimate taken out.
+    """The last metres of a robot's path, without the jumps of the estimate.
 
     ``poses`` (3,) follow each other as the estimate had them when the later one was new; ``path_m``
     driven there. ``places`` are the times of places that the robot has not left yet.
@@ -89,7 +91,7 @@ class LoopCloser:
         self._config, self._backend, self._frames = config, backend, frames
         self._trails: dict[str, _Trail] = defaultdict(_Trail)
         self._places: list[SubmapPose] = []
-        self._waiting: deque[SubmapPair] = deque()
+        self._waiting: deque[SubmapPair] = deque(maxlen=MOST_WAITING)
         self._asked: tuple[SubmapPair, Future[list[Verified | None]]] | None = None
         self._found: list[Closure] = []  # of recent places
         self._repeated: set[State] = set()  # places that are earlier ones
@@ -102,7 +104,7 @@ class LoopCloser:
             moved = np.zeros(3)
             if trail.scans:
                 ends = (trail.scans[-1].time_ns, scan.time_ns)
-                moved = between(*(self._backend.latest_pose(scan.robot, t) for t in ends))
+                moved = between(*(self._backend.pose_of(scan.robot, t) for t in ends))
             trail.add(scan, moved)
             last = trail.places[-1] if trail.places else None
             since = np.inf if last is None else trail.path_m[-1] - trail.path_m[trail.index(last)]
@@ -121,11 +123,17 @@ class LoopCloser:
 
     def _complete(self, robot: str, trail: _Trail, time_ns: int) -> None:
         """A place that its robot has left is searched for in the earlier ones."""
-        stamps = np.array([scan.time_ns for scan in trail.scans], dtype=np.int64)
-        clouds = {(robot, scan.time_ns): scan for scan in trail.scans}
-        middle = np.array([trail.index(time_ns)], dtype=np.int64)
-        made = submaps_around(robot, np.array(trail.poses), stamps, middle, clouds, self._config)
-        place = replace(made[0], path_m=trail.path_m[middle[0]])
+        shown = [k for k, scan in enumerate(trail.scans) if len(scan.points) >= MIN_POINTS]
+        own = trail.index(time_ns)
+        if own not in shown:  # nothing is in reach there
+            self._backend.drop(robot, time_ns)
+            return
+        scans, poses = [trail.scans[k] for k in shown], np.array(trail.poses)[shown]
+        stamps = np.array([scan.time_ns for scan in scans], dtype=np.int64)
+        clouds = {(robot, scan.time_ns): scan for scan in scans}
+        middle = np.array([shown.index(own)], dtype=np.int64)
+        (made,) = submaps_around(robot, poses, stamps, middle, clouds, self._config)
+        place = replace(made, path_m=trail.path_m[own])
         self._waiting += self._candidates(place)
         self._places.append(place)
 
@@ -156,8 +164,8 @@ class LoopCloser:
         if not others:
             return []
         limit = np.array([settings.search_max_m, settings.search_max_m, settings.search_max_rad])
-        poses = np.array([self._backend.latest_pose(*other.state) for other in others])
-        here = self._backend.latest_pose(*place.state)
+        poses = np.array([self._backend.pose_of(*other.state) for other in others])
+        here = self._backend.pose_of(*place.state)
         distance = np.hypot(*(poses[:, :2] - here[:2]).T)
         pairs = []
         for k in np.argsort(distance)[:MOST_COMPARED].tolist():
@@ -186,7 +194,7 @@ class LoopCloser:
             if found is not None:
                 self._take(pair, found)
                 agreed = self._agreed()
-        elif self._asked is None and self._waiting:
+        if self._asked is None and self._waiting:
             pair = self._waiting.popleft()
             self._asked = pair, Future(lambda: verify_pairs([pair], along=True), urgent=False)
         return agreed
@@ -219,7 +227,8 @@ class LoopCloser:
         placed = [replace(at[s], pose=pose) for s, pose in zip(states, poses, strict=True)]
         agreed = consistent_closures(closures, placed, cov)
         if _count_places(agreed) < AGREEING:
-            last = np.array([s in {(c.robot, c.time_ns) for c in closures} for s in states])
+            later = {c.pair[0] for c in closures}
+            last = np.array([s in later for s in states])
             agreed = consistent_closures(closures, placed, cov + _drift(poses, last))
             if _count_places(agreed) < AGAINST:
                 return ()

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from graphslam.core.config import Config, RobustConfig
-from graphslam.core.geometry import compose, rotate_cov, wrap
+from graphslam.core.geometry import between, compose, rotate_cov, wrap
 from graphslam.core.known_landmarks import KnownLandmarks
 from graphslam.core.observation_models import MODELS
-from graphslam.core.records import Association, Motion, Start, Step
+from graphslam.core.records import Association, Closure, Motion, Start, Step
 from graphslam.core.sparse_gaussian import MAX_WIDENING, sparse_root
 from graphslam.estimation import dormant_variables, factors, window
 from graphslam.estimation.backends import BACKENDS
@@ -196,3 +196,25 @@ def test_known_landmarks_out_of_sight_are_dormant_at_once():
     assert ratio.max() < 3.0
     backend.add(second)
     assert 3 < len(backend._window.dims) < 20
+
+
+def test_a_kept_state_sleeps_again_after_a_closure_and_can_be_dropped():
+    """Breaks if what is forgotten meanwhile lets it stay in the window, or the prior, for ever."""
+    backend = smoother(5.0)
+    steps = rounds(3, 2 * LAP_S)
+    for k, step in enumerate(steps):
+        if k == LAP_S + 3:
+            (there, here), cov = backend.poses([("a", 3 * S), ("a", (k - 1) * S)])
+            assert np.linalg.eigvalsh(cov)[0] > 0
+            delta = between(there, here)
+            closed = Closure("a", (k - 1) * S, "a", 3 * S, delta, 1e-4 * np.eye(3), verified=True)
+            backend.add(Step((k - 1) * S, closures=(closed,)))
+        backend.add(step)
+        if k == 3:
+            backend.keep("a", 3 * S)
+        backend.forget()
+    (key,) = backend.builder.kept
+    assert key in backend._dormant
+    assert backend.drop("a", 3 * S)
+    assert key not in backend._window.dims
+    assert not backend.builder.kept

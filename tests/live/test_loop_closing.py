@@ -99,6 +99,21 @@ def test_other_places_are_not_taken_for_it(back):
     assert np.abs(off).max() < 0.05
 
 
+def test_where_nothing_is_in_reach_there_is_no_place():
+    """A laser outdoors: scans without returns are no error, and nothing is kept of them."""
+    backend = FixedLagBackend(CONFIG)
+    closer = LoopCloser(CONFIG, backend, {"robot": "robot"})
+    backend.add(Step(0, starts={"robot": Start(np.zeros(3), 1e-4 * np.eye(3))}))
+    ahead = np.array([0.25, 0.0, 0.0])
+    for k in range(1, 100):
+        motion = Motion((k - 1) * S, k * S, ahead, COV, np.zeros((3, 0)), 0.25)
+        backend.add(Step(k * S, motions={"robot": motion}))
+        closer.add([KeyframeScan("robot", k * S, np.zeros((0, 2), dtype=np.float32))])
+        assert closer.closures() == ()
+        backend.forget()
+    assert len(backend.builder.kept) <= 3  # of the last metres, not judged yet
+
+
 def test_a_kept_state_changes_nothing_and_can_be_dropped():
     """It is one more variable, and marginalising it out is exact: 1e-8 is what rounding leaves."""
     true = circles(30.0)
