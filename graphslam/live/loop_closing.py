@@ -7,7 +7,8 @@ for in those that may be the same (`mapping.loop_closure`), in a second process 
 allows that. What two searches agree on becomes a closure between two kept states. The estimate then
 moves at once, and says so.
 
-Places stay, one where several are near each other: of the others three dormant numbers each are left.
+Places stay, one where several are near each other; of each of the others three dormant variables
+may be left.
 """
 
 from collections import defaultdict, deque
