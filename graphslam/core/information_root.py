@@ -24,6 +24,10 @@ class InformationRoot:
     each state, ``landmarks[number]`` that of each landmark, ``mounts[robot]`` (3,) those of its
     mount, -1 of what is held. Errors are along the axes of each pose's own frame, in its tangent
     space, so that R is the same in every world frame; those of a mount along the base's.
+
+    ``shared`` (n, k): by how much each row's variable is off for each sigma of k independent errors
+    that many measurements share, which R takes for independent; (0, 0) without any. The covariance
+    is (R'R)⁻¹ + shared shared'.
     """
 
     above: IntArray
@@ -34,3 +38,4 @@ class InformationRoot:
     states: Mapping[str, IntArray]
     landmarks: Mapping[int, int] = field(default_factory=dict)
     mounts: Mapping[str, IntArray] = field(default_factory=dict)
+    shared: Array = field(default_factory=lambda: np.zeros((0, 0)))

@@ -22,12 +22,21 @@ from graphslam.core.records import Estimate, Motion, Step
 from graphslam.estimation import factors
 from graphslam.estimation.backend import JointMarginal
 from graphslam.estimation.covariance_columns import covariance_columns
+from graphslam.estimation.information_root import information_root
 from graphslam.estimation.isam2 import NO_COVARIANCES, with_means
-from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH, marginals_of, reweighted
+from graphslam.estimation.line_residuals import LineResiduals
+from graphslam.estimation.optimisation import (
+    CONVERGED_ERROR_ROUGH,
+    marginals_of,
+    reweighted,
+    root_of,
+)
 from graphslam.estimation.posterior_residuals import Posterior, posterior_pairs
 from graphslam.estimation.recorded_graph import ObservationNoise, RecordedGraph, Source
 from graphslam.estimation.sandwich_covariance import CovarianceFactors, covariance_factors
 from graphslam.estimation.selected_inverse import CliqueRows
+from graphslam.estimation.surface_bias import with_surface_bias
+from graphslam.estimation.weighed_walls import WeighedWalls
 
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
@@ -88,6 +97,18 @@ def at_calibration(
                 motions[robot] = replace(motion, delta=np.append(delta[:2], wrap(delta[2])))
         made.append(replace(step, motions=motions))
     return tuple(made)
+
+
+@dataclass(frozen=True, slots=True)
+class WallErrors:
+    """What observations of walls are off by.
+
+    ``variances``: robot -> factors (2,) on those of lines' normal offsets and directions that the
+    log shows; ``bias_m``: sigma of the bias of a surface.
+    """
+
+    variances: Mapping[str, Array]
+    bias_m: float
 
 
 class CalibrationGraph:
@@ -190,7 +211,12 @@ class CalibrationGraph:
         self._values, self._marginals = values, None
 
     def solution(
-        self, *, marginals: bool = False, joint: bool = False, mounts: bool = False
+        self,
+        *,
+        marginals: bool = False,
+        joint: bool = False,
+        mounts: bool = False,
+        walls: WallErrors | None = None,
     ) -> tuple[Estimate, dict[str, Calibration]]:
         """The estimate and the calibrations where it was optimised last.
 
@@ -198,13 +224,20 @@ class CalibrationGraph:
             marginals: whether covariances are wanted; else they are NaN.
             joint: whether the root of the information is wanted beside them.
             mounts: whether covariances with the mounts are then wanted too.
+            walls: errors of walls that covariances are then to be by; as stated otherwise. The
+                graph keeps them.
 
         Raises:
             EstimationError: the estimate is indeterminate.
         """
         builder, values, found = self._builder, self._values, NO_COVARIANCES
+        weighed: list[WeighedWalls] = []
         if marginals:
             self._relinearise()
+        half_error = float(builder.graph.error(values))
+        if marginals:
+            if walls is not None:
+                weighed = builder.weigh_walls(values, walls.variances)
             try:
                 found = marginals_of(builder.graph, values, keep_rows=joint)
             except RuntimeError as error:
@@ -212,10 +245,11 @@ class CalibrationGraph:
         covs = found.marginals
         means = with_means(values, builder.dims(), covs)
         mounted = self._mount_places() if mounts else {}
-        half_error = float(builder.graph.error(values))
         estimate = builder.estimate(means, half_error, found.rows, mounted)
         if found.rows is not None and mounted:
             estimate = replace(estimate, mounts=self._mounts(found.rows, values, mounted))
+        if found.rows is not None and walls is not None and weighed:
+            estimate = with_surface_bias(estimate, weighed, walls.bias_m)
         return estimate, self._calibrations(covs)
 
     def _calibrations(self, covs: Mapping[int, Array]) -> dict[str, Calibration]:
@@ -303,6 +337,22 @@ class CalibrationGraph:
         except RuntimeError as error:
             raise builder.explain(error) from error
         return Posterior(self._steps, builder, self._values, blocks, free)
+
+    def line_residuals(self) -> LineResiduals:
+        """Residuals of lines in the last solution.
+
+        Raises:
+            EstimationError: it is indeterminate.
+        """
+        builder = self._builder
+        self._relinearise()
+        try:
+            rows = root_of(builder.graph, self._values)
+        except RuntimeError as error:
+            raise builder.explain(error) from error
+        keys = {robot: builder.state_keys(robot) for robot in builder.robots}
+        marks = {number: factors.landmark_key(number) for number in builder.landmark_dims}
+        return LineResiduals(builder, self._values, information_root(rows, keys, marks))
 
     def covariance_factors(self, noise: Mapping[Source, ObservationNoise]) -> CovarianceFactors:
         """See `sandwich_covariance`; of the last solution.

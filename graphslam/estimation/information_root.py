@@ -3,7 +3,8 @@
 The root of a graph of n states is sparse, their joint covariance of n² blocks is not. So the root
 is kept, and the blocks that are asked for are computed from it: with R'R the information, the
 covariance of two linear combinations E'x and F'x is (R'⁻¹E)'(R'⁻¹F), and a column of R'⁻¹E has
-entries only in the cliques from that of its variable up to the last one. M. Kaess and F. Dellaert,
+entries only in the cliques from that of its variable up to the last one. To that comes what errors
+have in common that R takes for independent (`InformationRoot.shared`). M. Kaess and F. Dellaert,
 Covariance recovery from a square root information matrix, RAS 57, 2009, DOI
 10.1016/j.robot.2009.06.008.
 """
@@ -136,7 +137,39 @@ def covariance_of(
         solved[end : end + n, use] = y
         end += n
     P += solved[:end].T @ solved[:end]
+    if root.shared.size:
+        by_shared = np.zeros((k, root.shared.shape[1]))
+        np.add.at(by_shared, columns, derivatives[:, None] * root.shared[rows])
+        P += by_shared @ by_shared.T
     return P
+
+
+def solve_root(root: InformationRoot, right: Array) -> Array:
+    """(R'R)⁻¹ ``right``, (n, k) both: a forward substitution through all of R, and one back.
+
+    The time is that of k products with R. What errors share (`InformationRoot.shared`) has no part
+    in it.
+    """
+    starts = np.concatenate([[0], np.cumsum(root.own)])
+    widths = np.concatenate([[0], np.cumsum(root.width)])
+    values = np.concatenate([[0], np.cumsum(root.own * (root.own + root.width))])
+    x = np.array(right, dtype=float)
+
+    def clique(c: int) -> tuple[slice, IntArray, Array]:
+        n, m = int(root.own[c]), int(root.width[c])
+        block = root.values[values[c] : values[c + 1]].reshape(n, n + m)
+        return slice(starts[c], starts[c + 1]), root.separators[widths[c] : widths[c + 1]], block
+
+    for c in reversed(range(len(root.own))):  # the last clique depends on no other
+        own, separator, block = clique(c)
+        n = own.stop - own.start
+        x[own], _ = dtrtrs(block[:, :n], x[own], trans=1)
+        x[separator] -= block[:, n:].T @ x[own]
+    for c in range(len(root.own)):
+        own, separator, block = clique(c)
+        n = own.stop - own.start
+        x[own], _ = dtrtrs(block[:, :n], x[own] - block[:, n:] @ x[separator])
+    return x
 
 
 def pair_covariances(
@@ -198,6 +231,11 @@ def pair_covariances(
             cross[some] += by_query[ends[:, 0]] @ by_query[ends[:, 1]].mT
         if root.above[c] >= 0:
             below[int(root.above[c])].append((use, active, separator, rest))
+    if root.shared.size:
+        of_states = root.shared[rows[:, :, None] + np.arange(3)]  # (n, k, 3, errors)
+        by_shared = np.einsum("qkij,qkjs->qis", maps, of_states)
+        own_cov += by_shared @ by_shared.mT
+        cross += by_shared[pairs[:, 0]] @ by_shared[pairs[:, 1]].mT
     return own_cov, cross
 
 

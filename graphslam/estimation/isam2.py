@@ -121,25 +121,37 @@ class BatchGraph(GraphBuilder):
             return
         self.reserve_lines()
         keys, targets, seen = zip(*self._lines, strict=True)
-        unique = np.unique([keys, targets])
-        poses = np.array([factors.read(values, int(key), 3) for key in unique])
         made = factors.line_factors(
             keys,
             targets,
             np.array([a.z for a in seen]),
             np.array([a.cov for a in seen]),
-            poses[np.searchsorted(unique, keys)],
-            poses[np.searchsorted(unique, targets)],
+            *observed_ends(self._lines, values),
             self.kernel,
             sliding=self.sliding_lines,
         )
         for index, factor in zip(self._line_indices, made, strict=True):
             self.graph.replace(index, factor)
 
+    def lines_of(self, robot: str) -> list[tuple[int, int, Association]]:
+        """Keys of the state and of the landmark of a robot's observations of lines, and these."""
+        first, last = self.state_key(robot, 0), self.latest_key(robot)
+        return [one for one in self._lines if first <= one[0] <= last]
+
     def add_closures(self, closures: Iterable[Closure]) -> None:
         """Add closures between existing states."""
         for group in self.closure_groups(closures):
             self._add(group)
+
+
+def observed_ends(
+    observed: Sequence[tuple[int, int, Association]], values: gtsam.Values
+) -> tuple[Array, Array]:
+    """The states (n, 3) and landmarks (n, 3) of observations of walls, given with their keys."""
+    keys, targets, _ = zip(*observed, strict=True)
+    unique = np.unique([keys, targets])
+    poses = np.array([factors.read(values, int(key), 3) for key in unique])
+    return poses[np.searchsorted(unique, keys)], poses[np.searchsorted(unique, targets)]
 
 
 def isam2_parameters(config: Config, factorization: str) -> gtsam.ISAM2Params:

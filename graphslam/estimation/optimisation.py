@@ -15,7 +15,12 @@ from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array
 from graphslam.core.records import Closure, Motion
 from graphslam.estimation.path_retraction import PathRetraction
-from graphslam.estimation.selected_inverse import CovarianceBlocks, covariance_blocks
+from graphslam.estimation.selected_inverse import (
+    CliqueRows,
+    CovarianceBlocks,
+    covariance_blocks,
+    root_rows,
+)
 
 #: relative decrease of the error at which optimisation ends: without a kernel; with one
 #: (reweighting converges linearly: beyond 1e-6 hundreds of iterations move nothing that shows); and
@@ -241,6 +246,19 @@ def marginals_of(
     if not all(np.isfinite(cov).all() for cov in blocks.marginals.values()):
         raise error
     return blocks
+
+
+def root_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> tuple[CliqueRows, ...]:
+    """The root of the information: by Cholesky, or by QR where that fails.
+
+    Raises:
+        RuntimeError: the graph is indeterminate.
+    """
+    linear = graph.linearize(values)
+    try:
+        return root_rows(linear)
+    except RuntimeError:
+        return root_rows(linear, use_qr=True)
 
 
 def joint_marginal(tree: gtsam.ISAM2 | gtsam.GaussianBayesTree, keys: list[int]) -> Array:

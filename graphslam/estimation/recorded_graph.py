@@ -20,7 +20,8 @@ from graphslam.core.records import Association, Estimate, Motion, Step
 from graphslam.estimation import factors
 from graphslam.estimation.factor_graph import covariance_of
 from graphslam.estimation.input_checks import describe, describe_motion
-from graphslam.estimation.isam2 import BatchGraph
+from graphslam.estimation.isam2 import BatchGraph, observed_ends
+from graphslam.estimation.weighed_walls import WeighedWalls, weighed_walls
 
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
 #: who made an observation of bearing and range, and its row of `MODELS`
@@ -64,7 +65,8 @@ class RecordedGraph(BatchGraph):
 
     ``motions``: index in the graph, robot, and the keys of the states before and after.
     ``bearings_and_ranges``: by source, keys of the state and of the target of each, and its
-    association; ``shared_errors`` by source, where its ``noise`` has such a part.
+    association, and likewise ``segments``; ``shared_errors`` by source, where its ``noise`` has
+    such a part.
     """
 
     def __init__(
@@ -77,6 +79,7 @@ class RecordedGraph(BatchGraph):
         super().__init__(kernel, defer_lines=True)
         self.noise = noise or {}
         self.motions: list[tuple[int, str, int, int]] = []
+        self.segments: list[tuple[int, int, Association]] = []
         self.bearings_and_ranges: dict[Source, list[tuple[int, int, Association]]] = {}
         self.shared_errors: dict[Source, SharedErrors] = {}
         self._stand_ins = 0
@@ -104,6 +107,8 @@ class RecordedGraph(BatchGraph):
                     self._insert_line(seen, start, values)
                 else:
                     others.append(seen)
+                    if seen.model == "segment":
+                        self._note_segment(seen)
             if others or step.closures:
                 rest = Step(step.time_ns, {}, {}, tuple(others), step.closures)
                 self.insert(rest, start, values)
@@ -137,6 +142,10 @@ class RecordedGraph(BatchGraph):
             self.graph.replace(index, factor)
         self.rows += delta.size
 
+    def _note_segment(self, seen: Association) -> None:
+        key = self.state_key(seen.robot, self.states.number(seen.robot, seen.time_ns))
+        self.segments.append((key, factors.landmark_key(int(seen.target)), seen))
+
     def _insert_line(self, seen: Association, start: Estimate, values: gtsam.Values) -> None:
         """Note an observation of a line; a new one gets its variable and its gauge."""
         if seen.target not in self.landmark_dims:
@@ -145,6 +154,37 @@ class RecordedGraph(BatchGraph):
         key = self.state_key(seen.robot, self.states.number(seen.robot, seen.time_ns))
         self.rows += MODELS["line"].rows
         self._lines.append((key, factors.landmark_key(int(seen.target)), seen))
+
+    def weigh_walls(
+        self, values: gtsam.Values, variances: Mapping[str, Array]
+    ) -> list[WeighedWalls]:
+        """What walls are observed with, see `weighed_walls`; lines by the noise that a log shows.
+
+        The factors of lines are made again so, Gaussian; those of segments stay.
+        """
+        found = []
+        if self._lines:
+            self.reserve_lines()
+            lines = self._weighed("line", self._lines, values, variances)
+            keys, targets, _ = zip(*self._lines, strict=True)
+            given = lines.z, lines.cov, lines.x, lines.t
+            made = factors.line_factors(keys, targets, *given, factors.NO_KERNEL)
+            for index, factor in zip(self._line_indices, made, strict=True):
+                self.graph.replace(index, factor)
+            found.append(lines)
+        if self.segments:
+            found.append(self._weighed("segment", self.segments, values, {}))
+        return found
+
+    def _weighed(
+        self,
+        model: str,
+        observed: Sequence[tuple[int, int, Association]],
+        values: gtsam.Values,
+        variances: Mapping[str, Array],
+    ) -> WeighedWalls:
+        ends = observed_ends(observed, values)
+        return weighed_walls(model, self.robots, observed, ends, variances, self.kernel)
 
     def _insert_polar(
         self,

@@ -72,10 +72,7 @@ def covariance_blocks(
         for pair in sorted(wanted):
             if frozenset(pair) not in linked:
                 graph.add(_empty_factor(*pair[:2]))
-    ordering = gtsam.Ordering.ColamdGaussianFactorGraph(graph)
-    by_qr = (gtsam.EliminateQR,) if use_qr else ()
-    net = graph.eliminateSequential(ordering, *by_qr)
-    cliques, clique_of = _cliques(net)
+    cliques, clique_of = _eliminated(graph, use_qr)
     pairs_in: dict[int, list[tuple[int, ...]]] = defaultdict(list)
     for pair in wanted:
         # of the variables in one factor the first eliminated has the others in its row
@@ -85,10 +82,10 @@ def covariance_blocks(
     rows: list[CliqueRows] = []
     for number, clique in enumerate(cliques):
         above = None if clique.above is None else cliques[clique.above]
-        cov, block = clique.invert(above)
+        block = clique.square_root(above)
+        cov = clique.invert(above, block)
         if keep_rows:
-            own = {key: clique.rows[key].stop - clique.rows[key].start for key in clique.own}
-            rows.append(CliqueRows(own, clique.separator, clique.above, block))
+            rows.append(clique.with_block(block))
         for key in clique.own:
             marginals[key] = cov[clique.rows[key], clique.rows[key]]
         for pair in pairs_in[number]:
@@ -96,6 +93,28 @@ def covariance_blocks(
         if above is not None:
             above.release()
     return CovarianceBlocks(marginals, joint, tuple(rows) if keep_rows else None)
+
+
+def root_rows(graph: gtsam.GaussianFactorGraph, *, use_qr: bool = False) -> tuple[CliqueRows, ...]:
+    """The root of the information of a linear graph, from the last eliminated clique on.
+
+    Raises:
+        RuntimeError: the graph is indeterminate (by QR: the root is not finite instead).
+    """
+    cliques, _ = _eliminated(graph, use_qr)
+    rows = []
+    for clique in cliques:
+        block = clique.square_root(None if clique.above is None else cliques[clique.above])
+        rows.append(clique.with_block(block))
+    return tuple(rows)
+
+
+def _eliminated(
+    graph: gtsam.GaussianFactorGraph, use_qr: bool
+) -> tuple[list["_Clique"], dict[int, int]]:
+    ordering = gtsam.Ordering.ColamdGaussianFactorGraph(graph)
+    by_qr = (gtsam.EliminateQR,) if use_qr else ()
+    return _cliques(graph.eliminateSequential(ordering, *by_qr))
 
 
 def _joint(cov: Array, rows: Sequence[slice]) -> Array:
@@ -137,26 +156,36 @@ class _Clique:
         rows = self.rows
         return [row for key in keys for row in range(rows[key].start, rows[key].stop)]
 
-    def invert(self, above: "_Clique | None") -> tuple[Array, Array]:
-        """Covariance of the own variables and then the separator; kept while it is needed.
-
-        Also the rows (n, n + m) of the root that it is made of.
-        """
+    def square_root(self, above: "_Clique | None") -> Array:
+        """Rows (n, n + m) of the root of the own variables, and then of the separator."""
         roots = [conditional.R() for conditional in self.conditionals]
         end = 0
         for key, root in zip(self.own, roots, strict=True):
             self.rows[key] = slice(end, end := end + len(root))
         own = end
+        if above is not None:
+            for key in self.separator:
+                rows = above.rows[key]
+                self.rows[key] = slice(end, end := end + rows.stop - rows.start)
+        return self._square_root(roots, own, end)
+
+    def with_block(self, block: Array) -> CliqueRows:
+        """What others see of it, with its rows of the root."""
+        own = {key: self.rows[key].stop - self.rows[key].start for key in self.own}
+        return CliqueRows(own, self.separator, self.above, block)
+
+    def invert(self, above: "_Clique | None", block: Array) -> Array:
+        """Covariance of the own variables and then the separator; kept while it is needed.
+
+        ``block``: its `square_root`.
+        """
+        own, end = block.shape
         if above is None:
             joint = np.zeros((0, 0))
         else:
             assert above._cov is not None
             which = np.array(above.indices(self.separator))
             joint = above._cov.take(which, axis=0).take(which, axis=1)
-            for key in self.separator:
-                rows = above.rows[key]
-                self.rows[key] = slice(end, end := end + rows.stop - rows.start)
-        block = self._square_root(roots, own, end)
         inverse, singular = dtrtri(block[:, :own])
         if singular:
             inverse = np.full((own, own), np.nan)
@@ -169,7 +198,7 @@ class _Clique:
         cov[own:, own:] = joint
         if self.below:
             self._cov = cov
-        return cov, block
+        return cov
 
     def _square_root(self, roots: Sequence[Array], own: int, end: int) -> Array:
         """Rows of the own variables: upper triangular (n, n), and (n, m) of the separator.

@@ -45,6 +45,8 @@ def joint_bytes(joint: JointScans) -> bytes:
         "separators": root.separators.astype(np.int32),
         "values": root.values,
     }
+    if root.shared.size:
+        arrays["shared"] = root.shared.astype(np.float32)
     for n, name in enumerate(sorted(joint.ties)):
         states, ties = joint.states[name], joint.ties[name]
         arrays |= {
@@ -144,5 +146,9 @@ def _joint(arrays: Mapping[str, Array]) -> JointScans:
                 dict(zip(numbers, arrays["landmark_mount"], strict=True)),
                 dict(zip(names, placing, strict=True)) if len(placing) else {},
             )
-    root = InformationRoot(above, own, width, separators, arrays["values"], rows, marks, mount_rows)
+    # earlier versions took what walls' observations share for independent
+    shared = arrays.get("shared", np.zeros((0, 0))).astype(float)
+    root = InformationRoot(
+        above, own, width, separators, arrays["values"], rows, marks, mount_rows, shared
+    )
     return JointScans(root, states, ties, known)

@@ -13,6 +13,7 @@ import numpy as np
 
 from graphslam.core.allocation import give_back_freed_memory
 from graphslam.core.config import Config
+from graphslam.core.geometry import Array
 from graphslam.core.motion_models import Calibration
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Step
@@ -22,10 +23,12 @@ from graphslam.estimation.calibration_graph import (
     CONVERGED_ERROR,
     CalibratedSolution,
     CalibrationGraph,
+    WallErrors,
     at_calibration,
 )
 from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH
 from graphslam.estimation.settled import moved_to, settled
+from graphslam.estimation.surface_bias import mount_errors
 from graphslam.mapping.composite_walls import split_composites
 from graphslam.mapping.duplicate_landmarks import (
     find_duplicates,
@@ -40,6 +43,8 @@ from graphslam.mapping.reassociation import reassociate
 from graphslam.mapping.redundant_closures import untied_closures
 from graphslam.mapping.visits import tie_visits
 from graphslam.odometry.preintegration import Track
+from graphslam.slam.line_noise import fit_line_noise
+from graphslam.slam.log_noise import LogNoise
 from graphslam.slam.log_pass import timed
 from graphslam.slam.motion_noise import (
     fit_motion_noise,
@@ -51,7 +56,6 @@ from graphslam.slam.reoptimise_scans import with_closures
 from graphslam.slam.scan_evidence import find_parked, gather_scan_evidence
 from graphslam.slam.scan_refinement import refine_motions
 from graphslam.slam.scan_tracking import TrackedLog
-from graphslam.slam.surface_bias import mount_bias
 
 #: factors on the gates of re-association (across, direction): with the closed paths, and solved
 CLOSED_FACTORS, SOLVED_FACTORS = (1.0, 1.0), (1 / 2, 2 / 3)
@@ -98,7 +102,8 @@ def optimise_scan_log(
 class _Problem:
     """All states, landmarks and, if it is wanted, the calibration of the tracks, in one graph.
 
-    Motions are by the latest calibration, and as noisy as ``start`` shows them.
+    Motions are by the latest calibration, and as noisy as ``start`` shows them. ``line_noise``:
+    see `fit_line_noise`, once it is solved.
     """
 
     def __init__(
@@ -112,6 +117,8 @@ class _Problem:
         if not config.odometry.calibrate:
             priors = {name: prior.held() for name, prior in priors.items()}
         self._tracks, self._kernel = tracks, config.robust
+        self._bias_m = config.front_end.floor_normal_m
+        self.line_noise: dict[str, Array] = {}
         self._initial = {name: track.calibration for name, track in tracks.items()}
         for track in tracks.values():
             track.calibration = track.calibration.held()
@@ -130,14 +137,16 @@ class _Problem:
     ) -> tuple[tuple[Step, ...], CalibratedSolution, Future[Estimate] | None]:
         """The steps as they are solved, the solution, and if wanted the exact minimum of the steps.
 
-        The minimum, without covariances, is sought in the second process while they are computed
-        here.
+        Covariances are by the noise of lines that their residuals show, and the biases of surfaces.
+        The minimum, without covariances, is sought in the second process meanwhile.
         """
         self._graph.optimise(CONVERGED_ERROR)
         near, calibrations = self._graph.solution()
         steps = at_calibration(self._steps, self._initial, calibrations)
         minimum = Future(lambda: settled(steps, near, self._kernel)) if settle else None
-        found = self._graph.solution(marginals=True, joint=True, mounts=True)
+        self.line_noise = fit_line_noise(self._graph.line_residuals())
+        walls = WallErrors(self.line_noise, self._bias_m)
+        found = self._graph.solution(marginals=True, joint=True, mounts=True, walls=walls)
         return steps, self._found(*found), minimum
 
     def _found(
@@ -181,11 +190,9 @@ def _solved(
     )
     counts["observations_by_loose_returns"] = _count_observations(more) - _count_observations(steps)
     steps = more
-    if asked is not None:
-        noise = asked.result()
-        for name, own in noise.odometry.items():
-            tracks[name].config = own
-        scan_log.noise = noise.to_summary()
+    noise = LogNoise() if asked is None else asked.result()
+    for name, own in noise.odometry.items():
+        tracks[name].config = own
     steps, near = refine_motions(
         steps,
         found,
@@ -195,7 +202,9 @@ def _solved(
     )
     problem = _Problem(with_closures(steps, closures), near, tracks, config)
     steps, done, minimum = problem.solve(settle=config.backend.optimise_at_end)
-    estimate = _with_surface_bias(steps, done.estimate, tracks, config)
+    scan_log.noise = replace(noise, lines=problem.line_noise).to_summary()
+    estimate = done.estimate
+    _add_surface_bias(estimate, tracks)
     for name in tracks:
         scan_log.runs[name].is_calibrated = config.odometry.calibrate
     # what the second process does meanwhile moves the estimate by far less than scans can tell
@@ -211,19 +220,16 @@ def _count_observations(steps: tuple[Step, ...]) -> int:
     return sum(len(step.associations) for step in steps)
 
 
-def _with_surface_bias(
-    steps: tuple[Step, ...], estimate: Estimate, tracks: Mapping[str, Track], config: Config
-) -> Estimate:
-    """An estimate whose mounts, and those of the tracks, have the bias of surfaces."""
+def _add_surface_bias(estimate: Estimate, tracks: Mapping[str, Track]) -> None:
+    """Tracks get the part of their mounts' covariances that biases of surfaces have."""
     mounts = estimate.mounts
-    if mounts is None:
-        return estimate
-    bias = mount_bias(steps, estimate, config.front_end.floor_normal_m)
+    if mounts is None or estimate.root is None:
+        return
+    errors = mount_errors(estimate.root, mounts)
     for name, track in tracks.items():
         if name in mounts.robots:
-            own = mounts.columns(name)
-            track.add_mount_cov(bias[own, own])  # of further lasers too: they see the same walls
-    return replace(estimate, mounts=replace(mounts, cov=mounts.cov + bias))
+            own = errors[mounts.columns(name)]
+            track.add_mount_cov(own @ own.T)  # of further lasers too: they see the same walls
 
 
 def _tied(

@@ -26,11 +26,14 @@ class LogNoise:
     ``sightings``: that of bearings and ranges by source; ``odometry``: robot -> its settings,
     without floors; ``measured``: source -> factors (2,) on the stated variances, shared errors
     included, that the log shows, and likewise (3,) of motions whose covariances are stated.
+    ``lines``: robot -> factors (2,) on the stated variances of normal offsets and directions of
+    its lines, by which covariances are computed.
     """
 
     sightings: Mapping[Source, ObservationNoise] = field(default_factory=dict)
     odometry: Mapping[str, OdometryConfig] = field(default_factory=dict)
     measured: Mapping[Source, Array] = field(default_factory=dict)
+    lines: Mapping[str, Array] = field(default_factory=dict)
 
     def motion_scales(self) -> dict[str, Array]:
         """Robot -> factor (3,) on the sigmas of its motions: the stated noise is never reduced."""
@@ -61,6 +64,9 @@ class LogNoise:
             if noise is not None:
                 entry |= {"white": noise.white.tolist(), "shared": noise.shared.tolist()}
             out[f"{robot} {model}"] = entry
+        for robot, factors in self.lines.items():
+            names = ("normal offsets", "directions")
+            out[f"{robot} lines"] = {"measured": dict(zip(names, factors.tolist(), strict=True))}
         for robot, config in self.odometry.items():
             out[f"{robot} odometry"] = {name: getattr(config, name) for name in RATES}
         return out

@@ -1,12 +1,18 @@
 """Covariances of linear combinations from the root of the information."""
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from graphslam.core.information_root import InformationRoot
-from graphslam.estimation.information_root import covariance_of, joint_covariance
+from graphslam.estimation.information_root import (
+    covariance_of,
+    joint_covariance,
+    pair_covariances,
+    solve_root,
+)
 
 
 def tree(rng, cliques, reach=3):
@@ -67,6 +73,36 @@ def test_covariances_are_those_of_the_inverse_information(seed):
     np.testing.assert_allclose(
         joint_covariance(root, some), P[np.ix_(some, some)], atol=1e-12 * np.abs(P).max()
     )
+
+
+def test_right_sides_are_solved_with_the_whole_information():
+    rng = np.random.default_rng(8)
+    root = tree(rng, 40)
+    R, right = dense(root), rng.normal(size=(int(root.own.sum()), 7))
+    np.testing.assert_allclose(R.T @ R @ solve_root(root, right), right, atol=1e-9)
+
+
+def test_shared_errors_are_in_all_covariances():
+    """Breaks if one kind of query leaves them out, or takes rows of other variables."""
+    rng = np.random.default_rng(9)
+    root = tree(rng, 60)
+    size = int(root.own.sum())
+    root = replace(root, shared=rng.normal(size=(size, 4)))
+    R = dense(root)
+    P = np.linalg.inv(R.T @ R) + root.shared @ root.shared.T
+    some = rng.permutation(size)[:10]
+    tolerance = {"atol": 1e-12 * np.abs(P).max()}
+    np.testing.assert_allclose(joint_covariance(root, some), P[np.ix_(some, some)], **tolerance)
+    starts = np.concatenate([[0], np.cumsum(root.own)[:-1]])[root.own == 3]
+    n = 5
+    rows, maps, pairs = starts[:n, None], rng.normal(size=(n, 1, 3, 3)), np.array([[0, 4], [2, 1]])
+    E = np.zeros((n, size, 3))
+    for q in range(n):
+        E[q, rows[q, 0] : rows[q, 0] + 3] = maps[q, 0].T
+    own, cross = pair_covariances(root, rows, maps, pairs)
+    np.testing.assert_allclose(own, E.mT @ P @ E, atol=1e-10 * np.abs(P).max())
+    expected = [E[a].T @ P @ E[b] for a, b in pairs]
+    np.testing.assert_allclose(cross, expected, atol=1e-10 * np.abs(P).max())
 
 
 def test_memory_is_that_of_the_combinations_not_of_the_graph():
