@@ -21,6 +21,7 @@ import gtsam
 
 from graphslam.core.config import Config
 from graphslam.core.config_io import load_config
+from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.records import Result
 from graphslam.logs import open_logs, pose_stamp_ns
 from graphslam.simulation import load_scenario, simulate
@@ -41,6 +42,17 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     return argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+
+
+def pooled_bounds(effective_poses: Sequence[float]) -> tuple[float, float]:
+    """The 99 % bounds of the mean NEES per degree of freedom of independent runs.
+
+    ``effective_poses``: of each run, see `nees_statistics`; they are much the same, so that the
+    mean is about a chi-square of all their degrees of freedom.
+    """
+    dof = 3.0 * sum(effective_poses)
+    low, high = (chi2_quantile((0.005, 0.995), dof) / dof).tolist()
+    return low, high
 
 
 @dataclass(frozen=True)

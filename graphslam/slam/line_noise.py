@@ -21,7 +21,7 @@ MOST_SPANS = 300
 #: wall, odometry) would otherwise be taken for noise of these observations
 LEAST_LEFT = 0.3
 #: the noise as stated counts like so many sums that have shown it
-AS_STATED = 10
+AS_STATED = 3
 
 
 def fit_line_noise(residuals: LineResiduals) -> dict[str, Array]:
