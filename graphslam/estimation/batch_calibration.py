@@ -45,6 +45,7 @@ def calibrate(
     rough: bool = False,
     solved_once: Callable[[CalibratedSolution, Sequence[Step]], None] | None = None,
     shared: Mapping[Source, ObservationNoise] | None = None,
+    bias_m: float | None = None,
 ) -> tuple[Estimate, tuple[Step, ...]]:
     """Solve for states, landmarks and calibrations together, ``rounds`` times.
 
@@ -53,6 +54,7 @@ def calibrate(
     information, and the steps behind it. All rounds but the last converge roughly, with ``rough``
     that one too. ``solved_once`` is called with every solution and its steps. ``shared``: noise of
     sightings that share errors; covariances are then those of `sandwich_covariance`, if not rough.
+    ``bias_m``: of surfaces, see `CalibrationGraph.solution`.
 
     Raises:
         EstimationError: the estimate is indeterminate.
@@ -74,6 +76,7 @@ def calibrate(
             rough=rough or not last,
             joint=joint and last,
             mounts=len(tracks) == 1,  # of several robots starts have the errors of the mounts
+            bias_m=bias_m if last else None,
         )
         estimate = solved.estimate
         for name, track in tracks.items():

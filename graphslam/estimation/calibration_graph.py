@@ -24,6 +24,7 @@ from graphslam.estimation.backend import JointMarginal
 from graphslam.estimation.covariance_columns import covariance_columns
 from graphslam.estimation.information_root import information_root
 from graphslam.estimation.isam2 import NO_COVARIANCES, with_means
+from graphslam.estimation.line_noise import fit_line_noise
 from graphslam.estimation.line_residuals import LineResiduals
 from graphslam.estimation.optimisation import (
     CONVERGED_ERROR_ROUGH,
@@ -54,6 +55,7 @@ def solve_calibrated(
     rough: bool = False,
     joint: bool = False,
     mounts: bool = False,
+    bias_m: float | None = None,
 ) -> "CalibratedSolution":
     """Optimise all states, landmarks and calibrations together.
 
@@ -70,6 +72,7 @@ def solve_calibrated(
         rough: stop early, see `Reoptimiser.solve`; covariances are NaN.
         joint: whether the estimate is to have the root of the information.
         mounts: whether it is then to have covariances with the mounts.
+        bias_m: see `CalibrationGraph.solution`.
 
     Raises:
         EstimationError: a covariance is not positive definite, or a state is unknown.
@@ -77,7 +80,8 @@ def solve_calibrated(
     problem = CalibrationGraph(steps, start, priors, now, kernel)
     problem.calibrate_motions(steps, now)
     converged = CONVERGED_ERROR_ROUGH if rough else CONVERGED_ERROR
-    found = problem.solve(converged, marginals=not rough, joint=joint, mounts=mounts)
+    problem.optimise(converged)
+    found = problem.solution(marginals=not rough, joint=joint, mounts=mounts, bias_m=bias_m)
     return CalibratedSolution(*found, problem)
 
 
@@ -99,22 +103,11 @@ def at_calibration(
     return tuple(made)
 
 
-@dataclass(frozen=True, slots=True)
-class WallErrors:
-    """What observations of walls are off by.
-
-    ``variances``: robot -> factors (2,) on those of lines' normal offsets and directions that the
-    log shows; ``bias_m``: sigma of the bias of a surface.
-    """
-
-    variances: Mapping[str, Array]
-    bias_m: float
-
-
 class CalibrationGraph:
     """The graph of steps with calibrations as variables, whose motions can be exchanged.
 
-    The motions are first those of the steps, with nothing about calibrations.
+    The motions are first those of the steps, with nothing about calibrations. ``line_noise``: robot
+    -> factors (2,), see `fit_line_noise`, once covariances are by them.
     """
 
     def __init__(
@@ -134,6 +127,7 @@ class CalibrationGraph:
         self._builder = builder = RecordedGraph(kernel, noise)
         self._values, self._priors = gtsam.Values(), priors
         self._marginals: gtsam.Marginals | None = None  # at the last solution
+        self.line_noise: Mapping[str, Array] = {}
         self._steps, self._now = steps, now  # the motions in the graph, and their calibration
         self._linear_at: gtsam.Values | None = None  # the solution around which they are linear
         self._keys = {r: int(gtsam.symbol("c", k)) for k, r in enumerate(sorted(priors))}
@@ -216,7 +210,7 @@ class CalibrationGraph:
         marginals: bool = False,
         joint: bool = False,
         mounts: bool = False,
-        walls: WallErrors | None = None,
+        bias_m: float | None = None,
     ) -> tuple[Estimate, dict[str, Calibration]]:
         """The estimate and the calibrations where it was optimised last.
 
@@ -224,8 +218,9 @@ class CalibrationGraph:
             marginals: whether covariances are wanted; else they are NaN.
             joint: whether the root of the information is wanted beside them.
             mounts: whether covariances with the mounts are then wanted too.
-            walls: errors of walls that covariances are then to be by; as stated otherwise. The
-                graph keeps them.
+            bias_m: sigma of the biases of surfaces. Covariances are then by these, and by the noise
+                of lines that their residuals show, which the graph keeps (`line_noise`); else by
+                what is stated.
 
         Raises:
             EstimationError: the estimate is indeterminate.
@@ -236,8 +231,9 @@ class CalibrationGraph:
             self._relinearise()
         half_error = float(builder.graph.error(values))
         if marginals:
-            if walls is not None:
-                weighed = builder.weigh_walls(values, walls.variances)
+            if bias_m is not None and builder.observes_walls:
+                self.line_noise = fit_line_noise(self.line_residuals())
+                weighed = builder.weigh_walls(values, self.line_noise)
             try:
                 found = marginals_of(builder.graph, values, keep_rows=joint)
             except RuntimeError as error:
@@ -248,8 +244,8 @@ class CalibrationGraph:
         estimate = builder.estimate(means, half_error, found.rows, mounted)
         if found.rows is not None and mounted:
             estimate = replace(estimate, mounts=self._mounts(found.rows, values, mounted))
-        if found.rows is not None and walls is not None and weighed:
-            estimate = with_surface_bias(estimate, weighed, walls.bias_m)
+        if found.rows is not None and bias_m is not None and weighed:
+            estimate = with_surface_bias(estimate, weighed, bias_m)
         return estimate, self._calibrations(covs)
 
     def _calibrations(self, covs: Mapping[int, Array]) -> dict[str, Calibration]:

@@ -155,6 +155,11 @@ class RecordedGraph(BatchGraph):
         self.rows += MODELS["line"].rows
         self._lines.append((key, factors.landmark_key(int(seen.target)), seen))
 
+    @property
+    def observes_walls(self) -> bool:
+        """Whether there are lines or segments."""
+        return bool(self._lines or self.segments)
+
     def weigh_walls(
         self, values: gtsam.Values, variances: Mapping[str, Array]
     ) -> list[WeighedWalls]:

@@ -13,7 +13,6 @@ import numpy as np
 
 from graphslam.core.allocation import give_back_freed_memory
 from graphslam.core.config import Config
-from graphslam.core.geometry import Array
 from graphslam.core.motion_models import Calibration
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Step
@@ -23,12 +22,10 @@ from graphslam.estimation.calibration_graph import (
     CONVERGED_ERROR,
     CalibratedSolution,
     CalibrationGraph,
-    WallErrors,
     at_calibration,
 )
 from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH
 from graphslam.estimation.settled import moved_to, settled
-from graphslam.estimation.surface_bias import mount_errors
 from graphslam.mapping.composite_walls import split_composites
 from graphslam.mapping.duplicate_landmarks import (
     find_duplicates,
@@ -43,7 +40,6 @@ from graphslam.mapping.reassociation import reassociate
 from graphslam.mapping.redundant_closures import untied_closures
 from graphslam.mapping.visits import tie_visits
 from graphslam.odometry.preintegration import Track
-from graphslam.slam.line_noise import fit_line_noise
 from graphslam.slam.log_noise import LogNoise
 from graphslam.slam.log_pass import timed
 from graphslam.slam.motion_noise import (
@@ -52,7 +48,7 @@ from graphslam.slam.motion_noise import (
     scale_motion_noise,
 )
 from graphslam.slam.path_closing import ClosedPaths, close_paths
-from graphslam.slam.reoptimise_scans import with_closures
+from graphslam.slam.reoptimise_scans import add_mount_bias, with_closures
 from graphslam.slam.scan_evidence import find_parked, gather_scan_evidence
 from graphslam.slam.scan_refinement import refine_motions
 from graphslam.slam.scan_tracking import TrackedLog
@@ -102,8 +98,7 @@ def optimise_scan_log(
 class _Problem:
     """All states, landmarks and, if it is wanted, the calibration of the tracks, in one graph.
 
-    Motions are by the latest calibration, and as noisy as ``start`` shows them. ``line_noise``:
-    see `fit_line_noise`, once it is solved.
+    Motions are by the latest calibration, and as noisy as ``start`` shows them.
     """
 
     def __init__(
@@ -118,7 +113,6 @@ class _Problem:
             priors = {name: prior.held() for name, prior in priors.items()}
         self._tracks, self._kernel = tracks, config.robust
         self._bias_m = config.front_end.floor_normal_m
-        self.line_noise: dict[str, Array] = {}
         self._initial = {name: track.calibration for name, track in tracks.items()}
         for track in tracks.values():
             track.calibration = track.calibration.held()
@@ -144,9 +138,8 @@ class _Problem:
         near, calibrations = self._graph.solution()
         steps = at_calibration(self._steps, self._initial, calibrations)
         minimum = Future(lambda: settled(steps, near, self._kernel)) if settle else None
-        self.line_noise = fit_line_noise(self._graph.line_residuals())
-        walls = WallErrors(self.line_noise, self._bias_m)
-        found = self._graph.solution(marginals=True, joint=True, mounts=True, walls=walls)
+        wanted = {"marginals": True, "joint": True, "mounts": True}
+        found = self._graph.solution(**wanted, bias_m=self._bias_m)
         return steps, self._found(*found), minimum
 
     def _found(
@@ -202,9 +195,9 @@ def _solved(
     )
     problem = _Problem(with_closures(steps, closures), near, tracks, config)
     steps, done, minimum = problem.solve(settle=config.backend.optimise_at_end)
-    scan_log.noise = replace(noise, lines=problem.line_noise).to_summary()
+    scan_log.noise = replace(noise, lines=done.graph.line_noise).to_summary()
     estimate = done.estimate
-    _add_surface_bias(estimate, tracks)
+    add_mount_bias(estimate, tracks)
     for name in tracks:
         scan_log.runs[name].is_calibrated = config.odometry.calibrate
     # what the second process does meanwhile moves the estimate by far less than scans can tell
@@ -218,18 +211,6 @@ def _solved(
 
 def _count_observations(steps: tuple[Step, ...]) -> int:
     return sum(len(step.associations) for step in steps)
-
-
-def _add_surface_bias(estimate: Estimate, tracks: Mapping[str, Track]) -> None:
-    """Tracks get the part of their mounts' covariances that biases of surfaces have."""
-    mounts = estimate.mounts
-    if mounts is None or estimate.root is None:
-        return
-    errors = mount_errors(estimate.root, mounts)
-    for name, track in tracks.items():
-        if name in mounts.robots:
-            own = errors[mounts.columns(name)]
-            track.add_mount_cov(own @ own.T)  # of further lasers too: they see the same walls
 
 
 def _tied(

@@ -66,7 +66,8 @@ class LogNoise:
             out[f"{robot} {model}"] = entry
         for robot, factors in self.lines.items():
             names = ("normal offsets", "directions")
-            out[f"{robot} lines"] = {"measured": dict(zip(names, factors.tolist(), strict=True))}
+            # stated by the front end, not by the log: no warning is due
+            out[f"{robot} lines"] = {"variances": dict(zip(names, factors.tolist(), strict=True))}
         for robot, config in self.odometry.items():
             out[f"{robot} odometry"] = {name: getattr(config, name) for name in RATES}
         return out

@@ -19,6 +19,7 @@ from graphslam.core.records import Closure, Estimate, KeyframeScan, Start, Step
 from graphslam.estimation.batch_calibration import ROUNDS, calibrate, recompute_motions
 from graphslam.estimation.calibration_graph import CalibratedSolution
 from graphslam.estimation.isam2 import Reoptimiser
+from graphslam.estimation.surface_bias import mount_errors
 from graphslam.mapping.composite_walls import split_composites
 from graphslam.mapping.duplicate_landmarks import (
     find_duplicates,
@@ -139,9 +140,10 @@ def reoptimise_scan_log(
             made = recompute_motions(closed, tracks)
             return scale_motion_noise(made, noise_scales(made, estimate))
 
-        def find_noise(solution: CalibratedSolution, _made: Sequence[Step]) -> None:
-            nonlocal noise
-            noise = fit_motion_noise(tracks, solution.graph.posterior())
+        solved: list[CalibratedSolution] = []  # the last one
+
+        def keep(solution: CalibratedSolution, _made: Sequence[Step]) -> None:
+            solved[:] = [solution]
 
         estimate, _ = calibrate(
             rebuild,
@@ -150,8 +152,9 @@ def reoptimise_scan_log(
             config.robust,
             1,
             rough=len(tracks) == 1,
-            solved_once=find_noise,
+            solved_once=keep,
         )
+        noise = fit_motion_noise(tracks, solved[0].graph.posterior())
         if len(tracks) > 1:
             # the world lies where the mount of the first robot puts it: a mount that this drive
             # does not tell would move the others away from where they started
@@ -159,12 +162,35 @@ def reoptimise_scan_log(
                 track.hold_mount_unless(MOUNT_SIGMAS)
             closed = with_sensor_starts(closed, tracks, frames)
         rounds = ROUNDS - (len(tracks) == 1)
-        estimate, steps = calibrate(rebuild, estimate, tracks, config.robust, rounds, joint=True)
+        estimate, steps = calibrate(
+            rebuild,
+            estimate,
+            tracks,
+            config.robust,
+            rounds,
+            joint=True,
+            solved_once=keep,
+            bias_m=config.front_end.floor_normal_m,
+        )
+        noise = replace(noise, lines=solved[0].graph.line_noise)
+        add_mount_bias(estimate, tracks)
     else:
         estimate = solve(steps, estimate, closures, rough=False, joint=True)
         steps = with_closures(steps, closures)
     landmarks.update_from(steps, estimate)
     return estimate, steps, counts, noise
+
+
+def add_mount_bias(estimate: Estimate, tracks: Mapping[str, Track]) -> None:
+    """Tracks get the part of their mounts' covariances that biases of surfaces have."""
+    mounts = estimate.mounts
+    if mounts is None or estimate.root is None:
+        return
+    errors = mount_errors(estimate.root, mounts)
+    for name, track in tracks.items():
+        if name in mounts.robots:
+            own = errors[mounts.columns(name)]
+            track.add_mount_cov(own @ own.T)  # of further lasers too: they see the same walls
 
 
 def with_sensor_starts(

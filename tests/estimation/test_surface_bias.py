@@ -64,7 +64,7 @@ def solved(log, monkeypatch, change):
 
         patch.setattr(batch_optimisation, "with_closures", last_changed)
         # covariances by the weights that the estimate is made with
-        patch.setattr(batch_optimisation, "fit_line_noise", lambda _: {})
+        patch.setattr(calibration_graph, "fit_line_noise", lambda _: {})
         patch.setattr(calibration_graph, "with_surface_bias", seen)
         patch.setattr(batch_optimisation, "CONVERGED_ERROR", 1e-12)
         result = graphslam.smooth(log, robust={"kernel": "none"})

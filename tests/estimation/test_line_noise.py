@@ -8,7 +8,7 @@ from graphslam.core.geometry import between, compose, path_length, rotate_cov
 from graphslam.core.motion_models import Calibration
 from graphslam.core.records import Association, Estimate, Motion, Start, Step, Trajectory
 from graphslam.estimation.calibration_graph import CalibrationGraph
-from graphslam.slam.line_noise import AS_STATED, SHARED_M, fit_line_noise
+from graphslam.estimation.line_noise import AS_STATED, SHARED_M, fit_line_noise
 
 S, N = 1_000_000_000, 400
 #: walls of a room of 10 m: poses along them, the room on their right
