@@ -6,6 +6,10 @@ from graphslam.core.geometry import Array, transform, unit_vectors
 from graphslam.core.records import Estimate, Landmark
 from graphslam.mapping.landmark_map import Entry, LandmarkMap
 
+#: by how much the biases at both ends of a wall differ, in sigmas of a bias; and how far these ends
+#: are apart at least, m
+ALONG, SHORTEST_M = 0.5, 0.3
+
 
 def line_parameters(pose: Array, cov: Array) -> tuple[float, float, Array]:
     """Normal direction (rad), offset (m) and their covariance (2, 2) of the line through a pose.
@@ -31,9 +35,10 @@ def make_landmark(entry: Entry, mean: Array, cov: Array, bias_m: float = 0.0) ->
         extent = np.array([mean, mean])
     else:
         n = np.append(unit_vectors(float(mean[2] + np.pi / 2)), 0.0)
-        cov = cov + bias_m**2 * np.outer(n, n)
-        position, line = mean, line_parameters(mean, cov)
         low, high = entry.extent_at(mean)
+        cov = cov + bias_m**2 * np.outer(n, n)
+        cov[2, 2] += (ALONG * bias_m / max(high - low, SHORTEST_M)) ** 2
+        position, line = mean, line_parameters(mean, cov)
         extent = transform(mean, np.array([[low, 0.0], [high, 0.0]]))
     history = entry.sightings, entry.first_ns, entry.last_ns, entry.identity
     return Landmark(entry.id, entry.kind, position, cov, extent, line, *history)
