@@ -11,6 +11,7 @@ import graphslam
 from graphslam.change_detection.visit import load_visit
 from graphslam.core.errors import ConfigError, EstimationError, OutputError
 from graphslam.core.geometry import rotate_cov, rotation3
+from graphslam.mapping.landmark_records import ALONG, SHORTEST_M
 from graphslam.results.folder import JOINT_FILE
 from graphslam.results.known_map import (
     KNOWN_MAP_FILE,
@@ -247,6 +248,7 @@ def test_the_joint_covariance_has_the_marginals_of_the_landmarks(first_day):
         if mark.kind != "point":
             # along a wall is a gauge, of which a heading that settles by 1e-5 rad has a part
             turn = rotation3(-mark.position[2])
-            own = own[1:, 1:] + np.diag([bias, 0.0])
+            length = max(float(np.hypot(*(mark.extent[1] - mark.extent[0]))), SHORTEST_M)
+            own = own[1:, 1:] + bias * np.diag([1.0, (ALONG / length) ** 2])
             told = (turn @ told @ turn.T)[1:, 1:]
         np.testing.assert_allclose(own, told, rtol=1e-3, atol=1e-7)
