@@ -19,6 +19,7 @@ from scipy.linalg.lapack import dtrtrs
 
 from graphslam.core.geometry import Array
 from graphslam.core.information_root import InformationRoot, IntArray
+from graphslam.core.mount_covariances import MountCovariances
 
 if TYPE_CHECKING:  # what reads the root of a folder needs no GTSAM
     from graphslam.estimation.selected_inverse import CliqueRows
@@ -170,6 +171,14 @@ def solve_root(root: InformationRoot, right: Array) -> Array:
         n = own.stop - own.start
         x[own], _ = dtrtrs(block[:, :n], x[own] - block[:, n:] @ x[separator])
     return x
+
+
+def mount_errors(root: InformationRoot, mounts: MountCovariances) -> Array:
+    """Errors (3R, k) of R mounts, m and rad, by what is shared; (3R, 0) where nothing is."""
+    rows = np.concatenate([root.mounts[robot] for robot in mounts.robots])
+    if not root.shared.size:
+        return np.zeros((len(rows), 0))
+    return np.where(rows[:, None] < 0, 0.0, root.shared[rows])
 
 
 def pair_covariances(

@@ -15,11 +15,10 @@ import numpy as np
 
 from graphslam.core.geometry import Array, inverse, rotation3
 from graphslam.core.information_root import InformationRoot, IntArray
-from graphslam.core.mount_covariances import MountCovariances
 from graphslam.core.observation_models import MODELS, LineModel
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate
-from graphslam.estimation.information_root import solve_root
+from graphslam.estimation.information_root import mount_errors, solve_root
 from graphslam.estimation.weighed_walls import WeighedWalls
 
 #: beams of a wall at which the bias is looked at
@@ -103,14 +102,6 @@ def with_surface_bias(
             },
         )
     return replace(estimate, states=states, landmarks=landmarks, root=root, mounts=mounts)
-
-
-def mount_errors(root: InformationRoot, mounts: MountCovariances) -> Array:
-    """Errors (3R, k) of R mounts, m and rad, by what is shared; (3R, 0) where nothing is."""
-    rows = np.concatenate([root.mounts[robot] for robot in mounts.robots])
-    if not root.shared.size:
-        return np.zeros((len(rows), 0))
-    return np.where(rows[:, None] < 0, 0.0, root.shared[rows])
 
 
 def surface_errors(walls: Sequence[WeighedWalls], root: InformationRoot) -> Array:

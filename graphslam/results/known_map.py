@@ -2,7 +2,9 @@
 
 The joint covariance of the landmarks follows from the root of the information in joint.npz, places
 from scans.npz. A result that was itself made with a known map has all of it in known_map.npz: of
-the days before nothing else is left. The layout is documented in docs/formats.md.
+the days before nothing else is left. What the biases of surfaces leave of the landmarks' errors is
+not in it: on another day they are the same, and do the same to its path. The layout is documented
+in docs/formats.md.
 """
 
 import hashlib
@@ -19,9 +21,10 @@ from graphslam.core.config import Config
 from graphslam.core.errors import ConfigError, OutputError
 from graphslam.core.geometry import Array, rotation3
 from graphslam.core.known_landmarks import KnownLandmarks, SparseRoot
+from graphslam.core.record import replace
 from graphslam.core.records import JointScans, KeyframeScan, Landmark, Result, Trajectory
 from graphslam.core.sparse_gaussian import sparse_root
-from graphslam.estimation.information_root import joint_covariance
+from graphslam.estimation.information_root import joint_covariance, mount_errors
 from graphslam.mapping.known_map import KnownMap, latest_places, map_place
 from graphslam.mapping.map_update import (
     with_covariances,
@@ -69,7 +72,8 @@ def load_known_map(directory: Path) -> KnownMap:
         if mark.frame is None and mark.id in saved.joint.root.landmarks
     )
     bias_m = saved.config.front_end.floor_normal_m
-    cov = with_surface_biases(landmarks, landmark_covariance(saved.joint, landmarks), bias_m)
+    cov = landmark_covariance(saved.joint, landmarks, biases=False)
+    cov = with_surface_biases(landmarks, cov, bias_m)
     known = known_landmarks(landmarks, cov)
     places = latest_places(_submaps(directory, saved))
     name, sha256 = directory.absolute().name, _digest(directory)
@@ -113,7 +117,7 @@ def continued(result: Result, earlier: KnownMap) -> KnownMap:
     if joint is None:
         raise OutputError("known_map.update: the result has no joint covariance")
     bias_m = result.config.front_end.floor_normal_m
-    cov = landmark_covariance(joint, result.landmarks)
+    cov = landmark_covariance(joint, result.landmarks, biases=False)
     landmarks, cov = without_days_biases(earlier.known, earlier.bias_m, result.landmarks, cov)
     cov = with_surface_biases(landmarks, cov, bias_m)
     landmarks, known = with_covariances(landmarks, cov), known_landmarks(landmarks, cov)
@@ -123,28 +127,41 @@ def continued(result: Result, earlier: KnownMap) -> KnownMap:
     return KnownMap("", "", landmarks, known, places, bias_m, earlier.ancestry)
 
 
-def landmark_covariance(joint: JointScans, landmarks: Sequence[Landmark]) -> Array:
-    """Joint covariance (D, D) of landmarks, errors of walls along each one's own axes."""
+def landmark_covariance(
+    joint: JointScans, landmarks: Sequence[Landmark], *, biases: bool = True
+) -> Array:
+    """Joint covariance (D, D) of landmarks, errors of walls along each one's own axes.
+
+    ``biases``: with what the biases of surfaces leave of them.
+    """
+    root, mounts = joint.root, joint.mounts
+    if not biases:
+        root = replace(root, shared=np.zeros((0, 0)))
     dims = [2 if mark.kind == "point" else 3 for mark in landmarks]
-    first = [joint.root.landmarks[mark.id] for mark in landmarks]
+    first = [root.landmarks[mark.id] for mark in landmarks]
     rows = np.concatenate(
         [np.zeros(0), *(np.arange(row, row + dim) for row, dim in zip(first, dims, strict=True))]
     ).astype(np.int64)
-    cov = joint_covariance(joint.root, rows)
-    if joint.mounts is None or not joint.mounts.placing:
+    cov = joint_covariance(root, rows)
+    if mounts is None or not mounts.placing:
         return cov
     # a mount places the world: an error of it moves all landmarks together
-    twist = next(iter(joint.mounts.placing.values()))  # there is one world
+    twist = next(iter(mounts.placing.values()))  # there is one world
     own_axes = [_own_axes(mark)[:dim, :dim] for mark, dim in zip(landmarks, dims, strict=True)]
     cross, placing = (
-        np.concatenate([axes @ one[: len(axes)] for axes, one in zip(own_axes, rows, strict=True)])
-        for rows in (
-            [joint.mounts.landmarks[mark.id] for mark in landmarks],
+        np.concatenate([axes @ one[: len(axes)] for axes, one in zip(own_axes, parts, strict=True)])
+        for parts in (
+            [mounts.landmarks[mark.id] for mark in landmarks],
             [moved_by_world(np.nan_to_num(mark.position)) @ twist for mark in landmarks],
         )
     )
+    of_mounts = mounts.cov
+    if not biases and joint.root.shared.size:
+        by_mounts = mount_errors(joint.root, mounts)
+        cross = cross - joint.root.shared[rows] @ by_mounts.T
+        of_mounts = of_mounts - by_mounts @ by_mounts.T
     mixed = cross @ placing.T
-    return np.asarray(cov + mixed + mixed.T - placing @ joint.mounts.cov @ placing.T)
+    return np.asarray(cov + mixed + mixed.T - placing @ of_mounts @ placing.T)
 
 
 def _own_axes(mark: Landmark) -> Array:
