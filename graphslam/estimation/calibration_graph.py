@@ -21,8 +21,7 @@ from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Motion, Step
 from graphslam.estimation import factors
 from graphslam.estimation.backend import JointMarginal
-from graphslam.estimation.covariance_columns import covariance_columns
-from graphslam.estimation.information_root import information_root
+from graphslam.estimation.information_root import information_root, solve_root
 from graphslam.estimation.isam2 import NO_COVARIANCES, with_means
 from graphslam.estimation.line_noise import fit_line_noise
 from graphslam.estimation.line_residuals import LineResiduals
@@ -35,7 +34,6 @@ from graphslam.estimation.optimisation import (
 from graphslam.estimation.posterior_residuals import Posterior, posterior_pairs
 from graphslam.estimation.recorded_graph import ObservationNoise, RecordedGraph, Source
 from graphslam.estimation.sandwich_covariance import CovarianceFactors, covariance_factors
-from graphslam.estimation.selected_inverse import CliqueRows
 from graphslam.estimation.surface_bias import with_surface_bias
 from graphslam.estimation.weighed_walls import WeighedWalls
 
@@ -230,10 +228,10 @@ class CalibrationGraph:
         if marginals:
             self._relinearise()
         half_error = float(builder.graph.error(values))
+        if marginals and bias_m is not None and builder.observes_walls:
+            self.line_noise = fit_line_noise(self.line_residuals())
+            weighed = builder.weigh_walls(values, self.line_noise)
         if marginals:
-            if bias_m is not None and builder.observes_walls:
-                self.line_noise = fit_line_noise(self.line_residuals())
-                weighed = builder.weigh_walls(values, self.line_noise)
             try:
                 found = marginals_of(builder.graph, values, keep_rows=joint)
             except RuntimeError as error:
@@ -243,7 +241,7 @@ class CalibrationGraph:
         mounted = self._mount_places() if mounts else {}
         estimate = builder.estimate(means, half_error, found.rows, mounted)
         if found.rows is not None and mounted:
-            estimate = replace(estimate, mounts=self._mounts(found.rows, values, mounted))
+            estimate = replace(estimate, mounts=self._mounts(estimate))
         if found.rows is not None and bias_m is not None and weighed:
             estimate = with_surface_bias(estimate, weighed, bias_m)
         return estimate, self._calibrations(covs)
@@ -282,40 +280,26 @@ class CalibrationGraph:
                 found[robot] = (self._keys[robot], at)
         return found
 
-    def _mounts(
-        self,
-        cliques: Sequence[CliqueRows],
-        values: gtsam.Values,
-        mounted: Mapping[str, tuple[int, Sequence[int]]],
-    ) -> MountCovariances:
-        """Covariances of the mounts, and of states and landmarks with them."""
-        builder, robots = self._builder, tuple(sorted(mounted))
-        columns: list[dict[int, Array]] = []  # key -> covariance (d, 3) with each mount
-        picks = []  # parameters -> mount
-        for robot in robots:
-            key, at = mounted[robot]
-            pick = (np.arange(len(self._free[robot]))[:, None] == np.array(at)).astype(float)
-            found = covariance_columns(cliques, key)
-            columns.append({k: column @ pick for k, column in found.items()})
-            picks.append(pick)
-
-        def with_all(key: int) -> Array:
-            return np.concatenate([one[key] for one in columns], axis=1)
-
-        cov = np.concatenate([
-            pick.T @ with_all(mounted[robot][0])
-            for robot, pick in zip(robots, picks, strict=True)
-        ])  # fmt: skip
-        states = {}
-        for robot in builder.robots:
-            keys = builder.state_keys(robot)
-            turns = rotation3([factors.read(values, key, 3)[2] for key in keys])
-            states[robot] = turns @ np.array([with_all(key) for key in keys])
+    def _mounts(self, estimate: Estimate) -> MountCovariances:
+        """Covariances of the mounts, and of states and landmarks with them, by the root."""
+        root = estimate.root
+        assert root is not None
+        robots = tuple(sorted(root.mounts))
+        rows = np.concatenate([root.mounts[robot] for robot in robots])
+        free = np.flatnonzero(rows >= 0)
+        unit = np.zeros((int(root.own.sum()), len(rows)))
+        unit[rows[free], free] = 1.0
+        columns, cov = solve_root(root, unit), np.zeros((len(rows), len(rows)))
+        cov[free] = columns[rows[free]]
+        states = {
+            robot: rotation3(path.poses[:, 2]) @ columns[root.states[robot][:, None] + np.arange(3)]
+            for robot, path in estimate.states.items()
+        }
         landmarks = {}
-        for i, dim in builder.landmark_dims.items():
-            key = factors.landmark_key(i)
-            turn = rotation3(factors.read(values, key, dim)[2]) if dim == 3 else np.eye(dim)
-            landmarks[i] = turn @ with_all(key)
+        for number, (mean, _) in estimate.landmarks.items():
+            first, dim = root.landmarks[number], len(mean)
+            turn = rotation3(mean[2]) if dim == 3 else np.eye(dim)
+            landmarks[number] = turn @ columns[first : first + dim]
         return MountCovariances(robots, cov, states, landmarks)
 
     def posterior(self) -> Posterior:

@@ -44,11 +44,13 @@ LITTLE_TURN_RAD = 3e-3
 
 #: a symbol's letter is in its highest byte, its number in the others
 FIRST_STATE, FIRST_LANDMARK = (int(gtsam.symbol(letter, 0)) for letter in "xl")
+#: states of a robot, at most: from one robot's keys to the next one's
+STATES = 1 << 40
 
 
 def state_key(robot_index: int, number: int) -> int:
     """Key of a robot's state; up to 2^16 robots and 2^40 states each."""
-    return FIRST_STATE | robot_index << 40 | number
+    return FIRST_STATE | robot_index * STATES | number
 
 
 def landmark_key(landmark: int) -> int:
@@ -65,7 +67,7 @@ def number_of(key: int) -> tuple[int | None, int]:
     """Index of the robot and number of its state, or None and the landmark's number."""
     if not is_state(key):
         return None, key - FIRST_LANDMARK
-    return divmod(key - FIRST_STATE, 1 << 40)
+    return divmod(key - FIRST_STATE, STATES)
 
 
 def pose2(pose: Array) -> gtsam.Pose2:

@@ -257,8 +257,12 @@ def root_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> tuple[Cl
     linear = graph.linearize(values)
     try:
         return root_rows(linear)
-    except RuntimeError:
-        return root_rows(linear, use_qr=True)
+    except RuntimeError as error:
+        rows = root_rows(linear, use_qr=True)
+        # QR does not fail on an indeterminate graph, its root is not finite
+        if not all(np.isfinite(clique.block).all() for clique in rows):
+            raise error
+        return rows
 
 
 def joint_marginal(tree: gtsam.ISAM2 | gtsam.GaussianBayesTree, keys: list[int]) -> Array:

@@ -16,9 +16,6 @@ from graphslam.estimation.m_estimators import WEIGHTS
 
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
-#: mask of a state's number in its key
-_NUMBER = (1 << 40) - 1
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WeighedWalls:
@@ -43,7 +40,7 @@ class WeighedWalls:
 
     def state_rows(self, root: InformationRoot) -> IntArray:
         """First row (n,) of the root of each observation's state."""
-        of, number = (self.keys - factors.FIRST_STATE) >> 40, self.keys & _NUMBER
+        of, number = np.divmod(self.keys - factors.FIRST_STATE, factors.STATES)
         rows = np.zeros(len(self.keys), dtype=np.int64)
         for k, robot in enumerate(self.robots):
             own = of == k

@@ -111,7 +111,7 @@ def joint_base_covariance(joint: JointScans, robots: Robots, used: Mapping[str, 
     )
     P = covariance_of(root, rows, columns, derivatives, len(by_mounts))
     if mounts is not None and len(free):
-        # what a mount's covariance has beyond that of the solution: biases of surfaces
+        # in files of earlier versions mounts alone have the biases of surfaces, beside the root
         beyond = mounts.cov[np.ix_(free, free)] - joint_covariance(root, mount_rows[free])
         P += by_mounts[:, free] @ beyond @ by_mounts[:, free].T
     blocks = P.reshape(len(own), 3, len(own), 3)

@@ -138,8 +138,7 @@ class _Problem:
         near, calibrations = self._graph.solution()
         steps = at_calibration(self._steps, self._initial, calibrations)
         minimum = Future(lambda: settled(steps, near, self._kernel)) if settle else None
-        wanted = {"marginals": True, "joint": True, "mounts": True}
-        found = self._graph.solution(**wanted, bias_m=self._bias_m)
+        found = self._graph.solution(marginals=True, joint=True, mounts=True, bias_m=self._bias_m)
         return steps, self._found(*found), minimum
 
     def _found(

@@ -3,16 +3,19 @@
 import tracemalloc
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 import pytest
 
 from graphslam.core.information_root import InformationRoot
 from graphslam.estimation.information_root import (
     covariance_of,
+    information_root,
     joint_covariance,
     pair_covariances,
     solve_root,
 )
+from graphslam.estimation.selected_inverse import covariance_blocks
 
 
 def tree(rng, cliques, reach=3):
@@ -80,6 +83,46 @@ def test_right_sides_are_solved_with_the_whole_information():
     root = tree(rng, 40)
     R, right = dense(root), rng.normal(size=(int(root.own.sum()), 7))
     np.testing.assert_allclose(R.T @ R @ solve_root(root, right), right, atol=1e-9)
+
+
+CALIBRATION = 1000
+
+
+def chain(seed):
+    """States in a row, points that some of them see, and a variable that all motions depend on."""
+    rng, unit = np.random.default_rng(seed), gtsam.noiseModel.Unit.Create
+    graph = gtsam.GaussianFactorGraph()
+    graph.add(gtsam.JacobianFactor(0, np.eye(3), np.zeros(3), unit(3)))
+    graph.add(gtsam.JacobianFactor(CALIBRATION, np.eye(2), np.zeros(2), unit(2)))
+    for k in range(25):
+        a, b, c = rng.normal(size=(3, 3)), rng.normal(size=(3, 3)), rng.normal(size=(3, 2))
+        graph.add(gtsam.JacobianFactor(k, a, k + 1, b, CALIBRATION, c, np.zeros(3), unit(3)))
+    for k in range(26):
+        a, b = rng.normal(size=(2, 3)), rng.normal(size=(2, 2))
+        graph.add(gtsam.JacobianFactor(k, a, 100 + k % 4, b, np.zeros(2), unit(2)))
+    return graph
+
+
+@pytest.mark.parametrize("row", [0, 13])
+def test_columns_of_an_eliminated_graph_are_those_of_the_dense_inverse(row):
+    """Of a state, and of the variable that all motions depend on, in the last clique."""
+    graph = chain(3)
+    keys, marks = list(range(26)), {k: 100 + k for k in range(4)}
+    root = information_root(
+        covariance_blocks(graph, keep_rows=True).rows,
+        {"r": keys},
+        marks,
+        {"r": (CALIBRATION, [0, 1, -1])},
+    )
+    ordering = gtsam.Ordering()
+    for key in (*keys, *marks.values(), CALIBRATION):
+        ordering.push_back(key)
+    P = np.linalg.inv(graph.hessian(ordering)[0])
+    rows = [row + k for row in root.states["r"] for k in range(3)]
+    rows += [root.landmarks[k] + d for k in marks for d in range(2)] + root.mounts["r"][:2].tolist()
+    unit = np.eye(len(P))[:, [rows[3 * row], root.mounts["r"][1]]]
+    found = solve_root(root, unit)[rows]
+    np.testing.assert_allclose(found, P[:, [3 * row, -1]], atol=1e-12)
 
 
 def test_shared_errors_are_in_all_covariances():
