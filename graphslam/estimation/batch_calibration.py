@@ -138,9 +138,9 @@ def calibrate_so_far(
         for name, track in tracks.items():
             track.calibration = now[name]
     solved = solve_calibrated(made, estimate, priors, now, kernel, rough=True)
+    covs = solved.graph.calibration_covariances()
     for name, track in tracks.items():
-        cov = solved.graph.calibration_covariance(name)
-        track.calibration = replace(solved.calibrations[name], cov=cov)
+        track.calibration = replace(solved.calibrations[name], cov=covs[name])
     return solved.estimate
 
 

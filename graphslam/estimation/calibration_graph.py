@@ -75,8 +75,7 @@ def solve_calibrated(
     Raises:
         EstimationError: a covariance is not positive definite, or a state is unknown.
     """
-    problem = CalibrationGraph(steps, start, priors, now, kernel)
-    problem.calibrate_motions(steps, now)
+    problem = CalibrationGraph(steps, start, priors, now, kernel, calibrated=True)
     converged = CONVERGED_ERROR_ROUGH if rough else CONVERGED_ERROR
     problem.optimise(converged)
     found = problem.solution(marginals=not rough, joint=joint, mounts=mounts, bias_m=bias_m)
@@ -104,8 +103,9 @@ def at_calibration(
 class CalibrationGraph:
     """The graph of steps with calibrations as variables, whose motions can be exchanged.
 
-    The motions are first those of the steps, with nothing about calibrations. ``line_noise``: robot
-    -> factors (2,), see `fit_line_noise`, once covariances are by them.
+    The motions are those of the steps, at first with nothing about calibrations unless the graph is
+    made ``calibrated``. ``line_noise``: robot -> factors (2,), see `fit_line_noise`, once
+    covariances are by them.
     """
 
     def __init__(
@@ -116,8 +116,12 @@ class CalibrationGraph:
         now: Mapping[str, Calibration],
         kernel: RobustConfig,
         noise: Mapping[Source, ObservationNoise] | None = None,
+        *,
+        calibrated: bool = False,
     ) -> None:
         """Build the graph; for the arguments see `solve_calibrated` and `RecordedGraph`.
+
+        ``calibrated``: the motions depend on the calibrations, as by `calibrate_motions`.
 
         Raises:
             EstimationError: a covariance is not positive definite, or a state is unknown.
@@ -137,10 +141,13 @@ class CalibrationGraph:
                 self._values.insert(key, now[robot].mean[use])
                 model = factors.gaussian(prior.cov[np.ix_(use, use)])
                 builder.graph.add(gtsam.PriorFactorVector(key, prior.mean[use], model))
-        builder.insert_all(steps, start, self._values)
+        free = [robot for robot, use in self._free.items() if calibrated and len(use)]
+        builder.insert_all(steps, start, self._values, free)
         builder.rebuild_lines(self._values)
         for index, robot, last, key in builder.motions:
             self._motions[robot].append((index, last, key))
+        if calibrated:
+            self.calibrate_motions(steps, now)
 
     def calibrate_motions(self, steps: Sequence[Step], now: Mapping[str, Calibration]) -> None:
         """Put motions in the graph that depend on the calibration.
@@ -345,18 +352,26 @@ class CalibrationGraph:
         except RuntimeError as error:
             raise self._builder.explain(error) from error
 
-    def calibration_covariance(self, robot: str, posterior: Posterior | None = None) -> Array:
-        """Covariance (p, p) of a robot's calibration at the last solution, or at a ``posterior``.
+    def calibration_covariances(self, posterior: Posterior | None = None) -> dict[str, Array]:
+        """Robot -> covariance (p, p) of its calibration at the last solution, or a ``posterior``.
 
         Raises:
             EstimationError: it is indeterminate.
         """
-        cov, use = self._priors[robot].cov.copy(), self._free[robot]
-        if len(use):
-            key = self._keys[robot]
-            known = {} if posterior is None else posterior.blocks.marginals
-            cov[np.ix_(use, use)] = known[key] if key in known else self._joint_covariance([key])
-        return cov
+        free = {robot: key for robot, key in self._keys.items() if len(self._free[robot])}
+        if posterior is not None:
+            known = {robot: posterior.blocks.marginals[key] for robot, key in free.items()}
+        else:
+            joint = self._joint_covariance(list(free.values())) if free else np.zeros((0, 0))
+            ends = np.cumsum([len(self._free[robot]) for robot in free])
+            known = {
+                robot: joint[end - len(self._free[robot]) : end, end - len(self._free[robot]) : end]
+                for robot, end in zip(free, ends.tolist(), strict=True)
+            }
+        covs = {robot: prior.cov.copy() for robot, prior in self._priors.items()}
+        for robot, own in known.items():
+            covs[robot][np.ix_(self._free[robot], self._free[robot])] = own
+        return covs
 
     def landmark_covariance(self, landmarks: Sequence[int]) -> Array:
         """Joint covariance (D, D) of landmarks at the last solution, along world axes.

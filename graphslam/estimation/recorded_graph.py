@@ -6,7 +6,7 @@ of thousands.
 """
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -84,8 +84,16 @@ class RecordedGraph(BatchGraph):
         self.shared_errors: dict[Source, SharedErrors] = {}
         self._stand_ins = 0
 
-    def insert_all(self, steps: Iterable[Step], start: Estimate, values: gtsam.Values) -> None:
+    def insert_all(
+        self,
+        steps: Iterable[Step],
+        start: Estimate,
+        values: gtsam.Values,
+        without_motions: Collection[str] = (),
+    ) -> None:
         """`insert` all steps; factors of bearings and ranges follow all others.
+
+        ``without_motions``: robots whose motions get a place in the graph, but no factor yet.
 
         Raises:
             EstimationError: a covariance is not positive definite and finite, or a state that a
@@ -112,7 +120,7 @@ class RecordedGraph(BatchGraph):
             if others or step.closures:
                 rest = Step(step.time_ns, {}, {}, tuple(others), step.closures)
                 self.insert(rest, start, values)
-        self._make_motions(motions)
+        self._make_motions(motions, without_motions)
         for source, observed in sorted(polar.items(), key=lambda one: (one[0][1], one[0][0])):
             self._insert_polar(source, observed, start, values)
 
@@ -126,8 +134,8 @@ class RecordedGraph(BatchGraph):
         self.motions.append((self.graph.size(), robot, last, last + 1))
         self.graph.resize(self.graph.size() + 1)
 
-    def _make_motions(self, motions: Sequence[Motion]) -> None:
-        """Fill the places of `motions`."""
+    def _make_motions(self, motions: Sequence[Motion], but: Collection[str]) -> None:
+        """Fill the places of `motions` of all robots ``but`` some."""
         if not motions:
             return
         cov = np.array([motion.cov for motion in motions])
@@ -136,11 +144,14 @@ class RecordedGraph(BatchGraph):
             time_ns = self.states.times[robot][key - self.state_key(robot, 0)]
             with covariance_of(describe_motion(robot, time_ns), cov[bad]):
                 factors.gaussian(cov[bad])
-        delta = np.array([motion.delta for motion in motions])
-        made = factors.motion_factors([ends[2:] for ends in self.motions], delta, cov)
-        for (index, *_), factor in zip(self.motions, made, strict=True):
-            self.graph.replace(index, factor)
-        self.rows += delta.size
+        self.rows += 3 * len(motions)
+        made = [k for k, (_, robot, *_) in enumerate(self.motions) if robot not in but]
+        if made:
+            delta = np.array([motions[k].delta for k in made])
+            ends = [self.motions[k][2:] for k in made]
+            own = factors.motion_factors(ends, delta, cov[made])
+            for k, factor in zip(made, own, strict=True):
+                self.graph.replace(self.motions[k][0], factor)
 
     def _note_segment(self, seen: Association) -> None:
         key = self.state_key(seen.robot, self.states.number(seen.robot, seen.time_ns))

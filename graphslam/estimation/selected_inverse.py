@@ -11,13 +11,17 @@ climbs its tree for each variable that it is asked for.
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import accumulate
+from typing import Any
 
 import gtsam
 import numpy as np
 from scipy.linalg.lapack import dtrtri
 
 from graphslam.core.geometry import Array
+
+
+#: numbers in covariances of cliques that are kept until joint ones are read from them
+NOTED = 1_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +82,7 @@ def covariance_blocks(
         # of the variables in one factor the first eliminated has the others in its row
         pairs_in[max(clique_of[key] for key in pair)].append(pair)
     marginals: dict[int, Array] = {}
-    joint: dict[tuple[int, ...], Array] = {}
+    joint = _Blocks()
     rows: list[CliqueRows] = []
     for number, clique in enumerate(cliques):
         above = None if clique.above is None else cliques[clique.above]
@@ -88,11 +92,11 @@ def covariance_blocks(
             rows.append(clique.with_block(block))
         for key in clique.own:
             marginals[key] = cov[clique.rows[key], clique.rows[key]]
-        for pair in pairs_in[number]:
-            joint[pair] = _joint(cov, [clique.rows[key] for key in pair])
+        if number in pairs_in:
+            joint.note(cov, clique.rows, pairs_in[number])
         if above is not None:
             above.release()
-    return CovarianceBlocks(marginals, joint, tuple(rows) if keep_rows else None)
+    return CovarianceBlocks(marginals, joint.read(), tuple(rows) if keep_rows else None)
 
 
 def root_rows(graph: gtsam.GaussianFactorGraph, *, use_qr: bool = False) -> tuple[CliqueRows, ...]:
@@ -117,15 +121,43 @@ def _eliminated(
     return _cliques(graph.eliminateSequential(ordering, *by_qr))
 
 
-def _joint(cov: Array, rows: Sequence[slice]) -> Array:
-    """Joint covariance of a few variables by their rows, in less time than by `np.ix_`."""
-    ends = list(accumulate((own.stop - own.start for own in rows), initial=0))
-    places = [slice(*ends[k : k + 2]) for k in range(len(rows))]
-    made = np.empty((ends[-1], ends[-1]))
-    for i, a in zip(places, rows, strict=True):
-        for j, b in zip(places, rows, strict=True):
-            made[i, j] = cov[a, b]
-    return made
+class _Blocks:
+    """Joint covariances of a few variables each, read from those of cliques many at once."""
+
+    def __init__(self) -> None:
+        self._found: dict[tuple[int, ...], Array] = {}
+        self._forget()
+
+    def _forget(self) -> None:
+        # by dimensions: keys, where the covariance begins, its width, where their rows begin
+        self._noted: dict[tuple[int, ...], list[tuple[Any, ...]]] = defaultdict(list)
+        self._covs: list[Array] = []
+        self._size = 0
+
+    def note(
+        self, cov: Array, rows: Mapping[int, slice], wanted: Iterable[tuple[int, ...]]
+    ) -> None:
+        """Note which keys are wanted of a covariance (n, n) with the ``rows`` of each."""
+        for keys in wanted:
+            own = [rows[key] for key in keys]
+            dims = tuple([one.stop - one.start for one in own])
+            self._noted[dims].append((keys, self._size, len(cov), [one.start for one in own]))
+        self._covs.append(cov.ravel())
+        self._size += cov.size
+        if self._size > NOTED:
+            self.read()
+
+    def read(self) -> dict[tuple[int, ...], Array]:
+        """Keys -> covariance (k, k), of all that was noted."""
+        flat = np.concatenate([*self._covs, np.zeros(0)])
+        for dims, noted in self._noted.items():
+            keys, first, width, starts = zip(*noted, strict=True)
+            rows = np.repeat(starts, dims, axis=1)
+            rows += np.concatenate([np.arange(dim) for dim in dims])
+            begin = np.array(first)[:, None] + rows * np.array(width)[:, None]
+            self._found.update(zip(keys, flat[begin[:, :, None] + rows[:, None]], strict=True))
+        self._forget()
+        return self._found
 
 
 def _empty_factor(a: int, b: int) -> gtsam.JacobianFactor:

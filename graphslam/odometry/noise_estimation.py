@@ -29,6 +29,8 @@ FLOOR_M, FLOOR_RAD = 5e-4, 1e-4
 CLIP_SIGMAS = 3.0
 #: motions whose variances by nine rates are computed at once, and readings in them, at most
 BLOCK, READINGS = 1000, 20_000
+#: a step beyond that of the residuals by themselves changes a variance by such a factor at most
+FARTHEST = 4.0
 #: a median of absolute values, as the sigma of a normal variable
 SIGMA_OF_MEDIAN = 1.4826
 
@@ -68,7 +70,7 @@ def fit_noise(
         variances: (n, 3) of the noise by which the motions were solved.
         normalised: (n, 3) residuals by this noise, see `Residuals`.
         redundancy: (n, 3) see `Residuals`.
-        relax: whether to go farther, as the noise so far comes from such a fit already.
+        relax: whether to go farther, as other fits follow until nothing changes.
     """
     bare = without_floors(with_rates(track.config, np.zeros(len(RATES))))
     known = motion_variances(track, bare, times_ns)
@@ -88,7 +90,7 @@ def fit_noise(
     x = _non_negative(A.reshape(-1, len(RATES)), b.ravel())
     if relax:
         before = np.maximum(np.mean(1.0 - known / R, axis=0), 1e-9)
-        ratio = np.clip(np.mean(C @ x / R, axis=0) / before, 0.5, 2.0)
+        ratio = np.clip(np.mean(C @ x / R, axis=0) / before, 1.0 / FARTHEST, FARTHEST)
         x *= np.repeat(ratio ** _farther(left, prior), 3)
     return with_rates(bare, x)
 

@@ -118,8 +118,9 @@ class _Problem:
             track.calibration = track.calibration.held()
         made = recompute_motions(steps, tracks)
         self._steps = scale_motion_noise(made, noise_scales(made, start))
-        self._graph = CalibrationGraph(self._steps, start, priors, self._initial, config.robust)
-        self._graph.calibrate_motions(self._steps, self._initial)
+        self._graph = CalibrationGraph(
+            self._steps, start, priors, self._initial, config.robust, calibrated=True
+        )
 
     def solve_roughly(self) -> CalibratedSolution:
         """Without covariances, and ended early."""

@@ -27,13 +27,14 @@ class LogNoise:
     without floors; ``measured``: source -> factors (2,) on the stated variances, shared errors
     included, that the log shows, and likewise (3,) of motions whose covariances are stated.
     ``lines``: robot -> factors (2,) on the stated variances of normal offsets and directions of
-    its lines, by which covariances are computed.
+    its lines, by which covariances are computed. ``of_whole_log``: found in all of it.
     """
 
     sightings: Mapping[Source, ObservationNoise] = field(default_factory=dict)
     odometry: Mapping[str, OdometryConfig] = field(default_factory=dict)
     measured: Mapping[Source, Array] = field(default_factory=dict)
     lines: Mapping[str, Array] = field(default_factory=dict)
+    of_whole_log: bool = False
 
     def motion_scales(self) -> dict[str, Array]:
         """Robot -> factor (3,) on the sigmas of its motions: the stated noise is never reduced."""

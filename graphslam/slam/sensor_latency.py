@@ -18,17 +18,24 @@ def has_latency(track: Track) -> bool:
     return track.is_mounted and not track.has_burst_stamps
 
 
-def hold_insignificant_latency(track: Track) -> None:
-    """Take the clocks of sightings and odometry as one, unless the log is clearly likelier not so.
+def shows_latency(track: Track) -> bool:
+    """Whether the log is clearly likelier with the latency in a track's calibration than without.
 
-    Where a robot drives evenly only noise tells of an offset, and its sigma is too small.
-    ``track`` has the calibration that the log shows, with its covariance.
+    The calibration is the one that the log shows, with its covariance.
     """
-    if not has_latency(track):
-        return
     mean, cov = track.calibration.mean, track.calibration.cov
-    if mean[-1] ** 2 > LATENCY_SIGMAS**2 * cov[-1, -1]:
+    return has_latency(track) and bool(mean[-1] ** 2 > LATENCY_SIGMAS**2 * cov[-1, -1])
+
+
+def hold_insignificant_latency(track: Track) -> None:
+    """Take the clocks of sightings and odometry as one, unless the log clearly shows otherwise.
+
+    Where a robot drives evenly only noise tells of an offset, and its sigma is too small. For
+    ``track`` see `shows_latency`.
+    """
+    if not has_latency(track) or shows_latency(track):
         return
+    mean = track.calibration.mean
     last = [len(mean) - 1]
     track.prior = track.prior.at_zero(last)
     track.calibration = replace(track.prior, mean=np.append(mean[:-1], 0.0))

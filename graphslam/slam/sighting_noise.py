@@ -65,12 +65,19 @@ def estimate_noise(
     Raises:
         EstimationError: the estimate is indeterminate.
     """
-    sample = steps_at_sightings(stretch(steps), sources, {}, Counter())
+    chosen = stretch(steps)
+    sample = steps_at_sightings(chosen, sources, {}, Counter())
     tracks = {name: tracks[name] for name in state_times(sample)}
     estimate = at_states(estimate, sample, tracks)
     before = {name: track.config for name, track in tracks.items()}
     try:
-        return _estimated(sample, estimate, tracks, config, rounds)
+        noise = _estimated(sample, estimate, tracks, config, rounds)
+        if len(chosen) > len(steps):  # with the starts apart
+            noise = replace(noise, of_whole_log=True)
+        if noise.of_whole_log or not has_state_at_every_sighting(noise.sightings):
+            for track in tracks.values():  # else a solution of the whole log decides
+                hold_insignificant_latency(track)
+        return noise
     finally:
         for name, track in tracks.items():
             track.config = before[name]
@@ -117,34 +124,32 @@ def _estimated(
     for name in stated:
         tracks[name].config = without_floors(tracks[name].config)
     measured: dict[Source, Array] = {}
-    for k in range(rounds):
+    for _ in range(rounds):
         initial = {name: track.calibration for name, track in tracks.items()}
         for track in tracks.values():
             track.calibration = track.calibration.held()
         made = with_motions(_beginning_at(steps, estimate), tracks, estimate)
-        graph = CalibrationGraph(made, estimate, priors, initial, config.robust, noise)
-        graph.calibrate_motions(made, initial)
+        graph = CalibrationGraph(
+            made, estimate, priors, initial, config.robust, noise, calibrated=True
+        )
         estimate, calibrations = graph.solve(CONVERGED_ERROR)
         posterior = graph.posterior()
         new = _sighting_noise(posterior, noise)
         change = _largest_change(noise, new)
         noise = new
+        covs = graph.calibration_covariances(posterior)
         for name, track in tracks.items():
-            cov = graph.calibration_covariance(name, posterior)
-            track.calibration = replace(calibrations[name], cov=cov)
+            track.calibration = replace(calibrations[name], cov=covs[name])
             if name in stated:
                 factors = measured_motion_noise(track, name, posterior)
                 if factors is not None:
                     measured[name, MOTION] = factors
                 continue
-            changed = fit_track_noise(track, name, posterior, relax=k > 0)
+            changed = fit_track_noise(track, name, posterior, relax=is_white(noise))
             track.config = without_floors(track.config)
             change = max(change, changed or 0.0)
         if change < CONVERGED_SHARE or not is_white(noise):
             break
-    if not has_state_at_every_sighting(noise):  # else the whole log decides
-        for track in tracks.values():
-            hold_insignificant_latency(track)
     for source, found in noise.items():
         measured[source] = found.white + found.shared
     final = {source: _cautious(found, config) for source, found in noise.items()}

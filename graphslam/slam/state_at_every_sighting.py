@@ -13,7 +13,11 @@ from graphslam.odometry.preintegration import Track
 from graphslam.slam.log_noise import LogNoise, weighed, with_own_noise
 from graphslam.slam.log_pass import LogPass
 from graphslam.slam.motion_noise import scale_motion_noise
-from graphslam.slam.sensor_latency import has_latency, hold_insignificant_latency
+from graphslam.slam.sensor_latency import (
+    has_latency,
+    hold_insignificant_latency,
+    shows_latency,
+)
 from graphslam.slam.sighting_states import (
     at_states,
     state_times,
@@ -55,10 +59,10 @@ class SightingProblem:
         """
 
         def decide(solved: CalibratedSolution, _steps: Sequence[Step]) -> None:
+            covs = solved.graph.calibration_covariances()
             for name, track in self.tracks.items():
                 if has_latency(track):
-                    cov = solved.graph.calibration_covariance(name)
-                    track.calibration = replace(track.calibration, cov=cov)
+                    track.calibration = replace(track.calibration, cov=covs[name])
                     hold_insignificant_latency(track)
 
         estimate, _ = self._solved(self.steps, start, rough=True, solved_once=decide)
@@ -128,7 +132,8 @@ def state_at_every_sighting(
     dropped: Counter[str] = Counter()
     late_ns = _late_ns(one)
     problem, start = _problem(one, estimate, noise, late_ns, dropped)
-    start = problem.decide_latencies(start)
+    if not noise.of_whole_log:  # else it is decided
+        start = problem.decide_latencies(start)
     if (decided_ns := _late_ns(one)) != late_ns:
         dropped.clear()
         problem, start = _problem(one, start, noise, decided_ns, dropped)
@@ -137,9 +142,13 @@ def state_at_every_sighting(
 
 
 def _late_ns(one: LogPass) -> dict[str, int]:
-    """By how much later than its odometry each robot's sightings are stamped, as known now."""
+    """Robot -> by how much its sightings are stamped late, as known now; only what shows clearly."""
     tracks = {name: run.track for name, run in one.started.items()}
-    return {name: track.reported_late_ns(track.calibration) for name, track in tracks.items()}
+    return {
+        name: track.reported_late_ns(track.calibration)
+        for name, track in tracks.items()
+        if shows_latency(track)
+    }
 
 
 def _problem(

@@ -73,7 +73,7 @@ def test_what_is_left_in_all_residuals_are_the_redundant_measurements(sigma):
     left = [1.0 - of.absorbed / of.variance for of in (of_motions, of_points)]
     assert min(map(np.min, left)) > 0.0
     state = posterior.blocks.marginals[posterior.builder.state_key("r", 0)]
-    scale = graph.calibration_covariance("r", posterior)[0, 0]
+    scale = graph.calibration_covariances(posterior)["r"][0, 0]
     of_priors = 4 - np.trace(state) / START**2 - scale / SCALE**2
     measurements, unknowns = 3 * N + 2 * len(POINTS) * (N + 1) + 4, 3 * (N + 1) + 4 + 1
     total = sum(map(np.sum, left)) + of_priors
